@@ -1,0 +1,21 @@
+"""lanebev: how a camera looks at the road, frame by frame, from lane boundaries alone."""
+
+from lanebev.geometry.camera import Camera
+from lanebev.geometry.road import image_from_road_points, road_covariance, road_from_image_points
+from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
+from lanebev.view.grid import BEVGrid, bev_from_image
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "BEVGrid",
+    "Calibration",
+    "Camera",
+    "Extrinsics",
+    "LaneSegments",
+    "Status",
+    "bev_from_image",
+    "image_from_road_points",
+    "road_covariance",
+    "road_from_image_points",
+]

@@ -1,0 +1,1 @@
+"""Vanishing direction, lane width, the filter, the calibrators and the mount."""

@@ -1,0 +1,257 @@
+"""Lenses: pixels to rays and back, with distortion, for a whole batch of cameras.
+
+Pixels are (x, y) with centres at integers. "Undistorted" pixels are those of the ideal pinhole
+camera with the same intrinsics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from kornia.geometry import calibration
+from kornia.geometry.camera import distort_points_kannala_brandt
+from torch import Tensor
+
+MODELS = ("pinhole", "fisheye")
+DISTORTION_LENGTHS = {"pinhole": (0, 4, 5, 8, 12), "fisheye": (4,)}
+_UNDISTORT_ITERATIONS = 20  # kornia's default of 5 leaves 1e-2 px at the corners of a wide lens
+_KB_NEWTON_ITERATIONS = 10  # quadratic from theta = theta_d: 1e-12 rad below 80 deg
+
+
+def _check_lens(distortion: Tensor, model: str) -> None:
+    if model not in MODELS:
+        raise ValueError(f"model: expected one of {', '.join(MODELS)}, got {model!r}")
+    if distortion.shape[-1] not in DISTORTION_LENGTHS[model]:
+        expected = ", ".join(map(str, DISTORTION_LENGTHS[model]))
+        raise ValueError(
+            f"distortion: expected {expected} coefficients for a {model} lens, got {distortion.shape[-1]}"
+        )
+
+
+def _check_points(points: Tensor, size: int = 2) -> None:
+    if points.ndim < 2 or points.shape[-1] != size:
+        raise ValueError(f"points: expected (..., N, {size}), got {tuple(points.shape)}")
+
+
+def normalise_points(points: Tensor, intrinsics: Tensor) -> Tensor:
+    """Undistorted pixels to the z = 1 plane.
+
+    Args:
+        points: (..., N, 2) px.
+        intrinsics: (..., 3, 3).
+
+    Returns:
+        (..., N, 2) (x/z, y/z).
+    """
+    _check_points(points)
+    fx, fy = intrinsics[..., None, 0, 0], intrinsics[..., None, 1, 1]
+    skew, cx, cy = intrinsics[..., None, 0, 1], intrinsics[..., None, 0, 2], intrinsics[..., None, 1, 2]
+    y = (points[..., 1] - cy) / fy
+    return torch.stack([(points[..., 0] - cx - skew * y) / fx, y], dim=-1)
+
+
+def denormalise_points(points: Tensor, intrinsics: Tensor) -> Tensor:
+    """Inverse of :func:`normalise_points`."""
+    _check_points(points)
+    fx, fy = intrinsics[..., None, 0, 0], intrinsics[..., None, 1, 1]
+    skew, cx, cy = intrinsics[..., None, 0, 1], intrinsics[..., None, 0, 2], intrinsics[..., None, 1, 2]
+    x, y = points.unbind(-1)
+    return torch.stack([fx * x + skew * y + cx, fy * y + cy], dim=-1)
+
+
+def distort_points(points: Tensor, intrinsics: Tensor, distortion: Tensor, model: str = "pinhole") -> Tensor:
+    """Undistorted pixels to pixels of the image as it was taken.
+
+    Source: Brown-Conrady as in OpenCV ``calib3d`` (kornia.geometry.calibration); Kannala and Brandt 2006
+    (kornia.geometry.camera).
+
+    Args:
+        points: (B, N, 2) px, undistorted.
+        intrinsics: (B, 3, 3).
+        distortion: (B, D), D in 0, 4, 5, 8, 12 (pinhole) or 4 (fisheye), OpenCV's order.
+        model: "pinhole" or "fisheye".
+
+    Returns:
+        (B, N, 2) px, distorted. Differentiable in all tensors.
+
+    Raises:
+        ValueError: unknown model, or a number of coefficients that it does not have.
+    """
+    _check_lens(distortion, model)
+    _check_points(points)
+    if distortion.shape[-1] == 0:
+        return points
+    if model == "fisheye":
+        plane = normalise_points(points, intrinsics)
+        unit = distortion.new_tensor([1.0, 1.0, 0.0, 0.0]).expand(*distortion.shape[:-1], 4)
+        params = torch.cat([unit, distortion], dim=-1)  # (B, 8) of an ideal focal length: stays on the plane
+        return denormalise_points(
+            distort_points_kannala_brandt(plane, params.unsqueeze(-2).expand(*plane.shape[:-1], 8)),
+            intrinsics,
+        )
+    return calibration.distort_points(points, intrinsics, distortion)
+
+
+def undistort_points(
+    points: Tensor, intrinsics: Tensor, distortion: Tensor, model: str = "pinhole"
+) -> Tensor:
+    """Pixels of the image as it was taken to those of the ideal pinhole.
+
+    Inverse of :func:`distort_points`, by fixed-point iteration (pinhole) or Newton's method on the polar
+    angle (fisheye). Where the lens polynomial folds over, far outside the image, the result is not a
+    solution; :meth:`Camera.undistort_points` reports such points.
+
+    Args:
+        points: (B, N, 2) px, distorted.
+        intrinsics: (B, 3, 3).
+        distortion: (B, D).
+        model: "pinhole" or "fisheye".
+
+    Returns:
+        (B, N, 2) px, undistorted.
+
+    Raises:
+        ValueError: unknown model, or a number of coefficients that it does not have.
+    """
+    _check_lens(distortion, model)
+    _check_points(points)
+    if distortion.shape[-1] == 0:
+        return points
+    if model == "fisheye":
+        plane = normalise_points(points, intrinsics)
+        return denormalise_points(_undistort_plane_kannala_brandt(plane, distortion), intrinsics)
+    return calibration.undistort_points(points, intrinsics, distortion, num_iters=_UNDISTORT_ITERATIONS)
+
+
+def _undistort_plane_kannala_brandt(plane: Tensor, distortion: Tensor) -> Tensor:
+    """Kannala-Brandt inverse on the z = 1 plane, (B, N, 2): theta_d = theta (1 + k1 theta^2 + ...)."""
+    k1, k2, k3, k4 = distortion[..., None, :].unbind(-1)  # each (B, 1)
+    squared = (plane * plane).sum(-1)
+    centre = squared < 1e-16  # sqrt has no gradient there, and the lens no effect
+    theta_d = torch.where(centre, 1.0, squared).sqrt()
+    theta = theta_d
+    for _ in range(_KB_NEWTON_ITERATIONS):
+        t2 = theta * theta
+        value = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+        theta = theta - (value - theta_d) / slope
+    scale = torch.where(centre, 1.0, theta.tan() / theta_d)
+    return plane * scale.unsqueeze(-1)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera's lens.
+
+    Attributes:
+        intrinsics: (3, 3) px.
+        distortion: (D,), OpenCV's order; empty for an ideal lens.
+        model: "pinhole" (Brown-Conrady, D = 0, 4, 5, 8, 12) or "fisheye" (Kannala-Brandt, D = 4).
+        image_size: (height, width) px.
+    """
+
+    intrinsics: Tensor
+    distortion: Tensor
+    model: str
+    image_size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        if self.intrinsics.shape != (3, 3):
+            raise ValueError(f"intrinsics: expected (3, 3), got {tuple(self.intrinsics.shape)}")
+        if self.distortion.ndim != 1:
+            raise ValueError(f"distortion: expected (D,), got {tuple(self.distortion.shape)}")
+        _check_lens(self.distortion, self.model)
+        height, width = self.image_size
+        if height <= 0 or width <= 0:
+            raise ValueError(f"image_size: expected positive (height, width), got {self.image_size}")
+        fx, fy = float(self.intrinsics[0, 0]), float(self.intrinsics[1, 1])
+        if not (fx > 0 and fy > 0):
+            raise ValueError(f"intrinsics: expected positive focal lengths, got fx {fx:g}, fy {fy:g}")
+
+    @classmethod
+    def from_parameters(
+        cls,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        width: int,
+        height: int,
+        distortion: tuple[float, ...] | list[float] = (),
+        model: str = "pinhole",
+        dtype: torch.dtype = torch.float64,
+    ) -> Camera:
+        """From plain numbers, in pixels."""
+        intrinsics = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=dtype)
+        return cls(intrinsics, torch.tensor(list(distortion), dtype=dtype), model, (height, width))
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> Camera:
+        """Read OpenCV FileStorage or ROS ``camera_info`` YAML, KITTI ``calib.txt`` or our short YAML.
+
+        Raises:
+            ValueError: the file is missing, cut, or holds an absurd value; one line says which.
+        """
+        from lanebev.io.cameras import read_camera  # the edge, for the convenience of one name
+
+        return read_camera(path)
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
+        """The same camera on another device or in another precision."""
+        return replace(
+            self,
+            intrinsics=self.intrinsics.to(device=device, dtype=dtype),
+            distortion=self.distortion.to(device=device, dtype=dtype),
+        )
+
+    def scaled(self, image_size: tuple[int, int]) -> Camera:
+        """The camera of the image resized to (height, width); pixel centres at integers on both sides."""
+        sy, sx = image_size[0] / self.image_size[0], image_size[1] / self.image_size[1]
+        resize = self.intrinsics.new_tensor(
+            [[sx, 0.0, 0.5 * (sx - 1)], [0.0, sy, 0.5 * (sy - 1)], [0.0, 0.0, 1.0]]
+        )
+        return replace(self, intrinsics=resize @ self.intrinsics, image_size=tuple(image_size))
+
+    def cropped(self, top: int, left: int, height: int, width: int) -> Camera:
+        """The camera of ``image[top:top+height, left:left+width]``; may reach beyond the image."""
+        shift = self.intrinsics.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+        return replace(self, intrinsics=self.intrinsics - shift, image_size=(height, width))
+
+    def distort_points(self, points: Tensor) -> Tensor:
+        """(N, 2) px undistorted to (N, 2) px as taken."""
+        return distort_points(points[None], self.intrinsics[None], self.distortion[None], self.model)[0]
+
+    def undistort_points(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 2) px as taken to (N, 2) px undistorted and (N,) bool, false where no such point exists."""
+        undistorted = undistort_points(
+            points[None], self.intrinsics[None], self.distortion[None], self.model
+        )[0]
+        error = (self.distort_points(undistorted) - points).norm(dim=-1)
+        return undistorted, error < 0.05  # NaN and Inf compare false
+
+    def rays(self, points: Tensor) -> Tensor:
+        """(N, 2) px as taken to (N, 3) camera rays with z = 1."""
+        plane = normalise_points(self.undistort_points(points)[0], self.intrinsics)
+        return torch.cat([plane, torch.ones_like(plane[..., :1])], dim=-1)
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Camera-frame points to pixels as taken.
+
+        Args:
+            points: (N, 3) m.
+
+        Returns:
+            (N, 2) px, and (N,) bool: in front of the camera and inside the image.
+        """
+        _check_points(points, 3)
+        front = points[..., 2] > 1e-6
+        depth = torch.where(front, points[..., 2], 1.0)
+        pixels = self.distort_points(
+            denormalise_points(points[..., :2] / depth.unsqueeze(-1), self.intrinsics)
+        )
+        height, width = self.image_size
+        x, y = pixels.unbind(-1)
+        inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
+        return pixels, front & inside

@@ -1,0 +1,122 @@
+"""Great circles, the road plane, and points between image and road, with their covariance."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lanebev.geometry.camera import normalise_points
+from lanebev.geometry.rotation import road_from_cam
+from lanebev.types import Extrinsics
+
+
+def rays_from_pixels(points: Tensor, intrinsics: Tensor) -> Tensor:
+    """Undistorted pixels to camera rays, K⁻¹ p.
+
+    Args:
+        points: (..., N, 2) px.
+        intrinsics: (..., 3, 3).
+
+    Returns:
+        (..., N, 3), z = 1.
+    """
+    plane = normalise_points(points, intrinsics)
+    return torch.cat([plane, torch.ones_like(plane[..., :1])], dim=-1)
+
+
+def great_circle_normals(endpoints: Tensor, intrinsics: Tensor) -> Tensor:
+    """Normals of the planes through the camera and each segment, not normalised.
+
+    Source: Eq. (3), n = (K⁻¹ p₁) × (K⁻¹ p₂). Left unnormalised because |n| grows with the segment's
+    length, and with it the segment's say (PAPER_NOTES 9).
+
+    Args:
+        endpoints: (..., N, 2, 2) px, undistorted.
+        intrinsics: (..., 3, 3).
+
+    Returns:
+        (..., N, 3).
+    """
+    rays = rays_from_pixels(endpoints.flatten(-3, -2), intrinsics)
+    rays = rays.unflatten(-2, (-1, 2))  # (..., N, 2, 3)
+    return torch.linalg.cross(rays[..., 0, :], rays[..., 1, :])
+
+
+def road_from_image_points(
+    points: Tensor, intrinsics: Tensor, extrinsics: Extrinsics
+) -> tuple[Tensor, Tensor]:
+    """Undistorted pixels to the road.
+
+    Args:
+        points: (B, N, 2) px.
+        intrinsics: (B, 3, 3).
+        extrinsics: each (B,).
+
+    Returns:
+        (B, N, 2) m, (X right, Z along the lanes), and (B, N) bool, false above the horizon or behind.
+    """
+    rays = rays_from_pixels(points, intrinsics) @ _road_from_cam(extrinsics).mT  # (B, N, 3)
+    x, down, z = rays.unbind(-1)
+    valid = down > 1e-6
+    scale = extrinsics.height.unsqueeze(-1) / torch.where(valid, down, 1.0)
+    return torch.stack([x * scale, z * scale], dim=-1), valid & (scale > 0)
+
+
+def image_from_road_points(
+    points: Tensor, intrinsics: Tensor, extrinsics: Extrinsics
+) -> tuple[Tensor, Tensor]:
+    """Road points to undistorted pixels.
+
+    Args:
+        points: (B, N, 2) m, (X right, Z along the lanes).
+        intrinsics: (B, 3, 3).
+        extrinsics: each (B,).
+
+    Returns:
+        (B, N, 2) px, and (B, N) bool, false behind the camera.
+    """
+    x, z = points.unbind(-1)
+    road = torch.stack([x, extrinsics.height.unsqueeze(-1).expand_as(x), z], dim=-1)
+    pixels = road @ _road_from_cam(extrinsics) @ intrinsics.mT  # rows: (K R_cam_from_road p)ᵀ
+    depth = pixels[..., 2]
+    valid = depth > 1e-3
+    return pixels[..., :2] / torch.where(valid, depth, 1.0).unsqueeze(-1), valid
+
+
+def road_covariance(
+    points: Tensor,
+    intrinsics: Tensor,
+    extrinsics: Extrinsics,
+    pixel_cov: Tensor | None = None,
+    extrinsics_cov: Tensor | None = None,
+) -> Tensor:
+    """Covariance of road points, to first order, from that of the pixels and of the pose.
+
+    Args:
+        points: (B, N, 2) px.
+        intrinsics: (B, 3, 3).
+        extrinsics: each (B,).
+        pixel_cov: (B, N, 2, 2) px², or None for exact pixels.
+        extrinsics_cov: (B, 4, 4) of (pitch, yaw, roll, height), or None for an exact pose.
+
+    Returns:
+        (B, N, 2, 2) m² of (X, Z).
+    """
+
+    def to_road(pixel: Tensor, pose: Tensor, matrix: Tensor) -> Tensor:
+        pose_1 = Extrinsics.unstack(pose.unsqueeze(0))
+        return road_from_image_points(pixel[None, None], matrix.unsqueeze(0), pose_1)[0][0, 0]
+
+    jacobians = torch.func.jacfwd(to_road, argnums=(0, 1))
+    over_points = torch.func.vmap(jacobians, in_dims=(0, None, None))
+    by_pixel, by_pose = torch.func.vmap(over_points)(points, extrinsics.stack(), intrinsics)
+    cov = points.new_zeros(*points.shape, 2)
+    if pixel_cov is not None:
+        cov = cov + by_pixel @ pixel_cov @ by_pixel.mT
+    if extrinsics_cov is not None:
+        cov = cov + by_pose @ extrinsics_cov.unsqueeze(1) @ by_pose.mT
+    return cov
+
+
+def _road_from_cam(extrinsics: Extrinsics) -> Tensor:
+    return road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)

@@ -1,0 +1,1 @@
+"""Probability maps from images, and line segments from probability maps."""

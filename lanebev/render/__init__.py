@@ -1,0 +1,1 @@
+"""The rendered road: textures, scene, camera, drive."""

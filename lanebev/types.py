@@ -1,0 +1,77 @@
+"""The tuples of tensors and the status that cross module borders."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+NUM_BOUNDARIES = 6
+"""Semantic lane boundaries by default: 0, 1, 2 left of the ego lane's middle, 3, 4, 5 right of it."""
+
+
+class Status(IntEnum):
+    """What a row of a calibration is worth. A new meaning is a new value."""
+
+    UNINITIALISED = 0  # nothing has been seen yet: the extrinsics are the initial guess
+    TRACKING = 1  # this frame's observations were used
+    COASTING = 2  # nothing usable in this frame: predicted from earlier ones
+    LOST = 3  # too long without support: the extrinsics are the last that were believed
+
+
+class LaneSegments(NamedTuple):
+    """Line segments on lane boundaries, padded to N per image.
+
+    Attributes:
+        endpoints: (B, N, 2, 2) px, undistorted image coordinates, ``[segment, end, (x, y)]``.
+        boundary: (B, N) int64, index of the semantic lane boundary, left to right, 0..L-1.
+        weight: (B, N) in [0, 1]; 0 is padding or "not seen".
+        sigma: (B, N) px, standard deviation of an end point's position across the line.
+    """
+
+    endpoints: Tensor
+    boundary: Tensor
+    weight: Tensor
+    sigma: Tensor
+
+
+class Extrinsics(NamedTuple):
+    """Camera pose over the road, each (B,): rad, rad, rad, m; always in this order.
+
+    pitch > 0 is nose down, yaw > 0 points left of the lanes, roll > 0 is counter-clockwise
+    seen from behind, height > 0 is above the road.
+    """
+
+    pitch: Tensor
+    yaw: Tensor
+    roll: Tensor
+    height: Tensor
+
+    def stack(self) -> Tensor:
+        """(B, 4) tensor of (pitch, yaw, roll, height)."""
+        return torch.stack(tuple(self), dim=-1)
+
+    @classmethod
+    def unstack(cls, values: Tensor) -> Extrinsics:
+        """From a (B, 4) tensor of (pitch, yaw, roll, height)."""
+        if values.shape[-1] != 4:
+            raise ValueError(f"values: expected (..., 4), got {tuple(values.shape)}")
+        return cls(*values.unbind(-1))
+
+
+class Calibration(NamedTuple):
+    """One frame's estimate.
+
+    Attributes:
+        extrinsics: pitch, yaw, roll, height, each (B,).
+        covariance: (B, 4, 4) of (pitch, yaw, roll, height).
+        status: (B,) int64, values of :class:`Status`.
+        inliers: (B, N) in [0, 1], how far each segment was believed.
+    """
+
+    extrinsics: Extrinsics
+    covariance: Tensor
+    status: Tensor
+    inliers: Tensor

@@ -1,0 +1,94 @@
+"""The bird's-eye grid and the homography from the image to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lanebev.geometry.rotation import road_from_cam
+from lanebev.types import Extrinsics
+
+
+@dataclass(frozen=True)
+class BEVGrid:
+    """A rectangle of the road and its resolution.
+
+    Pixel (column, row) with centres at integers lies at X = x[0] + column · resolution,
+    Z = z[1] - row · resolution: rows run far to near, columns left to right (Eq. (19)'s convention).
+
+    Attributes:
+        x: (left, right) m.
+        z: (near, far) m.
+        resolution: m per pixel.
+    """
+
+    x: tuple[float, float] = (-10.0, 10.0)
+    z: tuple[float, float] = (3.0, 60.0)
+    resolution: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not self.resolution > 0:
+            raise ValueError(f"resolution: expected > 0 m, got {self.resolution}")
+        for name, (low, high) in (("x", self.x), ("z", self.z)):
+            if not high - low >= self.resolution:
+                raise ValueError(f"{name}: expected (low, high) with high > low, got {(low, high)}")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(U, V): rows far to near, columns left to right."""
+        return (
+            round((self.z[1] - self.z[0]) / self.resolution),
+            round((self.x[1] - self.x[0]) / self.resolution),
+        )
+
+    def road_from_bev_points(self, points: Tensor) -> Tensor:
+        """(..., 2) BEV px (column, row) to (..., 2) m (X, Z)."""
+        column, row = points.unbind(-1)
+        return torch.stack([self.x[0] + column * self.resolution, self.z[1] - row * self.resolution], dim=-1)
+
+    def bev_from_road_points(self, points: Tensor) -> Tensor:
+        """(..., 2) m (X, Z) to (..., 2) BEV px (column, row)."""
+        x, z = points.unbind(-1)
+        return torch.stack([(x - self.x[0]) / self.resolution, (self.z[1] - z) / self.resolution], dim=-1)
+
+    def bev_from_road_covariance(self, cov: Tensor) -> Tensor:
+        """(..., 2, 2) m² of (X, Z) to (..., 2, 2) px² of (column, row)."""
+        sign = cov.new_tensor([1.0, -1.0]) / self.resolution
+        return cov * sign[:, None] * sign
+
+    def cells(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
+        """(U, V, 2) road coordinates (X, Z) of every pixel centre, m."""
+        rows, columns = self.shape
+        row, column = torch.meshgrid(
+            torch.arange(rows, dtype=dtype, device=device),
+            torch.arange(columns, dtype=dtype, device=device),
+            indexing="ij",
+        )
+        return self.road_from_bev_points(torch.stack([column, row], dim=-1))
+
+
+def bev_from_image(extrinsics: Extrinsics, intrinsics: Tensor, grid: BEVGrid) -> Tensor:
+    """Homography from undistorted image pixels to BEV pixels.
+
+    Source: Eq. (19), H_WC = S [r₁; r₃; r₂/h] K⁻¹ with r_i the rows of R(θ, φ, ψ). S is the paper's for a
+    grid x = (-b_X/2, b_X/2), z = (0, b_Z); other rectangles shift it.
+
+    Args:
+        extrinsics: each (B,).
+        intrinsics: (B, 3, 3).
+        grid: the BEV rectangle.
+
+    Returns:
+        (B, 3, 3), pixels to pixels. Not normalised: its last row is the depth below the horizon.
+    """
+    rows = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)
+    right, down, forward = rows.unbind(-2)
+    plane_from_cam = torch.stack([right, forward, down / extrinsics.height.unsqueeze(-1)], dim=-2)
+    scale = 1.0 / grid.resolution
+    bev_from_plane = intrinsics.new_tensor(
+        [[scale, 0.0, -grid.x[0] * scale], [0.0, -scale, grid.z[1] * scale], [0.0, 0.0, 1.0]]
+    )
+    cam_from_image = torch.linalg.inv(intrinsics)
+    return bev_from_plane @ plane_from_cam @ cam_from_image
