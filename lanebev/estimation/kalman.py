@@ -1,0 +1,133 @@
+"""Batched Kalman prediction and update. Knows nothing of lanes or cameras.
+
+The update is in information form: N scalar measurements enter as a D × D matrix and a D-vector, so it
+costs O(N D²) where the gain form inverts an N × N matrix (Eq. (16)), and a measurement of weight zero is
+simply not there.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def predict(mean: Tensor, cov: Tensor, transition: Tensor, process_noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Prediction of a linear system model.
+
+    Source: Eqs. (12)-(13).
+
+    Args:
+        mean: (..., D).
+        cov: (..., D, D).
+        transition: (..., D, D), F.
+        process_noise: (..., D, D), W.
+
+    Returns:
+        mean (..., D) and covariance (..., D, D).
+    """
+    predicted = (transition @ mean.unsqueeze(-1)).squeeze(-1)
+    return predicted, symmetrise(transition @ cov @ transition.mT + process_noise)
+
+
+def information(
+    innovation: Tensor, jacobian: Tensor, measurement_noise: Tensor, weight: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """What N independent scalar measurements say, Hᵀ Q⁻¹ H and Hᵀ Q⁻¹ y.
+
+    Args:
+        innovation: (..., N), measured minus predicted.
+        jacobian: (..., N, D), of the predicted measurement by the state.
+        measurement_noise: (..., N) variances, > 0 where the weight is.
+        weight: (..., N) in [0, 1], or None for all 1. Zero: not there, whatever the other entries hold.
+
+    Returns:
+        (..., D, D) and (..., D).
+    """
+    if weight is None:
+        weight = torch.ones_like(innovation)
+    there = weight > 0
+    precision = torch.where(there, weight, 0.0) / torch.where(there, measurement_noise, 1.0)
+    jacobian = torch.where(there.unsqueeze(-1), jacobian, 0.0)
+    scaled = jacobian * precision.unsqueeze(-1)  # (..., N, D)
+    vector = scaled.mT @ torch.where(there, innovation, 0.0).unsqueeze(-1)
+    return scaled.mT @ jacobian, vector.squeeze(-1)
+
+
+def update(mean: Tensor, cov: Tensor, info_matrix: Tensor, info_vector: Tensor) -> tuple[Tensor, Tensor]:
+    """Update with the information of any number of measurements.
+
+    Source: Eqs. (16)-(18). Deviation: information form instead of the gain form, equal to rounding, since
+    S is N × N; and Joseph form of the covariance, since (I - G H) P loses symmetry and, in float32, sign.
+
+    With P = L Lᵀ: P⁺ = L (I + Lᵀ Λ L)⁻¹ Lᵀ, which needs no inverse of P; then
+    P⁺ = (I - P⁺ Λ) P (I - P⁺ Λ)ᵀ + P⁺ Λ P⁺, the Joseph form for the gain G = P⁺ Hᵀ Q⁻¹.
+
+    Args:
+        mean: (..., D), predicted.
+        cov: (..., D, D), predicted, positive definite.
+        info_matrix: (..., D, D), Λ = Hᵀ Q⁻¹ H.
+        info_vector: (..., D), Hᵀ Q⁻¹ y with y the innovation at ``mean``.
+
+    Returns:
+        mean (..., D) and covariance (..., D, D).
+    """
+    root = torch.linalg.cholesky_ex(cov).L
+    eye = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
+    inner = torch.linalg.cholesky_ex(eye + root.mT @ info_matrix @ root).L
+    half = torch.linalg.solve_triangular(inner, root.mT, upper=False)  # (..., D, D)
+    posterior = half.mT @ half
+    keep = eye - posterior @ info_matrix
+    joseph = keep @ cov @ keep.mT + posterior @ info_matrix @ posterior
+    return mean + (posterior @ info_vector.unsqueeze(-1)).squeeze(-1), symmetrise(joseph)
+
+
+def gate(
+    innovation: Tensor, jacobian: Tensor, measurement_noise: Tensor, cov: Tensor, sigmas: float
+) -> Tensor:
+    """Which measurements lie within so many standard deviations of their prediction.
+
+    Args:
+        innovation: (..., N).
+        jacobian: (..., N, D).
+        measurement_noise: (..., N) variances.
+        cov: (..., D, D), predicted.
+        sigmas: bound on |innovation| over its standard deviation sqrt(h P hᵀ + q).
+
+    Returns:
+        (..., N) bool.
+    """
+    predicted = ((jacobian @ cov) * jacobian).sum(-1)
+    return innovation.square() <= sigmas**2 * (predicted + measurement_noise)
+
+
+def constant_velocity(dt: Tensor, spectral_density: Tensor) -> tuple[Tensor, Tensor]:
+    """Transition and process noise of D/2 positions followed by their D/2 rates.
+
+    Source: Eqs. (10), (11); Bar-Shalom, Li, Kirubarajan 2001, Sec. 6.2.2. Deviation: the noise is a white
+    acceleration integrated over dt, which reaches the positions too, so that frames of any spacing agree.
+
+    Args:
+        dt: (B,) s, >= 0.
+        spectral_density: (D/2,) of the acceleration, unit² / s³.
+
+    Returns:
+        (B, D, D) F and (B, D, D) W.
+    """
+    half = spectral_density.shape[-1]
+    eye = torch.eye(half, dtype=dt.dtype, device=dt.device)
+    step = dt[:, None, None]
+    zero, one = torch.zeros_like(step), torch.ones_like(step)
+    steps = torch.cat([torch.cat([one, step], -1), torch.cat([zero, one], -1)], -2)  # (B, 2, 2)
+    noise = torch.cat([torch.cat([step**3 / 3, step**2 / 2], -1), torch.cat([step**2 / 2, step], -1)], -2)
+    return _kron(steps, eye), _kron(noise, torch.diag(spectral_density))
+
+
+def symmetrise(matrix: Tensor) -> Tensor:
+    """The symmetric part, (M + Mᵀ) / 2."""
+    return 0.5 * (matrix + matrix.mT)
+
+
+def _kron(blocks: Tensor, inner: Tensor) -> Tensor:
+    """(B, a, a) ⊗ (b, b) -> (B, ab, ab)."""
+    product: Tensor = torch.einsum("nij,kl->nikjl", blocks, inner)
+    return product.reshape(blocks.shape[0], blocks.shape[1] * inner.shape[0], -1)

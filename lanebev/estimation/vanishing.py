@@ -1,0 +1,200 @@
+"""The vanishing direction of a set of segments: Algorithm 1, batched over rows and hypotheses."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+SCORE_ANGLE_WEIGHT = 0.8  # λ₁
+SCORE_LENGTH_WEIGHT = 0.2  # λ₂
+GATE_ANGLE = math.radians(0.7)  # θ_th
+_EPS = 1e-12
+
+
+def segment_angles(endpoints: Tensor, vanishing_points: Tensor) -> Tensor:
+    """Angle between each segment and the line from its centre to a vanishing point.
+
+    Source: Rother 2002 as in Fig. 5, θ(v, l).
+
+    Args:
+        endpoints: (..., N, 2, 2) px.
+        vanishing_points: (..., 3) homogeneous px; infinite ones have a zero third entry.
+
+    Returns:
+        (..., N) rad in [0, pi/2].
+    """
+    first, second = endpoints.unbind(-2)
+    along = second - first
+    centre = 0.5 * (first + second)
+    point = vanishing_points.unsqueeze(-2)
+    to_vp = point[..., :2] - point[..., 2:] * centre  # direction only: finite at infinity too
+    cross = along[..., 0] * to_vp[..., 1] - along[..., 1] * to_vp[..., 0]
+    dot = (along * to_vp).sum(-1)
+    return torch.atan2(cross.abs(), dot.abs() + _EPS)
+
+
+def gate_angles(endpoints: Tensor, sigma: Tensor, gate_sigmas: float) -> Tensor:
+    """Largest angle at which a segment still counts as pointing to the vanishing point.
+
+    Source: Sec. III-B, θ_th = 0.7°. Deviation: never less than ``gate_sigmas`` of the angle's own standard
+    deviation √2 σ / length, since 0.7° throws away half of the true segments at σ² = 9 (PAPER_NOTES 10).
+    ``gate_sigmas=0`` is the paper.
+
+    Args:
+        endpoints: (..., N, 2, 2) px.
+        sigma: (..., N) px.
+        gate_sigmas: number of standard deviations.
+
+    Returns:
+        (..., N) rad.
+    """
+    spread = gate_sigmas * math.sqrt(2.0) * sigma / segment_lengths(endpoints).clamp_min(1e-6)
+    return spread.clamp(GATE_ANGLE, math.radians(20.0))
+
+
+def segment_lengths(endpoints: Tensor) -> Tensor:
+    """(..., N, 2, 2) px to (..., N) px."""
+    squared = (endpoints[..., 1, :] - endpoints[..., 0, :]).square().sum(-1)
+    return squared.clamp_min(_EPS).sqrt()
+
+
+def rother_score(angles: Tensor, gates: Tensor, lengths: Tensor, weight: Tensor) -> Tensor:
+    """Support of a vanishing point.
+
+    Source: Eq. (2), Σ λ₁ (1 - θ/θ_th) + λ₂ l / l_m over segments with θ < θ_th.
+
+    Args:
+        angles: (..., N) rad.
+        gates: (..., N) rad, θ_th.
+        lengths: (..., N) px.
+        weight: (..., N) in [0, 1].
+
+    Returns:
+        (...,).
+    """
+    longest = (lengths * (weight > 0)).amax(-1, keepdim=True).clamp_min(_EPS)
+    score = SCORE_ANGLE_WEIGHT * (1 - angles / gates) + SCORE_LENGTH_WEIGHT * lengths / longest
+    return torch.where(angles < gates, weight * score, 0.0).sum(-1)
+
+
+def segment_pairs(weight: Tensor, num_hypotheses: int, seed: int) -> Tensor:
+    """Pairs of segments to intersect: all of them when there are few, seeded samples otherwise.
+
+    Args:
+        weight: (B, N); only segments of positive weight are drawn where a row has two of them.
+        num_hypotheses: M, the most pairs per row.
+        seed: of the draws, the same for every row, so that a row's pairs don't depend on its batch.
+
+    Returns:
+        (B, M', 2) int64, M' <= M.
+    """
+    num_segments = weight.shape[-1]
+    if num_segments * (num_segments - 1) // 2 <= num_hypotheses:
+        pairs = torch.combinations(torch.arange(num_segments, device=weight.device))
+        return pairs.expand(weight.shape[0], -1, -1)
+    present = weight > 0
+    order = torch.argsort(~present, dim=-1, stable=True)  # the present ones first
+    count = present.sum(-1).clamp_min(2)[:, None]  # (B, 1)
+    draws = torch.rand(num_hypotheses, 2, generator=torch.Generator().manual_seed(seed)).to(weight.device)
+    first = (draws[:, 0] * count).long().clamp_max(num_segments - 1)  # (B, M)
+    other = (draws[:, 1] * (count - 1)).long().clamp_max(num_segments - 2)
+    second = other + (other >= first)  # never the first again
+    return torch.stack([order.gather(1, first), order.gather(1, second)], dim=-1)
+
+
+def ransac_vanishing_point(
+    endpoints: Tensor,
+    weight: Tensor,
+    sigma: Tensor,
+    num_hypotheses: int = 256,
+    gate_sigmas: float = 3.0,
+    seed: int = 0,
+) -> tuple[Tensor, Tensor]:
+    """The hypothesis with the highest score, and the segments that agree with it.
+
+    Source: Algorithm 1 with Eqs. (1), (2).
+
+    Args:
+        endpoints: (B, N, 2, 2) px, finite.
+        weight: (B, N) in [0, 1].
+        sigma: (B, N) px.
+        num_hypotheses: N_loop, at most; exhaustive over pairs where that is no more.
+        gate_sigmas: see :func:`gate_angles`.
+        seed: of the sampling.
+
+    Returns:
+        (B, 3) homogeneous px of the best hypothesis and (B, N) bool inliers, L_c. No inliers where no
+        hypothesis is supported by any segment.
+    """
+    ones = torch.ones_like(endpoints[..., :1])
+    ends = torch.cat([endpoints, ones], dim=-1)
+    lines = torch.linalg.cross(ends[..., 0, :], ends[..., 1, :])  # (B, N, 3)
+    lines = lines / lines[..., :2].norm(dim=-1, keepdim=True).clamp_min(_EPS)
+    pairs = segment_pairs(weight, num_hypotheses, seed)  # (B, M, 2)
+    rows = torch.arange(weight.shape[0], device=weight.device)[:, None]
+    hypotheses = torch.linalg.cross(lines[rows, pairs[..., 0]], lines[rows, pairs[..., 1]])
+    usable = (weight[rows, pairs] > 0).all(-1) & (hypotheses.abs().amax(-1) > 1e-6)
+    lengths, gates = segment_lengths(endpoints), gate_angles(endpoints, sigma, gate_sigmas)
+    angles = segment_angles(endpoints.unsqueeze(1), hypotheses)  # (B, M, N)
+    scores = rother_score(angles, gates.unsqueeze(1), lengths.unsqueeze(1), weight.unsqueeze(1))
+    scores = torch.where(usable, scores, -1.0)
+    best = scores.argmax(-1)  # (B,)
+    chosen = angles[rows[:, 0], best]
+    inliers = (chosen < gates) & (weight > 0) & (scores.amax(-1, keepdim=True) > 0)
+    return hypotheses[rows[:, 0], best], inliers
+
+
+def incidence_noise(rays: Tensor, vanishing_dir: Tensor, sigma: Tensor, intrinsics: Tensor) -> Tensor:
+    """Variance of the residual n·v for end points with pixel noise.
+
+    Source: first-order propagation through Eq. (3). Deviation: the paper's Q_PY is one constant, but the
+    variance grows as σ² (d₁² + d₂²), d the distances end point to vanishing point (PAPER_NOTES 9).
+
+    Args:
+        rays: (B, N, 2, 3), K⁻¹ p of both end points.
+        vanishing_dir: (B, 3), any length.
+        sigma: (B, N) px.
+        intrinsics: (B, 3, 3).
+
+    Returns:
+        (B, N).
+    """
+    moments = torch.linalg.cross(rays, vanishing_dir[:, None, None, :].expand_as(rays))
+    focal = torch.stack([intrinsics[:, 0, 0], intrinsics[:, 1, 1]], dim=-1)[:, None, None, :]
+    per_end = (moments[..., :2] / focal).square().sum(-1)  # (B, N, 2)
+    return sigma.square() * per_end.sum(-1)
+
+
+def vanishing_dir_least_squares(
+    normals: Tensor, noise: Tensor, weight: Tensor, prior_dir: Tensor, prior_std: float = 1.0
+) -> tuple[Tensor, Tensor]:
+    """Vanishing direction from great-circle normals, with its covariance.
+
+    Source: Eq. (4), A v = 0. Deviation: solved as 2 × 2 normal equations for v = (x, y, 1) with a weak
+    prior instead of an SVD: no sign to guess (PAPER_NOTES 2), each row weighted by its noise, and value
+    and gradient stay finite when the normals don't determine v (PAPER_NOTES 16).
+
+    Args:
+        normals: (B, N, 3), not normalised.
+        noise: (B, N) variances of n·v at v_z = 1, > 0 where the weight is.
+        weight: (B, N) in [0, 1].
+        prior_dir: (B, 3) with z > 0, what to return where nothing is observed.
+        prior_std: standard deviation of the prior, in units of x/z.
+
+    Returns:
+        (B, 3) direction with z = 1, and (B, 2, 2) covariance of (x, y).
+    """
+    there = weight > 0
+    precision = torch.where(there, weight, 0.0) / torch.where(there, noise, 1.0)
+    scaled = normals * precision.unsqueeze(-1)
+    moments = scaled.mT @ normals  # (B, 3, 3) Σ n nᵀ / var
+    prior = prior_dir[..., :2] / prior_dir[..., 2:]
+    eye = torch.eye(2, dtype=normals.dtype, device=normals.device)
+    matrix = moments[..., :2, :2] + eye / prior_std**2
+    vector = prior / prior_std**2 - moments[..., :2, 2]
+    root = torch.linalg.cholesky_ex(matrix).L
+    solution = torch.cholesky_solve(vector.unsqueeze(-1), root).squeeze(-1)
+    cov = torch.cholesky_solve(eye.expand_as(matrix), root)
+    return torch.cat([solution, torch.ones_like(solution[..., :1])], dim=-1), cov
