@@ -1,0 +1,63 @@
+"""``calibration.yaml``: the lens and how it is mounted, in formats others read."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+
+from lanebev.geometry.camera import Camera
+from lanebev.geometry.rotation import road_from_cam
+from lanebev.io.cameras import camera_info, dump_yaml
+from lanebev.types import Extrinsics
+
+
+def vehicle_from_camera(mount: Extrinsics) -> torch.Tensor:
+    """Camera pose in ROS's (and OpenLane's) vehicle frame: x forward, y left, z up, origin on the road.
+
+    Args:
+        mount: each (B,).
+
+    Returns:
+        (B, 4, 4), camera frame (x right, y down, z forward) to vehicle.
+    """
+    rotation = road_from_cam(mount.pitch, mount.yaw, mount.roll)
+    vehicle_from_road = rotation.new_tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    matrix = torch.eye(4, dtype=rotation.dtype, device=rotation.device).repeat(rotation.shape[0], 1, 1)
+    matrix[:, :3, :3] = vehicle_from_road @ rotation
+    matrix[:, 2, 3] = mount.height
+    return matrix
+
+
+def write_calibration(
+    path: str | Path, camera: Camera, mount: Extrinsics, std: Extrinsics, name: str = "camera"
+) -> None:
+    """Write ``calibration.yaml``: a ROS ``camera_info`` with the mount's pose beside it.
+
+    The pose is there as angles and height in our signs, as a 4 x 4 camera-to-vehicle matrix in the axes of
+    ROS and OpenLane (x forward, y left, z up), and as that rotation's quaternion. PyYAML, ROS's camera
+    calibration parsers and ``cv2.FileStorage`` read the file; so does :func:`read_camera`.
+
+    Args:
+        path: the file.
+        camera: the lens.
+        mount: each (1,).
+        std: standard deviations of the mount, each (1,).
+        name: ``camera_name`` in the file.
+    """
+    from scipy.spatial.transform import Rotation  # its import is slow, and only this needs it
+
+    matrix = vehicle_from_camera(mount)[0].double()
+    quaternion = Rotation.from_matrix(matrix[:3, :3].numpy()).as_quat()
+    fields = camera_info(camera, name)
+    angles = ("pitch", "yaw", "roll")
+    fields["mount"] = {
+        **{f"{key}_deg": math.degrees(float(getattr(mount, key)[0])) for key in angles},
+        "height_m": float(mount.height[0]),
+        **{f"{key}_std_deg": math.degrees(float(getattr(std, key)[0])) for key in angles},
+        "height_std_m": float(std.height[0]),
+    }
+    fields["vehicle_from_camera"] = {"rows": 4, "cols": 4, "data": matrix.flatten().tolist()}
+    fields["quaternion_xyzw"] = [float(value) for value in quaternion]
+    Path(path).write_text(dump_yaml(fields), encoding="utf-8")

@@ -1,0 +1,216 @@
+"""Camera files: every flavour gives the same lens, and every mistake one clear line."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from lanebev import Camera, Extrinsics
+from lanebev.io.cameras import read_camera, write_camera
+from lanebev.io.mount_file import vehicle_from_camera, write_calibration
+
+DISTORTION = [-0.25, 0.04, -0.0007, 0.0001, -0.115]
+SHORT = {"fx": 1150.0, "fy": 1148.0, "cx": 650.0, "cy": 370.0, "width": 1280, "height": 720}
+LENS = Camera.from_parameters(**SHORT, distortion=DISTORTION)
+
+
+def _write(path, text):
+    path.write_text(text)
+    return path
+
+
+def _assert_same(camera, expected):
+    torch.testing.assert_close(camera.intrinsics, expected.intrinsics, rtol=0, atol=0)
+    torch.testing.assert_close(camera.distortion, expected.distortion, rtol=0, atol=0)
+    assert camera.model == expected.model
+    assert camera.image_size == expected.image_size
+
+
+def test_short_yaml(tmp_path):
+    path = _write(
+        tmp_path / "c.yaml", yaml.safe_dump({**SHORT, "distortion": DISTORTION, "model": "pinhole"})
+    )
+    _assert_same(Camera.from_file(path), LENS)
+
+
+@pytest.mark.parametrize("suffix", ["yml", "xml"])
+@pytest.mark.parametrize("shape", [(5,), (5, 1), (1, 5)])
+def test_opencv_file_storage(tmp_path, suffix, shape):
+    path = tmp_path / f"c.{suffix}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 1280)
+    storage.write("image_height", 720)
+    storage.write("camera_matrix", LENS.intrinsics.numpy())
+    storage.write("distortion_coefficients", np.array(DISTORTION).reshape(shape))
+    storage.write("avg_reprojection_error", 0.3)
+    storage.release()
+    _assert_same(read_camera(path), LENS)
+
+
+@pytest.mark.parametrize(
+    ("name", "coefficients", "model"),
+    [
+        ("plumb_bob", DISTORTION, "pinhole"),
+        ("rational_polynomial", [0.1, 0.01, 0.0, 0.0, 0.001, 0.2, 0.02, 0.0], "pinhole"),
+        ("equidistant", [0.01, -0.002, 0.001, 0.0], "fisheye"),
+        ("fisheye", [0.01, -0.002, 0.001, 0.0], "fisheye"),
+    ],
+)
+def test_ros_camera_info(tmp_path, name, coefficients, model):
+    fields = {
+        "image_width": 1280,
+        "image_height": 720,
+        "camera_name": "front",
+        "camera_matrix": {"rows": 3, "cols": 3, "data": LENS.intrinsics.flatten().tolist()},
+        "distortion_model": name,
+        "distortion_coefficients": {"rows": 1, "cols": len(coefficients), "data": coefficients},
+    }
+    camera = read_camera(_write(tmp_path / "c.yaml", yaml.safe_dump(fields)))
+    _assert_same(camera, Camera.from_parameters(**SHORT, distortion=coefficients, model=model))
+
+
+def test_ros_message_dump(tmp_path):
+    fields = {"width": 1280, "height": 720, "distortion_model": "plumb_bob"}
+    fields |= {"K": LENS.intrinsics.flatten().tolist(), "D": DISTORTION}
+    _assert_same(read_camera(_write(tmp_path / "c.yaml", yaml.safe_dump(fields))), LENS)
+
+
+P2 = "P2: 721.5377 0 609.5593 44.85728 0 721.5377 172.854 0.2163791 0 0 1 0.002745884\n"
+
+
+def test_kitti_object_file_knows_the_recording_day(tmp_path):
+    camera = read_camera(
+        _write(tmp_path / "calib.txt", "P0: " + P2[4:] + P2 + "R0_rect: 1 0 0 0 1 0 0 0 1\n")
+    )
+    expected = Camera.from_parameters(721.5377, 721.5377, 609.5593, 172.854, 1242, 375)
+    _assert_same(camera, expected)
+
+
+def test_kitti_raw_file_prefers_its_own_size(tmp_path):
+    text = "calib_time: 09-Jan-2012\nS_rect_02: 1.242e+03 3.75e+02\nP_rect_02:" + P2[3:].replace(
+        "721.5377", "700"
+    )
+    camera = read_camera(_write(tmp_path / "calib_cam_to_cam.txt", text), image_size=(10, 10))
+    assert camera.image_size == (375, 1242)
+    assert float(camera.intrinsics[0, 0]) == 700
+
+
+def test_kitti_file_of_an_unknown_camera_needs_a_size(tmp_path):
+    path = _write(tmp_path / "calib.txt", P2.replace("721.5377", "700"))
+    with pytest.raises(ValueError, match=r"image size.*S_rect_02: WIDTH HEIGHT"):
+        read_camera(path)
+    assert read_camera(path, image_size=(370, 1224)).image_size == (370, 1224)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fx": None}, "fx: expected a value, got none"),
+        ({"fx": -5.0}, "fx: expected .* px for an image of 1280 x 720, got -5"),
+        ({"fx": 1.2, "fy": 1.2}, "focal lengths are in pixels"),
+        ({"fx": 100_000.0}, "fx: expected"),
+        ({"fy": 300.0}, "square pixels"),
+        ({"cx": 2000.0}, "cx: expected a principal point inside the image, 0 to 1280, got 2000"),
+        ({"cy": -3.0}, "cy: expected"),
+        ({"cy": float("nan")}, "cy: expected finite numbers, got nan"),
+        ({"fx": "wide"}, "fx: expected finite numbers, got wide"),
+        ({"width": 0}, "image size: expected"),
+        ({"width": 640.5}, "whole pixels"),
+        ({"height": None}, "image_height: expected a value"),
+        ({"distortion": [0.1, 0.2]}, "distortion: expected 0 or 4 or 5 or 8 or 12 coefficients"),
+        ({"distortion": [0.1] * 5, "model": "fisheye"}, r"expected 4 coefficients \(fisheye\), got 5"),
+        ({"distortion": 0.3}, "distortion: expected a list"),
+        ({"distortion": [-900.0, 0, 0, 0]}, "lens that can be inverted"),
+        ({"model": "catadioptric"}, "model: expected one of pinhole"),
+        ({"focal": 3}, "unknown key 'focal'"),
+    ],
+)
+def test_bad_entries_are_one_clear_line(tmp_path, change, message):
+    fields = {key: value for key, value in {**SHORT, **change}.items() if value is not None}
+    path = _write(tmp_path / "c.yaml", yaml.safe_dump(fields))
+    with pytest.raises(ValueError, match=message) as error:
+        read_camera(path)
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("c.yaml", "", "is the file empty"),
+        ("c.yaml", "fx: 1150\nfx: 1151\n", "fx twice"),
+        (
+            "c.yaml",
+            "camera_matrix: {rows: 3, cols: 3, data: [1150.0, 0.0",
+            "syntax error at line 1; is the file cut",
+        ),
+        (
+            "c.xml",
+            "<?xml version='1.0'?><opencv_storage><camera_matrix>",
+            "syntax error at line 1; is the file cut",
+        ),
+        ("calib.txt", "R0_rect: 1 0 0", "P_rect_02 or P2"),
+        ("calib.txt", "P2: 721.5 0 609", "P2: expected 12 numbers, got 3"),
+    ],
+)
+def test_malformed_files_are_one_clear_line(tmp_path, name, text, message):
+    with pytest.raises(ValueError, match=message) as error:
+        read_camera(_write(tmp_path / name, text))
+    assert "\n" not in str(error.value)
+
+
+def test_matrix_cut_short(tmp_path):
+    fields = {
+        "image_width": 1280,
+        "image_height": 720,
+        "camera_matrix": {"rows": 3, "cols": 3, "data": [1.0] * 8},
+    }
+    with pytest.raises(ValueError, match="camera_matrix: expected 9 numbers, got 8"):
+        read_camera(_write(tmp_path / "c.yaml", yaml.safe_dump(fields)))
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(ValueError, match="No such file"):
+        read_camera(tmp_path / "none.yaml")
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xd8\xff\xe0")
+    with pytest.raises(ValueError, match="not a text file"):
+        read_camera(tmp_path / "binary.yaml")
+
+
+@pytest.mark.parametrize(
+    ("distortion", "model"),
+    [([], "pinhole"), (DISTORTION[:4], "pinhole"), (DISTORTION, "pinhole"), ([0.01] * 4, "fisheye")],
+)
+def test_write_camera_round_trip(tmp_path, distortion, model):
+    camera = Camera.from_parameters(**SHORT, distortion=distortion, model=model)
+    write_camera(tmp_path / "c.yaml", camera)
+    again = read_camera(tmp_path / "c.yaml")
+    padded = distortion if model == "fisheye" else distortion + [0.0] * (5 - len(distortion))
+    _assert_same(again, Camera.from_parameters(**SHORT, distortion=padded, model=model))
+
+
+def test_calibration_file_is_read_by_others(tmp_path):
+    mount = Extrinsics(*(torch.tensor([value], dtype=torch.float64) for value in (0.05, -0.02, 0.01, 1.5)))
+    path = tmp_path / "calibration.yaml"
+    write_calibration(path, LENS, mount, mount)
+    _assert_same(read_camera(path), LENS)
+    fields = yaml.safe_load(path.read_text())
+    assert fields["mount"]["pitch_deg"] == pytest.approx(math.degrees(0.05), abs=1e-12)
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    assert storage.getNode("mount").getNode("height_m").real() == 1.5
+    assert storage.getNode("camera_matrix").getNode("data").at(0).real() == 1150.0
+
+
+def test_convention_vehicle_from_camera():
+    zero, height = torch.zeros(1, dtype=torch.float64), torch.tensor([1.5], dtype=torch.float64)
+    level = vehicle_from_camera(Extrinsics(zero, zero, zero, height))[0]
+    forward, right = level @ level.new_tensor([0, 0, 10, 1]), level @ level.new_tensor([2, 0, 0, 1])
+    torch.testing.assert_close(forward, level.new_tensor([10, 0, 1.5, 1]))
+    torch.testing.assert_close(right, level.new_tensor([0, -2, 1.5, 1]))
+    nose_down = vehicle_from_camera(Extrinsics(zero + 0.1, zero, zero, height))[0]
+    assert (nose_down @ level.new_tensor([0, 0, 10, 1]))[2] < 1.5
+    left = vehicle_from_camera(Extrinsics(zero, zero + 0.1, zero, height))[0]
+    assert (left @ level.new_tensor([0, 0, 10, 1]))[1] > 0
