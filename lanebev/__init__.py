@@ -1,5 +1,6 @@
 """lanebev: how a camera looks at the road, frame by frame, from lane boundaries alone."""
 
+from lanebev.estimation.two_stage import TwoStageCalibrator
 from lanebev.geometry.camera import Camera
 from lanebev.geometry.road import image_from_road_points, road_covariance, road_from_image_points
 from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
@@ -14,6 +15,7 @@ __all__ = [
     "Extrinsics",
     "LaneSegments",
     "Status",
+    "TwoStageCalibrator",
     "bev_from_image",
     "image_from_road_points",
     "road_covariance",

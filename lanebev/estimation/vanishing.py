@@ -50,7 +50,7 @@ def gate_angles(endpoints: Tensor, sigma: Tensor, gate_sigmas: float) -> Tensor:
     Returns:
         (..., N) rad.
     """
-    spread = gate_sigmas * math.sqrt(2.0) * sigma / segment_lengths(endpoints).clamp_min(1e-6)
+    spread: Tensor = gate_sigmas * math.sqrt(2.0) * sigma / segment_lengths(endpoints).clamp_min(1e-6)
     return spread.clamp(GATE_ANGLE, math.radians(20.0))
 
 
@@ -79,25 +79,24 @@ def rother_score(angles: Tensor, gates: Tensor, lengths: Tensor, weight: Tensor)
     return torch.where(angles < gates, weight * score, 0.0).sum(-1)
 
 
-def segment_pairs(weight: Tensor, num_hypotheses: int, seed: int) -> Tensor:
-    """Pairs of segments to intersect: all of them when there are few, seeded samples otherwise.
+def segment_pairs(weight: Tensor, draws: Tensor) -> Tensor:
+    """Pairs of segments to intersect: all of them when there are few, the given draws otherwise.
 
     Args:
         weight: (B, N); only segments of positive weight are drawn where a row has two of them.
-        num_hypotheses: M, the most pairs per row.
-        seed: of the draws, the same for every row, so that a row's pairs don't depend on its batch.
+        draws: (M, 2) in [0, 1), random numbers shared by all rows, so that a row's pairs don't depend on
+            its batch.
 
     Returns:
         (B, M', 2) int64, M' <= M.
     """
     num_segments = weight.shape[-1]
-    if num_segments * (num_segments - 1) // 2 <= num_hypotheses:
+    if num_segments * (num_segments - 1) // 2 <= draws.shape[0]:
         pairs = torch.combinations(torch.arange(num_segments, device=weight.device))
         return pairs.expand(weight.shape[0], -1, -1)
     present = weight > 0
-    order = torch.argsort(~present, dim=-1, stable=True)  # the present ones first
+    order = torch.argsort((~present).to(torch.int8), dim=-1, stable=True)  # the present ones first
     count = present.sum(-1).clamp_min(2)[:, None]  # (B, 1)
-    draws = torch.rand(num_hypotheses, 2, generator=torch.Generator().manual_seed(seed)).to(weight.device)
     first = (draws[:, 0] * count).long().clamp_max(num_segments - 1)  # (B, M)
     other = (draws[:, 1] * (count - 1)).long().clamp_max(num_segments - 2)
     second = other + (other >= first)  # never the first again
@@ -108,9 +107,8 @@ def ransac_vanishing_point(
     endpoints: Tensor,
     weight: Tensor,
     sigma: Tensor,
-    num_hypotheses: int = 256,
+    draws: Tensor,
     gate_sigmas: float = 3.0,
-    seed: int = 0,
 ) -> tuple[Tensor, Tensor]:
     """The hypothesis with the highest score, and the segments that agree with it.
 
@@ -120,9 +118,8 @@ def ransac_vanishing_point(
         endpoints: (B, N, 2, 2) px, finite.
         weight: (B, N) in [0, 1].
         sigma: (B, N) px.
-        num_hypotheses: N_loop, at most; exhaustive over pairs where that is no more.
+        draws: (N_loop, 2) in [0, 1), see :func:`segment_pairs`.
         gate_sigmas: see :func:`gate_angles`.
-        seed: of the sampling.
 
     Returns:
         (B, 3) homogeneous px of the best hypothesis and (B, N) bool inliers, L_c. No inliers where no
@@ -132,10 +129,10 @@ def ransac_vanishing_point(
     ends = torch.cat([endpoints, ones], dim=-1)
     lines = torch.linalg.cross(ends[..., 0, :], ends[..., 1, :])  # (B, N, 3)
     lines = lines / lines[..., :2].norm(dim=-1, keepdim=True).clamp_min(_EPS)
-    pairs = segment_pairs(weight, num_hypotheses, seed)  # (B, M, 2)
+    pairs = segment_pairs(weight, draws)  # (B, M, 2)
     rows = torch.arange(weight.shape[0], device=weight.device)[:, None]
     hypotheses = torch.linalg.cross(lines[rows, pairs[..., 0]], lines[rows, pairs[..., 1]])
-    usable = (weight[rows, pairs] > 0).all(-1) & (hypotheses.abs().amax(-1) > 1e-6)
+    usable = (weight[rows.unsqueeze(-1), pairs] > 0).all(-1) & (hypotheses.abs().amax(-1) > 1e-6)
     lengths, gates = segment_lengths(endpoints), gate_angles(endpoints, sigma, gate_sigmas)
     angles = segment_angles(endpoints.unsqueeze(1), hypotheses)  # (B, M, N)
     scores = rother_score(angles, gates.unsqueeze(1), lengths.unsqueeze(1), weight.unsqueeze(1))
@@ -163,7 +160,7 @@ def incidence_noise(rays: Tensor, vanishing_dir: Tensor, sigma: Tensor, intrinsi
     """
     moments = torch.linalg.cross(rays, vanishing_dir[:, None, None, :].expand_as(rays))
     focal = torch.stack([intrinsics[:, 0, 0], intrinsics[:, 1, 1]], dim=-1)[:, None, None, :]
-    per_end = (moments[..., :2] / focal).square().sum(-1)  # (B, N, 2)
+    per_end: Tensor = (moments[..., :2] / focal).square().sum(-1)  # (B, N, 2)
     return sigma.square() * per_end.sum(-1)
 
 

@@ -91,7 +91,8 @@ def distort_points(points: Tensor, intrinsics: Tensor, distortion: Tensor, model
             distort_points_kannala_brandt(plane, params.unsqueeze(-2).expand(*plane.shape[:-1], 8)),
             intrinsics,
         )
-    return calibration.distort_points(points, intrinsics, distortion)
+    distorted: Tensor = calibration.distort_points(points, intrinsics, distortion)
+    return distorted
 
 
 def undistort_points(
@@ -122,7 +123,10 @@ def undistort_points(
     if model == "fisheye":
         plane = normalise_points(points, intrinsics)
         return denormalise_points(_undistort_plane_kannala_brandt(plane, distortion), intrinsics)
-    return calibration.undistort_points(points, intrinsics, distortion, num_iters=_UNDISTORT_ITERATIONS)
+    undistorted: Tensor = calibration.undistort_points(
+        points, intrinsics, distortion, num_iters=_UNDISTORT_ITERATIONS
+    )
+    return undistorted
 
 
 def _undistort_plane_kannala_brandt(plane: Tensor, distortion: Tensor) -> Tensor:
@@ -212,7 +216,7 @@ class Camera:
         resize = self.intrinsics.new_tensor(
             [[sx, 0.0, 0.5 * (sx - 1)], [0.0, sy, 0.5 * (sy - 1)], [0.0, 0.0, 1.0]]
         )
-        return replace(self, intrinsics=resize @ self.intrinsics, image_size=tuple(image_size))
+        return replace(self, intrinsics=resize @ self.intrinsics, image_size=(image_size[0], image_size[1]))
 
     def cropped(self, top: int, left: int, height: int, width: int) -> Camera:
         """The camera of ``image[top:top+height, left:left+width]``; may reach beyond the image."""

@@ -38,8 +38,9 @@ def great_circle_normals(endpoints: Tensor, intrinsics: Tensor) -> Tensor:
         (..., N, 3).
     """
     rays = rays_from_pixels(endpoints.flatten(-3, -2), intrinsics)
-    rays = rays.unflatten(-2, (-1, 2))  # (..., N, 2, 3)
-    return torch.linalg.cross(rays[..., 0, :], rays[..., 1, :])
+    rays = rays.reshape(*endpoints.shape[:-1], 3)  # (..., N, 2, 3)
+    normals: Tensor = torch.linalg.cross(rays[..., 0, :], rays[..., 1, :])
+    return normals
 
 
 def road_from_image_points(

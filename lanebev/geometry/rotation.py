@@ -115,4 +115,5 @@ def horizon_line(extrinsics: Extrinsics, intrinsics: Tensor) -> Tensor:
     """
     down = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)[..., 1, :]
     line = torch.linalg.solve(intrinsics.mT, down.unsqueeze(-1)).squeeze(-1)
-    return line / line[..., :2].norm(dim=-1, keepdim=True)
+    unit: Tensor = line / line[..., :2].norm(dim=-1, keepdim=True)
+    return unit

@@ -91,4 +91,5 @@ def bev_from_image(extrinsics: Extrinsics, intrinsics: Tensor, grid: BEVGrid) ->
         [[scale, 0.0, -grid.x[0] * scale], [0.0, -scale, grid.z[1] * scale], [0.0, 0.0, 1.0]]
     )
     cam_from_image = torch.linalg.inv(intrinsics)
-    return bev_from_plane @ plane_from_cam @ cam_from_image
+    homography: Tensor = bev_from_plane @ plane_from_cam @ cam_from_image
+    return homography

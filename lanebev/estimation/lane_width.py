@@ -1,0 +1,259 @@
+"""Roll and height from the equality of lane widths."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.geometry.rotation import cam_from_world
+
+_MIN_DOWN = 1e-3  # a ray less than 0.06 deg below the horizon says nothing about where on the road it ends
+_MAX_SLOPE = 50.0  # 89 deg from the vertical
+
+
+class BoundarySlopes(NamedTuple):
+    """Where each boundary's plane stands around the vanishing direction.
+
+    Attributes:
+        slopes: (B, L), tan α; positive left of the camera.
+        noise: (B, L) variances from the pixels.
+        jacobian: (B, L, 2), by pitch and yaw, 1/rad.
+        present: (B, L) bool.
+    """
+
+    slopes: Tensor
+    noise: Tensor
+    jacobian: Tensor
+    present: Tensor
+
+
+def line_angles(normals: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
+    """Angles of boundary planes from the camera's vertical, seen along the lanes.
+
+    Source: Fig. 6(c), α. Deviation: the normal is rotated into the frame of the vanishing direction and
+    α = atan(n_y / n_x), positive to the left; only so is Eq. (21) exact (PAPER_NOTES 3).
+
+    Args:
+        normals: (B, N, 3) great-circle normals, camera frame.
+        pitch: (B,) rad.
+        yaw: (B,) rad.
+
+    Returns:
+        (B, N) rad in (-pi/2, pi/2).
+    """
+    world = normals @ cam_from_world(pitch, yaw)  # rows: (R_WC n)ᵀ
+    x = world[..., 0]
+    x = torch.where(x.abs() < 1e-12, 1e-12, x)
+    return torch.atan(world[..., 1] / x)
+
+
+def lane_widths(line_angles: Tensor, roll: Tensor, height: Tensor) -> Tensor:
+    """Distances between adjacent boundaries on the road.
+
+    Source: Eq. (21), w = h (tan(α_L - ψ) - tan(α_R - ψ)). Deviation: adjacent boundary indices instead of
+    any two sides, since a missed boundary would double the width (PAPER_NOTES 7).
+
+    Args:
+        line_angles: (B, L) rad, left to right.
+        roll: (B,) rad.
+        height: (B,) m.
+
+    Returns:
+        (B, L-1) m, positive.
+    """
+    tangents = (line_angles - roll.unsqueeze(-1)).tan()
+    return height.unsqueeze(-1) * (tangents[..., :-1] - tangents[..., 1:])
+
+
+def boundary_slopes(
+    rays: Tensor,
+    boundary: Tensor,
+    weight: Tensor,
+    sigma: Tensor,
+    intrinsics: Tensor,
+    pitch: Tensor,
+    yaw: Tensor,
+    num_boundaries: int,
+) -> BoundarySlopes:
+    """One slope tan α per boundary from all its segments, and what it is worth.
+
+    Source: Eq. (21) takes α of single line pairs. Deviation: one α per boundary, the least-squares plane
+    through the vanishing direction and the boundary's end points, as pairs that share a segment are not
+    independent and a single segment's own direction ignores the known vanishing point. Segments off their
+    boundary's median by more than 4 sigma are left out.
+
+    Args:
+        rays: (B, N, 2, 3) of both end points.
+        boundary: (B, N) int64.
+        weight: (B, N) in [0, 1].
+        sigma: (B, N) px.
+        intrinsics: (B, 3, 3).
+        pitch: (B,) rad.
+        yaw: (B,) rad.
+        num_boundaries: L.
+
+    Returns:
+        slopes with noise, Jacobian and presence.
+    """
+    world = rays @ cam_from_world(pitch, yaw).unsqueeze(1)  # (B, N, 2, 3)
+    x, y, z = world.unbind(-1)
+    below = (y > _MIN_DOWN).all(-1) & (weight > 0)  # (B, N)
+    y = torch.where(below.unsqueeze(-1), y, 1.0)
+    focal = 0.5 * (intrinsics[:, 0, 0] + intrinsics[:, 1, 1]).unsqueeze(-1)
+    pull = (y * y).sum(-1)  # (B, N) how strongly a segment's ends fix the slope
+    slope = -(x * y).sum(-1) / pull
+    below = below & (slope.abs() < _MAX_SLOPE)
+    variance = (sigma / focal).square() * (1 + slope * slope) / pull
+    member = torch.nn.functional.one_hot(boundary.clamp(0, num_boundaries - 1), num_boundaries)
+    member = (member.mT > 0) & below.unsqueeze(1)  # (B, L, N)
+    centre = _masked_median(slope.unsqueeze(1).expand(member.shape), member)
+    off = (slope.unsqueeze(1) - centre.unsqueeze(-1)).abs()
+    member = member & (off < 4.0 * variance.sqrt().unsqueeze(1) + 0.02 * (1 + centre.square()).unsqueeze(-1))
+    precision = torch.where(member, (weight / variance).unsqueeze(1), 0.0)  # (B, L, N)
+    total = precision.sum(-1)
+    present = total > 0
+    share = precision / torch.where(present, total, 1.0).unsqueeze(-1)
+
+    # The slope's change as the camera pitches and yaws: d(R_WC r) is -(cosφ, 0, sinφ) × and -(0, 1, 0) ×.
+    sy, cy = yaw.sin()[:, None, None], yaw.cos()[:, None, None]
+    by_pitch = ((x * (cy * z - sy * x) - sy * y * y).sum(-1)) / pull
+    by_yaw = (z * y).sum(-1) / pull
+    by_pose = torch.stack([by_pitch, by_yaw], dim=-1)  # (B, N, 2)
+    slopes = (share @ slope.unsqueeze(-1)).squeeze(-1)
+    return BoundarySlopes(slopes, 1.0 / torch.where(present, total, 1.0), share @ by_pose, present)
+
+
+class WidthMeasurement(NamedTuple):
+    """Lane widths, linearised in (roll, height).
+
+    Attributes:
+        widths: (B, L-1) m.
+        jacobian: (B, L-1, 2), by roll and height.
+        noise: (B, L-1, L-1) m², identity where a lane is not there.
+        present: (B, L-1) bool.
+    """
+
+    widths: Tensor
+    jacobian: Tensor
+    noise: Tensor
+    present: Tensor
+
+
+def measure_widths(
+    boundaries: BoundarySlopes,
+    roll: Tensor,
+    height: Tensor,
+    direction_cov: Tensor | None = None,
+    lane_noise: float = 0.0,
+) -> WidthMeasurement:
+    """Widths of the lanes whose two boundaries are present, with Jacobian and covariance.
+
+    Source: Eq. (21) and its derivatives, with tan(α - ψ) = (t - τ) / (1 + t τ).
+
+    Args:
+        boundaries: from :func:`boundary_slopes`.
+        roll: (B,) rad.
+        height: (B,) m.
+        direction_cov: (B, 2, 2) of pitch and yaw, or None where they are exact.
+        lane_noise: m, standard deviation of a lane's width about the prior.
+
+    Returns:
+        the measurement.
+    """
+    tau, h = roll.tan().unsqueeze(-1), height.unsqueeze(-1)
+    denominator = 1 + boundaries.slopes * tau
+    facing = boundaries.present & (denominator > 0.05)  # beyond: at or above the rolled horizon
+    denominator = torch.where(facing, denominator, 1.0)
+    tangents = (boundaries.slopes - tau) / denominator  # (B, L) tan(α - ψ)
+    present = facing[..., :-1] & facing[..., 1:]
+    widths = h * (tangents[..., :-1] - tangents[..., 1:])
+    by_roll = -h * (tangents[..., :-1].square() - tangents[..., 1:].square())
+    jacobian = torch.stack([by_roll, widths / h], dim=-1)
+
+    by_slope = h * (1 + tau * tau) / denominator.square()  # (B, L)
+    eye = torch.eye(widths.shape[-1] + 1, dtype=widths.dtype, device=widths.device)
+    difference = (eye[:-1] - eye[1:]) * by_slope.unsqueeze(1)  # (B, L-1, L) d widths / d slopes
+    noise = difference @ (boundaries.noise.unsqueeze(-1) * difference.mT)
+    if direction_cov is not None:
+        by_direction = difference @ boundaries.jacobian  # (B, L-1, 2)
+        noise = noise + by_direction @ direction_cov @ by_direction.mT
+    both = present.unsqueeze(-1) & present.unsqueeze(-2)
+    lanes = eye[:-1, :-1]
+    noise = torch.where(both, noise + lane_noise**2 * lanes, lanes)
+    return WidthMeasurement(widths, jacobian, noise, present)
+
+
+def initial_roll_height(
+    boundaries: BoundarySlopes,
+    lane_width: Tensor,
+    roll_guess: Tensor,
+    search_range: float = math.radians(30.0),
+    num_steps: int = 121,
+    num_iterations: int = 5,
+) -> tuple[Tensor, Tensor]:
+    """Roll and height that make the observed widths most alike the prior's.
+
+    Source: Sec. IV-A, Eqs. (22)-(23): exhaustive search, then Gauss-Newton. Deviation: the energy is a sum
+    of squares, as a sum of signed residuals has no minimum (PAPER_NOTES 4); for each roll of the search
+    the best height is in closed form; with one lane roll stays at the guess (PAPER_NOTES 6).
+
+    Args:
+        boundaries: from :func:`boundary_slopes`.
+        lane_width: (B, L-1) m, the prior.
+        roll_guess: (B,) rad, the middle of the search, and the answer where roll is not observable.
+        search_range: rad to either side.
+        num_steps: of the search.
+        num_iterations: of Gauss-Newton.
+
+    Returns:
+        roll (B,) rad and height (B,) m. Height is 1 where no lane is present.
+    """
+    rolls = torch.linspace(
+        -search_range, search_range, num_steps, dtype=lane_width.dtype, device=lane_width.device
+    )
+    rolls = roll_guess.unsqueeze(-1) + rolls  # (B, G)
+    repeated = BoundarySlopes(*(part.repeat_interleave(num_steps, 0) for part in boundaries))
+    unit = measure_widths(repeated, rolls.flatten(), torch.ones_like(rolls.flatten()))
+    shape = (*rolls.shape, -1)
+    widths, present = unit.widths.reshape(shape), unit.present.reshape(shape)  # (B, G, L-1) at height 1
+    prior = lane_width.unsqueeze(1)
+    widths = torch.where(present, widths, 0.0)
+    heights = (widths * prior).sum(-1) / widths.square().sum(-1).clamp_min(1e-9)
+    error = torch.where(present, prior - heights.unsqueeze(-1) * widths, 0.0)
+    possible = (present.sum(-1) == present.sum(-1).amax(-1, keepdim=True)) & (heights > 0)
+    energy = torch.where(possible, error.square().sum(-1), torch.inf)
+    best = energy.argmin(-1, keepdim=True)
+    observable = present.sum(-1).amax(-1) >= 2
+    middle = torch.full_like(best, num_steps // 2)
+    best = torch.where(observable.unsqueeze(-1), best, middle)
+    roll, height = rolls.gather(-1, best).squeeze(-1), heights.gather(-1, best).squeeze(-1)
+    height = torch.where(height > 0, height, 1.0)
+    for _ in range(num_iterations):
+        roll, height = _gauss_newton_step(boundaries, lane_width, roll, height, observable)
+    return roll, height
+
+
+def _gauss_newton_step(
+    boundaries: BoundarySlopes, lane_width: Tensor, roll: Tensor, height: Tensor, observable: Tensor
+) -> tuple[Tensor, Tensor]:
+    measured = measure_widths(boundaries, roll, height)
+    there = measured.present.unsqueeze(-1)
+    jacobian = torch.where(there, measured.jacobian, 0.0)
+    held = torch.stack([observable, torch.ones_like(observable)], dim=-1)  # roll only where it shows
+    jacobian = jacobian * held.unsqueeze(1)
+    error = torch.where(there, (lane_width - measured.widths).unsqueeze(-1), 0.0)
+    eye = torch.eye(2, dtype=roll.dtype, device=roll.device)
+    normal = jacobian.mT @ jacobian + 1e-9 * eye
+    step = torch.cholesky_solve(jacobian.mT @ error, torch.linalg.cholesky_ex(normal).L).squeeze(-1)
+    return roll + step[..., 0].clamp(-0.1, 0.1), (height + step[..., 1]).clamp(0.1, 10.0)
+
+
+def _masked_median(values: Tensor, mask: Tensor) -> Tensor:
+    """Median of the last dimension where the mask holds, 0 where it holds nowhere."""
+    ordered = torch.where(mask, values, torch.inf).sort(dim=-1).values
+    count = mask.sum(-1, keepdim=True)
+    middle = ordered.gather(-1, ((count - 1) // 2).clamp_min(0)).squeeze(-1)
+    return torch.where(count.squeeze(-1) > 0, middle, 0.0)
