@@ -1,0 +1,274 @@
+"""Lane files of other detectors and data sets: TuSimple, CULane, OpenLane; which frame each belongs to.
+
+Everything here is in pixels of the image as it came. A cut or malformed file is a ``ValueError`` of one line
+that names file and line.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path, PurePath
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanebev.types import NUM_BOUNDARIES
+
+_OPENLANE_CURBS = (20, 21)  # left and right kerb: no lane ends there, so no lane width holds
+
+
+class LaneLine(NamedTuple):
+    """One line as a detector or a person drew it.
+
+    Attributes:
+        points: (P, 2) px, (x, y) of the image as it came; x is NaN in a gap of the line.
+        boundary: index of the semantic boundary if the file says so, else None.
+    """
+
+    points: NDArray[np.float64]
+    boundary: int | None = None
+
+
+class FrameLines(NamedTuple):
+    """The lines of one frame, and the frame's name in the file."""
+
+    name: str
+    lines: list[LaneLine]
+
+
+def read_lanes(path: str | Path) -> list[FrameLines]:
+    """Read a TuSimple, CULane or OpenLane file, or a folder of the latter two.
+
+    Raises:
+        ValueError: there is no such file, or it is cut, malformed or of no known format.
+    """
+    path = Path(path)
+    if path.is_dir():
+        files = sorted([*path.rglob("*.lines.txt"), *path.rglob("*.json")])
+        frames = [frame for file in files for frame in read_lanes(file)]
+        if not frames:
+            raise ValueError(f"lane folder {path}: expected .lines.txt or .json files, got none")
+        return frames
+    if path.name.endswith(".txt"):
+        return [read_culane(path)]
+    text = _text(path)
+    start = next((line for line in text.splitlines() if line.strip()), "")
+    return [read_openlane(path)] if _is_openlane(start, text) else read_tusimple(path)
+
+
+def read_tusimple(path: str | Path) -> list[FrameLines]:
+    """Read TuSimple JSON lines: ``lanes``, ``h_samples``, ``raw_file``, and ``boundary`` if it is there."""
+    frames = []
+    for number, text in enumerate(_text(Path(path)).splitlines(), start=1):
+        if text.strip():
+            with _Where(path, number):
+                frames.append(_tusimple_frame(_json(text)))
+    if not frames:
+        raise ValueError(f"lane file {path}: expected TuSimple JSON lines, got an empty file")
+    names = [frame.name for frame in frames]
+    if len(set(names)) < len(names):
+        twice = next(name for i, name in enumerate(names) if name in names[:i])
+        raise ValueError(f"lane file {path}: expected each raw_file once, got {twice!r} again")
+    return frames
+
+
+def read_culane(path: str | Path) -> FrameLines:
+    """Read CULane's ``.lines.txt``, a line of ``x y x y ...`` per lane; the path without suffix names it."""
+    path = Path(path)
+    lines = []
+    for number, text in enumerate(_text(path).splitlines(), start=1):
+        with _Where(path, number):
+            values = _floats("points", text.split())
+            if len(values) % 2:
+                raise ValueError(f"expected x y pairs, got {len(values)} numbers; is the file cut?")
+            points = np.array(values).reshape(-1, 2)
+            _check_culane_rows(points[:, 1])
+            if len(points):
+                lines.append(LaneLine(points))
+    return FrameLines(str(path).removesuffix(".txt").removesuffix(".lines"), lines)
+
+
+def read_openlane(path: str | Path) -> FrameLines:
+    """Read an OpenLane 2D or 3D JSON: the ``uv`` of its lane lines, kerbs left out."""
+    path = Path(path)
+    with _Where(path, None):
+        fields = _json(_text(path))
+        name = _field(fields, "file_path", str)
+        lines = []
+        for i, lane in enumerate(_field(fields, "lane_lines", list)):
+            uv = _field(lane, "uv", list)
+            if len(uv) != 2 or len(uv[0]) != len(uv[1]):
+                raise ValueError(f"lane_lines[{i}].uv: expected two lists of one length, got {len(uv)} lists")
+            if lane.get("category") not in _OPENLANE_CURBS and len(uv[0]):
+                lines.append(LaneLine(np.array([_floats(f"lane_lines[{i}].uv", axis) for axis in uv]).T))
+    return FrameLines(name, lines)
+
+
+def tusimple_line(name: str, rows: NDArray[np.float64], x: NDArray[np.float64]) -> str:
+    """One frame's boundaries as a line of TuSimple JSON, with each lane's ``boundary``.
+
+    Args:
+        name: ``raw_file``.
+        rows: (R,) px.
+        x: (L, R) px; NaN where a boundary was not seen.
+    """
+    seen = [index for index in range(len(x)) if np.isfinite(x[index]).any()]
+    lanes = [[-2 if math.isnan(value) else round(value, 3) for value in x[index].tolist()] for index in seen]
+    h_samples = [round(row) for row in rows.tolist()]
+    return json.dumps({"raw_file": name, "lanes": lanes, "h_samples": h_samples, "boundary": seen})
+
+
+def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int | None]:
+    """Which lane entry belongs to each image: the one that shares the longest tail of its path.
+
+    Compared are whole path components from the end, the last without suffix. An entry goes to the image
+    that shares most with it, so an image without an entry of its own gets None rather than a stranger's.
+
+    Args:
+        names: paths of the images.
+        frames: entries of the lane file.
+
+    Returns:
+        for each image an index into ``frames``, or None.
+
+    Raises:
+        ValueError: no image matches, or two entries (or two images) match equally well.
+    """
+    by_tail: dict[tuple[str, ...], list[int]] = defaultdict(list)
+    for i, frame in enumerate(frames):
+        parts = _parts(frame.name)
+        for start in range(len(parts)):
+            by_tail[parts[start:]].append(i)
+    matches: list[tuple[int, int] | None] = []  # (length of the common tail, entry)
+    for name in names:
+        parts = _parts(name)
+        tail = next((parts[k:] for k in range(len(parts)) if parts[k:] in by_tail), None)
+        matches.append(None if tail is None else (len(tail), by_tail[tail][0]))
+        if tail is not None and len(by_tail[tail]) > 1:
+            first, second = (frames[i].name for i in by_tail[tail][:2])
+            raise ValueError(
+                f"image {name}: expected one lane entry, got {first!r} and {second!r}, which fit equally "
+                "well; give images by a path that tells them apart"
+            )
+    owners: dict[int, list[int]] = defaultdict(list)
+    for image, match in enumerate(matches):
+        if match is not None:
+            owners[match[1]].append(image)
+    result: list[int | None] = [None] * len(names)
+    for entry, images in owners.items():
+        longest = max(matches[image][0] for image in images)  # type: ignore[index]
+        best = [image for image in images if matches[image][0] == longest]  # type: ignore[index]
+        if len(best) > 1:
+            raise ValueError(
+                f"lane entry {frames[entry].name!r}: expected one image, got {names[best[0]]} and "
+                f"{names[best[1]]}, which fit equally well; give entries a longer path"
+            )
+        result[best[0]] = entry
+    if names and all(entry is None for entry in result):
+        raise ValueError(
+            f"lanes: expected an entry for at least one image, got none that ends like {names[0]}; "
+            f"the file's first is {frames[0].name!r}"
+        )
+    return result
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    path = PurePath(name.replace("\\", "/"))
+    return tuple(part for part in path.with_suffix("").parts if part not in ("/", "."))
+
+
+def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
+    name = _field(fields, "raw_file", str)
+    if not name:
+        raise ValueError("raw_file: expected the image's path, got an empty string")
+    rows = _floats("h_samples", _field(fields, "h_samples", list))
+    if any(b <= a for a, b in pairwise(rows)):
+        raise ValueError("h_samples: expected rising rows, got others")
+    lanes = _field(fields, "lanes", list)
+    indices: Sequence[int | None] = fields.get("boundary") or [None] * len(lanes)
+    if "boundary" in fields:
+        valid = isinstance(fields["boundary"], list) and len(indices) == len(lanes) == len(set(indices))
+        if not (valid and all(type(i) is int and 0 <= i < NUM_BOUNDARIES for i in indices)):
+            raise ValueError(
+                f"boundary: expected one different index of 0..{NUM_BOUNDARIES - 1} per lane, got "
+                f"{fields['boundary']!r:.60}"
+            )
+    lines = []
+    for i, (lane, index) in enumerate(zip(lanes, indices, strict=True)):
+        if not isinstance(lane, list) or len(lane) != len(rows):
+            got = len(lane) if isinstance(lane, list) else repr(lane)
+            raise ValueError(f"lanes[{i}]: expected {len(rows)} numbers, one per h_sample, got {got}")
+        x = np.array(_floats(f"lanes[{i}]", lane))
+        x[x < 0] = np.nan  # -2 is "not there"
+        if np.isfinite(x).any():
+            lines.append(LaneLine(np.stack([x, np.array(rows)], axis=-1), index))
+    return FrameLines(name, lines)
+
+
+def _check_culane_rows(y: NDArray[np.float64]) -> None:
+    steps = np.diff(y)
+    if len(steps) and not (np.all(steps > 0) or np.all(steps < 0)):
+        raise ValueError("expected rows in one direction, got others; is the file cut?")
+    if len(steps) > 2 and abs(steps[-1]) > 5 * np.median(np.abs(steps)):
+        raise ValueError(f"expected evenly spaced rows, got {y[-2]:g} then {y[-1]:g}; is the file cut?")
+
+
+def _is_openlane(first_line: str, text: str) -> bool:
+    try:
+        return "lane_lines" in json.loads(text)
+    except ValueError:
+        return '"lane_lines"' in first_line
+
+
+class _Where:
+    """Puts file and line before the message of a ValueError."""
+
+    def __init__(self, path: str | Path, line: int | None) -> None:
+        self.place = f"lane file {path}" + (f", line {line}" if line else "")
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        if isinstance(error, ValueError) and not str(error).startswith("lane file"):
+            raise ValueError(f"{self.place}: {error}") from error
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise ValueError(f"lane file {path}: expected a readable file, got: {reason}") from error
+
+
+def _json(text: str) -> dict[str, Any]:
+    try:
+        fields = json.loads(text)
+    except ValueError as error:
+        raise ValueError("expected JSON, got a line that breaks off or is none; is the file cut?") from error
+    if not isinstance(fields, dict):
+        raise ValueError(f"expected a JSON object, got {type(fields).__name__}")
+    return fields
+
+
+def _field(fields: Any, key: str, kind: type) -> Any:
+    if not isinstance(fields, dict) or not isinstance(fields.get(key), kind):
+        got = type(fields.get(key)).__name__ if isinstance(fields, dict) and key in fields else "none"
+        raise ValueError(f"{key}: expected a {kind.__name__}, got {got}; formats: TuSimple, CULane, OpenLane")
+    return fields[key]
+
+
+def _floats(name: str, values: Sequence[Any]) -> list[float]:
+    try:
+        numbers = [float(value) for value in values if not isinstance(value, bool)]
+    except (TypeError, ValueError):
+        numbers = []
+    if len(numbers) != len(values) or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{name}: expected finite numbers, got {str(list(values))[:60]}")
+    return numbers
