@@ -3,16 +3,21 @@
 from lanebev.estimation.two_stage import TwoStageCalibrator
 from lanebev.geometry.camera import Camera
 from lanebev.geometry.road import image_from_road_points, road_covariance, road_from_image_points
+from lanebev.pipeline import LaneBEV, LaneBEVOutput
 from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
 from lanebev.view.grid import BEVGrid, bev_from_image
+from lanebev.view.warp import BEVWarp
 
 __version__ = "0.1.0"
 
 __all__ = [
     "BEVGrid",
+    "BEVWarp",
     "Calibration",
     "Camera",
     "Extrinsics",
+    "LaneBEV",
+    "LaneBEVOutput",
     "LaneSegments",
     "Status",
     "TwoStageCalibrator",

@@ -145,6 +145,36 @@ def _undistort_plane_kannala_brandt(plane: Tensor, distortion: Tensor) -> Tensor
     return plane * scale.unsqueeze(-1)
 
 
+def max_undistorted_radius(distortion: Tensor, model: str = "pinhole", limit: float = 10.0) -> Tensor:
+    """How far from the axis a lens polynomial still grows.
+
+    Beyond it the polynomial folds over and maps points that the camera can't see back into the image.
+    Tangential and thin-prism terms, small in comparison, are left out.
+
+    Args:
+        distortion: (B, D), OpenCV's order.
+        model: "pinhole" or "fisheye".
+        limit: the largest radius looked at; 10 is 84 deg off the axis.
+
+    Returns:
+        (B,) radius on the undistorted z = 1 plane.
+    """
+    _check_lens(distortion, model)
+    radius = torch.linspace(0.0, limit, 2001, dtype=distortion.dtype, device=distortion.device)
+    k = torch.nn.functional.pad(distortion, (0, 12 - distortion.shape[-1])).unsqueeze(-1)  # (B, 12, 1)
+    if model == "fisheye":
+        x = radius.atan()
+        t = x * x
+        value = x * (1 + t * (k[:, 0] + t * (k[:, 1] + t * (k[:, 2] + t * k[:, 3]))))
+    else:
+        r = radius * radius
+        numerator = 1 + r * (k[:, 0] + r * (k[:, 1] + r * k[:, 4]))
+        value = radius * numerator / (1 + r * (k[:, 5] + r * (k[:, 6] + r * k[:, 7])))
+    grows = (value.diff(dim=-1) > 0).to(torch.int8).cumprod(-1)  # 1 up to the first step that doesn't
+    reach: Tensor = grows.sum(-1) * (limit / 2000)
+    return reach.to(distortion.dtype)
+
+
 @dataclass(frozen=True)
 class Camera:
     """One camera's lens.

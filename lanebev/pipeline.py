@@ -1,0 +1,188 @@
+"""LaneBEV: the modules wired together. Adds no maths."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lanebev.geometry.camera import undistort_points
+from lanebev.types import Calibration, LaneSegments
+from lanebev.view.grid import BEVGrid, bev_from_image
+from lanebev.view.warp import BEVWarp
+
+
+class LaneBEVOutput(NamedTuple):
+    """What one frame, or with (B, T) input every frame, gives.
+
+    Attributes:
+        bev: (B, 3, U, V), zero where not valid.
+        valid: (B, 1, U, V) bool.
+        calibration: extrinsics, covariance, status, inliers.
+        bev_from_image: (B, 3, 3) homography from undistorted pixels to BEV pixels.
+        segments: what the calibrator was given, in undistorted pixels of the image.
+        logits: (B, 1 + L, h, w) of the network.
+    """
+
+    bev: Tensor
+    valid: Tensor
+    calibration: Calibration
+    bev_from_image: Tensor
+    segments: LaneSegments
+    logits: Tensor
+
+
+class LaneBEV(nn.Module):
+    """Image to bird's-eye view: segmenter, line extractor, calibrator, warp.
+
+    Args:
+        segmenter: image (B, 3, h, w) in [0, 1] to logits (B, 1 + L, h', w').
+        extractor: logits and the image's (H, W) to :class:`LaneSegments` in its pixels.
+        calibrator: e.g. :class:`lanebev.JointCalibrator`.
+        warp: default :class:`BEVWarp` on the default grid.
+        network_width: px, the image is resized to this width, its aspect kept to the next multiple of 32,
+            before the segmenter; None leaves it as it is.
+    """
+
+    def __init__(
+        self,
+        segmenter: nn.Module,
+        extractor: nn.Module,
+        calibrator: nn.Module,
+        warp: BEVWarp | None = None,
+        network_width: int | None = None,
+    ) -> None:
+        super().__init__()
+        self.segmenter = segmenter
+        self.extractor = extractor
+        self.calibrator = calibrator
+        self.warp = warp or BEVWarp()
+        self.network_width = network_width
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        weights: str | Path | None = None,
+        grid: BEVGrid | None = None,
+        calibrator: nn.Module | None = None,
+        network_width: int | None = None,
+    ) -> LaneBEV:
+        """With the shipped weights; needs no network.
+
+        Args:
+            weights: another file in the same format; None is the shipped one.
+            grid: of the view.
+            calibrator: None is :class:`lanebev.JointCalibrator` with default settings.
+            network_width: px; None is what the weights were trained for.
+
+        Raises:
+            ValueError: a weights file that doesn't fit the network.
+        """
+        from lanebev.estimation.joint import JointCalibrator
+        from lanebev.observation.lines import LineExtractor
+        from lanebev.weights import load_segmenter
+
+        segmenter = load_segmenter(weights)
+        width = network_width or int(segmenter.image_size[1])
+        return cls(segmenter, LineExtractor(), calibrator or JointCalibrator(), BEVWarp(grid), width)
+
+    def initial_state(
+        self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
+    ) -> Any:
+        """The calibrator's state before the first frame."""
+        initial_state: Any = self.calibrator.initial_state
+        return initial_state(batch_size, dtype=dtype, device=device)
+
+    def forward(
+        self,
+        image: Tensor,
+        intrinsics: Tensor,
+        state: Any = None,
+        dt: float | Tensor = 1 / 30,
+        lane_width: float | Tensor = 3.7,
+        distortion: Tensor | None = None,
+        model: str = "pinhole",
+    ) -> tuple[LaneBEVOutput, Any]:
+        """One frame of every row, or T frames of every row in order.
+
+        Args:
+            image: (B, 3, H, W) or (B, T, 3, H, W), RGB in [0, 1], as taken.
+            intrinsics: (B, 3, 3) px.
+            state: of the frame before; None starts anew.
+            dt: s since the frame before: float, (B,) or, with T frames, (B, T).
+            lane_width: m: float, (B,) or (B, L-1).
+            distortion: (B, D) of the lens, or None.
+            model: "pinhole" or "fisheye".
+
+        Returns:
+            the output, every tensor with (B, T, ...) where the image has T, and the state after it.
+
+        Raises:
+            ValueError: shapes that don't fit.
+        """
+        if image.ndim not in (4, 5) or image.shape[-3] != 3:
+            raise ValueError(f"image: expected (B, 3, H, W) or (B, T, 3, H, W), got {tuple(image.shape)}")
+        if state is None:
+            state = self.initial_state(image.shape[0], intrinsics.dtype, image.device)
+        frames = image if image.ndim == 5 else image.unsqueeze(1)
+        batch, steps = frames.shape[:2]
+        logits, segments = self.observe(
+            frames.flatten(0, 1),
+            intrinsics.repeat_interleave(steps, 0),
+            None if distortion is None else distortion.repeat_interleave(steps, 0),
+            model,
+        )
+        intervals = torch.as_tensor(dt, dtype=intrinsics.dtype, device=intrinsics.device)
+        intervals = (intervals if intervals.ndim == 2 else intervals.reshape(-1, 1)).expand(batch, steps)
+        outputs = []
+        for step in range(steps):
+            now = LaneSegments(*(part.reshape(batch, steps, *part.shape[1:])[:, step] for part in segments))
+            calibration, state = self.calibrator(now, intrinsics, state, intervals[:, step], lane_width)
+            bev, valid = self.warp(frames[:, step], intrinsics, calibration.extrinsics, distortion, model)
+            homography = bev_from_image(calibration.extrinsics, intrinsics, self.warp.grid)
+            logits_now = logits.reshape(batch, steps, *logits.shape[1:])[:, step]
+            outputs.append(LaneBEVOutput(bev, valid, calibration, homography, now, logits_now))
+        return (outputs[0] if image.ndim == 4 else _stack(outputs)), state
+
+    def observe(
+        self, image: Tensor, intrinsics: Tensor, distortion: Tensor | None = None, model: str = "pinhole"
+    ) -> tuple[Tensor, LaneSegments]:
+        """Network and line extraction only.
+
+        Args:
+            image: (B, 3, H, W) as taken.
+            intrinsics: (B, 3, 3) px.
+            distortion: (B, D) or None.
+            model: "pinhole" or "fisheye".
+
+        Returns:
+            logits (B, 1 + L, h, w) and segments in undistorted pixels of the image.
+        """
+        height, width = image.shape[-2:]
+        logits = self.segmenter(self._resize(image))
+        segments = self.extractor(logits, (height, width))
+        if distortion is not None and distortion.shape[-1]:
+            ends = segments.endpoints
+            flat = undistort_points(ends.flatten(1, 2), intrinsics, distortion, model)
+            segments = segments._replace(endpoints=flat.reshape(ends.shape))
+        return logits, segments
+
+    def _resize(self, image: Tensor) -> Tensor:
+        if self.network_width is None:
+            return image
+        height, width = image.shape[-2:]
+        rows = max(32, 32 * round(height * self.network_width / width / 32))
+        if (rows, self.network_width) == (height, width):
+            return image
+        return nn.functional.interpolate(
+            image, size=(rows, self.network_width), mode="bilinear", antialias=True, align_corners=False
+        )
+
+
+def _stack(outputs: list[Any]) -> Any:
+    """Per-frame (nested) tuples of tensors to one with (B, T, ...) tensors."""
+    if isinstance(outputs[0], Tensor):
+        return torch.stack(outputs, dim=1)
+    return type(outputs[0])(*(_stack(list(parts)) for parts in zip(*outputs, strict=True)))
