@@ -1,0 +1,220 @@
+"""The single-frame fit: from anywhere, through outliers, and honest about what it cannot see."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from lanebev.estimation.joint_boundaries import boundary_polylines, fit_boundaries
+from lanebev.estimation.joint_model import (
+    NUM_PARAMS,
+    boundary_places,
+    boundary_residuals,
+    observe,
+)
+from lanebev.estimation.single_frame import FramePrior, fit_single_frame
+from lanebev.geometry.road import image_from_road_points
+from lanebev.types import Extrinsics, LaneSegments
+
+torch.set_num_threads(1)
+DOUBLE = torch.float64
+CAMERA = torch.tensor([[1050.0, 0.0, 959.5], [0.0, 1050.0, 509.5], [0.0, 0.0, 1.0]], dtype=DOUBLE)
+
+
+def drive_frames(params: Tensor, sigma: float, seed: int, per_boundary: int = 30, boundaries=range(6)):
+    """Segments between random points at 5-60 m of every boundary, for (B, 7) parameters."""
+    generator = torch.Generator().manual_seed(seed)
+    batch, num = params.shape[0], len(boundaries)
+    index = torch.tensor(list(boundaries)).repeat_interleave(per_boundary).expand(batch, -1)
+    inverse = torch.rand(batch, num * per_boundary, 2, generator=generator, dtype=DOUBLE)
+    z = 1 / (1 / 5.0 + (1 / 60.0 - 1 / 5.0) * inverse)
+    places = boundary_places(3.7, 6, params).gather(1, index) + params[:, 4:5]
+    c0, c1 = params[:, 5, None, None], params[:, 6, None, None]
+    x = places.unsqueeze(-1) + c0 * z**2 / 2 + c1 * z**3 / 6
+    points, _ = image_from_road_points(
+        torch.stack([x, z], dim=-1).flatten(1, 2),
+        CAMERA.expand(batch, 3, 3),
+        Extrinsics.unstack(params[:, :4]),
+    )
+    points = points.unflatten(1, (-1, 2))
+    points = points + sigma * torch.randn(points.shape, generator=generator, dtype=DOUBLE)
+    weight = torch.ones(index.shape, dtype=DOUBLE)
+    return LaneSegments(points, index.clone(), weight, torch.full_like(weight, max(sigma, 0.1)))
+
+
+def random_params(batch: int, seed: int, degrees: tuple[float, float, float], curvature: float = 0.0):
+    generator = torch.Generator().manual_seed(seed)
+    half = torch.tensor([*map(math.radians, degrees), 0.4, 1.2, curvature, 0.0], dtype=DOUBLE)
+    centre = torch.tensor([0.0, 0.0, 0.0, 1.5, 0.0, 0.0, 0.0], dtype=DOUBLE)
+    return centre + half * (2 * torch.rand(batch, NUM_PARAMS, generator=generator, dtype=DOUBLE) - 1)
+
+
+def cameras(batch: int) -> Tensor:
+    return CAMERA.expand(batch, 3, 3)
+
+
+@pytest.mark.parametrize("curved", [0.0, 1e-3])
+def test_residual_jacobian_equals_jacfwd(curved):
+    params = random_params(2, 0, (5, 5, 10))
+    params[:, 5], params[:, 6] = curved, curved / 100
+    seen = observe(drive_frames(params, 0.0, 1, per_boundary=4), cameras(2), 6)
+    places = boundary_places(3.7, 6, params).gather(1, seen.boundary)
+    found = boundary_residuals(params, places, seen)
+    assert found.distance.abs().max() < 1e-9  # the truth lies on its boundaries
+    full = torch.func.jacfwd(lambda p: boundary_residuals(p, places, seen).distance)(params)
+    expected = torch.stack([full[row, :, :, row] for row in range(2)])
+    torch.testing.assert_close(found.jacobian, expected, rtol=1e-9, atol=1e-6)
+
+
+def test_distance_of_a_straight_boundary_is_exact():
+    params = torch.tensor([[0.0, 0.0, 0.0, 1.5, 0.0, 0.0, 0.0]], dtype=DOUBLE)
+    segments = drive_frames(params, 0.0, 0, per_boundary=2, boundaries=(3,))
+    # boundary 3 at X = 1.85, height 1.5: slope 1.85/1.5 in the image; move 10 px along its normal
+    normal = torch.tensor([1.5, -1.85], dtype=DOUBLE) / math.hypot(1.5, 1.85)
+    moved = segments._replace(endpoints=segments.endpoints + 10 * normal)
+    seen = observe(moved, cameras(1), 6)
+    places = boundary_places(3.7, 6, params).gather(1, seen.boundary)
+    distance = boundary_residuals(params, places, seen).distance
+    torch.testing.assert_close(distance, torch.full_like(distance, 10.0))
+
+
+@pytest.mark.parametrize(
+    ("degrees", "curvature"), [((2, 2, 2), 0.0), ((8, 8, 20), 0.0), ((4, 4, 5), 1 / 300)]
+)
+def test_finds_the_pose_from_anywhere(degrees, curvature):
+    truth = random_params(12, 3, degrees, curvature)
+    fit = fit_single_frame(drive_frames(truth, 1.0, 4), cameras(12))
+    error = fit.params() - truth
+    nees = (error.unsqueeze(-2) @ torch.linalg.solve(fit.covariance, error.unsqueeze(-1))).squeeze() / 7
+    assert fit.valid.all()
+    assert fit.observed.all()
+    assert error[:, :3].abs().max() < math.radians(0.3)
+    assert error[:, 3].abs().max() < 0.01
+    assert 0.6 < nees.mean() < 1.5  # chi2 of 84 degrees of freedom: 0.7..1.35 at 98 %
+    assert (fit.inliers > 0.9).double().mean() > 0.98
+
+
+def test_survives_half_gross_outliers_and_wrong_indices():
+    truth = random_params(12, 5, (4, 4, 8), 1 / 500)
+    segments = drive_frames(truth, 1.0, 6)
+    generator = torch.Generator().manual_seed(7)
+    gross = torch.rand(segments.weight.shape, generator=generator) < 0.5
+    anywhere = torch.rand(segments.endpoints.shape, generator=generator, dtype=DOUBLE)
+    anywhere = anywhere * torch.tensor([1920.0, 510.0], dtype=DOUBLE) + torch.tensor([0.0, 510.0])
+    wrong = torch.rand(segments.weight.shape, generator=generator) < 0.05
+    shifted = (segments.boundary + torch.randint(1, 6, wrong.shape, generator=generator)) % 6
+    segments = segments._replace(
+        endpoints=torch.where(gross[..., None, None], anywhere, segments.endpoints),
+        boundary=torch.where(wrong, shifted, segments.boundary),
+    )
+    fit = fit_single_frame(segments, cameras(12))
+    error = fit.params() - truth
+    assert error[:, :3].abs().max() < math.radians(0.4)
+    assert error[:, 3].abs().max() < 0.015
+    assert fit.inliers[gross | wrong].mean() < 0.03
+    assert fit.inliers[~(gross | wrong)].mean() > 0.95
+
+
+def test_one_lane_leaves_roll_at_the_prior():
+    truth = random_params(8, 8, (3, 3, 0))
+    truth[:, 3] = 1.5
+    fit = fit_single_frame(drive_frames(truth, 1.0, 9, boundaries=(2, 3)), cameras(8))
+    assert fit.valid.all()
+    assert fit.observed[:, :2].all()
+    assert not fit.observed[:, 2].any()
+    assert (fit.extrinsics.roll.abs() < math.radians(2)).all()
+    assert (fit.covariance[:, 2, 2].sqrt() > 0.4 * FramePrior().roll_std).all()
+
+
+def test_one_boundary_is_not_a_pose():
+    truth = random_params(4, 10, (1, 1, 1))
+    fit = fit_single_frame(drive_frames(truth, 1.0, 11, boundaries=(2,)), cameras(4))
+    assert not fit.observed[:, 2:].any()
+    assert fit.params().isfinite().all()
+
+
+def test_rows_are_independent_and_bad_rows_finite():
+    truth = random_params(5, 12, (3, 3, 3))
+    segments = drive_frames(truth, 1.0, 13, per_boundary=8)
+    alone = fit_single_frame(LaneSegments(*(value[:1] for value in segments)), cameras(1))
+    matrix = cameras(5).clone()
+    segments.endpoints[1] = torch.nan
+    segments.weight[2] = 0.0
+    segments.endpoints[3] = segments.endpoints[3, :1, :1]  # one point, again and again
+    matrix[4] = torch.nan
+    fit = fit_single_frame(segments, matrix)
+    assert all(value.isfinite().all() for value in (fit.params(), fit.covariance, fit.inliers, fit.scale))
+    assert fit.valid.tolist() == [True, False, False, False, False]
+    torch.testing.assert_close(fit.params()[:1], alone.params(), rtol=0, atol=1e-9)
+
+
+def test_order_and_direction_of_segments_do_not_matter():
+    truth = random_params(2, 14, (3, 3, 3))
+    segments = drive_frames(truth, 1.0, 15, per_boundary=8)
+    order = torch.randperm(48, generator=torch.Generator().manual_seed(1))
+    mixed = LaneSegments(*(value[:, order] for value in segments))
+    mixed = mixed._replace(endpoints=mixed.endpoints.flip(2))
+    one, other = fit_single_frame(segments, cameras(2)), fit_single_frame(mixed, cameras(2))
+    torch.testing.assert_close(one.params(), other.params(), rtol=0, atol=1e-9)
+
+
+def test_gradient_reaches_the_endpoints():
+    truth = random_params(1, 16, (2, 2, 2))
+    segments = drive_frames(truth, 0.5, 17, per_boundary=6)
+
+    def pitch(points: Tensor) -> Tensor:
+        fit = fit_single_frame(segments._replace(endpoints=points), cameras(1), iterations=12)
+        return fit.extrinsics.pitch.sum()
+
+    points = segments.endpoints.clone().requires_grad_(True)
+    (gradient,) = torch.autograd.grad(pitch(points), points)
+    direction = torch.randn(points.shape, generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
+    step = 1e-4 * direction
+    numeric = (pitch(segments.endpoints + step) - pitch(segments.endpoints - step)) / 2e-4
+    torch.testing.assert_close((gradient * direction).sum(), numeric, rtol=0.02, atol=0)
+
+
+def test_wrong_shapes_are_one_clear_line():
+    segments = drive_frames(random_params(2, 18, (1, 1, 1)), 1.0, 19, per_boundary=2)
+    with pytest.raises(ValueError, match=r"segments.weight: expected \(2, 12\)"):
+        fit_single_frame(segments._replace(weight=segments.weight[:, :3]), cameras(2))
+    with pytest.raises(ValueError, match=r"intrinsics: expected \(2, 3, 3\), got \(3, 3\)"):
+        fit_single_frame(segments, CAMERA)
+    with pytest.raises(ValueError, match=r"lane_width: expected a float, \(2,\) or \(2, 5\), got \(2, 3\)"):
+        fit_single_frame(segments, cameras(2), lane_width=torch.full((2, 3), 3.7))
+
+
+def test_boundaries_of_unequal_lanes_and_their_polylines():
+    truth = random_params(3, 20, (2, 2, 2), 1e-3)
+    segments = drive_frames(truth, 0.3, 21)
+    pose, curvature = Extrinsics.unstack(truth[:, :4]), truth[:, 5:]
+    segments.weight[:, segments.boundary[0] == 5] = 0.0
+    widened = truth.clone()
+    widened[:, 4] += 0.4  # boundary 4 stands 40 cm farther right
+    other = drive_frames(widened, 0.3, 21)
+    is_4 = segments.boundary[0] == 4
+    segments.endpoints[:, is_4] = other.endpoints[:, is_4]
+    found = fit_boundaries(segments, cameras(3), pose, curvature)
+    expected = boundary_places(3.7, 6, truth) + truth[:, 4:5]
+    expected[:, 4] += 0.4
+    assert found.present.tolist() == [[True] * 5 + [False]] * 3
+    assert (found.offset - expected)[:, :5].abs().max() < 0.03
+    lines, visible = boundary_polylines(found, cameras(3), pose, num_points=16)
+    assert lines.shape == (3, 6, 16, 2)
+    assert visible[:, :5].all()
+    assert not visible[:, 5].any()
+    seen = observe(
+        segments._replace(
+            endpoints=lines[:, 4].view(3, 8, 2, 2),
+            boundary=torch.full((3, 8), 4),
+            weight=torch.ones(3, 8),
+            sigma=torch.ones(3, 8),
+        ),
+        cameras(3),
+        6,
+    )
+    places = expected[:, 4:5].expand(3, 8) - truth[:, 4:5]
+    assert boundary_residuals(truth, places, seen).distance.abs().max() < 2.0
