@@ -1,0 +1,90 @@
+"""Decoding, network and writing side by side: a reader thread in front, a writer thread behind."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from types import TracebackType
+from typing import TypeVar
+
+T = TypeVar("T")
+_END = object()
+
+
+def prefetch(items: Iterable[T], depth: int = 4) -> Iterator[T]:
+    """The same items in the same order, up to ``depth`` of them made ahead in a thread.
+
+    An exception of the producer is raised here. Leaving the loop early stops the thread.
+    """
+    ready: queue.Queue[object] = queue.Queue(depth)
+    stop = threading.Event()
+
+    def put(item: object) -> bool:
+        while not stop.is_set():
+            try:
+                ready.put(item, timeout=0.1)
+                return True
+            except queue.Full:
+                continue
+        return False
+
+    def produce() -> None:
+        try:
+            for item in items:
+                if not put(item):
+                    return
+            put(_END)
+        except BaseException as error:
+            put(_Failure(error))
+
+    thread = threading.Thread(target=produce, name="prefetch", daemon=True)
+    thread.start()
+    try:
+        while (item := ready.get()) is not _END:
+            if isinstance(item, _Failure):
+                raise item.error
+            yield item  # type: ignore[misc]
+    finally:
+        stop.set()
+        thread.join()
+
+
+class Background:
+    """Runs calls one after another in a thread; ``with`` waits for them and raises what they raised."""
+
+    def __init__(self, depth: int = 8) -> None:
+        self._calls: queue.Queue[Callable[[], object] | None] = queue.Queue(depth)
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="background", daemon=True)
+
+    def __enter__(self) -> Background:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._calls.put(None)
+        self._thread.join()
+        if error is None and self._error is not None:
+            raise self._error
+
+    def submit(self, call: Callable[[], object]) -> None:
+        """Queue a call; waits while the queue is full, raises if an earlier call failed."""
+        if self._error is not None:
+            raise self._error
+        self._calls.put(call)
+
+    def _run(self) -> None:
+        while (call := self._calls.get()) is not None:
+            if self._error is None:
+                try:
+                    call()
+                except BaseException as error:
+                    self._error = error
+
+
+class _Failure:
+    def __init__(self, error: BaseException) -> None:
+        self.error = error

@@ -1,0 +1,182 @@
+"""The output folder: complete or not there at all, and ``extrinsics.csv`` in it."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+from torch import Tensor
+
+from lanebev.types import Calibration, Status
+
+CSV_COLUMNS = (
+    "frame", "time_s", "pitch_deg", "yaw_deg", "roll_deg", "height_m", "pitch_std_deg", "yaw_std_deg",
+    "roll_std_deg", "height_std_m", "status", "segments", "image",
+)  # fmt: skip
+
+_COLUMN_TYPES = (int, *[float] * 9, str, int, str)
+
+OUTPUT_NAMES = (
+    "extrinsics.csv", "lanes.json", "bev.mp4", "bev.png", "overlay.mp4", "overlay.png", "report.html",
+    "state.safetensors", "mount.safetensors", "calibration.yaml",
+)  # fmt: skip
+
+
+class ExtrinsicsRow(NamedTuple):
+    """One row of ``extrinsics.csv``, in its units and order."""
+
+    frame: int
+    time_s: float
+    pitch_deg: float
+    yaw_deg: float
+    roll_deg: float
+    height_m: float
+    pitch_std_deg: float
+    yaw_std_deg: float
+    roll_std_deg: float
+    height_std_m: float
+    status: str
+    segments: int
+    image: str
+
+
+def extrinsics_row(
+    frame: int, time: float, calibration: Calibration, weight: Tensor, image: str
+) -> ExtrinsicsRow:
+    """Row of a frame.
+
+    Args:
+        frame: its number.
+        time: s.
+        calibration: of batch size 1.
+        weight: (1, N) of the frame's segments; those above zero are counted.
+        image: the file's path as found, empty for a video.
+    """
+    pitch, yaw, roll, height = calibration.extrinsics.stack()[0].tolist()
+    variances = calibration.covariance[0].diagonal().clamp_min(0)
+    pitch_std, yaw_std, roll_std, height_std = variances.sqrt().tolist()
+    return ExtrinsicsRow(
+        frame=frame,
+        time_s=time,
+        pitch_deg=math.degrees(pitch),
+        yaw_deg=math.degrees(yaw),
+        roll_deg=math.degrees(roll),
+        height_m=height,
+        pitch_std_deg=math.degrees(pitch_std),
+        yaw_std_deg=math.degrees(yaw_std),
+        roll_std_deg=math.degrees(roll_std),
+        height_std_m=height_std,
+        status=Status(int(calibration.status[0])).name,
+        segments=int((weight[0] > 0).sum()),
+        image=image,
+    )
+
+
+def write_extrinsics(path: str | Path, rows: list[ExtrinsicsRow]) -> None:
+    """Write ``extrinsics.csv``: a header and one row per frame."""
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(CSV_COLUMNS)
+        for row in rows:
+            writer.writerow([f"{value:.6f}" if isinstance(value, float) else value for value in row])
+
+
+def read_extrinsics(path: str | Path) -> list[ExtrinsicsRow]:
+    """Read what :func:`write_extrinsics` wrote.
+
+    Raises:
+        ValueError: the file is missing, or its header or a row is not ours.
+    """
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            header, *rows = list(csv.reader(file)) or [[]]
+    except OSError as error:
+        raise ValueError(f"{path}: expected a readable extrinsics.csv, got: {error.strerror}") from error
+    if tuple(header) != CSV_COLUMNS:
+        raise ValueError(f"{path}: expected the columns {','.join(CSV_COLUMNS)}, got {','.join(header)}")
+    result = []
+    for number, row in enumerate(rows, start=2):
+        try:
+            typed = [kind(value) for kind, value in zip(_COLUMN_TYPES, row, strict=True)]
+            result.append(ExtrinsicsRow._make(typed))
+        except ValueError as error:
+            raise ValueError(f"{path}, line {number}: expected 13 values, got {','.join(row)}") from error
+    return result
+
+
+class OutputFolder:
+    """A folder whose files appear all together when the work is done, or not at all.
+
+    Files are written into a hidden temporary folder beside it, on the same disk. On success they take
+    their place, and outputs of an earlier run that this one did not write anew are removed;
+    files of other names in an existing folder are left alone. On any error the folder is as it was.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+
+    def __enter__(self) -> OutputFolder:
+        """Make the temporary folder.
+
+        Raises:
+            ValueError: the folder cannot be made or written.
+        """
+        target = self.folder.absolute()
+        self._made = [parent for parent in target.parents if not parent.exists()]
+        try:
+            if target.exists() and not target.is_dir():
+                raise NotADirectoryError(0, "a file of that name is there")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if target.is_dir() and not os.access(target, os.W_OK | os.X_OK):
+                raise PermissionError(0, "no permission to write in it")
+            self._partial = Path(tempfile.mkdtemp(prefix=f".{target.name}.partial-", dir=target.parent))
+        except OSError as error:
+            self._remove_parents()
+            raise ValueError(
+                f"output folder {self.folder}: expected one that can be written, got: {error.strerror}; "
+                "give another with --out"
+            ) from error
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if error is None:
+                self._publish()
+        finally:
+            shutil.rmtree(self._partial, ignore_errors=True)
+            if error is not None:
+                self._remove_parents()
+
+    def __truediv__(self, name: str) -> Path:
+        """Where to write the file of this name until the work is done."""
+        return self._partial / name
+
+    def _publish(self) -> None:
+        if not self.folder.exists():
+            self._partial.chmod(0o777 & ~_umask())  # mkdtemp's is for the owner alone
+            self._partial.rename(self.folder)
+            return
+        written = {path.name for path in self._partial.iterdir()}
+        for path in self._partial.iterdir():
+            path.replace(self.folder / path.name)
+        for name in set(OUTPUT_NAMES) - written:
+            (self.folder / name).unlink(missing_ok=True)
+
+    def _remove_parents(self) -> None:
+        for parent in self._made:
+            if parent.is_dir() and not any(parent.iterdir()):
+                parent.rmdir()
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

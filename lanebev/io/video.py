@@ -1,0 +1,245 @@
+"""Frames in from a video, a folder, a glob or one image; H.264 that browsers play out."""
+
+from __future__ import annotations
+
+import glob
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm")
+DEFAULT_FPS = Fraction(30)
+
+
+class Frame(NamedTuple):
+    """One frame of a source.
+
+    Attributes:
+        number: 0, 1, ...
+        time: s since the first frame.
+        dt: s since the frame before; of the first, the source's nominal interval.
+        name: the image's path as found, empty for a video.
+        image: (H, W, 3) uint8 RGB, or None if it did not decode.
+        problem: why not, else empty.
+    """
+
+    number: int
+    time: float
+    dt: float
+    name: str
+    image: NDArray[np.uint8] | None
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class FrameSource:
+    """A video or a list of images, iterated frame by frame, as often as wanted.
+
+    Attributes:
+        source: what the user gave.
+        paths: the images in order; empty for a video.
+        fps: nominal frame rate.
+        count: number of frames; of a damaged video an estimate.
+        image_size: (height, width) of the first frame that decodes.
+    """
+
+    source: str
+    paths: tuple[str, ...]
+    fps: Fraction
+    count: int
+    image_size: tuple[int, int]
+
+    @property
+    def is_video(self) -> bool:
+        """Whether the frames come out of one container."""
+        return not self.paths
+
+    @property
+    def is_single(self) -> bool:
+        """Whether it is one image given by its own path."""
+        return len(self.paths) == 1 and self.paths[0] == self.source
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self._video_frames() if self.is_video else self._image_frames()
+
+    def _image_frames(self) -> Iterator[Frame]:
+        for index, path in enumerate(self.paths):
+            image, problem = None, ""
+            try:
+                image = self._right_size(read_image(path))
+            except ValueError as error:
+                problem = str(error)
+            yield Frame(index, float(index / self.fps), float(1 / self.fps), path, image, problem)
+
+    def _video_frames(self) -> Iterator[Frame]:
+        index, first, before, problem = 0, None, None, ""
+        with _open_video(self.source) as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            for packet in container.demux(stream):
+                try:
+                    decoded: Sequence[av.VideoFrame | None] = packet.decode()
+                except av.error.FFmpegError as error:  # one frame lost, the next may be whole
+                    decoded, problem = [None], f"frame {index}: expected a whole frame, got: {error.strerror}"
+                for frame in decoded:
+                    nominal = (first or 0) + index / self.fps
+                    time = frame.pts * frame.time_base if frame and frame.pts is not None else nominal
+                    first = time if first is None else first
+                    dt = float(1 / self.fps) if before is None else float(time - before)
+                    try:
+                        image = self._right_size(frame.to_ndarray(format="rgb24")) if frame else None
+                    except ValueError as error:
+                        image, problem = None, str(error)
+                    yield Frame(
+                        index, float(time - first), dt, "", image, "" if image is not None else problem
+                    )
+                    index, before = index + 1, time
+
+    def _right_size(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        if image.shape[:2] != self.image_size:
+            height, width = self.image_size
+            got = f"{image.shape[1]} x {image.shape[0]}"
+            raise ValueError(f"expected {width} x {height} like the first frame, got {got}")
+        return image
+
+
+def open_source(source: str, fps: Fraction = DEFAULT_FPS) -> FrameSource:
+    """Look at what the user gave and check that a frame of it decodes.
+
+    Args:
+        source: a video, a folder of images, a glob (recursive with ``**``) or one image.
+        fps: frame rate of a folder or glob; a video knows its own.
+
+    Raises:
+        ValueError: nothing there, no images in it, or the only (or every) image does not decode.
+    """
+    path = Path(source)
+    if path.is_dir():
+        paths = sorted((str(p) for p in path.iterdir() if _is_image(p)), key=natural_order)
+        if not paths:
+            raise ValueError(
+                f"{source}: expected images in the folder, got none; for those in folders below it give "
+                f"a quoted glob such as '{path}/**/*.jpg'"
+            )
+        return _image_source(source, paths, fps)
+    if path.is_file():
+        return _image_source(source, [source], fps) if _is_image(path) else _video_source(source)
+    if glob.has_magic(source):
+        paths = sorted(filter(_is_image, glob.glob(source, recursive=True)), key=natural_order)
+        if not paths:
+            raise ValueError(f"{source}: expected images that match, got none; quote the pattern")
+        return _image_source(source, paths, fps)
+    raise ValueError(f"{source}: expected a video, an image, a folder or a glob of images, got nothing there")
+
+
+def read_image(path: str | Path) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 RGB. A file that is cut is an error, not an image with a grey half.
+
+    Raises:
+        ValueError: the file is missing, cut or no image.
+    """
+    try:
+        with warnings.catch_warnings(), Image.open(path) as image:
+            warnings.simplefilter("ignore")  # of odd EXIF; errors are errors
+            return np.asarray(image.convert("RGB"))
+    except (OSError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        if isinstance(error, UnidentifiedImageError):
+            reason = "no image or one whose header is cut"
+        else:
+            reason = (getattr(error, "strerror", None) or str(error)).splitlines()[0].lower()
+        raise ValueError(f"image {path}: expected a whole image, got: {reason}") from error
+
+
+def write_png(path: str | Path, image: NDArray[np.uint8]) -> None:
+    """(H, W, 3) uint8 RGB to a PNG."""
+    Image.fromarray(image).save(path)
+
+
+def natural_order(path: str) -> list[tuple[int, int, str]]:
+    """Sort key with numbers by value: 2.jpg before 10.jpg."""
+    return [(0, int(part), part) if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", path)]
+
+
+class VideoWriter:
+    """H.264, yuv420p, the index in front: plays in browsers. Frames are padded to even sides.
+
+    Use as a context manager; the file is whole only after it closes.
+    """
+
+    def __init__(self, path: str | Path, fps: Fraction) -> None:
+        self._container = av.open(str(path), "w", options={"movflags": "faststart"})
+        self._stream = self._container.add_stream("libx264", rate=fps.limit_denominator(65535))
+        self._stream.pix_fmt = "yuv420p"
+        self._stream.options = {"crf": "21", "preset": "veryfast"}
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            for packet in self._stream.encode():
+                self._container.mux(packet)
+        self._container.close()
+
+    def write(self, image: NDArray[np.uint8]) -> None:
+        """(H, W, 3) uint8 RGB, the same size every time."""
+        height, width = image.shape[:2]
+        if height % 2 or width % 2:
+            image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        if not self._stream.codec_context.is_open:
+            self._stream.height, self._stream.width = image.shape[:2]
+        for packet in self._stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")):
+            self._container.mux(packet)
+
+
+def _is_image(path: str | Path) -> bool:
+    return Path(path).suffix.lower() in IMAGE_SUFFIXES and Path(path).is_file()
+
+
+def _image_source(source: str, paths: Sequence[str], fps: Fraction) -> FrameSource:
+    problem = ""
+    for path in paths:
+        try:
+            return FrameSource(source, tuple(paths), fps, len(paths), read_image(path).shape[:2])
+        except ValueError as error:
+            problem = problem or str(error)
+    raise ValueError(problem)
+
+
+def _video_source(source: str) -> FrameSource:
+    with _open_video(source) as container:
+        stream = container.streams.video[0]
+        fps = stream.average_rate or stream.guessed_rate or DEFAULT_FPS
+        try:
+            frame = next(container.decode(stream))
+        except (av.error.FFmpegError, StopIteration) as error:
+            raise ValueError(f"video {source}: expected at least one whole frame, got none") from error
+        size = (frame.height, frame.width)
+    with _open_video(source) as container:  # the header's count includes frames that an edit list cuts
+        packets = container.demux(container.streams.video[0])
+        count = sum(packet.pts is not None and not packet.is_discard for packet in packets)
+    return FrameSource(source, (), Fraction(fps), count, size)
+
+
+def _open_video(source: str) -> av.container.InputContainer:
+    try:
+        container = av.open(source)
+    except (av.error.FFmpegError, OSError) as error:
+        reason = error.strerror or "unknown format"
+        raise ValueError(f"video {source}: expected a video that opens, got: {reason}; is it cut?") from error
+    if not container.streams.video:
+        container.close()
+        raise ValueError(f"video {source}: expected a video stream, got none")
+    return container

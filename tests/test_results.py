@@ -1,0 +1,113 @@
+"""The output folder: all of it or nothing; extrinsics.csv exactly as promised."""
+
+import math
+import os
+
+import pytest
+import torch
+
+from lanebev import Calibration, Extrinsics, Status
+from lanebev.io.results import CSV_COLUMNS, OutputFolder, extrinsics_row, read_extrinsics, write_extrinsics
+
+
+def _row(frame=0, image=""):
+    pose = Extrinsics(*(torch.tensor([math.radians(v)]) for v in (1.0, -2.0, 3.0)), torch.tensor([1.5]))
+    cov = torch.diag(torch.tensor([math.radians(0.1), math.radians(0.2), math.radians(0.3), 0.04]) ** 2)[None]
+    status = torch.tensor([int(Status.TRACKING)])
+    calibration = Calibration(pose, cov, status, torch.ones(1, 4))
+    return extrinsics_row(frame, 0.04 * frame, calibration, torch.tensor([[1.0, 0.5, 0.0, 0.0]]), image)
+
+
+def test_csv_is_as_promised(tmp_path):
+    write_extrinsics(tmp_path / "e.csv", [_row(0), _row(1, "a,b.jpg")])
+    lines = (tmp_path / "e.csv").read_text().splitlines()
+    assert lines[0] == (
+        "frame,time_s,pitch_deg,yaw_deg,roll_deg,height_m,pitch_std_deg,yaw_std_deg,roll_std_deg,"
+        "height_std_m,status,segments,image"
+    )
+    expected = (
+        "0,0.000000,1.000000,-2.000000,3.000000,1.500000,0.100000,0.200000,0.300000,0.040000,TRACKING,2,"
+    )
+    assert lines[1] == expected
+    assert lines[2].endswith('TRACKING,2,"a,b.jpg"')
+    assert len(CSV_COLUMNS) == 13
+
+
+def test_csv_round_trip(tmp_path):
+    write_extrinsics(tmp_path / "e.csv", [_row(0), _row(1, "a,b.jpg")])
+    rows = read_extrinsics(tmp_path / "e.csv")
+    assert [row.frame for row in rows] == [0, 1]
+    assert rows[1].image == "a,b.jpg"
+    assert rows[0].yaw_deg == -2.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "expected the columns"),
+        ("a,b\n1,2\n", "expected the columns"),
+        ("0,1\n", "line 2: expected 13 values"),
+    ],
+)
+def test_foreign_csv(tmp_path, text, message):
+    header = ",".join(CSV_COLUMNS) + "\n" if "line 2" in message else ""
+    (tmp_path / "e.csv").write_text(header + text)
+    with pytest.raises(ValueError, match=message):
+        read_extrinsics(tmp_path / "e.csv")
+    with pytest.raises(ValueError, match="No such file"):
+        read_extrinsics(tmp_path / "none.csv")
+
+
+def test_folder_appears_whole(tmp_path):
+    with OutputFolder(tmp_path / "a" / "out") as out:
+        (out / "extrinsics.csv").write_text("1")
+        assert not (tmp_path / "a" / "out").exists()
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["out"]
+    assert (tmp_path / "a" / "out" / "extrinsics.csv").read_text() == "1"
+    assert os.access(tmp_path / "a" / "out", os.R_OK)
+
+
+def test_nothing_is_left_after_an_error(tmp_path):
+    def fail():
+        with OutputFolder(tmp_path / "a" / "b" / "out") as out:
+            (out / "extrinsics.csv").write_text("half")
+            raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        fail()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_earlier_run_is_replaced_or_untouched(tmp_path):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    for name in ("extrinsics.csv", "bev.mp4", "mine.txt"):
+        (folder / name).write_text("old")
+
+    def run(fail):
+        with OutputFolder(folder) as out:
+            (out / "extrinsics.csv").write_text("new")
+            (out / "bev.png").write_text("new")
+            if fail:
+                raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        run(fail=True)
+    assert {path.name: path.read_text() for path in folder.iterdir()} == {
+        "extrinsics.csv": "old", "bev.mp4": "old", "mine.txt": "old",
+    }  # fmt: skip
+    run(fail=False)
+    assert {path.name: path.read_text() for path in folder.iterdir()} == {
+        "extrinsics.csv": "new", "bev.png": "new", "mine.txt": "old",
+    }  # fmt: skip
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_unwritable_folder_is_one_clear_line(tmp_path):
+    (tmp_path / "file").write_text("I am a file")
+    for folder in (tmp_path / "file", tmp_path / "file" / "out", tmp_path / "file" / "a" / "out"):
+        with pytest.raises(ValueError, match="expected one that can be written") as error:
+            OutputFolder(folder).__enter__()
+        assert "\n" not in str(error.value)
+        assert "--out" in str(error.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -1,0 +1,219 @@
+"""Frames from videos, folders, globs and single images; H.264 out; work side by side."""
+
+import threading
+import time
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from lanebev.io.overlap import Background, prefetch
+from lanebev.io.video import VideoWriter, natural_order, open_source, read_image, write_png
+
+
+def _picture(value, height=48, width=64):
+    image = np.zeros((height, width, 3), np.uint8)
+    image[..., 0] = value
+    image[: height // 2, :, 2] = 255
+    return image
+
+
+def _folder(path, names):
+    for i, name in enumerate(names):
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(_picture(10 * i)).save(path / name)
+    return path
+
+
+def _video(path, count=5, fps=25, height=48, width=64):
+    with VideoWriter(path, Fraction(fps)) as writer:
+        for i in range(count):
+            writer.write(_picture(40 * i, height, width))
+    return path
+
+
+def test_folder_frames_come_in_natural_order(tmp_path):
+    _folder(tmp_path, ["2.png", "10.png", "1.png"])
+    (tmp_path / "notes.txt").write_text("no image")
+    source = open_source(str(tmp_path), Fraction(10))
+    frames = list(source)
+    assert [frame.name for frame in frames] == [str(tmp_path / f"{i}.png") for i in (1, 2, 10)]
+    assert [frame.time for frame in frames] == [0.0, 0.1, 0.2]
+    assert [frame.dt for frame in frames] == [0.1] * 3
+    assert [frame.number for frame in frames] == [0, 1, 2]
+    assert not source.is_video
+    assert not source.is_single
+    np.testing.assert_array_equal(frames[2].image, _picture(10))
+
+
+def test_recursive_glob(tmp_path):
+    _folder(tmp_path, ["a/1/20.png", "a/2/20.png", "b/20.jpg"])
+    source = open_source(f"{tmp_path}/**/*.png")
+    assert source.paths == (f"{tmp_path}/a/1/20.png", f"{tmp_path}/a/2/20.png")
+    assert list(open_source(f"{tmp_path}/**/*.png"))[1].name == source.paths[1]
+
+
+def test_single_image(tmp_path):
+    _folder(tmp_path, ["[1].png"])
+    source = open_source(str(tmp_path / "[1].png"))
+    assert source.is_single
+    assert source.image_size == (48, 64)
+
+
+def test_video_round_trip(tmp_path):
+    source = open_source(str(_video(tmp_path / "v.mp4")))
+    assert source.is_video
+    assert (source.fps, source.count, source.image_size) == (25, 5, (48, 64))
+    for _ in range(2):  # as often as wanted
+        frames = list(source)
+        assert [frame.number for frame in frames] == list(range(5))
+        np.testing.assert_allclose([frame.time for frame in frames], np.arange(5) / 25, atol=1e-9)
+        assert {frame.dt for frame in frames} == {0.04}
+        for i, frame in enumerate(frames):
+            assert abs(float(frame.image[24:, :, 0].mean()) - 40 * i) < 4  # RGB: red is first
+            assert frame.image[10, 10, 2] > 200
+
+
+def test_writer_makes_what_browsers_play(tmp_path):
+    path = _video(tmp_path / "v.mp4", height=47, width=63)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert (stream.height, stream.width) == (48, 64)
+    data = path.read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat")  # plays before it is fully loaded
+
+
+def test_a_damaged_image_in_a_drive_is_a_frame_without_image(tmp_path):
+    _folder(tmp_path, ["1.jpg", "2.jpg", "3.jpg"])
+    data = (tmp_path / "2.jpg").read_bytes()
+    (tmp_path / "2.jpg").write_bytes(data[: len(data) // 2])
+    (tmp_path / "1.jpg").write_bytes(b"")
+    frames = list(open_source(str(tmp_path)))
+    assert [frame.image is None for frame in frames] == [True, True, False]
+    problems = [frame.problem for frame in frames]
+    assert "1.jpg" in problems[0]
+    assert "truncated" in problems[1].lower()
+    assert all("\n" not in problem for problem in problems)
+
+
+def test_an_image_of_another_size_is_a_frame_without_image(tmp_path):
+    _folder(tmp_path, ["1.png", "2.png"])
+    Image.fromarray(_picture(0, 32, 40)).save(tmp_path / "2.png")
+    first, second = open_source(str(tmp_path))
+    assert first.image is not None
+    assert second.image is None
+    assert second.problem == "expected 64 x 48 like the first frame, got 40 x 32"
+
+
+def test_a_damaged_stretch_of_a_video_does_not_end_it(tmp_path):
+    path = tmp_path / "v.mp4"
+    noise = np.random.default_rng(0)
+    with VideoWriter(path, Fraction(25)) as writer:
+        for _ in range(30):
+            writer.write(noise.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    data = bytearray(path.read_bytes())
+    start = data.index(b"mdat") + len(data) // 3
+    data[start : start + 3000] = bytes(3000)
+    path.write_bytes(data)
+    frames = list(open_source(str(path)))
+    assert len(frames) >= 20
+    assert [frame.number for frame in frames] == list(range(len(frames)))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("none.mp4", None, "expected a video, an image, a folder or a glob of images, got nothing there"),
+        ("v.mp4", b"not a video", "expected a video that opens, got: Invalid data"),
+        ("v.mp4", b"", "expected a video that opens"),
+        ("i.png", b"\x89PNG\r\n\x1a\n", "expected a whole image, got"),
+        ("i.jpg", b"", "no image or one whose header is cut"),
+        ("*.jpg", None, "expected images that match, got none"),
+    ],
+)
+def test_bad_sources_are_one_clear_line(tmp_path, name, content, message):
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ValueError, match=message) as error:
+        open_source(str(path))
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
+
+
+def test_cut_video(tmp_path):
+    path = _video(tmp_path / "v.mp4")
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(ValueError, match=r"v\.mp4: expected"):
+        open_source(str(path))
+
+
+def test_folder_without_images_suggests_a_glob(tmp_path):
+    _folder(tmp_path, ["a/1.png"])
+    with pytest.raises(ValueError, match=r"quoted glob such as '.*/\*\*/\*\.jpg'"):
+        open_source(str(tmp_path))
+
+
+def test_write_png(tmp_path):
+    write_png(tmp_path / "a.png", _picture(7))
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), _picture(7))
+
+
+def test_natural_order():
+    assert sorted(["a/10.jpg", "a/9.jpg", "b/1.jpg", "a/x.jpg"], key=natural_order)[:2] == [
+        "a/9.jpg",
+        "a/10.jpg",
+    ]
+
+
+def test_prefetch_keeps_order_and_runs_ahead():
+    made = []
+
+    def produce():
+        for i in range(6):
+            made.append(i)
+            yield i
+
+    items = prefetch(produce(), depth=3)
+    assert next(items) == 0
+    deadline = time.monotonic() + 5
+    while len(made) < 4 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert len(made) >= 4
+    assert list(items) == [1, 2, 3, 4, 5]
+
+
+def test_prefetch_raises_what_the_producer_raised_and_stops_when_left():
+    def broken():
+        yield 1
+        raise ValueError("frame 2")
+
+    items = prefetch(broken())
+    assert next(items) == 1
+    with pytest.raises(ValueError, match="frame 2"):
+        next(items)
+    endless = prefetch(iter(int, 1))
+    next(endless)
+    endless.close()
+    assert not any(thread.name == "prefetch" for thread in threading.enumerate())
+
+
+def test_background_runs_in_order_and_raises():
+    done = []
+    with Background() as background:
+        for i in range(20):
+            background.submit(lambda i=i: done.append(i))
+    assert done == list(range(20))
+
+    def fail():
+        raise OSError("disk full")
+
+    def run():
+        with Background() as background:
+            background.submit(fail)
+
+    with pytest.raises(OSError, match="disk full"):
+        run()
