@@ -1,0 +1,117 @@
+"""Lenses against OpenCV, and their round trips."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from lanebev import Camera
+from lanebev.geometry import camera as lens
+
+BROWN = {
+    4: [-0.25, 0.05, -0.0007, 0.0001],
+    5: [-0.2567775, 0.0433809, -0.0006875, 0.0001257, -0.1150202],
+    8: [0.1, -0.05, 0.001, -0.0005, 0.01, 0.15, -0.02, 0.005],
+    12: [0.1, -0.05, 0.001, -0.0005, 0.01, 0.15, -0.02, 0.005, 1e-4, -2e-4, 3e-4, 1e-4],
+}
+FISHEYE = [-0.02, 0.003, -0.001, 0.0002]
+
+
+def camera(distortion, model="pinhole", focal=1100.0):
+    return Camera.from_parameters(focal, focal + 5, 650.0, 370.0, 1280, 720, distortion, model)
+
+
+def pixels(n=400, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(n, 2, generator=generator, dtype=torch.float64) * torch.tensor([1279.0, 719.0])
+
+
+@pytest.mark.parametrize("count", sorted(BROWN))
+def test_brown_conrady_equals_opencv(count):
+    cam = camera(BROWN[count])
+    undistorted = pixels()
+    rays = torch.linalg.solve(cam.intrinsics, torch.cat([undistorted, torch.ones(400, 1)], -1).double().T).T
+    expected, _ = cv2.projectPoints(
+        rays.numpy(), np.zeros(3), np.zeros(3), cam.intrinsics.numpy(), np.array(BROWN[count])
+    )
+    np.testing.assert_allclose(cam.distort_points(undistorted).numpy(), expected[:, 0], atol=1e-8)
+
+
+def test_fisheye_equals_opencv():
+    cam = camera(FISHEYE, "fisheye", 500.0)
+    plane = lens.normalise_points(pixels(), cam.intrinsics)
+    expected = cv2.fisheye.distortPoints(plane.numpy()[None], cam.intrinsics.numpy(), np.array(FISHEYE))
+    np.testing.assert_allclose(cam.distort_points(pixels()).numpy(), expected[0], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "model", "focal"),
+    [([], "pinhole", 1100.0), (FISHEYE, "fisheye", 500.0), *((BROWN[n], "pinhole", 1100.0) for n in BROWN)],
+)
+def test_undistortion_inverts_distortion(distortion, model, focal):
+    cam = camera(distortion, model, focal)
+    undistorted, valid = cam.undistort_points(pixels())
+    assert valid.all()
+    torch.testing.assert_close(cam.distort_points(undistorted), pixels(), atol=1e-4, rtol=0)
+
+
+def test_fisheye_undistortion_has_a_gradient_at_the_centre():
+    cam = camera(FISHEYE, "fisheye", 500.0)
+    points = torch.tensor([[[650.0, 370.0], [100.0, 600.0]]], dtype=torch.float64, requires_grad=True)
+    args = (cam.intrinsics[None], cam.distortion[None], "fisheye")
+    lens.undistort_points(points, *args).sum().backward()
+    assert points.grad.isfinite().all()
+    away = torch.tensor([[[700.0, 400.0], [100.0, 600.0]]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda p: lens.undistort_points(p, *args), (away,))
+
+
+def test_rays_project_back():
+    cam = camera(BROWN[5])
+    points = pixels()
+    back, inside = cam.project(cam.rays(points) * 7.0)
+    torch.testing.assert_close(back, points, atol=1e-4, rtol=0)
+    assert inside.all()
+    _, behind = cam.project(-cam.rays(points))
+    assert not behind.any()
+
+
+def test_points_beyond_the_fold_of_the_lens_are_not_seen():
+    cam = camera(BROWN[5])
+    radius = float(lens.max_undistorted_radius(cam.distortion[None])[0])
+    assert 0.8 < radius < 1.5
+    folded = torch.tensor([[radius * 1.2, 0.0, 1.0]], dtype=torch.float64)
+    _, inside = cam.project(folded)
+    assert not inside.any()
+    none = torch.zeros(1, 0, dtype=torch.float64)
+    assert float(lens.max_undistorted_radius(none)[0]) == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize("size", [(360, 640), (500, 1280)])
+def test_scaled_camera_sees_the_resized_image(size):
+    cam = camera([])
+    point = torch.tensor([[0.3, 0.2, 2.0]], dtype=torch.float64)
+    x, y = cam.project(point)[0][0]
+    sx, sy = size[1] / 1280, size[0] / 720
+    expected = torch.stack([(x + 0.5) * sx - 0.5, (y + 0.5) * sy - 0.5])
+    torch.testing.assert_close(cam.scaled(size).project(point)[0][0], expected)
+
+
+def test_cropped_camera_shifts():
+    cam, point = camera(BROWN[5]), torch.tensor([[0.1, 0.2, 2.0]], dtype=torch.float64)
+    shift = cam.project(point)[0] - cam.cropped(100, 40, 300, 500).project(point)[0]
+    torch.testing.assert_close(shift, torch.tensor([[40.0, 100.0]], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"distortion": [0.1, 0.2, 0.3]}, "expected 0, 4, 5, 8, 12 coefficients for a pinhole lens, got 3"),
+        ({"model": "ball"}, "model: expected one of pinhole, fisheye, got 'ball'"),
+        ({"fx": -1.0}, "expected positive focal lengths, got fx -1"),
+        ({"width": 0}, "image_size: expected positive"),
+    ],
+)
+def test_impossible_cameras_are_refused(arguments, message):
+    values = {"fx": 1000.0, "fy": 1000.0, "cx": 640.0, "cy": 360.0, "width": 1280, "height": 720} | arguments
+    with pytest.raises(ValueError, match=message):
+        Camera.from_parameters(**values)

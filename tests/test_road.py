@@ -1,0 +1,109 @@
+"""Points between image, road and BEV, and their covariance."""
+
+import itertools
+import math
+
+import pytest
+import torch
+
+from lanebev import BEVGrid, Extrinsics, bev_from_image, image_from_road_points, road_covariance
+from lanebev.geometry.road import great_circle_normals, road_from_image_points
+from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
+
+K = torch.tensor([[[1000.0, 0.0, 640.0], [0.0, 980.0, 360.0], [0.0, 0.0, 1.0]]], dtype=torch.float64)
+ROAD = torch.tensor([[[-4.0, 8.0], [0.0, 20.0], [3.0, 45.0]]], dtype=torch.float64)
+
+
+def pose(pitch=0.0, yaw=0.0, roll=0.0, height=1.5):
+    return Extrinsics(*(torch.tensor([v], dtype=torch.float64) for v in (pitch, yaw, roll, height)))
+
+
+def test_a_point_straight_ahead_by_hand():
+    pixel, valid = image_from_road_points(
+        torch.tensor([[[2.0, 10.0]]], dtype=torch.float64), K, pose(height=1.5)
+    )
+    assert valid.all()
+    torch.testing.assert_close(pixel, torch.tensor([[[640 + 200.0, 360 + 98.0 * 1.5]]], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("pitch", "yaw", "roll", "height"),
+    list(itertools.product((-0.05, 0.0, 0.1), (-0.17, 0.0, 0.1), (-0.35, 0.0, 0.2), (1.0, 2.3))),
+)
+def test_road_image_bev_round_trip(pitch, yaw, roll, height):
+    e, grid = pose(pitch, yaw, roll, height), BEVGrid()
+    pixels, front = image_from_road_points(ROAD, K, e)
+    assert front.all()
+    back, valid = road_from_image_points(pixels, K, e)
+    assert valid.all()
+    torch.testing.assert_close(back, ROAD)
+    homography = bev_from_image(e, K, grid)
+    bev = torch.cat([pixels, torch.ones(1, 3, 1)], -1) @ homography.mT
+    torch.testing.assert_close(bev[..., :2] / bev[..., 2:], grid.bev_from_road_points(ROAD))
+    torch.testing.assert_close(grid.road_from_bev_points(grid.bev_from_road_points(ROAD)), ROAD)
+
+
+def test_homography_is_the_papers_for_its_grid():
+    # Eq. (19) with a_X = a_Z = 20 px/m, b_X = 16 m, b_Z = 50 m.
+    a, b_x, b_z = 20.0, 16.0, 50.0
+    e = pose(0.03, -0.02, 0.01, 1.4)
+    from lanebev.geometry.rotation import road_from_cam
+
+    rows = road_from_cam(e.pitch, e.yaw, e.roll)[0]
+    scale = torch.tensor([[a, 0, b_x * a / 2], [0, -a, b_z * a], [0, 0, 1]], dtype=torch.float64)
+    paper = scale @ torch.stack([rows[0], rows[2], rows[1] / 1.4]) @ torch.linalg.inv(K[0])
+    grid = BEVGrid(x=(-b_x / 2, b_x / 2), z=(0.0, b_z), resolution=1 / a)
+    torch.testing.assert_close(bev_from_image(e, K, grid)[0], paper)
+
+
+def test_above_the_horizon_is_not_road():
+    _, valid = road_from_image_points(torch.tensor([[[640.0, 300.0]]], dtype=torch.float64), K, pose())
+    assert not valid.any()
+    _, front = image_from_road_points(torch.tensor([[[0.0, -5.0]]], dtype=torch.float64), K, pose())
+    assert not front.any()
+
+
+def test_great_circles_of_parallel_lines_meet_in_the_vanishing_direction():
+    e = pose(0.05, -0.1, 0.2, 1.3)
+    near = torch.tensor([[[-5.0, 8.0], [-1.0, 8.0], [4.0, 9.0]]], dtype=torch.float64)
+    far = near + torch.tensor([0.0, 25.0], dtype=torch.float64)
+    ends = torch.stack([image_from_road_points(p, K, e)[0] for p in (near, far)], dim=2)
+    normals = great_circle_normals(ends, K)
+    v = vanishing_dir_from_pitch_yaw(e.pitch, e.yaw)
+    torch.testing.assert_close((normals @ v[..., None]).abs().max(), torch.zeros((), dtype=torch.float64))
+
+
+def test_road_covariance_equals_monte_carlo():
+    e = pose(0.02, 0.01, -0.01, 1.5)
+    pixels, _ = image_from_road_points(ROAD, K, e)
+    pixel_std, pose_std = 0.3, torch.tensor([5e-4, 1e-3, 1e-3, 0.01], dtype=torch.float64)
+    cov = road_covariance(
+        pixels,
+        K,
+        e,
+        (torch.eye(2, dtype=torch.float64) * pixel_std**2).expand(1, 3, 2, 2),
+        torch.diag(pose_std**2)[None],
+    )
+    generator = torch.Generator().manual_seed(0)
+    n = 20000
+    noise = torch.randn(n, 3, 2, generator=generator, dtype=torch.float64) * pixel_std
+    poses = e.stack() + torch.randn(n, 4, generator=generator, dtype=torch.float64) * pose_std
+    road, _ = road_from_image_points(pixels + noise, K.expand(n, 3, 3), Extrinsics.unstack(poses))
+    for k in range(3):
+        torch.testing.assert_close(torch.cov(road[:, k].T), cov[0, k], rtol=0.1, atol=2e-4)
+    bev = BEVGrid(resolution=0.1).bev_from_road_covariance(cov)
+    torch.testing.assert_close(bev[0, :, 0, 1], -100 * cov[0, :, 0, 1])
+
+
+def test_grid_shape_and_cells():
+    grid = BEVGrid(x=(-10.0, 10.0), z=(3.0, 60.0), resolution=0.05)
+    assert grid.shape == (1140, 400)
+    cells = grid.cells(torch.float64)
+    assert cells.shape == (1140, 400, 2)
+    assert cells[0, 0].tolist() == [-10.0, 60.0]
+    assert cells[-1, -1].tolist() == pytest.approx([9.95, 3.05])
+    with pytest.raises(ValueError, match="resolution: expected > 0"):
+        BEVGrid(resolution=0.0)
+    with pytest.raises(ValueError, match="x: expected"):
+        BEVGrid(x=(5.0, -5.0))
+    assert math.isclose(float(grid.bev_from_road_points(torch.tensor([0.0, 60.0]))[1]), 0.0)

@@ -1,0 +1,114 @@
+"""The resampling against the homography, on lenses, on feature maps, and its gradients."""
+
+import pytest
+import torch
+from kornia.geometry.transform import warp_perspective
+
+from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics, bev_from_image
+
+GRID = BEVGrid(x=(-4.0, 4.0), z=(5.0, 25.0), resolution=0.1)
+CAMERA = Camera.from_parameters(300.0, 300.0, 160.0, 90.0, 320, 180)
+LENS = Camera.from_parameters(300.0, 300.0, 160.0, 90.0, 320, 180, [-0.2, 0.03, 0.001, -0.001, 0.0])
+
+
+def pose(*rows, dtype=torch.float64):
+    return Extrinsics.unstack(torch.tensor(rows, dtype=dtype))
+
+
+def smooth_image(batch=1, height=180, width=320):
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    channels = torch.stack([x / width, y / height, (x / 20).sin() * (y / 15).cos()]).double()
+    return channels.expand(batch, 3, height, width).contiguous()
+
+
+def interior(pixels, margin=1.0):
+    """(1, 1, U, V) bool: not in the outermost pixels, where border and zero padding differ."""
+    x, y = pixels.unbind(-1)
+    inside = (x > margin) & (x < 319 - margin) & (y > margin) & (y < 179 - margin)
+    return inside.reshape(1, 1, *GRID.shape)
+
+
+def test_equals_kornia_with_the_papers_homography():
+    extrinsics, intrinsics = pose([0.03, 0.02, -0.05, 1.4]), CAMERA.intrinsics[None]
+    bev, valid = BEVWarp(GRID)(smooth_image(), intrinsics, extrinsics)
+    homography = bev_from_image(extrinsics, intrinsics, GRID)
+    expected = warp_perspective(smooth_image(), homography, GRID.shape, align_corners=True)
+    inner = (valid & interior(BEVWarp(GRID).image_points(intrinsics, extrinsics)[0])).expand_as(bev)
+    assert inner.double().mean() > 0.5
+    torch.testing.assert_close(bev[inner], expected[inner], atol=2e-6, rtol=0)
+
+
+def test_valid_is_depth_and_border():
+    looking_up = pose([-0.3, 0.0, 0.0, 1.5])
+    bev, valid = BEVWarp(GRID)(smooth_image() + 1, CAMERA.intrinsics[None], looking_up)
+    assert not valid[0, 0, -1].any()  # below the image
+    assert (bev[~valid.expand_as(bev)] == 0).all()
+    behind = BEVWarp(BEVGrid(x=(-4.0, 4.0), z=(-10.0, 10.0), resolution=0.5))
+    _, valid = behind(smooth_image(), CAMERA.intrinsics[None], pose([0.3, 0.0, 0.0, 1.5]))
+    assert not valid[0, 0, 20:].any()
+    assert valid.any()
+
+
+def test_lens_is_folded_into_the_same_resampling():
+    # A distorted image of a smooth function of the undistorted pixel: the BEV must not notice the lens.
+    extrinsics, intrinsics = pose([0.03, 0.02, 0.05, 1.4]), LENS.intrinsics[None]
+    y, x = torch.meshgrid(torch.arange(180.0), torch.arange(320.0), indexing="ij")
+    taken = torch.stack([x, y], dim=-1).reshape(-1, 2).double()
+    undistorted, _ = LENS.undistort_points(taken)
+    image = undistorted.T.reshape(1, 2, 180, 320)  # holds undistorted coordinates
+    bev, valid = BEVWarp(GRID)(image, intrinsics, extrinsics, LENS.distortion[None])
+    plain, plain_valid = BEVWarp(GRID).image_points(intrinsics, extrinsics)
+    plain = plain.mT.reshape(1, 2, *GRID.shape)
+    seen, _ = BEVWarp(GRID).image_points(intrinsics, extrinsics, LENS.distortion[None])
+    both = (valid & plain_valid.reshape(1, 1, *GRID.shape) & interior(seen)).expand_as(bev)
+    assert both.double().mean() > 0.3
+    assert (bev[both] - plain[both]).abs().max() < 0.02
+
+
+@pytest.mark.parametrize("stride", [4, 8])
+def test_feature_maps_of_any_stride_land_where_the_image_does(stride):
+    extrinsics, intrinsics = pose([0.03, 0.02, -0.05, 1.4]), CAMERA.intrinsics[None]
+    y, x = torch.meshgrid(torch.arange(176.0), torch.arange(320.0), indexing="ij")
+    image = torch.stack([x, y])[None].double()
+    features = torch.nn.functional.avg_pool2d(image, stride)
+    warp = BEVWarp(GRID)
+    full, valid = warp(image, intrinsics, extrinsics)
+    coarse, coarse_valid = warp(features, intrinsics, extrinsics, image_size=(176, 320))
+    assert torch.equal(valid, coarse_valid)
+    x, y = full[:, :1], full[:, 1:]
+    inner = valid & (x > stride) & (x < 320 - stride) & (y > stride) & (y < 176 - stride)
+    assert (coarse - full)[inner.expand_as(full)].abs().max() < 1e-3
+
+
+def test_rows_are_independent_and_cameras_per_sample():
+    extrinsics = pose([0.03, 0.02, -0.05, 1.4], [-0.02, 0.0, 0.1, 2.0])
+    intrinsics = torch.stack(
+        [CAMERA.intrinsics, CAMERA.intrinsics * torch.tensor([1.2, 1.2, 1.0]).double()[:, None]]
+    )
+    image = smooth_image(2) * torch.tensor([1.0, 2.0]).double()[:, None, None, None]
+    both, _ = BEVWarp(GRID)(image, intrinsics, extrinsics)
+    for row in range(2):
+        one = Extrinsics(*(value[row : row + 1] for value in extrinsics))
+        alone, _ = BEVWarp(GRID)(image[row : row + 1], intrinsics[row : row + 1], one)
+        torch.testing.assert_close(both[row : row + 1], alone)
+
+
+def test_gradcheck_through_pose_lens_and_image():
+    grid = BEVGrid(x=(-2.0, 2.0), z=(6.0, 12.0), resolution=1.0)
+    small = Camera.from_parameters(30.0, 30.0, 16.0, 9.0, 32, 18)
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(1, 1, 18, 32, generator=generator, dtype=torch.float64, requires_grad=True)
+    values = torch.tensor([[0.013, 0.021, -0.017, 1.43]], dtype=torch.float64, requires_grad=True)
+    distortion = torch.tensor([[-0.1, 0.01, 0.001, 0.001]], dtype=torch.float64, requires_grad=True)
+
+    def forward(i, p, d):
+        return BEVWarp(grid)(i, small.intrinsics[None], Extrinsics.unstack(p), d)[0]
+
+    assert torch.autograd.gradcheck(forward, (image, values, distortion), atol=1e-6)
+
+
+def test_shapes_are_checked():
+    with pytest.raises(ValueError, match=r"image: expected \(B, C, h, w\)"):
+        BEVWarp(GRID)(torch.zeros(3, 4, 5), CAMERA.intrinsics[None], pose([0.0, 0.0, 0.0, 1.5]))
+    with pytest.raises(ValueError, match="for 2 images"):
+        BEVWarp(GRID)(smooth_image(2), CAMERA.intrinsics[None], pose([0.0, 0.0, 0.0, 1.5]))
