@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from lanebev.estimation import kalman
 from lanebev.estimation.checks import as_batch, as_lane_width, check_segments, clean_segments
-from lanebev.estimation.lane_width import (
-    BoundarySlopes,
-    boundary_slopes,
-    initial_roll_height,
-    measure_widths,
-)
-from lanebev.estimation.vanishing import (
-    gate_angles,
-    incidence_noise,
-    ransac_vanishing_point,
-    segment_angles,
-    vanishing_dir_least_squares,
-)
+from lanebev.estimation.direction_stage import track_direction
+from lanebev.estimation.lane_width import boundary_slopes
+from lanebev.estimation.roll_height_stage import track_roll_height
 from lanebev.geometry.road import rays_from_pixels
-from lanebev.geometry.rotation import pitch_yaw_from_vanishing_dir, vanishing_dir_from_pitch_yaw
 from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status
 
 
@@ -154,187 +141,22 @@ class TwoStageCalibrator(nn.Module):
         rays = rays_from_pixels(segments.endpoints.flatten(1, 2), intrinsics)
         rays = rays.reshape(*segments.endpoints.shape[:-1], 3)  # (B, N, 2, 3)
 
-        direction, cov, inliers, seen, fresh = self._direction(segments, rays, intrinsics, state, dt)
+        one = track_direction(segments, rays, intrinsics, state, dt, self.draws, self.config)
         boundaries = boundary_slopes(
             rays,
             segments.boundary,
-            segments.weight * inliers,
+            segments.weight * one.inliers,
             segments.sigma,
             intrinsics,
-            direction[:, 0],
-            direction[:, 1],
+            one.mean[:, 0],
+            one.mean[:, 1],
             self.config.num_boundaries,
         )
-        roll_height, roll_height_cov, roll_known, height_known = self._roll_height(
-            boundaries, widths, cov[:, :2, :2], state, dt, fresh
-        )
-        unseen = torch.where(seen, 0.0, state.unseen + dt)
-        status = _status(state.status, seen, unseen, self.config.lost_after)
-        state = TwoStageState(
-            direction, cov, roll_height, roll_height_cov, roll_known, height_known, unseen, status
-        )
-        return self._calibration(state, widths, inliers * segments.weight), state
-
-    def _direction(
-        self, segments: LaneSegments, rays: Tensor, intrinsics: Tensor, state: TwoStageState, dt: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Stage 1: predict, gate, update; start over where that fails.
-
-        Returns mean (B, 4), covariance (B, 4, 4), inliers (B, N), seen (B,) and freshly started (B,).
-        """
-        cfg = self.config
-        density = dt.new_full((2,), cfg.angular_acceleration_density)
-        mean, cov = kalman.predict(
-            state.direction, state.direction_cov, *kalman.constant_velocity(dt, density)
-        )
-        normals = torch.linalg.cross(rays[:, :, 0], rays[:, :, 1])
-
-        residual, jacobian, noise = incidence(mean, normals, rays, segments.sigma, intrinsics)
-        there = segments.weight > 0
-        gates = gate_angles(segments.endpoints, segments.sigma, cfg.gate_sigmas)
-        vanishing = vanishing_dir_from_pitch_yaw(mean[:, 0], mean[:, 1])
-        point = (intrinsics @ vanishing.unsqueeze(-1)).squeeze(-1)
-        near = segment_angles(segments.endpoints, point) < gates
-        if cfg.gate_sigmas > 0:
-            near = near | kalman.gate(-residual, jacobian, noise, cov, cfg.gate_sigmas)
-        inliers = (near & there).to(mean.dtype)
-        supported = self._supported(segments, inliers)
-
-        tracking = (state.status == Status.TRACKING) | (state.status == Status.COASTING)
-        start = ~tracking | (~supported & (state.unseen + dt > cfg.reacquire_after))
-        started = self._start(segments, rays, normals, intrinsics, mean, start)
-        fresh = start & started.supported
-        seen = torch.where(start, fresh, supported)
-        inliers = torch.where(fresh.unsqueeze(-1), started.inliers, inliers * supported.unsqueeze(-1))
-
-        use = segments.weight * inliers * (seen & ~fresh).unsqueeze(-1)
-        updated, updated_cov = kalman.update(mean, cov, *kalman.information(-residual, jacobian, noise, use))
-        # A start replaces the state; before the first one the state waits where it is.
-        waiting = (state.status == Status.UNINITIALISED) & ~seen
-        mean = torch.where(fresh.unsqueeze(-1), started.mean, updated)
-        cov = torch.where(fresh[:, None, None], started.cov, updated_cov)
-        mean = torch.where(waiting.unsqueeze(-1), state.direction, mean)
-        cov = torch.where(waiting[:, None, None], state.direction_cov, cov)
-        return mean, cov, inliers, seen, fresh
-
-    def _supported(self, segments: LaneSegments, inliers: Tensor) -> Tensor:
-        """(B,) bool: enough segments agree, on two boundaries at least."""
-        cfg = self.config
-        weight = segments.weight * inliers
-        member = torch.nn.functional.one_hot(segments.boundary, cfg.num_boundaries).to(weight.dtype)
-        boundaries = ((weight.unsqueeze(1) @ member).squeeze(1) > 0).sum(-1)
-        count = (weight > 0).sum(-1)
-        share = weight.sum(-1) / segments.weight.sum(-1).clamp_min(1e-9)
-        return (count >= cfg.min_segments) & (boundaries >= 2) & (share >= cfg.min_inlier_share)
-
-    def _start(
-        self,
-        segments: LaneSegments,
-        rays: Tensor,
-        normals: Tensor,
-        intrinsics: Tensor,
-        mean: Tensor,
-        wanted: Tensor,
-    ) -> _Start:
-        """Algorithm 1 and the least-squares vanishing direction, Sec. III-B and III-C."""
-        cfg = self.config
-        if not torch.compiler.is_compiling() and not bool(wanted.any()):
-            # Same result, without the search; every row's start is discarded by the caller.
-            nothing = torch.zeros_like(segments.weight)
-            return _Start(mean, torch.zeros_like(mean).diag_embed(), nothing, torch.zeros_like(wanted))
-        _, agree = ransac_vanishing_point(
-            segments.endpoints, segments.weight, segments.sigma, self.draws.to(mean.dtype), cfg.gate_sigmas
-        )
-        inliers = agree.to(mean.dtype)
-        weight = segments.weight * inliers
-        vanishing = mean.new_tensor([0.0, 0.0, 1.0]).expand(mean.shape[0], 3)
-        for _ in range(3):  # the noise depends on where the vanishing point is
-            noise = incidence_noise(rays, vanishing, segments.sigma, intrinsics)
-            vanishing, plane_cov = vanishing_dir_least_squares(normals, noise, weight, vanishing)
-        pitch, yaw = pitch_yaw_from_vanishing_dir(vanishing)
-        rates = torch.zeros_like(pitch)
-        # d(x, y) of the z = 1 plane to d(yaw, pitch): exact on the axis, cos² of the angle off it.
-        angle_cov = plane_cov.flip(-1, -2) * mean.new_tensor([[1.0, -1.0], [-1.0, 1.0]])
-        rate_cov = mean.new_tensor(cfg.initial_rate_std[:2]).square().diag().expand_as(angle_cov)
-        zero = torch.zeros_like(angle_cov)
-        cov = torch.cat([torch.cat([angle_cov, zero], -1), torch.cat([zero, rate_cov], -1)], -2)
-        determined = angle_cov.diagonal(dim1=-2, dim2=-1).amax(-1) < math.radians(2.0) ** 2
-        return _Start(
-            torch.stack([pitch, yaw, rates, rates], dim=-1),
-            cov,
-            inliers,
-            self._supported(segments, inliers) & determined,
-        )
-
-    def _roll_height(
-        self,
-        boundaries: BoundarySlopes,
-        lane_width: Tensor,
-        direction_cov: Tensor,
-        state: TwoStageState,
-        dt: Tensor,
-        fresh: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Stage 2: predict, start where nothing is known, update; one lane moves height only.
-
-        Returns mean (B, 4), covariance (B, 4, 4), roll_known (B,) and height_known (B,).
-        """
-        cfg = self.config
-        num_lanes = (boundaries.present[:, :-1] & boundaries.present[:, 1:]).sum(-1)
-        height_seen, roll_seen = num_lanes >= 1, num_lanes >= 2
-        mean, cov = self._predict_roll_height(state, dt, roll_seen, height_seen)
-
-        lost = fresh & (state.status == Status.LOST)
-        start_roll = roll_seen & (~state.roll_known | lost)
-        start_height = height_seen & (~state.height_known | lost | start_roll)
-        roll, height = initial_roll_height(boundaries, lane_width, mean[:, 0])
-        started = torch.stack([roll, height, torch.zeros_like(roll), torch.zeros_like(roll)], dim=-1)
-        first = torch.stack([start_roll, start_height, start_roll, start_height], dim=-1)
-        mean = torch.where(first, started, mean)
-        wide = mean.new_tensor([*cfg.initial_pose_std[2:], *cfg.initial_rate_std[2:]]).square().diag()
-        cov = torch.where((first.unsqueeze(-1) | first.unsqueeze(-2)), wide, cov)
-
-        measured = measure_widths(boundaries, mean[:, 0], mean[:, 1], direction_cov, cfg.lane_noise)
-        whiten = torch.linalg.cholesky_ex(measured.noise).L
-        error = torch.where(measured.present, lane_width - measured.widths, 0.0)
-        jacobian = torch.where(measured.present.unsqueeze(-1), measured.jacobian, 0.0)
-        jacobian = jacobian * torch.stack([roll_seen, height_seen], dim=-1).unsqueeze(1)
-        jacobian = torch.cat([jacobian, torch.zeros_like(jacobian)], dim=-1)  # (B, L-1, 4)
-        white = torch.linalg.solve_triangular(
-            whiten, torch.cat([jacobian, error.unsqueeze(-1)], dim=-1), upper=False
-        )
-        mean, cov = kalman.update(
-            mean, cov, *kalman.information(white[..., -1], white[..., :-1], torch.ones_like(error))
-        )
-        mean = torch.cat([mean[:, :1], mean[:, 1:2].clamp(0.1, 20.0), mean[:, 2:]], dim=-1)
-        return mean, cov, state.roll_known | roll_seen, state.height_known | height_seen
-
-    def _predict_roll_height(
-        self, state: TwoStageState, dt: Tensor, roll_seen: Tensor, height_seen: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Constant velocity, but what is not observed in this frame holds still while its sigma grows.
-
-        Deviation: the paper would extrapolate roll on one lane for ever (PAPER_NOTES 6).
-        """
-        cfg = self.config
-        density = dt.new_tensor([cfg.angular_acceleration_density, cfg.height_acceleration_density])
-        transition, noise = kalman.constant_velocity(dt, density)
-        moving = torch.stack([roll_seen & state.roll_known, height_seen & state.height_known], dim=-1)
-        moving = torch.cat([moving, moving], dim=-1)  # (B, 4) of position and rate
-        eye = torch.eye(4, dtype=dt.dtype, device=dt.device)
-        still = eye * dt.new_tensor([1.0, 1.0, 0.0, 0.0])
-        transition = torch.where(moving.unsqueeze(-1), transition, still)
-        # What is not known yet stays at its prior; what was known and is not seen forgets at its noise.
-        known = torch.stack([state.roll_known, state.height_known] * 2, dim=-1)
-        known = known.unsqueeze(-1) & known.unsqueeze(-2)
-        mean, cov = kalman.predict(state.roll_height, state.roll_height_cov, transition, noise * known)
-        limit = dt.new_tensor([*cfg.initial_pose_std[2:], *cfg.initial_rate_std[2:]]).square()
-        cov = _limit_variance(cov, limit)
-        rates = torch.where(moving[:, 2:], 0.0, limit[2:])
-        cov = cov + torch.cat([torch.zeros_like(rates), rates], dim=-1).diag_embed()
-        # Without roll in the measurement, its correlation with height would still move it: cut it.
-        together = moving.unsqueeze(-1) == moving.unsqueeze(-2)
-        return mean, torch.where(together, cov, 0.0)
+        two = track_roll_height(boundaries, widths, one.cov[:, :2, :2], state, dt, one.fresh, self.config)
+        unseen = torch.where(one.seen, 0.0, state.unseen + dt)
+        status = _status(state.status, one.seen, unseen, self.config.lost_after)
+        state = TwoStageState(one.mean, one.cov, *two, unseen, status)
+        return self._calibration(state, widths, one.inliers * segments.weight), state
 
     def _calibration(self, state: TwoStageState, lane_width: Tensor, inliers: Tensor) -> Calibration:
         pose = torch.cat([state.direction[:, :2], state.roll_height[:, :2]], dim=-1)
@@ -347,51 +169,9 @@ class TwoStageCalibrator(nn.Module):
         return Calibration(Extrinsics.unstack(pose), cov, state.status, inliers)
 
 
-class _Start(NamedTuple):
-    mean: Tensor
-    cov: Tensor
-    inliers: Tensor
-    supported: Tensor
-
-
-def incidence(
-    mean: Tensor, normals: Tensor, rays: Tensor, sigma: Tensor, intrinsics: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """How far each great circle misses the vanishing direction.
-
-    Source: Eq. (14), h = d_Zᵀ R_CWᵀ n, with its derivatives by pitch and yaw.
-
-    Args:
-        mean: (B, D), pitch and yaw first.
-        normals: (B, N, 3), not normalised.
-        rays: (B, N, 2, 3) of the end points.
-        sigma: (B, N) px.
-        intrinsics: (B, 3, 3).
-
-    Returns:
-        residual (B, N), Jacobian (B, N, D), variance (B, N).
-    """
-    pitch, yaw = mean[:, 0], mean[:, 1]
-    sp, cp, sy, cy = pitch.sin(), pitch.cos(), yaw.sin(), yaw.cos()
-    direction = vanishing_dir_from_pitch_yaw(pitch, yaw)
-    by_pitch = torch.stack([torch.zeros_like(sp), -cp * cy, -sp * cy], dim=-1)
-    by_yaw = torch.stack([cy, sp * sy, -cp * sy], dim=-1)
-    products = normals @ torch.stack([direction, by_pitch, by_yaw], dim=-1)  # (B, N, 3)
-    rest = torch.zeros(*products.shape[:2], mean.shape[-1] - 2, dtype=mean.dtype, device=mean.device)
-    jacobian = torch.cat([products[..., 1:], rest], dim=-1)
-    noise = incidence_noise(rays, direction, sigma, intrinsics).clamp_min(1e-18)
-    return products[..., 0], jacobian, noise
-
-
 def _status(before: Tensor, seen: Tensor, unseen: Tensor, lost_after: float) -> Tensor:
     """initialise -> track -> coast -> lost -> re-initialise, per row."""
     coasting = torch.where(unseen > lost_after, int(Status.LOST), int(Status.COASTING))
     idle = (before == Status.UNINITIALISED) | (before == Status.LOST)
     unsupported = torch.where(idle, before, coasting)
     return torch.where(seen, int(Status.TRACKING), unsupported)
-
-
-def _limit_variance(cov: Tensor, limit: Tensor) -> Tensor:
-    """Scale a covariance until no variance exceeds its limit: not seeing is never worse than the prior."""
-    scale = (limit / cov.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30)).clamp_max(1.0).sqrt()
-    return cov * scale.unsqueeze(-1) * scale.unsqueeze(-2)

@@ -1,0 +1,118 @@
+"""Stage 2: roll and height from lane widths, by EKF."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.estimation import kalman
+from lanebev.estimation.lane_width import BoundarySlopes, initial_roll_height, measure_widths
+from lanebev.types import Status
+
+if TYPE_CHECKING:
+    from lanebev.estimation.two_stage import TwoStageConfig, TwoStageState
+
+
+class RollHeightStep(NamedTuple):
+    """Stage 2 after a frame.
+
+    Attributes:
+        mean: (B, 4) roll, height and their rates; cov: (B, 4, 4).
+        roll_known: (B,) bool; height_known: (B,) bool.
+    """
+
+    mean: Tensor
+    cov: Tensor
+    roll_known: Tensor
+    height_known: Tensor
+
+
+def track_roll_height(
+    boundaries: BoundarySlopes,
+    lane_width: Tensor,
+    direction_cov: Tensor,
+    state: TwoStageState,
+    dt: Tensor,
+    fresh: Tensor,
+    cfg: TwoStageConfig,
+) -> RollHeightStep:
+    """Predict and update roll and height; start where nothing is known; one lane moves height only.
+
+    Source: Sec. IV-B, with the measurement of Eq. (22).
+
+    Args:
+        boundaries: slopes about the direction of stage 1.
+        lane_width: (B, L-1) m, the prior.
+        direction_cov: (B, 2, 2) of pitch and yaw.
+        state: of the frame before.
+        dt: (B,) s.
+        fresh: (B,) bool, stage 1 started over.
+        cfg: the numbers.
+
+    Returns:
+        the step.
+    """
+    num_lanes = (boundaries.present[:, :-1] & boundaries.present[:, 1:]).sum(-1)
+    height_seen, roll_seen = num_lanes >= 1, num_lanes >= 2
+    mean, cov = predict_roll_height(state, dt, roll_seen, height_seen, cfg)
+
+    lost = fresh & (state.status == Status.LOST)
+    start_roll = roll_seen & (~state.roll_known | lost)
+    start_height = height_seen & (~state.height_known | lost | start_roll)
+    first = torch.stack([start_roll, start_height, start_roll, start_height], dim=-1)
+    if torch.compiler.is_compiling() or bool(first.any()):
+        roll, height = initial_roll_height(boundaries, lane_width, mean[:, 0])
+        started = torch.stack([roll, height, torch.zeros_like(roll), torch.zeros_like(roll)], dim=-1)
+        mean = torch.where(first, started, mean)
+    wide = mean.new_tensor([*cfg.initial_pose_std[2:], *cfg.initial_rate_std[2:]]).square().diag()
+    cov = torch.where((first.unsqueeze(-1) | first.unsqueeze(-2)), wide, cov)
+
+    measured = measure_widths(boundaries, mean[:, 0], mean[:, 1], direction_cov, cfg.lane_noise)
+    whiten = torch.linalg.cholesky_ex(measured.noise).L
+    error = torch.where(measured.present, lane_width - measured.widths, 0.0)
+    jacobian = torch.where(measured.present.unsqueeze(-1), measured.jacobian, 0.0)
+    jacobian = jacobian * torch.stack([roll_seen, height_seen], dim=-1).unsqueeze(1)
+    jacobian = torch.cat([jacobian, torch.zeros_like(jacobian)], dim=-1)  # (B, L-1, 4)
+    white = torch.linalg.solve_triangular(
+        whiten, torch.cat([jacobian, error.unsqueeze(-1)], dim=-1), upper=False
+    )
+    mean, cov = kalman.update(
+        mean, cov, *kalman.information(white[..., -1], white[..., :-1], torch.ones_like(error))
+    )
+    mean = torch.cat([mean[:, :1], mean[:, 1:2].clamp(0.1, 20.0), mean[:, 2:]], dim=-1)
+    return RollHeightStep(mean, cov, state.roll_known | roll_seen, state.height_known | height_seen)
+
+
+def predict_roll_height(
+    state: TwoStageState, dt: Tensor, roll_seen: Tensor, height_seen: Tensor, cfg: TwoStageConfig
+) -> tuple[Tensor, Tensor]:
+    """Constant velocity, but what is not observed in this frame holds still while its sigma grows.
+
+    Deviation: the paper would extrapolate roll on one lane for ever (PAPER_NOTES 6).
+    """
+    density = dt.new_tensor([cfg.angular_acceleration_density, cfg.height_acceleration_density])
+    transition, noise = kalman.constant_velocity(dt, density)
+    moving = torch.stack([roll_seen & state.roll_known, height_seen & state.height_known], dim=-1)
+    moving = torch.cat([moving, moving], dim=-1)  # (B, 4) of position and rate
+    eye = torch.eye(4, dtype=dt.dtype, device=dt.device)
+    still = eye * dt.new_tensor([1.0, 1.0, 0.0, 0.0])
+    transition = torch.where(moving.unsqueeze(-1), transition, still)
+    # What is not known yet stays at its prior; what was known and is not seen forgets at its noise.
+    known = torch.stack([state.roll_known, state.height_known] * 2, dim=-1)
+    known = known.unsqueeze(-1) & known.unsqueeze(-2)
+    mean, cov = kalman.predict(state.roll_height, state.roll_height_cov, transition, noise * known)
+    limit = dt.new_tensor([*cfg.initial_pose_std[2:], *cfg.initial_rate_std[2:]]).square()
+    cov = _limit_variance(cov, limit)
+    rates = torch.where(moving[:, 2:], 0.0, limit[2:])
+    cov = cov + torch.cat([torch.zeros_like(rates), rates], dim=-1).diag_embed()
+    # Without roll in the measurement, its correlation with height would still move it: cut it.
+    together = moving.unsqueeze(-1) == moving.unsqueeze(-2)
+    return mean, torch.where(together, cov, 0.0)
+
+
+def _limit_variance(cov: Tensor, limit: Tensor) -> Tensor:
+    """Scale a covariance until no variance exceeds its limit: not seeing is never worse than the prior."""
+    scale = (limit / cov.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30)).clamp_max(1.0).sqrt()
+    return cov * scale.unsqueeze(-1) * scale.unsqueeze(-2)
