@@ -1,0 +1,62 @@
+"""Random numbers for whole batches, from one generator; rows and joins of nested tuples of tensors."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+T = TypeVar("T", bound=tuple[Any, ...])
+
+
+class Dice:
+    """Draws (B, ...) tensors.
+
+    Args:
+        batch_size: B.
+        generator: the only source of randomness.
+    """
+
+    def __init__(self, batch_size: int, generator: torch.Generator) -> None:
+        self.batch_size = batch_size
+        self.generator = generator
+
+    def uniform(self, low: float, high: float, *shape: int) -> Tensor:
+        """(B, *shape) uniform in [low, high)."""
+        return low + (high - low) * torch.rand(self.batch_size, *shape, generator=self.generator)
+
+    def normal(self, std: float, *shape: int) -> Tensor:
+        """(B, *shape) Gaussian of zero mean."""
+        return std * torch.randn(self.batch_size, *shape, generator=self.generator)
+
+    def chance(self, probability: float, *shape: int) -> Tensor:
+        """(B, *shape) bool."""
+        return torch.rand(self.batch_size, *shape, generator=self.generator) < probability
+
+    def pick(self, weights: list[float] | tuple[float, ...], *shape: int) -> Tensor:
+        """(B, *shape) int64, an index with the given weights."""
+        cumulative = torch.tensor(weights).cumsum(0)
+        draw = torch.rand(self.batch_size, *shape, generator=self.generator) * cumulative[-1]
+        return torch.bucketize(draw, cumulative, right=True).clamp(max=len(weights) - 1)
+
+    def pick_from(self, values: list[float] | list[tuple[float, ...]], *shape: int) -> Tensor:
+        """(B, *shape, ...) one of the values, all equally likely."""
+        return torch.tensor(values)[self.pick([1.0] * len(values), *shape)]
+
+
+def row_of(values: T, index: int) -> T:
+    """Row ``index`` of a (nested) NamedTuple of (B, ...) tensors, the batch dimension kept."""
+    parts = [row_of(v, index) if isinstance(v, tuple) else v[index : index + 1] for v in values]
+    return type(values)(*parts)
+
+
+def join_rows(rows: list[T]) -> T:
+    """Inverse of :func:`row_of`."""
+    columns = zip(*rows, strict=True)
+    first = rows[0]
+    parts = [
+        join_rows(list(column)) if isinstance(value, tuple) else torch.cat(column)
+        for value, column in zip(first, columns, strict=True)
+    ]
+    return type(first)(*parts)

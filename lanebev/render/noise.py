@@ -1,0 +1,86 @@
+"""Noise tiles, computed once, sampled anywhere: the grain of everything that is rendered."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+TILE = 512
+GRAIN, CLOUD, CRACK, SECOND = 0, 1, 2, 3  # channels of the tile
+_TILE_SEED = 20261122
+
+
+@lru_cache(maxsize=1)
+def noise_tile() -> Tensor:
+    """(4, TILE + 1, TILE + 1) periodic tile: grain and its like of unit variance, about four texels wide;
+    cloud, 1/f noise of unit variance; crack, 1 on the edges of irregular cells and 0 elsewhere.
+    """
+    generator = torch.Generator().manual_seed(_TILE_SEED)
+    frequency = torch.fft.fftfreq(TILE) * TILE
+    radius = torch.hypot(frequency[:, None], frequency[None])
+    grain = _shaped(torch.exp(-((radius / 110) ** 2)), generator)
+    cloud = _shaped((radius + 1.5) ** -1.35, generator)
+    warp = _shaped((radius + 3) ** -1.6, generator)
+    second = _shaped(torch.exp(-((radius / 110) ** 2)), generator)
+    tile = torch.stack([grain, cloud, _cracks(warp, generator), second])
+    return functional.pad(tile[None], (0, 1, 0, 1), mode="circular")[0]
+
+
+def _shaped(spectrum: Tensor, generator: torch.Generator) -> Tensor:
+    white = torch.fft.fft2(torch.randn(TILE, TILE, generator=generator))
+    spectrum = spectrum.clone()
+    spectrum[0, 0] = 0
+    field = torch.fft.ifft2(white * spectrum).real
+    return field / field.std()
+
+
+def _cracks(warp: Tensor, generator: torch.Generator, cells: int = 9) -> Tensor:
+    """Edges of the cells of a jittered periodic grid, bent by a noise."""
+    axis = torch.arange(TILE) / TILE * cells
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    y, x = y + 0.12 * warp, x + 0.12 * warp.roll(200, 1)
+    jitter = torch.rand(cells, cells, 2, generator=generator)
+    distances = []
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            row, column = y.floor() + dy, x.floor() + dx
+            seed = jitter[row.long() % cells, column.long() % cells]
+            distances.append(torch.hypot(row + seed[..., 0] - y, column + seed[..., 1] - x))
+    nearest = torch.stack(distances).topk(2, dim=0, largest=False).values
+    return torch.exp(-(((nearest[1] - nearest[0]) / 0.03) ** 2))
+
+
+def sample_noise(channel: int, u: Tensor, v: Tensor) -> Tensor:
+    """The tile at (u, v), bilinear and periodic.
+
+    Args:
+        channel: GRAIN, CLOUD, CRACK or SECOND.
+        u: (...,) in periods of the tile; broadcasts with v.
+        v: (...,) likewise.
+
+    Returns:
+        (...,).
+    """
+    u, v = torch.broadcast_tensors(u, v)
+    grid = torch.stack([u, v], dim=-1)
+    grid = (grid - grid.floor()) * 2 - 1
+    tile = noise_tile()[channel : channel + 1].to(u.device)
+    values = functional.grid_sample(
+        tile[None], grid.reshape(1, 1, -1, 2), align_corners=True, padding_mode="border"
+    )
+    return values.reshape(u.shape)
+
+
+def hash01(a: Tensor, b: Tensor, salt: float) -> Tensor:
+    """Repeatable pseudo-random numbers in [0, 1) of two integer-valued float tensors."""
+    value = (a * 12.9898 + b * 78.233 + salt * 37.719).sin() * 43758.5453
+    return value - value.floor()
+
+
+def smoothstep(low: float | Tensor, high: float | Tensor, value: Tensor) -> Tensor:
+    """0 below low, 1 above high, smooth between."""
+    t = ((value - low) / (high - low)).clamp(0, 1)
+    return t * t * (3 - 2 * t)

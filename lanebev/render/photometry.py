@@ -1,0 +1,240 @@
+"""Light on the scene, and what a camera makes of it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from lanebev.render.dice import Dice
+from lanebev.render.noise import CLOUD, sample_noise
+from lanebev.render.solids import Light
+
+CLEAR, OVERCAST, DUSK, NIGHT, RAIN = range(5)
+
+
+class Weather(NamedTuple):
+    """Conditions, each (B,) unless said otherwise.
+
+    Attributes:
+        kind: int64, CLEAR, OVERCAST, DUSK, NIGHT or RAIN.
+        grey: [0, 1] overcast.
+        wet: [0, 1].
+        visibility: m.
+        sun_azimuth: rad in the world, right positive.
+        sun_height: rad.
+    """
+
+    kind: Tensor
+    grey: Tensor
+    wet: Tensor
+    visibility: Tensor
+    sun_azimuth: Tensor
+    sun_height: Tensor
+
+
+def sample_weather(dice: Dice) -> Weather:
+    """Mostly clear days."""
+    kind = dice.pick([0.6, 0.17, 0.09, 0.07, 0.07])
+    clear = dice.uniform(0.0, 0.25)
+    grey = torch.where((kind == OVERCAST) | (kind == RAIN), dice.uniform(0.7, 1.0), clear)
+    hazy = dice.chance(0.25) | (kind == RAIN)
+    dusk = kind == DUSK
+    return Weather(
+        kind=kind,
+        grey=grey,
+        wet=torch.where(kind == RAIN, dice.uniform(0.5, 1.0), 0.0),
+        visibility=torch.where(hazy, dice.uniform(150, 600), dice.uniform(600, 4000)),
+        sun_azimuth=dice.uniform(-3.1416, 3.1416),
+        sun_height=torch.where(dusk, dice.uniform(0.03, 0.2), dice.uniform(0.3, 1.3)),
+    )
+
+
+def light_of(weather: Weather, road_heading: Tensor) -> Light:
+    """Illumination in the local road frame, whose Z axis points along ``road_heading`` (B,) rad."""
+    azimuth, height = weather.sun_azimuth - road_heading, weather.sun_height
+    sun = torch.stack([azimuth.sin() * height.cos(), height.sin(), azimuth.cos() * height.cos()], dim=1)
+    night, dusk = weather.kind == NIGHT, weather.kind == DUSK
+    strength = torch.where(night, 0.0, 1.0 - weather.grey)
+    warm = torch.where(dusk[:, None], torch.tensor([1.0, 0.62, 0.32]), torch.tensor([1.0, 0.95, 0.86]))
+    sky = torch.where(dusk[:, None], torch.tensor([0.30, 0.30, 0.38]), torch.tensor([0.27, 0.31, 0.37]))
+    ambient = sky * (1 + 1.2 * weather.grey)[:, None]
+    ambient = torch.where(night[:, None], torch.tensor([0.010, 0.010, 0.013]), ambient)
+    return Light(
+        sun=sun,
+        direct=strength[:, None] * warm,
+        ambient=ambient,
+        headlight=torch.where(night, 1.0, torch.where(dusk, 0.1, 0.0)),
+        night=night.float(),
+    )
+
+
+def headlight_irradiance(x: Tensor, z: Tensor) -> Tensor:
+    """(B, N) relative irradiance of dipped headlights on the road at (x, z) m."""
+    distance = z.clamp(min=0.5)
+    spread = torch.exp(-(((x - 0.02 * distance) / (1.8 + 0.22 * distance)) ** 2))
+    pools = 1 + 0.5 * torch.exp(-(((x.abs() - 0.9 - 0.05 * distance) / (0.7 + 0.05 * distance)) ** 2))
+    reach = (1 - torch.exp(-((distance / 5.0) ** 2))) / (1 + (distance / 14.0) ** 2)
+    return 1.2 * spread * pools * reach
+
+
+class Sensor(NamedTuple):
+    """What the camera does to the light, each (B,) unless said otherwise.
+
+    Attributes:
+        exposure: linear level that the road's mean is brought to.
+        tint: (B, 3) white balance.
+        contrast: exponent about middle grey.
+        saturation: factor.
+        black: offset.
+        blur: px at 640 px width, standard deviation.
+        read_noise: standard deviation, of full scale.
+        shot_noise: standard deviation at full scale.
+        vignette: loss in the corners.
+        glare: veil over the image.
+        jpeg: quality, 0 for none.
+        bonnet: share of the image's height, 0 for none.
+        bonnet_colour: (B, 3).
+        bonnet_bow: share of the height by which its edge falls to the sides.
+    """
+
+    exposure: Tensor
+    tint: Tensor
+    contrast: Tensor
+    saturation: Tensor
+    black: Tensor
+    blur: Tensor
+    read_noise: Tensor
+    shot_noise: Tensor
+    vignette: Tensor
+    glare: Tensor
+    jpeg: Tensor
+    bonnet: Tensor
+    bonnet_colour: Tensor
+    bonnet_bow: Tensor
+
+
+def sample_sensor(dice: Dice, weather: Weather, bright: Tensor) -> Sensor:
+    """A random camera; ``bright`` (B,) bool overexposes."""
+    exposure = torch.where(bright, dice.uniform(0.45, 0.8), dice.uniform(0.07, 0.42))
+    dark = (weather.kind == NIGHT) | (weather.kind == DUSK)
+    exposure = torch.where(dark, dice.uniform(0.03, 0.2), exposure)
+    noisy = torch.where(weather.kind == NIGHT, 2.5, 1.0)
+    return Sensor(
+        exposure=exposure,
+        tint=1 + dice.normal(0.05, 3),
+        contrast=dice.uniform(0.85, 1.3),
+        saturation=torch.where(dice.chance(0.05), 0.0, dice.uniform(0.5, 1.25)),
+        black=dice.uniform(-0.02, 0.04),
+        blur=torch.where(dice.chance(0.8), dice.uniform(0.2, 0.8), dice.uniform(0.8, 2.0)),
+        read_noise=dice.uniform(0.001, 0.012) * noisy,
+        shot_noise=dice.uniform(0.002, 0.022) * noisy,
+        vignette=torch.where(dice.chance(0.5), dice.uniform(0.0, 0.4), 0.0),
+        glare=torch.where(dice.chance(0.3), dice.uniform(0.0, 0.2), 0.0),
+        jpeg=torch.where(dice.chance(0.7), dice.uniform(35, 95), 0.0),
+        bonnet=torch.where(dice.chance(0.3), dice.uniform(0.02, 0.14), 0.0),
+        bonnet_colour=dice.uniform(0.01, 0.25, 1) * (1 + dice.normal(0.2, 3)).clamp(0.4, 1.6),
+        bonnet_bow=dice.uniform(0.0, 0.12),
+    )
+
+
+def add_bonnet(
+    radiance: Tensor, blocked: Tensor, sensor: Sensor, light: Light, sky: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The own vehicle's bonnet at the bottom.
+
+    Args:
+        radiance: (B, 3, H, W).
+        blocked: (B, H, W) m.
+        sensor: has the bonnet.
+        light: falls on it.
+        sky: (B, 3) radiance that it reflects.
+
+    Returns:
+        Both with the bonnet in front.
+    """
+    _, _, height, width = radiance.shape
+    y = torch.arange(height)[:, None] / height
+    x = (torch.arange(width)[None] + 0.5) / width - 0.5
+    edge = 1 - sensor.bonnet[:, None, None] + 4 * sensor.bonnet_bow[:, None, None] * x * x
+    alpha = ((y - edge) * height + 0.5).clamp(0, 1) * (sensor.bonnet > 0)[:, None, None]
+    below = ((y - edge) / sensor.bonnet.clamp(min=0.02)[:, None, None]).clamp(0, 1)
+    lit = light.ambient + 0.6 * light.direct + 0.02
+    gloss = (0.30 - 0.22 * below + 0.05 * sample_noise(CLOUD, x * 0.5 + 0 * y, 0.2 * y + 0 * x)).clamp(0.02)
+    colour = sensor.bonnet_colour * lit
+    paint = (
+        colour[..., None, None] * (1.1 - 0.3 * below)[:, None] + gloss[:, None] * sky[..., None, None] * 0.5
+    )
+    mixed = radiance + (paint - radiance) * alpha[:, None]
+    return mixed, torch.where(alpha > 0.5, 0.0, blocked)
+
+
+def expose(radiance: Tensor, sensor: Sensor, metered: Tensor) -> Tensor:
+    """Linear radiance to display values before noise.
+
+    Args:
+        radiance: (B, 3, H, W).
+        sensor: the camera.
+        metered: (B,) mean radiance of what the exposure is set for.
+
+    Returns:
+        (B, 3, H, W) in [0, 1].
+    """
+    _, _, height, width = radiance.shape
+    y = torch.arange(height)[:, None] / height - 0.5
+    x = torch.arange(width)[None] / width - 0.5
+    falloff = 1 - sensor.vignette[:, None, None] * 2 * (x * x + y * y)
+    gain = (sensor.exposure / metered.clamp(min=1e-4))[:, None] * sensor.tint
+    value = radiance * gain[..., None, None] * falloff[:, None]
+    veil = sensor.glare[:, None] * value.flatten(2).mean(2)
+    value = value + veil[..., None, None]
+    value = torch.where(
+        value > 0.6, 0.6 + 0.4 * (1 - torch.exp(-(value - 0.6) / 0.4)), value
+    )  # soft shoulder
+    value = value.clamp(min=0) ** (1 / 2.2)
+    middle = 0.45
+    value = middle * (value / middle).clamp(min=1e-4) ** sensor.contrast[:, None, None, None]
+    grey = value.mean(1, keepdim=True)
+    value = grey + (value - grey) * sensor.saturation[:, None, None, None]
+    return (value + sensor.black[:, None, None, None]).clamp(0, 1)
+
+
+def blur(image: Tensor, std: Tensor) -> Tensor:
+    """Separable Gaussian blur of (B, C, H, W), standard deviation (B,) px, at most 3 px."""
+    batch, channels, height, width = image.shape
+    reach = int((2.5 * std.max()).ceil().clamp(1, 7))
+    offsets = torch.arange(-reach, reach + 1, dtype=image.dtype)
+    kernel = torch.exp(-0.5 * (offsets / std.clamp(min=0.05)[:, None]) ** 2)
+    kernel = (kernel / kernel.sum(1, keepdim=True)).repeat_interleave(channels, 0)  # (B·C, 2·reach + 1)
+    flat = image.reshape(1, batch * channels, height, width)
+    flat = functional.pad(flat, (reach, reach, reach, reach), mode="replicate")
+    flat = functional.conv2d(flat, kernel[:, None, None], groups=batch * channels)
+    flat = functional.conv2d(flat, kernel[:, None, :, None], groups=batch * channels)
+    return flat.reshape(batch, channels, height, width)
+
+
+def add_noise(image: Tensor, sensor: Sensor, generator: torch.Generator) -> Tensor:
+    """Shot and read noise on display values, (B, 3, H, W)."""
+    noise = torch.randn(image.shape, generator=generator)
+    level = (
+        sensor.read_noise[:, None, None, None] ** 2 + image * sensor.shot_noise[:, None, None, None] ** 2
+    ).sqrt()
+    return (image + noise * level).clamp(0, 1)
+
+
+def compress(image: Tensor, quality: Tensor) -> Tensor:
+    """JPEG there and back; (B, 3, H, W) in [0, 1], quality (B,), 0 leaves the row as it is."""
+    rows = []
+    for row, level in zip(image, quality.tolist(), strict=True):
+        if level <= 0:
+            rows.append(row)
+            continue
+        pixels = (row.flip(0).permute(1, 2, 0) * 255).round().byte().numpy()
+        _, data = cv2.imencode(".jpg", np.ascontiguousarray(pixels), [cv2.IMWRITE_JPEG_QUALITY, int(level)])
+        decoded = torch.from_numpy(cv2.imdecode(data, cv2.IMREAD_COLOR))
+        rows.append(decoded.permute(2, 0, 1).flip(0).to(image.dtype) / 255)
+    return torch.stack(rows)

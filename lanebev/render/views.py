@@ -1,0 +1,111 @@
+"""Independent random views: training material."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from lanebev.render.alignment import Alignment, build_alignment
+from lanebev.render.dice import Dice, join_rows, row_of
+from lanebev.render.frame import RenderedFrame
+from lanebev.render.lens import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
+from lanebev.render.paint import paint_view
+from lanebev.render.photometry import add_bonnet, add_noise, blur, compress, expose, light_of
+from lanebev.render.scene import Place, World, sample_course, sample_world
+from lanebev.render.traffic import place_solids
+from lanebev.render.truth import frame_truth
+
+
+def render_place(
+    world: World,
+    place: Place,
+    alignment: Alignment,
+    lens: Lens,
+    size: tuple[int, int],
+    generator: torch.Generator,
+    ideal_sensor: bool = False,
+) -> RenderedFrame:
+    """Cameras at places in worlds.
+
+    Args:
+        world: B of them.
+        place: of the cameras.
+        alignment: the road's course, seen from there.
+        lens: the cameras.
+        size: image (height, width).
+        generator: of the sensor's noise.
+        ideal_sensor: leave out blur, noise and compression.
+    """
+    solids = place_solids(world.traffic, alignment, place.along, place.across, place.moved)
+    rows = []
+    for b in range(len(place.along)):  # one scene at a time: see paint_view
+        one = Lens(
+            lens.intrinsics[b : b + 1], lens.distortion[b : b + 1], lens.model, row_of(lens.extrinsics, b)
+        )
+        rows.append(
+            paint_view(row_of(world, b), row_of(place, b), row_of(alignment, b), one, row_of(solids, b), size)
+        )
+    painted = join_rows(rows)
+    radiance, blocked = painted.radiance, painted.blocked
+    sensor = world.sensor
+    light = light_of(world.weather, place.heading)
+    radiance, blocked = add_bonnet(radiance, blocked, sensor, light, world.surroundings.skyline)
+    image = expose(radiance, sensor, painted.metered)
+    if not ideal_sensor:
+        image = blur(image, sensor.blur * size[1] / 640)
+        image = compress(add_noise(image, sensor, generator), sensor.jpeg)
+    return frame_truth(image, blocked, world.layout, place, alignment, lens, solids, painted.nearest)
+
+
+def sample_place(dice: Dice, world: World, ego_lane: Tensor) -> Place:
+    """Random places in the ego lane, at times close to its border or over it."""
+    across = world.layout.across
+    left, right = (across.gather(1, ego_lane[:, None] + i)[:, 0] for i in (0, 1))
+    changing = dice.chance(0.15)
+    centred = dice.normal(0.25).clamp(-0.8, 0.8)
+    anywhere = dice.uniform(-0.5, 0.5) * (right - left)
+    things = world.traffic.along.shape[1]
+    return Place(
+        along=torch.zeros_like(left),
+        across=0.5 * (left + right) + torch.where(changing, anywhere, centred),
+        ego_lane=ego_lane,
+        heading=dice.uniform(-math.pi, math.pi),
+        moved=torch.zeros(dice.batch_size, things),
+    )
+
+
+@torch.no_grad()
+def render_views(
+    batch_size: int,
+    image_size: tuple[int, int],
+    generator: torch.Generator,
+    *,
+    model: str = "pinhole",
+    ideal_sensor: bool = False,
+) -> RenderedFrame:
+    """Random scenes, poses, lenses and weather, one image each.
+
+    Args:
+        batch_size: B.
+        image_size: (H, W).
+        generator: the only source of randomness.
+        model: "pinhole" (Brown-Conrady, D = 5) or "fisheye" (Kannala-Brandt, D = 4) lenses.
+        ideal_sensor: leave out blur, noise and compression.
+
+    Raises:
+        ValueError: no images asked for, an image smaller than 16 px, or an unknown lens model.
+    """
+    if batch_size < 1 or min(image_size) < 16:
+        raise ValueError(
+            f"expected batch_size >= 1 and image_size >= (16, 16), got {batch_size} and {tuple(image_size)}"
+        )
+    dice = Dice(batch_size, generator)
+    world, ego_lane = sample_world(dice)
+    place = sample_place(dice, world, ego_lane)
+    alignment = build_alignment(*sample_course(dice))
+    intrinsics = sample_intrinsics(dice, image_size)
+    distortion = sample_distortion(dice, intrinsics, image_size, model)
+    lens = Lens(intrinsics, distortion, model, sample_extrinsics(dice))
+    return render_place(world, place, alignment, lens, image_size, generator, ideal_sensor)
