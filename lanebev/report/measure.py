@@ -1,0 +1,117 @@
+"""What a person checks in a bird's-eye view: are the boundaries parallel, and the lanes equally wide."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lanebev.geometry.road import road_from_image_points
+from lanebev.types import NUM_BOUNDARIES, Extrinsics, LaneSegments
+
+_MIN_VERTICES = 4
+_MIN_STRETCH = 5.0  # m of road that a boundary must cover
+_MIN_PARTICULAR = 1e-9
+
+
+class RoadBoundaries(NamedTuple):
+    """One frame's boundaries on the road, X_k(Z) = a_k + b_k Z + c Z² with one c for all.
+
+    Attributes:
+        direction: (L,) rad, heading of each boundary at the near end; NaN where it was not seen.
+        widths: (L-1,) m between neighbours, mean over the stretch that both cover; NaN where not both seen.
+    """
+
+    direction: NDArray[np.float64]
+    widths: NDArray[np.float64]
+
+
+def measure_boundaries(
+    segments: LaneSegments,
+    intrinsics: Tensor,
+    extrinsics: Extrinsics,
+    near: float = 5.0,
+    far: float = 40.0,
+    num_boundaries: int = NUM_BOUNDARIES,
+) -> RoadBoundaries:
+    """Measure a frame's boundaries in the bird's-eye view that these extrinsics give.
+
+    Only the observed vertices and the pose enter, no model of the lanes: with a wrong pose the lanes fan out
+    and the widths are wrong, which is what this is for. Vertices count by what a pixel is worth on the road
+    (1 / Z²); a boundary's vertices off its line by 3 robust sigmas are left out.
+
+    Args:
+        segments: of batch size 1, end points in undistorted pixels.
+        intrinsics: (1, 3, 3).
+        extrinsics: each (1,).
+        near: m, nearest Z that counts.
+        far: m, farthest.
+        num_boundaries: L.
+    """
+    points, valid = road_from_image_points(segments.endpoints.flatten(1, 2), intrinsics, extrinsics)
+    boundary = segments.boundary[0].repeat_interleave(2).numpy()
+    seen = (valid[0] & (segments.weight[0] > 0).repeat_interleave(2)).numpy()
+    x, z = points[0].double().numpy().T
+    seen &= np.isfinite(x) & np.isfinite(z) & (z >= near) & (z <= far)
+    seen &= _long_enough(boundary, z, seen, num_boundaries)
+    nothing = RoadBoundaries(np.full(num_boundaries, np.nan), np.full(num_boundaries - 1, np.nan))
+    if not seen.any():
+        return nothing
+    for _ in range(3):
+        offset, slope, bend = _fit(x[seen], z[seen], boundary[seen], num_boundaries)
+        residual = (x - offset[boundary] - slope[boundary] * z - bend * z**2) / z  # like rad
+        sigma = 1.4826 * np.median(np.abs(residual[seen])) + _MIN_PARTICULAR
+        seen &= np.abs(residual) < 3 * sigma
+    present = np.array([(seen & (boundary == k)).sum() >= _MIN_VERTICES for k in range(num_boundaries)])
+    direction = np.where(present, np.arctan(slope + 2 * bend * near), np.nan)
+    widths = np.full(num_boundaries - 1, np.nan)
+    for k in np.flatnonzero(present[:-1] & present[1:]):
+        extents = [(z[seen & (boundary == i)].min(), z[seen & (boundary == i)].max()) for i in (k, k + 1)]
+        start, end = max(e[0] for e in extents), min(e[1] for e in extents)
+        if end > start:
+            middle = 0.5 * (start + end)
+            heading = 0.5 * (slope[k] + slope[k + 1]) + 2 * bend * middle
+            across = offset[k + 1] - offset[k] + (slope[k + 1] - slope[k]) * middle
+            widths[k] = across / np.hypot(1.0, heading)  # square to the lane
+    return RoadBoundaries(direction, widths)
+
+
+def direction_spread(directions: NDArray[np.float64]) -> float:
+    """Largest difference between the directions of a frame's boundaries, rad; NaN with fewer than two."""
+    seen = directions[np.isfinite(directions)]
+    return float(np.ptp(seen)) if len(seen) > 1 else float("nan")
+
+
+def width_spread(widths: NDArray[np.float64]) -> float:
+    """Largest difference between the widths of a frame's lanes, m; NaN with fewer than two."""
+    return direction_spread(widths)
+
+
+def pose(pitch: float, yaw: float, roll: float, height: float, like: Tensor) -> Extrinsics:
+    """Extrinsics of batch size 1 from plain numbers in rad and m."""
+    return Extrinsics(*(torch.full((1,), value, dtype=like.dtype) for value in (pitch, yaw, roll, height)))
+
+
+def _long_enough(
+    boundary: NDArray[np.int64], z: NDArray[np.float64], seen: NDArray[np.bool_], num_boundaries: int
+) -> NDArray[np.bool_]:
+    enough = np.zeros(num_boundaries, dtype=bool)
+    for k in range(num_boundaries):
+        of = z[seen & (boundary == k)]
+        enough[k] = len(of) >= _MIN_VERTICES and np.ptp(of) >= _MIN_STRETCH
+    long_enough: NDArray[np.bool_] = enough[boundary]
+    return long_enough
+
+
+def _fit(
+    x: NDArray[np.float64], z: NDArray[np.float64], boundary: NDArray[np.int64], num_boundaries: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Offsets (L,), slopes (L,) and the common bend, by least squares weighted with 1 / Z²."""
+    member = np.eye(num_boundaries)[boundary]
+    columns = np.concatenate([member, member * z[:, None], z[:, None] ** 2], axis=1) / z[:, None]
+    solution = np.linalg.lstsq(columns, x / z, rcond=None)[0]
+    offset, slope = np.asarray(solution[:-1], dtype=np.float64).reshape(2, num_boundaries)
+    return offset, slope, float(solution[-1])
