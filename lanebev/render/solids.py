@@ -118,27 +118,29 @@ def intersect_hexahedron(origin: Tensor, ray: Tensor, shape: Tensor) -> tuple[Te
     return torch.where(hit, entry, math.inf), face
 
 
-def _local(values: Tensor, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-    sin, cos = values.sin(), values.cos()
-    return x * cos - z * sin, x * sin + z * cos
-
-
-def cast(solids: Solids, row: Tensor, index: Tensor, height: Tensor, ray: Tensor) -> Hit:
+def cast(solids: Solids, index: Tensor, height: Tensor, ray: Tensor, margin: Tensor | None = None) -> Hit:
     """Rays against one thing each.
 
     Args:
-        solids: the things.
-        row: (N,) batch row of each ray.
+        solids: the things, of one image.
         index: (N,) thing of each ray.
-        height: (N,) m, camera height.
-        ray: (N, 3) right, up, forward; forward component 1, so the ray parameter is Z.
+        height: (1,) m, camera height.
+        ray: (N, 2) right and up per metre forward, so the ray parameter is Z.
+        margin: (N,) per metre of distance: how much larger the things are taken to be.
     """
-    heading = solids.heading[row, index]
-    x, z = _local(heading, -solids.x[row, index], -solids.z[row, index])
-    origin = torch.stack([x, height - solids.ground[row, index], z], dim=1)
-    ray_x, ray_z = _local(heading, ray[:, 0], ray[:, 2])
-    ray = torch.stack([ray_x, ray[:, 1], ray_z], dim=1)
-    shape = solids.shape[row, index]
+    heading, x, z, ground = (t[0] for t in (solids.heading, solids.x, solids.z, solids.ground))
+    sin, cos = heading.sin(), heading.cos()
+    origin = torch.stack([z * sin - x * cos, height - ground, -x * sin - z * cos], dim=1)
+    sin, cos = sin[index], cos[index]
+    ray = torch.stack([ray[:, 0] * cos - sin, ray[:, 1], ray[:, 0] * sin + cos], dim=1)
+    shape = solids.shape[0]
+    if margin is not None:
+        grow = shape.new_tensor([1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
+        exists = (shape[..., 7] > shape[..., 6])[..., None]
+        largest = z.clamp(min=0)[:, None, None] + 1.0
+        pixel = margin.max() if len(margin) else 0.0
+        shape = shape + grow * (largest * pixel) * exists
+    origin, shape = origin[index], shape[index]
     lower, lower_face = intersect_hexahedron(origin, ray, shape[:, 0])
     upper, upper_face = intersect_hexahedron(origin, ray, shape[:, 1])
     is_upper = upper < lower
@@ -173,23 +175,19 @@ def bounding_boxes(solids: Solids, lens: Lens, height: Tensor, size: tuple[int, 
                 down = height[:, None] - solids.ground - level
                 corners.append(torch.stack([x, down, z], dim=-1))
     points = torch.stack(corners, dim=2)  # (B, M, 8, 3)
-    z_near = points[..., 2].amin(-1)
     seen = solids.valid & (points[..., 2].amax(-1) > 0.5)
     points = torch.cat([points[..., :2], points[..., 2:].clamp(min=0.3)], dim=-1)
     pixels = lens.pixels_as_taken(points.flatten(1, 2), size).unflatten(1, points.shape[1:3])
     limit = pixels.new_tensor([size[1], size[0]])
     low_px = (pixels.amin(2).floor() - 1).clamp(min=0).minimum(limit)
     high_px = (pixels.amax(2).ceil() + 2).clamp(min=0).minimum(limit)
-    beside = (z_near < 0.5)[..., None]  # passing the camera plane: bounds by projection are unsafe
-    low_px = torch.where(beside, 0.0, low_px)
-    high_px = torch.where(beside, limit.expand_as(high_px), high_px)
     return torch.cat([low_px, high_px], dim=-1).where(seen[..., None], 0.0).long()
 
 
-def shade(solids: Solids, row: Tensor, index: Tensor, hit: Hit, light: Light) -> Tensor:
+def shade(solids: Solids, index: Tensor, hit: Hit, light: Light) -> Tensor:
     """Linear radiance of hit points, (N, 3)."""
-    kind, colour = solids.kind[row, index], solids.colour[row, index]
-    heading, shape = solids.heading[row, index], solids.shape[row, index, 0]
+    kind, colour = solids.kind[0, index], solids.colour[0, index]
+    heading, shape = solids.heading[0, index], solids.shape[0, index, 0]
     x, up, z = hit.point.unbind(-1)
     half_width, low, high = shape[:, 0], shape[:, 6], shape[:, 7]
     rear, front = shape[:, 2], shape[:, 3]
@@ -201,7 +199,7 @@ def shade(solids: Solids, row: Tensor, index: Tensor, hit: Hit, light: Light) ->
 
     surface = colour.clone()
     glass = vehicle & hit.upper & (hit.face < TOP)
-    span = solids.shape[row, index, 1]
+    span = solids.shape[0, index, 1]
     pane = (up - span[:, 6]) / (span[:, 7] - span[:, 6]).clamp(min=1e-3)
     width_here = span[:, 0] + (span[:, 1] - span[:, 0]) * pane
     frame = (pane > 0.88) | (pane < 0.08) | (end & (x.abs() > width_here - 0.09))
@@ -254,19 +252,19 @@ def shade(solids: Solids, row: Tensor, index: Tensor, hit: Hit, light: Light) ->
         + 0.35 * (hit.upper & (hit.face < TOP)).float()
     )
     sin, cos = heading.sin(), heading.cos()
-    sun = light.sun[row]
+    sun = light.sun
     facing = (normal_x * cos + normal_z * sin) * sun[:, 0] + normal_up * sun[:, 1]
     facing = (facing + (normal_z * cos - normal_x * sin) * sun[:, 2]).clamp(0, 1)
     open_sky = (0.55 + 0.45 * normal_up).clamp(0.12, 1.0) * torch.where(vehicle & (up < 0.5), 0.6, 1.0)
-    lit = light.direct[row] * facing[:, None] + light.ambient[row] * open_sky[:, None]
+    lit = light.direct * facing[:, None] + light.ambient * open_sky[:, None]
     distance = hit.depth.clamp(1.0, 1e4)
-    beam = light.headlight[row] * 60 / (distance * distance + 60) * (hit.face == REAR)
+    beam = light.headlight * 60 / (distance * distance + 60) * (hit.face == REAR)
     lit = lit + beam[:, None] * lit.new_tensor([1.0, 0.95, 0.85])
     gloss = (vehicle & ~truck & ~below).float() * (0.04 + 0.10 * (normal_up > 0.5))
-    radiance = surface * lit + gloss[:, None] * light.ambient[row] * 1.2
-    tail = red & (solids.braking[row, index] | (light.night[row] > 0.4))
-    glow = (0.35 + 0.5 * solids.braking[row, index].float()) * tail
-    oncoming = lamp & (hit.face == FRONT) & (light.night[row] > 0.4)
+    radiance = surface * lit + gloss[:, None] * light.ambient * 1.2
+    tail = red & (solids.braking[0, index] | (light.night > 0.4))
+    glow = (0.35 + 0.5 * solids.braking[0, index].float()) * tail
+    oncoming = lamp & (hit.face == FRONT) & (light.night > 0.4)
     radiance = radiance + glow[:, None] * radiance.new_tensor([0.9, 0.04, 0.02])
     return radiance + (2.5 * oncoming)[:, None] * radiance.new_tensor([1.0, 0.95, 0.8])
 
@@ -305,57 +303,71 @@ def draw(
     """Paint all things into the image, far to near; changes image, depth and blocked.
 
     Args:
-        image: (B, 3, H, W) linear radiance.
-        depth: (B, H, W) m, Z of what is already there.
-        blocked: (B, H, W) m, Z of the nearest thing that is not the road.
+        image: (1, 3, H, W) linear radiance.
+        depth: (1, H, W) m, Z of what is already there.
+        blocked: (1, H, W) m, Z of the nearest thing that is not the road.
         solids: the things.
-        rays: (B, 2, H, W) right and up per metre forward.
-        steps: (B, 4, H, W) change of right and up per pixel to the right, then per pixel down.
+        rays: (1, 2, H, W) right and up per metre forward.
+        steps: (1, 4, H, W) change of right and up per pixel to the right, then per pixel down.
         lens: from road directions to pixels.
-        height: (B,) m.
+        height: (1,) m.
         light: the illumination.
-        haze: (B, 3) radiance of the air.
-        visibility: (B,) m.
+        haze: (1, 3) radiance of the air.
+        visibility: (1,) m.
     """
-    batch, _, rows, columns = image.shape
-    boxes = bounding_boxes(solids, lens, height, (rows, columns))
-    order = solids.z.where(solids.valid, math.inf).argsort(1, descending=True)
-    flat_image, flat_depth, flat_blocked = image.flatten(2), depth.flatten(1), blocked.flatten(1)
-    for rank in range(solids.z.shape[1]):
-        row_list, index_list, pixel_list = [], [], []
-        for b in range(batch):
-            m = int(order[b, rank])
-            left, top, right, bottom = boxes[b, m].tolist()
-            if right <= left or bottom <= top:
-                continue
+    rows, columns = image.shape[2:]
+    index, pixel = _covered_pixels(solids, lens, height, (rows, columns))
+    flat_image, flat_depth, flat_blocked = image[0].flatten(1), depth[0].flatten(), blocked[0].flatten()
+    ray = rays[0].flatten(1)[:, pixel].T
+    step = steps[0].flatten(1)[:, pixel].T
+    behind = flat_depth[pixel] + 0.6
+
+    near = cast(solids, index, height, ray, margin=step.abs().amax(1)).depth < behind
+    index, pixel, ray, step, behind = (t[near] for t in (index, pixel, ray, step, behind))
+    share = ray.new_zeros(len(index))
+    hit = Hit(share + math.inf, index * 0, share > 1, ray.new_zeros(len(index), 3))
+    for dx, dy in _SUBPIXELS:
+        one = cast(solids, index, height, ray + dx * step[:, :2] + dy * step[:, 2:])
+        seen = one.depth < behind
+        share = share + seen / len(_SUBPIXELS)
+        nearer = seen & (one.depth < hit.depth)
+        hit = Hit(*(_where(nearer, new, old) for new, old in zip(one, hit, strict=True)))
+
+    whole = share > 0.99  # hides what is behind it: no need to shade that
+    front = flat_depth.clone()
+    front.scatter_reduce_(0, pixel[whole], hit.depth[whole], "amin")
+    keep = (share > 0) & (hit.depth <= front[pixel] + 0.6)
+    index, pixel, share = index[keep], pixel[keep], share[keep]
+    hit = Hit(*(t[keep] for t in hit))
+    clear = torch.exp(-hit.depth / visibility)[:, None]
+    radiance = haze * (1 - clear) + shade(solids, index, hit, light) * clear
+
+    changes = (index.diff() != 0).nonzero()[:, 0] + 1  # entries of one thing are together, far ones first
+    bounds = [0, *changes.tolist(), len(index)]
+    for begin, end in zip(bounds, bounds[1:], strict=False):
+        here, part = pixel[begin:end], share[begin:end]
+        old = flat_image[:, here]
+        flat_image[:, here] = old + (radiance[begin:end].T - old) * part
+        covered = part > 0.4
+        solid, z = here[covered], hit.depth[begin:end][covered]
+        flat_depth[solid] = z
+        flat_blocked[solid] = torch.minimum(flat_blocked[solid], z)
+
+
+def _where(condition: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    return torch.where(condition[:, None] if new.ndim == 2 else condition, new, old)
+
+
+def _covered_pixels(
+    solids: Solids, lens: Lens, height: Tensor, size: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """Things, far to near, and the pixels of their bounding boxes: (N,) int64 both."""
+    boxes = bounding_boxes(solids, lens, height, size)[0]
+    order = solids.z[0].argsort(descending=True)
+    indices, pixels = [boxes.new_zeros(0)], [boxes.new_zeros(0)]
+    for m, (left, top, right, bottom) in zip(order.tolist(), boxes[order].tolist(), strict=True):
+        if right > left and bottom > top:
             ys, xs = torch.arange(top, bottom), torch.arange(left, right)
-            pixels = (ys[:, None] * columns + xs).flatten()
-            pixel_list.append(pixels)
-            row_list.append(torch.full_like(pixels, b))
-            index_list.append(torch.full_like(pixels, m))
-        if not pixel_list:
-            continue
-        row, index, pixel = torch.cat(row_list), torch.cat(index_list), torch.cat(pixel_list)
-        ray, step = rays.flatten(2)[row, :, pixel], steps.flatten(2)[row, :, pixel]
-        behind = flat_depth[row, pixel]
-        total, share, nearest = ray.new_zeros(len(row), 3), ray.new_zeros(len(row)), behind
-        for dx, dy in _SUBPIXELS:
-            direction = ray + dx * step[:, :2] + dy * step[:, 2:]
-            direction = torch.cat([direction, torch.ones_like(direction[:, :1])], dim=1)
-            hit = cast(solids, row, index, height[row], direction)
-            seen = (hit.depth < behind + 0.6).nonzero()[:, 0]
-            if not len(seen):
-                continue
-            part = Hit(*(t[seen] for t in hit))
-            radiance = shade(solids, row[seen], index[seen], part, light)
-            clear = torch.exp(-part.depth / visibility[row[seen]])[:, None]
-            radiance = haze[row[seen]] * (1 - clear) + radiance * clear
-            total[seen] += radiance / len(_SUBPIXELS)
-            share[seen] += 1 / len(_SUBPIXELS)
-            nearest = nearest.index_put((seen,), torch.minimum(nearest[seen], part.depth))
-        old = flat_image[row, :, pixel]
-        flat_image[row, :, pixel] = old * (1 - share)[:, None] + total
-        covered = share > 0.4
-        flat_depth[row, pixel] = torch.where(covered, nearest, behind)
-        near = flat_blocked[row, pixel]
-        flat_blocked[row, pixel] = torch.where(covered, torch.minimum(near, nearest), near)
+            pixels.append((ys[:, None] * size[1] + xs).flatten())
+            indices.append(torch.full_like(pixels[-1], m))
+    return torch.cat(indices), torch.cat(pixels)
