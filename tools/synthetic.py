@@ -7,6 +7,7 @@ every 30 px along each boundary, paired at random, Gaussian noise on every end p
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -83,7 +84,7 @@ def boundary_spans(pose: Tensor, positions: Tensor, intrinsics: Tensor, exp: Exp
     vp = vanishing[:2] / vanishing[2]
     spans = []
     for line in boundary_lines(pose, positions, intrinsics):
-        a, b, c = line.tolist()
+        a, b = line[:2].tolist()
         direction = torch.tensor([-b, a], dtype=pose.dtype)
         direction = direction * (1 if direction[1] > 0 else -1)  # down the image
         reach = []
@@ -168,7 +169,7 @@ class Frame:
         )
 
 
-def frames(exp: Experiment, rows: int, generator: torch.Generator):  # noqa: ANN201 - a generator of Frame
+def frames(exp: Experiment, rows: int, generator: torch.Generator) -> Iterator[Frame]:
     """Yield every :class:`Frame` of the experiment, R rows each with its own pairs."""
     extrinsics, offset = exp.motion()
     intrinsics = exp.intrinsics()

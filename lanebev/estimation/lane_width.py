@@ -10,21 +10,22 @@ from torch import Tensor
 
 from lanebev.geometry.rotation import cam_from_world
 
-_MIN_DOWN = 1e-3  # a ray less than 0.06 deg below the horizon says nothing about where on the road it ends
-_MAX_SLOPE = 50.0  # 89 deg from the vertical
+_MIN_RADIUS = 1e-3  # a ray closer than 0.06 deg to the vanishing direction says nothing about its boundary
+_MIN_COSINE = 0.02  # 1.1 deg: a boundary plane closer to the road's own has no foot on it
 
 
-class BoundarySlopes(NamedTuple):
+class BoundaryAngles(NamedTuple):
     """Where each boundary's plane stands around the vanishing direction.
 
     Attributes:
-        slopes: (B, L), tan α; positive left of the camera.
-        noise: (B, L) variances from the pixels.
-        jacobian: (B, L, 2), by pitch and yaw, 1/rad.
+        angles: (B, L) rad, α of Fig. 6(c), positive left of the camera; beyond ±pi/2 where roll lifts a
+            boundary above the level.
+        noise: (B, L) rad², variances from the pixels.
+        jacobian: (B, L, 2), by pitch and yaw.
         present: (B, L) bool.
     """
 
-    slopes: Tensor
+    angles: Tensor
     noise: Tensor
     jacobian: Tensor
     present: Tensor
@@ -68,7 +69,7 @@ def lane_widths(line_angles: Tensor, roll: Tensor, height: Tensor) -> Tensor:
     return height.unsqueeze(-1) * (tangents[..., :-1] - tangents[..., 1:])
 
 
-def boundary_slopes(
+def boundary_angles(
     rays: Tensor,
     boundary: Tensor,
     weight: Tensor,
@@ -77,13 +78,13 @@ def boundary_slopes(
     pitch: Tensor,
     yaw: Tensor,
     num_boundaries: int,
-) -> BoundarySlopes:
-    """One slope tan α per boundary from all its segments, and what it is worth.
+) -> BoundaryAngles:
+    """One angle α per boundary from all its segments, and what it is worth.
 
     Source: Eq. (21) takes α of single line pairs. Deviation: one α per boundary, the least-squares plane
     through the vanishing direction and the boundary's end points, as pairs that share a segment are not
     independent and a single segment's own direction ignores the known vanishing point. Segments off their
-    boundary's median by more than 4 sigma are left out.
+    boundary's median by more than 4 sigma and a degree are left out.
 
     Args:
         rays: (B, N, 2, 3) of both end points.
@@ -96,34 +97,34 @@ def boundary_slopes(
         num_boundaries: L.
 
     Returns:
-        slopes with noise, Jacobian and presence.
+        angles with noise, Jacobian and presence.
     """
     world = rays @ cam_from_world(pitch, yaw).unsqueeze(1)  # (B, N, 2, 3)
     x, y, z = world.unbind(-1)
-    below = (y > _MIN_DOWN).all(-1) & (weight > 0)  # (B, N)
-    y = torch.where(below.unsqueeze(-1), y, 1.0)
+    far = (x * x + y * y > _MIN_RADIUS**2).all(-1) & (weight > 0)  # (B, N)
+    y = torch.where(far.unsqueeze(-1), y, 1.0)
+    radius = x * x + y * y
+    pull = radius.sum(-1)  # (B, N), how strongly a segment's ends fix the angle
+    angle = (radius * torch.atan2(-x, y)).sum(-1) / pull
     focal = 0.5 * (intrinsics[:, 0, 0] + intrinsics[:, 1, 1]).unsqueeze(-1)
-    pull = (y * y).sum(-1)  # (B, N) how strongly a segment's ends fix the slope
-    slope = -(x * y).sum(-1) / pull
-    below = below & (slope.abs() < _MAX_SLOPE)
-    variance = (sigma / focal).square() * (1 + slope * slope) / pull
-    member = torch.nn.functional.one_hot(boundary.clamp(0, num_boundaries - 1), num_boundaries)
-    member = (member.mT > 0) & below.unsqueeze(1)  # (B, L, N)
-    centre = _masked_median(slope.unsqueeze(1).expand(member.shape), member)
-    off = (slope.unsqueeze(1) - centre.unsqueeze(-1)).abs()
-    member = member & (off < 4.0 * variance.sqrt().unsqueeze(1) + 0.02 * (1 + centre.square()).unsqueeze(-1))
-    precision = torch.where(member, (weight / variance).unsqueeze(1), 0.0)  # (B, L, N)
+    variance = (sigma / focal).square() / pull
+    index = torch.arange(num_boundaries, device=boundary.device)[:, None]
+    member = (boundary.unsqueeze(1) == index) & far.unsqueeze(1)  # (B, L, N)
+    centre = _masked_median(angle.unsqueeze(1).expand(member.shape), member)
+    off = (angle.unsqueeze(1) - centre.unsqueeze(-1)).abs()
+    member = member & (off < 4.0 * variance.sqrt().unsqueeze(1) + math.radians(1.0))
+    precision = torch.where(member, (weight / variance).unsqueeze(1), 0.0)
     total = precision.sum(-1)
     present = total > 0
     share = precision / torch.where(present, total, 1.0).unsqueeze(-1)
 
-    # The slope's change as the camera pitches and yaws: d(R_WC r) is -(cosφ, 0, sinφ) × and -(0, 1, 0) ×.
+    # How the angle changes as the camera pitches and yaws: d(R_WC r) is -(cosφ, 0, sinφ) × and -(0, 1, 0) ×.
     sy, cy = yaw.sin()[:, None, None], yaw.cos()[:, None, None]
-    by_pitch = ((x * (cy * z - sy * x) - sy * y * y).sum(-1)) / pull
+    by_pitch = (x * (cy * z - sy * x) - sy * y * y).sum(-1) / pull
     by_yaw = (z * y).sum(-1) / pull
     by_pose = torch.stack([by_pitch, by_yaw], dim=-1)  # (B, N, 2)
-    slopes = (share @ slope.unsqueeze(-1)).squeeze(-1)
-    return BoundarySlopes(slopes, 1.0 / torch.where(present, total, 1.0), share @ by_pose, present)
+    angles = (share @ angle.unsqueeze(-1)).squeeze(-1)
+    return BoundaryAngles(angles, 1.0 / torch.where(present, total, 1.0), share @ by_pose, present)
 
 
 class WidthMeasurement(NamedTuple):
@@ -143,7 +144,7 @@ class WidthMeasurement(NamedTuple):
 
 
 def measure_widths(
-    boundaries: BoundarySlopes,
+    boundaries: BoundaryAngles,
     roll: Tensor,
     height: Tensor,
     direction_cov: Tensor | None = None,
@@ -151,10 +152,10 @@ def measure_widths(
 ) -> WidthMeasurement:
     """Widths of the lanes whose two boundaries are present, with Jacobian and covariance.
 
-    Source: Eq. (21) and its derivatives, with tan(α - ψ) = (t - τ) / (1 + t τ).
+    Source: Eq. (21) and its derivatives.
 
     Args:
-        boundaries: from :func:`boundary_slopes`.
+        boundaries: from :func:`boundary_angles`.
         roll: (B,) rad.
         height: (B,) m.
         direction_cov: (B, 2, 2) of pitch and yaw, or None where they are exact.
@@ -163,19 +164,18 @@ def measure_widths(
     Returns:
         the measurement.
     """
-    tau, h = roll.tan().unsqueeze(-1), height.unsqueeze(-1)
-    denominator = 1 + boundaries.slopes * tau
-    facing = boundaries.present & (denominator > 0.05)  # beyond: at or above the rolled horizon
-    denominator = torch.where(facing, denominator, 1.0)
-    tangents = (boundaries.slopes - tau) / denominator  # (B, L) tan(α - ψ)
+    relative = boundaries.angles - roll.unsqueeze(-1)
+    facing = boundaries.present & (relative.cos() > _MIN_COSINE)
+    relative = torch.where(facing, relative, 0.0)
+    tangents, h = relative.tan(), height.unsqueeze(-1)
     present = facing[..., :-1] & facing[..., 1:]
-    widths = h * (tangents[..., :-1] - tangents[..., 1:])
-    by_roll = -h * (tangents[..., :-1].square() - tangents[..., 1:].square())
+    widths = lane_widths(relative, torch.zeros_like(roll), height)
+    by_roll = h * (tangents[..., 1:].square() - tangents[..., :-1].square())
     jacobian = torch.stack([by_roll, widths / h], dim=-1)
 
-    by_slope = h * (1 + tau * tau) / denominator.square()  # (B, L)
+    by_angle = h * (1 + tangents.square())  # (B, L)
     eye = torch.eye(widths.shape[-1] + 1, dtype=widths.dtype, device=widths.device)
-    difference = (eye[:-1] - eye[1:]) * by_slope.unsqueeze(1)  # (B, L-1, L) d widths / d slopes
+    difference = (eye[:-1] - eye[1:]) * by_angle.unsqueeze(1)  # (B, L-1, L) d widths / d angles
     noise = difference @ (boundaries.noise.unsqueeze(-1) * difference.mT)
     if direction_cov is not None:
         by_direction = difference @ boundaries.jacobian  # (B, L-1, 2)
@@ -187,7 +187,7 @@ def measure_widths(
 
 
 def initial_roll_height(
-    boundaries: BoundarySlopes,
+    boundaries: BoundaryAngles,
     lane_width: Tensor,
     roll_guess: Tensor,
     search_range: float = math.radians(30.0),
@@ -201,7 +201,7 @@ def initial_roll_height(
     the best height is in closed form; with one lane roll stays at the guess (PAPER_NOTES 6).
 
     Args:
-        boundaries: from :func:`boundary_slopes`.
+        boundaries: from :func:`boundary_angles`.
         lane_width: (B, L-1) m, the prior.
         roll_guess: (B,) rad, the middle of the search, and the answer where roll is not observable.
         search_range: rad to either side.
@@ -215,7 +215,7 @@ def initial_roll_height(
         -search_range, search_range, num_steps, dtype=lane_width.dtype, device=lane_width.device
     )
     rolls = roll_guess.unsqueeze(-1) + rolls  # (B, G)
-    repeated = BoundarySlopes(*(part.repeat_interleave(num_steps, 0) for part in boundaries))
+    repeated = BoundaryAngles(*(part.repeat_interleave(num_steps, 0) for part in boundaries))
     unit = measure_widths(repeated, rolls.flatten(), torch.ones_like(rolls.flatten()))
     shape = (*rolls.shape, -1)
     widths, present = unit.widths.reshape(shape), unit.present.reshape(shape)  # (B, G, L-1) at height 1
@@ -237,7 +237,7 @@ def initial_roll_height(
 
 
 def _gauss_newton_step(
-    boundaries: BoundarySlopes, lane_width: Tensor, roll: Tensor, height: Tensor, observable: Tensor
+    boundaries: BoundaryAngles, lane_width: Tensor, roll: Tensor, height: Tensor, observable: Tensor
 ) -> tuple[Tensor, Tensor]:
     measured = measure_widths(boundaries, roll, height)
     there = measured.present.unsqueeze(-1)

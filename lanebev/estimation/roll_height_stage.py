@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation import kalman
-from lanebev.estimation.lane_width import BoundarySlopes, initial_roll_height, measure_widths
+from lanebev.estimation.lane_width import BoundaryAngles, initial_roll_height, measure_widths
 from lanebev.types import Status
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class RollHeightStep(NamedTuple):
 
 
 def track_roll_height(
-    boundaries: BoundarySlopes,
+    boundaries: BoundaryAngles,
     lane_width: Tensor,
     direction_cov: Tensor,
     state: TwoStageState,
@@ -43,7 +43,7 @@ def track_roll_height(
     Source: Sec. IV-B, with the measurement of Eq. (22).
 
     Args:
-        boundaries: slopes about the direction of stage 1.
+        boundaries: angles about the direction of stage 1.
         lane_width: (B, L-1) m, the prior.
         direction_cov: (B, 2, 2) of pitch and yaw.
         state: of the frame before.

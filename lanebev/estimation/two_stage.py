@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from lanebev.estimation.checks import as_batch, as_lane_width, check_segments, clean_segments
 from lanebev.estimation.direction_stage import track_direction
-from lanebev.estimation.lane_width import boundary_slopes
+from lanebev.estimation.lane_width import boundary_angles
 from lanebev.estimation.roll_height_stage import track_roll_height
 from lanebev.geometry.road import rays_from_pixels
 from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status
@@ -142,7 +142,7 @@ class TwoStageCalibrator(nn.Module):
         rays = rays.reshape(*segments.endpoints.shape[:-1], 3)  # (B, N, 2, 3)
 
         one = track_direction(segments, rays, intrinsics, state, dt, self.draws, self.config)
-        boundaries = boundary_slopes(
+        boundaries = boundary_angles(
             rays,
             segments.boundary,
             segments.weight * one.inliers,

@@ -1,0 +1,133 @@
+"""Line angles, widths, and the search for roll and height."""
+
+import itertools
+import math
+
+import pytest
+import torch
+
+from lanebev import Extrinsics, image_from_road_points
+from lanebev.estimation import lane_width as lw
+from lanebev.geometry.road import great_circle_normals, rays_from_pixels
+
+K = torch.tensor([[[1000.0, 0, 640], [0, 1000, 360], [0, 0, 1]]], dtype=torch.float64)
+EDGES = torch.tensor([-5.8, -2.1, 1.6, 5.3], dtype=torch.float64)  # 3.7 m apart, camera off the middle
+
+
+def t(*values):
+    return [torch.tensor([v], dtype=torch.float64) for v in values]
+
+
+def boundary_segments(pitch, yaw, roll, height, edges=EDGES):
+    near = torch.stack([edges, torch.full_like(edges, 9.0)], dim=-1)[None]
+    far = torch.stack([edges, torch.full_like(edges, 30.0)], dim=-1)[None]
+    pose = Extrinsics(*t(pitch, yaw, roll, height))
+    ends = torch.stack([image_from_road_points(p, K, pose)[0] for p in (near, far)], dim=2)
+    return ends, pose
+
+
+def angles_of(ends, pose, sigma=1.0, boundary=None):
+    n = ends.shape[1]
+    rays = rays_from_pixels(ends.flatten(1, 2), K).reshape(1, n, 2, 3)
+    boundary = torch.arange(n)[None] if boundary is None else boundary
+    weight = torch.ones(1, n, dtype=torch.float64)
+    return lw.boundary_angles(rays, boundary, weight, sigma * weight, K, pose.pitch, pose.yaw, 4)
+
+
+@pytest.mark.parametrize(
+    ("pitch", "yaw", "roll", "height"),
+    list(itertools.product((-0.05, 0.08), (-0.1, 0.1), (-0.3, 0.0, 0.2), (1.2, 2.0))),
+)
+def test_deviation_angle_positive_to_the_left_makes_widths_exact(pitch, yaw, roll, height):
+    ends, pose = boundary_segments(pitch, yaw, roll, height)
+    angles = lw.line_angles(great_circle_normals(ends, K), pose.pitch, pose.yaw)
+    widths = lw.lane_widths(angles, pose.roll, pose.height)
+    torch.testing.assert_close(widths, torch.full((1, 3), 3.7, dtype=torch.float64))
+    found = angles_of(ends, pose)
+    torch.testing.assert_close(found.angles.tan(), angles.tan())
+    # The other sign, or no rotation into the frame of the vanishing direction, is not exact:
+    assert (lw.lane_widths(-angles, pose.roll, pose.height) - 3.7).abs().max() > 0.5
+    raw = lw.line_angles(great_circle_normals(ends, K), *t(0.0, 0.0))
+    assert (lw.lane_widths(raw, pose.roll, pose.height) - 3.7).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("roll", "height"), list(itertools.product((-0.35, -0.02, 0.0, 0.1, 0.35), (1.0, 2.3)))
+)
+def test_initial_roll_and_height_over_all_signs(roll, height):
+    ends, pose = boundary_segments(0.03, -0.02, roll, height)
+    prior = torch.full((1, 3), 3.7, dtype=torch.float64)
+    found = lw.initial_roll_height(angles_of(ends, pose), prior, *t(0.0))
+    assert [float(x) for x in found] == pytest.approx([roll, height], abs=1e-9)
+
+
+def test_deviation_a_sum_of_signed_residuals_has_no_minimum():
+    # Eq. (23) as printed falls without end as the height grows; the squares have their minimum at 1.5 m.
+    ends, pose = boundary_segments(0.0, 0.0, 0.0, 1.5)
+    angles = angles_of(ends, pose).angles
+    heights = torch.linspace(1.0, 3.0, 21, dtype=torch.float64)
+    errors = torch.stack([3.7 - lw.lane_widths(angles, *t(0.0), h[None]).squeeze() for h in heights])
+    assert (errors.sum(-1).diff() < 0).all()
+    assert float(heights[errors.square().sum(-1).argmin()]) == pytest.approx(1.5)
+
+
+def test_one_lane_leaves_roll_at_the_guess():
+    ends, pose = boundary_segments(0.0, 0.0, 0.1, 1.5, EDGES[1:3])
+    found = angles_of(ends, pose)
+    prior = torch.full((1, 3), 3.7, dtype=torch.float64)
+    roll, height = lw.initial_roll_height(found, prior, *t(0.07))
+    assert float(roll) == pytest.approx(0.07)
+    assert float(lw.measure_widths(found, roll, height).widths[0, 0]) == pytest.approx(3.7)
+
+
+def test_a_missed_boundary_is_two_lanes_missed_not_one_twice_as_wide():
+    ends, pose = boundary_segments(0.0, 0.0, 0.0, 1.5, EDGES[[0, 2, 3]])
+    measured = lw.measure_widths(
+        angles_of(ends, pose, boundary=torch.tensor([[0, 2, 3]])), pose.roll, pose.height
+    )
+    assert measured.present.tolist() == [[False, False, True]]
+    assert float(measured.widths[0, 2]) == pytest.approx(3.7)
+
+
+def test_jacobians_equal_jacfwd():
+    ends, pose = boundary_segments(0.03, -0.05, 0.06, 1.4)
+    found = angles_of(ends, pose)
+    measured = lw.measure_widths(found, pose.roll, pose.height)
+
+    def widths(x):
+        return lw.lane_widths(found.angles, x[:1], x[1:])[0]
+
+    expected = torch.func.jacfwd(widths)(torch.cat([pose.roll, pose.height]))
+    torch.testing.assert_close(measured.jacobian[0], expected)
+
+    def angles_at(x):
+        return angles_of(ends, Extrinsics(x[:1], x[1:], pose.roll, pose.height)).angles[0]
+
+    by_pose = torch.func.jacfwd(angles_at)(torch.cat([pose.pitch, pose.yaw]))
+    torch.testing.assert_close(found.jacobian[0], by_pose, rtol=2e-3, atol=1e-4)
+
+
+def test_width_noise_equals_monte_carlo():
+    ends, pose = boundary_segments(0.02, 0.01, 0.03, 1.5)
+    noise = lw.measure_widths(angles_of(ends, pose, 0.5), pose.roll, pose.height).noise[0]
+    generator = torch.Generator().manual_seed(0)
+    samples = []
+    for _ in range(3000):
+        noisy = ends + 0.5 * torch.randn(ends.shape, generator=generator, dtype=torch.float64)
+        samples.append(lw.measure_widths(angles_of(noisy, pose, 0.5), pose.roll, pose.height).widths[0])
+    cov = torch.cov(torch.stack(samples).T)
+    torch.testing.assert_close(cov.diagonal(), noise.diagonal(), rtol=0.12, atol=0)
+    assert float(cov[0, 1] / noise[0, 1]) == pytest.approx(1.0, abs=0.25)
+
+
+def test_above_the_rolled_horizon_is_not_a_lane():
+    found = lw.BoundaryAngles(
+        *t([math.atan(a) for a in (1.0, -1.0, -40.0)]),
+        *t([1e-6] * 3),
+        *t([[0.0, 0.0]] * 3),
+        torch.ones(1, 3, dtype=torch.bool),
+    )
+    for roll, there in ((20, [True, False]), (2, [True, False]), (-5, [True, True])):
+        measured = lw.measure_widths(found, *t(math.radians(roll)), *t(1.5))
+        assert measured.present.tolist() == [there]
+        assert measured.widths.isfinite().all()
