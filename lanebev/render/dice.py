@@ -1,4 +1,4 @@
-"""Random numbers for whole batches, from one generator; rows and joins of nested tuples of tensors."""
+"""Random numbers for whole batches, from one generator; rows of nested tuples of tensors."""
 
 from __future__ import annotations
 
@@ -49,14 +49,3 @@ def row_of(values: T, index: int) -> T:
     """Row ``index`` of a (nested) NamedTuple of (B, ...) tensors, the batch dimension kept."""
     parts = [row_of(v, index) if isinstance(v, tuple) else v[index : index + 1] for v in values]
     return type(values)(*parts)
-
-
-def join_rows(rows: list[T]) -> T:
-    """Inverse of :func:`row_of`."""
-    columns = zip(*rows, strict=True)
-    first = rows[0]
-    parts = [
-        join_rows(list(column)) if isinstance(value, tuple) else torch.cat(column)
-        for value, column in zip(first, columns, strict=True)
-    ]
-    return type(first)(*parts)

@@ -121,9 +121,9 @@ def sample_layout(dice: Dice, dotted: Tensor, faint: Tensor) -> Layout:
     yellow = ((index == 0) & dice.chance(0.6, 1)) | dice.chance(0.03, slots)
     colour = torch.where(yellow[..., None], torch.tensor(YELLOW), torch.tensor(WHITE))
     colour = colour * dice.uniform(0.85, 1.1, 1, 1) + dice.normal(0.015, 1, 3)
-    opacity = torch.where(dice.chance(0.55), dice.uniform(0.75, 1.0), dice.uniform(0.3, 0.85))[:, None]
-    opacity = (opacity * dice.uniform(0.75, 1.15, slots)).clamp(0.15, 1.0)
-    opacity = torch.where(faint[:, None], dice.uniform(0.3, 0.9, 1), opacity)
+    opacity = torch.where(dice.chance(0.55), dice.uniform(0.75, 1.0), dice.uniform(0.4, 0.85))[:, None]
+    opacity = (opacity * dice.uniform(0.75, 1.15, slots)).clamp(0.3, 1.0)
+    opacity = torch.where(faint[:, None], dice.uniform(0.4, 0.9, 1), opacity)
 
     stud = kind == STUDS
     reflectors = dice.chance(0.35, 1) & (dice.chance(0.8, slots)) & (kind != NONE)
@@ -142,7 +142,7 @@ def sample_layout(dice: Dice, dotted: Tensor, faint: Tensor) -> Layout:
         dash_phase=dice.uniform(0, 20, 1) + torch.where(dice.chance(0.2, 1), dice.uniform(0, 20, slots), 0.0),
         colour=colour.clamp(0.02, 0.95).expand(-1, slots, -1).contiguous(),
         opacity=torch.where(stud | (kind == NONE), 0.0, opacity),
-        wear=torch.where(dice.chance(0.5), dice.uniform(0.0, 0.3), dice.uniform(0.2, 0.8))[:, None].repeat(
+        wear=torch.where(dice.chance(0.5), dice.uniform(0.0, 0.3), dice.uniform(0.2, 0.65))[:, None].repeat(
             1, slots
         ),
         stud_period=stud_period.contiguous(),

@@ -9,14 +9,13 @@ import torch
 from torch import Tensor
 
 from lanebev.render.alignment import Alignment, elevation_at, ground_hit, road_from_local, wall_hit
-from lanebev.render.layout import Layout
-from lanebev.render.lens import Lens, pixel_rays
+from lanebev.render.lens import Lens
 from lanebev.render.markings import paint
 from lanebev.render.noise import CLOUD, sample_noise, smoothstep
 from lanebev.render.pavement import pavement_albedo
-from lanebev.render.photometry import headlight_irradiance, light_of
+from lanebev.render.photometry import headlight_irradiance
 from lanebev.render.scene import Place, World
-from lanebev.render.solids import Light, Solids, draw
+from lanebev.render.solids import TRUCK, Light, Solids, draw
 from lanebev.render.surroundings import (
     NOTHING,
     NUM_WALLS,
@@ -37,13 +36,13 @@ class Painted(NamedTuple):
     Attributes:
         radiance: (1, 3, H, W) linear.
         blocked: (1, H, W) m, Z of the nearest thing that is not the road; infinite: none.
-        metered: (1,) mean radiance of the road before the camera.
+        road_level: (1,) mean radiance of the road before the camera.
         nearest: (1,) m, Z of the nearest road in the image.
     """
 
     radiance: Tensor
     blocked: Tensor
-    metered: Tensor
+    road_level: Tensor
     nearest: Tensor
 
 
@@ -59,7 +58,14 @@ class _Ground(NamedTuple):
 
 
 def paint_view(
-    world: World, place: Place, alignment: Alignment, lens: Lens, solids: Solids, size: tuple[int, int]
+    world: World,
+    place: Place,
+    alignment: Alignment,
+    lens: Lens,
+    solids: Solids,
+    light: Light,
+    rays: Tensor,
+    steps: Tensor,
 ) -> Painted:
     """One scene, B = 1: a row at a time stays in the processor's cache and skips what it has not.
 
@@ -69,30 +75,30 @@ def paint_view(
         alignment: seen from there.
         lens: the camera.
         solids: things in the local road frame.
-        size: image (height, width).
+        light: in the local road frame.
+        rays: (1, 2, H, W), see :func:`~lanebev.render.lens.pixel_rays`.
+        steps: (1, 4, H, W).
     """
-    height, width = size
-    rays, steps = pixel_rays(lens, size)
+    height, width = rays.shape[2:]
+    size = (height, width)
     swing, drop = rays[:, 0].flatten(1), -rays[:, 1].flatten(1)  # (1, H·W)
-    light = light_of(world.weather, place.heading)
     camera_height = lens.extrinsics.height
 
     radiance = torch.zeros(1, 3, height * width)
-    depth, _ = ground_hit(alignment, camera_height, drop)
+    depth, slope = ground_hit(alignment, camera_height, drop)
     depth = torch.where(depth < _GROUND_LIMIT, depth, math.inf)
     blocked = torch.full_like(depth, math.inf)
 
     above = depth[0].isinf().nonzero()[:, 0]
     radiance[:, :, above] = _sky(world, place, light, swing[:, above], -drop[:, above])
     below = depth[0].isfinite().nonzero()[:, 0]
-    slope = ground_hit(alignment, camera_height, drop[:, below])[1]
     ground = _ground(
         place,
         alignment,
         swing[:, below],
         drop[:, below],
         depth[:, below],
-        slope,
+        slope[:, below],
         steps.flatten(2)[:, :, below],
     )
     lit = _ground_radiance(
@@ -107,7 +113,7 @@ def paint_view(
         & (ground.across[0] > world.pavement.left)
         & (ground.across[0] < world.pavement.right)
     )
-    metered = lit.mean(1)[:, near].mean(1) if bool(near.any()) else lit.mean((1, 2))
+    road_level = lit.mean(1)[:, near].mean(1) if bool(near.any()) else lit.mean((1, 2))
     ahead = ground.across.new_zeros(1, height * width)
     ahead[:, below] = ground.across
     _add_walls(
@@ -129,7 +135,7 @@ def paint_view(
         world.weather.visibility,
     )
     nearest = ground.z.amin(1).clamp(0.8, 8.0) if len(below) else torch.full((1,), 3.0)
-    return Painted(radiance, blocked, metered, nearest)
+    return Painted(radiance, blocked, road_level, nearest)
 
 
 def _sky(world: World, place: Place, light: Light, swing: Tensor, rise: Tensor) -> Tensor:
@@ -206,7 +212,7 @@ def _gloss(
     sun = (swing * light.sun[:, 0:1] + drop * light.sun[:, 1:2] + light.sun[:, 2:3]) * norm
     sparkle = 0.35 * sun.clamp(min=0) ** 24 * sunlit
     puddles = smoothstep(-0.5, 1.2, sample_noise(CLOUD, ground.along / 80.0, ground.across / 30.0))
-    mirror = world.pavement.wet[:, None] * (0.12 + 0.5 * (1 - drop * norm) ** 8) * (0.35 + 0.65 * puddles)
+    mirror = world.pavement.wet[:, None] * (0.05 + 0.3 * (1 - drop * norm) ** 8) * (0.35 + 0.65 * puddles)
     sky = world.surroundings.skyline[..., None]
     shine = light.direct[..., None] * (sparkle * (0.4 + world.pavement.wet[:, None]))[:, None]
     return shine + sky * (mirror * (0.3 + 0.7 * open_sky))[:, None]
@@ -234,38 +240,30 @@ def _shadows(world: World, light: Light, ground: _Ground, solids: Solids) -> tup
 
 
 def _vehicle_shadows(light: Light, ground: _Ground, solids: Solids) -> tuple[Tensor, Tensor]:
-    casts = (solids.valid & (solids.kind <= 1)).nonzero()[:, 1]
+    """What vehicles leave of the sun (a swept rectangle) and of the sky (dark below them), (1, N) both."""
     lit, contact = torch.ones_like(ground.z), torch.ones_like(ground.z)
-    near = (ground.z[0] < 260).nonzero()[:, 0]
-    x, z, soft = ground.x[:, near], ground.z[:, near], 0.08 + ground.reach_along[:, near]
-    dark, touch = torch.ones_like(x), torch.ones_like(x)
-    climb = light.sun[:, 1, None].clamp(min=0.12)
-    for m in casts.tolist():
-        heading = solids.heading[:, m, None]
-        sin, cos = heading.sin(), heading.cos()
-        dx, dz = x - solids.x[:, m, None], z - solids.z[:, m, None]
-        reach = (dx.abs() + dz.abs()) < 45
-        part = reach[0].nonzero()[:, 0]
+    climb = light.sun[:, 1].clamp(min=0.12)
+    for m in (solids.valid & (solids.kind <= TRUCK) & (solids.z < 260)).nonzero()[:, 1].tolist():
+        shape = solids.shape[:, m]
+        half, rear, front = shape[:, 0, 0], shape[:, :, 2].amin(1), shape[:, :, 3].amax(1)
+        tall = shape[:, :, 7].amax(1) * 0.9
+        sin, cos = solids.heading[:, m].sin(), solids.heading[:, m].cos()
+        sun_x = (light.sun[:, 0] * cos - light.sun[:, 2] * sin) / climb * tall
+        sun_z = (light.sun[:, 0] * sin + light.sun[:, 2] * cos) / climb * tall
+        length = torch.hypot(sun_x, sun_z).clamp(min=0.5)
+        dx, dz = ground.x - solids.x[:, m], ground.z - solids.z[:, m]
+        part = (torch.maximum(dx.abs(), dz.abs()) < front + 2 + length)[0].nonzero()[:, 0]
         if not len(part):
             continue
-        dx, dz, blur = dx[:, part], dz[:, part], soft[:, part]
+        dx, dz, blur = dx[:, part], dz[:, part], 0.08 + ground.reach_along[:, part]
         right, ahead = dx * cos - dz * sin, dx * sin + dz * cos
-        shape = solids.shape[:, m]
-        half = shape[:, 0, 0, None]
-        rear, front = shape[:, :, 2].amin(1)[:, None], shape[:, :, 3].amax(1)[:, None]
-        tall = shape[:, :, 7].amax(1)[:, None] * 0.9
-        sun_x = (light.sun[:, 0:1] * cos - light.sun[:, 2:3] * sin) / climb * tall
-        sun_z = (light.sun[:, 0:1] * sin + light.sun[:, 2:3] * cos) / climb * tall
         low_x, high_x = _slab(right, sun_x, -half, half)
         low_z, high_z = _slab(ahead, sun_z, rear, front)
         enter = torch.maximum(low_x, low_z).clamp(min=0)
         leave = torch.minimum(high_x, high_z).clamp(max=1)
-        length = torch.hypot(sun_x, sun_z).clamp(min=0.5)
-        inside = ((leave - enter) * length / blur + 0.3).clamp(0, 1)
-        dark[:, part] *= 1 - inside
+        lit[:, part] *= 1 - ((leave - enter) * length / blur + 0.3).clamp(0, 1)
         gap = torch.maximum(right.abs() - half, torch.maximum(rear - ahead, ahead - front))
-        touch[:, part] *= 1 - 0.85 * smoothstep(0.45 + blur, -0.25, gap)
-    lit[:, near], contact[:, near] = dark, touch
+        contact[:, part] *= 1 - 0.85 * smoothstep(0.45 + blur, -0.25, gap)
     return lit, contact
 
 
@@ -301,8 +299,11 @@ def _add_walls(
         side = place_across.sign()
         tall = surroundings.wall_height[:, wall] * 1.5
         beyond = (across - surroundings.wall_across[:, wall, None]) * side[:, None] > 0
-        steepest = (tall - camera_height).clamp(min=0) / place_across.abs().clamp(min=0.5) * 3 + 0.02
-        sky = depth.isinf() & (-drop < steepest[:, None])
+        aside = place_across.abs().clamp(min=0.5)[:, None]
+        bent = (alignment.curvature.abs().amax(1)[:, None] / aside).sqrt()
+        outward = (swing * side[:, None]).clamp(min=0)  # on a bend the road turns towards its wall
+        steepest = (tall - camera_height).clamp(min=0)[:, None] * (1.3 * outward / aside + bent + 0.004)
+        sky = depth.isinf() & (-drop < steepest)
         part = ((beyond & depth.isfinite()) | sky)[0].nonzero()[:, 0]
         if not len(part):
             continue
@@ -328,8 +329,3 @@ def _add_walls(
         solid = alpha > 0.5
         depth[:, part] = torch.where(solid, torch.minimum(depth[:, part], z), depth[:, part])
         blocked[:, part] = torch.where(solid, torch.minimum(blocked[:, part], z), blocked[:, part])
-
-
-def layout_edge(layout: Layout) -> Tensor:
-    """(B,) m across of the last boundary."""
-    return layout.across.masked_fill(~layout.exists, 0.0).amax(1)

@@ -142,65 +142,60 @@ def sample_sensor(dice: Dice, weather: Weather, bright: Tensor) -> Sensor:
     )
 
 
-def add_bonnet(
-    radiance: Tensor, blocked: Tensor, sensor: Sensor, light: Light, sky: Tensor
-) -> tuple[Tensor, Tensor]:
-    """The own vehicle's bonnet at the bottom.
+def add_bonnet(radiance: Tensor, blocked: Tensor, sensor: Sensor, light: Light, sky: Tensor) -> None:
+    """Paint the own vehicle's bonnet at the bottom; changes radiance and blocked.
 
     Args:
-        radiance: (B, 3, H, W).
-        blocked: (B, H, W) m.
+        radiance: (1, 3, H, W).
+        blocked: (1, H, W) m.
         sensor: has the bonnet.
         light: falls on it.
-        sky: (B, 3) radiance that it reflects.
-
-    Returns:
-        Both with the bonnet in front.
+        sky: (1, 3) radiance that it reflects.
     """
     _, _, height, width = radiance.shape
-    y = torch.arange(height)[:, None] / height
+    top = int(height * (1 - float(sensor.bonnet))) - 1
+    y = torch.arange(top, height)[:, None] / height
     x = (torch.arange(width)[None] + 0.5) / width - 0.5
-    edge = 1 - sensor.bonnet[:, None, None] + 4 * sensor.bonnet_bow[:, None, None] * x * x
-    alpha = ((y - edge) * height + 0.5).clamp(0, 1) * (sensor.bonnet > 0)[:, None, None]
-    below = ((y - edge) / sensor.bonnet.clamp(min=0.02)[:, None, None]).clamp(0, 1)
-    lit = light.ambient + 0.6 * light.direct + 0.02
+    edge = 1 - sensor.bonnet + 4 * sensor.bonnet_bow * x * x
+    alpha = ((y - edge) * height + 0.5).clamp(0, 1)
+    below = ((y - edge) / sensor.bonnet.clamp(min=0.02)).clamp(0, 1)
     gloss = (0.30 - 0.22 * below + 0.05 * sample_noise(CLOUD, x * 0.5 + 0 * y, 0.2 * y + 0 * x)).clamp(0.02)
-    colour = sensor.bonnet_colour * lit
-    paint = (
-        colour[..., None, None] * (1.1 - 0.3 * below)[:, None] + gloss[:, None] * sky[..., None, None] * 0.5
-    )
-    mixed = radiance + (paint - radiance) * alpha[:, None]
-    return mixed, torch.where(alpha > 0.5, 0.0, blocked)
+    colour = sensor.bonnet_colour * (light.ambient + 0.6 * light.direct + 0.02)
+    paint = colour[..., None, None] * (1.1 - 0.3 * below) + gloss * sky[..., None, None]
+    part = radiance[:, :, top:]
+    part += (paint - part) * alpha
+    blocked[:, top:].masked_fill_(alpha > 0.5, 0.0)
 
 
-def expose(radiance: Tensor, sensor: Sensor, metered: Tensor) -> Tensor:
+def expose(radiance: Tensor, sensor: Sensor, road_level: Tensor) -> Tensor:
     """Linear radiance to display values before noise.
 
     Args:
-        radiance: (B, 3, H, W).
+        radiance: (1, 3, H, W).
         sensor: the camera.
-        metered: (B,) mean radiance of what the exposure is set for.
+        road_level: (1,) mean radiance of the road; the exposure is set for it, and less for all the rest.
 
     Returns:
-        (B, 3, H, W) in [0, 1].
+        (1, 3, H, W) in [0, 1].
     """
     _, _, height, width = radiance.shape
-    y = torch.arange(height)[:, None] / height - 0.5
-    x = torch.arange(width)[None] / width - 0.5
-    falloff = 1 - sensor.vignette[:, None, None] * 2 * (x * x + y * y)
-    gain = (sensor.exposure / metered.clamp(min=1e-4))[:, None] * sensor.tint
-    value = radiance * gain[..., None, None] * falloff[:, None]
-    veil = sensor.glare[:, None] * value.flatten(2).mean(2)
-    value = value + veil[..., None, None]
-    value = torch.where(
-        value > 0.6, 0.6 + 0.4 * (1 - torch.exp(-(value - 0.6) / 0.4)), value
-    )  # soft shoulder
-    value = value.clamp(min=0) ** (1 / 2.2)
-    middle = 0.45
-    value = middle * (value / middle).clamp(min=1e-4) ** sensor.contrast[:, None, None, None]
+    mean = radiance.mean((1, 2, 3))
+    metered = road_level.clamp(min=1e-4) ** 0.7 * mean.clamp(min=1e-4) ** 0.3
+    gain = (sensor.exposure / metered)[:, None] * sensor.tint
+    value = radiance * gain[..., None, None]
+    if bool(sensor.vignette > 0):
+        y = torch.arange(height)[:, None] / height - 0.5
+        x = torch.arange(width)[None] / width - 0.5
+        value *= 1 - sensor.vignette * 2 * (x * x + y * y)
+    value += sensor.glare * value.mean()
+    over = (value - 0.6).clamp(min=0)
+    value = value.clamp(1e-4, 0.6) + 0.4 * (1 - torch.exp(-over / 0.4))  # soft shoulder
+    # display gamma, then contrast about middle grey, in one power
+    middle, contrast = 0.45, sensor.contrast
+    value = value ** (contrast / 2.2) * middle ** (1 - contrast)
     grey = value.mean(1, keepdim=True)
-    value = grey + (value - grey) * sensor.saturation[:, None, None, None]
-    return (value + sensor.black[:, None, None, None]).clamp(0, 1)
+    value = grey + (value - grey) * sensor.saturation
+    return (value + sensor.black).clamp(0, 1)
 
 
 def blur(image: Tensor, std: Tensor) -> Tensor:

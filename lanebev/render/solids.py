@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from lanebev.render.lens import Lens
 
@@ -65,88 +66,83 @@ class Light(NamedTuple):
 
 
 class Hit(NamedTuple):
-    """First intersections, (..., N): ray parameter (infinite: none), face, which hexahedron, local point."""
+    """First intersections of N rays with things.
 
+    Attributes:
+        thing: (N,) int64.
+        pixel: (N,) int64, row-major.
+        share: (N,) of the pixel that the thing covers.
+        depth: (N,) m, Z.
+        face: (N,) int64.
+        upper: (N,) bool, the second hexahedron.
+    """
+
+    thing: Tensor
+    pixel: Tensor
+    share: Tensor
     depth: Tensor
     face: Tensor
     upper: Tensor
-    point: Tensor  # (N, 3) right, up, forward in the thing's frame, m
 
 
-def intersect_hexahedron(origin: Tensor, ray: Tensor, shape: Tensor) -> tuple[Tensor, Tensor]:
-    """Rays against hexahedra with sloping sides.
+def face_planes(solids: Solids, height: Tensor) -> tuple[Tensor, Tensor]:
+    """Planes of all faces, seen from the camera.
 
     Args:
-        origin: (N, 3) right, up, forward, m, in the hexahedron's frame.
-        ray: (N, 3).
-        shape: (N, 8), see :class:`Solids`.
+        solids: the things.
+        height: (B,) m, of the camera.
 
     Returns:
-        (N,) ray parameter of the entry, infinite where there is none, and (N,) int64 face.
+        (B, M, 2, 6, 3) outward normals (right, up, forward) in the road frame, not of unit length, and
+        (B, M, 2, 6) how far the camera lies inside of each plane, in lengths of its normal.
     """
-    wide_low, wide_high, rear_low, front_low, rear_high, front_high, low, high = shape.unbind(-1)
+    wide_low, wide_high, rear_low, front_low, rear_high, front_high, low, high = solids.shape.unbind(-1)
     tall = (high - low).clamp(min=1e-3)
-    up, climb = origin[:, 1] - low, ray[:, 1]
     side = (wide_low - wide_high) / tall
     front, rear = (front_low - front_high) / tall, (rear_high - rear_low) / tall
-    x, z = origin[:, 0], origin[:, 2]
-    room = torch.stack(  # distance to each plane, m
+    zero, one = torch.zeros_like(low), torch.ones_like(low)
+    right = torch.stack([one, -one, zero, zero, zero, zero], dim=-1)
+    up = torch.stack([side, side, front, rear, one, -one], dim=-1)
+    ahead = torch.stack([zero, zero, one, -one, zero, zero], dim=-1)
+    reach = torch.stack(
         [
-            wide_low - x - side * up,
-            wide_low + x - side * up,
-            front_low - z - front * up,
-            z - rear_low - rear * up,
-            tall - up,
-            up,
-        ]
+            wide_low + side * low,
+            wide_low + side * low,
+            front_low + front * low,
+            -rear_low + rear * low,
+            high,
+            -low,
+        ],
+        dim=-1,
     )
-    speed = torch.stack(  # approach of each plane per ray parameter
-        [
-            ray[:, 0] + side * climb,
-            -ray[:, 0] + side * climb,
-            ray[:, 2] + front * climb,
-            -ray[:, 2] + rear * climb,
-            climb,
-            -climb,
-        ]
-    )
-    speed = torch.where(speed.abs() < 1e-9, 1e-9, speed)
-    time = room / speed
-    entry, face = torch.where(speed < 0, time, -math.inf).max(0)
-    leave = torch.where(speed > 0, time, math.inf).amin(0)
-    hit = (entry < leave) & (entry > 0) & (high > low)
-    return torch.where(hit, entry, math.inf), face
+    sin, cos = solids.heading.sin()[..., None, None], solids.heading.cos()[..., None, None]
+    normal = torch.stack([right * cos + ahead * sin, up, ahead * cos - right * sin], dim=-1)
+    away = torch.stack([-solids.x, height[:, None] - solids.ground, -solids.z], dim=-1)
+    return normal, reach - (normal * away[:, :, None, None]).sum(-1)
 
 
-def cast(solids: Solids, index: Tensor, height: Tensor, ray: Tensor, margin: Tensor | None = None) -> Hit:
-    """Rays against one thing each.
+def cast(normal: Tensor, room: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
+    """Rays against one thing of one or two convex hexahedra.
 
     Args:
-        solids: the things, of one image.
-        index: (N,) thing of each ray.
-        height: (1,) m, camera height.
-        ray: (N, 2) right and up per metre forward, so the ray parameter is Z.
-        margin: (N,) per metre of distance: how much larger the things are taken to be.
+        normal: (S, 6, 3), see :func:`face_planes`.
+        room: (S, 6).
+        ray: (2, N) right and up per metre forward.
+
+    Returns:
+        (N,) Z of the entry, m, infinite where there is none; (N,) int64 face, plus 6 on the second one.
     """
-    heading, x, z, ground = (t[0] for t in (solids.heading, solids.x, solids.z, solids.ground))
-    sin, cos = heading.sin(), heading.cos()
-    origin = torch.stack([z * sin - x * cos, height - ground, -x * sin - z * cos], dim=1)
-    sin, cos = sin[index], cos[index]
-    ray = torch.stack([ray[:, 0] * cos - sin, ray[:, 1], ray[:, 0] * sin + cos], dim=1)
-    shape = solids.shape[0]
-    if margin is not None:
-        grow = shape.new_tensor([1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
-        exists = (shape[..., 7] > shape[..., 6])[..., None]
-        largest = z.clamp(min=0)[:, None, None] + 1.0
-        pixel = margin.max() if len(margin) else 0.0
-        shape = shape + grow * (largest * pixel) * exists
-    origin, shape = origin[index], shape[index]
-    lower, lower_face = intersect_hexahedron(origin, ray, shape[:, 0])
-    upper, upper_face = intersect_hexahedron(origin, ray, shape[:, 1])
-    is_upper = upper < lower
-    depth = torch.minimum(lower, upper)
-    point = origin + torch.where(depth.isfinite(), depth, 0.0)[:, None] * ray
-    return Hit(depth, torch.where(is_upper, upper_face, lower_face), is_upper, point)
+    flat = normal.flatten(0, 1)
+    speed = torch.addmm(flat[:, 2:], flat[:, :2], ray)  # (S·6, N) approach per metre forward
+    time = (room.flatten()[:, None] / speed).unflatten(0, room.shape)
+    enters = (speed < 0).unflatten(0, room.shape)
+    entry, face = time.masked_fill(~enters, -math.inf).max(1)
+    leave = time.masked_fill(enters, math.inf).amin(1)
+    entry = entry.masked_fill((entry >= leave) | (entry <= 0), math.inf)
+    if len(room) == 1:
+        return entry[0], face[0]
+    depth, which = entry.min(0)
+    return depth, face.gather(0, which[None])[0] + 6 * which
 
 
 def bounding_boxes(solids: Solids, lens: Lens, height: Tensor, size: tuple[int, int]) -> Tensor:
@@ -184,11 +180,15 @@ def bounding_boxes(solids: Solids, lens: Lens, height: Tensor, size: tuple[int, 
     return torch.cat([low_px, high_px], dim=-1).where(seen[..., None], 0.0).long()
 
 
-def shade(solids: Solids, index: Tensor, hit: Hit, light: Light) -> Tensor:
-    """Linear radiance of hit points, (N, 3)."""
+def shade(solids: Solids, hit: Hit, ray: Tensor, height: Tensor, light: Light) -> Tensor:
+    """Linear radiance of hit points, (N, 3), of rays (2, N) right and up per metre forward."""
+    index = hit.thing
     kind, colour = solids.kind[0, index], solids.colour[0, index]
     heading, shape = solids.heading[0, index], solids.shape[0, index, 0]
-    x, up, z = hit.point.unbind(-1)
+    right, ahead = ray[0] * hit.depth - solids.x[0, index], hit.depth - solids.z[0, index]
+    x = right * heading.cos() - ahead * heading.sin()
+    z = right * heading.sin() + ahead * heading.cos()
+    up = height + ray[1] * hit.depth - solids.ground[0, index]
     half_width, low, high = shape[:, 0], shape[:, 6], shape[:, 7]
     rear, front = shape[:, 2], shape[:, 3]
     vehicle, truck = kind <= TRUCK, kind == TRUCK
@@ -287,6 +287,48 @@ def _lettering(x: Tensor, up: Tensor, span: Tensor, colour: Tensor) -> Tensor:
     return torch.where(white[:, None], colour.new_tensor([0.6, 0.6, 0.6]), colour)
 
 
+def _hit_thing(
+    thing: int,
+    normal: Tensor,
+    room: Tensor,
+    box: tuple[int, int, int, int],
+    rays: Tensor,
+    steps: Tensor,
+    depth: Tensor,
+) -> Hit | None:
+    """Pixels of one thing inside its bounding box: one ray each inside, four along its outline."""
+    left, top, right, bottom = box
+    window = (slice(top, bottom), slice(left, right))
+    limit = depth[window].flatten() + 0.6
+    ray = rays[:, window[0], window[1]].flatten(1)
+    pixel_size = steps[:, window[0], window[1]].abs().amax()
+    distance = room.amin(-1, keepdim=True).abs().clamp(min=1.0, max=400.0)
+    z, face = cast(normal, room + 0.6 * pixel_size * distance, ray)
+    seen = (z < limit).view(1, 1, bottom - top, right - left)
+    if not bool(seen.any()):
+        return None
+    inner = -functional.max_pool2d(-seen.float(), 3, stride=1, padding=1)[0, 0].flatten()
+    inner_at, edge_at = inner.nonzero()[:, 0], (seen.flatten() & (inner == 0)).nonzero()[:, 0]
+    step = steps[:, window[0], window[1]].flatten(1)[:, edge_at]
+    fine = [ray[:, edge_at] + dx * step[:2] + dy * step[2:] for dx, dy in _SUBPIXELS]
+    fine_z, fine_face = (t.unflatten(0, (4, -1)) for t in cast(normal, room, torch.cat(fine, dim=1)))
+    hits = fine_z < limit[edge_at]
+    edge_z, nearest = fine_z.masked_fill(~hits, math.inf).min(0)
+    share = hits.float().mean(0)
+    some = share > 0
+    at = torch.cat([inner_at, edge_at[some]])
+    row, column = at // (right - left), at % (right - left)
+    face = torch.cat([face[inner_at], fine_face.gather(0, nearest[None])[0][some]])
+    return Hit(
+        thing=torch.full_like(at, thing),
+        pixel=(row + top) * rays.shape[2] + column + left,
+        share=torch.cat([torch.ones(len(inner_at)), share[some]]),
+        depth=torch.cat([z[inner_at], edge_z[some]]),
+        face=face % 6,
+        upper=face >= 6,
+    )
+
+
 def draw(
     image: Tensor,
     depth: Tensor,
@@ -315,59 +357,33 @@ def draw(
         haze: (1, 3) radiance of the air.
         visibility: (1,) m.
     """
-    rows, columns = image.shape[2:]
-    index, pixel = _covered_pixels(solids, lens, height, (rows, columns))
+    boxes = bounding_boxes(solids, lens, height, (image.shape[2], image.shape[3]))[0].tolist()
+    normal, room = face_planes(solids, height)
+    double = (solids.shape[0, :, 1, 7] > solids.shape[0, :, 1, 6]).tolist()
+    found = []
+    for m in solids.z[0].argsort(descending=True).tolist():
+        left, top, right, bottom = boxes[m]
+        if right <= left or bottom <= top:
+            continue
+        parts = 2 if double[m] else 1
+        hit = _hit_thing(m, normal[0, m, :parts], room[0, m, :parts], boxes[m], rays[0], steps[0], depth[0])
+        if hit is not None:
+            found.append(hit)
+    if not found:
+        return
     flat_image, flat_depth, flat_blocked = image[0].flatten(1), depth[0].flatten(), blocked[0].flatten()
-    ray = rays[0].flatten(1)[:, pixel].T
-    step = steps[0].flatten(1)[:, pixel].T
-    behind = flat_depth[pixel] + 0.6
-
-    near = cast(solids, index, height, ray, margin=step.abs().amax(1)).depth < behind
-    index, pixel, ray, step, behind = (t[near] for t in (index, pixel, ray, step, behind))
-    share = ray.new_zeros(len(index))
-    hit = Hit(share + math.inf, index * 0, share > 1, ray.new_zeros(len(index), 3))
-    for dx, dy in _SUBPIXELS:
-        one = cast(solids, index, height, ray + dx * step[:, :2] + dy * step[:, 2:])
-        seen = one.depth < behind
-        share = share + seen / len(_SUBPIXELS)
-        nearer = seen & (one.depth < hit.depth)
-        hit = Hit(*(_where(nearer, new, old) for new, old in zip(one, hit, strict=True)))
-
-    whole = share > 0.99  # hides what is behind it: no need to shade that
-    front = flat_depth.clone()
-    front.scatter_reduce_(0, pixel[whole], hit.depth[whole], "amin")
-    keep = (share > 0) & (hit.depth <= front[pixel] + 0.6)
-    index, pixel, share = index[keep], pixel[keep], share[keep]
-    hit = Hit(*(t[keep] for t in hit))
-    clear = torch.exp(-hit.depth / visibility)[:, None]
-    radiance = haze * (1 - clear) + shade(solids, index, hit, light) * clear
-
-    changes = (index.diff() != 0).nonzero()[:, 0] + 1  # entries of one thing are together, far ones first
-    bounds = [0, *changes.tolist(), len(index)]
-    for begin, end in zip(bounds, bounds[1:], strict=False):
-        here, part = pixel[begin:end], share[begin:end]
-        old = flat_image[:, here]
-        flat_image[:, here] = old + (radiance[begin:end].T - old) * part
-        covered = part > 0.4
-        solid, z = here[covered], hit.depth[begin:end][covered]
-        flat_depth[solid] = z
-        flat_blocked[solid] = torch.minimum(flat_blocked[solid], z)
-
-
-def _where(condition: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    return torch.where(condition[:, None] if new.ndim == 2 else condition, new, old)
-
-
-def _covered_pixels(
-    solids: Solids, lens: Lens, height: Tensor, size: tuple[int, int]
-) -> tuple[Tensor, Tensor]:
-    """Things, far to near, and the pixels of their bounding boxes: (N,) int64 both."""
-    boxes = bounding_boxes(solids, lens, height, size)[0]
-    order = solids.z[0].argsort(descending=True)
-    indices, pixels = [boxes.new_zeros(0)], [boxes.new_zeros(0)]
-    for m, (left, top, right, bottom) in zip(order.tolist(), boxes[order].tolist(), strict=True):
-        if right > left and bottom > top:
-            ys, xs = torch.arange(top, bottom), torch.arange(left, right)
-            pixels.append((ys[:, None] * size[1] + xs).flatten())
-            indices.append(torch.full_like(pixels[-1], m))
-    return torch.cat(indices), torch.cat(pixels)
+    lengths = [len(hit.pixel) for hit in found]
+    every = Hit(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+    local = rays[0].flatten(1)[:, every.pixel]
+    clear = torch.exp(-every.depth / visibility)[:, None]
+    radiance = haze * (1 - clear) + shade(solids, every, local, height, light) * clear
+    begin = 0
+    for length in lengths:
+        part = slice(begin, begin + length)
+        begin += length
+        at, share, z = every.pixel[part], every.share[part], every.depth[part]
+        old = flat_image[:, at]
+        flat_image[:, at] = old + (radiance[part].T - old) * share
+        solid = share > 0.4
+        flat_depth[at] = torch.where(solid, z, flat_depth[at])
+        flat_blocked[at] = torch.where(solid, torch.minimum(z, flat_blocked[at]), flat_blocked[at])

@@ -83,9 +83,9 @@ def sample_surroundings(dice: Dice, left: Tensor, right: Tensor, grey: Tensor) -
     colour = torch.where((kind == SLOPE)[..., None], earth, colour)
     colour = colour * dice.uniform(0.7, 1.3, NUM_WALLS, 1)
 
-    blue = torch.stack([dice.uniform(0.10, 0.26), dice.uniform(0.22, 0.40), dice.uniform(0.5, 0.8)], dim=1)
-    pale = torch.stack([dice.uniform(0.5, 0.85), dice.uniform(0.6, 0.85), dice.uniform(0.7, 0.95)], dim=1)
-    overcast = dice.uniform(0.55, 0.95, 1) * torch.tensor([0.97, 1.0, 1.03])
+    blue = torch.stack([dice.uniform(0.04, 0.12), dice.uniform(0.09, 0.19), dice.uniform(0.20, 0.36)], dim=1)
+    pale = torch.stack([dice.uniform(0.22, 0.42), dice.uniform(0.28, 0.42), dice.uniform(0.34, 0.46)], dim=1)
+    overcast = dice.uniform(0.3, 0.55, 1) * torch.tensor([0.97, 1.0, 1.03])
     mix = grey[:, None]
     verge = torch.where(dice.chance(0.5, 1, 1), dice.pick_from(GREENS, 2), dice.pick_from(EARTHS, 2))
     return Surroundings(
@@ -177,7 +177,7 @@ def _foliage(
     leaves = sample_noise(CLOUD, along / 33.0 + seed, up / 33.0)
     fine = sample_noise(GRAIN, along / 22.0, up / 22.0 + seed) / (1 + footprint / 0.15)
     top = height * (0.62 + 0.33 * outline).clamp(0.1, 1.4)
-    edge = (top - up) / height + 0.12 * leaves + 0.05 * fine
+    edge = (top - up) / height + 0.09 * leaves + 0.015 * fine
     alpha = smoothstep(-0.01, 0.02 + 0.5 * footprint / height, edge)
     light = 0.55 + 0.5 * (up / top.clamp(min=0.5)).clamp(0, 1) + 0.28 * leaves + 0.2 * fine
     trunk = kind == TREES

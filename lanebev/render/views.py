@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from lanebev.render.alignment import Alignment, build_alignment
-from lanebev.render.dice import Dice, join_rows, row_of
+from lanebev.render.dice import Dice, row_of
 from lanebev.render.frame import RenderedFrame
-from lanebev.render.lens import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
+from lanebev.render.lens import Lens, pixel_rays, sample_distortion, sample_extrinsics, sample_intrinsics
 from lanebev.render.paint import paint_view
 from lanebev.render.photometry import add_bonnet, add_noise, blur, compress, expose, light_of
 from lanebev.render.scene import Place, World, sample_course, sample_world
@@ -39,24 +39,34 @@ def render_place(
         ideal_sensor: leave out blur, noise and compression.
     """
     solids = place_solids(world.traffic, alignment, place.along, place.across, place.moved)
-    rows = []
-    for b in range(len(place.along)):  # one scene at a time: see paint_view
-        one = Lens(
-            lens.intrinsics[b : b + 1], lens.distortion[b : b + 1], lens.model, row_of(lens.extrinsics, b)
-        )
-        rows.append(
-            paint_view(row_of(world, b), row_of(place, b), row_of(alignment, b), one, row_of(solids, b), size)
-        )
-    painted = join_rows(rows)
-    radiance, blocked = painted.radiance, painted.blocked
-    sensor = world.sensor
     light = light_of(world.weather, place.heading)
-    radiance, blocked = add_bonnet(radiance, blocked, sensor, light, world.surroundings.skyline)
-    image = expose(radiance, sensor, painted.metered)
-    if not ideal_sensor:
-        image = blur(image, sensor.blur * size[1] / 640)
-        image = compress(add_noise(image, sensor, generator), sensor.jpeg)
-    return frame_truth(image, blocked, world.layout, place, alignment, lens, solids, painted.nearest)
+    rays, steps = pixel_rays(lens, size)
+    images, covers, nearest = [], [], []
+    for b in range(len(place.along)):  # one scene at a time: see paint_view
+        one, sensor, lamp = row_of(world, b), row_of(world.sensor, b), row_of(light, b)
+        cut = slice(b, b + 1)
+        lens_b = Lens(lens.intrinsics[cut], lens.distortion[cut], lens.model, row_of(lens.extrinsics, b))
+        painted = paint_view(
+            one,
+            row_of(place, b),
+            row_of(alignment, b),
+            lens_b,
+            row_of(solids, b),
+            lamp,
+            rays[cut],
+            steps[cut],
+        )
+        if bool(sensor.bonnet > 0):
+            add_bonnet(painted.radiance, painted.blocked, sensor, lamp, one.surroundings.skyline)
+        image = expose(painted.radiance, sensor, painted.road_level)
+        if not ideal_sensor:
+            image = blur(image, sensor.blur * size[1] / 640)
+            image = compress(add_noise(image, sensor, generator), sensor.jpeg)
+        images.append(image)
+        covers.append(painted.blocked)
+        nearest.append(painted.nearest)
+    image, blocked = torch.cat(images), torch.cat(covers)
+    return frame_truth(image, blocked, world.layout, place, alignment, lens, solids, torch.cat(nearest))
 
 
 def sample_place(dice: Dice, world: World, ego_lane: Tensor) -> Place:
