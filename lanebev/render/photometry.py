@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from lanebev.render.dice import Dice
 from lanebev.render.noise import CLOUD, sample_noise
@@ -198,18 +197,13 @@ def expose(radiance: Tensor, sensor: Sensor, road_level: Tensor) -> Tensor:
     return (value + sensor.black).clamp(0, 1)
 
 
-def blur(image: Tensor, std: Tensor) -> Tensor:
-    """Separable Gaussian blur of (B, C, H, W), standard deviation (B,) px, at most 3 px."""
-    batch, channels, height, width = image.shape
-    reach = int((2.5 * std.max()).ceil().clamp(1, 7))
-    offsets = torch.arange(-reach, reach + 1, dtype=image.dtype)
-    kernel = torch.exp(-0.5 * (offsets / std.clamp(min=0.05)[:, None]) ** 2)
-    kernel = (kernel / kernel.sum(1, keepdim=True)).repeat_interleave(channels, 0)  # (B·C, 2·reach + 1)
-    flat = image.reshape(1, batch * channels, height, width)
-    flat = functional.pad(flat, (reach, reach, reach, reach), mode="replicate")
-    flat = functional.conv2d(flat, kernel[:, None, None], groups=batch * channels)
-    flat = functional.conv2d(flat, kernel[:, None, :, None], groups=batch * channels)
-    return flat.reshape(batch, channels, height, width)
+def blur(image: Tensor, std: float) -> Tensor:
+    """Gaussian blur of one image, (1, 3, H, W), standard deviation in px; none below 0.2 px."""
+    if std < 0.2:
+        return image
+    pixels = image[0].permute(1, 2, 0).contiguous().numpy()
+    blurred = cv2.GaussianBlur(pixels, (0, 0), std, borderType=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(blurred).permute(2, 0, 1)[None]
 
 
 def add_noise(image: Tensor, sensor: Sensor, generator: torch.Generator) -> Tensor:

@@ -60,7 +60,7 @@ def render_place(
             add_bonnet(painted.radiance, painted.blocked, sensor, lamp, one.surroundings.skyline)
         image = expose(painted.radiance, sensor, painted.road_level)
         if not ideal_sensor:
-            image = blur(image, sensor.blur * size[1] / 640)
+            image = blur(image, float(sensor.blur) * size[1] / 640)
             image = compress(add_noise(image, sensor, generator), sensor.jpeg)
         images.append(image)
         covers.append(painted.blocked)
