@@ -65,8 +65,7 @@ def track_direction(
     Returns:
         the step; a row that is neither supported nor started keeps its prediction.
     """
-    density = dt.new_full((2,), cfg.angular_acceleration_density)
-    mean, cov = kalman.predict(state.direction, state.direction_cov, *kalman.constant_velocity(dt, density))
+    mean, cov = predict_direction(state, dt, cfg)
     normals = torch.linalg.cross(rays[:, :, 0], rays[:, :, 1])
 
     residual, jacobian, noise = incidence(mean, normals, rays, segments.sigma, intrinsics)
@@ -81,21 +80,38 @@ def track_direction(
     supported = is_supported(segments, inliers, cfg)
 
     tracking = (state.status == Status.TRACKING) | (state.status == Status.COASTING)
-    start = ~tracking | (~supported & (state.unseen + dt > cfg.reacquire_after))
+    # After a gap the prediction is too wide to tell right segments from wrong: search instead of gating.
+    spread = cov[:, :2, :2].diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()
+    start = ~tracking | (state.unseen + dt > cfg.reacquire_after) | (spread > cfg.reacquire_spread)
     started = start_direction(segments, rays, normals, intrinsics, mean, start, draws, cfg)
     fresh = start & started.seen
     seen = torch.where(start, fresh, supported)
     inliers = torch.where(fresh.unsqueeze(-1), started.inliers, inliers * supported.unsqueeze(-1))
 
     use = segments.weight * inliers * (seen & ~fresh).unsqueeze(-1)
-    updated, updated_cov = kalman.update(mean, cov, *kalman.information(-residual, jacobian, noise, use))
-    # A start replaces the state; before the first one the state waits where it is.
-    waiting = (state.status == Status.UNINITIALISED) & ~seen
-    mean = torch.where(fresh.unsqueeze(-1), started.mean, updated)
-    cov = torch.where(fresh[:, None, None], started.cov, updated_cov)
-    mean = torch.where(waiting.unsqueeze(-1), state.direction, mean)
-    cov = torch.where(waiting[:, None, None], state.direction_cov, cov)
+    mean, cov = kalman.update(mean, cov, *kalman.information(-residual, jacobian, noise, use))
+    mean = torch.where(fresh.unsqueeze(-1), started.mean, mean)
+    cov = torch.where(fresh[:, None, None], started.cov, cov)
     return DirectionStep(mean, cov, inliers, seen, fresh)
+
+
+def predict_direction(state: TwoStageState, dt: Tensor, cfg: TwoStageConfig) -> tuple[Tensor, Tensor]:
+    """Constant velocity of pitch and yaw, for no longer than a gap of ``reacquire_after``.
+
+    Deviation: the paper extrapolates for ever; after a gap the pose holds still and only its sigma grows, up
+    to that of the initial guess.
+
+    Returns:
+        mean (B, 4) and covariance (B, 4, 4).
+    """
+    density = dt.new_full((2,), cfg.angular_acceleration_density)
+    moving = torch.minimum(dt, (cfg.reacquire_after - state.unseen).clamp_min(0.0))
+    tracking = (state.status == Status.TRACKING) | (state.status == Status.COASTING)
+    transition, _ = kalman.constant_velocity(torch.where(tracking, moving, 0.0), density)
+    _, noise = kalman.constant_velocity(torch.where(tracking, dt, 0.0), density)
+    mean, cov = kalman.predict(state.direction_mean, state.direction_cov, transition, noise)
+    limit = dt.new_tensor([*cfg.initial_pose_std[:2], *cfg.initial_rate_std[:2]]).square()
+    return mean, kalman.limit_variance(cov, limit)
 
 
 def is_supported(segments: LaneSegments, inliers: Tensor, cfg: TwoStageConfig) -> Tensor:

@@ -122,6 +122,20 @@ def constant_velocity(dt: Tensor, spectral_density: Tensor) -> tuple[Tensor, Ten
     return _kron(steps, eye), _kron(noise, torch.diag(spectral_density))
 
 
+def limit_variance(cov: Tensor, limit: Tensor) -> Tensor:
+    """Scale a covariance until no variance exceeds its limit, correlations kept.
+
+    Args:
+        cov: (..., D, D).
+        limit: (D,) variances.
+
+    Returns:
+        (..., D, D).
+    """
+    scale = (limit / cov.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30)).clamp_max(1.0).sqrt()
+    return cov * scale.unsqueeze(-1) * scale.unsqueeze(-2)
+
+
 def symmetrise(matrix: Tensor) -> Tensor:
     """The symmetric part, (M + Mᵀ) / 2."""
     return 0.5 * (matrix + matrix.mT)

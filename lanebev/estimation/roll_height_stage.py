@@ -102,17 +102,11 @@ def predict_roll_height(
     # What is not known yet stays at its prior; what was known and is not seen forgets at its noise.
     known = torch.stack([state.roll_known, state.height_known] * 2, dim=-1)
     known = known.unsqueeze(-1) & known.unsqueeze(-2)
-    mean, cov = kalman.predict(state.roll_height, state.roll_height_cov, transition, noise * known)
+    mean, cov = kalman.predict(state.roll_height_mean, state.roll_height_cov, transition, noise * known)
     limit = dt.new_tensor([*cfg.initial_pose_std[2:], *cfg.initial_rate_std[2:]]).square()
-    cov = _limit_variance(cov, limit)
+    cov = kalman.limit_variance(cov, limit)
     rates = torch.where(moving[:, 2:], 0.0, limit[2:])
     cov = cov + torch.cat([torch.zeros_like(rates), rates], dim=-1).diag_embed()
     # Without roll in the measurement, its correlation with height would still move it: cut it.
     together = moving.unsqueeze(-1) == moving.unsqueeze(-2)
     return mean, torch.where(together, cov, 0.0)
-
-
-def _limit_variance(cov: Tensor, limit: Tensor) -> Tensor:
-    """Scale a covariance until no variance exceeds its limit: not seeing is never worse than the prior."""
-    scale = (limit / cov.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30)).clamp_max(1.0).sqrt()
-    return cov * scale.unsqueeze(-1) * scale.unsqueeze(-2)

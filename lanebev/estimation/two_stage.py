@@ -35,7 +35,8 @@ class TwoStageConfig:
     initial_rate_std: tuple[float, float, float, float] = (0.2, 0.2, 0.2, 0.5)  # per second
     min_segments: int = 4  # for a vanishing point to be believed
     min_inlier_share: float = 0.3
-    reacquire_after: float = 0.2  # s of failing gates before the search starts over
+    reacquire_after: float = 0.2  # s without support before the search starts over
+    reacquire_spread: float = 0.013  # rad, sigma of the predicted direction at which it does, too
     lost_after: float = 1.5  # s without support
     lane_noise: float = 0.0  # m, how far single lanes differ from the prior
     lane_width_std: float = 0.0  # m, how far the prior itself may be off: a common scale of height
@@ -51,16 +52,16 @@ class TwoStageState(NamedTuple):
     """Everything the calibrator remembers, tensors only.
 
     Attributes:
-        direction: (B, 4) pitch, yaw and their rates; direction_cov: (B, 4, 4).
-        roll_height: (B, 4) roll, height and their rates; roll_height_cov: (B, 4, 4).
+        direction_mean: (B, 4) pitch, yaw and their rates; direction_cov: (B, 4, 4).
+        roll_height_mean: (B, 4) roll, height and their rates; roll_height_cov: (B, 4, 4).
         roll_known, height_known: (B,) bool, initialised from lane widths.
         unseen: (B,) s since the vanishing point was last supported.
         status: (B,) int64.
     """
 
-    direction: Tensor
+    direction_mean: Tensor
     direction_cov: Tensor
-    roll_height: Tensor
+    roll_height_mean: Tensor
     roll_height_cov: Tensor
     roll_known: Tensor
     height_known: Tensor
@@ -136,11 +137,15 @@ class TwoStageCalibrator(nn.Module):
         """
         check_segments(segments, intrinsics)
         segments = clean_segments(segments, self.config.num_boundaries)
-        dt = as_batch(dt, segments.sigma).nan_to_num(0.0).clamp(0.0, 60.0)
+        dt = as_batch(dt, segments.sigma)
+        dt = torch.where(dt.isfinite(), dt, 0.0).clamp(0.0, 60.0)
         widths = as_lane_width(lane_width, segments.sigma, self.config.num_boundaries)
         rays = rays_from_pixels(segments.endpoints.flatten(1, 2), intrinsics)
         rays = rays.reshape(*segments.endpoints.shape[:-1], 3)  # (B, N, 2, 3)
 
+        known = state.status != Status.UNINITIALISED
+        stale = known & (state.unseen + dt > self.config.lost_after)
+        state = state._replace(status=torch.where(stale, int(Status.LOST), state.status))
         one = track_direction(segments, rays, intrinsics, state, dt, self.draws, self.config)
         boundaries = boundary_angles(
             rays,
@@ -159,7 +164,7 @@ class TwoStageCalibrator(nn.Module):
         return self._calibration(state, widths, one.inliers * segments.weight), state
 
     def _calibration(self, state: TwoStageState, lane_width: Tensor, inliers: Tensor) -> Calibration:
-        pose = torch.cat([state.direction[:, :2], state.roll_height[:, :2]], dim=-1)
+        pose = torch.cat([state.direction_mean[:, :2], state.roll_height_mean[:, :2]], dim=-1)
         cov = torch.zeros(*pose.shape, 4, dtype=pose.dtype, device=pose.device)
         upper = torch.cat([state.direction_cov[:, :2, :2], cov[:, :2, 2:]], dim=-1)
         lower = torch.cat([cov[:, 2:, :2], state.roll_height_cov[:, :2, :2]], dim=-1)

@@ -1,0 +1,302 @@
+"""TwoStageCalibrator: accuracy, honesty, life cycle, and rows that mind their own business."""
+
+import itertools
+import math
+
+import pytest
+import torch
+
+from lanebev import Extrinsics, LaneSegments, Status, TwoStageCalibrator, image_from_road_points
+from lanebev.estimation.two_stage import TwoStageConfig
+from tools.reproduce_table1 import run, table
+from tools.synthetic import Experiment
+
+K = torch.tensor([[1000.0, 0, 640], [0, 1000, 360], [0, 0, 1]], dtype=torch.float64)
+POSE = (0.03, -0.02, 0.015, 1.45)
+
+
+def lanes(
+    pose=POSE, boundaries=(0, 1, 2, 3, 4, 5), per=8, noise=0.5, seed=0, width=3.7, offset=0.3, bend=0.0
+):
+    """LaneSegments (1, N) of boundaries seen from a pose, with pixel noise."""
+    generator = torch.Generator().manual_seed(seed)
+    index = torch.tensor(boundaries).repeat_interleave(per)
+    x = (index - 2.5) * width - offset
+    z = torch.rand(len(index), 2, generator=generator, dtype=torch.float64) * 10
+    z = z + torch.tensor([7.0, 25.0])
+    road = torch.stack([x[:, None] + 0.5 * bend * z * z, z], dim=-1).reshape(1, -1, 2)
+    extrinsics = Extrinsics(*(torch.tensor([v], dtype=torch.float64) for v in pose))
+    ends = image_from_road_points(road, K[None], extrinsics)[0].reshape(1, -1, 2, 2)
+    ends = ends + noise * torch.randn(ends.shape, generator=generator, dtype=torch.float64)
+    ones = torch.ones(1, len(index), dtype=torch.float64)
+    return LaneSegments(ends, index[None], ones, max(noise, 0.1) * ones)
+
+
+def nothing(n=48):
+    segments = lanes(per=n // 6)
+    return segments._replace(weight=segments.weight * 0)
+
+
+def rows(*parts):
+    """Rows of a batch, padded to the longest."""
+    longest = max(p.weight.shape[1] for p in parts)
+
+    def pad(value):
+        shape = (1, longest - value.shape[1], *value.shape[2:])
+        return torch.cat([value, torch.zeros(shape, dtype=value.dtype)], dim=1)
+
+    return LaneSegments(*(torch.cat([pad(v) for v in values]) for values in zip(*parts, strict=True)))
+
+
+def drive(calibrator, frames, dt=1 / 30, lane_width=3.7):
+    state = calibrator.initial_state(frames[0].weight.shape[0], dtype=torch.float64)
+    outputs = []
+    for segments in frames:
+        k = K.expand(segments.weight.shape[0], 3, 3)
+        calibration, state = calibrator(segments, k, state, dt, lane_width)
+        outputs.append(calibration)
+    return outputs, state
+
+
+def finite(calibration):
+    return calibration.extrinsics.stack().isfinite().all() and calibration.covariance.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    "pose", list(itertools.product((-0.05, 0.05), (-0.08, 0.08), (-0.1, 0.1), (1.0, 2.2)))
+)
+def test_one_exact_frame_gives_the_pose_over_all_signs(pose):
+    outputs, _ = drive(TwoStageCalibrator(), [lanes(pose, noise=0.0)])
+    assert outputs[0].extrinsics.stack()[0].tolist() == pytest.approx(pose, abs=1e-6)
+    assert outputs[0].status.tolist() == [Status.TRACKING]
+
+
+def test_table_one_fast():
+    exp = Experiment(num_frames=60, segments_per_boundary=30)
+    for row in table(run(TwoStageCalibrator(), exp, 4, torch.float64, 0)):
+        assert all(h <= p for h, p in zip(row["here"], row["paper"], strict=True)), row
+        assert 0.7 < row["nees_per_dof"] < 1.4
+        assert row["tracking"] == 1.0
+
+
+def test_invariant_to_order_and_end_point_swap():
+    segments = lanes()
+    order = torch.randperm(48, generator=torch.Generator().manual_seed(2))
+    swapped = LaneSegments(*(v[:, order] for v in segments))
+    swapped = swapped._replace(endpoints=swapped.endpoints.flip(2))
+    a, _ = drive(TwoStageCalibrator(), [segments] * 3)
+    b, _ = drive(TwoStageCalibrator(), [swapped] * 3)
+    torch.testing.assert_close(a[-1].extrinsics.stack(), b[-1].extrinsics.stack(), atol=1e-9, rtol=0)
+
+
+DEGENERATE = {
+    "one lane": lanes(boundaries=(2, 3)),
+    "one boundary": lanes(boundaries=(2,)),
+    "empty": nothing(),
+    "nan": lanes()._replace(endpoints=lanes().endpoints * torch.nan),
+    "duplicates": LaneSegments(*(v[:, :1].repeat(1, 48, *([1] * (v.ndim - 2))) for v in lanes())),
+    "points": lanes()._replace(endpoints=lanes().endpoints[:, :, :1].repeat(1, 1, 2, 1)),
+    "wrong index": lanes()._replace(boundary=lanes().boundary + 40),
+    "far out": lanes()._replace(endpoints=lanes().endpoints * 1e30),
+    "no sigma": lanes()._replace(sigma=lanes().sigma * 0),
+}
+
+
+@pytest.mark.parametrize("kind", sorted(DEGENERATE))
+def test_bad_rows_give_a_status_and_finite_numbers_and_touch_no_other(kind):
+    good, bad = [lanes(seed=s) for s in range(4)], DEGENERATE[kind]
+    alone, _ = drive(TwoStageCalibrator(), good)
+    beside, _ = drive(TwoStageCalibrator(), [rows(bad, g, bad) for g in good])
+    for a, b in zip(alone, beside, strict=True):
+        assert finite(b)
+        torch.testing.assert_close(a.extrinsics.stack()[0], b.extrinsics.stack()[1], atol=1e-10, rtol=0)
+        torch.testing.assert_close(a.covariance[0], b.covariance[1], atol=1e-12, rtol=1e-6)
+        assert a.status[0] == b.status[1]
+    seen = kind == "one lane"
+    assert (beside[-1].status[0] == Status.TRACKING) == seen
+    if not seen:
+        assert beside[-1].inliers[0].sum() == 0
+
+
+def test_bad_rows_carry_no_nan_gradient():
+    segments = rows(lanes(), DEGENERATE["nan"], DEGENERATE["one boundary"])
+    ends = segments.endpoints.detach().clone().requires_grad_()
+    calibrator = TwoStageCalibrator()
+    state = calibrator.initial_state(3, dtype=torch.float64)
+    for _ in range(2):
+        out, state = calibrator(segments._replace(endpoints=ends), K.expand(3, 3, 3), state, 1 / 30)
+    (out.extrinsics.stack().sum() + out.covariance.sum()).backward()
+    assert ends.grad.isfinite().all()
+    assert ends.grad[0].abs().sum() > 0
+
+
+def test_gradcheck_through_start_and_update():
+    segments = lanes(per=3)
+    calibrator = TwoStageCalibrator()
+
+    def forward(ends, sigma):
+        state = calibrator.initial_state(1, dtype=torch.float64)
+        moved = segments._replace(endpoints=ends, sigma=sigma)
+        for _ in range(2):
+            calibration, state = calibrator(moved, K[None], state, 1 / 30)
+        return calibration.extrinsics.stack()
+
+    inputs = (segments.endpoints.requires_grad_(), segments.sigma.requires_grad_())
+    assert torch.autograd.gradcheck(forward, inputs, eps=1e-5, atol=1e-6, rtol=2e-3)
+
+
+def test_life_cycle_track_coast_lost_and_back():
+    calibrator = TwoStageCalibrator(lost_after=0.5)
+    frames = [nothing()] * 2 + [lanes(seed=s) for s in range(10)] + [nothing()] * 30
+    outputs, state = drive(calibrator, frames)
+    statuses = [int(o.status[0]) for o in outputs]
+    assert statuses[:2] == [Status.UNINITIALISED] * 2
+    assert statuses[2:12] == [Status.TRACKING] * 10
+    assert statuses[12:26] == [Status.COASTING] * 14
+    assert statuses[-1] == Status.LOST
+    sigmas = torch.stack([o.covariance[0].diagonal() for o in outputs[12:26]])
+    assert (sigmas.diff(dim=0)[:, :2] > 0).all()
+    elsewhere = (-0.06, 0.05, -0.03, 1.7)  # found again without help, wherever the camera is now
+    out, state = calibrator(lanes(elsewhere), K[None], state, 1 / 30)
+    assert out.status.tolist() == [Status.TRACKING]
+    assert out.extrinsics.stack()[0].tolist() == pytest.approx(elsewhere, abs=0.02)
+
+
+def test_a_jump_is_reacquired():
+    calibrator = TwoStageCalibrator()
+    before, after = (0.0, 0.0, 0.0, 1.5), (0.12, -0.1, 0.0, 1.5)
+    frames = [lanes(before, seed=s) for s in range(5)] + [lanes(after, seed=s) for s in range(15)]
+    outputs, _ = drive(calibrator, frames)
+    assert outputs[-1].status.tolist() == [Status.TRACKING]
+    assert outputs[-1].extrinsics.stack()[0].tolist() == pytest.approx(after, abs=0.01)
+
+
+def test_one_lane_never_moves_roll_and_says_so():
+    calibrator = TwoStageCalibrator()
+    frames = [lanes(seed=s) for s in range(10)]
+    frames += [lanes(boundaries=(2, 3), per=24, seed=s, noise=2.0) for s in range(60)]
+    outputs, _ = drive(calibrator, frames)
+    rolls = torch.stack([o.extrinsics.roll[0] for o in outputs])
+    assert (rolls[10:] == rolls[9]).all()
+    spread = torch.stack([o.covariance[0, 2, 2].sqrt() for o in outputs])
+    assert (spread[10:].diff() >= 0).all()
+    assert spread[-1] > 10 * spread[9]
+    assert abs(float(outputs[-1].extrinsics.height[0]) - POSE[3]) < 0.05
+    never, _ = drive(calibrator, [lanes(boundaries=(2, 3), per=24, seed=s) for s in range(20)])
+    assert all(float(o.extrinsics.roll[0]) == 0.0 for o in never)
+    assert float(never[-1].covariance[0, 2, 2].sqrt()) == pytest.approx(0.05, rel=0.01)
+
+
+def test_gross_outliers_are_left_out():
+    generator = torch.Generator().manual_seed(3)
+    outputs = []
+    calibrator = TwoStageCalibrator()
+    state = calibrator.initial_state(1, dtype=torch.float64)
+    for seed in range(20):
+        good, wild = lanes(seed=seed), lanes(seed=seed + 100)
+        ends = wild.endpoints + 200 * torch.randn(wild.endpoints.shape, generator=generator).double()
+        both = LaneSegments(*(torch.cat(p, 1) for p in zip(good, wild._replace(endpoints=ends), strict=True)))
+        out, state = calibrator(both, K[None], state, 1 / 30)
+        outputs.append(out)
+    assert outputs[-1].extrinsics.stack()[0].tolist() == pytest.approx(POSE, abs=0.01)
+    assert outputs[-1].inliers[0, :48].mean() > 0.9
+    assert outputs[-1].inliers[0, 48:].mean() < 0.2
+
+
+@pytest.mark.parametrize("dt", [0.0, -1.0, 30.0, float("nan"), float("inf")])
+def test_strange_time_steps_are_survived(dt):
+    calibrator = TwoStageCalibrator()
+    outputs, state = drive(calibrator, [lanes(seed=s) for s in range(3)])
+    out, _ = calibrator(lanes(seed=9), K[None], state, dt)
+    assert finite(out)
+    assert out.extrinsics.stack()[0].tolist() == pytest.approx(POSE, abs=0.01)
+
+
+@pytest.mark.parametrize("width", [3.5, torch.tensor([3.5]), torch.full((1, 5), 3.5)])
+def test_lane_width_scales_height_and_per_lane_widths_are_taken(width):
+    outputs, _ = drive(TwoStageCalibrator(), [lanes(noise=0.0, width=3.5)] * 2, lane_width=width)
+    assert float(outputs[-1].extrinsics.height[0]) == pytest.approx(POSE[3], abs=1e-5)
+    wrong, _ = drive(TwoStageCalibrator(), [lanes(noise=0.0, width=3.5)] * 2)
+    assert float(wrong[-1].extrinsics.height[0]) == pytest.approx(POSE[3] * 3.7 / 3.5, abs=1e-5)
+
+
+def test_lane_width_uncertainty_reaches_the_covariance():
+    plain, _ = drive(TwoStageCalibrator(), [lanes()] * 3)
+    unsure, _ = drive(TwoStageCalibrator(lane_width_std=0.1), [lanes()] * 3)
+    added = unsure[-1].covariance[0, 3, 3] - plain[-1].covariance[0, 3, 3]
+    assert float(added.sqrt()) == pytest.approx(float(plain[-1].extrinsics.height[0]) * 0.1 / 3.7, rel=1e-6)
+
+
+def test_documented_bias_on_a_curve():
+    """PAPER_NOTES 17: the paper assumes a straight road; R = 860 m costs about a degree of yaw."""
+    outputs, _ = drive(TwoStageCalibrator(), [lanes((0.0, 0.0, 0.0, 1.5), noise=0.0, bend=1 / 860)] * 5)
+    assert 0.7 < abs(math.degrees(float(outputs[-1].extrinsics.yaw[0]))) < 2.0
+
+
+def test_float32_follows_float64():
+    calibrator = TwoStageCalibrator()
+    states = [calibrator.initial_state(1, dtype=d) for d in (torch.float32, torch.float64)]
+    for seed in range(30):
+        segments = lanes(seed=seed)
+        results = []
+        for i, dtype in enumerate((torch.float32, torch.float64)):
+            cast = LaneSegments(*(v.to(dtype) if v.is_floating_point() else v for v in segments))
+            out, states[i] = calibrator(cast, K[None].to(dtype), states[i], 1 / 30)
+            results.append(out)
+        gap = (results[0].extrinsics.stack().double() - results[1].extrinsics.stack())[0]
+        assert (gap.abs() < 0.05 * results[1].covariance[0].diagonal().sqrt()).all()
+
+
+def test_export_equals_eager():
+    calibrator = TwoStageCalibrator()
+    state = calibrator.initial_state(2, dtype=torch.float64)
+    segments = rows(lanes(seed=0), lanes(seed=1))
+
+    class Step(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.calibrator = calibrator
+
+        def forward(self, segments, intrinsics, state, dt):
+            return self.calibrator(segments, intrinsics, state, dt)
+
+    dt = torch.full((2,), 1 / 30, dtype=torch.float64)
+    args = (segments, K.expand(2, 3, 3).contiguous(), state, dt)
+    exported = torch.export.export(Step(), args).module()
+    for _ in range(3):
+        (a, next_a), (b, next_b) = exported(*args), Step()(*args)
+        torch.testing.assert_close(a.extrinsics.stack(), b.extrinsics.stack())
+        torch.testing.assert_close(next_a.roll_height_cov, next_b.roll_height_cov)
+        args = (segments, args[1], type(state)(*next_b), dt)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"endpoints": torch.zeros(8, 30, 4)},
+            r"segments.endpoints: expected \(B, N, 2, 2\), got \(8, 30, 4\)",
+        ),
+        ({"weight": torch.zeros(1, 3)}, r"segments.weight: expected \(1, 48\)"),
+        ({"boundary": torch.zeros(1, 48)}, "segments.boundary: expected int64 indices"),
+    ],
+)
+def test_shapes_are_checked(change, message):
+    calibrator = TwoStageCalibrator()
+    with pytest.raises(ValueError, match=message):
+        calibrator(lanes()._replace(**change), K[None], calibrator.initial_state(1), 1 / 30)
+
+
+def test_arguments_are_checked():
+    calibrator = TwoStageCalibrator()
+    state = calibrator.initial_state(1, dtype=torch.float64)
+    with pytest.raises(ValueError, match="lane_width: expected a positive width"):
+        calibrator(lanes(), K[None], state, 1 / 30, -3.7)
+    with pytest.raises(ValueError, match=r"lane_width: expected a float, \(1,\) or \(1, 5\), got \(1, 3\)"):
+        calibrator(lanes(), K[None], state, 1 / 30, torch.ones(1, 3))
+    with pytest.raises(ValueError, match=r"intrinsics: expected \(1, 3, 3\)"):
+        calibrator(lanes(), K, state, 1 / 30)
+    with pytest.raises(TypeError, match="no_such_number"):
+        TwoStageCalibrator(no_such_number=1)
+    with pytest.raises(ValueError, match="num_boundaries: expected at least 2"):
+        TwoStageConfig(num_boundaries=1)
