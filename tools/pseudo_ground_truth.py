@@ -1,0 +1,157 @@
+"""The paper's pseudo ground truth: extrinsics of every frame alone, from annotated lanes.
+
+    python -m tools.pseudo_ground_truth LANES --camera camera.yaml --out pseudo.csv
+
+Source: Sec. VI-C. Pitch and yaw minimise Eq. (14) over the frame's segments, roll and height then Eq. (23);
+no filter, so a frame knows nothing of its neighbours. With --estimate, the root-mean-square difference of a
+run's extrinsics.csv to it is printed and both are drawn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lanebev import Camera, Extrinsics, LaneSegments
+from lanebev.estimation.lane_width import boundary_angles, initial_roll_height
+from lanebev.estimation.vanishing import incidence_noise, vanishing_dir_least_squares
+from lanebev.geometry.road import great_circle_normals, rays_from_pixels
+from lanebev.geometry.rotation import pitch_yaw_from_vanishing_dir
+from lanebev.io.lane_rows import rows_from_lines, segments_from_rows
+from lanebev.io.lanes import read_lanes
+from lanebev.io.results import read_extrinsics
+from lanebev.types import NUM_BOUNDARIES
+
+COLUMNS = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
+
+
+class PseudoTruth(NamedTuple):
+    """Extrinsics each (B,), and what of them the frame's lanes determine."""
+
+    extrinsics: Extrinsics
+    direction_known: Tensor  # (B,) two boundaries
+    roll_known: Tensor  # (B,) two lanes
+    height_known: Tensor  # (B,) one lane
+
+
+def pseudo_ground_truth(
+    segments: LaneSegments, intrinsics: Tensor, lane_width: float, iterations: int = 10
+) -> PseudoTruth:
+    """Per-frame optimum of the paper's two measurements, annotated lanes taken as they are.
+
+    Args:
+        segments: (B, N) of annotated boundaries.
+        intrinsics: (B, 3, 3) px.
+        lane_width: m.
+        iterations: of re-weighting by distance to the vanishing point.
+
+    Returns:
+        the optimum, per row.
+    """
+    ends, boundary, weight, sigma = segments
+    batch = ends.shape[0]
+    normals = great_circle_normals(ends, intrinsics)
+    rays = rays_from_pixels(ends.flatten(1, 2), intrinsics).reshape(*ends.shape[:-1], 3)
+    forward = ends.new_tensor([0.0, 0.0, 1.0]).expand(batch, 3)
+    direction = forward
+    for _ in range(iterations):
+        noise = incidence_noise(rays, direction, sigma, intrinsics)
+        direction, _ = vanishing_dir_least_squares(normals, noise, weight, forward)
+    pitch, yaw = pitch_yaw_from_vanishing_dir(direction)
+    angles = boundary_angles(rays, boundary, weight, sigma, intrinsics, pitch, yaw, NUM_BOUNDARIES)
+    prior = ends.new_full((batch, NUM_BOUNDARIES - 1), lane_width)
+    roll, height = initial_roll_height(angles, prior, torch.zeros_like(pitch), num_iterations=20)
+    lanes = (angles.present[:, 1:] & angles.present[:, :-1]).sum(-1)
+    return PseudoTruth(
+        Extrinsics(pitch, yaw, roll, height), angles.present.sum(-1) >= 2, lanes >= 2, lanes >= 1
+    )
+
+
+def as_table(truth: PseudoTruth) -> np.ndarray:
+    """(B, 4) in degrees and metres, NaN where the frame's lanes don't determine a value."""
+    values = truth.extrinsics.stack() * torch.tensor([180 / math.pi] * 3 + [1.0], dtype=torch.float64)
+    known = torch.stack(
+        [truth.direction_known, truth.direction_known, truth.roll_known, truth.height_known], -1
+    )
+    return torch.where(known, values, torch.nan).numpy()
+
+
+def plot(table: np.ndarray, estimate: np.ndarray | None, path: Path) -> None:
+    """Pseudo truth, and a run's estimate, of every frame."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(4, 1, figsize=(11, 8), sharex=True)
+    for axis, name, column in zip(axes, COLUMNS, range(4), strict=True):
+        axis.plot(table[:, column], "k.", ms=3, label="pseudo ground truth, each frame alone")
+        if estimate is not None:
+            axis.plot(estimate[:, column], color="tab:blue", lw=1, label="estimate")
+        axis.set_ylabel(name.replace("_", " (") + ")")
+        axis.grid(alpha=0.3)
+    axes[0].legend(fontsize=8)
+    axes[-1].set_xlabel("frame")
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("lanes", type=Path, help="TuSimple JSON lines, CULane .lines.txt or OpenLane JSON")
+    parser.add_argument("--camera", type=Path, required=True)
+    parser.add_argument("--lane-width", type=float, default=3.7, help="m")
+    parser.add_argument("--estimate", type=Path, help="extrinsics.csv of a run over the same frames")
+    parser.add_argument("--out", type=Path, default=Path("out/pseudo_ground_truth.csv"))
+    args = parser.parse_args()
+    try:
+        camera = Camera.from_file(args.camera)
+        frames = read_lanes(args.lanes)
+        rows = [rows_from_lines(frame.lines, camera) for frame in frames]
+        estimate = None
+        if args.estimate:
+            read = read_extrinsics(args.estimate)
+            if len(read) != len(frames):
+                raise ValueError(
+                    f"--estimate: expected {len(frames)} rows like {args.lanes}, got {len(read)}"
+                )
+            estimate = np.array([[getattr(row, name) for name in COLUMNS] for row in read])
+    except ValueError as error:
+        print(f"pseudo_ground_truth: {error}", file=sys.stderr)
+        return 2
+    segments = segments_from_rows(rows, camera)
+    intrinsics = camera.intrinsics.expand(len(frames), 3, 3)
+    table = as_table(pseudo_ground_truth(segments, intrinsics, args.lane_width))
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    with args.out.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("frame", *COLUMNS, "image"))
+        for number, (values, frame) in enumerate(zip(table, frames, strict=True)):
+            cells = ("" if math.isnan(v) else f"{v:.6f}" for v in values)
+            writer.writerow((number, *cells, frame.name))
+    plot(table, estimate, args.out.with_suffix(".png"))
+    print(
+        f"{len(table)} frames; median "
+        + ", ".join(f"{n} {m:.3f}" for n, m in zip(COLUMNS, np.nanmedian(table, 0), strict=True))
+    )
+    if estimate is not None:
+        rms = np.sqrt(np.nanmean((estimate - table) ** 2, axis=0))
+        print(
+            "rms difference of the estimate: "
+            + ", ".join(f"{n} {r:.3f}" for n, r in zip(COLUMNS, rms, strict=True))
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
