@@ -93,7 +93,8 @@ def plot_widths(
         low, high = np.percentile(both, [1, 99])
         margin = max(0.15 * (high - low), 0.2)
         axes[0].set_ylim(min(low, lane_width) - margin, max(high, lane_width) + margin)
-        axes[1].legend(title="lane", loc="upper right", ncols=3, fontsize=8, title_fontsize=8, frameon=False)
+        seen = axes[1] if np.isfinite(after).any() else axes[0]
+        seen.legend(title="lane", loc="upper right", ncols=3, fontsize=8, title_fontsize=8, frameon=False)
     axes[0].set_ylabel("lane width (m)")
     return _png(figure)
 

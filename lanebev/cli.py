@@ -1,0 +1,86 @@
+"""The command line: arguments, nothing else."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any, NoReturn
+
+DESCRIPTION = "Online camera-to-road calibration from lane boundaries, and a stable bird's-eye view."
+CAMERA_HELP = "OpenCV or ROS camera_info YAML, KITTI calib.txt, or YAML of fx fy cx cy width height"
+SOURCE_HELP = "a video, a folder of images, a quoted glob ('DIR/**/*.jpg'), or one image"
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {message}; see {self.prog} --help\n")
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of ``lanebev``."""
+    top = _Parser(prog="lanebev", description=DESCRIPTION, allow_abbrev=False)
+    commands = top.add_subparsers(dest="command", required=True, metavar="{demo,run}")
+    demo = commands.add_parser("demo", help="a rendered drive end to end", allow_abbrev=False)
+    demo.add_argument("--out", default="lanebev-demo", metavar="DIR", help="output folder (%(default)s)")
+    run = commands.add_parser("run", help="calibrate on images or a video", allow_abbrev=False)
+    run.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
+    run.add_argument("--camera", required=True, metavar="FILE",
+                     help=CAMERA_HELP)  # fmt: skip
+    run.add_argument("--lane-width", type=float, default=3.7, metavar="M", help="metres (%(default)s)")
+    run.add_argument("--lanes", metavar="FILE",
+                     help="lanes of another detector: TuSimple JSON lines, CULane .lines.txt, OpenLane JSON, "
+                     "or a folder of them")  # fmt: skip
+    run.add_argument("--stills", action="store_true", help="every image on its own, not frames of a drive")
+    run.add_argument("--out", default="lanebev-out", metavar="DIR", help="output folder (%(default)s)")
+    run.add_argument("--resume", metavar="DIR", help="begin with the state that a run left in this folder")
+    run.add_argument("--calibrator", default="joint", choices=("joint", "two-stage"),
+                     help="two-stage is the paper's (%(default)s)")  # fmt: skip
+    run.add_argument("--fps", type=float, default=30.0, metavar="HZ",
+                     help="frame rate of a folder or glob; a video knows its own (%(default)g)")  # fmt: skip
+    return top
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; 0 when it is done, 2 with one line on bad input, 130 when interrupted."""
+    options = vars(parser().parse_args(arguments))
+    command = options.pop("command")
+    try:
+        report = _run(options) if command == "run" else _demo(options)
+    except (ValueError, OSError) as error:
+        print(f"lanebev {command}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"lanebev {command}: interrupted, nothing written", file=sys.stderr)
+        return 130
+    print(report)
+    return 0
+
+
+def _run(options: dict[str, Any]) -> str:
+    from lanebev.run import RunConfig, run, summary
+
+    config = RunConfig(**options)
+    return summary(run(config, _progress("calibrating")), config)
+
+
+def _demo(options: dict[str, Any]) -> str:
+    from lanebev.demo import demo
+
+    return str(demo(options["out"], _progress))
+
+
+def _progress(label: str) -> Any:
+    """A progress bar on stderr; on anything but a terminal it stays silent."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    def follow(items: Iterator[Any], total: int) -> Iterator[Any]:
+        columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        console = Console(stderr=True)
+        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+            yield from bar.track(items, total=total)
+
+    return follow

@@ -1,0 +1,255 @@
+"""The main job: frames in, extrinsics and a stable bird's-eye view out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from lanebev.geometry.camera import Camera
+from lanebev.io.cameras import read_camera
+from lanebev.io.lanes import read_lanes
+from lanebev.io.overlap import prefetch
+from lanebev.io.results import OutputFolder
+from lanebev.io.video import DEFAULT_FPS, Frame, FrameSource, open_source
+from lanebev.observers import LaneFileObserver, Observer
+from lanebev.report.measure import pose
+from lanebev.report.overlay import Picture
+from lanebev.report.page import Report
+from lanebev.report.recorder import Recorded, Recorder
+from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
+from lanebev.view.grid import BEVGrid
+from lanebev.view.warp import BEVWarp
+
+CALIBRATORS = ("joint", "two-stage")
+STILLS_FPS = Fraction(2)  # of the videos that show images one after another
+STILL_PASSES = 4  # updates on one image: the linearisation settles
+_NOMINAL_HEIGHT = 1.5  # m, of the view before anything is known
+
+Progress = Callable[[Iterator[Frame], int], Iterator[Frame]]
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What to run.
+
+    Attributes:
+        source: video, folder, glob or image.
+        camera: camera file.
+        out: output folder.
+        lane_width: m.
+        lanes: lane file or folder of another detector, None for the network.
+        stills: every image on its own.
+        resume: output folder of an earlier run whose state to begin with.
+        calibrator: one of CALIBRATORS.
+        fps: of a folder or glob; a video knows its own.
+    """
+
+    source: str
+    camera: str
+    out: str
+    lane_width: float = 3.7
+    lanes: str | None = None
+    stills: bool = False
+    resume: str | None = None
+    calibrator: str = "joint"
+    fps: float = float(DEFAULT_FPS)
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.lane_width) and 1.0 < self.lane_width < 10.0):
+            raise ValueError(f"lane width: expected 1 to 10 m, got {self.lane_width:g}")
+        if not (math.isfinite(self.fps) and 0.01 <= self.fps <= 10_000):
+            raise ValueError(f"fps: expected 0.01 to 10000 frames per second, got {self.fps:g}")
+        if self.calibrator not in CALIBRATORS:
+            raise ValueError(f"calibrator: expected {' or '.join(CALIBRATORS)}, got {self.calibrator!r}")
+        if self.stills and self.resume:
+            raise ValueError("resume: expected a drive, got --stills; images on their own have no state")
+
+
+def run(config: RunConfig, progress: Progress | None = None) -> Report:
+    """Run on all frames and write the output folder, all of it or nothing.
+
+    Args:
+        config: what to run.
+        progress: wraps the frames, told how many there are.
+
+    Returns:
+        what the report page shows.
+
+    Raises:
+        ValueError: bad input; one line says which and what would be right.
+    """
+    source = open_source(config.source, Fraction(config.fps).limit_denominator(1000))
+    camera = read_camera(config.camera, source.image_size)
+    check_image_size(camera, source)
+    observer = make_observer(config, source, camera)
+    calibrator = make_calibrator(config.calibrator)
+    state = calibrator.initial_state(1, dtype=torch.float64)
+    frames: Iterator[Frame] = prefetch(source)
+    frames = progress(frames, source.count) if progress else frames
+    warp = BEVWarp(BEVGrid())
+    with OutputFolder(config.out) as out, torch.inference_mode():
+        recorder = Recorder(
+            out.__truediv__,
+            camera,
+            warp.grid,
+            source.count,
+            STILLS_FPS if config.stills else source.fps,
+            config.lane_width,
+            source.is_single,
+            config.stills,
+        )
+        before = None
+        with recorder:
+            for frame in frames:
+                rows, segments = observer(frame)
+                calibration, state = calibrate(calibrator, segments, camera, state, frame, config)
+                before = pose_before(before, calibration, config.stills or source.is_single, camera)
+                recorder.add(
+                    Recorded(
+                        frame,
+                        frame.name or f"{Path(source.source).name}/{frame.number:06d}",
+                        rows,
+                        segments,
+                        calibration,
+                        before,
+                        bird_view(warp, frame, camera, before),
+                        bird_view(warp, frame, camera, calibration.extrinsics),
+                    )
+                )
+        return recorder.finish(run_facts(config, source, camera), Path(source.source).name)
+
+
+def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Observer:
+    """Lanes from a file if one is given, else from the network."""
+    if config.lanes:
+        return LaneFileObserver(read_lanes(config.lanes), source, camera)
+    raise ValueError("lanes: expected a lane file with --lanes")
+
+
+def make_calibrator(name: str) -> Any:
+    """The calibrator of this name with default settings."""
+    if name == "two-stage":
+        from lanebev.estimation.two_stage import TwoStageCalibrator
+
+        return TwoStageCalibrator()
+    from lanebev.estimation.joint import JointCalibrator
+
+    return JointCalibrator()
+
+
+def check_image_size(camera: Camera, source: FrameSource) -> None:
+    """The camera file must be for images of this size.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if camera.image_size != source.image_size:
+        (height, width), (rows, columns) = camera.image_size, source.image_size
+        raise ValueError(
+            f"camera: expected one for the source's {columns} x {rows} px, got one for {width} x {height}; "
+            "give the calibration of these images or resize them"
+        )
+
+
+def calibrate(
+    calibrator: nn.Module, segments: LaneSegments, camera: Camera, state: Any, frame: Frame, config: RunConfig
+) -> tuple[Calibration, Any]:
+    """One frame of a drive, or one image on its own with a fresh state."""
+    intrinsics = camera.intrinsics[None]
+    calibration: Calibration
+    if config.stills:
+        return calibrate_still(calibrator, segments, intrinsics, config.lane_width), state
+    calibration, state = calibrator(segments, intrinsics, state, frame.dt, config.lane_width)
+    return calibration, state
+
+
+def calibrate_still(
+    calibrator: nn.Module, segments: LaneSegments, intrinsics: Tensor, lane_width: float
+) -> Calibration:
+    """Several passes over images of their own, each pass with its share of the information.
+
+    Source: with the end points' variance times the number of passes, all passes together say as much as the
+    image does once (progressive update), so the covariance stays honest while the linearisation settles.
+
+    Args:
+        calibrator: any.
+        segments: B images.
+        intrinsics: (B, 3, 3).
+        lane_width: m.
+    """
+    initial_state: Any = calibrator.initial_state
+    state = initial_state(segments.sigma.shape[0], dtype=segments.sigma.dtype)
+    shared = segments._replace(sigma=segments.sigma * math.sqrt(STILL_PASSES))
+    for _ in range(STILL_PASSES):
+        calibration: Calibration
+        calibration, state = calibrator(shared, intrinsics, state, 1e-3, lane_width)
+    return calibration
+
+
+def pose_before(
+    before: Extrinsics | None, now: Calibration, alone: bool, camera: Camera
+) -> Extrinsics | None:
+    """Pose of the view before: level for images on their own, in a drive the first that was tracked."""
+    if alone:
+        return pose(0.0, 0.0, 0.0, _NOMINAL_HEIGHT, camera.intrinsics)
+    if before is None and int(now.status[0]) == Status.TRACKING:
+        return now.extrinsics
+    return before
+
+
+def bird_view(warp: BEVWarp, frame: Frame, camera: Camera, extrinsics: Extrinsics | None) -> Picture:
+    """(U, V, 3) uint8 RGB, black where the camera does not see, or nothing is known."""
+    if frame.image is None or extrinsics is None:
+        return np.zeros((*warp.grid.shape, 3), np.uint8)
+    image = torch.from_numpy(frame.image.copy()).permute(2, 0, 1)[None].float()
+    single = Extrinsics(*(value.float() for value in extrinsics))
+    intrinsics, distortion = camera.intrinsics[None].float(), camera.distortion[None].float()
+    bev: Tensor = warp(image, intrinsics, single, distortion, camera.model)[0][0]
+    picture: Picture = bev.permute(1, 2, 0).round().clamp(0, 255).byte().contiguous().numpy()
+    return picture
+
+
+def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[str, str]:
+    """What ran, for the report."""
+    from lanebev import __version__
+
+    height, width = camera.image_size
+    fx, fy = float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1])
+    kind = "images, each on its own" if config.stills else "frames"
+    rate = "" if config.stills or source.is_single else f" at {float(source.fps):g} fps"
+    return {
+        "source": f"{source.source} ({width} x {height})",
+        kind: f"{source.count}{rate}",
+        "camera": f"{config.camera}: {camera.model}, f = {fx:.1f} / {fy:.1f} px",
+        "lanes from": config.lanes or "the network",
+        "lane width": f"{config.lane_width:g} m",
+        "calibrator": config.calibrator,
+        "lanebev": __version__,
+    }
+
+
+def summary(report: Report, config: RunConfig) -> str:
+    """What to print when a run is done."""
+    tracking = [row for row in report.rows if row.status == "TRACKING"]
+    lines = [f"{len(report.rows)} frames, {len(tracking)} TRACKING"]
+    if tracking:
+        middle = {name: float(np.median([getattr(row, name) for row in tracking])) for name in _SHOWN}
+        values = "  ".join(f"{name.rsplit('_', 1)[0]} {middle[name]:+.3f} {_SHOWN[name]}" for name in _SHOWN)
+        lines.append(f"median  {values}")
+    lines += [f"{label}: {text}" for label, text in report.facts.items() if label.startswith("lane width σ")]
+    lines += [f"problem: {problem}" for problem in report.problems[:5]]
+    if len(report.problems) > 5:
+        lines.append(f"and {len(report.problems) - 5} more, see the report")
+    written = sorted(path.name for path in Path(config.out).iterdir())
+    return "\n".join([*lines, f"{config.out}: {', '.join(written)}"])
+
+
+_SHOWN = {"pitch_deg": "deg", "yaw_deg": "deg", "roll_deg": "deg", "height_m": "m"}

@@ -1,0 +1,256 @@
+"""The command line as a person uses it: outputs as promised, one clear line and status 2 on bad input."""
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from lanebev import Camera, image_from_road_points
+from lanebev.cli import main
+from lanebev.io.results import CSV_COLUMNS
+from lanebev.io.video import VideoWriter
+from lanebev.report.measure import pose
+from lanebev.run import RunConfig
+
+HEIGHT, WIDTH, FRAMES = 240, 416, 6
+CAMERA = Camera.from_parameters(330, 330, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
+OFFSETS = (-5.5, -1.8, 1.9, 5.6)
+POSE = (0.03, -0.01, 0.005, 1.4)
+ROWS = range(0, HEIGHT, 10)
+
+
+def _lane_lines(names):
+    """TuSimple lines of a straight road with 3.7 m lanes; no boundary index."""
+    z = torch.logspace(0.5, 2.3, 300, dtype=torch.float64)
+    lanes = []
+    for offset in OFFSETS:
+        road = torch.stack([torch.full_like(z, offset), z], dim=-1)[None]
+        pixels = image_from_road_points(road, CAMERA.intrinsics[None], pose(*POSE, CAMERA.intrinsics))[0][0]
+        x, y = pixels.flip(0).numpy().T
+        on_rows = np.interp(ROWS, y, x, left=-2, right=-2)
+        lanes.append([round(v, 2) if 0 <= v < WIDTH else -2 for v in on_rows])
+    return [json.dumps({"raw_file": name, "lanes": lanes, "h_samples": list(ROWS)}) for name in names]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """A folder with a camera file, a video, images, and lanes for both."""
+    root = tmp_path_factory.mktemp("data")
+    fields = {
+        "fx": 330,
+        "fy": 330,
+        "cx": (WIDTH - 1) / 2,
+        "cy": (HEIGHT - 1) / 2,
+        "width": WIDTH,
+        "height": HEIGHT,
+    }
+    (root / "camera.yaml").write_text(yaml.safe_dump(fields))
+    noise = np.random.default_rng(0)
+    (root / "images").mkdir()
+    with VideoWriter(root / "drive.mp4", Fraction(25)) as writer:
+        for i in range(FRAMES):
+            image = noise.integers(60, 90, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+            writer.write(image)
+            Image.fromarray(image).save(root / "images" / f"{i}.png")
+    (root / "video_lanes.json").write_text("\n".join(_lane_lines(f"x/{i}" for i in range(FRAMES))))
+    names = [f"images/{i}.png" for i in range(FRAMES)]
+    (root / "lanes.json").write_text("\n".join(_lane_lines(names)))
+    return root
+
+
+def _run(data, *extra, source="images", lanes="lanes.json", out):
+    fixed = ["--camera", str(data / "camera.yaml"), "--lanes", str(data / lanes), "--calibrator", "two-stage"]
+    return main(["run", str(data / source), *fixed, "--out", str(out), *extra])
+
+
+def _table(folder):
+    with open(folder / "extrinsics.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def _fails(capsys, arguments, *words):
+    """The command says one line with these words, returns 2."""
+    try:
+        status = main([str(argument) for argument in arguments])
+    except SystemExit as exit_:
+        status = exit_.code
+    output = capsys.readouterr()
+    assert status == 2
+    assert output.out == ""
+    assert output.err.count("\n") == 1, output.err
+    for word in words:
+        assert word in output.err, output.err
+
+
+@pytest.fixture(scope="module")
+def drive(data, tmp_path_factory):
+    """Outputs of a run on the video."""
+    out = tmp_path_factory.mktemp("out") / "drive"
+    assert _run(data, source="drive.mp4", lanes="video_lanes.json", out=out) == 0
+    return out
+
+
+def test_a_run_on_a_video_finds_the_pose(drive):
+    rows = _table(drive)
+    assert tuple(rows[0]) == CSV_COLUMNS
+    assert [row["frame"] for row in rows] == [str(i) for i in range(FRAMES)]
+    assert {row["status"] for row in rows} == {"TRACKING"}
+    assert {row["image"] for row in rows} == {""}
+    assert rows[1]["time_s"] == "0.040000"
+    names = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
+    found = [float(rows[-1][name]) for name in names]
+    np.testing.assert_allclose(found[:3], np.degrees(POSE[:3]), atol=0.1)
+    assert abs(found[3] - POSE[3]) < 0.02
+    assert int(rows[0]["segments"]) >= 16
+
+
+def test_every_output_is_there_and_whole(drive):
+    names = {path.name for path in drive.iterdir()}
+    promised = {"extrinsics.csv", "lanes.json", "bev.mp4", "overlay.mp4", "report.html"}
+    assert promised <= names
+    for name, size in (("bev.mp4", (1140, 400)), ("overlay.mp4", None)):
+        with av.open(str(drive / name)) as video:
+            stream = video.streams.video[0]
+            assert stream.codec_context.name == "h264"
+            assert size in (None, (stream.height, stream.width))
+            assert sum(1 for _ in video.decode(stream)) == FRAMES
+    lines = [json.loads(line) for line in (drive / "lanes.json").read_text().splitlines()]
+    assert len(lines) == FRAMES
+    assert lines[0]["boundary"] == [1, 2, 3, 4]
+    assert lines[0]["h_samples"] == list(ROWS)
+    page = (drive / "report.html").read_text()
+    assert "6 of 6 frames TRACKING" in page
+    assert 'src="http' not in page
+
+
+def test_lanes_json_gives_the_same_calibration(data, drive, tmp_path):
+    shutil.copy(drive / "lanes.json", data / "again.json")
+    assert _run(data, source="drive.mp4", lanes="again.json", out=tmp_path / "out") == 0
+    assert (tmp_path / "out" / "extrinsics.csv").read_text() == (drive / "extrinsics.csv").read_text()
+    assert (tmp_path / "out" / "lanes.json").read_text() == (drive / "lanes.json").read_text()
+
+
+def test_folder_glob_and_stills(data, tmp_path):
+    assert _run(data, "--fps", "10", out=tmp_path / "folder") == 0
+    folder = _table(tmp_path / "folder")
+    assert [row["image"] for row in folder] == [str(data / "images" / f"{i}.png") for i in range(FRAMES)]
+    assert folder[1]["time_s"] == "0.100000"
+    assert _run(data, "--stills", source="**/*.png", out=tmp_path / "stills") == 0
+    stills = _table(tmp_path / "stills")
+    assert len(stills) == FRAMES
+    assert len({row["pitch_deg"] for row in stills}) == 1  # each on its own, and all the same
+    assert float(stills[0]["pitch_deg"]) == pytest.approx(np.degrees(POSE[0]), abs=0.1)
+
+
+def test_one_image_gives_pictures(data, tmp_path):
+    assert _run(data, source="images/3.png", out=tmp_path / "out") == 0
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"bev.png", "overlay.png"} <= names
+    assert not {"bev.mp4", "overlay.mp4"} & names
+    assert len(_table(tmp_path / "out")) == 1
+
+
+def test_a_damaged_image_in_a_drive_is_a_row(data, tmp_path, capsys):
+    shutil.copytree(data / "images", tmp_path / "images")
+    (tmp_path / "images" / "2.png").write_bytes((tmp_path / "images" / "2.png").read_bytes()[:2000])
+    assert _run(data, source=tmp_path / "images", out=tmp_path / "out") == 0
+    rows = _table(tmp_path / "out")
+    assert len(rows) == FRAMES
+    assert rows[2]["status"] == "COASTING"
+    assert rows[2]["segments"] == "0"
+    assert "problem: frame 2" in capsys.readouterr().out
+    assert "truncated" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_frames_without_lanes_are_rows(data, tmp_path):
+    (data / "some.json").write_text("\n".join(_lane_lines(["images/1.png"])))
+    assert _run(data, lanes="some.json", out=tmp_path / "out") == 0
+    assert [row["status"] for row in _table(tmp_path / "out")][:3] == [
+        "UNINITIALISED",
+        "TRACKING",
+        "COASTING",
+    ]
+
+
+def test_bad_input_is_one_line_and_status_2(data, tmp_path, capsys):
+    camera, out = data / "camera.yaml", tmp_path / "out"
+    good = ["run", data / "images", "--camera", camera, "--lanes", data / "lanes.json", "--out", out]
+    _fails(capsys, ["run", tmp_path / "none.mp4", "--camera", camera], "none.mp4", "nothing there")
+    _fails(capsys, ["run", data / "images"], "--camera")
+    _fails(capsys, [], "demo", "run", "--help")
+    _fails(capsys, [*good, "--lane-widht", "3"], "unrecognized arguments: --lane-widht")
+    _fails(capsys, [*good, "--lane-width", "wide"], "invalid float value: 'wide'")
+    _fails(capsys, [*good, "--lane-width", "37"], "lane width: expected 1 to 10 m, got 37")
+    _fails(capsys, [*good, "--fps", "0"], "fps: expected")
+    _fails(capsys, [*good, "--stills", "--resume", tmp_path], "resume: expected a drive")
+    _fails(capsys, [*good, "--calibrator", "magic"], "invalid choice: 'magic'")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_camera_or_lane_file_writes_nothing(data, tmp_path, capsys):
+    fields = yaml.safe_load((data / "camera.yaml").read_text())
+    out = tmp_path / "a" / "out"
+
+    def case(*words, camera=None, lanes=None, source="images"):
+        if camera is not None:
+            (data / "bad.yaml").write_text(yaml.safe_dump(camera))
+        if lanes is not None:
+            (data / "bad.json").write_text(lanes)
+        arguments = ["--camera", data / ("camera.yaml" if camera is None else "bad.yaml")]
+        arguments += ["--lanes", data / ("lanes.json" if lanes is None else "bad.json"), "--out", out]
+        _fails(capsys, ["run", data / source, *arguments], *words)
+        assert list(tmp_path.iterdir()) == []
+
+    case("bad.yaml", "fx: expected", camera={**fields, "fx": 0})
+    case("expected one for the source's 416 x 240", camera={**fields, "width": 640})
+    text = (data / "lanes.json").read_text()
+    case("bad.json, line 6", "is the file cut", lanes=text[:-40])
+    case("at least one image", lanes="\n".join(_lane_lines(["elsewhere.png"])))
+    case("expected 6 entries, one per frame", lanes="\n".join(text.splitlines()[:4]), source="drive.mp4")
+
+
+def test_an_undecodable_single_image_writes_nothing(data, tmp_path, capsys):
+    (tmp_path / "1.jpg").write_bytes(b"\xff\xd8\xff")
+    arguments = ["run", tmp_path / "1.jpg", "--camera", data / "camera.yaml", "--out", tmp_path / "out"]
+    _fails(capsys, arguments, "1.jpg", "expected a whole image")
+    assert [path.name for path in tmp_path.iterdir()] == ["1.jpg"]
+
+
+def test_an_unwritable_folder_is_one_line(data, tmp_path, capsys):
+    (tmp_path / "file").write_text("not a folder")
+    for out in (tmp_path / "file", tmp_path / "file" / "out"):
+        arguments = ["run", data / "images", "--camera", data / "camera.yaml", "--lanes", data / "lanes.json"]
+        _fails(capsys, [*arguments, "--calibrator", "two-stage", "--out", out], "output folder", "--out")
+    assert (tmp_path / "file").read_text() == "not a folder"
+
+
+def test_an_interrupted_run_leaves_nothing(data, tmp_path, capsys, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lanebev.run.calibrate", interrupt)
+    assert _run(data, out=tmp_path / "out") == 130
+    assert capsys.readouterr().err == "lanebev run: interrupted, nothing written\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_module_is_the_command():
+    done = subprocess.run(
+        [sys.executable, "-m", "lanebev", "--help"], capture_output=True, text=True, check=True
+    )
+    assert "demo" in done.stdout
+    assert "run" in done.stdout
+
+
+def test_config_checks_itself():
+    with pytest.raises(ValueError, match="calibrator: expected joint or two-stage"):
+        RunConfig("a", "b", "c", calibrator="x")

@@ -1,0 +1,164 @@
+"""What a person looks at: measured boundaries, the overlay, plots and the page."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from lanebev import BEVGrid, Calibration, Camera, Extrinsics, LaneSegments, Status, image_from_road_points
+from lanebev.io.results import ExtrinsicsRow
+from lanebev.report.measure import direction_spread, measure_boundaries, pose, width_spread
+from lanebev.report.overlay import BOUNDARY_COLOURS, PANEL_HEIGHT, Panel, draw_frame
+from lanebev.report.page import Report, write_report
+from lanebev.report.plots import plot_estimates, plot_widths, width_deviation
+
+CAMERA = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720)
+INTRINSICS = CAMERA.intrinsics[None]
+POSE = pose(0.03, -0.02, 0.01, 1.4, INTRINSICS)
+OFFSETS = {1: -5.3, 2: -1.7, 3: 2.0, 4: 5.7}  # lanes of 3.6, 3.7 and 3.7 m
+
+
+def _segments(bend=0.0, noise=0.0):
+    """Six vertices, three segments, on each boundary of a road with curvature 2 · bend."""
+    z = torch.linspace(6.0, 38.0, 16, dtype=torch.float64)
+    ends, boundary = [], []
+    for index, offset in OFFSETS.items():
+        road = torch.stack([offset + bend * z * z, z], dim=-1)[None]
+        pixels = image_from_road_points(road, INTRINSICS, POSE)[0][0]
+        pixels = pixels + noise * torch.randn(16, 2, generator=torch.Generator().manual_seed(index)).double()
+        ends.append(torch.stack([pixels[:8], pixels[8:]], dim=1))
+        boundary += [index] * 8
+    count = len(boundary)
+    return LaneSegments(
+        torch.cat(ends)[None],
+        torch.tensor(boundary)[None],
+        torch.ones(1, count).double(),
+        torch.ones(1, count).double(),
+    )
+
+
+def _calibration(segments, status=Status.TRACKING):
+    cov = torch.diag(torch.tensor([1e-3, 1e-3, 2e-3, 0.01], dtype=torch.float64) ** 2)[None]
+    return Calibration(POSE, cov, torch.tensor([int(status)]), torch.ones_like(segments.weight))
+
+
+def _rows(count, status="TRACKING"):
+    row = ExtrinsicsRow(0, 0.0, 1.0, 2.0, 0.1, 1.5, 0.01, 0.02, 0.03, 0.004, status, 12, "")
+    return [row._replace(frame=i, time_s=i / 25, pitch_deg=math.sin(i)) for i in range(count)]
+
+
+@pytest.mark.parametrize("bend", [0.0, 5e-4])
+def test_measured_widths_are_those_of_the_road(bend):
+    measured = measure_boundaries(_segments(bend), INTRINSICS, POSE)
+    np.testing.assert_allclose(measured.widths[1:4], [3.6, 3.7, 3.7], atol=0.01)
+    assert np.isnan(measured.widths[[0, 4]]).all()
+    assert direction_spread(measured.direction) < 1e-3
+    assert abs(width_spread(measured.widths) - 0.1) < 0.01
+
+
+def test_a_wrong_pitch_fans_the_boundaries_out():
+    wrong = POSE._replace(pitch=POSE.pitch - math.radians(1))
+    measured = measure_boundaries(_segments(), INTRINSICS, wrong)
+    assert direction_spread(measured.direction) > math.radians(5)
+
+
+def test_a_wrong_height_scales_the_widths():
+    higher = POSE._replace(height=POSE.height * 1.1)
+    measured = measure_boundaries(_segments(), INTRINSICS, higher, far=60.0)
+    np.testing.assert_allclose(measured.widths[1:4], [3.96, 4.07, 4.07], atol=0.01)
+
+
+def test_measuring_survives_noise_outliers_and_nothing():
+    segments = _segments(noise=0.5)
+    segments.endpoints[0, 0, 0, 0] += 80.0
+    widths = measure_boundaries(segments, INTRINSICS, POSE).widths
+    np.testing.assert_allclose(widths[1:4], [3.6, 3.7, 3.7], atol=0.12)
+    nothing = measure_boundaries(segments._replace(weight=torch.zeros(1, 32)), INTRINSICS, POSE)
+    assert np.isnan(nothing.widths).all()
+    assert np.isnan(direction_spread(nothing.direction))
+    broken = segments._replace(endpoints=segments.endpoints * math.nan)
+    assert np.isnan(measure_boundaries(broken, INTRINSICS, POSE).widths).all()
+
+
+@pytest.mark.parametrize("status", [Status.TRACKING, Status.LOST])
+@pytest.mark.parametrize(("height", "width"), [(720, 1280), (360, 640)])
+def test_overlay_draws_what_is_believed(status, height, width):
+    camera = CAMERA.scaled((height, width))
+    segments = _segments()
+    segments = segments._replace(endpoints=(segments.endpoints + 0.5) * height / 720 - 0.5)
+    grid = BEVGrid()
+    view = Panel("after", np.zeros((*grid.shape, 3), np.uint8), POSE)
+    image = np.full((height, width, 3), 90, np.uint8)
+    picture = draw_frame(image, camera, segments, _calibration(segments, status), "frame 1", (view,), grid)
+    assert picture.shape[0] == PANEL_HEIGHT
+    assert picture.dtype == np.uint8
+    scale = 720 / height
+    for index in (2, 3):  # a vertex of each boundary has the boundary's colour
+        k = int((segments.boundary[0] == index).nonzero()[0])
+        x, y = (segments.endpoints[0, k, 0] * scale).round().int().tolist()
+        np.testing.assert_allclose(picture[y, x], BOUNDARY_COLOURS[index], atol=30)
+    assert (image == 90).all()  # the input is not drawn on
+
+
+def test_overlay_of_an_empty_frame_and_of_a_wide_lens():
+    fisheye = Camera.from_parameters(300, 300, 639.5, 359.5, 1280, 720, [0.01, -0.002, 0.0, 0.0], "fisheye")
+    segments = _segments()._replace(weight=torch.zeros(1, 32).double())
+    grid = BEVGrid(resolution=0.2)
+    view = Panel("after", np.zeros((*grid.shape, 3), np.uint8), POSE)
+    image = np.zeros((720, 1280, 3), np.uint8)
+    for pitch in (0.03, 1.4):  # and with the horizon far outside
+        calibration = _calibration(segments)._replace(
+            extrinsics=POSE._replace(pitch=torch.tensor([pitch]).double())
+        )
+        assert (
+            draw_frame(image, fisheye, segments, calibration, "f", (view, view), grid).shape[0]
+            == PANEL_HEIGHT
+        )
+
+
+@pytest.mark.parametrize("stills", [False, True])
+def test_plots_are_png(stills):
+    rows = _rows(30) if stills else _rows(5, "UNINITIALISED")
+    assert plot_estimates(rows, stills).startswith(b"\x89PNG")
+    widths = np.full((30, 5), 3.7)
+    widths[:, 0] = np.nan
+    assert plot_widths(np.arange(30.0), widths, widths * np.nan, 3.7).startswith(b"\x89PNG")
+    assert width_deviation(widths) == pytest.approx(0, abs=1e-9)
+    assert math.isnan(width_deviation(widths * np.nan))
+
+
+def test_page_is_self_contained_and_escapes(tmp_path):
+    widths = np.full((8, 5), 3.7)
+    widths[:, 4] = np.nan
+    picture = np.zeros((40, 60, 3), np.uint8)
+    report = Report(
+        "<b>.mp4",
+        _rows(8),
+        widths,
+        widths,
+        3.7,
+        {"camera": "a&b.yaml"},
+        [("still", picture)],
+        ["frame 3: no"],
+    )
+    write_report(tmp_path / "report.html", report)
+    page = (tmp_path / "report.html").read_text()
+    assert "&lt;b&gt;.mp4" in page
+    assert "a&amp;b.yaml" in page
+    assert "8 of 8 frames TRACKING" in page
+    assert "frame 3: no" in page
+    sources = re.findall(r'(?:src|href)="([^"]{0,30})', page)
+    assert len(sources) == 3
+    assert all(source.startswith("data:image/") for source in sources)
+
+
+def test_page_of_nothing(tmp_path):
+    nothing = np.full((1, 5), np.nan)
+    write_report(tmp_path / "r.html", Report("x", _rows(1, "UNINITIALISED"), nothing, nothing, 3.7, {}))
+    assert "No frame was calibrated" in (tmp_path / "r.html").read_text()
+
+
+def test_rows_of_extrinsics_type():
+    assert isinstance(pose(0.1, 0.2, 0.3, 1.5, INTRINSICS), Extrinsics)
