@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from lanebev.render.layout import Layout, presence
-from lanebev.render.noise import CLOUD, GRAIN, sample_noise, smoothstep
+from lanebev.render.noise import GRAIN, sample_grain, smoothstep
 
 PSF = 0.5  # px, standard deviation of the pixel's Gaussian: keeps thin stripes' centroids unbiased
 STUD_SPACING, STUD_SIZE, STUD_HEIGHT = 1.22, 0.11, 0.020  # m, Botts' dots
@@ -49,6 +49,7 @@ def paint(
     reach_along: Tensor,
     reach_across: Tensor,
     grazing: Tensor,
+    blotch: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Paint and studs over road points.
 
@@ -59,6 +60,7 @@ def paint(
         reach_along: (B, N) m per pixel.
         reach_across: (B, N) m per pixel.
         grazing: (B, N) distance over camera height: how much longer a raised stud looks.
+        blotch: (B, N) slow noise: where the paint is worn.
 
     Returns:
         coverage of paint and of studs (B, N) each in [0, 1], and the paint's colour (B, 3, N).
@@ -78,7 +80,7 @@ def paint(
         for shift, i in ((apart, 0), (-apart, 2))
     )
     here = presence(layout, slot, along)
-    worn = _wear(along, across, of(layout.wear), reach_along)
+    worn = _wear(along, across, of(layout.wear), reach_along, blotch)
     stripes = torch.where(apart > 0, left + right, left).clamp(max=1) * of(layout.opacity) * worn
     ghost = of(layout.ghost) * stripe_coverage(distance - of(layout.ghost_shift), width, reach_across)
     ghost = (
@@ -101,8 +103,7 @@ def _stud_pattern(along: Tensor, period: Tensor, group: Tensor, reach: Tensor, g
     return dots * dash_coverage(along, group, period, reach)
 
 
-def _wear(along: Tensor, across: Tensor, wear: Tensor, reach: Tensor) -> Tensor:
+def _wear(along: Tensor, across: Tensor, wear: Tensor, reach: Tensor, patches: Tensor) -> Tensor:
     """(B, N) in [0, 1] remaining paint: patches worn off by the tyres, grain showing through."""
-    patches = sample_noise(CLOUD, along / 37.0, across / 9.0)
-    grain = sample_noise(GRAIN, along / 5.0, across / 2.5) / (1 + reach / 0.05)
+    grain = sample_grain(GRAIN, along / 5.0, across / 2.5) / (1 + reach / 0.05)
     return smoothstep(-0.6, 0.5, patches * 0.5 + grain * 0.45 + 0.95 - 1.6 * wear)

@@ -74,6 +74,44 @@ def sample_noise(channel: int, u: Tensor, v: Tensor) -> Tensor:
     return values.reshape(u.shape)
 
 
+def sample_grain(channel: int, u: Tensor, v: Tensor) -> Tensor:
+    """As :func:`sample_noise`, the nearest texel: for grain that is finer than a pixel, four times faster."""
+    row, column = (v * TILE).long() & (TILE - 1), (u * TILE).long() & (TILE - 1)
+    return noise_tile()[channel].to(u.device).take(row * (TILE + 1) + column)
+
+
+@lru_cache(maxsize=1)
+def _blotch_tile() -> Tensor:
+    """(1, 4, TILE + 1, TILE + 1) four independent clouds."""
+    cloud = noise_tile()[CLOUD, :-1, :-1]
+    moved = [cloud.roll((151 * i, 97 * i), (0, 1)) for i in range(4)]
+    return functional.pad(torch.stack(moved)[None], (0, 1, 0, 1), mode="circular")
+
+
+def blotches(along: Tensor, across: Tensor) -> Tensor:
+    """Four slow noises over the road in one look-up, (4, B, N): 1/f, features up to 60 m by 20 m."""
+    grid = torch.stack([along * (1 / 173.0), across * (1 / 61.0)], dim=-1)
+    grid = (grid - grid.floor()) * 2 - 1
+    values = functional.grid_sample(
+        _blotch_tile().to(along.device), grid.reshape(1, 1, -1, 2), align_corners=True, padding_mode="border"
+    )
+    return values.reshape(4, *along.shape)
+
+
+@lru_cache(maxsize=1)
+def _line_table() -> Tensor:
+    """(16 · TILE,) a periodic cloud over a line, finely sampled."""
+    row = noise_tile()[CLOUD, 77]
+    return functional.interpolate(row[None, None], 16 * TILE + 1, mode="linear", align_corners=True)[
+        0, 0, :-1
+    ]
+
+
+def sample_line(u: Tensor) -> Tensor:
+    """A periodic noise over a line, u (...,) in periods."""
+    return _line_table().to(u.device).take((u * (16 * TILE)).long() & (16 * TILE - 1))
+
+
 def hash01(a: Tensor, b: Tensor, salt: float) -> Tensor:
     """Repeatable pseudo-random numbers in [0, 1) of two integer-valued float tensors."""
     value = (a * 12.9898 + b * 78.233 + salt * 37.719).sin() * 43758.5453

@@ -11,7 +11,7 @@ from torch import Tensor
 from lanebev.render.alignment import Alignment, elevation_at, ground_hit, road_from_local, wall_hit
 from lanebev.render.lens import Lens
 from lanebev.render.markings import paint
-from lanebev.render.noise import CLOUD, sample_noise, smoothstep
+from lanebev.render.noise import CLOUD, blotches, sample_noise, smoothstep
 from lanebev.render.pavement import pavement_albedo
 from lanebev.render.photometry import headlight_irradiance
 from lanebev.render.scene import Place, World
@@ -182,18 +182,30 @@ def _ground_radiance(
     drop: Tensor,
 ) -> Tensor:
     """(1, 3, N) linear radiance of the ground."""
-    reach = (ground.reach_along, ground.reach_across)
-    bare = pavement_albedo(world.pavement, world.layout, ground.along, ground.across, *reach)
-    grazing = ground.z / camera_height[:, None]
-    coverage, studs, colour = paint(world.layout, ground.along, ground.across, *reach, grazing)
-    studs = studs * (1 - coverage)
-    albedo = bare + (colour - bare) * coverage[:, None] + (STUD_ALBEDO - bare) * studs[:, None]
-
-    ragged = 0.12 * sample_noise(CLOUD, ground.along / 40.0, ground.across / 40.0)
+    blotch = blotches(ground.along, ground.across)
+    ragged = 0.15 * blotch[3]
     inside = torch.minimum(ground.across - world.pavement.left, world.pavement.right - ground.across)
     paved = ((inside + ragged) / ground.reach_across + 0.5).clamp(0, 1)
-    verge = verge_albedo(world.surroundings, ground.along, ground.across, ground.reach_along)
-    albedo = verge + (albedo - verge) * paved[:, None]
+    albedo = torch.empty(1, 3, ground.z.shape[1])
+    coverage, studs = torch.zeros_like(ground.z), torch.zeros_like(ground.z)
+    road = (paved[0] > 0).nonzero()[:, 0]
+    if len(road):
+        part, stain = _Ground(*(t[:, road] for t in ground)), blotch[:, :, road]
+        reach = (part.reach_along, part.reach_across)
+        bare = pavement_albedo(world.pavement, world.layout, part.along, part.across, *reach, stain)
+        grazing = part.z / camera_height[:, None]
+        paint_on, studs_on, colour = paint(world.layout, part.along, part.across, *reach, grazing, stain[2])
+        studs_on = studs_on * (1 - paint_on)
+        bare = bare + (colour - bare) * paint_on[:, None] + (STUD_ALBEDO - bare) * studs_on[:, None]
+        albedo[:, :, road], coverage[:, road], studs[:, road] = bare, paint_on, studs_on
+    beside = (paved[0] < 1).nonzero()[:, 0]
+    if len(beside):
+        part = _Ground(*(t[:, beside] for t in ground))
+        verge = verge_albedo(
+            world.surroundings, part.along, part.across, part.reach_along, blotch[0][:, beside]
+        )
+        share = paved[:, None, beside]
+        albedo[:, :, beside] = torch.where(share > 0, verge + (albedo[:, :, beside] - verge) * share, verge)
 
     sunlit, open_sky = _shadows(world, light, ground, solids)
     lit = light.direct[..., None] * (light.sun[:, 1, None] * sunlit)[:, None]
@@ -201,17 +213,26 @@ def _ground_radiance(
     retro = 1 + 2.5 * coverage + 8.0 * studs
     beam = headlight_irradiance(ground.x, ground.z) * light.headlight[:, None] * retro
     lit = lit + beam[:, None] * lit.new_tensor([1.0, 0.95, 0.85])[:, None]
-    return albedo * lit + _gloss(world, light, ground, swing, drop, sunlit, open_sky) * paved[:, None]
+    return (
+        albedo * lit + _gloss(world, light, ground, swing, drop, sunlit, open_sky, blotch[2]) * paved[:, None]
+    )
 
 
 def _gloss(
-    world: World, light: Light, ground: _Ground, swing: Tensor, drop: Tensor, sunlit: Tensor, open_sky: Tensor
+    world: World,
+    light: Light,
+    ground: _Ground,
+    swing: Tensor,
+    drop: Tensor,
+    sunlit: Tensor,
+    open_sky: Tensor,
+    puddle: Tensor,
 ) -> Tensor:
     """Mirrored sun and, on wet roads, sky; (1, 3, N)."""
     norm = (1 + swing * swing + drop * drop).rsqrt()
     sun = (swing * light.sun[:, 0:1] + drop * light.sun[:, 1:2] + light.sun[:, 2:3]) * norm
     sparkle = 0.35 * sun.clamp(min=0) ** 24 * sunlit
-    puddles = smoothstep(-0.5, 1.2, sample_noise(CLOUD, ground.along / 80.0, ground.across / 30.0))
+    puddles = smoothstep(-0.5, 1.2, puddle)
     mirror = world.pavement.wet[:, None] * (0.05 + 0.3 * (1 - drop * norm) ** 8) * (0.35 + 0.65 * puddles)
     sky = world.surroundings.skyline[..., None]
     shine = light.direct[..., None] * (sparkle * (0.4 + world.pavement.wet[:, None]))[:, None]

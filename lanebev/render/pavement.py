@@ -10,7 +10,16 @@ from torch import Tensor
 from lanebev.render.dice import Dice
 from lanebev.render.layout import MAX_BOUNDARIES, Layout
 from lanebev.render.markings import dash_coverage, nearest_slot, stripe_coverage
-from lanebev.render.noise import CLOUD, CRACK, GRAIN, SECOND, hash01, sample_noise, smoothstep
+from lanebev.render.noise import (
+    CRACK,
+    GRAIN,
+    SECOND,
+    hash01,
+    sample_grain,
+    sample_line,
+    sample_noise,
+    smoothstep,
+)
 
 
 class Pavement(NamedTuple):
@@ -113,8 +122,8 @@ def sample_pavement(dice: Dice, layout: Layout, dotted: Tensor, bright: Tensor, 
         deck_phase=dice.uniform(-90, 40),
         lane_tone=tone.clamp(0.75, 1.25),
         grain=dice.uniform(0.04, 0.22),
-        mottle=dice.uniform(0.02, 0.12),
-        streak=dice.uniform(0.01, 0.09),
+        mottle=dice.uniform(0.01, 0.08),
+        streak=dice.uniform(0.01, 0.08),
         tracks=dice.uniform(-0.12, 0.2),
         oil=torch.where(dice.chance(0.6), dice.uniform(0.0, 0.35), 0.0),
         seam=seam,
@@ -138,6 +147,7 @@ def pavement_albedo(
     across: Tensor,
     reach_along: Tensor,
     reach_across: Tensor,
+    blotch: Tensor,
 ) -> Tensor:
     """Linear reflectance of the bare surface, (B, 3, N).
 
@@ -148,6 +158,7 @@ def pavement_albedo(
         across: (B, N) m in the layout's frame.
         reach_along: (B, N) m per pixel.
         reach_across: (B, N) m per pixel.
+        blotch: (4, B, N), see :func:`~lanebev.render.noise.blotches`.
     """
     lane = torch.searchsorted(layout.across, across.contiguous())  # 0: left of the first boundary
     count = layout.exists.sum(1, keepdim=True)
@@ -161,9 +172,9 @@ def pavement_albedo(
     inside = across - middle
 
     shade = pavement.lane_tone.gather(1, lane) * (
-        1 + _weathering(pavement, along, across, inside, reach_along)
+        1 + _weathering(pavement, along, across, inside, reach_along, blotch[0])
     )
-    shade = shade * (1 - _lines(pavement, layout, along, across, inside, reach_along, reach_across))
+    shade = shade * (1 - _lines(pavement, layout, along, across, inside, reach_along, reach_across, blotch))
     shade = shade * _patches(pavement, lane, along, inside, reach_along, reach_across)
 
     deck = ((along + pavement.deck_phase[:, None]) % pavement.deck_period[:, None]) < pavement.deck_length[
@@ -175,13 +186,14 @@ def pavement_albedo(
     return (colour * (shade * darkening[:, None]).clamp(min=0.08)[:, None]).clamp(0.005, 0.9)
 
 
-def _weathering(pavement: Pavement, along: Tensor, across: Tensor, inside: Tensor, reach: Tensor) -> Tensor:
+def _weathering(
+    pavement: Pavement, along: Tensor, across: Tensor, inside: Tensor, reach: Tensor, mottle: Tensor
+) -> Tensor:
     """(B, N) relative change by aggregate, blotches, streaks, tyre tracks and oil."""
     u, v = along, across
-    grain = sample_noise(GRAIN, u / 6.1, v / 6.1) / (1 + reach / 0.05)
+    grain = sample_grain(GRAIN, u / 6.1, v / 6.1) / (1 + reach / 0.05)
     medium = sample_noise(SECOND, u / 61.0, v / 47.0) / (1 + reach / 0.5)
-    mottle = sample_noise(CLOUD, u / 173.0, v / 61.0)
-    streak = sample_noise(SECOND, u / 2300.0, v / 23.0) + 0.6 * sample_noise(GRAIN, u / 900.0, v / 9.0)
+    streak = sample_noise(SECOND, u / 2300.0, v / 23.0)
     tracks = torch.exp(-(((inside.abs() - 0.85) / 0.32) ** 2))
     oil = torch.exp(-((inside / 0.45) ** 2)) * (0.8 + 0.3 * mottle)
     total = pavement.grain[:, None] * (grain + 0.5 * medium) + pavement.mottle[:, None] * mottle
@@ -197,10 +209,11 @@ def _lines(
     inside: Tensor,
     reach_along: Tensor,
     reach_across: Tensor,
+    blotch: Tensor,
 ) -> Tensor:
     """(B, N) darkening by seams, joints, cracks and skids."""
     slot = nearest_slot(layout, across)
-    wobble = sample_noise(CLOUD, along / 90.0, across * 0 + 0.37)
+    wobble = sample_line(along / 90.0)
     seam = pavement.seam.gather(1, slot)
     distance = across - layout.across.gather(1, slot) - pavement.seam_shift.gather(1, slot) - 0.02 * wobble
     width = pavement.seam_width[:, None] * (1 + 0.4 * wobble).clamp(0.3)
@@ -215,11 +228,11 @@ def _lines(
     dark = dark + pavement.joint[:, None] * (joint * 2.5).clamp(max=1)
 
     crack = sample_noise(CRACK, along / 41.0, across / 29.0) / (1 + reach_along / 0.25)
-    where = smoothstep(-0.2, 0.8, sample_noise(CLOUD, along / 210.0, across / 90.0))
+    where = smoothstep(-0.2, 0.8, blotch[1])
     dark = dark + pavement.crack[:, None] * crack * where * (1 + pavement.tar[:, None])
 
     skid = stripe_coverage(inside.abs() - 0.75 - 0.1 * wobble, torch.full_like(across, 0.2), reach_across)
-    skid = skid * smoothstep(0.9, 1.4, sample_noise(CLOUD, along / 400.0, across / 800.0 + 0.6))
+    skid = skid * smoothstep(0.9, 1.4, sample_line(along / 400.0 + 0.5))
     return (dark + pavement.skid[:, None] * skid).clamp(0, 0.92)
 
 

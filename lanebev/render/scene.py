@@ -88,6 +88,17 @@ def sample_world(dice: Dice) -> tuple[World, Tensor]:
     return World(layout, pavement, surroundings, traffic, weather, sensor, bridge, shade), ego_lane
 
 
+def moved_along(world: World, start: Tensor) -> World:
+    """The same worlds with everything that was placed from zero on placed from ``start`` (B,) m on."""
+    shift = start[:, None]
+    return world._replace(
+        layout=world.layout._replace(missing_phase=world.layout.missing_phase - shift),
+        pavement=world.pavement._replace(deck_phase=world.pavement.deck_phase - start),
+        traffic=world.traffic._replace(along=world.traffic.along + shift),
+        bridge=world.bridge + shift,
+    )
+
+
 def _tinted(surroundings: Surroundings, weather: Weather) -> Surroundings:
     """The sky of dusk and night."""
     night, dusk = (weather.kind == NIGHT)[:, None], (weather.kind == DUSK)[:, None]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lanebev.render.dice import Dice
-from lanebev.render.noise import CLOUD, GRAIN, SECOND, sample_noise, smoothstep
+from lanebev.render.noise import CLOUD, GRAIN, sample_grain, sample_line, sample_noise, smoothstep
 
 NUM_WALLS = 6  # left and right, from the outside inwards
 NOTHING, CONCRETE, RAIL, TREES, FENCE, SLOPE, HEDGE = range(7)
@@ -103,13 +103,14 @@ def sample_surroundings(dice: Dice, left: Tensor, right: Tensor, grey: Tensor) -
     )
 
 
-def verge_albedo(surroundings: Surroundings, along: Tensor, across: Tensor, reach: Tensor) -> Tensor:
+def verge_albedo(
+    surroundings: Surroundings, along: Tensor, across: Tensor, reach: Tensor, patches: Tensor
+) -> Tensor:
     """Linear reflectance of the ground beside the pavement, (B, 3, N)."""
     colour = torch.where(
         (across > 0)[:, None], surroundings.verge[:, 1, :, None], surroundings.verge[:, 0, :, None]
     )
-    tufts = sample_noise(GRAIN, along / 19.0, across / 17.0) / (1 + reach / 0.15)
-    patches = sample_noise(CLOUD, along / 150.0, across / 70.0)
+    tufts = sample_grain(GRAIN, along / 19.0, across / 17.0) / (1 + reach / 0.15)
     shade = (1 + 0.3 * tufts + 0.22 * patches).clamp(0.25, 2.0)
     dry = colour.new_tensor([1.25, 1.05, 0.8])[:, None]
     return colour * shade[:, None] * torch.where((patches > 0.7)[:, None], dry, 1.0)
@@ -154,7 +155,7 @@ def wall_texture(
         panel = dash_like(along, 0.15, 5.0, footprint)
         return colour * (0.9 + 0.12 * stain - 0.3 * panel)[:, None], inside * below(height)
     if kind == SLOPE:
-        top = height * (0.75 + 0.3 * sample_noise(CLOUD, along / 420.0 + seed, seed).clamp(-1.5, 1.5))
+        top = height * (0.75 + 0.3 * sample_line(along / 420.0 + seed).clamp(-1.5, 1.5))
         tufts = sample_noise(CLOUD, along / 60.0 + seed, up / 25.0)
         bush = smoothstep(0.5, 0.9, sample_noise(CLOUD, along / 90.0, up / 60.0 + seed))
         colour = (
@@ -171,11 +172,9 @@ def _foliage(
 ) -> tuple[Tensor, Tensor]:
     """A row of trees or bushes: crowns by noise on their outline, lit from above, holes of sky."""
     wide = 260.0 if kind == TREES else 90.0
-    outline = sample_noise(CLOUD, along / wide + seed, seed) + 0.35 * sample_noise(
-        CLOUD, along / 37.0, seed + 0.4
-    )
+    outline = sample_line(along / wide + seed) + 0.35 * sample_line(along / 37.0 + 0.4)
     leaves = sample_noise(CLOUD, along / 33.0 + seed, up / 33.0)
-    fine = sample_noise(GRAIN, along / 22.0, up / 22.0 + seed) / (1 + footprint / 0.15)
+    fine = sample_grain(GRAIN, along / 22.0, up / 22.0 + seed) / (1 + footprint / 0.15)
     top = height * (0.62 + 0.33 * outline).clamp(0.1, 1.4)
     edge = (top - up) / height + 0.09 * leaves + 0.015 * fine
     alpha = smoothstep(-0.01, 0.02 + 0.5 * footprint / height, edge)
@@ -216,11 +215,11 @@ def sky_radiance(surroundings: Surroundings, azimuth: Tensor, rise: Tensor, sun:
     sky = sky + glow[:, None] * sky.new_tensor([1.0, 0.93, 0.8])[:, None]
     haze = surroundings.skyline[..., None]
     for ridge, distance in ((0, 0.75), (1, 0.5)):
-        noise = sample_noise(CLOUD, azimuth * 0.16 + 0.4 * ridge, azimuth * 0 + 0.2 + 0.3 * ridge)
-        fine = sample_noise(SECOND, azimuth * 0.9, azimuth * 0 + 0.4)
-        top = surroundings.hill_height[:, ridge, None] * (1 + 0.45 * noise) + 0.0015 * fine
-        colour = haze * distance + (1 - distance) * surroundings.hill_colour[..., None] * 1.2
-        colour = colour * (1 + 0.06 * sample_noise(CLOUD, azimuth * 1.5, rise * 6))[:, None]
+        noise = sample_line(azimuth * (1 / 6.2832) + 0.4 * ridge)
+        top = surroundings.hill_height[:, ridge, None] * (1 + 0.45 * noise)
+        colour = haze * distance + (1 - distance) * surroundings.hill_colour[..., None] * haze.amax(
+            1, keepdim=True
+        )
         alpha = smoothstep(0.002, -0.002, rise - top) * (surroundings.hill_height[:, ridge, None] > 0)
         sky = sky + (colour - sky) * alpha[:, None]
     return sky

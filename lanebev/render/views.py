@@ -13,7 +13,7 @@ from lanebev.render.frame import RenderedFrame
 from lanebev.render.lens import Lens, pixel_rays, sample_distortion, sample_extrinsics, sample_intrinsics
 from lanebev.render.paint import paint_view
 from lanebev.render.photometry import add_bonnet, add_noise, blur, compress, expose, light_of
-from lanebev.render.scene import Place, World, sample_course, sample_world
+from lanebev.render.scene import Place, World, moved_along, sample_course, sample_world
 from lanebev.render.traffic import place_solids
 from lanebev.render.truth import frame_truth
 
@@ -69,21 +69,23 @@ def render_place(
     return frame_truth(image, blocked, world.layout, place, alignment, lens, solids, torch.cat(nearest))
 
 
-def sample_place(dice: Dice, world: World, ego_lane: Tensor) -> Place:
-    """Random places in the ego lane, at times close to its border or over it."""
+def sample_place(dice: Dice, world: World, ego_lane: Tensor) -> tuple[World, Place]:
+    """Random places in the ego lane, at times close to its border or over it, and the worlds about them."""
     across = world.layout.across
     left, right = (across.gather(1, ego_lane[:, None] + i)[:, 0] for i in (0, 1))
+    start = dice.uniform(0, 3000)  # elsewhere in the endless textures
     changing = dice.chance(0.15)
     centred = dice.normal(0.25).clamp(-0.8, 0.8)
     anywhere = dice.uniform(-0.5, 0.5) * (right - left)
     things = world.traffic.along.shape[1]
-    return Place(
-        along=torch.zeros_like(left),
+    place = Place(
+        along=start,
         across=0.5 * (left + right) + torch.where(changing, anywhere, centred),
         ego_lane=ego_lane,
         heading=dice.uniform(-math.pi, math.pi),
         moved=torch.zeros(dice.batch_size, things),
     )
+    return moved_along(world, start), place
 
 
 @torch.no_grad()
@@ -113,7 +115,7 @@ def render_views(
         )
     dice = Dice(batch_size, generator)
     world, ego_lane = sample_world(dice)
-    place = sample_place(dice, world, ego_lane)
+    world, place = sample_place(dice, world, ego_lane)
     alignment = build_alignment(*sample_course(dice))
     intrinsics = sample_intrinsics(dice, image_size)
     distortion = sample_distortion(dice, intrinsics, image_size, model)
