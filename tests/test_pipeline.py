@@ -1,0 +1,116 @@
+"""LaneBEV as a layer: shapes, batches over time, gradients from the view back to the image."""
+
+import pytest
+import torch
+from torch import nn
+
+from lanebev import BEVGrid, BEVWarp, LaneBEV, LaneSegments, Status, TwoStageCalibrator
+from lanebev.geometry.camera import distort_points
+from lanebev.types import Extrinsics
+from tests.test_two_stage import K, lanes
+
+GRID = BEVGrid(x=(-6.0, 6.0), z=(6.0, 30.0), resolution=0.5)
+SIZE = (72, 128)
+SCALE = 0.1  # of K, made for 1280 × 720
+INTRINSICS = torch.diag(torch.tensor([SCALE, SCALE, 1.0], dtype=torch.float64)) @ K
+
+
+class BrightnessSegmenter(nn.Module):
+    """Stands in for the network: logits that depend on the image, so that gradients have a way back."""
+
+    def __init__(self):
+        super().__init__()
+        self.gain = nn.Parameter(torch.tensor(0.1, dtype=torch.float64))
+        self.seen = []
+
+    def forward(self, image):
+        self.seen.append(tuple(image.shape))
+        return self.gain * image.mean(1, keepdim=True).repeat(1, 7, 1, 1)
+
+
+class FixedExtractor(nn.Module):
+    """True segments, shifted a little by the logits."""
+
+    def __init__(self, distortion=None):
+        super().__init__()
+        self.distortion = distortion
+
+    def forward(self, logits, image_size):
+        assert image_size == SIZE
+        batch = logits.shape[0]
+        segments = LaneSegments(*(v.expand(batch, *v.shape[1:]) for v in lanes(noise=0.0)))
+        shift = logits.mean((1, 2, 3))[:, None, None, None]
+        ends = segments.endpoints * SCALE
+        if self.distortion is not None:
+            flat = distort_points(ends.flatten(1, 2), INTRINSICS.expand(batch, 3, 3), self.distortion)
+            ends = flat.reshape(ends.shape)
+        return segments._replace(endpoints=ends + 0.01 * shift, sigma=segments.sigma * 0.1)
+
+
+def model(**kwargs):
+    return LaneBEV(
+        BrightnessSegmenter(), FixedExtractor(kwargs.pop("distortion", None)), TwoStageCalibrator(),
+        BEVWarp(GRID), **kwargs,
+    )  # fmt: skip
+
+
+def images(*shape, seed=0):
+    return torch.rand(*shape, 3, *SIZE, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_one_frame():
+    out, state = model()(images(2), INTRINSICS.expand(2, 3, 3), None, dt=0.05)
+    assert out.bev.shape == (2, 3, *GRID.shape)
+    assert out.valid.shape == (2, 1, *GRID.shape)
+    assert out.valid.dtype == torch.bool
+    assert out.bev_from_image.shape == (2, 3, 3)
+    assert out.logits.shape == (2, 7, *SIZE)
+    assert out.segments.endpoints.shape == (2, 48, 2, 2)
+    assert out.calibration.status.tolist() == [Status.TRACKING] * 2
+    assert state.status.tolist() == [Status.TRACKING] * 2
+
+
+def test_frames_at_once_equal_frames_one_by_one():
+    net, frames = model(), images(2, 3)
+    dt = torch.tensor([[0.1, 0.03, 0.04], [0.1, 0.05, 0.02]], dtype=torch.float64)
+    together, last = net(frames, INTRINSICS.expand(2, 3, 3), None, dt)
+    assert together.bev.shape == (2, 3, 3, *GRID.shape)
+    state = None
+    for step in range(3):
+        one, state = net(frames[:, step], INTRINSICS.expand(2, 3, 3), state, dt[:, step])
+        torch.testing.assert_close(together.bev[:, step], one.bev)
+        torch.testing.assert_close(together.calibration.covariance[:, step], one.calibration.covariance)
+        assert isinstance(together.calibration.extrinsics, Extrinsics)
+    torch.testing.assert_close(last.direction_mean, state.direction_mean)
+
+
+def test_gradients_flow_from_the_view_to_image_and_weights():
+    net, frames = model(), images(1, 2).requires_grad_()
+    out, _ = net(frames, INTRINSICS[None], None)
+    out.calibration.extrinsics.pitch[:, -1].sum().backward(retain_graph=True)
+    assert frames.grad[:, 1].abs().sum() > 0  # through network, lines and filter alone
+    assert frames.grad[:, 0].abs().sum() > 0  # and through time
+    frames.grad = None
+    out.bev.sum().backward()
+    assert frames.grad.isfinite().all()
+    assert net.segmenter.gain.grad.abs() > 0
+
+
+def test_lens_is_taken_out_of_the_segments():
+    distortion = torch.tensor([[-0.2, 0.03, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    straight, _ = model()(images(1) * 0, INTRINSICS[None], None)
+    bent, _ = model(distortion=distortion)(images(1) * 0, INTRINSICS[None], None, distortion=distortion)
+    torch.testing.assert_close(
+        bent.calibration.extrinsics.stack(), straight.calibration.extrinsics.stack(), atol=1e-5, rtol=0
+    )
+
+
+def test_network_sees_its_width_and_the_rest_does_not():
+    net = model(network_width=64)
+    net(images(1), INTRINSICS[None], None)
+    assert net.segmenter.seen == [(1, 3, 32, 64)]
+
+
+def test_shapes_are_checked():
+    with pytest.raises(ValueError, match=r"image: expected \(B, 3, H, W\)"):
+        model()(torch.zeros(3, 72, 128), INTRINSICS[None], None)
