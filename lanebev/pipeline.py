@@ -39,7 +39,8 @@ class LaneBEV(nn.Module):
 
     Args:
         segmenter: image (B, 3, h, w) in [0, 1] to logits (B, 1 + L, h', w').
-        extractor: logits and the image's (H, W) to :class:`LaneSegments` in its pixels.
+        extractor: logits, the image's (H, W) and the network input's (h, w) to :class:`LaneSegments` in the
+            image's pixels.
         calibrator: e.g. :class:`lanebev.JointCalibrator`.
         warp: default :class:`BEVWarp` on the default grid.
         network_width: px, the image is resized to this width, its aspect kept to the next multiple of 32,
@@ -160,9 +161,10 @@ class LaneBEV(nn.Module):
         Returns:
             logits (B, 1 + L, h, w) and segments in undistorted pixels of the image.
         """
+        resized = self._resize(image)
+        logits = self.segmenter(resized)
         height, width = image.shape[-2:]
-        logits = self.segmenter(self._resize(image))
-        segments = self.extractor(logits, (height, width))
+        segments = self.extractor(logits, (height, width), tuple(resized.shape[-2:]))
         if distortion is not None and distortion.shape[-1]:
             ends = segments.endpoints
             flat = undistort_points(ends.flatten(1, 2), intrinsics, distortion, model)

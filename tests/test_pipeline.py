@@ -35,8 +35,9 @@ class FixedExtractor(nn.Module):
         super().__init__()
         self.distortion = distortion
 
-    def forward(self, logits, image_size):
+    def forward(self, logits, image_size, network_size):
         assert image_size == SIZE
+        assert network_size in (SIZE, (32, 64))
         batch = logits.shape[0]
         segments = LaneSegments(*(v.expand(batch, *v.shape[1:]) for v in lanes(noise=0.0)))
         shift = logits.mean((1, 2, 3))[:, None, None, None]
