@@ -312,6 +312,10 @@ def _add_walls(
     """Paint the walls beside the road, outside in; changes radiance, depth and blocked."""
     surroundings = world.surroundings
     pixel = steps[:, 3].flatten(1).abs()  # rise per pixel down, at one metre
+    away = torch.maximum(across - world.pavement.right, world.pavement.left - across) > 0
+    candidates = (away | depth.isinf())[0].nonzero()[:, 0]
+    sky, across, outward, climb = (t[:, candidates] for t in (depth.isinf(), across, swing, -drop))
+    sharpest = alignment.curvature.abs().amax(1)[:, None]
     for wall in range(NUM_WALLS):
         kind = int(surroundings.wall_kind[0, wall])
         if kind == NOTHING:
@@ -319,13 +323,12 @@ def _add_walls(
         place_across = surroundings.wall_across[:, wall] - place.across
         side = place_across.sign()
         tall = surroundings.wall_height[:, wall] * 1.5
-        beyond = (across - surroundings.wall_across[:, wall, None]) * side[:, None] > 0
         aside = place_across.abs().clamp(min=0.5)[:, None]
-        bent = (alignment.curvature.abs().amax(1)[:, None] / aside).sqrt()
-        outward = (swing * side[:, None]).clamp(min=0)  # on a bend the road turns towards its wall
-        steepest = (tall - camera_height).clamp(min=0)[:, None] * (1.3 * outward / aside + bent + 0.004)
-        sky = depth.isinf() & (-drop < steepest)
-        part = ((beyond & depth.isfinite()) | sky)[0].nonzero()[:, 0]
+        beyond = (across - surroundings.wall_across[:, wall, None]) * side[:, None] > 0
+        bent = (sharpest / aside).sqrt()  # on a bend the road turns towards its wall
+        steepest = 1.3 / aside * (outward * side[:, None]).clamp(min=0) + (bent + 0.004)
+        low = climb < (tall - camera_height).clamp(min=0)[:, None] * steepest
+        part = candidates[torch.where(sky, low, beyond)[0]]
         if not len(part):
             continue
         z, arc = wall_hit(alignment, place_across, swing[:, part])

@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from lanebev.render.lens import Lens
 
@@ -304,11 +305,12 @@ def _hit_thing(
     pixel_size = steps[:, window[0], window[1]].abs().amax()
     distance = room.amin(-1, keepdim=True).abs().clamp(min=1.0, max=400.0)
     z, face = cast(normal, room + 0.6 * pixel_size * distance, ray)
-    seen = (z < limit).view(1, 1, bottom - top, right - left)
+    seen = z < limit
     if not bool(seen.any()):
         return None
-    inner = -functional.max_pool2d(-seen.float(), 3, stride=1, padding=1)[0, 0].flatten()
-    inner_at, edge_at = inner.nonzero()[:, 0], (seen.flatten() & (inner == 0)).nonzero()[:, 0]
+    mask = seen.view(bottom - top, right - left).byte().numpy()
+    inner = torch.from_numpy(cv2.erode(mask, np.ones((3, 3), np.uint8))).flatten().bool()
+    inner_at, edge_at = inner.nonzero()[:, 0], (seen & ~inner).nonzero()[:, 0]
     step = steps[:, window[0], window[1]].flatten(1)[:, edge_at]
     fine = [ray[:, edge_at] + dx * step[:2] + dy * step[2:] for dx, dy in _SUBPIXELS]
     fine_z, fine_face = (t.unflatten(0, (4, -1)) for t in cast(normal, room, torch.cat(fine, dim=1)))
