@@ -8,9 +8,10 @@ from typing import Protocol
 import torch
 
 from lanebev.geometry.camera import Camera
-from lanebev.io.lane_rows import BoundaryRows, rows_from_lines, segments_from_rows
+from lanebev.io.lane_rows import BoundaryRows, rows_from_lines, rows_from_segments, segments_from_rows
 from lanebev.io.lanes import FrameLines, match_frames
 from lanebev.io.video import Frame, FrameSource
+from lanebev.pipeline import LaneBEV
 from lanebev.types import LaneSegments
 
 
@@ -51,4 +52,30 @@ class LaneFileObserver:
         entry = self.matches[frame.number] if frame.number < len(self.matches) else None
         lines = [] if entry is None or frame.image is None else self.entries[entry].lines
         rows = rows_from_lines(lines, self.camera)
+        return rows, segments_from_rows([rows], self.camera, dtype=torch.float64)
+
+
+class NetworkObserver:
+    """Lanes from the images.
+
+    What the network sees goes by the rows of ``lanes.json`` to the calibrator, so that the file says all
+    that the calibrator was told.
+
+    Args:
+        model: its segmenter and extractor are used.
+        camera: the lens.
+    """
+
+    def __init__(self, model: LaneBEV, camera: Camera) -> None:
+        self.model, self.camera = model.eval(), camera
+
+    def __call__(self, frame: Frame) -> tuple[BoundaryRows, LaneSegments]:
+        """See :class:`Observer`."""
+        if frame.image is None:
+            rows = rows_from_lines([], self.camera)
+        else:
+            image = torch.from_numpy(frame.image.copy()).permute(2, 0, 1)[None].float() / 255
+            with torch.inference_mode():  # no lens: pixels as taken
+                _, segments = self.model.observe(image, self.camera.intrinsics[None].float())
+            rows = rows_from_segments(segments, self.camera)
         return rows, segments_from_rows([rows], self.camera, dtype=torch.float64)

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from lanebev import Camera
+from lanebev import Camera, LaneSegments
+from lanebev.io.lane_order import boundary_indices
 from lanebev.io.lane_rows import (
     BoundaryRows,
-    boundary_indices,
     image_rows,
     paired,
     rows_from_lines,
+    rows_from_segments,
     segments_from_rows,
 )
 from lanebev.io.lanes import (
@@ -79,6 +80,8 @@ def test_tusimple_lines(tmp_path):
         (json.dumps({**_tusimple("b"), "boundary": [2, 6]}), r"line 2: boundary: .* 0\.\.5"),
         (json.dumps({**_tusimple("b"), "boundary": [2, 2]}), "line 2: boundary"),
         (json.dumps({**_tusimple("b"), "boundary": [2]}), "line 2: boundary"),
+        (json.dumps({**_tusimple("b"), "sigma": [[1, 1, 1]]}), "line 2: sigma: expected a list per lane"),
+        (json.dumps({**_tusimple("b"), "sigma": [[1], [1]]}), r"line 2: sigma\[0\]: expected 3 numbers"),
         (json.dumps(_tusimple()), "each raw_file once, got 'a/20.jpg' again"),
     ],
 )
@@ -258,6 +261,43 @@ def test_lanes_json_gives_the_same_segments_bit_for_bit(tmp_path, seed):
         assert torch.equal(a, b)
     assert first.x.shape == (6, 72)
     assert np.isfinite(first.x).sum() > 100
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_networks_segments_go_through_the_file_bit_for_bit(tmp_path, seed):
+    draw = torch.Generator().manual_seed(seed)
+    ends, boundary = [], []
+    for index, line in enumerate(_fan([-9.0, -5.4, -1.8, 1.8, 5.5, 9.1])):
+        vertices = torch.from_numpy(line[np.linspace(0, len(line) - 1, 32).round().astype(int)])
+        vertices = vertices + 0.3 * torch.randn(32, 2, generator=draw).double()
+        ends.append(torch.stack([vertices[:16], vertices[16:]], dim=1))
+        boundary += [index] * 16
+    weight = torch.rand(1, 96, generator=draw).double()
+    sigma = 0.3 + torch.rand(1, 96, generator=draw).double()
+    segments = LaneSegments(torch.cat(ends)[None], torch.tensor(boundary)[None], weight, sigma)
+    first = rows_from_segments(segments, CAMERA)
+    path = _write(tmp_path / "lanes.json", tusimple_line("1.jpg", *first) + "\n")
+    again = rows_from_lines(read_lanes(path)[0].lines, CAMERA)
+    np.testing.assert_array_equal(again.x, first.x)
+    np.testing.assert_array_equal(again.sigma, first.sigma)
+    for a, b in zip(segments_from_rows([first], CAMERA), segments_from_rows([again], CAMERA), strict=True):
+        assert torch.equal(a, b)
+    information = (2 * weight / sigma.square()).reshape(6, 16)[2:4].sum(-1)
+    kept = np.nansum(1 / first.sigma[2:4] ** 2, axis=-1)
+    assert (kept < 1.1 * information.numpy()).all()
+    assert (kept > 0.5 * information.numpy()).all()
+
+
+def test_a_hidden_stretch_stays_hidden():
+    vertices = torch.from_numpy(_fan([-1.8])[0])
+    vertices = vertices[(vertices[:, 1] < 420) | (vertices[:, 1] > 560)]
+    half = len(vertices) // 2
+    ends = torch.stack([vertices[:half], vertices[-half:]], dim=1)[None]
+    ones = torch.ones(1, half).double()
+    rows = rows_from_segments(LaneSegments(ends, torch.full((1, half), 2), ones, ones), CAMERA)
+    seen = rows.rows[np.isfinite(rows.x[2])]
+    assert not ((seen > 430) & (seen < 550)).any()
+    assert len(seen) > 15
 
 
 def test_empty_frame_writes_a_line_and_reads_back(tmp_path):

@@ -7,7 +7,6 @@ A :class:`BoundaryRows` is in pixels of the image as it came. Whatever drew the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from lanebev.geometry.camera import Camera
+from lanebev.io.lane_order import boundary_indices
 from lanebev.io.lanes import LaneLine
 from lanebev.types import NUM_BOUNDARIES, LaneSegments
 
@@ -26,7 +26,9 @@ LINE_SIGMA = 1.5
 """Standard deviation (px) of a line that comes without one: a careful label or a good detector."""
 
 _DIGITS = 3  # of x in lanes.json; rounded here too, so that file and run see the same
-_SAME_LINE, _NEXT_BUT_ONE = 0.4, 1.75  # gap between neighbours, in usual gaps
+_LEAST_WEIGHT = 0.05  # of a segment that counts
+_LEAST_SIGMA = 0.05  # px
+_GAP, _GAP_ROWS = 4.0, 30.0  # between vertices: times the usual distance, and px
 
 
 class BoundaryRows(NamedTuple):
@@ -35,10 +37,12 @@ class BoundaryRows(NamedTuple):
     Attributes:
         rows: (R,) px, rising.
         x: (L, R) px; NaN where a boundary was not seen.
+        sigma: (L, R) px, standard deviation across the line; None if nobody said, then it is LINE_SIGMA.
     """
 
     rows: NDArray[np.float64]
     x: NDArray[np.float64]
+    sigma: NDArray[np.float64] | None = None
 
 
 def image_rows(height: int) -> NDArray[np.float64]:
@@ -57,6 +61,7 @@ def rows_from_lines(
     height, width = camera.image_size
     rows = image_rows(height)
     x = np.full((num_boundaries, len(rows)), np.nan)
+    sigma = np.full_like(x, np.nan)
     if all(line.boundary is not None for line in lines):
         indices: list[int | None] = [line.boundary for line in lines]
     else:
@@ -67,47 +72,42 @@ def rows_from_lines(
             inside = (on_rows >= 0) & (on_rows <= width - 1)
             if inside.sum() >= 2:
                 x[index] = np.where(inside, on_rows.round(_DIGITS), np.nan)
-    return BoundaryRows(rows, x)
+                if line.sigma is not None:
+                    noise = _on_rows(np.stack([line.sigma, line.points[:, 1]], axis=-1), rows)
+                    sigma[index] = np.where(inside, noise.round(_DIGITS), np.nan)
+    return BoundaryRows(rows, x, sigma if np.isfinite(sigma).any() else None)
 
 
-def boundary_indices(
-    lines: Sequence[NDArray[np.float64]], num_boundaries: int = NUM_BOUNDARIES
-) -> list[int | None]:
-    """Semantic boundary of each line: the nearest on the left is L/2 - 1, the nearest on the right L/2.
+def rows_from_segments(segments: LaneSegments, camera: Camera) -> BoundaryRows:
+    """Sample the vertices of a network's segments on the rows of ``lanes.json``.
 
-    The lower half of each line is extended to the bottom of the image; the lines are counted outwards in
-    that order, also those that leave the image sideways. A line runs down to its own side of the camera, so
-    its slope tells the side at any yaw. A neighbour much nearer than usual is the other edge of the same
-    marking and gets None; one twice as far as usual is the next but one.
+    A row lies between two vertices and takes both their errors; where rows are denser than vertices its
+    variance is raised by their ratio, so that all rows together say no more than the vertices did.
 
     Args:
-        lines: each (P, 2) px, undistorted; P = 0 and 1 get None.
-        num_boundaries: L, even.
-
-    Returns:
-        for each line its index, or None.
+        segments: of batch size 1, in pixels of the image as it came.
+        camera: the lens.
     """
-    result: list[int | None] = [None] * len(lines)
-    drawn = [i for i, line in enumerate(lines) if len(line) > 1 and np.ptp(line[:, 1]) > 0]
-    if not drawn:
-        return result
-    bottom = max(float(lines[i][:, 1].max()) for i in drawn)
-    crossings, slopes = zip(*(_crossing(lines[i], bottom) for i in drawn), strict=True)
-    order = np.argsort(crossings)
-    kept = _without_doubles([drawn[k] for k in order], np.asarray(crossings)[order], lines)
-    crossing = {i: crossings[k] for k, i in enumerate(drawn)}
-    left = sum(slopes[drawn.index(i)] < 0 for i in kept)
-    usual = _usual_gap([crossing[b] - crossing[a] for a, b in pairwise(kept)])
-    steps = [2 if crossing[b] - crossing[a] > _NEXT_BUT_ONE * usual else 1 for a, b in pairwise(kept)]
-    position = np.concatenate([[0], np.cumsum(steps)]).astype(int)
-    if left == 0:
-        origin = position[0] - num_boundaries // 2
-    else:
-        origin = position[left - 1] - (num_boundaries // 2 - 1)
-    for i, place in zip(kept, position - origin, strict=True):
-        if 0 <= place < num_boundaries:
-            result[i] = int(place)
-    return result
+    height, width = camera.image_size
+    rows = image_rows(height)
+    num_boundaries = int(segments.boundary.max()) + 1
+    x = np.full((num_boundaries, len(rows)), np.nan)
+    sigma = np.full_like(x, np.nan)
+    weight = segments.weight[0].double().numpy()
+    noise = segments.sigma[0].double().numpy() / np.sqrt(np.maximum(weight, _LEAST_WEIGHT))
+    ends = segments.endpoints[0].double().numpy()
+    for index in range(num_boundaries):
+        mine = (segments.boundary[0].numpy() == index) & (weight > _LEAST_WEIGHT)
+        vertices, own = ends[mine].reshape(-1, 2), noise[mine].repeat(2)
+        order = np.argsort(vertices[:, 1])
+        on_rows = _on_rows(_with_gaps(vertices[order]), rows)
+        inside = (on_rows >= 0) & (on_rows <= width - 1)
+        count = int(inside.sum())
+        if count >= 2:
+            between = np.interp(rows, vertices[order, 1], own[order]) * np.sqrt(max(1.0, count / len(own)))
+            x[index] = np.where(inside, on_rows.round(_DIGITS), np.nan)
+            sigma[index] = np.where(inside, np.maximum(between, _LEAST_SIGMA).round(_DIGITS), np.nan)
+    return BoundaryRows(rows, x, sigma)
 
 
 def segments_from_rows(
@@ -126,7 +126,7 @@ def segments_from_rows(
     Args:
         frames: B frames.
         camera: the lens that took them; points that it cannot have imaged are left out.
-        sigma: px, standard deviation of a vertex across its line.
+        sigma: px, standard deviation of a vertex across its line where the frame does not know it.
         per_boundary: most segments on one boundary.
         dtype: of the result.
 
@@ -136,13 +136,15 @@ def segments_from_rows(
     num_boundaries = frames[0].x.shape[0]
     endpoints = np.zeros((len(frames), num_boundaries, per_boundary, 2, 2))
     weight = np.zeros((len(frames), num_boundaries, per_boundary))
+    noise = np.full_like(weight, sigma)
     for row, frame in enumerate(frames):
-        for index, x in enumerate(frame.x):
-            seen = np.isfinite(x)
-            vertices = _undistorted(np.stack([x[seen], frame.rows[seen]], axis=-1), camera)
+        known = np.full_like(frame.x, sigma) if frame.sigma is None else frame.sigma
+        for index, (x, own) in enumerate(zip(frame.x, known, strict=True)):
+            vertices = _undistorted(np.stack([x, frame.rows], axis=-1), camera, own)
             pairs = paired(vertices, per_boundary)
-            endpoints[row, index, : len(pairs)] = pairs
+            endpoints[row, index, : len(pairs)] = pairs[..., :2]
             weight[row, index, : len(pairs)] = 1.0
+            noise[row, index, : len(pairs)] = np.sqrt((pairs[..., 2] ** 2).mean(-1))
     boundary = torch.arange(num_boundaries).repeat_interleave(per_boundary).repeat(len(frames), 1)
     weights = torch.from_numpy(weight).flatten(1).to(dtype)
     return LaneSegments(
@@ -154,7 +156,7 @@ def segments_from_rows(
 
 
 def paired(vertices: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """(K, 2) vertices along a line to (M, 2, 2) segments, M = min(K // 2, most), i with i + ceil(K / 2)."""
+    """(K, D) vertices along a line to (M, 2, D) segments, M = min(K // 2, most), i with i + ceil(K / 2)."""
     if len(vertices) > 2 * most:
         vertices = vertices[np.linspace(0, len(vertices) - 1, 2 * most).round().astype(int)]
     count = len(vertices) // 2
@@ -172,37 +174,22 @@ def _on_rows(points: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[
     return np.where(between == 1.0, np.interp(rows, y[there], x[there]), np.nan)
 
 
-def _undistorted(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+def _with_gaps(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Vertices from top to bottom, with a NaN put where something hides the line between two of them."""
+    steps = np.diff(vertices[:, 1])
+    if not len(steps):
+        return vertices
+    gaps = np.flatnonzero(steps > max(_GAP * float(np.median(steps)), _GAP_ROWS))
+    middle = 0.5 * (vertices[gaps, 1] + vertices[gaps + 1, 1])
+    return np.insert(vertices, gaps + 1, np.stack([np.full(len(gaps), np.nan), middle], axis=-1), axis=0)
+
+
+def _undistorted(
+    points: NDArray[np.float64], camera: Camera, sigma: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """(P, 2) px as taken to those (Q, 2) px undistorted that the lens can have imaged; (Q, 3) with sigma."""
     if not len(points):
         return points
     undistorted, valid = camera.undistort_points(torch.from_numpy(points).to(camera.intrinsics))
     kept: NDArray[np.float64] = undistorted[valid].double().numpy()
-    return kept
-
-
-def _crossing(points: NDArray[np.float64], bottom: float) -> tuple[float, float]:
-    """Where the lower half of a line meets the row ``bottom``, and its slope dx/dy there."""
-    lower = points[np.argsort(points[:, 1])][-max(4, len(points) // 2) :]
-    y = lower[:, 1] - lower[:, 1].mean()
-    slope = float((y * lower[:, 0]).sum() / max((y * y).sum(), 1e-9))
-    return float(lower[:, 0].mean() + slope * (bottom - lower[:, 1].mean())), slope
-
-
-def _without_doubles(
-    order: list[int], crossings: NDArray[np.float64], lines: Sequence[NDArray[np.float64]]
-) -> list[int]:
-    gaps = np.diff(crossings)
-    if len(gaps) < 2:
-        return order
-    usual = float(np.median(gaps))
-    kept = [order[0]]
-    for i, gap in zip(order[1:], gaps, strict=True):
-        if gap > _SAME_LINE * usual:
-            kept.append(i)
-        elif len(lines[i]) > len(lines[kept[-1]]):
-            kept[-1] = i
-    return kept
-
-
-def _usual_gap(gaps: Sequence[float]) -> float:
-    return sorted(gaps)[(len(gaps) - 1) // 2] if gaps else 1.0
+    return kept if sigma is None else np.concatenate([kept, sigma[valid.numpy(), None]], axis=-1)

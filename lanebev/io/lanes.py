@@ -28,10 +28,12 @@ class LaneLine(NamedTuple):
     Attributes:
         points: (P, 2) px, (x, y) of the image as it came; x is NaN in a gap of the line.
         boundary: index of the semantic boundary if the file says so, else None.
+        sigma: (P,) px, standard deviation of each point across the line if the file says so, else None.
     """
 
     points: NDArray[np.float64]
     boundary: int | None = None
+    sigma: NDArray[np.float64] | None = None
 
 
 class FrameLines(NamedTuple):
@@ -62,7 +64,7 @@ def read_lanes(path: str | Path) -> list[FrameLines]:
 
 
 def read_tusimple(path: str | Path) -> list[FrameLines]:
-    """Read TuSimple JSON lines: ``lanes``, ``h_samples``, ``raw_file``, and ``boundary`` if it is there."""
+    """Read TuSimple JSON lines: ``lanes``, ``h_samples``, ``raw_file``, maybe ``boundary`` and ``sigma``."""
     frames = []
     for number, text in enumerate(_text(Path(path)).splitlines(), start=1):
         if text.strip():
@@ -109,18 +111,27 @@ def read_openlane(path: str | Path) -> FrameLines:
     return FrameLines(name, lines)
 
 
-def tusimple_line(name: str, rows: NDArray[np.float64], x: NDArray[np.float64]) -> str:
+def tusimple_line(
+    name: str, rows: NDArray[np.float64], x: NDArray[np.float64], sigma: NDArray[np.float64] | None = None
+) -> str:
     """One frame's boundaries as a line of TuSimple JSON, with each lane's ``boundary``.
 
     Args:
         name: ``raw_file``.
         rows: (R,) px.
         x: (L, R) px; NaN where a boundary was not seen.
+        sigma: (L, R) px, written as another key that other readers pass over; None leaves it out.
     """
     seen = [index for index in range(len(x)) if np.isfinite(x[index]).any()]
-    lanes = [[-2 if math.isnan(value) else round(value, 3) for value in x[index].tolist()] for index in seen]
-    h_samples = [round(row) for row in rows.tolist()]
-    return json.dumps({"raw_file": name, "lanes": lanes, "h_samples": h_samples, "boundary": seen})
+    fields: dict[str, Any] = {"raw_file": name, "lanes": [_written(x[index]) for index in seen]}
+    fields |= {"h_samples": [round(row) for row in rows.tolist()], "boundary": seen}
+    if sigma is not None:
+        fields["sigma"] = [_written(sigma[index]) for index in seen]
+    return json.dumps(fields)
+
+
+def _written(values: NDArray[np.float64]) -> list[float]:
+    return [-2 if math.isnan(value) else round(value, 3) for value in values.tolist()]
 
 
 def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int | None]:
@@ -198,16 +209,25 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
                 f"boundary: expected one different index of 0..{NUM_BOUNDARIES - 1} per lane, got "
                 f"{fields['boundary']!r:.60}"
             )
+    sigmas = fields.get("sigma") or [None] * len(lanes)
+    if not isinstance(sigmas, list) or len(sigmas) != len(lanes):
+        raise ValueError("sigma: expected a list per lane, got another number of them")
     lines = []
-    for i, (lane, index) in enumerate(zip(lanes, indices, strict=True)):
-        if not isinstance(lane, list) or len(lane) != len(rows):
-            got = len(lane) if isinstance(lane, list) else repr(lane)
-            raise ValueError(f"lanes[{i}]: expected {len(rows)} numbers, one per h_sample, got {got}")
-        x = np.array(_floats(f"lanes[{i}]", lane))
-        x[x < 0] = np.nan  # -2 is "not there"
+    for i, (lane, index, noise) in enumerate(zip(lanes, indices, sigmas, strict=True)):
+        x = _on_h_samples(f"lanes[{i}]", lane, len(rows))
+        sigma = None if noise is None else _on_h_samples(f"sigma[{i}]", noise, len(rows))
         if np.isfinite(x).any():
-            lines.append(LaneLine(np.stack([x, np.array(rows)], axis=-1), index))
+            lines.append(LaneLine(np.stack([x, np.array(rows)], axis=-1), index, sigma))
     return FrameLines(name, lines)
+
+
+def _on_h_samples(name: str, values: Any, count: int) -> NDArray[np.float64]:
+    if not isinstance(values, list) or len(values) != count:
+        got = len(values) if isinstance(values, list) else repr(values)
+        raise ValueError(f"{name}: expected {count} numbers, one per h_sample, got {got}")
+    x = np.array(_floats(name, values))
+    x[x < 0] = np.nan  # -2 is "not there"
+    return x
 
 
 def _check_culane_rows(y: NDArray[np.float64]) -> None:
