@@ -1,6 +1,8 @@
 """The rendered road: textures, scene, camera, drive."""
 
+from lanebev.render.drive import Drive
 from lanebev.render.frame import RenderedFrame
+from lanebev.render.masks import boundary_masks
 from lanebev.render.views import render_views
 
-__all__ = ["RenderedFrame", "render_views"]
+__all__ = ["Drive", "RenderedFrame", "boundary_masks", "render_views"]

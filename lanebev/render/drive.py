@@ -1,0 +1,276 @@
+"""A camera that drives through one world: the same seed gives the same drive, bit for bit."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from lanebev.geometry.camera import Camera
+from lanebev.render.alignment import Alignment, arc_nodes, build_alignment
+from lanebev.render.dice import Dice
+from lanebev.render.frame import RenderedFrame
+from lanebev.render.lens import Lens
+from lanebev.render.photometry import CLEAR
+from lanebev.render.scene import Place, World, sample_world
+from lanebev.render.traffic import NUM_VEHICLES
+from lanebev.render.views import render_place
+from lanebev.types import Extrinsics
+
+_SCENERY_PERIOD = 450.0  # m; bridges, signs and lamps come again
+_ONCOMING_PERIOD = 420.0  # m
+_BEHIND = 40.0  # m behind the camera at which things move to the far end
+_LANE_CHANGE = 4.5  # s
+_DAMPING, _BUMP_RATE = 4.0, 9.0  # 1/s and rad/s of a suspension after a bump
+
+
+class SmoothNoise:
+    """A sum of sinusoids: a repeatable, band-limited signal at any time.
+
+    Args:
+        dice: the randomness, one row.
+        amplitude: about the largest value.
+        low: Hz, lowest frequency.
+        high: Hz, highest frequency.
+    """
+
+    def __init__(self, dice: Dice, amplitude: float, low: float, high: float, terms: int = 6) -> None:
+        self.rate = 2 * math.pi * low * (high / low) ** dice.uniform(0, 1, terms)[0].double()
+        self.phase = dice.uniform(0, 2 * math.pi, terms)[0].double()
+        weight = self.rate**-0.5
+        self.weight = amplitude * weight / weight.norm() / math.sqrt(2)
+
+    def __call__(self, time: float) -> float:
+        """Value at ``time`` s."""
+        return float((self.weight * (self.rate * time + self.phase).sin()).sum())
+
+
+class Drive:
+    """A continuous drive: curves with clothoids, crests, lane changes, suspension, bumps, traffic.
+
+    Args:
+        seed: of everything.
+        image_size: (H, W); with a camera, its own image size.
+        num_frames: length.
+        fps: frames per second.
+        camera: the lens; by default an ideal one with 60 degrees of horizontal view.
+        mount: pitch, yaw, roll (rad) and height (m) of the camera at rest; random by default.
+        speed: m/s.
+        motion: factor of all suspension movement.
+        curves: largest curvature is this over 300 m.
+        hills: factor of the crests; 0 is a flat road.
+        lane_changes: whether there are any.
+        weather: "any", or "clear" for a clear day.
+        ideal_sensor: leave out blur, noise and compression.
+
+    Attributes:
+        times: (N,) s, float64.
+        camera: the lens in use.
+
+    Raises:
+        ValueError: no frames, or a frame rate or speed that is not positive.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        image_size: tuple[int, int] = (360, 640),
+        num_frames: int = 300,
+        fps: float = 20.0,
+        camera: Camera | None = None,
+        *,
+        mount: Extrinsics | None = None,
+        speed: float = 28.0,
+        motion: float = 1.0,
+        curves: float = 1.0,
+        hills: float = 1.0,
+        lane_changes: bool = True,
+        weather: str = "any",
+        ideal_sensor: bool = False,
+    ) -> None:
+        if num_frames < 1 or not fps > 0 or not speed > 0:
+            raise ValueError(
+                f"expected num_frames >= 1, fps > 0 and speed > 0, got {num_frames}, {fps} and {speed}"
+            )
+        if weather not in ("any", "clear"):
+            raise ValueError(f"weather: expected 'any' or 'clear', got {weather!r}")
+        self.seed, self.speed, self.ideal_sensor = seed, speed, ideal_sensor
+        self.camera = (camera or _default_camera(image_size)).to(dtype=torch.float32)
+        self.times = torch.arange(num_frames, dtype=torch.float64) / fps
+        dice = Dice(1, torch.Generator().manual_seed(seed))
+        self.world, first_lane = _sample_drive_world(dice, weather)
+        self.start = float(dice.uniform(0, 2000))
+        duration = num_frames / fps
+        self._sample_course(dice, duration, curves, hills)
+        self._sample_lanes(dice, int(first_lane), duration, lane_changes)
+        self._sample_motion(dice, duration, motion, mount)
+        self.world = self._without_collisions(self.world)
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def _sample_course(self, dice: Dice, duration: float, curves: float, hills: float) -> None:
+        count = int((duration * self.speed + 2600) / 90) + 3
+        value = dice.uniform(-1, 1, count)[0].double() * dice.chance(0.65, count)[0]
+        value[: 1 + int(dice.uniform(1, 4))] = 0.0  # the first hundreds of metres are straight
+        self._curvature = value * curves / 300.0
+        self._wave = 2 * math.pi / dice.uniform(250, 700, 3)[0].double()
+        self._wave_phase = dice.uniform(0, 2 * math.pi, 3)[0].double()
+        self._wave_bend = hills * dice.uniform(0, 1, 3)[0].double() / 9000.0
+
+    def curvature_at(self, arc: Tensor) -> Tensor:
+        """Curvature of the road, 1/m, at arc lengths from the drive's start, m: linear between nodes."""
+        position = (arc / 90.0 + 1.0).clamp(0, len(self._curvature) - 1.001)
+        index = position.long()
+        low, high = self._curvature[index], self._curvature[index + 1]
+        return low + (high - low) * (position - index)
+
+    def _heading_at(self, arc: float) -> float:
+        nodes = torch.linspace(0, arc, max(2, int(arc / 5) + 2), dtype=torch.float64)
+        return float(torch.trapezoid(self.curvature_at(nodes), nodes))
+
+    def _elevation_about(self, arc: float, ahead: Tensor) -> Tensor:
+        """Elevation above the tangent at ``arc``, m, for distances ``ahead`` m."""
+        amplitude = self._wave_bend / self._wave**2
+        angle = self._wave * arc + self._wave_phase
+        there = (self._wave * (ahead[..., None] + arc) + self._wave_phase).sin()
+        tangent = angle.sin() + self._wave * angle.cos() * ahead[..., None]
+        return (amplitude * (there - tangent)).sum(-1)
+
+    def _sample_lanes(self, dice: Dice, first: int, duration: float, lane_changes: bool) -> None:
+        """Lane changes as (start time, from lane, to lane)."""
+        lanes = int(self.world.layout.exists.sum()) - 1
+        self._changes: list[tuple[float, int, int]] = []
+        self._first_lane = lane = min(first, max(lanes - 1, 0))
+        time = float(dice.uniform(3.0, 7.0))
+        while lane_changes and lanes > 1 and time + _LANE_CHANGE < duration:
+            step = 1 if bool(dice.chance(0.5)) else -1
+            target = lane + step if 0 <= lane + step < lanes else lane - step
+            self._changes.append((time, lane, target))
+            lane, time = target, time + float(dice.uniform(7.0, 16.0))
+
+    def _lane_middle(self, lane: int) -> float:
+        return float(self.world.layout.across[0, lane : lane + 2].mean())
+
+    def _across(self, time: float) -> float:
+        """m across at a time: the lane's middle, lane changes with smooth lateral jerk, and wander."""
+        place = self._lane_middle(self._first_lane)
+        for start, old, new in self._changes:
+            u = min(max((time - start) / _LANE_CHANGE, 0.0), 1.0)
+            blend = u**3 * (10 - 15 * u + 6 * u * u)
+            place += blend * (self._lane_middle(new) - self._lane_middle(old))
+        return place + self._wander(time)
+
+    def _ego_lane(self, across: float) -> int:
+        layout = self.world.layout
+        last = max(int(layout.exists.sum()) - 2, 0)
+        lane = int((layout.across[0] <= across).sum()) - 1
+        return min(max(lane, 0), last)
+
+    def _sample_motion(self, dice: Dice, duration: float, motion: float, mount: Extrinsics | None) -> None:
+        degree = math.pi / 180 * motion
+        self._wander = SmoothNoise(dice, 0.25, 0.05, 0.25)
+        self._noises = (
+            SmoothNoise(dice, 0.45 * degree, 0.15, 2.0),  # pitch
+            SmoothNoise(dice, 0.15 * degree, 0.1, 0.8),  # yaw, beside that of the path
+            SmoothNoise(dice, 0.35 * degree, 0.1, 1.5),  # roll
+            SmoothNoise(dice, 0.015 * motion, 0.2, 2.0),  # height
+        )
+        bumps = max(1, int(duration / 6))
+        self._bump_times = dice.uniform(1.0, max(duration, 1.5), bumps)[0].double()
+        self._bump_sizes = dice.uniform(-1.0, 1.0, bumps)[0].double() * degree
+        if mount is None:
+            angles = dice.normal(1.0, 3)[0].clamp(-2, 2) * torch.tensor([1.5, 1.0, 0.6]) * (math.pi / 180)
+            self._mount = [*angles.tolist(), float(dice.uniform(1.25, 1.6))]
+        else:
+            self._mount = [float(value) for value in mount]
+
+    def extrinsics_at(self, time: float) -> Extrinsics:
+        """True pose over the road at a time, each (1,)."""
+        arc = self.speed * time
+        h = 0.01
+        slip = (self._across(time + h) - self._across(time - h)) / (2 * h * self.speed)
+        since = (time - self._bump_times).clamp(min=0)
+        bump = self._bump_sizes * (-_DAMPING * since).exp() * (_BUMP_RATE * since).sin()
+        lean = 0.02 * float(self.curvature_at(torch.tensor(arc, dtype=torch.float64))) * self.speed**2 / 9.81
+        pitch, yaw, roll, height = (
+            m + noise(time) for m, noise in zip(self._mount, self._noises, strict=True)
+        )
+        values = (pitch + float(bump.sum()), yaw - math.atan(slip), roll + lean, height)
+        return Extrinsics(*(torch.tensor([v], dtype=torch.float32) for v in values))
+
+    def _without_collisions(self, world: World) -> World:
+        """Take out vehicles that the camera would drive through; the rest of a lane moves at one speed."""
+        traffic = world.traffic
+        lane = torch.tensor([self._ego_lane(a) for a in traffic.across[0, :NUM_VEHICLES].tolist()])
+        speed = traffic.speed.clone()
+        speed[0, :NUM_VEHICLES] = speed[0, lane]  # the first few speeds serve as those of the lanes
+        valid = traffic.valid.clone()
+        for time in torch.arange(0, float(self.times[-1]) + 0.5, 0.5).tolist():
+            across, along = (
+                self._across(time),
+                traffic.along[0, :NUM_VEHICLES] + speed[0, :NUM_VEHICLES] * time,
+            )
+            beside = (traffic.across[0, :NUM_VEHICLES] - across).abs() < 2.6
+            valid[0, :NUM_VEHICLES] &= ~(beside & (along < 16.0) & (along > -14.0))
+        return world._replace(traffic=traffic._replace(speed=speed, valid=valid))
+
+    def _world_at(self, arc: float, time: float) -> tuple[World, Tensor]:
+        """The world with its scenery wrapped about the camera, and how far each vehicle went, (1, M)."""
+        traffic = self.world.traffic
+        ahead = traffic.along + traffic.speed * time  # of the camera
+        oncoming, still = traffic.speed < -20, traffic.speed == 0
+        ahead = torch.where(oncoming, (ahead + _BEHIND) % _ONCOMING_PERIOD - _BEHIND, ahead)
+        ahead = torch.where(still, (traffic.along - arc + _BEHIND) % _SCENERY_PERIOD - _BEHIND, ahead)
+        begin, end = self.world.bridge.unbind(1)
+        shift = ((0.5 * (begin + end) - arc + _BEHIND) % _SCENERY_PERIOD - _BEHIND) - 0.5 * (end - begin)
+        shift = torch.where(begin.isfinite(), shift, math.inf) + self.start + arc
+        traffic = traffic._replace(along=ahead + self.start + arc)
+        bridge = torch.stack([shift, shift + torch.where(begin.isfinite(), end - begin, 0.0)], dim=1)
+        return self.world._replace(traffic=traffic, bridge=bridge), torch.zeros_like(ahead)
+
+    def alignment_at(self, arc: float) -> Alignment:
+        """The road's course from ``arc`` m after the start on."""
+        ahead = arc_nodes()
+        return build_alignment(self.curvature_at(ahead + arc)[None], self._elevation_about(arc, ahead)[None])
+
+    @torch.no_grad()
+    def frame(self, index: int) -> RenderedFrame:
+        """One frame with its truth, B = 1; frames can be asked for in any order.
+
+        Raises:
+            IndexError: there is no such frame.
+        """
+        if not 0 <= index < len(self):
+            raise IndexError(f"index: expected 0..{len(self) - 1}, got {index}")
+        time = float(self.times[index])
+        arc, across = self.speed * time, self._across(time)
+        world, moved = self._world_at(arc, time)
+        place = Place(
+            along=torch.tensor([self.start + arc]),
+            across=torch.tensor([across]),
+            ego_lane=torch.tensor([self._ego_lane(across)]),
+            heading=torch.tensor([self._heading_at(arc)]),
+            moved=moved,
+        )
+        camera = self.camera
+        lens = Lens(camera.intrinsics[None], camera.distortion[None], camera.model, self.extrinsics_at(time))
+        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + index)
+        return render_place(
+            world, place, self.alignment_at(arc), lens, camera.image_size, generator, self.ideal_sensor
+        )
+
+
+def _default_camera(image_size: tuple[int, int]) -> Camera:
+    height, width = image_size
+    focal = 0.5 * width / math.tan(math.radians(30.0))
+    return Camera.from_parameters(focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
+
+
+def _sample_drive_world(dice: Dice, weather: str) -> tuple[World, Tensor]:
+    """Any world, or the first on a clear day."""
+    while True:
+        world, lane = sample_world(dice)
+        if weather == "any" or int(world.weather.kind) == CLEAR:
+            return world, lane
