@@ -1,0 +1,149 @@
+"""All figures on real and third-party images, each beside its target.
+
+    python tools/evaluate_real.py [--data ../shared/data] [--json FILE] [--sheet FILE.png] [--weights FILE]
+
+Without shipped weights only the parts that take lanes from files are run, and it says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from real_figures import (
+    Figure,
+    carla_drive,
+    carla_stills,
+    tusimple_camera,
+    tusimple_labels,
+    tusimple_pixels,
+    tusimple_segments,
+    udacity,
+)
+from rich.console import Console
+from rich.table import Table
+
+import lanebev
+from lanebev import BEVGrid, BEVWarp, LaneSegments
+from lanebev.io.video import open_source
+from lanebev.report.measure import pose
+from lanebev.report.overlay import Panel, draw_frame
+from lanebev.run import bird_view, calibrate_still, make_calibrator
+
+NEEDED = {
+    "tusimple": "label_data.json",
+    "carla": "truth.csv",
+    "udacity": "camera.yaml",
+}
+SHEET = tuple(range(0, 88, 8))  # and the last: a dozen
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    default = Path(__file__).resolve().parents[2] / "shared" / "data"
+    parser.add_argument("--data", type=Path, default=default, help="folder of the data (../shared/data)")
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--sheet", type=Path, help="write a PNG of a dozen TuSimple images, before and after")
+    parser.add_argument("--weights", type=Path, help="other weights than the shipped")
+    parser.add_argument("--only", help="run only parts whose name contains this")
+    options = parser.parse_args()
+    missing = [f"{name}/{file}" for name, file in NEEDED.items() if not (options.data / name / file).exists()]
+    if missing:
+        print(f"{options.data}: missing {', '.join(missing)}; give the folder with --data", file=sys.stderr)
+        return 2
+    calibrators = {name: make_calibrator(name) for name in ("two-stage", "joint")}
+    model = load_model(options.weights)
+    start = time.monotonic()
+    figures = [figure for part in parts(options, model, calibrators) for figure in part]
+    print_table(figures)
+    if options.sheet:
+        write_sheet(options.sheet, options.data, calibrators["joint"])
+    if options.json:
+        options.json.write_text(json.dumps(as_json(figures, options, time.monotonic() - start), indent=1))
+    return 0
+
+
+def parts(options: Any, model: Any, calibrators: dict[str, Any]) -> Any:
+    """The parts asked for, each an iterable of figures."""
+    chosen = [("tusimple labels", lambda: tusimple_labels(options.data, calibrators))]
+    if model is not None:
+        for function in (carla_stills, carla_drive, udacity, tusimple_pixels):
+            name = function.__name__.replace("_", " ")
+            chosen.append((name, lambda f=function: f(options.data, model, calibrators)))
+    for name, run in chosen:
+        if not options.only or options.only in name:
+            yield run()
+
+
+def load_model(weights: Path | None) -> Any:
+    """The network, or None, said on stderr, while none is shipped."""
+    try:
+        return lanebev.LaneBEV.from_pretrained(weights)
+    except (ImportError, FileNotFoundError) as error:
+        print(f"no network ({error}): only lanes from files are evaluated", file=sys.stderr)
+        return None
+
+
+def print_table(figures: list[Figure]) -> None:
+    """Here beside the target."""
+    table = Table("part", "figure", "calibrator", "here", "target", "met")
+    for i, figure in enumerate(figures):
+        sign = "≥" if figure.least else "≤"
+        target = "" if figure.target is None else f"{sign} {figure.target:.3g} {figure.unit}"
+        met = {True: "yes", False: "NO", None: ""}[figure.met]
+        last = i + 1 == len(figures) or figures[i + 1].part != figure.part
+        here = f"{figure.value:.3g} {figure.unit}"
+        table.add_row(figure.part, figure.name, figure.calibrator, here, target, met, end_section=last)
+    Console(width=None if sys.stdout.isatty() else 130).print(table)
+    judged = [figure.met for figure in figures if figure.met is not None]
+    print(
+        f"{sum(judged)} of {len(judged)} targets met; TuSimple's camera is not published: f = 1000 px assumed"
+    )
+
+
+def write_sheet(path: Path, data: Path, calibrator: Any) -> None:
+    """Input, view before and view after of a dozen labelled images, two a row."""
+    images, segments = tusimple_segments(data)
+    camera, warp = tusimple_camera(), BEVWarp(BEVGrid())
+    level = pose(0.0, 0.0, 0.0, 1.5, camera.intrinsics)
+    pictures = []
+    for i in (*SHEET, 87):
+        one = LaneSegments(*(part[i : i + 1] for part in segments))
+        calibration = calibrate_still(calibrator, one, camera.intrinsics[None], 3.7)
+        frame = next(iter(open_source(images[i])))
+        assert frame.image is not None
+        views = tuple(
+            Panel(title, bird_view(warp, frame, camera, extrinsics), extrinsics)
+            for title, extrinsics in (("before", level), ("after", calibration.extrinsics))
+        )
+        name = "/".join(Path(images[i]).parts[-3:])
+        picture = draw_frame(frame.image, camera, one, calibration, name, views, warp.grid)
+        pictures.append(np.asarray(Image.fromarray(picture).resize((919, 360), Image.Resampling.LANCZOS)))
+    rows = [np.concatenate(pictures[k : k + 2], axis=1) for k in range(0, len(pictures), 2)]
+    Image.fromarray(np.concatenate(rows, axis=0)).save(path)
+
+
+def as_json(figures: list[Figure], options: Any, seconds: float) -> dict[str, Any]:
+    """The figures with what they were made with."""
+    return {
+        "command": "python tools/evaluate_real.py",
+        "lanebev": lanebev.__version__,
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "threads": torch.get_num_threads(),
+        "weights": str(options.weights.name) if options.weights else "shipped",
+        "seconds": round(seconds, 1),
+        "figures": [figure.as_dict() for figure in figures],
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

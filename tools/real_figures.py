@@ -1,0 +1,236 @@
+"""The figures of ``evaluate_real.py``: each part of the data to numbers beside their targets."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from lanebev import Camera, Extrinsics, LaneSegments, Status
+from lanebev.io.lane_rows import rows_from_lines, segments_from_rows
+from lanebev.io.lanes import match_frames, read_lanes
+from lanebev.io.video import open_source
+from lanebev.observers import NetworkObserver
+from lanebev.report.measure import direction_spread, measure_boundaries, width_spread
+from lanebev.report.plots import width_deviation
+from lanebev.run import calibrate_still
+
+TUSIMPLE_FOCAL = 1000.0  # px, assumed: the camera is not published
+UDACITY_LANE_WIDTH, CARLA_LANE_WIDTH = 3.66, 3.5
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One number beside its target; ``least`` where more is better."""
+
+    part: str
+    name: str
+    calibrator: str
+    value: float
+    target: float | None
+    unit: str = ""
+    least: bool = False
+
+    @property
+    def met(self) -> bool | None:
+        """Whether it meets the target; None without one."""
+        if self.target is None:
+            return None
+        return bool(self.value >= self.target if self.least else self.value <= self.target)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {**asdict(self), "met": self.met}
+
+
+class Drive(NamedTuple):
+    """A drive's poses (F, 4) in rad and m, status (F,), times (F,) s and segments."""
+
+    poses: torch.Tensor
+    status: torch.Tensor
+    times: np.ndarray
+    segments: list[LaneSegments]
+
+
+def tusimple_camera() -> Camera:
+    """1280 x 720, f = 1000 px assumed, centred."""
+    return Camera.from_parameters(TUSIMPLE_FOCAL, TUSIMPLE_FOCAL, 640, 360, 1280, 720)
+
+
+def tusimple_segments(data: Path) -> tuple[list[str], LaneSegments]:
+    """Paths of the 88 images and their labelled lanes."""
+    frames = read_lanes(data / "tusimple" / "label_data.json")
+    images = [str(data / "tusimple" / frame.name) for frame in frames]
+    match_frames(images, frames)
+    camera = tusimple_camera()
+    return images, segments_from_rows([rows_from_lines(frame.lines, camera) for frame in frames], camera)
+
+
+def tusimple_labels(data: Path, calibrators: dict[str, Any]) -> Iterable[Figure]:
+    """Lanes from the label file, one image each."""
+    _, segments = tusimple_segments(data)
+    count = segments.boundary.shape[0]
+    intrinsics = tusimple_camera().intrinsics.expand(count, 3, 3)
+    for name, calibrator in calibrators.items():
+        calibration = calibrate_still(calibrator, segments, intrinsics, 3.7)
+        directions, widths = [], []
+        for i in range(count):
+            one = LaneSegments(*(part[i : i + 1] for part in segments))
+            pose = Extrinsics(*(value[i : i + 1] for value in calibration.extrinsics))
+            measured = measure_boundaries(one, intrinsics[:1], pose)
+            directions.append(direction_spread(measured.direction))
+            widths.append(width_spread(measured.widths))
+        height = calibration.extrinsics.height.numpy()
+        tracking = int((calibration.status == Status.TRACKING).sum())
+        part = "tusimple, labels"
+        yield Figure(part, "images calibrated", name, tracking, 88, least=True)
+        yield Figure(part, "direction spread, median", name, np.degrees(np.nanmedian(directions)), 2.4, "deg")
+        yield Figure(part, "lane width spread, median", name, 100 * np.nanmedian(widths), 27, "cm")
+        iqr = float(np.subtract(*np.percentile(height, [75, 25])))
+        yield Figure(part, "height, interquartile range", name, 100 * iqr, 12, "cm")
+        yield Figure(part, "height, median", name, float(np.median(height)), None, "m")
+
+
+def tusimple_pixels(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable[Figure]:
+    """Lanes from the pixels: against the labels' points, and the pose against that from the labels."""
+    from train.metrics import tusimple_score  # needs lightning
+
+    images, labelled = tusimple_segments(data)
+    camera = tusimple_camera()
+    observer = NetworkObserver(model, camera)
+    seen = [observer(next(iter(open_source(image)))) for image in images]
+    frames = read_lanes(data / "tusimple" / "label_data.json")
+    scores = [tusimple_score(rows.x, rows.rows, frame) for (rows, _), frame in zip(seen, frames, strict=True)]
+    accuracy, false_positive, false_negative = np.mean(scores, axis=0)
+    part = "tusimple, pixels"
+    yield Figure(part, "accuracy", "-", accuracy, 0.92, least=True)
+    yield Figure(part, "false positives", "-", false_positive, 0.25)
+    yield Figure(part, "false negatives", "-", false_negative, 0.15)
+    segments = LaneSegments(*(torch.cat(parts) for parts in zip(*(s for _, s in seen), strict=True)))
+    intrinsics = camera.intrinsics.expand(len(images), 3, 3)
+    for name, calibrator in calibrators.items():
+        pose = calibrate_still(calibrator, segments, intrinsics, 3.7).extrinsics.stack()
+        truth = calibrate_still(calibrator, labelled, intrinsics, 3.7).extrinsics.stack()
+        error = (pose - truth).abs()
+        error[:, 3] /= truth[:, 3]
+        middle = error.nanmedian(0).values.tolist()
+        for axis, value, target in zip(("pitch", "yaw", "roll"), middle, (0.15, 0.15, 0.4), strict=False):
+            yield Figure(part, f"{axis} against labels, median", name, np.degrees(value), target, "deg")
+        yield Figure(part, "height against labels, median", name, 100 * middle[3], 3, "%")
+
+
+def carla_truth(data: Path) -> dict[str, torch.Tensor]:
+    """Pose (4,) in rad and m of each image."""
+    lines = (data / "carla" / "truth.csv").read_text().splitlines()
+    rows = csv.DictReader(line for line in lines if not line.startswith("#"))
+    names = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
+    poses = {row["image"]: torch.tensor([float(row[name]) for name in names]).double() for row in rows}
+    return {image: torch.cat([pose[:3].deg2rad(), pose[3:]]) for image, pose in poses.items()}
+
+
+def carla_stills(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable[Figure]:
+    """Five renderings, one frame each."""
+    truth = carla_truth(data)
+    camera = Camera.from_file(data / "carla" / "camera.yaml")
+    observer = NetworkObserver(model, camera)
+    names = [name for name in truth if name.endswith(".png")]
+    seen = [observer(next(iter(open_source(str(data / "carla" / name)))))[1] for name in names]
+    segments = LaneSegments(*(torch.cat(parts) for parts in zip(*seen, strict=True)))
+    intrinsics = camera.intrinsics.expand(len(names), 3, 3)
+    expected = torch.stack([truth[name] for name in names])
+    for name, calibrator in calibrators.items():
+        found = calibrate_still(calibrator, segments, intrinsics, CARLA_LANE_WIDTH).extrinsics.stack()
+        error = _in_units((found - expected).abs())
+        yield from _per_axis("carla stills", "mean error", name, error.mean(0), (0.15, 0.12, 0.35, 5))
+        yield from _per_axis("carla stills", "worst error", name, error.amax(0), (0.4, 0.3, 1.0, 12))
+
+
+def carla_drive(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable[Figure]:
+    """The drive: its straight frames 10-66 against the truth."""
+    camera = Camera.from_file(data / "carla" / "camera.yaml")
+    expected = carla_truth(data)["drive.mp4"]
+    drives = follow(str(data / "carla" / "drive.mp4"), camera, model, calibrators, CARLA_LANE_WIDTH)
+    for name, drive in drives.items():
+        error = _in_units(drive.poses[10:67] - expected).square().mean(0).sqrt()
+        yield from _per_axis("carla drive 10-66", "RMSE", name, error, (0.1, 0.1, 0.2, 3))
+        yield from _width_figures("carla drive", name, drive, camera, targets=False)
+
+
+def udacity(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable[Figure]:
+    """Two highway videos: tracked, and lanes equally wide in the bird's-eye view."""
+    camera = Camera.from_file(data / "udacity" / "camera.yaml")
+    for video, count in (("highway_a", 76), ("highway_b", 201)):
+        path = str(data / "udacity" / f"{video}.mp4")
+        drives = follow(path, camera, model, calibrators, UDACITY_LANE_WIDTH)
+        for name, drive in drives.items():
+            part = f"udacity {video}"
+            yield Figure(part, "rows", name, len(drive.poses), count, least=True)
+            later = torch.from_numpy(drive.times > 1.0)
+            share = (drive.status[later] == Status.TRACKING).double().mean()
+            yield Figure(part, "TRACKING after 1 s", name, 100 * float(share), 95, "%", least=True)
+            yield from _width_figures(part, name, drive, camera, targets=True)
+
+
+def follow(
+    source: str, camera: Camera, model: Any, calibrators: dict[str, Any], lane_width: float
+) -> dict[str, Drive]:
+    """Every calibrator over the same observations of a video."""
+    observer = NetworkObserver(model, camera)
+    states = {
+        name: calibrator.initial_state(1, dtype=torch.float64) for name, calibrator in calibrators.items()
+    }
+    poses: dict[str, list[torch.Tensor]] = {name: [] for name in calibrators}
+    status: dict[str, list[torch.Tensor]] = {name: [] for name in calibrators}
+    times, seen = [], []
+    for frame in open_source(source):
+        _, segments = observer(frame)
+        times.append(frame.time)
+        seen.append(segments)
+        for name, calibrator in calibrators.items():
+            with torch.inference_mode():
+                calibration, states[name] = calibrator(
+                    segments, camera.intrinsics[None], states[name], frame.dt, lane_width
+                )
+            poses[name].append(calibration.extrinsics.stack()[0])
+            status[name].append(calibration.status[0])
+    return {
+        name: Drive(torch.stack(poses[name]), torch.stack(status[name]), np.array(times), seen)
+        for name in calibrators
+    }
+
+
+def _width_figures(part: str, name: str, drive: Drive, camera: Camera, targets: bool) -> Iterable[Figure]:
+    tracked = (drive.status == Status.TRACKING).nonzero().flatten()
+    if not len(tracked):
+        yield Figure(part, "lane width deviation, online", name, float("nan"), 5.0, "cm")
+        return
+
+    def deviation(pose_of: Callable[[int], torch.Tensor]) -> float:
+        widths = [
+            measure_boundaries(segments, camera.intrinsics[None], Extrinsics.unstack(pose_of(i)[None])).widths
+            for i, segments in enumerate(drive.segments)
+        ]
+        return 100 * width_deviation(np.array(widths))
+
+    online, fixed = deviation(lambda i: drive.poses[i]), deviation(lambda _: drive.poses[int(tracked[0])])
+    target = max(5.0, fixed / 3) if targets else None
+    yield Figure(part, "lane width deviation, first frame's pose", name, fixed, None, "cm")
+    yield Figure(part, "lane width deviation, online", name, online, target, "cm")
+
+
+def _in_units(pose: torch.Tensor) -> torch.Tensor:
+    """(..., 4) rad and m to deg and cm."""
+    return torch.cat([pose[..., :3].rad2deg(), 100 * pose[..., 3:]], dim=-1)
+
+
+def _per_axis(
+    part: str, what: str, name: str, values: torch.Tensor, targets: tuple[float, float, float, float]
+) -> Iterable[Figure]:
+    axes = (("pitch", "deg"), ("yaw", "deg"), ("roll", "deg"), ("height", "cm"))
+    for (axis, unit), value, target in zip(axes, values.tolist(), targets, strict=True):
+        yield Figure(part, f"{axis}, {what}", name, value, target, unit)
