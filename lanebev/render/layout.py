@@ -52,6 +52,10 @@ class Layout(NamedTuple):
         missing_phase: m.
         ghost: [0, 1] strength of an old line, repainted beside this one.
         ghost_shift: m from the boundary to it.
+        symbol: int64, what is painted in the lane right of each boundary, see symbols.py; 0 is nothing.
+        symbol_period: (B,) m.
+        symbol_phase: (B,) m.
+        symbol_opacity: (B,) in [0, 1].
     """
 
     across: Tensor
@@ -72,6 +76,10 @@ class Layout(NamedTuple):
     missing_phase: Tensor
     ghost: Tensor
     ghost_shift: Tensor
+    symbol: Tensor
+    symbol_period: Tensor
+    symbol_phase: Tensor
+    symbol_opacity: Tensor
 
 
 def sample_layout(dice: Dice, dotted: Tensor, faint: Tensor) -> Layout:
@@ -154,6 +162,12 @@ def sample_layout(dice: Dice, dotted: Tensor, faint: Tensor) -> Layout:
         .expand(-1, slots)
         .contiguous(),
         ghost_shift=dice.uniform(-0.5, 0.5, slots),
+        symbol=torch.where(
+            dice.chance(0.15, 1) & dice.chance(0.6, slots), dice.pick([0, 3, 1, 2, 1], slots), 0
+        ),
+        symbol_period=dice.uniform(25, 150),
+        symbol_phase=dice.uniform(0, 150),
+        symbol_opacity=dice.uniform(0.5, 1.0),
     )
 
 

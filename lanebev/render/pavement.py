@@ -83,7 +83,7 @@ class Pavement(NamedTuple):
 def _tone(dice: Dice, concrete: Tensor, bright: Tensor) -> Tensor:
     """(B, 3) reflectance of asphalt or concrete."""
     level = torch.where(concrete, dice.uniform(0.20, 0.40), dice.uniform(0.045, 0.17))
-    level = torch.where(bright, dice.uniform(0.40, 0.62), level)
+    level = torch.where(bright, dice.uniform(0.33, 0.50), level)
     warm = torch.where(concrete, dice.uniform(-0.01, 0.07), dice.uniform(-0.04, 0.04))
     tint = torch.stack([1 + warm, 1 + 0.3 * warm, 1 - warm], dim=1) + dice.normal(0.008, 3)
     return level[:, None] * tint

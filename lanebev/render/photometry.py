@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from lanebev.render.dice import Dice
+from lanebev.render.effects import bloom
 from lanebev.render.noise import CLOUD, sample_noise
 from lanebev.render.solids import Light
 
@@ -38,10 +39,10 @@ class Weather(NamedTuple):
 
 def sample_weather(dice: Dice) -> Weather:
     """Mostly clear days."""
-    kind = dice.pick([0.6, 0.17, 0.09, 0.07, 0.07])
+    kind = dice.pick([0.66, 0.14, 0.08, 0.06, 0.06])
     clear = dice.uniform(0.0, 0.25)
     grey = torch.where((kind == OVERCAST) | (kind == RAIN), dice.uniform(0.7, 1.0), clear)
-    hazy = dice.chance(0.25) | (kind == RAIN)
+    hazy = dice.chance(0.12) | (kind == RAIN)
     dusk = kind == DUSK
     return Weather(
         kind=kind,
@@ -95,6 +96,7 @@ class Sensor(NamedTuple):
         shot_noise: standard deviation at full scale.
         vignette: loss in the corners.
         glare: veil over the image.
+        bloom: share of saturated light that spills.
         jpeg: quality, 0 for none.
         bonnet: share of the image's height, 0 for none.
         bonnet_colour: (B, 3).
@@ -111,6 +113,7 @@ class Sensor(NamedTuple):
     shot_noise: Tensor
     vignette: Tensor
     glare: Tensor
+    bloom: Tensor
     jpeg: Tensor
     bonnet: Tensor
     bonnet_colour: Tensor
@@ -119,13 +122,14 @@ class Sensor(NamedTuple):
 
 def sample_sensor(dice: Dice, weather: Weather, bright: Tensor) -> Sensor:
     """A random camera; ``bright`` (B,) bool overexposes."""
-    exposure = torch.where(bright, dice.uniform(0.45, 0.8), dice.uniform(0.07, 0.42))
+    usual = torch.where(dice.chance(0.8), dice.uniform(0.045, 0.2), dice.uniform(0.2, 0.34))
+    exposure = torch.where(bright, dice.uniform(0.28, 0.5), usual)
     dark = (weather.kind == NIGHT) | (weather.kind == DUSK)
     exposure = torch.where(dark, dice.uniform(0.03, 0.2), exposure)
     noisy = torch.where(weather.kind == NIGHT, 2.5, 1.0)
     return Sensor(
         exposure=exposure,
-        tint=1 + dice.normal(0.05, 3),
+        tint=1 + dice.normal(0.03, 3),
         contrast=dice.uniform(0.85, 1.3),
         saturation=torch.where(dice.chance(0.05), 0.0, dice.uniform(0.5, 1.25)),
         black=dice.uniform(-0.02, 0.04),
@@ -134,6 +138,7 @@ def sample_sensor(dice: Dice, weather: Weather, bright: Tensor) -> Sensor:
         shot_noise=dice.uniform(0.002, 0.022) * noisy,
         vignette=torch.where(dice.chance(0.5), dice.uniform(0.0, 0.4), 0.0),
         glare=torch.where(dice.chance(0.3), dice.uniform(0.0, 0.2), 0.0),
+        bloom=torch.where(dice.chance(0.6), dice.uniform(0.0, 0.35), 0.0),
         jpeg=torch.where(dice.chance(0.7), dice.uniform(35, 95), 0.0),
         bonnet=torch.where(dice.chance(0.3), dice.uniform(0.02, 0.14), 0.0),
         bonnet_colour=dice.uniform(0.01, 0.25, 1) * (1 + dice.normal(0.2, 3)).clamp(0.4, 1.6),
@@ -181,7 +186,8 @@ def expose(radiance: Tensor, sensor: Sensor, road_level: Tensor) -> Tensor:
     mean = radiance.mean((1, 2, 3))
     metered = road_level.clamp(min=1e-4) ** 0.7 * mean.clamp(min=1e-4) ** 0.3
     gain = (sensor.exposure / metered)[:, None] * sensor.tint
-    value = radiance * gain[..., None, None]
+    white = 1.0 / float(gain.amax())
+    value = bloom(radiance, white, float(sensor.bloom)) * gain[..., None, None]
     if bool(sensor.vignette > 0):
         y = torch.arange(height)[:, None] / height - 0.5
         x = torch.arange(width)[None] / width - 0.5

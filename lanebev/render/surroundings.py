@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lanebev.render.dice import Dice
-from lanebev.render.noise import CLOUD, GRAIN, sample_grain, sample_line, sample_noise, smoothstep
+from lanebev.render.noise import CLOUD, GRAIN, hash01, sample_grain, sample_line, sample_noise, smoothstep
 
 NUM_WALLS = 6  # left and right, from the outside inwards
 NOTHING, CONCRETE, RAIL, TREES, FENCE, SLOPE, HEDGE = range(7)
@@ -36,6 +36,8 @@ class Surroundings(NamedTuple):
         zenith: (B, 3) linear radiance of the sky.
         skyline: (B, 3) linear radiance at the horizon.
         cloud: (B,) share of the sky.
+        opposite: (B,) m, right edge of the opposite carriageway in the layout's frame; -infinite: none.
+        opposite_colour: (B, 3) linear reflectance of it.
         hill_height: (B, 2) rad, two ridges.
         hill_colour: (B, 3).
     """
@@ -49,11 +51,15 @@ class Surroundings(NamedTuple):
     zenith: Tensor
     skyline: Tensor
     cloud: Tensor
+    opposite: Tensor
+    opposite_colour: Tensor
     hill_height: Tensor
     hill_colour: Tensor
 
 
-def sample_surroundings(dice: Dice, left: Tensor, right: Tensor, grey: Tensor) -> Surroundings:
+def sample_surroundings(
+    dice: Dice, left: Tensor, right: Tensor, grey: Tensor, opposite: Tensor
+) -> Surroundings:
     """Random surroundings of a pavement.
 
     Args:
@@ -61,6 +67,7 @@ def sample_surroundings(dice: Dice, left: Tensor, right: Tensor, grey: Tensor) -
         left: (B,) m, the pavement's left edge.
         right: (B,) m, its right edge.
         grey: (B,) in [0, 1], how overcast it is.
+        opposite: (B,) m, the opposite carriageway's right edge; -infinite: none.
     """
     far = [
         torch.where(dice.chance(0.75), dice.pick([0, 0, 0, 5, 0, 1.5, 0.5]), 0) for _ in range(2)
@@ -68,10 +75,13 @@ def sample_surroundings(dice: Dice, left: Tensor, right: Tensor, grey: Tensor) -
     middle = [torch.where(dice.chance(0.45), dice.pick([0, 0, 0, 3, 3, 2, 2]), 0) for _ in range(2)]
     near = [dice.pick([2.5, 4, 1.5]), dice.pick([4.5, 2, 2.5])]  # the median has a barrier more often
     kind = torch.stack([far[0], far[1], middle[0], middle[1], near[0], near[1]], dim=1)
+    divided = opposite.isfinite()
+    kind[:, 2] = torch.where(divided, NOTHING, kind[:, 2])
     gap = torch.cat([dice.uniform(14, 45, 2), dice.uniform(4, 14, 2), dice.uniform(0.05, 1.2, 2)], dim=1)
     sides = torch.tensor([-1.0, 1.0] * 3)
     across = torch.stack([left, right] * 3, dim=1) + sides * gap
 
+    across[:, 0] = torch.where(divided, torch.minimum(across[:, 0], opposite - 16), across[:, 0])
     low = dice.pick_from([0.55, 0.81, 0.9, 1.07, 1.4], NUM_WALLS)
     tall = dice.uniform(4.0, 14.0, NUM_WALLS)
     height = torch.where(kind == CONCRETE, low, tall)
@@ -83,7 +93,7 @@ def sample_surroundings(dice: Dice, left: Tensor, right: Tensor, grey: Tensor) -
     colour = torch.where((kind == SLOPE)[..., None], earth, colour)
     colour = colour * dice.uniform(0.7, 1.3, NUM_WALLS, 1)
 
-    blue = torch.stack([dice.uniform(0.04, 0.12), dice.uniform(0.09, 0.19), dice.uniform(0.20, 0.36)], dim=1)
+    blue = dice.uniform(0.16, 0.36, 1) * torch.tensor([0.30, 0.60, 1.0]) * (1 + dice.normal(0.06, 3))
     pale = torch.stack([dice.uniform(0.22, 0.42), dice.uniform(0.28, 0.42), dice.uniform(0.34, 0.46)], dim=1)
     overcast = dice.uniform(0.3, 0.55, 1) * torch.tensor([0.97, 1.0, 1.03])
     mix = grey[:, None]
@@ -98,6 +108,8 @@ def sample_surroundings(dice: Dice, left: Tensor, right: Tensor, grey: Tensor) -
         zenith=blue * (1 - mix) + 0.9 * overcast * mix,
         skyline=pale * (1 - mix) + overcast * mix,
         cloud=torch.where(dice.chance(0.5), dice.uniform(0.0, 0.9), 0.0),
+        opposite=opposite,
+        opposite_colour=dice.uniform(0.06, 0.3, 1) * torch.tensor([1.0, 0.99, 0.96]),
         hill_height=torch.where(dice.chance(0.6, 2), dice.uniform(0.0, 0.09, 2), -0.05),
         hill_colour=(0.5 * dice.pick_from(GREENS) + 0.5 * dice.pick_from(EARTHS)),
     )
@@ -113,7 +125,14 @@ def verge_albedo(
     tufts = sample_grain(GRAIN, along / 19.0, across / 17.0) / (1 + reach / 0.15)
     shade = (1 + 0.3 * tufts + 0.22 * patches).clamp(0.25, 2.0)
     dry = colour.new_tensor([1.25, 1.05, 0.8])[:, None]
-    return colour * shade[:, None] * torch.where((patches > 0.7)[:, None], dry, 1.0)
+    colour = colour * shade[:, None] * torch.where((patches > 0.7)[:, None], dry, 1.0)
+    inside = surroundings.opposite[:, None] - across  # m into the opposite carriageway
+    other = (inside > 0) & (inside < 13.5)
+    line = ((inside - 1.0).abs() < 0.1) | ((inside - 12.2).abs() < 0.1)
+    line = line | (((inside - 4.7).abs() < 0.07) | ((inside - 8.4).abs() < 0.07)) & ((along % 12.0) < 3.0)
+    grey = surroundings.opposite_colour[..., None] * (1 + 0.1 * tufts + 0.06 * patches)[:, None]
+    grey = torch.where(line[:, None], 0.5, grey)
+    return torch.where(other[:, None], grey, colour)
 
 
 def wall_texture(
@@ -172,16 +191,39 @@ def _foliage(
 ) -> tuple[Tensor, Tensor]:
     """A row of trees or bushes: crowns by noise on their outline, lit from above, holes of sky."""
     wide = 260.0 if kind == TREES else 90.0
-    outline = sample_line(along / wide + seed) + 0.35 * sample_line(along / 37.0 + 0.4)
+    style = int(float(seed.flatten()[0]) * 97) % 3 if kind == TREES else 0
     leaves = sample_noise(CLOUD, along / 33.0 + seed, up / 33.0)
     fine = sample_grain(GRAIN, along / 22.0, up / 22.0 + seed) / (1 + footprint / 0.15)
-    top = height * (0.62 + 0.33 * outline).clamp(0.1, 1.4)
+    if style == 0:
+        outline = sample_line(along / wide + seed) + 0.35 * sample_line(along / 37.0 + 0.4)
+        top = height * (0.62 + 0.33 * outline).clamp(0.1, 1.4)
+    else:
+        top = _crowns(along, height, seed, conifer=style == 2)
     edge = (top - up) / height + 0.09 * leaves + 0.015 * fine
     alpha = smoothstep(-0.01, 0.02 + 0.5 * footprint / height, edge)
     light = 0.55 + 0.5 * (up / top.clamp(min=0.5)).clamp(0, 1) + 0.28 * leaves + 0.2 * fine
     trunk = kind == TREES
     ground = smoothstep(0.0, 0.6, up) if trunk else 1.0
     return colour * (light * ground).clamp(0.12, 1.8)[:, None], alpha * (up > -0.1)
+
+
+def _crowns(along: Tensor, height: Tensor, seed: Tensor, conifer: bool) -> Tensor:
+    """(B, N) m, outline of single trees of random place, size and shape over some undergrowth."""
+    spacing = height * (0.45 if conifer else 0.8)
+    u = along / spacing
+    row = (seed * 97.0).floor()
+    top = height * (0.12 + 0.08 * sample_line(along / 50.0 + seed))
+    for shift in (-1, 0, 1):
+        cell = u.floor() + shift
+        centre = cell + 0.2 + 0.6 * hash01(cell, row, 1.0)
+        tall = height * (0.35 + 0.75 * hash01(cell, row, 2.0) ** 1.5)
+        apart = (u - centre) / (0.3 + 0.45 * hash01(cell, row, 3.0))
+        if conifer:
+            shape = 1 - apart.abs() * 1.5
+        else:
+            shape = 0.25 + 0.75 * (1 - apart * apart).clamp(min=0).sqrt()
+        top = torch.maximum(top, tall * torch.where(apart.abs() < 1, shape, 0.0))
+    return top
 
 
 def dash_like(along: Tensor, length: float, period: float, footprint: Tensor) -> Tensor:

@@ -90,6 +90,7 @@ def sample_traffic(
     dice: Dice,
     layout: Layout,
     ego_lane: Tensor,
+    opposite: Tensor,
     left: Tensor,
     right: Tensor,
     bridge_at: Tensor,
@@ -101,17 +102,18 @@ def sample_traffic(
         dice: the randomness.
         layout: the boundaries.
         ego_lane: (B,) int64.
+        opposite: (B,) m, the opposite carriageway's right edge; -infinite: none.
         left: (B,) m, the pavement's left edge.
         right: (B,) m, its right edge.
         bridge_at: (B,) m along, where a bridge begins; infinite: none.
         bridge_long: (B,) m, its extent along the road.
     """
-    vehicles = _sample_vehicles(dice, layout, ego_lane, left)
+    vehicles = _sample_vehicles(dice, layout, ego_lane, opposite)
     props = _sample_props(dice, left, right, bridge_at, bridge_long)
     return Traffic(*(torch.cat(pair, dim=1) for pair in zip(vehicles, props, strict=True)))
 
 
-def _sample_vehicles(dice: Dice, layout: Layout, ego_lane: Tensor, left: Tensor) -> Traffic:
+def _sample_vehicles(dice: Dice, layout: Layout, ego_lane: Tensor, opposite: Tensor) -> Traffic:
     ahead, count = NUM_VEHICLES, NUM_VEHICLES + NUM_ONCOMING
     lanes = (layout.exists.sum(1) - 1).clamp(min=1)[:, None]
     start, hop = (
@@ -127,16 +129,16 @@ def _sample_vehicles(dice: Dice, layout: Layout, ego_lane: Tensor, left: Tensor)
     middle = 0.5 * (layout.across.gather(1, lane) + layout.across.gather(1, lane + 1))
     across = middle + dice.normal(0.2, ahead)
     wanted = dice.chance(0.75, 1) & (dice.uniform(0, 1, ahead) < dice.uniform(0.1, 1.0, 1))
-    clear = (lane != ego_lane[:, None]) | (along - half_length[:, :ahead] > 5.0)
+    ahead_of_ego = lane == ego_lane[:, None]
+    tail = along - half_length[:, :ahead]
+    clear = ~ahead_of_ego | (tail > 22.0) | ((tail > 6.0) & dice.chance(0.3, ahead))
     overlap = (lane[:, :, None] == lane[:, None, :]) & (
         (along[:, :, None] - along[:, None, :]).abs()
         < half_length[:, :ahead, None] + half_length[:, None, :ahead] + 1.5
     )
     first = torch.tril(overlap, diagonal=-1).any(2)
     oncoming_along = dice.uniform(10, 200, NUM_ONCOMING)
-    oncoming_across = (
-        left[:, None] - 2.5 - dice.uniform(0, 1, 1) * 5 - 3.6 * dice.pick([1, 1, 1], NUM_ONCOMING)
-    )
+    oncoming_across = opposite[:, None].clamp(min=-500) - 2.85 - 3.7 * dice.pick([1, 1, 1], NUM_ONCOMING)
     return Traffic(
         along=torch.cat([along, oncoming_along], 1),
         across=torch.cat([across, oncoming_across], 1),
@@ -149,7 +151,9 @@ def _sample_vehicles(dice: Dice, layout: Layout, ego_lane: Tensor, left: Tensor)
             dice.pick_from(CAR_COLOURS, count) * dice.uniform(0.7, 1.2, count, 1),
         ),
         braking=dice.chance(0.2, count),
-        valid=torch.cat([wanted & clear & ~first, dice.chance(0.35, 1) & dice.chance(0.7, NUM_ONCOMING)], 1),
+        valid=torch.cat(
+            [wanted & clear & ~first, opposite.isfinite()[:, None] & dice.chance(0.6, NUM_ONCOMING)], 1
+        ),
     )
 
 

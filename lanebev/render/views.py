@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lanebev.render.alignment import Alignment, build_alignment
 from lanebev.render.dice import Dice, row_of
+from lanebev.render.effects import rain
 from lanebev.render.frame import RenderedFrame
 from lanebev.render.lens import Lens, pixel_rays, sample_distortion, sample_extrinsics, sample_intrinsics
 from lanebev.render.paint import paint_view
@@ -60,6 +61,8 @@ def render_place(
             add_bonnet(painted.radiance, painted.blocked, sensor, lamp, one.surroundings.skyline)
         image = expose(painted.radiance, sensor, painted.road_level)
         if not ideal_sensor:
+            if bool(one.weather.wet > 0):
+                image = rain(image, float(one.weather.wet), generator)
             image = blur(image, float(sensor.blur) * size[1] / 640)
             image = compress(add_noise(image, sensor, generator), sensor.jpeg)
         images.append(image)
