@@ -1,0 +1,91 @@
+"""Probability maps to line segments in pixels of the image, differentiable in the probabilities."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from lanebev.observation.vertices import LineConfig, representative_vertices, scan_vertices
+from lanebev.types import LaneSegments
+
+
+class LineExtractor(nn.Module):
+    """Logits to :class:`~lanebev.LaneSegments`.
+
+    Source: Sect. "Experiments": where a boundary's probability is larger than 0.5, the mean position of its
+    on-pixels, then representative vertices. Deviation: so it is on maps of zeros and ones; on others a pixel
+    counts by its probability, so that gradients flow and a faint line is a line with less weight. Rows are
+    scanned for steep boundaries and columns for shallow ones. A representative vertex is the mean of its
+    stretch of the boundary, not one sample of it.
+
+    Vertex i of 2S along a boundary is paired with vertex i + S: each is used once, so end points' errors are
+    independent, and every segment is half as long as the boundary.
+    """
+
+    def __init__(self, config: LineConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or LineConfig()
+
+    def forward(
+        self, logits: Tensor, image_size: tuple[int, int], network_size: tuple[int, int] | None = None
+    ) -> LaneSegments:
+        """Extract.
+
+        Args:
+            logits: (B, 1+L, h, w), background first.
+            image_size: (H, W) of the image in whose pixels the segments are wanted.
+            network_size: (H', W') of the same image, resized, as the network had it; None is the map's size
+                times the stride.
+
+        Returns:
+            Segments with N = L·S, in pixels of the image as it came (undistorted if that was).
+
+        Raises:
+            ValueError: another shape.
+        """
+        if logits.ndim != 4 or logits.shape[1] < 2:
+            raise ValueError(f"logits: expected (B, 1+L, h, w), got {tuple(logits.shape)}")
+        return extract_segments(logits.softmax(1)[:, 1:], image_size, self.config, network_size)
+
+
+def extract_segments(
+    probabilities: Tensor,
+    image_size: tuple[int, int],
+    config: LineConfig,
+    network_size: tuple[int, int] | None = None,
+) -> LaneSegments:
+    """Probability maps (B, L, h, w), without background, to segments; see :class:`LineExtractor`."""
+    if probabilities.ndim != 4:
+        raise ValueError(f"probabilities: expected (B, L, h, w), got {tuple(probabilities.shape)}")
+    batch, boundaries, rows, columns = probabilities.shape
+    if network_size is None:
+        network_size = (rows * config.stride, columns * config.stride)
+    vertices = representative_vertices(scan_vertices(probabilities, config), config)
+    scale = probabilities.new_tensor([image_size[1] / network_size[1], image_size[0] / network_size[0]])
+    points = (config.stride * vertices.points + 0.5) * scale - 0.5  # network pixel s·j under cell j
+    half = (vertices.weight > 0).sum(-1) // 2  # (B, L) pairs; vertices are filled from the front
+    first = torch.arange(config.segments, device=points.device).expand(batch, boundaries, -1)
+    second = (first + half.unsqueeze(-1)).clamp(max=2 * config.segments - 1)
+    ends = torch.stack([_take(points, first), _take(points, second)], dim=-2)  # (B, L, S, 2, 2)
+    weight = vertices.weight.gather(-1, first) * vertices.weight.gather(-1, second)
+    weight = torch.where(first < half.unsqueeze(-1), weight, 0.0)
+    along = ends[..., 1, :] - ends[..., 0, :]
+    # across the line in image px: the normal of the image line, taken back to label px
+    along_label = along / scale
+    stretch = scale.prod() * along_label.square().sum(-1) / along.square().sum(-1).clamp(min=1e-12)
+    stretch = (scale.prod() * stretch).clamp(min=1e-12).sqrt() * config.stride
+    variance = vertices.common_var + vertices.own_var
+    sigma = (0.5 * (variance.gather(-1, first) + variance.gather(-1, second))).sqrt() * stretch
+    seen = weight > 0
+    index = torch.arange(boundaries, device=points.device).view(1, -1, 1).expand_as(first)
+    return LaneSegments(
+        endpoints=torch.where(seen[..., None, None], ends, 0.0).flatten(1, 2),
+        boundary=index.flatten(1),
+        weight=weight.flatten(1),
+        sigma=torch.where(seen, sigma, 1.0).flatten(1),
+    )
+
+
+def _take(points: Tensor, index: Tensor) -> Tensor:
+    """(B, L, V, 2) at (B, L, S) to (B, L, S, 2)."""
+    return points.gather(2, index.unsqueeze(-1).expand(*index.shape, 2))

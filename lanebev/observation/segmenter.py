@@ -1,0 +1,159 @@
+"""Images to per-boundary logits: an FCN on ResNet-18."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from lanebev.observation.resnet import ResNet18
+from lanebev.types import NUM_BOUNDARIES
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+@dataclass(frozen=True)
+class SegmenterConfig:
+    """Shape of a :class:`LaneSegmenter`.
+
+    Attributes:
+        num_boundaries: L, semantic lane boundaries.
+        base_width: channels of the trunk's first stage; 64 is ResNet-18.
+        trunk_stride: 8, 16 or 32; below 32 the trunk's last stages are dilated.
+        output_stride: 1, 2 or 4 input pixels per logit.
+        decoder_width: channels of the decoder.
+        context: reach, in cells of stride 8, of each message passing step along the lanes.
+    """
+
+    num_boundaries: int = NUM_BOUNDARIES
+    base_width: int = 64
+    trunk_stride: int = 32
+    output_stride: int = 2
+    decoder_width: int = 48
+    context: tuple[int, ...] = (1, 2, 4, 8)
+
+    def __post_init__(self) -> None:
+        if self.num_boundaries < 1:
+            raise ValueError(f"num_boundaries: expected at least 1, got {self.num_boundaries}")
+        if self.output_stride not in (1, 2, 4):
+            raise ValueError(f"output_stride: expected 1, 2 or 4, got {self.output_stride}")
+        if self.decoder_width < 4:
+            raise ValueError(f"decoder_width: expected at least 4, got {self.decoder_width}")
+
+
+class LaneSegmenter(nn.Module):
+    """One class per semantic lane boundary, and background.
+
+    Source: Sect. "Experiments", FCN (Shelhamer et al. 2017) on ResNet-18. Deviation: the skips fuse features
+    instead of scores, and strip convolutions pass messages along the lanes (after Pan et al. 2018 and Zheng
+    et al. 2021), so that a dashed line is one line.
+
+    Logit (i, j) sits on input pixel (x, y) = (s·j, s·i), s the output stride: pixel 0 is under cell 0, and no
+    half pixels appear anywhere (:class:`~lanebev.observation.resnet.ResNet18` says why).
+    """
+
+    def __init__(self, config: SegmenterConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = config or SegmenterConfig()
+        width = config.decoder_width
+        self.trunk = ResNet18(config.base_width, config.trunk_stride)
+        stem, *skips = self.trunk.widths
+        self.fine = nn.Conv2d(stem, 8, 1)
+        self.lateral = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in skips)
+        self.position = nn.Conv2d(2, width, 1)
+        self.context = nn.ModuleList(StripMessage(width, reach) for reach in config.context)
+        self.unfold = nn.Conv2d(32, width, 1)
+        self.refine = nn.Conv2d(width, 32, 3, padding=1, bias=False)
+        self.norm = nn.BatchNorm2d(32)
+        self.shuffle = 4 // config.output_stride
+        self.head = nn.Conv2d(32, (1 + config.num_boundaries) * self.shuffle**2, 1)
+        nn.init.normal_(self.head.weight, std=0.01)
+        self.mean: Tensor
+        self.std: Tensor
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Segment.
+
+        Args:
+            image: (B, 3, H, W) RGB in [0, 1], any size.
+
+        Returns:
+            (B, 1+L, ceil(H/s), ceil(W/s)) logits: background is channel 0, boundary k is channel 1+k.
+
+        Raises:
+            ValueError: another shape.
+        """
+        if image.ndim != 4 or image.shape[1] != 3:
+            raise ValueError(f"image: expected (B, 3, H, W), got {tuple(image.shape)}")
+        stem, c2, c3, c4, c5 = self.trunk((image - self.mean) / self.std)
+        lateral2, lateral3, lateral4, lateral5 = self.lateral
+        x = lateral5(c5) + self.position(_positions(c5))
+        x = lateral4(c4) + upsample_aligned(x, c4.shape[-2:])
+        x = F.relu(lateral3(c3) + upsample_aligned(x, c3.shape[-2:]))
+        for message in self.context:
+            x = message(x)
+        x = (
+            lateral2(c2)
+            + upsample_aligned(x, c2.shape[-2:])
+            + self.unfold(_fold(self.fine(stem), c2.shape[-2:]))
+        )
+        x = F.relu(self.norm(self.refine(F.relu(x))))
+        logits = F.pixel_shuffle(self.head(x), self.shuffle)
+        stride = self.config.output_stride
+        return logits[..., : -(-image.shape[-2] // stride), : -(-image.shape[-1] // stride)]
+
+
+class StripMessage(nn.Module):
+    """A message along the lanes: three rows ``reach`` cells apart, nine columns wide, as a residual.
+
+    Source: Pan et al. 2018 (SCNN), with the sequential pass over rows replaced by doubling reaches as in
+    Zheng et al. 2021 (RESA), and the 3×9 kernel by a 3×1 and a 1×9.
+    """
+
+    def __init__(self, channels: int, reach: int) -> None:
+        super().__init__()
+        self.down = nn.Conv2d(channels, channels, (3, 1), padding=(reach, 0), dilation=(reach, 1))
+        self.across = nn.Conv2d(channels, channels, (1, 9), padding=(0, 4), bias=False)
+        self.norm = nn.BatchNorm2d(channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to the same."""
+        return x + F.relu(self.norm(self.across(F.relu(self.down(x)))))
+
+
+def upsample_aligned(x: Tensor, size: torch.Size | tuple[int, int]) -> Tensor:
+    """Double a map so that fine cell 2i is coarse cell i and fine cell 2i+1 the mean of its neighbours.
+
+    Args:
+        x: (B, C, h, w).
+        size: (H, W), 2h - 1 or 2h by 2w - 1 or 2w; (h, w) itself returns x.
+
+    Returns:
+        (B, C, H, W); a last row or column without a right neighbour repeats its left one.
+    """
+    if tuple(size) == tuple(x.shape[-2:]):
+        return x
+    height, width = x.shape[-2:]
+    padded = torch.cat([x, x[..., -1:, :]], dim=-2)
+    padded = torch.cat([padded, padded[..., -1:]], dim=-1)
+    doubled = F.interpolate(padded, (2 * height + 1, 2 * width + 1), mode="bilinear", align_corners=True)
+    return doubled[..., : size[0], : size[1]]
+
+
+def _fold(x: Tensor, size: torch.Size) -> Tensor:
+    """Stride-2 cells (2i, 2i+1) as channels of stride-4 cell i: (B, C, ·, ·) to (B, 4C, *size)."""
+    padded = F.pad(x, (0, 2 * size[1] - x.shape[-1], 0, 2 * size[0] - x.shape[-2]))
+    return F.pixel_unshuffle(padded, 2)
+
+
+def _positions(features: Tensor) -> Tensor:
+    """(B, 2, h, w): x and y of each cell, -1 to 1 over the map."""
+    height, width = features.shape[-2:]
+    y = torch.linspace(-1, 1, height, dtype=features.dtype, device=features.device)
+    x = torch.linspace(-1, 1, width, dtype=features.dtype, device=features.device)
+    return torch.stack(torch.meshgrid(y, x, indexing="ij")).flip(0).expand(features.shape[0], -1, -1, -1)

@@ -1,0 +1,212 @@
+"""Probability maps to vertices: where rows and columns cross each boundary.
+
+Label pixels are cells of the map. Everything is differentiable in the probabilities.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+_FLOOR = 0.01  # probability that background noise has everywhere; counts as nothing
+_PEAK = 2  # half-width of the box whose largest sum is a scan's peak, label px
+_END = 2  # scans at either end of a stripe that its round cap makes crooked
+_NEIGHBOURS = 5  # scans on either side that decide a vertex' direction and scatter
+
+
+@dataclass(frozen=True)
+class LineConfig:
+    """How lines are read off the maps.
+
+    Attributes:
+        stride: px of the network's input per label px.
+        half_width: of the stripes that the network learned, across the line, label px.
+        segments: per boundary, S.
+        window: half-width of the window about a scan's peak, label px.
+        absent, present: share of a stripe's mass at and below which a scan has no boundary, and at and above
+            which it has one for sure.
+        min_vertices: a boundary with fewer is not seen.
+        sigma_floor: least standard deviation of a vertex, label px: what correlates along the line.
+    """
+
+    stride: int = 2
+    half_width: float = 1.125
+    segments: int = 16
+    window: int = 6
+    absent: float = 0.2
+    present: float = 0.6
+    min_vertices: int = 8
+    sigma_floor: float = 0.03
+
+    def __post_init__(self) -> None:
+        for name in ("stride", "segments", "window", "min_vertices"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if not 0 <= self.absent < self.present:
+            raise ValueError(f"present: expected more than absent ({self.absent}), got {self.present}")
+
+
+class Vertices(NamedTuple):
+    """Points on boundaries, padded.
+
+    Attributes:
+        points: (B, L, V, 2) (x, y) label px.
+        weight: (B, L, V) in [0, 1].
+        common_var: (B, L, V) label px², across the line: what neighbouring vertices share.
+        own_var: (B, L, V) label px², across the line: each vertex' own.
+    """
+
+    points: Tensor
+    weight: Tensor
+    common_var: Tensor
+    own_var: Tensor
+
+
+def scan_vertices(probabilities: Tensor, config: LineConfig) -> Vertices:
+    """Where each row and each column crosses each boundary, V = h + w.
+
+    Rows count where a boundary is steep and columns where it is shallow, with a blend about 45 degrees.
+    """
+    by_row = _scan(probabilities, config)
+    by_column = _scan(probabilities.mT, config)
+    by_column = by_column._replace(points=by_column.points.flip(-1))
+    return Vertices(*(torch.cat(pair, dim=2) for pair in zip(by_row, by_column, strict=True)))
+
+
+def _scan(probabilities: Tensor, config: LineConfig) -> Vertices:
+    """One vertex a row: (B, L, h, w) to V = h."""
+    position, mass, spread = row_moments(probabilities, config.window)
+    width = probabilities.shape[-1]
+    share = mass / (2 * config.half_width)
+    step = ((share - config.absent) / (config.present - config.absent)).clamp(0, 1)
+    slope, scatter = local_line(position, step)
+    cos2 = 1 / (1 + slope.square())  # of the angle between line and vertical
+    cos = cos2.sqrt()
+    weight = ((share * cos - config.absent) / (config.present - config.absent)).clamp(0, 1)
+    weight = -F.max_pool1d(-weight.flatten(0, -2), 2 * _END + 1, 1, _END).view_as(
+        weight
+    )  # not a stripe's end
+    steep = (2.5 * (2 * cos2 - 1) + 0.5).clamp(0, 1)  # 1 below 39 degrees, 0 above 51
+    reach = config.half_width / cos + 1.0  # of the stripe's band in its row
+    inside = (position - reach >= 0) & (position + reach <= width - 1)
+    weight = torch.where(inside, weight * steep, 0.0)
+    stripe = config.half_width**2 / (3 * cos2) + 1 / 12  # variance of a uniform stripe in pixels
+    excess = (spread - stripe).clamp(min=0)
+    rows = torch.arange(position.shape[-1], dtype=position.dtype, device=position.device)
+    points = torch.stack([position, rows.expand_as(position)], dim=-1)
+    return Vertices(points, weight, excess * cos2, scatter * cos2)
+
+
+def row_moments(probabilities: Tensor, window: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean position, mass and variance of each row's probability about its peak.
+
+    The window is put about the peak, then about the mean within it; where it lies is a constant to the
+    gradient.
+
+    Args:
+        probabilities: (..., h, w).
+        window: half-width, px.
+
+    Returns:
+        position px, mass px, variance px²: each (..., h). Position of an empty row is its window's centre.
+    """
+    counted = (probabilities - _FLOOR).clamp(min=0) / (1 - _FLOOR)
+    boxes = F.avg_pool1d(counted.flatten(0, -2).detach().unsqueeze(1), 2 * _PEAK + 1, 1, _PEAK).squeeze(1)
+    peak = boxes.argmax(-1).reshape(counted.shape[:-1]).to(counted.dtype)  # (..., h)
+    for _ in range(2):
+        centre = peak.detach().round()
+        peak, mass, variance = _windowed(counted, centre, window)
+    return peak, mass, variance
+
+
+def _windowed(counted: Tensor, centre: Tensor, window: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Moments of (..., h, w) rows within ``window`` of (..., h) centres."""
+    offset = torch.arange(-window, window + 1, device=counted.device)
+    column = centre.long().unsqueeze(-1) + offset  # (..., h, 2·window + 1)
+    inside = (column >= 0) & (column < counted.shape[-1])
+    values = counted.gather(-1, column.clamp(0, counted.shape[-1] - 1)) * inside
+    mass = values.sum(-1)
+    safe = mass.clamp(min=1e-3)
+    step = offset.to(counted.dtype)
+    mean = (values * step).sum(-1) / safe
+    variance = (values * (step - mean.unsqueeze(-1)).square()).sum(-1) / safe
+    return centre + mean, mass, variance
+
+
+def local_line(position: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Line through each row's neighbours: slope in px a row, and the variance of a row about it.
+
+    Args:
+        position: (..., h).
+        weight: (..., h).
+
+    Returns:
+        slope and variance, each (..., h). Fewer than three rows have slope 0 and variance 1.
+    """
+    rows = torch.arange(position.shape[-1], dtype=position.dtype, device=position.device)
+    # moments about the row itself: sums of weight · r^a · (x - x_row)^b over r = -5..5
+    index = rows.long().unsqueeze(-1) + torch.arange(-_NEIGHBOURS, _NEIGHBOURS + 1, device=position.device)
+    inside = (index >= 0) & (index < len(rows))
+    index = index.clamp(0, len(rows) - 1)
+    w = weight[..., index] * inside  # (..., h, 11)
+    x = position[..., index] - position.unsqueeze(-1)
+    r = torch.arange(-_NEIGHBOURS, _NEIGHBOURS + 1, dtype=position.dtype, device=position.device)
+    total = w.sum(-1)
+    enough = total > 2.5
+    safe = torch.where(enough, total, 1.0)
+    mean_r, mean_x = (w * r).sum(-1) / safe, (w * x).sum(-1) / safe
+    dr, dx = r - mean_r.unsqueeze(-1), x - mean_x.unsqueeze(-1)
+    var_r = (w * dr * dr).sum(-1)
+    slope = (w * dr * dx).sum(-1) / torch.where(enough, var_r, 1.0).clamp(min=1e-3)
+    slope = torch.where(enough, slope, 0.0)
+    residual = dx - slope.unsqueeze(-1) * dr
+    freedom = (total - 2).clamp(min=0.5)
+    variance = (w * residual.square()).sum(-1) / freedom
+    return slope, torch.where(enough, variance, 1.0)
+
+
+def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
+    """At most 2S vertices a boundary, in order along it: means over stretches of equally many vertices.
+
+    A boundary of n < 2S vertices keeps 2·floor(n/2) of them as they are.
+    """
+    points, weight = vertices.points, vertices.weight
+    seen = weight > 0
+    count = seen.sum(-1)
+    bins = 2 * _half_of(count, config)
+    rank = _rank_along(points.detach(), weight.detach())  # (B, L, V)
+    total = count.clamp(min=1).unsqueeze(-1)
+    slot = (rank * bins.unsqueeze(-1)).div(total, rounding_mode="floor")
+    slots = torch.arange(2 * config.segments, device=points.device)
+    member = (slot.unsqueeze(-1) == slots) & seen.unsqueeze(-1)  # (B, L, V, 2S)
+    share = member * weight.unsqueeze(-1)
+    mass = share.sum(2)
+    members = member.sum(2)
+    share = share / mass.clamp(min=1e-6).unsqueeze(2)  # weights of a mean
+    mean = torch.einsum("blvs,blvd->blsd", share, points)
+    common = torch.einsum("blvs,blv->bls", share, vertices.common_var)
+    own = torch.einsum("blvs,blv->bls", share.square(), vertices.own_var)
+    return Vertices(mean, mass / members.clamp(min=1), common + config.sigma_floor**2, own)
+
+
+def _half_of(count: Tensor, config: LineConfig) -> Tensor:
+    """Number of pairs of a boundary with so many vertices."""
+    half = (count // 2).clamp(max=config.segments)
+    return torch.where(count >= config.min_vertices, half, 0)
+
+
+def _rank_along(points: Tensor, weight: Tensor) -> Tensor:
+    """Place of each vertex in the order along its boundary's main direction; those not seen come last."""
+    total = weight.sum(-1, keepdim=True).clamp(min=1e-6)
+    mean = (points * weight.unsqueeze(-1)).sum(-2, keepdim=True) / total.unsqueeze(-1)
+    x, y = (points - mean).unbind(-1)
+    xx, yy, xy = (weight * x * x).sum(-1), (weight * y * y).sum(-1), (weight * x * y).sum(-1)
+    angle = 0.5 * torch.atan2(2 * xy, xx - yy).unsqueeze(-1)
+    along = x * angle.cos() + y * angle.sin()
+    along = torch.where(weight > 0, along, math.inf)
+    return along.argsort(dim=-1, stable=True).argsort(dim=-1)

@@ -1,0 +1,220 @@
+import numpy as np
+import pytest
+import torch
+
+from lanebev.observation.lines import LineExtractor, extract_segments
+from lanebev.observation.vertices import LineConfig, local_line, row_moments, scan_vertices
+
+ROWS, COLUMNS, HALF_WIDTH = 96, 160, 1.125
+CONFIG = LineConfig(half_width=HALF_WIDTH)
+
+
+def stripe(start, end, rows=ROWS, columns=COLUMNS, half_width=HALF_WIDTH, fine=5):
+    """Share of each pixel within half_width of a segment, by supersampling; independent of train.labels."""
+    step = (np.arange(fine) - (fine - 1) / 2) / fine
+    y, x = np.mgrid[0:rows, 0:columns].astype(float)
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    direction = (end - start) / np.linalg.norm(end - start)
+    share = np.zeros((rows, columns))
+    for dy in step:
+        for dx in step:
+            px, py = x + dx - start[0], y + dy - start[1]
+            along = np.clip(px * direction[0] + py * direction[1], 0, np.linalg.norm(end - start))
+            share += np.hypot(px - along * direction[0], py - along * direction[1]) <= half_width
+    return torch.from_numpy(share / fine**2)
+
+
+def fan(seed=0):
+    """Six boundaries through one vanishing point, and their ends, (6, 2, 2)."""
+    rng = np.random.default_rng(seed)
+    vanishing = np.array([80 + 8 * rng.standard_normal(), 28 + 3 * rng.standard_normal()])
+    feet = vanishing[0] + rng.uniform(-25, 25) + (np.arange(6) - 2.5) * rng.uniform(70, 110)
+    near = np.stack([feet, np.full(6, 110.0)], -1)
+    far = vanishing + 0.15 * (near - vanishing)
+    return torch.stack([stripe(a, b) for a, b in zip(near, far, strict=True)]), np.stack([near, far], 1)
+
+
+def across(points, ends):
+    """Signed distances of (..., 2) points to the lines through (2, 2) ends."""
+    direction = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    return (np.asarray(points) - ends[0]) @ np.array([-direction[1], direction[0]])
+
+
+def to_label(endpoints, stride=2):
+    return endpoints.numpy() / stride
+
+
+@pytest.fixture(scope="module")
+def fans():
+    maps, ends = zip(*(fan(seed) for seed in range(6)), strict=True)
+    return torch.stack(maps), np.stack(ends)
+
+
+def segment_errors(segments, ends, stride=2):
+    """Across-line errors of end points in label px, their sigmas, and the mask of what was seen."""
+    batch = len(ends)
+    points = to_label(segments.endpoints, stride).reshape(batch, 6, -1, 2, 2)
+    errors = np.stack([[across(points[b, k], ends[b, k]) for k in range(6)] for b in range(batch)])
+    sigma = segments.sigma.numpy().reshape(batch, 6, -1) / stride
+    return errors, sigma, segments.weight.numpy().reshape(batch, 6, -1) > 0
+
+
+def test_vertices_lie_on_rendered_boundaries_to_a_tenth_of_a_pixel(fans):
+    maps, ends = fans
+    segments = extract_segments(maps, (2 * ROWS, 2 * COLUMNS), CONFIG)
+    errors, _, seen = segment_errors(segments, ends)
+    assert seen.mean() > 0.95
+    assert np.abs(errors[seen]).max() < 0.1
+    assert abs(errors[seen].mean()) < 0.01
+
+
+def test_every_vertex_is_used_once_and_baselines_are_long(fans):
+    maps, ends = fans
+    segments = extract_segments(maps, (2 * ROWS, 2 * COLUMNS), CONFIG)
+    seen = segments.weight[0] > 0
+    points = segments.endpoints[0][seen].flatten(0, 1)
+    assert len(points.unique(dim=0)) == len(points)
+    chords = (segments.endpoints[:, :, 1] - segments.endpoints[:, :, 0]).norm(dim=-1)
+    per_boundary = chords.view(len(maps), 6, -1) / 2
+    visible = np.clip(ends[..., 1], 0, ROWS) - 0
+    assert per_boundary[:, 2:4].median() > 0.4 * np.median(visible[:, 2:4, 0] - visible[:, 2:4, 1])
+
+
+def test_zeros_and_ones_are_the_papers_rule():
+    maps = torch.zeros(1, 1, 40, 60, dtype=torch.float64)
+    for row in range(40):
+        maps[0, 0, row, 20 + row // 4 : 23 + row // 4] = 1  # three on-pixels: mean 21 + row // 4
+    position, mass, _ = row_moments(maps, window=6)
+    torch.testing.assert_close(position[0, 0], 21.0 + torch.arange(40, dtype=torch.float64) // 4)
+    torch.testing.assert_close(mass[0, 0], torch.full((40,), 3.0, dtype=torch.float64))
+    below = row_moments(torch.zeros_like(maps), window=6)[1]
+    assert (below == 0).all()
+
+
+def test_convention_pixel_centres():
+    """Label column 30 under stride 2 is network pixel 60, which is pixel 120.5 of an image twice as large."""
+    maps = torch.zeros(1, 1, 96, 160, dtype=torch.float64)
+    maps[..., 29:32] = 1
+    small = extract_segments(maps, (192, 320), CONFIG)
+    large = extract_segments(maps, (384, 640), CONFIG)
+    assert (small.weight > 0).all()
+    torch.testing.assert_close(small.endpoints[..., 0], torch.full_like(small.endpoints[..., 0], 60.0))
+    torch.testing.assert_close(large.endpoints[..., 0], torch.full_like(large.endpoints[..., 0], 120.5))
+    torch.testing.assert_close(large.sigma, 2 * small.sigma)
+
+
+@pytest.mark.parametrize("angle_deg", [0, 20, 40, 45, 50, 70, 90, 110, 135, 160])
+def test_steep_and_shallow_alike(angle_deg):
+    direction = np.array([np.sin(np.deg2rad(angle_deg)), np.cos(np.deg2rad(angle_deg))])
+    ends = np.stack([[80.3, 47.6] - 40 * direction, [80.3, 47.6] + 40 * direction])
+    segments = extract_segments(stripe(*ends)[None, None], (192, 320), CONFIG)
+    seen = segments.weight[0].numpy() > 0
+    assert seen.sum() == CONFIG.segments
+    assert np.abs(across(to_label(segments.endpoints[0])[seen], ends)).max() < 0.1
+
+
+@pytest.mark.parametrize("wobble", [0.3, 1.0])
+def test_sigma_matches_a_hedging_map(wobble):
+    """A map that does not know where the line is within a normal of sd `wobble` says so."""
+    rng = np.random.default_rng(1)
+    quantiles = torch.special.ndtri((torch.arange(9, dtype=torch.float64) + 0.5) / 9).numpy()
+    quantiles /= quantiles.std()
+    scores = []
+    for guess in wobble * quantiles:  # where the truth is within what the map thinks possible
+        angle, centre = np.deg2rad(rng.uniform(-35, 35)), np.array([60, 48]) + rng.uniform(-5, 5, 2)
+        direction = np.array([np.sin(angle), np.cos(angle)])
+        normal = np.array([direction[1], -direction[0]])
+        ends = np.stack([centre - 30 * direction, centre + 30 * direction])
+        maps = sum(stripe(*(ends + (guess + wobble * q) * normal), columns=120) for q in quantiles) / 9
+        segments = extract_segments(maps[None, None], (192, 240), CONFIG)
+        seen = segments.weight[0].numpy() > 0
+        errors = across(to_label(segments.endpoints[0])[seen], ends)
+        scores.append(np.mean((errors / segments.sigma[0].numpy()[seen, None] * 2) ** 2))
+    assert 0.8 < np.sqrt(np.mean(scores)) < 1.2
+
+
+def test_gradcheck():
+    generator = torch.Generator().manual_seed(0)
+    maps = stripe((3.3, 19), (16.2, -2), rows=18, columns=20, fine=3)[None, None]
+    maps = (0.9 * maps + 0.02 + 0.06 * torch.rand(maps.shape, generator=generator)).requires_grad_()
+    config = LineConfig(half_width=HALF_WIDTH, segments=2)
+
+    def endpoints_weight_sigma(p):
+        segments = extract_segments(p, (36, 40), config)
+        return segments.endpoints, segments.weight, segments.sigma
+
+    assert endpoints_weight_sigma(maps)[1].max() > 0
+    assert torch.autograd.gradcheck(endpoints_weight_sigma, (maps,), eps=1e-7, atol=1e-4, fast_mode=True)
+
+
+def test_absent_is_weight_zero_and_finite():
+    for maps in (torch.zeros(1, 6, 32, 48), torch.ones(1, 6, 32, 48), torch.full((1, 6, 32, 48), 1 / 7)):
+        maps.requires_grad_()
+        segments = extract_segments(maps, (64, 96), CONFIG)
+        assert all(part.isfinite().all() for part in segments)
+        (segments.endpoints.sum() + segments.sigma.sum() + segments.weight.sum()).backward()
+        assert maps.grad.isfinite().all()
+    assert (extract_segments(torch.zeros(1, 6, 32, 48), (64, 96), CONFIG).weight == 0).all()
+
+
+def test_band_at_the_image_edge_is_dropped():
+    """A vertical line half outside would be seen too far inside."""
+    segments = extract_segments(stripe((0.2, -5), (0.2, 120))[None, None], (192, 320), CONFIG)
+    assert (segments.weight == 0).all()
+
+
+def test_rows_of_a_batch_are_alone(fans):
+    maps, _ = fans
+    alone = extract_segments(maps[1:2], (192, 320), CONFIG)
+    noise = torch.full_like(maps[:1], float("nan"))
+    together = extract_segments(torch.cat([noise, maps[1:2], 0 * maps[:1]]), (192, 320), CONFIG)
+    for a, b in zip(alone, together, strict=True):
+        torch.testing.assert_close(b[1], a[0])
+
+
+def test_local_line_of_a_straight_line_with_a_gap():
+    rows = torch.arange(30, dtype=torch.float64)
+    weight = torch.ones_like(rows)
+    weight[10:13] = 0
+    slope, variance = local_line(torch.where(weight > 0, 3 + 0.7 * rows, 99.0), weight)
+    torch.testing.assert_close(slope[weight > 0], torch.full((27,), 0.7, dtype=torch.float64))
+    assert variance[weight > 0].max() < 1e-18
+
+
+def test_vertices_count_is_static():
+    vertices = scan_vertices(torch.rand(2, 3, 20, 30), CONFIG)
+    assert vertices.points.shape == (2, 3, 50, 2)
+    segments = LineExtractor(CONFIG)(torch.randn(2, 4, 20, 30), (40, 60))
+    assert segments.endpoints.shape == (2, 3 * CONFIG.segments, 2, 2)
+
+
+def test_export_equals_eager(fans):
+    logits = torch.log(
+        torch.cat([(1 - fans[0].sum(1, keepdim=True)).clamp(min=1e-3), fans[0].clamp(min=1e-3)], 1)
+    )
+
+    class AtSize(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.lines = LineExtractor(CONFIG)
+
+        def forward(self, logits):
+            return tuple(self.lines(logits, (192, 320)))
+
+    exported = torch.export.export(AtSize(), (logits[:2],)).module()
+    for a, b in zip(exported(logits[2:4]), AtSize()(logits[2:4]), strict=True):
+        torch.testing.assert_close(a, b)
+
+
+@pytest.mark.parametrize(
+    ("call", "match"),
+    [
+        (lambda: LineExtractor()(torch.zeros(2, 7, 8), (16, 16)), "logits: expected"),
+        (lambda: extract_segments(torch.zeros(7, 8), (16, 16), CONFIG), "probabilities: expected"),
+        (lambda: LineConfig(segments=0), "segments: expected"),
+        (lambda: LineConfig(absent=0.7), "present: expected"),
+    ],
+)
+def test_errors(call, match):
+    with pytest.raises(ValueError, match=match):
+        call()
