@@ -91,7 +91,8 @@ def sample_layout(dice: Dice, dotted: Tensor, faint: Tensor) -> Layout:
         faint: (B,) bool, thin worn paint of little contrast.
     """
     slots = MAX_BOUNDARIES
-    count = dice.pick([0, 0, 1, 2, 3, 3, 3, 0.6, 0.6])  # boundaries
+    few_or_many, many = dice.pick([0, 0, 1, 2, 3, 3, 3, 0.6, 0.6]), dice.pick([0, 0, 0, 0.2, 1, 2, 2, 1, 0.5])
+    count = torch.where(dotted, many, few_or_many)  # boundaries
     lane_width = torch.where(dice.chance(0.6), dice.uniform(3.4, 3.8), dice.uniform(2.7, 4.0))
     uneven = torch.where(dice.chance(0.45), 0.09, 0.0)[:, None] * dice.normal(1.0, slots - 1).clamp(-2, 2)
     widths = (lane_width[:, None] + uneven).clamp(2.6, 4.2)

@@ -38,12 +38,14 @@ class Pavement(NamedTuple):
         grain: strength of the aggregate.
         mottle: strength of blotches.
         streak: strength of streaks along the road.
+        bands: strength of broad bands along the road.
         tracks: strength of tyre tracks, negative where polished bright.
         oil: strength of the dark strip in the lane's middle.
         seam: (B, K) strength of the longitudinal seam beside each boundary.
         seam_shift: (B, K) m from the boundary to it.
         seam_width: m.
         middle_seam: strength of a seam inside lanes.
+        middle_shift: m from the lane's middle to it.
         joint: strength of transverse joints.
         joint_period: m.
         crack: strength.
@@ -65,12 +67,14 @@ class Pavement(NamedTuple):
     grain: Tensor
     mottle: Tensor
     streak: Tensor
+    bands: Tensor
     tracks: Tensor
     oil: Tensor
     seam: Tensor
     seam_shift: Tensor
     seam_width: Tensor
     middle_seam: Tensor
+    middle_shift: Tensor
     joint: Tensor
     joint_period: Tensor
     crack: Tensor
@@ -108,7 +112,7 @@ def sample_pavement(dice: Dice, layout: Layout, dotted: Tensor, bright: Tensor, 
     shoulder = torch.where(narrow, dice.uniform(0.2, 1.0, 2), dice.uniform(1.0, 4.0, 2))
     old = dice.uniform(0, 1)  # how old the road is
     seams = torch.where(concrete, dice.chance(0.75), dice.chance(0.35))
-    seam = torch.where(seams[:, None], dice.uniform(0.1, 0.75, 1), 0.0) * dice.uniform(
+    seam = torch.where(seams[:, None], dice.uniform(0.2, 0.95, 1), 0.0) * dice.uniform(
         0.3, 1.0, MAX_BOUNDARIES
     )
     return Pavement(
@@ -124,12 +128,14 @@ def sample_pavement(dice: Dice, layout: Layout, dotted: Tensor, bright: Tensor, 
         grain=dice.uniform(0.04, 0.22),
         mottle=dice.uniform(0.01, 0.08),
         streak=dice.uniform(0.01, 0.08),
+        bands=torch.where(dice.chance(0.6), dice.uniform(0.0, 0.13), 0.0),
         tracks=dice.uniform(-0.12, 0.2),
         oil=torch.where(dice.chance(0.6), dice.uniform(0.0, 0.35), 0.0),
         seam=seam,
         seam_shift=dice.normal(0.15, MAX_BOUNDARIES) + 0.17 * torch.where(dice.chance(0.5, 1), 1.0, -1.0),
         seam_width=dice.uniform(0.012, 0.05),
-        middle_seam=torch.where(dice.chance(0.15), dice.uniform(0.1, 0.6), 0.0),
+        middle_seam=torch.where(dice.chance(0.2), dice.uniform(0.1, 0.7), 0.0),
+        middle_shift=dice.uniform(-1.2, 1.2),
         joint=torch.where(concrete, dice.chance(0.7), dice.chance(0.06)) * dice.uniform(0.05, 0.5),
         joint_period=dice.uniform(3.5, 7.5),
         crack=torch.where(dice.chance(0.5), dice.uniform(0.0, 0.6) * old, 0.0),
@@ -198,6 +204,9 @@ def _weathering(
     oil = torch.exp(-((inside / 0.45) ** 2)) * (0.8 + 0.3 * mottle)
     total = pavement.grain[:, None] * (grain + 0.5 * medium) + pavement.mottle[:, None] * mottle
     total = total + pavement.streak[:, None] * streak - pavement.oil[:, None] * oil
+    total = total + pavement.bands[:, None] * sample_line(
+        across / 55.0 + along / 9000.0 + pavement.joint_period[:, None]
+    )
     return total - pavement.tracks[:, None] * tracks * (1 + 0.3 * mottle)
 
 
@@ -219,7 +228,7 @@ def _lines(
     width = pavement.seam_width[:, None] * (1 + 0.4 * wobble).clamp(0.3)
     dark = seam * stripe_coverage(distance, width, reach_across) * (1 + pavement.tar[:, None])
     dark = dark + pavement.middle_seam[:, None] * stripe_coverage(
-        inside - 0.4 - 0.03 * wobble, width, reach_across
+        inside - pavement.middle_shift[:, None] - 0.03 * wobble, width, reach_across
     )
 
     period = pavement.joint_period[:, None]

@@ -130,8 +130,8 @@ def sample_sensor(dice: Dice, weather: Weather, bright: Tensor) -> Sensor:
     return Sensor(
         exposure=exposure,
         tint=1 + dice.normal(0.03, 3),
-        contrast=dice.uniform(0.85, 1.3),
-        saturation=torch.where(dice.chance(0.05), 0.0, dice.uniform(0.5, 1.25)),
+        contrast=dice.uniform(0.9, 1.5),
+        saturation=torch.where(dice.chance(0.05), 0.0, dice.uniform(0.6, 1.6)),
         black=dice.uniform(-0.02, 0.04),
         blur=torch.where(dice.chance(0.8), dice.uniform(0.2, 0.8), dice.uniform(0.8, 2.0)),
         read_noise=dice.uniform(0.001, 0.012) * noisy,

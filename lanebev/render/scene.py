@@ -12,7 +12,7 @@ from lanebev.render.alignment import arc_nodes
 from lanebev.render.dice import Dice
 from lanebev.render.layout import Layout, sample_layout
 from lanebev.render.pavement import Pavement, sample_pavement
-from lanebev.render.photometry import DUSK, NIGHT, RAIN, Sensor, Weather, sample_sensor, sample_weather
+from lanebev.render.photometry import CLEAR, DUSK, NIGHT, RAIN, Sensor, Weather, sample_sensor, sample_weather
 from lanebev.render.surroundings import Surroundings, sample_surroundings
 from lanebev.render.traffic import Traffic, sample_traffic
 
@@ -73,8 +73,9 @@ def sample_world(dice: Dice) -> tuple[World, Tensor]:
     layout = sample_layout(dice, dotted, faint)
     ego_lane = sample_ego_lane(dice, layout)
     weather = sample_weather(dice)
+    sunny = bright | (dotted & dice.chance(0.7))
     weather = weather._replace(
-        kind=torch.where(bright, 0, weather.kind), grey=torch.where(bright, 0.1, weather.grey)
+        kind=torch.where(sunny, CLEAR, weather.kind), grey=torch.where(sunny, 0.1, weather.grey)
     )
     pavement = sample_pavement(dice, layout, dotted, bright, weather.wet)
     opposite = torch.where(dice.chance(0.5), pavement.left - dice.uniform(0.8, 9.0), -math.inf)

@@ -48,7 +48,7 @@ def _crown_shadow(world: World, ground: Ground) -> Tensor:
     crown = sample_noise(CLOUD, ground.along / 110.0, ground.across / 70.0)
     gaps = sample_noise(CLOUD, ground.along / 21.0, ground.across / 16.0)
     edge = torch.minimum(ground.across - world.pavement.left, world.pavement.right - ground.across)
-    return smoothstep(0.35, 0.65, crown + 0.35 * gaps - 0.09 * edge.clamp(min=0) + 0.25)
+    return smoothstep(0.2, 0.75, crown + 0.35 * gaps - 0.09 * edge.clamp(min=0) + 0.25)
 
 
 def _wall_shadows(world: World, light: Light, ground: Ground) -> Tensor:

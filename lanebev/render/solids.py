@@ -226,7 +226,7 @@ def shade(solids: Solids, hit: Hit, ray: Tensor, height: Tensor, light: Light) -
     surface = torch.where(bumper[:, None], surface * 0.6, surface)
     plate = car_end & (x.abs() < 0.26) & (level > 0.45) & (level < 0.62)
     surface = _put(surface, plate, colour.new_tensor([0.5, 0.5, 0.5]))
-    lamp = ((car_end & (level > 0.68) & (level < 0.9)) | (truck & end & (up > 1.0) & (up < 1.15))) & (
+    lamp = ((car_end & (level > 0.7) & (level < 0.86)) | (truck & end & (up > 1.0) & (up < 1.15))) & (
         aside > 0.7
     )
     red = lamp & (hit.face == REAR)

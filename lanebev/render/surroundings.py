@@ -70,7 +70,7 @@ def sample_surroundings(
         opposite: (B,) m, the opposite carriageway's right edge; -infinite: none.
     """
     far = [
-        torch.where(dice.chance(0.75), dice.pick([0, 0, 0, 5, 0, 1.5, 0.5]), 0) for _ in range(2)
+        torch.where(dice.chance(0.75), dice.pick([0, 0, 0, 5, 0, 2.5, 0.5]), 0) for _ in range(2)
     ]  # trees, slopes, hedges
     middle = [torch.where(dice.chance(0.45), dice.pick([0, 0, 0, 3, 3, 2, 2]), 0) for _ in range(2)]
     near = [dice.pick([2.5, 4, 1.5]), dice.pick([4.5, 2, 2.5])]  # the median has a barrier more often
@@ -93,9 +93,9 @@ def sample_surroundings(
     colour = torch.where((kind == SLOPE)[..., None], earth, colour)
     colour = colour * dice.uniform(0.7, 1.3, NUM_WALLS, 1)
 
-    blue = dice.uniform(0.16, 0.36, 1) * torch.tensor([0.30, 0.60, 1.0]) * (1 + dice.normal(0.06, 3))
-    pale = torch.stack([dice.uniform(0.22, 0.42), dice.uniform(0.28, 0.42), dice.uniform(0.34, 0.46)], dim=1)
-    overcast = dice.uniform(0.3, 0.55, 1) * torch.tensor([0.97, 1.0, 1.03])
+    blue = dice.uniform(0.18, 0.45, 1) * torch.tensor([0.30, 0.60, 1.0]) * (1 + dice.normal(0.06, 3))
+    pale = torch.stack([dice.uniform(0.28, 0.52), dice.uniform(0.36, 0.54), dice.uniform(0.44, 0.6)], dim=1)
+    overcast = dice.uniform(0.35, 0.7, 1) * torch.tensor([0.97, 1.0, 1.03])
     mix = grey[:, None]
     verge = torch.where(dice.chance(0.5, 1, 1), dice.pick_from(GREENS, 2), dice.pick_from(EARTHS, 2))
     return Surroundings(
@@ -107,7 +107,7 @@ def sample_surroundings(
         verge=verge * dice.uniform(0.7, 1.3, 1, 1),
         zenith=blue * (1 - mix) + 0.9 * overcast * mix,
         skyline=pale * (1 - mix) + overcast * mix,
-        cloud=torch.where(dice.chance(0.5), dice.uniform(0.0, 0.9), 0.0),
+        cloud=torch.where(dice.chance(0.35), dice.uniform(0.0, 0.8), 0.0),
         opposite=opposite,
         opposite_colour=dice.uniform(0.06, 0.3, 1) * torch.tensor([1.0, 0.99, 0.96]),
         hill_height=torch.where(dice.chance(0.6, 2), dice.uniform(0.0, 0.09, 2), -0.05),
@@ -195,7 +195,7 @@ def _foliage(
     leaves = sample_noise(CLOUD, along / 33.0 + seed, up / 33.0)
     fine = sample_grain(GRAIN, along / 22.0, up / 22.0 + seed) / (1 + footprint / 0.15)
     if style == 0:
-        outline = sample_line(along / wide + seed) + 0.35 * sample_line(along / 37.0 + 0.4)
+        outline = sample_line(along / wide + seed) + 0.13 * sample_line(along / 37.0 + 0.4)
         top = height * (0.62 + 0.33 * outline).clamp(0.1, 1.4)
     else:
         top = _crowns(along, height, seed, conifer=style == 2)

@@ -13,7 +13,7 @@ from lanebev.render.dice import Dice
 from lanebev.render.layout import Layout
 from lanebev.render.solids import BRIDGE, CAR, POLE, SIGN, TRUCK, Solids
 
-NUM_VEHICLES, NUM_ONCOMING = 10, 5
+NUM_VEHICLES, NUM_ONCOMING = 14, 5
 CAR_COLOURS = [
     (0.75, 0.75, 0.75), (0.75, 0.75, 0.75), (0.02, 0.02, 0.022), (0.02, 0.02, 0.022), (0.35, 0.36, 0.38),
     (0.12, 0.125, 0.13), (0.10, 0.015, 0.015), (0.03, 0.06, 0.16), (0.25, 0.22, 0.17), (0.05, 0.09, 0.06),
@@ -122,7 +122,7 @@ def _sample_vehicles(dice: Dice, layout: Layout, ego_lane: Tensor, opposite: Ten
     )
     lane = (start + hop.cumsum(1)) % lanes
     near = torch.where(dice.chance(0.3, 1), -2.0, 3.0)
-    along = near + 6.5 * torch.exp(0.37 * torch.arange(ahead) + 0.15 * dice.uniform(0, 1, ahead))
+    along = near + 6.5 * torch.exp(0.27 * torch.arange(ahead) + 0.12 * dice.uniform(0, 1, ahead))
     truck = dice.chance(0.16, count)
     shape = _vehicle_shapes(dice, count, truck)
     half_length = 0.5 * (shape[..., 0, 3] - shape[..., 0, 2])

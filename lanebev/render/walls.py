@@ -60,8 +60,11 @@ def add_walls(
         albedo, alpha = wall_texture(surroundings, wall, along, up, (pixel[:, part] * z).clamp(min=1e-3))
         faces = (-side * light.sun[:, 0]).clamp(min=0)[:, None]
         if kind >= TREES and kind != SLOPE:
-            faces = 0.45 * light.sun[:, 1, None] + 0.5 * faces
-        lit = light.direct[..., None] * faces[:, None] + light.ambient[..., None] * 0.62
+            away = (-light.sun[:, 2, None]).clamp(min=0)  # sun from behind lights what the camera sees
+            faces = 0.10 + 0.3 * light.sun[:, 1, None] * away + 0.35 * away + 0.35 * faces
+        lit = light.direct[..., None] * faces[:, None] + light.ambient[..., None] * (
+            0.35 if kind >= TREES and kind != SLOPE else 0.62
+        )
         beam = headlight_irradiance(swing[:, part] * z, z) * light.headlight[:, None] * 0.6
         lit = albedo * (lit + beam[:, None])
         clear = torch.exp(-z / world.weather.visibility[:, None])[:, None]
