@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -17,9 +17,10 @@ from lanebev.geometry.camera import Camera
 from lanebev.io.cameras import read_camera
 from lanebev.io.lanes import read_lanes
 from lanebev.io.overlap import prefetch
-from lanebev.io.results import OutputFolder
+from lanebev.io.results import ExtrinsicsRow, OutputFolder
 from lanebev.io.video import DEFAULT_FPS, Frame, FrameSource, open_source
-from lanebev.observers import LaneFileObserver, Observer
+from lanebev.observers import LaneFileObserver, NetworkObserver, Observer
+from lanebev.pipeline import LaneBEV
 from lanebev.report.measure import pose
 from lanebev.report.overlay import Picture
 from lanebev.report.page import Report
@@ -73,12 +74,15 @@ class RunConfig:
             raise ValueError("resume: expected a drive, got --stills; images on their own have no state")
 
 
-def run(config: RunConfig, progress: Progress | None = None) -> Report:
+def run(
+    config: RunConfig, progress: Progress | None = None, truth: Sequence[ExtrinsicsRow] | None = None
+) -> Report:
     """Run on all frames and write the output folder, all of it or nothing.
 
     Args:
         config: what to run.
         progress: wraps the frames, told how many there are.
+        truth: of a rendered drive, a row per frame, for the report.
 
     Returns:
         what the report page shows.
@@ -124,14 +128,14 @@ def run(config: RunConfig, progress: Progress | None = None) -> Report:
                         bird_view(warp, frame, camera, calibration.extrinsics),
                     )
                 )
-        return recorder.finish(run_facts(config, source, camera), Path(source.source).name)
+        return recorder.finish(run_facts(config, source, camera), Path(source.source).name, truth)
 
 
 def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Observer:
     """Lanes from a file if one is given, else from the network."""
     if config.lanes:
         return LaneFileObserver(read_lanes(config.lanes), source, camera)
-    raise ValueError("lanes: expected a lane file with --lanes")
+    return NetworkObserver(LaneBEV.from_pretrained(), camera)
 
 
 def make_calibrator(name: str) -> Any:

@@ -174,13 +174,18 @@ class VideoWriter:
     """H.264, yuv420p, the index in front: plays in browsers. Frames are padded to even sides.
 
     Use as a context manager; the file is whole only after it closes.
+
+    Args:
+        path: the file.
+        fps: frames per second.
+        crf: x264's quality, less is better.
     """
 
-    def __init__(self, path: str | Path, fps: Fraction) -> None:
+    def __init__(self, path: str | Path, fps: Fraction, crf: int = 21) -> None:
         self._container = av.open(str(path), "w", options={"movflags": "faststart"})
         self._stream = self._container.add_stream("libx264", rate=fps.limit_denominator(65535))
         self._stream.pix_fmt = "yuv420p"
-        self._stream.options = {"crf": "21", "preset": "veryfast"}
+        self._stream.options = {"crf": str(crf), "preset": "veryfast"}
 
     def __enter__(self) -> VideoWriter:
         return self

@@ -48,6 +48,7 @@ class Report:
         problems: frames that did not decode and the like, one line each.
         is_stills: each image on its own.
         before_title: what "before" is.
+        truth: a row per frame, of a rendered drive.
     """
 
     title: str
@@ -60,6 +61,7 @@ class Report:
     problems: Sequence[str] = field(default_factory=list)
     is_stills: bool = False
     before_title: str = "first frame's pose held"
+    truth: Sequence[ExtrinsicsRow] | None = None
 
 
 def write_report(path: str | Path, report: Report) -> None:
@@ -75,7 +77,10 @@ def write_report(path: str | Path, report: Report) -> None:
         parts.append(f'<h2>Problems</h2><ul class="problems">{items}</ul>')
     if len(rows) > 1:
         x = np.array([row.frame if report.is_stills else row.time_s for row in rows], dtype=np.float64)
-        parts += ["<h2>Estimates</h2>", _figure(plot_estimates(rows, report.is_stills), "png", "±2σ shaded")]
+        parts += [
+            "<h2>Estimates</h2>",
+            _figure(plot_estimates(rows, report.is_stills, report.truth), "png", "±2σ"),
+        ]
         widths = plot_widths(
             x,
             report.before,

@@ -27,8 +27,16 @@ _STATUS_COLOURS = {
 _LEAST_RANGE = {"pitch_deg": 0.5, "yaw_deg": 0.5, "roll_deg": 0.5, "height_m": 0.1}  # no zoom into nothing
 
 
-def plot_estimates(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> bytes:
-    """PNG of pitch, yaw, roll and height over time (or image number) with ±2 sigma, status below."""
+def plot_estimates(
+    rows: Sequence[ExtrinsicsRow], stills: bool = False, truth: Sequence[ExtrinsicsRow] | None = None
+) -> bytes:
+    """PNG of pitch, yaw, roll and height over time (or image number) with ±2 sigma, status below.
+
+    Args:
+        rows: what was found.
+        stills: each image on its own.
+        truth: a row per frame where it is known.
+    """
     figure = Figure(figsize=(11, 8), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(5, 1, sharex=True, height_ratios=[4, 4, 4, 4, 0.6])
@@ -43,12 +51,15 @@ def plot_estimates(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> bytes
         else:
             shown = np.where(known, value, np.nan)
             axis.fill_between(x, shown - 2 * std, shown + 2 * std, color=_BAND, alpha=0.18, lw=0, label="±2σ")
+            if truth is not None:
+                true = [getattr(row, name) for row in truth]
+                axis.plot(x, true, color="#24292f", lw=1.0, ls=(0, (4, 2)), label="truth")
             axis.plot(x, shown, color=_LINE, lw=1.4, label="estimate")
         _limit(axis, value[known], std[known], _LEAST_RANGE[name])
         axis.set_ylabel(label)
         _tidy(axis)
     if not stills:
-        axes[0].legend(loc="upper right", ncols=2, frameon=False, fontsize=9)
+        axes[0].legend(loc="upper right", ncols=3, frameon=False, fontsize=9)
     _status_strip(axes[4], x, [row.status for row in rows])
     axes[4].set_xlabel("image" if stills else "time (s)")
     figure.align_ylabels(axes)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
@@ -108,7 +108,9 @@ class Recorder:
         self.rows.append(extrinsics_row(frame.number, frame.time, done.calibration, weight, frame.name))
         self._background.submit(lambda: self._write(done))
 
-    def finish(self, facts: Mapping[str, str], title: str) -> Report:
+    def finish(
+        self, facts: Mapping[str, str], title: str, truth: Sequence[ExtrinsicsRow] | None = None
+    ) -> Report:
         """Write extrinsics.csv and the report, after the last frame and outside of ``with``."""
         write_extrinsics(self.path("extrinsics.csv"), self.rows)
         before, after = (np.array([pair[i] for pair in self._widths]) for i in (0, 1))
@@ -123,6 +125,7 @@ class Recorder:
             problems=self.problems,
             is_stills=self.stills,
             before_title=self.before_title,
+            truth=truth,
         )
         report.facts = {**facts, **summary_facts(report)}
         write_report(self.path("report.html"), report)
