@@ -96,9 +96,10 @@ def ground_radiance(
     sunlit, open_sky = shadows(world, light, ground, solids)
     lit = light.direct[..., None] * (light.sun[:, 1, None] * sunlit)[:, None]
     lit = lit + light.ambient[..., None] * open_sky[:, None]
-    retro = 1 + 2.5 * coverage + 8.0 * studs
-    beam = headlight_irradiance(ground.x, ground.z) * light.headlight[:, None] * retro
-    lit = lit + beam[:, None] * lit.new_tensor([1.0, 0.95, 0.85])[:, None]
+    if bool(light.headlight > 0):
+        retro = 1 + 2.5 * coverage + 8.0 * studs
+        beam = headlight_irradiance(ground.x, ground.z) * light.headlight[:, None] * retro
+        lit = lit + beam[:, None] * lit.new_tensor([1.0, 0.95, 0.85])[:, None]
     return (
         albedo * lit + _gloss(world, light, ground, swing, drop, sunlit, open_sky, blotch[2]) * paved[:, None]
     )

@@ -80,28 +80,32 @@ def _wall_shadows(world: World, light: Light, ground: Ground) -> Tensor:
 def _vehicle_shadows(light: Light, ground: Ground, solids: Solids) -> tuple[Tensor, Tensor]:
     """What vehicles leave of the sun (a swept rectangle) and of the sky (dark below them), (1, N) both."""
     lit, contact = torch.ones_like(ground.z), torch.ones_like(ground.z)
-    climb = light.sun[:, 1].clamp(min=0.12)
-    for m in (solids.valid & (solids.kind <= TRUCK) & (solids.z < 260)).nonzero()[:, 1].tolist():
-        shape = solids.shape[:, m]
-        half, rear, front = shape[:, 0, 0], shape[:, :, 2].amin(1), shape[:, :, 3].amax(1)
-        tall = shape[:, :, 7].amax(1) * 0.9
-        sin, cos = solids.heading[:, m].sin(), solids.heading[:, m].cos()
-        sun_x = (light.sun[:, 0] * cos - light.sun[:, 2] * sin) / climb * tall
-        sun_z = (light.sun[:, 0] * sin + light.sun[:, 2] * cos) / climb * tall
-        length = torch.hypot(sun_x, sun_z).clamp(min=0.5)
-        dx, dz = ground.x - solids.x[:, m], ground.z - solids.z[:, m]
-        part = (torch.maximum(dx.abs(), dz.abs()) < front + 2 + length)[0].nonzero()[:, 0]
-        if not len(part):
-            continue
-        dx, dz, blur = dx[:, part], dz[:, part], 0.08 + ground.reach_along[:, part]
-        right, ahead = dx * cos - dz * sin, dx * sin + dz * cos
-        low_x, high_x = _slab(right, sun_x, -half, half)
-        low_z, high_z = _slab(ahead, sun_z, rear, front)
-        enter = torch.maximum(low_x, low_z).clamp(min=0)
-        leave = torch.minimum(high_x, high_z).clamp(max=1)
-        lit[:, part] *= 1 - ((leave - enter) * length / blur + 0.3).clamp(0, 1)
-        gap = torch.maximum(right.abs() - half, torch.maximum(rear - ahead, ahead - front))
-        contact[:, part] *= 1 - 0.85 * smoothstep(0.45 + blur, -0.25, gap)
+    casts = (solids.valid & (solids.kind <= TRUCK) & (solids.z < 260) & (solids.z > -15)).nonzero()[:, 1]
+    if not len(casts):
+        return lit, contact
+    shape, heading = solids.shape[0, casts], solids.heading[0, casts]  # (V, 2, 8), (V,)
+    half, rear, front = shape[:, 0, 0], shape[:, :, 2].amin(1), shape[:, :, 3].amax(1)
+    tall = shape[:, :, 7].amax(1) * 0.9
+    sin, cos = heading.sin(), heading.cos()
+    sun = light.sun[0] / light.sun[0, 1].clamp(min=0.12)
+    sun_x, sun_z = (sun[0] * cos - sun[2] * sin) * tall, (sun[0] * sin + sun[2] * cos) * tall
+    length = torch.hypot(sun_x, sun_z).clamp(min=0.5)
+
+    dx, dz = ground.x - solids.x[0, casts, None], ground.z - solids.z[0, casts, None]  # (V, N)
+    which, at = (torch.maximum(dx.abs(), dz.abs()) < (front + 1.5 + length)[:, None]).nonzero(as_tuple=True)
+    dx, dz, blur = dx[which, at], dz[which, at], 0.08 + ground.reach_along[0, at]
+    table = torch.stack([sin, cos, half, rear, front, sun_x, sun_z, length])[:, which]
+    sin, cos, half, rear, front, sun_x, sun_z, length = table
+    right, ahead = dx * cos - dz * sin, dx * sin + dz * cos
+    low_x, high_x = _slab(right, sun_x, -half, half)
+    low_z, high_z = _slab(ahead, sun_z, rear, front)
+    enter = torch.maximum(low_x, low_z).clamp(min=0)
+    leave = torch.minimum(high_x, high_z).clamp(max=1)
+    sunlit = 1 - ((leave - enter) * length / blur + 0.3).clamp(0, 1)
+    gap = torch.maximum(right.abs() - half, torch.maximum(rear - ahead, ahead - front))
+    open_sky = 1 - 0.85 * smoothstep(0.45 + blur, -0.25, gap)
+    lit[0].scatter_reduce_(0, at, sunlit, "amin")
+    contact[0].scatter_reduce_(0, at, open_sky, "amin")
     return lit, contact
 
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import cv2
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -122,28 +120,26 @@ def face_planes(solids: Solids, height: Tensor) -> tuple[Tensor, Tensor]:
     return normal, reach - (normal * away[:, :, None, None]).sum(-1)
 
 
-def cast(normal: Tensor, room: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
-    """Rays against one thing of one or two convex hexahedra.
+def cast(normal: Tensor, room: Tensor, ray: Tensor, grow: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Rays against one thing of two convex hexahedra each.
 
     Args:
-        normal: (S, 6, 3), see :func:`face_planes`.
-        room: (S, 6).
+        normal: (12, 3, N), see :func:`face_planes`.
+        room: (12, N).
         ray: (2, N) right and up per metre forward.
+        grow: (N,) m by which the things are taken to be larger.
 
     Returns:
         (N,) Z of the entry, m, infinite where there is none; (N,) int64 face, plus 6 on the second one.
     """
-    flat = normal.flatten(0, 1)
-    speed = torch.addmm(flat[:, 2:], flat[:, :2], ray)  # (S·6, N) approach per metre forward
-    time = (room.flatten()[:, None] / speed).unflatten(0, room.shape)
-    enters = (speed < 0).unflatten(0, room.shape)
+    speed = normal[:, 0] * ray[0] + normal[:, 1] * ray[1] + normal[:, 2]  # approach per metre forward
+    time = ((room if grow is None else room + grow) / speed).unflatten(0, (2, 6))
+    enters = (speed < 0).unflatten(0, (2, 6))
     entry, face = time.masked_fill(~enters, -math.inf).max(1)
     leave = time.masked_fill(enters, math.inf).amin(1)
     entry = entry.masked_fill((entry >= leave) | (entry <= 0), math.inf)
-    if len(room) == 1:
-        return entry[0], face[0]
-    depth, which = entry.min(0)
-    return depth, face.gather(0, which[None])[0] + 6 * which
+    upper = entry[1] < entry[0]
+    return torch.where(upper, entry[1], entry[0]), torch.where(upper, face[1] + 6, face[0])
 
 
 def bounding_boxes(solids: Solids, lens: Lens, height: Tensor, size: tuple[int, int]) -> Tensor:
@@ -288,47 +284,70 @@ def _lettering(x: Tensor, up: Tensor, span: Tensor, colour: Tensor) -> Tensor:
     return torch.where(white[:, None], colour.new_tensor([0.6, 0.6, 0.6]), colour)
 
 
-def _hit_thing(
-    thing: int,
+def _pixels_in(boxes: list[list[int]], things: list[int], columns: int) -> tuple[Tensor, Tensor]:
+    """Things and the row-major pixels of their bounding boxes, (N,) int64 both."""
+    indices, pixels = [torch.zeros(0, dtype=torch.long)], [torch.zeros(0, dtype=torch.long)]
+    for m in things:
+        left, top, right, bottom = boxes[m]
+        if right > left and bottom > top:
+            pixel = (torch.arange(top, bottom)[:, None] * columns + torch.arange(left, right)).flatten()
+            pixels.append(pixel)
+            indices.append(torch.full_like(pixel, m))
+    return torch.cat(indices), torch.cat(pixels)
+
+
+def _hits(
+    thing: Tensor,
+    pixel: Tensor,
     normal: Tensor,
     room: Tensor,
-    box: tuple[int, int, int, int],
+    z: Tensor,
     rays: Tensor,
     steps: Tensor,
     depth: Tensor,
-) -> Hit | None:
-    """Pixels of one thing inside its bounding box: one ray each inside, four along its outline."""
-    left, top, right, bottom = box
-    window = (slice(top, bottom), slice(left, right))
-    limit = depth[window].flatten() + 0.6
-    ray = rays[:, window[0], window[1]].flatten(1)
-    pixel_size = steps[:, window[0], window[1]].abs().amax()
-    distance = room.amin(-1, keepdim=True).abs().clamp(min=1.0, max=400.0)
-    z, face = cast(normal, room + 0.6 * pixel_size * distance, ray)
-    seen = z < limit
-    if not bool(seen.any()):
-        return None
-    mask = seen.view(bottom - top, right - left).byte().numpy()
-    inner = torch.from_numpy(cv2.erode(mask, np.ones((3, 3), np.uint8))).flatten().bool()
-    inner_at, edge_at = inner.nonzero()[:, 0], (seen & ~inner).nonzero()[:, 0]
-    step = steps[:, window[0], window[1]].flatten(1)[:, edge_at]
-    fine = [ray[:, edge_at] + dx * step[:2] + dy * step[2:] for dx, dy in _SUBPIXELS]
-    fine_z, fine_face = (t.unflatten(0, (4, -1)) for t in cast(normal, room, torch.cat(fine, dim=1)))
-    hits = fine_z < limit[edge_at]
-    edge_z, nearest = fine_z.masked_fill(~hits, math.inf).min(0)
-    share = hits.float().mean(0)
-    some = share > 0
-    at = torch.cat([inner_at, edge_at[some]])
-    row, column = at // (right - left), at % (right - left)
-    face = torch.cat([face[inner_at], fine_face.gather(0, nearest[None])[0][some]])
-    return Hit(
-        thing=torch.full_like(at, thing),
-        pixel=(row + top) * rays.shape[2] + column + left,
-        share=torch.cat([torch.ones(len(inner_at)), share[some]]),
-        depth=torch.cat([z[inner_at], edge_z[some]]),
-        face=face % 6,
-        upper=face >= 6,
+) -> Hit:
+    """What is hit of the given things in the given pixels: one ray each inside, four along the outlines.
+
+    Args:
+        thing: (N,) int64.
+        pixel: (N,) int64.
+        normal: (12, 3, M), see :func:`face_planes`.
+        room: (12, M).
+        z: (M,) m.
+        rays: (2, H·W).
+        steps: (4, H·W).
+        depth: (H·W,) m, Z of what is already there.
+    """
+    limit, ray, step = depth[pixel] + 0.6, rays[:, pixel], steps[:, pixel]
+    planes, space = normal[:, :, thing], room[:, thing]
+    margin = 0.6 * step.abs().amax(0) * (z.clamp(min=0)[thing] + 1.0)
+    outer_z, face = cast(planes, space, ray, margin)
+    near = (outer_z < limit).nonzero()[:, 0]
+    thing, pixel, limit, ray, step = thing[near], pixel[near], limit[near], ray[:, near], step[:, near]
+    planes, space, margin, first_z, face = (
+        planes[:, :, near],
+        space[:, near],
+        margin[near],
+        outer_z[near],
+        face[near],
     )
+    inner_z, _ = cast(planes, space, ray, -margin)
+    share = torch.ones_like(first_z)
+    edge = inner_z.isinf().nonzero()[:, 0]
+    if len(edge):
+        fine = [ray[:, edge] + dx * step[:2, edge] + dy * step[2:, edge] for dx, dy in _SUBPIXELS]
+        four = len(_SUBPIXELS)
+        fine_z, fine_face = cast(
+            planes[:, :, edge].repeat(1, 1, four), space[:, edge].repeat(1, four), torch.cat(fine, 1)
+        )
+        fine_z, fine_face = fine_z.unflatten(0, (four, -1)), fine_face.unflatten(0, (four, -1))
+        seen = fine_z < limit[edge]
+        edge_z, nearest = fine_z.masked_fill(~seen, math.inf).min(0)
+        share[edge] = seen.float().mean(0)
+        first_z[edge], face[edge] = edge_z, fine_face.gather(0, nearest[None])[0]
+    keep = (share > 0).nonzero()[:, 0]
+    face = face[keep]
+    return Hit(thing[keep], pixel[keep], share[keep], first_z[keep], face % 6, face >= 6)
 
 
 def draw(
@@ -359,33 +378,49 @@ def draw(
         haze: (1, 3) radiance of the air.
         visibility: (1,) m.
     """
-    boxes = bounding_boxes(solids, lens, height, (image.shape[2], image.shape[3]))[0].tolist()
-    normal, room = face_planes(solids, height)
-    double = (solids.shape[0, :, 1, 7] > solids.shape[0, :, 1, 6]).tolist()
-    found = []
-    for m in solids.z[0].argsort(descending=True).tolist():
-        left, top, right, bottom = boxes[m]
-        if right <= left or bottom <= top:
-            continue
-        parts = 2 if double[m] else 1
-        hit = _hit_thing(m, normal[0, m, :parts], room[0, m, :parts], boxes[m], rays[0], steps[0], depth[0])
-        if hit is not None:
-            found.append(hit)
-    if not found:
+    columns = image.shape[3]
+    boxes = bounding_boxes(solids, lens, height, (image.shape[2], columns))[0].tolist()
+    order = solids.z[0].argsort(descending=True)
+    things, pixels = _pixels_in(boxes, order.tolist(), columns)
+    if not len(things):
         return
+    normal, room = face_planes(solids, height)
+    room = room.where(
+        (solids.shape[..., 7] > solids.shape[..., 6])[..., None], -1.0
+    )  # nobody is inside nothing
     flat_image, flat_depth, flat_blocked = image[0].flatten(1), depth[0].flatten(), blocked[0].flatten()
-    lengths = [len(hit.pixel) for hit in found]
-    every = Hit(*(torch.cat(parts) for parts in zip(*found, strict=True)))
-    local = rays[0].flatten(1)[:, every.pixel]
-    clear = torch.exp(-every.depth / visibility)[:, None]
-    radiance = haze * (1 - clear) + shade(solids, every, local, height, light) * clear
-    begin = 0
-    for length in lengths:
-        part = slice(begin, begin + length)
-        begin += length
-        at, share, z = every.pixel[part], every.share[part], every.depth[part]
+    normal, room = normal[0].flatten(1, 2).permute(1, 2, 0), room[0].flatten(1).T
+    hit = _hits(
+        things,
+        pixels,
+        normal,
+        room.contiguous(),
+        solids.z[0],
+        rays[0].flatten(1),
+        steps[0].flatten(1),
+        flat_depth,
+    )
+    whole = hit.share > 0.99  # hides what is behind it
+    front = flat_depth.clone().scatter_reduce_(0, hit.pixel[whole], hit.depth[whole], "amin")
+    seen = (hit.depth < front[hit.pixel] + 0.6).nonzero()[:, 0]
+    hit = Hit(*(t[seen] for t in hit))
+    clear = torch.exp(-hit.depth / visibility)[:, None]
+    colour = haze * (1 - clear) + shade(solids, hit, rays[0].flatten(1)[:, hit.pixel], height, light) * clear
+
+    # a pixel's hits one after another, far to near: the k-th of every pixel at once
+    rank = torch.empty_like(order).scatter_(0, order, torch.arange(len(order)))
+    by_pixel = (hit.pixel * len(order) + rank[hit.thing]).argsort()
+    pixel = hit.pixel[by_pixel]
+    first = (
+        torch.cat([torch.ones(1, dtype=torch.bool), pixel[1:] != pixel[:-1]]) if len(pixel) else pixel.bool()
+    )
+    position = torch.arange(len(pixel))
+    layer = position - position.where(first, 0).cummax(0).values
+    for k in range(int(layer.max()) + 1 if len(layer) else 0):
+        entry = by_pixel[layer == k]
+        at, share, z = hit.pixel[entry], hit.share[entry], hit.depth[entry]
         old = flat_image[:, at]
-        flat_image[:, at] = old + (radiance[part].T - old) * share
+        flat_image[:, at] = old + (colour[entry].T - old) * share
         solid = share > 0.4
         flat_depth[at] = torch.where(solid, z, flat_depth[at])
         flat_blocked[at] = torch.where(solid, torch.minimum(z, flat_blocked[at]), flat_blocked[at])

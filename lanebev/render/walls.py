@@ -65,8 +65,11 @@ def add_walls(
         lit = light.direct[..., None] * faces[:, None] + light.ambient[..., None] * (
             0.35 if kind >= TREES and kind != SLOPE else 0.62
         )
-        beam = headlight_irradiance(swing[:, part] * z, z) * light.headlight[:, None] * 0.6
-        lit = albedo * (lit + beam[:, None])
+        if bool(light.headlight > 0):
+            lit = (
+                lit + 0.6 * (headlight_irradiance(swing[:, part] * z, z) * light.headlight[:, None])[:, None]
+            )
+        lit = albedo * lit
         clear = torch.exp(-z / world.weather.visibility[:, None])[:, None]
         lit = surroundings.skyline[..., None] * (1 - clear) + lit * clear
         radiance[:, :, part] += (lit - radiance[:, :, part]) * alpha[:, None]
