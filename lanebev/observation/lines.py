@@ -69,11 +69,9 @@ def extract_segments(
     ends = torch.stack([_take(points, first), _take(points, second)], dim=-2)  # (B, L, S, 2, 2)
     weight = vertices.weight.gather(-1, first) * vertices.weight.gather(-1, second)
     weight = torch.where(first < half.unsqueeze(-1), weight, 0.0)
-    along = ends[..., 1, :] - ends[..., 0, :]
-    # across the line in image px: the normal of the image line, taken back to label px
-    along_label = along / scale
-    stretch = scale.prod() * along_label.square().sum(-1) / along.square().sum(-1).clamp(min=1e-12)
-    stretch = (scale.prod() * stretch).clamp(min=1e-12).sqrt() * config.stride
+    along = (ends[..., 1, :] - ends[..., 0, :]).square()  # (B, L, S, 2)
+    shrink = (along / scale.square()).sum(-1) / along.sum(-1).clamp(min=1e-12)
+    stretch = config.stride * scale.prod() * shrink.clamp(min=1e-12).sqrt()  # areas keep their ratio
     variance = vertices.common_var + vertices.own_var
     sigma = (0.5 * (variance.gather(-1, first) + variance.gather(-1, second))).sqrt() * stretch
     seen = weight > 0

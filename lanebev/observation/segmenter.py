@@ -26,6 +26,7 @@ class SegmenterConfig:
         output_stride: 1, 2 or 4 input pixels per logit.
         decoder_width: channels of the decoder.
         context: reach, in cells of stride 8, of each message passing step along the lanes.
+        image_size: (height, width) that the weights were trained for; any other runs, with less accuracy.
     """
 
     num_boundaries: int = NUM_BOUNDARIES
@@ -34,6 +35,7 @@ class SegmenterConfig:
     output_stride: int = 2
     decoder_width: int = 48
     context: tuple[int, ...] = (1, 2, 4, 8)
+    image_size: tuple[int, int] = (192, 320)
 
     def __post_init__(self) -> None:
         if self.num_boundaries < 1:
@@ -75,6 +77,11 @@ class LaneSegmenter(nn.Module):
         self.std: Tensor
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(height, width) that the weights were trained for."""
+        return self.config.image_size
 
     def forward(self, image: Tensor) -> Tensor:
         """Segment.

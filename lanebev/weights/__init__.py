@@ -1,0 +1,86 @@
+"""The shipped weights, and the one way to load weights: strictly.
+
+A weights file is safetensors with JSON metadata: ``config`` (:class:`SegmenterConfig`), and for the record
+``training``, ``seed``, ``commit`` and ``metrics``. Tensors may be stored in half precision; they are loaded
+in single.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
+
+SHIPPED = Path(__file__).with_name("lane_segmenter.safetensors")
+_FORMAT = "lanebev.LaneSegmenter/1"
+
+
+def load_segmenter(path: str | Path | None = None) -> LaneSegmenter:
+    """A segmenter with its weights, ready for inference.
+
+    Args:
+        path: a file written by :func:`save_segmenter`; None is the shipped one.
+
+    Raises:
+        ValueError: the file is missing, cut, of another format, or does not fit the network it describes.
+    """
+    path = SHIPPED if path is None else Path(path)
+    metadata, tensors = _read(path)
+    try:
+        segmenter = LaneSegmenter(_config(json.loads(metadata["config"])))
+        segmenter.load_state_dict(tensors, strict=True)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"{path}: weights do not fit the network they describe: {reason}") from error
+    return segmenter.eval()
+
+
+def read_metadata(path: str | Path | None = None) -> dict[str, Any]:
+    """What a weights file says about itself: config, training, seed, commit, metrics."""
+    metadata, _ = _read(SHIPPED if path is None else Path(path), tensors=False)
+    return {name: json.loads(value) for name, value in metadata.items() if name != "format"}
+
+
+def save_segmenter(segmenter: LaneSegmenter, path: str | Path, half: bool = True, **record: Any) -> None:
+    """Write a segmenter's weights.
+
+    Args:
+        segmenter: whose weights.
+        path: of the file.
+        half: store weights of convolutions as float16; norms and biases stay float32.
+        record: JSON-able facts for the metadata: training, seed, commit, metrics.
+    """
+    tensors = {
+        name: (value.half() if half and value.ndim > 1 else value).contiguous()
+        for name, value in segmenter.state_dict().items()
+    }
+    facts = {"config": asdict(segmenter.config), **record}
+    metadata = {"format": _FORMAT, **{name: json.dumps(value) for name, value in facts.items()}}
+    save_file(tensors, str(path), metadata)
+
+
+def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
+    """Metadata, and every tensor in single precision (counters as they are)."""
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a weights file, there is none")
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            metadata = file.metadata() or {}
+            values = {name: file.get_tensor(name) for name in file.keys()} if tensors else {}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{path}: expected a whole safetensors file: {error}") from error
+    if metadata.get("format") != _FORMAT:
+        raise ValueError(f"{path}: expected format {_FORMAT}, got {metadata.get('format')}")
+    return metadata, {k: v.float() if v.is_floating_point() else v for k, v in values.items()}
+
+
+def _config(values: dict[str, Any]) -> SegmenterConfig:
+    arguments: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    return SegmenterConfig(**arguments)

@@ -1,0 +1,70 @@
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+
+from lanebev.weights import load_segmenter, read_metadata
+from train.__main__ import main
+from train.export import export
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # of Lightning about itself
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+TINY = [
+    "--trainer.max_steps=1",
+    "--trainer.limit_val_batches=1",
+    "--trainer.val_check_interval=1",
+    "--trainer.num_sanity_val_steps=0",
+    "--trainer.enable_progress_bar=false",
+    "--trainer.accelerator=cpu",
+    "--model.init_args.network.base_width=4",
+    "--model.init_args.network.decoder_width=4",
+    "--data.init_args.batch_size=2",
+    "--data.init_args.workers=0",
+    "--data.init_args.render_size=[72,128]",
+]
+VIEWS = [
+    "--data.init_args.sizes=[[64,96]]",
+    "--data.init_args.val_size=[64,96]",
+    "--data.init_args.val_batches=1",
+]
+
+
+def run(subcommand, config, tmp_path, *extra):
+    here = [f"--trainer.default_root_dir={tmp_path}", f"--trainer.logger.init_args.save_dir={tmp_path}"]
+    main([subcommand, "--config", str(CONFIGS / config), *here, *extra])
+
+
+@pytest.mark.parametrize("config", ["default.yaml", "paper.yaml"])
+def test_every_config_trains_a_step(config, tmp_path):
+    run("fit", config, tmp_path, *TINY, *VIEWS)
+    with next(tmp_path.rglob("metrics.csv")).open() as file:
+        rows = list(csv.DictReader(file))
+    assert any(row["val/recall"] for row in rows)
+
+
+def test_every_config_is_tested():
+    assert {path.name for path in CONFIGS.glob("*.yaml")} == {"default.yaml", "paper.yaml", "fast.yaml"}
+
+
+def test_fit_resume_test_predict_export(tmp_path):
+    run("fit", "fast.yaml", tmp_path)
+    last = next(tmp_path.rglob("last.ckpt"))
+    assert torch.load(last, weights_only=False)["global_step"] == 2
+    run("fit", "fast.yaml", tmp_path, f"--ckpt_path={last}", "--trainer.max_steps=3")
+    newest = max(tmp_path.rglob("*.ckpt"), key=lambda p: torch.load(p, weights_only=False)["global_step"])
+    assert torch.load(newest, weights_only=False)["global_step"] == 3
+    run("test", "fast.yaml", tmp_path, f"--ckpt_path={newest}")
+    assert any("test/iou_2" in path.read_text() for path in tmp_path.rglob("metrics.csv"))
+    run("predict", "fast.yaml", tmp_path, f"--ckpt_path={newest}")
+    exported = export(newest, tmp_path / "w.safetensors", seed=1, commit="0" * 7, metrics={})
+    loaded = load_segmenter(tmp_path / "w.safetensors")
+    torch.testing.assert_close(loaded.head.bias, exported.head.bias)
+    assert read_metadata(tmp_path / "w.safetensors")["training"]["optimizer"] == "adamw"
+
+
+def test_typos_are_errors(tmp_path):
+    with pytest.raises(SystemExit) as stop:
+        run("fit", "fast.yaml", tmp_path, "--model.init_args.lerning_rate=1")
+    assert stop.value.code == 2

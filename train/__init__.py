@@ -1,0 +1,1 @@
+"""Training of the segmentation model: ``python -m train fit --config configs/default.yaml``."""

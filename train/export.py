@@ -1,0 +1,101 @@
+"""Checkpoints to weights files (``python -m train.export CKPT OUT``), and narrow weights to wide ones."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
+from lanebev.weights import save_segmenter
+from train.losses import unweighted_bias
+
+
+def checkpoint_weights(path: Path) -> dict[str, Tensor]:
+    """The segmenter's weights in a Lightning checkpoint; averaged ones where there are any.
+
+    Raises:
+        ValueError: no segmenter in it.
+    """
+    checkpoint = torch.load(path, map_location="cpu", weights_only=False)
+    prefix = "segmenter."
+    weights = {k.removeprefix(prefix): v for k, v in checkpoint["state_dict"].items() if k.startswith(prefix)}
+    if not weights:
+        raise ValueError(f"{path}: expected weights named {prefix}*, found none")
+    return weights
+
+
+def load_weights(segmenter: LaneSegmenter, path: Path) -> None:
+    """Load a checkpoint's weights, widening a trunk of half the width."""
+    weights = checkpoint_weights(path)
+    if weights["trunk.conv1.weight"].shape[0] * 2 == segmenter.config.base_width:
+        weights = widen(weights, segmenter.state_dict())
+    segmenter.load_state_dict(weights, strict=True)
+
+
+def widen(narrow: dict[str, Tensor], wide: dict[str, Tensor], noise: float = 0.02) -> dict[str, Tensor]:
+    """Weights of a network whose trunk has twice the channels, and which computes the same.
+
+    Source: Chen et al. 2016, Net2Net: every channel twice, incoming weights halved. A little noise tells the
+    twins apart.
+
+    Args:
+        narrow: state of the narrow network.
+        wide: state of a wide network, for the shapes and the noise.
+        noise: relative to each tensor's standard deviation.
+    """
+    result = {}
+    for name, target in wide.items():
+        value = narrow[name]
+        if value.shape == target.shape:
+            result[name] = value.clone()
+            continue
+        if value.ndim == 4 and value.shape[1] * 2 == target.shape[1]:
+            value = torch.cat([value, value], dim=1) / 2
+        if value.shape[0] * 2 == target.shape[0]:
+            value = torch.cat([value, value], dim=0)
+        if value.shape != target.shape:
+            raise ValueError(f"{name}: expected twice {tuple(narrow[name].shape)}, got {tuple(target.shape)}")
+        if value.ndim == 4:
+            generator = torch.Generator().manual_seed(len(result))
+            value = value + noise * value.std() * torch.randn(value.shape, generator=generator)
+        result[name] = value
+    return result
+
+
+def export(checkpoint: Path, out: Path, **record: Any) -> LaneSegmenter:
+    """Write a checkpoint's averaged weights as lanebev loads them, class weights undone in the last bias."""
+    settings = torch.load(checkpoint, map_location="cpu", weights_only=False)["settings"]
+    segmenter = LaneSegmenter(SegmenterConfig(**settings["network"]))
+    segmenter.load_state_dict(checkpoint_weights(checkpoint), strict=True)
+    if settings["class_weight"] is not None:
+        bias = unweighted_bias(torch.tensor(settings["class_weight"]))
+        with torch.no_grad():
+            segmenter.head.bias += bias.repeat_interleave(segmenter.shuffle**2)  # pixel_shuffle's order
+    save_segmenter(segmenter, out, training={k: v for k, v in settings.items() if k != "network"}, **record)
+    return segmenter
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--commit", required=True, help="of the code that trained")
+    parser.add_argument("--metrics", default="{}", help="JSON, measured on these weights")
+    parser.add_argument("--note", default="", help="what else there is to know")
+    args = parser.parse_args()
+    try:
+        metrics = json.loads(args.metrics)
+        export(args.checkpoint, args.out, seed=args.seed, commit=args.commit, metrics=metrics, note=args.note)
+    except (ValueError, OSError) as error:
+        parser.exit(2, f"error: {error}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""Losses on per-boundary logits."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def boundary_cross_entropy(
+    logits: Tensor, target: Tensor, weight: Tensor, class_weight: Tensor | None = None
+) -> Tensor:
+    """Cross-entropy with soft labels, mean over the pixels that count.
+
+    Source: Sect. "Experiments", "a cross entropy loss". Weighting classes moves the probabilities away from
+    frequencies; :func:`unweighted_bias` undoes it.
+
+    Args:
+        logits: (B, 1+L, h, w).
+        target: (B, 1+L, h, w), sums to one over channels.
+        weight: (B, h, w).
+        class_weight: (1+L,), or None for ones.
+    """
+    log_p = logits.log_softmax(1)
+    scaled = target if class_weight is None else target * class_weight.view(1, -1, 1, 1)
+    return -((scaled * log_p).sum(1) * weight).sum() / weight.sum().clamp(min=1)
+
+
+def row_cross_entropy(logits: Tensor, target: Tensor, weight: Tensor, least: float = 0.5) -> Tensor:
+    """How far each boundary's share of a row's probability is from where the boundary crosses the row.
+
+    Each row of each boundary that is there counts the same, however thin its stripe: this says where, the
+    pixels' cross-entropy says whether.
+
+    Args:
+        logits: (B, 1+L, h, w).
+        target: (B, 1+L, h, w).
+        weight: (B, h, w).
+        least: label mass below which a row does not count.
+
+    Returns:
+        Mean Kullback-Leibler divergence over counting rows.
+    """
+    log_p = (logits.log_softmax(1)[:, 1:] + (weight.unsqueeze(1) - 1) * 30).log_softmax(-1)  # over columns
+    share = target[:, 1:] * weight.unsqueeze(1)
+    mass = share.sum(-1, keepdim=True)
+    counts = (mass > least).squeeze(-1)
+    share = share / mass.clamp(min=least)
+    divergence = (torch.special.xlogy(share, share) - share * log_p).sum(-1)
+    return (divergence * counts).sum() / counts.sum().clamp(min=1)
+
+
+def unweighted_bias(class_weight: Tensor) -> Tensor:
+    """What to add to logits trained with class weights, so that their softmax is a frequency (TRIALS 4).
+
+    With weights w the loss is least at p ∝ w q; adding -log w makes it p = q.
+    """
+    return -class_weight.log()

@@ -1,0 +1,169 @@
+"""The training step."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning as L
+import torch
+from torch import Tensor
+from torchmetrics.segmentation import MeanIoU
+
+from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
+from train.augment import Photometric
+from train.data import Batch
+from train.losses import boundary_cross_entropy, row_cross_entropy, unweighted_bias
+from train.metrics import point_recall
+
+
+class Segmentation(L.LightningModule):
+    """A :class:`LaneSegmenter` learning boundaries.
+
+    Args:
+        network: its shape.
+        optimizer: "sgd" with Nesterov momentum, as in the paper, or "adamw".
+        learning_rate: after warm-up.
+        weight_decay: on weights of two dimensions and more.
+        warmup_steps: of linear growth.
+        decay_steps: the last steps of the run, in which the rate falls linearly to zero; before them it
+            stays, so that a run can be prolonged at any time (warm-up, stable, decay).
+        class_weight: (1+L,) of the cross-entropy, or None for ones; undone on export.
+        row_weight: of :func:`row_cross_entropy` beside the cross-entropy; the paper's is 0.
+        augment: strength of the photometric augmentation, 0 for none.
+        init_from: checkpoint whose weights to begin with; a narrower one is widened.
+    """
+
+    def __init__(
+        self,
+        network: SegmenterConfig | None = None,
+        optimizer: Literal["sgd", "adamw"] = "adamw",
+        learning_rate: float = 2e-3,
+        weight_decay: float = 0.02,
+        warmup_steps: int = 100,
+        decay_steps: int = 0,
+        class_weight: list[float] | None = None,
+        row_weight: float = 0.03,
+        augment: float = 1.0,
+        init_from: str | None = None,
+    ) -> None:
+        super().__init__()
+        network = network or SegmenterConfig()
+        given = locals()
+        self.settings = {"network": asdict(network), **{name: given[name] for name in _SETTINGS}}
+        # torch 2.13 corrupts memory in the backward pass of channels-last convolutions of 4 channels
+        self.layout = torch.channels_last if network.base_width % 8 == 0 else torch.contiguous_format
+        self.segmenter = LaneSegmenter(network).to(memory_format=self.layout)
+        weights = torch.tensor(class_weight or [1.0] * (1 + network.num_boundaries))
+        if weights.numel() != 1 + network.num_boundaries:
+            raise ValueError(
+                f"class_weight: expected {1 + network.num_boundaries} values, got {weights.numel()}"
+            )
+        self.class_weight: Tensor
+        self.register_buffer("class_weight", weights, persistent=False)
+        self.photometric = Photometric(augment) if augment > 0 else None
+        if init_from is not None:
+            from train.export import load_weights
+
+            load_weights(self.segmenter, Path(init_from))
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(B, 3, H, W) in [0, 1] to logits whose softmax is a frequency, class weights undone."""
+        bias = unweighted_bias(self.class_weight).view(1, -1, 1, 1)
+        return self.segmenter(image) + bias  # type: ignore[no-any-return]
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep the settings; not as hyperparameters, which LightningCLI would read back."""
+        checkpoint["settings"] = self.settings
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Augment, segment, compare."""
+        image, target, weight = unpack(batch)
+        if self.photometric is not None:
+            with torch.no_grad():
+                image = self.photometric(image)
+        logits = self.segmenter(image.contiguous(memory_format=self.layout))
+        pixels = boundary_cross_entropy(logits, target, weight, self.class_weight)
+        rows = row_cross_entropy(logits, target, weight)
+        self.log_dict({"loss/pixels": pixels, "loss/rows": rows}, prog_bar=True)
+        return pixels + self.settings["row_weight"] * rows
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Loss, and recall of each boundary's points."""
+        image, target, weight = unpack(batch)
+        logits = self(image)
+        self.log("val/loss", boundary_cross_entropy(logits, target, weight), batch_size=len(image))
+        found, there = point_recall(logits.softmax(1)[:, 1:], target[:, 1:])
+        self.val_found += found.sum(0)
+        self.val_there += there.sum(0)
+
+    def on_validation_epoch_start(self) -> None:
+        """Count anew."""
+        self.val_found = torch.zeros(self.segmenter.config.num_boundaries, device=self.device)
+        self.val_there = torch.zeros_like(self.val_found)
+
+    def on_validation_epoch_end(self) -> None:
+        """Report."""
+        recall = self.val_found / self.val_there.clamp(min=1)
+        self.log_dict({f"val/recall_{k}": value for k, value in enumerate(recall)})
+        self.log("val/recall", self.val_found.sum() / self.val_there.sum().clamp(min=1), prog_bar=True)
+
+    def on_test_start(self) -> None:
+        """Intersection over union besides."""
+        self.iou = MeanIoU(
+            1 + self.segmenter.config.num_boundaries,
+            include_background=False,
+            per_class=True,
+            input_format="index",
+        ).to(self.device)
+
+    def test_step(self, batch: Batch, batch_idx: int) -> None:
+        """Loss and intersection over union of each boundary."""
+        image, target, weight = unpack(batch)
+        logits = self(image)
+        self.log("test/loss", boundary_cross_entropy(logits, target, weight), batch_size=len(image))
+        self.iou.update(logits.argmax(1), target.argmax(1))
+
+    def on_test_epoch_end(self) -> None:
+        """Report."""
+        self.log_dict({f"test/iou_{k}": value for k, value in enumerate(self.iou.compute())})
+
+    def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Probabilities, (B, 1+L, h, w)."""
+        return self(unpack(batch)[0]).softmax(1)  # type: ignore[no-any-return]
+
+    def configure_optimizers(self) -> Any:
+        """Warm-up, stable, decay."""
+        settings = self.settings
+        decayed = [p for p in self.segmenter.parameters() if p.ndim > 1]
+        others = [p for p in self.segmenter.parameters() if p.ndim <= 1]
+        groups = [{"params": decayed}, {"params": others, "weight_decay": 0.0}]
+        kwargs = {"lr": settings["learning_rate"], "weight_decay": settings["weight_decay"]}
+        optimizer: torch.optim.Optimizer
+        if settings["optimizer"] == "sgd":
+            optimizer = torch.optim.SGD(groups, momentum=0.9, nesterov=True, **kwargs)
+        else:
+            optimizer = torch.optim.AdamW(groups, betas=(0.9, 0.99), **kwargs)
+        total = self.trainer.max_steps
+
+        def rate(step: int) -> float:
+            warm = min(1.0, (step + 1) / max(1, settings["warmup_steps"]))
+            left = (total - step) / max(1, settings["decay_steps"]) if total > 0 else 1.0
+            return warm * min(1.0, max(0.0, left))
+
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, rate)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+_SETTINGS = (
+    "optimizer", "learning_rate", "weight_decay", "warmup_steps", "decay_steps",
+    "class_weight", "row_weight", "augment", "init_from",
+)  # fmt: skip
+
+
+def unpack(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+    """Image in [0, 1], target (B, 1+L, h, w) with its background, weight (B, h, w)."""
+    target = batch.target.float() / 255
+    background = (1 - target.sum(1, keepdim=True)).clamp(min=0)
+    return batch.image.float() / 255, torch.cat([background, target], dim=1), batch.weight.float()

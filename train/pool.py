@@ -1,0 +1,147 @@
+"""Rendered frames on disk: ``python -m train.pool OUT --shards 10 --seed 1`` renders, training reads.
+
+A shard is one ``.npz`` of frames: JPEG bytes, boundaries in pixels as taken, and the exact pose. Rendering
+costs about as much as training on a view, and several views can be drawn from each frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from lanebev.geometry.camera import denormalise_points, distort_points
+from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
+from lanebev.render import RenderedFrame, render_views
+from train.labels import LabelledImage
+
+_SHARD_FIELDS = ("jpeg", "ends", "points", "painted", "visible", "vanishing_point")
+
+
+class Shard(NamedTuple):
+    """Frames of one file, images still compressed.
+
+    Attributes:
+        jpeg: (bytes,) uint8, all images one after the other.
+        ends: (N,) int64, where each image's bytes end.
+        points: (N, L, P, 2) px as taken.
+        painted: (N, L, P) bool.
+        visible: (N, L, P) bool.
+        vanishing_point: (N, 2) px as taken.
+    """
+
+    jpeg: npt.NDArray[np.uint8]
+    ends: npt.NDArray[np.int64]
+    points: npt.NDArray[np.float32]
+    painted: npt.NDArray[np.bool_]
+    visible: npt.NDArray[np.bool_]
+    vanishing_point: npt.NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+    def frame(self, index: int) -> LabelledImage:
+        """Decode one frame."""
+        start = 0 if index == 0 else int(self.ends[index - 1])
+        image = cv2.imdecode(self.jpeg[start : int(self.ends[index])], cv2.IMREAD_COLOR_RGB)
+        return LabelledImage(
+            image,
+            self.points[index],
+            self.painted[index],
+            self.visible[index],
+            self.vanishing_point[index],
+        )
+
+
+def labelled_images(frame: RenderedFrame) -> Iterator[LabelledImage]:
+    """The rows of a rendered batch, with boundaries as the lens shows them."""
+    batch, boundaries, count, _ = frame.boundaries.shape
+    points = distort_points(frame.boundaries.flatten(1, 2), frame.intrinsics, frame.distortion)
+    points = points.unflatten(1, (boundaries, count))
+    direction = vanishing_dir_from_pitch_yaw(frame.extrinsics.pitch, frame.extrinsics.yaw)
+    vanishing = denormalise_points((direction[:, :2] / direction[:, 2:])[:, None], frame.intrinsics)
+    vanishing = distort_points(vanishing, frame.intrinsics, frame.distortion)[:, 0]
+    images = (frame.image * 255).round().clamp(0, 255).byte().permute(0, 2, 3, 1)
+    for row in range(batch):
+        yield LabelledImage(
+            images[row].contiguous().numpy(),
+            points[row].float().numpy(),
+            (frame.painted[row] > 0.5).numpy(),
+            (frame.visible[row] > 0.5).numpy(),
+            vanishing[row].float().numpy(),
+        )
+
+
+def write_shard(path: Path, frames: list[RenderedFrame], quality: int = 94) -> None:
+    """Write rendered batches as one shard, whole or not at all."""
+    samples = [sample for frame in frames for sample in labelled_images(frame)]
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    jpegs = [cv2.imencode(".jpg", sample.image[..., ::-1], options)[1].ravel() for sample in samples]
+    poses = torch.cat([frame.extrinsics.stack() for frame in frames]).float().numpy()
+    partial = path.with_suffix(".part")
+    with partial.open("wb") as file:
+        np.savez(
+            file,
+            jpeg=np.concatenate(jpegs),
+            ends=np.cumsum([len(jpeg) for jpeg in jpegs]),
+            points=np.stack([sample.points for sample in samples]),
+            painted=np.stack([sample.painted for sample in samples]),
+            visible=np.stack([sample.visible for sample in samples]),
+            vanishing_point=np.stack([sample.vanishing_point for sample in samples]),
+            extrinsics=poses,
+            intrinsics=torch.cat([frame.intrinsics for frame in frames]).float().numpy(),
+            distortion=torch.cat([frame.distortion for frame in frames]).float().numpy(),
+            lane_width=torch.cat([frame.lane_width for frame in frames]).float().numpy(),
+        )
+    os.replace(partial, path)
+
+
+def read_shard(path: Path) -> Shard:
+    """Read one shard.
+
+    Raises:
+        ValueError: not a shard.
+    """
+    try:
+        with np.load(path) as file:
+            return Shard(*(file[name] for name in _SHARD_FIELDS))
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(f"{path}: expected a pool shard with {', '.join(_SHARD_FIELDS)}: {error}") from error
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--shards", type=int, default=10)
+    parser.add_argument("--frames", type=int, default=64, help="per shard")
+    parser.add_argument("--batch", type=int, default=8, help="rendered together")
+    parser.add_argument("--size", type=int, nargs=2, default=(360, 640), metavar=("HEIGHT", "WIDTH"))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--prefix", default="shard")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    for index in range(args.shards):
+        path = args.out / f"{args.prefix}-{args.seed}-{index:05d}.npz"
+        if path.exists():
+            continue
+        generator = torch.Generator().manual_seed(args.seed * 1_000_003 + index)
+        start = time.perf_counter()
+        frames = [
+            render_views(args.batch, tuple(args.size), generator) for _ in range(args.frames // args.batch)
+        ]
+        write_shard(path, frames)
+        seconds = (time.perf_counter() - start) / args.frames
+        print(f"{path}: {args.frames} frames, {1e3 * seconds:.0f} ms each", flush=True)
+
+
+if __name__ == "__main__":
+    main()
