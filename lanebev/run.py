@@ -34,6 +34,8 @@ STILLS_FPS = Fraction(2)  # of the videos that show images one after another
 STILL_PASSES = 4  # updates on one image: the linearisation settles
 _NOMINAL_HEIGHT = 1.5  # m, of the view before anything is known
 
+_BEFORE_RESOLUTION = 0.1  # m, of the view before: it is only shown small
+
 Progress = Callable[[Iterator[Frame], int], Iterator[Frame]]
 
 
@@ -98,7 +100,7 @@ def run(
     state = calibrator.initial_state(1, dtype=torch.float64)
     frames: Iterator[Frame] = prefetch(source)
     frames = progress(frames, source.count) if progress else frames
-    warp = BEVWarp(BEVGrid())
+    warp, coarse = BEVWarp(BEVGrid()), BEVWarp(BEVGrid(resolution=_BEFORE_RESOLUTION))
     with OutputFolder(config.out) as out, torch.inference_mode():
         recorder = Recorder(
             out.__truediv__,
@@ -124,7 +126,7 @@ def run(
                         segments,
                         calibration,
                         before,
-                        bird_view(warp, frame, camera, before),
+                        bird_view(coarse, frame, camera, before),
                         bird_view(warp, frame, camera, calibration.extrinsics),
                     )
                 )

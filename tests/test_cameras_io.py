@@ -188,7 +188,7 @@ def test_write_camera_round_trip(tmp_path, distortion, model):
     camera = Camera.from_parameters(**SHORT, distortion=distortion, model=model)
     write_camera(tmp_path / "c.yaml", camera)
     again = read_camera(tmp_path / "c.yaml")
-    padded = distortion if model == "fisheye" else distortion + [0.0] * (5 - len(distortion))
+    padded = distortion + [0.0] * (5 - len(distortion)) if distortion and model == "pinhole" else distortion
     _assert_same(again, Camera.from_parameters(**SHORT, distortion=padded, model=model))
 
 

@@ -199,6 +199,10 @@ def _checked(matrix: list[float], distortion: list[float], model: str, size: tup
         raise ValueError("camera matrix: expected [fx s cx; 0 fy cy; 0 0 1], got other off-diagonal entries")
     if len(distortion) == 14 and not any(distortion[12:]):  # OpenCV's tilted sensor, not tilted
         distortion = distortion[:12]
+    if (
+        model == "pinhole" and not any(distortion) and len(distortion) in DISTORTION_LENGTHS[model]
+    ):  # no lens to undo, which is much faster to do
+        distortion = []
     lengths = DISTORTION_LENGTHS[model]
     if model == "fisheye" and not distortion:
         distortion = [0.0] * 4
@@ -279,6 +283,7 @@ def camera_info(camera: Camera, name: str = "camera") -> dict[str, Any]:
     """The camera as the fields of a ROS ``camera_info`` YAML.
 
     ROS knows no lens with fewer than five pinhole coefficients: zeros are added, the lens stays the same.
+    Reading takes all zeros as no distortion.
     """
     height, width = camera.image_size
     coefficients = [float(value) for value in camera.distortion.tolist()]

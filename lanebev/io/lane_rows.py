@@ -139,8 +139,7 @@ def segments_from_rows(
     noise = np.full_like(weight, sigma)
     for row, frame in enumerate(frames):
         known = np.full_like(frame.x, sigma) if frame.sigma is None else frame.sigma
-        for index, (x, own) in enumerate(zip(frame.x, known, strict=True)):
-            vertices = _undistorted(np.stack([x, frame.rows], axis=-1), camera, own)
+        for index, vertices in enumerate(_vertices(frame, known, camera)):
             pairs = paired(vertices, per_boundary)
             endpoints[row, index, : len(pairs)] = pairs[..., :2]
             weight[row, index, : len(pairs)] = 1.0
@@ -184,12 +183,19 @@ def _with_gaps(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.insert(vertices, gaps + 1, np.stack([np.full(len(gaps), np.nan), middle], axis=-1), axis=0)
 
 
-def _undistorted(
-    points: NDArray[np.float64], camera: Camera, sigma: NDArray[np.float64] | None = None
-) -> NDArray[np.float64]:
-    """(P, 2) px as taken to those (Q, 2) px undistorted that the lens can have imaged; (Q, 3) with sigma."""
+def _vertices(frame: BoundaryRows, sigma: NDArray[np.float64], camera: Camera) -> list[NDArray[np.float64]]:
+    """Vertices (K, 3) of each boundary: undistorted x, y and sigma, px; those the lens can have imaged."""
+    points = np.stack([frame.x, np.broadcast_to(frame.rows, frame.x.shape)], axis=-1)
+    undistorted, valid = camera.undistort_points(torch.from_numpy(points).flatten(0, 1).to(camera.intrinsics))
+    vertices = np.concatenate([undistorted.double().numpy(), sigma.reshape(-1, 1)], axis=-1)
+    kept = valid.numpy().reshape(frame.x.shape)
+    return [own[seen] for own, seen in zip(vertices.reshape(*frame.x.shape, 3), kept, strict=True)]
+
+
+def _undistorted(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """(P, 2) px as taken to those (Q, 2) px undistorted that the lens can have imaged."""
     if not len(points):
         return points
     undistorted, valid = camera.undistort_points(torch.from_numpy(points).to(camera.intrinsics))
     kept: NDArray[np.float64] = undistorted[valid].double().numpy()
-    return kept if sigma is None else np.concatenate([kept, sigma[valid.numpy(), None]], axis=-1)
+    return kept
