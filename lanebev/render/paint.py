@@ -25,7 +25,7 @@ class Painted(NamedTuple):
     Attributes:
         radiance: (1, 3, H, W) linear.
         blocked: (1, H, W) m, Z of the nearest thing that is not the road; infinite: none.
-        road_level: (1,) mean radiance of the road before the camera.
+        road_level: (1,) radiance of the road before the camera.
         nearest: (1,) m, Z of the nearest road in the image.
     """
 
@@ -89,7 +89,8 @@ def paint_view(
         & (ground.across[0] > world.pavement.left)
         & (ground.across[0] < world.pavement.right)
     )
-    road_level = lit.mean(1)[:, near].mean(1) if bool(near.any()) else lit.mean((1, 2))
+    metered = lit.mean(1)[:, near] if bool(near.any()) else lit.mean(1)
+    road_level = metered.square().mean(1).sqrt()  # the root mean square: bright parts count for more
     ahead = ground.across.new_zeros(1, height * width)
     ahead[:, below] = ground.across
     add_walls(

@@ -89,6 +89,7 @@ def _tone(dice: Dice, concrete: Tensor, bright: Tensor) -> Tensor:
     level = torch.where(concrete, dice.uniform(0.20, 0.40), dice.uniform(0.045, 0.17))
     level = torch.where(bright, dice.uniform(0.33, 0.50), level)
     warm = torch.where(concrete, dice.uniform(-0.01, 0.07), dice.uniform(-0.04, 0.04))
+    warm = torch.where(bright, dice.uniform(0.02, 0.12), warm)
     tint = torch.stack([1 + warm, 1 + 0.3 * warm, 1 - warm], dim=1) + dice.normal(0.008, 3)
     return level[:, None] * tint
 
@@ -111,6 +112,8 @@ def sample_pavement(dice: Dice, layout: Layout, dotted: Tensor, bright: Tensor, 
     narrow = dice.chance(0.3, 2)
     shoulder = torch.where(narrow, dice.uniform(0.2, 1.0, 2), dice.uniform(1.0, 4.0, 2))
     old = dice.uniform(0, 1)  # how old the road is
+    even = torch.where(bright, dice.chance(0.6), dice.chance(0.3))
+    rough = torch.where(even, dice.uniform(0.0, 0.3), 1.0)
     seams = torch.where(concrete, dice.chance(0.75), dice.chance(0.35))
     seam = torch.where(seams[:, None], dice.uniform(0.2, 0.95, 1), 0.0) * dice.uniform(
         0.3, 1.0, MAX_BOUNDARIES
@@ -125,12 +128,12 @@ def sample_pavement(dice: Dice, layout: Layout, dotted: Tensor, bright: Tensor, 
         deck_length=torch.where(dice.chance(0.2), dice.uniform(15, 120), 0.0),
         deck_phase=dice.uniform(-90, 40),
         lane_tone=tone.clamp(0.75, 1.25),
-        grain=dice.uniform(0.04, 0.22),
-        mottle=dice.uniform(0.01, 0.08),
-        streak=dice.uniform(0.01, 0.08),
-        bands=torch.where(dice.chance(0.6), dice.uniform(0.0, 0.13), 0.0),
-        tracks=dice.uniform(-0.12, 0.2),
-        oil=torch.where(dice.chance(0.6), dice.uniform(0.0, 0.35), 0.0),
+        grain=dice.uniform(0.04, 0.22) * (0.4 + 0.6 * rough),
+        mottle=dice.uniform(0.01, 0.08) * rough,
+        streak=dice.uniform(0.01, 0.08) * rough,
+        bands=torch.where(dice.chance(0.6), dice.uniform(0.0, 0.13), 0.0) * rough,
+        tracks=dice.uniform(-0.12, 0.2) * rough,
+        oil=torch.where(dice.chance(0.6), dice.uniform(0.0, 0.35), 0.0) * rough,
         seam=seam,
         seam_shift=dice.normal(0.15, MAX_BOUNDARIES) + 0.17 * torch.where(dice.chance(0.5, 1), 1.0, -1.0),
         seam_width=dice.uniform(0.012, 0.05),

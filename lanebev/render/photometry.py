@@ -88,7 +88,7 @@ class Sensor(NamedTuple):
     Attributes:
         exposure: linear level that the road's mean is brought to.
         tint: (B, 3) white balance.
-        contrast: exponent about middle grey.
+        contrast: slope at middle grey.
         saturation: factor.
         black: offset.
         blur: px at 640 px width, standard deviation.
@@ -122,8 +122,8 @@ class Sensor(NamedTuple):
 
 def sample_sensor(dice: Dice, weather: Weather, bright: Tensor) -> Sensor:
     """A random camera; ``bright`` (B,) bool overexposes."""
-    usual = torch.where(dice.chance(0.8), dice.uniform(0.045, 0.2), dice.uniform(0.2, 0.34))
-    exposure = torch.where(bright, dice.uniform(0.28, 0.5), usual)
+    usual = torch.where(dice.chance(0.8), dice.uniform(0.055, 0.22), dice.uniform(0.2, 0.34))
+    exposure = torch.where(bright, dice.uniform(0.3, 0.75), usual)
     dark = (weather.kind == NIGHT) | (weather.kind == DUSK)
     exposure = torch.where(dark, dice.uniform(0.03, 0.2), exposure)
     noisy = torch.where(weather.kind == NIGHT, 2.5, 1.0)
@@ -177,7 +177,7 @@ def expose(radiance: Tensor, sensor: Sensor, road_level: Tensor) -> Tensor:
     Args:
         radiance: (1, 3, H, W).
         sensor: the camera.
-        road_level: (1,) mean radiance of the road; the exposure is set for it, and less for all the rest.
+        road_level: (1,) radiance of the road; the exposure is set for it, and less for all the rest.
 
     Returns:
         (1, 3, H, W) in [0, 1].
@@ -195,12 +195,17 @@ def expose(radiance: Tensor, sensor: Sensor, road_level: Tensor) -> Tensor:
     value += sensor.glare * value.mean()
     over = (value - 0.6).clamp(min=0)
     value = value.clamp(1e-4, 0.6) + 0.4 * (1 - torch.exp(-over / 0.4))  # soft shoulder
-    # display gamma, then contrast about middle grey, in one power
-    middle, contrast = 0.45, sensor.contrast
-    value = value ** (contrast / 2.2) * middle ** (1 - contrast)
+    value = _contrast(value ** (1 / 2.2), float(sensor.contrast))
     grey = value.mean(1, keepdim=True)
     value = grey + (value - grey) * sensor.saturation
     return (value + sensor.black).clamp(0, 1)
+
+
+def _contrast(value: Tensor, power: float, middle: float = 0.45) -> Tensor:
+    """An S-shaped curve through 0, the middle and 1, with slope ``power`` at the middle."""
+    low = middle * (value.clamp(max=middle) / middle) ** power
+    high = (1 - middle) * ((1 - value).clamp(0, 1 - middle) / (1 - middle)) ** power
+    return low + (1 - middle) - high
 
 
 def blur(image: Tensor, std: float) -> Tensor:
