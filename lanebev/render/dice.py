@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -40,7 +41,7 @@ class Dice:
         draw = torch.rand(self.batch_size, *shape, generator=self.generator) * cumulative[-1]
         return torch.bucketize(draw, cumulative, right=True).clamp(max=len(weights) - 1)
 
-    def pick_from(self, values: list[float] | list[tuple[float, ...]], *shape: int) -> Tensor:
+    def pick_from(self, values: Sequence[float] | Sequence[tuple[float, ...]], *shape: int) -> Tensor:
         """(B, *shape, ...) one of the values, all equally likely."""
         return torch.tensor(values)[self.pick([1.0] * len(values), *shape)]
 

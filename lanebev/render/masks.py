@@ -51,7 +51,7 @@ def boundary_masks(
 
     start, end = points[:, :, :-1], points[:, :, 1:]
     strength = torch.minimum(weight[:, :, :-1], weight[:, :, 1:])
-    masks = points.new_zeros(batch * boundaries * height * width)
+    masks: Tensor = points.new_zeros(batch * boundaries * height * width)
     layer, part = (strength.flatten(0, 1) > 0).nonzero(as_tuple=True)  # (S,) pieces that are there
     if len(layer) == 0:
         return masks.reshape(batch, boundaries, height, width)

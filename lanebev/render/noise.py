@@ -33,7 +33,7 @@ def _shaped(spectrum: Tensor, generator: torch.Generator) -> Tensor:
     white = torch.fft.fft2(torch.randn(TILE, TILE, generator=generator))
     spectrum = spectrum.clone()
     spectrum[0, 0] = 0
-    field = torch.fft.ifft2(white * spectrum).real
+    field: Tensor = torch.fft.ifft2(white * spectrum).real
     return field / field.std()
 
 
