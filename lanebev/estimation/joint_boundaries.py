@@ -67,7 +67,7 @@ def fit_boundaries(
     seen = observe(segments, intrinsics, num_boundaries)
     curvature = intrinsics.new_zeros(intrinsics.shape[0], 2) if curvature is None else curvature
     rotation = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)
-    x, down, ahead = torch.einsum("bij,bnej->ibne", rotation, seen.rays).flatten(2).unbind(0)  # (B, 2N)
+    x, down, ahead = (rotation @ seen.rays).unbind(1)  # each (B, 2N)
     height = extrinsics.height.unsqueeze(-1)
     on_road = (down * FARTHEST > height * ahead) & (ahead > 1e-3)
     down = torch.where(on_road, down, 1.0)

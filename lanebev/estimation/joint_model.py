@@ -32,10 +32,10 @@ FOOT_RANGE = 0.02  # of the focal length; a foot point farther off is an outlier
 
 
 class Observations(NamedTuple):
-    """Segments made ready: rays once per frame, bad entries at weight zero.
+    """Segments made ready: rays once per frame, bad entries at weight zero. M = 2 N end points.
 
     Attributes:
-        rays: (B, N, 2, 3), z = 1, of both end points.
+        rays: (B, 3, M), z = 1; end point e of segment n is entry 2 n + e.
         boundary: (B, N) int64, 0..L-1.
         weight: (B, N) in [0, 1].
         sigma: (B, N) px.
@@ -54,7 +54,7 @@ class Residuals(NamedTuple):
 
     Attributes:
         distance: (B, N, 2) px, positive right of the boundary.
-        jacobian: (B, N, 2, 7) of the distance by the frame's parameters.
+        jacobian: (B, 7, M) of the distance by the frame's parameters; finite also where not valid.
         valid: (B, N) bool, both end points on the road and nearer than 200 m.
     """
 
@@ -88,7 +88,7 @@ def observe(segments: LaneSegments, intrinsics: Tensor, num_boundaries: int) -> 
     matrix = torch.where(camera_ok[:, None, None], intrinsics, harmless)
     rays = rays_from_pixels(segments.endpoints.flatten(1, 2), matrix)
     return Observations(
-        rays=rays.view(*segments.endpoints.shape[:3], 3),
+        rays=rays.mT.contiguous(),
         boundary=segments.boundary,
         weight=segments.weight * camera_ok.unsqueeze(-1),
         sigma=segments.sigma,
@@ -128,82 +128,87 @@ def boundary_residuals(params: Tensor, places: Tensor, seen: Observations) -> Re
         seen: what was observed.
 
     Returns:
-        Distances, Jacobian, validity. Invalid entries are zero.
+        Distances, zero where not valid, Jacobian, validity.
     """
-    pitch, yaw, roll, height = params[:, :OFFSET].unbind(-1)
-    rotation = road_from_cam(pitch, yaw, roll)  # (B, 3, 3)
-    directions = torch.einsum("bij,bnej->bnei", rotation, seen.rays)  # (B, N, 2, 3)
-    x_k = (places + params[:, OFFSET, None]).unsqueeze(-1)  # (B, N, 1)
-    directions, valid = _on_road(directions, height)
+    rotation = road_from_cam(*params[:, :HEIGHT].unbind(-1))  # (B, 3, 3)
+    direction_by_pixel = rotation @ _ray_by_pixel(seen.intrinsics)  # (B, 3, 2)
+    directions, valid = _on_road(rotation @ seen.rays, params)
+    x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (B, M)
     value, by_direction, _ = _implicit(directions, x_k, params)
-    by_pixel = _pixel_gradient(by_direction, rotation, seen.intrinsics)  # (B, N, 2, 2)
-    slope = by_pixel.norm(dim=-1)
+    by_pixel = direction_by_pixel.mT @ by_direction  # (B, 2, M)
+    slope = torch.hypot(*by_pixel.unbind(1))
     distance = value / slope
 
-    fx, fy, skew = _lens(seen.intrinsics)
-    near = distance.clamp(-FOOT_RANGE * fx, FOOT_RANGE * fx)
-    step = (near / slope).unsqueeze(-1) * by_pixel  # px, from the foot point to the end point
-    step_y = step[..., 1] / fy
-    step_x = (step[..., 0] - skew * step_y) / fx
-    moved = step_x.unsqueeze(-1) * rotation[:, None, None, :, 0]
-    moved = moved + step_y.unsqueeze(-1) * rotation[:, None, None, :, 1]
-    foot, foot_valid = _on_road(directions - moved, height)
-    foot = torch.where(foot_valid[..., None, None], foot, directions)
+    reach = FOOT_RANGE * seen.intrinsics[:, 0, 0, None]
+    near = torch.maximum(torch.minimum(distance, reach), -reach) / slope
+    foot, foot_valid = _on_road(directions - direction_by_pixel @ (near.unsqueeze(1) * by_pixel), params)
+    foot = torch.where(foot_valid.unsqueeze(1), foot, directions)
     _, by_foot, by_shape = _implicit(foot, x_k, params)
-    across = torch.linalg.cross(foot, by_foot)  # ∂G/∂angle = by · (-axis × d) = -axis · (d × by)
-    sin, cos = roll.sin(), roll.cos()
-    by_pitch = -(across * rotation[:, None, None, :, 0]).sum(-1)
-    by_yaw = -(across[..., 0] * sin[:, None, None] + across[..., 1] * cos[:, None, None])
-    by_roll = -across[..., 2]
-    jacobian = torch.cat([torch.stack([by_pitch, by_yaw, by_roll], dim=-1), by_shape], dim=-1)
-    keep = valid.unsqueeze(-1)
+    turning = torch.linalg.cross(by_foot, foot, dim=1)  # ∂G/∂angle = by · (-axis × d) = axis · (by × d)
+    jacobian = torch.cat([_axes(rotation, params[:, ROLL]) @ turning, by_shape], dim=1)
+    both = valid.unflatten(-1, (-1, 2)).all(-1)
     return Residuals(
-        distance=torch.where(keep, distance, 0.0),
-        jacobian=torch.where(keep.unsqueeze(-1), jacobian / slope.unsqueeze(-1), 0.0),
-        valid=valid,
+        distance=torch.where(both.unsqueeze(-1), distance.unflatten(-1, (-1, 2)), 0.0),
+        jacobian=jacobian / slope.unsqueeze(1),
+        valid=both,
     )
 
 
-def _on_road(directions: Tensor, height: Tensor) -> tuple[Tensor, Tensor]:
-    """Directions with d_y kept off zero, and (B, N) bool: both end points meet the road before FARTHEST."""
-    x, down, forward = directions.unbind(-1)
-    lowest = height[:, None, None].clamp(min=0.1) / FARTHEST * forward
-    on_road = (forward > 1e-3) & (down > lowest)
+def boundary_distances(params: Tensor, places: Tensor, seen: Observations) -> tuple[Tensor, Tensor]:
+    """The distances alone, for several hypotheses of the places at once.
+
+    Args:
+        params: (B, 7).
+        places: (H, B, N) m.
+        seen: what was observed.
+
+    Returns:
+        (H, B, N, 2) px, zero where not valid, and (B, N) bool.
+    """
+    rotation = road_from_cam(*params[:, :HEIGHT].unbind(-1))
+    direction_by_pixel = rotation @ _ray_by_pixel(seen.intrinsics)
+    directions, valid = _on_road(rotation @ seen.rays, params)
+    x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (H, B, M)
+    value, by_direction, _ = _implicit(directions, x_k, params)
+    distance = value / torch.hypot(*(direction_by_pixel.mT @ by_direction).unbind(-2))
+    both = valid.unflatten(-1, (-1, 2)).all(-1)
+    return torch.where(both.unsqueeze(-1), distance.unflatten(-1, (-1, 2)), 0.0), both
+
+
+def _ray_by_pixel(intrinsics: Tensor) -> Tensor:
+    """(B, 3, 2): the first columns of K⁻¹, with skew."""
+    fx, fy, skew = intrinsics[:, 0, 0], intrinsics[:, 1, 1], intrinsics[:, 0, 1]
+    zero = torch.zeros_like(fx)
+    entries = [1 / fx, -skew / (fx * fy), zero, 1 / fy, zero, zero]
+    return torch.stack(entries, dim=-1).view(-1, 3, 2)
+
+
+def _axes(rotation: Tensor, roll: Tensor) -> Tensor:
+    """Axes, in the road frame, about which pitch, yaw and roll turn a direction backwards; (B, 3, 3) rows."""
+    zero, one = torch.zeros_like(roll), torch.ones_like(roll)
+    yaw = torch.stack([roll.sin(), roll.cos(), zero], dim=-1)
+    return torch.stack([rotation[:, :, 0], yaw, torch.stack([zero, zero, one], dim=-1)], dim=1)
+
+
+def _on_road(directions: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
+    """(B, 3, M) directions with d_y kept off zero, and (B, M) bool: they meet the road before FARTHEST."""
+    x, down, ahead = directions.unbind(1)
+    lowest = ahead * (params[:, HEIGHT, None].clamp(min=0.1) / FARTHEST)
+    on_road = (ahead > 1e-3) & (down > lowest)
     down = torch.where(on_road, down, lowest.abs() + 1e-3)
-    return torch.stack([x, down, forward], dim=-1), on_road.all(-1)
+    return torch.stack([x, down, ahead], dim=1), on_road
 
 
 def _implicit(directions: Tensor, x_k: Tensor, params: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """G, its gradient by the direction (…, 3), and by (height, offset, c0, c1) (…, 4)."""
-    x, down, forward = directions.unbind(-1)
-    height, _, c0, c1 = params[:, HEIGHT:, None, None].unbind(1)
-    z = height * forward / down
-    bend = z * z * (c0 / 2 + c1 * z / 6)  # m, of the boundary from its tangent
-    heading = z * (c0 + c1 * z / 2)
-    value = height * x - (x_k + bend) * down
-    by_direction = torch.stack(
-        [height.expand_as(x), z * heading - bend - x_k, -height * heading],
-        dim=-1,
-    )
-    by_shape = torch.stack(
-        [x - heading * forward, -down, -down * z * z / 2, -down * z * z * z / 6],
-        dim=-1,
-    )
-    return value, by_direction, by_shape
-
-
-def _lens(intrinsics: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """fx, fy, skew, each (B, 1, 1)."""
-    return (
-        intrinsics[:, 0, 0, None, None],
-        intrinsics[:, 1, 1, None, None],
-        intrinsics[:, 0, 1, None, None],
-    )
-
-
-def _pixel_gradient(by_direction: Tensor, rotation: Tensor, intrinsics: Tensor) -> Tensor:
-    """Gradient by the undistorted pixel (…, 2) from that by the road direction (…, 3)."""
-    by_ray = torch.einsum("bji,bnej->bnei", rotation, by_direction)
-    fx, fy, skew = _lens(intrinsics)
-    by_x = by_ray[..., 0] / fx
-    return torch.stack([by_x, (by_ray[..., 1] - skew * by_x) / fy], dim=-1)
+    """G, its gradient by the direction (…, B, 3, M), and by (height, offset, c0, c1) (B, 4, M)."""
+    x, down, ahead = directions.unbind(1)
+    height, _, c0, c1 = params[:, HEIGHT:, None].unbind(1)  # each (B, 1)
+    z = height * ahead / down
+    heading = z * (c0 + 0.5 * c1 * z)
+    bend = z * z * (0.5 * c0 + c1 * z / 6)  # m, of the boundary from its tangent
+    out = x_k + bend
+    value = height * x - out * down
+    across = torch.broadcast_tensors(height, z * heading - out, -height * heading)
+    area = -0.5 * down * z * z
+    by_shape = torch.stack([x - heading * ahead, -down, area, area * z / 3], dim=1)
+    return value, torch.stack(across, dim=-2), by_shape

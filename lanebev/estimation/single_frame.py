@@ -189,7 +189,9 @@ def refine(
         fitted = noise_scale(residuals.distance, seen.sigma, trust)
         scale = torch.minimum(torch.maximum(fitted, 0.5 * scale), scale)
         by_noise = trust / (seen.sigma * scale.unsqueeze(-1)).square()
-        information, gradient = normal_equations(residuals.jacobian, residuals.distance, by_noise)
+        information, gradient = normal_equations(
+            residuals.jacobian, residuals.distance, by_noise * residuals.valid
+        )
         held = precision * _student_weight((params - mean).square() * precision)
         information = information + held.diag_embed()
         gradient = gradient + held * (params - mean)
@@ -201,10 +203,9 @@ def refine(
 
 
 def normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Jᵀ W J (B, P, P) and Jᵀ W r (B, P), from (B, N, 2, P), (B, N, 2) and a weight (B, N) per segment."""
-    flat = jacobian.flatten(1, 2)
-    weighted = (jacobian * weight[..., None, None]).flatten(1, 2).mT  # (B, P, 2N)
-    return weighted @ flat, (weighted @ distance.flatten(1, 2).unsqueeze(-1)).squeeze(-1)
+    """Jᵀ W J (B, P, P) and Jᵀ W r (B, P), from (B, P, 2N), (B, N, 2) and a weight (B, N) per segment."""
+    weighted = jacobian * weight.repeat_interleave(2, dim=1).unsqueeze(1)
+    return weighted @ jacobian.mT, (weighted @ distance.flatten(1).unsqueeze(-1)).squeeze(-1)
 
 
 def _student_weight(squared: Tensor) -> Tensor:
@@ -224,8 +225,9 @@ def _subset(seen: Observations, places: Tensor, count: int) -> tuple[Observation
         return seen, places
     order = torch.arange(total, dtype=torch.float64, device=places.device) * 0.6180339887498949 % 1.0
     index = ((seen.weight > 0).to(torch.float64) + order).topk(count, dim=-1).indices  # (B, count)
+    ends = torch.stack([2 * index, 2 * index + 1], dim=-1).flatten(1)  # (B, 2 count)
     picked = seen._replace(
-        rays=seen.rays.gather(1, index[..., None, None].expand(-1, -1, 2, 3)),
+        rays=seen.rays.gather(2, ends.unsqueeze(1).expand(-1, 3, -1)),
         boundary=seen.boundary.gather(1, index),
         weight=seen.weight.gather(1, index),
         sigma=seen.sigma.gather(1, index),
@@ -247,8 +249,7 @@ def _linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Ten
     roll = prior.roll + prior.roll_range * torch.linspace(-1, 1, prior.roll_steps).to(like)
     pitch, roll = (grid.flatten() for grid in torch.meshgrid(pitch, roll, indexing="ij"))  # (H,)
     axes = road_from_cam(pitch, torch.zeros_like(pitch), roll)  # (H, 3, 3) rows right, down, forward
-    rays = seen.rays.flatten(1, 2)  # (B, M, 3)
-    right, below, ahead = torch.einsum("hij,bmj->ibhm", axes, rays).unbind(0)  # each (B, H, M)
+    right, below, ahead = torch.einsum("hij,bjm->ibhm", axes, seen.rays).unbind(0)  # each (B, H, M)
     valid = (below > 0.005) & (ahead > 0.1)
     below = torch.where(valid, below, 1.0)
     bend = ahead * ahead / (2 * below)

@@ -1,0 +1,343 @@
+"""One filter over the whole pose: every end point a measurement, every boundary told apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntFlag
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lanebev.estimation import kalman
+from lanebev.estimation.checks import as_batch
+from lanebev.estimation.joint_filter import Update, best_shift, evidence_index, iterate, surprise
+from lanebev.estimation.joint_model import (
+    HEIGHT,
+    NUM_PARAMS,
+    OFFSET,
+    Observations,
+    boundary_places,
+    observe,
+)
+from lanebev.estimation.joint_motion import MEANS, NUM_COMMON, NUM_POSE, RATES, MotionConfig, motion
+from lanebev.estimation.single_frame import FramePrior, fit_single_frame
+from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status
+
+
+class Reason(IntFlag):
+    """Why a row is not (fully) tracking; several may hold at once."""
+
+    NONE = 0
+    NO_SEGMENTS = 1  # nothing was seen in this frame
+    FEW_INLIERS = 2  # what was seen does not fit the road that is believed
+    TIME = 4  # dt was zero, negative or not finite: the frame was not used
+    NO_START = 8  # no start found yet: pitch and yaw not determined by this frame
+    ROLL_UNSEEN = 16  # one lane or less: roll holds with growing sigma
+    HEIGHT_UNSEEN = 32  # no lane: height holds with growing sigma
+    LANE_CHANGE = 64  # the boundary indices moved by one in this frame
+    RESTARTED = 128  # started, or started anew, in this frame
+
+
+@dataclass(frozen=True)
+class JointConfig:
+    """Numbers of :class:`JointCalibrator`; angles in rad, lengths in m, times in s.
+
+    Attributes:
+        num_boundaries: L.
+        iterations: Gauss-Newton steps a frame.
+        lane_width_std: relative sigma of the lane width prior, a common scale of height; 0: as given.
+        motion: how the state moves.
+        prior: where a start is searched, and what holds before it.
+        open_pose: rad (and 10 of these in m of height), jump admitted where one frame contradicts the motion.
+        open_curvature, open_curvature_rate: 1/m, 1/m², change admitted a frame when a bend begins or ends.
+        open_deviation: m, admitted where the lanes turn out unequal.
+        evidence_time: s over which a bend's or unequal lanes' evidence is summed.
+        min_support: inlier segments (weights summed) of a usable frame.
+        min_share, enter_share: share of inliers to go on tracking, and to begin again.
+        restart_after: s of segments that don't fit before the search starts over.
+        lost_after: s without support.
+    """
+
+    num_boundaries: int = NUM_BOUNDARIES
+    iterations: int = 2
+    lane_width_std: float = 0.0
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    prior: FramePrior = field(default_factory=FramePrior)
+    open_pose: float = 0.01
+    open_curvature: float = 2e-4
+    open_curvature_rate: float = 5e-6
+    open_deviation: float = 0.1
+    evidence_time: float = 0.15
+    min_support: float = 3.0
+    min_share: float = 0.15
+    enter_share: float = 0.25
+    restart_after: float = 0.3
+    lost_after: float = 5.0
+
+    def __post_init__(self) -> None:
+        if self.num_boundaries < 2 or self.num_boundaries % 2:
+            raise ValueError(f"num_boundaries: expected an even number >= 2, got {self.num_boundaries}")
+        if self.iterations < 1:
+            raise ValueError(f"iterations: expected at least 1, got {self.iterations}")
+
+
+class JointState(NamedTuple):
+    """Everything the calibrator remembers, tensors only.
+
+    Attributes:
+        mean: (B, 16 + L), see ``joint_motion``.
+        cov: (B, 16 + L, 16 + L).
+        evidence: (B, 6 + L) summed evidence against the motion: pose, curvature, deviations; unit variance.
+        unseen: (B,) s since the last usable frame.
+        misfit: (B,) s for which there were segments that did not fit.
+        status: (B,) int64, values of Status.
+        reasons: (B,) int64, :class:`Reason` flags of the last frame.
+    """
+
+    mean: Tensor
+    cov: Tensor
+    evidence: Tensor
+    unseen: Tensor
+    misfit: Tensor
+    status: Tensor
+    reasons: Tensor
+
+
+class JointCalibrator(nn.Module):
+    """Online calibration by one iterated filter, per row of a batch, state in and state out.
+
+    Deviation from the paper: one stage instead of two, so that roll and height profit from what pitch and
+    yaw know and the other way round; perpendicular pixel distances with propagated noise instead of
+    normals; curved roads, lane changes, unequal lanes.
+
+    Args:
+        config: the numbers, or keywords of :class:`JointConfig`.
+    """
+
+    def __init__(self, config: JointConfig | None = None, **numbers: object) -> None:
+        super().__init__()
+        if config is not None and numbers:
+            raise ValueError("config: expected either a JointConfig or its keywords, got both")
+        self.config = config or JointConfig(**numbers)  # type: ignore[arg-type]
+
+    def initial_state(
+        self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
+    ) -> JointState:
+        """State before the first frame: the prior, UNINITIALISED."""
+        cfg = self.config
+        like = torch.zeros((), dtype=dtype, device=device)
+        mean, cov = self._begin(
+            cfg.prior.mean(like).repeat(batch_size, 1),
+            cfg.prior.std(like).square().diag().repeat(batch_size, 1, 1),
+        )
+        none = torch.zeros(batch_size, dtype=torch.int64, device=device)
+        zero = torch.zeros(batch_size, dtype=dtype, device=device)
+        return JointState(
+            mean=mean,
+            cov=cov,
+            evidence=mean.new_zeros(batch_size, NUM_POSE + 2 + cfg.num_boundaries),
+            unseen=zero,
+            misfit=zero.clone(),
+            status=none + int(Status.UNINITIALISED),
+            reasons=none + int(Reason.NO_START),
+        )
+
+    def forward(
+        self,
+        segments: LaneSegments,
+        intrinsics: Tensor,
+        state: JointState,
+        dt: float | Tensor,
+        lane_width: float | Tensor = 3.7,
+    ) -> tuple[Calibration, JointState]:
+        """One frame.
+
+        Args:
+            segments: of this frame, N per row; weight 0 is not there, non-finite counts as not there.
+            intrinsics: (B, 3, 3) px.
+            state: of the frame before, or :meth:`initial_state`.
+            dt: s since that frame, float or (B,). A started row skips a frame whose dt is not positive.
+            lane_width: m, float, (B,) or (B, L-1) per lane.
+
+        Returns:
+            calibration of this frame and the state after it.
+
+        Raises:
+            ValueError: a shape that doesn't fit.
+        """
+        cfg = self.config
+        seen = observe(segments, intrinsics, cfg.num_boundaries)
+        positions = boundary_places(lane_width, cfg.num_boundaries, seen.sigma)  # (B, L)
+        places = positions.gather(1, seen.boundary)  # (B, N)
+        elapsed = as_batch(dt, seen.sigma)
+        step = torch.where(elapsed.isfinite() & (elapsed > 0), elapsed, 0.0).clamp(max=60.0)
+
+        mean, cov = kalman.predict(state.mean, state.cov, *motion(step, cfg.num_boundaries, cfg.motion))
+        mean, shift, scale = self._follow_lane_change(mean, positions, seen)
+        update, evidence = self._update(mean, cov, scale, state.evidence, places, seen, step)
+        judged, supported = self._judge(state, update, evidence, shift, step, seen)
+        after, trust = self._restart(judged, update.trust, supported, segments, intrinsics, lane_width)
+
+        late = ~(elapsed > 0) & _running(state.status)
+        skipped = state._replace(reasons=state.reasons | int(Reason.TIME))
+        after = JointState(*(_where(late, old, new) for old, new in zip(skipped, after, strict=True)))
+        return self._calibration(after, torch.where(seen.weight > 0, trust, 0.0)), after
+
+    def _follow_lane_change(
+        self, mean: Tensor, positions: Tensor, seen: Observations
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Predicted mean with offset and deviations moved by a lane if the indices were; shift; noise scale."""
+        ego = self.config.num_boundaries // 2 - 1
+        width = positions[:, ego + 1] - positions[:, ego]
+        shift, scale = best_shift(mean, positions, seen, width)
+        moved = mean.clone()
+        moved[:, OFFSET] = mean[:, OFFSET] + shift * width
+        own = mean[:, NUM_COMMON:]
+        none = torch.zeros_like(own[:, :1])
+        right, left = torch.cat([own[:, 1:], none], -1), torch.cat([none, own[:, :-1]], -1)
+        shifted = torch.where(shift.unsqueeze(-1) > 0, right, torch.where(shift.unsqueeze(-1) < 0, left, own))
+        moved[:, NUM_COMMON:] = shifted
+        return moved, shift, scale
+
+    def _update(
+        self,
+        mean: Tensor,
+        cov: Tensor,
+        scale: Tensor,
+        evidence: Tensor,
+        places: Tensor,
+        seen: Observations,
+        step: Tensor,
+    ) -> tuple[Update, Tensor]:
+        """Robust update; what contradicts the motion opens its process noise, and the frame is used again."""
+        cfg = self.config
+        first = iterate(mean, cov, mean, scale, places, seen, cfg.iterations)
+        index = evidence_index(cfg.num_boundaries, mean.device)
+        fade = (-step / cfg.evidence_time).exp().unsqueeze(-1)
+        news = surprise(first, index)
+        slow = evidence * fade + (1 - fade * fade).sqrt() * news
+        evidence = torch.cat([news[:, :NUM_POSE], slow[:, NUM_POSE:]], dim=-1)
+        cov = cov + self._opened(evidence)
+        return iterate(mean, cov, first.mean, first.scale, places, seen, 1), evidence
+
+    def _opened(self, evidence: Tensor) -> Tensor:
+        """Process noise (B, D, D) that the evidence calls for; next to none while |evidence| < 3."""
+        cfg = self.config
+        pose, bend, own = evidence.square().split([NUM_POSE, 2, cfg.num_boundaries], dim=-1)
+        pose, bend, own = (
+            torch.sigmoid(0.5 * (squared.amax(-1, keepdim=True) - threshold)) * squared.amax(-1, keepdim=True)
+            for squared, threshold in ((pose, 25.0), (bend, 16.0), (own, 25.0))
+        )
+        jump = evidence.new_tensor([cfg.open_pose] * 3 + [10 * cfg.open_pose]).square()
+        change = evidence.new_tensor([cfg.open_curvature, cfg.open_curvature_rate]).square()
+        rest = evidence.new_zeros(evidence.shape[0], NUM_COMMON - NUM_PARAMS)
+        offset = torch.zeros_like(pose)
+        width = evidence.new_full((cfg.num_boundaries,), cfg.open_deviation).square()
+        scaled = [0.01 * pose * jump, offset, 0.01 * bend * change, rest, 0.01 * own * width]
+        return torch.cat(scaled, dim=-1).diag_embed()
+
+    def _judge(
+        self,
+        state: JointState,
+        update: Update,
+        evidence: Tensor,
+        shift: Tensor,
+        step: Tensor,
+        seen: Observations,
+    ) -> tuple[JointState, Tensor]:
+        """State after the frame, before any restart, and (B,) bool: the frame supported it."""
+        cfg = self.config
+        running = _running(state.status)
+        support = (seen.weight * update.trust).sum(-1)
+        total = seen.weight.sum(-1)
+        share = support / total.clamp(min=1e-6)
+        least = torch.where(state.status == Status.TRACKING, cfg.min_share, cfg.enter_share)
+        finite = update.mean.isfinite().all(-1) & update.cov.isfinite().all(-1).all(-1)
+        supported = running & finite & (support >= cfg.min_support) & (share >= least)
+        empty = total < 1e-3
+        unseen = torch.where(supported, 0.0, state.unseen + step)
+        misfit = torch.where(supported, 0.0, state.misfit + torch.where(empty, 0.0, step))
+        coasting = torch.where(unseen > cfg.lost_after, int(Status.LOST), int(Status.COASTING))
+        status = torch.where(supported, int(Status.TRACKING), torch.where(running, coasting, state.status))
+        reasons = _flag(empty, Reason.NO_SEGMENTS) | _flag(~empty & ~supported, Reason.FEW_INLIERS)
+        reasons = reasons | _flag(supported & (shift != 0), Reason.LANE_CHANGE)
+        reasons = reasons | _flag(~running, Reason.NO_START)
+        after = JointState(update.mean, update.cov, evidence, unseen, misfit, status, reasons)
+        return after, supported
+
+    def _restart(
+        self,
+        state: JointState,
+        trust: Tensor,
+        supported: Tensor,
+        segments: LaneSegments,
+        intrinsics: Tensor,
+        lane_width: float | Tensor,
+    ) -> tuple[JointState, Tensor]:
+        """Rows that have nothing, or nothing that fits, start from this frame alone if it allows that."""
+        cfg = self.config
+        wanted = ~_running(state.status) | (~supported & (state.misfit > cfg.restart_after))
+        if not torch.compiler.is_compiling() and not bool(wanted.any()):
+            return state, trust  # the same result: every row would discard the search
+        fit = fit_single_frame(segments, intrinsics, lane_width, cfg.prior, cfg.num_boundaries)
+        share = (fit.inliers * segments.weight.nan_to_num()).sum(-1) / segments.weight.nan_to_num().sum(
+            -1
+        ).clamp(min=1e-6)
+        fresh = wanted & fit.valid & (share >= cfg.enter_share)
+        mean, cov = self._begin(fit.params(), fit.covariance)
+        zero = torch.zeros_like(state.unseen)
+        begun = JointState(
+            mean,
+            cov,
+            torch.zeros_like(state.evidence),
+            zero,
+            zero,
+            torch.full_like(state.status, int(Status.TRACKING)),
+            torch.full_like(state.reasons, int(Reason.RESTARTED)),
+        )
+        after = JointState(*(_where(fresh, new, old) for new, old in zip(begun, state, strict=True)))
+        return after, torch.where(fresh.unsqueeze(-1), fit.inliers, trust)
+
+    def _begin(self, params: Tensor, param_cov: Tensor) -> tuple[Tensor, Tensor]:
+        """State (B, D) and covariance (B, D, D) around one frame's parameters and their covariance."""
+        cfg = self.config
+        batch, num = params.shape[0], cfg.num_boundaries
+        angle, height = (
+            density / (4 * cfg.motion.spring**3)
+            for density in (cfg.motion.angular_density, cfg.motion.height_density)
+        )
+        swing = params.new_tensor([angle, angle, angle, height])  # stationary variances
+        rates = torch.cat([swing * cfg.motion.spring**2, params.new_tensor([0.5**2])])
+        zero = params.new_zeros(batch, 5)
+        own = params.new_zeros(batch, num)
+        mean = torch.cat([params, zero, params[:, :NUM_POSE], own], dim=-1)
+        cov = params.new_zeros(batch, NUM_COMMON + num, NUM_COMMON + num)
+        cov[:, :NUM_PARAMS, :NUM_PARAMS] = param_cov
+        cov[:, :NUM_PARAMS, MEANS] = param_cov[:, :, :NUM_POSE]
+        cov[:, MEANS, :NUM_PARAMS] = param_cov[:, :NUM_POSE]
+        cov[:, MEANS, MEANS] = param_cov[:, :NUM_POSE, :NUM_POSE] + swing.diag()
+        cov[:, RATES, RATES] = rates.diag()
+        tiny = cfg.motion.deviation_walk**2
+        return mean, cov + torch.cat([mean.new_zeros(NUM_COMMON), mean.new_full((num,), tiny)]).diag()
+
+    def _calibration(self, state: JointState, inliers: Tensor) -> Calibration:
+        """What goes out: the pose, its covariance with the lane width's scale, status, inliers."""
+        cov = state.cov[:, :NUM_POSE, :NUM_POSE]
+        height = state.mean[:, HEIGHT]
+        scale = torch.zeros_like(cov)
+        scale[:, HEIGHT, HEIGHT] = (self.config.lane_width_std * height).square()
+        return Calibration(Extrinsics.unstack(state.mean[:, :NUM_POSE]), cov + scale, state.status, inliers)
+
+
+def _running(status: Tensor) -> Tensor:
+    return (status == Status.TRACKING) | (status == Status.COASTING)
+
+
+def _flag(condition: Tensor, reason: Reason) -> Tensor:
+    return condition.to(torch.int64) * int(reason)
+
+
+def _where(row: Tensor, yes: Tensor, no: Tensor) -> Tensor:
+    """Per row of the batch."""
+    return torch.where(row.view(-1, *[1] * (yes.ndim - 1)), yes, no)

@@ -1,0 +1,150 @@
+"""One frame's update of the joint filter: lane changes, robust iteration, and noise that follows evidence."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.estimation import kalman
+from lanebev.estimation.joint_model import (
+    CURVATURE,
+    NUM_PARAMS,
+    OFFSET,
+    Observations,
+    boundary_distances,
+    boundary_residuals,
+)
+from lanebev.estimation.joint_motion import NUM_COMMON, NUM_POSE
+from lanebev.estimation.joint_robust import inlier_weights, log_likelihood, noise_scale, start_scale
+from lanebev.estimation.single_frame import normal_equations
+
+
+class Update(NamedTuple):
+    """What one frame made of a prediction.
+
+    Attributes:
+        mean: (B, D); cov: (B, D, D).
+        trust: (B, N) in [0, 1].
+        scale: (B,) >= 1, of the noise.
+        info: (B, D, D) of the frame's observations.
+        score: (B, D), P⁻¹ (mean - predicted): the pull of the observations on the prediction.
+    """
+
+    mean: Tensor
+    cov: Tensor
+    trust: Tensor
+    scale: Tensor
+    info: Tensor
+    score: Tensor
+
+
+def iterate(
+    predicted: Tensor,
+    cov: Tensor,
+    start: Tensor,
+    scale: Tensor,
+    places: Tensor,
+    seen: Observations,
+    iterations: int,
+) -> Update:
+    """Iterated robust update: relinearised and reweighted at each step, the prediction held as it was.
+
+    Source: Bell and Cathey 1993, the iterated Kalman filter as Gauss-Newton.
+
+    Args:
+        predicted: (B, D) mean.
+        cov: (B, D, D) of the prediction.
+        start: (B, D), where to linearise first.
+        scale: (B,) noise scale to start with.
+        places: (B, N) m, X of each segment's boundary at Z = 0 less offset and deviation.
+        seen: what was observed.
+        iterations: steps.
+
+    Returns:
+        mean and covariance, weights, noise scale and what the observations said.
+    """
+    num_boundaries = predicted.shape[-1] - NUM_COMMON
+    member = torch.nn.functional.one_hot(seen.boundary, num_boundaries).mT.to(places)  # (B, L, N)
+    focal = seen.intrinsics[:, 0, 0]
+    mean, posterior = start, cov
+    for _ in range(iterations):
+        own = mean[:, NUM_COMMON:].gather(1, seen.boundary)  # (B, N) m
+        residuals = boundary_residuals(mean[:, :NUM_PARAMS], places + own, seen)
+        there = seen.weight * residuals.valid
+        trust = inlier_weights(residuals.distance, residuals.valid, seen.sigma, scale, focal)
+        fitted = noise_scale(residuals.distance, seen.sigma, trust * seen.weight)
+        scale = torch.minimum(torch.maximum(fitted, 0.5 * scale), scale)
+        by_noise = trust * there / (seen.sigma * scale.unsqueeze(-1)).square()
+        info, pull = _information(residuals.jacobian, residuals.distance, by_noise, member)
+        pull = pull + (info @ (mean - predicted).unsqueeze(-1)).squeeze(-1)
+        mean, posterior = kalman.update(predicted, cov, info, pull)
+    score = pull - (info @ (mean - predicted).unsqueeze(-1)).squeeze(-1)
+    return Update(mean, posterior, trust, scale, info, score)
+
+
+def _information(
+    jacobian: Tensor, distance: Tensor, by_noise: Tensor, member: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Information of a frame in the whole state (B, D, D) and (B, D), rates and means left at zero."""
+    by_deviation = member.repeat_interleave(2, dim=-1) * jacobian[:, OFFSET, None]  # (B, L, 2N)
+    info, pull = normal_equations(torch.cat([jacobian, by_deviation], dim=1), distance, by_noise)
+    size = NUM_COMMON + member.shape[1]
+    place = torch.cat([torch.arange(NUM_PARAMS), torch.arange(NUM_COMMON, size)]).to(info.device)
+    whole = info.new_zeros(info.shape[0], size, info.shape[-1]).index_copy(1, place, info)
+    whole = info.new_zeros(info.shape[0], size, size).index_copy(2, place, whole)
+    return whole, info.new_zeros(info.shape[0], size).index_copy(1, place, -pull)
+
+
+def evidence_index(num_boundaries: int, device: torch.device) -> Tensor:
+    """State entries whose motion is put in question: pose, c0, c1, deviations; (6 + L,)."""
+    first = [*range(NUM_POSE), CURVATURE, CURVATURE + 1]
+    last = range(NUM_COMMON, NUM_COMMON + num_boundaries)
+    return torch.tensor([*first, *last], device=device)
+
+
+def surprise(update: Update, index: Tensor) -> Tensor:
+    """Normalised score of single state entries: N(0, 1) each if the motion is as assumed.
+
+    The score u = P⁻¹ (mean - predicted) has covariance Λ - Λ P⁺ Λ. It is the score test (Rao 1948) for
+    more process noise in that entry.
+
+    Returns:
+        (B, len(index)); 0 where the observations say nothing of an entry.
+    """
+    seen = update.info - update.info @ update.cov @ update.info
+    variance = seen.diagonal(dim1=-2, dim2=-1)[:, index]
+    known = variance > 1e-3 * update.info.diagonal(dim1=-2, dim2=-1)[:, index]
+    known = known & (variance > 0)
+    return torch.where(known, update.score[:, index] * torch.where(known, variance, 1.0).rsqrt(), 0.0)
+
+
+def best_shift(
+    mean: Tensor, positions: Tensor, seen: Observations, lane_width: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Lanes by which the boundary indices moved since the prediction: -1, 0 or 1.
+
+    A shift must explain the frame far better than none: the camera crossed a line, or the detector
+    numbers the boundaries anew.
+
+    Args:
+        mean: (B, D) predicted.
+        positions: (B, L) m, of the boundaries from the ego lane's middle.
+        seen: what was observed.
+        lane_width: (B,) m, of the ego lane.
+
+    Returns:
+        shift (B,) in the dtype of ``mean``, and (B,) noise scale of the frame's residuals after it.
+    """
+    focal = seen.intrinsics[:, 0, 0]
+    places = (positions + mean[:, NUM_COMMON:]).gather(1, seen.boundary)
+    shifts = mean.new_tensor([0.0, -1.0, 1.0])
+    moved = places + (shifts[:, None] * lane_width)[:, :, None]  # (3, B, N)
+    distance, valid = boundary_distances(mean[:, :NUM_PARAMS], moved, seen)
+    weight = seen.weight * valid
+    scales = torch.stack([start_scale(each, seen.sigma, weight) for each in distance])  # (3, B)
+    scores = log_likelihood(distance, valid, weight, seen.sigma, scales.amin(0), focal)  # (3, B)
+    clear = scores[1:].amax(0) > 2.0 * scores[0] + 10.0
+    best = torch.where(clear, 1 + scores[1:].argmax(0), 0)  # (B,)
+    return shifts[best], scales.gather(0, best.unsqueeze(0)).squeeze(0)

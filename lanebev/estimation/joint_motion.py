@@ -1,0 +1,150 @@
+"""How the joint filter's state moves between frames, and what it is made of.
+
+The mean is [pitch, yaw, roll, height, offset, c0, c1 | rates of the first five | slow mean of the pose |
+deviation of each boundary from its place]: 16 + L numbers.
+
+The pose swings about its slow mean as a critically damped spring driven by white noise: within a frame a
+constant-velocity model, over seconds of nothing a return to the mount's pose with a bounded sigma.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lanebev.estimation.joint_model import CURVATURE, CURVATURE_RATE, NUM_PARAMS, OFFSET
+
+NUM_POSE = 4
+RATES = slice(NUM_PARAMS, NUM_PARAMS + 5)
+MEANS = slice(NUM_PARAMS + 5, NUM_PARAMS + 9)
+NUM_COMMON = NUM_PARAMS + 9  # then follow the L deviations
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Numbers of the motion; angles in rad, lengths in m, times in s.
+
+    Attributes:
+        angular_density: of the angular acceleration, rad²/s³.
+        height_density: of the vertical acceleration, m²/s³.
+        spring: rad/s, rate of return to the slow mean.
+        mean_angle_walk: rad/√s, of the slow mean.
+        mean_height_walk: m/√s.
+        offset_density: of the lateral acceleration, m²/s³.
+        offset_memory: s, of the lateral velocity.
+        curvature_walk: 1/m/√s, of c0 while nothing speaks for a bend.
+        curvature_rate_walk: 1/m²/√s, of c1 likewise.
+        curvature_memory: s, decay of c1.
+        speed: m/s assumed, for c0 to follow c1.
+        deviation_memory: s, decay of a boundary's deviation.
+        deviation_walk: m/√s, while nothing speaks for unequal lanes.
+    """
+
+    angular_density: float = 0.08
+    height_density: float = 0.15
+    spring: float = 2.2
+    mean_angle_walk: float = 5e-4
+    mean_height_walk: float = 1e-3
+    offset_density: float = 0.2
+    offset_memory: float = 2.0
+    curvature_walk: float = 1e-5
+    curvature_rate_walk: float = 1e-7
+    curvature_memory: float = 4.0
+    speed: float = 20.0
+    deviation_memory: float = 20.0
+    deviation_walk: float = 1e-4
+
+
+def motion(dt: Tensor, num_boundaries: int, cfg: MotionConfig) -> tuple[Tensor, Tensor]:
+    """Transition and process noise over dt.
+
+    Args:
+        dt: (B,) s, >= 0.
+        num_boundaries: L.
+        cfg: the numbers.
+
+    Returns:
+        (B, D, D) F and (B, D, D) W, D = 16 + L.
+    """
+    swing, drive = spring(dt, cfg.spring)  # (B, 4) each
+    slide, push = _damped(dt, cfg.offset_memory)
+    fade = (-dt / cfg.curvature_memory).exp()
+    follow = cfg.speed * cfg.curvature_memory * (1 - fade)
+    settle = (-dt / cfg.deviation_memory).exp()
+    still = torch.stack([torch.ones_like(dt), fade, follow, settle], dim=-1)
+    moves = torch.cat([swing, 1 - swing[:, :1], -swing[:, 2:3], slide, still], dim=-1)  # (B, 14)
+    shakes = torch.cat([drive, push, dt.unsqueeze(-1)], dim=-1)  # (B, 9)
+    on_moves, on_shakes = _patterns(num_boundaries, cfg)
+    transition = torch.einsum("bk,kij->bij", moves, torch.as_tensor(on_moves).to(dt))
+    return transition, torch.einsum("bk,kij->bij", shakes, torch.as_tensor(on_shakes).to(dt))
+
+
+@lru_cache(maxsize=16)
+def _patterns(num_boundaries: int, cfg: MotionConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Where each of the 14 numbers of F and the 9 of W go, (14, D, D) and (9, D, D)."""
+    size = NUM_COMMON + num_boundaries
+    moves, shakes = np.zeros((14, size, size)), np.zeros((9, size, size))
+    density = [cfg.angular_density] * 3 + [cfg.height_density]
+    walk = [cfg.mean_angle_walk] * 3 + [cfg.mean_height_walk]
+    for x in range(NUM_POSE):
+        rate, mean = RATES.start + x, MEANS.start + x
+        for k, (row, column) in enumerate(((x, x), (x, rate), (rate, x), (rate, rate))):
+            moves[k, row, column] = 1
+            shakes[k, row, column] = density[x]
+        moves[4, x, mean] = moves[5, rate, mean] = moves[10, mean, mean] = 1
+        shakes[8, mean, mean] = walk[x] ** 2
+    rate = RATES.start + OFFSET
+    for k, (row, column) in enumerate(((OFFSET, OFFSET), (OFFSET, rate), (rate, OFFSET), (rate, rate))):
+        moves[6 + k, row, column] = 1
+        shakes[4 + k, row, column] = cfg.offset_density
+    moves[10, CURVATURE, CURVATURE] = moves[11, CURVATURE_RATE, CURVATURE_RATE] = 1
+    moves[12, CURVATURE, CURVATURE_RATE] = 1
+    shakes[8, CURVATURE, CURVATURE] = cfg.curvature_walk**2
+    shakes[8, CURVATURE_RATE, CURVATURE_RATE] = cfg.curvature_rate_walk**2
+    for own in range(NUM_COMMON, size):
+        moves[13, own, own] = 1
+        shakes[8, own, own] = cfg.deviation_walk**2
+    return moves, shakes
+
+
+def spring(dt: Tensor, rate: float) -> tuple[Tensor, Tensor]:
+    """Critically damped spring driven by white noise, ẍ = -2 ω ẋ - ω² x + w.
+
+    Source: the exact discretisation; the impulse response is h(t) = t e^(-ω t), and the noise integrals are
+    those of h², h ḣ and ḣ². For ω → 0 it is :func:`lanebev.estimation.kalman.constant_velocity`.
+
+    Args:
+        dt: (B,) s.
+        rate: ω, rad/s. The stationary variance of x is density / (4 ω³).
+
+    Returns:
+        (B, 4) transition of (x, ẋ), its 2 × 2 entries row by row, and (B, 4) noise at unit density.
+    """
+    turn = rate * dt
+    decay = (-turn).exp()
+    transition = torch.stack(
+        [decay * (1 + turn), decay * dt, -decay * rate * turn, decay * (1 - turn)], dim=-1
+    )
+    faded = decay * decay
+    # (1 - e^(-2a) (1 + 2a + 2a²)) / (4 ω³) and its like cancel at small a: as series, in float32 too
+    small = turn < 0.1
+    safe = torch.where(small, 1.0, turn)
+    position = (1 - (-2 * safe).exp() * (1 + 2 * safe + 2 * safe**2)) / (4 * rate**3)
+    position = torch.where(small, dt**3 * (1 / 3 - turn / 2 + 2 * turn**2 / 5 - 2 * turn**3 / 9), position)
+    velocity = (1 - faded * (1 - 2 * turn + 2 * turn**2)) / (4 * rate)
+    both = 0.5 * dt * dt * faded
+    return transition, torch.stack([position, both, both, velocity], dim=-1)
+
+
+def _damped(dt: Tensor, memory: float) -> tuple[Tensor, Tensor]:
+    """Position and decaying velocity: (B, 4) transition and (B, 4) noise, as :func:`spring`."""
+    fade = (-dt / memory).exp()
+    one, zero = torch.ones_like(dt), torch.zeros_like(dt)
+    transition = torch.stack([one, memory * (1 - fade), zero, fade], dim=-1)
+    short = dt.clamp(max=memory)  # the velocity's variance stops growing there
+    noise = torch.stack([short**2 * dt / 3, short * short / 2, short * short / 2, short], dim=-1)
+    return transition, noise

@@ -1,0 +1,182 @@
+"""States of calibrators and mount on disk: written atomically, read back bit for bit or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+FORMAT = "lanebev-state"
+VERSION = 1
+_SEPARATOR = "."
+
+
+class LoadedState(NamedTuple):
+    """What :func:`load_state` found.
+
+    Attributes:
+        states: the named tuples of tensors, by name; empty if the file was refused.
+        metadata: the plain values saved beside them.
+        problem: None, or one line saying why the file was ignored.
+    """
+
+    states: dict[str, Any]
+    metadata: dict[str, Any]
+    problem: str | None
+
+
+def save_state(path: str | Path, contents: Mapping[str, Any]) -> None:
+    """Write states and plain values to one safetensors file, whole or not at all.
+
+    Args:
+        path: of the file; its folder must exist. An older file stays until the new one is complete.
+        contents: by name, NamedTuples of tensors (``JointState``, ``TwoStageState``, ``MountState``), single
+            tensors, or values that JSON can hold (str, int, float, bool, None, lists and dicts of them).
+
+    Raises:
+        ValueError: a name with a dot, a value of another kind, or a state with a non-finite number.
+        OSError: the file can't be written.
+    """
+    tensors: dict[str, Tensor] = {}
+    kinds: dict[str, str] = {}
+    plain: dict[str, Any] = {}
+    for name, value in contents.items():
+        if _SEPARATOR in name or not name:
+            raise ValueError(f"name: expected one without {_SEPARATOR!r}, got {name!r}")
+        fields = _fields(value)
+        if fields is None:
+            plain[name] = _jsonable(name, value)
+            continue
+        kinds[name] = type(value).__name__
+        for field, tensor in fields.items():
+            _check_finite(f"{name}{_SEPARATOR}{field}", tensor)
+            tensors[f"{name}{_SEPARATOR}{field}"] = tensor.detach().cpu().contiguous().clone()
+    header = {
+        "format": FORMAT,
+        "version": str(VERSION),
+        "kinds": json.dumps(kinds),
+        "metadata": json.dumps(plain),
+    }
+    path = Path(path)
+    descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+    os.close(descriptor)
+    try:
+        save_file(tensors, temporary, metadata=header)
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())
+        Path(temporary).chmod(0o644)
+        os.replace(temporary, path)
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+
+
+def load_state(
+    path: str | Path,
+    like: Mapping[str, Any] | None = None,
+    device: torch.device | str | None = None,
+) -> LoadedState:
+    """Read a file of :func:`save_state`. Never half: any problem is reported and nothing is used.
+
+    Args:
+        path: of the file.
+        like: by name, states as they are expected (``calibrator.initial_state(1)``): same type, fields,
+            shapes and dtypes, else the file is refused. Names that are not in ``like`` come back as dicts
+            of tensors by field.
+        device: where the tensors go; None is the CPU.
+
+    Returns:
+        states, metadata and the problem, if there was one (a missing file is one too).
+    """
+    like = like or {}
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            header = file.metadata() or {}
+            if header.get("format") != FORMAT:
+                return _refused(path, "it was not written by lanebev")
+            if header.get("version") != str(VERSION):
+                return _refused(path, f"expected version {VERSION}, got {header.get('version')}")
+            kinds = json.loads(header["kinds"])
+            metadata = json.loads(header["metadata"])
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
+    except FileNotFoundError:
+        return _refused(path, "there is no such file")
+    except (OSError, SafetensorError, KeyError, ValueError, TypeError) as error:
+        return _refused(path, f"it is cut or not a state file ({str(error).splitlines()[0]})")
+
+    states: dict[str, dict[str, Tensor]] = {name: {} for name in kinds}
+    for key, tensor in tensors.items():
+        name, _, field = key.partition(_SEPARATOR)
+        if name not in states:
+            return _refused(path, f"{key} belongs to no state")
+        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            return _refused(path, f"{key} is not finite")
+        states[name][field] = tensor.to(device) if device is not None else tensor
+    built: dict[str, Any] = {}
+    for name, fields in states.items():
+        if name not in like:
+            built[name] = fields[""] if set(fields) == {""} else fields
+            continue
+        problem = _mismatch(name, kinds[name], fields, like[name])
+        if problem:
+            return _refused(path, problem)
+        built[name] = type(like[name])(**fields)
+    missing = [name for name in like if name not in built]
+    if missing:
+        return _refused(path, f"expected {', '.join(missing)}, found {', '.join(built) or 'nothing'}")
+    return LoadedState(built, metadata, None)
+
+
+def _refused(path: str | Path, why: str) -> LoadedState:
+    return LoadedState({}, {}, f"{path}: state ignored: {why}; calibration starts anew")
+
+
+def _fields(value: Any) -> dict[str, Tensor] | None:
+    """A NamedTuple's tensors by field, a tensor's under '', None for anything else."""
+    if isinstance(value, Tensor):
+        return {"": value}
+    names = getattr(value, "_fields", None)
+    if names is None or not all(isinstance(getattr(value, name), Tensor) for name in names):
+        return None
+    return {name: getattr(value, name) for name in names}
+
+
+def _jsonable(name: str, value: Any) -> Any:
+    try:
+        text = json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{name}: expected a NamedTuple of tensors, a tensor or a plain finite value, got {value!r}"
+        ) from error
+    return json.loads(text)
+
+
+def _check_finite(key: str, tensor: Tensor) -> None:
+    if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+        bad = math.prod(tensor.shape) - int(tensor.isfinite().sum())
+        raise ValueError(f"{key}: expected finite numbers, got {bad} that are not; nothing was written")
+
+
+def _mismatch(name: str, kind: str, fields: Mapping[str, Tensor], like: Any) -> str | None:
+    """Why the saved fields are not those of ``like``, or None."""
+    if kind != type(like).__name__:
+        return f"{name} is a {kind}, expected {type(like).__name__}"
+    expected = _fields(like) or {}
+    if set(fields) != set(expected):
+        return f"{name} has the fields {', '.join(sorted(fields))}, expected {', '.join(sorted(expected))}"
+    for field, tensor in expected.items():
+        got = fields[field]
+        if got.shape != tensor.shape or got.dtype != tensor.dtype:
+            return (
+                f"{name}{_SEPARATOR}{field} is {got.dtype} {tuple(got.shape)}, "
+                f"expected {tensor.dtype} {tuple(tensor.shape)}"
+            )
+    return None

@@ -1,0 +1,94 @@
+"""States on disk: whole and bit for bit, or refused with a reason."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from lanebev.estimation.joint import JointCalibrator, JointState
+from lanebev.estimation.two_stage import TwoStageCalibrator
+from lanebev.io.state import load_state, save_state
+
+
+@pytest.fixture
+def states():
+    return {"calibrator": JointCalibrator().initial_state(2), "other": TwoStageCalibrator().initial_state(1)}
+
+
+def test_round_trip_is_bit_for_bit(tmp_path, states):
+    path = tmp_path / "state.safetensors"
+    noisy = JointState(*(value + 1 if value.is_floating_point() else value for value in states["calibrator"]))
+    save_state(path, {**states, "calibrator": noisy, "frame": 17, "source": "a.mp4", "alone": torch.ones(2)})
+    loaded = load_state(path, like=states)
+    assert loaded.problem is None
+    assert isinstance(loaded.states["calibrator"], JointState)
+    for before, after in zip(noisy, loaded.states["calibrator"], strict=True):
+        assert torch.equal(before, after)
+        assert before.dtype == after.dtype
+    assert loaded.metadata == {"frame": 17, "source": "a.mp4"}
+    assert torch.equal(loaded.states["alone"], torch.ones(2))
+    assert [file.name for file in tmp_path.iterdir()] == ["state.safetensors"]  # no temporary left
+
+
+def test_without_like_states_are_dicts(tmp_path, states):
+    save_state(tmp_path / "s", states)
+    assert set(load_state(tmp_path / "s").states["calibrator"]) == set(JointState._fields)
+
+
+@pytest.mark.parametrize("length", [0, 5, 100, 2000])
+def test_truncated_file_is_reported_and_ignored(tmp_path, states, length):
+    path = tmp_path / "state.safetensors"
+    save_state(path, states)
+    path.write_bytes(path.read_bytes()[:length])
+    loaded = load_state(path, like=states)
+    assert loaded.states == {}
+    assert "cut or not a state file" in loaded.problem
+    assert "\n" not in loaded.problem
+
+
+def test_missing_foreign_and_non_finite_files(tmp_path, states):
+    assert "no such file" in load_state(tmp_path / "none", like=states).problem
+    save_file({"weights": torch.ones(3)}, tmp_path / "foreign")
+    assert "not written by lanebev" in load_state(tmp_path / "foreign", like=states).problem
+    (tmp_path / "text").write_text("pitch: 1\n")
+    assert "cut or not a state file" in load_state(tmp_path / "text", like=states).problem
+    bad = states["calibrator"]._replace(mean=torch.full_like(states["calibrator"].mean, torch.nan))
+    with pytest.raises(ValueError, match=r"calibrator.mean: expected finite numbers, got 44"):
+        save_state(tmp_path / "bad", {"calibrator": bad})
+    assert not (tmp_path / "bad").exists()
+    header = {
+        "format": "lanebev-state",
+        "version": "1",
+        "kinds": '{"calibrator": "JointState"}',
+        "metadata": "{}",
+    }
+    tensors = {f"calibrator.{name}": value for name, value in bad._asdict().items()}
+    save_file(tensors, tmp_path / "nan", metadata=header)
+    loaded = load_state(tmp_path / "nan", like={"calibrator": states["calibrator"]})
+    assert "calibrator.mean is not finite" in loaded.problem
+    assert loaded.states == {}
+
+
+def test_another_calibrator_batch_or_precision_is_refused(tmp_path, states):
+    save_state(tmp_path / "s", {"calibrator": states["calibrator"]})
+    other = {"calibrator": states["other"]}
+    assert "is a JointState, expected TwoStageState" in load_state(tmp_path / "s", like=other).problem
+    wider = {"calibrator": JointCalibrator().initial_state(3)}
+    assert "expected torch.float32 (3, 22)" in load_state(tmp_path / "s", like=wider).problem
+    double = {"calibrator": JointCalibrator().initial_state(2, dtype=torch.float64)}
+    assert "expected torch.float64" in load_state(tmp_path / "s", like=double).problem
+    more = {**states, "mount": states["other"]}
+    assert "expected other, mount" in load_state(tmp_path / "s", like=more).problem
+
+
+def test_failed_write_keeps_the_old_file(tmp_path, states):
+    path = tmp_path / "s"
+    save_state(path, {"frame": 1, **states})
+    with pytest.raises(ValueError, match="frame: expected a NamedTuple of tensors"):
+        save_state(path, {"frame": float("nan"), **states})
+    with pytest.raises(ValueError, match="name: expected one without"):
+        save_state(path, {"a.b": 1})
+    assert load_state(path, like=states).metadata == {"frame": 1}
+    with pytest.raises(OSError, match="No such file"):
+        save_state(tmp_path / "nowhere" / "s", states)

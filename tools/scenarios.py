@@ -1,0 +1,282 @@
+"""Drives that break the paper's assumptions one at a time, as batches of noisy segments with exact truth.
+
+Every row of a batch is the same drive with its own pairs of points and its own noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from lanebev.geometry.road import image_from_road_points
+from lanebev.types import Extrinsics, LaneSegments
+
+FPS = 30.0
+WIDTH = 3.7
+IMAGE = (1020, 1920)
+STEP = 30.0  # px between points of a boundary
+CAMERA = torch.tensor([[1050.0, 0.0, 959.5], [0.0, 1050.0, 509.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+PLACES = (torch.arange(6, dtype=torch.float64) - 2.5) * WIDTH
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One frame of a drive: the truth, and what is done to the observations."""
+
+    pose: tuple[float, float, float, float]  # rad, rad, rad, m
+    offset: float = 0.0  # m, X of the ego lane's middle
+    places: Tensor = field(default_factory=lambda: PLACES)  # (6,) m
+    headings: Tensor = field(default_factory=lambda: torch.zeros(6, dtype=torch.float64))  # (6,) tangent
+    curvature: Callable[[Tensor], Tensor] | None = None  # of Z ahead, 1/m
+    visible: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+    shift: int = 0  # wrong numbering of the whole frame
+    near: float = 3.5
+    far: float = 75.0
+    outliers: float = 0.0
+    wrong_index: float = 0.0
+    wrong_boundary: float = 0.0  # probability that a whole boundary has another one's index
+    longest: int = 10**6  # points between the ends of a segment, at most
+    dt: float = 1 / FPS
+    tag: str = ""  # scenarios name the moments that they bound separately
+
+
+def swing(t: float) -> tuple[float, float, float, float]:
+    """The motion of the Table I experiment: ±1.5° pitch and yaw, ±1° roll, ±5 cm, up to 1 Hz."""
+    turn = 2 * math.pi * t
+    return (
+        math.radians(1.5) * math.sin(turn + 0.3),
+        math.radians(1.5) * math.sin(0.7 * turn + 1.1),
+        math.radians(1.0) * math.sin(0.9 * turn + 2.0),
+        1.5 + 0.05 * math.sin(0.8 * turn),
+    )
+
+
+def drift(t: float) -> float:
+    """Lateral offset of the same experiment, m."""
+    return -0.4 * math.sin(0.3 * math.pi * t + 0.5)
+
+
+def moments(seconds: float, change: Callable[[float, Moment], Moment] | None = None) -> list[Moment]:
+    """A drive of the usual motion, each frame changed by ``change(t, moment)``."""
+    drive = []
+    for k in range(round(seconds * FPS)):
+        t = k / FPS
+        moment = Moment(swing(t), drift(t))
+        drive.append(change(t, moment) if change else moment)
+    return drive
+
+
+def observe(
+    drive: list[Moment], rows: int, sigma: float, per_boundary: int, seed: int, dtype: torch.dtype
+) -> Iterator[tuple[Moment, LaneSegments]]:
+    """Yield every frame's segments for R rows."""
+    generator = torch.Generator().manual_seed(seed)
+    for moment in drive:
+        endpoints, boundary, weight = _exact(moment, rows, per_boundary, generator)
+        noise = torch.randn(endpoints.shape, generator=generator, dtype=torch.float64)
+        endpoints = endpoints + sigma * noise
+        endpoints, boundary = _corrupt(moment, endpoints, boundary, generator)
+        boundary = boundary + moment.shift
+        weight = weight * ((boundary >= 0) & (boundary < 6))
+        segments = LaneSegments(
+            endpoints.to(dtype),
+            boundary.clamp(0, 5),
+            weight.to(dtype),
+            torch.full_like(weight, sigma).to(dtype),
+        )
+        yield moment, segments
+
+
+def curves(moment: Moment, num: int = 400) -> tuple[Tensor, Tensor]:
+    """(6, G, 2) px of the boundaries from near to far, and (6, G) bool: in the image."""
+    inverse = torch.linspace(1 / moment.near, 1 / moment.far, num, dtype=torch.float64)
+    z = 1 / inverse
+    x_mid, heading = torch.zeros_like(z), torch.zeros_like(z)
+    if moment.curvature is not None:
+        fine = torch.linspace(0, moment.far * 1.1, 2000, dtype=torch.float64)
+        step = fine[1] - fine[0]
+        turned = torch.cumulative_trapezoid(moment.curvature(fine), dx=float(step))
+        turned = torch.cat([torch.zeros(1, dtype=torch.float64), turned])
+        # along the arc: dX = sin(heading) ds, dZ = cos(heading) ds
+        side = torch.cat(
+            [torch.zeros(1, dtype=torch.float64), torch.cumulative_trapezoid(turned.sin(), dx=float(step))]
+        )
+        ahead = torch.cat(
+            [torch.zeros(1, dtype=torch.float64), torch.cumulative_trapezoid(turned.cos(), dx=float(step))]
+        )
+        points = []
+        for place, own in zip(moment.places + moment.offset, moment.headings, strict=True):
+            x = side + place * turned.cos() + own * ahead
+            zz = ahead - place * turned.sin()
+            points.append(_resample(zz, x, z))
+        x = torch.stack(points)
+    else:
+        x = (moment.places + moment.offset).unsqueeze(-1) + moment.headings.unsqueeze(-1) * z
+        x = x + x_mid + heading
+    road = torch.stack([x, z.expand_as(x)], dim=-1)
+    pose = Extrinsics.unstack(torch.tensor([moment.pose], dtype=torch.float64))
+    pixels, ahead_ok = image_from_road_points(road.flatten(0, 1)[None], CAMERA[None], pose)
+    pixels = pixels[0].view(6, num, 2)
+    inside = (pixels >= 0).all(-1) & (pixels[..., 0] <= IMAGE[1] - 1) & (pixels[..., 1] <= IMAGE[0] - 1)
+    return pixels, inside & ahead_ok[0].view(6, num)
+
+
+def _resample(z: Tensor, x: Tensor, at: Tensor) -> Tensor:
+    """x at the given z, linearly; z increasing."""
+    right = torch.searchsorted(z.contiguous(), at.contiguous()).clamp(1, len(z) - 1)
+    share = (at - z[right - 1]) / (z[right] - z[right - 1])
+    return x[right - 1] + share * (x[right] - x[right - 1])
+
+
+def _exact(
+    moment: Moment, rows: int, per_boundary: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """End points (R, N, 2, 2), boundary (R, N), weight (R, N): points every 30 px, paired at random."""
+    pixels, inside = curves(moment)
+    ends, weights = [], []
+    for k in range(6):
+        line = pixels[k][inside[k]]
+        arc = torch.cat([torch.zeros(1, dtype=torch.float64), line.diff(dim=0).norm(dim=-1).cumsum(0)])
+        count = int(arc[-1] // STEP) + 1 if len(arc) > 1 else 0
+        if k not in moment.visible or count < 2:
+            ends.append(torch.zeros(rows, per_boundary, 2, 2, dtype=torch.float64))
+            weights.append(torch.zeros(rows, per_boundary, dtype=torch.float64))
+            continue
+        at = torch.arange(count, dtype=torch.float64) * STEP
+        points = torch.stack([_resample(arc, line[:, 0], at), _resample(arc, line[:, 1], at)], dim=-1)
+        first = torch.randint(count, (rows, per_boundary), generator=generator)
+        reach = min(count - 1, moment.longest)
+        second = first + torch.randint(1, reach + 1, first.shape, generator=generator)
+        second = torch.where(second < count, second, (second - count) if reach == count - 1 else first - 1)
+        ends.append(torch.stack([points[first], points[second.clamp(min=0)]], dim=2))
+        weights.append((second >= 0).double())
+    boundary = torch.arange(6).repeat_interleave(per_boundary).expand(rows, -1).clone()
+    return torch.cat(ends, dim=1), boundary, torch.cat(weights, dim=1)
+
+
+def _corrupt(
+    moment: Moment, endpoints: Tensor, boundary: Tensor, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Gross outliers anywhere in the lower half, wrong indices one by one or a boundary at a time."""
+
+    def draw() -> Tensor:
+        return torch.rand(boundary.shape, generator=generator)
+
+    gross = draw() < moment.outliers
+    size = torch.tensor([IMAGE[1], IMAGE[0] / 2], dtype=torch.float64)
+    anywhere = torch.rand(endpoints.shape, generator=generator, dtype=torch.float64) * size
+    anywhere[..., 1] += IMAGE[0] / 2
+    endpoints = torch.where(gross[..., None, None], anywhere, endpoints)
+    other = (boundary + torch.randint(1, 6, boundary.shape, generator=generator)) % 6
+    boundary = torch.where(draw() < moment.wrong_index, other, boundary)
+    whole = torch.rand(boundary.shape[0], 6, generator=generator) < moment.wrong_boundary
+    onto = torch.randint(0, 6, whole.shape, generator=generator)
+    return endpoints, torch.where(whole.gather(1, boundary), onto.gather(1, boundary), boundary)
+
+
+def _clothoid(s: Tensor) -> Tensor:
+    """Curvature along the road, 1/m: 60 m clothoids into R = 300 m, right then left, from s = 60 m."""
+    knots = torch.tensor([60.0, 120.0, 180.0, 240.0, 270.0, 330.0, 390.0, 450.0], dtype=torch.float64)
+    values = torch.tensor([0.0, 1.0, 1.0, 0.0, 0.0, -1.0, -1.0, 0.0], dtype=torch.float64) / 300.0
+    s = s.clamp(float(knots[0]), float(knots[-1]) - 1e-6)
+    right = torch.searchsorted(knots, s.contiguous(), right=True).clamp(1, len(knots) - 1)
+    share = (s - knots[right - 1]) / (knots[right] - knots[right - 1])
+    return values[right - 1] + share * (values[right] - values[right - 1])
+
+
+def _curves(t: float, moment: Moment) -> Moment:
+    return replace(moment, near=5.0, far=40.0, curvature=lambda z: _clothoid(z + 30.0 * t))
+
+
+def _lane_change(t: float, moment: Moment) -> Moment:
+    done = min(max((t - 2.0) / 4.0, 0.0), 1.0)
+    moved = WIDTH * (done - math.sin(2 * math.pi * done) / (2 * math.pi))  # camera to the right
+    crossed = moved > WIDTH / 2
+    return replace(
+        moment, offset=moment.offset - moved + WIDTH * crossed, tag="change" if 0 < done < 1 else ""
+    )
+
+
+def _bumps(t: float, moment: Moment) -> Moment:
+    phase = (t % 2.0) - 1.0
+    bump = math.radians(1.0) * math.sin(math.pi * phase / 0.2) if 0 <= phase < 0.2 else 0.0
+    pitch, *rest = moment.pose
+    return replace(moment, pose=(pitch + bump, *rest), tag="bump" if 0 <= phase < 0.3 else "")
+
+
+def _brake(t: float, moment: Moment) -> Moment:
+    dive = (
+        math.radians(1.5)
+        * min(max((t - 3.0) / 0.3, 0.0), 1.0)
+        * (1.0 if t < 5.0 else max(0.0, 1 - (t - 5) / 0.3))
+    )
+    pitch, *rest = moment.pose
+    return replace(moment, pose=(pitch + dive, *rest))
+
+
+def _exit(t: float, moment: Moment) -> Moment:
+    away = min(max(t - 3.0, 0.0), 3.0) / 3.0
+    headings, places = moment.headings.clone(), moment.places.clone()
+    if 0 < away < 1:
+        headings[5], places[5] = 0.06, places[5] + 3.0 * away
+    return replace(moment, headings=headings, places=places, tag="exit" if 0 < away < 1 else "")
+
+
+_UNEQUAL = torch.tensor([0.10, -0.08, 0.0, 0.05, -0.12, 0.15], dtype=torch.float64)
+
+
+def _only(visible: tuple[int, ...], first: float, last: float) -> Callable[[float, Moment], Moment]:
+    def change(t: float, moment: Moment) -> Moment:
+        inside = first <= t < last
+        return replace(moment, visible=visible if inside else moment.visible, tag="less" if inside else "")
+
+    return change
+
+
+def _garbage(t: float, moment: Moment) -> Moment:
+    bad = t < 0.33 or 3.0 <= t < 3.5
+    return replace(moment, outliers=1.0 if bad else 0.0, tag="bad" if bad else "")
+
+
+def _clock(t: float, moment: Moment) -> Moment:
+    k = round(t * FPS)
+    return replace(moment, dt={3: 0.0, 5: -1 / FPS, 7: float("nan")}.get(k % 10, 1 / FPS))
+
+
+def _far_start(t: float, moment: Moment) -> Moment:
+    pitch, yaw, roll, height = moment.pose
+    return replace(
+        moment, pose=(pitch + math.radians(7), yaw - math.radians(6), roll + math.radians(9), height + 0.7)
+    )
+
+
+def _wrong_class(t: float, moment: Moment) -> Moment:
+    k = round(t * FPS)
+    return replace(moment, shift=(0, 1, -1)[k % 40 // 13 if k % 13 == 5 else 0])
+
+
+SCENARIOS: dict[str, tuple[float, Callable[[float, Moment], Moment] | None]] = {
+    "straight": (6.0, None),
+    "straight 5-40 m": (6.0, lambda t, m: replace(m, near=5.0, far=40.0)),
+    "curves R 300 m, 5-40 m": (17.0, _curves),
+    "50 % outliers, 5 % wrong index": (6.0, lambda t, m: replace(m, outliers=0.5, wrong_index=0.05)),
+    "lane change": (8.0, _lane_change),
+    "bumps 1 deg in 0.2 s": (6.0, _bumps),
+    "braking": (7.0, _brake),
+    "2 s of nothing": (8.0, _only((), 3.0, 5.0)),
+    "one lane for 4 s": (8.0, _only((2, 3), 3.0, 7.0)),
+    "one boundary for 2 s": (8.0, _only((2,), 3.0, 5.0)),
+    "exit": (8.0, _exit),
+    "unequal lanes": (6.0, lambda t, m: replace(m, places=PLACES + _UNEQUAL)),
+    "wrong boundaries": (6.0, lambda t, m: replace(m, wrong_boundary=0.1)),
+    "whole frames misnumbered": (6.0, _wrong_class),
+    "short dashes": (6.0, lambda t, m: replace(m, longest=2)),
+    "garbage at first and in between": (6.0, _garbage),
+    "bad clock": (6.0, _clock),
+    "far start": (4.0, _far_start),
+}
+"""Name: seconds, and the change to the usual drive."""
