@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from train.metrics import CULaneCounts, culane_counts, point_recall, tusimple_score
+from lanebev.io.lanes import FrameLines, LaneLine
+from train.metrics import CULaneCounts, culane_counts, point_recall, tusimple_lane_score, tusimple_score
 
 ROWS = list(range(0, 100, 10))  # ten rows
 STRAIGHT = [100.0] * 10
@@ -14,40 +15,53 @@ def shifted(pixels, rows=10):
 
 
 def test_tusimple_counts_points_within_20_px():
-    assert tusimple_score([shifted(19.9)], [STRAIGHT], ROWS) == (1.0, 0.0, 0.0)
-    assert tusimple_score([shifted(20)], [STRAIGHT], ROWS) == (0.0, 1.0, 1.0)
-    assert tusimple_score([shifted(20, rows=1)], [STRAIGHT], ROWS) == (0.9, 0.0, 0.0)  # 9 of 10 >= 0.85
-    assert tusimple_score([shifted(20, rows=2)], [STRAIGHT], ROWS) == (0.8, 1.0, 1.0)
+    assert tusimple_lane_score([shifted(19.9)], [STRAIGHT], ROWS) == (1.0, 0.0, 0.0)
+    assert tusimple_lane_score([shifted(20)], [STRAIGHT], ROWS) == (0.0, 1.0, 1.0)
+    assert tusimple_lane_score([shifted(20, rows=1)], [STRAIGHT], ROWS) == (0.9, 0.0, 0.0)  # 9 of 10 >= 0.85
+    assert tusimple_lane_score([shifted(20, rows=2)], [STRAIGHT], ROWS) == (0.8, 1.0, 1.0)
 
 
 def test_tusimple_tolerance_grows_with_the_slope():
     slanted = [4 / 3 * y for y in ROWS]  # atan(4/3): 20 px / cos = 33.3 px
-    assert tusimple_score([[x + 33 for x in slanted]], [slanted], ROWS).accuracy == 1.0
-    assert tusimple_score([[x + 34 for x in slanted]], [slanted], ROWS).accuracy == 0.0
+    assert tusimple_lane_score([[x + 33 for x in slanted]], [slanted], ROWS).accuracy == 1.0
+    assert tusimple_lane_score([[x + 34 for x in slanted]], [slanted], ROWS).accuracy == 0.0
 
 
 def test_tusimple_rows_without_a_lane_count_as_agreed():
     half = [-2.0] * 5 + [100.0] * 5
-    assert tusimple_score([half], [half], ROWS).accuracy == 1.0
-    assert tusimple_score([STRAIGHT], [half], ROWS) == (0.5, 1.0, 1.0)
+    assert tusimple_lane_score([half], [half], ROWS).accuracy == 1.0
+    assert tusimple_lane_score([STRAIGHT], [half], ROWS) == (0.5, 1.0, 1.0)
 
 
 def test_tusimple_extra_and_missing_lanes():
     lanes = [[50.0 * k + 50] * 10 for k in range(4)]
-    assert tusimple_score([*lanes, [600.0] * 10], lanes, ROWS) == (1.0, 0.2, 0.0)
-    assert tusimple_score(lanes[:3], lanes, ROWS) == (0.75, 0.0, 0.25)
-    assert tusimple_score([], lanes, ROWS) == (0.0, 0.0, 1.0)
-    assert tusimple_score(lanes, lanes[:1], ROWS) == (0.0, 0.0, 1.0)  # three too many
+    assert tusimple_lane_score([*lanes, [600.0] * 10], lanes, ROWS) == (1.0, 0.2, 0.0)
+    assert tusimple_lane_score(lanes[:3], lanes, ROWS) == (0.75, 0.0, 0.25)
+    assert tusimple_lane_score([], lanes, ROWS) == (0.0, 0.0, 1.0)
+    assert tusimple_lane_score(lanes, lanes[:1], ROWS) == (0.0, 0.0, 1.0)  # three too many
 
 
 def test_tusimple_forgives_the_worst_of_five():
     lanes = [[50.0 * k + 50] * 10 for k in range(5)]
-    assert tusimple_score(lanes[:4], lanes, ROWS) == (1.0, 0.0, 0.0)
+    assert tusimple_lane_score(lanes[:4], lanes, ROWS) == (1.0, 0.0, 0.0)
 
 
 def test_tusimple_wants_one_x_per_row():
     with pytest.raises(ValueError, match="predicted: expected 10 x per lane"):
-        tusimple_score([[1.0]], [STRAIGHT], ROWS)
+        tusimple_lane_score([[1.0]], [STRAIGHT], ROWS)
+
+
+def test_tusimple_score_of_boundaries_on_other_rows():
+    """Rows every 10 px from 0; the label file's begin at 20, and its line at 40."""
+    label_rows = np.arange(20.0, 100, 10)
+    label = LaneLine(np.stack([np.where(label_rows < 40, np.nan, 2 * label_rows), label_rows], axis=-1))
+    rows = np.arange(0.0, 120, 10)
+    x = np.full((6, 12), np.nan)
+    x[2, 5:] = 2 * rows[5:] + 3  # row 40 is missed: 7 of 8 agree
+    assert tusimple_score(x, rows, FrameLines("a", [label])) == (0.875, 0.0, 0.0)
+    x[4] = 0.0
+    assert tusimple_score(x, rows, FrameLines("a", [label])) == (0.875, 0.5, 0.0)
+    assert tusimple_score(x, rows, FrameLines("a", [])) == (0.0, 1.0, 0.0)
 
 
 def vertical(x, top=100, bottom=500):

@@ -13,6 +13,8 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
+from lanebev.io.lanes import FrameLines
+
 Points = npt.NDArray[np.float64]
 
 
@@ -50,8 +52,24 @@ class TuSimpleScore(NamedTuple):
     false_negatives: float
 
 
-def tusimple_score(
-    predicted: Sequence[Sequence[float]], labelled: Sequence[Sequence[float]], rows: Sequence[float]
+def tusimple_score(x: Points, rows: Points, labelled: FrameLines) -> TuSimpleScore:
+    """TuSimple's score of boundaries on image rows against one entry of its label file.
+
+    Args:
+        x: (L, R) px, NaN where a boundary was not seen.
+        rows: (R,) px, rising.
+        labelled: lines on the rows of the label file, NaN where a line is not.
+    """
+    label_rows = labelled.lines[0].points[:, 1] if labelled.lines else rows
+    label_x = [np.nan_to_num(line.points[:, 0], nan=-2.0) for line in labelled.lines]
+    sampled = [np.interp(label_rows, rows, lane, -2.0, -2.0) for lane in x if np.isfinite(lane).any()]
+    return tusimple_lane_score([np.nan_to_num(lane, nan=-2.0) for lane in sampled], label_x, label_rows)
+
+
+def tusimple_lane_score(
+    predicted: Sequence[Sequence[float] | Points],
+    labelled: Sequence[Sequence[float] | Points],
+    rows: Sequence[float] | Points,
 ) -> TuSimpleScore:
     """TuSimple's accuracy, FP and FN of one image.
 
@@ -83,7 +101,9 @@ def tusimple_score(
     return TuSimpleScore(total / count, wrong / len(predicted) if predicted else 0.0, missed / count)
 
 
-def _row_accuracy(predicted: Sequence[float], labelled: Sequence[float], rows: Sequence[float]) -> float:
+def _row_accuracy(
+    predicted: Sequence[float] | Points, labelled: Sequence[float] | Points, rows: Sequence[float] | Points
+) -> float:
     """Share of rows on which the two agree."""
     p, g, y = (np.asarray(values, float) for values in (predicted, labelled, rows))
     there = g >= 0
