@@ -7,17 +7,8 @@ import math
 import pytest
 import torch
 
-from lanebev.geometry.camera import distort_points
-from lanebev.geometry.road import image_from_road_points, road_from_image_points
 from lanebev.render.alignment import (
-    arc_nodes,
     build_alignment,
-    elevation_at,
-    ground_hit,
-    hidden_by_crest,
-    local_from_road,
-    road_from_local,
-    wall_hit,
 )
 from lanebev.render.dice import Dice, row_of
 from lanebev.render.lens import Lens, pixel_rays, sample_distortion, sample_extrinsics, sample_intrinsics
@@ -25,7 +16,7 @@ from lanebev.render.paint import paint_view
 from lanebev.render.photometry import light_of
 from lanebev.render.scene import World, sample_course, sample_world
 from lanebev.render.traffic import place_solids
-from lanebev.render.truth import FARTHEST, boundary_points, project
+from lanebev.render.truth import boundary_points, project
 from lanebev.render.views import sample_place
 
 SIZE = (360, 640)
@@ -49,7 +40,9 @@ def bare_world(dice: Dice) -> tuple[World, torch.Tensor]:
         stripe_width=zero + 0.04,  # wide ones look lopsided: their near half is larger
     )
     none = torch.zeros_like(pavement.left)
-    flat = {name: none for name in ("grain", "mottle", "streak", "tracks", "oil", "middle_seam", "joint", "crack")}
+    flat = {
+        name: none for name in ("grain", "mottle", "streak", "tracks", "oil", "middle_seam", "joint", "crack")
+    }
     flat |= {name: none for name in ("tar", "patch", "skid", "wet", "deck_length")}
     dark = torch.full_like(pavement.base, 0.02)
     pavement = pavement._replace(
@@ -97,8 +90,8 @@ def test_points_lie_on_the_centre_of_the_painted_stripe(model: str, seed: int) -
         cut = slice(b, b + 1)
         one = Lens(intrinsics[cut], lens.distortion[cut], model, row_of(lens.extrinsics, b))
         painted = paint_view(
-            row_of(world, b), row_of(place, b), row_of(alignment, b), one, row_of(solids, b), row_of(light, b),
-            rays[cut], steps[cut],
+            row_of(world, b), row_of(place, b), row_of(alignment, b), one, row_of(solids, b),
+            row_of(light, b), rays[cut], steps[cut],
         )  # fmt: skip
         errors += _centroid_errors(painted.radiance[0, 1], taken[b], usable[b])
     assert len(errors) > 150
@@ -135,14 +128,24 @@ def _centroid_errors(image: torch.Tensor, points: torch.Tensor, usable: torch.Te
 
 
 def _centroid(strip: torch.Tensor, expected: float) -> float | None:
-    """Centroid of the bright run about ``expected``; None where it has no dark ground on both sides."""
-    middle = round(expected)
-    for reach in range(3, 40):
-        if middle - reach < 0 or middle + reach >= len(strip):
-            return None
-        window = strip[middle - reach : middle + reach + 1]
-        excess = window - window.min()
-        if float(torch.maximum(excess[0], excess[-1])) < 2e-3 * float(excess.max()):
-            position = torch.arange(middle - reach, middle + reach + 1, dtype=torch.float64)
-            return float((excess * position).sum() / excess.sum())
-    return None
+    """Centroid of the bright run about ``expected``, less its ground; None where the ground is not dark."""
+    first = last = round(expected)
+    if not 3 <= first < len(strip) - 3:
+        return None
+    ground, peak = strip[max(0, first - 40) : first + 41].median(), strip[first - 2 : first + 3].max()
+    dark = float(ground + 0.012 * (peak - ground))
+    while first > 0 and strip[first] > dark:
+        first -= 1
+    while last < len(strip) - 1 and strip[last] > dark:
+        last += 1
+    level = max(float(strip[first]), float(strip[last]))
+    if first < 1 or last > len(strip) - 2 or last - first < 2 or level > 0.1 * float(peak):
+        return None
+    run = strip[first : last + 1]
+    top, step = int(run.argmax()), run.diff()
+    if bool((step[:top] < -0.05 * peak).any() or (step[top:] > 0.05 * peak).any()):
+        return None  # two stripes in one run
+    position = torch.arange(first, last + 1, dtype=torch.float64)
+    share = (position - first) / (last - first)
+    excess = strip[first : last + 1] - (1 - share) * strip[first] - share * strip[last]
+    return float((excess * position).sum() / excess.sum())
