@@ -18,6 +18,7 @@ from lanebev.io.cameras import read_camera
 from lanebev.io.lanes import read_lanes
 from lanebev.io.overlap import prefetch
 from lanebev.io.results import ExtrinsicsRow, OutputFolder
+from lanebev.io.state import load_state, save_state
 from lanebev.io.video import DEFAULT_FPS, Frame, FrameSource, open_source
 from lanebev.observers import LaneFileObserver, NetworkObserver, Observer
 from lanebev.pipeline import LaneBEV
@@ -30,6 +31,7 @@ from lanebev.view.grid import BEVGrid
 from lanebev.view.warp import BEVWarp
 
 CALIBRATORS = ("joint", "two-stage")
+STATE_FILE = "state.safetensors"
 STILLS_FPS = Fraction(2)  # of the videos that show images one after another
 STILL_PASSES = 4  # updates on one image: the linearisation settles
 _NOMINAL_HEIGHT = 1.5  # m, of the view before anything is known
@@ -97,7 +99,7 @@ def run(
     check_image_size(camera, source)
     observer = make_observer(config, source, camera)
     calibrator = make_calibrator(config.calibrator)
-    state = calibrator.initial_state(1, dtype=torch.float64)
+    state, problem = begin(config.resume, calibrator)
     frames: Iterator[Frame] = prefetch(source)
     frames = progress(frames, source.count) if progress else frames
     warp, coarse = BEVWarp(BEVGrid()), BEVWarp(BEVGrid(resolution=_BEFORE_RESOLUTION))
@@ -112,6 +114,7 @@ def run(
             source.is_single,
             config.stills,
         )
+        recorder.problems += [problem] if problem else []
         before = None
         with recorder:
             for frame in frames:
@@ -130,7 +133,27 @@ def run(
                         bird_view(warp, frame, camera, calibration.extrinsics),
                     )
                 )
+        if not config.stills:
+            save_state(out / STATE_FILE, {"calibrator": state})
         return recorder.finish(run_facts(config, source, camera), Path(source.source).name, truth)
+
+
+def begin(resume: str | None, calibrator: Any) -> tuple[Any, str | None]:
+    """The state to begin with, and why it is not the one asked for, if it isn't.
+
+    Raises:
+        ValueError: ``resume`` is not the folder of an earlier run.
+    """
+    fresh = calibrator.initial_state(1, dtype=torch.float64)
+    if resume is None:
+        return fresh, None
+    path = Path(resume) / STATE_FILE
+    if not path.is_file():
+        raise ValueError(
+            f"resume: expected the output folder of an earlier run, got {resume}: no {STATE_FILE}"
+        )
+    loaded = load_state(path, {"calibrator": fresh})
+    return loaded.states.get("calibrator", fresh), loaded.problem
 
 
 def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Observer:

@@ -17,6 +17,7 @@ from PIL import Image
 from lanebev import Camera, image_from_road_points
 from lanebev.cli import main
 from lanebev.io.results import CSV_COLUMNS
+from lanebev.io.state import load_state
 from lanebev.io.video import VideoWriter
 from lanebev.report.measure import pose
 from lanebev.run import RunConfig
@@ -157,6 +158,44 @@ def test_one_image_gives_pictures(data, tmp_path):
     assert {"bev.png", "overlay.png"} <= names
     assert not {"bev.mp4", "overlay.mp4"} & names
     assert len(_table(tmp_path / "out")) == 1
+
+
+@pytest.mark.parametrize("calibrator", ["two-stage", "joint"])
+def test_resuming_gives_what_an_uninterrupted_run_gives(data, tmp_path, calibrator):
+    for part, numbers in (("whole", range(6)), ("first", range(3)), ("second", range(3, 6))):
+        (tmp_path / part).mkdir()
+        for i in numbers:
+            shutil.copy(data / "images" / f"{i}.png", tmp_path / part / f"{i}.png")
+        lines = "\n".join(_lane_lines(f"{part}/{i}.png" for i in numbers))
+        (tmp_path / part / "lanes.json").write_text(lines)
+        resume = ["--resume", str(tmp_path / "out_first")] if part == "second" else []
+        sources = {"source": tmp_path / part, "lanes": tmp_path / part / "lanes.json"}
+        out = tmp_path / f"out_{part}"
+        assert _run(data, "--calibrator", calibrator, *resume, out=out, **sources) == 0
+    estimates = slice(2, 11)  # after frame and time, up to the status
+    whole, second = (
+        [list(row.values())[estimates] for row in _table(tmp_path / f"out_{part}")]
+        for part in ("whole", "second")
+    )
+    assert whole[3:] == second
+    one, other = (
+        load_state(tmp_path / f"out_{part}" / "state.safetensors").states["calibrator"]
+        for part in ("whole", "second")
+    )
+    assert one.keys() == other.keys()
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_a_damaged_state_is_reported_and_a_missing_one_refused(data, tmp_path, capsys):
+    assert _run(data, source="images/3.png", out=tmp_path / "out") == 0
+    state = tmp_path / "out" / "state.safetensors"
+    state.write_bytes(state.read_bytes()[:-5])
+    assert _run(data, "--resume", str(tmp_path / "out"), source="images/3.png", out=tmp_path / "next") == 0
+    assert "state ignored" in capsys.readouterr().out
+    images, camera, lanes = data / "images", data / "camera.yaml", data / "lanes.json"
+    arguments = ["run", images, "--camera", camera, "--lanes", lanes, "--out", tmp_path / "third"]
+    _fails(capsys, [*arguments, "--resume", data], "resume: expected the output folder", "state.safetensors")
+    assert not (tmp_path / "third").exists()
 
 
 def test_a_damaged_image_in_a_drive_is_a_row(data, tmp_path, capsys):
