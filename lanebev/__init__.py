@@ -1,8 +1,11 @@
 """lanebev: how a camera looks at the road, frame by frame, from lane boundaries alone."""
 
+from lanebev.estimation.joint import JointCalibrator
 from lanebev.estimation.two_stage import TwoStageCalibrator
 from lanebev.geometry.camera import Camera
 from lanebev.geometry.road import image_from_road_points, road_covariance, road_from_image_points
+from lanebev.observation.lines import LineExtractor
+from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.pipeline import LaneBEV, LaneBEVOutput
 from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
 from lanebev.view.grid import BEVGrid, bev_from_image
@@ -16,9 +19,12 @@ __all__ = [
     "Calibration",
     "Camera",
     "Extrinsics",
+    "JointCalibrator",
     "LaneBEV",
     "LaneBEVOutput",
+    "LaneSegmenter",
     "LaneSegments",
+    "LineExtractor",
     "Status",
     "TwoStageCalibrator",
     "bev_from_image",
