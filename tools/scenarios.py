@@ -41,6 +41,7 @@ class Moment:
     wrong_boundary: float = 0.0  # probability that a whole boundary has another one's index
     longest: int = 10**6  # points between the ends of a segment, at most
     dt: float = 1 / FPS
+    stale: Moment | None = None  # an older moment whose image comes instead
     tag: str = ""  # scenarios name the moments that they bound separately
 
 
@@ -76,7 +77,7 @@ def observe(
     """Yield every frame's segments for R rows."""
     generator = torch.Generator().manual_seed(seed)
     for moment in drive:
-        endpoints, boundary, weight = _exact(moment, rows, per_boundary, generator)
+        endpoints, boundary, weight = _exact(moment.stale or moment, rows, per_boundary, generator)
         noise = torch.randn(endpoints.shape, generator=generator, dtype=torch.float64)
         endpoints = endpoints + sigma * noise
         endpoints, boundary = _corrupt(moment, endpoints, boundary, generator)
@@ -243,8 +244,20 @@ def _garbage(t: float, moment: Moment) -> Moment:
 
 
 def _clock(t: float, moment: Moment) -> Moment:
+    """Of ten frames one comes twice, one late, one without a time, and one is dropped."""
     k = round(t * FPS)
-    return replace(moment, dt={3: 0.0, 5: -1 / FPS, 7: float("nan")}.get(k % 10, 1 / FPS))
+
+    def at(frame: int) -> Moment:
+        return Moment(swing(frame / FPS), drift(frame / FPS))
+
+    ten, phase = k // 10 * 9, k % 10  # nine true frames in ten: one twice, one late, one missing
+    true = ten + (0, 1, 2, 2, 3, 3, 4, 5, 6, 8)[phase]
+    now = at(true)
+    if phase == 3:
+        return replace(now, dt=0.0)
+    if phase == 5:
+        return replace(now, dt=-2 / FPS, stale=at(true - 2))
+    return replace(now, dt={6: 3 / FPS, 7: float("nan"), 9: 2 / FPS}.get(phase, 1 / FPS))
 
 
 def _far_start(t: float, moment: Moment) -> Moment:

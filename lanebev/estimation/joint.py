@@ -31,7 +31,7 @@ class Reason(IntFlag):
     NONE = 0
     NO_SEGMENTS = 1  # nothing was seen in this frame
     FEW_INLIERS = 2  # what was seen does not fit the road that is believed
-    TIME = 4  # dt was zero, negative or not finite: the frame was not used
+    TIME = 4  # not later than the last frame, and not used; or the time unknown, and one guessed
     NO_START = 8  # no start found yet: pitch and yaw not determined by this frame
     ROLL_UNSEEN = 16  # one lane or less: roll holds with growing sigma
     HEIGHT_UNSEEN = 32  # no lane: height holds with growing sigma
@@ -55,6 +55,7 @@ class JointConfig:
         evidence_time: s over which a bend's or unequal lanes' evidence is summed.
         min_support: inlier segments (weights summed) of a usable frame.
         min_share, enter_share: share of inliers to go on tracking, and to begin again.
+        assumed_dt: s between frames where it is not finite, or the clock jumped back by more than a second.
         restart_after: s of segments that don't fit before the search starts over.
         lost_after: s without support.
     """
@@ -72,6 +73,7 @@ class JointConfig:
     min_support: float = 3.0
     min_share: float = 0.15
     enter_share: float = 0.25
+    assumed_dt: float = 1 / 30
     restart_after: float = 0.3
     lost_after: float = 5.0
 
@@ -89,6 +91,7 @@ class JointState(NamedTuple):
         mean: (B, 16 + L), see ``joint_motion``.
         cov: (B, 16 + L, 16 + L).
         evidence: (B, 6 + L) summed evidence against the motion: pose, curvature, deviations; unit variance.
+        early: (B,) s by which the state is ahead of the last frame, which came out of order.
         unseen: (B,) s since the last usable frame.
         misfit: (B,) s for which there were segments that did not fit.
         status: (B,) int64, values of Status.
@@ -98,6 +101,7 @@ class JointState(NamedTuple):
     mean: Tensor
     cov: Tensor
     evidence: Tensor
+    early: Tensor
     unseen: Tensor
     misfit: Tensor
     status: Tensor
@@ -137,6 +141,7 @@ class JointCalibrator(nn.Module):
             mean=mean,
             cov=cov,
             evidence=mean.new_zeros(batch_size, NUM_POSE + 2 + cfg.num_boundaries),
+            early=zero.clone(),
             unseen=zero,
             misfit=zero.clone(),
             status=none + int(Status.UNINITIALISED),
@@ -157,7 +162,8 @@ class JointCalibrator(nn.Module):
             segments: of this frame, N per row; weight 0 is not there, non-finite counts as not there.
             intrinsics: (B, 3, 3) px.
             state: of the frame before, or :meth:`initial_state`.
-            dt: s since that frame, float or (B,). A started row skips a frame whose dt is not positive.
+            dt: s since that frame, float or (B,). A started row skips a duplicate (0) and a frame that comes
+                late (negative; the next dt counts from it). Where not finite, an interval is assumed.
             lane_width: m, float, (B,) or (B, L-1) per lane.
 
         Returns:
@@ -170,24 +176,31 @@ class JointCalibrator(nn.Module):
         seen = observe(segments, intrinsics, cfg.num_boundaries)
         positions = boundary_places(lane_width, cfg.num_boundaries, seen.sigma)  # (B, L)
         places = positions.gather(1, seen.boundary)  # (B, N)
-        elapsed = as_batch(dt, seen.sigma)
-        step = torch.where(elapsed.isfinite() & (elapsed > 0), elapsed, 0.0).clamp(max=60.0)
+        step, skip, early, guessed = self._elapsed(as_batch(dt, seen.sigma), state)
 
-        mean, cov = kalman.predict(state.mean, state.cov, *motion(step, cfg.num_boundaries, cfg.motion))
-        mean, shift, scale = self._follow_lane_change(mean, positions, seen)
-        update, evidence = self._update(mean, cov, scale, state.evidence, places, seen, step)
-        judged, supported = self._judge(state, update, evidence, shift, step, seen)
+        predicted = kalman.predict(state.mean, state.cov, *motion(step, cfg.num_boundaries, cfg.motion))
+        mean, shift, scale = self._follow_lane_change(predicted[0], positions, seen)
+        update, evidence = self._update(mean, predicted[1], scale, state.evidence, places, seen, step)
+        judged, supported = self._judge(state, predicted, update, evidence, shift, step, seen)
         after, trust = self._restart(judged, update.trust, supported, segments, intrinsics, lane_width)
+        after = after._replace(reasons=after.reasons | _flag(guessed, Reason.TIME))
 
-        late = ~(elapsed > 0) & _running(state.status)
-        skipped = state._replace(reasons=state.reasons | int(Reason.TIME))
-        after = JointState(*(_where(late, old, new) for old, new in zip(skipped, after, strict=True)))
+        skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=early)
+        after = JointState(*(_where(skip, old, new) for old, new in zip(skipped, after, strict=True)))
         return self._calibration(after, torch.where(seen.weight > 0, trust, 0.0)), after
+
+    def _elapsed(self, dt: Tensor, state: JointState) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Time to predict over; whether to skip the frame; how far ahead the state then is; if guessed."""
+        due = dt - state.early
+        guessed = ~(due > -1.0) | ~dt.isfinite()
+        due = torch.where(guessed, self.config.assumed_dt, due)
+        skip = (due <= 0) & _running(state.status)
+        return due.clamp(0.0, 60.0), skip, torch.where(skip, -due, 0.0), guessed
 
     def _follow_lane_change(
         self, mean: Tensor, positions: Tensor, seen: Observations
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Predicted mean with offset and deviations moved by a lane if the indices were; shift; noise scale."""
+        """Predicted mean, offset and deviations moved by a lane if the indices were; shift; noise scale."""
         ego = self.config.num_boundaries // 2 - 1
         width = positions[:, ego + 1] - positions[:, ego]
         shift, scale = best_shift(mean, positions, seen, width)
@@ -240,6 +253,7 @@ class JointCalibrator(nn.Module):
     def _judge(
         self,
         state: JointState,
+        predicted: tuple[Tensor, Tensor],
         update: Update,
         evidence: Tensor,
         shift: Tensor,
@@ -263,7 +277,9 @@ class JointCalibrator(nn.Module):
         reasons = _flag(empty, Reason.NO_SEGMENTS) | _flag(~empty & ~supported, Reason.FEW_INLIERS)
         reasons = reasons | _flag(supported & (shift != 0), Reason.LANE_CHANGE)
         reasons = reasons | _flag(~running, Reason.NO_START)
-        after = JointState(update.mean, update.cov, evidence, unseen, misfit, status, reasons)
+        mean, cov = _where(supported, update.mean, predicted[0]), _where(supported, update.cov, predicted[1])
+        evidence = _where(supported, evidence, torch.zeros_like(evidence))
+        after = JointState(mean, cov, evidence, torch.zeros_like(unseen), unseen, misfit, status, reasons)
         return after, supported
 
     def _restart(
@@ -291,6 +307,7 @@ class JointCalibrator(nn.Module):
             mean,
             cov,
             torch.zeros_like(state.evidence),
+            zero,
             zero,
             zero,
             torch.full_like(state.status, int(Status.TRACKING)),

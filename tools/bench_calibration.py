@@ -1,0 +1,351 @@
+"""Every calibrator on every hard drive of tools/scenarios.py, Monte Carlo runs as rows of a batch.
+
+    python -m tools.bench_calibration --out out/bench
+
+Prints and writes (bench.json, bench.md) the RMSE of every parameter, its ratio to the per-frame Cramér-Rao
+bound, NEES per degree of freedom, the time in each status and the time to recover. ``--stream N`` runs N
+frames of an endless drive and watches memory, covariance, drift, and float32 against float64.
+
+"Hard" frames are those a scenario names (nothing to see, a bump, a line crossed); they are counted on their
+own. The first half second is left out of every figure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import math
+import platform
+import resource
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.estimation.joint import JointCalibrator
+from lanebev.estimation.joint_model import NUM_PARAMS, boundary_residuals
+from lanebev.estimation.joint_model import observe as make_ready
+from lanebev.estimation.single_frame import normal_equations
+from lanebev.estimation.two_stage import TwoStageCalibrator
+from lanebev.types import LaneSegments, Status
+from tools.scenarios import CAMERA, FPS, PLACES, SCENARIOS, WIDTH, Moment, moments, observe
+from tools.textbook_ekf import TextbookEKF
+
+NAMES = ("pitch_deg", "yaw_deg", "roll_deg", "height_cm")
+UNITS = torch.tensor([180 / math.pi] * 3 + [100.0], dtype=torch.float64)
+WARM_UP = 15  # frames left out
+CALIBRATORS: dict[str, Callable[[], Any]] = {
+    "joint": JointCalibrator,
+    "two-stage": TwoStageCalibrator,
+    "textbook EKF": TextbookEKF,
+}
+
+
+class Track(NamedTuple):
+    """What a calibrator made of a drive of T frames in R rows.
+
+    Attributes:
+        errors: (T, R, 4) rad and m.
+        variances: (T, R, 4).
+        nees: (T, R).
+        status: (T, R) int64.
+        bounds: (T, R, 4) variances of the per-frame Cramér-Rao bound, inf where there is none.
+        hard: (T,) bool, frames that the scenario names.
+        dt: (T,) s between frames as they were, not as the clock said.
+    """
+
+    errors: Tensor
+    variances: Tensor
+    nees: Tensor
+    status: Tensor
+    bounds: Tensor
+    hard: Tensor
+
+
+def track(
+    calibrator: Any,
+    drive: list[Moment],
+    rows: int,
+    sigma: float = 1.0,
+    per_boundary: int = 30,
+    seed: int = 0,
+    dtype: torch.dtype = torch.float64,
+) -> Track:
+    """Run a calibrator over a drive.
+
+    Args:
+        calibrator: with ``initial_state`` and a call as ``JointCalibrator``.
+        drive: from ``tools.scenarios.moments``.
+        rows: R Monte Carlo runs.
+        sigma: px, noise of an end point.
+        per_boundary: segments of each boundary.
+        seed: of pairs and noise.
+        dtype: of the calibrator.
+    """
+    state = calibrator.initial_state(rows, dtype=dtype)
+    intrinsics = CAMERA.to(dtype).expand(rows, 3, 3)
+    found = []
+    for moment, segments in observe(drive, rows, sigma, per_boundary, seed, dtype):
+        calibration, state = calibrator(segments, intrinsics, state, moment.dt, WIDTH)
+        error = calibration.extrinsics.stack().double() - torch.tensor(moment.pose, dtype=torch.float64)
+        cov = calibration.covariance.double()
+        nees = (error * torch.linalg.solve(cov, error)).sum(-1)
+        found.append(
+            (error, cov.diagonal(dim1=1, dim2=2), nees, calibration.status, frame_bound(moment, segments))
+        )
+    hard = torch.tensor([bool(moment.tag) for moment in drive])
+    return Track(*(torch.stack(part) for part in zip(*found, strict=True)), hard)
+
+
+def frame_bound(moment: Moment, segments: LaneSegments) -> Tensor:
+    """Variances (R, 4) of the per-frame bound with the offset unknown, or inf where roll is not determined.
+
+    Source: Kay 1993, Sec. 3.9. Wrong segments count as if they were right ones, which only lowers it.
+    """
+    rows = segments.boundary.shape[0]
+    seen = make_ready(LaneSegments(*(_double(part) for part in segments)), CAMERA.expand(rows, 3, 3), 6)
+    params = torch.zeros(rows, NUM_PARAMS, dtype=torch.float64)
+    params[:, :5] = torch.tensor([*moment.pose, moment.offset], dtype=torch.float64)
+    at = boundary_residuals(params, PLACES[segments.boundary], seen)
+    weight = seen.weight * at.valid / seen.sigma.square()
+    info, _ = normal_equations(at.jacobian[:, :5], at.distance, weight)
+    cov = torch.linalg.inv(info + 1e-6 * torch.eye(5, dtype=torch.float64))
+    variances = cov.diagonal(dim1=1, dim2=2)[:, :4]
+    return torch.where((variances[:, 2:3] < 0.01), variances, torch.inf)
+
+
+def _double(part: Tensor) -> Tensor:
+    return part.double() if part.is_floating_point() else part
+
+
+def summarise(run: Track, usual: Tensor | None = None) -> dict[str, Any]:
+    """Figures of one track; ``usual`` (4,) is the RMSE on the straight road, for the time to recover."""
+    later = torch.arange(len(run.hard)) >= WARM_UP
+    easy, hard = later & ~run.hard, later & run.hard
+    known = run.bounds.isfinite().all(-1) & easy.unsqueeze(-1)
+    bound = run.bounds[known].mean(0).sqrt()
+    figures: dict[str, Any] = {
+        "rmse": (_rms(run.errors[easy]) * UNITS).tolist(),
+        "ratio_to_bound": (_rms(run.errors[known]) / bound).tolist(),
+        "nees_per_dof": float(run.nees[easy].mean() / 4),
+        "time_in_status": {s.name: float((run.status[later] == s).double().mean()) for s in Status},
+    }
+    if hard.any():
+        figures["hard"] = {
+            "rmse": (_rms(run.errors[hard]) * UNITS).tolist(),
+            "largest": (run.errors[hard].abs().amax((0, 1)) * UNITS).tolist(),
+            "largest_sigma": (run.variances[hard].amax((0, 1)).sqrt() * UNITS).tolist(),
+            "nees_per_dof": float(run.nees[hard].mean() / 4),
+        }
+        if usual is not None:
+            figures["recovery_s"] = recovery(run, usual)
+    return figures
+
+
+def recovery(run: Track, usual: Tensor) -> float | None:
+    """Longest time, s, from the end of hard frames until the error of all rows is back at twice the usual.
+
+    None if it never comes back before the next hard frames or the end.
+    """
+    fine = (run.errors.square().mean(1).sqrt() <= 2 * usual).all(-1)  # (T,)
+    ends = [k + 1 for k in range(len(fine) - 1) if run.hard[k] and not run.hard[k + 1]]
+    longest = 0.0
+    for end in ends:
+        until = end
+        while until < len(fine) and not fine[until] and not run.hard[until]:
+            until += 1
+        if until == len(fine) or run.hard[until]:
+            return None
+        longest = max(longest, (until - end) / FPS)
+    return longest
+
+
+def _rms(values: Tensor) -> Tensor:
+    """Over all dimensions but the last."""
+    return values.flatten(0, -2).square().mean(0).sqrt()
+
+
+def compare(
+    names: list[str], scenarios: list[str], rows: int, seconds: float | None, sigma: float
+) -> dict[str, Any]:
+    """All scenarios with all calibrators: figures by scenario and calibrator."""
+    results: dict[str, Any] = {}
+    usual: dict[str, Tensor] = {}
+    for scenario in scenarios:
+        length, change = SCENARIOS[scenario]
+        drive = moments(min(length, seconds or length), change)
+        results[scenario] = {}
+        for name in names:
+            began = time.perf_counter()
+            run = track(CALIBRATORS[name](), drive, rows if name != "textbook EKF" else min(rows, 4), sigma)
+            if name not in usual:
+                later = torch.arange(len(run.hard)) >= WARM_UP
+                usual[name] = _rms(run.errors[later])
+            figures = summarise(run, usual[name])
+            figures["seconds"] = time.perf_counter() - began
+            results[scenario][name] = figures
+            print(_line(scenario, name, figures), flush=True)
+    return results
+
+
+def _line(scenario: str, name: str, figures: dict[str, Any]) -> str:
+    def numbers(values: list[float]) -> str:
+        return " ".join(f"{value:7.3f}" for value in values)
+
+    text = f"{scenario:>32} | {name:>12} | {numbers(figures['rmse'])} | {numbers(figures['ratio_to_bound'])}"
+    text += f" | {figures['nees_per_dof']:6.2f} | {_status_text(figures)}"
+    if "hard" in figures:
+        hard = figures["hard"]
+        text += f" | hard: {numbers(hard['rmse'])}, sigma to {numbers(hard['largest_sigma'])}"
+        text += f", NEES {hard['nees_per_dof']:.2f}, recovers {_seconds(figures.get('recovery_s'))}"
+    return text
+
+
+def _status_text(figures: dict[str, Any]) -> str:
+    shares = figures["time_in_status"]
+    return ", ".join(f"{100 * share:.0f} % {name}" for name, share in shares.items() if share > 0)
+
+
+def _seconds(value: float | None) -> str:
+    return "not" if value is None else f"{value:.2f} s"
+
+
+def markdown(results: dict[str, Any]) -> str:
+    """The README's table."""
+    lines = [
+        "| drive | calibrator | pitch ° | yaw ° | roll ° | height cm | × bound | NEES/dof | tracking "
+        "| hard frames: pitch, yaw, roll °, height cm | recovery |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for scenario, by_name in results.items():
+        for name, figures in by_name.items():
+            rmse = " | ".join(f"{value:.3f}" for value in figures["rmse"])
+            ratio = " ".join(f"{value:.2f}" for value in figures["ratio_to_bound"])
+            hard = " ".join(f"{value:.3f}" for value in figures["hard"]["rmse"]) if "hard" in figures else ""
+            back = _seconds(figures["recovery_s"]) if "recovery_s" in figures else ""
+            tracking = f"{100 * figures['time_in_status']['TRACKING']:.0f} %"
+            lines.append(
+                f"| {scenario} | {name} | {rmse} | {ratio} | {figures['nees_per_dof']:.2f} | {tracking} "
+                f"| {hard} | {back} |"
+            )
+    return "\n".join(lines) + "\n"
+
+
+def stream(frames: int, rows: int, per_boundary: int = 8, seed: int = 0) -> dict[str, Any]:
+    """An endless straight drive, its observations drawn from one period of the motion and re-noised.
+
+    The same frames go to a float32 and a float64 calibrator.
+
+    Returns:
+        memory at a tenth and at the end, smallest eigenvalue of the correlation matrix, RMSE of the first and
+        the last tenth, and the difference between the precisions in sigmas.
+    """
+    period = moments(20.0)  # the motion's frequencies are multiples of 0.1 Hz, the drift's of 0.05 Hz
+    bank = list(observe(period, rows, 0.0, per_boundary, seed, torch.float64))
+    generator = torch.Generator().manual_seed(seed + 1)
+    single, double = JointCalibrator(), JointCalibrator()
+    low = single.initial_state(rows, dtype=torch.float32)
+    high = double.initial_state(rows, dtype=torch.float64)
+    tenth = max(frames // 10, 1)
+    squared = {"first": torch.zeros(4, dtype=torch.float64), "last": torch.zeros(4, dtype=torch.float64)}
+    apart, smallest, lost, memory = torch.zeros(4, dtype=torch.float64), math.inf, 0, {}
+    with torch.inference_mode():
+        for k in range(frames):
+            moment, exact = bank[k % len(bank)]
+            noise = torch.randn(exact.endpoints.shape, generator=generator, dtype=torch.float64)
+            segments = exact._replace(endpoints=exact.endpoints + noise, sigma=torch.ones_like(exact.sigma))
+            rough = LaneSegments(*(p.float() if p.is_floating_point() else p for p in segments))
+            one, low = single(rough, CAMERA.float().expand(rows, 3, 3), low, 1 / FPS, WIDTH)
+            two, high = double(segments, CAMERA.expand(rows, 3, 3), high, 1 / FPS, WIDTH)
+            pose = two.extrinsics.stack()
+            error = pose - torch.tensor(moment.pose, dtype=torch.float64)
+            part = "first" if k < tenth else "last" if k >= frames - tenth else None
+            if part:
+                squared[part] += error.square().mean(0)
+            std = two.covariance.diagonal(dim1=1, dim2=2).sqrt()
+            apart += ((one.extrinsics.stack().double() - pose) / std).square().mean(0)
+            lost += int((one.status != Status.TRACKING).sum() + (two.status != Status.TRACKING).sum())
+            if k % 1000 == 0 or k == frames - 1:
+                smallest = min(smallest, smallest_eigenvalue(low.cov), smallest_eigenvalue(high.cov))
+            if k in (tenth, frames - 1):
+                memory[k] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {
+        "frames": frames,
+        "rows": rows,
+        "segments_per_boundary": per_boundary,
+        "memory_mb": list(memory.values()),
+        "smallest_eigenvalue_of_correlation": smallest,
+        "rmse_first_tenth": ((squared["first"] / tenth).sqrt() * UNITS).tolist(),
+        "rmse_last_tenth": ((squared["last"] / tenth).sqrt() * UNITS).tolist(),
+        "float32_from_float64_sigmas": (apart / frames).sqrt().tolist(),
+        "rows_not_tracking": lost,
+    }
+
+
+def smallest_eigenvalue(cov: Tensor) -> float:
+    """Of the correlation matrices of (B, D, D): positive if and only if all covariances are."""
+    size = cov.double().diagonal(dim1=1, dim2=2).rsqrt()
+    return float(torch.linalg.eigvalsh(size.unsqueeze(-1) * cov.double() * size.unsqueeze(-2)).min())
+
+
+def speed(calibrator: Any, frames: int = 60) -> dict[str, float]:
+    """Milliseconds a frame of one row, 180 segments, float64 and one thread; median and quartiles."""
+    drive = list(observe(moments(frames / FPS), 1, 1.0, 30, 0, torch.float64))
+    state, took = calibrator.initial_state(1, dtype=torch.float64), []
+    with torch.inference_mode():
+        for _, segments in drive:
+            began = time.perf_counter()
+            _, state = calibrator(segments, CAMERA[None], state, 1 / FPS, WIDTH)
+            took.append(1e3 * (time.perf_counter() - began))
+    low, middle, high = torch.tensor(took[5:]).quantile(torch.tensor([0.25, 0.5, 0.75])).tolist()
+    return {"median_ms": middle, "quartile_ms": low, "upper_quartile_ms": high}
+
+
+def main(arguments: list[str] | None = None) -> dict[str, Any]:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--calibrators", nargs="+", choices=list(CALIBRATORS), default=list(CALIBRATORS))
+    parser.add_argument("--scenarios", nargs="+", choices=list(SCENARIOS), default=list(SCENARIOS))
+    parser.add_argument("--rows", type=int, default=32, help="Monte Carlo runs")
+    parser.add_argument("--sigma", type=float, default=1.0, help="noise of an end point, px")
+    parser.add_argument("--quick", action="store_true", help="2 rows, 1.5 s of the first two scenarios")
+    parser.add_argument("--stream", type=int, metavar="N", help="stream N frames instead")
+    parser.add_argument("--out", type=Path, default=Path("out/bench"))
+    args = parser.parse_args(arguments)
+    names = [n for n in args.calibrators if n != "textbook EKF" or importlib.util.find_spec("filterpy")]
+    if len(names) < len(args.calibrators):
+        print("textbook EKF: left out, filterpy is not installed (pip install filterpy)")
+    report: dict[str, Any] = {
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "threads": torch.get_num_threads(),
+        "seed": 0,
+        "rows": 2 if args.quick else args.rows,
+        "sigma_px": args.sigma,
+        "units": NAMES,
+    }
+    args.out.mkdir(parents=True, exist_ok=True)
+    if args.stream:
+        report["stream"] = stream(args.stream, 2)
+        print(json.dumps(report["stream"], indent=1))
+        (args.out / "stream.json").write_text(json.dumps(report, indent=1))
+        return report
+    scenarios = args.scenarios[:2] if args.quick else args.scenarios
+    with torch.inference_mode():
+        results = compare(names, scenarios, report["rows"], 1.5 if args.quick else None, args.sigma)
+    report["speed"] = {name: speed(CALIBRATORS[name](), 20 if args.quick else 60) for name in names}
+    report["scenarios"] = results
+    for name, took in report["speed"].items():
+        print(f"{name}: {took['median_ms']:.1f} ms a frame of one row, 180 segments")
+    (args.out / "bench.json").write_text(json.dumps(report, indent=1))
+    (args.out / "bench.md").write_text(markdown(results))
+    return report
+
+
+if __name__ == "__main__":
+    main()
