@@ -4,6 +4,8 @@ import torch
 
 from lanebev.observation.lines import LineExtractor, extract_segments
 from lanebev.observation.vertices import LineConfig, local_line, row_moments, scan_vertices
+from lanebev.render import render_views
+from train.extraction import distance_to_polyline, extraction_error
 
 ROWS, COLUMNS, HALF_WIDTH = 96, 160, 1.125
 CONFIG = LineConfig(half_width=HALF_WIDTH)
@@ -66,6 +68,45 @@ def test_vertices_lie_on_rendered_boundaries_to_a_tenth_of_a_pixel(fans):
     assert seen.mean() > 0.95
     assert np.abs(errors[seen]).max() < 0.1
     assert abs(errors[seen].mean()) < 0.01
+
+
+def test_extraction_on_masks_of_rendered_roads():
+    """Curves, hills, hidden stretches and lenses included; what remains turns back on itself at the horizon."""
+    frame = render_views(24, (64, 112), torch.Generator().manual_seed(0))
+    error = extraction_error(frame, (144, 256), LineConfig(stride=1))
+    assert len(error.distance) > 1000
+    assert error.missed == 0
+    assert (error.distance < 0.1).double().mean() > 0.993
+    assert error.distance.quantile(0.99) < 0.07
+    assert 0.8 < error.normalised() < 1.2
+
+
+def test_distance_to_a_bent_polyline():
+    line = torch.tensor([[0.0, 0], [4, 0], [4, 3]])
+    points = torch.tensor([[2.0, 1], [6, 1], [-3, 4]])
+    torch.testing.assert_close(distance_to_polyline(points, line), torch.tensor([1.0, 2.0, 5.0]))
+
+
+@pytest.mark.parametrize("gap", [0, 24])
+def test_bent_line_with_a_gap(gap):
+    """R = 250 px about (290, 48): means of points on both sides of the gap would lie 0.3 px off it."""
+    y, x = torch.meshgrid(torch.arange(96.0), torch.arange(160.0), indexing="ij")
+    radius = (x.double() - 290).hypot(y.double() - 48)
+    maps = (HALF_WIDTH + 0.5 - (radius - 250).abs()).clamp(0, 1)
+    maps[48 - gap // 2 : 48 + gap // 2] = 0
+    segments = extract_segments(maps[None, None], (192, 320), LineConfig(segments=3))
+    points = segments.endpoints[0][segments.weight[0] > 0] / 2
+    assert len(points) == 3
+    assert ((points - torch.tensor([290.0, 48])).norm(dim=-1) - 250).abs().max() < 0.1
+
+
+def test_scans_that_cross_twice_say_nothing():
+    """The columns right of a hook's bend cross it twice."""
+    hook = torch.maximum(stripe((20, 20), (100, 40)), stripe((100, 40), (20, 60)))
+    vertices = scan_vertices(hook[None, None], CONFIG)
+    columns = vertices.weight[0, 0, ROWS:]
+    assert (columns[90:96] == 0).all()
+    assert (columns[40:60] > 0.9).all()  # where only the upper one is near its peak
 
 
 def test_every_vertex_is_used_once_and_baselines_are_long(fans):

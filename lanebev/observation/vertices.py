@@ -30,6 +30,8 @@ class LineConfig:
         window: half-width of the window about a scan's peak, label px.
         absent, present: share of a stripe's mass at and below which a scan has no boundary, and at and above
             which it has one for sure.
+        twice: share at and above which the scan crosses the boundary more than once, as where it turns back
+            at the horizon, and says nothing.
         min_vertices: a boundary with fewer is not seen.
         sigma_floor: least standard deviation of a vertex, label px: what correlates along the line.
     """
@@ -40,8 +42,9 @@ class LineConfig:
     window: int = 6
     absent: float = 0.2
     present: float = 0.6
+    twice: float = 2.0
     min_vertices: int = 8
-    sigma_floor: float = 0.03
+    sigma_floor: float = 0.004
 
     def __post_init__(self) -> None:
         for name in ("stride", "segments", "window", "min_vertices"):
@@ -49,6 +52,8 @@ class LineConfig:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
         if not 0 <= self.absent < self.present:
             raise ValueError(f"present: expected more than absent ({self.absent}), got {self.present}")
+        if not self.present < self.twice:
+            raise ValueError(f"twice: expected more than present ({self.present}), got {self.twice}")
 
 
 class Vertices(NamedTuple):
@@ -56,12 +61,14 @@ class Vertices(NamedTuple):
 
     Attributes:
         points: (B, L, V, 2) (x, y) label px.
+        normal: (B, L, V, 2) unit vectors across the line, of either sign.
         weight: (B, L, V) in [0, 1].
         common_var: (B, L, V) label px², across the line: what neighbouring vertices share.
         own_var: (B, L, V) label px², across the line: each vertex' own.
     """
 
     points: Tensor
+    normal: Tensor
     weight: Tensor
     common_var: Tensor
     own_var: Tensor
@@ -74,7 +81,7 @@ def scan_vertices(probabilities: Tensor, config: LineConfig) -> Vertices:
     """
     by_row = _scan(probabilities, config)
     by_column = _scan(probabilities.mT, config)
-    by_column = by_column._replace(points=by_column.points.flip(-1))
+    by_column = by_column._replace(points=by_column.points.flip(-1), normal=by_column.normal.flip(-1))
     return Vertices(*(torch.cat(pair, dim=2) for pair in zip(by_row, by_column, strict=True)))
 
 
@@ -88,18 +95,31 @@ def _scan(probabilities: Tensor, config: LineConfig) -> Vertices:
     cos2 = 1 / (1 + slope.square())  # of the angle between line and vertical
     cos = cos2.sqrt()
     weight = ((share * cos - config.absent) / (config.present - config.absent)).clamp(0, 1)
-    weight = -F.max_pool1d(-weight.flatten(0, -2), 2 * _END + 1, 1, _END).view_as(
-        weight
-    )  # not a stripe's end
+    weight = weight * (2 * (config.twice - share * cos)).clamp(0, 1)
+    weight = _eroded(weight)
     steep = (2.5 * (2 * cos2 - 1) + 0.5).clamp(0, 1)  # 1 below 39 degrees, 0 above 51
     reach = config.half_width / cos + 1.0  # of the stripe's band in its row
     inside = (position - reach >= 0) & (position + reach <= width - 1)
     weight = torch.where(inside, weight * steep, 0.0)
-    stripe = config.half_width**2 / (3 * cos2) + 1 / 12  # variance of a uniform stripe in pixels
-    excess = (spread - stripe).clamp(min=0)
+    stripe = config.half_width**2 / 3 + 1 / 12  # variance across a uniform stripe drawn in pixels
+    excess = _local_mean(spread * cos2 - stripe, step).clamp(min=0)  # of one scan it depends on pixel phase
     rows = torch.arange(position.shape[-1], dtype=position.dtype, device=position.device)
     points = torch.stack([position, rows.expand_as(position)], dim=-1)
-    return Vertices(points, weight, excess * cos2, scatter * cos2)
+    normal = torch.stack([torch.ones_like(slope), -slope], dim=-1) * cos.unsqueeze(-1)
+    return Vertices(points, normal, weight, excess, scatter * cos2)
+
+
+def _eroded(weight: Tensor) -> Tensor:
+    """Least weight within _END scans, (..., h): nothing at the ends of a stripe and of the map."""
+    padded = F.pad(weight.flatten(0, -2), (_END, _END))
+    return -F.max_pool1d(-padded, 2 * _END + 1, 1).view_as(weight)
+
+
+def _local_mean(values: Tensor, weight: Tensor) -> Tensor:
+    """Weighted mean over _NEIGHBOURS scans on either side, (..., h); 0 where nothing has weight."""
+    both = torch.stack([values * weight, weight]).flatten(0, -2)
+    total, mass = F.avg_pool1d(both, 2 * _NEIGHBOURS + 1, 1, _NEIGHBOURS).view(2, *values.shape)
+    return total / mass.clamp(min=1e-3)
 
 
 def row_moments(probabilities: Tensor, window: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -173,7 +193,8 @@ def local_line(position: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
     """At most 2S vertices a boundary, in order along it: means over stretches of equally many vertices.
 
-    A boundary of n < 2S vertices keeps 2·floor(n/2) of them as they are.
+    The mean of points on a parabola lies off it by half of what it lies off their tangents, on average: by
+    that it is moved back. A boundary of n < 2S vertices keeps 2·floor(n/2) of them as they are.
     """
     points, weight = vertices.points, vertices.weight
     seen = weight > 0
@@ -189,9 +210,15 @@ def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
     members = member.sum(2)
     share = share / mass.clamp(min=1e-6).unsqueeze(2)  # weights of a mean
     mean = torch.einsum("blvs,blvd->blsd", share, points)
+    normal = vertices.normal
+    along = (mean.unsqueeze(2) - points.unsqueeze(3)) @ normal.unsqueeze(
+        -1
+    )  # (B, L, V, 2S, 1) px off tangents
+    mean = mean - 0.5 * torch.einsum("blvs,blvd->blsd", share * along.squeeze(-1), normal)
     common = torch.einsum("blvs,blv->bls", share, vertices.common_var)
     own = torch.einsum("blvs,blv->bls", share.square(), vertices.own_var)
-    return Vertices(mean, mass / members.clamp(min=1), common + config.sigma_floor**2, own)
+    across = torch.einsum("blvs,blvd->blsd", share, normal)
+    return Vertices(mean, across, mass / members.clamp(min=1), common + config.sigma_floor**2, own)
 
 
 def _half_of(count: Tensor, config: LineConfig) -> Tensor:

@@ -1,0 +1,101 @@
+"""Line extraction alone, on the masks of rendered roads: ``python -m train.extraction``.
+
+Prints how far the vertices are from the true boundaries, in pixels of the mask, and how that compares with
+the standard deviations they come with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.geometry.camera import distort_points
+from lanebev.observation.lines import extract_segments
+from lanebev.observation.vertices import LineConfig
+from lanebev.render import RenderedFrame, boundary_masks, render_views
+
+
+class ExtractionError(NamedTuple):
+    """End points of all segments on all images.
+
+    Attributes:
+        distance: (K,) px of the mask, from the true boundary, across it.
+        sigma: (K,) px of the mask, as reported.
+        missed: share of boundaries with at least 20 px of stripe of which nothing was extracted.
+    """
+
+    distance: Tensor
+    sigma: Tensor
+    missed: float
+
+    def normalised(self) -> float:
+        """Root mean square of the errors in sigmas; 1 is honest."""
+        return float((self.distance / self.sigma).square().mean().sqrt())
+
+
+def extraction_error(frame: RenderedFrame, size: tuple[int, int], config: LineConfig) -> ExtractionError:
+    """Draw each boundary's mask, extract, and compare with the boundary.
+
+    Args:
+        frame: rendered images.
+        size: (h, w) of the masks.
+        config: of the extraction; its stripes are drawn.
+    """
+    masks = boundary_masks(frame, size, config.half_width).double()
+    segments = extract_segments(masks, size, config, size)._asdict()
+    batch, boundaries, count, _ = frame.boundaries.shape
+    points = distort_points(frame.boundaries.flatten(1, 2), frame.intrinsics, frame.distortion).double()
+    scale = points.new_tensor([size[1] / frame.image.shape[3], size[0] / frame.image.shape[2]])
+    truth = ((points + 0.5) * scale - 0.5).view(batch, boundaries, count, 2)
+    # the masks are taken for the image: one network pixel per cell, so stride is 1
+    ends = segments["endpoints"].view(batch, boundaries, -1, 2)
+    seen = segments["weight"].view(batch, boundaries, -1, 1).expand(-1, -1, -1, 2).flatten(2) > 0
+    sigma = segments["sigma"].view(batch, boundaries, -1, 1).expand(-1, -1, -1, 2).flatten(2)
+    distance = distance_to_polyline(ends, truth)
+    there = masks.sum((2, 3)) > 20 * 2 * config.half_width
+    missed = (there & ~seen.any(-1)).sum() / there.sum().clamp(min=1)
+    return ExtractionError(distance[seen], sigma[seen], float(missed))
+
+
+def distance_to_polyline(points: Tensor, line: Tensor) -> Tensor:
+    """Distance of each point to the nearest piece of a polyline: (..., N, 2) and (..., P, 2) to (..., N)."""
+    start, along = line[..., None, :-1, :], line.diff(dim=-2).unsqueeze(-3)  # (..., 1, P - 1, 2)
+    away = points.unsqueeze(-2) - start
+    part = (away * along).sum(-1) / along.square().sum(-1).clamp(min=1e-12)
+    return (away - part.clamp(0, 1).unsqueeze(-1) * along).norm(dim=-1).amin(-1)
+
+
+def join(errors: list[ExtractionError]) -> ExtractionError:
+    """Errors of several batches of equally many images as one."""
+    distance, sigma, missed = zip(*errors, strict=True)
+    return ExtractionError(torch.cat(distance), torch.cat(sigma), sum(missed) / len(missed))
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=64)
+    parser.add_argument("--size", type=int, nargs=2, default=(144, 256), metavar=("HEIGHT", "WIDTH"))
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    generator, size = torch.Generator().manual_seed(args.seed), tuple(args.size)
+    image_size = (size[0] // 2, size[1] // 2)  # only the truth is used
+    batches = [render_views(8, image_size, generator) for _ in range(args.frames // 8)]
+    error = join([extraction_error(batch, size, LineConfig(stride=1)) for batch in batches])
+    report = {
+        "vertices": len(error.distance),
+        "rms_px": float(error.distance.square().mean().sqrt()),
+        "within_0.1_px": float((error.distance < 0.1).double().mean()),
+        "p99_px": float(error.distance.quantile(0.99)),
+        "normalised_error": error.normalised(),
+        "missed": error.missed,
+    }
+    print(json.dumps(report, indent=1))
+
+
+if __name__ == "__main__":
+    main()
