@@ -58,6 +58,7 @@ class MountConfig:
         largest_std: of the fast pose, for a frame to be used.
         block_std: expected scatter of blocks, worth ``prior_blocks`` blocks of evidence.
         prior_blocks: see above.
+        block_correlation: of neighbouring blocks, which slow motion shares.
         prior_pose, prior_std: before anything is seen.
         moved_least: smallest change that counts as a moved camera.
         moved_sigmas: and it must exceed so many sigmas of a block.
@@ -77,6 +78,7 @@ class MountConfig:
     largest_std: tuple[float, float, float, float] = (0.01, 0.01, 0.02, 0.1)
     block_std: tuple[float, float, float, float] = (0.004, 0.006, 0.004, 0.01)
     prior_blocks: float = 4.0
+    block_correlation: float = 0.2
     prior_pose: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.5)
     prior_std: tuple[float, float, float, float] = (0.12, 0.15, 0.05, 0.5)
     moved_least: tuple[float, float, float, float] = (0.015, 0.02, 0.02, 0.06)
@@ -320,7 +322,7 @@ class MountEstimator(nn.Module):
         prior, prior_var = mean.new_tensor(cfg.prior_pose), mean.new_tensor(cfg.prior_std).square()
         both = (count.unsqueeze(-1) * mean + now) / safe
         # errors of the fast pose are common to all blocks (lane width), so they do not average out
-        variance = scatter / safe + noise / safe
+        variance = (1 + 2 * cfg.block_correlation) * scatter / safe + noise / safe
         return (
             torch.where(some > 1e-3, both, prior),
             torch.where(some > 1e-3, torch.minimum(variance, prior_var), prior_var),
