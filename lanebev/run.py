@@ -13,9 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lanebev.estimation.mount import MountCalibration, MountEstimator, MountReason, MountStatus
 from lanebev.geometry.camera import Camera
 from lanebev.io.cameras import read_camera
 from lanebev.io.lanes import read_lanes
+from lanebev.io.mount_file import write_calibration
 from lanebev.io.overlap import prefetch
 from lanebev.io.results import ExtrinsicsRow, OutputFolder
 from lanebev.io.state import load_state, save_state
@@ -98,8 +100,8 @@ def run(
     camera = read_camera(config.camera, source.image_size)
     check_image_size(camera, source)
     observer = make_observer(config, source, camera)
-    calibrator = make_calibrator(config.calibrator)
-    state, problem = begin(config.resume, calibrator)
+    calibrator, mount = make_calibrator(config.calibrator), MountEstimator()
+    states, problem = begin(config.resume, calibrator, mount)
     frames: Iterator[Frame] = prefetch(source)
     frames = progress(frames, source.count) if progress else frames
     warp, coarse = BEVWarp(BEVGrid()), BEVWarp(BEVGrid(resolution=_BEFORE_RESOLUTION))
@@ -119,7 +121,10 @@ def run(
         with recorder:
             for frame in frames:
                 rows, segments = observer(frame)
-                calibration, state = calibrate(calibrator, segments, camera, state, frame, config)
+                calibration, states["calibrator"] = calibrate(
+                    calibrator, segments, camera, states["calibrator"], frame, config
+                )
+                mounted, states["mount"] = mount(calibration, states["mount"], frame.dt)
                 before = pose_before(before, calibration, config.stills or source.is_single, camera)
                 recorder.add(
                     Recorded(
@@ -133,18 +138,24 @@ def run(
                         bird_view(warp, frame, camera, calibration.extrinsics),
                     )
                 )
+        facts = run_facts(config, source, camera)
         if not config.stills:
-            save_state(out / STATE_FILE, {"calibrator": state})
-        return recorder.finish(run_facts(config, source, camera), Path(source.source).name, truth)
+            save_state(out / STATE_FILE, states)
+            facts |= mount_facts(mounted)
+            write_calibration(out / "calibration.yaml", camera, mounted)
+        return recorder.finish(facts, Path(source.source).name, truth)
 
 
-def begin(resume: str | None, calibrator: Any) -> tuple[Any, str | None]:
-    """The state to begin with, and why it is not the one asked for, if it isn't.
+def begin(resume: str | None, calibrator: Any, mount: MountEstimator) -> tuple[dict[str, Any], str | None]:
+    """The states to begin with, by name, and why they are not those asked for, if they aren't.
 
     Raises:
         ValueError: ``resume`` is not the folder of an earlier run.
     """
-    fresh = calibrator.initial_state(1, dtype=torch.float64)
+    fresh = {
+        "calibrator": calibrator.initial_state(1, dtype=torch.float64),
+        "mount": mount.initial_state(1, dtype=torch.float64),
+    }
     if resume is None:
         return fresh, None
     path = Path(resume) / STATE_FILE
@@ -152,8 +163,8 @@ def begin(resume: str | None, calibrator: Any) -> tuple[Any, str | None]:
         raise ValueError(
             f"resume: expected the output folder of an earlier run, got {resume}: no {STATE_FILE}"
         )
-    loaded = load_state(path, {"calibrator": fresh})
-    return loaded.states.get("calibrator", fresh), loaded.problem
+    loaded = load_state(path, fresh)
+    return fresh | loaded.states, loaded.problem
 
 
 def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Observer:
@@ -265,6 +276,14 @@ def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[st
     }
 
 
+def mount_facts(mounted: MountCalibration) -> dict[str, str]:
+    """How far the mount is known, for the report."""
+    status = MountStatus(int(mounted.status[0])).name
+    reasons = MountReason(int(mounted.reasons[0]))
+    why = f" ({reasons.name})" if reasons else ""
+    return {"mount": f"{status}, {float(mounted.progress[0]):.0f} %{why}"}
+
+
 def summary(report: Report, config: RunConfig) -> str:
     """What to print when a run is done."""
     tracking = [row for row in report.rows if row.status == "TRACKING"]
@@ -273,7 +292,8 @@ def summary(report: Report, config: RunConfig) -> str:
         middle = {name: float(np.median([getattr(row, name) for row in tracking])) for name in _SHOWN}
         values = "  ".join(f"{name.rsplit('_', 1)[0]} {middle[name]:+.3f} {_SHOWN[name]}" for name in _SHOWN)
         lines.append(f"median  {values}")
-    lines += [f"{label}: {text}" for label, text in report.facts.items() if label.startswith("lane width σ")]
+    shown = ("lane width σ", "mount")
+    lines += [f"{label}: {text}" for label, text in report.facts.items() if label.startswith(shown)]
     lines += [f"problem: {problem}" for problem in report.problems[:5]]
     if len(report.problems) > 5:
         lines.append(f"and {len(report.problems) - 5} more, see the report")

@@ -9,6 +9,7 @@ import torch
 import yaml
 
 from lanebev import Camera, Extrinsics
+from lanebev.estimation.mount import MountCalibration, MountReason
 from lanebev.io.cameras import read_camera, write_camera
 from lanebev.io.mount_file import vehicle_from_camera, write_calibration
 
@@ -195,10 +196,16 @@ def test_write_camera_round_trip(tmp_path, distortion, model):
 def test_calibration_file_is_read_by_others(tmp_path):
     mount = Extrinsics(*(torch.tensor([value], dtype=torch.float64) for value in (0.05, -0.02, 0.01, 1.5)))
     path = tmp_path / "calibration.yaml"
-    write_calibration(path, LENS, mount, mount)
+    variances = torch.tensor([0.01, 0.02, 0.03, 0.04], dtype=torch.float64).square()
+    reasons = torch.tensor([int(MountReason.FEW_BLOCKS | MountReason.SLOW)])
+    status, progress = torch.tensor([0]), torch.tensor([40.0])
+    write_calibration(path, LENS, MountCalibration(mount, variances.diag()[None], status, progress, reasons))
     _assert_same(read_camera(path), LENS)
     fields = yaml.safe_load(path.read_text())
     assert fields["mount"]["pitch_deg"] == pytest.approx(math.degrees(0.05), abs=1e-12)
+    assert fields["mount"]["roll_std_deg"] == pytest.approx(math.degrees(0.03), abs=1e-12)
+    assert (fields["mount"]["status"], fields["mount"]["progress_percent"]) == ("UNCALIBRATED", 40.0)
+    assert fields["mount"]["reasons"] == ["SLOW", "FEW_BLOCKS"]
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     assert storage.getNode("mount").getNode("height_m").real() == 1.5
     assert storage.getNode("camera_matrix").getNode("data").at(0).real() == 1150.0

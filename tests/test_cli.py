@@ -117,7 +117,10 @@ def test_a_run_on_a_video_finds_the_pose(drive):
 def test_every_output_is_there_and_whole(drive):
     names = {path.name for path in drive.iterdir()}
     promised = {"extrinsics.csv", "lanes.json", "bev.mp4", "overlay.mp4", "report.html"}
-    assert promised <= names
+    assert names == promised | {"state.safetensors", "calibration.yaml"}
+    mount = yaml.safe_load((drive / "calibration.yaml").read_text())["mount"]
+    assert mount["height_m"] == pytest.approx(POSE[3], abs=0.02)
+    assert mount["status"] == "UNCALIBRATED"  # 0.24 s
     for name, size in (("bev.mp4", (1140, 400)), ("overlay.mp4", None)):
         with av.open(str(drive / name)) as video:
             stream = video.streams.video[0]
@@ -179,11 +182,11 @@ def test_resuming_gives_what_an_uninterrupted_run_gives(data, tmp_path, calibrat
     )
     assert whole[3:] == second
     one, other = (
-        load_state(tmp_path / f"out_{part}" / "state.safetensors").states["calibrator"]
-        for part in ("whole", "second")
+        load_state(tmp_path / f"out_{part}" / "state.safetensors").states for part in ("whole", "second")
     )
-    assert one.keys() == other.keys()
-    assert all(torch.equal(one[name], other[name]) for name in one)
+    assert set(one) == {"calibrator", "mount"}
+    for name in one:
+        assert all(torch.equal(one[name][field], other[name][field]) for field in one[name])
 
 
 def test_a_damaged_state_is_reported_and_a_missing_one_refused(data, tmp_path, capsys):

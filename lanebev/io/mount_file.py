@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from lanebev.estimation.mount import MountCalibration, MountReason, MountStatus
 from lanebev.geometry.camera import Camera
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.io.cameras import camera_info, dump_yaml
@@ -30,9 +31,7 @@ def vehicle_from_camera(mount: Extrinsics) -> torch.Tensor:
     return matrix
 
 
-def write_calibration(
-    path: str | Path, camera: Camera, mount: Extrinsics, std: Extrinsics, name: str = "camera"
-) -> None:
+def write_calibration(path: str | Path, camera: Camera, mounted: MountCalibration) -> None:
     """Write ``calibration.yaml``: a ROS ``camera_info`` with the mount's pose beside it.
 
     The pose is there as angles and height in our signs, as a 4 x 4 camera-to-vehicle matrix in the axes of
@@ -42,21 +41,24 @@ def write_calibration(
     Args:
         path: the file.
         camera: the lens.
-        mount: each (1,).
-        std: standard deviations of the mount, each (1,).
-        name: ``camera_name`` in the file.
+        mounted: of batch size 1.
     """
     from scipy.spatial.transform import Rotation  # its import is slow, and only this needs it
 
-    matrix = vehicle_from_camera(mount)[0].double()
+    matrix = vehicle_from_camera(mounted.extrinsics)[0].double()
     quaternion = Rotation.from_matrix(matrix[:3, :3].numpy()).as_quat()
-    fields = camera_info(camera, name)
+    pose = mounted.extrinsics.stack()[0].tolist()
+    std = mounted.covariance[0].diagonal().clamp(min=0).sqrt().tolist()
     angles = ("pitch", "yaw", "roll")
+    fields = camera_info(camera, "camera")
     fields["mount"] = {
-        **{f"{key}_deg": math.degrees(float(getattr(mount, key)[0])) for key in angles},
-        "height_m": float(mount.height[0]),
-        **{f"{key}_std_deg": math.degrees(float(getattr(std, key)[0])) for key in angles},
-        "height_std_m": float(std.height[0]),
+        "status": MountStatus(int(mounted.status[0])).name,
+        "progress_percent": float(mounted.progress[0]),
+        "reasons": [flag.name for flag in MountReason(int(mounted.reasons[0]))],
+        **{f"{name}_deg": math.degrees(value) for name, value in zip(angles, pose[:3], strict=True)},
+        "height_m": pose[3],
+        **{f"{name}_std_deg": math.degrees(value) for name, value in zip(angles, std[:3], strict=True)},
+        "height_std_m": std[3],
     }
     fields["vehicle_from_camera"] = {"rows": 4, "cols": 4, "data": matrix.flatten().tolist()}
     fields["quaternion_xyzw"] = [float(value) for value in quaternion]

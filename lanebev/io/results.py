@@ -24,7 +24,7 @@ _COLUMN_TYPES = (int, *[float] * 9, str, int, str)
 
 OUTPUT_NAMES = (
     "extrinsics.csv", "lanes.json", "bev.mp4", "bev.png", "overlay.mp4", "overlay.png", "report.html",
-    "state.safetensors", "mount.safetensors", "calibration.yaml",
+    "state.safetensors", "calibration.yaml",
 )  # fmt: skip
 
 
