@@ -71,7 +71,7 @@ def test_vertices_lie_on_rendered_boundaries_to_a_tenth_of_a_pixel(fans):
 
 
 def test_extraction_on_masks_of_rendered_roads():
-    """Curves, hills, hidden stretches and lenses included; what remains turns back on itself at the horizon."""
+    """Curves, hills, hidden stretches and lenses included; what remains turns back at the horizon."""
     frame = render_views(24, (64, 112), torch.Generator().manual_seed(0))
     error = extraction_error(frame, (144, 256), LineConfig(stride=1))
     assert len(error.distance) > 1000

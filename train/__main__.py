@@ -5,8 +5,10 @@ from __future__ import annotations
 import torch
 from lightning.pytorch.cli import LightningCLI
 
-import train.data
-import train.module  # noqa: F401  for the class paths of the configs
+import train.datasets
+import train.end_to_end
+import train.module
+import train.poses  # noqa: F401  for the class paths of the configs
 
 
 def main(args: list[str] | None = None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import lightning as L
 import numpy as np
@@ -36,6 +36,14 @@ class Batch(NamedTuple):
         return cls(*(torch.from_numpy(np.stack(field)) for field in zip(*views, strict=True)))
 
 
+class Frames(Protocol):
+    """A source of labelled images."""
+
+    def __call__(self, rng: np.random.Generator) -> Iterator[LabelledImage]:
+        """Endless, in an order that the generator decides."""
+        ...
+
+
 class PoolFrames:
     """Frames of a pool that may still be growing, in random order, a few shards at a time."""
 
@@ -46,7 +54,7 @@ class PoolFrames:
         """Shards present now.
 
         Raises:
-            ValueError: none.
+            ValueError: there are none.
         """
         paths = sorted(self.folder.glob(self.pattern))
         if not paths:
@@ -89,12 +97,11 @@ class ViewBatches(IterableDataset[Batch]):
         sizes: (height, width) of the views; one is drawn for each batch.
         view: how views are drawn.
         seed: with the worker's number, decides everything.
-        repeats: views drawn from each decoded frame, far apart in the stream.
     """
 
     def __init__(
         self,
-        frames: PoolFrames | LiveFrames,
+        frames: Frames,
         batch_size: int,
         sizes: list[tuple[int, int]],
         view: ViewConfig,
@@ -121,7 +128,7 @@ class FullBatches(IterableDataset[Batch]):
 
     def __init__(
         self,
-        frames: PoolFrames | LiveFrames,
+        frames: Frames,
         batch_size: int,
         size: tuple[int, int],
         view: ViewConfig,

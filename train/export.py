@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,15 +68,37 @@ def widen(narrow: dict[str, Tensor], wide: dict[str, Tensor], noise: float = 0.0
     return result
 
 
-def export(checkpoint: Path, out: Path, **record: Any) -> LaneSegmenter:
-    """Write a checkpoint's averaged weights as lanebev loads them, class weights undone in the last bias."""
-    settings = torch.load(checkpoint, map_location="cpu", weights_only=False)["settings"]
+def checkpoint_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
+    """A checkpoint's network, class weights undone in the last bias, and its training settings.
+
+    Raises:
+        ValueError: no segmenter in it.
+    """
+    weights = checkpoint_weights(path)
+    settings = torch.load(path, map_location="cpu", weights_only=False)["settings"]
     segmenter = LaneSegmenter(SegmenterConfig(**settings["network"]))
-    segmenter.load_state_dict(checkpoint_weights(checkpoint), strict=True)
+    segmenter.load_state_dict(weights, strict=True)
     if settings["class_weight"] is not None:
         bias = unweighted_bias(torch.tensor(settings["class_weight"]))
         with torch.no_grad():
             segmenter.head.bias += bias.repeat_interleave(segmenter.shuffle**2)  # pixel_shuffle's order
+    return segmenter, settings
+
+
+def export(
+    checkpoint: Path, out: Path, image_size: tuple[int, int] | None = None, **record: Any
+) -> LaneSegmenter:
+    """Write a checkpoint's averaged weights as lanebev loads them.
+
+    Args:
+        checkpoint: of Lightning.
+        out: the weights file.
+        image_size: (height, width) to run at by default; None is what the configuration said.
+        record: further facts for the file's metadata.
+    """
+    segmenter, settings = checkpoint_segmenter(checkpoint)
+    if image_size is not None:
+        segmenter.config = replace(segmenter.config, image_size=image_size)
     save_segmenter(segmenter, out, training={k: v for k, v in settings.items() if k != "network"}, **record)
     return segmenter
 
@@ -88,11 +111,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--commit", required=True, help="of the code that trained")
     parser.add_argument("--metrics", default="{}", help="JSON, measured on these weights")
+    parser.add_argument("--image-size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="to run at")
     parser.add_argument("--note", default="", help="what else there is to know")
     args = parser.parse_args()
     try:
         metrics = json.loads(args.metrics)
-        export(args.checkpoint, args.out, seed=args.seed, commit=args.commit, metrics=metrics, note=args.note)
+        size = tuple(args.image_size) if args.image_size else None
+        record = {"seed": args.seed, "commit": args.commit, "metrics": metrics, "note": args.note}
+        export(args.checkpoint, args.out, size, **record)
     except (ValueError, OSError) as error:
         parser.exit(2, f"error: {error}\n")
 

@@ -14,8 +14,10 @@ from torchmetrics.segmentation import MeanIoU
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from train.augment import Photometric
 from train.data import Batch
+from train.datasets import ScoredBatch
 from train.losses import boundary_cross_entropy, row_cross_entropy, unweighted_bias
 from train.metrics import point_recall
+from train.scores import BenchmarkScores
 
 
 class Segmentation(L.LightningModule):
@@ -89,9 +91,9 @@ class Segmentation(L.LightningModule):
         self.log_dict({"loss/pixels": pixels, "loss/rows": rows}, prog_bar=True)
         return pixels + self.settings["row_weight"] * rows
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+    def validation_step(self, batch: Batch | ScoredBatch, batch_idx: int) -> None:
         """Loss, and recall of each boundary's points."""
-        image, target, weight = unpack(batch)
+        image, target, weight = unpack(batch.views if isinstance(batch, ScoredBatch) else batch)
         logits = self(image)
         self.log("val/loss", boundary_cross_entropy(logits, target, weight), batch_size=len(image))
         found, there = point_recall(logits.softmax(1)[:, 1:], target[:, 1:])
@@ -110,28 +112,33 @@ class Segmentation(L.LightningModule):
         self.log("val/recall", self.val_found.sum() / self.val_there.sum().clamp(min=1), prog_bar=True)
 
     def on_test_start(self) -> None:
-        """Intersection over union besides."""
+        """Intersection over union besides, and a benchmark's scores where the data come with one."""
         self.iou = MeanIoU(
             1 + self.segmenter.config.num_boundaries,
             include_background=False,
             per_class=True,
             input_format="index",
         ).to(self.device)
+        self.scores = BenchmarkScores()
 
-    def test_step(self, batch: Batch, batch_idx: int) -> None:
-        """Loss and intersection over union of each boundary."""
-        image, target, weight = unpack(batch)
+    def test_step(self, batch: Batch | ScoredBatch, batch_idx: int) -> None:
+        """Loss, intersection over union of each boundary, and scores."""
+        views = batch.views if isinstance(batch, ScoredBatch) else batch
+        image, target, weight = unpack(views)
         logits = self(image)
         self.log("test/loss", boundary_cross_entropy(logits, target, weight), batch_size=len(image))
         self.iou.update(logits.argmax(1), target.argmax(1))
+        if isinstance(batch, ScoredBatch):
+            self.scores.update(logits, (image.shape[-2], image.shape[-1]), batch)
 
     def on_test_epoch_end(self) -> None:
         """Report."""
         self.log_dict({f"test/iou_{k}": value for k, value in enumerate(self.iou.compute())})
+        self.log_dict({f"test/{name}": value for name, value in self.scores.compute().items()})
 
-    def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
+    def predict_step(self, batch: Batch | ScoredBatch, batch_idx: int) -> Tensor:
         """Probabilities, (B, 1+L, h, w)."""
-        return self(unpack(batch)[0]).softmax(1)  # type: ignore[no-any-return]
+        return self(unpack(batch.views if isinstance(batch, ScoredBatch) else batch)[0]).softmax(1)  # type: ignore[no-any-return]
 
     def configure_optimizers(self) -> Any:
         """Warm-up, stable, decay."""

@@ -23,7 +23,21 @@ from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
 from lanebev.render import RenderedFrame, render_views
 from train.labels import LabelledImage
 
-_SHARD_FIELDS = ("jpeg", "ends", "points", "painted", "visible", "vanishing_point")
+
+class Pose(NamedTuple):
+    """The camera of a frame over the road, exactly. A shard has N of each.
+
+    Attributes:
+        extrinsics: (4,) pitch, yaw, roll in rad, height in m.
+        intrinsics: (3, 3) px as taken.
+        distortion: (5,) Brown-Conrady.
+        lane_width: (L - 1,) m.
+    """
+
+    extrinsics: npt.NDArray[np.float32]
+    intrinsics: npt.NDArray[np.float32]
+    distortion: npt.NDArray[np.float32]
+    lane_width: npt.NDArray[np.float32]
 
 
 class Shard(NamedTuple):
@@ -36,6 +50,7 @@ class Shard(NamedTuple):
         painted: (N, L, P) bool.
         visible: (N, L, P) bool.
         vanishing_point: (N, 2) px as taken.
+        poses: of the N frames.
     """
 
     jpeg: npt.NDArray[np.uint8]
@@ -44,6 +59,7 @@ class Shard(NamedTuple):
     painted: npt.NDArray[np.bool_]
     visible: npt.NDArray[np.bool_]
     vanishing_point: npt.NDArray[np.float32]
+    poses: Pose
 
     def __len__(self) -> int:
         return len(self.ends)
@@ -59,6 +75,10 @@ class Shard(NamedTuple):
             self.visible[index],
             self.vanishing_point[index],
         )
+
+    def pose(self, index: int) -> Pose:
+        """Of one frame."""
+        return Pose(*(field[index] for field in self.poses))
 
 
 def labelled_images(frame: RenderedFrame) -> Iterator[LabelledImage]:
@@ -80,12 +100,17 @@ def labelled_images(frame: RenderedFrame) -> Iterator[LabelledImage]:
         )
 
 
+def camera_poses(frames: list[RenderedFrame]) -> Pose:
+    """The poses of rendered batches, one after the other."""
+    parts = [(f.extrinsics.stack(), f.intrinsics, f.distortion, f.lane_width) for f in frames]
+    return Pose(*(torch.cat(field).float().numpy() for field in zip(*parts, strict=True)))
+
+
 def write_shard(path: Path, frames: list[RenderedFrame], quality: int = 94) -> None:
     """Write rendered batches as one shard, whole or not at all."""
     samples = [sample for frame in frames for sample in labelled_images(frame)]
     options = [cv2.IMWRITE_JPEG_QUALITY, quality]
     jpegs = [cv2.imencode(".jpg", sample.image[..., ::-1], options)[1].ravel() for sample in samples]
-    poses = torch.cat([frame.extrinsics.stack() for frame in frames]).float().numpy()
     partial = path.with_suffix(".part")
     with partial.open("wb") as file:
         np.savez(
@@ -96,10 +121,7 @@ def write_shard(path: Path, frames: list[RenderedFrame], quality: int = 94) -> N
             painted=np.stack([sample.painted for sample in samples]),
             visible=np.stack([sample.visible for sample in samples]),
             vanishing_point=np.stack([sample.vanishing_point for sample in samples]),
-            extrinsics=poses,
-            intrinsics=torch.cat([frame.intrinsics for frame in frames]).float().numpy(),
-            distortion=torch.cat([frame.distortion for frame in frames]).float().numpy(),
-            lane_width=torch.cat([frame.lane_width for frame in frames]).float().numpy(),
+            **camera_poses(frames)._asdict(),
         )
     os.replace(partial, path)
 
@@ -112,9 +134,11 @@ def read_shard(path: Path) -> Shard:
     """
     try:
         with np.load(path) as file:
-            return Shard(*(file[name] for name in _SHARD_FIELDS))
+            own = (file[name] for name in Shard._fields[:-1])
+            return Shard(*own, poses=Pose(*(file[name] for name in Pose._fields)))
     except (OSError, KeyError, ValueError) as error:
-        raise ValueError(f"{path}: expected a pool shard with {', '.join(_SHARD_FIELDS)}: {error}") from error
+        names = ", ".join((*Shard._fields[:-1], *Pose._fields))
+        raise ValueError(f"{path}: expected a pool shard with {names}: {error}") from error
 
 
 def main() -> None:

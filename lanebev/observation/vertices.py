@@ -112,7 +112,8 @@ def _scan(probabilities: Tensor, config: LineConfig) -> Vertices:
 def _eroded(weight: Tensor) -> Tensor:
     """Least weight within _END scans, (..., h): nothing at the ends of a stripe and of the map."""
     padded = F.pad(weight.flatten(0, -2), (_END, _END))
-    return -F.max_pool1d(-padded, 2 * _END + 1, 1).view_as(weight)
+    eroded: Tensor = -F.max_pool1d(-padded, 2 * _END + 1, 1)
+    return eroded.view_as(weight)
 
 
 def _local_mean(values: Tensor, weight: Tensor) -> Tensor:

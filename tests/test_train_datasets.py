@@ -1,0 +1,135 @@
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from lanebev.io.lanes import FrameLines, LaneLine
+from train.__main__ import main
+from train.data import Batch
+from train.datasets import LaneFiles, ScoredBatch, labelled_image, read_entries
+from train.scores import BenchmarkScores
+
+HEIGHT, WIDTH = 360, 640
+ROWS = list(range(90, 360, 10))
+FEET = (-200, 160, 480, 850)  # where four lines through (320, 60) meet the image's bottom
+
+
+def line_x(foot, y):
+    return 320 + (foot - 320) * (y - 60) / (HEIGHT - 60)
+
+
+def lanes():
+    """x on ROWS, -2 outside the image."""
+    x = [[line_x(foot, y) for y in ROWS] for foot in FEET]
+    return [[round(v, 2) if 0 <= v < WIDTH else -2 for v in lane] for lane in x]
+
+
+def points():
+    return [[(x, y) for x, y in zip(lane, ROWS, strict=True) if x >= 0] for lane in lanes()]
+
+
+@pytest.fixture
+def root(tmp_path):
+    """Two images in all three layouts."""
+    for k in range(2):
+        image = np.full((HEIGHT, WIDTH, 3), 60 + k, np.uint8)
+        for line in points():
+            cv2.polylines(image, [np.rint(line).astype(np.int32)], False, (255, 255, 255), 3)
+        for folder in ("clips/a", "driver", "images/validation/s"):
+            (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(tmp_path / folder / f"{k}.jpg"), image)
+        text = "\n".join(" ".join(f"{x:.3f} {y}" for x, y in reversed(line)) for line in points())
+        (tmp_path / "driver" / f"{k}.lines.txt").write_text(text)
+        uv = [{"category": 1, "uv": [list(axis) for axis in zip(*line, strict=True)]} for line in points()]
+        labels = tmp_path / "lane3d/validation/s"
+        labels.mkdir(parents=True, exist_ok=True)
+        frame = {"file_path": f"validation/s/{k}.jpg", "lane_lines": uv}
+        (labels / f"{k}.json").write_text(json.dumps(frame))
+    entries = [{"raw_file": f"clips/a/{k}.jpg", "lanes": lanes(), "h_samples": ROWS} for k in range(2)]
+    (tmp_path / "label.json").write_text("\n".join(json.dumps(entry) for entry in entries))
+    (tmp_path / "list.txt").write_text("/driver/0.jpg /laneseg/0.png 1 1 1 1\n/driver/1.jpg\n")
+    return tmp_path
+
+
+LAYOUTS = [("tusimple", "label.json"), ("culane", "list.txt"), ("openlane", "lane3d/validation")]
+
+
+@pytest.mark.parametrize(("layout", "name"), LAYOUTS)
+def test_layouts_give_the_same_boundaries(root, layout, name):
+    entries = read_entries(layout, root, [name])
+    assert len(entries) == 2
+    sample = labelled_image(entries[1])
+    assert sample.image.shape == (HEIGHT, WIDTH, 3)
+    np.testing.assert_array_equal(sample.painted.any(-1), [False, True, True, True, True, False])
+    for index, foot in zip(range(1, 5), FEET, strict=True):
+        x, y = sample.points[index][sample.painted[index]].T
+        assert len(x) > 2
+        assert y[0] > y[-1]  # near to far
+        np.testing.assert_allclose(x, line_x(foot, y), atol=0.01)
+
+
+@pytest.mark.parametrize(("layout", "name"), LAYOUTS)
+def test_data_module(root, layout, name):
+    data = LaneFiles(layout, str(root), [name], [name], 2, [(64, 96)], (64, 96), workers=0)
+    train = next(iter(data.train_dataloader()))
+    assert isinstance(train, Batch)
+    assert train.image.shape == (2, 3, 64, 96)
+    (whole,) = data.val_dataloader()
+    assert isinstance(whole, ScoredBatch)
+    assert whole.image_sizes == [(HEIGHT, WIDTH)] * 2
+    assert whole.views.target[:, 1:5].flatten(2).amax(-1).min() > 200
+
+
+@pytest.mark.parametrize(("layout", "name"), LAYOUTS)
+def test_labels_as_logits_score_full_marks(root, layout, name):
+    (batch,) = LaneFiles(layout, str(root), val=[name], batch_size=2, val_size=(144, 256)).val_dataloader()
+    target = batch.views.target.float() / 255
+    logits = torch.cat([1 - target.sum(1, keepdim=True), target], dim=1).clamp(min=1e-6).log()
+    scores = BenchmarkScores()
+    scores.update(logits, (144, 256), batch)
+    figures = scores.compute()
+    if layout == "tusimple":
+        assert figures["accuracy"] > 0.9  # a stripe's ends are left out
+        assert (figures["false_positives"], figures["false_negatives"]) == (0, 0)
+    else:
+        assert figures == {"f1": 1.0}
+    nothing = BenchmarkScores()
+    nothing.update(torch.zeros_like(logits).index_fill(1, torch.tensor([0]), 10.0), (144, 256), batch)
+    assert nothing.compute().get("accuracy", nothing.compute().get("f1")) == 0
+    assert BenchmarkScores().compute() == {}
+
+
+@pytest.mark.filterwarnings("ignore")  # of Lightning about itself
+def test_config_trains_and_prints_the_benchmarks_figures(root):
+    here = [f"--trainer.default_root_dir={root}", f"--trainer.logger.init_args.save_dir={root}"]
+    small = ["--model.init_args.network.base_width=4", "--model.init_args.network.decoder_width=4"]
+    data = {"root": root, "train": "[label.json]", "val": "[label.json]", "batch_size": 2, "workers": 0}
+    data |= {"sizes": "[[64,96]]", "val_size": "[64,96]"}
+    given = [f"--data.init_args.{name}={value}" for name, value in data.items()]
+    brief = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
+    once = ["--trainer.max_steps=1", "--trainer.val_check_interval=1", "--trainer.num_sanity_val_steps=0"]
+    config = str(Path(__file__).parents[1] / "configs" / "tusimple.yaml")
+    main(["fit", "--config", config, *here, *small, *given, *brief, *once])
+    last = next(root.rglob("last.ckpt"))
+    main(["test", "--config", config, *here, *small, *given, *brief, f"--ckpt_path={last}"])
+    logged = "".join(path.read_text() for path in root.rglob("metrics.csv"))
+    assert all(f"test/{name}" in logged for name in ("accuracy", "false_positives", "false_negatives"))
+
+
+def test_errors(root):
+    with pytest.raises(ValueError, match="expected a list of images"):
+        read_entries("culane", root, ["none.txt"])
+    with pytest.raises(ValueError, match="expected labelled images"):
+        read_entries("openlane", root, ["clips"])
+    with pytest.raises(ValueError, match="layout: expected tusimple"):
+        read_entries("bdd", root, ["label.json"])
+    (root / "clips/a/0.jpg").write_bytes(b"cut")
+    entry = read_entries("tusimple", root, ["label.json"])[0]
+    with pytest.raises(ValueError, match="expected an image"):
+        labelled_image(entry)
+    line = LaneLine(np.zeros((0, 2)))
+    blank = labelled_image(entry._replace(image=root / "driver/0.jpg", lines=FrameLines("a", [line])))
+    assert not blank.painted.any()

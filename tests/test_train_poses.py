@@ -1,0 +1,139 @@
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from lanebev.geometry.camera import distort_points
+from lanebev.observation.lines import LineExtractor
+from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
+from lanebev.render import render_views
+from lanebev.weights import save_segmenter
+from train import evaluate_poses
+from train.data import LiveFrames, PoolFrames
+from train.end_to_end import EndToEnd
+from train.labels import ViewConfig
+from train.module import unpack
+from train.pool import read_shard, write_shard
+from train.poses import PoseBatch, PoseBatches, fit_poses, pool_frames, pose_loss
+
+SIZE = (144, 256)
+
+
+@pytest.fixture(scope="module")
+def rendered():
+    return render_views(4, (72, 128), torch.Generator().manual_seed(5))
+
+
+@pytest.fixture(scope="module")
+def batch():
+    return next(iter(PoseBatches(LiveFrames((72, 128)), 6, SIZE, ViewConfig(), seed=3)))
+
+
+def logits_of(batch):
+    return unpack(batch)[1].clamp(min=1e-4).log()
+
+
+def fit(logits, batch):
+    return fit_poses(logits, SIZE, batch.intrinsics, batch.distortion, batch.lane_width, LineExtractor())
+
+
+def test_shards_keep_the_pose(rendered, tmp_path):
+    write_shard(tmp_path / "a.npz", [rendered])
+    shard = read_shard(tmp_path / "a.npz")
+    pose = shard.pose(2)
+    np.testing.assert_allclose(pose.extrinsics, rendered.extrinsics.stack()[2], rtol=1e-6)
+    np.testing.assert_allclose(pose.lane_width, rendered.lane_width[2], rtol=1e-6)
+    samples = list(zip(range(8), pool_frames(PoolFrames(tmp_path), np.random.default_rng(0)), strict=False))
+    assert len({tuple(pose.extrinsics) for _, (_, pose) in samples}) == 4
+    (tmp_path / "a.npz").write_bytes(b"cut")
+    with pytest.raises(ValueError, match="expected a pool shard with jpeg"):
+        read_shard(tmp_path / "a.npz")
+
+
+def test_resized_intrinsics_project_to_resized_pixels(rendered, tmp_path):
+    """A pixel (x, y) of the frame is (2x + 0.5, 2y + 0.5) of one twice as large, lens and all."""
+    write_shard(tmp_path / "a.npz", [rendered])
+    shard = read_shard(tmp_path / "a.npz")
+    two = PoseBatch.stack([(shard.frame(0), shard.pose(0))], SIZE, ViewConfig())
+    plane = torch.tensor([[[0.1, 0.2, 1.0], [-0.3, 0.1, 1.0]]])
+    small = distort_points(
+        (plane @ rendered.intrinsics[:1].mT)[..., :2], rendered.intrinsics[:1], two.distortion
+    )
+    large = distort_points((plane @ two.intrinsics.mT)[..., :2], two.intrinsics, two.distortion)
+    torch.testing.assert_close(large, 2 * small + 0.5, atol=1e-3, rtol=0)
+
+
+def test_labels_lead_to_the_pose(batch):
+    found = fit(logits_of(batch), batch)
+    error = (found.extrinsics.stack() - batch.extrinsics)[found.valid]
+    assert found.valid.sum() >= 4
+    assert error[:, 0].abs().median() < math.radians(0.1)
+    assert error[:, 3].abs().median() < 0.05
+
+
+def test_pose_loss_counts_what_was_said(batch):
+    found = fit(logits_of(batch), batch)
+    unit = torch.ones(4, dtype=torch.float64)
+    truth = found.extrinsics.stack()
+    assert pose_loss(found, truth, unit) == 0
+    shifted = truth + torch.tensor([3.0**0.5, 0, 0, 0])  # Charbonnier of sqrt(3) is 1
+    torch.testing.assert_close(pose_loss(found, shifted, unit), unit.new_tensor(1.0))
+    nothing = found._replace(valid=torch.zeros_like(found.valid))
+    assert pose_loss(nothing, shifted, unit) == 0
+
+
+def test_gradient_of_the_pose_lowers_its_error(batch):
+    """Maps shifted sideways by a label pixel: following the gradient for a few steps turns the pose back."""
+    logits = logits_of(batch).roll(1, dims=-1).double().requires_grad_()
+    unit = torch.tensor([0.005, 0.005, 0.01, 0.05], dtype=torch.float64)
+    losses = []
+    for _ in range(8):
+        loss = pose_loss(fit(logits, batch), batch.extrinsics.double(), unit)
+        (gradient,) = torch.autograd.grad(loss, logits)
+        assert gradient.isfinite().all()
+        losses.append(loss.item())
+        logits = (
+            logits - 0.3 * gradient / gradient.abs().amax((1, 2, 3), keepdim=True).clamp(min=1e-9)
+        ).detach()
+        logits.requires_grad_()
+    assert losses[-1] < 0.9 * losses[0]
+
+
+def test_empty_maps_train_on_finite_gradients(batch):
+    torch.manual_seed(0)
+    model = EndToEnd(network=SegmenterConfig(base_width=4, decoder_width=4), augment=0.0)
+    model.log = model.log_dict = lambda *args, **kwargs: None
+    model.training_step(batch, 0).backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
+
+
+def test_evaluate_poses_reports_both(tmp_path, capsys, monkeypatch):
+    torch.manual_seed(0)
+    for name in ("before", "after"):
+        network = LaneSegmenter(SegmenterConfig(base_width=4, decoder_width=4))
+        save_segmenter(network, tmp_path / f"{name}.safetensors")
+    paths = [str(tmp_path / f"{name}.safetensors") for name in ("before", "after")]
+    options = ["--drives", "1", "--frames", "2", "--size", "64", "96"]
+    monkeypatch.setattr(sys, "argv", ["evaluate_poses", *paths, *options])
+    evaluate_poses.main()
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line["weights"] for line in lines] == ["before.safetensors", "after.safetensors"]
+    assert set(evaluate_poses.AXES) < set(lines[0])
+    monkeypatch.setattr(sys, "argv", ["evaluate_poses", str(tmp_path / "none.safetensors")])
+    with pytest.raises(SystemExit) as stop:
+        evaluate_poses.main()
+    assert stop.value.code == 2
+
+
+def test_pose_error_summary():
+    """Two frames off by 3 and 4 deg in pitch, one more that does not count."""
+    error = torch.zeros(3, 4, dtype=torch.float64)
+    error[:, 0] = torch.tensor([3.0, -4.0, 90.0]).deg2rad()
+    error[:, 3] = torch.tensor([0.05, 0.05, 0.05])
+    counted = torch.tensor([[True] * 4, [True] * 4, [False] * 3 + [True]])
+    report = evaluate_poses.summary(error, counted)
+    assert report["pitch_deg"] == {"rmse": round(12.5**0.5, 3), "median": 3.0, "frames": 2}
+    assert report["height_cm"] == {"rmse": 5.0, "median": 5.0, "frames": 3}

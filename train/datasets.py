@@ -1,0 +1,201 @@
+"""Labelled images on disk in the layouts of TuSimple, CULane and OpenLane, for training on one's own data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import cv2
+import lightning as L
+import numpy as np
+from torch.utils.data import DataLoader, IterableDataset
+
+from lanebev.io.lane_order import boundary_indices
+from lanebev.io.lanes import FrameLines, read_culane, read_openlane, read_tusimple
+from lanebev.types import NUM_BOUNDARIES
+from train.data import Batch, ViewBatches
+from train.labels import LabelledImage, ViewConfig, full_view
+
+Format = Literal["tusimple", "culane", "openlane"]
+
+
+class Entry(NamedTuple):
+    """An image and its lines, in pixels of the image."""
+
+    image: Path
+    lines: FrameLines
+
+
+class ScoredBatch(NamedTuple):
+    """Whole images with what a benchmark needs besides.
+
+    Attributes:
+        views: images and label maps at the network's size.
+        lines: the label of each image, in its own pixels.
+        image_sizes: (height, width) of each image as it came.
+        benchmark: whose rules apply.
+    """
+
+    views: Batch
+    lines: list[FrameLines]
+    image_sizes: list[tuple[int, int]]
+    benchmark: Format
+
+
+def read_entries(layout: Format, root: Path, names: list[str]) -> list[Entry]:
+    """Entries of a data set.
+
+    Args:
+        layout: "tusimple": names are label files whose ``raw_file`` is under the root. "culane": names are
+            lists of images under the root, each with its ``.lines.txt`` beside it (what follows the image in
+            a line of ``train_gt.txt`` is passed over). "openlane": names are folders of JSON files, whose
+            ``file_path`` is under the root's ``images``.
+        root: of the data set.
+        names: relative to the root.
+
+    Raises:
+        ValueError: a file is missing or malformed, or there are no entries.
+    """
+    entries: list[Entry] = []
+    for name in names:
+        path = root / name
+        if layout == "tusimple":
+            entries += [Entry(root / frame.name, frame) for frame in read_tusimple(path)]
+        elif layout == "culane":
+            entries += [_culane_entry(root, line) for line in _lines(path) if line.strip()]
+        elif layout == "openlane":
+            frames = [read_openlane(file) for file in sorted(path.rglob("*.json"))]
+            entries += [Entry(root / "images" / frame.name, frame) for frame in frames]
+        else:
+            raise ValueError(f"layout: expected tusimple, culane or openlane, got {layout!r}")
+    if not entries:
+        raise ValueError(f"{root}: expected labelled images in {', '.join(names) or 'a list'}, found none")
+    return entries
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text().splitlines()
+    except OSError as error:
+        raise ValueError(f"{path}: expected a list of images: {error.strerror}") from error
+
+
+def _culane_entry(root: Path, line: str) -> Entry:
+    image = root / line.split()[0].lstrip("/")
+    return Entry(image, read_culane(image.with_suffix(".lines.txt")))
+
+
+def labelled_image(entry: Entry, num_boundaries: int = NUM_BOUNDARIES) -> LabelledImage:
+    """Decode an image and give its lines their boundary; lines beyond the outermost are left out.
+
+    Raises:
+        ValueError: the image is missing or does not decode.
+    """
+    image = cv2.imread(str(entry.image), cv2.IMREAD_COLOR_RGB)
+    if image is None:
+        raise ValueError(f"{entry.image}: expected an image, got none that decodes")
+    drawn = [line.points[np.isfinite(line.points).all(-1)] for line in entry.lines.lines]
+    drawn = [points[np.argsort(-points[:, 1])] for points in drawn]  # near to far
+    count = max([len(points) for points in drawn] + [2])
+    points = np.full((num_boundaries, count, 2), np.nan, np.float32)
+    for line, index in zip(drawn, boundary_indices(drawn, num_boundaries), strict=True):
+        if index is not None:
+            points[index, : len(line)] = line
+    there = np.isfinite(points).all(-1)
+    return LabelledImage(image, points, there, there, np.full(2, np.nan, np.float32))
+
+
+class EntryFrames:
+    """Labelled images in random order, endless."""
+
+    def __init__(self, entries: list[Entry]) -> None:
+        self.entries = entries
+
+    def __call__(self, rng: np.random.Generator) -> Iterator[LabelledImage]:
+        """Each entry once, then again in another order."""
+        while True:
+            for i in rng.permutation(len(self.entries)):
+                yield labelled_image(self.entries[i])
+
+
+class ScoredBatches(IterableDataset[ScoredBatch]):
+    """All entries in order, as whole images."""
+
+    def __init__(
+        self, entries: list[Entry], layout: Format, batch_size: int, size: tuple[int, int], view: ViewConfig
+    ) -> None:
+        super().__init__()
+        self.entries, self.layout, self.batch_size, self.size, self.view = (
+            entries,
+            layout,
+            batch_size,
+            size,
+            view,
+        )
+
+    def __iter__(self) -> Iterator[ScoredBatch]:
+        """Draw."""
+        for start in range(0, len(self.entries), self.batch_size):
+            entries = self.entries[start : start + self.batch_size]
+            samples = [labelled_image(entry) for entry in entries]
+            views = Batch.stack([full_view(sample, self.size, self.view) for sample in samples])
+            sizes = [sample.image.shape[:2] for sample in samples]
+            yield ScoredBatch(views, [entry.lines for entry in entries], sizes, self.layout)
+
+
+class LaneFiles(L.LightningDataModule):
+    """A data set on disk.
+
+    Args:
+        layout: see :func:`read_entries`.
+        root: its folder.
+        train: label files, lists or folders to train on.
+        val: the same for validation, test and prediction.
+        batch_size: views per batch.
+        sizes: (height, width) choices of training views.
+        val_size: (height, width) that whole images are resized to.
+        view: how views are drawn.
+        seed: of the views.
+        workers: processes that read.
+    """
+
+    def __init__(
+        self,
+        layout: Format,
+        root: str,
+        train: list[str] | None = None,
+        val: list[str] | None = None,
+        batch_size: int = 8,
+        sizes: list[tuple[int, int]] | None = None,
+        val_size: tuple[int, int] = (192, 320),
+        view: ViewConfig | None = None,
+        seed: int = 0,
+        workers: int = 1,
+    ) -> None:
+        super().__init__()
+        self.layout, self.root, self.train, self.val = layout, Path(root), train or [], val or []
+        self.batch_size, self.sizes, self.val_size = batch_size, sizes or [(192, 320)], val_size
+        self.view, self.seed, self.workers = view or ViewConfig(), seed, workers
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        """Endless random views."""
+        frames = EntryFrames(read_entries(self.layout, self.root, self.train))
+        return DataLoader(
+            ViewBatches(frames, self.batch_size, self.sizes, self.view, self.seed),
+            batch_size=None,
+            num_workers=self.workers,
+        )
+
+    def val_dataloader(self) -> DataLoader[ScoredBatch]:
+        """Every image once, whole."""
+        entries = read_entries(self.layout, self.root, self.val)
+        data = ScoredBatches(entries, self.layout, self.batch_size, self.val_size, self.view)
+        return DataLoader(data, batch_size=None, collate_fn=_as_it_is)
+
+    test_dataloader = val_dataloader
+    predict_dataloader = val_dataloader
+
+
+def _as_it_is(batch: ScoredBatch) -> ScoredBatch:
+    return batch

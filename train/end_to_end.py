@@ -1,0 +1,80 @@
+"""Fine-tuning through extractor and calibrator: the network learns what makes the pose right."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lanebev.observation.lines import LineExtractor
+from lanebev.observation.vertices import LineConfig
+from train.losses import boundary_cross_entropy, row_cross_entropy, unweighted_bias
+from train.module import Segmentation, unpack
+from train.poses import PoseBatch, fit_poses, pose_loss
+
+_UNIT = (math.radians(0.3), math.radians(0.3), math.radians(0.6), 0.06)  # rad, rad, rad, m
+
+
+class EndToEnd(Segmentation):
+    """A segmentation that also answers for the pose.
+
+    Beside the cross-entropy, which keeps the maps what they are, a loss on pitch, yaw, roll and height of a
+    joint single-frame fit to the extracted segments. All of it is differentiable.
+
+    Args:
+        pose_weight: of the pose's loss; 0 trains on the same frames with cross-entropy alone.
+        kwargs: as of :class:`~train.module.Segmentation`.
+    """
+
+    def __init__(self, pose_weight: float = 0.05, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.settings["pose_weight"] = pose_weight
+        self.extractor = LineExtractor(LineConfig(stride=self.segmenter.config.output_stride))
+        self.unit: Tensor
+        self.register_buffer("unit", torch.tensor(_UNIT, dtype=torch.float64), persistent=False)
+
+    def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:  # type: ignore[override]
+        """Augment, segment, compare maps and poses."""
+        image, target, weight = unpack(batch)
+        if self.photometric is not None:
+            with torch.no_grad():
+                image = self.photometric(image)
+        logits = self.segmenter(image.contiguous(memory_format=self.layout))
+        pixels = boundary_cross_entropy(logits, target, weight, self.class_weight)
+        rows = row_cross_entropy(logits, target, weight)
+        loss = pixels + self.settings["row_weight"] * rows
+        self.log_dict({"loss/pixels": pixels, "loss/rows": rows})
+        if self.settings["pose_weight"] > 0:
+            fit = self._fit(logits + unweighted_bias(self.class_weight).view(1, -1, 1, 1), batch)
+            pose = pose_loss(fit, batch.extrinsics.double(), self.unit)
+            self.log("loss/pose", pose, prog_bar=True)
+            loss = loss + self.settings["pose_weight"] * pose.to(loss.dtype)
+        return loss
+
+    def validation_step(self, batch: PoseBatch, batch_idx: int) -> None:  # type: ignore[override]
+        """As ever, and the errors of the pose."""
+        super().validation_step(batch, batch_idx)  # type: ignore[arg-type]
+        fit = self._fit(self(unpack(batch)[0]), batch)
+        said = fit.observed & fit.valid.unsqueeze(-1)
+        error = fit.extrinsics.stack() - batch.extrinsics
+        self.val_squares += torch.where(said, error, 0.0).square().sum(0)
+        self.val_frames += said.sum(0)
+
+    def on_validation_epoch_start(self) -> None:
+        """Collect anew."""
+        super().on_validation_epoch_start()
+        self.val_squares, self.val_frames = torch.zeros_like(self.unit), torch.zeros_like(self.unit)
+
+    def on_validation_epoch_end(self) -> None:
+        """Report in degrees and metres."""
+        super().on_validation_epoch_end()
+        rmse = (self.val_squares / self.val_frames.clamp(min=1)).sqrt()
+        rmse = torch.cat([rmse[:3].rad2deg(), rmse[3:]])
+        names = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
+        self.log_dict({f"val/rmse_{name}": value for name, value in zip(names, rmse, strict=True)})
+
+    def _fit(self, logits: Tensor, batch: PoseBatch) -> Any:
+        size = (batch.image.shape[-2], batch.image.shape[-1])
+        return fit_poses(logits, size, batch.intrinsics, batch.distortion, batch.lane_width, self.extractor)

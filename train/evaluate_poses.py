@@ -1,0 +1,94 @@
+"""Errors of the pose on held-out rendered drives: ``python -m train.evaluate_poses BEFORE AFTER``.
+
+Every weights file (safetensors, or a Lightning checkpoint) sees the same frames, each frame on its own. An
+axis counts on the frames where every network's fit is valid and observes it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lanebev.observation.lines import LineExtractor
+from lanebev.observation.segmenter import LaneSegmenter
+from lanebev.observation.vertices import LineConfig
+from lanebev.render import Drive
+from lanebev.weights import load_segmenter
+from train.export import checkpoint_segmenter
+from train.poses import fit_poses
+
+AXES = ("pitch_deg", "yaw_deg", "roll_deg", "height_cm")
+
+
+def held_out_frames(drives: int, frames: int, size: tuple[int, int], seed: int) -> tuple[Tensor, ...]:
+    """Images (N, 3, H, W), poses (N, 4), lane widths (N, L - 1), intrinsics (N, 3, 3), of spread-out frames.
+
+    Training never sees drives: it is given single views with other seeds.
+    """
+    parts = []
+    for number in range(drives):
+        drive = Drive(seed + number, size, num_frames=frames, fps=1.0)
+        for i in range(frames):
+            frame = drive.frame(i)
+            parts.append((frame.image, frame.extrinsics.stack(), frame.lane_width, frame.intrinsics))
+    return tuple(torch.cat(field) for field in zip(*parts, strict=True))
+
+
+def load(path: Path) -> LaneSegmenter:
+    """Weights file or checkpoint."""
+    return checkpoint_segmenter(path)[0].eval() if path.suffix == ".ckpt" else load_segmenter(path)
+
+
+@torch.no_grad()
+def pose_errors(segmenter: LaneSegmenter, frames: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    """Errors (N, 4) in rad and m, and where the frame says something of the axis (N, 4) bool."""
+    extractor = LineExtractor(LineConfig(stride=segmenter.config.output_stride))
+    errors, said = [], []
+    for image, pose, lane_width, intrinsics in zip(*(field.split(8) for field in frames), strict=True):
+        size = (image.shape[-2], image.shape[-1])
+        none = image.new_zeros(len(image), 0)
+        fit = fit_poses(segmenter(image), size, intrinsics, none, lane_width, extractor)
+        errors.append(fit.extrinsics.stack() - pose)
+        said.append(fit.observed & fit.valid.unsqueeze(-1))
+    return torch.cat(errors), torch.cat(said)
+
+
+def summary(error: Tensor, counted: Tensor) -> dict[str, dict[str, float]]:
+    """Root mean square and median of the absolute error per axis, in degrees and centimetres."""
+    unit = error.new_tensor([math.degrees(1)] * 3 + [100.0])
+    report = {}
+    for axis, (name, values) in enumerate(zip(AXES, (error * unit).T, strict=True)):
+        own = values[counted[:, axis]]
+        rmse, median = own.square().mean().sqrt(), own.abs().median()
+        report[name] = {"rmse": round(float(rmse), 3), "median": round(float(median), 3), "frames": len(own)}
+    return report
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("weights", type=Path, nargs="+")
+    parser.add_argument("--drives", type=int, default=12)
+    parser.add_argument("--frames", type=int, default=12, help="of each drive, a second apart")
+    parser.add_argument("--size", type=int, nargs=2, default=(192, 320), metavar=("HEIGHT", "WIDTH"))
+    parser.add_argument("--seed", type=int, default=70_000)
+    args = parser.parse_args()
+    try:
+        networks = [load(path) for path in args.weights]
+    except (ValueError, OSError) as error:
+        parser.exit(2, f"error: {error}\n")
+    frames = held_out_frames(args.drives, args.frames, tuple(args.size), args.seed)
+    found = [pose_errors(network, frames) for network in networks]
+    common = torch.stack([said for _, said in found]).all(0)
+    for path, (error, said) in zip(args.weights, found, strict=True):
+        valid = round(float(said[:, 0].double().mean()), 3)
+        print(json.dumps({"weights": path.name, "valid": valid, **summary(error, common)}))
+
+
+if __name__ == "__main__":
+    main()

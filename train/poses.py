@@ -1,0 +1,149 @@
+"""Whole frames with the pose they were taken from, and the pose that a network's logits lead to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset
+
+from lanebev.estimation.single_frame import SingleFrameFit, fit_single_frame
+from lanebev.geometry.camera import undistort_points
+from lanebev.observation.lines import LineExtractor
+from lanebev.render import render_views
+from train.data import Batch, LiveFrames, PoolFrames, RenderedRoads
+from train.labels import LabelledImage, ViewConfig, full_view
+from train.pool import Pose, camera_poses, labelled_images, read_shard
+
+
+class PoseBatch(NamedTuple):
+    """Whole frames, their labels and their cameras.
+
+    Attributes:
+        image, target, weight: as in :class:`~train.data.Batch`.
+        extrinsics: (B, 4) pitch, yaw, roll in rad, height in m.
+        intrinsics: (B, 3, 3) px of ``image``.
+        distortion: (B, 5).
+        lane_width: (B, L - 1) m.
+    """
+
+    image: Tensor
+    target: Tensor
+    weight: Tensor
+    extrinsics: Tensor
+    intrinsics: Tensor
+    distortion: Tensor
+    lane_width: Tensor
+
+    @classmethod
+    def stack(
+        cls, samples: list[tuple[LabelledImage, Pose]], size: tuple[int, int], view: ViewConfig
+    ) -> PoseBatch:
+        """Frames resized to (height, width)."""
+        views = Batch.stack([full_view(sample, size, view) for sample, _ in samples])
+        pose = Pose(*(np.stack(field) for field in zip(*(pose for _, pose in samples), strict=True)))
+        taken = [sample.image.shape[:2] for sample, _ in samples]
+        scale = np.array([[size[1] / width, size[0] / height, 1.0] for height, width in taken], np.float32)
+        intrinsics = pose.intrinsics * scale[:, :, None]
+        intrinsics[:, :2, 2] += 0.5 * (scale[:, :2] - 1)  # pixel centres at integers
+        resized = pose._replace(intrinsics=intrinsics)
+        return cls(*views, *(torch.from_numpy(field) for field in resized))
+
+
+def pool_frames(frames: PoolFrames, rng: np.random.Generator) -> Iterator[tuple[LabelledImage, Pose]]:
+    """Endless, shard after shard in random order."""
+    while True:
+        for path in rng.permutation(np.array(frames.paths())):
+            shard = read_shard(path)
+            for i in rng.permutation(len(shard)):
+                yield shard.frame(i), shard.pose(i)
+
+
+def live_frames(frames: LiveFrames, rng: np.random.Generator) -> Iterator[tuple[LabelledImage, Pose]]:
+    """Endless, rendered on demand."""
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    while True:
+        rendered = render_views(frames.batch, frames.size, generator)
+        poses = camera_poses([rendered])
+        for i, sample in enumerate(labelled_images(rendered)):
+            yield sample, Pose(*(field[i] for field in poses))
+
+
+class PoseBatches(IterableDataset[PoseBatch]):
+    """Batches of whole frames; ``batches`` of them, or endless with None."""
+
+    def __init__(
+        self,
+        frames: PoolFrames | LiveFrames,
+        batch_size: int,
+        size: tuple[int, int],
+        view: ViewConfig,
+        seed: int,
+        batches: int | None = None,
+    ) -> None:
+        super().__init__()
+        self.frames, self.batch_size, self.size = frames, batch_size, size
+        self.view, self.seed, self.batches = view, seed, batches
+
+    def __iter__(self) -> Iterator[PoseBatch]:
+        """Draw."""
+        rng = np.random.default_rng(self.seed)
+        samples = pool_frames(self.frames, rng) if isinstance(self.frames, PoolFrames) else None
+        samples = samples or live_frames(self.frames, rng)  # type: ignore[arg-type]
+        drawn = 0
+        while self.batches is None or drawn < self.batches:
+            drawn += 1
+            yield PoseBatch.stack([next(samples) for _ in range(self.batch_size)], self.size, self.view)
+
+
+class RenderedPoses(RenderedRoads):
+    """As :class:`~train.data.RenderedRoads`, but whole frames of ``val_size`` with their poses."""
+
+    def train_dataloader(self) -> DataLoader[PoseBatch]:  # type: ignore[override]
+        """Endless."""
+        return self._batches(self.pool, self.seed, None)
+
+    def val_dataloader(self) -> DataLoader[PoseBatch]:  # type: ignore[override]
+        """Held-out frames."""
+        return self._batches(self.val_pool, self.seed + 7_919, self.val_batches)
+
+    def _batches(self, pool: str | None, seed: int, batches: int | None) -> DataLoader[PoseBatch]:
+        frames = self._frames(pool)
+        data = PoseBatches(frames, self.batch_size, self.val_size, self.view, seed, batches)
+        return DataLoader(data, batch_size=None)
+
+    test_dataloader = val_dataloader
+    predict_dataloader = val_dataloader
+
+
+def fit_poses(
+    logits: Tensor,
+    size: tuple[int, int],
+    intrinsics: Tensor,
+    distortion: Tensor,
+    lane_width: float | Tensor,
+    extractor: LineExtractor,
+) -> SingleFrameFit:
+    """Logits of images of (height, width) to each image's pose, in double precision, differentiable."""
+    segments = extractor(logits.double(), size, size)
+    intrinsics, distortion = intrinsics.double(), distortion.double()
+    ends = undistort_points(segments.endpoints.flatten(1, 2), intrinsics, distortion)
+    segments = segments._replace(endpoints=ends.view_as(segments.endpoints))
+    width = lane_width.double() if isinstance(lane_width, Tensor) else lane_width
+    return fit_single_frame(segments, intrinsics, width)
+
+
+def pose_loss(fit: SingleFrameFit, truth: Tensor, unit: Tensor) -> Tensor:
+    """Charbonnier loss of what the frame says of its pose, summed over axes, mean over frames with a fit.
+
+    Args:
+        fit: of B frames; what it took from the prior (roll on one lane) does not count.
+        truth: (B, 4).
+        unit: (4,) rad, rad, rad, m: errors that count as one; far larger ones count linearly.
+    """
+    said = fit.observed & fit.valid.unsqueeze(-1)
+    error = torch.where(said, (fit.extrinsics.stack() - truth) / unit, 0.0)
+    return ((1 + error.square()).sqrt() - 1).sum() / fit.valid.sum().clamp(min=1)
