@@ -62,7 +62,8 @@ class Vertices(NamedTuple):
     Attributes:
         points: (B, L, V, 2) (x, y) label px.
         normal: (B, L, V, 2) unit vectors across the line, of either sign.
-        weight: (B, L, V) in [0, 1].
+        weight: (B, L, V) in [0, 1], how sure it is that the boundary is there.
+        density: (B, L, V) in [0, 1], what it counts for in a mean: about 45 degrees, rows and columns share.
         common_var: (B, L, V) label px², across the line: what neighbouring vertices share.
         own_var: (B, L, V) label px², across the line: each vertex' own.
     """
@@ -70,6 +71,7 @@ class Vertices(NamedTuple):
     points: Tensor
     normal: Tensor
     weight: Tensor
+    density: Tensor
     common_var: Tensor
     own_var: Tensor
 
@@ -100,20 +102,20 @@ def _scan(probabilities: Tensor, config: LineConfig) -> Vertices:
     steep = (2.5 * (2 * cos2 - 1) + 0.5).clamp(0, 1)  # 1 below 39 degrees, 0 above 51
     reach = config.half_width / cos + 1.0  # of the stripe's band in its row
     inside = (position - reach >= 0) & (position + reach <= width - 1)
-    weight = torch.where(inside, weight * steep, 0.0)
+    weight = torch.where(inside & (steep > 0), weight, 0.0)
     stripe = config.half_width**2 / 3 + 1 / 12  # variance across a uniform stripe drawn in pixels
     excess = _local_mean(spread * cos2 - stripe, step).clamp(min=0)  # of one scan it depends on pixel phase
     rows = torch.arange(position.shape[-1], dtype=position.dtype, device=position.device)
     points = torch.stack([position, rows.expand_as(position)], dim=-1)
     normal = torch.stack([torch.ones_like(slope), -slope], dim=-1) * cos.unsqueeze(-1)
-    return Vertices(points, normal, weight, excess, scatter * cos2)
+    return Vertices(points, normal, weight, steep, excess, scatter * cos2)
 
 
 def _eroded(weight: Tensor) -> Tensor:
     """Least weight within _END scans, (..., h): nothing at the ends of a stripe and of the map."""
     padded = F.pad(weight.flatten(0, -2), (_END, _END))
-    eroded: Tensor = -F.max_pool1d(-padded, 2 * _END + 1, 1)
-    return eroded.view_as(weight)
+    least: Tensor = F.max_pool1d(-padded, 2 * _END + 1, 1).view_as(weight)
+    return least.neg()
 
 
 def _local_mean(values: Tensor, weight: Tensor) -> Tensor:
@@ -206,9 +208,9 @@ def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
     slot = (rank * bins.unsqueeze(-1)).div(total, rounding_mode="floor")
     slots = torch.arange(2 * config.segments, device=points.device)
     member = (slot.unsqueeze(-1) == slots) & seen.unsqueeze(-1)  # (B, L, V, 2S)
-    share = member * weight.unsqueeze(-1)
-    mass = share.sum(2)
-    members = member.sum(2)
+    density = member * vertices.density.unsqueeze(-1)
+    share = density * weight.unsqueeze(-1)
+    mass, counted = share.sum(2), density.sum(2)
     share = share / mass.clamp(min=1e-6).unsqueeze(2)  # weights of a mean
     mean = torch.einsum("blvs,blvd->blsd", share, points)
     normal = vertices.normal
@@ -219,7 +221,8 @@ def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
     common = torch.einsum("blvs,blv->bls", share, vertices.common_var)
     own = torch.einsum("blvs,blv->bls", share.square(), vertices.own_var)
     across = torch.einsum("blvs,blvd->blsd", share, normal)
-    return Vertices(mean, across, mass / members.clamp(min=1), common + config.sigma_floor**2, own)
+    sure = mass / counted.clamp(min=1e-6)
+    return Vertices(mean, across, sure, counted, common + config.sigma_floor**2, own)
 
 
 def _half_of(count: Tensor, config: LineConfig) -> Tensor:
