@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from lanebev.estimation.joint_boundaries import boundary_polylines, fit_boundaries
+from lanebev.estimation.single_frame import fit_single_frame
 from lanebev.geometry.camera import Camera
 from lanebev.io.lane_rows import BoundaryRows, rows_from_lines, rows_from_segments, segments_from_rows
 from lanebev.io.lanes import FrameLines, match_frames
@@ -55,6 +59,10 @@ class LaneFileObserver:
         return rows, segments_from_rows([rows], self.camera, dtype=torch.float64)
 
 
+FITTED_SUPPORT = 1.0  # segments' weights that a boundary needs to be written as a lane
+FITTED_REACH = 60.0  # m that a fitted boundary is drawn at least: all lead to one horizon
+
+
 class NetworkObserver:
     """Lanes from the images.
 
@@ -64,10 +72,11 @@ class NetworkObserver:
     Args:
         model: its segmenter and extractor are used.
         camera: the lens.
+        lane_width: m.
     """
 
-    def __init__(self, model: LaneBEV, camera: Camera) -> None:
-        self.model, self.camera = model.eval(), camera
+    def __init__(self, model: LaneBEV, camera: Camera, lane_width: float) -> None:
+        self.model, self.camera, self.lane_width = model.eval(), camera, lane_width
 
     def __call__(self, frame: Frame) -> tuple[BoundaryRows, LaneSegments]:
         """See :class:`Observer`."""
@@ -78,4 +87,39 @@ class NetworkObserver:
             with torch.inference_mode():  # no lens: pixels as taken
                 _, segments = self.model.observe(image, self.camera.intrinsics[None].float())
             rows = rows_from_segments(segments, self.camera)
-        return rows, segments_from_rows([rows], self.camera, dtype=torch.float64)
+        seen = segments_from_rows([rows], self.camera, dtype=torch.float64)
+        return rows._replace(fitted=fitted_rows(seen, rows.rows, self.camera, self.lane_width)), seen
+
+
+def fitted_rows(
+    segments: LaneSegments, rows: NDArray[np.float64], camera: Camera, lane_width: float
+) -> NDArray[np.float64]:
+    """All boundaries of one frame fitted together, one pose and one curvature for all, on image rows.
+
+    A boundary that is seen in pieces is whole then, and what fits no road is left out.
+
+    Args:
+        segments: of batch size 1, in undistorted pixels.
+        rows: (R,) px, rising.
+        camera: the lens.
+        lane_width: m.
+
+    Returns:
+        (L, R) px of the image as it came; NaN where there is no boundary.
+    """
+    intrinsics = camera.intrinsics[None].to(segments.endpoints)
+    fit = fit_single_frame(segments, intrinsics, lane_width)
+    curves = fit_boundaries(segments, intrinsics, fit.extrinsics, fit.curvature, least_support=FITTED_SUPPORT)
+    far = curves.extent[..., 1].clamp(min=FITTED_REACH)
+    curves = curves._replace(
+        extent=torch.stack([torch.ones_like(far), far], dim=-1), present=curves.present & fit.valid[:, None]
+    )
+    lines, shown = boundary_polylines(curves, intrinsics, fit.extrinsics, num_points=96)
+    x = np.full((lines.shape[1], len(rows)), np.nan)
+    for index, (line, there) in enumerate(zip(lines[0], shown[0], strict=True)):
+        points = camera.distort_points(line[there]).double().numpy()
+        if len(points) > 1:
+            order = np.argsort(points[:, 1])
+            across = np.interp(rows, points[order, 1], points[order, 0], np.nan, np.nan)
+            x[index] = np.where((across >= 0) & (across <= camera.image_size[1] - 1), across, np.nan)
+    return x

@@ -171,7 +171,7 @@ def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Obs
     """Lanes from a file if one is given, else from the network."""
     if config.lanes:
         return LaneFileObserver(read_lanes(config.lanes), source, camera)
-    return NetworkObserver(LaneBEV.from_pretrained(), camera)
+    return NetworkObserver(LaneBEV.from_pretrained(), camera, config.lane_width)
 
 
 def make_calibrator(name: str) -> Any:

@@ -21,7 +21,7 @@ from lanebev.report.plots import width_deviation
 from lanebev.run import calibrate_still
 
 TUSIMPLE_FOCAL = 1000.0  # px, assumed: the camera is not published
-UDACITY_LANE_WIDTH, CARLA_LANE_WIDTH = 3.66, 3.5
+UDACITY_LANE_WIDTH, CARLA_LANE_WIDTH, TUSIMPLE_LANE_WIDTH = 3.66, 3.5, 3.7
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def tusimple_labels(data: Path, calibrators: dict[str, Any]) -> Iterable[Figure]
     count = segments.boundary.shape[0]
     intrinsics = tusimple_camera().intrinsics.expand(count, 3, 3)
     for name, calibrator in calibrators.items():
-        calibration = calibrate_still(calibrator, segments, intrinsics, 3.7)
+        calibration = calibrate_still(calibrator, segments, intrinsics, TUSIMPLE_LANE_WIDTH)
         directions, widths = [], []
         for i in range(count):
             one = LaneSegments(*(part[i : i + 1] for part in segments))
@@ -102,10 +102,12 @@ def tusimple_pixels(data: Path, model: Any, calibrators: dict[str, Any]) -> Iter
 
     images, labelled = tusimple_segments(data)
     camera = tusimple_camera()
-    observer = NetworkObserver(model, camera)
+    observer = NetworkObserver(model, camera, TUSIMPLE_LANE_WIDTH)
     seen = [observer(next(iter(open_source(image)))) for image in images]
     frames = read_lanes(data / "tusimple" / "label_data.json")
-    scores = [tusimple_score(rows.x, rows.rows, frame) for (rows, _), frame in zip(seen, frames, strict=True)]
+    scores = [
+        tusimple_score(rows.fitted, rows.rows, frame) for (rows, _), frame in zip(seen, frames, strict=True)
+    ]
     accuracy, false_positive, false_negative = np.mean(scores, axis=0)
     part = "tusimple, pixels"
     yield Figure(part, "accuracy", "-", accuracy, 0.92, least=True)
@@ -114,8 +116,8 @@ def tusimple_pixels(data: Path, model: Any, calibrators: dict[str, Any]) -> Iter
     segments = LaneSegments(*(torch.cat(parts) for parts in zip(*(s for _, s in seen), strict=True)))
     intrinsics = camera.intrinsics.expand(len(images), 3, 3)
     for name, calibrator in calibrators.items():
-        pose = calibrate_still(calibrator, segments, intrinsics, 3.7).extrinsics.stack()
-        truth = calibrate_still(calibrator, labelled, intrinsics, 3.7).extrinsics.stack()
+        pose = calibrate_still(calibrator, segments, intrinsics, TUSIMPLE_LANE_WIDTH).extrinsics.stack()
+        truth = calibrate_still(calibrator, labelled, intrinsics, TUSIMPLE_LANE_WIDTH).extrinsics.stack()
         error = (pose - truth).abs()
         error[:, 3] /= truth[:, 3]
         middle = error.nanmedian(0).values.tolist()
@@ -137,7 +139,7 @@ def carla_stills(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterabl
     """Five renderings, one frame each."""
     truth = carla_truth(data)
     camera = Camera.from_file(data / "carla" / "camera.yaml")
-    observer = NetworkObserver(model, camera)
+    observer = NetworkObserver(model, camera, CARLA_LANE_WIDTH)
     names = [name for name in truth if name.endswith(".png")]
     seen = [observer(next(iter(open_source(str(data / "carla" / name)))))[1] for name in names]
     segments = LaneSegments(*(torch.cat(parts) for parts in zip(*seen, strict=True)))
@@ -180,7 +182,7 @@ def follow(
     source: str, camera: Camera, model: Any, calibrators: dict[str, Any], lane_width: float
 ) -> dict[str, Drive]:
     """Every calibrator over the same observations of a video."""
-    observer = NetworkObserver(model, camera)
+    observer = NetworkObserver(model, camera, lane_width)
     states = {
         name: calibrator.initial_state(1, dtype=torch.float64) for name, calibrator in calibrators.items()
     }

@@ -25,7 +25,7 @@ class Boundaries(NamedTuple):
         heading: (B, L) rad (tangent), own deviation from the common direction.
         std: (B, L) m, of the offset.
         extent: (B, L, 2) m, nearest and farthest Z of believed end points; (0, 0) where not present.
-        present: (B, L) bool, at least two believed segments.
+        present: (B, L) bool, enough believed segments.
         support: (B, L) sum of the believed segments' weights.
         curvature: (B, 2), c0 and c1, common to all.
     """
@@ -45,6 +45,7 @@ def fit_boundaries(
     extrinsics: Extrinsics,
     curvature: Tensor | None = None,
     num_boundaries: int = NUM_BOUNDARIES,
+    least_support: float = 2.0,
 ) -> Boundaries:
     """Every boundary's own offset and heading, by robust least squares on perpendicular pixel distances.
 
@@ -57,6 +58,7 @@ def fit_boundaries(
         extrinsics: each (B,), of this frame.
         curvature: (B, 2), c0 and c1, or None for a straight road.
         num_boundaries: L.
+        least_support: sum of the believed segments' weights from which a boundary is present.
 
     Returns:
         The curves.
@@ -91,7 +93,7 @@ def fit_boundaries(
         offset, heading, variance = _fit_line(z, lateral, precision)
     believed = member * trust
     support = 0.5 * believed.sum(-1)
-    present = support >= 2.0
+    present = support >= least_support
     reached = (member > 0) & (trust > 0.25)
     near = z.unsqueeze(1).masked_fill(~reached, torch.inf).amin(-1)
     far = z.unsqueeze(1).masked_fill(~reached, -torch.inf).amax(-1)

@@ -38,11 +38,13 @@ class BoundaryRows(NamedTuple):
         rows: (R,) px, rising.
         x: (L, R) px; NaN where a boundary was not seen.
         sigma: (L, R) px, standard deviation across the line; None if nobody said, then it is LINE_SIGMA.
+        fitted: (L, R) px, the same boundaries fitted together; None where they are taken as they came.
     """
 
     rows: NDArray[np.float64]
     x: NDArray[np.float64]
     sigma: NDArray[np.float64] | None = None
+    fitted: NDArray[np.float64] | None = None
 
 
 def image_rows(height: int) -> NDArray[np.float64]:

@@ -64,7 +64,7 @@ def read_lanes(path: str | Path) -> list[FrameLines]:
 
 
 def read_tusimple(path: str | Path) -> list[FrameLines]:
-    """Read TuSimple JSON lines: ``lanes``, ``h_samples``, ``raw_file``, maybe ``boundary`` and ``sigma``."""
+    """Read TuSimple JSON lines: ``lanes``, ``h_samples``, ``raw_file``, and what ours say besides."""
     frames = []
     for number, text in enumerate(_text(Path(path)).splitlines(), start=1):
         if text.strip():
@@ -112,7 +112,11 @@ def read_openlane(path: str | Path) -> FrameLines:
 
 
 def tusimple_line(
-    name: str, rows: NDArray[np.float64], x: NDArray[np.float64], sigma: NDArray[np.float64] | None = None
+    name: str,
+    rows: NDArray[np.float64],
+    x: NDArray[np.float64],
+    sigma: NDArray[np.float64] | None = None,
+    fitted: NDArray[np.float64] | None = None,
 ) -> str:
     """One frame's boundaries as a line of TuSimple JSON, with each lane's ``boundary``.
 
@@ -121,13 +125,21 @@ def tusimple_line(
         rows: (R,) px.
         x: (L, R) px; NaN where a boundary was not seen.
         sigma: (L, R) px, written as another key that other readers pass over; None leaves it out.
+        fitted: (L, R) px, the same boundaries as curves; then these are the ``lanes``, and what was seen
+            goes to another key, ``seen``, which :func:`read_tusimple` prefers. None leaves it out.
     """
-    seen = [index for index in range(len(x)) if np.isfinite(x[index]).any()]
-    fields: dict[str, Any] = {"raw_file": name, "lanes": [_written(x[index]) for index in seen]}
-    fields |= {"h_samples": [round(row) for row in rows.tolist()], "boundary": seen}
-    if sigma is not None:
-        fields["sigma"] = [_written(sigma[index]) for index in seen]
+    fields: dict[str, Any] = {"raw_file": name, "h_samples": [round(row) for row in rows.tolist()]}
+    if fitted is None:
+        fields |= _lane_fields(x, sigma)
+    else:
+        fields |= {**_lane_fields(fitted, None), "seen": _lane_fields(x, sigma)}
     return json.dumps(fields)
+
+
+def _lane_fields(x: NDArray[np.float64], sigma: NDArray[np.float64] | None) -> dict[str, Any]:
+    seen = [index for index in range(len(x)) if np.isfinite(x[index]).any()]
+    fields: dict[str, Any] = {"lanes": [_written(x[index]) for index in seen], "boundary": seen}
+    return fields if sigma is None else {**fields, "sigma": [_written(sigma[index]) for index in seen]}
 
 
 def _written(values: NDArray[np.float64]) -> list[float]:
@@ -200,6 +212,8 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
     rows = _floats("h_samples", _field(fields, "h_samples", list))
     if any(b <= a for a, b in pairwise(rows)):
         raise ValueError("h_samples: expected rising rows, got others")
+    if "seen" in fields:
+        fields = _field(fields, "seen", dict)
     lanes = _field(fields, "lanes", list)
     indices: Sequence[int | None] = fields.get("boundary") or [None] * len(lanes)
     if "boundary" in fields:
