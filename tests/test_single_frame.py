@@ -33,7 +33,8 @@ def drive_frames(params: Tensor, sigma: float, seed: int, per_boundary: int = 30
     z = 1 / (1 / 5.0 + (1 / 60.0 - 1 / 5.0) * inverse)
     places = boundary_places(3.7, 6, params).gather(1, index) + params[:, 4:5]
     c0, c1 = params[:, 5, None, None], params[:, 6, None, None]
-    x = places.unsqueeze(-1) + c0 * z**2 / 2 + c1 * z**3 / 6
+    heading = c0 * z + c1 * z**2 / 2  # parallel curves, to second order
+    x = places.unsqueeze(-1) * (1 + heading**2 / 2) + c0 * z**2 / 2 + c1 * z**3 / 6
     points, _ = image_from_road_points(
         torch.stack([x, z], dim=-1).flatten(1, 2),
         CAMERA.expand(batch, 3, 3),

@@ -54,7 +54,9 @@ def test_missing_foreign_and_non_finite_files(tmp_path, states):
     (tmp_path / "text").write_text("pitch: 1\n")
     assert "cut or not a state file" in load_state(tmp_path / "text", like=states).problem
     bad = states["calibrator"]._replace(mean=torch.full_like(states["calibrator"].mean, torch.nan))
-    with pytest.raises(ValueError, match=r"calibrator.mean: expected finite numbers, got 44"):
+    with pytest.raises(
+        ValueError, match=rf"calibrator.mean: expected finite numbers, got {bad.mean.numel()}"
+    ):
         save_state(tmp_path / "bad", {"calibrator": bad})
     assert not (tmp_path / "bad").exists()
     header = {
@@ -75,7 +77,8 @@ def test_another_calibrator_batch_or_precision_is_refused(tmp_path, states):
     other = {"calibrator": states["other"]}
     assert "is a JointState, expected TwoStageState" in load_state(tmp_path / "s", like=other).problem
     wider = {"calibrator": JointCalibrator().initial_state(3)}
-    assert "expected torch.float32 (3, 22)" in load_state(tmp_path / "s", like=wider).problem
+    shape = tuple(wider["calibrator"].mean.shape)
+    assert f"expected torch.float32 {shape}" in load_state(tmp_path / "s", like=wider).problem
     double = {"calibrator": JointCalibrator().initial_state(2, dtype=torch.float64)}
     assert "expected torch.float64" in load_state(tmp_path / "s", like=double).problem
     more = {**states, "mount": states["other"]}

@@ -11,16 +11,40 @@ from torch import Tensor, nn
 
 from lanebev.estimation import kalman
 from lanebev.estimation.checks import as_batch
-from lanebev.estimation.joint_filter import Update, best_shift, evidence_index, iterate, surprise
+from lanebev.estimation.joint_filter import (
+    ROLL_SEEN,
+    Update,
+    best_shift,
+    evidence_index,
+    iterate,
+    surprise,
+)
 from lanebev.estimation.joint_model import (
+    CURVATURE,
     HEIGHT,
+    KNOT_SPACING,
     NUM_PARAMS,
+    NUM_STEPS,
+    NUM_STRAIGHT,
     OFFSET,
+    ROLL,
     Observations,
     boundary_places,
     observe,
 )
-from lanebev.estimation.joint_motion import MEANS, NUM_COMMON, NUM_POSE, RATES, MotionConfig, motion
+from lanebev.estimation.joint_motion import (
+    MEANS,
+    NUM_COMMON,
+    NUM_POSE,
+    NUM_SEEN,
+    RATES,
+    SHAPE,
+    SPEED,
+    STEPS,
+    MotionConfig,
+    come_nearer,
+    motion,
+)
 from lanebev.estimation.single_frame import FramePrior, fit_single_frame
 from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status
 
@@ -50,8 +74,10 @@ class JointConfig:
         motion: how the state moves.
         prior: where a start is searched, and what holds before it.
         open_pose: rad (and 10 of these in m of height), jump admitted where one frame contradicts the motion.
-        open_curvature, open_curvature_rate: 1/m, 1/m², change admitted a frame when a bend begins or ends.
+        open_curvature, open_step: 1/m, change of the knots admitted a frame when a bend begins or ends.
+        straight: 1/m and 1/m², sigmas of c0 and c1 of a road that is taken as straight at a start.
         open_deviation: m, admitted where the lanes turn out unequal.
+        height_seen: m, sigma of height from one frame above which it counts as unseen.
         evidence_time: s over which a bend's or unequal lanes' evidence is summed.
         min_support: inlier segments (weights summed) of a usable frame.
         min_share, enter_share: share of inliers to go on tracking, and to begin again.
@@ -66,9 +92,11 @@ class JointConfig:
     motion: MotionConfig = field(default_factory=MotionConfig)
     prior: FramePrior = field(default_factory=FramePrior)
     open_pose: float = 0.01
-    open_curvature: float = 2e-4
-    open_curvature_rate: float = 5e-6
+    open_curvature: float = 1e-5
+    open_step: float = 3e-5
+    straight: tuple[float, float] = (1e-4, 3e-6)
     open_deviation: float = 0.1
+    height_seen: float = 0.3
     evidence_time: float = 0.15
     min_support: float = 3.0
     min_share: float = 0.15
@@ -88,9 +116,10 @@ class JointState(NamedTuple):
     """Everything the calibrator remembers, tensors only.
 
     Attributes:
-        mean: (B, 16 + L), see ``joint_motion``.
-        cov: (B, 16 + L, 16 + L).
-        evidence: (B, 6 + L) summed evidence against the motion: pose, curvature, deviations; unit variance.
+        mean: (B, D), see ``joint_motion``.
+        cov: (B, D, D).
+        phase: (B,) m, how far the first knot of the road's curvature lies behind the camera.
+        evidence: (B, 10 + L) summed evidence against the motion: pose, shape, deviations; unit variance.
         early: (B,) s by which the state is ahead of the last frame, which came out of order.
         unseen: (B,) s since the last usable frame.
         misfit: (B,) s for which there were segments that did not fit.
@@ -100,6 +129,7 @@ class JointState(NamedTuple):
 
     mean: Tensor
     cov: Tensor
+    phase: Tensor
     evidence: Tensor
     early: Tensor
     unseen: Tensor
@@ -140,7 +170,8 @@ class JointCalibrator(nn.Module):
         return JointState(
             mean=mean,
             cov=cov,
-            evidence=mean.new_zeros(batch_size, NUM_POSE + 2 + cfg.num_boundaries),
+            phase=zero.clone(),
+            evidence=mean.new_zeros(batch_size, NUM_POSE + 1 + NUM_STEPS + cfg.num_boundaries),
             early=zero.clone(),
             unseen=zero,
             misfit=zero.clone(),
@@ -178,10 +209,12 @@ class JointCalibrator(nn.Module):
         places = positions.gather(1, seen.boundary)  # (B, N)
         step, skip, early, guessed = self._elapsed(as_batch(dt, seen.sigma), state)
 
-        predicted = kalman.predict(state.mean, state.cov, *motion(step, cfg.num_boundaries, cfg.motion))
-        mean, shift, scale = self._follow_lane_change(predicted[0], positions, seen)
-        update, evidence = self._update(mean, predicted[1], scale, state.evidence, places, seen, step)
-        judged, supported = self._judge(state, predicted, update, evidence, shift, step, seen)
+        mean, cov, phase = come_nearer(state.mean, state.cov, state.phase, step, cfg.motion)
+        mean, cov = kalman.predict(mean, cov, *motion(step, cfg.num_boundaries, cfg.motion))
+        predicted = state._replace(mean=mean, cov=cov, phase=phase)
+        mean, shift, scale = self._follow_lane_change(predicted, positions, seen)
+        update, evidence = self._update(predicted, mean, scale, places, seen, step)
+        judged, supported = self._judge(predicted, update, evidence, shift, step, seen)
         after, trust = self._restart(judged, update.trust, supported, segments, intrinsics, lane_width)
         after = after._replace(reasons=after.reasons | _flag(guessed, Reason.TIME))
 
@@ -198,12 +231,13 @@ class JointCalibrator(nn.Module):
         return due.clamp(0.0, 60.0), skip, torch.where(skip, -due, 0.0), guessed
 
     def _follow_lane_change(
-        self, mean: Tensor, positions: Tensor, seen: Observations
+        self, predicted: JointState, positions: Tensor, seen: Observations
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Predicted mean, offset and deviations moved by a lane if the indices were; shift; noise scale."""
         ego = self.config.num_boundaries // 2 - 1
         width = positions[:, ego + 1] - positions[:, ego]
-        shift, scale = best_shift(mean, positions, seen, width)
+        mean = predicted.mean
+        shift, scale = best_shift(mean, positions, seen, predicted.phase, width)
         moved = mean.clone()
         moved[:, OFFSET] = mean[:, OFFSET] + shift * width
         own = mean[:, NUM_COMMON:]
@@ -215,36 +249,36 @@ class JointCalibrator(nn.Module):
 
     def _update(
         self,
+        predicted: JointState,
         mean: Tensor,
-        cov: Tensor,
         scale: Tensor,
-        evidence: Tensor,
         places: Tensor,
         seen: Observations,
         step: Tensor,
     ) -> tuple[Update, Tensor]:
         """Robust update; what contradicts the motion opens its process noise, and the frame is used again."""
         cfg = self.config
-        first = iterate(mean, cov, mean, scale, places, seen, cfg.iterations)
+        cov, phase = predicted.cov, predicted.phase
+        first = iterate(mean, cov, mean, scale, places, seen, phase, cfg.iterations)
         index = evidence_index(cfg.num_boundaries, mean.device)
         fade = (-step / cfg.evidence_time).exp().unsqueeze(-1)
         news = surprise(first, index)
-        slow = evidence * fade + (1 - fade * fade).sqrt() * news
+        slow = predicted.evidence * fade + (1 - fade * fade).sqrt() * news
         evidence = torch.cat([news[:, :NUM_POSE], slow[:, NUM_POSE:]], dim=-1)
         cov = cov + self._opened(evidence)
-        return iterate(mean, cov, first.mean, first.scale, places, seen, 1), evidence
+        return iterate(mean, cov, first.mean, first.scale, places, seen, phase, 1), evidence
 
     def _opened(self, evidence: Tensor) -> Tensor:
         """Process noise (B, D, D) that the evidence calls for; next to none while |evidence| < 3."""
         cfg = self.config
-        pose, bend, own = evidence.square().split([NUM_POSE, 2, cfg.num_boundaries], dim=-1)
+        pose, bend, own = evidence.square().split([NUM_POSE, 1 + NUM_STEPS, cfg.num_boundaries], dim=-1)
         pose, bend, own = (
             torch.sigmoid(0.5 * (squared.amax(-1, keepdim=True) - threshold)) * squared.amax(-1, keepdim=True)
             for squared, threshold in ((pose, 25.0), (bend, 16.0), (own, 25.0))
         )
         jump = evidence.new_tensor([cfg.open_pose] * 3 + [10 * cfg.open_pose]).square()
-        change = evidence.new_tensor([cfg.open_curvature, cfg.open_curvature_rate]).square()
-        rest = evidence.new_zeros(evidence.shape[0], NUM_COMMON - NUM_PARAMS)
+        change = evidence.new_tensor([cfg.open_curvature] + [cfg.open_step] * NUM_STEPS).square()
+        rest = evidence.new_zeros(evidence.shape[0], NUM_COMMON - NUM_SEEN)
         offset = torch.zeros_like(pose)
         width = evidence.new_full((cfg.num_boundaries,), cfg.open_deviation).square()
         scaled = [0.01 * pose * jump, offset, 0.01 * bend * change, rest, 0.01 * own * width]
@@ -253,14 +287,16 @@ class JointCalibrator(nn.Module):
     def _judge(
         self,
         state: JointState,
-        predicted: tuple[Tensor, Tensor],
         update: Update,
         evidence: Tensor,
         shift: Tensor,
         step: Tensor,
         seen: Observations,
     ) -> tuple[JointState, Tensor]:
-        """State after the frame, before any restart, and (B,) bool: the frame supported it."""
+        """State after the frame, before any restart, and (B,) bool: the frame supported it.
+
+        Without support the predicted state stands.
+        """
         cfg = self.config
         running = _running(state.status)
         support = (seen.weight * update.trust).sum(-1)
@@ -277,9 +313,19 @@ class JointCalibrator(nn.Module):
         reasons = _flag(empty, Reason.NO_SEGMENTS) | _flag(~empty & ~supported, Reason.FEW_INLIERS)
         reasons = reasons | _flag(supported & (shift != 0), Reason.LANE_CHANGE)
         reasons = reasons | _flag(~running, Reason.NO_START)
-        mean, cov = _where(supported, update.mean, predicted[0]), _where(supported, update.cov, predicted[1])
-        evidence = _where(supported, evidence, torch.zeros_like(evidence))
-        after = JointState(mean, cov, evidence, torch.zeros_like(unseen), unseen, misfit, status, reasons)
+        reasons = reasons | _flag(update.alone[:, ROLL] > ROLL_SEEN, Reason.ROLL_UNSEEN)
+        reasons = reasons | _flag(update.alone[:, HEIGHT] > cfg.height_seen, Reason.HEIGHT_UNSEEN)
+        after = JointState(
+            mean=_where(supported, update.mean, state.mean),
+            cov=_where(supported, update.cov, state.cov),
+            phase=state.phase,
+            evidence=_where(supported, evidence, torch.zeros_like(evidence)),
+            early=torch.zeros_like(unseen),
+            unseen=unseen,
+            misfit=misfit,
+            status=status,
+            reasons=reasons,
+        )
         return after, supported
 
     def _restart(
@@ -304,14 +350,15 @@ class JointCalibrator(nn.Module):
         mean, cov = self._begin(fit.params(), fit.covariance)
         zero = torch.zeros_like(state.unseen)
         begun = JointState(
-            mean,
-            cov,
-            torch.zeros_like(state.evidence),
-            zero,
-            zero,
-            zero,
-            torch.full_like(state.status, int(Status.TRACKING)),
-            torch.full_like(state.reasons, int(Reason.RESTARTED)),
+            mean=mean,
+            cov=cov,
+            phase=zero,
+            evidence=torch.zeros_like(state.evidence),
+            early=zero,
+            unseen=zero,
+            misfit=zero,
+            status=torch.full_like(state.status, int(Status.TRACKING)),
+            reasons=torch.full_like(state.reasons, int(Reason.RESTARTED)),
         )
         after = JointState(*(_where(fresh, new, old) for new, old in zip(begun, state, strict=True)))
         return after, torch.where(fresh.unsqueeze(-1), fit.inliers, trust)
@@ -326,17 +373,36 @@ class JointCalibrator(nn.Module):
         )
         swing = params.new_tensor([angle, angle, angle, height])  # stationary variances
         rates = torch.cat([swing * cfg.motion.spring**2, params.new_tensor([0.5**2])])
-        zero = params.new_zeros(batch, 5)
-        own = params.new_zeros(batch, num)
-        mean = torch.cat([params, zero, params[:, :NUM_POSE], own], dim=-1)
+        params, param_cov = self._straighten(params, param_cov)
+        spread = params.new_zeros(NUM_SEEN, NUM_PARAMS)  # c0 and c1 to the knots
+        spread[:NUM_STRAIGHT, :NUM_STRAIGHT] = torch.eye(NUM_STRAIGHT)
+        spread[CURVATURE, CURVATURE] = 1.0
+        spread[STEPS, CURVATURE + 1] = KNOT_SPACING
+        seen, seen_cov = params @ spread.mT, spread @ param_cov @ spread.mT
+        zero, own = params.new_zeros(batch, 5), params.new_zeros(batch, num)
+        mean = torch.cat([seen, zero, params[:, :NUM_POSE], own[:, :1], own], dim=-1)
         cov = params.new_zeros(batch, NUM_COMMON + num, NUM_COMMON + num)
-        cov[:, :NUM_PARAMS, :NUM_PARAMS] = param_cov
-        cov[:, :NUM_PARAMS, MEANS] = param_cov[:, :, :NUM_POSE]
-        cov[:, MEANS, :NUM_PARAMS] = param_cov[:, :NUM_POSE]
+        cov[:, :NUM_SEEN, :NUM_SEEN] = seen_cov
+        cov[:, :NUM_SEEN, MEANS] = seen_cov[:, :, :NUM_POSE]
+        cov[:, MEANS, :NUM_SEEN] = seen_cov[:, :NUM_POSE]
         cov[:, MEANS, MEANS] = param_cov[:, :NUM_POSE, :NUM_POSE] + swing.diag()
         cov[:, RATES, RATES] = rates.diag()
-        tiny = cfg.motion.deviation_walk**2
-        return mean, cov + torch.cat([mean.new_zeros(NUM_COMMON), mean.new_full((num,), tiny)]).diag()
+        own_variance = params.new_zeros(NUM_COMMON + num)
+        own_variance[SHAPE] = cfg.motion.curvature_step**2
+        own_variance[SPEED] = cfg.motion.speed_std**2
+        own_variance[NUM_COMMON:] = cfg.motion.deviation_walk**2
+        return mean, cov + own_variance.diag()
+
+    def _straighten(self, params: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:
+        """Believe in a straight road where one frame's curvature (c0, c1) does not contradict it."""
+        variance = params.new_tensor(self.config.straight).square().diag()
+        bend, gain = params[:, CURVATURE:], cov[:, :, CURVATURE:]
+        factor = torch.linalg.cholesky_ex(cov[:, CURVATURE:, CURVATURE:] + variance).L
+        solved = torch.cholesky_solve(bend.unsqueeze(-1), factor)
+        straight = (bend.unsqueeze(1) @ solved).flatten() < 16.0
+        pulled = params - (gain @ solved).squeeze(-1)
+        reduced = kalman.symmetrise(cov - gain @ torch.cholesky_solve(gain.mT, factor))
+        return _where(straight, pulled, params), _where(straight, reduced, cov)
 
     def _calibration(self, state: JointState, inliers: Tensor) -> Calibration:
         """What goes out: the pose, its covariance with the lane width's scale, status, inliers."""

@@ -10,15 +10,19 @@ from torch import Tensor
 from lanebev.estimation import kalman
 from lanebev.estimation.joint_model import (
     CURVATURE,
-    NUM_PARAMS,
+    NUM_STRAIGHT,
     OFFSET,
+    ROLL,
     Observations,
     boundary_distances,
     boundary_residuals,
 )
-from lanebev.estimation.joint_motion import NUM_COMMON, NUM_POSE
+from lanebev.estimation.joint_motion import MEANS, NUM_COMMON, NUM_POSE, NUM_SEEN, RATES
 from lanebev.estimation.joint_robust import inlier_weights, log_likelihood, noise_scale, start_scale
 from lanebev.estimation.single_frame import normal_equations
+
+_LOOSE = (0.3, 0.3, 0.3, 1.0, 2.0)  # rad, m: sigmas before a frame, to ask what it alone determines
+ROLL_SEEN = 0.01  # rad, sigma of roll from one frame above which roll is held instead of estimated
 
 
 class Update(NamedTuple):
@@ -29,7 +33,9 @@ class Update(NamedTuple):
         trust: (B, N) in [0, 1].
         scale: (B,) >= 1, of the noise.
         info: (B, D, D) of the frame's observations.
-        score: (B, D), P⁻¹ (mean - predicted): the pull of the observations on the prediction.
+        score: (B, D), P⁻¹ (best - predicted): the pull of the observations on the prediction.
+        best_cov: (B, D, D), were everything estimated.
+        alone: (B, 5) sigmas of pitch, yaw, roll, height and offset from this frame alone.
     """
 
     mean: Tensor
@@ -38,6 +44,8 @@ class Update(NamedTuple):
     scale: Tensor
     info: Tensor
     score: Tensor
+    best_cov: Tensor
+    alone: Tensor
 
 
 def iterate(
@@ -47,11 +55,14 @@ def iterate(
     scale: Tensor,
     places: Tensor,
     seen: Observations,
+    phase: Tensor,
     iterations: int,
 ) -> Update:
     """Iterated robust update: relinearised and reweighted at each step, the prediction held as it was.
 
-    Source: Bell and Cathey 1993, the iterated Kalman filter as Gauss-Newton.
+    Source: Bell and Cathey 1993, the iterated Kalman filter as Gauss-Newton; Schmidt 1966 for the roll that
+    a frame does not determine: it is considered, not estimated. On one lane roll and offset are the same to
+    first order, and what sets them apart is a difference of second order that linearised updates overrate.
 
     Args:
         predicted: (B, D) mean.
@@ -60,6 +71,7 @@ def iterate(
         scale: (B,) noise scale to start with.
         places: (B, N) m, X of each segment's boundary at Z = 0 less offset and deviation.
         seen: what was observed.
+        phase: (B,) m, of the knots.
         iterations: steps.
 
     Returns:
@@ -68,10 +80,10 @@ def iterate(
     num_boundaries = predicted.shape[-1] - NUM_COMMON
     member = torch.nn.functional.one_hot(seen.boundary, num_boundaries).mT.to(places)  # (B, L, N)
     focal = seen.intrinsics[:, 0, 0]
-    mean, posterior = start, cov
+    mean = start
     for _ in range(iterations):
         own = mean[:, NUM_COMMON:].gather(1, seen.boundary)  # (B, N) m
-        residuals = boundary_residuals(mean[:, :NUM_PARAMS], places + own, seen)
+        residuals = boundary_residuals(mean[:, :NUM_SEEN], places + own, seen, phase)
         there = seen.weight * residuals.valid
         trust = inlier_weights(residuals.distance, residuals.valid, seen.sigma, scale, focal)
         fitted = noise_scale(residuals.distance, seen.sigma, trust * seen.weight)
@@ -79,9 +91,38 @@ def iterate(
         by_noise = trust * there / (seen.sigma * scale.unsqueeze(-1)).square()
         info, pull = _information(residuals.jacobian, residuals.distance, by_noise, member)
         pull = pull + (info @ (mean - predicted).unsqueeze(-1)).squeeze(-1)
-        mean, posterior = kalman.update(predicted, cov, info, pull)
-    score = pull - (info @ (mean - predicted).unsqueeze(-1)).squeeze(-1)
-    return Update(mean, posterior, trust, scale, info, score)
+        alone = _alone(info)
+        best, posterior = kalman.update(predicted, cov, info, pull)
+        estimated = _estimated(alone, mean)
+        mean = predicted + estimated * (best - predicted)
+    score = pull - (info @ (best - predicted).unsqueeze(-1)).squeeze(-1)
+    after = _consider(cov, posterior, info, estimated)
+    return Update(mean, after, trust, scale, info, score, posterior, alone)
+
+
+def _consider(cov: Tensor, posterior: Tensor, info: Tensor, estimated: Tensor) -> Tensor:
+    """Covariance after an update that leaves the mean's entries where they are not estimated.
+
+    Source: Schmidt 1966; the Joseph form for a gain with rows set to zero.
+    """
+    gain = estimated.unsqueeze(-1) * posterior
+    keep = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device) - gain @ info
+    return kalman.symmetrise(keep @ cov @ keep.mT + gain @ info @ gain.mT)
+
+
+def _alone(info: Tensor) -> Tensor:
+    """(B, 5) sigmas of a straight road's parameters from this frame's information (B, D, D)."""
+    loose = info.new_tensor(_LOOSE)
+    scaled = loose.unsqueeze(-1) * info[:, :NUM_STRAIGHT, :NUM_STRAIGHT] * loose
+    factor = torch.linalg.cholesky_ex(scaled + torch.eye(NUM_STRAIGHT).to(info)).L
+    return loose * torch.cholesky_inverse(factor).diagonal(dim1=1, dim2=2).sqrt()
+
+
+def _estimated(alone: Tensor, mean: Tensor) -> Tensor:
+    """(B, D): 0 for roll, its rate and its slow mean where the frame does not determine roll, else 1."""
+    index = torch.arange(mean.shape[-1], device=mean.device)
+    about_roll = (index == ROLL) | (index == RATES.start + ROLL) | (index == MEANS.start + ROLL)
+    return torch.where(about_roll & (alone[:, ROLL, None] > ROLL_SEEN), 0.0, torch.ones_like(mean))
 
 
 def _information(
@@ -91,15 +132,15 @@ def _information(
     by_deviation = member.repeat_interleave(2, dim=-1) * jacobian[:, OFFSET, None]  # (B, L, 2N)
     info, pull = normal_equations(torch.cat([jacobian, by_deviation], dim=1), distance, by_noise)
     size = NUM_COMMON + member.shape[1]
-    place = torch.cat([torch.arange(NUM_PARAMS), torch.arange(NUM_COMMON, size)]).to(info.device)
+    place = torch.cat([torch.arange(NUM_SEEN), torch.arange(NUM_COMMON, size)]).to(info.device)
     whole = info.new_zeros(info.shape[0], size, info.shape[-1]).index_copy(1, place, info)
     whole = info.new_zeros(info.shape[0], size, size).index_copy(2, place, whole)
     return whole, info.new_zeros(info.shape[0], size).index_copy(1, place, -pull)
 
 
 def evidence_index(num_boundaries: int, device: torch.device) -> Tensor:
-    """State entries whose motion is put in question: pose, c0, c1, deviations; (6 + L,)."""
-    first = [*range(NUM_POSE), CURVATURE, CURVATURE + 1]
+    """State entries whose motion is put in question: pose, shape, deviations."""
+    first = [*range(NUM_POSE), *range(CURVATURE, NUM_SEEN)]
     last = range(NUM_COMMON, NUM_COMMON + num_boundaries)
     return torch.tensor([*first, *last], device=device)
 
@@ -113,7 +154,7 @@ def surprise(update: Update, index: Tensor) -> Tensor:
     Returns:
         (B, len(index)); 0 where the observations say nothing of an entry.
     """
-    seen = update.info - update.info @ update.cov @ update.info
+    seen = update.info - update.info @ update.best_cov @ update.info
     variance = seen.diagonal(dim1=-2, dim2=-1)[:, index]
     known = variance > 1e-3 * update.info.diagonal(dim1=-2, dim2=-1)[:, index]
     known = known & (variance > 0)
@@ -121,7 +162,7 @@ def surprise(update: Update, index: Tensor) -> Tensor:
 
 
 def best_shift(
-    mean: Tensor, positions: Tensor, seen: Observations, lane_width: Tensor
+    mean: Tensor, positions: Tensor, seen: Observations, phase: Tensor, lane_width: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Lanes by which the boundary indices moved since the prediction: -1, 0 or 1.
 
@@ -132,6 +173,7 @@ def best_shift(
         mean: (B, D) predicted.
         positions: (B, L) m, of the boundaries from the ego lane's middle.
         seen: what was observed.
+        phase: (B,) m, of the knots.
         lane_width: (B,) m, of the ego lane.
 
     Returns:
@@ -141,7 +183,7 @@ def best_shift(
     places = (positions + mean[:, NUM_COMMON:]).gather(1, seen.boundary)
     shifts = mean.new_tensor([0.0, -1.0, 1.0])
     moved = places + (shifts[:, None] * lane_width)[:, :, None]  # (3, B, N)
-    distance, valid = boundary_distances(mean[:, :NUM_PARAMS], moved, seen)
+    distance, valid = boundary_distances(mean[:, :NUM_SEEN], moved, seen, phase)
     weight = seen.weight * valid
     scales = torch.stack([start_scale(each, seen.sigma, weight) for each in distance])  # (3, B)
     scores = log_likelihood(distance, valid, weight, seen.sigma, scales.amin(0), focal)  # (3, B)

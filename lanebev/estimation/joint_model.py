@@ -1,10 +1,12 @@
 """The measurement of the joint estimators: end points against projected lane boundaries, in pixels.
 
-Boundary k lies on the road at X_k(Z) = x_k + c0 Z²/2 + c1 Z³/6 (flat road, third-order clothoid), with
-x_k = offset + (its place in the ego lane's frame). A ray d = road_from_cam K⁻¹ p meets the road at
-(X, Z) = h (d_x, d_z) / d_y, so the boundary is the zero of
+Boundary k lies on the flat road at X_k(Z) = b(Z) + x_k (1 + b'(Z)² / 2), with x_k = offset + (its place in
+the ego lane's frame): parallel curves, to second order in their heading b'. The bend b is linear in the
+shape parameters: c0 Z²/2 + c1 Z³/6 (third-order clothoid), or the double integral of a curvature that is
+linear between knots. A ray d = road_from_cam K⁻¹ p meets the road at (X, Z) = h (d_x, d_z) / d_y, so the
+boundary is the zero of
 
-    G(d) = h d_x - x_k d_y - c0 h² d_z² / (2 d_y) - c1 h³ d_z³ / (6 d_y²),
+    G(d) = h d_x - X_k(h d_z / d_y) d_y,
 
 and G / |∂G/∂p| is the perpendicular distance in pixels: exact for straight boundaries, where G is linear
 in p and regular on the horizon; Sampson's first order for curved ones.
@@ -25,6 +27,13 @@ from lanebev.types import LaneSegments
 PITCH, YAW, ROLL, HEIGHT, OFFSET, CURVATURE, CURVATURE_RATE = range(7)
 NUM_PARAMS = 7
 """Parameters of one frame: pitch, yaw, roll (rad), height, offset (m), c0 (1/m), c1 (1/m²)."""
+
+NUM_STRAIGHT = 5
+"""Those of a straight road."""
+
+KNOT_SPACING = 10.0  # m
+NUM_STEPS = 5
+"""Steps of curvature between knots, where the shape is a spline: c at the first knot and these, 1/m."""
 
 FARTHEST = 200.0  # m; beyond it a pixel is tens of metres and the flat road is fiction
 
@@ -54,7 +63,7 @@ class Residuals(NamedTuple):
 
     Attributes:
         distance: (B, N, 2) px, positive right of the boundary.
-        jacobian: (B, 7, M) of the distance by the frame's parameters; finite also where not valid.
+        jacobian: (B, P, M) of the distance by the frame's parameters; finite also where not valid.
         valid: (B, N) bool, both end points on the road and nearer than 200 m.
     """
 
@@ -116,16 +125,19 @@ def boundary_places(lane_width: float | Tensor, num_boundaries: int, like: Tenso
     return edges - 0.5 * (edges[:, ego] + edges[:, ego + 1]).unsqueeze(-1)
 
 
-def boundary_residuals(params: Tensor, places: Tensor, seen: Observations) -> Residuals:
+def boundary_residuals(
+    params: Tensor, places: Tensor, seen: Observations, phase: Tensor | None = None
+) -> Residuals:
     """Perpendicular pixel distance of every end point to its boundary, with its Jacobian.
 
     The Jacobian is taken at the foot point on the boundary, which is the total derivative of G / |∂G/∂p|:
     taken at the noisy point instead, noise and Jacobian correlate and the fit is biased by their product.
 
     Args:
-        params: (B, 7), see ``NUM_PARAMS``.
+        params: (B, 7), see ``NUM_PARAMS``; with a phase (B, 6 + NUM_STEPS), the shape being a spline.
         places: (B, N) m, X of each segment's boundary at Z = 0 less the offset.
         seen: what was observed.
+        phase: (B,) m, how far the first knot lies behind the camera, 0 to KNOT_SPACING; or None.
 
     Returns:
         Distances, zero where not valid, Jacobian, validity.
@@ -134,7 +146,7 @@ def boundary_residuals(params: Tensor, places: Tensor, seen: Observations) -> Re
     direction_by_pixel = rotation @ _ray_by_pixel(seen.intrinsics)  # (B, 3, 2)
     directions, valid = _on_road(rotation @ seen.rays, params)
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (B, M)
-    value, by_direction, _ = _implicit(directions, x_k, params)
+    value, by_direction, _ = _implicit(directions, x_k, params, phase)
     by_pixel = direction_by_pixel.mT @ by_direction  # (B, 2, M)
     slope = torch.hypot(*by_pixel.unbind(1))
     distance = value / slope
@@ -143,7 +155,7 @@ def boundary_residuals(params: Tensor, places: Tensor, seen: Observations) -> Re
     near = torch.maximum(torch.minimum(distance, reach), -reach) / slope
     foot, foot_valid = _on_road(directions - direction_by_pixel @ (near.unsqueeze(1) * by_pixel), params)
     foot = torch.where(foot_valid.unsqueeze(1), foot, directions)
-    _, by_foot, by_shape = _implicit(foot, x_k, params)
+    _, by_foot, by_shape = _implicit(foot, x_k, params, phase)
     turning = torch.linalg.cross(by_foot, foot, dim=1)  # ∂G/∂angle = by · (-axis × d) = axis · (by × d)
     jacobian = torch.cat([_axes(rotation, params[:, ROLL]) @ turning, by_shape], dim=1)
     both = valid.unflatten(-1, (-1, 2)).all(-1)
@@ -154,13 +166,16 @@ def boundary_residuals(params: Tensor, places: Tensor, seen: Observations) -> Re
     )
 
 
-def boundary_distances(params: Tensor, places: Tensor, seen: Observations) -> tuple[Tensor, Tensor]:
+def boundary_distances(
+    params: Tensor, places: Tensor, seen: Observations, phase: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """The distances alone, for several hypotheses of the places at once.
 
     Args:
-        params: (B, 7).
+        params: (B, P), as :func:`boundary_residuals`.
         places: (H, B, N) m.
         seen: what was observed.
+        phase: (B,) or None, likewise.
 
     Returns:
         (H, B, N, 2) px, zero where not valid, and (B, N) bool.
@@ -169,7 +184,7 @@ def boundary_distances(params: Tensor, places: Tensor, seen: Observations) -> tu
     direction_by_pixel = rotation @ _ray_by_pixel(seen.intrinsics)
     directions, valid = _on_road(rotation @ seen.rays, params)
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (H, B, M)
-    value, by_direction, _ = _implicit(directions, x_k, params)
+    value, by_direction, _ = _implicit(directions, x_k, params, phase)
     distance = value / torch.hypot(*(direction_by_pixel.mT @ by_direction).unbind(-2))
     both = valid.unflatten(-1, (-1, 2)).all(-1)
     return torch.where(both.unsqueeze(-1), distance.unflatten(-1, (-1, 2)), 0.0), both
@@ -199,16 +214,53 @@ def _on_road(directions: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([x, down, ahead], dim=1), on_road
 
 
-def _implicit(directions: Tensor, x_k: Tensor, params: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """G, its gradient by the direction (…, B, 3, M), and by (height, offset, c0, c1) (B, 4, M)."""
+def _implicit(
+    directions: Tensor, x_k: Tensor, params: Tensor, phase: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """G, its gradient by the direction (…, B, 3, M), and by height, offset and shape (B, 2 + K, M)."""
     x, down, ahead = directions.unbind(1)
-    height, _, c0, c1 = params[:, HEIGHT:, None].unbind(1)  # each (B, 1)
+    height, shape = params[:, HEIGHT, None], params[:, None, NUM_STRAIGHT:]  # (B, 1), (B, 1, K)
     z = height * ahead / down
-    heading = z * (c0 + 0.5 * c1 * z)
-    bend = z * z * (0.5 * c0 + c1 * z / 6)  # m, of the boundary from its tangent
-    out = x_k + bend
+    basis = _polynomial(z) if phase is None else _spline(z, phase)  # each (B, K, M)
+    bend, heading, curvature = ((shape @ part).squeeze(1) for part in basis)
+    tilt = x_k * heading
+    out = x_k + bend + 0.5 * tilt * heading
+    slope = heading + tilt * curvature
     value = height * x - out * down
-    across = torch.broadcast_tensors(height, z * heading - out, -height * heading)
-    area = -0.5 * down * z * z
-    by_shape = torch.stack([x - heading * ahead, -down, area, area * z / 3], dim=1)
-    return value, torch.stack(across, dim=-2), by_shape
+    across = torch.broadcast_tensors(height, z * slope - out, -height * slope)
+    if x_k.ndim > z.ndim:  # hypotheses: only the distance is asked for
+        return value, torch.stack(across, dim=-2), value
+    by_height, by_offset = x - slope * ahead, -down * (1 + 0.5 * heading * heading)
+    by_shape = -down.unsqueeze(1) * (basis[0] + tilt.unsqueeze(1) * basis[1])
+    by_rest = torch.cat([torch.stack([by_height, by_offset], dim=1), by_shape], dim=1)
+    return value, torch.stack(across, dim=-2), by_rest
+
+
+def _polynomial(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Bend, heading and curvature at (B, M) for unit c0 and unit c1, each (B, 2, M)."""
+    half = 0.5 * z * z
+    bend, heading = torch.stack([half, half * z / 3], 1), torch.stack([z, half], 1)
+    return bend, heading, torch.stack([torch.ones_like(z), z], 1)
+
+
+def _spline(z: Tensor, phase: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Bend, heading and curvature at (B, M) for a unit curvature and unit steps, each (B, 1 + NUM_STEPS, M).
+
+    A step rises from 0 at its knot to 1 at the next. Bend and heading are zero at Z = 0.
+    """
+    knots = KNOT_SPACING * torch.arange(NUM_STEPS, dtype=z.dtype, device=z.device) - phase.unsqueeze(-1)
+    past = z.unsqueeze(1) - knots.unsqueeze(-1)  # (B, NUM_STEPS, M)
+    rise = (past / KNOT_SPACING).clamp(0.0, 1.0)
+    beyond = (past - KNOT_SPACING).clamp(min=0.0)
+    heading = KNOT_SPACING * 0.5 * rise * rise + beyond
+    bend = KNOT_SPACING**2 / 6 * rise**3 + 0.5 * beyond * (beyond + KNOT_SPACING)
+    first = (phase / KNOT_SPACING)[:, None, None]  # what lies behind the camera, of the first step only
+    turned = 0.5 * KNOT_SPACING * first * first
+    behind = KNOT_SPACING**2 / 6 * first**3 + turned * z.unsqueeze(1)
+    head_bend, head_heading = bend[:, :1] - behind, heading[:, :1] - turned
+    one = z.unsqueeze(1)
+    return (
+        torch.cat([0.5 * one * one, head_bend, bend[:, 1:]], 1),
+        torch.cat([one, head_heading, heading[:, 1:]], 1),
+        torch.cat([torch.ones_like(one), rise], 1),
+    )

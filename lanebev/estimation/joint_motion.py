@@ -1,10 +1,14 @@
 """How the joint filter's state moves between frames, and what it is made of.
 
-The mean is [pitch, yaw, roll, height, offset, c0, c1 | rates of the first five | slow mean of the pose |
-deviation of each boundary from its place]: 16 + L numbers.
+The mean is [pitch, yaw, roll, height, offset | curvature at the first knot and its steps | rates of the
+first five | slow mean of the pose | speed | deviation of each boundary from its place].
 
 The pose swings about its slow mean as a critically damped spring driven by white noise: within a frame a
 constant-velocity model, over seconds of nothing a return to the mount's pose with a bounded sigma.
+
+The road does not change, it comes nearer: knots of its curvature stand in the world, and the camera passes
+them at a speed that is estimated too. What was seen far ahead so holds when it is near, and new is only
+the step that comes into view.
 """
 
 from __future__ import annotations
@@ -16,12 +20,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint_model import CURVATURE, CURVATURE_RATE, NUM_PARAMS, OFFSET
+from lanebev.estimation import kalman
+from lanebev.estimation.joint_model import CURVATURE, KNOT_SPACING, NUM_STEPS, NUM_STRAIGHT, OFFSET
 
 NUM_POSE = 4
-RATES = slice(NUM_PARAMS, NUM_PARAMS + 5)
-MEANS = slice(NUM_PARAMS + 5, NUM_PARAMS + 9)
-NUM_COMMON = NUM_PARAMS + 9  # then follow the L deviations
+NUM_SEEN = NUM_STRAIGHT + 1 + NUM_STEPS  # what a frame observes, the deviations apart
+STEPS = slice(CURVATURE + 1, NUM_SEEN)
+SHAPE = slice(CURVATURE, NUM_SEEN)
+RATES = slice(NUM_SEEN, NUM_SEEN + 5)
+MEANS = slice(NUM_SEEN + 5, NUM_SEEN + 9)
+SPEED = NUM_SEEN + 9
+NUM_COMMON = NUM_SEEN + 10  # then follow the L deviations
 
 
 @dataclass(frozen=True)
@@ -36,10 +45,10 @@ class MotionConfig:
         mean_height_walk: m/√s.
         offset_density: of the lateral acceleration, m²/s³.
         offset_memory: s, of the lateral velocity.
-        curvature_walk: 1/m/√s, of c0 while nothing speaks for a bend.
-        curvature_rate_walk: 1/m²/√s, of c1 likewise.
-        curvature_memory: s, decay of c1.
-        speed: m/s assumed, for c0 to follow c1.
+        curvature_walk: 1/m/√s, of every knot.
+        curvature_step: 1/m, sigma of a step that comes into view.
+        speed, speed_std: m/s, before anything is known.
+        speed_memory: s, over which it is forgotten.
         deviation_memory: s, decay of a boundary's deviation.
         deviation_walk: m/√s, while nothing speaks for unequal lanes.
     """
@@ -51,16 +60,17 @@ class MotionConfig:
     mean_height_walk: float = 1e-3
     offset_density: float = 0.2
     offset_memory: float = 2.0
-    curvature_walk: float = 1e-5
-    curvature_rate_walk: float = 1e-7
-    curvature_memory: float = 4.0
+    curvature_walk: float = 2e-6
+    curvature_step: float = 2e-4
     speed: float = 20.0
+    speed_std: float = 8.0
+    speed_memory: float = 30.0
     deviation_memory: float = 20.0
     deviation_walk: float = 1e-4
 
 
 def motion(dt: Tensor, num_boundaries: int, cfg: MotionConfig) -> tuple[Tensor, Tensor]:
-    """Transition and process noise over dt.
+    """Transition and process noise over dt, the road's coming nearer apart (:func:`come_nearer`).
 
     Args:
         dt: (B,) s, >= 0.
@@ -68,15 +78,14 @@ def motion(dt: Tensor, num_boundaries: int, cfg: MotionConfig) -> tuple[Tensor, 
         cfg: the numbers.
 
     Returns:
-        (B, D, D) F and (B, D, D) W, D = 16 + L.
+        (B, D, D) F and (B, D, D) W, D = NUM_COMMON + L.
     """
     swing, drive = spring(dt, cfg.spring)  # (B, 4) each
     slide, push = _damped(dt, cfg.offset_memory)
-    fade = (-dt / cfg.curvature_memory).exp()
-    follow = cfg.speed * cfg.curvature_memory * (1 - fade)
+    fade = (-dt / cfg.speed_memory).exp()
     settle = (-dt / cfg.deviation_memory).exp()
-    still = torch.stack([torch.ones_like(dt), fade, follow, settle], dim=-1)
-    moves = torch.cat([swing, 1 - swing[:, :1], -swing[:, 2:3], slide, still], dim=-1)  # (B, 14)
+    still = torch.stack([torch.ones_like(dt), fade, settle], dim=-1)
+    moves = torch.cat([swing, 1 - swing[:, :1], -swing[:, 2:3], slide, still], dim=-1)  # (B, 13)
     shakes = torch.cat([drive, push, dt.unsqueeze(-1)], dim=-1)  # (B, 9)
     on_moves, on_shakes = _patterns(num_boundaries, cfg)
     transition = torch.einsum("bk,kij->bij", moves, torch.as_tensor(on_moves).to(dt))
@@ -85,9 +94,9 @@ def motion(dt: Tensor, num_boundaries: int, cfg: MotionConfig) -> tuple[Tensor, 
 
 @lru_cache(maxsize=16)
 def _patterns(num_boundaries: int, cfg: MotionConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Where each of the 14 numbers of F and the 9 of W go, (14, D, D) and (9, D, D)."""
+    """Where each of the 13 numbers of F and the 9 of W go, (13, D, D) and (9, D, D)."""
     size = NUM_COMMON + num_boundaries
-    moves, shakes = np.zeros((14, size, size)), np.zeros((9, size, size))
+    moves, shakes = np.zeros((13, size, size)), np.zeros((9, size, size))
     density = [cfg.angular_density] * 3 + [cfg.height_density]
     walk = [cfg.mean_angle_walk] * 3 + [cfg.mean_height_walk]
     for x in range(NUM_POSE):
@@ -101,14 +110,55 @@ def _patterns(num_boundaries: int, cfg: MotionConfig) -> tuple[np.ndarray, np.nd
     for k, (row, column) in enumerate(((OFFSET, OFFSET), (OFFSET, rate), (rate, OFFSET), (rate, rate))):
         moves[6 + k, row, column] = 1
         shakes[4 + k, row, column] = cfg.offset_density
-    moves[10, CURVATURE, CURVATURE] = moves[11, CURVATURE_RATE, CURVATURE_RATE] = 1
-    moves[12, CURVATURE, CURVATURE_RATE] = 1
-    shakes[8, CURVATURE, CURVATURE] = cfg.curvature_walk**2
-    shakes[8, CURVATURE_RATE, CURVATURE_RATE] = cfg.curvature_rate_walk**2
+    for knot in range(CURVATURE, NUM_SEEN):
+        moves[10, knot, knot] = 1
+        shakes[8, knot, knot] = cfg.curvature_walk**2
+    moves[11, SPEED, SPEED] = 1
+    shakes[8, SPEED, SPEED] = 2 * cfg.speed_std**2 / cfg.speed_memory
     for own in range(NUM_COMMON, size):
-        moves[13, own, own] = 1
+        moves[12, own, own] = 1
         shakes[8, own, own] = cfg.deviation_walk**2
     return moves, shakes
+
+
+def come_nearer(
+    mean: Tensor, cov: Tensor, phase: Tensor, dt: Tensor, cfg: MotionConfig
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The camera passes knots: shape parameters move up, and new steps come into view.
+
+    Args:
+        mean: (B, D) with the speed about its prior.
+        cov: (B, D, D).
+        phase: (B,) m, how far the first knot lies behind the camera.
+        dt: (B,) s.
+        cfg: the numbers.
+
+    Returns:
+        mean, covariance and phase after it.
+    """
+    gone = phase + dt * (cfg.speed + mean[:, SPEED]).clamp(min=0.0)
+    passed = (gone / KNOT_SPACING).floor()  # (B,) knots
+    order = torch.arange(NUM_STEPS, dtype=mean.dtype, device=mean.device)
+    shift = (order[:, None] + passed[:, None, None] == order).to(mean)  # (B, NUM_STEPS, NUM_STEPS)
+    left = (order < passed.unsqueeze(-1)).to(mean).unsqueeze(1)  # (B, 1, NUM_STEPS)
+    first = torch.cat([torch.ones_like(left[..., :1]), left], dim=-1)
+    moved = torch.cat([first, torch.cat([torch.zeros_like(shift[..., :1]), shift], dim=-1)], dim=1)
+
+    steps = mean[:, STEPS]
+    slope = torch.cat([steps[:, :1], 0.5 * (steps[:, 1:] + steps[:, :-1]), 0.5 * steps[:, -1:]], -1)
+    change = torch.cat([slope[:, :1], slope[:, 1:] - slope[:, :-1]], -1) / KNOT_SPACING
+    by_speed = dt.unsqueeze(-1) * (moved @ change.unsqueeze(-1)).squeeze(-1)  # (B, 1 + NUM_STEPS)
+
+    transition = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device).repeat(len(dt), 1, 1)
+    transition[:, SHAPE, SHAPE] = moved
+    transition[:, SHAPE, SPEED] = by_speed
+    fresh = (order + passed.unsqueeze(-1) >= NUM_STEPS).to(mean) * cfg.curvature_step**2
+    noise = torch.zeros_like(mean)
+    noise[:, STEPS] = fresh
+    moved_mean = mean.clone()
+    moved_mean[:, SHAPE] = (moved @ mean[:, SHAPE].unsqueeze(-1)).squeeze(-1)
+    cov = kalman.symmetrise(transition @ cov @ transition.mT) + noise.diag_embed()
+    return moved_mean, cov, gone - passed * KNOT_SPACING
 
 
 def spring(dt: Tensor, rate: float) -> tuple[Tensor, Tensor]:

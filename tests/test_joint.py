@@ -1,0 +1,324 @@
+"""The joint calibrator: interface, life cycle, gradients, rows, precision, export."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from lanebev.estimation.joint import JointCalibrator, JointConfig, Reason
+from lanebev.estimation.joint_filter import iterate
+from lanebev.estimation.joint_model import (
+    KNOT_SPACING,
+    NUM_STEPS,
+    boundary_places,
+    boundary_residuals,
+    observe,
+)
+from lanebev.estimation.joint_motion import (
+    NUM_COMMON,
+    NUM_SEEN,
+    SHAPE,
+    SPEED,
+    STEPS,
+    MotionConfig,
+    come_nearer,
+    motion,
+    spring,
+)
+from lanebev.types import LaneSegments, Status
+from tools.scenarios import CAMERA, FPS, WIDTH, moments
+from tools.scenarios import observe as see
+
+torch.set_num_threads(1)
+DOUBLE = torch.float64
+
+
+def drive(frames: int, rows: int = 2, per_boundary: int = 8, sigma: float = 1.0, seed: int = 0):
+    return list(see(moments(frames / FPS), rows, sigma, per_boundary, seed, DOUBLE))
+
+
+def cameras(rows: int):
+    return CAMERA.expand(rows, 3, 3)
+
+
+def run(calibrator, frames, state=None, dt=1 / FPS):
+    rows = frames[0][1].boundary.shape[0]
+    state = calibrator.initial_state(rows, dtype=DOUBLE) if state is None else state
+    for _, segments in frames:
+        out, state = calibrator(segments, cameras(rows), state, dt, WIDTH)
+    return out, state
+
+
+def nothing(segments: LaneSegments) -> LaneSegments:
+    return segments._replace(weight=torch.zeros_like(segments.weight))
+
+
+def test_first_frame_is_enough_and_the_interface_is_that_of_all_calibrators():
+    frames = drive(1, rows=3)
+    calibrator = JointCalibrator()
+    before = calibrator.initial_state(3, dtype=DOUBLE)
+    assert (before.status == Status.UNINITIALISED).all()
+    out, state = run(calibrator, frames)
+    truth = torch.tensor(frames[0][0].pose, dtype=DOUBLE)
+    assert (out.status == Status.TRACKING).all()
+    assert (state.reasons & Reason.RESTARTED).all()
+    assert out.covariance.shape == (3, 4, 4)
+    assert out.inliers.shape == frames[0][1].boundary.shape
+    assert (out.extrinsics.stack() - truth).abs().max() < 0.02
+
+
+def test_life_cycle_with_reasons():
+    calibrator = JointCalibrator(lost_after=1.0)
+    frames = drive(56)
+    _, state = run(calibrator, frames[:10])
+    empty = nothing(frames[0][1])
+    out, state = calibrator(empty, cameras(2), state, 1 / FPS, WIDTH)
+    assert (out.status == Status.COASTING).all()
+    assert (state.reasons & Reason.NO_SEGMENTS).all()
+    early = out.covariance[0].diagonal()
+    for _ in range(8):
+        out, state = calibrator(empty, cameras(2), state, 0.15, WIDTH)
+    assert (out.status == Status.LOST).all()
+    assert (out.covariance[0].diagonal() > early).all()
+    out, state = run(calibrator, frames[51:52], state)
+    assert (out.status == Status.TRACKING).all()
+    assert (state.reasons & Reason.RESTARTED).all()
+    out, state = run(calibrator, frames[52:56], state)
+    truth = torch.tensor(frames[55][0].pose, dtype=DOUBLE)
+    error = out.extrinsics.stack() - truth
+    assert (error.abs() < 5 * out.covariance.diagonal(dim1=1, dim2=2).sqrt()).all()
+
+
+def test_one_lane_and_one_boundary_say_what_is_unseen():
+    calibrator = JointCalibrator()
+    frames = drive(12)
+    _, state = run(calibrator, frames[:10])
+    for boundaries, reasons in (
+        ((2, 3), Reason.ROLL_UNSEEN),
+        ((2,), Reason.ROLL_UNSEEN | Reason.HEIGHT_UNSEEN),
+    ):
+        segments = frames[10][1]
+        there = torch.zeros_like(segments.weight)
+        for boundary in boundaries:
+            there = there + (segments.boundary == boundary)
+        _, after = calibrator(segments._replace(weight=there), cameras(2), state, 1 / FPS, WIDTH)
+        assert (after.reasons & reasons == reasons).all()
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.01])
+def test_duplicate_and_late_frames_change_nothing_and_keep_their_time(dt):
+    calibrator = JointCalibrator()
+    frames = drive(12)
+    before, state = run(calibrator, frames[:10])
+    out, skipped = calibrator(frames[3][1], cameras(2), state, dt, WIDTH)
+    assert torch.equal(out.extrinsics.stack(), before.extrinsics.stack())
+    assert (skipped.reasons & Reason.TIME).all()
+    torch.testing.assert_close(skipped.early, torch.full((2,), -dt, dtype=DOUBLE))
+    direct, _ = calibrator(frames[10][1], cameras(2), state, 1 / FPS, WIDTH)
+    after, state = calibrator(frames[10][1], cameras(2), skipped, 1 / FPS - dt, WIDTH)
+    torch.testing.assert_close(after.extrinsics.stack(), direct.extrinsics.stack())
+    assert (state.early == 0).all()
+
+
+def test_time_that_is_not_known_is_guessed():
+    calibrator = JointCalibrator()
+    frames = drive(11)
+    _, state = run(calibrator, frames[:10])
+    expected, _ = calibrator(frames[10][1], cameras(2), state, 1 / 30, WIDTH)
+    for dt in (math.nan, math.inf, -1e9):
+        found, after = calibrator(frames[10][1], cameras(2), state, dt, WIDTH)
+        torch.testing.assert_close(found.extrinsics.stack(), expected.extrinsics.stack())
+        assert (after.reasons & Reason.TIME).all()
+
+
+def test_row_alone_equals_row_in_batch_beside_degenerate_rows():
+    frames = drive(8, rows=3)
+    calibrator = JointCalibrator()
+    state, alone = calibrator.initial_state(3, dtype=DOUBLE), calibrator.initial_state(1, dtype=DOUBLE)
+    for _, segments in frames:
+        ends = segments.endpoints.clone()
+        ends[0] = math.nan
+        weight = segments.weight.clone()
+        weight[1] = 0
+        mixed = segments._replace(endpoints=ends, weight=weight)
+        out, state = calibrator(mixed, cameras(3), state, 1 / FPS, WIDTH)
+        single = LaneSegments(*(part[2:] for part in mixed))
+        one, alone = calibrator(single, cameras(1), alone, 1 / FPS, WIDTH)
+    torch.testing.assert_close(one.extrinsics.stack()[0], out.extrinsics.stack()[2], rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(one.covariance[0], out.covariance[2], rtol=1e-7, atol=1e-15)
+    assert all(part.isfinite().all() for part in (*out.extrinsics, out.covariance))
+    assert (out.status[:2] == Status.UNINITIALISED).all()
+
+
+def test_order_of_segments_and_of_end_points_does_not_matter():
+    frames = drive(5)
+    mixed = []
+    for moment, segments in frames:
+        order = torch.randperm(segments.boundary.shape[1], generator=torch.Generator().manual_seed(1))
+        swapped = LaneSegments(*(part[:, order] for part in segments))
+        mixed.append((moment, swapped._replace(endpoints=swapped.endpoints.flip(2))))
+    one, _ = run(JointCalibrator(), frames)
+    other, _ = run(JointCalibrator(), mixed)
+    torch.testing.assert_close(one.extrinsics.stack(), other.extrinsics.stack(), rtol=1e-8, atol=1e-9)
+
+
+def test_spline_jacobian_equals_jacfwd():
+    generator = torch.Generator().manual_seed(0)
+    moment, segments = drive(1, sigma=0.3)[0]
+    seen = observe(segments, cameras(2), 6)
+    places = boundary_places(WIDTH, 6, seen.sigma).gather(1, seen.boundary)
+    params = torch.zeros(2, NUM_SEEN, dtype=DOUBLE)
+    params[:, :5] = torch.tensor([*moment.pose, moment.offset], dtype=DOUBLE)
+    params[:, SHAPE] = 1e-5 * torch.randn(2, 1 + NUM_STEPS, generator=generator, dtype=DOUBLE)
+    phase = torch.tensor([0.0, 7.3], dtype=DOUBLE)
+    found = boundary_residuals(params, places, seen, phase)
+    full = torch.func.jacfwd(lambda p: boundary_residuals(p, places, seen, phase).distance)(params)
+    expected = torch.stack([full[row, :, :, row] for row in range(2)]).flatten(1, 2)
+    # taken at the foot point, some tenths of a pixel away, where it is the total derivative
+    near = found.valid.repeat_interleave(2, dim=1) & (found.distance.flatten(1).abs() < 1.0)
+    gap = (found.jacobian.mT - expected) / expected.abs().amax(1, keepdim=True)
+    assert near.sum() > 100
+    assert gap[near].abs().max() < 0.01
+
+
+def test_road_comes_nearer_by_the_way_that_was_driven():
+    """A clothoid seen ahead is the same clothoid after 23 m, of which the knots passed two."""
+    rate, size = 4e-5, NUM_COMMON + 6
+    mean = torch.zeros(1, size, dtype=DOUBLE)
+    mean[:, SHAPE.start] = 1e-3
+    mean[:, STEPS] = rate * KNOT_SPACING
+    cov = torch.eye(size, dtype=DOUBLE)[None] * 1e-10
+    cov[:, SPEED, SPEED] = 64.0
+    cfg = MotionConfig(speed=20.0)
+    after, spread, phase = come_nearer(
+        mean, cov, torch.zeros(1, dtype=DOUBLE), torch.tensor([1.15], dtype=DOUBLE), cfg
+    )
+    assert phase.item() == pytest.approx(3.0)
+    assert after[0, SHAPE.start].item() == pytest.approx(1e-3 + 20 * rate)
+    steps = after[0, STEPS] / KNOT_SPACING
+    torch.testing.assert_close(steps, torch.tensor([rate] * (NUM_STEPS - 2) + [0.0, 0.0], dtype=DOUBLE))
+    # an unknown speed is an unknown curvature on a clothoid, here 8 m/s · 1.15 s · rate
+    assert spread[0, SHAPE.start, SHAPE.start].sqrt().item() == pytest.approx(8 * 1.15 * rate, rel=0.01)
+    torch.testing.assert_close(spread, spread.mT)
+
+
+def test_spring_is_constant_velocity_when_soft_and_halves_join():
+    dt = torch.tensor([0.02, 0.5], dtype=DOUBLE)
+    move, noise = (part.view(2, 2, 2) for part in spring(dt, 2.2))
+    half, half_noise = (part.view(2, 2, 2) for part in spring(dt / 2, 2.2))
+    torch.testing.assert_close(half @ half, move)
+    torch.testing.assert_close(half @ half_noise @ half.mT + half_noise, noise, rtol=1e-3, atol=1e-9)
+    soft, soft_noise = (part.view(2, 2, 2) for part in spring(dt, 1e-6))
+    torch.testing.assert_close(soft[:, 0, 1], dt, rtol=1e-5, atol=0)
+    torch.testing.assert_close(soft_noise[:, 0, 0], dt**3 / 3, rtol=1e-5, atol=0)
+
+
+def test_minutes_of_nothing_keep_the_covariance_positive_and_bounded():
+    cfg = MotionConfig()
+    calibrator = JointCalibrator()
+    state = calibrator.initial_state(1, dtype=DOUBLE)
+    mean, cov, phase = state.mean, state.cov, state.phase
+    dt = torch.ones(1, dtype=DOUBLE)
+    for _ in range(300):
+        mean, cov, phase = come_nearer(mean, cov, phase, dt, cfg)
+        transition, noise = motion(dt, 6, cfg)
+        mean, cov = (transition @ mean.unsqueeze(-1)).squeeze(-1), transition @ cov @ transition.mT + noise
+    size = cov.diagonal(dim1=1, dim2=2).rsqrt()
+    assert torch.linalg.eigvalsh(size.unsqueeze(-1) * cov * size.unsqueeze(-2)).min() > 0
+    assert cov[0, :3].diagonal().sqrt().max() < 0.3  # the pose stays about its mean
+
+
+def test_update_equals_a_plain_gauss_newton_on_all_data():
+    """One linear step against stacked least squares with the prior as rows."""
+    frames = drive(6)
+    calibrator = JointCalibrator()
+    _, state = run(calibrator, frames[:5])
+    seen = observe(frames[5][1], cameras(2), 6)
+    places = boundary_places(WIDTH, 6, seen.sigma).gather(1, seen.boundary)
+    scale = torch.ones(2, dtype=DOUBLE)
+    update = iterate(state.mean, state.cov, state.mean, scale, places, seen, state.phase, 1)
+    at = boundary_residuals(
+        state.mean[:, :NUM_SEEN],
+        places + state.mean[:, NUM_COMMON:].gather(1, seen.boundary),
+        seen,
+        state.phase,
+    )
+    for row in range(2):
+        jacobian = torch.zeros(at.jacobian.shape[-1], state.mean.shape[1], dtype=DOUBLE)
+        jacobian[:, :NUM_SEEN] = at.jacobian[row].mT
+        boundary = seen.boundary[row].repeat_interleave(2)
+        jacobian[torch.arange(len(boundary)), NUM_COMMON + boundary] = at.jacobian[row, 4]
+        weight = (update.trust[row] * seen.weight[row] / seen.sigma[row] ** 2).repeat_interleave(2).sqrt()
+        root = torch.linalg.inv(torch.linalg.cholesky(state.cov[row]))
+        rows = torch.cat([jacobian * weight.unsqueeze(-1), root])
+        right = torch.cat([-at.distance[row].flatten() * weight, torch.zeros(len(root), dtype=DOUBLE)])
+        step = torch.linalg.lstsq(rows, right.unsqueeze(-1)).solution.squeeze(-1)
+        scaled = (update.mean[row] - state.mean[row] - step) / state.cov[row].diagonal().sqrt()
+        assert scaled.abs().max() < 1e-6
+
+
+def test_gradient_flows_from_the_pose_to_the_end_points():
+    frames = drive(3, rows=1)
+    calibrator = JointCalibrator()
+    _, state = run(calibrator, frames[:2])
+    ends = frames[2][1].endpoints.clone().requires_grad_()
+
+    def pitch_of(points):
+        out, _ = calibrator(frames[2][1]._replace(endpoints=points), cameras(1), state, 1 / FPS, WIDTH)
+        return out.extrinsics.pitch.sum()
+
+    (slope,) = torch.autograd.grad(pitch_of(ends), ends)
+    assert slope.isfinite().all()
+    direction = torch.randn(ends.shape, generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
+    step = 1e-5
+    with torch.no_grad():
+        numeric = (pitch_of(ends + step * direction) - pitch_of(ends - step * direction)) / (2 * step)
+    assert (slope * direction).sum().item() == pytest.approx(numeric.item(), rel=1e-4)
+
+
+def test_float32_follows_float64_within_a_hundredth_of_a_sigma():
+    frames = drive(30, rows=4)
+    calibrator = JointCalibrator()
+    low, high = calibrator.initial_state(4), calibrator.initial_state(4, dtype=DOUBLE)
+    apart = []
+    for _, segments in frames:
+        single = LaneSegments(*(part.float() if part.is_floating_point() else part for part in segments))
+        one, low = calibrator(single, cameras(4).float(), low, 1 / FPS, WIDTH)
+        same = LaneSegments(*(part.double() if part.is_floating_point() else part for part in single))
+        two, high = calibrator(same, cameras(4), high, 1 / FPS, WIDTH)
+        std = two.covariance.diagonal(dim1=1, dim2=2).sqrt()
+        apart.append((one.extrinsics.stack().double() - two.extrinsics.stack()) / std)
+    assert torch.stack(apart).square().mean((0, 1)).sqrt().max() < 0.01
+
+
+def test_exports_and_equals_eager():
+    frames = drive(4)
+    calibrator = JointCalibrator()
+    _, state = run(calibrator, frames[:3])
+    dt = torch.full((2,), 1 / FPS, dtype=DOUBLE)
+    arguments = (frames[3][1], cameras(2), state, dt)
+    exported = torch.export.export(calibrator, arguments).module()
+    expected, after = calibrator(*arguments)
+    found, after_exported = exported(*arguments)
+    torch.testing.assert_close(found.extrinsics.stack(), expected.extrinsics.stack())
+    torch.testing.assert_close(after_exported.cov, after.cov)
+
+
+def test_bad_input_is_named():
+    with pytest.raises(ValueError, match="num_boundaries: expected an even number"):
+        JointCalibrator(num_boundaries=5)
+    with pytest.raises(ValueError, match="iterations: expected at least 1"):
+        JointCalibrator(iterations=0)
+    with pytest.raises(ValueError, match="config: expected either"):
+        JointCalibrator(JointConfig(), iterations=1)
+    calibrator = JointCalibrator()
+    _, segments = drive(1)[0]
+    state = calibrator.initial_state(2, dtype=DOUBLE)
+    with pytest.raises(ValueError, match=r"intrinsics: expected \(2, 3, 3\)"):
+        calibrator(segments, CAMERA, state, 0.1)
+    with pytest.raises(ValueError, match="lane_width: expected a positive width"):
+        calibrator(segments, cameras(2), state, 0.1, -1.0)
+    with pytest.raises(ValueError, match="dt: expected a float"):
+        calibrator(segments, cameras(2), state, torch.ones(3), WIDTH)
