@@ -22,7 +22,7 @@ from lanebev.render import Drive, RenderedFrame
 from lanebev.run import RunConfig, run, summary
 from lanebev.types import Calibration, Extrinsics, Status
 
-SEED, FRAMES, FPS, IMAGE_SIZE = 12, 200, 20, (360, 640)
+SEED, FRAMES, FPS, IMAGE_SIZE = 10, 200, 20, (360, 640)
 _RENDERED_CRF = 16  # nearly as rendered
 
 ProgressOf = Callable[[str], Callable[[Any, int], Any]]

@@ -284,6 +284,10 @@ def test_a_networks_segments_go_through_the_file_bit_for_bit(tmp_path, seed):
     np.testing.assert_array_equal(again.sigma, first.sigma)
     for a, b in zip(segments_from_rows([first], CAMERA), segments_from_rows([again], CAMERA), strict=True):
         assert torch.equal(a, b)
+    told = segments_from_rows([again], CAMERA)
+    for index in range(6):
+        said, mine = first.sigma[index], told.sigma[(told.boundary == index) & (told.weight > 0)].numpy()
+        assert np.nanmin(said) <= mine.min() < mine.max() <= np.nanmax(said)
     information = (2 * weight / sigma.square()).reshape(6, 16)[2:4].sum(-1)
     kept = np.nansum(1 / first.sigma[2:4] ** 2, axis=-1)
     assert (kept < 1.1 * information.numpy()).all()

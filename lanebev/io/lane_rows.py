@@ -147,12 +147,11 @@ def segments_from_rows(
             weight[row, index, : len(pairs)] = 1.0
             noise[row, index, : len(pairs)] = np.sqrt((pairs[..., 2] ** 2).mean(-1))
     boundary = torch.arange(num_boundaries).repeat_interleave(per_boundary).repeat(len(frames), 1)
-    weights = torch.from_numpy(weight).flatten(1).to(dtype)
     return LaneSegments(
         torch.from_numpy(endpoints).flatten(1, 2).to(dtype),
         boundary,
-        weights,
-        torch.full_like(weights, sigma),
+        torch.from_numpy(weight).flatten(1).to(dtype),
+        torch.from_numpy(noise).flatten(1).to(dtype),
     )
 
 
