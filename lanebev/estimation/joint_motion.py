@@ -53,15 +53,15 @@ class MotionConfig:
         deviation_walk: m/√s, while nothing speaks for unequal lanes.
     """
 
-    angular_density: float = 0.08
-    height_density: float = 0.15
-    spring: float = 2.2
+    angular_density: float = 0.04
+    height_density: float = 0.08
+    spring: float = 1.8
     mean_angle_walk: float = 5e-4
     mean_height_walk: float = 1e-3
     offset_density: float = 0.2
     offset_memory: float = 2.0
     curvature_walk: float = 2e-6
-    curvature_step: float = 2e-4
+    curvature_step: float = 1e-4
     speed: float = 20.0
     speed_std: float = 8.0
     speed_memory: float = 30.0

@@ -1,0 +1,63 @@
+"""The bench tool runs, and its figures mean what they say."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from tools.bench_calibration import Track, main, recovery, smallest_eigenvalue, stream, summarise
+
+
+def test_quick_bench_writes_json_and_a_table(tmp_path):
+    report = main(["--quick", "--calibrators", "joint", "two-stage", "--out", str(tmp_path)])
+    written = json.loads((tmp_path / "bench.json").read_text())
+    assert written["scenarios"].keys() == report["scenarios"].keys() == {"straight", "straight 5-40 m"}
+    for figures in written["scenarios"].values():
+        assert set(figures) == {"joint", "two-stage"}
+        assert all(0 < value < 1 for value in figures["joint"]["rmse"])
+        assert figures["joint"]["time_in_status"]["TRACKING"] == 1.0
+    lines = (tmp_path / "bench.md").read_text().splitlines()
+    assert len(lines) == 2 + 4
+    assert len({line.count("|") for line in lines}) == 1
+    assert written["speed"]["joint"]["median_ms"] > 0
+
+
+def test_stream_reports_drift_memory_and_precision():
+    found = stream(60, rows=2)
+    assert found["rows_not_tracking"] == 0
+    assert found["smallest_eigenvalue_of_correlation"] > 0
+    assert max(found["float32_from_float64_sigmas"]) < 0.05
+    assert len(found["memory_mb"]) == 2
+
+
+def track(errors: list[float], hard: list[bool]) -> Track:
+    """One row, the same error in all four, unit variances and bounds."""
+    error = torch.tensor(errors, dtype=torch.float64)[:, None, None].expand(-1, 1, 4)
+    one = torch.ones_like(error)
+    status = torch.ones(len(errors), 1, dtype=torch.int64)
+    return Track(error, one, error.square().sum(-1), status, one, torch.tensor(hard))
+
+
+def test_figures_of_a_known_track():
+    errors = [9.0] * 15 + [1.0, 2.0, 3.0, 1.0]
+    run = track(errors, [False] * 16 + [True, True, False])
+    figures = summarise(run, torch.full((4,), 0.6, dtype=torch.float64))
+    assert figures["ratio_to_bound"] == pytest.approx([1.0] * 4)  # the first half second is left out
+    assert figures["nees_per_dof"] == pytest.approx(1.0)
+    assert figures["hard"]["largest"][3] == pytest.approx(300.0)  # cm
+    assert figures["hard"]["nees_per_dof"] == pytest.approx(6.5)
+    assert figures["recovery_s"] == 0.0
+
+
+def test_recovery_counts_from_the_end_of_the_hard_frames():
+    hard = [False, True, False, False, False]
+    usual = torch.ones(4, dtype=torch.float64)
+    assert recovery(track([0, 9, 5, 3, 1], hard), usual) == pytest.approx(2 / 30)
+    assert recovery(track([0, 9, 5, 3, 3], hard), usual) is None
+
+
+def test_smallest_eigenvalue_is_of_the_correlations():
+    cov = torch.tensor([[[1e-12, 5e-7], [5e-7, 1.0]]])
+    assert smallest_eigenvalue(cov) == pytest.approx(0.5, rel=1e-5)
