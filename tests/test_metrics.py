@@ -59,6 +59,8 @@ def test_tusimple_score_of_boundaries_on_other_rows():
     x = np.full((6, 12), np.nan)
     x[2, 5:] = 2 * rows[5:] + 3  # row 40 is missed: 7 of 8 agree
     assert tusimple_score(x, rows, FrameLines("a", [label])) == (0.875, 0.0, 0.0)
+    x[0] = x[5] = 0.0  # beyond the lanes beside the current one: not asked for
+    assert tusimple_score(x, rows, FrameLines("a", [label])) == (0.875, 0.0, 0.0)
     x[4] = 0.0
     assert tusimple_score(x, rows, FrameLines("a", [label])) == (0.875, 0.5, 0.0)
     assert tusimple_score(x, rows, FrameLines("a", [])) == (0.0, 1.0, 0.0)
