@@ -17,7 +17,7 @@ from train.end_to_end import EndToEnd
 from train.labels import ViewConfig
 from train.module import unpack
 from train.pool import read_shard, write_shard
-from train.poses import PoseBatch, PoseBatches, fit_poses, pool_frames, pose_loss
+from train.poses import EvenGradients, PoseBatch, PoseBatches, fit_poses, pool_frames, pose_loss
 
 SIZE = (144, 256)
 
@@ -100,6 +100,14 @@ def test_gradient_of_the_pose_lowers_its_error(batch):
         ).detach()
         logits.requires_grad_()
     assert losses[-1] < 0.9 * losses[0]
+
+
+def test_even_gradients_are_no_longer_than_the_median():
+    x = torch.zeros(4, 2, requires_grad=True)
+    slope = torch.tensor([[3.0, 4], [0, 1], [300, 400], [float("nan"), 1]])
+    (EvenGradients.apply(x) * slope).sum().backward()
+    # lengths 5, 1, 500 and none: the (lower) median is 1
+    torch.testing.assert_close(x.grad, torch.tensor([[0.6, 0.8], [0, 1], [0.6, 0.8], [0, 0]]))
 
 
 def test_empty_maps_train_on_finite_gradients(batch):

@@ -122,7 +122,7 @@ def _local_mean(values: Tensor, weight: Tensor) -> Tensor:
     """Weighted mean over _NEIGHBOURS scans on either side, (..., h); 0 where nothing has weight."""
     both = torch.stack([values * weight, weight]).flatten(0, -2)
     pooled: Tensor = F.avg_pool1d(both, 2 * _NEIGHBOURS + 1, 1, _NEIGHBOURS)
-    total, mass = pooled.view(2, *values.shape)
+    total, mass = pooled.view(2, *values.shape).unbind()
     return total / mass.clamp(min=1e-3)
 
 
