@@ -7,8 +7,10 @@ import torch
 from safetensors.torch import save_file
 
 from lanebev.estimation.joint import JointCalibrator, JointState
+from lanebev.estimation.mount import MountEstimator
 from lanebev.estimation.two_stage import TwoStageCalibrator
 from lanebev.io.state import load_state, save_state
+from tools.scenarios import CAMERA, FPS, moments, observe
 
 
 @pytest.fixture
@@ -95,3 +97,29 @@ def test_failed_write_keeps_the_old_file(tmp_path, states):
     assert load_state(path, like=states).metadata == {"frame": 1}
     with pytest.raises(OSError, match="No such file"):
         save_state(tmp_path / "nowhere" / "s", states)
+
+
+def test_resuming_gives_bit_for_bit_what_an_uninterrupted_run_gives(tmp_path):
+    calibrator, mount = JointCalibrator(), MountEstimator(block_time=0.1)
+    frames = list(observe(moments(0.5), 2, 1.0, 8, 0, torch.float32))
+    intrinsics = CAMERA.float().expand(2, 3, 3)
+
+    def run(frames, states):
+        for _, segments in frames:
+            fast, after = calibrator(segments, intrinsics, states["calibrator"], 1 / FPS)
+            slow, mounted = mount(fast, states["mount"], 1 / FPS, curvature=calibrator.curvature(after))
+            states = {"calibrator": after, "mount": mounted}
+        return fast, slow, states
+
+    fresh = {"calibrator": calibrator.initial_state(2), "mount": mount.initial_state(2)}
+    whole = run(frames, fresh)
+    _, _, half = run(frames[:7], fresh)
+    save_state(tmp_path / "s", half)
+    loaded = load_state(tmp_path / "s", like=fresh)
+    assert loaded.problem is None
+    parts = run(frames[7:], loaded.states)
+    assert torch.equal(parts[0].extrinsics.stack(), whole[0].extrinsics.stack())
+    assert torch.equal(parts[1].extrinsics.stack(), whole[1].extrinsics.stack())
+    for name in fresh:
+        for one, other in zip(parts[2][name], whole[2][name], strict=True):
+            assert torch.equal(one, other)

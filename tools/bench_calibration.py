@@ -55,7 +55,6 @@ class Track(NamedTuple):
         status: (T, R) int64.
         bounds: (T, R, 4) variances of the per-frame Cramér-Rao bound, inf where there is none.
         hard: (T,) bool, frames that the scenario names.
-        dt: (T,) s between frames as they were, not as the clock said.
     """
 
     errors: Tensor
@@ -315,6 +314,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--sigma", type=float, default=1.0, help="noise of an end point, px")
     parser.add_argument("--quick", action="store_true", help="2 rows, 1.5 s of the first two scenarios")
     parser.add_argument("--stream", type=int, metavar="N", help="stream N frames instead")
+    parser.add_argument("--stream-rows", type=int, default=2, help="vehicles streamed side by side")
     parser.add_argument("--out", type=Path, default=Path("out/bench"))
     args = parser.parse_args(arguments)
     names = [n for n in args.calibrators if n != "textbook EKF" or importlib.util.find_spec("filterpy")]
@@ -331,7 +331,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     }
     args.out.mkdir(parents=True, exist_ok=True)
     if args.stream:
-        report["stream"] = stream(args.stream, 2)
+        report["stream"] = stream(args.stream, args.stream_rows)
         print(json.dumps(report["stream"], indent=1))
         (args.out / "stream.json").write_text(json.dumps(report, indent=1))
         return report

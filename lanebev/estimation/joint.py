@@ -74,6 +74,7 @@ class JointConfig:
     Attributes:
         num_boundaries: L.
         iterations: Gauss-Newton steps a frame.
+        start_iterations: likewise of every start that is tried on a first frame.
         lane_width_std: relative sigma of the lane width prior, a common scale of height; 0: as given.
         motion: how the state moves.
         prior: where a start is searched, and what holds before it.
@@ -92,6 +93,7 @@ class JointConfig:
 
     num_boundaries: int = NUM_BOUNDARIES
     iterations: int = 2
+    start_iterations: int = 8
     lane_width_std: float = 0.0
     motion: MotionConfig = field(default_factory=MotionConfig)
     prior: FramePrior = field(default_factory=FramePrior)
@@ -112,8 +114,9 @@ class JointConfig:
     def __post_init__(self) -> None:
         if self.num_boundaries < 2 or self.num_boundaries % 2:
             raise ValueError(f"num_boundaries: expected an even number >= 2, got {self.num_boundaries}")
-        if self.iterations < 1:
-            raise ValueError(f"iterations: expected at least 1, got {self.iterations}")
+        if self.iterations < 1 or self.start_iterations < 1:
+            got = min(self.iterations, self.start_iterations)
+            raise ValueError(f"iterations: expected at least 1, got {got}")
 
 
 class JointState(NamedTuple):
@@ -225,6 +228,12 @@ class JointCalibrator(nn.Module):
         skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=early)
         after = JointState(*(_where(skip, old, new) for old, new in zip(skipped, after, strict=True)))
         return self._calibration(after, torch.where(seen.weight > 0, trust, 0.0)), after
+
+    def curvature(self, state: JointState) -> Tensor:
+        """Curvature of the road at the camera, (B,) 1/m, positive to the right."""
+        share = (state.phase / KNOT_SPACING).unsqueeze(-1)
+        first, steps = state.mean[:, CURVATURE], state.mean[:, STEPS]
+        return first + (share * steps)[:, 0]
 
     def _elapsed(self, dt: Tensor, state: JointState) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Time to predict over; whether to skip the frame; how far ahead the state then is; if guessed."""
@@ -348,10 +357,16 @@ class JointCalibrator(nn.Module):
         wanted = ~_running(state.status) | (~supported & (state.misfit > cfg.restart_after))
         if not torch.compiler.is_compiling() and not bool(wanted.any()):
             return state, trust  # the same result: every row would discard the search
-        fit = fit_single_frame(segments, intrinsics, lane_width, cfg.prior, cfg.num_boundaries)
-        share = (fit.inliers * segments.weight.nan_to_num()).sum(-1) / segments.weight.nan_to_num().sum(
-            -1
-        ).clamp(min=1e-6)
+        fit = fit_single_frame(
+            segments,
+            intrinsics,
+            lane_width,
+            cfg.prior,
+            cfg.num_boundaries,
+            iterations=cfg.start_iterations,
+        )
+        weight = segments.weight.nan_to_num()
+        share = (fit.inliers * weight).sum(-1) / weight.sum(-1).clamp(min=1e-6)
         fresh = wanted & fit.valid & (share >= cfg.enter_share)
         mean, cov = self._begin(fit.params(), fit.covariance)
         zero = torch.zeros_like(state.unseen)
