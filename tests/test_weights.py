@@ -1,0 +1,64 @@
+"""The shipped weights: what they say of themselves, and that they see a rendered road."""
+
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+import lanebev
+from lanebev.render import Drive, boundary_masks
+from lanebev.weights import SHIPPED, load_segmenter, read_metadata
+from train.metrics import point_recall
+
+
+@pytest.fixture(scope="module")
+def segmenter():
+    return load_segmenter()
+
+
+def test_shipped_weights_are_small_and_say_where_they_are_from():
+    assert SHIPPED.stat().st_size <= 30_000_000
+    record = read_metadata()
+    assert {"config", "training", "seed", "commit", "metrics"} <= set(record)
+    assert record["metrics"]
+    assert record["training"]["optimizer"] in ("sgd", "adamw")
+
+
+def test_shipped_network_is_the_papers_or_half_as_wide(segmenter):
+    assert segmenter.config.base_width in (32, 64)
+    assert segmenter.config.num_boundaries == lanebev.types.NUM_BOUNDARIES
+    assert not segmenter.training
+
+
+def test_from_pretrained_runs_at_the_size_it_was_trained_for(segmenter):
+    model = lanebev.LaneBEV.from_pretrained()
+    assert model.network_width == segmenter.image_size[1]
+    stride = segmenter.config.output_stride
+    logits, segments = model.observe(torch.rand(1, 3, 360, 640), torch.eye(3)[None] * 600)
+    assert logits.shape[-1] == segmenter.image_size[1] // stride
+    assert all(part.isfinite().all() for part in segments)
+
+
+def test_sees_the_ego_lane_of_rendered_drives(segmenter):
+    """Six clear drives, one frame each: most of both boundaries of the ego lane is found."""
+    height, width = segmenter.image_size
+    found, there = torch.zeros(6), torch.zeros(6)
+    for seed in range(91_000, 91_006):
+        frame = Drive(seed, (height, width), num_frames=1, weather="clear").frame(0)
+        with torch.inference_mode():
+            probabilities = segmenter(frame.image).softmax(1)[:, 1:]
+        truth = boundary_masks(frame, (height, width), 2.25)
+        target = F.interpolate(truth, probabilities.shape[-2:], mode="area")
+        hits, rows = point_recall(probabilities, target, tolerance=3.5)
+        found, there = found + hits[0], there + rows[0]
+    recall = found[2:4] / there[2:4]
+    assert there[2:4].min() > 200
+    assert recall.min() > 0.75
+
+
+def test_a_cut_file_is_one_clear_error(tmp_path):
+    cut = tmp_path / "cut.safetensors"
+    cut.write_bytes(Path(SHIPPED).read_bytes()[:100_000])
+    with pytest.raises(ValueError, match="expected a whole safetensors file"):
+        load_segmenter(cut)
