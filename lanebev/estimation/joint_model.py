@@ -155,9 +155,10 @@ def boundary_residuals(
     near = torch.maximum(torch.minimum(distance, reach), -reach) / slope
     foot, foot_valid = _on_road(directions - direction_by_pixel @ (near.unsqueeze(1) * by_pixel), params)
     foot = torch.where(foot_valid.unsqueeze(1), foot, directions)
-    _, by_foot, by_shape = _implicit(foot, x_k, params, phase)
+    _, by_foot, bend = _implicit(foot, x_k, params, phase)
     turning = torch.linalg.cross(by_foot, foot, dim=1)  # ∂G/∂angle = by · (-axis × d) = axis · (by × d)
-    jacobian = torch.cat([_axes(rotation, params[:, ROLL]) @ turning, by_shape], dim=1)
+    by_angles = _axes(rotation, params[:, ROLL]) @ turning
+    jacobian = torch.cat([by_angles, _by_shape(foot, bend)], dim=1)
     both = valid.unflatten(-1, (-1, 2)).all(-1)
     return Residuals(
         distance=torch.where(both.unsqueeze(-1), distance.unflatten(-1, (-1, 2)), 0.0),
@@ -214,26 +215,37 @@ def _on_road(directions: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([x, down, ahead], dim=1), on_road
 
 
+class _Bend(NamedTuple):
+    """Where directions meet the road, and what the bend does there."""
+
+    heading: Tensor  # (B, M)
+    tilt: Tensor  # (…, B, M) m, x_k times the heading
+    slope: Tensor  # (…, B, M) dX_k / dZ
+    basis: tuple[Tensor, Tensor, Tensor]  # (B, K, M) bend, heading, curvature by shape parameter
+
+
 def _implicit(
     directions: Tensor, x_k: Tensor, params: Tensor, phase: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """G, its gradient by the direction (…, B, 3, M), and by height, offset and shape (B, 2 + K, M)."""
+) -> tuple[Tensor, Tensor, _Bend]:
+    """G (…, B, M), its gradient by the direction (…, B, 3, M), and the bend for :func:`_by_shape`."""
     x, down, ahead = directions.unbind(1)
     height, shape = params[:, HEIGHT, None], params[:, None, NUM_STRAIGHT:]  # (B, 1), (B, 1, K)
     z = height * ahead / down
-    basis = _polynomial(z) if phase is None else _spline(z, phase)  # each (B, K, M)
+    basis = _polynomial(z) if phase is None else _spline(z, phase)
     bend, heading, curvature = ((shape @ part).squeeze(1) for part in basis)
     tilt = x_k * heading
     out = x_k + bend + 0.5 * tilt * heading
     slope = heading + tilt * curvature
-    value = height * x - out * down
     across = torch.broadcast_tensors(height, z * slope - out, -height * slope)
-    if x_k.ndim > z.ndim:  # hypotheses: only the distance is asked for
-        return value, torch.stack(across, dim=-2), value
-    by_height, by_offset = x - slope * ahead, -down * (1 + 0.5 * heading * heading)
-    by_shape = -down.unsqueeze(1) * (basis[0] + tilt.unsqueeze(1) * basis[1])
-    by_rest = torch.cat([torch.stack([by_height, by_offset], dim=1), by_shape], dim=1)
-    return value, torch.stack(across, dim=-2), by_rest
+    return height * x - out * down, torch.stack(across, dim=-2), _Bend(heading, tilt, slope, basis)
+
+
+def _by_shape(directions: Tensor, bend: _Bend) -> Tensor:
+    """Gradient of G by height, offset and shape, (B, 2 + K, M)."""
+    x, down, ahead = directions.unbind(1)
+    straight = torch.stack([x - bend.slope * ahead, -down * (1 + 0.5 * bend.heading * bend.heading)], dim=1)
+    shape = bend.basis[0] + bend.tilt.unsqueeze(1) * bend.basis[1]
+    return torch.cat([straight, -down.unsqueeze(1) * shape], dim=1)
 
 
 def _polynomial(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
