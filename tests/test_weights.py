@@ -25,8 +25,8 @@ def test_shipped_weights_are_small_and_say_where_they_are_from():
     assert record["training"]["optimizer"] in ("sgd", "adamw")
 
 
-def test_shipped_network_is_the_papers_or_half_as_wide(segmenter):
-    assert segmenter.config.base_width in (32, 64)
+def test_shipped_network_is_the_papers_resnet_18(segmenter):
+    assert segmenter.config.base_width == 64
     assert segmenter.config.num_boundaries == lanebev.types.NUM_BOUNDARIES
     assert not segmenter.training
 
