@@ -187,6 +187,27 @@ def test_one_lane_never_moves_roll_and_says_so():
     assert float(never[-1].covariance[0, 2, 2].sqrt()) == pytest.approx(0.05, rel=0.01)
 
 
+def test_garbage_never_runs_away_and_is_recovered_from():
+    generator = torch.Generator().manual_seed(3)
+    shape = lanes().weight.shape[1]
+    garbage = [
+        LaneSegments(
+            torch.rand(8, shape, 2, 2, generator=generator, dtype=torch.float64) * 700 + 10,
+            torch.randint(0, 6, (8, shape), generator=generator),
+            torch.ones(8, shape, dtype=torch.float64),
+            torch.ones(8, shape, dtype=torch.float64),
+        )
+        for _ in range(60)
+    ]
+    clean = LaneSegments(*(part.expand(8, *part.shape[1:]) for part in lanes()))
+    results, _ = drive(TwoStageCalibrator(), [clean, *garbage, *[clean] * 40])
+    poses = torch.stack([calibration.extrinsics.stack() for calibration in results])
+    assert poses.isfinite().all()
+    assert poses[..., 2].abs().max() < 0.8
+    assert (poses[..., 3] > 0.1).all()
+    torch.testing.assert_close(poses[-1], poses[0], atol=0.05, rtol=0.0)
+
+
 def test_gross_outliers_are_left_out():
     generator = torch.Generator().manual_seed(3)
     outputs = []

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from lanebev.estimation.two_stage import TwoStageConfig, TwoStageState
 
 
+LARGEST_ROLL = 0.8  # rad
+LEAST_HEIGHT, LARGEST_HEIGHT = 0.1, 20.0  # m
+
+
 class RollHeightStep(NamedTuple):
     """Stage 2 after a frame.
 
@@ -81,8 +85,13 @@ def track_roll_height(
     mean, cov = kalman.update(
         mean, cov, *kalman.information(white[..., -1], white[..., :-1], torch.ones_like(error))
     )
-    mean = torch.cat([mean[:, :1], mean[:, 1:2].clamp(0.1, 20.0), mean[:, 2:]], dim=-1)
-    return RollHeightStep(mean, cov, state.roll_known | roll_seen, state.height_known | height_seen)
+    # Nothing says that widths of wrong boundaries lead anywhere: what has run away starts over.
+    possible = (mean[:, 0].abs() < LARGEST_ROLL) & (mean[:, 1] > LEAST_HEIGHT) & (mean[:, 1] < LARGEST_HEIGHT)
+    prior = torch.cat([mean.new_tensor(cfg.initial_pose[2:]), mean.new_zeros(2)])
+    mean = torch.where(possible.unsqueeze(-1), mean, prior)
+    cov = torch.where(possible[:, None, None], cov, wide)
+    roll_known = (state.roll_known | roll_seen) & possible
+    return RollHeightStep(mean, cov, roll_known, (state.height_known | height_seen) & possible)
 
 
 def predict_roll_height(
