@@ -1,6 +1,7 @@
 """lanebev: how a camera looks at the road, frame by frame, from lane boundaries alone."""
 
 from lanebev.estimation.joint import JointCalibrator
+from lanebev.estimation.mount import MountEstimator
 from lanebev.estimation.two_stage import TwoStageCalibrator
 from lanebev.geometry.camera import Camera
 from lanebev.geometry.road import image_from_road_points, road_covariance, road_from_image_points
@@ -25,6 +26,7 @@ __all__ = [
     "LaneSegmenter",
     "LaneSegments",
     "LineExtractor",
+    "MountEstimator",
     "Status",
     "TwoStageCalibrator",
     "bev_from_image",
