@@ -83,11 +83,13 @@ class LaneBEV(nn.Module):
         """
         from lanebev.estimation.joint import JointCalibrator
         from lanebev.observation.lines import LineExtractor
+        from lanebev.observation.vertices import LineConfig
         from lanebev.weights import load_segmenter
 
         segmenter = load_segmenter(weights)
         width = network_width or int(segmenter.image_size[1])
-        return cls(segmenter, LineExtractor(), calibrator or JointCalibrator(), BEVWarp(grid), width)
+        extractor = LineExtractor(LineConfig(stride=segmenter.config.output_stride))
+        return cls(segmenter, extractor, calibrator or JointCalibrator(), BEVWarp(grid), width)
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None

@@ -1,5 +1,6 @@
 """The shipped weights: what they say of themselves, and that they see a rendered road."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -7,8 +8,9 @@ import torch
 import torch.nn.functional as F
 
 import lanebev
+from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.render import Drive, boundary_masks
-from lanebev.weights import SHIPPED, load_segmenter, read_metadata
+from lanebev.weights import SHIPPED, load_segmenter, read_metadata, save_segmenter
 from train.metrics import point_recall
 
 
@@ -23,6 +25,7 @@ def test_shipped_weights_are_small_and_say_where_they_are_from():
     assert {"config", "training", "seed", "commit", "metrics"} <= set(record)
     assert record["metrics"]
     assert record["training"]["optimizer"] in ("sgd", "adamw")
+    assert "/" not in json.dumps(record["training"])  # no path of the machine that trained
 
 
 def test_shipped_network_is_the_papers_resnet_18(segmenter):
@@ -38,6 +41,14 @@ def test_from_pretrained_runs_at_the_size_it_was_trained_for(segmenter):
     logits, segments = model.observe(torch.rand(1, 3, 360, 640), torch.eye(3)[None] * 600)
     assert logits.shape[-1] == segmenter.image_size[1] // stride
     assert all(part.isfinite().all() for part in segments)
+
+
+@pytest.mark.parametrize("stride", [1, 4])
+def test_from_pretrained_knows_the_networks_stride(tmp_path, stride):
+    config = SegmenterConfig(base_width=8, decoder_width=8, output_stride=stride, image_size=(64, 96))
+    save_segmenter(LaneSegmenter(config), tmp_path / "w.safetensors")
+    model = lanebev.LaneBEV.from_pretrained(tmp_path / "w.safetensors")
+    assert model.extractor.config.stride == stride
 
 
 def test_sees_the_ego_lane_of_rendered_drives(segmenter):

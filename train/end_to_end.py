@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.vertices import LineConfig
-from train.losses import boundary_cross_entropy, row_cross_entropy, unweighted_bias
+from train.losses import unweighted_bias
 from train.module import Segmentation, unpack
 from train.poses import PoseBatch, fit_poses, pose_loss
 
@@ -37,15 +37,7 @@ class EndToEnd(Segmentation):
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:  # type: ignore[override]
         """Augment, segment, compare maps and poses."""
-        image, target, weight = unpack(batch)
-        if self.photometric is not None:
-            with torch.no_grad():
-                image = self.photometric(image)
-        logits = self.segmenter(image.contiguous(memory_format=self.layout))
-        pixels = boundary_cross_entropy(logits, target, weight, self.class_weight)
-        rows = row_cross_entropy(logits, target, weight)
-        loss = pixels + self.settings["row_weight"] * rows
-        self.log_dict({"loss/pixels": pixels, "loss/rows": rows})
+        loss, logits = self.map_loss(batch)
         if self.settings["pose_weight"] > 0:
             fit = self._fit(logits + unweighted_bias(self.class_weight).view(1, -1, 1, 1), batch)
             pose = pose_loss(fit, batch.extrinsics.double(), self.unit)

@@ -88,7 +88,7 @@ def checkpoint_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
 def export(
     checkpoint: Path, out: Path, image_size: tuple[int, int] | None = None, **record: Any
 ) -> LaneSegmenter:
-    """Write a checkpoint's averaged weights as lanebev loads them.
+    """Write a checkpoint's averaged weights as lanebev loads them, with the settings they were trained with.
 
     Args:
         checkpoint: of Lightning.
@@ -99,7 +99,10 @@ def export(
     segmenter, settings = checkpoint_segmenter(checkpoint)
     if image_size is not None:
         segmenter.config = replace(segmenter.config, image_size=image_size)
-    save_segmenter(segmenter, out, training={k: v for k, v in settings.items() if k != "network"}, **record)
+    training = {name: value for name, value in settings.items() if name != "network"}
+    if training["init_from"] is not None:
+        training["init_from"] = Path(training["init_from"]).name  # its folder is nobody else's business
+    save_segmenter(segmenter, out, training=training, **record)
     return segmenter
 
 

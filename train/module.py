@@ -81,6 +81,10 @@ class Segmentation(L.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Augment, segment, compare."""
+        return self.map_loss(batch)[0]
+
+    def map_loss(self, batch: Any) -> tuple[Tensor, Tensor]:
+        """Loss of the maps, and the logits, class weights not undone, of an augmented batch."""
         image, target, weight = unpack(batch)
         if self.photometric is not None:
             with torch.no_grad():
@@ -89,7 +93,7 @@ class Segmentation(L.LightningModule):
         pixels = boundary_cross_entropy(logits, target, weight, self.class_weight)
         rows = row_cross_entropy(logits, target, weight)
         self.log_dict({"loss/pixels": pixels, "loss/rows": rows}, prog_bar=True)
-        return pixels + self.settings["row_weight"] * rows
+        return pixels + self.settings["row_weight"] * rows, logits
 
     def validation_step(self, batch: Batch | ScoredBatch, batch_idx: int) -> None:
         """Loss, and recall of each boundary's points."""

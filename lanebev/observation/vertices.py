@@ -215,9 +215,8 @@ def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
     share = share / mass.clamp(min=1e-6).unsqueeze(2)  # weights of a mean
     mean = torch.einsum("blvs,blvd->blsd", share, points)
     normal = vertices.normal
-    along = (mean.unsqueeze(2) - points.unsqueeze(3)) @ normal.unsqueeze(
-        -1
-    )  # (B, L, V, 2S, 1) px off tangents
+    away = mean.unsqueeze(2) - points.unsqueeze(3)  # (B, L, V, 2S, 2)
+    along = away @ normal.unsqueeze(-1)  # (B, L, V, 2S, 1) px off tangents
     mean = mean - 0.5 * torch.einsum("blvs,blvd->blsd", share * along.squeeze(-1), normal)
     common = torch.einsum("blvs,blv->bls", share, vertices.common_var)
     own = torch.einsum("blvs,blv->bls", share.square(), vertices.own_var)
