@@ -270,7 +270,7 @@ def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[st
         kind: f"{source.count}{rate}",
         "camera": f"{config.camera}: {camera.model}, f = {fx:.1f} / {fy:.1f} px",
         "lanes from": config.lanes or "the network",
-        "lane width": f"{config.lane_width:g} m",
+        "lane width": f"{config.lane_width:.4g} m",
         "calibrator": config.calibrator,
         "lanebev": __version__,
     }

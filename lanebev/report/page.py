@@ -89,7 +89,7 @@ def write_report(path: str | Path, report: Report) -> None:
             (report.before_title, after_title),
             "image" if report.is_stills else "time (s)",
         )
-        note = f"Widths of all lanes seen in the bird's-eye view; dashed: {report.lane_width:g} m assumed."
+        note = f"Widths of all lanes seen in the bird's-eye view; dashed: {report.lane_width:.4g} m assumed."
         parts += ["<h2>Lane widths in the bird's-eye view</h2>", _figure(widths, "png", note)]
     if report.stills:
         parts.append("<h2>Stills</h2>")
