@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
-from lanebev.weights import save_segmenter
+from lanebev.weights import load_segmenter, save_segmenter
 from train.losses import unweighted_bias
 
 
 def checkpoint_weights(path: Path) -> dict[str, Tensor]:
-    """The segmenter's weights in a Lightning checkpoint; averaged ones where there are any.
+    """The segmenter's weights in a Lightning checkpoint, averaged ones where there are any.
 
     Raises:
         ValueError: no segmenter in it.
@@ -30,12 +30,27 @@ def checkpoint_weights(path: Path) -> dict[str, Tensor]:
     return weights
 
 
-def load_weights(segmenter: LaneSegmenter, path: Path) -> None:
-    """Load a checkpoint's weights, widening a trunk of half the width."""
-    weights = checkpoint_weights(path)
+def load_weights(segmenter: LaneSegmenter, path: Path, class_weight: Tensor) -> None:
+    """Load weights to go on training with, widening a trunk of half the width.
+
+    Args:
+        segmenter: to load into.
+        path: a Lightning checkpoint, or a weights file, into whose last bias the class weights go again.
+        class_weight: (1+L,) of the training to come.
+    """
+    exported = path.suffix == ".safetensors"
+    weights = load_segmenter(path).state_dict() if exported else checkpoint_weights(path)
     if weights["trunk.conv1.weight"].shape[0] * 2 == segmenter.config.base_width:
         weights = widen(weights, segmenter.state_dict())
     segmenter.load_state_dict(weights, strict=True)
+    if exported:
+        add_to_bias(segmenter, -unweighted_bias(class_weight))
+
+
+def add_to_bias(segmenter: LaneSegmenter, bias: Tensor) -> None:
+    """Add (1+L,) to the logits, in pixel_shuffle's order of channels."""
+    with torch.no_grad():
+        segmenter.head.bias += bias.repeat_interleave(segmenter.shuffle**2)
 
 
 def widen(narrow: dict[str, Tensor], wide: dict[str, Tensor], noise: float = 0.02) -> dict[str, Tensor]:
@@ -79,9 +94,7 @@ def checkpoint_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
     segmenter = LaneSegmenter(SegmenterConfig(**settings["network"]))
     segmenter.load_state_dict(weights, strict=True)
     if settings["class_weight"] is not None:
-        bias = unweighted_bias(torch.tensor(settings["class_weight"]))
-        with torch.no_grad():
-            segmenter.head.bias += bias.repeat_interleave(segmenter.shuffle**2)  # pixel_shuffle's order
+        add_to_bias(segmenter, unweighted_bias(torch.tensor(settings["class_weight"])))
     return segmenter, settings
 
 

@@ -34,7 +34,7 @@ class Segmentation(L.LightningModule):
         class_weight: (1+L,) of the cross-entropy, or None for ones; undone on export.
         row_weight: of :func:`row_cross_entropy` beside the cross-entropy; the paper's is 0.
         augment: strength of the photometric augmentation, 0 for none.
-        init_from: checkpoint whose weights to begin with; a narrower one is widened.
+        init_from: checkpoint or weights file to begin with; a network of half the width is widened.
     """
 
     def __init__(
@@ -68,12 +68,12 @@ class Segmentation(L.LightningModule):
         if init_from is not None:
             from train.export import load_weights
 
-            load_weights(self.segmenter, Path(init_from))
+            load_weights(self.segmenter, Path(init_from), weights)
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, H, W) in [0, 1] to logits whose softmax is a frequency, class weights undone."""
         bias = unweighted_bias(self.class_weight).view(1, -1, 1, 1)
-        return self.segmenter(image) + bias  # type: ignore[no-any-return]
+        return self.segmenter(image).float() + bias  # type: ignore[no-any-return]
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep the settings; not as hyperparameters, which LightningCLI would read back."""
@@ -89,7 +89,7 @@ class Segmentation(L.LightningModule):
         if self.photometric is not None:
             with torch.no_grad():
                 image = self.photometric(image)
-        logits = self.segmenter(image.contiguous(memory_format=self.layout))
+        logits = self.segmenter(image.contiguous(memory_format=self.layout)).float()  # sums need it under bf16
         pixels = boundary_cross_entropy(logits, target, weight, self.class_weight)
         rows = row_cross_entropy(logits, target, weight)
         self.log_dict({"loss/pixels": pixels, "loss/rows": rows}, prog_bar=True)

@@ -101,7 +101,7 @@ class JointConfig:
     open_curvature: float = 1e-5
     open_step: float = 3e-5
     straight: tuple[float, float] = (3e-5, 1e-6)
-    open_deviation: float = 0.1
+    open_deviation: float = 0.12
     height_seen: float = 0.3
     evidence_time: float = 0.15
     min_support: float = 3.0
@@ -278,26 +278,57 @@ class JointCalibrator(nn.Module):
         news = surprise(first, index)
         slow = predicted.evidence * fade + (1 - fade * fade).sqrt() * news
         evidence = torch.cat([news[:, :NUM_POSE], slow[:, NUM_POSE:]], dim=-1)
-        cov = cov + self._opened(evidence)
+        cov = cov + self._opened(evidence, cov) + self._swing(first.alone, step)
+        mean, cov = self._unequal_lanes(mean, cov)
         return iterate(mean, cov, first.mean, first.scale, places, seen, phase, 1), evidence
 
-    def _opened(self, evidence: Tensor) -> Tensor:
-        """Process noise (B, D, D) that the evidence calls for; next to none while |evidence| < 3."""
+    def _opened(self, evidence: Tensor, cov: Tensor) -> Tensor:
+        """Process noise (B, D, D) that the evidence calls for; next to none while |evidence| < 3.
+
+        Of the boundaries only the one most out of place is let go, and by ``open_deviation`` at most: a
+        detector errs on one boundary for seconds, and if all were let go, its error would pass for a road of
+        unequal lanes and turn the roll.
+        """
         cfg = self.config
-        pose, bend, own = evidence.square().split([NUM_POSE, 1 + NUM_STEPS, cfg.num_boundaries], dim=-1)
+        parts = evidence.square().split([NUM_POSE, 1 + NUM_STEPS, cfg.num_boundaries], dim=-1)
+        worst = [part.amax(-1, keepdim=True) for part in parts]
         pose, bend, own = (
-            0.01 * torch.sigmoid(0.5 * (worst - threshold)) * worst
-            for worst, threshold in (
-                (part.amax(-1, keepdim=True), threshold)
-                for part, threshold in ((pose, 25.0), (bend, 16.0), (own, 25.0))
-            )
+            0.01 * torch.sigmoid(0.5 * (most - least)) * most
+            for most, least in zip(worst, (25.0, 16.0, 25.0), strict=True)
         )
         jump = evidence.new_tensor([cfg.open_pose] * 3 + [10 * cfg.open_pose, 0.0]).square()
-        lanes = cfg.open_deviation**2 * evidence.new_tensor(_OF_LANES).square()
         change = evidence.new_tensor([cfg.open_curvature] + [cfg.open_step] * NUM_STEPS).square()
         rest = evidence.new_zeros(evidence.shape[0], NUM_COMMON - NUM_SEEN)
-        width = evidence.new_full((cfg.num_boundaries,), cfg.open_deviation).square()
-        return torch.cat([pose * jump + own * lanes, bend * change, rest, own * width], dim=-1).diag_embed()
+        room = cfg.open_deviation**2 - cov.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:]
+        width = (parts[2] == worst[2]) * own.clamp(max=1.0) * room.clamp(min=0.0)
+        return torch.cat([pose * jump, bend * change, rest, width], dim=-1).diag_embed()
+
+    def _swing(self, alone: Tensor, step: Tensor) -> Tensor:
+        """More noise (B, D, D) of the rates of pitch and yaw while a frame does not determine them.
+
+        From frame to frame any density follows a swing; for a second on its own it must cover the swing.
+        """
+        motion = self.config.motion
+        unseen = (alone[:, :ROLL] > ROLL_SEEN) * step.unsqueeze(-1)
+        noise = alone.new_zeros(alone.shape[0], NUM_COMMON + self.config.num_boundaries)
+        noise[:, RATES.start : RATES.start + ROLL] = motion.unseen_factor * motion.angular_density * unseen
+        return noise.diag_embed()
+
+    def _unequal_lanes(self, mean: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:
+        """Where a second boundary is out of place, all may be: their deviations start anew, each as unsure.
+
+        What equal lanes had told of the pose is in doubt with them.
+        """
+        own, known = mean[:, NUM_COMMON:], cov.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:]
+        second = own.abs().topk(2, dim=-1).values[:, 1].clamp(max=self.config.open_deviation)  # (B,)
+        anew = (known.amin(-1) < 0.25 * second.square()) & (second > 0.1 * self.config.open_deviation)
+        index = torch.arange(mean.shape[-1], device=mean.device)
+        kept = ~(anew.unsqueeze(-1) & (index >= NUM_COMMON))
+        doubt = torch.zeros_like(mean)
+        doubt[:, :NUM_STRAIGHT] = mean.new_tensor(_OF_LANES)
+        doubt[:, NUM_COMMON:] = 1.0
+        noise = (doubt * (anew * second).unsqueeze(-1)).square()
+        return mean * kept, cov * kept.unsqueeze(-1) * kept.unsqueeze(-2) + noise.diag_embed()
 
     def _judge(
         self,

@@ -39,6 +39,7 @@ class MotionConfig:
 
     Attributes:
         angular_density: of the angular acceleration, rad²/s³.
+        unseen_factor: as much of it again while a frame does not determine pitch and yaw.
         height_density: of the vertical acceleration, m²/s³.
         spring: rad/s, rate of return to the slow mean.
         mean_angle_walk: rad/√s, of the slow mean.
@@ -54,6 +55,7 @@ class MotionConfig:
     """
 
     angular_density: float = 0.04
+    unseen_factor: float = 2.0
     height_density: float = 0.08
     spring: float = 1.8
     mean_angle_walk: float = 5e-4
