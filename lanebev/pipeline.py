@@ -83,12 +83,11 @@ class LaneBEV(nn.Module):
         """
         from lanebev.estimation.joint import JointCalibrator
         from lanebev.observation.lines import LineExtractor
-        from lanebev.observation.vertices import LineConfig
         from lanebev.weights import load_segmenter
 
         segmenter = load_segmenter(weights)
         width = network_width or int(segmenter.image_size[1])
-        extractor = LineExtractor(LineConfig(stride=segmenter.config.output_stride))
+        extractor = LineExtractor.for_network(segmenter.config)
         return cls(segmenter, extractor, calibrator or JointCalibrator(), BEVWarp(grid), width)
 
     def initial_state(

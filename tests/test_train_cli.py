@@ -4,7 +4,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from lanebev.weights import load_segmenter, read_metadata
+from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
+from lanebev.weights import load_segmenter, read_metadata, save_segmenter
 from train.__main__ import main
 from train.export import export
 
@@ -44,9 +45,24 @@ def test_every_config_trains_a_step(config, tmp_path):
     assert any(row["val/recall"] for row in rows)
 
 
+def test_training_goes_on_from_a_weights_file_and_exports_it_unchanged(tmp_path):
+    torch.manual_seed(0)
+    before = LaneSegmenter(SegmenterConfig(base_width=4, decoder_width=4))
+    save_segmenter(before, tmp_path / "before.safetensors", half=False)
+    frozen = [
+        "--model.init_args.learning_rate=0",
+        f"--model.init_args.init_from={tmp_path}/before.safetensors",
+    ]
+    run("fit", "refine.yaml", tmp_path, *TINY, *VIEWS, *frozen)
+    export(next(tmp_path.rglob("*.ckpt")), tmp_path / "after.safetensors", {}, seed=1, commit="", metrics={})
+    after = load_segmenter(tmp_path / "after.safetensors")
+    torch.testing.assert_close(after.head.bias, before.head.bias)  # class weights done and undone
+    torch.testing.assert_close(after.trunk.conv1.weight, before.trunk.conv1.weight, rtol=1e-3, atol=1e-4)
+
+
 def test_every_config_is_tested():
     """Here, and tusimple.yaml, which needs data, beside its data module."""
-    names = {"default.yaml", "paper.yaml", "end_to_end.yaml", "fast.yaml", "tusimple.yaml"}
+    names = {"default.yaml", "paper.yaml", "end_to_end.yaml", "fast.yaml", "refine.yaml", "tusimple.yaml"}
     assert {path.name for path in CONFIGS.glob("*.yaml")} == names
 
 
@@ -60,7 +76,9 @@ def test_fit_resume_test_predict_export(tmp_path):
     run("test", "fast.yaml", tmp_path, f"--ckpt_path={newest}")
     assert any("test/iou_2" in path.read_text() for path in tmp_path.rglob("metrics.csv"))
     run("predict", "fast.yaml", tmp_path, f"--ckpt_path={newest}")
-    exported = export(newest, tmp_path / "w.safetensors", seed=1, commit="0" * 7, metrics={})
+    exported = export(
+        newest, tmp_path / "w.safetensors", {"noise_factor": 2.5}, seed=1, commit="0" * 7, metrics={}
+    )
     loaded = load_segmenter(tmp_path / "w.safetensors")
     torch.testing.assert_close(loaded.head.bias, exported.head.bias)
     assert read_metadata(tmp_path / "w.safetensors")["training"]["optimizer"] == "adamw"

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from lanebev.observation.lines import LineExtractor
-from lanebev.observation.vertices import LineConfig
 from train.losses import unweighted_bias
 from train.module import Segmentation, unpack
 from train.poses import PoseBatch, fit_poses, pose_loss
@@ -31,7 +30,7 @@ class EndToEnd(Segmentation):
     def __init__(self, pose_weight: float = 0.05, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.settings["pose_weight"] = pose_weight
-        self.extractor = LineExtractor(LineConfig(stride=self.segmenter.config.output_stride))
+        self.extractor = LineExtractor.for_network(self.segmenter.config)
         self.unit: Tensor
         self.register_buffer("unit", torch.tensor(_UNIT, dtype=torch.float64), persistent=False)
 

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter
-from lanebev.observation.vertices import LineConfig
 from lanebev.render import Drive
 from lanebev.weights import load_segmenter
 from train.export import checkpoint_segmenter
@@ -47,7 +46,7 @@ def load(path: Path) -> LaneSegmenter:
 @torch.no_grad()
 def pose_errors(segmenter: LaneSegmenter, frames: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
     """Errors (N, 4) in rad and m, and where the frame says something of the axis (N, 4) bool."""
-    extractor = LineExtractor(LineConfig(stride=segmenter.config.output_stride))
+    extractor = LineExtractor.for_network(segmenter.config)
     errors, said = [], []
     for image, pose, lane_width, intrinsics in zip(*(field.split(8) for field in frames), strict=True):
         size = (image.shape[-2], image.shape[-1])

@@ -98,20 +98,17 @@ def checkpoint_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
     return segmenter, settings
 
 
-def export(
-    checkpoint: Path, out: Path, image_size: tuple[int, int] | None = None, **record: Any
-) -> LaneSegmenter:
+def export(checkpoint: Path, out: Path, changes: dict[str, Any], **record: Any) -> LaneSegmenter:
     """Write a checkpoint's averaged weights as lanebev loads them, with the settings they were trained with.
 
     Args:
         checkpoint: of Lightning.
         out: the weights file.
-        image_size: (height, width) to run at by default; None is what the configuration said.
+        changes: of the configuration: ``image_size`` to run at by default, ``noise_factor``.
         record: further facts for the file's metadata.
     """
     segmenter, settings = checkpoint_segmenter(checkpoint)
-    if image_size is not None:
-        segmenter.config = replace(segmenter.config, image_size=image_size)
+    segmenter.config = replace(segmenter.config, **changes)
     training = {name: value for name, value in settings.items() if name != "network"}
     if training["init_from"] is not None:
         training["init_from"] = Path(training["init_from"]).name  # its folder is nobody else's business
@@ -128,13 +125,18 @@ def main() -> None:
     parser.add_argument("--commit", required=True, help="of the code that trained")
     parser.add_argument("--metrics", default="{}", help="JSON, measured on these weights")
     parser.add_argument("--image-size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="to run at")
+    parser.add_argument("--noise-factor", type=float, help="as train.noise measured it")
     parser.add_argument("--note", default="", help="what else there is to know")
     args = parser.parse_args()
     try:
         metrics = json.loads(args.metrics)
-        size = tuple(args.image_size) if args.image_size else None
+        changes: dict[str, Any] = {}
+        if args.image_size:
+            changes["image_size"] = tuple(args.image_size)
+        if args.noise_factor:
+            changes["noise_factor"] = args.noise_factor
         record = {"seed": args.seed, "commit": args.commit, "metrics": metrics, "note": args.note}
-        export(args.checkpoint, args.out, size, **record)
+        export(args.checkpoint, args.out, changes, **record)
     except (ValueError, OSError) as error:
         parser.exit(2, f"error: {error}\n")
 

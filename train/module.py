@@ -89,7 +89,9 @@ class Segmentation(L.LightningModule):
         if self.photometric is not None:
             with torch.no_grad():
                 image = self.photometric(image)
-        logits = self.segmenter(image.contiguous(memory_format=self.layout)).float()  # sums need it under bf16
+        logits = self.segmenter(
+            image.contiguous(memory_format=self.layout)
+        ).float()  # sums need it under bf16
         pixels = boundary_cross_entropy(logits, target, weight, self.class_weight)
         rows = row_cross_entropy(logits, target, weight)
         self.log_dict({"loss/pixels": pixels, "loss/rows": rows}, prog_bar=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.observation.vertices import LineConfig, representative_vertices, scan_vertices
 from lanebev.types import LaneSegments
 
@@ -25,6 +26,11 @@ class LineExtractor(nn.Module):
     def __init__(self, config: LineConfig | None = None) -> None:
         super().__init__()
         self.config = config or LineConfig()
+
+    @classmethod
+    def for_network(cls, network: SegmenterConfig) -> LineExtractor:
+        """As a network's maps are to be read."""
+        return cls(LineConfig(stride=network.output_stride, noise_factor=network.noise_factor))
 
     def forward(
         self, logits: Tensor, image_size: tuple[int, int], network_size: tuple[int, int] | None = None
@@ -74,6 +80,7 @@ def extract_segments(
     stretch = config.stride * scale.prod() * shrink.clamp(min=1e-12).sqrt()  # areas keep their ratio
     variance = vertices.common_var + vertices.own_var
     sigma = (0.5 * (variance.gather(-1, first) + variance.gather(-1, second))).sqrt() * stretch
+    sigma = config.noise_factor * sigma
     seen = weight > 0
     index = torch.arange(boundaries, device=points.device).view(1, -1, 1).expand_as(first)
     return LaneSegments(

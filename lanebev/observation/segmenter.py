@@ -27,6 +27,8 @@ class SegmenterConfig:
         decoder_width: channels of the decoder.
         context: reach, in cells of stride 8, of each message passing step along the lanes.
         image_size: (height, width) that the weights were trained for; any other runs, with less accuracy.
+        noise_factor: of the maps' sigmas, as measured for the weights: a network errs alike along a line and
+            from frame to frame, so its vertices together say less than each by itself.
     """
 
     num_boundaries: int = NUM_BOUNDARIES
@@ -36,12 +38,15 @@ class SegmenterConfig:
     decoder_width: int = 48
     context: tuple[int, ...] = (1, 2, 4, 8)
     image_size: tuple[int, int] = (192, 320)
+    noise_factor: float = 1.0
 
     def __post_init__(self) -> None:
         if self.num_boundaries < 1:
             raise ValueError(f"num_boundaries: expected at least 1, got {self.num_boundaries}")
         if self.output_stride not in (1, 2, 4):
             raise ValueError(f"output_stride: expected 1, 2 or 4, got {self.output_stride}")
+        if not self.noise_factor > 0:
+            raise ValueError(f"noise_factor: expected more than 0, got {self.noise_factor}")
         if self.decoder_width < 4:
             raise ValueError(f"decoder_width: expected at least 4, got {self.decoder_width}")
 

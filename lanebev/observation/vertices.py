@@ -34,6 +34,7 @@ class LineConfig:
             at the horizon, and says nothing.
         min_vertices: a boundary with fewer is not seen.
         sigma_floor: least standard deviation of a vertex, label px: what correlates along the line.
+        noise_factor: of all standard deviations; 1 where the maps are true.
     """
 
     stride: int = 2
@@ -45,11 +46,14 @@ class LineConfig:
     twice: float = 2.0
     min_vertices: int = 8
     sigma_floor: float = 0.004
+    noise_factor: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("stride", "segments", "window", "min_vertices"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if not self.noise_factor > 0:
+            raise ValueError(f"noise_factor: expected more than 0, got {self.noise_factor}")
         if not 0 <= self.absent < self.present:
             raise ValueError(f"present: expected more than absent ({self.absent}), got {self.present}")
         if not self.present < self.twice:

@@ -1,0 +1,38 @@
+"""The factor on a network's sigmas, measured on drives."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
+from tools.scenarios import CAMERA, FPS, WIDTH, moments
+from tools.scenarios import observe as see
+from train.noise import Seen, consistency, noise_factor, watch
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Errors of 2 px that are said to be 1 px."""
+    course = list(see(moments(1.0), 1, 2.0, 12, 0, torch.float64))
+    segments = [seen._replace(sigma=torch.ones_like(seen.sigma)) for _, seen in course]
+    poses = torch.tensor([moment.pose for moment, _ in course], dtype=torch.float64)
+    width = [torch.full((1, 5), WIDTH, dtype=torch.float64)] * len(course)
+    return Seen(segments, width, poses, CAMERA[None], 1 / FPS)
+
+
+def test_sigmas_half_as_large_as_the_errors_are_found_out(drive):
+    factor = noise_factor([drive], steps=4)
+    assert factor == pytest.approx(2.0, rel=0.4)  # one second is some ten independent errors an axis
+    assert consistency(drive, 8.0) < consistency(drive, 2.0)
+
+
+def test_watches_a_rendered_drive_through_a_network_without_its_factor():
+    torch.manual_seed(0)
+    config = SegmenterConfig(base_width=4, decoder_width=4, image_size=(64, 96), noise_factor=3.0)
+    seen = watch(LaneSegmenter(config).eval(), 5, 2, 20.0)
+    assert len(seen.segments) == 2
+    assert seen.poses.shape == (2, 4)
+    assert math.isnan(consistency(seen, 1.0))  # no frame after the warm-up
