@@ -21,6 +21,7 @@ TINY = [
     "--trainer.accelerator=cpu",
     "--model.init_args.network.base_width=4",
     "--model.init_args.network.decoder_width=4",
+    "--model.init_args.init_from=null",
     "--data.init_args.batch_size=2",
     "--data.init_args.workers=0",
     "--data.init_args.render_size=[72,128]",
