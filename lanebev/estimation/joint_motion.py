@@ -32,6 +32,12 @@ MEANS = slice(NUM_SEEN + 5, NUM_SEEN + 9)
 SPEED = NUM_SEEN + 9
 NUM_COMMON = NUM_SEEN + 10  # then follow the L deviations
 
+CLEAR_BEND = 25.0  # chi-square of the five steps of curvature at which they tell half as much of the speed
+ENTRY = KNOT_SPACING / 3  # m, way over which a step comes into view
+_SLOPE = 0.5 * (np.eye(1 + NUM_STEPS) + np.eye(1 + NUM_STEPS, k=1))  # at a knot, by the steps about it
+_SLOPE[0] = np.eye(1 + NUM_STEPS)[1]
+_CHANGE = np.diff(_SLOPE, axis=0, prepend=0.0) / KNOT_SPACING  # of the shape parameters by a metre, 1/m
+
 
 @dataclass(frozen=True)
 class MotionConfig:
@@ -146,21 +152,46 @@ def come_nearer(
     first = torch.cat([torch.ones_like(left[..., :1]), left], dim=-1)
     moved = torch.cat([first, torch.cat([torch.zeros_like(shift[..., :1]), shift], dim=-1)], dim=1)
 
-    steps = mean[:, STEPS]
-    slope = torch.cat([steps[:, :1], 0.5 * (steps[:, 1:] + steps[:, :-1]), 0.5 * steps[:, -1:]], -1)
-    change = torch.cat([slope[:, :1], slope[:, 1:] - slope[:, :-1]], -1) / KNOT_SPACING
+    change = _change_per_metre(mean[:, SHAPE], cov[:, SHAPE, SHAPE])
     by_speed = dt.unsqueeze(-1) * (moved @ change.unsqueeze(-1)).squeeze(-1)  # (B, 1 + NUM_STEPS)
 
     transition = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device).repeat(len(dt), 1, 1)
     transition[:, SHAPE, SHAPE] = moved
     transition[:, SHAPE, SPEED] = by_speed
-    fresh = (order + passed.unsqueeze(-1) >= NUM_STEPS).to(mean) * cfg.curvature_step**2
     noise = torch.zeros_like(mean)
-    noise[:, STEPS] = fresh
+    noise[:, STEPS] = cfg.curvature_step**2 * _come_into_view(phase, gone, passed)
     moved_mean = mean.clone()
     moved_mean[:, SHAPE] = (moved @ mean[:, SHAPE].unsqueeze(-1)).squeeze(-1)
     cov = kalman.symmetrise(transition @ cov @ transition.mT) + noise.diag_embed()
     return moved_mean, cov, gone - passed * KNOT_SPACING
+
+
+def _change_per_metre(shape: Tensor, cov: Tensor) -> Tensor:
+    """Change of the shape parameters by a metre driven, (B, 1 + NUM_STEPS), as far as there is a bend.
+
+    On a straight road the steps are noise, and noise does not come nearer. Taken for a bend it would tell
+    that the car stands, and where knots are passed would be left to chance.
+    """
+    change: Tensor = (torch.as_tensor(_CHANGE).to(shape) @ shape.unsqueeze(-1)).squeeze(-1)
+    steps, spread = shape[:, 1:], cov[:, 1:, 1:]
+    size = spread.diagonal(dim1=1, dim2=2).rsqrt()  # (B, NUM_STEPS)
+    factor = torch.linalg.cholesky_ex(size.unsqueeze(-1) * spread * size.unsqueeze(-2)).L
+    white = torch.linalg.solve_triangular(factor, (size * steps).unsqueeze(-1), upper=False)
+    squared = white.square().sum((1, 2)).square()  # (B,)
+    known: Tensor = squared / (squared + CLEAR_BEND**2)
+    return change * known.unsqueeze(-1)
+
+
+def _come_into_view(phase: Tensor, gone: Tensor, passed: Tensor) -> Tensor:
+    """Share (B, NUM_STEPS) of each step, numbered anew, that came into view on the way from phase to gone.
+
+    The last step comes in over ``ENTRY`` metres, not at once when a knot is passed: so it matters little in
+    which of two frames that is.
+    """
+    behind = torch.arange(NUM_STEPS - 1, -1, -1, dtype=gone.dtype, device=gone.device) * KNOT_SPACING
+    since = behind - KNOT_SPACING * passed.unsqueeze(-1)  # m, less the way, since a step came into view
+    after, before = gone.unsqueeze(-1) + since, phase.unsqueeze(-1) + since
+    return (after.clamp(0.0, ENTRY) - before.clamp(0.0, ENTRY)) / ENTRY
 
 
 def spring(dt: Tensor, rate: float) -> tuple[Tensor, Tensor]:
