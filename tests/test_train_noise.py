@@ -10,7 +10,7 @@ import torch
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from tools.scenarios import CAMERA, FPS, WIDTH, moments
 from tools.scenarios import observe as see
-from train.noise import Seen, consistency, noise_factor, watch
+from train.noise import Seen, compare, least_error, outcome, watch
 
 
 @pytest.fixture(scope="module")
@@ -24,9 +24,11 @@ def drive():
 
 
 def test_sigmas_half_as_large_as_the_errors_are_found_out(drive):
-    factor = noise_factor([drive], steps=4)
-    assert factor == pytest.approx(2.0, rel=0.4)  # one second is some ten independent errors an axis
-    assert consistency(drive, 8.0) < consistency(drive, 2.0)
+    report = compare([drive], (1.0, 2.0, 8.0))
+    assert 0.5 < report[2.0].nees < 1.6  # one second is some ten independent errors an axis
+    assert report[1.0].nees > report[2.0].nees > 3 * report[8.0].nees
+    assert least_error(report) in (1.0, 2.0)  # the filter scales its noise itself; 8 follows too slowly
+    assert (report[2.0].rmse < torch.tensor([0.05, 0.15, 0.1, 1.0])).all()
 
 
 def test_watches_a_rendered_drive_through_a_network_without_its_factor():
@@ -35,4 +37,4 @@ def test_watches_a_rendered_drive_through_a_network_without_its_factor():
     seen = watch(LaneSegmenter(config).eval(), 5, 2, 20.0)
     assert len(seen.segments) == 2
     assert seen.poses.shape == (2, 4)
-    assert math.isnan(consistency(seen, 1.0))  # no frame after the warm-up
+    assert math.isnan(outcome(seen, 1.0).nees)  # no frame after the warm-up
