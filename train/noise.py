@@ -2,9 +2,9 @@
 
 A network errs alike along a line and from frame to frame. Held-out rendered drives tell what factor on
 all sigmas that is worth: for each factor the calibrator's errors, median over the drives, and NEES/dof,
-which is 1 where its covariance is as large as its errors. The factor of least error goes into the weights file
-(``python -m train.export --noise-factor``). NEES asks for more, but sigmas as large as that no longer tell an
-outlier from a vertex.
+which is 1 where its covariance is as large as its errors. The factor of least error goes into the weights
+file (``python -m train.export --noise-factor``). NEES asks for more, but with sigmas as large as that an
+outlier is no longer told from a vertex.
 """
 
 from __future__ import annotations
