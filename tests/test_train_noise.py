@@ -10,7 +10,7 @@ import torch
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from tools.scenarios import CAMERA, FPS, WIDTH, moments
 from tools.scenarios import observe as see
-from train.noise import Seen, compare, least_error, outcome, watch
+from train.noise import Seen, compare, outcome, watch
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,6 @@ def test_sigmas_half_as_large_as_the_errors_are_found_out(drive):
     report = compare([drive], (1.0, 2.0, 8.0))
     assert 0.5 < report[2.0].nees < 1.6  # one second is some ten independent errors an axis
     assert report[1.0].nees > report[2.0].nees > 3 * report[8.0].nees
-    assert least_error(report) in (1.0, 2.0)  # the filter scales its noise itself; 8 follows too slowly
     assert (report[2.0].rmse < torch.tensor([0.05, 0.15, 0.1, 1.0])).all()
 
 
