@@ -91,6 +91,7 @@ def main() -> None:
         "rms_px": float(error.distance.square().mean().sqrt()),
         "within_0.1_px": float((error.distance < 0.1).double().mean()),
         "p99_px": float(error.distance.quantile(0.99)),
+        "max_px": float(error.distance.max()),
         "normalised_error": error.normalised(),
         "missed": error.missed,
     }

@@ -16,6 +16,8 @@ from torch import Tensor
 _FLOOR = 0.01  # probability that background noise has everywhere; counts as nothing
 _PEAK = 2  # half-width of the box whose largest sum is a scan's peak, label px
 _END = 2  # scans at either end of a stripe that its round cap makes crooked
+_FADE = 0.2  # of a stripe's mass, over which a scan's weight goes to zero below ``twice``
+_TOGETHER = 3.0  # px off a circle through two vertices, at and above which they are not averaged
 _NEIGHBOURS = 5  # scans on either side that decide a vertex' direction and scatter
 
 
@@ -31,7 +33,7 @@ class LineConfig:
         absent, present: share of a stripe's mass at and below which a scan has no boundary, and at and above
             which it has one for sure.
         twice: share at and above which the scan crosses the boundary more than once, as where it turns back
-            at the horizon, and says nothing.
+            at the horizon, and says nothing; it says less from ``_FADE`` below.
         min_vertices: a boundary with fewer is not seen.
         sigma_floor: least standard deviation of a vertex, label px: what correlates along the line.
         noise_factor: of all standard deviations; 1 where the maps are true.
@@ -43,7 +45,7 @@ class LineConfig:
     window: int = 6
     absent: float = 0.2
     present: float = 0.6
-    twice: float = 2.0
+    twice: float = 1.4
     min_vertices: int = 8
     sigma_floor: float = 0.004
     noise_factor: float = 1.0
@@ -101,7 +103,7 @@ def _scan(probabilities: Tensor, config: LineConfig) -> Vertices:
     cos2 = 1 / (1 + slope.square())  # of the angle between line and vertical
     cos = cos2.sqrt()
     weight = ((share * cos - config.absent) / (config.present - config.absent)).clamp(0, 1)
-    weight = weight * (2 * (config.twice - share * cos)).clamp(0, 1)
+    weight = weight * ((config.twice - share * cos) / _FADE).clamp(0, 1)
     weight = _eroded(weight)
     steep = (2.5 * (2 * cos2 - 1) + 0.5).clamp(0, 1)  # 1 below 39 degrees, 0 above 51
     reach = config.half_width / cos + 1.0  # of the stripe's band in its row
@@ -213,6 +215,7 @@ def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
     slot = (rank * bins.unsqueeze(-1)).div(total, rounding_mode="floor")
     slots = torch.arange(2 * config.segments, device=points.device)
     member = (slot.unsqueeze(-1) == slots) & seen.unsqueeze(-1)  # (B, L, V, 2S)
+    member = member & _with_the_middle(vertices, rank, member)
     density = member * vertices.density.unsqueeze(-1)
     share = density * weight.unsqueeze(-1)
     mass, counted = share.sum(2), density.sum(2)
@@ -227,6 +230,27 @@ def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
     across = torch.einsum("blvs,blvd->blsd", share, normal)
     sure = mass / counted.clamp(min=1e-6)
     return Vertices(mean, across, sure, counted, common + config.sigma_floor**2, own)
+
+
+def _with_the_middle(vertices: Vertices, rank: Tensor, member: Tensor) -> Tensor:
+    """Which vertices may be averaged with the middle one of each stretch, (B, L, V, 2S).
+
+    Not those across a gap, further away than so many scans reach (two for scans that were dropped), nor
+    those of another arm of a boundary that turns back: a chord of a circle makes equal angles with the
+    tangents at its ends.
+    """
+    points, normal = vertices.points.detach(), vertices.normal.detach()
+    ranks = torch.where(member, rank.unsqueeze(-1), -1)
+    size = member.sum(2)  # (B, L, 2S)
+    central = ranks.amax(2) - size.div(2, rounding_mode="floor")
+    middle = (ranks == central.unsqueeze(2)).to(torch.uint8).argmax(2)
+    chord = points.unsqueeze(3) - _take(points, middle).unsqueeze(2)  # (B, L, V, 2S, 2)
+    other = _take(normal, middle).unsqueeze(2)
+    normal = normal.unsqueeze(3)
+    facing = torch.where((normal * other).sum(-1, keepdim=True) < 0, -normal, normal)
+    off = 0.5 * ((facing + other) * chord).sum(-1).abs()
+    near: Tensor = chord.norm(dim=-1) < 1.5 * size.unsqueeze(2) + 2
+    return near & (off < _TOGETHER)
 
 
 def _half_of(count: Tensor, config: LineConfig) -> Tensor:
@@ -245,3 +269,8 @@ def _rank_along(points: Tensor, weight: Tensor) -> Tensor:
     along = x * angle.cos() + y * angle.sin()
     along = torch.where(weight > 0, along, math.inf)
     return along.argsort(dim=-1, stable=True).argsort(dim=-1)
+
+
+def _take(points: Tensor, index: Tensor) -> Tensor:
+    """(B, L, V, 2) at (B, L, S) to (B, L, S, 2)."""
+    return points.gather(2, index.unsqueeze(-1).expand(*index.shape, 2))
