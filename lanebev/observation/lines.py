@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.observation.segmenter import SegmenterConfig
-from lanebev.observation.vertices import LineConfig, representative_vertices, scan_vertices
+from lanebev.observation.vertices import LineConfig, representative_vertices, scan_vertices, take
 from lanebev.types import LaneSegments
 
 
@@ -72,7 +72,7 @@ def extract_segments(
     half = (vertices.weight > 0).sum(-1) // 2  # (B, L) pairs; vertices are filled from the front
     first = torch.arange(config.segments, device=points.device).expand(batch, boundaries, -1)
     second = (first + half.unsqueeze(-1)).clamp(max=2 * config.segments - 1)
-    ends = torch.stack([_take(points, first), _take(points, second)], dim=-2)  # (B, L, S, 2, 2)
+    ends = torch.stack([take(points, first), take(points, second)], dim=-2)  # (B, L, S, 2, 2)
     weight = torch.minimum(vertices.weight.gather(-1, first), vertices.weight.gather(-1, second))
     weight = torch.where(first < half.unsqueeze(-1), weight, 0.0)
     along = (ends[..., 1, :] - ends[..., 0, :]).square()  # (B, L, S, 2)
@@ -89,8 +89,3 @@ def extract_segments(
         weight=weight.flatten(1),
         sigma=torch.where(seen, sigma, 1.0).flatten(1),
     )
-
-
-def _take(points: Tensor, index: Tensor) -> Tensor:
-    """(B, L, V, 2) at (B, L, S) to (B, L, S, 2)."""
-    return points.gather(2, index.unsqueeze(-1).expand(*index.shape, 2))

@@ -244,8 +244,8 @@ def _with_the_middle(vertices: Vertices, rank: Tensor, member: Tensor) -> Tensor
     size = member.sum(2)  # (B, L, 2S)
     central = ranks.amax(2) - size.div(2, rounding_mode="floor")
     middle = (ranks == central.unsqueeze(2)).to(torch.uint8).argmax(2)
-    chord = points.unsqueeze(3) - _take(points, middle).unsqueeze(2)  # (B, L, V, 2S, 2)
-    other = _take(normal, middle).unsqueeze(2)
+    chord = points.unsqueeze(3) - take(points, middle).unsqueeze(2)  # (B, L, V, 2S, 2)
+    other = take(normal, middle).unsqueeze(2)
     normal = normal.unsqueeze(3)
     facing = torch.where((normal * other).sum(-1, keepdim=True) < 0, -normal, normal)
     off = 0.5 * ((facing + other) * chord).sum(-1).abs()
@@ -271,6 +271,6 @@ def _rank_along(points: Tensor, weight: Tensor) -> Tensor:
     return along.argsort(dim=-1, stable=True).argsort(dim=-1)
 
 
-def _take(points: Tensor, index: Tensor) -> Tensor:
+def take(points: Tensor, index: Tensor) -> Tensor:
     """(B, L, V, 2) at (B, L, S) to (B, L, S, 2)."""
     return points.gather(2, index.unsqueeze(-1).expand(*index.shape, 2))
