@@ -113,16 +113,8 @@ def main() -> None:
     report = compare(drives)
     for factor, (rmse, nees) in report.items():
         errors = dict(zip(AXES, (round(value, 3) for value in rmse.tolist()), strict=True))
-        print(
-            json.dumps(
-                {
-                    "weights": args.weights.name,
-                    "factor": factor,
-                    **errors,
-                    "nees_per_dof": round(float(nees), 2),
-                }
-            )
-        )
+        line = {"weights": args.weights.name, "factor": factor, **errors}
+        print(json.dumps({**line, "nees_per_dof": round(float(nees), 2)}))
 
 
 if __name__ == "__main__":
