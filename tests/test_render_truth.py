@@ -52,6 +52,7 @@ def bare_world(dice: Dice) -> tuple[World, torch.Tensor]:
         base=dark,
         shoulder=dark,
         seam=torch.zeros_like(pavement.seam),
+        gutter_width=torch.zeros_like(pavement.gutter_width),
         lane_tone=torch.ones_like(pavement.lane_tone),
     )
     around = world.surroundings._replace(wall_kind=torch.zeros_like(world.surroundings.wall_kind))
@@ -134,9 +135,11 @@ def _centroid(strip: torch.Tensor, expected: float) -> float | None:
         return None
     ground, peak = strip[max(0, first - 40) : first + 41].median(), strip[first - 2 : first + 3].max()
     dark = float(ground + 0.012 * (peak - ground))
-    while first > 0 and strip[first] > dark:
+    top = first - 2 + int(strip[first - 2 : first + 3].argmax())
+    first = last = top  # down both sides, to the ground or to where it rises again
+    while first > 0 and strip[first] > dark and strip[first - 1] < strip[first]:
         first -= 1
-    while last < len(strip) - 1 and strip[last] > dark:
+    while last < len(strip) - 1 and strip[last] > dark and strip[last + 1] < strip[last]:
         last += 1
     level = max(float(strip[first]), float(strip[last]))
     if first < 1 or last > len(strip) - 2 or last - first < 2 or level > 0.1 * float(peak):

@@ -52,6 +52,8 @@ class Pavement(NamedTuple):
         tar: strength of tar on the cracks and seams.
         patch: probability that a 14 m stretch of a lane has a patch.
         skid: strength of tyre skids.
+        gutter: (B, 2) factor of the strip along the left and right edge: dust, or another pour.
+        gutter_width: (B, 2) m; 0 is none.
         wet: [0, 1].
     """
 
@@ -81,6 +83,8 @@ class Pavement(NamedTuple):
     tar: Tensor
     patch: Tensor
     skid: Tensor
+    gutter: Tensor
+    gutter_width: Tensor
     wet: Tensor
 
 
@@ -145,6 +149,8 @@ def sample_pavement(dice: Dice, layout: Layout, dotted: Tensor, bright: Tensor, 
         tar=torch.where(dice.chance(0.3), dice.uniform(0.3, 0.9), 0.0),
         patch=torch.where(dice.chance(0.35), dice.uniform(0.02, 0.2), 0.0),
         skid=torch.where(dice.chance(0.25), dice.uniform(0.1, 0.5), 0.0),
+        gutter=torch.where(dice.chance(0.7, 2), dice.uniform(1.1, 2.2, 2), dice.uniform(0.4, 0.9, 2)),
+        gutter_width=torch.where(dice.chance(0.5, 2), dice.uniform(0.05, 0.6, 2), 0.0),
         wet=wet,
     )
 
@@ -185,6 +191,7 @@ def pavement_albedo(
     )
     shade = shade * (1 - _lines(pavement, layout, along, across, inside, reach_along, reach_across, blotch))
     shade = shade * _patches(pavement, lane, along, inside, reach_along, reach_across)
+    shade = shade * _gutters(pavement, along, across, reach_across, blotch[0])
 
     deck = ((along + pavement.deck_phase[:, None]) % pavement.deck_period[:, None]) < pavement.deck_length[
         :, None
@@ -261,3 +268,17 @@ def _patches(
     covered = covered * stripe_coverage(inside - shift, width, reach_across)
     tone = 0.55 + 0.8 * hash01(cell, row, 6.0)
     return torch.where(exists, 1 + covered * (tone - 1), 1.0)
+
+
+def _gutters(
+    pavement: Pavement, along: Tensor, across: Tensor, reach_across: Tensor, mottle: Tensor
+) -> Tensor:
+    """(B, N) factor of the strips along both edges: a line beside a barrier's foot that is no marking."""
+    tone = torch.ones_like(across)
+    for side, edge in ((0, pavement.left), (1, pavement.right)):
+        width = pavement.gutter_width[:, side, None] * (1 + 0.15 * sample_line(along / 70.0 + side))
+        inwards = (across - edge[:, None]) * (1 - 2 * side)
+        covered = stripe_coverage(inwards - 0.5 * width, width, reach_across)
+        strength = covered * (0.85 + 0.15 * mottle).clamp(0, 1.3) * (width > 0.01)
+        tone = tone * (1 + strength * (pavement.gutter[:, side, None] - 1))
+    return tone.clamp(min=0.1)

@@ -73,11 +73,12 @@ def sample_surroundings(
         torch.where(dice.chance(0.75), dice.pick([0, 0, 0, 5, 0, 2.5, 0.5]), 0) for _ in range(2)
     ]  # trees, slopes, hedges
     middle = [torch.where(dice.chance(0.45), dice.pick([0, 0, 0, 3, 3, 2, 2]), 0) for _ in range(2)]
-    near = [dice.pick([2.5, 4, 1.5]), dice.pick([4.5, 2, 2.5])]  # the median has a barrier more often
+    near = [dice.pick([2, 6, 1.5]), dice.pick([4, 3, 2.5])]  # the median has a barrier more often
     kind = torch.stack([far[0], far[1], middle[0], middle[1], near[0], near[1]], dim=1)
     divided = opposite.isfinite()
     kind[:, 2] = torch.where(divided, NOTHING, kind[:, 2])
-    gap = torch.cat([dice.uniform(14, 45, 2), dice.uniform(4, 14, 2), dice.uniform(0.05, 1.2, 2)], dim=1)
+    close = dice.uniform(0.05, 1.2, 2) * dice.pick_from([0.0, 1.0], 2)  # at the pavement's edge, or behind it
+    gap = torch.cat([dice.uniform(14, 45, 2), dice.uniform(4, 14, 2), close], dim=1)
     sides = torch.tensor([-1.0, 1.0] * 3)
     across = torch.stack([left, right] * 3, dim=1) + sides * gap
 
@@ -88,7 +89,7 @@ def sample_surroundings(
     height = torch.where(kind == RAIL, dice.uniform(0.7, 0.85, NUM_WALLS), height)
     height = torch.where((kind == FENCE) | (kind == HEDGE), dice.uniform(1.2, 4.5, NUM_WALLS), height)
     green, earth = dice.pick_from(GREENS, NUM_WALLS), dice.pick_from(EARTHS, NUM_WALLS)
-    grey_wall = dice.uniform(0.15, 0.5, NUM_WALLS, 1) * torch.tensor([1.0, 0.98, 0.94])
+    grey_wall = dice.uniform(0.07, 0.5, NUM_WALLS, 1) * torch.tensor([1.0, 0.98, 0.94])
     colour = torch.where(((kind == TREES) | (kind == HEDGE))[..., None], green, grey_wall)
     colour = torch.where((kind == SLOPE)[..., None], earth, colour)
     colour = colour * dice.uniform(0.7, 1.3, NUM_WALLS, 1)
