@@ -17,8 +17,10 @@ from lanebev.estimation.joint_model import (
     observe,
 )
 from lanebev.estimation.joint_motion import (
+    MEANS,
     NUM_COMMON,
     NUM_SEEN,
+    RATES,
     SHAPE,
     SPEED,
     STEPS,
@@ -215,15 +217,35 @@ def test_spring_is_constant_velocity_when_soft_and_halves_join():
     torch.testing.assert_close(soft_noise[:, 0, 0], dt**3 / 3, rtol=1e-5, atol=0)
 
 
+def test_what_is_held_returns_by_a_stiffer_spring_and_unequal_lanes_forget():
+    cfg, dt = MotionConfig(), torch.full((2,), 0.1, dtype=DOUBLE)
+    held = torch.tensor([[False] * 4, [False, False, True, False]])
+    unequal = torch.tensor([0.0, 0.12], dtype=DOUBLE)
+    transition, noise = motion(dt, held, unequal, 6, cfg)
+    for row, rate, factor in ((0, cfg.spring, 1.0), (1, cfg.held_spring, cfg.held_factor)):
+        x = [2, RATES.start + 2]  # roll and its rate
+        move, density = spring(dt[:1], rate)
+        torch.testing.assert_close(transition[row][x][:, x].flatten(), move[0])
+        torch.testing.assert_close(noise[row][x][:, x].flatten(), factor * cfg.angular_density * density[0])
+        assert transition[row, 2, MEANS.start + 2] == pytest.approx(1 - float(move[0, 0]))
+    torch.testing.assert_close(transition[0, 0], transition[1, 0])  # pitch is seen in both
+    settled = math.exp(-0.1 / cfg.unequal_memory)
+    assert transition[1, NUM_COMMON, NUM_COMMON] == pytest.approx(settled)
+    assert noise[1, NUM_COMMON, NUM_COMMON] == pytest.approx(
+        0.12**2 * (1 - settled**2) + 0.1 * cfg.deviation_walk**2
+    )
+
+
 def test_minutes_of_nothing_keep_the_covariance_positive_and_bounded():
     cfg = MotionConfig()
     calibrator = JointCalibrator()
     state = calibrator.initial_state(1, dtype=DOUBLE)
     mean, cov, phase = state.mean, state.cov, state.phase
-    dt = torch.ones(1, dtype=DOUBLE)
+    dt, unequal = torch.ones(1, dtype=DOUBLE), torch.zeros(1, dtype=DOUBLE)
+    held = torch.ones(1, 4, dtype=torch.bool)
     for _ in range(300):
         mean, cov, phase = come_nearer(mean, cov, phase, dt, cfg)
-        transition, noise = motion(dt, 6, cfg)
+        transition, noise = motion(dt, held, unequal, 6, cfg)
         mean, cov = (transition @ mean.unsqueeze(-1)).squeeze(-1), transition @ cov @ transition.mT + noise
     size = cov.diagonal(dim1=1, dim2=2).rsqrt()
     assert torch.linalg.eigvalsh(size.unsqueeze(-1) * cov * size.unsqueeze(-2)).min() > 0

@@ -17,7 +17,7 @@ from lanebev.estimation.two_stage import TwoStageCalibrator
 from lanebev.types import Status
 from tools.bench_calibration import UNITS, WARM_UP, Track, summarise, track
 from tools.reproduce_table1 import VARIANCES, run, table
-from tools.scenarios import SCENARIOS, Moment, moments
+from tools.scenarios import PLACES, SCENARIOS, Moment, moments
 from tools.synthetic import Experiment
 
 torch.set_num_threads(1)
@@ -96,13 +96,13 @@ def test_lane_changes_bumps_and_exits_leave_no_trace(name, first, last):
 
 
 def test_two_seconds_of_nothing_stay_within_sigmas_that_stop_growing():
-    """The pose swings by 1.5 deg: error below 3 deg and 6 cm RMS, sigma below 3 deg and 8 cm, no drift."""
+    """The pose swings by 1.5 deg: error below 2 deg and 5 cm RMS, sigma below 2 deg and 5 cm, no drift."""
     run = bench("2 s of nothing", 2.4, 5.4)
     error, sigma, nees = hard_part(run)
-    assert (error < torch.tensor([3.0, 3.0, 3.0, 6.0])).all()
-    assert (sigma < torch.tensor([3.0, 3.0, 3.0, 8.0])).all()
+    assert (error < torch.tensor([2.0, 2.0, 1.2, 5.0])).all()
+    assert (sigma < torch.tensor([2.0, 2.0, 2.0, 5.0])).all()
     assert (sigma > torch.tensor([1.0, 1.0, 1.0, 3.0])).all()
-    assert nees < 1.5
+    assert nees < 1.25
     assert (run.status[run.hard] == Status.COASTING).all()
     assert (run.status[-1] == Status.TRACKING).all()
     again = run.errors[-5:].square().mean((0, 1)).sqrt() * UNITS
@@ -110,14 +110,14 @@ def test_two_seconds_of_nothing_stay_within_sigmas_that_stop_growing():
 
 
 def test_one_lane_holds_roll_with_growing_sigma():
-    """Pitch and yaw stay at 0.2 deg; roll's error is the swing of 1 deg that cannot be seen, and no drift."""
+    """Pitch and yaw as ever; roll's error is the swing of 1 deg that cannot be seen, and no drift."""
     run = bench("one lane for 4 s", 2.4, 6.0)
     error, _, nees = hard_part(run)
-    assert (error < torch.tensor([0.2, 0.25, 1.6, 6.0])).all()
+    assert (error < torch.tensor([0.03, 0.04, 1.2, 2.0])).all()
     assert nees < 1.25
     roll = run.variances[run.hard][:, :, 2].mean(1).sqrt() * UNITS[2]
     assert roll[0] < 0.5
-    assert 1.5 < roll[-1] < 3.5
+    assert 1.0 < roll[-1] < 2.0
     assert (roll[10:] >= roll[:-10] - 0.05).all()
     assert (run.status == Status.TRACKING).all()
 
@@ -125,8 +125,8 @@ def test_one_lane_holds_roll_with_growing_sigma():
 def test_one_boundary_is_within_its_sigmas():
     run = bench("one boundary for 2 s", 2.3, 5.0)
     error, sigma, nees = hard_part(run)
-    assert (error < torch.tensor([3.0, 3.0, 3.0, 7.0])).all()
-    assert (sigma < torch.tensor([3.0, 3.0, 3.0, 9.0])).all()
+    assert (error < torch.tensor([1.5, 1.5, 1.2, 5.0])).all()
+    assert (sigma < torch.tensor([2.0, 2.0, 2.0, 5.0])).all()
     assert nees < 1.25
 
 
@@ -136,7 +136,7 @@ def test_garbage_neither_starts_nor_moves_the_filter():
     assert (run.status[11:89] == Status.TRACKING).all()
     assert (run.status[91:104] == Status.COASTING).all()
     assert (run.status[-5:] == Status.TRACKING).all()
-    assert hard_part(run)[2] < 1.5
+    assert hard_part(run)[2] < 1.25
 
 
 @pytest.mark.parametrize(
@@ -161,7 +161,23 @@ def test_unequal_lanes_show_in_the_covariance_of_height():
     assert (rmse(run)[:3] < torch.tensor([0.02, 0.06, 0.15])).all()
     assert rmse(run)[3] < 3.0
     assert (run.variances[WARM_UP:, :, 3].sqrt() * UNITS[3] > 0.6).all()
-    assert summarise(run)["nees_per_dof"] < 2.0
+    assert summarise(run)["nees_per_dof"] < 1.25
+
+
+@pytest.mark.parametrize("size", [0.03, 0.1])
+def test_unequal_lanes_are_honest_on_most_roads(size):
+    """After a second the median NEES/dof is below 1.25, and one road in eight at most is above 2.
+
+    Deviations that look just like another pose cannot be told from it: some road is always worse.
+    """
+    draws = size * torch.randn(8, 6, generator=torch.Generator().manual_seed(11), dtype=torch.float64)
+    nees = []
+    for places in PLACES + draws:
+        drive = moments(1.7, lambda t, moment, own=places: replace(moment, places=own))
+        with torch.inference_mode():
+            nees.append(track(JointCalibrator(), drive, 1).nees[30:].mean() / 4)
+    assert torch.stack(nees).median() < 1.25
+    assert (torch.stack(nees) > 2).sum() <= 1
 
 
 def test_lost_after_long_nothing_and_recovers_without_help():

@@ -228,6 +228,8 @@ def _exit(t: float, moment: Moment) -> Moment:
 
 
 _UNEQUAL = torch.tensor([0.10, -0.08, 0.0, 0.05, -0.12, 0.15], dtype=torch.float64)
+_ONE_LARGE = torch.tensor([0.04, 0.17, 0.02, -0.03, 0.05, 0.22], dtype=torch.float64)
+_SLIGHT = torch.tensor([-0.01, 0.03, 0.02, -0.01, -0.03, 0.02], dtype=torch.float64)
 
 
 def _only(visible: tuple[int, ...], first: float, last: float) -> Callable[[float, Moment], Moment]:
@@ -285,6 +287,8 @@ SCENARIOS: dict[str, tuple[float, Callable[[float, Moment], Moment] | None]] = {
     "one boundary for 2 s": (8.0, _only((2,), 3.0, 5.0)),
     "exit": (8.0, _exit),
     "unequal lanes": (6.0, lambda t, m: replace(m, places=PLACES + _UNEQUAL)),
+    "unequal lanes, one would explain them": (6.0, lambda t, m: replace(m, places=PLACES + _ONE_LARGE)),
+    "slightly unequal lanes": (6.0, lambda t, m: replace(m, places=PLACES + _SLIGHT)),
     "wrong boundaries": (6.0, lambda t, m: replace(m, wrong_boundary=0.1)),
     "whole frames misnumbered": (6.0, _wrong_class),
     "short dashes": (6.0, lambda t, m: replace(m, longest=2)),

@@ -65,6 +65,7 @@ class Reason(IntFlag):
     HEIGHT_UNSEEN = 32  # no lane: height holds with growing sigma
     LANE_CHANGE = 64  # the boundary indices moved by one in this frame
     RESTARTED = 128  # started, or started anew, in this frame
+    DIRECTION_UNSEEN = 256  # one boundary or less: pitch and yaw hold with growing sigma
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ class JointConfig:
         open_curvature, open_step: 1/m, change of the knots admitted a frame when a bend begins or ends.
         straight: 1/m and 1/m², sigmas of c0 and c1 of a road that is taken as straight at a start.
         open_deviation: m, admitted where the lanes turn out unequal.
-        height_seen: m, sigma of height from one frame above which it counts as unseen.
+        seen: rad and m, sigmas of the pose from one frame above which it counts as unseen.
         evidence_time: s over which a bend's or unequal lanes' evidence is summed.
         min_support: inlier segments (weights summed) of a usable frame.
         min_share, enter_share: share of inliers to go on tracking, and to begin again.
@@ -102,7 +103,7 @@ class JointConfig:
     open_step: float = 3e-5
     straight: tuple[float, float] = (3e-5, 1e-6)
     open_deviation: float = 0.12
-    height_seen: float = 0.3
+    seen: tuple[float, float, float, float] = (0.01, 0.01, ROLL_SEEN, 0.3)
     evidence_time: float = 0.15
     min_support: float = 3.0
     min_share: float = 0.15
@@ -217,7 +218,8 @@ class JointCalibrator(nn.Module):
         step, skip, early, guessed = self._elapsed(as_batch(dt, seen.sigma), state)
 
         mean, cov, phase = come_nearer(state.mean, state.cov, state.phase, step, cfg.motion)
-        mean, cov = kalman.predict(mean, cov, *motion(step, cfg.num_boundaries, cfg.motion))
+        moves = motion(step, _held(state.reasons), self._inequality(mean), cfg.num_boundaries, cfg.motion)
+        mean, cov = kalman.predict(mean, cov, *moves)
         predicted = state._replace(mean=mean, cov=cov, phase=phase)
         mean, shift, scale = self._follow_lane_change(predicted, positions, seen)
         update, evidence = self._update(predicted, mean, scale, places, seen, step)
@@ -227,7 +229,8 @@ class JointCalibrator(nn.Module):
 
         skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=early)
         after = JointState(*(_where(skip, old, new) for old, new in zip(skipped, after, strict=True)))
-        return self._calibration(after, torch.where(seen.weight > 0, trust, 0.0)), after
+        inliers = torch.where(seen.weight > 0, trust, 0.0)
+        return self._calibration(after, inliers, positions, update.mimicry), after
 
     def curvature(self, state: JointState) -> Tensor:
         """Curvature of the road at the camera, (B,) 1/m, positive to the right."""
@@ -275,10 +278,12 @@ class JointCalibrator(nn.Module):
         first = iterate(mean, cov, mean, scale, places, seen, phase, cfg.iterations)
         index = evidence_index(cfg.num_boundaries, mean.device)
         fade = (-step / cfg.evidence_time).exp().unsqueeze(-1)
-        news = surprise(first, index)
+        believed = 2 * (seen.weight * first.trust)
+        count = cov.new_zeros(cov.shape[0], cfg.num_boundaries).scatter_add(1, seen.boundary, believed)
+        news = surprise(first, index, count)
         slow = predicted.evidence * fade + (1 - fade * fade).sqrt() * news
         evidence = torch.cat([news[:, :NUM_POSE], slow[:, NUM_POSE:]], dim=-1)
-        cov = cov + self._opened(evidence, cov) + self._swing(first.alone, step)
+        cov = cov + self._opened(evidence, cov)
         mean, cov = self._unequal_lanes(mean, cov)
         return iterate(mean, cov, first.mean, first.scale, places, seen, phase, 1), evidence
 
@@ -303,31 +308,29 @@ class JointCalibrator(nn.Module):
         width = (parts[2] == worst[2]) * own.clamp(max=1.0) * room.clamp(min=0.0)
         return torch.cat([pose * jump, bend * change, rest, width], dim=-1).diag_embed()
 
-    def _swing(self, alone: Tensor, step: Tensor) -> Tensor:
-        """More noise (B, D, D) of the rates of pitch and yaw while a frame does not determine them.
+    def _inequality(self, mean: Tensor) -> Tensor:
+        """(B,) m, sigma that deviations may have, by the second largest of them; 0 on a road of equal lanes.
 
-        From frame to frame any density follows a swing; for a second on its own it must cover the swing.
+        One boundary alone out of place is a detector's error. Of six deviations four say nothing, since
+        offset, roll and height mimic them: what is seen is a third of what there may be.
         """
-        motion = self.config.motion
-        unseen = (alone[:, :ROLL] > ROLL_SEEN) * step.unsqueeze(-1)
-        noise = alone.new_zeros(alone.shape[0], NUM_COMMON + self.config.num_boundaries)
-        noise[:, RATES.start : RATES.start + ROLL] = motion.unseen_factor * motion.angular_density * unseen
-        return noise.diag_embed()
+        size = self.config.open_deviation
+        second = mean[:, NUM_COMMON:].abs().topk(2, dim=-1).values[:, 1]
+        return torch.where(second > 0.1 * size, (3 * second).clamp(max=size), 0.0)
 
     def _unequal_lanes(self, mean: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:
         """Where a second boundary is out of place, all may be: their deviations start anew, each as unsure.
 
         What equal lanes had told of the pose is in doubt with them.
         """
-        own, known = mean[:, NUM_COMMON:], cov.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:]
-        second = own.abs().topk(2, dim=-1).values[:, 1].clamp(max=self.config.open_deviation)  # (B,)
-        anew = (known.amin(-1) < 0.25 * second.square()) & (second > 0.1 * self.config.open_deviation)
+        known, size = cov.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:], self.config.open_deviation
+        anew = (self._inequality(mean) > 0) & (known.amin(-1) < 0.01 * size**2)
         index = torch.arange(mean.shape[-1], device=mean.device)
         kept = ~(anew.unsqueeze(-1) & (index >= NUM_COMMON))
         doubt = torch.zeros_like(mean)
         doubt[:, :NUM_STRAIGHT] = mean.new_tensor(_OF_LANES)
         doubt[:, NUM_COMMON:] = 1.0
-        noise = (doubt * (anew * second).unsqueeze(-1)).square()
+        noise = (doubt * (size * anew).unsqueeze(-1)).square()
         return mean * kept, cov * kept.unsqueeze(-1) * kept.unsqueeze(-2) + noise.diag_embed()
 
     def _judge(
@@ -359,8 +362,10 @@ class JointCalibrator(nn.Module):
         reasons = _flag(empty, Reason.NO_SEGMENTS) | _flag(~empty & ~supported, Reason.FEW_INLIERS)
         reasons = reasons | _flag(supported & (shift != 0), Reason.LANE_CHANGE)
         reasons = reasons | _flag(~running, Reason.NO_START)
-        reasons = reasons | _flag(update.alone[:, ROLL] > ROLL_SEEN, Reason.ROLL_UNSEEN)
-        reasons = reasons | _flag(update.alone[:, HEIGHT] > cfg.height_seen, Reason.HEIGHT_UNSEEN)
+        blind = ~supported.unsqueeze(-1) | (update.alone[:, :NUM_POSE] > update.alone.new_tensor(cfg.seen))
+        reasons = reasons | _flag(blind[:, :ROLL].any(-1), Reason.DIRECTION_UNSEEN)
+        reasons = reasons | _flag(blind[:, ROLL], Reason.ROLL_UNSEEN)
+        reasons = reasons | _flag(blind[:, HEIGHT], Reason.HEIGHT_UNSEEN)
         after = JointState(
             mean=_where(supported, update.mean, state.mean),
             cov=_where(supported, update.cov, state.cov),
@@ -456,17 +461,46 @@ class JointCalibrator(nn.Module):
         reduced = kalman.symmetrise(cov - gain @ torch.cholesky_solve(gain.mT, factor))
         return _where(straight, pulled, params), _where(straight, reduced, cov)
 
-    def _calibration(self, state: JointState, inliers: Tensor) -> Calibration:
-        """What goes out: the pose, its covariance with the lane width's scale, status, inliers."""
+    def _calibration(
+        self, state: JointState, inliers: Tensor, positions: Tensor, mimicry: Tensor
+    ) -> Calibration:
+        """What goes out: the pose, its covariance, status, inliers.
+
+        To the filter's covariance comes what it does not follow: the lane width's own scale; what the other
+        boundaries may be out of place where one is; and height by the square of an error of roll, where
+        roll is held. With boundaries at x₁ and x₂ seen as they are, h'' = -2 (h - x₁ x₂ / h).
+        """
         cov = state.cov[:, :NUM_POSE, :NUM_POSE]
-        height = state.mean[:, HEIGHT]
-        scale = torch.zeros_like(cov)
-        scale[:, HEIGHT, HEIGHT] = (self.config.lane_width_std * height).square()
-        return Calibration(Extrinsics.unstack(state.mean[:, :NUM_POSE]), cov + scale, state.status, inliers)
+        height, ego = state.mean[:, HEIGHT], self.config.num_boundaries // 2 - 1
+        left, right = (positions[:, ego : ego + 2] + state.mean[:, OFFSET, None]).unbind(-1)
+        bend = height - left * right / height.clamp(min=0.1)
+        more = 3.0 * (bend * cov[:, ROLL, ROLL]).square() * _held(state.reasons)[:, ROLL]
+        more = more + (self.config.lane_width_std * height).square()
+        by_others = self._one_out_of_place(state.mean)[:, None, None] * mimicry[:, :NUM_POSE]
+        by_others = by_others @ by_others.mT
+        only_height = torch.arange(NUM_POSE, device=cov.device) == HEIGHT
+        cov = cov + by_others + (only_height * more.unsqueeze(-1)).diag_embed()
+        return Calibration(Extrinsics.unstack(state.mean[:, :NUM_POSE]), cov, state.status, inliers)
+
+    def _one_out_of_place(self, mean: Tensor) -> Tensor:
+        """(B,) m, what the others may be out of place where one boundary is, by no more than lanes differ."""
+        size = self.config.open_deviation
+        worst = mean[:, NUM_COMMON:].abs().amax(-1)
+        alone = (worst > 0.1 * size) & (worst < 5 * size) & (self._inequality(mean) == 0)
+        return torch.where(alone, worst.clamp(max=size), 0.0)
 
 
 def _running(status: Tensor) -> Tensor:
     return (status == Status.TRACKING) | (status == Status.COASTING)
+
+
+def _held(reasons: Tensor) -> Tensor:
+    """(B, 4) bool, what of pitch, yaw, roll and height the frame with these reasons did not determine."""
+    direction, roll, height = (
+        (reasons & int(reason)) != 0
+        for reason in (Reason.DIRECTION_UNSEEN, Reason.ROLL_UNSEEN, Reason.HEIGHT_UNSEEN)
+    )
+    return torch.stack([direction, direction, roll, height], dim=-1)
 
 
 def _flag(condition: Tensor, reason: Reason) -> Tensor:

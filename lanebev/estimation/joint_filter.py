@@ -22,6 +22,8 @@ from lanebev.estimation.joint_robust import inlier_weights, log_likelihood, nois
 from lanebev.estimation.single_frame import normal_equations
 
 _LOOSE = (0.3, 0.3, 0.3, 1.0, 2.0)  # rad, m: sigmas before a frame, to ask what it alone determines
+_KNOWN = 1e-4  # share of its sigma that roll keeps where it is held: as good as known, yet not singular
+SHARED = 0.2  # sigmas by which all end points of a boundary may be off alike
 ROLL_SEEN = 0.01  # rad, sigma of roll from one frame above which roll is held instead of estimated
 
 
@@ -34,8 +36,9 @@ class Update(NamedTuple):
         scale: (B,) >= 1, of the noise.
         info: (B, D, D) of the frame's observations.
         score: (B, D), P⁻¹ (best - predicted): the pull of the observations on the prediction.
-        best_cov: (B, D, D), were everything estimated.
+        best_cov: (B, D, D), were roll known where it is held.
         alone: (B, 5) sigmas of pitch, yaw, roll, height and offset from this frame alone.
+        mimicry: (B, 5, L) change of them, fitted to this frame, by a metre that a boundary is out of place.
     """
 
     mean: Tensor
@@ -46,6 +49,7 @@ class Update(NamedTuple):
     score: Tensor
     best_cov: Tensor
     alone: Tensor
+    mimicry: Tensor
 
 
 def iterate(
@@ -63,6 +67,7 @@ def iterate(
     Source: Bell and Cathey 1993, the iterated Kalman filter as Gauss-Newton; Schmidt 1966 for the roll that
     a frame does not determine: it is considered, not estimated. On one lane roll and offset are the same to
     first order, and what sets them apart is a difference of second order that linearised updates overrate.
+    The other parameters are estimated as if roll were known: pitch and yaw do not depend on it then.
 
     Args:
         predicted: (B, D) mean.
@@ -91,13 +96,14 @@ def iterate(
         by_noise = trust * there / (seen.sigma * scale.unsqueeze(-1)).square()
         info, pull = _information(residuals.jacobian, residuals.distance, by_noise, member)
         pull = pull + (info @ (mean - predicted).unsqueeze(-1)).squeeze(-1)
-        alone = _alone(info)
-        best, posterior = kalman.update(predicted, cov, info, pull)
+        alone, mimicry = _alone(info)
         estimated = _estimated(alone, mean)
+        held = estimated.clamp(min=_KNOWN)
+        best, posterior = kalman.update(predicted, held.unsqueeze(-1) * cov * held.unsqueeze(-2), info, pull)
         mean = predicted + estimated * (best - predicted)
     score = pull - (info @ (best - predicted).unsqueeze(-1)).squeeze(-1)
     after = _consider(cov, posterior, info, estimated)
-    return Update(mean, after, trust, scale, info, score, posterior, alone)
+    return Update(mean, after, trust, scale, info, score, posterior, alone, mimicry)
 
 
 def _consider(cov: Tensor, posterior: Tensor, info: Tensor, estimated: Tensor) -> Tensor:
@@ -110,12 +116,17 @@ def _consider(cov: Tensor, posterior: Tensor, info: Tensor, estimated: Tensor) -
     return kalman.symmetrise(keep @ cov @ keep.mT + gain @ info @ gain.mT)
 
 
-def _alone(info: Tensor) -> Tensor:
-    """(B, 5) sigmas of a straight road's parameters from this frame's information (B, D, D)."""
+def _alone(info: Tensor) -> tuple[Tensor, Tensor]:
+    """Of a straight road's five parameters, from this frame's information (B, D, D) alone.
+
+    Returns:
+        (B, 5) sigmas, and (B, 5, L) their change by a metre that a boundary is out of place.
+    """
     loose = info.new_tensor(_LOOSE)
     scaled = loose.unsqueeze(-1) * info[:, :NUM_STRAIGHT, :NUM_STRAIGHT] * loose
     factor = torch.linalg.cholesky_ex(scaled + torch.eye(NUM_STRAIGHT).to(info)).L
-    return loose * torch.cholesky_inverse(factor).diagonal(dim1=1, dim2=2).sqrt()
+    cov = loose.unsqueeze(-1) * torch.cholesky_inverse(factor) * loose
+    return cov.diagonal(dim1=1, dim2=2).sqrt(), -cov @ info[:, :NUM_STRAIGHT, NUM_COMMON:]
 
 
 def _estimated(alone: Tensor, mean: Tensor) -> Tensor:
@@ -145,18 +156,27 @@ def evidence_index(num_boundaries: int, device: torch.device) -> Tensor:
     return torch.tensor([*first, *last], device=device)
 
 
-def surprise(update: Update, index: Tensor) -> Tensor:
+def surprise(update: Update, index: Tensor, count: Tensor) -> Tensor:
     """Normalised score of single state entries: N(0, 1) each if the motion is as assumed.
 
     The score u = P⁻¹ (mean - predicted) has covariance Λ - Λ P⁺ Λ. It is the score test (Rao 1948) for
-    more process noise in that entry.
+    more process noise in that entry. Detectors err alike along a boundary, so n end points say no more of
+    its place than 1 / (1 / n + ``SHARED``²) do.
+
+    Args:
+        update: of the frame.
+        index: (M,) entries, the L deviations last.
+        count: (B, L) end points that each boundary was seen with.
 
     Returns:
-        (B, len(index)); 0 where the observations say nothing of an entry.
+        (B, M); 0 where the observations say nothing of an entry.
     """
     seen = update.info - update.info @ update.best_cov @ update.info
     variance = seen.diagonal(dim1=-2, dim2=-1)[:, index]
     known = variance > 1e-3 * update.info.diagonal(dim1=-2, dim2=-1)[:, index]
+    shared = torch.ones_like(variance)
+    shared[:, -count.shape[-1] :] += SHARED**2 * count
+    variance = variance * shared
     known = known & (variance > 0)
     return torch.where(known, update.score[:, index] * torch.where(known, variance, 1.0).rsqrt(), 0.0)
 

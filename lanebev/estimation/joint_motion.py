@@ -4,7 +4,9 @@ The mean is [pitch, yaw, roll, height, offset | curvature at the first knot and 
 first five | slow mean of the pose | speed | deviation of each boundary from its place].
 
 The pose swings about its slow mean as a critically damped spring driven by white noise: within a frame a
-constant-velocity model, over seconds of nothing a return to the mount's pose with a bounded sigma.
+constant-velocity model, over seconds of nothing a return to the mount's pose with a bounded sigma. What the
+last frame did not determine is held by a stiffer spring with more noise: from frame to frame any density
+follows a swing, on its own it must cover it, and a suspension swings back.
 
 The road does not change, it comes nearer: knots of its curvature stand in the world, and the camera passes
 them at a speed that is estimated too. What was seen far ahead so holds when it is near, and new is only
@@ -45,9 +47,10 @@ class MotionConfig:
 
     Attributes:
         angular_density: of the angular acceleration, rad²/s³.
-        unseen_factor: as much of it again while a frame does not determine pitch and yaw.
         height_density: of the vertical acceleration, m²/s³.
         spring: rad/s, rate of return to the slow mean.
+        held_spring: rad/s, likewise of what the last frame did not determine.
+        held_factor: by which its density is larger.
         mean_angle_walk: rad/√s, of the slow mean.
         mean_height_walk: m/√s.
         offset_density: of the lateral acceleration, m²/s³.
@@ -58,12 +61,14 @@ class MotionConfig:
         speed_memory: s, over which it is forgotten.
         deviation_memory: s, decay of a boundary's deviation.
         deviation_walk: m/√s, while nothing speaks for unequal lanes.
+        unequal_memory: s, decay of the deviations on a road of unequal lanes.
     """
 
     angular_density: float = 0.04
-    unseen_factor: float = 2.0
     height_density: float = 0.08
-    spring: float = 1.8
+    spring: float = 2.5
+    held_spring: float = 5.0
+    held_factor: float = 6.0
     mean_angle_walk: float = 5e-4
     mean_height_walk: float = 1e-3
     offset_density: float = 0.2
@@ -75,26 +80,38 @@ class MotionConfig:
     speed_memory: float = 30.0
     deviation_memory: float = 20.0
     deviation_walk: float = 1e-4
+    unequal_memory: float = 1.0
 
 
-def motion(dt: Tensor, num_boundaries: int, cfg: MotionConfig) -> tuple[Tensor, Tensor]:
+def motion(
+    dt: Tensor, held: Tensor, unequal: Tensor, num_boundaries: int, cfg: MotionConfig
+) -> tuple[Tensor, Tensor]:
     """Transition and process noise over dt, the road's coming nearer apart (:func:`come_nearer`).
 
     Args:
         dt: (B,) s, >= 0.
+        held: (B, 4) bool, what of pitch, yaw, roll, height the last frame did not determine.
+        unequal: (B,) m, sigma of the deviations on a road of unequal lanes; 0 on one of equal lanes.
         num_boundaries: L.
         cfg: the numbers.
 
     Returns:
         (B, D, D) F and (B, D, D) W, D = NUM_COMMON + L.
     """
-    swing, drive = spring(dt, cfg.spring)  # (B, 4) each
+    density = dt.new_tensor([cfg.angular_density] * 3 + [cfg.height_density])
+    density = torch.where(held, cfg.held_factor * density, density)  # (B, 4)
+    swing, drive = spring(dt.unsqueeze(-1), torch.where(held, cfg.held_spring, cfg.spring).to(dt))
+    swing = torch.cat([swing, 1 - swing[..., :1], -swing[..., 2:3]], dim=-1)  # (B, 4, 6)
     slide, push = _damped(dt, cfg.offset_memory)
     fade = (-dt / cfg.speed_memory).exp()
-    settle = (-dt / cfg.deviation_memory).exp()
+    memory = torch.where(unequal > 0, cfg.unequal_memory, cfg.deviation_memory).to(dt)
+    settle = (-dt / memory).exp()
     still = torch.stack([torch.ones_like(dt), fade, settle], dim=-1)
-    moves = torch.cat([swing, 1 - swing[:, :1], -swing[:, 2:3], slide, still], dim=-1)  # (B, 13)
-    shakes = torch.cat([drive, push, dt.unsqueeze(-1)], dim=-1)  # (B, 9)
+    moves = torch.cat([swing.flatten(1), slide, still], dim=-1)  # (B, 31)
+    drive = (density.unsqueeze(-1) * drive).flatten(1)
+    wander = cfg.deviation_walk**2 * dt + unequal.square() * (1 - settle * settle)
+    still = torch.stack([dt, wander], dim=-1)
+    shakes = torch.cat([drive, cfg.offset_density * push, still], dim=-1)  # (B, 22)
     on_moves, on_shakes = _patterns(num_boundaries, cfg)
     transition = torch.einsum("bk,kij->bij", moves, torch.as_tensor(on_moves).to(dt))
     return transition, torch.einsum("bk,kij->bij", shakes, torch.as_tensor(on_shakes).to(dt))
@@ -102,30 +119,32 @@ def motion(dt: Tensor, num_boundaries: int, cfg: MotionConfig) -> tuple[Tensor, 
 
 @lru_cache(maxsize=16)
 def _patterns(num_boundaries: int, cfg: MotionConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Where each of the 13 numbers of F and the 9 of W go, (13, D, D) and (9, D, D)."""
+    """Where each of the 31 numbers of F and the 22 of W go, (31, D, D) and (22, D, D)."""
     size = NUM_COMMON + num_boundaries
-    moves, shakes = np.zeros((13, size, size)), np.zeros((9, size, size))
-    density = [cfg.angular_density] * 3 + [cfg.height_density]
+    moves, shakes = np.zeros((31, size, size)), np.zeros((22, size, size))
+    one, fade, settle, time, wander = 28, 29, 30, 20, 21
     walk = [cfg.mean_angle_walk] * 3 + [cfg.mean_height_walk]
     for x in range(NUM_POSE):
         rate, mean = RATES.start + x, MEANS.start + x
-        for k, (row, column) in enumerate(((x, x), (x, rate), (rate, x), (rate, rate))):
-            moves[k, row, column] = 1
-            shakes[k, row, column] = density[x]
-        moves[4, x, mean] = moves[5, rate, mean] = moves[10, mean, mean] = 1
-        shakes[8, mean, mean] = walk[x] ** 2
+        places = ((x, x), (x, rate), (rate, x), (rate, rate), (x, mean), (rate, mean))
+        for k, place in enumerate(places):
+            moves[6 * x + k][place] = 1
+        for k, place in enumerate(places[:4]):
+            shakes[4 * x + k][place] = 1
+        moves[one, mean, mean] = 1
+        shakes[time, mean, mean] = walk[x] ** 2
     rate = RATES.start + OFFSET
-    for k, (row, column) in enumerate(((OFFSET, OFFSET), (OFFSET, rate), (rate, OFFSET), (rate, rate))):
-        moves[6 + k, row, column] = 1
-        shakes[4 + k, row, column] = cfg.offset_density
+    for k, place in enumerate(((OFFSET, OFFSET), (OFFSET, rate), (rate, OFFSET), (rate, rate))):
+        moves[24 + k][place] = 1
+        shakes[16 + k][place] = 1
     for knot in range(CURVATURE, NUM_SEEN):
-        moves[10, knot, knot] = 1
-        shakes[8, knot, knot] = cfg.curvature_walk**2
-    moves[11, SPEED, SPEED] = 1
-    shakes[8, SPEED, SPEED] = 2 * cfg.speed_std**2 / cfg.speed_memory
+        moves[one, knot, knot] = 1
+        shakes[time, knot, knot] = cfg.curvature_walk**2
+    moves[fade, SPEED, SPEED] = 1
+    shakes[time, SPEED, SPEED] = 2 * cfg.speed_std**2 / cfg.speed_memory
     for own in range(NUM_COMMON, size):
-        moves[12, own, own] = 1
-        shakes[8, own, own] = cfg.deviation_walk**2
+        moves[settle, own, own] = 1
+        shakes[wander, own, own] = 1
     return moves, shakes
 
 
@@ -194,18 +213,18 @@ def _come_into_view(phase: Tensor, gone: Tensor, passed: Tensor) -> Tensor:
     return (after.clamp(0.0, ENTRY) - before.clamp(0.0, ENTRY)) / ENTRY
 
 
-def spring(dt: Tensor, rate: float) -> tuple[Tensor, Tensor]:
+def spring(dt: Tensor, rate: float | Tensor) -> tuple[Tensor, Tensor]:
     """Critically damped spring driven by white noise, ẍ = -2 ω ẋ - ω² x + w.
 
     Source: the exact discretisation; the impulse response is h(t) = t e^(-ω t), and the noise integrals are
     those of h², h ḣ and ḣ². For ω → 0 it is :func:`lanebev.estimation.kalman.constant_velocity`.
 
     Args:
-        dt: (B,) s.
-        rate: ω, rad/s. The stationary variance of x is density / (4 ω³).
+        dt: (...) s.
+        rate: ω, rad/s, float or broadcast against dt. The stationary variance of x is density / (4 ω³).
 
     Returns:
-        (B, 4) transition of (x, ẋ), its 2 × 2 entries row by row, and (B, 4) noise at unit density.
+        (..., 4) transition of (x, ẋ), its 2 × 2 entries row by row, and (..., 4) noise at unit density.
     """
     turn = rate * dt
     decay = (-turn).exp()
