@@ -72,14 +72,13 @@ def test_vertices_lie_on_rendered_boundaries_to_a_tenth_of_a_pixel(fans):
 
 @pytest.mark.parametrize("size", [(144, 256), (96, 160)])
 def test_extraction_on_masks_of_rendered_roads(size):
-    """Curves, hills, hidden stretches and lenses included; what remains is nicked or bends in a few px."""
+    """Curves, hills, hidden stretches and lenses included: every vertex within 0.1 px."""
     frame = render_views(24, (64, 112), torch.Generator().manual_seed(0))
     error = extraction_error(frame, size, LineConfig(stride=1))
     assert len(error.distance) > 1000
     assert error.missed == 0
-    assert (error.distance < 0.1).double().mean() > 0.9985
     assert error.distance.quantile(0.99) < 0.06
-    assert error.distance.max() < 0.4
+    assert error.distance.max() < 0.1
     if size == (144, 256):  # on coarser masks the sigmas are a fifth too large
         assert 0.8 < error.normalised() < 1.2
 
@@ -120,8 +119,8 @@ def test_arms_of_a_hook_are_not_averaged():
     segments = extract_segments(maps[None, None], (2 * ROWS, 2 * COLUMNS), CONFIG)
     points = to_label(segments.endpoints[0][segments.weight[0] > 0]).reshape(-1, 2)
     off = np.minimum(*(np.abs(across(points, np.array(ends, float))) for ends in (upper, lower)))
-    assert len(points) == 2 * CONFIG.segments
-    assert off.max() < 0.2  # at the tip; means of both arms lie up to 9 px off
+    assert len(points) >= 2 * CONFIG.segments - 2  # all but the tip, which says nothing
+    assert off.max() < 0.1  # means of both arms lie up to 9 px off
 
 
 def test_every_vertex_is_used_once_and_baselines_are_long(fans):

@@ -26,7 +26,7 @@ def drive():
 def test_sigmas_half_as_large_as_the_errors_are_found_out(drive):
     report = compare([drive], (1.0, 2.0, 8.0))
     assert 0.5 < report[2.0].nees < 1.6  # one second is some ten independent errors an axis
-    assert report[1.0].nees > report[2.0].nees > 3 * report[8.0].nees
+    assert report[1.0].nees > report[2.0].nees > 2 * report[8.0].nees  # at 8 px it lags behind the swing
     assert (report[2.0].rmse < torch.tensor([0.05, 0.15, 0.1, 1.0])).all()
 
 

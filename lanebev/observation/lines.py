@@ -69,7 +69,7 @@ def extract_segments(
     vertices = representative_vertices(scan_vertices(probabilities, config), config)
     scale = probabilities.new_tensor([image_size[1] / network_size[1], image_size[0] / network_size[0]])
     points = (config.stride * vertices.points + 0.5) * scale - 0.5  # network pixel s·j under cell j
-    half = (vertices.weight > 0).sum(-1) // 2  # (B, L) pairs; vertices are filled from the front
+    half = (vertices.density > 0).sum(-1) // 2  # (B, L) pairs; vertices are filled from the front
     first = torch.arange(config.segments, device=points.device).expand(batch, boundaries, -1)
     second = (first + half.unsqueeze(-1)).clamp(max=2 * config.segments - 1)
     ends = torch.stack([take(points, first), take(points, second)], dim=-2)  # (B, L, S, 2, 2)

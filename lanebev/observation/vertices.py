@@ -15,9 +15,15 @@ from torch import Tensor
 
 _FLOOR = 0.01  # probability that background noise has everywhere; counts as nothing
 _PEAK = 2  # half-width of the box whose largest sum is a scan's peak, label px
-_END = 2  # scans at either end of a stripe that its round cap makes crooked
+_END = 3  # scans at either end of a stripe that its round cap makes crooked
 _FADE = 0.2  # of a stripe's mass, over which a scan's weight goes to zero below ``twice``
 _TOGETHER = 3.0  # px off a circle through two vertices, at and above which they are not averaged
+_UNSURE = (
+    12.0,
+    24.0,
+)  # variance over the boundary's median up to which a vertex counts in full; from which not
+_CLEAN = 0.03  # px, median sigma of a boundary above which its map hedges
+_SURE = 0.05  # px, sigma that is good enough for any boundary's median
 _NEIGHBOURS = 5  # scans on either side that decide a vertex' direction and scatter
 
 
@@ -228,8 +234,21 @@ def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
     common = torch.einsum("blvs,blv->bls", share, vertices.common_var)
     own = torch.einsum("blvs,blv->bls", share.square(), vertices.own_var)
     across = torch.einsum("blvs,blvd->blsd", share, normal)
-    sure = mass / counted.clamp(min=1e-6)
-    return Vertices(mean, across, sure, counted, common + config.sigma_floor**2, own)
+    common = common + config.sigma_floor**2
+    sure = mass / counted.clamp(min=1e-6) * _as_sure_as_most(common + own, counted > 0)
+    return Vertices(mean, across, sure, counted, common, own)
+
+
+def _as_sure_as_most(variance: Tensor, there: Tensor) -> Tensor:
+    """Weight (B, L, V) of vertices by their variance over the median of their boundary's.
+
+    On a clean map one far less sure than most is where the line is none: at its end, at a nick, on a bend of
+    a few px. On a map that hedges they differ anyway.
+    """
+    typical = variance.masked_fill(~there, math.nan).nanmedian(-1, keepdim=True).values
+    typical = typical.nan_to_num(1.0).clamp(min=_SURE**2)
+    excess = variance / (typical * (1 + typical / _CLEAN**2))
+    return ((_UNSURE[1] - excess) / (_UNSURE[1] - _UNSURE[0])).clamp(0, 1)
 
 
 def _with_the_middle(vertices: Vertices, rank: Tensor, member: Tensor) -> Tensor:
