@@ -10,7 +10,8 @@ import torch
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from tools.scenarios import CAMERA, FPS, WIDTH, moments
 from tools.scenarios import observe as see
-from train.noise import Seen, compare, outcome, watch
+from train.drives import Seen, watch
+from train.noise import compare, outcome
 
 
 @pytest.fixture(scope="module")

@@ -130,6 +130,11 @@ def test_evaluate_poses_reports_both(tmp_path, capsys, monkeypatch):
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["weights"] for line in lines] == ["before.safetensors", "after.safetensors"]
     assert set(evaluate_poses.AXES) < set(lines[0])
+    online = ["--online", "--drives", "1", "--frames", "12"]
+    monkeypatch.setattr(sys, "argv", ["evaluate_poses", paths[0], *online])
+    evaluate_poses.main()
+    line = json.loads(capsys.readouterr().out)
+    assert line["pitch_deg"]["frames"] == 2  # after ten frames of warm-up
     monkeypatch.setattr(sys, "argv", ["evaluate_poses", str(tmp_path / "none.safetensors")])
     with pytest.raises(SystemExit) as stop:
         evaluate_poses.main()

@@ -1,7 +1,8 @@
 """Errors of the pose on held-out rendered drives: ``python -m train.evaluate_poses BEFORE AFTER``.
 
-Every weights file (safetensors, or a Lightning checkpoint) sees the same frames, each frame on its own. An
-axis counts on the frames where every network's fit is valid and observes it.
+Every weights file (safetensors, or a Lightning checkpoint) sees the same frames. Each frame is taken on its
+own, an axis counting where every network's fit is valid and observes it; or, with ``--online``, the joint
+calibrator follows each drive, and all frames after its warm-up count, whatever their status.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.render import Drive
 from lanebev.weights import load_segmenter
+from train.drives import follow, watch
 from train.export import checkpoint_segmenter
 from train.poses import fit_poses
 
@@ -57,6 +59,12 @@ def pose_errors(segmenter: LaneSegmenter, frames: tuple[Tensor, ...]) -> tuple[T
     return torch.cat(errors), torch.cat(said)
 
 
+def online_errors(segmenter: LaneSegmenter, drives: int, frames: int, fps: float, seed: int) -> Tensor:
+    """Errors (N, 4) in rad and m of the joint calibrator on drives, at the size the network runs at."""
+    factor = segmenter.config.noise_factor
+    return torch.cat([follow(watch(segmenter, seed + i, frames, fps), factor).error for i in range(drives)])
+
+
 def summary(error: Tensor, counted: Tensor) -> dict[str, dict[str, float]]:
     """Root mean square and median of the absolute error per axis, in degrees and centimetres."""
     unit = error.new_tensor([math.degrees(1)] * 3 + [100.0])
@@ -73,14 +81,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("weights", type=Path, nargs="+")
     parser.add_argument("--drives", type=int, default=12)
-    parser.add_argument("--frames", type=int, default=12, help="of each drive, a second apart")
+    parser.add_argument("--frames", type=int, default=12, help="of each drive, a second apart if not online")
     parser.add_argument("--size", type=int, nargs=2, default=(192, 320), metavar=("HEIGHT", "WIDTH"))
     parser.add_argument("--seed", type=int, default=70_000)
+    parser.add_argument("--online", action="store_true", help="follow each drive with the joint calibrator")
+    parser.add_argument("--fps", type=float, default=10.0, help="of the drives followed online")
     args = parser.parse_args()
     try:
         networks = [load(path) for path in args.weights]
     except (ValueError, OSError) as error:
         parser.exit(2, f"error: {error}\n")
+    if args.online:
+        for path, network in zip(args.weights, networks, strict=True):
+            error = online_errors(network, args.drives, args.frames, args.fps, args.seed)
+            print(
+                json.dumps({"weights": path.name, **summary(error, torch.ones_like(error).bool())}),
+                flush=True,
+            )
+        return
     frames = held_out_frames(args.drives, args.frames, tuple(args.size), args.seed)
     found = [pose_errors(network, frames) for network in networks]
     common = torch.stack([said for _, said in found]).all(0)

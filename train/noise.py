@@ -19,46 +19,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint import JointCalibrator
-from lanebev.io.lane_rows import rows_from_segments, segments_from_rows
-from lanebev.observation.lines import LineExtractor
-from lanebev.observation.segmenter import LaneSegmenter
-from lanebev.pipeline import LaneBEV
-from lanebev.render import Drive
-from lanebev.types import LaneSegments, Status
+from train.drives import Seen, follow, watch
 from train.evaluate_poses import AXES, load
 
-WARM_UP = 10  # frames
 FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
-
-
-class Seen(NamedTuple):
-    """What a network saw of a drive: segments, lane widths (L - 1,) and poses (4,) of its frames."""
-
-    segments: list[LaneSegments]
-    lane_width: list[Tensor]
-    poses: Tensor
-    intrinsics: Tensor
-    interval: float
-
-
-def watch(segmenter: LaneSegmenter, seed: int, frames: int, fps: float) -> Seen:
-    """A rendered drive through the network, its sigmas as the maps say, by way of ``lanes.json``'s rows."""
-    drive = Drive(seed, num_frames=frames, fps=fps)
-    config = segmenter.config
-    extractor = LineExtractor.for_network(config)
-    model = LaneBEV(segmenter, extractor, JointCalibrator(), network_width=config.image_size[1]).eval()
-    segments, widths, poses = [], [], []
-    for i in range(frames):
-        frame = drive.frame(i)
-        with torch.inference_mode():
-            _, found = model.observe(frame.image, frame.intrinsics)
-        rows = rows_from_segments(found, drive.camera)
-        taken = segments_from_rows([rows], drive.camera)
-        segments.append(taken._replace(sigma=taken.sigma / config.noise_factor))
-        widths.append(frame.lane_width.double())
-        poses.append(frame.extrinsics.stack()[0].double())
-    return Seen(segments, widths, torch.stack(poses), frame.intrinsics.double(), 1 / fps)
 
 
 class Outcome(NamedTuple):
@@ -68,23 +32,15 @@ class Outcome(NamedTuple):
     nees: Tensor
 
 
-@torch.inference_mode()
 def outcome(seen: Seen, factor: float) -> Outcome:
     """How the calibrator fares on a drive with all sigmas times ``factor``."""
-    calibrator = JointCalibrator()
-    state = calibrator.initial_state(1, dtype=torch.float64)
-    errors, nees = [], []
-    for number, (segments, width) in enumerate(zip(seen.segments, seen.lane_width, strict=True)):
-        noisy = segments._replace(sigma=factor * segments.sigma)
-        out, state = calibrator(noisy, seen.intrinsics, state, seen.interval, width)
-        if number >= WARM_UP and out.status.item() == Status.TRACKING:
-            error = out.extrinsics.stack()[0] - seen.poses[number]
-            errors.append(error)
-            nees.append(error @ torch.linalg.solve(out.covariance[0], error) / 4)
-    if not errors:
+    followed = follow(seen, factor)
+    error, covariance = (part[followed.tracking] for part in followed[:2])
+    if not len(error):
         return Outcome(seen.poses.new_full((4,), math.nan), seen.poses.new_tensor(math.nan))
-    rmse = torch.stack(errors).square().mean(0).sqrt()
-    return Outcome(torch.cat([rmse[:3].rad2deg(), 100 * rmse[3:]]), torch.stack(nees).mean())
+    rmse = error.square().mean(0).sqrt()
+    nees = (error * torch.linalg.solve(covariance, error)).sum(-1) / 4
+    return Outcome(torch.cat([rmse[:3].rad2deg(), 100 * rmse[3:]]), nees.mean())
 
 
 def compare(drives: list[Seen], factors: tuple[float, ...] = FACTORS) -> dict[float, Outcome]:

@@ -1,0 +1,75 @@
+"""Held-out rendered drives through a network and the online calibrator."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.estimation.joint import JointCalibrator
+from lanebev.io.lane_rows import rows_from_segments, segments_from_rows
+from lanebev.observation.lines import LineExtractor
+from lanebev.observation.segmenter import LaneSegmenter
+from lanebev.pipeline import LaneBEV
+from lanebev.render import Drive
+from lanebev.types import LaneSegments, Status
+
+WARM_UP = 10  # frames
+
+
+class Seen(NamedTuple):
+    """What a network saw of a drive: segments, lane widths (L - 1,) and poses (4,) of its frames."""
+
+    segments: list[LaneSegments]
+    lane_width: list[Tensor]
+    poses: Tensor
+    intrinsics: Tensor
+    interval: float
+
+
+def watch(segmenter: LaneSegmenter, seed: int, frames: int, fps: float) -> Seen:
+    """A rendered drive through the network, its sigmas as the maps say, by way of ``lanes.json``'s rows."""
+    drive = Drive(seed, num_frames=frames, fps=fps)
+    config = segmenter.config
+    extractor = LineExtractor.for_network(config)
+    model = LaneBEV(segmenter, extractor, JointCalibrator(), network_width=config.image_size[1]).eval()
+    segments, widths, poses = [], [], []
+    for i in range(frames):
+        frame = drive.frame(i)
+        with torch.inference_mode():
+            _, found = model.observe(frame.image, frame.intrinsics)
+        rows = rows_from_segments(found, drive.camera)
+        taken = segments_from_rows([rows], drive.camera)
+        segments.append(taken._replace(sigma=taken.sigma / config.noise_factor))
+        widths.append(frame.lane_width.double())
+        poses.append(frame.extrinsics.stack()[0].double())
+    return Seen(segments, widths, torch.stack(poses), frame.intrinsics.double(), 1 / fps)
+
+
+class Followed(NamedTuple):
+    """Of a drive's F frames after the warm-up.
+
+    Attributes:
+        error: (F, 4) rad and m.
+        covariance: (F, 4, 4).
+        tracking: (F,) bool.
+    """
+
+    error: Tensor
+    covariance: Tensor
+    tracking: Tensor
+
+
+@torch.inference_mode()
+def follow(seen: Seen, factor: float) -> Followed:
+    """The online calibrator over a drive, all sigmas times ``factor``."""
+    calibrator = JointCalibrator()
+    state = calibrator.initial_state(1, dtype=torch.float64)
+    found = []
+    for segments, width, pose in zip(seen.segments, seen.lane_width, seen.poses, strict=True):
+        noisy = segments._replace(sigma=factor * segments.sigma)
+        out, state = calibrator(noisy, seen.intrinsics, state, seen.interval, width)
+        error = out.extrinsics.stack()[0] - pose
+        found.append((error, out.covariance[0], out.status[0] == Status.TRACKING))
+    return Followed(*(torch.stack(part)[WARM_UP:] for part in zip(*found, strict=True)))
