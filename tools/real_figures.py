@@ -16,7 +16,7 @@ from lanebev.io.lane_rows import rows_from_lines, segments_from_rows
 from lanebev.io.lanes import match_frames, read_lanes
 from lanebev.io.video import open_source
 from lanebev.observers import NetworkObserver
-from lanebev.report.measure import direction_spread, measure_boundaries, width_spread
+from lanebev.report.measure import believed, direction_spread, measure_boundaries, width_spread
 from lanebev.report.plots import width_deviation
 from lanebev.run import calibrate_still
 
@@ -49,12 +49,13 @@ class Figure:
 
 
 class Drive(NamedTuple):
-    """A drive's poses (F, 4) in rad and m, status (F,), times (F,) s and segments."""
+    """A drive's poses (F, 4) in rad and m, status (F,), times (F,) s, segments, and those believed."""
 
     poses: torch.Tensor
     status: torch.Tensor
     times: np.ndarray
     segments: list[LaneSegments]
+    lanes: list[LaneSegments]
 
 
 def tusimple_camera() -> Camera:
@@ -188,6 +189,7 @@ def follow(
     }
     poses: dict[str, list[torch.Tensor]] = {name: [] for name in calibrators}
     status: dict[str, list[torch.Tensor]] = {name: [] for name in calibrators}
+    lanes: dict[str, list[LaneSegments]] = {name: [] for name in calibrators}
     times, seen = [], []
     for frame in open_source(source):
         _, segments = observer(frame)
@@ -200,8 +202,9 @@ def follow(
                 )
             poses[name].append(calibration.extrinsics.stack()[0])
             status[name].append(calibration.status[0])
+            lanes[name].append(believed(segments, calibration.inliers))
     return {
-        name: Drive(torch.stack(poses[name]), torch.stack(status[name]), np.array(times), seen)
+        name: Drive(torch.stack(poses[name]), torch.stack(status[name]), np.array(times), seen, lanes[name])
         for name in calibrators
     }
 
@@ -212,17 +215,24 @@ def _width_figures(part: str, name: str, drive: Drive, camera: Camera, targets: 
         yield Figure(part, "lane width deviation, online", name, float("nan"), 5.0, "cm")
         return
 
-    def deviation(pose_of: Callable[[int], torch.Tensor]) -> float:
+    def deviation(seen: list[LaneSegments], pose_of: Callable[[int], torch.Tensor]) -> float:
         widths = [
             measure_boundaries(segments, camera.intrinsics[None], Extrinsics.unstack(pose_of(i)[None])).widths
-            for i, segments in enumerate(drive.segments)
+            for i, segments in enumerate(seen)
         ]
         return 100 * width_deviation(np.array(widths))
 
-    online, fixed = deviation(lambda i: drive.poses[i]), deviation(lambda _: drive.poses[int(tracked[0])])
+    def both(seen: list[LaneSegments]) -> tuple[float, float]:
+        first = drive.poses[int(tracked[0])]
+        return deviation(seen, lambda _: first), deviation(seen, lambda i: drive.poses[i])
+
+    fixed, online = both(drive.lanes)
     target = max(5.0, fixed / 3) if targets else None
     yield Figure(part, "lane width deviation, first frame's pose", name, fixed, None, "cm")
     yield Figure(part, "lane width deviation, online", name, online, target, "cm")
+    fixed, online = both(drive.segments)
+    yield Figure(part, "the same of all that was detected, first pose", name, fixed, None, "cm")
+    yield Figure(part, "the same of all that was detected, online", name, online, None, "cm")
 
 
 def _in_units(pose: torch.Tensor) -> torch.Tensor:

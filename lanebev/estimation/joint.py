@@ -52,6 +52,8 @@ _OF_LANES = (0.0, 0.0, 0.012, 0.1, 0.4)
 """What 1 m of independent deviations does to pitch, yaw, roll (rad), height and offset (m) fitted to six
 equal lanes at 1.5 m height: where lanes turn out unequal, what they had told is in doubt too."""
 
+_LANES_DIFFER = 5.0  # sigmas of ``open_deviation``: a boundary farther out of place bounds no lane
+
 
 class Reason(IntFlag):
     """Why a row is not (fully) tracking; several may hold at once."""
@@ -206,7 +208,8 @@ class JointCalibrator(nn.Module):
             lane_width: m, float, (B,) or (B, L-1) per lane.
 
         Returns:
-            calibration of this frame and the state after it.
+            calibration of this frame and the state after it. Inliers fit the road, and are of no boundary
+            that lies where none can be, as the foot of a barrier.
 
         Raises:
             ValueError: a shape that doesn't fit.
@@ -229,7 +232,8 @@ class JointCalibrator(nn.Module):
 
         skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=early)
         after = JointState(*(_where(skip, old, new) for old, new in zip(skipped, after, strict=True)))
-        inliers = torch.where(seen.weight > 0, trust, 0.0)
+        lane = after.mean[:, NUM_COMMON:].abs() < _LANES_DIFFER * cfg.open_deviation  # (B, L)
+        inliers = torch.where((seen.weight > 0) & lane.gather(1, seen.boundary), trust, 0.0)
         return self._calibration(after, inliers, positions, update.mimicry), after
 
     def curvature(self, state: JointState) -> Tensor:
@@ -486,7 +490,7 @@ class JointCalibrator(nn.Module):
         """(B,) m, what the others may be out of place where one boundary is, by no more than lanes differ."""
         size = self.config.open_deviation
         worst = mean[:, NUM_COMMON:].abs().amax(-1)
-        alone = (worst > 0.1 * size) & (worst < 5 * size) & (self._inequality(mean) == 0)
+        alone = (worst > 0.1 * size) & (worst < _LANES_DIFFER * size) & (self._inequality(mean) == 0)
         return torch.where(alone, worst.clamp(max=size), 0.0)
 
 

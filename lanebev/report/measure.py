@@ -29,6 +29,11 @@ class RoadBoundaries(NamedTuple):
     widths: NDArray[np.float64]
 
 
+def believed(segments: LaneSegments, inliers: Tensor) -> LaneSegments:
+    """The segments that a calibrator believes: with :attr:`~lanebev.Calibration.inliers` above a half."""
+    return segments._replace(weight=torch.where(inliers > 0.5, segments.weight, 0.0))
+
+
 def measure_boundaries(
     segments: LaneSegments,
     intrinsics: Tensor,

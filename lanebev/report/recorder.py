@@ -19,7 +19,7 @@ from lanebev.io.lanes import tusimple_line
 from lanebev.io.overlap import Background
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video import Frame, VideoWriter, write_png
-from lanebev.report.measure import measure_boundaries
+from lanebev.report.measure import believed, measure_boundaries
 from lanebev.report.overlay import Panel, Picture, draw_frame
 from lanebev.report.page import Report, summary_facts, write_report
 from lanebev.types import Calibration, Extrinsics, LaneSegments
@@ -134,12 +134,10 @@ class Recorder:
     def _write(self, done: Recorded) -> None:
         self._lanes.write(tusimple_line(done.name, *done.rows) + "\n")
         intrinsics = self.camera.intrinsics[None].to(done.segments.endpoints)
-        self._widths.append(
-            (
-                self._measure(done.segments, intrinsics, done.before),
-                self._measure(done.segments, intrinsics, done.calibration.extrinsics),
-            )
-        )
+        lanes = believed(done.segments, done.calibration.inliers)
+        poses = (done.before, done.calibration.extrinsics)
+        before, after = (self._measure(lanes, intrinsics, pose) for pose in poses)
+        self._widths.append((before, after))
         frame = done.frame
         image = frame.image if frame.image is not None else np.zeros((*self.camera.image_size, 3), np.uint8)
         place = frame.name if self.single or self.stills else f"frame {frame.number}   {frame.time:.2f} s"
