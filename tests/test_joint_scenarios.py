@@ -17,7 +17,7 @@ from lanebev.estimation.two_stage import TwoStageCalibrator
 from lanebev.types import Status
 from tools.bench_calibration import UNITS, WARM_UP, Track, summarise, track
 from tools.reproduce_table1 import VARIANCES, run, table
-from tools.scenarios import PLACES, SCENARIOS, Moment, moments
+from tools.scenarios import CAMERA, PLACES, SCENARIOS, WIDTH, Moment, moments, observe
 from tools.synthetic import Experiment
 
 torch.set_num_threads(1)
@@ -178,6 +178,22 @@ def test_unequal_lanes_are_honest_on_most_roads(size):
             nees.append(track(JointCalibrator(), drive, 1).nees[30:].mean() / 4)
     assert torch.stack(nees).median() < 1.25
     assert (torch.stack(nees) > 2).sum() <= 1
+
+
+@pytest.mark.parametrize("sigma", [1.0, 8.0])
+def test_a_boundary_where_none_can_be_is_not_believed(sigma):
+    """The foot of a barrier, a metre nearer than a lane's edge, by a sharp detector or by a vague one."""
+    shift = torch.tensor([0.0, 1.0, 0, 0, 0, 0], dtype=torch.float64)
+    drive = moments(1.0, lambda t, moment: replace(moment, places=PLACES + shift))
+    calibrator, state = JointCalibrator(), JointCalibrator().initial_state(2, dtype=torch.float64)
+    with torch.inference_mode():
+        for moment, segments in observe(drive, 2, sigma, 30, 0, torch.float64):
+            out, state = calibrator(segments, CAMERA.expand(2, 3, 3), state, moment.dt, WIDTH)
+    foot = segments.boundary == 1
+    assert (out.inliers[foot] < 0.5).all()
+    assert out.inliers[~foot].mean() > 0.95
+    error = (out.extrinsics.stack() - torch.tensor(moment.pose, dtype=torch.float64)).abs()
+    assert (error < 4 * out.covariance.diagonal(dim1=1, dim2=2).sqrt()).all()
 
 
 def test_lost_after_long_nothing_and_recovers_without_help():

@@ -79,7 +79,8 @@ def draw_boundaries(points: Float, shown: Bool, size: tuple[int, int], half_widt
 def _runs(line: Float, mask: Bool) -> list[npt.NDArray[np.int32]]:
     """Connected pieces of a polyline where the mask holds, in fixed point."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    fixed = np.rint(np.nan_to_num(line) * 2**_FRACTION_BITS).astype(np.int32)
+    near = np.clip(np.nan_to_num(line), -1e6, 1e6)  # what is farther is masked, and no int32
+    fixed = np.rint(near * 2**_FRACTION_BITS).astype(np.int32)
     return [fixed[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
 
 
