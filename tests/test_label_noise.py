@@ -1,0 +1,32 @@
+"""The measure of labels against the paint they mark."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tools.label_noise import line_offsets, stripe_centre
+
+
+def row_with(*stripes: tuple[int, int]) -> np.ndarray:
+    """A dark row of 200 px with stripes from one px to another, exclusive."""
+    row = np.full(200, 60, np.uint8)
+    for first, last in stripes:
+        row[first:last] = 200
+    return row
+
+
+def test_centre_of_a_stripe_and_nothing_where_it_is_not_clear():
+    assert stripe_centre(row_with((95, 104)), 103.0) == pytest.approx(99.0)
+    assert math.isnan(stripe_centre(row_with(), 100.0))
+    assert math.isnan(stripe_centre(row_with((90, 94), (100, 104)), 100.0))  # two stripes
+    assert math.isnan(stripe_centre(row_with((99, 100)), 100.0))  # a stone
+    assert math.isnan(stripe_centre(row_with((8, 14)), 10.0))  # cut by the image's edge
+
+
+def test_offsets_of_label_and_line_from_a_stripe():
+    grey = np.stack([row_with((95, 104))] * 500)
+    rows = np.arange(400, 500, 10.0)
+    label, line = np.full(10, 103.0), np.full(10, 98.5)
+    assert line_offsets(grey, rows, label, line) == pytest.approx((4.0, -0.5))
+    assert line_offsets(grey, rows, label + 40, line) is None  # another stripe
