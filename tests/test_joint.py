@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -30,7 +31,7 @@ from lanebev.estimation.joint_motion import (
     spring,
 )
 from lanebev.types import LaneSegments, Status
-from tools.scenarios import CAMERA, FPS, WIDTH, moments
+from tools.scenarios import CAMERA, FPS, PLACES, WIDTH, moments
 from tools.scenarios import observe as see
 
 torch.set_num_threads(1)
@@ -71,6 +72,34 @@ def test_first_frame_is_enough_and_the_interface_is_that_of_all_calibrators():
     assert (out.extrinsics.stack() - truth).abs().max() < 0.02
 
 
+def test_doubt_about_lanes_outlasts_frames_that_show_nothing():
+    """A boundary 0.1 m out of place puts height in doubt, and an empty or skipped frame leaves it there."""
+    places = PLACES + 0.1 * (torch.arange(6) == 5)
+    frames = list(see(moments(0.8, lambda t, m: replace(m, places=places)), 2, 1.0, 30, 0, DOUBLE))
+    calibrator = JointCalibrator()
+    before, state = run(calibrator, frames)
+    assert (before.covariance[:, 3, 3].sqrt() > 0.005).all()
+    again, _ = run(calibrator, frames[-1:], state, dt=0.0)
+    assert torch.equal(again.covariance, before.covariance)
+    empty = [(frames[-1][0], nothing(frames[-1][1]))]
+    after, _ = run(calibrator, empty, state)
+    variances = (out.covariance.diagonal(dim1=1, dim2=2) for out in (after, before))
+    assert torch.div(*variances).min() > 0.99
+
+
+def test_a_start_on_one_lane_says_that_roll_is_unseen():
+    frames = drive(1, per_boundary=30)
+    _, segments = frames[0]
+    middle = segments._replace(weight=segments.weight * ((segments.boundary == 2) | (segments.boundary == 3)))
+    out, state = run(JointCalibrator(), [(frames[0][0], middle)])
+    assert (state.reasons & Reason.RESTARTED).all()
+    assert (state.reasons & Reason.ROLL_UNSEEN).all()
+    assert not (state.reasons & Reason.HEIGHT_UNSEEN).any()
+    whole, state = run(JointCalibrator(), frames)
+    assert not (state.reasons & Reason.ROLL_UNSEEN).any()
+    assert (out.covariance[:, 2, 2] > 10 * whole.covariance[:, 2, 2]).all()
+
+
 def test_life_cycle_with_reasons():
     calibrator = JointCalibrator(lost_after=1.0)
     frames = drive(56)
@@ -99,7 +128,7 @@ def test_one_lane_and_one_boundary_say_what_is_unseen():
     _, state = run(calibrator, frames[:10])
     for boundaries, reasons in (
         ((2, 3), Reason.ROLL_UNSEEN),
-        ((2,), Reason.ROLL_UNSEEN | Reason.HEIGHT_UNSEEN),
+        ((2,), Reason.ROLL_UNSEEN | Reason.HEIGHT_UNSEEN | Reason.DIRECTION_UNSEEN),
     ):
         segments = frames[10][1]
         there = torch.zeros_like(segments.weight)

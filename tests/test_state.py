@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 from lanebev.estimation.joint import JointCalibrator, JointState
 from lanebev.estimation.mount import MountEstimator
 from lanebev.estimation.two_stage import TwoStageCalibrator
-from lanebev.io.state import load_state, save_state
+from lanebev.io.state import VERSION, load_state, save_state
 from tools.scenarios import CAMERA, FPS, moments, observe
 
 
@@ -63,7 +63,7 @@ def test_missing_foreign_and_non_finite_files(tmp_path, states):
     assert not (tmp_path / "bad").exists()
     header = {
         "format": "lanebev-state",
-        "version": "1",
+        "version": str(VERSION),
         "kinds": '{"calibrator": "JointState"}',
         "metadata": "{}",
     }

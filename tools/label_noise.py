@@ -50,7 +50,7 @@ def stripe_centre(row: NDArray[np.uint8], about: float) -> float:
 def line_offsets(
     grey: NDArray[np.uint8], rows: NDArray[np.float64], label: NDArray[np.float64], line: NDArray[np.float64]
 ) -> tuple[float, float] | None:
-    """Mean distance, px to the right, of a label and of the network's line from the stripe; None: no paint."""
+    """Mean distance, px to the right, of label and network's line from the stripe; None: no paint."""
     pairs = []
     for y, one, other in zip(rows, label, line, strict=True):
         if y < NEAREST_ROW or not abs(one - other) < APART:

@@ -19,7 +19,7 @@ from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.render import Drive
 from lanebev.weights import load_segmenter
-from train.drives import follow, watch
+from train.drives import WARM_UP, follow, watch
 from train.export import checkpoint_segmenter
 from train.poses import fit_poses
 
@@ -81,12 +81,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("weights", type=Path, nargs="+")
     parser.add_argument("--drives", type=int, default=12)
-    parser.add_argument("--frames", type=int, default=12, help="of each drive, a second apart if not online")
-    parser.add_argument("--size", type=int, nargs=2, default=(192, 320), metavar=("HEIGHT", "WIDTH"))
+    parser.add_argument("--frames", type=int, help="of each drive: 12, a second apart, or online 40")
+    parser.add_argument(
+        "--size", type=int, nargs=2, default=(192, 320), metavar=("HEIGHT", "WIDTH"), help="not online"
+    )
     parser.add_argument("--seed", type=int, default=70_000)
     parser.add_argument("--online", action="store_true", help="follow each drive with the joint calibrator")
     parser.add_argument("--fps", type=float, default=10.0, help="of the drives followed online")
     args = parser.parse_args()
+    args.frames = args.frames or (40 if args.online else 12)
+    if args.online and args.frames <= WARM_UP:
+        parser.error(f"--frames: expected more than the warm-up of {WARM_UP}, got {args.frames}")
     try:
         networks = [load(path) for path in args.weights]
     except (ValueError, OSError) as error:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from lanebev.estimation import kalman
 from lanebev.estimation.checks import as_batch
 from lanebev.estimation.joint_filter import (
-    ROLL_SEEN,
+    UNSEEN,
     Update,
     best_shift,
     evidence_index,
@@ -48,11 +48,7 @@ from lanebev.estimation.joint_motion import (
 from lanebev.estimation.single_frame import FramePrior, fit_single_frame
 from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status
 
-_OF_LANES = (0.0, 0.0, 0.012, 0.1, 0.4)
-"""What 1 m of independent deviations does to pitch, yaw, roll (rad), height and offset (m) fitted to six
-equal lanes at 1.5 m height: where lanes turn out unequal, what they had told is in doubt too."""
-
-_LANES_DIFFER = 5.0  # sigmas of ``open_deviation``: a boundary farther out of place bounds no lane
+_NO_BOUNDARY = 0.6  # m out of place, at and above which a line bounds no lane
 
 
 class Reason(IntFlag):
@@ -63,11 +59,11 @@ class Reason(IntFlag):
     FEW_INLIERS = 2  # what was seen does not fit the road that is believed
     TIME = 4  # not later than the last frame, and not used; or the time unknown, and one guessed
     NO_START = 8  # no start found yet: pitch and yaw not determined by this frame
-    ROLL_UNSEEN = 16  # one lane or less: roll holds with growing sigma
-    HEIGHT_UNSEEN = 32  # no lane: height holds with growing sigma
+    ROLL_UNSEEN = 16  # one lane or less, or the frame was not used: roll holds with growing sigma
+    HEIGHT_UNSEEN = 32  # no lane, or not used: height holds with growing sigma
     LANE_CHANGE = 64  # the boundary indices moved by one in this frame
     RESTARTED = 128  # started, or started anew, in this frame
-    DIRECTION_UNSEEN = 256  # one boundary or less: pitch and yaw hold with growing sigma
+    DIRECTION_UNSEEN = 256  # one boundary or less, or not used: pitch and yaw hold with growing sigma
 
 
 @dataclass(frozen=True)
@@ -84,8 +80,7 @@ class JointConfig:
         open_pose: rad (and 10 of these in m of height), jump admitted where one frame contradicts the motion.
         open_curvature, open_step: 1/m, change of the knots admitted a frame when a bend begins or ends.
         straight: 1/m and 1/m², sigmas of c0 and c1 of a road that is taken as straight at a start.
-        open_deviation: m, admitted where the lanes turn out unequal.
-        seen: rad and m, sigmas of the pose from one frame above which it counts as unseen.
+        open_deviation: m, sigma of a boundary's deviation on a road of unequal lanes; 0: there are none.
         evidence_time: s over which a bend's or unequal lanes' evidence is summed.
         min_support: inlier segments (weights summed) of a usable frame.
         min_share, enter_share: share of inliers to go on tracking, and to begin again.
@@ -105,7 +100,6 @@ class JointConfig:
     open_step: float = 3e-5
     straight: tuple[float, float] = (3e-5, 1e-6)
     open_deviation: float = 0.12
-    seen: tuple[float, float, float, float] = (0.01, 0.01, ROLL_SEEN, 0.3)
     evidence_time: float = 0.15
     min_support: float = 3.0
     min_share: float = 0.15
@@ -129,18 +123,23 @@ class JointState(NamedTuple):
         mean: (B, D), see ``joint_motion``.
         cov: (B, D, D).
         phase: (B,) m, how far the first knot of the road's curvature lies behind the camera.
-        evidence: (B, 10 + L) summed evidence against the motion: pose, shape, deviations; unit variance.
+        evidence: (B, 10 + L) evidence against the motion, unit variance: the last frame's of the pose, summed
+            of shape and deviations.
+        mimicry: (B, 4, L) change of the pose by a metre that a boundary is out of place, by the last frame
+            that determined the pose.
         early: (B,) s by which the state is ahead of the last frame, which came out of order.
         unseen: (B,) s since the last usable frame.
         misfit: (B,) s for which there were segments that did not fit.
         status: (B,) int64, values of Status.
-        reasons: (B,) int64, :class:`Reason` flags of the last frame.
+        reasons: (B,) int64, :class:`Reason` flags of the last frame; those of what is unseen decide how the
+            next prediction moves.
     """
 
     mean: Tensor
     cov: Tensor
     phase: Tensor
     evidence: Tensor
+    mimicry: Tensor
     early: Tensor
     unseen: Tensor
     misfit: Tensor
@@ -182,6 +181,7 @@ class JointCalibrator(nn.Module):
             cov=cov,
             phase=zero.clone(),
             evidence=mean.new_zeros(batch_size, NUM_POSE + 1 + NUM_STEPS + cfg.num_boundaries),
+            mimicry=mean.new_zeros(batch_size, NUM_POSE, cfg.num_boundaries),
             early=zero.clone(),
             unseen=zero,
             misfit=zero.clone(),
@@ -208,8 +208,8 @@ class JointCalibrator(nn.Module):
             lane_width: m, float, (B,) or (B, L-1) per lane.
 
         Returns:
-            calibration of this frame and the state after it. Inliers fit the road, and are of no boundary
-            that lies where none can be, as the foot of a barrier.
+            calibration of this frame and the state after it. Inliers fit the road; 0 for a boundary too far
+            out of place to bound a lane, as the foot of a barrier.
 
         Raises:
             ValueError: a shape that doesn't fit.
@@ -232,9 +232,9 @@ class JointCalibrator(nn.Module):
 
         skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=early)
         after = JointState(*(_where(skip, old, new) for old, new in zip(skipped, after, strict=True)))
-        lane = after.mean[:, NUM_COMMON:].abs() < _LANES_DIFFER * cfg.open_deviation  # (B, L)
+        lane = after.mean[:, NUM_COMMON:].abs() < _NO_BOUNDARY  # (B, L)
         inliers = torch.where((seen.weight > 0) & lane.gather(1, seen.boundary), trust, 0.0)
-        return self._calibration(after, inliers, positions, update.mimicry), after
+        return self._calibration(after, inliers, positions), after
 
     def curvature(self, state: JointState) -> Tensor:
         """Curvature of the road at the camera, (B,) 1/m, positive to the right."""
@@ -288,7 +288,6 @@ class JointCalibrator(nn.Module):
         slow = predicted.evidence * fade + (1 - fade * fade).sqrt() * news
         evidence = torch.cat([news[:, :NUM_POSE], slow[:, NUM_POSE:]], dim=-1)
         cov = cov + self._opened(evidence, cov)
-        mean, cov = self._unequal_lanes(mean, cov)
         return iterate(mean, cov, first.mean, first.scale, places, seen, phase, 1), evidence
 
     def _opened(self, evidence: Tensor, cov: Tensor) -> Tensor:
@@ -315,27 +314,12 @@ class JointCalibrator(nn.Module):
     def _inequality(self, mean: Tensor) -> Tensor:
         """(B,) m, sigma that deviations may have, by the second largest of them; 0 on a road of equal lanes.
 
-        One boundary alone out of place is a detector's error. Of six deviations four say nothing, since
-        offset, roll and height mimic them: what is seen is a third of what there may be.
+        One boundary alone out of place is a detector's error. Of six deviations three directions say nothing,
+        since offset, height and roll mimic them: there may be three times what is seen.
         """
         size = self.config.open_deviation
         second = mean[:, NUM_COMMON:].abs().topk(2, dim=-1).values[:, 1]
         return torch.where(second > 0.1 * size, (3 * second).clamp(max=size), 0.0)
-
-    def _unequal_lanes(self, mean: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:
-        """Where a second boundary is out of place, all may be: their deviations start anew, each as unsure.
-
-        What equal lanes had told of the pose is in doubt with them.
-        """
-        known, size = cov.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:], self.config.open_deviation
-        anew = (self._inequality(mean) > 0) & (known.amin(-1) < 0.01 * size**2)
-        index = torch.arange(mean.shape[-1], device=mean.device)
-        kept = ~(anew.unsqueeze(-1) & (index >= NUM_COMMON))
-        doubt = torch.zeros_like(mean)
-        doubt[:, :NUM_STRAIGHT] = mean.new_tensor(_OF_LANES)
-        doubt[:, NUM_COMMON:] = 1.0
-        noise = (doubt * (size * anew).unsqueeze(-1)).square()
-        return mean * kept, cov * kept.unsqueeze(-1) * kept.unsqueeze(-2) + noise.diag_embed()
 
     def _judge(
         self,
@@ -366,7 +350,7 @@ class JointCalibrator(nn.Module):
         reasons = _flag(empty, Reason.NO_SEGMENTS) | _flag(~empty & ~supported, Reason.FEW_INLIERS)
         reasons = reasons | _flag(supported & (shift != 0), Reason.LANE_CHANGE)
         reasons = reasons | _flag(~running, Reason.NO_START)
-        blind = ~supported.unsqueeze(-1) | (update.alone[:, :NUM_POSE] > update.alone.new_tensor(cfg.seen))
+        blind = ~supported.unsqueeze(-1) | (update.alone[:, :NUM_POSE] > update.alone.new_tensor(UNSEEN))
         reasons = reasons | _flag(blind[:, :ROLL].any(-1), Reason.DIRECTION_UNSEEN)
         reasons = reasons | _flag(blind[:, ROLL], Reason.ROLL_UNSEEN)
         reasons = reasons | _flag(blind[:, HEIGHT], Reason.HEIGHT_UNSEEN)
@@ -375,6 +359,7 @@ class JointCalibrator(nn.Module):
             cov=_where(supported, update.cov, state.cov),
             phase=state.phase,
             evidence=_where(supported, evidence, torch.zeros_like(evidence)),
+            mimicry=_where(supported & ~blind.any(-1), update.mimicry, state.mimicry),
             early=torch.zeros_like(unseen),
             unseen=unseen,
             misfit=misfit,
@@ -415,11 +400,14 @@ class JointCalibrator(nn.Module):
             cov=cov,
             phase=zero,
             evidence=torch.zeros_like(state.evidence),
+            mimicry=torch.zeros_like(state.mimicry),
             early=zero,
             unseen=zero,
             misfit=zero,
             status=torch.full_like(state.status, int(Status.TRACKING)),
-            reasons=torch.full_like(state.reasons, int(Reason.RESTARTED)),
+            reasons=int(Reason.RESTARTED)
+            | _flag(~fit.observed[:, ROLL], Reason.ROLL_UNSEEN)
+            | _flag(~fit.observed[:, HEIGHT], Reason.HEIGHT_UNSEEN),
         )
         after = JointState(*(_where(fresh, new, old) for new, old in zip(begun, state, strict=True)))
         return after, torch.where(fresh.unsqueeze(-1), fit.inliers, trust)
@@ -465,14 +453,12 @@ class JointCalibrator(nn.Module):
         reduced = kalman.symmetrise(cov - gain @ torch.cholesky_solve(gain.mT, factor))
         return _where(straight, pulled, params), _where(straight, reduced, cov)
 
-    def _calibration(
-        self, state: JointState, inliers: Tensor, positions: Tensor, mimicry: Tensor
-    ) -> Calibration:
+    def _calibration(self, state: JointState, inliers: Tensor, positions: Tensor) -> Calibration:
         """What goes out: the pose, its covariance, status, inliers.
 
-        To the filter's covariance comes what it does not follow: the lane width's own scale; what the other
-        boundaries may be out of place where one is; and height by the square of an error of roll, where
-        roll is held. With boundaries at x₁ and x₂ seen as they are, h'' = -2 (h - x₁ x₂ / h).
+        To the filter's covariance comes what it does not follow: the lane width's own scale; what any
+        boundary may be out of place where one is; and height by the square of an error of roll, where that is
+        held. With boundaries at x₁ and x₂ seen as they are, h'' = -2 (h - x₁ x₂ / h).
         """
         cov = state.cov[:, :NUM_POSE, :NUM_POSE]
         height, ego = state.mean[:, HEIGHT], self.config.num_boundaries // 2 - 1
@@ -480,17 +466,16 @@ class JointCalibrator(nn.Module):
         bend = height - left * right / height.clamp(min=0.1)
         more = 3.0 * (bend * cov[:, ROLL, ROLL]).square() * _held(state.reasons)[:, ROLL]
         more = more + (self.config.lane_width_std * height).square()
-        by_others = self._one_out_of_place(state.mean)[:, None, None] * mimicry[:, :NUM_POSE]
-        by_others = by_others @ by_others.mT
+        by_lanes = self._one_out_of_place(state.mean)[:, None, None] * state.mimicry
         only_height = torch.arange(NUM_POSE, device=cov.device) == HEIGHT
-        cov = cov + by_others + (only_height * more.unsqueeze(-1)).diag_embed()
+        cov = cov + by_lanes @ by_lanes.mT + (only_height * more.unsqueeze(-1)).diag_embed()
         return Calibration(Extrinsics.unstack(state.mean[:, :NUM_POSE]), cov, state.status, inliers)
 
     def _one_out_of_place(self, mean: Tensor) -> Tensor:
-        """(B,) m, what the others may be out of place where one boundary is, by no more than lanes differ."""
+        """(B,) m, what any boundary may be out of place where one is, by no more than lanes differ."""
         size = self.config.open_deviation
         worst = mean[:, NUM_COMMON:].abs().amax(-1)
-        alone = (worst > 0.1 * size) & (worst < _LANES_DIFFER * size) & (self._inequality(mean) == 0)
+        alone = (worst > 0.1 * size) & (worst < _NO_BOUNDARY) & (self._inequality(mean) == 0)
         return torch.where(alone, worst.clamp(max=size), 0.0)
 
 

@@ -23,8 +23,9 @@ from lanebev.estimation.single_frame import normal_equations
 
 _LOOSE = (0.3, 0.3, 0.3, 1.0, 2.0)  # rad, m: sigmas before a frame, to ask what it alone determines
 _KNOWN = 1e-4  # share of its sigma that roll keeps where it is held: as good as known, yet not singular
-SHARED = 0.2  # sigmas by which all end points of a boundary may be off alike
-ROLL_SEEN = 0.01  # rad, sigma of roll from one frame above which roll is held instead of estimated
+_SHARED = 0.2  # sigmas by which all end points of a boundary may be off alike
+UNSEEN = (0.01, 0.01, 0.01, 0.3)
+"""Sigmas (rad, m) of the pose from one frame up to which the frame determines it; beyond, roll is held."""
 
 
 class Update(NamedTuple):
@@ -38,7 +39,7 @@ class Update(NamedTuple):
         score: (B, D), P⁻¹ (best - predicted): the pull of the observations on the prediction.
         best_cov: (B, D, D), were roll known where it is held.
         alone: (B, 5) sigmas of pitch, yaw, roll, height and offset from this frame alone.
-        mimicry: (B, 5, L) change of them, fitted to this frame, by a metre that a boundary is out of place.
+        mimicry: (B, 4, L) change of the pose fitted to this frame by a metre that a boundary is out of place.
     """
 
     mean: Tensor
@@ -67,7 +68,7 @@ def iterate(
     Source: Bell and Cathey 1993, the iterated Kalman filter as Gauss-Newton; Schmidt 1966 for the roll that
     a frame does not determine: it is considered, not estimated. On one lane roll and offset are the same to
     first order, and what sets them apart is a difference of second order that linearised updates overrate.
-    The other parameters are estimated as if roll were known: pitch and yaw do not depend on it then.
+    The rest is estimated as if roll were known, so that pitch and yaw do not depend on it.
 
     Args:
         predicted: (B, D) mean.
@@ -98,8 +99,8 @@ def iterate(
         pull = pull + (info @ (mean - predicted).unsqueeze(-1)).squeeze(-1)
         alone, mimicry = _alone(info)
         estimated = _estimated(alone, mean)
-        held = estimated.clamp(min=_KNOWN)
-        best, posterior = kalman.update(predicted, held.unsqueeze(-1) * cov * held.unsqueeze(-2), info, pull)
+        free = estimated.clamp(min=_KNOWN)
+        best, posterior = kalman.update(predicted, free.unsqueeze(-1) * cov * free.unsqueeze(-2), info, pull)
         mean = predicted + estimated * (best - predicted)
     score = pull - (info @ (best - predicted).unsqueeze(-1)).squeeze(-1)
     after = _consider(cov, posterior, info, estimated)
@@ -120,20 +121,20 @@ def _alone(info: Tensor) -> tuple[Tensor, Tensor]:
     """Of a straight road's five parameters, from this frame's information (B, D, D) alone.
 
     Returns:
-        (B, 5) sigmas, and (B, 5, L) their change by a metre that a boundary is out of place.
+        (B, 5) sigmas, and (B, 4, L) change of the pose by a metre that a boundary is out of place.
     """
     loose = info.new_tensor(_LOOSE)
     scaled = loose.unsqueeze(-1) * info[:, :NUM_STRAIGHT, :NUM_STRAIGHT] * loose
     factor = torch.linalg.cholesky_ex(scaled + torch.eye(NUM_STRAIGHT).to(info)).L
     cov = loose.unsqueeze(-1) * torch.cholesky_inverse(factor) * loose
-    return cov.diagonal(dim1=1, dim2=2).sqrt(), -cov @ info[:, :NUM_STRAIGHT, NUM_COMMON:]
+    return cov.diagonal(dim1=1, dim2=2).sqrt(), cov[:, :NUM_POSE] @ info[:, :NUM_STRAIGHT, NUM_COMMON:]
 
 
 def _estimated(alone: Tensor, mean: Tensor) -> Tensor:
     """(B, D): 0 for roll, its rate and its slow mean where the frame does not determine roll, else 1."""
     index = torch.arange(mean.shape[-1], device=mean.device)
     about_roll = (index == ROLL) | (index == RATES.start + ROLL) | (index == MEANS.start + ROLL)
-    return torch.where(about_roll & (alone[:, ROLL, None] > ROLL_SEEN), 0.0, torch.ones_like(mean))
+    return torch.where(about_roll & (alone[:, ROLL, None] > UNSEEN[ROLL]), 0.0, torch.ones_like(mean))
 
 
 def _information(
@@ -161,7 +162,7 @@ def surprise(update: Update, index: Tensor, count: Tensor) -> Tensor:
 
     The score u = P⁻¹ (mean - predicted) has covariance Λ - Λ P⁺ Λ. It is the score test (Rao 1948) for
     more process noise in that entry. Detectors err alike along a boundary, so n end points say no more of
-    its place than 1 / (1 / n + ``SHARED``²) do.
+    its place than 1 / (1 / n + ``_SHARED``²) do.
 
     Args:
         update: of the frame.
@@ -175,7 +176,7 @@ def surprise(update: Update, index: Tensor, count: Tensor) -> Tensor:
     variance = seen.diagonal(dim1=-2, dim2=-1)[:, index]
     known = variance > 1e-3 * update.info.diagonal(dim1=-2, dim2=-1)[:, index]
     shared = torch.ones_like(variance)
-    shared[:, -count.shape[-1] :] += SHARED**2 * count
+    shared[:, -count.shape[-1] :] += _SHARED**2 * count
     variance = variance * shared
     known = known & (variance > 0)
     return torch.where(known, update.score[:, index] * torch.where(known, variance, 1.0).rsqrt(), 0.0)

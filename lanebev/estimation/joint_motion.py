@@ -5,8 +5,11 @@ first five | slow mean of the pose | speed | deviation of each boundary from its
 
 The pose swings about its slow mean as a critically damped spring driven by white noise: within a frame a
 constant-velocity model, over seconds of nothing a return to the mount's pose with a bounded sigma. What the
-last frame did not determine is held by a stiffer spring with more noise: from frame to frame any density
-follows a swing, on its own it must cover it, and a suspension swings back.
+last frame did not determine swings on a stiffer spring with more noise: between seen frames any density
+follows the swing, unseen its sigma must cover it, and a suspension does swing back.
+
+Boundaries keep their places: deviations decay slowly, and on a road of unequal lanes fast, with noise that
+keeps up how much they may be, since offset, height and roll mimic half of them.
 
 The road does not change, it comes nearer: knots of its curvature stand in the world, and the camera passes
 them at a speed that is estimated too. What was seen far ahead so holds when it is near, and new is only
@@ -59,8 +62,8 @@ class MotionConfig:
         curvature_step: 1/m, sigma of a step that comes into view.
         speed, speed_std: m/s, before anything is known.
         speed_memory: s, over which it is forgotten.
-        deviation_memory: s, decay of a boundary's deviation.
-        deviation_walk: m/√s, while nothing speaks for unequal lanes.
+        deviation_memory: s, decay of a boundary's deviation where lanes are equal.
+        deviation_walk: m/√s.
         unequal_memory: s, decay of the deviations on a road of unequal lanes.
     """
 
@@ -88,6 +91,8 @@ def motion(
 ) -> tuple[Tensor, Tensor]:
     """Transition and process noise over dt, the road's coming nearer apart (:func:`come_nearer`).
 
+    What is held is decided once for all of dt: half a second at once is not fifteen frames without segments.
+
     Args:
         dt: (B,) s, >= 0.
         held: (B, 4) bool, what of pitch, yaw, roll, height the last frame did not determine.
@@ -100,18 +105,18 @@ def motion(
     """
     density = dt.new_tensor([cfg.angular_density] * 3 + [cfg.height_density])
     density = torch.where(held, cfg.held_factor * density, density)  # (B, 4)
-    swing, drive = spring(dt.unsqueeze(-1), torch.where(held, cfg.held_spring, cfg.spring).to(dt))
+    swing, drive = spring(dt.unsqueeze(-1), torch.where(held, cfg.held_spring, dt.new_tensor(cfg.spring)))
     swing = torch.cat([swing, 1 - swing[..., :1], -swing[..., 2:3]], dim=-1)  # (B, 4, 6)
     slide, push = _damped(dt, cfg.offset_memory)
     fade = (-dt / cfg.speed_memory).exp()
-    memory = torch.where(unequal > 0, cfg.unequal_memory, cfg.deviation_memory).to(dt)
+    memory = torch.where(unequal > 0, cfg.unequal_memory, dt.new_tensor(cfg.deviation_memory))
     settle = (-dt / memory).exp()
     still = torch.stack([torch.ones_like(dt), fade, settle], dim=-1)
     moves = torch.cat([swing.flatten(1), slide, still], dim=-1)  # (B, 31)
     drive = (density.unsqueeze(-1) * drive).flatten(1)
     wander = cfg.deviation_walk**2 * dt + unequal.square() * (1 - settle * settle)
-    still = torch.stack([dt, wander], dim=-1)
-    shakes = torch.cat([drive, cfg.offset_density * push, still], dim=-1)  # (B, 22)
+    walks = torch.stack([dt, wander], dim=-1)
+    shakes = torch.cat([drive, cfg.offset_density * push, walks], dim=-1)  # (B, 22)
     on_moves, on_shakes = _patterns(num_boundaries, cfg)
     transition = torch.einsum("bk,kij->bij", moves, torch.as_tensor(on_moves).to(dt))
     return transition, torch.einsum("bk,kij->bij", shakes, torch.as_tensor(on_shakes).to(dt))

@@ -161,7 +161,7 @@ class TwoStageCalibrator(nn.Module):
         unseen = torch.where(one.seen, 0.0, state.unseen + dt)
         status = _status(state.status, one.seen, unseen, self.config.lost_after)
         state = TwoStageState(one.mean, one.cov, *two, unseen, status)
-        return self._calibration(state, widths, one.inliers * segments.weight), state
+        return self._calibration(state, widths, one.inliers), state
 
     def _calibration(self, state: TwoStageState, lane_width: Tensor, inliers: Tensor) -> Calibration:
         pose = torch.cat([state.direction_mean[:, :2], state.roll_height_mean[:, :2]], dim=-1)

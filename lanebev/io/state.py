@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 FORMAT = "lanebev-state"
-VERSION = 1
+VERSION = 2
 _SEPARATOR = "."
 
 

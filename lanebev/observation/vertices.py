@@ -18,12 +18,8 @@ _PEAK = 2  # half-width of the box whose largest sum is a scan's peak, label px
 _END = 3  # scans at either end of a stripe that its round cap makes crooked
 _FADE = 0.2  # of a stripe's mass, over which a scan's weight goes to zero below ``twice``
 _TOGETHER = 3.0  # px off a circle through two vertices, at and above which they are not averaged
-_UNSURE = (
-    12.0,
-    24.0,
-)  # variance over the boundary's median up to which a vertex counts in full; from which not
-_CLEAN = 0.03  # px, median sigma of a boundary above which its map hedges
-_SURE = 0.05  # px, sigma that is good enough for any boundary's median
+_SURE = 0.05  # px, sigma up to which the median vertex of a boundary is that of a clean map
+_UNSURE = 0.33  # px, sigma of a clean map's vertex above which it counts less, and at 3/2 of which not at all
 _NEIGHBOURS = 5  # scans on either side that decide a vertex' direction and scatter
 
 
@@ -240,15 +236,14 @@ def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
 
 
 def _as_sure_as_most(variance: Tensor, there: Tensor) -> Tensor:
-    """Weight (B, L, V) of vertices by their variance over the median of their boundary's.
+    """Weight (B, L, 2S) of vertices by their variance and the median variance of their boundary.
 
-    On a clean map one far less sure than most is where the line is none: at its end, at a nick, on a bend of
-    a few px. On a map that hedges they differ anyway.
+    On a clean map an unsure vertex is where there is no line: at its end, at a nick, on a bend of a few px.
+    A map that hedges has unsure ones anyway: there the limit grows as the median variance does.
     """
     typical = variance.masked_fill(~there, math.nan).nanmedian(-1, keepdim=True).values
-    typical = typical.nan_to_num(1.0).clamp(min=_SURE**2)
-    excess = variance / (typical * (1 + typical / _CLEAN**2))
-    return ((_UNSURE[1] - excess) / (_UNSURE[1] - _UNSURE[0])).clamp(0, 1)
+    limit = _UNSURE * (typical.nan_to_num(1.0) / _SURE**2).clamp(min=1.0)
+    return (3.0 - 2.0 * variance.sqrt() / limit).clamp(0, 1)
 
 
 def _with_the_middle(vertices: Vertices, rank: Tensor, member: Tensor) -> Tensor:
