@@ -37,7 +37,7 @@ MEANS = slice(NUM_SEEN + 5, NUM_SEEN + 9)
 SPEED = NUM_SEEN + 9
 NUM_COMMON = NUM_SEEN + 10  # then follow the L deviations
 
-CLEAR_BEND = 25.0  # chi-square of the five steps of curvature at which they tell half as much of the speed
+CLEAR_BEND = (20.0, 40.0)  # chi-square of the five steps of curvature between which they come to tell speed
 ENTRY = KNOT_SPACING / 3  # m, way over which a step comes into view
 _SLOPE = 0.5 * (np.eye(1 + NUM_STEPS) + np.eye(1 + NUM_STEPS, k=1))  # at a knot, by the steps about it
 _SLOPE[0] = np.eye(1 + NUM_STEPS)[1]
@@ -194,15 +194,15 @@ def _change_per_metre(shape: Tensor, cov: Tensor) -> Tensor:
     """Change of the shape parameters by a metre driven, (B, 1 + NUM_STEPS), as far as there is a bend.
 
     On a straight road the steps are noise, and noise does not come nearer. Taken for a bend it would tell
-    that the car stands, and where knots are passed would be left to chance.
+    that the car stands, and where knots are passed would be left to chance: precisions would drift apart.
     """
     change: Tensor = (torch.as_tensor(_CHANGE).to(shape) @ shape.unsqueeze(-1)).squeeze(-1)
     steps, spread = shape[:, 1:], cov[:, 1:, 1:]
     size = spread.diagonal(dim1=1, dim2=2).rsqrt()  # (B, NUM_STEPS)
     factor = torch.linalg.cholesky_ex(size.unsqueeze(-1) * spread * size.unsqueeze(-2)).L
     white = torch.linalg.solve_triangular(factor, (size * steps).unsqueeze(-1), upper=False)
-    squared = white.square().sum((1, 2)).square()  # (B,)
-    known: Tensor = squared / (squared + CLEAR_BEND**2)
+    chi2, (least, clear) = white.square().sum((1, 2)), CLEAR_BEND
+    known: Tensor = ((chi2 - least) / (clear - least)).clamp(0, 1)  # (B,)
     return change * known.unsqueeze(-1)
 
 
