@@ -48,7 +48,8 @@ from lanebev.estimation.joint_motion import (
 from lanebev.estimation.single_frame import FramePrior, fit_single_frame
 from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status
 
-_NO_BOUNDARY = 0.6  # m out of place, at and above which a line bounds no lane
+_NO_BOUNDARY = 0.36  # m out of place, three sigmas of what lanes differ, from which a line bounds no lane
+_DOUBTFUL = 0.6  # m out of place, below which a boundary let go alone may stand for several
 
 
 class Reason(IntFlag):
@@ -475,7 +476,7 @@ class JointCalibrator(nn.Module):
         """(B,) m, what any boundary may be out of place where one is, by no more than lanes differ."""
         size = self.config.open_deviation
         worst = mean[:, NUM_COMMON:].abs().amax(-1)
-        alone = (worst > 0.1 * size) & (worst < _NO_BOUNDARY) & (self._inequality(mean) == 0)
+        alone = (worst > 0.1 * size) & (worst < _DOUBTFUL) & (self._inequality(mean) == 0)
         return torch.where(alone, worst.clamp(max=size), 0.0)
 
 
