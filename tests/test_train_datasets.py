@@ -85,11 +85,11 @@ def test_data_module(root, layout, name):
 
 @pytest.mark.parametrize(("layout", "name"), LAYOUTS)
 def test_labels_as_logits_score_full_marks(root, layout, name):
-    (batch,) = LaneFiles(layout, str(root), val=[name], batch_size=2, val_size=(144, 256)).val_dataloader()
+    (batch,) = LaneFiles(layout, str(root), val=[name], batch_size=2, val_size=(288, 512)).val_dataloader()
     target = batch.views.target.float() / 255
     logits = torch.cat([1 - target.sum(1, keepdim=True), target], dim=1).clamp(min=1e-6).log()
     scores = BenchmarkScores()
-    scores.update(logits, (144, 256), batch)
+    scores.update(logits, (288, 512), batch)
     figures = scores.compute()
     if layout == "tusimple":
         assert figures["accuracy"] > 0.9  # a stripe's ends are left out
@@ -97,7 +97,7 @@ def test_labels_as_logits_score_full_marks(root, layout, name):
     else:
         assert figures == {"f1": 1.0}
     nothing = BenchmarkScores()
-    nothing.update(torch.zeros_like(logits).index_fill(1, torch.tensor([0]), 10.0), (144, 256), batch)
+    nothing.update(torch.zeros_like(logits).index_fill(1, torch.tensor([0]), 10.0), (288, 512), batch)
     assert nothing.compute().get("accuracy", nothing.compute().get("f1")) == 0
     assert BenchmarkScores().compute() == {}
 
