@@ -113,8 +113,9 @@ def sample_pavement(dice: Dice, layout: Layout, dotted: Tensor, bright: Tensor, 
     same = dice.chance(0.6)[:, None]
     tone = 1 + dice.normal(0.06, MAX_BOUNDARIES + 1) * dice.chance(0.6, 1)
     width = layout.across.masked_fill(~layout.exists, 0.0).amax(1)
-    narrow = dice.chance(0.3, 2)
-    shoulder = torch.where(narrow, dice.uniform(0.2, 1.0, 2), dice.uniform(1.0, 4.0, 2))
+    narrow, full = dice.chance(0.3, 2), dice.chance(0.4, 2)  # a full one is as wide as a lane, or nearly
+    shoulder = torch.where(full, dice.uniform(2.2, 3.7, 2), dice.uniform(1.0, 4.0, 2))
+    shoulder = torch.where(narrow, dice.uniform(0.2, 1.0, 2), shoulder)
     old = dice.uniform(0, 1)  # how old the road is
     even = torch.where(bright, dice.chance(0.6), dice.chance(0.3))
     rough = torch.where(even, dice.uniform(0.0, 0.3), 1.0)

@@ -32,6 +32,7 @@ class Surroundings(NamedTuple):
         wall_height: m.
         wall_colour: (B, W, 3) linear reflectance.
         wall_seed: shifts the noise.
+        wall_toe: factor of a concrete barrier's sloping foot, which faces the sky; 1 is none.
         verge: (B, 2, 3) linear reflectance of the ground beside the pavement, left and right.
         zenith: (B, 3) linear radiance of the sky.
         skyline: (B, 3) linear radiance at the horizon.
@@ -47,6 +48,7 @@ class Surroundings(NamedTuple):
     wall_height: Tensor
     wall_colour: Tensor
     wall_seed: Tensor
+    wall_toe: Tensor
     verge: Tensor
     zenith: Tensor
     skyline: Tensor
@@ -105,6 +107,7 @@ def sample_surroundings(
         wall_height=height,
         wall_colour=colour,
         wall_seed=dice.uniform(0, 1, NUM_WALLS),
+        wall_toe=torch.where(dice.chance(0.6, NUM_WALLS), dice.uniform(1.1, 3.0, NUM_WALLS), 1.0),
         verge=verge * dice.uniform(0.7, 1.3, 1, 1),
         zenith=blue * (1 - mix) + 0.9 * overcast * mix,
         skyline=pale * (1 - mix) + overcast * mix,
@@ -164,7 +167,9 @@ def wall_texture(
         stain = sample_noise(CLOUD, along / 30.0 + seed, up / 9.0)
         foot = smoothstep(0.0, 0.35, up / height)
         shade = (0.65 + 0.4 * foot + 0.14 * stain) * (1 - 0.5 * panel)
-        return colour * shade[:, None], inside * below(height)
+        toe = surroundings.wall_toe[:, wall, None]
+        shade = torch.where(toe > 1, (1.05 + 0.14 * stain) * (1 + (toe - 1) * below(0.4 * height)), shade)
+        return (colour * shade[:, None]).clamp(max=0.85), inside * below(height)
     if kind == RAIL:
         beam = below(height) * (1 - below(height - 0.31))
         post = dash_like(along, 0.14, 2.0, footprint) * below(height)
