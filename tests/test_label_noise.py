@@ -26,7 +26,18 @@ def test_centre_of_a_stripe_and_nothing_where_it_is_not_clear():
 
 def test_offsets_of_label_and_line_from_a_stripe():
     grey = np.stack([row_with((95, 104))] * 500)
-    rows = np.arange(400, 500, 10.0)
-    label, line = np.full(10, 103.0), np.full(10, 98.5)
-    assert line_offsets(grey, rows, label, line) == pytest.approx((4.0, -0.5))
-    assert line_offsets(grey, rows, label + 40, line) is None  # another stripe
+    rows, horizon = np.arange(300, 500, 10.0), 240.0
+    beside = 99.0 + 8.0 * (rows - horizon) / 200.0  # a line beside the stripe on the road meets it there
+    turned = np.full(20, 97.5)
+    label, line = line_offsets(grey, rows, beside, turned, horizon)
+    assert label.mean == pytest.approx(8.0 * (415 - horizon) / 200.0)
+    assert label.horizon == pytest.approx(0.0, abs=1e-9)
+    assert line == pytest.approx((-1.5, -1.5))
+
+
+def test_lines_without_enough_paint_do_not_count():
+    grey = np.stack([row_with((95, 104))] * 500)
+    rows, x = np.arange(400, 500, 10.0), np.full(10, 99.0)
+    assert line_offsets(grey, rows, x, x, 240.0) is None  # 90 px only
+    rows, x = np.arange(300, 500, 10.0), np.full(20, 99.0)
+    assert line_offsets(grey, rows, x + 40, x, 240.0) is None  # another stripe

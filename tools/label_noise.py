@@ -3,8 +3,10 @@
     python -m tools.label_noise [--data ../shared/data] [--weights FILE]
 
 On rows where a label and the network's line pass the same stripe, the stripe's centre is measured in the
-image: the centroid of what is brighter than halfway between the ground and the stripe. Prints the median over
-lines of the mean distance from it, in px of the image, and what an angle of yaw that is at the horizon.
+image: the centroid of what is brighter than halfway between the ground and the stripe. A line whose distance
+from the paint shrinks to nothing at the horizon lies beside it on the road and says the same of the yaw; what
+is left of it there is an error of the yaw. Prints medians over lines, in px of the image: the mean distance,
+and the distance at the horizon by a straight line through all distances.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,14 +24,15 @@ import lanebev
 from lanebev.io.lanes import read_lanes
 from lanebev.io.video import open_source
 from lanebev.observers import NetworkObserver
+from lanebev.run import calibrate_still
 from tools.real_figures import TUSIMPLE_FOCAL, TUSIMPLE_LANE_WIDTH, tusimple_camera, tusimple_segments
 
 REACH = 30  # px about a line in which its stripe is looked for
 APART = 25.0  # px, label and network mean the same stripe if nearer
-WIDTHS = (3, 40)  # px, of a stripe
-CONTRAST = 25.0  # grey levels
-NEAREST_ROW = 430  # px; above it stripes are too thin to be measured
-LEAST_ROWS = 4  # with paint, of a line that counts
+WIDTHS = (2, 40)  # px, of a stripe
+CONTRAST = 20.0  # grey levels
+FIRST_ROW = 340  # px; above it stripes are too thin to be measured
+LEAST_ROWS, LEAST_SPAN = 6, 100  # rows with paint, and px from the first to the last, of a line that counts
 
 
 def stripe_centre(row: NDArray[np.uint8], about: float) -> float:
@@ -47,18 +51,31 @@ def stripe_centre(row: NDArray[np.uint8], about: float) -> float:
     return first + float((bright * excess).sum() / excess.sum())
 
 
+class Offsets(NamedTuple):
+    """Of a line from its stripe, px to the right: mean over the rows with paint, and at the horizon."""
+
+    mean: float
+    horizon: float
+
+
 def line_offsets(
-    grey: NDArray[np.uint8], rows: NDArray[np.float64], label: NDArray[np.float64], line: NDArray[np.float64]
-) -> tuple[float, float] | None:
-    """Mean distance, px to the right, of label and network's line from the stripe; None: no paint."""
-    pairs = []
+    grey: NDArray[np.uint8],
+    rows: NDArray[np.float64],
+    label: NDArray[np.float64],
+    line: NDArray[np.float64],
+    horizon: float,
+) -> tuple[Offsets, Offsets] | None:
+    """Of label and network's line (R,) on image rows (R,); None: too little paint. Horizon: its row."""
+    found = []
     for y, one, other in zip(rows, label, line, strict=True):
-        if y < NEAREST_ROW or not abs(one - other) < APART:
-            continue
-        centre = stripe_centre(grey[int(y)], 0.5 * (one + other))
-        pairs.append((one - centre, other - centre))
-    found = np.array([pair for pair in pairs if np.isfinite(pair[0])])
-    return None if len(found) < LEAST_ROWS else (float(found[:, 0].mean()), float(found[:, 1].mean()))
+        if y >= FIRST_ROW and abs(one - other) < APART:
+            centre = stripe_centre(grey[int(y)], 0.5 * (one + other))
+            found += [(y - horizon, one - centre, other - centre)] if np.isfinite(centre) else []
+    if len(found) < LEAST_ROWS or np.ptp([below for below, *_ in found]) < LEAST_SPAN:
+        return None
+    below, *distances = np.array(found).T
+    first, second = (Offsets(float(d.mean()), float(np.polyfit(below, d, 1)[1])) for d in distances)
+    return first, second
 
 
 def main() -> int:
@@ -71,26 +88,27 @@ def main() -> int:
     if not labels.exists():
         print(f"{labels}: missing; give the folder with --data", file=sys.stderr)
         return 2
-    images, _ = tusimple_segments(options.data)
-    observer = NetworkObserver(
-        lanebev.LaneBEV.from_pretrained(options.weights), tusimple_camera(), TUSIMPLE_LANE_WIDTH
-    )
+    images, segments = tusimple_segments(options.data)
+    camera = tusimple_camera()
+    intrinsics = camera.intrinsics.expand(len(images), 3, 3)
+    pose = calibrate_still(lanebev.TwoStageCalibrator(), segments, intrinsics, TUSIMPLE_LANE_WIDTH).extrinsics
+    horizons = (camera.intrinsics[1, 2] - camera.intrinsics[1, 1] * pose.pitch.tan()).tolist()
+    observer = NetworkObserver(lanebev.LaneBEV.from_pretrained(options.weights), camera, TUSIMPLE_LANE_WIDTH)
     offsets = []
-    for image, entry in zip(images, read_lanes(labels), strict=True):
+    for image, entry, horizon in zip(images, read_lanes(labels), horizons, strict=True):
         frame = next(iter(open_source(image)))
         seen, _ = observer(frame)
         grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         for labelled in entry.lines:
             x = np.interp(seen.rows, labelled.points[:, 1], labelled.points[:, 0], np.nan, np.nan)
             for line in seen.x:
-                pair = line_offsets(grey, seen.rows, x, line)
+                pair = line_offsets(grey, seen.rows, x, line, horizon)
                 offsets += [] if pair is None else [pair]
-    both = np.abs(np.array(offsets))
-    print(f"{len(both)} lines with paint in {len(images)} images")
-    for name, values in zip(("labels", "network"), both.T, strict=True):
-        middle, most = np.median(values), np.percentile(values, 90)
-        yaw = np.degrees(np.arctan(middle / TUSIMPLE_FOCAL))
-        print(f"{name}: median {middle:.2f} px ({yaw:.3f} deg), nine in ten within {most:.2f} px")
+    both = np.median(np.abs(offsets), axis=0)  # (2, 2)
+    print(f"{len(offsets)} lines with paint in {len(images)} images")
+    for name, (mean, horizon) in zip(("labels", "network"), both, strict=True):
+        yaw = np.degrees(np.arctan(horizon / TUSIMPLE_FOCAL))
+        print(f"{name}: median distance {mean:.2f} px, at the horizon {horizon:.2f} px ({yaw:.3f} deg)")
     return 0
 
 
