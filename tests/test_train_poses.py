@@ -36,8 +36,9 @@ def logits_of(batch):
     return unpack(batch)[1].clamp(min=1e-4).log()
 
 
-def fit(logits, batch):
-    return fit_poses(logits, SIZE, batch.intrinsics, batch.distortion, batch.lane_width, LineExtractor())
+def fit(logits, batch, **options):
+    camera = (batch.intrinsics, batch.distortion, batch.lane_width)
+    return fit_poses(logits, SIZE, *camera, LineExtractor(), **options)
 
 
 def test_shards_keep_the_pose(rendered, tmp_path):
@@ -100,6 +101,20 @@ def test_gradient_of_the_pose_lowers_its_error(batch):
         ).detach()
         logits.requires_grad_()
     assert losses[-1] < 0.9 * losses[0]
+
+
+def test_fainter_lines_are_no_way_to_a_better_pose(batch):
+    """A map as a whole made fainter lies where it lay: with ``where_only`` that has no gradient."""
+    unit = torch.tensor([0.005, 0.005, 0.01, 0.05], dtype=torch.float64)
+    share = (unpack(batch)[1][:, 1:].double() * 0.5).roll(1, dims=-1)
+    slopes = []
+    for where_only in (False, True):
+        faint = torch.ones(6, 1, 1, dtype=torch.float64, requires_grad=True)
+        maps = torch.cat([1 - (faint * share).sum(1, keepdim=True), faint * share], dim=1)
+        found = fit(maps.clamp(min=1e-6).log(), batch, where_only=where_only)
+        (slope,) = torch.autograd.grad(pose_loss(found, batch.extrinsics.double(), unit), faint)
+        slopes.append(slope.norm())
+    assert slopes[1] < 0.1 * slopes[0]
 
 
 def test_even_gradients_are_no_longer_than_the_median():

@@ -24,12 +24,13 @@ class EndToEnd(Segmentation):
 
     Args:
         pose_weight: of the pose's loss; 0 trains on the same frames with cross-entropy alone.
+        where_only: the pose's loss moves lines, but does not change how much they count.
         kwargs: as of :class:`~train.module.Segmentation`.
     """
 
-    def __init__(self, pose_weight: float = 0.05, **kwargs: Any) -> None:
+    def __init__(self, pose_weight: float = 0.05, where_only: bool = False, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.settings["pose_weight"] = pose_weight
+        self.settings |= {"pose_weight": pose_weight, "where_only": where_only}
         self.extractor = LineExtractor.for_network(self.segmenter.config)
         self.unit: Tensor
         self.register_buffer("unit", torch.tensor(_UNIT, dtype=torch.float64), persistent=False)
@@ -68,4 +69,5 @@ class EndToEnd(Segmentation):
 
     def _fit(self, logits: Tensor, batch: PoseBatch) -> Any:
         size = (batch.image.shape[-2], batch.image.shape[-1])
-        return fit_poses(logits, size, batch.intrinsics, batch.distortion, batch.lane_width, self.extractor)
+        camera = (batch.intrinsics, batch.distortion)
+        return fit_poses(logits, size, *camera, batch.lane_width, self.extractor, self.settings["where_only"])

@@ -126,13 +126,20 @@ def fit_poses(
     distortion: Tensor,
     lane_width: float | Tensor,
     extractor: LineExtractor,
+    where_only: bool = False,
 ) -> SingleFrameFit:
-    """Logits of images of (height, width) to each image's pose, in double precision, differentiable."""
+    """Logits of images of (height, width) to each image's pose, in double precision, differentiable.
+
+    With ``where_only`` gradients reach where lines lie, not how much they count: a network cannot get a
+    better pose by seeing fewer of them.
+    """
     even: Tensor = EvenGradients.apply(logits.double())
     segments = extractor(even, size, size)
     intrinsics, distortion = intrinsics.double(), distortion.double()
     ends = undistort_points(segments.endpoints.flatten(1, 2), intrinsics, distortion)
     segments = segments._replace(endpoints=ends.view_as(segments.endpoints))
+    if where_only:
+        segments = segments._replace(weight=segments.weight.detach(), sigma=segments.sigma.detach())
     width = lane_width.double() if isinstance(lane_width, Tensor) else lane_width
     return fit_single_frame(segments, intrinsics, width)
 
