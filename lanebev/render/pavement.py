@@ -98,7 +98,9 @@ def _tone(dice: Dice, concrete: Tensor, bright: Tensor) -> Tensor:
     return level[:, None] * tint
 
 
-def sample_pavement(dice: Dice, layout: Layout, dotted: Tensor, bright: Tensor, wet: Tensor) -> Pavement:
+def sample_pavement(
+    dice: Dice, layout: Layout, dotted: Tensor, bright: Tensor, wet: Tensor, median: Tensor
+) -> Pavement:
     """A random surface under a layout.
 
     Args:
@@ -107,6 +109,7 @@ def sample_pavement(dice: Dice, layout: Layout, dotted: Tensor, bright: Tensor, 
         dotted: (B,) bool, Californian concrete is likely.
         bright: (B,) bool, sun-bleached beige concrete.
         wet: (B,) in [0, 1].
+        median: (B,) bool, a barrier stands along the left edge, with a bright strip at its foot.
     """
     concrete = torch.where(dotted, dice.chance(0.75), dice.chance(0.25)) | bright
     base, other = _tone(dice, concrete, bright), _tone(dice, dice.chance(0.4), bright & dice.chance(0.5))
@@ -116,6 +119,11 @@ def sample_pavement(dice: Dice, layout: Layout, dotted: Tensor, bright: Tensor, 
     narrow, full = dice.chance(0.3, 2), dice.chance(0.4, 2)  # a full one is as wide as a lane, or nearly
     shoulder = torch.where(full, dice.uniform(2.2, 3.7, 2), dice.uniform(1.0, 4.0, 2))
     shoulder = torch.where(narrow, dice.uniform(0.2, 1.0, 2), shoulder)
+    shoulder[:, 0] = torch.where(median, dice.uniform(1.5, 3.7), shoulder[:, 0])
+    gutter = torch.where(dice.chance(0.7, 2), dice.uniform(1.1, 2.2, 2), dice.uniform(0.4, 0.9, 2))
+    gutter_width = torch.where(dice.chance(0.5, 2), dice.uniform(0.05, 0.6, 2), 0.0)
+    gutter[:, 0] = torch.where(median, dice.uniform(1.2, 2.4), gutter[:, 0])
+    gutter_width[:, 0] = torch.where(median, dice.uniform(0.05, 0.25), gutter_width[:, 0])
     old = dice.uniform(0, 1)  # how old the road is
     even = torch.where(bright, dice.chance(0.6), dice.chance(0.3))
     rough = torch.where(even, dice.uniform(0.0, 0.3), 1.0)
@@ -150,8 +158,8 @@ def sample_pavement(dice: Dice, layout: Layout, dotted: Tensor, bright: Tensor, 
         tar=torch.where(dice.chance(0.3), dice.uniform(0.3, 0.9), 0.0),
         patch=torch.where(dice.chance(0.35), dice.uniform(0.02, 0.2), 0.0),
         skid=torch.where(dice.chance(0.25), dice.uniform(0.1, 0.5), 0.0),
-        gutter=torch.where(dice.chance(0.7, 2), dice.uniform(1.1, 2.2, 2), dice.uniform(0.4, 0.9, 2)),
-        gutter_width=torch.where(dice.chance(0.5, 2), dice.uniform(0.05, 0.6, 2), 0.0),
+        gutter=gutter,
+        gutter_width=gutter_width,
         wet=wet,
     )
 

@@ -60,7 +60,7 @@ class Surroundings(NamedTuple):
 
 
 def sample_surroundings(
-    dice: Dice, left: Tensor, right: Tensor, grey: Tensor, opposite: Tensor
+    dice: Dice, left: Tensor, right: Tensor, grey: Tensor, opposite: Tensor, median: Tensor
 ) -> Surroundings:
     """Random surroundings of a pavement.
 
@@ -70,6 +70,7 @@ def sample_surroundings(
         right: (B,) m, its right edge.
         grey: (B,) in [0, 1], how overcast it is.
         opposite: (B,) m, the opposite carriageway's right edge; -infinite: none.
+        median: (B,) bool, a concrete barrier stands along the left edge, darker than others.
     """
     far = [
         torch.where(dice.chance(0.75), dice.pick([0, 0, 0, 5, 0, 2.5, 0.5]), 0) for _ in range(2)
@@ -79,7 +80,9 @@ def sample_surroundings(
     kind = torch.stack([far[0], far[1], middle[0], middle[1], near[0], near[1]], dim=1)
     divided = opposite.isfinite()
     kind[:, 2] = torch.where(divided, NOTHING, kind[:, 2])
+    kind[:, 4] = torch.where(median, CONCRETE, kind[:, 4])
     close = dice.uniform(0.05, 1.2, 2) * dice.pick_from([0.0, 1.0], 2)  # at the pavement's edge, or behind it
+    close[:, 0] = torch.where(median, 0.0, close[:, 0])
     gap = torch.cat([dice.uniform(14, 45, 2), dice.uniform(4, 14, 2), close], dim=1)
     sides = torch.tensor([-1.0, 1.0] * 3)
     across = torch.stack([left, right] * 3, dim=1) + sides * gap
@@ -91,7 +94,9 @@ def sample_surroundings(
     height = torch.where(kind == RAIL, dice.uniform(0.7, 0.85, NUM_WALLS), height)
     height = torch.where((kind == FENCE) | (kind == HEDGE), dice.uniform(1.2, 4.5, NUM_WALLS), height)
     green, earth = dice.pick_from(GREENS, NUM_WALLS), dice.pick_from(EARTHS, NUM_WALLS)
-    grey_wall = dice.uniform(0.07, 0.5, NUM_WALLS, 1) * torch.tensor([1.0, 0.98, 0.94])
+    paleness = dice.uniform(0.07, 0.5, NUM_WALLS, 1)
+    paleness[:, 4] = torch.where(median[:, None], dice.uniform(0.04, 0.25, 1), paleness[:, 4])
+    grey_wall = paleness * torch.tensor([1.0, 0.98, 0.94])
     colour = torch.where(((kind == TREES) | (kind == HEDGE))[..., None], green, grey_wall)
     colour = torch.where((kind == SLOPE)[..., None], earth, colour)
     colour = colour * dice.uniform(0.7, 1.3, NUM_WALLS, 1)
