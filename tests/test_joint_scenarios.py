@@ -164,6 +164,20 @@ def test_unequal_lanes_show_in_the_covariance_of_height():
     assert summarise(run)["nees_per_dof"] < 1.25
 
 
+def test_a_boundary_where_none_can_be_is_not_believed_for_a_frame():
+    """A vague detector takes the foot of a barrier for a lane's edge once: its sigmas would let it pass."""
+    places = PLACES + torch.tensor([0.0, 1.0, 0, 0, 0, 0], dtype=torch.float64)
+    drive = moments(1.0, lambda t, moment: replace(moment, places=places) if t > 0.95 else moment)
+    calibrator, state = JointCalibrator(), JointCalibrator().initial_state(2, dtype=torch.float64)
+    believed = []
+    with torch.inference_mode():
+        for moment, segments in observe(drive, 2, 20.0, 30, 0, torch.float64):
+            out, state = calibrator(segments, CAMERA.expand(2, 3, 3), state, moment.dt, WIDTH)
+            believed.append(out.inliers[segments.boundary == 1].mean())
+    assert torch.stack(believed[10:-2]).min() > 0.8
+    assert believed[-1] == 0
+
+
 @pytest.mark.parametrize("size", [0.03, 0.1])
 def test_unequal_lanes_are_honest_on_most_roads(size):
     """After a second the median NEES/dof is below 1.25, and one road in eight at most is above 2.

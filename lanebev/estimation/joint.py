@@ -210,7 +210,7 @@ class JointCalibrator(nn.Module):
 
         Returns:
             calibration of this frame and the state after it. Inliers fit the road; 0 for a boundary too far
-            out of place to bound a lane, as the foot of a barrier.
+            out of place to bound a lane, as the foot of a barrier, be it for long or in this frame.
 
         Raises:
             ValueError: a shape that doesn't fit.
@@ -233,7 +233,10 @@ class JointCalibrator(nn.Module):
 
         skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=early)
         after = JointState(*(_where(skip, old, new) for old, new in zip(skipped, after, strict=True)))
-        lane = after.mean[:, NUM_COMMON:].abs() < _NO_BOUNDARY  # (B, L)
+        begun = (after.reasons & int(Reason.RESTARTED)) != 0
+        now = torch.where(begun.unsqueeze(-1), 0.0, update.apart)
+        apart = torch.maximum(after.mean[:, NUM_COMMON:].abs(), now.abs())
+        lane = apart < _NO_BOUNDARY  # (B, L)
         inliers = torch.where((seen.weight > 0) & lane.gather(1, seen.boundary), trust, 0.0)
         return self._calibration(after, inliers, positions), after
 

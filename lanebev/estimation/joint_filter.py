@@ -23,6 +23,7 @@ from lanebev.estimation.single_frame import normal_equations
 
 _LOOSE = (0.3, 0.3, 0.3, 1.0, 2.0)  # rad, m: sigmas before a frame, to ask what it alone determines
 _KNOWN = 1e-4  # share of its sigma that roll keeps where it is held: as good as known, yet not singular
+_LITTLE = 1e-3  # 1/m², information about a boundary's place that is none
 _SHARED = 0.2  # sigmas by which all end points of a boundary may be off alike
 UNSEEN = (0.01, 0.01, 0.01, 0.3)
 """Sigmas (rad, m) of the pose from one frame up to which the frame determines it; beyond, roll is held."""
@@ -40,6 +41,7 @@ class Update(NamedTuple):
         best_cov: (B, D, D), were roll known where it is held.
         alone: (B, 5) sigmas of pitch, yaw, roll, height and offset from this frame alone.
         mimicry: (B, 4, L) change of the pose fitted to this frame by a metre that a boundary is out of place.
+        apart: (B, L) m, how far out of place this frame's believed end points have each boundary; 0: none.
     """
 
     mean: Tensor
@@ -51,6 +53,7 @@ class Update(NamedTuple):
     best_cov: Tensor
     alone: Tensor
     mimicry: Tensor
+    apart: Tensor
 
 
 def iterate(
@@ -96,6 +99,9 @@ def iterate(
         scale = torch.minimum(torch.maximum(fitted, 0.5 * scale), scale)
         by_noise = trust * there / (seen.sigma * scale.unsqueeze(-1)).square()
         info, pull = _information(residuals.jacobian, residuals.distance, by_noise, member)
+        known = info.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:]
+        apart = mean[:, NUM_COMMON:] + pull[:, NUM_COMMON:] / known.clamp(min=_LITTLE)
+        apart = torch.where(known > _LITTLE, apart, 0.0)
         pull = pull + (info @ (mean - predicted).unsqueeze(-1)).squeeze(-1)
         alone, mimicry = _alone(info)
         estimated = _estimated(alone, mean)
@@ -104,7 +110,7 @@ def iterate(
         mean = predicted + estimated * (best - predicted)
     score = pull - (info @ (best - predicted).unsqueeze(-1)).squeeze(-1)
     after = _consider(cov, posterior, info, estimated)
-    return Update(mean, after, trust, scale, info, score, posterior, alone, mimicry)
+    return Update(mean, after, trust, scale, info, score, posterior, alone, mimicry, apart)
 
 
 def _consider(cov: Tensor, posterior: Tensor, info: Tensor, estimated: Tensor) -> Tensor:
