@@ -13,8 +13,6 @@ from train.losses import unweighted_bias
 from train.module import Segmentation, unpack
 from train.poses import PoseBatch, fit_poses, pose_loss
 
-_UNIT = (math.radians(0.3), math.radians(0.3), math.radians(0.6), 0.06)  # rad, rad, rad, m
-
 
 class EndToEnd(Segmentation):
     """A segmentation that also answers for the pose.
@@ -24,16 +22,25 @@ class EndToEnd(Segmentation):
 
     Args:
         pose_weight: of the pose's loss; 0 trains on the same frames with cross-entropy alone.
+        pose_unit: deg, deg, deg, m: errors of pitch, yaw, roll and height that count as one.
         where_only: the pose's loss moves lines, but does not change how much they count.
         kwargs: as of :class:`~train.module.Segmentation`.
     """
 
-    def __init__(self, pose_weight: float = 0.05, where_only: bool = False, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        pose_weight: float = 0.05,
+        pose_unit: tuple[float, float, float, float] = (0.3, 0.3, 0.6, 0.06),
+        where_only: bool = False,
+        **kwargs: Any,
+    ) -> None:
         super().__init__(**kwargs)
-        self.settings |= {"pose_weight": pose_weight, "where_only": where_only}
+        own = {"pose_weight": pose_weight, "pose_unit": list(pose_unit), "where_only": where_only}
+        self.settings |= own
         self.extractor = LineExtractor.for_network(self.segmenter.config)
         self.unit: Tensor
-        self.register_buffer("unit", torch.tensor(_UNIT, dtype=torch.float64), persistent=False)
+        unit = torch.tensor([*map(math.radians, pose_unit[:3]), pose_unit[3]], dtype=torch.float64)
+        self.register_buffer("unit", unit, persistent=False)
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:  # type: ignore[override]
         """Augment, segment, compare maps and poses."""

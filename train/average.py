@@ -1,0 +1,57 @@
+"""The mean of several networks' weights: ``python -m train.average OUT A B``.
+
+Source: Wortsman et al. 2022, "Robust fine-tuning of zero-shot models": between a network and what it was
+fine-tuned to lie networks that are better than both. So are two that were fine-tuned from the same one.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from lanebev.observation.segmenter import LaneSegmenter
+from lanebev.weights import save_segmenter
+from train.evaluate_poses import load
+
+
+def average(segmenters: list[LaneSegmenter]) -> LaneSegmenter:
+    """A network with the mean of the weights; counters are the first one's.
+
+    Raises:
+        ValueError: networks of different configurations.
+    """
+    first, *others = segmenters
+    for other in others:
+        if other.config != first.config:
+            raise ValueError(f"expected networks of one configuration, got {first.config} and {other.config}")
+    states = [segmenter.state_dict() for segmenter in segmenters]
+    result = LaneSegmenter(first.config)
+    result.load_state_dict(
+        {
+            name: torch.stack([state[name] for state in states]).mean(0)
+            if value.is_floating_point()
+            else value
+            for name, value in states[0].items()
+        }
+    )
+    return result.eval()
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("weights", type=Path, nargs="+", help="weights files or checkpoints")
+    args = parser.parse_args()
+    try:
+        network = average([load(path) for path in args.weights])
+        names = [path.name for path in args.weights]
+        save_segmenter(network, args.out, training={"average_of": names})
+    except (ValueError, OSError) as error:
+        parser.exit(2, f"error: {error}\n")
+
+
+if __name__ == "__main__":
+    main()
