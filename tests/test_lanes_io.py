@@ -306,6 +306,19 @@ def test_a_hidden_stretch_stays_hidden():
     assert len(seen) > 15
 
 
+@pytest.mark.parametrize(("weight", "there"), [(0.3, True), (0.1, False)])
+def test_a_faint_line_counts_less_and_a_trace_of_one_not_at_all(weight, there):
+    vertices = torch.from_numpy(_fan([-1.8])[0])
+    half = len(vertices) // 2
+    ends = torch.stack([vertices[:half], vertices[half : 2 * half]], dim=1)[None]
+    ones = torch.ones(1, half).double()
+    segments = LaneSegments(ends, torch.full((1, half), 2), weight * ones, ones)
+    rows = rows_from_segments(segments, CAMERA)
+    assert np.isfinite(rows.x[2]).any() == there
+    if there:
+        assert np.nanmedian(rows.sigma[2]) == pytest.approx(weight**-0.5, rel=0.2)
+
+
 def test_empty_frame_writes_a_line_and_reads_back(tmp_path):
     empty = rows_from_lines([], CAMERA)
     path = _write(tmp_path / "lanes.json", tusimple_line("1.jpg", *empty))
