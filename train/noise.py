@@ -4,7 +4,7 @@ A network errs alike along a line and from frame to frame. Held-out rendered dri
 all sigmas that is worth: for each factor the calibrator's errors, median over the drives, and NEES/dof,
 which is 1 where its covariance is as large as its errors. A drive alone would take a factor of 6 and more;
 but with sigmas as large as that an outlier is no longer told from a vertex, and single frames lean on the
-prior (``python -m train.evaluate_poses``), so the shipped weights have 3 (``python -m train.export
+prior (``python -m train.evaluate_poses``), so the shipped weights have 2.25 (``python -m train.export
 --noise-factor``).
 """
 
