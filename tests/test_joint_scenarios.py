@@ -82,6 +82,19 @@ def test_curves_cost_at_most_the_double_and_bias_the_two_stages():
     assert rmse(biased)[1] > 20 * rmse(curved)[1]
 
 
+def test_a_sharp_bend_turns_the_curvature_and_neither_roll_nor_height():
+    """From the straight through a 20 m clothoid into R = 60 m at 15 m/s, three boundaries in sight.
+
+    A filter that lets curvature follow slowly takes the bend for roll and height: 2 deg and 7 cm.
+    """
+    straight = bench("straight 5-40 m", last=2.2)
+    bent = bench("sharp bends R 60 m, three boundaries", 2.0, 9.0)
+    pitch, _, roll, height = (rmse(bent) / rmse(straight)).tolist()
+    assert max(pitch, roll, height) < 4  # three boundaries up to 30 m instead of six up to 40
+    assert rmse(bent)[1] < 0.6
+    assert (bent.status == Status.TRACKING).all()
+
+
 @pytest.mark.parametrize(
     ("name", "first", "last"),
     [("lane change", 3.2, 5.0), ("bumps 1 deg in 0.2 s", 0.0, 1.8), ("exit", 2.4, 4.8)],

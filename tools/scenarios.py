@@ -179,10 +179,14 @@ def _corrupt(
     return endpoints, torch.where(whole.gather(1, boundary), onto.gather(1, boundary), boundary)
 
 
-def _clothoid(s: Tensor) -> Tensor:
-    """Curvature along the road, 1/m: 60 m clothoids into R = 300 m, right then left, from s = 60 m."""
-    knots = torch.tensor([60.0, 120.0, 180.0, 240.0, 270.0, 330.0, 390.0, 450.0], dtype=torch.float64)
-    values = torch.tensor([0.0, 1.0, 1.0, 0.0, 0.0, -1.0, -1.0, 0.0], dtype=torch.float64) / 300.0
+def _clothoid(s: Tensor, radius: float, transition: float) -> Tensor:
+    """Curvature along the road, 1/m: 60 m straight, a bend to the right, 30 m straight, one to the left.
+
+    Each bend is a clothoid, 60 m of an arc and a clothoid back.
+    """
+    ways = torch.tensor([60.0, transition, 60.0, transition, 30.0, transition, 60.0, transition])
+    knots = ways.double().cumsum(0)
+    values = torch.tensor([0.0, 1.0, 1.0, 0.0, 0.0, -1.0, -1.0, 0.0], dtype=torch.float64) / radius
     s = s.clamp(float(knots[0]), float(knots[-1]) - 1e-6)
     right = torch.searchsorted(knots, s.contiguous(), right=True).clamp(1, len(knots) - 1)
     share = (s - knots[right - 1]) / (knots[right] - knots[right - 1])
@@ -190,7 +194,13 @@ def _clothoid(s: Tensor) -> Tensor:
 
 
 def _curves(t: float, moment: Moment) -> Moment:
-    return replace(moment, near=5.0, far=40.0, curvature=lambda z: _clothoid(z + 30.0 * t))
+    return replace(moment, near=5.0, far=40.0, curvature=lambda z: _clothoid(z + 30.0 * t, 300.0, 60.0))
+
+
+def _sharp_bends(t: float, moment: Moment) -> Moment:
+    """An exit's loop, of whose boundaries a detector shows three."""
+    shown = replace(moment, near=5.0, far=30.0, visible=(1, 2, 3))
+    return replace(shown, curvature=lambda z: _clothoid(z + 15.0 * t, 60.0, 20.0))
 
 
 def _lane_change(t: float, moment: Moment) -> Moment:
@@ -277,6 +287,7 @@ def _wrong_class(t: float, moment: Moment) -> Moment:
 SCENARIOS: dict[str, tuple[float, Callable[[float, Moment], Moment] | None]] = {
     "straight": (6.0, None),
     "straight 5-40 m": (6.0, lambda t, m: replace(m, near=5.0, far=40.0)),
+    "sharp bends R 60 m, three boundaries": (20.0, _sharp_bends),
     "curves R 300 m, 5-40 m": (17.0, _curves),
     "50 % outliers, 5 % wrong index": (6.0, lambda t, m: replace(m, outliers=0.5, wrong_index=0.05)),
     "lane change": (8.0, _lane_change),

@@ -97,8 +97,8 @@ class JointConfig:
     motion: MotionConfig = field(default_factory=MotionConfig)
     prior: FramePrior = field(default_factory=FramePrior)
     open_pose: float = 0.01
-    open_curvature: float = 1e-5
-    open_step: float = 3e-5
+    open_curvature: float = 3e-4
+    open_step: float = 1e-3
     straight: tuple[float, float] = (3e-5, 1e-6)
     open_deviation: float = 0.12
     evidence_time: float = 0.15
@@ -304,10 +304,7 @@ class JointCalibrator(nn.Module):
         cfg = self.config
         parts = evidence.square().split([NUM_POSE, 1 + NUM_STEPS, cfg.num_boundaries], dim=-1)
         worst = [part.amax(-1, keepdim=True) for part in parts]
-        pose, bend, own = (
-            0.01 * torch.sigmoid(0.5 * (most - least)) * most
-            for most, least in zip(worst, (25.0, 16.0, 25.0), strict=True)
-        )
+        pose, bend, own = (0.01 * torch.sigmoid(0.5 * (most - 25.0)) * most for most in worst)
         jump = evidence.new_tensor([cfg.open_pose] * 3 + [10 * cfg.open_pose, 0.0]).square()
         change = evidence.new_tensor([cfg.open_curvature] + [cfg.open_step] * NUM_STEPS).square()
         rest = evidence.new_zeros(evidence.shape[0], NUM_COMMON - NUM_SEEN)

@@ -26,7 +26,7 @@ LINE_SIGMA = 1.5
 """Standard deviation (px) of a line that comes without one: a careful label or a good detector."""
 
 _DIGITS = 3  # of x in lanes.json; rounded here too, so that file and run see the same
-_LEAST_WEIGHT = 0.2  # of a segment that counts; what is fainter is a foot of a barrier as often as paint
+_LEAST_WEIGHT = 0.15  # of a segment that counts; what is fainter is a foot of a barrier as often as paint
 _LEAST_SIGMA = 0.05  # px
 _GAP, _GAP_ROWS = 4.0, 30.0  # between vertices: times the usual distance, and px
 
