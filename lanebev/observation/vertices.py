@@ -18,8 +18,8 @@ _PEAK = 2  # half-width of the box whose largest sum is a scan's peak, label px
 _END = 3  # scans at either end of a stripe that its round cap makes crooked
 _FADE = 0.2  # of a stripe's mass, over which a scan's weight goes to zero below ``twice``
 _TOGETHER = 3.0  # px off a circle through two vertices, at and above which they are not averaged
-_SURE = 0.05  # px, sigma up to which the median vertex of a boundary is that of a clean map
-_UNSURE = 0.33  # px, sigma of a clean map's vertex above which it counts less, and at 3/2 of which not at all
+_SURE = 0.03  # px, sigma up to which the median vertex of a boundary is that of a clean map
+_UNSURE = 0.12  # px, sigma of a clean map's vertex above which it counts less, and at 3/2 of which not at all
 _NEIGHBOURS = 5  # scans on either side that decide a vertex' direction and scatter
 
 
