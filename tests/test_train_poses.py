@@ -117,12 +117,14 @@ def test_fainter_lines_are_no_way_to_a_better_pose(batch):
     assert slopes[1] < 0.1 * slopes[0]
 
 
-def test_even_gradients_are_no_longer_than_the_median():
+@pytest.mark.parametrize("reach", [1.0, 4.0])
+def test_even_gradients_are_no_longer_than_the_median(reach):
     x = torch.zeros(4, 2, requires_grad=True)
     slope = torch.tensor([[3.0, 4], [0, 1], [300, 400], [float("nan"), 1]])
-    (EvenGradients.apply(x) * slope).sum().backward()
+    (EvenGradients.apply(x, reach) * slope).sum().backward()
     # lengths 5, 1, 500 and none: the (lower) median is 1
-    torch.testing.assert_close(x.grad, torch.tensor([[0.6, 0.8], [0, 1], [0.6, 0.8], [0, 0]]))
+    long = reach * torch.tensor([0.6, 0.8])
+    torch.testing.assert_close(x.grad, torch.stack([long, slope[1], long, torch.zeros(2)]))
 
 
 def test_empty_maps_train_on_finite_gradients(batch):

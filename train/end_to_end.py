@@ -23,6 +23,7 @@ class EndToEnd(Segmentation):
     Args:
         pose_weight: of the pose's loss; 0 trains on the same frames with cross-entropy alone.
         pose_unit: deg, deg, deg, m: errors of pitch, yaw, roll and height that count as one.
+        gradient_reach: how many times longer a frame's gradient may be than that of most.
         where_only: the pose's loss moves lines, but does not change how much they count.
         kwargs: as of :class:`~train.module.Segmentation`.
     """
@@ -32,11 +33,16 @@ class EndToEnd(Segmentation):
         pose_weight: float = 0.05,
         pose_unit: tuple[float, float, float, float] = (0.3, 0.3, 0.6, 0.06),
         where_only: bool = False,
+        gradient_reach: float = 1.0,
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
-        own = {"pose_weight": pose_weight, "pose_unit": list(pose_unit), "where_only": where_only}
-        self.settings |= own
+        self.settings |= {
+            "pose_weight": pose_weight,
+            "pose_unit": list(pose_unit),
+            "where_only": where_only,
+            "gradient_reach": gradient_reach,
+        }
         self.extractor = LineExtractor.for_network(self.segmenter.config)
         self.unit: Tensor
         unit = torch.tensor([*map(math.radians, pose_unit[:3]), pose_unit[3]], dtype=torch.float64)
@@ -76,5 +82,13 @@ class EndToEnd(Segmentation):
 
     def _fit(self, logits: Tensor, batch: PoseBatch) -> Any:
         size = (batch.image.shape[-2], batch.image.shape[-1])
-        camera = (batch.intrinsics, batch.distortion)
-        return fit_poses(logits, size, *camera, batch.lane_width, self.extractor, self.settings["where_only"])
+        return fit_poses(
+            logits,
+            size,
+            batch.intrinsics,
+            batch.distortion,
+            batch.lane_width,
+            self.extractor,
+            self.settings["where_only"],
+            self.settings["gradient_reach"],
+        )

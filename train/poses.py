@@ -127,13 +127,16 @@ def fit_poses(
     lane_width: float | Tensor,
     extractor: LineExtractor,
     where_only: bool = False,
+    reach: float = 1.0,
 ) -> SingleFrameFit:
     """Logits of images of (height, width) to each image's pose, in double precision, differentiable.
+
+    A frame's gradient is at most ``reach`` times as long as that of most.
 
     With ``where_only`` gradients reach where lines lie, not how much they count: a network cannot get a
     better pose by seeing fewer of them.
     """
-    even: Tensor = EvenGradients.apply(logits.double())
+    even: Tensor = EvenGradients.apply(logits.double(), reach)
     segments = extractor(even, size, size)
     intrinsics, distortion = intrinsics.double(), distortion.double()
     ends = undistort_points(segments.endpoints.flatten(1, 2), intrinsics, distortion)
@@ -145,23 +148,24 @@ def fit_poses(
 
 
 class EvenGradients(torch.autograd.Function):
-    """The identity, whose gradient is no longer for one sample of the batch than for most.
+    """The identity, whose gradient is at most ``reach`` times as long for one sample as for most of a batch.
 
     A fit close to another solution has a gradient a thousand times that of the others, and says the least.
     """
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
+    def forward(ctx: Any, x: Tensor, reach: float) -> Tensor:
         """(B, ...) as it is."""
+        ctx.reach = reach
         return x.view_as(x)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        """Each sample's gradient shortened to the batch's median length; what is not finite is left out."""
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        """Each sample's gradient shortened to that; what is not finite is left out."""
         finite = gradient.isfinite().flatten(1).all(1)
         length = torch.where(finite, gradient.nan_to_num(0, 0, 0).flatten(1).norm(dim=1), 0.0)
-        factor = (length.median() / length.clamp(min=1e-12)).clamp(max=1) * finite
-        return gradient.nan_to_num(0, 0, 0) * factor.view(-1, *[1] * (gradient.ndim - 1))
+        factor = (ctx.reach * length.median() / length.clamp(min=1e-12)).clamp(max=1) * finite
+        return gradient.nan_to_num(0, 0, 0) * factor.view(-1, *[1] * (gradient.ndim - 1)), None
 
 
 def pose_loss(fit: SingleFrameFit, truth: Tensor, unit: Tensor) -> Tensor:
