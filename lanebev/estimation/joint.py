@@ -99,7 +99,7 @@ class JointConfig:
     open_pose: float = 0.01
     open_curvature: float = 3e-4
     open_step: float = 1e-3
-    straight: tuple[float, float] = (3e-5, 1e-6)
+    straight: tuple[float, float] = (1e-4, 3e-6)
     open_deviation: float = 0.12
     evidence_time: float = 0.15
     min_support: float = 3.0
