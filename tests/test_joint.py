@@ -29,6 +29,7 @@ from lanebev.estimation.joint_motion import (
     come_nearer,
     motion,
     spring,
+    turn_along,
 )
 from lanebev.types import LaneSegments, Status
 from tools.scenarios import CAMERA, FPS, PLACES, WIDTH, moments
@@ -215,24 +216,44 @@ def test_spline_jacobian_equals_jacfwd():
 
 
 def test_road_comes_nearer_by_the_way_that_was_driven():
-    """A clothoid seen ahead is the same clothoid after 23 m, of which the knots passed two."""
-    rate, size = 4e-5, NUM_COMMON + 6
+    """A slight clothoid seen ahead is the same clothoid after 23 m, of which the knots passed two."""
+    rate, size = 4e-7, NUM_COMMON + 6
     mean = torch.zeros(1, size, dtype=DOUBLE)
-    mean[:, SHAPE.start] = 1e-3
+    mean[:, SHAPE.start] = 1e-5
     mean[:, STEPS] = rate * KNOT_SPACING
-    cov = torch.eye(size, dtype=DOUBLE)[None] * 1e-10
+    cov = torch.eye(size, dtype=DOUBLE)[None] * 1e-14
     cov[:, SPEED, SPEED] = 64.0
     cfg = MotionConfig(speed=20.0)
     after, spread, phase = come_nearer(
         mean, cov, torch.zeros(1, dtype=DOUBLE), torch.tensor([1.15], dtype=DOUBLE), cfg
     )
     assert phase.item() == pytest.approx(3.0)
-    assert after[0, SHAPE.start].item() == pytest.approx(1e-3 + 20 * rate)
-    steps = after[0, STEPS] / KNOT_SPACING
-    torch.testing.assert_close(steps, torch.tensor([rate] * (NUM_STEPS - 2) + [0.0, 0.0], dtype=DOUBLE))
+    assert after[0, SHAPE.start].item() == pytest.approx(1e-5 + 20 * rate)
+    steps = after[0, STEPS] / KNOT_SPACING / rate
+    ones = torch.tensor([1.0] * (NUM_STEPS - 2) + [0.0, 0.0], dtype=DOUBLE)
+    torch.testing.assert_close(steps, ones, rtol=1e-6, atol=1e-6)
     # an unknown speed is an unknown curvature on a clothoid, here 8 m/s · 1.15 s · rate
     assert spread[0, SHAPE.start, SHAPE.start].sqrt().item() == pytest.approx(8 * 1.15 * rate, rel=0.01)
     torch.testing.assert_close(spread, spread.mT)
+
+
+def test_the_frame_turns_along_an_arc_and_its_shape_stays():
+    """On an arc the road ahead looks the same everywhere: b'' = κ (1 - κ² Z²)^(-3/2)."""
+    curvature, way = 1 / 60, torch.tensor([3.0], dtype=torch.float64)
+
+    def shape(phase):
+        z = KNOT_SPACING * torch.arange(NUM_STEPS + 1, dtype=torch.float64) - phase
+        bend = curvature * (1 - (curvature * z[z < 35]).square()) ** -1.5
+        return torch.cat([bend[:1], bend.diff()])  # of the knots up to 35 m
+
+    before, after = shape(0.0), shape(float(way))
+    padded = torch.cat([before, before.new_zeros(1 + NUM_STEPS - len(before))])[None]
+    turned = turn_along(padded, torch.zeros(1, dtype=torch.float64), way)[0, : len(before)]
+    missed = (turned.cumsum(0) - after[: len(before)].cumsum(0)).abs().max()
+    unturned = (before.cumsum(0) - after[: len(before)].cumsum(0)).abs().max()
+    assert missed < 0.25 * unturned
+    straight = torch.zeros(1, 1 + NUM_STEPS, dtype=torch.float64)
+    assert (turn_along(straight, way, way) == 0).all()
 
 
 def test_spring_is_constant_velocity_when_soft_and_halves_join():

@@ -13,7 +13,7 @@ keeps up how much they may be, since offset, height and roll mimic half of them.
 
 The road does not change, it comes nearer: knots of its curvature stand in the world, and the camera passes
 them at a speed that is estimated too. What was seen far ahead so holds when it is near, and new is only
-the step that comes into view.
+the step that comes into view. The frame turns along with the road.
 """
 
 from __future__ import annotations
@@ -168,15 +168,17 @@ def come_nearer(
     Returns:
         mean, covariance and phase after it.
     """
-    gone = phase + dt * (cfg.speed + mean[:, SPEED]).clamp(min=0.0)
+    way = dt * (cfg.speed + mean[:, SPEED]).clamp(min=0.0)
+    gone = phase + way
     passed = (gone / KNOT_SPACING).floor()  # (B,) knots
+    shape = turn_along(mean[:, SHAPE], phase, way)
     order = torch.arange(NUM_STEPS, dtype=mean.dtype, device=mean.device)
     shift = (order[:, None] + passed[:, None, None] == order).to(mean)  # (B, NUM_STEPS, NUM_STEPS)
     left = (order < passed.unsqueeze(-1)).to(mean).unsqueeze(1)  # (B, 1, NUM_STEPS)
     first = torch.cat([torch.ones_like(left[..., :1]), left], dim=-1)
     moved = torch.cat([first, torch.cat([torch.zeros_like(shift[..., :1]), shift], dim=-1)], dim=1)
 
-    change = _change_per_metre(mean[:, SHAPE], cov[:, SHAPE, SHAPE])
+    change = _change_per_metre(shape, cov[:, SHAPE, SHAPE])
     by_speed = dt.unsqueeze(-1) * (moved @ change.unsqueeze(-1)).squeeze(-1)  # (B, 1 + NUM_STEPS)
 
     transition = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device).repeat(len(dt), 1, 1)
@@ -185,9 +187,32 @@ def come_nearer(
     noise = torch.zeros_like(mean)
     noise[:, STEPS] = cfg.curvature_step**2 * _come_into_view(phase, gone, passed)
     moved_mean = mean.clone()
-    moved_mean[:, SHAPE] = (moved @ mean[:, SHAPE].unsqueeze(-1)).squeeze(-1)
+    moved_mean[:, SHAPE] = (moved @ shape.unsqueeze(-1)).squeeze(-1)
     cov = kalman.symmetrise(transition @ cov @ transition.mT) + noise.diag_embed()
     return moved_mean, cov, gone - passed * KNOT_SPACING
+
+
+def turn_along(shape: Tensor, phase: Tensor, way: Tensor) -> Tensor:
+    """Shape parameters after the road frame turned with the road over a way, as it comes nearer.
+
+    What the shape has at a knot is b'' = dX²/dZ², which is the road's curvature only where the road leads
+    straight ahead. By b'' = κ (1 + b'²)^(3/2), differentiated by the heading, a frame that turns with the
+    road sees d b'' = -3 b'' b' κ₀ ds. On an arc this is what coming nearer adds. A mean's matter: it is of
+    third order in the curvature, and so is left out of the covariance.
+
+    Args:
+        shape: (B, 1 + NUM_STEPS).
+        phase: (B,) m, how far the first knot lies behind the camera.
+        way: (B,) m.
+    """
+    behind, steps = shape[:, :1], shape[:, 1:]
+    bend = torch.cat([behind, behind + steps.cumsum(-1)], dim=-1)  # (B, 1 + NUM_STEPS) 1/m, at the knots
+    here = bend[:, :1] + (phase / KNOT_SPACING).unsqueeze(-1) * steps[:, :1]
+    to_knots = (0.5 * KNOT_SPACING * (bend[:, 1:] + bend[:, :-1])).cumsum(-1)
+    to_here = 0.5 * phase.unsqueeze(-1) * (bend[:, :1] + here)
+    heading = torch.cat([torch.zeros_like(behind), to_knots], dim=-1) - to_here  # b'
+    bend = bend * (1 - (3 * heading * here * way.unsqueeze(-1)).clamp(-0.5, 0.5))
+    return torch.cat([bend[:, :1], bend.diff(dim=-1)], dim=-1)
 
 
 def _change_per_metre(shape: Tensor, cov: Tensor) -> Tensor:
