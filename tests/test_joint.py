@@ -216,44 +216,57 @@ def test_spline_jacobian_equals_jacfwd():
 
 
 def test_road_comes_nearer_by_the_way_that_was_driven():
-    """A slight clothoid seen ahead is the same clothoid after 23 m, of which the knots passed two."""
-    rate, size = 4e-7, NUM_COMMON + 6
+    """A clothoid seen ahead is the same clothoid after 23 m, of which the knots passed two."""
+    rate, size = 4e-5, NUM_COMMON + 6
     mean = torch.zeros(1, size, dtype=DOUBLE)
-    mean[:, SHAPE.start] = 1e-5
+    mean[:, SHAPE.start] = 1e-3
     mean[:, STEPS] = rate * KNOT_SPACING
-    cov = torch.eye(size, dtype=DOUBLE)[None] * 1e-14
+    cov = torch.eye(size, dtype=DOUBLE)[None] * 1e-10
     cov[:, SPEED, SPEED] = 64.0
     cfg = MotionConfig(speed=20.0)
-    after, spread, phase = come_nearer(
-        mean, cov, torch.zeros(1, dtype=DOUBLE), torch.tensor([1.15], dtype=DOUBLE), cfg
-    )
+    none = torch.zeros(1, dtype=DOUBLE)
+    after, spread, phase = come_nearer(mean, cov, none, torch.tensor([1.15], dtype=DOUBLE), cfg)
     assert phase.item() == pytest.approx(3.0)
-    assert after[0, SHAPE.start].item() == pytest.approx(1e-5 + 20 * rate)
-    steps = after[0, STEPS] / KNOT_SPACING / rate
-    ones = torch.tensor([1.0] * (NUM_STEPS - 2) + [0.0, 0.0], dtype=DOUBLE)
-    torch.testing.assert_close(steps, ones, rtol=1e-6, atol=1e-6)
+    turned = turn_along(mean[:, SHAPE], none, torch.tensor([23.0], dtype=DOUBLE))[0]
+    torch.testing.assert_close(turned, mean[0, SHAPE], rtol=0.02, atol=0.0)  # R > 300 m: a slight turn
+    assert after[0, SHAPE.start].item() == pytest.approx(turned[:3].sum().item())
+    steps = torch.cat([turned[3:], turned.new_zeros(2)])
+    torch.testing.assert_close(after[0, STEPS], steps)
     # an unknown speed is an unknown curvature on a clothoid, here 8 m/s · 1.15 s · rate
     assert spread[0, SHAPE.start, SHAPE.start].sqrt().item() == pytest.approx(8 * 1.15 * rate, rel=0.01)
     torch.testing.assert_close(spread, spread.mT)
 
 
-def test_the_frame_turns_along_an_arc_and_its_shape_stays():
+@pytest.mark.parametrize("phase", [0.0, 6.0])
+def test_the_frame_turns_along_an_arc_and_its_shape_stays(phase):
     """On an arc the road ahead looks the same everywhere: b'' = κ (1 - κ² Z²)^(-3/2)."""
-    curvature, way = 1 / 60, torch.tensor([3.0], dtype=torch.float64)
+    curvature, way = 1 / 60, 3.0
 
-    def shape(phase):
-        z = KNOT_SPACING * torch.arange(NUM_STEPS + 1, dtype=torch.float64) - phase
-        bend = curvature * (1 - (curvature * z[z < 35]).square()) ** -1.5
-        return torch.cat([bend[:1], bend.diff()])  # of the knots up to 35 m
+    def bend(behind):
+        z = KNOT_SPACING * torch.arange(NUM_STEPS + 1, dtype=DOUBLE) - behind
+        return curvature * (1 - (curvature * z.clamp(max=36)).square()) ** -1.5
 
-    before, after = shape(0.0), shape(float(way))
-    padded = torch.cat([before, before.new_zeros(1 + NUM_STEPS - len(before))])[None]
-    turned = turn_along(padded, torch.zeros(1, dtype=torch.float64), way)[0, : len(before)]
-    missed = (turned.cumsum(0) - after[: len(before)].cumsum(0)).abs().max()
-    unturned = (before.cumsum(0) - after[: len(before)].cumsum(0)).abs().max()
-    assert missed < 0.25 * unturned
-    straight = torch.zeros(1, 1 + NUM_STEPS, dtype=torch.float64)
-    assert (turn_along(straight, way, way) == 0).all()
+    before = bend(phase)
+    shape = torch.cat([before[:1], before.diff()])[None]
+    turned = turn_along(shape, *torch.tensor([[phase], [way]], dtype=DOUBLE))[0].cumsum(0)
+    near = slice(1, 4)  # knots at 10 to 30 m
+    missed = (turned - bend(phase + way))[near].abs().amax()
+    assert missed < 0.25 * (before - bend(phase + way))[near].abs().amax()
+
+
+def test_turning_along_at_once_is_turning_along_in_steps():
+    """And a way beyond all knots leaves each with what it has where it is passed."""
+    shape = torch.tensor([[1 / 60, 1e-3, 3e-3, -2e-3, 0.0, 0.0]], dtype=DOUBLE)
+    none = torch.zeros(1, dtype=DOUBLE)
+    at_once = turn_along(shape, none, none + 8.0)
+    assert (at_once - shape).abs().max() > 1e-3
+    by_steps = shape
+    for _ in range(16):  # the knots stay where they are, so they turn about the camera alone
+        by_steps = turn_along(by_steps, none, none + 0.5)
+    torch.testing.assert_close(by_steps.cumsum(-1), at_once.cumsum(-1), rtol=0.05, atol=0.0)
+    far, farther = (turn_along(shape, none, none + way) for way in (50.0, 5000.0))
+    torch.testing.assert_close(far, farther)
+    assert (turn_along(torch.zeros_like(shape), none, none + 8.0) == 0).all()
 
 
 def test_spring_is_constant_velocity_when_soft_and_halves_join():

@@ -118,7 +118,7 @@ def test_fainter_lines_are_no_way_to_a_better_pose(batch):
 
 
 @pytest.mark.parametrize("reach", [1.0, 4.0])
-def test_even_gradients_are_no_longer_than_the_median(reach):
+def test_even_gradients_are_no_longer_than_so_many_medians(reach):
     x = torch.zeros(4, 2, requires_grad=True)
     slope = torch.tensor([[3.0, 4], [0, 1], [300, 400], [float("nan"), 1]])
     (EvenGradients.apply(x, reach) * slope).sum().backward()

@@ -36,6 +36,8 @@ class EndToEnd(Segmentation):
         gradient_reach: float = 1.0,
         **kwargs: Any,
     ) -> None:
+        if not (math.isfinite(gradient_reach) and gradient_reach > 0):
+            raise ValueError(f"gradient_reach: expected more than 0 and finite, got {gradient_reach}")
         super().__init__(**kwargs)
         self.settings |= {
             "pose_weight": pose_weight,

@@ -78,8 +78,9 @@ class JointConfig:
         lane_width_std: relative sigma of the lane width prior, a common scale of height; 0: as given.
         motion: how the state moves.
         prior: where a start is searched, and what holds before it.
-        open_pose: rad (and 10 of these in m of height), jump admitted where one frame contradicts the motion.
-        open_curvature, open_step: 1/m, change of the knots admitted a frame when a bend begins or ends.
+        open_pose: rad (and 10 of these in m of height), jump admitted where one frame contradicts the motion,
+            at evidence of ten sigmas; as many times more at more.
+        open_curvature, open_step: 1/m, likewise, change of the knots when a bend begins or ends.
         straight: 1/m and 1/m², sigmas of c0 and c1 of a road that is taken as straight at a start.
         open_deviation: m, sigma of a boundary's deviation on a road of unequal lanes; 0: there are none.
         evidence_time: s over which a bend's or unequal lanes' evidence is summed.

@@ -195,23 +195,26 @@ def come_nearer(
 def turn_along(shape: Tensor, phase: Tensor, way: Tensor) -> Tensor:
     """Shape parameters after the road frame turned with the road over a way, as it comes nearer.
 
-    What the shape has at a knot is b'' = dX²/dZ², which is the road's curvature only where the road leads
-    straight ahead. By b'' = κ (1 + b'²)^(3/2), differentiated by the heading, a frame that turns with the
-    road sees d b'' = -3 b'' b' κ₀ ds. On an arc this is what coming nearer adds. A mean's matter: it is of
-    third order in the curvature, and so is left out of the covariance.
+    What the shape has at a knot is b'' = d²X/dZ², which is the road's curvature κ only where the road leads
+    straight ahead: b'' = κ / cos³ of its heading, which falls by κ₀ a metre until the knot is reached. On an
+    arc this takes back, to leading order, what coming nearer adds. Left out, as they gained nothing: a turn
+    also brings knots nearer, by κ₀ b; and an arc tells less of the speed than a clothoid does, so that in
+    sharp bends the speed is not to be trusted.
 
     Args:
         shape: (B, 1 + NUM_STEPS).
         phase: (B,) m, how far the first knot lies behind the camera.
         way: (B,) m.
     """
-    behind, steps = shape[:, :1], shape[:, 1:]
-    bend = torch.cat([behind, behind + steps.cumsum(-1)], dim=-1)  # (B, 1 + NUM_STEPS) 1/m, at the knots
-    here = bend[:, :1] + (phase / KNOT_SPACING).unsqueeze(-1) * steps[:, :1]
+    bend = torch.cat([shape[:, :1], shape[:, :1] + shape[:, 1:].cumsum(-1)], dim=-1)  # b'' at the knots
+    behind = phase.unsqueeze(-1)
+    here = bend[:, :1] + behind / KNOT_SPACING * shape[:, 1:2]
     to_knots = (0.5 * KNOT_SPACING * (bend[:, 1:] + bend[:, :-1])).cumsum(-1)
-    to_here = 0.5 * phase.unsqueeze(-1) * (bend[:, :1] + here)
-    heading = torch.cat([torch.zeros_like(behind), to_knots], dim=-1) - to_here  # b'
-    bend = bend * (1 - (3 * heading * here * way.unsqueeze(-1)).clamp(-0.5, 0.5))
+    to_here = 0.5 * behind * (bend[:, :1] + here)
+    heading = (torch.cat([torch.zeros_like(here), to_knots], dim=-1) - to_here).atan()
+    places = KNOT_SPACING * torch.arange(1 + NUM_STEPS, dtype=shape.dtype, device=shape.device)
+    after = heading - here * torch.minimum(way.unsqueeze(-1), (places - behind).clamp(min=0.0))
+    bend = bend * (heading.cos() / after.cos().clamp(min=0.6)) ** 3
     return torch.cat([bend[:, :1], bend.diff(dim=-1)], dim=-1)
 
 
