@@ -26,11 +26,10 @@ from lanebev.estimation.joint_motion import (
     SPEED,
     STEPS,
     MotionConfig,
-    come_nearer,
     motion,
     spring,
-    turn_along,
 )
+from lanebev.estimation.joint_road import come_nearer, turn_along
 from lanebev.types import LaneSegments, Status
 from tools.scenarios import CAMERA, FPS, PLACES, WIDTH, moments
 from tools.scenarios import observe as see

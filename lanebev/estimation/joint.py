@@ -42,9 +42,9 @@ from lanebev.estimation.joint_motion import (
     SPEED,
     STEPS,
     MotionConfig,
-    come_nearer,
     motion,
 )
+from lanebev.estimation.joint_road import come_nearer
 from lanebev.estimation.single_frame import FramePrior, fit_single_frame
 from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status
 
