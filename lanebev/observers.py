@@ -54,8 +54,9 @@ class LaneFileObserver:
     def __call__(self, frame: Frame) -> tuple[BoundaryRows, LaneSegments]:
         """See :class:`Observer`."""
         entry = self.matches[frame.number] if frame.number < len(self.matches) else None
-        lines = [] if entry is None or frame.image is None else self.entries[entry].lines
-        rows = rows_from_lines(lines, self.camera)
+        found = FrameLines(frame.name, []) if entry is None else self.entries[entry]
+        lines = [] if frame.image is None else found.lines
+        rows = rows_from_lines(lines, self.camera)._replace(pose_factor=found.pose_factor)
         return rows, segments_from_rows([rows], self.camera, dtype=torch.float64)
 
 
@@ -88,7 +89,8 @@ class NetworkObserver:
                 _, segments = self.model.observe(image, self.camera.intrinsics[None].float())
             rows = rows_from_segments(segments, self.camera)
         seen = segments_from_rows([rows], self.camera, dtype=torch.float64)
-        return rows._replace(fitted=fitted_rows(seen, rows.rows, self.camera, self.lane_width)), seen
+        fitted = fitted_rows(seen, rows.rows, self.camera, self.lane_width)
+        return rows._replace(fitted=fitted, pose_factor=self.model.pose_factor), seen
 
 
 def fitted_rows(

@@ -45,6 +45,7 @@ class LaneBEV(nn.Module):
         warp: default :class:`BEVWarp` on the default grid.
         network_width: px, the image is resized to this width, its aspect kept to the next multiple of 32,
             before the segmenter; None leaves it as it is.
+        pose_factor: of the pose's sigmas, as measured for the segmenter (:class:`SegmenterConfig`).
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class LaneBEV(nn.Module):
         calibrator: nn.Module,
         warp: BEVWarp | None = None,
         network_width: int | None = None,
+        pose_factor: float = 1.0,
     ) -> None:
         super().__init__()
         self.segmenter = segmenter
@@ -61,6 +63,7 @@ class LaneBEV(nn.Module):
         self.calibrator = calibrator
         self.warp = warp or BEVWarp()
         self.network_width = network_width
+        self.pose_factor = pose_factor
 
     @classmethod
     def from_pretrained(
@@ -88,7 +91,8 @@ class LaneBEV(nn.Module):
         segmenter = load_segmenter(weights)
         width = network_width or int(segmenter.image_size[1])
         extractor = LineExtractor.for_network(segmenter.config)
-        return cls(segmenter, extractor, calibrator or JointCalibrator(), BEVWarp(grid), width)
+        factor = segmenter.config.pose_factor
+        return cls(segmenter, extractor, calibrator or JointCalibrator(), BEVWarp(grid), width, factor)
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
@@ -142,6 +146,7 @@ class LaneBEV(nn.Module):
         for step in range(steps):
             now = LaneSegments(*(part.reshape(batch, steps, *part.shape[1:])[:, step] for part in segments))
             calibration, state = self.calibrator(now, intrinsics, state, intervals[:, step], lane_width)
+            calibration = calibration.widened(self.pose_factor)
             bev, valid = self.warp(frames[:, step], intrinsics, calibration.extrinsics, distortion, model)
             homography = bev_from_image(calibration.extrinsics, intrinsics, self.warp.grid)
             logits_now = logits.reshape(batch, steps, *logits.shape[1:])[:, step]

@@ -124,6 +124,7 @@ def run(
                 calibration, states["calibrator"] = calibrate(
                     calibrator, segments, camera, states["calibrator"], frame, config
                 )
+                calibration = calibration.widened(rows.pose_factor)
                 mounted, states["mount"] = mount(calibration, states["mount"], frame.dt)
                 before = pose_before(before, calibration, config.stills or source.is_single, camera)
                 recorder.add(

@@ -75,3 +75,11 @@ class Calibration(NamedTuple):
     covariance: Tensor
     status: Tensor
     inliers: Tensor
+
+    def widened(self, factor: float) -> Calibration:
+        """The same with all sigmas times ``factor``: of segments whose errors last over frames.
+
+        Source: covariance inflation (Anderson and Anderson 1999); Guo et al. 2017 do so with a network's
+        probabilities. A filter takes errors of two frames as independent, and a network repeats its own.
+        """
+        return self._replace(covariance=factor**2 * self.covariance)

@@ -82,6 +82,11 @@ def test_tusimple_lines(tmp_path):
         (json.dumps({**_tusimple("b"), "boundary": [2]}), "line 2: boundary"),
         (json.dumps({**_tusimple("b"), "sigma": [[1, 1, 1]]}), "line 2: sigma: expected a list per lane"),
         (json.dumps({**_tusimple("b"), "sigma": [[1], [1]]}), r"line 2: sigma\[0\]: expected 3 numbers"),
+        (
+            json.dumps({**_tusimple("b"), "pose_factor": 0}),
+            "line 2: pose_factor: expected a finite number above 0",
+        ),
+        (json.dumps({**_tusimple("b"), "pose_factor": "2"}), "line 2: pose_factor: .* got '2'"),
         (json.dumps(_tusimple()), "each raw_file once, got 'a/20.jpg' again"),
     ],
 )
@@ -276,9 +281,10 @@ def test_a_networks_segments_go_through_the_file_bit_for_bit(tmp_path, seed):
     sigma = 0.3 + torch.rand(1, 96, generator=draw).double()
     segments = LaneSegments(torch.cat(ends)[None], torch.tensor(boundary)[None], weight, sigma)
     first = rows_from_segments(segments, CAMERA)
-    first = first._replace(fitted=first.x[:5] + 3.0)  # what others read
+    first = first._replace(fitted=first.x[:5] + 3.0, pose_factor=1.7)  # what others read, and do not
     path = _write(tmp_path / "lanes.json", tusimple_line("1.jpg", *first) + "\n")
     assert json.loads(path.read_text())["boundary"] == [0, 1, 2, 3, 4]
+    assert read_lanes(path)[0].pose_factor == 1.7
     again = rows_from_lines(read_lanes(path)[0].lines, CAMERA)
     np.testing.assert_array_equal(again.x, first.x)
     np.testing.assert_array_equal(again.sigma, first.sigma)

@@ -112,6 +112,13 @@ def test_network_sees_its_width_and_the_rest_does_not():
     assert net.segmenter.seen == [(1, 3, 32, 64)]
 
 
+def test_the_pose_is_less_sure_by_the_networks_factor():
+    plain, _ = model()(images(1), INTRINSICS[None], None)
+    widened, _ = model(pose_factor=2.0)(images(1), INTRINSICS[None], None)
+    torch.testing.assert_close(widened.calibration.covariance, 4 * plain.calibration.covariance)
+    assert torch.equal(widened.calibration.extrinsics.stack(), plain.calibration.extrinsics.stack())
+
+
 def test_shapes_are_checked():
     with pytest.raises(ValueError, match=r"image: expected \(B, 3, H, W\)"):
         model()(torch.zeros(3, 72, 128), INTRINSICS[None], None)

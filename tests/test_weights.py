@@ -46,11 +46,17 @@ def test_from_pretrained_runs_at_the_size_it_was_trained_for(segmenter):
 @pytest.mark.parametrize("stride", [1, 4])
 def test_from_pretrained_reads_lines_as_the_network_draws_them(tmp_path, stride):
     config = SegmenterConfig(
-        base_width=8, output_stride=stride, decoder_width=8, image_size=(64, 96), noise_factor=2.0
+        base_width=8,
+        output_stride=stride,
+        decoder_width=8,
+        image_size=(64, 96),
+        noise_factor=2.0,
+        pose_factor=1.5,
     )
     save_segmenter(LaneSegmenter(config), tmp_path / "w.safetensors")
     model = lanebev.LaneBEV.from_pretrained(tmp_path / "w.safetensors")
     assert (model.extractor.config.stride, model.extractor.config.noise_factor) == (stride, 2.0)
+    assert model.pose_factor == 1.5
 
 
 def test_sees_the_ego_lane_of_rendered_drives(segmenter):

@@ -104,7 +104,7 @@ def export(checkpoint: Path, out: Path, changes: dict[str, Any], **record: Any) 
     Args:
         checkpoint: of Lightning.
         out: the weights file.
-        changes: of the configuration: ``image_size`` to run at by default, ``noise_factor``.
+        changes: of the configuration: ``image_size`` to run at by default, ``noise_factor``, ``pose_factor``.
         record: further facts for the file's metadata.
     """
     segmenter, settings = checkpoint_segmenter(checkpoint)
@@ -126,15 +126,17 @@ def main() -> None:
     parser.add_argument("--metrics", default="{}", help="JSON, measured on these weights")
     parser.add_argument("--image-size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="to run at")
     parser.add_argument("--noise-factor", type=float, help="as train.noise measured it")
+    parser.add_argument("--pose-factor", type=float, help="likewise")
     parser.add_argument("--note", default="", help="what else there is to know")
     args = parser.parse_args()
     try:
         metrics = json.loads(args.metrics)
-        changes: dict[str, Any] = {}
-        if args.image_size:
-            changes["image_size"] = tuple(args.image_size)
-        if args.noise_factor:
-            changes["noise_factor"] = args.noise_factor
+        given = {
+            "image_size": args.image_size and tuple(args.image_size),
+            "noise_factor": args.noise_factor,
+            "pose_factor": args.pose_factor,
+        }
+        changes = {name: value for name, value in given.items() if value is not None}
         record = {"seed": args.seed, "commit": args.commit, "metrics": metrics, "note": args.note}
         export(args.checkpoint, args.out, changes, **record)
     except (ValueError, OSError) as error:

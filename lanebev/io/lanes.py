@@ -37,10 +37,17 @@ class LaneLine(NamedTuple):
 
 
 class FrameLines(NamedTuple):
-    """The lines of one frame, and the frame's name in the file."""
+    """The lines of one frame.
+
+    Attributes:
+        name: of the frame in the file.
+        lines: as they were drawn.
+        pose_factor: of the sigmas of the pose that they lead to, 1 unless the file says so.
+    """
 
     name: str
     lines: list[LaneLine]
+    pose_factor: float = 1.0
 
 
 def read_lanes(path: str | Path) -> list[FrameLines]:
@@ -117,6 +124,7 @@ def tusimple_line(
     x: NDArray[np.float64],
     sigma: NDArray[np.float64] | None = None,
     fitted: NDArray[np.float64] | None = None,
+    pose_factor: float = 1.0,
 ) -> str:
     """One frame's boundaries as a line of TuSimple JSON, with each lane's ``boundary``.
 
@@ -127,13 +135,14 @@ def tusimple_line(
         sigma: (L, R) px, written as another key that other readers pass over; None leaves it out.
         fitted: (L, R) px, the same boundaries as curves; then these are the ``lanes``, and what was seen
             goes to another key, ``seen``, which :func:`read_tusimple` prefers. None leaves it out.
+        pose_factor: of the sigmas of the pose that they lead to; 1 leaves it out.
     """
     fields: dict[str, Any] = {"raw_file": name, "h_samples": [round(row) for row in rows.tolist()]}
     if fitted is None:
         fields |= _lane_fields(x, sigma)
     else:
         fields |= {**_lane_fields(fitted, None), "seen": _lane_fields(x, sigma)}
-    return json.dumps(fields)
+    return json.dumps(fields if pose_factor == 1.0 else {**fields, "pose_factor": pose_factor})
 
 
 def _lane_fields(x: NDArray[np.float64], sigma: NDArray[np.float64] | None) -> dict[str, Any]:
@@ -212,6 +221,9 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
     rows = _floats("h_samples", _field(fields, "h_samples", list))
     if any(b <= a for a, b in pairwise(rows)):
         raise ValueError("h_samples: expected rising rows, got others")
+    pose_factor = fields.get("pose_factor", 1.0)
+    if type(pose_factor) not in (int, float) or not 0 < pose_factor < math.inf:
+        raise ValueError(f"pose_factor: expected a finite number above 0, got {pose_factor!r:.60}")
     if "seen" in fields:
         fields = _field(fields, "seen", dict)
     lanes = _field(fields, "lanes", list)
@@ -232,7 +244,7 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
         sigma = None if noise is None else _on_h_samples(f"sigma[{i}]", noise, len(rows))
         if np.isfinite(x).any():
             lines.append(LaneLine(np.stack([x, np.array(rows)], axis=-1), index, sigma))
-    return FrameLines(name, lines)
+    return FrameLines(name, lines, float(pose_factor))
 
 
 def _on_h_samples(name: str, values: Any, count: int) -> NDArray[np.float64]:

@@ -29,6 +29,8 @@ class SegmenterConfig:
         image_size: (height, width) that the weights were trained for; any other runs, with less accuracy.
         noise_factor: of the maps' sigmas, as measured for the weights: a network errs alike along a line and
             from frame to frame, so its vertices together say less than each by itself.
+        pose_factor: of the pose's sigmas that its segments lead to, likewise: what of those errors lasts is
+            not averaged out by a filter, and with larger sigmas an outlier would not be told from a vertex.
     """
 
     num_boundaries: int = NUM_BOUNDARIES
@@ -39,6 +41,7 @@ class SegmenterConfig:
     context: tuple[int, ...] = (1, 2, 4, 8)
     image_size: tuple[int, int] = (192, 320)
     noise_factor: float = 1.0
+    pose_factor: float = 1.0
 
     def __post_init__(self) -> None:
         if self.num_boundaries < 1:
@@ -47,6 +50,8 @@ class SegmenterConfig:
             raise ValueError(f"output_stride: expected 1, 2 or 4, got {self.output_stride}")
         if not self.noise_factor > 0:
             raise ValueError(f"noise_factor: expected more than 0, got {self.noise_factor}")
+        if not self.pose_factor > 0:
+            raise ValueError(f"pose_factor: expected more than 0, got {self.pose_factor}")
         if self.decoder_width < 4:
             raise ValueError(f"decoder_width: expected at least 4, got {self.decoder_width}")
 
