@@ -83,6 +83,12 @@ def test_fit_resume_test_predict_export(tmp_path):
     loaded = load_segmenter(tmp_path / "w.safetensors")
     torch.testing.assert_close(loaded.head.bias, exported.head.bias)
     assert read_metadata(tmp_path / "w.safetensors")["training"]["optimizer"] == "adamw"
+    again = tmp_path / "again.safetensors"
+    export(tmp_path / "w.safetensors", again, {"pose_factor": 2.0}, seed=1, commit="0" * 7, metrics={"a": 1})
+    facts = read_metadata(again)
+    assert (facts["config"]["noise_factor"], facts["config"]["pose_factor"]) == (2.5, 2.0)
+    assert (facts["training"]["optimizer"], facts["metrics"]) == ("adamw", {"a": 1})
+    torch.testing.assert_close(load_segmenter(again).head.bias, exported.head.bias)
 
 
 def test_typos_are_errors(tmp_path):

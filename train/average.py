@@ -2,6 +2,7 @@
 
 Source: Wortsman et al. 2022, "Robust fine-tuning of zero-shot models": between a network and what it was
 fine-tuned to lie networks that are better than both. So are two that were fine-tuned from the same one.
+The training settings in its file are those of the last.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import torch
 
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.weights import save_segmenter
-from train.evaluate_poses import load
+from train.export import trained_segmenter
 
 
 def average(segmenters: list[LaneSegmenter]) -> LaneSegmenter:
@@ -46,9 +47,9 @@ def main() -> None:
     parser.add_argument("weights", type=Path, nargs="+", help="weights files or checkpoints")
     args = parser.parse_args()
     try:
-        network = average([load(path) for path in args.weights])
+        segmenters, training = zip(*map(trained_segmenter, args.weights), strict=True)
         names = [path.name for path in args.weights]
-        save_segmenter(network, args.out, training={"average_of": names})
+        save_segmenter(average(list(segmenters)), args.out, training={**training[-1], "average_of": names})
     except (ValueError, OSError) as error:
         parser.exit(2, f"error: {error}\n")
 

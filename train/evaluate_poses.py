@@ -18,9 +18,8 @@ from torch import Tensor
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.render import Drive
-from lanebev.weights import load_segmenter
 from train.drives import WARM_UP, follow, watch
-from train.export import checkpoint_segmenter
+from train.export import trained_segmenter
 from train.poses import fit_poses
 
 AXES = ("pitch_deg", "yaw_deg", "roll_deg", "height_cm")
@@ -38,11 +37,6 @@ def held_out_frames(drives: int, frames: int, size: tuple[int, int], seed: int) 
             frame = drive.frame(i)
             parts.append((frame.image, frame.extrinsics.stack(), frame.lane_width, frame.intrinsics))
     return tuple(torch.cat(field) for field in zip(*parts, strict=True))
-
-
-def load(path: Path) -> LaneSegmenter:
-    """Weights file or checkpoint."""
-    return checkpoint_segmenter(path)[0].eval() if path.suffix == ".ckpt" else load_segmenter(path)
 
 
 @torch.no_grad()
@@ -93,7 +87,7 @@ def main() -> None:
     if args.online and args.frames <= WARM_UP:
         parser.error(f"--frames: expected more than the warm-up of {WARM_UP}, got {args.frames}")
     try:
-        networks = [load(path) for path in args.weights]
+        networks = [trained_segmenter(path)[0] for path in args.weights]
     except (ValueError, OSError) as error:
         parser.exit(2, f"error: {error}\n")
     if args.online:

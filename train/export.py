@@ -1,4 +1,7 @@
-"""Checkpoints to weights files (``python -m train.export CKPT OUT``), and narrow weights to wide ones."""
+"""Checkpoints to weights files (``python -m train.export CKPT OUT``), and narrow weights to wide ones.
+
+A weights file may be given too, as ``train.average`` writes it: for other facts in it.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ import torch
 from torch import Tensor
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
-from lanebev.weights import load_segmenter, save_segmenter
+from lanebev.weights import load_segmenter, read_metadata, save_segmenter
 from train.losses import unweighted_bias
 
 
@@ -98,20 +101,32 @@ def checkpoint_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
     return segmenter, settings
 
 
+def trained_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
+    """The network of a checkpoint or of a weights file, ready for inference, and its training settings.
+
+    Raises:
+        ValueError: neither of them.
+    """
+    if path.suffix != ".ckpt":
+        return load_segmenter(path), read_metadata(path).get("training", {})
+    segmenter, settings = checkpoint_segmenter(path)
+    training = {name: value for name, value in settings.items() if name != "network"}
+    if training["init_from"] is not None:
+        training["init_from"] = Path(training["init_from"]).name  # its folder is nobody else's business
+    return segmenter.eval(), training
+
+
 def export(checkpoint: Path, out: Path, changes: dict[str, Any], **record: Any) -> LaneSegmenter:
     """Write a checkpoint's averaged weights as lanebev loads them, with the settings they were trained with.
 
     Args:
-        checkpoint: of Lightning.
+        checkpoint: of Lightning, or a weights file.
         out: the weights file.
         changes: of the configuration: ``image_size`` to run at by default, ``noise_factor``, ``pose_factor``.
         record: further facts for the file's metadata.
     """
-    segmenter, settings = checkpoint_segmenter(checkpoint)
+    segmenter, training = trained_segmenter(checkpoint)
     segmenter.config = replace(segmenter.config, **changes)
-    training = {name: value for name, value in settings.items() if name != "network"}
-    if training["init_from"] is not None:
-        training["init_from"] = Path(training["init_from"]).name  # its folder is nobody else's business
     save_segmenter(segmenter, out, training=training, **record)
     return segmenter
 
@@ -119,7 +134,7 @@ def export(checkpoint: Path, out: Path, changes: dict[str, Any], **record: Any) 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("checkpoint", type=Path, help="or weights file")
     parser.add_argument("out", type=Path)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--commit", required=True, help="of the code that trained")

@@ -21,7 +21,8 @@ import torch
 from torch import Tensor
 
 from train.drives import Seen, follow, watch
-from train.evaluate_poses import AXES, load
+from train.evaluate_poses import AXES
+from train.export import trained_segmenter
 
 FACTORS = (1.0, 1.5, 2.0, 2.25, 3.0, 4.0, 6.0)
 
@@ -63,7 +64,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=81_000)
     args = parser.parse_args()
     try:
-        segmenter = load(args.weights)
+        segmenter, _ = trained_segmenter(args.weights)
     except (ValueError, OSError) as error:
         parser.exit(2, f"error: {error}\n")
     drives = [watch(segmenter, args.seed + i, args.frames, args.fps) for i in range(args.drives)]
