@@ -2,8 +2,8 @@
 
 A network errs alike along a line and from frame to frame. Held-out rendered drives tell what factor on
 all sigmas that is worth: for each factor the calibrator's errors, median over the drives, and NEES/dof,
-which is 1 where its covariance is as large as its errors. A drive alone would take a factor of 6 and more;
-but with sigmas as large as that an outlier is no longer told from a vertex, and single frames lean on the
+which is 1 where its covariance is as large as its errors. A drive alone would take a factor of 4; but with
+sigmas as large as that an outlier is no longer told from a vertex, and single frames lean on the
 prior (``python -m train.evaluate_poses``), so the shipped weights have 2.25 (``python -m train.export
 --noise-factor``). By the square root of the NEES that is left there, their ``--pose-factor``, the pose's
 sigmas are widened.
