@@ -100,6 +100,22 @@ def test_a_start_on_one_lane_says_that_roll_is_unseen():
     assert (out.covariance[:, 2, 2] > 10 * whole.covariance[:, 2, 2]).all()
 
 
+def test_a_sharp_line_beside_a_vague_one_is_no_outlier():
+    """The prediction errs by more than the sharp line's sigma: that is the prediction's doubt, not the line's."""
+    frames = drive(90, sigma=0.1)[::3]
+    calibrator = JointCalibrator()
+    state = calibrator.initial_state(2, dtype=DOUBLE)
+    for moment, segments in frames:
+        sharp, vague = segments.boundary == 2, segments.boundary == 3
+        segments = segments._replace(
+            weight=segments.weight * (sharp | vague), sigma=torch.where(vague, 5.0, segments.sigma)
+        )
+        out, state = calibrator(segments, cameras(2), state, 3 / FPS, WIDTH)
+        assert (out.inliers[sharp & (segments.weight > 0)] > 0.5).all()
+    truth = torch.tensor(moment.pose, dtype=DOUBLE)
+    assert (out.extrinsics.stack() - truth)[:, :2].abs().max() < math.radians(0.1)
+
+
 def test_life_cycle_with_reasons():
     calibrator = JointCalibrator(lost_after=1.0)
     frames = drive(56)
@@ -322,7 +338,7 @@ def test_update_equals_a_plain_gauss_newton_on_all_data():
     seen = observe(frames[5][1], cameras(2), 6)
     places = boundary_places(WIDTH, 6, seen.sigma).gather(1, seen.boundary)
     scale = torch.ones(2, dtype=DOUBLE)
-    update = iterate(state.mean, state.cov, state.mean, scale, places, seen, state.phase, 1)
+    update = iterate(state.mean, state.cov, state.mean, scale, places, seen, state.phase, 1, state.cov)
     at = boundary_residuals(
         state.mean[:, :NUM_SEEN],
         places + state.mean[:, NUM_COMMON:].gather(1, seen.boundary),

@@ -284,7 +284,7 @@ class JointCalibrator(nn.Module):
         """Robust update; what contradicts the motion opens its process noise, and the frame is used again."""
         cfg = self.config
         cov, phase = predicted.cov, predicted.phase
-        first = iterate(mean, cov, mean, scale, places, seen, phase, cfg.iterations)
+        first = iterate(mean, cov, mean, scale, places, seen, phase, cfg.iterations, cov)
         index = evidence_index(cfg.num_boundaries, mean.device)
         fade = (-step / cfg.evidence_time).exp().unsqueeze(-1)
         believed = 2 * (seen.weight * first.trust)
@@ -293,7 +293,7 @@ class JointCalibrator(nn.Module):
         slow = predicted.evidence * fade + (1 - fade * fade).sqrt() * news
         evidence = torch.cat([news[:, :NUM_POSE], slow[:, NUM_POSE:]], dim=-1)
         cov = cov + self._opened(evidence, cov)
-        return iterate(mean, cov, first.mean, first.scale, places, seen, phase, 1), evidence
+        return iterate(mean, cov, first.mean, first.scale, places, seen, phase, 1, first.cov), evidence
 
     def _opened(self, evidence: Tensor, cov: Tensor) -> Tensor:
         """Process noise (B, D, D) that the evidence calls for; next to none while |evidence| < 3.

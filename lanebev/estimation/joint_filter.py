@@ -65,6 +65,7 @@ def iterate(
     seen: Observations,
     phase: Tensor,
     iterations: int,
+    doubt: Tensor,
 ) -> Update:
     """Iterated robust update: relinearised and reweighted at each step, the prediction held as it was.
 
@@ -82,6 +83,7 @@ def iterate(
         seen: what was observed.
         phase: (B,) m, of the knots.
         iterations: steps.
+        doubt: (B, D, D), covariance of ``start``: what lies within it is no outlier yet.
 
     Returns:
         mean and covariance, weights, noise scale and what the observations said.
@@ -94,11 +96,15 @@ def iterate(
         own = mean[:, NUM_COMMON:].gather(1, seen.boundary)  # (B, N) m
         residuals = boundary_residuals(mean[:, :NUM_SEEN], places + own, seen, phase)
         there = seen.weight * residuals.valid
-        trust = inlier_weights(residuals.distance, residuals.valid, seen.sigma, scale, focal)
+        by_deviation = member.repeat_interleave(2, dim=-1) * residuals.jacobian[:, OFFSET, None]
+        jacobian = torch.cat([residuals.jacobian, by_deviation], dim=1)  # (B, P + L, 2N)
+        unsure = _unsure(jacobian, doubt) / scale.unsqueeze(-1).square()
+        gate = (seen.sigma.square() + unsure).sqrt()
+        trust = inlier_weights(residuals.distance, residuals.valid, gate, scale, focal)
         fitted = noise_scale(residuals.distance, seen.sigma, trust * seen.weight)
         scale = torch.minimum(torch.maximum(fitted, 0.5 * scale), scale)
         by_noise = trust * there / (seen.sigma * scale.unsqueeze(-1)).square()
-        info, pull = _information(residuals.jacobian, residuals.distance, by_noise, member)
+        info, pull = _information(jacobian, residuals.distance, by_noise)
         known = info.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:]
         apart = mean[:, NUM_COMMON:] + pull[:, NUM_COMMON:] / known.clamp(min=_LITTLE)
         apart = torch.where(known > _LITTLE, apart, 0.0)
@@ -108,6 +114,7 @@ def iterate(
         free = estimated.clamp(min=_KNOWN)
         best, posterior = kalman.update(predicted, free.unsqueeze(-1) * cov * free.unsqueeze(-2), info, pull)
         mean = predicted + estimated * (best - predicted)
+        doubt = posterior
     score = pull - (info @ (best - predicted).unsqueeze(-1)).squeeze(-1)
     after = _consider(cov, posterior, info, estimated)
     return Update(mean, after, trust, scale, info, score, posterior, alone, mimicry, apart)
@@ -143,17 +150,27 @@ def _estimated(alone: Tensor, mean: Tensor) -> Tensor:
     return torch.where(about_roll & (alone[:, ROLL, None] > UNSEEN[ROLL]), 0.0, torch.ones_like(mean))
 
 
-def _information(
-    jacobian: Tensor, distance: Tensor, by_noise: Tensor, member: Tensor
-) -> tuple[Tensor, Tensor]:
+def _information(jacobian: Tensor, distance: Tensor, by_noise: Tensor) -> tuple[Tensor, Tensor]:
     """Information of a frame in the whole state (B, D, D) and (B, D), rates and means left at zero."""
-    by_deviation = member.repeat_interleave(2, dim=-1) * jacobian[:, OFFSET, None]  # (B, L, 2N)
-    info, pull = normal_equations(torch.cat([jacobian, by_deviation], dim=1), distance, by_noise)
-    size = NUM_COMMON + member.shape[1]
-    place = torch.cat([torch.arange(NUM_SEEN), torch.arange(NUM_COMMON, size)]).to(info.device)
+    info, pull = normal_equations(jacobian, distance, by_noise)
+    place = _observable(info.shape[-1], info.device)
+    size = info.shape[-1] + NUM_COMMON - NUM_SEEN
     whole = info.new_zeros(info.shape[0], size, info.shape[-1]).index_copy(1, place, info)
     whole = info.new_zeros(info.shape[0], size, size).index_copy(2, place, whole)
     return whole, info.new_zeros(info.shape[0], size).index_copy(1, place, -pull)
+
+
+def _unsure(jacobian: Tensor, cov: Tensor) -> Tensor:
+    """(B, N) px², h P hᵀ of a segment's end points, their mean, for (B, P + L, 2N) and (B, D, D)."""
+    place = _observable(jacobian.shape[1], cov.device)
+    seen = cov.index_select(1, place).index_select(2, place)
+    return ((seen @ jacobian) * jacobian).sum(1).unflatten(-1, (-1, 2)).mean(-1)
+
+
+def _observable(count: int, device: torch.device) -> Tensor:
+    """State entries that segments depend on, (P + L,): all but rates and slow means."""
+    own = range(NUM_COMMON, NUM_COMMON + count - NUM_SEEN)
+    return torch.tensor([*range(NUM_SEEN), *own], device=device)
 
 
 def evidence_index(num_boundaries: int, device: torch.device) -> Tensor:
