@@ -219,3 +219,17 @@ def test_boundaries_of_unequal_lanes_and_their_polylines():
     )
     places = expected[:, 4:5].expand(3, 8) - truth[:, 4:5]
     assert boundary_residuals(truth, places, seen).distance.abs().max() < 2.0
+
+
+def test_a_sharp_line_beside_a_vague_one_is_no_outlier():
+    """Where the vague one leads the search astray, that is by far more than the sharp one's sigma."""
+    frames = drive_frames(random_params(16, 4, (2, 2, 1)), 0.1, 5, per_boundary=8, boundaries=(2, 3))
+    vague = frames.boundary == 3
+    sideways = 4.0 * torch.randn(16, 1, 1, 1, generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
+    frames = frames._replace(
+        endpoints=frames.endpoints + vague[..., None, None] * sideways * torch.tensor([1.0, 0.0]),
+        sigma=torch.where(vague, 8.0, frames.sigma),
+    )
+    found = fit_single_frame(frames, cameras(16))
+    assert (found.inliers[~vague] > 0.5).all()
+    assert found.valid.all()

@@ -164,7 +164,13 @@ def fit_single_frame(
 
 
 def refine(
-    params: Tensor, scale: Tensor, places: Tensor, seen: Observations, prior: FramePrior, iterations: int
+    params: Tensor,
+    scale: Tensor,
+    places: Tensor,
+    seen: Observations,
+    prior: FramePrior,
+    iterations: int,
+    blur: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Reweighted Gauss-Newton on perpendicular distances, the noise scale falling by half at most each step.
 
@@ -175,6 +181,8 @@ def refine(
         seen: what was observed.
         prior: prior.
         iterations: number of steps.
+        blur: (B,) px or None, of a start that is not good yet: added to every segment's noise, alike for sharp
+            and vague ones, and halved each step.
 
     Returns:
         params (B, 7), scale (B,), and the information matrix (B, 7, 7) at the last step.
@@ -182,13 +190,16 @@ def refine(
     mean, precision = prior.mean(params), prior.std(params).square().reciprocal()
     largest_step = prior.std(params)
     focal = seen.intrinsics[:, 0, 0]
+    blur = torch.zeros_like(focal) if blur is None else blur
     information = precision.diag().expand(*params.shape, NUM_PARAMS)  # overwritten unless iterations == 0
     for _ in range(iterations):
         residuals = boundary_residuals(params, places, seen)
-        trust = inlier_weights(residuals.distance, residuals.valid, seen.sigma, scale, focal) * seen.weight
+        sigma = (seen.sigma.square() + (blur / scale).square().unsqueeze(-1)).sqrt()
+        trust = inlier_weights(residuals.distance, residuals.valid, sigma, scale, focal) * seen.weight
         fitted = noise_scale(residuals.distance, seen.sigma, trust)
         scale = torch.minimum(torch.maximum(fitted, 0.5 * scale), scale)
-        by_noise = trust / (seen.sigma * scale.unsqueeze(-1)).square()
+        by_noise = trust / ((seen.sigma * scale.unsqueeze(-1)).square() + blur.square().unsqueeze(-1))
+        blur = 0.5 * blur
         information, gradient = normal_equations(
             residuals.jacobian, residuals.distance, by_noise * residuals.valid
         )
@@ -307,7 +318,8 @@ def _best_start(
     focal = many.intrinsics[:, 0, 0]
     sigma = (many.sigma * many.weight).sum(-1) / many.weight.sum(-1).clamp(min=1e-3)
     scale = (_ANNEALING[-1] * focal / sigma.clamp(min=1e-3)).clamp(min=1.0)
-    params, scale, _ = refine(starts.flatten(0, 1), scale, many_places, many, prior, iterations)
+    blur = _ANNEALING[-1] * focal
+    params, scale, _ = refine(starts.flatten(0, 1), scale, many_places, many, prior, iterations, blur)
     residuals = boundary_residuals(params, many_places, many)
     score = log_likelihood(residuals.distance, residuals.valid, many.weight, many.sigma, scale, focal)
     away = (params - prior.mean(params)) / prior.std(params)
