@@ -1,5 +1,6 @@
 """lanebev: how a camera looks at the road, frame by frame, from lane boundaries alone."""
 
+from lanebev import weights as weights
 from lanebev.estimation.joint import JointCalibrator
 from lanebev.estimation.mount import MountEstimator
 from lanebev.estimation.two_stage import TwoStageCalibrator

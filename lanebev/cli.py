@@ -19,23 +19,34 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: error: {message}; see {self.prog} --help\n")
 
 
+def _path(text: str) -> str:
+    if not text:
+        raise argparse.ArgumentTypeError("expected a path, got an empty string")
+    return text
+
+
 def parser() -> argparse.ArgumentParser:
     """The parser of ``lanebev``."""
     top = _Parser(prog="lanebev", description=DESCRIPTION, allow_abbrev=False)
     commands = top.add_subparsers(dest="command", required=True, metavar="{demo,run}")
     demo = commands.add_parser("demo", help="a rendered drive end to end", allow_abbrev=False)
-    demo.add_argument("--out", default="lanebev-demo", metavar="DIR", help="output folder (%(default)s)")
+    demo.add_argument(
+        "--out", type=_path, default="lanebev-demo", metavar="DIR", help="output folder (%(default)s)"
+    )
     run = commands.add_parser("run", help="calibrate on images or a video", allow_abbrev=False)
-    run.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
-    run.add_argument("--camera", required=True, metavar="FILE",
+    run.add_argument("source", type=_path, metavar="SOURCE", help=SOURCE_HELP)
+    run.add_argument("--camera", type=_path, required=True, metavar="FILE",
                      help=CAMERA_HELP)  # fmt: skip
     run.add_argument("--lane-width", type=float, default=3.7, metavar="M", help="metres (%(default)s)")
-    run.add_argument("--lanes", metavar="FILE",
+    run.add_argument("--lanes", type=_path, metavar="FILE",
                      help="lanes of another detector: TuSimple JSON lines, CULane .lines.txt, OpenLane JSON, "
                      "or a folder of them")  # fmt: skip
     run.add_argument("--stills", action="store_true", help="every image on its own, not frames of a drive")
-    run.add_argument("--out", default="lanebev-out", metavar="DIR", help="output folder (%(default)s)")
-    run.add_argument("--resume", metavar="DIR", help="begin with the state that a run left in this folder")
+    run.add_argument(
+        "--out", type=_path, default="lanebev-out", metavar="DIR", help="output folder (%(default)s)"
+    )
+    run.add_argument("--resume", type=_path, metavar="DIR",
+                     help="begin with the state that a run left in this folder")  # fmt: skip
     run.add_argument("--calibrator", default="joint", choices=("joint", "two-stage"),
                      help="two-stage is the paper's (%(default)s)")  # fmt: skip
     run.add_argument("--fps", type=float, default=30.0, metavar="HZ",

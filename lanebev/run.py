@@ -16,10 +16,10 @@ from torch import Tensor, nn
 from lanebev.estimation.mount import MountCalibration, MountEstimator, MountReason, MountStatus
 from lanebev.geometry.camera import Camera
 from lanebev.io.cameras import read_camera
-from lanebev.io.lanes import read_lanes
+from lanebev.io.lanes import lane_files, read_lanes
 from lanebev.io.mount_file import write_calibration
 from lanebev.io.overlap import prefetch
-from lanebev.io.results import ExtrinsicsRow, OutputFolder
+from lanebev.io.results import ExtrinsicsRow, OutputFolder, check_inputs_stay
 from lanebev.io.state import load_state, save_state
 from lanebev.io.video import DEFAULT_FPS, Frame, FrameSource, open_source
 from lanebev.observers import LaneFileObserver, NetworkObserver, Observer
@@ -97,6 +97,7 @@ def run(
         ValueError: bad input; one line says which and what would be right.
     """
     source = open_source(config.source, Fraction(config.fps).limit_denominator(1000))
+    check_inputs_stay(config.out, inputs(config, source))
     camera = read_camera(config.camera, source.image_size)
     check_image_size(camera, source)
     observer = make_observer(config, source, camera)
@@ -116,7 +117,7 @@ def run(
             source.is_single,
             config.stills,
         )
-        recorder.problems += [problem] if problem else []
+        recorder.problems += filter(None, (source.problem, problem))
         before = None
         with recorder:
             for frame in frames:
@@ -125,7 +126,8 @@ def run(
                     calibrator, segments, camera, states["calibrator"], frame, config
                 )
                 calibration = calibration.widened(rows.pose_factor)
-                mounted, states["mount"] = mount(calibration, states["mount"], frame.dt)
+                bend = curvature(calibrator, states["calibrator"])
+                mounted, states["mount"] = mount(calibration, states["mount"], frame.dt, curvature=bend)
                 before = pose_before(before, calibration, config.stills or source.is_single, camera)
                 recorder.add(
                     Recorded(
@@ -168,9 +170,15 @@ def begin(resume: str | None, calibrator: Any, mount: MountEstimator) -> tuple[d
     return fresh | loaded.states, loaded.problem
 
 
+def inputs(config: RunConfig, source: FrameSource) -> list[str | Path]:
+    """The files that a run reads and does not mean to replace."""
+    lanes = [] if config.lanes is None else lane_files(config.lanes)
+    return [*(source.paths or [source.source]), config.camera, *lanes]
+
+
 def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Observer:
     """Lanes from a file if one is given, else from the network."""
-    if config.lanes:
+    if config.lanes is not None:
         return LaneFileObserver(read_lanes(config.lanes), source, camera)
     return NetworkObserver(LaneBEV.from_pretrained(), camera, config.lane_width)
 
@@ -210,6 +218,12 @@ def calibrate(
         return calibrate_still(calibrator, segments, intrinsics, config.lane_width), state
     calibration, state = calibrator(segments, intrinsics, state, frame.dt, config.lane_width)
     return calibration, state
+
+
+def curvature(calibrator: Any, state: Any) -> Tensor | None:
+    """Of the road at the camera, (1,) 1/m, where the calibrator estimates it."""
+    bend: Tensor | None = calibrator.curvature(state) if hasattr(calibrator, "curvature") else None
+    return bend
 
 
 def calibrate_still(

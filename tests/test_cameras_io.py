@@ -120,7 +120,8 @@ def test_kitti_file_of_an_unknown_camera_needs_a_size(tmp_path):
         ({"fx": "wide"}, "fx: expected finite numbers, got wide"),
         ({"width": 0}, "image size: expected"),
         ({"width": 640.5}, "whole pixels"),
-        ({"height": None}, "image_height: expected a value"),
+        ({"height": None}, "yaml: height: expected a value"),
+        ({"fx": 10**400}, "fx: expected finite numbers, got 1000"),
         ({"distortion": [0.1, 0.2]}, "distortion: expected 0 or 4 or 5 or 8 or 12 coefficients"),
         ({"distortion": [0.1] * 5, "model": "fisheye"}, r"expected 4 coefficients \(fisheye\), got 5"),
         ({"distortion": 0.3}, "distortion: expected a list"),
@@ -143,6 +144,14 @@ def test_bad_entries_are_one_clear_line(tmp_path, change, message):
     [
         ("c.yaml", "", "is the file empty"),
         ("c.yaml", "fx: 1150\nfx: 1151\n", "fx twice"),
+        ("c.yaml", "[" * 100_000, "expected YAML, got"),
+        ("c.yaml", "camera_matrix: []\nimage_width: 640\n", "image_height: expected a value"),
+        (
+            "c.yaml",
+            "{image_width: 9, image_height: 9, K: [1, 0, 1, 0, 1, 1, 0, 0, 1], "
+            "D: {rows: 1.0e+200, cols: 1.0e+200, data: []}}",
+            "distortion_coefficients: expected 1000000 numbers, got 0",
+        ),
         (
             "c.yaml",
             "camera_matrix: {rows: 3, cols: 3, data: [1150.0, 0.0",

@@ -14,8 +14,9 @@ import torch
 import yaml
 from PIL import Image
 
-from lanebev import Camera, image_from_road_points
+from lanebev import Camera, JointCalibrator, image_from_road_points
 from lanebev.cli import main
+from lanebev.estimation.mount import MountReason
 from lanebev.io.results import CSV_COLUMNS
 from lanebev.io.state import load_state
 from lanebev.io.video import VideoWriter
@@ -248,6 +249,10 @@ def test_bad_input_is_one_line_and_status_2(data, tmp_path, capsys):
     _fails(capsys, [*good, "--lane-width", "37"], "lane width: expected 1 to 10 m, got 37")
     _fails(capsys, [*good, "--fps", "0"], "fps: expected")
     _fails(capsys, [*good, "--stills", "--resume", tmp_path], "resume: expected a drive")
+    for option in ("--out", "--lanes", "--camera", "--resume"):
+        _fails(capsys, [*good, option, ""], f"argument {option}: expected a path, got an empty string")
+    _fails(capsys, ["run", "", "--camera", camera], "SOURCE: expected a path, got an empty string")
+    _fails(capsys, ["demo", "--out", ""], "argument --out: expected a path, got an empty string")
     _fails(capsys, [*good, "--calibrator", "magic"], "invalid choice: 'magic'")
     assert list(tmp_path.iterdir()) == []
 
@@ -281,6 +286,63 @@ def test_an_undecodable_single_image_writes_nothing(data, tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["1.jpg"]
 
 
+def test_a_run_does_not_replace_what_it_reads(data, drive, tmp_path, capsys):
+    out = tmp_path / "out"
+    shutil.copytree(drive, out)
+    shutil.copy(data / "drive.mp4", out / "bev.mp4")
+    shutil.copytree(data / "images", out / "images")
+    shutil.copy(data / "images" / "0.png", out / "bev.png")
+    before = {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
+
+    def case(
+        source=data / "drive.mp4", camera=data / "camera.yaml", lanes=data / "video_lanes.json", word=""
+    ):
+        arguments = ["run", source, "--camera", camera, "--lanes", lanes, "--out", out]
+        _fails(
+            capsys, arguments, f"input {out / word}: expected a file that the run leaves", "another folder"
+        )
+        assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
+
+    case(source=out / "bev.mp4", word="bev.mp4")
+    case(source=out / "*.png", word="bev.png")
+    case(source=out / "bev.png", word="bev.png")
+    case(camera=out / "calibration.yaml", word="calibration.yaml")
+    case(lanes=out / "lanes.json", word="lanes.json")
+    case(lanes=out, word="lanes.json")
+    lanes = {"source": "drive.mp4", "lanes": out / "lanes.json"}
+    assert _run(data, out=tmp_path / "other", **lanes) == 0
+    assert _run(data, "--resume", str(out), out=out, source="drive.mp4", lanes="video_lanes.json") == 0
+    assert (out / "images").is_dir()
+
+
+def test_a_cut_video_is_reported_and_takes_its_own_lanes(data, tmp_path, capsys):
+    with av.open(str(data / "drive.mp4")) as container:
+        end = [packet.pos + packet.size for packet in container.demux(video=0) if packet.size][3]
+    (tmp_path / "drive.mp4").write_bytes((data / "drive.mp4").read_bytes()[: end + 50])
+    shutil.copy(data / "camera.yaml", tmp_path)
+    lines = (data / "video_lanes.json").read_text().splitlines()
+    (tmp_path / "lanes.json").write_text("\n".join(lines[:5]))
+    assert _run(tmp_path, source="drive.mp4", out=tmp_path / "out") == 0
+    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("problem: ")]
+    declared = f"video {tmp_path / 'drive.mp4'}: expected 0.24 s as it declares, got 0.20 s; is it cut?"
+    assert said[0] == f"problem: {declared}"
+    assert said[1].startswith("problem: frame 4: expected a whole frame, got: ")
+    assert [row["status"] for row in _table(tmp_path / "out")] == 4 * ["TRACKING"] + ["COASTING"]
+    own = {"source": "drive.mp4", "lanes": tmp_path / "out" / "lanes.json"}
+    assert _run(tmp_path, out=tmp_path / "again", **own) == 0
+    first, again = (tmp_path / name / "extrinsics.csv" for name in ("out", "again"))
+    assert first.read_text() == again.read_text()
+
+
+def test_the_mount_does_not_learn_in_a_bend(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(JointCalibrator, "curvature", lambda _, state: 0.002 + 0 * state.mean[:, 0])
+    for name, turning in (("joint", True), ("two-stage", False)):  # which knows no curvature
+        assert _run(data, "--calibrator", name, out=tmp_path / name) == 0
+        mount = load_state(tmp_path / name / "state.safetensors").states["mount"]
+        assert bool(int(mount["reasons"]) & MountReason.TURNING) == turning
+        assert (float(mount["seconds"]) == 0) == turning
+
+
 def test_an_unwritable_folder_is_one_line(data, tmp_path, capsys):
     (tmp_path / "file").write_text("not a folder")
     for out in (tmp_path / "file", tmp_path / "file" / "out"):
@@ -305,6 +367,11 @@ def test_module_is_the_command():
     )
     assert "demo" in done.stdout
     assert "run" in done.stdout
+
+
+def test_weights_are_there_after_one_import():
+    script = "import lanebev; print(lanebev.weights.read_metadata()['seed'])"
+    subprocess.run([sys.executable, "-c", script], capture_output=True, check=True)
 
 
 def test_config_checks_itself():

@@ -101,7 +101,7 @@ def test_a_start_on_one_lane_says_that_roll_is_unseen():
 
 
 def test_a_sharp_line_beside_a_vague_one_is_no_outlier():
-    """The prediction errs by more than the sharp line's sigma: that is the prediction's doubt, not the line's."""
+    """The prediction errs by more than the sharp line's sigma: that casts no doubt on the line."""
     frames = drive(90, sigma=0.1)[::3]
     calibrator = JointCalibrator()
     state = calibrator.initial_state(2, dtype=DOUBLE)

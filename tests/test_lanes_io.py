@@ -81,6 +81,21 @@ def test_tusimple_lines(tmp_path):
         (json.dumps({**_tusimple("b"), "boundary": [2, 2]}), "line 2: boundary"),
         (json.dumps({**_tusimple("b"), "boundary": [2]}), "line 2: boundary"),
         (json.dumps({**_tusimple("b"), "sigma": [[1, 1, 1]]}), "line 2: sigma: expected a list per lane"),
+        (json.dumps({**_tusimple("b"), "boundary": [[2], [3]]}), "line 2: boundary"),
+        (
+            json.dumps({**_tusimple("b"), "sigma": [[-2, 1, 1], [1, -2, 0]]}),
+            r"line 2: sigma\[1\]: expected px above 0 where the lane is, got \[1, -2, 0\]",
+        ),
+        (
+            json.dumps({**_tusimple("b"), "sigma": [[1, -2, 1], [1, 1, 1]]}),
+            r"line 2: sigma\[0\]: expected px",
+        ),
+        (
+            json.dumps({**_tusimple("b"), "lanes": [[1, 10**400, 3]]}),
+            r"line 2: lanes\[0\]: expected finite",
+        ),
+        (json.dumps({**_tusimple("b"), "pose_factor": 10**400}), "line 2: pose_factor: expected a finite"),
+        ("[" * 100_000, "line 2: expected JSON"),
         (json.dumps({**_tusimple("b"), "sigma": [[1], [1]]}), r"line 2: sigma\[0\]: expected 3 numbers"),
         (
             json.dumps({**_tusimple("b"), "pose_factor": 0}),
@@ -139,6 +154,12 @@ def test_openlane_leaves_kerbs_out(tmp_path):
             r"lane_lines\[0\].uv: expected two",
         ),
         ({"file_path": "1.jpg", "lane_lines": [{}]}, "uv: expected a list, got none"),
+        *[
+            ({"file_path": "1.jpg", "lane_lines": [{"uv": uv}]}, r"lane_lines\[0\].uv: expected two lists")
+            for uv in ([[1, 2], None], [5, [1]], [], [[1]])
+        ],
+        ({"file_path": "1.jpg", "lane_lines": [{"uv": [[1], [10**400]]}]}, "uv: expected finite numbers"),
+        (5, "expected a JSON object, got int"),
         ({"lane_lines": []}, "file_path: expected a str, got none"),
     ],
 )
@@ -266,6 +287,16 @@ def test_lanes_json_gives_the_same_segments_bit_for_bit(tmp_path, seed):
         assert torch.equal(a, b)
     assert first.x.shape == (6, 72)
     assert np.isfinite(first.x).sum() > 100
+
+
+def test_a_sigma_of_one_line_leaves_the_others_their_own(tmp_path):
+    first, second = _fan([-1.8, 1.8])
+    lines = [LaneLine(first, 2, np.full(len(first), 1e-5)), LaneLine(second, 3)]
+    rows = rows_from_lines(lines, CAMERA)
+    assert np.nanmax(rows.sigma[2]) == 0.001  # lowest that the file tells
+    assert set(rows.sigma[3][np.isfinite(rows.x[3])]) == {1.5}
+    path = _write(tmp_path / "lanes.json", tusimple_line("1.jpg", *rows))
+    np.testing.assert_array_equal(rows_from_lines(read_lanes(path)[0].lines, CAMERA).sigma, rows.sigma)
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -2,12 +2,20 @@
 
 import math
 import os
+from pathlib import Path
 
 import pytest
 import torch
 
 from lanebev import Calibration, Extrinsics, Status
-from lanebev.io.results import CSV_COLUMNS, OutputFolder, extrinsics_row, read_extrinsics, write_extrinsics
+from lanebev.io.results import (
+    CSV_COLUMNS,
+    OutputFolder,
+    check_inputs_stay,
+    extrinsics_row,
+    read_extrinsics,
+    write_extrinsics,
+)
 
 
 def _row(frame=0, image=""):
@@ -111,3 +119,47 @@ def test_unwritable_folder_is_one_clear_line(tmp_path):
         assert "\n" not in str(error.value)
         assert "--out" in str(error.value)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_link_to_a_folder_elsewhere_is_filled_there(tmp_path, monkeypatch):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "disk", target_is_directory=True)
+    (tmp_path / "new").symlink_to(tmp_path / "disk" / "new", target_is_directory=True)
+    replace = Path.replace
+
+    def on_one_disk(self, target):
+        if self.resolve().is_relative_to(tmp_path / "disk") and target.resolve().is_relative_to(
+            tmp_path / "disk"
+        ):
+            return replace(self, target)
+        raise OSError(18, "Invalid cross-device link")
+
+    monkeypatch.setattr(Path, "replace", on_one_disk)
+    monkeypatch.setattr(Path, "rename", on_one_disk)
+    for folder in (tmp_path / "link", tmp_path / "new"):
+        with OutputFolder(folder) as out:
+            (out / "extrinsics.csv").write_text("new")
+        assert folder.is_symlink()
+        assert (folder / "extrinsics.csv").read_text() == "new"
+    names = sorted(path.name for path in (tmp_path / "disk").iterdir())
+    assert names == ["extrinsics.csv", "new"]
+
+
+def test_a_folder_where_an_output_goes_is_refused_before_the_work(tmp_path):
+    (tmp_path / "report.html").mkdir()
+    (tmp_path / "extrinsics.csv").write_text("old")
+    with pytest.raises(ValueError, match=r"a folder report\.html in it, where a file goes; .* --out"):
+        OutputFolder(tmp_path).__enter__()
+    assert {path.name for path in tmp_path.iterdir()} == {"report.html", "extrinsics.csv"}
+
+
+def test_inputs_are_not_outputs(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "lanes.json").write_text("mine")
+    (tmp_path / "link.json").symlink_to(out / "lanes.json")
+    check_inputs_stay(out, [tmp_path / "lanes.json", out / "drive.mp4", out / "drive" / "bev.mp4"])
+    check_inputs_stay(tmp_path / "other", [out / "lanes.json"])
+    for path in (out / "lanes.json", tmp_path / "link.json", tmp_path / "a" / ".." / "out" / "bev.mp4"):
+        with pytest.raises(ValueError, match=r"expected a file that the run leaves as it is, .* --out"):
+            check_inputs_stay(out, [tmp_path / "drive.mp4", path])

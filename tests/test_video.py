@@ -123,6 +123,77 @@ def test_a_damaged_stretch_of_a_video_does_not_end_it(tmp_path):
     assert [frame.number for frame in frames] == list(range(len(frames)))
 
 
+def _damaged(path, spoilt, count=16, **options):
+    """A video of noise with some packets, in the order of the file, overwritten; their frames' numbers."""
+    noise = np.random.default_rng(0)
+    with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt, stream.options = 64, 48, "yuv420p", options
+        for _ in range(count):
+            image = noise.integers(0, 255, (48, 64, 3), dtype=np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+    with av.open(str(path)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+        places = [(packets[i].pos, packets[i].size) for i in spoilt]
+        order = sorted(packet.pts for packet in packets)
+        numbers = [order.index(packets[i].pts) for i in spoilt]
+    data = bytearray(path.read_bytes())
+    for start, size in places:
+        data[start : start + size] = b"\xff" * size
+    path.write_bytes(data)
+    return sorted(numbers)
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "options"),
+    [
+        *[(spoilt, {"g": "1"}) for spoilt in ((5,), (0,), (14, 15), (3, 4, 9))],
+        *[(spoilt, {"bf": "3", "b_strategy": "0"}) for spoilt in ((5,), (14, 15), (3, 4, 9))],
+    ],
+)
+def test_every_frame_of_a_damaged_video_has_its_row_and_time(tmp_path, spoilt, options):
+    numbers = _damaged(tmp_path / "v.mp4", spoilt, **options)
+    source = open_source(str(tmp_path / "v.mp4"))
+    frames = list(source)
+    assert source.count == len(frames) == 16
+    np.testing.assert_allclose([frame.time for frame in frames], np.arange(16) / 25, atol=1e-9)
+    assert numbers == [frame.number for frame in frames if frame.image is None]
+    for frame in frames:
+        assert frame.problem.startswith("expected a whole frame, got: ") == (frame.number in numbers)
+
+
+def test_a_cut_video_says_so(tmp_path):
+    _damaged(tmp_path / "v.mp4", (), count=20)
+    path = tmp_path / "v.mp4"
+    assert open_source(str(path)).problem == ""
+    with av.open(str(path)) as container:
+        end = [packet.pos + packet.size for packet in container.demux(video=0) if packet.size][11]
+    path.write_bytes(path.read_bytes()[: end + 5])
+    source = open_source(str(path))
+    frames = list(source)
+    assert source.problem.endswith("expected 0.80 s as it declares, got 0.52 s; is it cut?")
+    assert source.count == len(frames) == 13
+    assert [frame.number for frame in frames if frame.image is None] == [12]
+
+
+def test_uneven_frame_times_are_no_damage(tmp_path):
+    path, times = tmp_path / "v.mp4", [0, 1, 2, 7, 8, 30, 31]
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for pts in times:
+            frame = av.VideoFrame.from_ndarray(_picture(pts), format="rgb24")
+            frame.pts, frame.time_base = pts, Fraction(1, 25)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    source = open_source(str(path))
+    frames = list(source)
+    np.testing.assert_allclose([frame.time for frame in frames], np.array(times) / 25, atol=1e-9)
+    assert all(frame.image is not None for frame in frames)
+    assert source.problem == ""
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -160,6 +231,14 @@ def test_folder_without_images_suggests_a_glob(tmp_path):
 def test_write_png(tmp_path):
     write_png(tmp_path / "a.png", _picture(7))
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), _picture(7))
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_16_bit_grey_keeps_its_scale(tmp_path, suffix):
+    values = np.array([[0, 257, 25700, 65535]], np.uint16).repeat(2, axis=0)
+    Image.fromarray(values).save(tmp_path / f"a.{suffix}")
+    expected = np.array([0, 1, 100, 255], np.uint8)[None, :, None]
+    np.testing.assert_array_equal(read_image(tmp_path / f"a.{suffix}"), np.broadcast_to(expected, (2, 4, 3)))
 
 
 def test_natural_order():

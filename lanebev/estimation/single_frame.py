@@ -181,8 +181,8 @@ def refine(
         seen: what was observed.
         prior: prior.
         iterations: number of steps.
-        blur: (B,) px or None, of a start that is not good yet: added to every segment's noise, alike for sharp
-            and vague ones, and halved each step.
+        blur: (B,) px or None, of a start that is not good yet: added to every segment's noise, sharp and vague
+            alike, and halved each step.
 
     Returns:
         params (B, 7), scale (B,), and the information matrix (B, 7, 7) at the last step.

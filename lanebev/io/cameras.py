@@ -106,7 +106,7 @@ def _parse_yaml(text: str) -> dict[str, Any]:
         lines[0] = ""
     try:
         fields = yaml.load("\n".join(lines), Loader=_StrictLoader)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f" at line {mark.line + 1}" if mark else ""
         raise ValueError(f"expected YAML, got a syntax error{where}; is the file cut?") from error
@@ -158,7 +158,8 @@ def _normalise(fields: Mapping[str, Any]) -> tuple[list[float], list[float], str
     if unknown:
         known = "fx, fy, cx, cy, width, height, distortion, model"
         raise ValueError(f"unknown key {unknown[0]!r}; expected {known}, or those of OpenCV or ROS")
-    width, height = _integer(fields, _WIDTH_KEYS), _integer(fields, _HEIGHT_KEYS)
+    sizes = (("width",), ("height",)) if short else (_WIDTH_KEYS, _HEIGHT_KEYS)
+    width, height = (_integer(fields, keys) for keys in sizes)
     if short:
         fx, fy, cx, cy = (
             _numbers(key, [_required(fields, (key,))], 1)[0] for key in ("fx", "fy", "cx", "cy")
@@ -253,7 +254,7 @@ def _opencv_data(name: str, value: Mapping[str, Any], count: int | None) -> tupl
     sizes = _numbers(f"{name}.rows and .cols", _sequence(name, shape))
     if not sizes:
         raise ValueError(f"{name}: expected rows and cols, got neither")
-    return _sequence(name, as_list.get("data") or []), count or round(math.prod(sizes))
+    return _sequence(name, as_list.get("data") or []), count or round(min(math.prod(sizes), 1e6))
 
 
 def _flat(value: Any) -> list[Any]:
@@ -271,7 +272,7 @@ def _numbers(name: str, values: Sequence[Any], count: int | None = None) -> list
         raise ValueError(f"{name}: expected {count} number{'s'[: count != 1]}, got {len(values)}")
     try:
         numbers = [float(value) for value in values if not isinstance(value, bool)]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = []
     if len(numbers) != len(values) or not all(map(math.isfinite, numbers)):
         shown = ", ".join(str(value) for value in values)[:60]

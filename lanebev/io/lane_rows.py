@@ -66,6 +66,7 @@ def rows_from_lines(
     rows = image_rows(height)
     x = np.full((num_boundaries, len(rows)), np.nan)
     sigma = np.full_like(x, np.nan)
+    told = any(line.sigma is not None for line in lines)
     if all(line.boundary is not None for line in lines):
         indices: list[int | None] = [line.boundary for line in lines]
     else:
@@ -76,10 +77,10 @@ def rows_from_lines(
             inside = (on_rows >= 0) & (on_rows <= width - 1)
             if inside.sum() >= 2:
                 x[index] = np.where(inside, on_rows.round(_DIGITS), np.nan)
-                if line.sigma is not None:
-                    noise = _on_rows(np.stack([line.sigma, line.points[:, 1]], axis=-1), rows)
-                    sigma[index] = np.where(inside, noise.round(_DIGITS), np.nan)
-    return BoundaryRows(rows, x, sigma if np.isfinite(sigma).any() else None)
+                said = np.full(len(line.points), LINE_SIGMA) if line.sigma is None else line.sigma
+                noise = _on_rows(np.stack([said, line.points[:, 1]], axis=-1), rows)
+                sigma[index] = np.where(inside, np.maximum(noise.round(_DIGITS), 10.0**-_DIGITS), np.nan)
+    return BoundaryRows(rows, x, sigma if told and np.isfinite(sigma).any() else None)
 
 
 def rows_from_segments(segments: LaneSegments, camera: Camera) -> BoundaryRows:

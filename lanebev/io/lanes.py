@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections import defaultdict
 from collections.abc import Sequence
 from itertools import pairwise
@@ -58,8 +59,7 @@ def read_lanes(path: str | Path) -> list[FrameLines]:
     """
     path = Path(path)
     if path.is_dir():
-        files = sorted([*path.rglob("*.lines.txt"), *path.rglob("*.json")])
-        frames = [frame for file in files for frame in read_lanes(file)]
+        frames = [frame for file in lane_files(path) for frame in read_lanes(file)]
         if not frames:
             raise ValueError(f"lane folder {path}: expected .lines.txt or .json files, got none")
         return frames
@@ -68,6 +68,12 @@ def read_lanes(path: str | Path) -> list[FrameLines]:
     text = _text(path)
     start = next((line for line in text.splitlines() if line.strip()), "")
     return [read_openlane(path)] if _is_openlane(start, text) else read_tusimple(path)
+
+
+def lane_files(path: str | Path) -> list[Path]:
+    """The files that :func:`read_lanes` reads: those of a folder, or the file itself."""
+    path = Path(path)
+    return sorted([*path.rglob("*.lines.txt"), *path.rglob("*.json")]) if path.is_dir() else [path]
 
 
 def read_tusimple(path: str | Path) -> list[FrameLines]:
@@ -111,8 +117,8 @@ def read_openlane(path: str | Path) -> FrameLines:
         lines = []
         for i, lane in enumerate(_field(fields, "lane_lines", list)):
             uv = _field(lane, "uv", list)
-            if len(uv) != 2 or len(uv[0]) != len(uv[1]):
-                raise ValueError(f"lane_lines[{i}].uv: expected two lists of one length, got {len(uv)} lists")
+            if len(uv) != 2 or not all(isinstance(axis, list) for axis in uv) or len(uv[0]) != len(uv[1]):
+                raise ValueError(f"lane_lines[{i}].uv: expected two lists of one length, got {uv!r:.60}")
             if lane.get("category") not in _OPENLANE_CURBS and len(uv[0]):
                 lines.append(LaneLine(np.array([_floats(f"lane_lines[{i}].uv", axis) for axis in uv]).T))
     return FrameLines(name, lines)
@@ -222,15 +228,16 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
     if any(b <= a for a, b in pairwise(rows)):
         raise ValueError("h_samples: expected rising rows, got others")
     pose_factor = fields.get("pose_factor", 1.0)
-    if type(pose_factor) not in (int, float) or not 0 < pose_factor < math.inf:
+    if type(pose_factor) not in (int, float) or not 0 < pose_factor <= sys.float_info.max:
         raise ValueError(f"pose_factor: expected a finite number above 0, got {pose_factor!r:.60}")
     if "seen" in fields:
         fields = _field(fields, "seen", dict)
     lanes = _field(fields, "lanes", list)
     indices: Sequence[int | None] = fields.get("boundary") or [None] * len(lanes)
     if "boundary" in fields:
-        valid = isinstance(fields["boundary"], list) and len(indices) == len(lanes) == len(set(indices))
-        if not (valid and all(type(i) is int and 0 <= i < NUM_BOUNDARIES for i in indices)):
+        valid = isinstance(fields["boundary"], list)
+        valid = valid and all(type(i) is int and 0 <= i < NUM_BOUNDARIES for i in indices)
+        if not (valid and len(indices) == len(lanes) == len(set(indices))):
             raise ValueError(
                 f"boundary: expected one different index of 0..{NUM_BOUNDARIES - 1} per lane, got "
                 f"{fields['boundary']!r:.60}"
@@ -242,6 +249,8 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
     for i, (lane, index, noise) in enumerate(zip(lanes, indices, sigmas, strict=True)):
         x = _on_h_samples(f"lanes[{i}]", lane, len(rows))
         sigma = None if noise is None else _on_h_samples(f"sigma[{i}]", noise, len(rows))
+        if sigma is not None and not (sigma[np.isfinite(x)] > 0).all():
+            raise ValueError(f"sigma[{i}]: expected px above 0 where the lane is, got {noise!r:.60}")
         if np.isfinite(x).any():
             lines.append(LaneLine(np.stack([x, np.array(rows)], axis=-1), index, sigma))
     return FrameLines(name, lines, float(pose_factor))
@@ -266,7 +275,7 @@ def _check_culane_rows(y: NDArray[np.float64]) -> None:
 
 def _is_openlane(first_line: str, text: str) -> bool:
     try:
-        return "lane_lines" in json.loads(text)
+        return "lane_lines" in _json(text)
     except ValueError:
         return '"lane_lines"' in first_line
 
@@ -296,7 +305,7 @@ def _text(path: Path) -> str:
 def _json(text: str) -> dict[str, Any]:
     try:
         fields = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError("expected JSON, got a line that breaks off or is none; is the file cut?") from error
     if not isinstance(fields, dict):
         raise ValueError(f"expected a JSON object, got {type(fields).__name__}")
@@ -313,7 +322,7 @@ def _field(fields: Any, key: str, kind: type) -> Any:
 def _floats(name: str, values: Sequence[Any]) -> list[float]:
     try:
         numbers = [float(value) for value in values if not isinstance(value, bool)]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = []
     if len(numbers) != len(values) or not all(map(math.isfinite, numbers)):
         raise ValueError(f"{name}: expected finite numbers, got {str(list(values))[:60]}")

@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
@@ -110,32 +111,56 @@ def read_extrinsics(path: str | Path) -> list[ExtrinsicsRow]:
     return result
 
 
+def check_inputs_stay(folder: str | Path, inputs: Iterable[str | Path]) -> None:
+    """No output of a run may take the place of a file that it reads.
+
+    Args:
+        folder: where the outputs go.
+        inputs: files that the run reads, its state to resume with left out: that one is meant to be renewed.
+
+    Raises:
+        ValueError: an input is one of the files that a run replaces or removes in this folder.
+    """
+    outputs = {Path(os.path.realpath(folder)) / name for name in OUTPUT_NAMES}
+    for path in map(Path, inputs):
+        if {path.resolve(), path.parent.resolve() / path.name} & outputs:
+            raise ValueError(
+                f"input {path}: expected a file that the run leaves as it is, got one of the outputs in "
+                f"{folder}; give another folder with --out"
+            )
+
+
 class OutputFolder:
     """A folder whose files appear all together when the work is done, or not at all.
 
-    Files are written into a hidden temporary folder beside it, on the same disk. On success they take
-    their place, and outputs of an earlier run that this one did not write anew are removed;
-    files of other names in an existing folder are left alone. On any error the folder is as it was.
+    Files are written into a hidden temporary folder in it, or beside it if it is new, so on the same disk.
+    On success they take their place, and outputs of an earlier run that this one did not write anew are
+    removed; files of other names in an existing folder are left alone. On any error the folder is as it was.
     """
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
+        self._target = Path(os.path.realpath(folder))  # of a link, where it leads to
 
     def __enter__(self) -> OutputFolder:
         """Make the temporary folder.
 
         Raises:
-            ValueError: the folder cannot be made or written.
+            ValueError: the folder cannot be made or written, or a folder is where an output goes.
         """
-        target = self.folder.absolute()
+        target = self._target
         self._made = [parent for parent in target.parents if not parent.exists()]
         try:
-            if target.exists() and not target.is_dir():
+            if os.path.lexists(target) and not target.is_dir():
                 raise NotADirectoryError(0, "a file of that name is there")
+            for path in map(target.joinpath, OUTPUT_NAMES):
+                if path.is_dir() and not path.is_symlink():
+                    raise IsADirectoryError(0, f"a folder {path.name} in it, where a file goes")
             target.parent.mkdir(parents=True, exist_ok=True)
             if target.is_dir() and not os.access(target, os.W_OK | os.X_OK):
                 raise PermissionError(0, "no permission to write in it")
-            self._partial = Path(tempfile.mkdtemp(prefix=f".{target.name}.partial-", dir=target.parent))
+            beside = target if target.is_dir() else target.parent
+            self._partial = Path(tempfile.mkdtemp(prefix=f".{target.name}.partial-", dir=beside))
         except OSError as error:
             self._remove_parents()
             raise ValueError(
@@ -160,15 +185,15 @@ class OutputFolder:
         return self._partial / name
 
     def _publish(self) -> None:
-        if not self.folder.exists():
+        if not self._target.exists():
             self._partial.chmod(0o777 & ~_umask())  # mkdtemp's is for the owner alone
-            self._partial.rename(self.folder)
+            self._partial.rename(self._target)
             return
         written = {path.name for path in self._partial.iterdir()}
         for path in self._partial.iterdir():
-            path.replace(self.folder / path.name)
+            path.replace(self._target / path.name)
         for name in set(OUTPUT_NAMES) - written:
-            (self.folder / name).unlink(missing_ok=True)
+            (self._target / name).unlink(missing_ok=True)
 
     def _remove_parents(self) -> None:
         for parent in self._made:

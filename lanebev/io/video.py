@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import glob
 import re
 import warnings
@@ -51,6 +52,7 @@ class FrameSource:
         fps: nominal frame rate.
         count: number of frames; of a damaged video an estimate.
         image_size: (height, width) of the first frame that decodes.
+        problem: what is wrong with the whole of it, else empty.
     """
 
     source: str
@@ -58,6 +60,7 @@ class FrameSource:
     fps: Fraction
     count: int
     image_size: tuple[int, int]
+    problem: str = ""
 
     @property
     def is_video(self) -> bool:
@@ -82,28 +85,20 @@ class FrameSource:
             yield Frame(index, float(index / self.fps), float(1 / self.fps), path, image, problem)
 
     def _video_frames(self) -> Iterator[Frame]:
-        index, first, before, problem = 0, None, None, ""
+        first, before = None, None
         with _open_video(self.source) as container:
             stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            for packet in container.demux(stream):
+            for index, (pts, decoded) in enumerate(_decoded(container, stream)):
+                time = (first or 0) + index / self.fps if pts is None else pts * stream.time_base
+                first = time if first is None else first
+                dt = float(1 / self.fps) if before is None else float(time - before)
+                image, problem = None, ""
                 try:
-                    decoded: Sequence[av.VideoFrame | None] = packet.decode()
-                except av.error.FFmpegError as error:  # one frame lost, the next may be whole
-                    decoded, problem = [None], f"frame {index}: expected a whole frame, got: {error.strerror}"
-                for frame in decoded:
-                    nominal = (first or 0) + index / self.fps
-                    time = frame.pts * frame.time_base if frame and frame.pts is not None else nominal
-                    first = time if first is None else first
-                    dt = float(1 / self.fps) if before is None else float(time - before)
-                    try:
-                        image = self._right_size(frame.to_ndarray(format="rgb24")) if frame else None
-                    except ValueError as error:
-                        image, problem = None, str(error)
-                    yield Frame(
-                        index, float(time - first), dt, "", image, "" if image is not None else problem
-                    )
-                    index, before = index + 1, time
+                    image = self._right_size(_rgb(decoded))
+                except ValueError as error:
+                    problem = str(error)
+                yield Frame(index, float(time - first), dt, "", image, problem)
+                before = time
 
     def _right_size(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if image.shape[:2] != self.image_size:
@@ -151,7 +146,7 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
     try:
         with warnings.catch_warnings(), Image.open(path) as image:
             warnings.simplefilter("ignore")  # of odd EXIF; errors are errors
-            return np.asarray(image.convert("RGB"))
+            return np.asarray(_eight_bit(image).convert("RGB"))
     except (OSError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         if isinstance(error, UnidentifiedImageError):
             reason = "no image or one whose header is cut"
@@ -213,6 +208,13 @@ def _is_image(path: str | Path) -> bool:
     return Path(path).suffix.lower() in IMAGE_SUFFIXES and Path(path).is_file()
 
 
+def _eight_bit(image: Image.Image) -> Image.Image:
+    """16-bit grey at its own scale; ``convert`` would cut it off at 255."""
+    if not image.mode.startswith("I"):
+        return image
+    return Image.fromarray((np.asarray(image).clip(0, 65535) / 257).round().astype(np.uint8))
+
+
 def _image_source(source: str, paths: Sequence[str], fps: Fraction) -> FrameSource:
     problem = ""
     for path in paths:
@@ -226,16 +228,63 @@ def _image_source(source: str, paths: Sequence[str], fps: Fraction) -> FrameSour
 def _video_source(source: str) -> FrameSource:
     with _open_video(source) as container:
         stream = container.streams.video[0]
-        fps = stream.average_rate or stream.guessed_rate or DEFAULT_FPS
+        fps = Fraction(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
+        frames = (frame for _, frame in _decoded(container, stream) if not isinstance(frame, str))
         try:
-            frame = next(container.decode(stream))
+            frame = next(frames)
         except (av.error.FFmpegError, StopIteration) as error:
             raise ValueError(f"video {source}: expected at least one whole frame, got none") from error
         size = (frame.height, frame.width)
     with _open_video(source) as container:  # the header's count includes frames that an edit list cuts
-        packets = container.demux(container.streams.video[0])
-        count = sum(packet.pts is not None and not packet.is_discard for packet in packets)
-    return FrameSource(source, (), Fraction(fps), count, size)
+        stream = container.streams.video[0]
+        begin, tick = stream.start_time or 0, stream.time_base or 1 / fps
+        count, end = 0, Fraction(0)
+        for packet in container.demux(stream):
+            if packet.pts is not None:
+                count += not packet.is_discard
+                end = max(end, packet.pts - begin + max(packet.duration or 0, 1 / fps / tick))
+        declared, got = float((stream.duration or 0) * tick), float(end * tick)
+    cut = declared - got > 0.5 / fps
+    problem = f"video {source}: expected {declared:.2f} s as it declares, got {got:.2f} s; is it cut?"
+    return FrameSource(source, (), fps, count, size, problem if cut else "")
+
+
+def _decoded(
+    container: av.container.InputContainer, stream: av.VideoStream
+) -> Iterator[tuple[int | None, av.VideoFrame | str]]:
+    """Frames with their presentation times, rising; of one that was lost, what was got instead of it.
+
+    A packet whose frame does not come is lost if the file is damaged up to there; in a sound one it shows
+    nothing. No frame threads: they drop what follows the last error.
+    """
+    due: list[int] = []  # times of packets whose frames have not come
+    damage = ""
+    for packet in container.demux(stream):
+        if packet.pts is not None and not packet.is_discard:
+            bisect.insort(due, packet.pts)
+        if packet.is_corrupt:
+            damage = damage or "a damaged one"
+        frames: Sequence[av.VideoFrame] = ()
+        try:
+            frames = packet.decode()
+        except av.error.FFmpegError as error:  # one frame lost, the next may be whole
+            damage = error.strerror
+            if packet.pts is None and packet.size:
+                yield None, damage
+        for frame in frames:
+            while due and frame.pts is not None and due[0] <= frame.pts:
+                if (pts := due.pop(0)) < frame.pts and damage:
+                    yield pts, damage
+            yield frame.pts, frame
+    if damage:
+        yield from ((pts, damage) for pts in due)
+
+
+def _rgb(decoded: av.VideoFrame | str) -> NDArray[np.uint8]:
+    if isinstance(decoded, str):
+        raise ValueError(f"expected a whole frame, got: {decoded}")
+    image: NDArray[np.uint8] = decoded.to_ndarray(format="rgb24")
+    return image
 
 
 def _open_video(source: str) -> av.container.InputContainer:
