@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.geometry.camera import undistort_points
+from lanebev.geometry.precision import autocast_off, common_dtype
 from lanebev.types import Calibration, LaneSegments
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
@@ -99,7 +100,8 @@ class LaneBEV(nn.Module):
     ) -> Any:
         """The calibrator's state before the first frame."""
         initial_state: Any = self.calibrator.initial_state
-        return initial_state(batch_size, dtype=dtype, device=device)
+        with autocast_off(torch.device(device or "cpu")):
+            return initial_state(batch_size, dtype=dtype, device=device)
 
     def forward(
         self,
@@ -116,7 +118,8 @@ class LaneBEV(nn.Module):
         Args:
             image: (B, 3, H, W) or (B, T, 3, H, W), RGB in [0, 1], as taken.
             intrinsics: (B, 3, 3) px.
-            state: of the frame before; None starts anew.
+            state: of the frame before; its dtype is the calibration's. None starts anew in the dtype of the
+                intrinsics, float32 at least.
             dt: s since the frame before: float, (B,) or, with T frames, (B, T).
             lane_width: m: float, (B,) or (B, L-1).
             distortion: (B, D) of the lens, or None.
@@ -126,12 +129,14 @@ class LaneBEV(nn.Module):
             the output, every tensor with (B, T, ...) where the image has T, and the state after it.
 
         Raises:
-            ValueError: shapes that don't fit.
+            ValueError: shapes that don't fit, or an image of whole numbers.
         """
         if image.ndim not in (4, 5) or image.shape[-3] != 3:
             raise ValueError(f"image: expected (B, 3, H, W) or (B, T, 3, H, W), got {tuple(image.shape)}")
+        if not image.is_floating_point():
+            raise ValueError(f"image: expected floating point in [0, 1], got {image.dtype}")
         if state is None:
-            state = self.initial_state(image.shape[0], intrinsics.dtype, image.device)
+            state = self.initial_state(image.shape[0], common_dtype(intrinsics), image.device)
         frames = image if image.ndim == 5 else image.unsqueeze(1)
         batch, steps = frames.shape[:2]
         logits, segments = self.observe(
@@ -140,8 +145,7 @@ class LaneBEV(nn.Module):
             None if distortion is None else distortion.repeat_interleave(steps, 0),
             model,
         )
-        intervals = torch.as_tensor(dt, dtype=intrinsics.dtype, device=intrinsics.device)
-        intervals = (intervals if intervals.ndim == 2 else intervals.reshape(-1, 1)).expand(batch, steps)
+        intervals = _intervals(dt, batch, steps, intrinsics)
         outputs = []
         for step in range(steps):
             now = LaneSegments(*(part.reshape(batch, steps, *part.shape[1:])[:, step] for part in segments))
@@ -187,6 +191,17 @@ class LaneBEV(nn.Module):
         return nn.functional.interpolate(
             image, size=(rows, self.network_width), mode="bilinear", antialias=True, align_corners=False
         )
+
+
+def _intervals(dt: float | Tensor, batch: int, steps: int, like: Tensor) -> Tensor:
+    """Time steps to (B, T) s, float32 at least, on the device of ``like``."""
+    intervals = torch.as_tensor(dt, dtype=common_dtype(like), device=like.device)
+    got = tuple(intervals.shape)
+    if intervals.ndim < 2:
+        intervals = intervals.reshape(-1, 1)
+    if intervals.ndim > 2 or intervals.shape[0] not in (1, batch) or intervals.shape[1] not in (1, steps):
+        raise ValueError(f"dt: expected a float, ({batch},) or ({batch}, {steps}), got {got}")
+    return intervals.expand(batch, steps)
 
 
 def _stack(outputs: list[Any]) -> Any:

@@ -105,14 +105,14 @@ def test_a_sharp_line_beside_a_vague_one_is_no_outlier():
     frames = drive(90, sigma=0.1)[::3]
     calibrator = JointCalibrator()
     state = calibrator.initial_state(2, dtype=DOUBLE)
-    for moment, segments in frames:
+    for _, segments in frames:
         sharp, vague = segments.boundary == 2, segments.boundary == 3
         segments = segments._replace(
             weight=segments.weight * (sharp | vague), sigma=torch.where(vague, 5.0, segments.sigma)
         )
         out, state = calibrator(segments, cameras(2), state, 3 / FPS, WIDTH)
         assert (out.inliers[sharp & (segments.weight > 0)] > 0.5).all()
-    truth = torch.tensor(moment.pose, dtype=DOUBLE)
+    truth = torch.tensor(frames[-1][0].pose, dtype=DOUBLE)
     assert (out.extrinsics.stack() - truth)[:, :2].abs().max() < math.radians(0.1)
 
 

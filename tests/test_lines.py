@@ -273,3 +273,19 @@ def test_export_equals_eager(fans):
 def test_errors(call, match):
     with pytest.raises(ValueError, match=match):
         call()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_logits_of_half_precision_and_autocast_give_float32_segments(fans, dtype):
+    maps = fans[0][:2]
+    logits = torch.cat([(1 - maps.sum(1, keepdim=True)), maps], 1).clamp(min=1e-3).log().to(dtype)
+    logits.requires_grad_()
+    expected = LineExtractor(CONFIG)(logits.detach().float(), (192, 320))
+    with torch.autocast("cpu", torch.bfloat16):
+        found = LineExtractor(CONFIG)(logits, (192, 320))
+    assert found.endpoints.dtype == torch.float32
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b)
+    found.endpoints.sum().backward()
+    assert logits.grad.dtype == dtype
+    assert logits.grad.abs().sum() > 0

@@ -195,3 +195,11 @@ def test_exports_and_equals_eager():
     torch.testing.assert_close(found[0].extrinsics.stack(), expected[0].extrinsics.stack())
     for one, other in zip(found[1], expected[1], strict=True):
         torch.testing.assert_close(one, other)
+
+
+def test_results_have_the_dtype_of_the_state():
+    mount = MountEstimator()
+    _, state = mount(fast(POSE), mount.initial_state(1), 0.1)
+    assert {part.dtype for part in state if part.is_floating_point()} == {torch.float32}
+    with pytest.raises(ValueError, match="speed: expected a float or"):
+        mount(fast(POSE), state, 0.1, speed=torch.ones(2))

@@ -4,8 +4,19 @@ import pytest
 import torch
 from torch import nn
 
-from lanebev import BEVGrid, BEVWarp, LaneBEV, LaneSegments, Status, TwoStageCalibrator
+from lanebev import (
+    BEVGrid,
+    BEVWarp,
+    JointCalibrator,
+    LaneBEV,
+    LaneSegmenter,
+    LaneSegments,
+    LineExtractor,
+    Status,
+    TwoStageCalibrator,
+)
 from lanebev.geometry.camera import distort_points
+from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.types import Extrinsics
 from tests.test_two_stage import K, lanes
 
@@ -122,3 +133,65 @@ def test_the_pose_is_less_sure_by_the_networks_factor():
 def test_shapes_are_checked():
     with pytest.raises(ValueError, match=r"image: expected \(B, 3, H, W\)"):
         model()(torch.zeros(3, 72, 128), INTRINSICS[None], None)
+
+
+SMALL = SegmenterConfig(base_width=8, decoder_width=8)
+
+
+def small(calibrator=None):
+    """A real network, untrained, and a real extractor, float32."""
+    torch.manual_seed(0)
+    net = LaneSegmenter(SMALL).eval()
+    calibrator = calibrator or TwoStageCalibrator(num_hypotheses=20)
+    return LaneBEV(net, LineExtractor.for_network(SMALL), calibrator, BEVWarp(GRID))
+
+
+@pytest.mark.parametrize("calibrator", [TwoStageCalibrator(), JointCalibrator()], ids=["two-stage", "joint"])
+def test_under_autocast_the_network_alone_is_of_half_precision(calibrator):
+    net, image = small(calibrator), images(1).float()
+    with torch.autocast("cpu", torch.bfloat16):
+        out, state = net(image, INTRINSICS[None].float())
+    assert out.logits.dtype == torch.bfloat16
+    assert out.bev.dtype == out.segments.endpoints.dtype == torch.float32
+    assert out.calibration.covariance.dtype == state[0].dtype == torch.float32
+    expected, _ = net.warp(image, INTRINSICS[None].float(), out.calibration.extrinsics)
+    assert torch.equal(out.bev, expected)
+
+
+def test_gradients_flow_under_autocast():
+    net, frames = model().float(), images(1).float().requires_grad_()
+    with torch.autocast("cpu", torch.bfloat16):
+        out, _ = net(frames, INTRINSICS[None].float())
+        out.calibration.extrinsics.pitch.sum().backward()
+    assert frames.grad.isfinite().all()
+    assert frames.grad.abs().sum() > 0
+
+
+def test_a_camera_in_double_precision_goes_with_single_precision_images():
+    out, state = small()(images(1).float(), INTRINSICS[None], distortion=torch.zeros(1, 5))
+    assert out.bev.dtype == torch.float32
+    assert out.calibration.covariance.dtype == state.direction_mean.dtype == torch.float64
+    kept, _ = small()(images(1).float(), INTRINSICS[None], small().initial_state(1))
+    assert kept.calibration.covariance.dtype == torch.float32
+
+
+def test_exports_and_equals_eager():
+    net, dt = small(), torch.tensor([0.05])
+    arguments = (images(1).float(), INTRINSICS[None].float(), net.initial_state(1), dt)
+    with torch.no_grad():
+        exported = torch.export.export(net, arguments).module()
+        (found, _), (expected, _) = exported(*arguments), net(*arguments)
+    torch.testing.assert_close(found.bev, expected.bev)
+    torch.testing.assert_close(found.calibration.covariance, expected.calibration.covariance)
+
+
+def test_arguments_are_checked():
+    for bad in (torch.ones(3), torch.ones(2, 2), torch.ones(1, 2, 3)):
+        with pytest.raises(ValueError, match=r"dt: expected a float, \(2,\) or \(2, 3\), got"):
+            model()(images(2, 3), INTRINSICS.expand(2, 3, 3), None, bad)
+    with pytest.raises(ValueError, match=r"image: expected floating point in \[0, 1\], got torch.uint8"):
+        model()((255 * images(1)).to(torch.uint8), INTRINSICS[None])
+    with pytest.raises(ValueError, match=r"distortion: expected \(1, D\) like the points, got \(5,\)"):
+        model()(images(1), INTRINSICS[None], distortion=torch.zeros(5, dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"state.direction_mean: expected \(2, ...\)"):
+        model()(images(2), INTRINSICS.expand(2, 3, 3), model().initial_state(1))

@@ -107,3 +107,26 @@ def test_grid_shape_and_cells():
     with pytest.raises(ValueError, match="x: expected"):
         BEVGrid(x=(5.0, -5.0))
     assert math.isclose(float(grid.bev_from_road_points(torch.tensor([0.0, 60.0]))[1]), 0.0)
+
+
+def test_covariance_is_infinite_where_there_is_no_road():
+    pixels = torch.tensor([[[640.0, 300.0], [640.0, 500.0]]], dtype=torch.float64)
+    pixel_cov = torch.eye(2, dtype=torch.float64).expand(1, 2, 2, 2)
+    cov = road_covariance(pixels, K, pose(), pixel_cov)
+    assert cov[0, 0].tolist() == [[math.inf, 0.0], [0.0, math.inf]]
+    assert cov[0, 1].isfinite().all()
+    assert road_covariance(pixels, K, pose())[0, :, 0, 0].tolist() == [math.inf, 0.0]
+    assert BEVGrid().bev_from_road_covariance(cov)[0, 0].diagonal().tolist() == [math.inf, math.inf]
+
+
+def test_points_keep_their_digits_under_autocast_and_in_mixed_dtypes():
+    e = Extrinsics(*(v.float() for v in pose(0.02, 0.01, -0.01, 1.5)))
+    single = K.float()
+    pixels, _ = image_from_road_points(ROAD.float(), single, e)
+    cov = road_covariance(pixels, single, e, extrinsics_cov=torch.eye(4)[None])
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(image_from_road_points(ROAD.float(), single, e)[0], pixels)
+        assert torch.equal(road_covariance(pixels, single, e, extrinsics_cov=torch.eye(4)[None]), cov)
+    mixed, _ = image_from_road_points(ROAD.float(), K, e)
+    assert mixed.dtype == torch.float64
+    torch.testing.assert_close(mixed.float(), pixels)

@@ -160,3 +160,8 @@ def test_bad_weights_are_one_clear_line(small, tmp_path):
 def test_errors(call, match):
     with pytest.raises(ValueError, match=match):
         call()
+
+
+def test_images_of_whole_numbers_are_refused(small):
+    with pytest.raises(ValueError, match=r"image: expected floating point in \[0, 1\], got torch.uint8"):
+        small(torch.zeros(1, 3, 64, 96, dtype=torch.uint8))

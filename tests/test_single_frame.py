@@ -233,3 +233,11 @@ def test_a_sharp_line_beside_a_vague_one_is_no_outlier():
     found = fit_single_frame(frames, cameras(16))
     assert (found.inliers[~vague] > 0.5).all()
     assert found.valid.all()
+
+
+def test_autocast_changes_nothing():
+    frames = drive_frames(random_params(2, 4, (2, 2, 1)), 1.0, 5)
+    expected = fit_single_frame(frames, cameras(2))
+    with torch.autocast("cpu", torch.bfloat16):
+        found = fit_single_frame(frames, cameras(2))
+    assert torch.equal(found.covariance, expected.covariance)

@@ -112,3 +112,58 @@ def test_shapes_are_checked():
         BEVWarp(GRID)(torch.zeros(3, 4, 5), CAMERA.intrinsics[None], pose([0.0, 0.0, 0.0, 1.5]))
     with pytest.raises(ValueError, match="for 2 images"):
         BEVWarp(GRID)(smooth_image(2), CAMERA.intrinsics[None], pose([0.0, 0.0, 0.0, 1.5]))
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_an_image_of_half_precision_is_sampled_where_it_should_be(dtype):
+    extrinsics, intrinsics = pose([0.03, 0.02, -0.05, 1.4]), CAMERA.intrinsics[None]
+    image = smooth_image().to(dtype)
+    half, valid = BEVWarp(GRID)(image, intrinsics, extrinsics)
+    full, expected = BEVWarp(GRID)(image.float(), intrinsics, extrinsics)
+    assert half.dtype == dtype
+    assert torch.equal(valid, expected)
+    torch.testing.assert_close(half, full.to(dtype))
+
+
+def test_autocast_and_half_modules_leave_the_geometry_alone():
+    extrinsics, intrinsics = pose([0.03, 0.02, -0.05, 1.4]), LENS.intrinsics[None]
+    inputs = (smooth_image().float(), intrinsics.float(), Extrinsics(*(v.float() for v in extrinsics)))
+    lens = LENS.distortion[None].float()
+    expected, _ = BEVWarp(GRID)(*inputs, lens)
+    homography = bev_from_image(inputs[2], inputs[1], GRID)
+    pixels, _ = BEVWarp(GRID).image_points(*inputs[1:], lens)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(BEVWarp(GRID)(*inputs, lens)[0], expected)
+        assert torch.equal(BEVWarp(GRID).image_points(*inputs[1:], lens)[0], pixels)
+        assert torch.equal(bev_from_image(inputs[2], inputs[1], GRID), homography)
+    assert (BEVWarp(GRID).bfloat16().image_points(*inputs[1:], lens)[0] - pixels).abs().max() < 0.01
+
+
+def test_gradients_flow_under_autocast_from_a_half_precision_image():
+    values = torch.tensor([[0.03, 0.02, -0.05, 1.4]], requires_grad=True)
+    image = smooth_image().bfloat16().requires_grad_()
+    with torch.autocast("cpu", torch.bfloat16):
+        bev, _ = BEVWarp(GRID)(image, CAMERA.intrinsics[None], Extrinsics.unstack(values))
+        bev.float().sum().backward()
+    assert image.grad.dtype == torch.bfloat16
+    assert image.grad.abs().sum() > 0
+    assert (values.grad != 0).all()
+
+
+def test_intrinsics_pose_and_lens_may_differ_in_dtype():
+    extrinsics, intrinsics = pose([0.03, 0.02, -0.05, 1.4], dtype=torch.float32), LENS.intrinsics[None]
+    image = smooth_image().float()
+    expected, _ = BEVWarp(GRID)(image, intrinsics.float(), extrinsics, LENS.distortion[None].float())
+    bev, _ = BEVWarp(GRID)(image, intrinsics, extrinsics, LENS.distortion[None].float())
+    assert bev.dtype == torch.float32
+    torch.testing.assert_close(bev, expected, atol=1e-3, rtol=0)
+    assert bev_from_image(extrinsics, intrinsics, GRID).dtype == torch.float64
+
+
+def test_whole_numbers_and_lenses_that_do_not_fit_are_named():
+    args = CAMERA.intrinsics.expand(2, 3, 3), pose([0.0, 0.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.5])
+    with pytest.raises(ValueError, match=r"image: expected floating point, got torch.uint8"):
+        BEVWarp(GRID)(torch.zeros(2, 3, 4, 5, dtype=torch.uint8), *args)
+    for shape in ((5,), (3, 5)):
+        with pytest.raises(ValueError, match=r"distortion: expected \(2, D\) like the points, got \("):
+            BEVWarp(GRID)(smooth_image(2), *args, torch.zeros(shape, dtype=torch.float64))

@@ -2,13 +2,63 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, TypeVar, cast
+
 import torch
 from torch import Tensor
 
-from lanebev.types import LaneSegments
+from lanebev.geometry.precision import autocast_off, cast_floating
+from lanebev.types import Calibration, LaneSegments
+
+Forward = TypeVar("Forward", bound=Callable[..., Any])
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
 _MIN_SIGMA = 1e-3  # px; nothing is known better
+_MIN_SEGMENTS = 2  # that the estimators' reductions and pairs ask for; the rest is padding
+_HARMLESS_FOCAL = 1000.0  # px
+_HARMLESS_WIDTH = 3.7  # m
+
+
+def calibrates(forward: Forward) -> Forward:
+    """The border of a calibrator: its ``forward`` gets what fits together, whatever came.
+
+    Shapes are checked. Everything is cast to the state's floating dtype, in which the calibrator computes and
+    gives its results, with autocast off. A row whose intrinsics or lane widths can't be used counts as one
+    that sees nothing, and N may be 0.
+
+    Args:
+        forward: method of a module with ``config.num_boundaries``, as in
+            :meth:`lanebev.TwoStageCalibrator.forward`.
+
+    Returns:
+        the method that asks first.
+    """
+
+    @wraps(forward)
+    def checked(
+        self: Any,
+        segments: LaneSegments,
+        intrinsics: Tensor,
+        state: Any,
+        dt: float | Tensor,
+        lane_width: float | Tensor = 3.7,
+    ) -> tuple[Calibration, Any]:
+        check_segments(segments, intrinsics)
+        count = segments.weight.shape[1]
+        like = check_state(state, intrinsics.shape[0])
+        segments, intrinsics = cast_floating(segments, like.dtype), intrinsics.to(like.dtype)
+        widths = as_lane_width(lane_width, like, self.config.num_boundaries)
+        segments, intrinsics, widths = _unseen_where_unusable(segments, intrinsics, widths)
+        with autocast_off(like.device):
+            calibration, state = forward(
+                self, _padded(segments), intrinsics, state, as_batch(dt, like), widths
+            )
+        return calibration._replace(inliers=calibration.inliers[:, :count]), state
+
+    return cast(Forward, checked)
 
 
 def check_segments(segments: LaneSegments, intrinsics: Tensor) -> None:
@@ -25,10 +75,28 @@ def check_segments(segments: LaneSegments, intrinsics: Tensor) -> None:
         got = tuple(getattr(segments, name).shape)
         if got != shape:
             raise ValueError(f"segments.{name}: expected {shape} like the end points, got {got}")
-    if segments.boundary.is_floating_point():
+    if segments.boundary.dtype != torch.int64:
         raise ValueError(f"segments.boundary: expected int64 indices, got {segments.boundary.dtype}")
     if intrinsics.shape != (ends.shape[0], 3, 3):
         raise ValueError(f"intrinsics: expected ({ends.shape[0]}, 3, 3), got {tuple(intrinsics.shape)}")
+
+
+def check_state(state: Any, rows: int) -> Tensor:
+    """Raise where a state is not that of so many rows.
+
+    Returns:
+        its first tensor, (B, D), whose dtype and device are those of the calibrator.
+
+    Raises:
+        ValueError: naming the tensor, what was expected and what came.
+    """
+    for name, part in zip(state._fields, state, strict=True):
+        if part.shape[:1] != (rows,):
+            raise ValueError(f"state.{name}: expected ({rows}, ...), got {tuple(part.shape)}")
+    like: Tensor = state[0]
+    if like.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"state.{state._fields[0]}: expected float32 or float64, got {like.dtype}")
+    return like
 
 
 def clean_segments(segments: LaneSegments, num_boundaries: int) -> LaneSegments:
@@ -58,7 +126,32 @@ def clean_segments(segments: LaneSegments, num_boundaries: int) -> LaneSegments:
     )
 
 
-def as_batch(value: float | Tensor, like: Tensor) -> Tensor:
+def _unseen_where_unusable(
+    segments: LaneSegments, intrinsics: Tensor, lane_width: Tensor
+) -> tuple[LaneSegments, Tensor, Tensor]:
+    """Weight zero, and harmless numbers, in rows of impossible (B, 3, 3) intrinsics or (B, L-1) widths."""
+    camera = intrinsics.isfinite().all(-1).all(-1) & (intrinsics[:, 0, 0] > 0) & (intrinsics[:, 1, 1] > 0)
+    usable = camera & (lane_width.isfinite() & (lane_width > 0)).all(-1)  # (B,)
+    harmless = torch.diag(intrinsics.new_tensor([_HARMLESS_FOCAL, _HARMLESS_FOCAL, 1.0]))
+    weight = torch.where(usable.unsqueeze(-1), segments.weight, 0.0)
+    return (
+        segments._replace(weight=weight),
+        torch.where(usable[:, None, None], intrinsics, harmless),
+        torch.where(usable.unsqueeze(-1), lane_width, _HARMLESS_WIDTH),
+    )
+
+
+def _padded(segments: LaneSegments) -> LaneSegments:
+    """With segments of weight zero where there are fewer than the estimators ask for."""
+    missing = _MIN_SEGMENTS - segments.weight.shape[1]
+    if missing <= 0:
+        return segments
+    return LaneSegments(
+        *(torch.cat([part, part.new_zeros(part.shape[0], missing, *part.shape[2:])], 1) for part in segments)
+    )
+
+
+def as_batch(value: float | Tensor, like: Tensor, name: str = "dt") -> Tensor:
     """A number or a (B,) tensor to (B,), with the dtype and device of ``like`` (B, ...).
 
     Raises:
@@ -66,7 +159,7 @@ def as_batch(value: float | Tensor, like: Tensor) -> Tensor:
     """
     tensor = torch.as_tensor(value, dtype=like.dtype, device=like.device)
     if tensor.ndim > 1 or (tensor.ndim == 1 and tensor.shape[0] not in (1, like.shape[0])):
-        raise ValueError(f"dt: expected a float or ({like.shape[0]},), got {tuple(tensor.shape)}")
+        raise ValueError(f"{name}: expected a float or ({like.shape[0]},), got {tuple(tensor.shape)}")
     return tensor.expand(like.shape[0])
 
 
@@ -76,7 +169,7 @@ def as_lane_width(value: float | Tensor, like: Tensor, num_boundaries: int) -> T
     Raises:
         ValueError: another shape, or a float that is not positive.
     """
-    if isinstance(value, (int, float)) and not value > 0:
+    if isinstance(value, (int, float)) and not 0 < value < math.inf:
         raise ValueError(f"lane_width: expected a positive width in m, got {value}")
     width = torch.as_tensor(value, dtype=like.dtype, device=like.device)
     rows, lanes, got = like.shape[0], num_boundaries - 1, tuple(width.shape)

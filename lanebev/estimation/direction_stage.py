@@ -79,7 +79,7 @@ def track_direction(
     inliers = (near & there).to(mean.dtype)
     supported = is_supported(segments, inliers, cfg)
 
-    tracking = (state.status == Status.TRACKING) | (state.status == Status.COASTING)
+    tracking = (state.status == int(Status.TRACKING)) | (state.status == int(Status.COASTING))
     # After a gap the prediction is too wide to tell right segments from wrong: search instead of gating.
     spread = cov[:, :2, :2].diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()
     start = ~tracking | (state.unseen + dt > cfg.reacquire_after) | (spread > cfg.reacquire_spread)
@@ -106,7 +106,7 @@ def predict_direction(state: TwoStageState, dt: Tensor, cfg: TwoStageConfig) -> 
     """
     density = dt.new_full((2,), cfg.angular_acceleration_density)
     moving = torch.minimum(dt, (cfg.reacquire_after - state.unseen).clamp_min(0.0))
-    tracking = (state.status == Status.TRACKING) | (state.status == Status.COASTING)
+    tracking = (state.status == int(Status.TRACKING)) | (state.status == int(Status.COASTING))
     transition, _ = kalman.constant_velocity(torch.where(tracking, moving, 0.0), density)
     _, noise = kalman.constant_velocity(torch.where(tracking, dt, 0.0), density)
     mean, cov = kalman.predict(state.direction_mean, state.direction_cov, transition, noise)

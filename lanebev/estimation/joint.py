@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.estimation import kalman
-from lanebev.estimation.checks import as_batch
+from lanebev.estimation.checks import as_batch, calibrates
 from lanebev.estimation.joint_filter import (
     UNSEEN,
     Update,
@@ -191,6 +191,7 @@ class JointCalibrator(nn.Module):
             reasons=none + int(Reason.NO_START),
         )
 
+    @calibrates
     def forward(
         self,
         segments: LaneSegments,
@@ -199,11 +200,11 @@ class JointCalibrator(nn.Module):
         dt: float | Tensor,
         lane_width: float | Tensor = 3.7,
     ) -> tuple[Calibration, JointState]:
-        """One frame.
+        """One frame, computed in the state's dtype, in which the results are.
 
         Args:
             segments: of this frame, N per row; weight 0 is not there, non-finite counts as not there.
-            intrinsics: (B, 3, 3) px.
+            intrinsics: (B, 3, 3) px. A row where they or the widths are not finite and positive sees nothing.
             state: of the frame before, or :meth:`initial_state`.
             dt: s since that frame, float or (B,). A started row skips a duplicate (0) and a frame that comes
                 late (negative; the next dt counts from it). Where not finite, an interval is assumed.
@@ -341,7 +342,7 @@ class JointCalibrator(nn.Module):
         support = (seen.weight * update.trust).sum(-1)
         total = seen.weight.sum(-1)
         share = support / total.clamp(min=1e-6)
-        least = torch.where(state.status == Status.TRACKING, cfg.min_share, cfg.enter_share)
+        least = torch.where(state.status == int(Status.TRACKING), cfg.min_share, cfg.enter_share)
         finite = update.mean.isfinite().all(-1) & update.cov.isfinite().all(-1).all(-1)
         supported = running & finite & (support >= cfg.min_support) & (share >= least)
         empty = total < 1e-3
@@ -482,7 +483,7 @@ class JointCalibrator(nn.Module):
 
 
 def _running(status: Tensor) -> Tensor:
-    return (status == Status.TRACKING) | (status == Status.COASTING)
+    return (status == int(Status.TRACKING)) | (status == int(Status.COASTING))
 
 
 def _held(reasons: Tensor) -> Tensor:

@@ -164,7 +164,8 @@ def _unsure(jacobian: Tensor, cov: Tensor) -> Tensor:
     """(B, N) px², h P hᵀ of a segment's end points, their mean, for (B, P + L, 2N) and (B, D, D)."""
     place = _observable(jacobian.shape[1], cov.device)
     seen = cov.index_select(1, place).index_select(2, place)
-    return ((seen @ jacobian) * jacobian).sum(1).unflatten(-1, (-1, 2)).mean(-1)
+    variance: Tensor = ((seen @ jacobian) * jacobian).sum(1).unflatten(-1, (-1, 2)).mean(-1)
+    return variance
 
 
 def _observable(count: int, device: torch.device) -> Tensor:

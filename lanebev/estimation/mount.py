@@ -190,7 +190,7 @@ class MountEstimator(nn.Module):
         yaw_rate: Tensor | None = None,
         curvature: Tensor | None = None,
     ) -> tuple[MountCalibration, MountState]:
-        """One frame.
+        """One frame, computed in the state's dtype.
 
         Args:
             calibration: of this frame, from any calibrator.
@@ -206,10 +206,10 @@ class MountEstimator(nn.Module):
         Raises:
             ValueError: a shape that doesn't fit.
         """
-        pose = calibration.extrinsics.stack()
+        pose = calibration.extrinsics.stack().to(state.pose_sum.dtype)
         if state.pose_sum.shape != pose.shape:
             raise ValueError(f"state: expected {pose.shape[0]} rows, got {state.pose_sum.shape[0]}")
-        variance = calibration.covariance.diagonal(dim1=-2, dim2=-1)
+        variance = calibration.covariance.diagonal(dim1=-2, dim2=-1).to(pose.dtype)
         step = as_batch(dt, pose)
         why = self._gates(calibration.status, pose, variance, step, speed, yaw_rate, curvature)
         used = why == 0
@@ -219,9 +219,9 @@ class MountEstimator(nn.Module):
         state = state._replace(blend=torch.where(used & ~moved, faded, state.blend))
 
         mean, var, count = self._estimate(state)
-        limits, outside = self._limits(mean, state.status == MountStatus.INVALID)
+        limits, outside = self._limits(mean, state.status == int(MountStatus.INVALID))
         enough = count >= self.config.needed
-        again = moved | (state.status == MountStatus.RECALIBRATING)
+        again = moved | (state.status == int(MountStatus.RECALIBRATING))
         waiting = torch.where(again, int(MountStatus.RECALIBRATING), int(MountStatus.UNCALIBRATED))
         valid = torch.where(outside, int(MountStatus.INVALID), int(MountStatus.CALIBRATED))
         status = torch.where(enough, valid, waiting)
@@ -249,13 +249,15 @@ class MountEstimator(nn.Module):
         cfg = self.config
         finite = pose.isfinite().all(-1) & variance.isfinite().all(-1)
         sure = finite & (variance < variance.new_tensor(cfg.largest_std).square()).all(-1)
-        why = _flag(status != Status.TRACKING, MountReason.NOT_TRACKING) | _flag(~sure, MountReason.UNSURE)
+        tracking = status == int(Status.TRACKING)
+        why = _flag(~tracking, MountReason.NOT_TRACKING) | _flag(~sure, MountReason.UNSURE)
         why = why | _flag(~(step.isfinite() & (step > 0)), MountReason.TIME)
         if speed is not None:
-            why = why | _flag(~(as_batch(speed, pose) >= cfg.min_speed), MountReason.SLOW)
-        for turn, most in ((yaw_rate, cfg.max_yaw_rate), (curvature, cfg.max_curvature)):
+            why = why | _flag(~(as_batch(speed, pose, "speed") >= cfg.min_speed), MountReason.SLOW)
+        turns = (("yaw_rate", yaw_rate, cfg.max_yaw_rate), ("curvature", curvature, cfg.max_curvature))
+        for name, turn, most in turns:
             if turn is not None:
-                why = why | _flag(~(as_batch(turn, pose).abs() <= most), MountReason.TURNING)
+                why = why | _flag(~(as_batch(turn, pose, name).abs() <= most), MountReason.TURNING)
         return why
 
     def _close_block(self, state: MountState) -> tuple[MountState, Tensor]:

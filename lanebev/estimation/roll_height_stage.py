@@ -62,7 +62,7 @@ def track_roll_height(
     height_seen, roll_seen = num_lanes >= 1, num_lanes >= 2
     mean, cov = predict_roll_height(state, dt, roll_seen, height_seen, cfg)
 
-    lost = fresh & (state.status == Status.LOST)
+    lost = fresh & (state.status == int(Status.LOST))
     start_roll = roll_seen & (~state.roll_known | lost)
     start_height = height_seen & (~state.height_known | lost | start_roll)
     first = torch.stack([start_roll, start_height, start_roll, start_height], dim=-1)

@@ -23,6 +23,7 @@ from lanebev.estimation.joint_model import (
     observe,
 )
 from lanebev.estimation.joint_robust import inlier_weights, log_likelihood, noise_scale
+from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import angles_from_matrix, road_from_cam
 from lanebev.types import NUM_BOUNDARIES, Extrinsics, LaneSegments
 
@@ -104,6 +105,7 @@ class SingleFrameFit(NamedTuple):
         return torch.cat([self.extrinsics.stack(), self.offset.unsqueeze(-1), self.curvature], dim=-1)
 
 
+@full_precision
 def fit_single_frame(
     segments: LaneSegments,
     intrinsics: Tensor,
@@ -181,8 +183,8 @@ def refine(
         seen: what was observed.
         prior: prior.
         iterations: number of steps.
-        blur: (B,) px or None, of a start that is not good yet: added to every segment's noise, sharp and vague
-            alike, and halved each step.
+        blur: (B,) px or None, of a start that is not good yet: added to every segment's noise, sharp or
+            vague, and halved each step.
 
     Returns:
         params (B, 7), scale (B,), and the information matrix (B, 7, 7) at the last step.

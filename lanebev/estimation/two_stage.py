@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lanebev.estimation.checks import as_batch, as_lane_width, check_segments, clean_segments
+from lanebev.estimation.checks import as_batch, as_lane_width, calibrates, clean_segments
 from lanebev.estimation.direction_stage import track_direction
 from lanebev.estimation.lane_width import boundary_angles
 from lanebev.estimation.roll_height_stage import track_roll_height
@@ -112,6 +112,7 @@ class TwoStageCalibrator(nn.Module):
             direction, direction_cov, roll_height, roll_height_cov, no, no.clone(), unseen, status
         )
 
+    @calibrates
     def forward(
         self,
         segments: LaneSegments,
@@ -120,11 +121,11 @@ class TwoStageCalibrator(nn.Module):
         dt: float | Tensor,
         lane_width: float | Tensor = 3.7,
     ) -> tuple[Calibration, TwoStageState]:
-        """One frame.
+        """One frame, computed in the state's dtype, in which the results are.
 
         Args:
             segments: of this frame, N per row; weight 0 is not there, non-finite counts as not there.
-            intrinsics: (B, 3, 3) px.
+            intrinsics: (B, 3, 3) px. A row where they or the widths are not finite and positive sees nothing.
             state: of the frame before, or :meth:`initial_state`.
             dt: s since that frame, float or (B,); negative or non-finite counts as 0.
             lane_width: m, float, (B,) or (B, L-1) per lane.
@@ -135,7 +136,6 @@ class TwoStageCalibrator(nn.Module):
         Raises:
             ValueError: a shape that doesn't fit.
         """
-        check_segments(segments, intrinsics)
         segments = clean_segments(segments, self.config.num_boundaries)
         dt = as_batch(dt, segments.sigma)
         dt = torch.where(dt.isfinite(), dt, 0.0).clamp(0.0, 60.0)
@@ -143,7 +143,7 @@ class TwoStageCalibrator(nn.Module):
         rays = rays_from_pixels(segments.endpoints.flatten(1, 2), intrinsics)
         rays = rays.reshape(*segments.endpoints.shape[:-1], 3)  # (B, N, 2, 3)
 
-        known = state.status != Status.UNINITIALISED
+        known = state.status != int(Status.UNINITIALISED)
         stale = known & (state.unseen + dt > self.config.lost_after)
         state = state._replace(status=torch.where(stale, int(Status.LOST), state.status))
         one = track_direction(segments, rays, intrinsics, state, dt, self.draws, self.config)
@@ -177,6 +177,6 @@ class TwoStageCalibrator(nn.Module):
 def _status(before: Tensor, seen: Tensor, unseen: Tensor, lost_after: float) -> Tensor:
     """initialise -> track -> coast -> lost -> re-initialise, per row."""
     coasting = torch.where(unseen > lost_after, int(Status.LOST), int(Status.COASTING))
-    idle = (before == Status.UNINITIALISED) | (before == Status.LOST)
+    idle = (before == int(Status.UNINITIALISED)) | (before == int(Status.LOST))
     unsupported = torch.where(idle, before, coasting)
     return torch.where(seen, int(Status.TRACKING), unsupported)

@@ -14,6 +14,8 @@ from kornia.geometry import calibration
 from kornia.geometry.camera import distort_points_kannala_brandt
 from torch import Tensor
 
+from lanebev.geometry.precision import full_precision
+
 MODELS = ("pinhole", "fisheye")
 DISTORTION_LENGTHS = {"pinhole": (0, 4, 5, 8, 12), "fisheye": (4,)}
 _UNDISTORT_ITERATIONS = 20  # kornia's default of 5 leaves 1e-2 px at the corners of a wide lens
@@ -28,6 +30,13 @@ def _check_lens(distortion: Tensor, model: str) -> None:
         raise ValueError(
             f"distortion: expected {expected} coefficients for a {model} lens, got {distortion.shape[-1]}"
         )
+
+
+def check_rows(distortion: Tensor, points: Tensor) -> None:
+    """Raise unless (..., D) coefficients go with (..., N, 2) points, row by row."""
+    if distortion.shape[:-1] != points.shape[:-2]:
+        rows = "".join(f"{size}, " for size in points.shape[:-2])
+        raise ValueError(f"distortion: expected ({rows}D) like the points, got {tuple(distortion.shape)}")
 
 
 def _check_points(points: Tensor, size: int = 2) -> None:
@@ -61,6 +70,7 @@ def denormalise_points(points: Tensor, intrinsics: Tensor) -> Tensor:
     return torch.stack([fx * x + skew * y + cx, fy * y + cy], dim=-1)
 
 
+@full_precision
 def distort_points(points: Tensor, intrinsics: Tensor, distortion: Tensor, model: str = "pinhole") -> Tensor:
     """Undistorted pixels to pixels of the image as it was taken.
 
@@ -77,10 +87,11 @@ def distort_points(points: Tensor, intrinsics: Tensor, distortion: Tensor, model
         (B, N, 2) px, distorted. Differentiable in all tensors.
 
     Raises:
-        ValueError: unknown model, or a number of coefficients that it does not have.
+        ValueError: unknown model, a number of coefficients that it does not have, or of rows.
     """
-    _check_lens(distortion, model)
     _check_points(points)
+    _check_lens(distortion, model)
+    check_rows(distortion, points)
     if distortion.shape[-1] == 0:
         return points
     if model == "fisheye":
@@ -95,6 +106,7 @@ def distort_points(points: Tensor, intrinsics: Tensor, distortion: Tensor, model
     return distorted
 
 
+@full_precision
 def undistort_points(
     points: Tensor, intrinsics: Tensor, distortion: Tensor, model: str = "pinhole"
 ) -> Tensor:
@@ -114,10 +126,11 @@ def undistort_points(
         (B, N, 2) px, undistorted.
 
     Raises:
-        ValueError: unknown model, or a number of coefficients that it does not have.
+        ValueError: unknown model, a number of coefficients that it does not have, or of rows.
     """
-    _check_lens(distortion, model)
     _check_points(points)
+    _check_lens(distortion, model)
+    check_rows(distortion, points)
     if distortion.shape[-1] == 0:
         return points
     if model == "fisheye":

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from lanebev.geometry.camera import normalise_points
+from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import Extrinsics
 
@@ -43,6 +44,7 @@ def great_circle_normals(endpoints: Tensor, intrinsics: Tensor) -> Tensor:
     return normals
 
 
+@full_precision
 def road_from_image_points(
     points: Tensor, intrinsics: Tensor, extrinsics: Extrinsics
 ) -> tuple[Tensor, Tensor]:
@@ -63,6 +65,7 @@ def road_from_image_points(
     return torch.stack([x * scale, z * scale], dim=-1), valid & (scale > 0)
 
 
+@full_precision
 def image_from_road_points(
     points: Tensor, intrinsics: Tensor, extrinsics: Extrinsics
 ) -> tuple[Tensor, Tensor]:
@@ -84,6 +87,7 @@ def image_from_road_points(
     return pixels[..., :2] / torch.where(valid, depth, 1.0).unsqueeze(-1), valid
 
 
+@full_precision
 def road_covariance(
     points: Tensor,
     intrinsics: Tensor,
@@ -101,7 +105,8 @@ def road_covariance(
         extrinsics_cov: (B, 4, 4) of (pitch, yaw, roll, height), or None for an exact pose.
 
     Returns:
-        (B, N, 2, 2) m² of (X, Z).
+        (B, N, 2, 2) m² of (X, Z). Where the pixel is not on the road, above the horizon or behind, variances
+        are infinite and covariances zero.
     """
 
     def to_road(pixel: Tensor, pose: Tensor, matrix: Tensor) -> Tensor:
@@ -116,7 +121,8 @@ def road_covariance(
         cov = cov + by_pixel @ pixel_cov @ by_pixel.mT
     if extrinsics_cov is not None:
         cov = cov + by_pose @ extrinsics_cov.unsqueeze(1) @ by_pose.mT
-    return cov
+    _, valid = road_from_image_points(points, intrinsics, extrinsics)
+    return torch.where(valid[..., None, None], cov, cov.new_full((2,), torch.inf).diag())
 
 
 def _road_from_cam(extrinsics: Extrinsics) -> Tensor:

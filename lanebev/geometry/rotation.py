@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lanebev.geometry.precision import full_precision
 from lanebev.types import Extrinsics
 
 
@@ -33,6 +34,7 @@ def cam_from_world(pitch: Tensor, yaw: Tensor) -> Tensor:
     return _rotation([[cy, zero, sy], [sp * sy, cp, -sp * cy], [-cp * sy, sp, cp * cy]])
 
 
+@full_precision
 def road_from_cam(pitch: Tensor, yaw: Tensor, roll: Tensor) -> Tensor:
     """Rotation from the camera to the road.
 
@@ -52,6 +54,7 @@ def road_from_cam(pitch: Tensor, yaw: Tensor, roll: Tensor) -> Tensor:
     return road_from_world @ cam_from_world(pitch, yaw).mT
 
 
+@full_precision
 def angles_from_matrix(road_from_cam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Inverse of :func:`road_from_cam`.
 
@@ -103,6 +106,7 @@ def pitch_yaw_from_vanishing_dir(vanishing_dir: Tensor) -> tuple[Tensor, Tensor]
     return torch.atan2(-y, z), torch.atan2(x, torch.hypot(y, z))
 
 
+@full_precision
 def horizon_line(extrinsics: Extrinsics, intrinsics: Tensor) -> Tensor:
     """Image of the road's horizon.
 

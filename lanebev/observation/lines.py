@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from lanebev.geometry.precision import full_precision
 from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.observation.vertices import LineConfig, representative_vertices, scan_vertices, take
 from lanebev.types import LaneSegments
@@ -32,13 +33,14 @@ class LineExtractor(nn.Module):
         """As a network's maps are to be read."""
         return cls(LineConfig(stride=network.output_stride, noise_factor=network.noise_factor))
 
+    @full_precision
     def forward(
         self, logits: Tensor, image_size: tuple[int, int], network_size: tuple[int, int] | None = None
     ) -> LaneSegments:
         """Extract.
 
         Args:
-            logits: (B, 1+L, h, w), background first.
+            logits: (B, 1+L, h, w), background first; of half precision they are raised to float32.
             image_size: (H, W) of the image in whose pixels the segments are wanted.
             network_size: (H', W') of the same image, resized, as the network had it; None is the map's size
                 times the stride.
@@ -54,6 +56,7 @@ class LineExtractor(nn.Module):
         return extract_segments(logits.softmax(1)[:, 1:], image_size, self.config, network_size)
 
 
+@full_precision
 def extract_segments(
     probabilities: Tensor,
     image_size: tuple[int, int],

@@ -103,10 +103,12 @@ class LaneSegmenter(nn.Module):
             (B, 1+L, ceil(H/s), ceil(W/s)) logits: background is channel 0, boundary k is channel 1+k.
 
         Raises:
-            ValueError: another shape.
+            ValueError: another shape, or whole numbers.
         """
         if image.ndim != 4 or image.shape[1] != 3:
             raise ValueError(f"image: expected (B, 3, H, W), got {tuple(image.shape)}")
+        if not image.is_floating_point():
+            raise ValueError(f"image: expected floating point in [0, 1], got {image.dtype}")
         stem, c2, c3, c4, c5 = self.trunk((image - self.mean) / self.std)
         lateral2, lateral3, lateral4, lateral5 = self.lateral
         x = lateral5(c5) + self.position(_positions(c5))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import Extrinsics
 
@@ -69,6 +70,7 @@ class BEVGrid:
         return self.road_from_bev_points(torch.stack([column, row], dim=-1))
 
 
+@full_precision
 def bev_from_image(extrinsics: Extrinsics, intrinsics: Tensor, grid: BEVGrid) -> Tensor:
     """Homography from undistorted image pixels to BEV pixels.
 

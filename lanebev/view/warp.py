@@ -6,7 +6,8 @@ import torch
 from kornia.geometry.transform import remap
 from torch import Tensor, nn
 
-from lanebev.geometry.camera import distort_points, max_undistorted_radius, normalise_points
+from lanebev.geometry.camera import check_rows, distort_points, max_undistorted_radius, normalise_points
+from lanebev.geometry.precision import common_dtype, full_precision
 from lanebev.geometry.road import image_from_road_points
 from lanebev.types import Extrinsics
 from lanebev.view.grid import BEVGrid
@@ -16,7 +17,8 @@ class BEVWarp(nn.Module):
     """Inverse perspective mapping of images or feature maps, differentiable in everything but the grid.
 
     Source: Sec. V; the homography of Eq. (19) applied cell by cell, with the lens distortion folded into the
-    same single bilinear resampling.
+    same single bilinear resampling. Geometry is float32 at least, also under autocast and for images of half
+    precision; so is the resampling, and its result has the image's dtype.
 
     Args:
         grid: the road's rectangle; default :class:`BEVGrid`.
@@ -53,10 +55,12 @@ class BEVWarp(nn.Module):
             inside the image.
 
         Raises:
-            ValueError: shapes that don't fit.
+            ValueError: shapes that don't fit, or an image of whole numbers.
         """
         if image.ndim != 4:
             raise ValueError(f"image: expected (B, C, h, w), got {tuple(image.shape)}")
+        if not image.is_floating_point():
+            raise ValueError(f"image: expected floating point, got {image.dtype}")
         batch = image.shape[0]
         if intrinsics.shape != (batch, 3, 3) or extrinsics.pitch.shape != (batch,):
             raise ValueError(
@@ -72,12 +76,14 @@ class BEVWarp(nn.Module):
         map_x = torch.where(valid, (x + 0.5) * scale_x - 0.5, -2.0).reshape(batch, *self.grid.shape)
         map_y = torch.where(valid, (y + 0.5) * scale_y - 0.5, -2.0).reshape(batch, *self.grid.shape)
         valid = valid.reshape(batch, 1, *self.grid.shape)
+        dtype = common_dtype(image)
         bev = remap(
-            image, map_x.to(image.dtype), map_y.to(image.dtype), mode="bilinear", padding_mode="border",
+            image.to(dtype), map_x.to(dtype), map_y.to(dtype), mode="bilinear", padding_mode="border",
             align_corners=True, normalized_coordinates=False,
         )  # fmt: skip
-        return torch.where(valid, bev, 0.0), valid
+        return torch.where(valid, bev, 0.0).to(image.dtype), valid
 
+    @full_precision
     def image_points(
         self,
         intrinsics: Tensor,
@@ -86,10 +92,13 @@ class BEVWarp(nn.Module):
         model: str = "pinhole",
     ) -> tuple[Tensor, Tensor]:
         """Where every cell is seen: (B, U·V, 2) px of the image as taken, and (B, U·V) bool in front."""
-        cells = self.cells.to(intrinsics.dtype).reshape(1, -1, 2).expand(intrinsics.shape[0], -1, -1)
+        rounded = self.cells.dtype.itemsize < 4  # by a network's half(), to 3 cm or worse
+        cells = self.grid.cells(device=intrinsics.device) if rounded else self.cells
+        cells = cells.to(intrinsics.dtype).reshape(1, -1, 2).expand(intrinsics.shape[0], -1, -1)
         pixels, valid = image_from_road_points(cells, intrinsics, extrinsics)
         if distortion is None or distortion.shape[-1] == 0:
             return pixels, valid
+        check_rows(distortion, pixels)
         radius = normalise_points(pixels, intrinsics).norm(dim=-1)
         seen = valid & (radius < max_undistorted_radius(distortion, model).unsqueeze(-1))
         centre = intrinsics[:, None, :2, 2]

@@ -1,0 +1,59 @@
+"""Half precision is for features: a pixel's place among 1920 takes more than the 8 bits of bfloat16."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from functools import reduce, wraps
+from typing import Any, ParamSpec, TypeVar, cast
+
+import torch
+from torch import Tensor
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def full_precision(function: Callable[P, R]) -> Callable[P, R]:
+    """A function of tensors, with autocast off and its floating arguments in one dtype.
+
+    That is the widest of theirs, and float32 at least; tensors in NamedTuples count. Integers and booleans
+    stay. Gradients flow back in the dtypes that came.
+    """
+
+    @wraps(function)
+    def precise(*args: P.args, **kwargs: P.kwargs) -> R:
+        tensors = list(_floating((*args, *kwargs.values())))
+        dtype = common_dtype(*tensors)
+        raised = [cast_floating(value, dtype) for value in args]
+        named = {name: cast_floating(value, dtype) for name, value in kwargs.items()}
+        with autocast_off(tensors[0].device if tensors else torch.device("cpu")):
+            return cast("Callable[..., R]", function)(*raised, **named)
+
+    return precise
+
+
+def autocast_off(device: torch.device) -> torch.autocast:
+    """Context in which operations on ``device`` keep the dtype of their arguments."""
+    return torch.autocast(device.type, enabled=False)
+
+
+def common_dtype(*tensors: Tensor) -> torch.dtype:
+    """The widest floating dtype among the tensors, and float32 at least."""
+    return reduce(torch.promote_types, (tensor.dtype for tensor in tensors), torch.float32)
+
+
+def cast_floating(value: Any, dtype: torch.dtype) -> Any:
+    """A floating tensor, or those of a NamedTuple, to a dtype; anything else as it is."""
+    if isinstance(value, Tensor):
+        return value.to(dtype) if value.is_floating_point() else value
+    if hasattr(value, "_fields"):
+        return type(value)(*(cast_floating(part, dtype) for part in value))
+    return value
+
+
+def _floating(values: Iterable[Any]) -> Iterator[Tensor]:
+    for value in values:
+        if isinstance(value, Tensor) and value.is_floating_point():
+            yield value
+        elif hasattr(value, "_fields"):
+            yield from _floating(value)

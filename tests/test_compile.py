@@ -1,0 +1,53 @@
+"""torch.compile without a graph break equals eager, frame after frame."""
+
+import pytest
+import torch
+
+from lanebev import JointCalibrator, Status, TwoStageCalibrator
+from lanebev.estimation.mount import MountEstimator
+from lanebev.types import Calibration, Extrinsics
+from tests.test_two_stage import K, lanes, nothing, rows
+
+
+@pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
+@pytest.mark.parametrize(
+    "calibrator",
+    [JointCalibrator(iterations=1, start_iterations=1), TwoStageCalibrator(num_hypotheses=20)],
+    ids=["joint", "two-stage"],
+)
+def test_calibrators(calibrator):
+    """Started, tracking and coasting: what compares the status sees each."""
+    torch.compiler.reset()
+    compiled = torch.compile(calibrator, backend="eager", fullgraph=True)
+    state = other = calibrator.initial_state(2, dtype=torch.float64)
+    dt = torch.full((2,), 1 / 30, dtype=torch.float64)
+    frames = [
+        rows(lanes(seed=0), nothing()),
+        rows(lanes(seed=1), lanes(seed=2)),
+        rows(nothing(), lanes(seed=3)),
+    ]
+    for segments in frames:
+        expected, state = calibrator(segments, K.expand(2, 3, 3), state, dt)
+        found, other = compiled(segments, K.expand(2, 3, 3), other, dt)
+        assert torch.equal(found.status, expected.status)
+        torch.testing.assert_close(found.extrinsics.stack(), expected.extrinsics.stack())
+        torch.testing.assert_close(found.covariance, expected.covariance)
+    assert expected.status.tolist() == [Status.COASTING, Status.TRACKING]
+
+
+def test_mount():
+    torch.compiler.reset()
+    mount = MountEstimator(block_time=1.0, needed=4)
+    compiled = torch.compile(mount, backend="eager", fullgraph=True)
+    state = other = mount.initial_state(2)
+    poses = torch.tensor([[0.02, -0.01, 0.0, 1.4], [0.02, 0.2, 0.0, 1.4]])  # the second beyond the limits
+    cov = 1e-6 * torch.eye(4).expand(2, 4, 4)
+    for frame in range(16):
+        status = torch.full((2,), int(Status.TRACKING if frame % 7 else Status.COASTING))
+        moved = poses + (frame > 10) * torch.tensor([0.05, 0.0, 0.0, 0.0])
+        fast = Calibration(Extrinsics.unstack(moved), cov, status, torch.ones(2, 1))
+        expected, state = mount(fast, state, torch.full((2,), 0.5))
+        found, other = compiled(fast, other, torch.full((2,), 0.5))
+        assert torch.equal(found.status, expected.status)
+        assert torch.equal(found.reasons, expected.reasons)
+        torch.testing.assert_close(found.extrinsics.stack(), expected.extrinsics.stack())
