@@ -13,7 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lanebev.estimation.joint import JointCalibrator
 from lanebev.estimation.mount import MountCalibration, MountEstimator, MountReason, MountStatus
+from lanebev.estimation.two_stage import TwoStageCalibrator
 from lanebev.geometry.camera import Camera
 from lanebev.io.cameras import read_camera
 from lanebev.io.lanes import lane_files, read_lanes
@@ -185,13 +187,7 @@ def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Obs
 
 def make_calibrator(name: str) -> Any:
     """The calibrator of this name with default settings."""
-    if name == "two-stage":
-        from lanebev.estimation.two_stage import TwoStageCalibrator
-
-        return TwoStageCalibrator()
-    from lanebev.estimation.joint import JointCalibrator
-
-    return JointCalibrator()
+    return TwoStageCalibrator() if name == "two-stage" else JointCalibrator()
 
 
 def check_image_size(camera: Camera, source: FrameSource) -> None:
@@ -229,10 +225,12 @@ def curvature(calibrator: Any, state: Any) -> Tensor | None:
 def calibrate_still(
     calibrator: nn.Module, segments: LaneSegments, intrinsics: Tensor, lane_width: float
 ) -> Calibration:
-    """Several passes over images of their own, each pass with its share of the information.
+    """Images of their own, each from the start.
 
-    Source: with the end points' variance times the number of passes, all passes together say as much as the
-    image does once (progressive update), so the covariance stays honest while the linearisation settles.
+    A calibrator that starts with a fit to the first frame is done after one pass. One that starts with a
+    guess takes several, each with its share of the information. Source: with the end points' variance times
+    the number of passes, all passes together say as much as the image does once (progressive update), so the
+    covariance stays honest while the linearisation settles.
 
     Args:
         calibrator: any.
@@ -240,10 +238,11 @@ def calibrate_still(
         intrinsics: (B, 3, 3).
         lane_width: m.
     """
+    passes = 1 if isinstance(calibrator, JointCalibrator) else STILL_PASSES
     initial_state: Any = calibrator.initial_state
-    state = initial_state(segments.sigma.shape[0], dtype=segments.sigma.dtype)
-    shared = segments._replace(sigma=segments.sigma * math.sqrt(STILL_PASSES))
-    for _ in range(STILL_PASSES):
+    state = initial_state(segments.sigma.shape[0], dtype=segments.sigma.dtype, device=segments.sigma.device)
+    shared = segments._replace(sigma=segments.sigma * math.sqrt(passes))
+    for _ in range(passes):
         calibration: Calibration
         calibration, state = calibrator(shared, intrinsics, state, 1e-3, lane_width)
     return calibration

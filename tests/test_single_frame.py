@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from lanebev.estimation.joint import JointCalibrator
 from lanebev.estimation.joint_boundaries import boundary_polylines, fit_boundaries
 from lanebev.estimation.joint_model import (
     NUM_PARAMS,
@@ -17,6 +18,7 @@ from lanebev.estimation.joint_model import (
 )
 from lanebev.estimation.single_frame import FramePrior, fit_single_frame
 from lanebev.geometry.road import image_from_road_points
+from lanebev.run import calibrate_still
 from lanebev.types import Extrinsics, LaneSegments
 
 torch.set_num_threads(1)
@@ -241,3 +243,14 @@ def test_autocast_changes_nothing():
     with torch.autocast("cpu", torch.bfloat16):
         found = fit_single_frame(frames, cameras(2))
     assert torch.equal(found.covariance, expected.covariance)
+
+
+def test_a_still_of_a_bend_says_how_sure_it_is():
+    """R = 700 m, which vague lines hardly tell from straight: all they know is needed to tell."""
+    params = random_params(48, 6, (1, 1, 1))
+    params[:, 5] = 1 / 700
+    frames = drive_frames(params, 2.5, 7, per_boundary=12, boundaries=(1, 2, 3, 4))
+    found = calibrate_still(JointCalibrator(), frames, cameras(48), 3.7)
+    error = found.extrinsics.stack() - params[:, :4]
+    nees = (error.unsqueeze(1) @ torch.linalg.solve(found.covariance, error.unsqueeze(-1))).mean() / 4
+    assert nees < 2
