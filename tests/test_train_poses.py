@@ -17,7 +17,15 @@ from train.end_to_end import EndToEnd
 from train.labels import ViewConfig
 from train.module import unpack
 from train.pool import read_shard, write_shard
-from train.poses import EvenGradients, PoseBatch, PoseBatches, fit_poses, pool_frames, pose_loss
+from train.poses import (
+    EvenGradients,
+    PoseBatch,
+    PoseBatches,
+    fit_poses,
+    pool_frames,
+    pose_loss,
+    pose_surprise,
+)
 
 SIZE = (144, 256)
 
@@ -117,6 +125,33 @@ def test_fainter_lines_are_no_way_to_a_better_pose(batch):
     assert slopes[1] < 0.1 * slopes[0]
 
 
+def test_surprise_is_least_where_sigmas_are_the_errors(batch):
+    """Errors of 0.1: sigmas that say so are better than a tenth of them, and than ten times as much."""
+    found = fit(logits_of(batch), batch)
+    floor = torch.full((4,), 0.01, dtype=torch.float64)
+    truth = found.extrinsics.stack() + 0.1
+    sizes = (0.01, 0.1, 1.0)
+    eye = torch.eye(7, dtype=torch.float64).expand(len(truth), 7, 7)
+    scores = [pose_surprise(found._replace(covariance=s**2 * eye), truth, floor) for s in sizes]
+    assert scores[1] < min(scores[0], scores[2])
+    widened = pose_surprise(found._replace(covariance=0.01 * eye), truth, floor, factor=10.0)
+    torch.testing.assert_close(widened, scores[2])
+    broken = found._replace(covariance=torch.full_like(eye, torch.nan))
+    assert pose_surprise(broken, truth, floor) == 0
+
+
+def test_surprise_asks_for_what_can_be_seen(batch):
+    """Faint maps where the truth is: stronger ones lower the loss, which errors alone don't ask for."""
+    floor = torch.tensor([0.0005, 0.0015, 0.002, 0.005], dtype=torch.float64)
+    share = unpack(batch)[1][:, 1:].double() * 0.6
+    faint = torch.ones(6, 1, 1, dtype=torch.float64, requires_grad=True)
+    maps = torch.cat([1 - (faint * share).sum(1, keepdim=True), faint * share], dim=1)
+    found = fit(maps.clamp(min=1e-6).log(), batch)
+    (slope,) = torch.autograd.grad(pose_surprise(found, batch.extrinsics.double(), floor), faint)
+    assert slope.isfinite().all()
+    assert slope.sum() < 0
+
+
 @pytest.mark.parametrize("reach", [1.0, 4.0])
 def test_even_gradients_are_no_longer_than_so_many_medians(reach):
     x = torch.zeros(4, 2, requires_grad=True)
@@ -127,9 +162,11 @@ def test_even_gradients_are_no_longer_than_so_many_medians(reach):
     torch.testing.assert_close(x.grad, torch.stack([long, slope[1], long, torch.zeros(2)]))
 
 
-def test_empty_maps_train_on_finite_gradients(batch):
+@pytest.mark.parametrize("surprise", [False, True])
+def test_empty_maps_train_on_finite_gradients(batch, surprise):
     torch.manual_seed(0)
-    model = EndToEnd(network=SegmenterConfig(base_width=4, decoder_width=4), augment=0.0)
+    network = SegmenterConfig(base_width=4, decoder_width=4)
+    model = EndToEnd(network=network, augment=0.0, surprise=surprise)
     model.log = model.log_dict = lambda *args, **kwargs: None
     model.training_step(batch, 0).backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())

@@ -11,7 +11,7 @@ from torch import Tensor
 from lanebev.observation.lines import LineExtractor
 from train.losses import unweighted_bias
 from train.module import Segmentation, unpack
-from train.poses import PoseBatch, fit_poses, pose_loss
+from train.poses import PoseBatch, fit_poses, pose_loss, pose_surprise
 
 
 class EndToEnd(Segmentation):
@@ -22,7 +22,9 @@ class EndToEnd(Segmentation):
 
     Args:
         pose_weight: of the pose's loss; 0 trains on the same frames with cross-entropy alone.
-        pose_unit: deg, deg, deg, m: errors of pitch, yaw, roll and height that count as one.
+        surprise: the loss is how little the fit, with its sigmas, expected the truth; else the error alone.
+        pose_unit: deg, deg, deg, m: errors of pitch, yaw, roll and height that count as one; for ``surprise``
+            those that are as good as none.
         gradient_reach: how many times longer a frame's gradient may be than that of most.
         where_only: the pose's loss moves lines, but does not change how much they count.
         kwargs: as of :class:`~train.module.Segmentation`.
@@ -34,6 +36,7 @@ class EndToEnd(Segmentation):
         pose_unit: tuple[float, float, float, float] = (0.3, 0.3, 0.6, 0.06),
         where_only: bool = False,
         gradient_reach: float = 1.0,
+        surprise: bool = False,
         **kwargs: Any,
     ) -> None:
         if not (math.isfinite(gradient_reach) and gradient_reach > 0):
@@ -44,6 +47,7 @@ class EndToEnd(Segmentation):
             "pose_unit": list(pose_unit),
             "where_only": where_only,
             "gradient_reach": gradient_reach,
+            "surprise": surprise,
         }
         self.extractor = LineExtractor.for_network(self.segmenter.config)
         self.unit: Tensor
@@ -55,7 +59,11 @@ class EndToEnd(Segmentation):
         loss, logits = self.map_loss(batch)
         if self.settings["pose_weight"] > 0:
             fit = self._fit(logits + unweighted_bias(self.class_weight).view(1, -1, 1, 1), batch)
-            pose = pose_loss(fit, batch.extrinsics.double(), self.unit)
+            truth = batch.extrinsics.double()
+            if self.settings["surprise"]:
+                pose = pose_surprise(fit, truth, self.unit, self.segmenter.config.pose_factor)
+            else:
+                pose = pose_loss(fit, truth, self.unit)
             self.log("loss/pose", pose, prog_bar=True)
             loss = loss + self.settings["pose_weight"] * pose.to(loss.dtype)
         return loss

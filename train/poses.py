@@ -179,3 +179,23 @@ def pose_loss(fit: SingleFrameFit, truth: Tensor, unit: Tensor) -> Tensor:
     said = fit.observed & fit.valid.unsqueeze(-1)
     error = torch.where(said, (fit.extrinsics.stack() - truth) / unit, 0.0)
     return ((1 + error.square()).sqrt() - 1).sum() / fit.valid.sum().clamp(min=1)
+
+
+def pose_surprise(fit: SingleFrameFit, truth: Tensor, floor: Tensor, factor: float = 1.0) -> Tensor:
+    """Negative log likelihood of the truth under the fit's own sigmas, summed over axes, mean over frames.
+
+    A proper score (Gneiting and Raftery 2007): lines that are not seen cost the sigma that they would have
+    given, and a line that is none costs what it claims to know. The density is Student's t with 4 degrees of
+    freedom, so that one frame gone wrong does not decide.
+
+    Args:
+        fit: of B frames; where one does not observe an axis, its prior answers for it.
+        truth: (B, 4).
+        floor: (4,) rad, rad, rad, m, added to the sigmas in quadrature: smaller errors are as good as none.
+        factor: on the fit's sigmas, see ``SegmenterConfig.pose_factor``.
+    """
+    error = fit.extrinsics.stack() - truth
+    variance = factor**2 * fit.covariance.diagonal(dim1=-2, dim2=-1)[:, :4] + floor.square()
+    surprise = 2.5 * (error.square() / (4 * variance)).log1p() + 0.5 * (variance / floor.square()).log()
+    usable = surprise.isfinite().all(-1)
+    return torch.where(usable.unsqueeze(-1), surprise, 0.0).sum() / usable.sum().clamp(min=1)
