@@ -116,6 +116,26 @@ def test_a_sharp_line_beside_a_vague_one_is_no_outlier():
     assert (out.extrinsics.stack() - truth)[:, :2].abs().max() < math.radians(0.1)
 
 
+def test_inliers_lie_where_the_pose_has_them():
+    """Sharp segments of one boundary that contradict each other are no inliers for the rest being vague."""
+    frames = drive(30, sigma=0.1)[::3]
+    calibrator = JointCalibrator()
+    state = calibrator.initial_state(2, dtype=DOUBLE)
+    for _, segments in frames:
+        own = (segments.boundary == 3) & (segments.weight > 0)
+        sharp = own & (own.cumsum(-1) <= 4)
+        side = 2.0 * (own.cumsum(-1) % 2) - 1.0
+        aside = torch.where(sharp, 3.0 * side, 0.0)  # px
+        ends = segments.endpoints + torch.stack([aside, torch.zeros_like(aside)], -1).unsqueeze(-2)
+        sigma = torch.where(sharp, 0.1, 5.0).to(segments.sigma)
+        out, state = calibrator(
+            segments._replace(endpoints=ends, sigma=sigma), cameras(2), state, 3 / FPS, WIDTH
+        )
+        assert (out.status == Status.TRACKING).all()
+        assert (out.inliers[~sharp & (segments.weight > 0)] > 0.5).all()
+        assert ((out.inliers > 0.5) & sharp).sum(-1).max() <= 2
+
+
 def test_life_cycle_with_reasons():
     calibrator = JointCalibrator(lost_after=1.0)
     frames = drive(56)

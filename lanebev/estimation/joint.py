@@ -14,6 +14,7 @@ from lanebev.estimation.checks import as_batch, calibrates
 from lanebev.estimation.joint_filter import (
     UNSEEN,
     Update,
+    agreement,
     best_shift,
     evidence_index,
     iterate,
@@ -230,7 +231,8 @@ class JointCalibrator(nn.Module):
         mean, shift, scale = self._follow_lane_change(predicted, positions, seen)
         update, evidence = self._update(predicted, mean, scale, places, seen, step)
         judged, supported = self._judge(predicted, update, evidence, shift, step, seen)
-        after, trust = self._restart(judged, update.trust, supported, segments, intrinsics, lane_width)
+        agreed = agreement(judged.mean, update.scale, places, seen, judged.phase)
+        after, agreed = self._restart(judged, agreed, supported, segments, intrinsics, lane_width)
         after = after._replace(reasons=after.reasons | _flag(guessed, Reason.TIME))
 
         skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=early)
@@ -239,7 +241,7 @@ class JointCalibrator(nn.Module):
         now = torch.where(begun.unsqueeze(-1), 0.0, update.apart)
         apart = torch.maximum(after.mean[:, NUM_COMMON:].abs(), now.abs())
         lane = apart < _NO_BOUNDARY  # (B, L)
-        inliers = torch.where((seen.weight > 0) & lane.gather(1, seen.boundary), trust, 0.0)
+        inliers = torch.where((seen.weight > 0) & lane.gather(1, seen.boundary), agreed, 0.0)
         return self._calibration(after, inliers, positions), after
 
     def curvature(self, state: JointState) -> Tensor:
@@ -374,7 +376,7 @@ class JointCalibrator(nn.Module):
     def _restart(
         self,
         state: JointState,
-        trust: Tensor,
+        agreed: Tensor,
         supported: Tensor,
         segments: LaneSegments,
         intrinsics: Tensor,
@@ -384,7 +386,7 @@ class JointCalibrator(nn.Module):
         cfg = self.config
         wanted = ~_running(state.status) | (~supported & (state.misfit > cfg.restart_after))
         if not torch.compiler.is_compiling() and not bool(wanted.any()):
-            return state, trust  # the same result: every row would discard the search
+            return state, agreed  # the same result: every row would discard the search
         fit = fit_single_frame(
             segments,
             intrinsics,
@@ -413,7 +415,7 @@ class JointCalibrator(nn.Module):
             | _flag(~fit.observed[:, HEIGHT], Reason.HEIGHT_UNSEEN),
         )
         after = JointState(*(_where(fresh, new, old) for new, old in zip(begun, state, strict=True)))
-        return after, torch.where(fresh.unsqueeze(-1), fit.inliers, trust)
+        return after, torch.where(fresh.unsqueeze(-1), fit.inliers, agreed)
 
     def _begin(self, params: Tensor, param_cov: Tensor) -> tuple[Tensor, Tensor]:
         """State (B, D) and covariance (B, D, D) around one frame's parameters and their covariance."""

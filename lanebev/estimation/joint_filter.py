@@ -120,6 +120,17 @@ def iterate(
     return Update(mean, after, trust, scale, info, score, posterior, alone, mimicry, apart)
 
 
+def agreement(mean: Tensor, scale: Tensor, places: Tensor, seen: Observations, phase: Tensor) -> Tensor:
+    """(B, N) in [0, 1], how far each segment lies where the state has it, by its own noise alone.
+
+    An update trusts what the prediction, unsure itself, does not contradict; its result is to be judged by
+    what then is left. Arguments as :func:`iterate`, ``mean`` and ``scale`` after the update.
+    """
+    own = mean[:, NUM_COMMON:].gather(1, seen.boundary)
+    distance, valid = boundary_distances(mean[:, :NUM_SEEN], (places + own).unsqueeze(0), seen, phase)
+    return inlier_weights(distance[0], valid, seen.sigma, scale, seen.intrinsics[:, 0, 0])
+
+
 def _consider(cov: Tensor, posterior: Tensor, info: Tensor, estimated: Tensor) -> Tensor:
     """Covariance after an update that leaves the mean's entries where they are not estimated.
 
