@@ -29,7 +29,7 @@ from lanebev.estimation.joint_motion import (
     motion,
     spring,
 )
-from lanebev.estimation.joint_road import come_nearer, turn_along
+from lanebev.estimation.joint_road import come_nearer, straight_or_bend, turn_along
 from lanebev.types import LaneSegments, Status
 from tools.scenarios import CAMERA, FPS, PLACES, WIDTH, moments
 from tools.scenarios import observe as see
@@ -413,6 +413,73 @@ def test_float32_follows_float64_within_a_hundredth_of_a_sigma(speed_std):
         std = two.covariance.diagonal(dim1=1, dim2=2).sqrt()
         apart.append((one.extrinsics.stack().double() - two.extrinsics.stack()) / std)
     assert torch.stack(apart).square().mean((0, 1)).sqrt().max() < 0.01
+
+
+STRAIGHT, BEND = torch.tensor([1e-4, 3e-6], dtype=DOUBLE), torch.tensor([2e-3, 2e-5], dtype=DOUBLE)
+
+
+def fitted_bend(curvature, sigma, dtype=DOUBLE):
+    """(1, 7) and (1, 7, 7): a fit whose curvature is known to sigma, its yaw thrown off by that of c0."""
+    spread = torch.tensor([1e-3, 1e-3, 1e-3, 0.01, 0.01, *sigma], dtype=dtype).diag()
+    mix = torch.eye(7, dtype=dtype)
+    mix[1, 5] = -15.0  # m
+    return torch.tensor([[0.01, 0.02, 0.0, 1.5, 0.0, *curvature]], dtype=dtype), (mix @ spread**2 @ mix.T)[
+        None
+    ]
+
+
+def test_straight_or_bend_is_the_mean_of_both_by_their_evidence():
+    params, cov = fitted_bend((5e-4, 2e-6), (2e-4, 4e-6))
+    mean, spread = straight_or_bend(params, cov, STRAIGHT, BEND, 0.2)
+    # by sampling: curvatures of either kind of road, weighed by what is left of the fit without its prior
+    torch.manual_seed(0)
+    known = torch.linalg.inv(cov[0, 5:, 5:])
+    alone = known - BEND.square().reciprocal().diag()
+    centre = torch.linalg.solve(alone, known @ params[0, 5:])
+    count = 400_000
+    kind = torch.where(torch.rand(count, 1) < 0.2, BEND, STRAIGHT)
+    drawn = kind * torch.randn(count, 2, dtype=DOUBLE)
+    off = drawn - centre
+    weight = (-0.5 * ((off @ alone) * off).sum(-1)).exp()
+    weight = weight / weight.sum()
+    gain = cov[0, :, 5:] @ known
+    each = params[0] + (drawn - params[0, 5:]) @ gain.T
+    expected = (weight[:, None] * each).sum(0)
+    left = cov[0] - gain @ cov[0, 5:, :]
+    around = ((each - expected).T * weight) @ (each - expected) + left
+    sigma = around.diagonal().sqrt()
+    assert ((mean[0] - expected).abs() < 0.02 * sigma).all()
+    assert ((spread[0] - around).abs() < 0.02 * sigma[:, None] * sigma).all()
+
+
+def test_what_is_clearly_straight_or_bent_is_taken_as_that():
+    params, cov = fitted_bend((3e-5, 0.0), (3e-5, 1e-6))
+    mean, spread = straight_or_bend(params, cov, STRAIGHT, BEND, 0.2)
+    assert (mean[0, 1] - params[0, 1]) / (3e-5 * 15) == pytest.approx(3e-5**2 / (3e-5**2 + 1e-4**2), rel=0.05)
+    assert spread[0, 1, 1] < cov[0, 1, 1]
+    params, cov = fitted_bend((2e-3, 0.0), (3e-5, 1e-6))
+    mean, spread = straight_or_bend(params, cov, STRAIGHT, BEND, 0.2)
+    torch.testing.assert_close(mean, params)
+    torch.testing.assert_close(spread, cov)
+    params, cov = fitted_bend((5e-4, 2e-6), (2e-4, 4e-6))
+    exact = straight_or_bend(params, cov, STRAIGHT, BEND, 0.2)
+    single = straight_or_bend(params.float(), cov.float(), STRAIGHT.float(), BEND.float(), 0.2)
+    for got, expected in zip(single, exact, strict=True):
+        torch.testing.assert_close(got.double(), expected, rtol=1e-3, atol=1e-8)
+
+
+@pytest.mark.parametrize("radius", [math.inf, 2000.0, 1000.0, 500.0])
+def test_single_images_of_bends_with_vague_lines_are_honest(radius):
+    """Two lanes' boundaries to 40 m at 2.5 px: whether R = 1,000 m is a bend cannot be told for sure."""
+    visible, bent = (1, 2, 3, 4), lambda z: torch.full_like(z, 1 / radius)
+    errors = []
+    for seed, moment in enumerate(moments(2.0)[3::20]):
+        moment = replace(moment, visible=visible, far=40.0, curvature=bent)
+        frames = list(see([moment], 60, 2.5, 8, seed, DOUBLE))
+        out, _ = run(JointCalibrator(), frames)
+        error = out.extrinsics.stack() - torch.tensor(moment.pose, dtype=DOUBLE)
+        errors.append((error * torch.linalg.solve(out.covariance, error)).sum(-1) / 4)
+    assert 0.5 < torch.cat(errors).mean() < 2.0
 
 
 def test_straight_road_does_not_tell_the_speed():

@@ -45,7 +45,7 @@ from lanebev.estimation.joint_motion import (
     MotionConfig,
     motion,
 )
-from lanebev.estimation.joint_road import come_nearer
+from lanebev.estimation.joint_road import come_nearer, straight_or_bend
 from lanebev.estimation.single_frame import FramePrior, fit_single_frame
 from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status
 
@@ -82,7 +82,8 @@ class JointConfig:
         open_pose: rad (and 10 of these in m of height), jump admitted where one frame contradicts the motion,
             at evidence of ten sigmas; as many times more at more.
         open_curvature, open_step: 1/m, likewise, change of the knots when a bend begins or ends.
-        straight: 1/m and 1/m², sigmas of c0 and c1 of a road that is taken as straight at a start.
+        straight: 1/m and 1/m², sigmas of c0 and c1 of a straight road.
+        bends: how probable it is that a start is on a bend, one of the curvatures of ``prior``.
         open_deviation: m, sigma of a boundary's deviation on a road of unequal lanes; 0: there are none.
         evidence_time: s over which a bend's or unequal lanes' evidence is summed.
         min_support: inlier segments (weights summed) of a usable frame.
@@ -102,6 +103,7 @@ class JointConfig:
     open_curvature: float = 3e-4
     open_step: float = 1e-3
     straight: tuple[float, float] = (1e-4, 3e-6)
+    bends: float = 0.2
     open_deviation: float = 0.12
     evidence_time: float = 0.15
     min_support: float = 3.0
@@ -117,6 +119,8 @@ class JointConfig:
         if self.iterations < 1 or self.start_iterations < 1:
             got = min(self.iterations, self.start_iterations)
             raise ValueError(f"iterations: expected at least 1, got {got}")
+        if not 0 < self.bends < 1:
+            raise ValueError(f"bends: expected a probability between 0 and 1, got {self.bends}")
 
 
 class JointState(NamedTuple):
@@ -427,7 +431,8 @@ class JointCalibrator(nn.Module):
         )
         swing = params.new_tensor([angle, angle, angle, height])  # stationary variances
         rates = torch.cat([swing * cfg.motion.spring**2, params.new_tensor([0.5**2])])
-        params, param_cov = self._straighten(params, param_cov)
+        straight, bend = params.new_tensor(cfg.straight), cfg.prior.std(params)[CURVATURE:]
+        params, param_cov = straight_or_bend(params, param_cov, straight, bend, cfg.bends)
         spread = params.new_zeros(NUM_SEEN, NUM_PARAMS)  # c0 and c1 to the knots
         spread[:NUM_STRAIGHT, :NUM_STRAIGHT] = torch.eye(NUM_STRAIGHT)
         spread[CURVATURE, CURVATURE] = 1.0
@@ -446,17 +451,6 @@ class JointCalibrator(nn.Module):
         own_variance[SPEED] = cfg.motion.speed_std**2
         own_variance[NUM_COMMON:] = cfg.motion.deviation_walk**2
         return mean, cov + own_variance.diag()
-
-    def _straighten(self, params: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:
-        """Believe in a straight road where one frame's curvature (c0, c1) does not contradict it."""
-        variance = params.new_tensor(self.config.straight).square().diag()
-        bend, gain = params[:, CURVATURE:], cov[:, :, CURVATURE:]
-        factor = torch.linalg.cholesky_ex(cov[:, CURVATURE:, CURVATURE:] + variance).L
-        solved = torch.cholesky_solve(bend.unsqueeze(-1), factor)
-        straight = (bend.unsqueeze(1) @ solved).flatten() < 16.0
-        pulled = params - (gain @ solved).squeeze(-1)
-        reduced = kalman.symmetrise(cov - gain @ torch.cholesky_solve(gain.mT, factor))
-        return _where(straight, pulled, params), _where(straight, reduced, cov)
 
     def _calibration(self, state: JointState, inliers: Tensor, positions: Tensor) -> Calibration:
         """What goes out: the pose, its covariance, status, inliers.

@@ -7,12 +7,14 @@ the step that comes into view. The frame turns along with the road.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from lanebev.estimation import kalman
-from lanebev.estimation.joint_model import KNOT_SPACING, NUM_STEPS
+from lanebev.estimation.joint_model import CURVATURE, KNOT_SPACING, NUM_STEPS
 from lanebev.estimation.joint_motion import SHAPE, SPEED, STEPS, MotionConfig
 
 CLEAR_BEND = (20.0, 40.0)  # chi-square of the five steps of curvature between which they come to tell speed
@@ -85,6 +87,40 @@ def turn_along(shape: Tensor, phase: Tensor, way: Tensor) -> Tensor:
     after = heading - here * torch.minimum(way.unsqueeze(-1), (places - behind).clamp(min=0.0))
     bend = bend * (heading.cos() / after.cos().clamp(min=0.6)) ** 3
     return torch.cat([bend[:, :1], bend.diff(dim=-1)], dim=-1)
+
+
+def straight_or_bend(
+    params: Tensor, cov: Tensor, straight: Tensor, bend: Tensor, share: float
+) -> tuple[Tensor, Tensor]:
+    """One frame's fit, averaged over the road being straight and its being a bend.
+
+    A bend far off and a yaw look alike. To take the likelier for certain is wrong by many sigmas as often as
+    it is the other; so each counts by its evidence, and what parts them goes to the covariance. Source:
+    Bayesian model averaging (Hoeting et al. 1999) of two Gaussians, moments matched. That the road is
+    straight is a measurement of c0 = c1 = 0 of the noise that turns the one prior into the other.
+
+    Args:
+        params: (B, 7) fitted to a frame as a bend, in the order of ``joint_model``.
+        cov: (B, 7, 7).
+        straight: (2,) 1/m and 1/m², sigmas of c0 and c1 of a straight road.
+        bend: (2,), those of a bend, larger, which the fit had for a prior.
+        share: of roads that are bends, before looking.
+
+    Returns:
+        mean (B, 7) and covariance (B, 7, 7).
+    """
+    noise = 1 / (straight.square().reciprocal() - bend.square().reciprocal())
+    curvature, gain = params[:, CURVATURE:], cov[:, :, CURVATURE:]
+    factor = torch.linalg.cholesky_ex(cov[:, CURVATURE:, CURVATURE:] + noise.diag()).L
+    solved = torch.cholesky_solve(curvature.unsqueeze(-1), factor)  # (B, 2, 1)
+    chi2 = (curvature.unsqueeze(1) @ solved).flatten()
+    sharper = 0.5 * (bend.square() + noise).log().sum() - factor.diagonal(dim1=1, dim2=2).log().sum(-1)
+    odds = math.log((1 - share) / share) + sharper - 0.5 * chi2
+    is_straight = odds.sigmoid()[:, None, None]
+    pull = gain @ solved  # (B, 7, 1), from the bend to the straight road
+    known = gain @ torch.cholesky_solve(gain.mT, factor)
+    spread = is_straight * (1 - is_straight) * (pull @ pull.mT)
+    return params - (is_straight * pull).squeeze(-1), kalman.symmetrise(cov - is_straight * known + spread)
 
 
 def _change_per_metre(shape: Tensor, cov: Tensor) -> Tensor:
