@@ -46,6 +46,7 @@ from lanebev.estimation.joint_motion import (
     motion,
 )
 from lanebev.estimation.joint_road import come_nearer, straight_or_bend
+from lanebev.estimation.rows import flag, where
 from lanebev.estimation.single_frame import FramePrior, fit_single_frame
 from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status
 
@@ -237,10 +238,10 @@ class JointCalibrator(nn.Module):
         judged, supported = self._judge(predicted, update, evidence, shift, step, seen)
         agreed = agreement(judged.mean, update.scale, places, seen, judged.phase)
         after, agreed = self._restart(judged, agreed, supported, segments, intrinsics, lane_width)
-        after = after._replace(reasons=after.reasons | _flag(guessed, Reason.TIME))
+        after = after._replace(reasons=after.reasons | flag(guessed, Reason.TIME))
 
         skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=early)
-        after = JointState(*(_where(skip, old, new) for old, new in zip(skipped, after, strict=True)))
+        after = JointState(*(where(skip, old, new) for old, new in zip(skipped, after, strict=True)))
         begun = (after.reasons & int(Reason.RESTARTED)) != 0
         now = torch.where(begun.unsqueeze(-1), 0.0, update.apart)
         apart = torch.maximum(after.mean[:, NUM_COMMON:].abs(), now.abs())
@@ -356,19 +357,19 @@ class JointCalibrator(nn.Module):
         misfit = torch.where(supported, 0.0, state.misfit + torch.where(empty, 0.0, step))
         coasting = torch.where(unseen > cfg.lost_after, int(Status.LOST), int(Status.COASTING))
         status = torch.where(supported, int(Status.TRACKING), torch.where(running, coasting, state.status))
-        reasons = _flag(empty, Reason.NO_SEGMENTS) | _flag(~empty & ~supported, Reason.FEW_INLIERS)
-        reasons = reasons | _flag(supported & (shift != 0), Reason.LANE_CHANGE)
-        reasons = reasons | _flag(~running, Reason.NO_START)
+        reasons = flag(empty, Reason.NO_SEGMENTS) | flag(~empty & ~supported, Reason.FEW_INLIERS)
+        reasons = reasons | flag(supported & (shift != 0), Reason.LANE_CHANGE)
+        reasons = reasons | flag(~running, Reason.NO_START)
         blind = ~supported.unsqueeze(-1) | (update.alone[:, :NUM_POSE] > update.alone.new_tensor(UNSEEN))
-        reasons = reasons | _flag(blind[:, :ROLL].any(-1), Reason.DIRECTION_UNSEEN)
-        reasons = reasons | _flag(blind[:, ROLL], Reason.ROLL_UNSEEN)
-        reasons = reasons | _flag(blind[:, HEIGHT], Reason.HEIGHT_UNSEEN)
+        reasons = reasons | flag(blind[:, :ROLL].any(-1), Reason.DIRECTION_UNSEEN)
+        reasons = reasons | flag(blind[:, ROLL], Reason.ROLL_UNSEEN)
+        reasons = reasons | flag(blind[:, HEIGHT], Reason.HEIGHT_UNSEEN)
         after = JointState(
-            mean=_where(supported, update.mean, state.mean),
-            cov=_where(supported, update.cov, state.cov),
+            mean=where(supported, update.mean, state.mean),
+            cov=where(supported, update.cov, state.cov),
             phase=state.phase,
-            evidence=_where(supported, evidence, torch.zeros_like(evidence)),
-            mimicry=_where(supported & ~blind.any(-1), update.mimicry, state.mimicry),
+            evidence=where(supported, evidence, torch.zeros_like(evidence)),
+            mimicry=where(supported & ~blind.any(-1), update.mimicry, state.mimicry),
             early=torch.zeros_like(unseen),
             unseen=unseen,
             misfit=misfit,
@@ -415,10 +416,10 @@ class JointCalibrator(nn.Module):
             misfit=zero,
             status=torch.full_like(state.status, int(Status.TRACKING)),
             reasons=int(Reason.RESTARTED)
-            | _flag(~fit.observed[:, ROLL], Reason.ROLL_UNSEEN)
-            | _flag(~fit.observed[:, HEIGHT], Reason.HEIGHT_UNSEEN),
+            | flag(~fit.observed[:, ROLL], Reason.ROLL_UNSEEN)
+            | flag(~fit.observed[:, HEIGHT], Reason.HEIGHT_UNSEEN),
         )
-        after = JointState(*(_where(fresh, new, old) for new, old in zip(begun, state, strict=True)))
+        after = JointState(*(where(fresh, new, old) for new, old in zip(begun, state, strict=True)))
         return after, torch.where(fresh.unsqueeze(-1), fit.inliers, agreed)
 
     def _begin(self, params: Tensor, param_cov: Tensor) -> tuple[Tensor, Tensor]:
@@ -489,12 +490,3 @@ def _held(reasons: Tensor) -> Tensor:
         for reason in (Reason.DIRECTION_UNSEEN, Reason.ROLL_UNSEEN, Reason.HEIGHT_UNSEEN)
     )
     return torch.stack([direction, direction, roll, height], dim=-1)
-
-
-def _flag(condition: Tensor, reason: Reason) -> Tensor:
-    return condition.to(torch.int64) * int(reason)
-
-
-def _where(row: Tensor, yes: Tensor, no: Tensor) -> Tensor:
-    """Per row of the batch."""
-    return torch.where(row.view(-1, *[1] * (yes.ndim - 1)), yes, no)

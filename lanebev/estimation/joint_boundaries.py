@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.joint_model import FARTHEST, observe
+from lanebev.estimation.rows import masked_median
 from lanebev.geometry.road import image_from_road_points
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import NUM_BOUNDARIES, Extrinsics, LaneSegments
@@ -82,7 +83,7 @@ def fit_boundaries(
     member = member * weight.unsqueeze(1)
     sigma = seen.sigma.repeat_interleave(2, dim=1)
 
-    offset = _masked_median(lateral.unsqueeze(1).expand_as(member), member > 0)  # (B, L)
+    offset = masked_median(lateral.unsqueeze(1).expand_as(member), member > 0)  # (B, L)
     heading = torch.zeros_like(offset)
     for _ in range(_REWEIGHTINGS):
         residual = lateral.unsqueeze(1) - offset.unsqueeze(-1) - heading.unsqueeze(-1) * z.unsqueeze(1)
@@ -169,11 +170,3 @@ def _fit_line(z: Tensor, lateral: Tensor, precision: Tensor) -> tuple[Tensor, Te
     heading = (precision * centred * (lateral.unsqueeze(1) - mean_x.unsqueeze(-1))).sum(-1) / spread
     variance = safe.reciprocal() + mean_z.square() / spread
     return mean_x - heading * mean_z, heading, variance
-
-
-def _masked_median(values: Tensor, mask: Tensor) -> Tensor:
-    """Lower median over the last dimension of the entries in the mask; 0 where there are none."""
-    ordered = values.masked_fill(~mask, torch.inf).sort(dim=-1).values
-    middle = ((mask.sum(-1, keepdim=True) - 1) // 2).clamp(min=0)
-    median = ordered.gather(-1, middle).squeeze(-1)
-    return torch.where(median.isfinite(), median, 0.0)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lanebev.estimation.rows import masked_median
 from lanebev.geometry.rotation import cam_from_world
 
 _MIN_RADIUS = 1e-3  # a ray closer than 0.06 deg to the vanishing direction says nothing about its boundary
@@ -110,7 +111,7 @@ def boundary_angles(
     variance = (sigma / focal).square() / pull
     index = torch.arange(num_boundaries, device=boundary.device)[:, None]
     member = (boundary.unsqueeze(1) == index) & far.unsqueeze(1)  # (B, L, N)
-    centre = _masked_median(angle.unsqueeze(1).expand(member.shape), member)
+    centre = masked_median(angle.unsqueeze(1).expand(member.shape), member)
     off = (angle.unsqueeze(1) - centre.unsqueeze(-1)).abs()
     member = member & (off < 4.0 * variance.sqrt().unsqueeze(1) + math.radians(1.0))
     precision = torch.where(member, (weight / variance).unsqueeze(1), 0.0)
@@ -249,11 +250,3 @@ def _gauss_newton_step(
     normal = jacobian.mT @ jacobian + 1e-9 * eye
     step = torch.cholesky_solve(jacobian.mT @ error, torch.linalg.cholesky_ex(normal).L).squeeze(-1)
     return roll + step[..., 0].clamp(-0.1, 0.1), (height + step[..., 1]).clamp(0.1, 10.0)
-
-
-def _masked_median(values: Tensor, mask: Tensor) -> Tensor:
-    """Median of the last dimension where the mask holds, 0 where it holds nowhere."""
-    ordered = torch.where(mask, values, torch.inf).sort(dim=-1).values
-    count = mask.sum(-1, keepdim=True)
-    middle = ordered.gather(-1, ((count - 1) // 2).clamp_min(0)).squeeze(-1)
-    return torch.where(count.squeeze(-1) > 0, middle, 0.0)

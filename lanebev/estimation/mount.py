@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.estimation.checks import as_batch
+from lanebev.estimation.rows import flag, where
 from lanebev.types import Calibration, Extrinsics, Status
 
 
@@ -225,8 +226,8 @@ class MountEstimator(nn.Module):
         waiting = torch.where(again, int(MountStatus.RECALIBRATING), int(MountStatus.UNCALIBRATED))
         valid = torch.where(outside, int(MountStatus.INVALID), int(MountStatus.CALIBRATED))
         status = torch.where(enough, valid, waiting)
-        why = why | _flag(~enough, MountReason.FEW_BLOCKS) | torch.where(enough, limits, 0)
-        why = why | _flag(state.suspect > 0, MountReason.SUSPECT) | _flag(moved, MountReason.MOVED)
+        why = why | flag(~enough, MountReason.FEW_BLOCKS) | torch.where(enough, limits, 0)
+        why = why | flag(state.suspect > 0, MountReason.SUSPECT) | flag(moved, MountReason.MOVED)
         state = state._replace(status=status, reasons=why)
 
         share = state.blend.unsqueeze(-1)
@@ -250,14 +251,14 @@ class MountEstimator(nn.Module):
         finite = pose.isfinite().all(-1) & variance.isfinite().all(-1)
         sure = finite & (variance < variance.new_tensor(cfg.largest_std).square()).all(-1)
         tracking = status == int(Status.TRACKING)
-        why = _flag(~tracking, MountReason.NOT_TRACKING) | _flag(~sure, MountReason.UNSURE)
-        why = why | _flag(~(step.isfinite() & (step > 0)), MountReason.TIME)
+        why = flag(~tracking, MountReason.NOT_TRACKING) | flag(~sure, MountReason.UNSURE)
+        why = why | flag(~(step.isfinite() & (step > 0)), MountReason.TIME)
         if speed is not None:
-            why = why | _flag(~(as_batch(speed, pose, "speed") >= cfg.min_speed), MountReason.SLOW)
+            why = why | flag(~(as_batch(speed, pose, "speed") >= cfg.min_speed), MountReason.SLOW)
         turns = (("yaw_rate", yaw_rate, cfg.max_yaw_rate), ("curvature", curvature, cfg.max_curvature))
         for name, turn, most in turns:
             if turn is not None:
-                why = why | _flag(~(as_batch(turn, pose, name).abs() <= most), MountReason.TURNING)
+                why = why | flag(~(as_batch(turn, pose, name).abs() <= most), MountReason.TURNING)
         return why
 
     def _close_block(self, state: MountState) -> tuple[MountState, Tensor]:
@@ -285,16 +286,16 @@ class MountEstimator(nn.Module):
         shown, _, _ = self._estimate(state)
         empty = torch.where(full, 0.0, 1.0)
         return state._replace(
-            blocks=_where(full, torch.cat([block.unsqueeze(1), state.blocks[:, :-1]], 1), state.blocks),
-            variances=_where(
+            blocks=where(full, torch.cat([block.unsqueeze(1), state.blocks[:, :-1]], 1), state.blocks),
+            variances=where(
                 full, torch.cat([noise.unsqueeze(1), state.variances[:, :-1]], 1), state.variances
             ),
-            filled=_where(full, filled, state.filled),
+            filled=where(full, filled, state.filled),
             pose_sum=state.pose_sum * empty.unsqueeze(-1),
             variance_sum=state.variance_sum * empty.unsqueeze(-1),
             seconds=state.seconds * empty,
             suspect=torch.where(moved, 0, suspect),
-            former=_where(moved, shown, state.former),
+            former=where(moved, shown, state.former),
             blend=torch.where(moved, 1.0, state.blend),
         ), moved
 
@@ -357,12 +358,3 @@ def _add(state: MountState, used: Tensor, pose: Tensor, variance: Tensor, step: 
         variance_sum=state.variance_sum + part * torch.where(keep, variance, 0.0),
         seconds=state.seconds + time,
     )
-
-
-def _flag(condition: Tensor, reason: MountReason) -> Tensor:
-    return condition.to(torch.int64) * int(reason)
-
-
-def _where(row: Tensor, yes: Tensor, no: Tensor) -> Tensor:
-    """Per row of the batch."""
-    return torch.where(row.view(-1, *[1] * (yes.ndim - 1)), yes, no)
