@@ -158,6 +158,15 @@ def test_under_autocast_the_network_alone_is_of_half_precision(calibrator):
     assert torch.equal(out.bev, expected)
 
 
+@pytest.mark.parametrize("calibrator", [TwoStageCalibrator(), JointCalibrator()], ids=["two-stage", "joint"])
+def test_calibrators_take_an_empty_batch(calibrator):
+    segments = LaneSegments(*(v[:0] for v in lanes()))
+    out, state = calibrator(segments, K.expand(0, 3, 3), calibrator.initial_state(0), 0.1, 3.7)
+    assert out.covariance.shape == (0, 4, 4)
+    assert out.inliers.shape == segments.weight.shape
+    assert state.status.shape == (0,)
+
+
 def test_gradients_flow_under_autocast():
     net, frames = model().float(), images(1).float().requires_grad_()
     with torch.autocast("cpu", torch.bfloat16):

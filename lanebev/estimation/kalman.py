@@ -142,6 +142,8 @@ def symmetrise(matrix: Tensor) -> Tensor:
 
 
 def _kron(blocks: Tensor, inner: Tensor) -> Tensor:
-    """(B, a, a) ⊗ (b, b) -> (B, ab, ab)."""
+    """(B, a, a) ⊗ (b, b) -> (B, ab, ab); B may be 0."""
     product: Tensor = torch.einsum("nij,kl->nikjl", blocks, inner)
-    return product.reshape(blocks.shape[0], blocks.shape[1] * inner.shape[0], -1)
+    return product.reshape(
+        blocks.shape[0], blocks.shape[1] * inner.shape[0], blocks.shape[2] * inner.shape[1]
+    )
