@@ -177,6 +177,18 @@ def test_a_cut_video_says_so(tmp_path):
     assert [frame.number for frame in frames if frame.image is None] == [12]
 
 
+def test_a_cut_matroska_says_so(tmp_path):
+    path = tmp_path / "v.mkv"
+    _damaged(path, (), count=20)
+    assert open_source(str(path)).problem == ""
+    with av.open(str(path)) as container:
+        end = [packet.pos + packet.size for packet in container.demux(video=0) if packet.size][11]
+    path.write_bytes(path.read_bytes()[: end + 20])
+    source = open_source(str(path))
+    assert source.problem.endswith("expected 0.80 s as it declares, got 0.48 s; is it cut?")
+    assert source.count == len(list(source)) == 12
+
+
 def test_uneven_frame_times_are_no_damage(tmp_path):
     path, times = tmp_path / "v.mp4", [0, 1, 2, 7, 8, 30, 31]
     with av.open(str(path), "w") as container:

@@ -243,10 +243,21 @@ def _video_source(source: str) -> FrameSource:
             if packet.pts is not None:
                 count += not packet.is_discard
                 end = max(end, packet.pts - begin + max(packet.duration or 0, 1 / fps / tick))
-        declared, got = float((stream.duration or 0) * tick), float(end * tick)
+        declared, got = _declared_duration(stream, begin * tick), float(end * tick)
     cut = declared - got > 0.5 / fps
     problem = f"video {source}: expected {declared:.2f} s as it declares, got {got:.2f} s; is it cut?"
     return FrameSource(source, (), fps, count, size, problem if cut else "")
+
+
+def _declared_duration(stream: av.VideoStream, begin: Fraction) -> float:
+    """How long the header says that the stream is, s; 0 if it does not. Matroska has its end, in a tag."""
+    if stream.duration is not None and stream.time_base is not None:
+        return float(stream.duration * stream.time_base)
+    match = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", stream.metadata.get("DURATION", ""))
+    if match is None:
+        return 0.0
+    hours, minutes, seconds = map(float, match.groups())
+    return 3600 * hours + 60 * minutes + seconds - float(begin)
 
 
 def _decoded(
