@@ -46,8 +46,8 @@ from lanebev.estimation.joint_motion import (
     motion,
 )
 from lanebev.estimation.joint_road import come_nearer, straight_or_bend
-from lanebev.estimation.rows import flag, where
 from lanebev.estimation.single_frame import FramePrior, fit_single_frame
+from lanebev.rows import flag, where
 from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status
 
 _NO_BOUNDARY = 0.36  # m out of place, three sigmas of what lanes differ, from which a line bounds no lane

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.joint_model import FARTHEST, observe
-from lanebev.estimation.rows import masked_median
 from lanebev.geometry.road import image_from_road_points
 from lanebev.geometry.rotation import road_from_cam
+from lanebev.rows import masked_median
 from lanebev.types import NUM_BOUNDARIES, Extrinsics, LaneSegments
 
 _HEADING_STD = 0.02  # rad; real boundaries differ by about a degree in direction

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.estimation.rows import masked_median
 from lanebev.geometry.rotation import cam_from_world
+from lanebev.rows import masked_median
 
 _MIN_RADIUS = 1e-3  # a ray closer than 0.06 deg to the vanishing direction says nothing about its boundary
 _MIN_COSINE = 0.02  # 1.1 deg: a boundary plane closer to the road's own has no foot on it

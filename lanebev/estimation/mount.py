@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.estimation.checks import as_batch
-from lanebev.estimation.rows import flag, where
+from lanebev.rows import flag, where
 from lanebev.types import Calibration, Extrinsics, Status
 
 

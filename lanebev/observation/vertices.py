@@ -13,6 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lanebev.rows import masked_median
+
 _FLOOR = 0.01  # probability that background noise has everywhere; counts as nothing
 _PEAK = 2  # half-width of the box whose largest sum is a scan's peak, label px
 _END = 3  # scans at either end of a stripe that its round cap makes crooked
@@ -241,8 +243,8 @@ def _as_sure_as_most(variance: Tensor, there: Tensor) -> Tensor:
     On a clean map an unsure vertex is where there is no line: at its end, at a nick, on a bend of a few px.
     A map that hedges has unsure ones anyway: there the limit grows as the median variance does.
     """
-    typical = variance.masked_fill(~there, math.nan).nanmedian(-1, keepdim=True).values
-    limit = _UNSURE * (typical.nan_to_num(1.0) / _SURE**2).clamp(min=1.0)
+    typical = masked_median(variance, there).unsqueeze(-1)
+    limit = _UNSURE * (typical / _SURE**2).clamp(min=1.0)
     return (3.0 - 2.0 * variance.sqrt() / limit).clamp(0, 1)
 
 
@@ -282,7 +284,7 @@ def _rank_along(points: Tensor, weight: Tensor) -> Tensor:
     angle = 0.5 * torch.atan2(2 * xy, xx - yy).unsqueeze(-1)
     along = x * angle.cos() + y * angle.sin()
     along = torch.where(weight > 0, along, math.inf)
-    return along.argsort(dim=-1, stable=True).argsort(dim=-1)
+    return along.argsort(dim=-1).argsort(dim=-1)  # ties: vertices that coincide, or are not seen
 
 
 def take(points: Tensor, index: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Small operations on the rows of a batch that the calibrators share."""
+"""Small operations on the rows of a batch that all rooms share."""
 
 from __future__ import annotations
 
