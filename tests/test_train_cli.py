@@ -1,4 +1,5 @@
 import csv
+import warnings
 from pathlib import Path
 
 import pytest
@@ -59,6 +60,16 @@ def test_training_goes_on_from_a_weights_file_and_exports_it_unchanged(tmp_path)
     after = load_segmenter(tmp_path / "after.safetensors")
     torch.testing.assert_close(after.head.bias, before.head.bias)  # class weights done and undone
     torch.testing.assert_close(after.trunk.conv1.weight, before.trunk.conv1.weight, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_emulated_bfloat16_is_pointed_out(native, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: native)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        run("fit", "refine.yaml", tmp_path, *TINY, *VIEWS)
+    said = [str(each.message) for each in caught if "32-true" in str(each.message)]
+    assert len(said) == (not native)
 
 
 def test_every_config_is_tested():
