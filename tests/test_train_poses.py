@@ -178,12 +178,13 @@ def test_evaluate_poses_reports_both(tmp_path, capsys, monkeypatch):
         network = LaneSegmenter(SegmenterConfig(base_width=4, decoder_width=4))
         save_segmenter(network, tmp_path / f"{name}.safetensors")
     paths = [str(tmp_path / f"{name}.safetensors") for name in ("before", "after")]
-    options = ["--drives", "1", "--frames", "2", "--size", "64", "96"]
+    options = ["--drives", "2", "--frames", "1", "--size", "64", "96"]
     monkeypatch.setattr(sys, "argv", ["evaluate_poses", *paths, *options])
     evaluate_poses.main()
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["weights"] for line in lines] == ["before.safetensors", "after.safetensors"]
     assert set(evaluate_poses.AXES) < set(lines[0])
+    assert set(lines[1]) - set(lines[0]) == {"rmse_below_first_by"}
     online = ["--online", "--drives", "1", "--frames", "12"]
     monkeypatch.setattr(sys, "argv", ["evaluate_poses", paths[0], *online])
     evaluate_poses.main()
@@ -204,3 +205,20 @@ def test_pose_error_summary():
     report = evaluate_poses.summary(error, counted)
     assert report["pitch_deg"] == {"rmse": round(12.5**0.5, 3), "median": 3.0, "frames": 2}
     assert report["height_cm"] == {"rmse": 5.0, "median": 5.0, "frames": 3}
+
+
+def test_gain_is_an_interval_over_drives():
+    """Half the error is a gain for sure; as much noise of its own, drive by drive, is none."""
+    torch.manual_seed(0)
+    before = torch.randn(40 * 5, 4, dtype=torch.float64)
+    counted = torch.rand(200, 4) < 0.9
+    found = evaluate_poses.gain(before, 0.5 * before, counted, 40)
+    rmse = evaluate_poses.summary(before, counted)
+    for name, (low, high) in found.items():
+        assert 0 < low < 0.5 * rmse[name]["rmse"] < high
+    found = evaluate_poses.gain(before, torch.randn_like(before), counted, 40)
+    assert all(low < 0 < high for low, high in found.values())
+    drives = torch.randn(40, 1, 4, dtype=torch.float64).expand(40, 5, 4).reshape(200, 4)
+    wide = evaluate_poses.gain(drives, 0.0 * drives, counted, 40)
+    narrow = evaluate_poses.gain(drives, 0.0 * drives, counted, 200)
+    assert all(wide[name][1] - wide[name][0] > narrow[name][1] - narrow[name][0] for name in wide)

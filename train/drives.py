@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -28,23 +29,30 @@ class Seen(NamedTuple):
     interval: float
 
 
-def watch(segmenter: LaneSegmenter, seed: int, frames: int, fps: float) -> Seen:
-    """A rendered drive through the network, its sigmas as the maps say, by way of ``lanes.json``'s rows."""
+def watch(segmenters: Sequence[LaneSegmenter], seed: int, frames: int, fps: float) -> list[Seen]:
+    """A rendered drive through each network, its sigmas as the maps say, by way of ``lanes.json``'s rows."""
     drive = Drive(seed, num_frames=frames, fps=fps)
-    config = segmenter.config
-    extractor = LineExtractor.for_network(config)
-    model = LaneBEV(segmenter, extractor, JointCalibrator(), network_width=config.image_size[1]).eval()
-    segments, widths, poses = [], [], []
+    models = [_observer(segmenter) for segmenter in segmenters]
+    segments: list[list[LaneSegments]] = [[] for _ in segmenters]
+    widths, poses = [], []
     for i in range(frames):
         frame = drive.frame(i)
-        with torch.inference_mode():
-            _, found = model.observe(frame.image, frame.intrinsics)
-        rows = rows_from_segments(found, drive.camera)
-        taken = segments_from_rows([rows], drive.camera)
-        segments.append(taken._replace(sigma=taken.sigma / config.noise_factor))
+        for model, own in zip(models, segments, strict=True):
+            with torch.inference_mode():
+                _, found = model.observe(frame.image, frame.intrinsics)
+            rows = rows_from_segments(found, drive.camera)
+            taken = segments_from_rows([rows], drive.camera)
+            own.append(taken._replace(sigma=taken.sigma / model.segmenter.config.noise_factor))
         widths.append(frame.lane_width.double())
         poses.append(frame.extrinsics.stack()[0].double())
-    return Seen(segments, widths, torch.stack(poses), frame.intrinsics.double(), 1 / fps)
+    truth = (widths, torch.stack(poses), frame.intrinsics.double(), 1 / fps)
+    return [Seen(own, *truth) for own in segments]
+
+
+def _observer(segmenter: LaneSegmenter) -> LaneBEV:
+    config = segmenter.config
+    extractor = LineExtractor.for_network(config)
+    return LaneBEV(segmenter, extractor, JointCalibrator(), network_width=config.image_size[1]).eval()
 
 
 class Followed(NamedTuple):

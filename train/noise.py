@@ -67,7 +67,7 @@ def main() -> None:
         segmenter, _ = trained_segmenter(args.weights)
     except (ValueError, OSError) as error:
         parser.exit(2, f"error: {error}\n")
-    drives = [watch(segmenter, args.seed + i, args.frames, args.fps) for i in range(args.drives)]
+    drives = [watch([segmenter], args.seed + i, args.frames, args.fps)[0] for i in range(args.drives)]
     report = compare(drives)
     for factor, (rmse, nees) in report.items():
         errors = dict(zip(AXES, (round(value, 3) for value in rmse.tolist()), strict=True))
