@@ -35,7 +35,7 @@ from lanebev.view.grid import BEVGrid
 from lanebev.view.warp import BEVWarp
 
 CALIBRATORS = ("joint", "two-stage")
-STATE_FILE = "state.safetensors"
+STATE_FILE, CALIBRATION_FILE = "state.safetensors", "calibration.yaml"
 STILLS_FPS = Fraction(2)  # of the videos that show images one after another
 STILL_PASSES = 4  # updates on one image: the linearisation settles
 _NOMINAL_HEIGHT = 1.5  # m, of the view before anything is known
@@ -56,7 +56,7 @@ class RunConfig:
         lane_width: m.
         lanes: lane file or folder of another detector, None for the network.
         stills: every image on its own.
-        resume: output folder of an earlier run whose state to begin with.
+        resume: output folder of an earlier run, with the same calibrator, whose state to begin with.
         calibrator: one of CALIBRATORS.
         fps: of a folder or glob; a video knows its own.
     """
@@ -104,11 +104,13 @@ def run(
     check_image_size(camera, source)
     observer = make_observer(config, source, camera)
     calibrator, mount = make_calibrator(config.calibrator), MountEstimator()
-    states, problem = begin(config.resume, calibrator, mount)
+    states, problem = begin(config, calibrator, mount)
     frames: Iterator[Frame] = prefetch(source)
     frames = progress(frames, source.count) if progress else frames
     warp, coarse = BEVWarp(BEVGrid()), BEVWarp(BEVGrid(resolution=_BEFORE_RESOLUTION))
     with OutputFolder(config.out) as out, torch.inference_mode():
+        if config.resume and problem:
+            problem += keep_refused(config.resume, out)
         recorder = Recorder(
             out.__truediv__,
             camera,
@@ -147,29 +149,45 @@ def run(
         if not config.stills:
             save_state(out / STATE_FILE, states)
             facts |= mount_facts(mounted)
-            write_calibration(out / "calibration.yaml", camera, mounted)
+            write_calibration(out / CALIBRATION_FILE, camera, mounted)
         return recorder.finish(facts, Path(source.source).name, truth)
 
 
-def begin(resume: str | None, calibrator: Any, mount: MountEstimator) -> tuple[dict[str, Any], str | None]:
+def begin(config: RunConfig, calibrator: Any, mount: MountEstimator) -> tuple[dict[str, Any], str | None]:
     """The states to begin with, by name, and why they are not those asked for, if they aren't.
 
     Raises:
-        ValueError: ``resume`` is not the folder of an earlier run.
+        ValueError: ``resume`` is not the folder of an earlier run, or of one with another calibrator.
     """
     fresh = {
         "calibrator": calibrator.initial_state(1, dtype=torch.float64),
         "mount": mount.initial_state(1, dtype=torch.float64),
     }
-    if resume is None:
+    if config.resume is None:
         return fresh, None
-    path = Path(resume) / STATE_FILE
+    path = Path(config.resume) / STATE_FILE
     if not path.is_file():
         raise ValueError(
-            f"resume: expected the output folder of an earlier run, got {resume}: no {STATE_FILE}"
+            f"resume: expected the output folder of an earlier run, got {config.resume}: no {STATE_FILE}"
         )
     loaded = load_state(path, fresh)
+    for name in CALIBRATORS if loaded.problem else ():
+        other = make_calibrator(name).initial_state(1, dtype=torch.float64)
+        if load_state(path, fresh | {"calibrator": other}).problem is None:
+            raise ValueError(
+                f"resume: expected a state of the {config.calibrator} calibrator, got one of the {name} "
+                f"calibrator in {config.resume}; give --calibrator {name} or leave out --resume"
+            )
     return fresh | loaded.states, loaded.problem
+
+
+def keep_refused(resume: str, out: OutputFolder) -> str:
+    """Keep a refused state that this run would replace, and its mount; where, for the report."""
+    replaced = out.folder / STATE_FILE
+    if not (replaced.exists() and replaced.samefile(Path(resume) / STATE_FILE)):
+        return ""
+    names = [name for name in (STATE_FILE, CALIBRATION_FILE) if (out.folder / name).is_file()]
+    return f"; kept as {', '.join(out.keep(name, 'refused') for name in names)}"
 
 
 def inputs(config: RunConfig, source: FrameSource) -> list[str | Path]:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import shutil
 import subprocess
 import sys
@@ -17,11 +18,12 @@ from PIL import Image
 from lanebev import Camera, JointCalibrator, image_from_road_points
 from lanebev.cli import main
 from lanebev.estimation.mount import MountReason
-from lanebev.io.results import CSV_COLUMNS
+from lanebev.io.results import CSV_COLUMNS, ExtrinsicsRow, write_extrinsics
 from lanebev.io.state import load_state
 from lanebev.io.video import VideoWriter
 from lanebev.report.measure import pose
 from lanebev.run import RunConfig
+from tools import pseudo_ground_truth
 
 HEIGHT, WIDTH, FRAMES = 240, 416, 6
 CAMERA = Camera.from_parameters(330, 330, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
@@ -137,6 +139,51 @@ def test_every_output_is_there_and_whole(drive):
     assert 'src="http' not in page
 
 
+def test_pseudo_ground_truth_compares_the_same_frames(data, tmp_path, capsys, monkeypatch):
+    names = ("10", "11", "2")  # a run over images may have another order than the lanes, which have 2, 10, 11
+    (tmp_path / "cul").mkdir()
+    z = torch.logspace(0.8, 2, 40, dtype=torch.float64)
+    for name, height in zip(names, (1.2, 1.4, 1.6), strict=True):
+        at = pose(POSE[0], POSE[1], POSE[2], height, CAMERA.intrinsics)
+        lanes = []
+        for offset in (-5.55, -1.85, 1.85, 5.55):
+            road = torch.stack([torch.full_like(z, offset), z], dim=-1)[None]
+            pixels = image_from_road_points(road, CAMERA.intrinsics[None], at)[0][0].flip(0).numpy()
+            y = np.arange(pixels[0, 1] + 1, pixels[-1, 1], 5)
+            x = np.interp(y, pixels[:, 1], pixels[:, 0])
+            lanes.append(" ".join(f"{u:.3f} {v:.3f}" for u, v in zip(x, y, strict=True)))
+        (tmp_path / "cul" / f"{name}.lines.txt").write_text("\n".join(lanes))
+
+    def command(*extra):
+        arguments = [tmp_path / "cul", "--camera", data / "camera.yaml", "--out", tmp_path / "pseudo.csv"]
+        monkeypatch.setattr(sys, "argv", ["pseudo_ground_truth", *map(str, (*arguments, *extra))])
+        return pseudo_ground_truth.main(), capsys.readouterr()
+
+    def estimate(images, heights):
+        degrees = [math.degrees(angle) for angle in POSE[:3]]
+        rows = [
+            ExtrinsicsRow(i, i / 30, *degrees, height, 0.1, 0.1, 0.1, 0.1, "TRACKING", 9, image)
+            for i, (image, height) in enumerate(zip(images, heights, strict=True))
+        ]
+        write_extrinsics(tmp_path / "extrinsics.csv", rows)
+        return command("--estimate", tmp_path / "extrinsics.csv")
+
+    images = [f"/elsewhere/cul/{name}.jpg" for name in names]
+    for count in (3, 2):  # of 2 the run may know nothing
+        status, output = estimate(images[:count], (1.2, 1.4, 1.6)[:count])
+        assert status == 0
+        said = output.out.splitlines()[-1]
+        assert said.startswith(f"rms difference of the estimate, {count} frames: pitch_deg 0.0")
+        assert float(said.split()[-1]) < 0.01
+    assert float(estimate([""] * 3, (1.6, 1.2, 1.4))[1].out.split()[-1]) < 0.01  # a video's, by position
+    status, output = estimate([""] * 2, (1.4, 1.6))
+    assert (status, output.err.count("\n")) == (2, 1)
+    assert "--estimate: expected 3 rows" in output.err
+    status, output = estimate(["/elsewhere/cul/3.jpg"], (1.2,))
+    assert (status, output.err.count("\n")) == (2, 1)
+    assert "expected an entry for at least one image" in output.err
+
+
 def test_a_lane_file_says_how_much_less_sure_its_pose_is(data, drive, tmp_path):
     lines = [json.loads(line) for line in (data / "video_lanes.json").read_text().splitlines()]
     wide = "\n".join(json.dumps({**line, "pose_factor": 2.0}) for line in lines)
@@ -214,6 +261,42 @@ def test_a_damaged_state_is_reported_and_a_missing_one_refused(data, tmp_path, c
     arguments = ["run", images, "--camera", camera, "--lanes", lanes, "--out", tmp_path / "third"]
     _fails(capsys, [*arguments, "--resume", data], "resume: expected the output folder", "state.safetensors")
     assert not (tmp_path / "third").exists()
+
+
+def test_the_state_of_the_other_calibrator_is_a_mistake(data, tmp_path, capsys):
+    for one, other in (("joint", "two-stage"), ("two-stage", "joint")):
+        folder = tmp_path / one
+        assert _run(data, "--calibrator", one, source="images/3.png", out=folder) == 0
+        capsys.readouterr()
+        before = {path.name: path.read_bytes() for path in folder.iterdir()}
+        arguments = ["run", data / "images", "--camera", data / "camera.yaml", "--lanes", data / "lanes.json"]
+        for out in (folder, tmp_path / "next"):
+            _fails(
+                capsys,
+                [*arguments, "--calibrator", other, "--resume", folder, "--out", out],
+                f"resume: expected a state of the {other} calibrator, got one of the {one} calibrator",
+                f"give --calibrator {one} or leave out --resume",
+            )
+        assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+        assert not (tmp_path / "next").exists()
+
+
+def test_a_refused_state_is_kept_beside_what_replaces_it(data, tmp_path, capsys):
+    out, names = tmp_path / "out", ("state.safetensors", "calibration.yaml")
+    (tmp_path / "link").symlink_to(out, target_is_directory=True)
+    assert _run(data, source="images/3.png", out=out) == 0
+    for number in ("", "1"):  # the second does not take the place of the first
+        (out / names[0]).write_bytes((out / names[0]).read_bytes()[: -5 - len(number)])
+        before = [(out / name).read_bytes() for name in names]
+        assert _run(data, "--resume", str(tmp_path / "link"), source="images/3.png", out=out) == 0
+        kept = [f"{name}.refused{number}" for name in names]
+        assert f"calibration starts anew; kept as {kept[0]}, {kept[1]}" in capsys.readouterr().out
+        assert [(out / name).read_bytes() for name in kept] == before
+        assert load_state(out / names[0]).problem is None
+    (out / names[0]).write_bytes(before[0])
+    assert _run(data, "--resume", str(out), source="images/3.png", out=tmp_path / "next") == 0
+    assert not list((tmp_path / "next").glob("*.refused*"))  # it stays where it is
+    assert (out / names[0]).read_bytes() == before[0]
 
 
 def test_a_damaged_image_in_a_drive_is_a_row(data, tmp_path, capsys):

@@ -123,12 +123,21 @@ def test_culane_lines(tmp_path):
     assert read_culane(_write(tmp_path / "8.lines.txt", "")).lines == []
 
 
+def test_a_culane_point_given_twice_counts_once(tmp_path):
+    path = _write(tmp_path / "7.lines.txt", "10 590 12 580 12 580 12 580 14 570\n500 590 500 590\n")
+    first, second = read_culane(path).lines
+    np.testing.assert_array_equal(first.points, [[10, 590], [12, 580], [14, 570]])
+    np.testing.assert_array_equal(second.points, [[500, 590]])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("1 590 2 580\n3 590 4", "line 2: expected x y pairs, got 3"),
         ("1 590 2 580 3 570 4 56", "line 1: expected evenly spaced rows, got 570 then 56; is the file cut"),
         ("1 590 2 600 3 570", "line 1: expected rows in one direction"),
+        ("1 590 2 580 3 580 4 570", "line 1: expected rows in one direction"),
+        ("1 590 2 580 1 590 3 570", "line 1: expected rows in one direction"),
         ("1 590 2 x", "line 1: points: expected finite numbers"),
     ],
 )
@@ -196,6 +205,20 @@ def test_match_by_longest_common_tail():
 
 def test_match_gives_an_entry_to_the_image_that_shares_most():
     assert match_frames(["/d/3/20.jpg", "/d/1/20.jpg"], _frames("clips/1/20.jpg")) == [None, 0]
+
+
+def test_a_folder_is_read_as_its_images_are(tmp_path):
+    for name in ("10", "9", "2"):
+        (tmp_path / f"{name}.lines.txt").write_text(f"{name} 590 11 580\n")
+    assert [frame.lines[0].points[0, 0] for frame in read_lanes(tmp_path)] == [2, 9, 10]
+
+
+def test_match_of_names_with_dots(tmp_path):
+    for name in ("1494452385.593783", "1494452385.627116"):
+        _write(tmp_path / f"{name}.lines.txt", "10 590 12 580\n")
+    images = ["/d/1494452385.627116.JPG", "/d/1494452385.593783.jpg", "/d/1494452385.jpg"]
+    assert match_frames(images, read_lanes(tmp_path)) == [1, 0, None]
+    assert match_frames(["/d/1.25.png"], _frames("d/1.5.jpg", "d/1.25.jpeg")) == [1]
 
 
 def test_match_refuses_a_tie_and_strangers():

@@ -86,7 +86,8 @@ def test_culane_matches_for_the_largest_sum():
 def test_culane_empty_sides_and_f1():
     assert culane_counts([], [vertical(300)]) == (0, 0, 1)
     assert culane_counts([vertical(300)], []) == (0, 1, 0)
-    assert culane_counts([vertical(300)[:1]], []) == (0, 0, 0)
+    assert culane_counts([vertical(300)[:1]], [vertical(300)]) == (0, 1, 1)  # a point overlaps nothing
+    assert culane_counts([vertical(300)[:0]], []) == (0, 0, 0)
     assert CULaneCounts(3, 1, 2).f1() == pytest.approx(2 * 0.75 * 0.6 / (0.75 + 0.6))
     assert CULaneCounts(0, 0, 0).f1() == 0
 

@@ -8,7 +8,9 @@ import torch
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.weights import load_segmenter, read_metadata, save_segmenter
 from train.__main__ import main
+from train.data import Batch
 from train.export import export
+from train.module import Segmentation
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of Lightning about itself
 
@@ -100,6 +102,77 @@ def test_fit_resume_test_predict_export(tmp_path):
     assert (facts["config"]["noise_factor"], facts["config"]["pose_factor"]) == (2.5, 2.0)
     assert (facts["training"]["optimizer"], facts["metrics"]) == ("adamw", {"a": 1})
     torch.testing.assert_close(load_segmenter(again).head.bias, exported.head.bias)
+
+
+def test_an_interrupted_run_ends_as_one_in_a_piece(tmp_path, monkeypatch):
+    """Bit for bit: views, augmentation, optimiser, rate and averaged weights, from the last checkpoint."""
+    averaged = "--trainer.callbacks+=lightning.pytorch.callbacks.EMAWeightAveraging"
+    options = ["--trainer.max_steps=4", "--model.init_args.augment=1.0", averaged]
+    run("fit", "fast.yaml", tmp_path / "whole", *options)
+    step = Segmentation.training_step
+
+    def until_the_third(self, batch, batch_idx):
+        if batch_idx == 2:
+            raise RuntimeError("power cut")
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(Segmentation, "training_step", until_the_third)
+    with pytest.raises(RuntimeError, match="power cut"):
+        run("fit", "fast.yaml", tmp_path / "parts", *options)
+    monkeypatch.undo()
+    run("fit", "fast.yaml", tmp_path / "parts", *options, "--ckpt_path=last")
+    whole, parts = (
+        torch.load(
+            max((tmp_path / name).rglob("last.ckpt"), key=lambda path: path.stat().st_mtime),
+            weights_only=False,
+        )
+        for name in ("whole", "parts")
+    )
+    assert whole["global_step"] == parts["global_step"] == 4
+    assert whole["state_dict"].keys() == parts["state_dict"].keys()
+    assert all(torch.equal(value, parts["state_dict"][name]) for name, value in whole["state_dict"].items())
+
+
+def test_last_of_nothing_is_an_error(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        run("fit", "fast.yaml", tmp_path, "--ckpt_path=last")
+    assert stop.value.code == 2
+    assert "expected a last.ckpt" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", [None, b"no checkpoint", b""])
+def test_what_cannot_be_begun_from_is_one_line(content, tmp_path, capsys):
+    path = tmp_path / "begin.ckpt"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SystemExit) as stop:
+        run("fit", "fast.yaml", tmp_path, f"--model.init_args.init_from={path}")
+    assert stop.value.code == 2
+    assert f"{path}: expected a checkpoint" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_iou_pools_images_and_leaves_out_what_is_not_labelled():
+    """One pixel wrong on a nearly empty image is one pixel; an absent class has none."""
+    model = Segmentation(network=SegmenterConfig(base_width=4, decoder_width=4), augment=0)
+    logged = {}
+    model.log = lambda name, value, **_: logged.update({name: value})
+    model.log_dict = logged.update
+    target = torch.zeros(2, 6, 4, 10, dtype=torch.uint8)
+    target[0, 2, :2] = 255  # 20 px, found
+    target[1, 2, 0, 0] = 255  # one, not found
+    target[1, 3, 3] = 255  # occluded
+    weight = torch.ones(2, 4, 10, dtype=torch.uint8)
+    weight[1, 3] = 0
+    seen = torch.zeros(2, 7, 4, 10)
+    seen[:, 0] = 1.0
+    seen[0, 3, :2] = 2.0
+    model.forward = lambda image: seen
+    model.on_test_start()
+    model.test_step(Batch(torch.zeros(2, 3, 8, 20, dtype=torch.uint8), target, weight), 0)
+    model.on_test_epoch_end()
+    assert float(logged["test/iou_2"]) == pytest.approx(20 / 21)
+    assert logged["test/iou_3"].isnan()
+    assert float(logged["test/iou"]) == pytest.approx(20 / 21)
 
 
 def test_typos_are_errors(tmp_path):

@@ -5,12 +5,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
+from lanebev.io.lane_rows import BoundaryRows
 from lanebev.io.lanes import FrameLines, LaneLine
 from train.__main__ import main
-from train.data import Batch
-from train.datasets import LaneFiles, ScoredBatch, labelled_image, read_entries
-from train.scores import BenchmarkScores
+from train.data import Batch, ViewBatches
+from train.datasets import EntryFrames, LaneFiles, ScoredBatch, labelled_image, read_entries
+from train.labels import ViewConfig
+from train.scores import DRAWN, BenchmarkScores, drawn_counts
 
 HEIGHT, WIDTH = 360, 640
 ROWS = list(range(90, 360, 10))
@@ -102,6 +105,21 @@ def test_labels_as_logits_score_full_marks(root, layout, name):
     assert BenchmarkScores().compute() == {}
 
 
+@pytest.mark.parametrize(("layout", "found"), [("culane", 0), ("openlane", 1)])
+def test_lanes_are_drawn_and_matched_as_their_benchmarks_do(layout, found):
+    """Stripes 30 px wide that lie 15 px apart overlap by a third; a sixth boundary is not CULane's."""
+    rules = DRAWN[layout]
+    size = (rules.height, 2 * rules.height)
+    rows = np.arange(0, rules.height, 10.0)
+    place = np.linspace(0.2, 0.8, 6) * size[1]
+    lines = [LaneLine(np.stack([np.full_like(rows, x), rows], -1)) for x in place[1:2]]
+    drawn = np.full((6, len(rows)), np.nan)
+    drawn[0], drawn[1] = place[0], place[1] + 15
+    counts = drawn_counts(BoundaryRows(rows, drawn), FrameLines("", lines), size, layout)
+    outer = int(layout == "openlane")  # all boundaries are labelled there
+    assert counts == (found, 1 - found + outer, 1 - found)
+
+
 @pytest.mark.filterwarnings("ignore")  # of Lightning about itself
 def test_config_trains_and_prints_the_benchmarks_figures(root):
     here = [f"--trainer.default_root_dir={root}", f"--trainer.logger.init_args.save_dir={root}"]
@@ -117,6 +135,22 @@ def test_config_trains_and_prints_the_benchmarks_figures(root):
     main(["test", "--config", config, *here, *small, *given, *brief, f"--ckpt_path={last}"])
     logged = "".join(path.read_text() for path in root.rglob("metrics.csv"))
     assert all(f"test/{name}" in logged for name in ("accuracy", "false_positives", "false_negatives"))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_an_interrupted_run_goes_on_with_the_views_that_would_have_followed(root, workers):
+    frames = EntryFrames(read_entries("tusimple", root, ["label.json"]))
+    arguments = (frames, 1, [(64, 96), (96, 64)], ViewConfig(), (3, 0))
+    threads = torch.get_num_threads()
+
+    def batches(first, count):
+        data = DataLoader(ViewBatches(*arguments, first), batch_size=None, num_workers=workers)
+        return [batch.image for batch, _ in zip(data, range(count), strict=False)]
+
+    whole, rest = batches(0, 7), batches(3, 4)
+    assert torch.get_num_threads() == threads
+    assert all(map(torch.equal, whole[3:], rest))
+    assert not any(map(torch.equal, whole[:3], rest))
 
 
 def test_errors(root):

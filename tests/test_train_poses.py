@@ -1,6 +1,7 @@
 import json
 import math
 import sys
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -22,7 +23,6 @@ from train.poses import (
     PoseBatch,
     PoseBatches,
     fit_poses,
-    pool_frames,
     pose_loss,
     pose_surprise,
 )
@@ -37,7 +37,7 @@ def rendered():
 
 @pytest.fixture(scope="module")
 def batch():
-    return next(iter(PoseBatches(LiveFrames((72, 128)), 6, SIZE, ViewConfig(), seed=3)))
+    return next(iter(PoseBatches(LiveFrames((72, 128)), 6, SIZE, ViewConfig(), seed=(3,))))
 
 
 def logits_of(batch):
@@ -55,11 +55,33 @@ def test_shards_keep_the_pose(rendered, tmp_path):
     pose = shard.pose(2)
     np.testing.assert_allclose(pose.extrinsics, rendered.extrinsics.stack()[2], rtol=1e-6)
     np.testing.assert_allclose(pose.lane_width, rendered.lane_width[2], rtol=1e-6)
-    samples = list(zip(range(8), pool_frames(PoolFrames(tmp_path), np.random.default_rng(0)), strict=False))
+    samples = list(zip(range(8), PoolFrames(tmp_path).posed((0,)), strict=False))
     assert len({tuple(pose.extrinsics) for _, (_, pose) in samples}) == 4
     (tmp_path / "a.npz").write_bytes(b"cut")
     with pytest.raises(ValueError, match="expected a pool shard with jpeg"):
         read_shard(tmp_path / "a.npz")
+
+
+def test_frames_go_on_from_any_of_them(rendered, tmp_path):
+    for name in "abcde":
+        write_shard(tmp_path / f"{name}.npz", [rendered])
+    pool, live = PoolFrames(tmp_path, resident=2), LiveFrames((36, 64), batch=3)
+    for frames, first, count in ((pool, 26, 6), (live, 4, 4)):
+        whole = [frame.image for frame, _ in zip(frames((1, 2)), range(first + count), strict=False)]
+        rest = [frame.image for frame, _ in zip(frames((1, 2), first), range(count), strict=False)]
+        assert all(map(np.array_equal, whole[first:], rest))
+
+
+def test_a_round_of_the_pool_has_every_shard_once(rendered, tmp_path):
+    for name in "abcde":
+        write_shard(tmp_path / f"{name}.npz", [rendered])
+    seen = Counter()
+    pool = PoolFrames(tmp_path, resident=2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("train.data.read_shard", lambda path: seen.update([path.name]) or read_shard(path))
+        for _ in zip(range(2 * 5 * 4), pool((0,)), strict=False):
+            pass
+    assert set(seen.values()) == {2}
 
 
 def test_resized_intrinsics_project_to_resized_pixels(rendered, tmp_path):

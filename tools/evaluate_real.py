@@ -60,7 +60,11 @@ def main() -> int:
         print(f"{options.data}: missing {', '.join(missing)}; give the folder with --data", file=sys.stderr)
         return 2
     calibrators = {name: make_calibrator(name) for name in ("two-stage", "joint")}
-    model = lanebev.LaneBEV.from_pretrained(options.weights)
+    try:
+        model = lanebev.LaneBEV.from_pretrained(options.weights)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     start = time.monotonic()
     figures = [figure for part in parts(options, model, calibrators) for figure in part]
     print_table(figures)

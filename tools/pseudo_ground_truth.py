@@ -4,7 +4,8 @@
 
 Source: Sec. VI-C. Pitch and yaw minimise Eq. (14) over the frame's segments, roll and height then Eq. (23);
 no filter, so a frame knows nothing of its neighbours. With --estimate, the root-mean-square difference of a
-run's extrinsics.csv to it is printed and both are drawn.
+run's extrinsics.csv to it is printed and both are drawn; images are paired by their paths, a video's frames
+by order.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import argparse
 import csv
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,8 +28,8 @@ from lanebev.estimation.vanishing import incidence_noise, vanishing_dir_least_sq
 from lanebev.geometry.road import great_circle_normals, rays_from_pixels
 from lanebev.geometry.rotation import pitch_yaw_from_vanishing_dir
 from lanebev.io.lane_rows import rows_from_lines, segments_from_rows
-from lanebev.io.lanes import read_lanes
-from lanebev.io.results import read_extrinsics
+from lanebev.io.lanes import FrameLines, match_frames, read_lanes
+from lanebev.io.results import ExtrinsicsRow, read_extrinsics
 from lanebev.types import NUM_BOUNDARIES
 
 COLUMNS = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
@@ -84,6 +86,24 @@ def as_table(truth: PseudoTruth) -> np.ndarray:
     return torch.where(known, values, torch.nan).numpy()
 
 
+def estimate_table(rows: Sequence[ExtrinsicsRow], frames: Sequence[FrameLines]) -> np.ndarray:
+    """(B, 4) of a run like :func:`as_table`, a row per frame, NaN where the run has no such image."""
+    table = np.full((len(frames), len(COLUMNS)), np.nan)
+    if any(row.image for row in rows):
+        matches = match_frames([row.image for row in rows], frames)
+    elif len(rows) == len(frames):
+        matches = list(range(len(frames)))
+    else:
+        raise ValueError(
+            f"--estimate: expected {len(frames)} rows, one per frame of the lanes, got {len(rows)}; give the "
+            "run over these frames"
+        )
+    for row, match in zip(rows, matches, strict=True):
+        if match is not None:
+            table[match] = [getattr(row, name) for name in COLUMNS]
+    return table
+
+
 def plot(table: np.ndarray, estimate: np.ndarray | None, path: Path) -> None:
     """Pseudo truth, and a run's estimate, of every frame."""
     import matplotlib
@@ -118,14 +138,7 @@ def main() -> int:
         camera = Camera.from_file(args.camera)
         frames = read_lanes(args.lanes)
         rows = [rows_from_lines(frame.lines, camera) for frame in frames]
-        estimate = None
-        if args.estimate:
-            read = read_extrinsics(args.estimate)
-            if len(read) != len(frames):
-                raise ValueError(
-                    f"--estimate: expected {len(frames)} rows like {args.lanes}, got {len(read)}"
-                )
-            estimate = np.array([[getattr(row, name) for name in COLUMNS] for row in read])
+        estimate = estimate_table(read_extrinsics(args.estimate), frames) if args.estimate else None
     except ValueError as error:
         print(f"pseudo_ground_truth: {error}", file=sys.stderr)
         return 2
@@ -147,7 +160,7 @@ def main() -> int:
     if estimate is not None:
         rms = np.sqrt(np.nanmean((estimate - table) ** 2, axis=0))
         print(
-            "rms difference of the estimate: "
+            f"rms difference of the estimate, {np.isfinite(estimate).all(-1).sum()} frames: "
             + ", ".join(f"{n} {r:.3f}" for n, r in zip(COLUMNS, rms, strict=True))
         )
     return 0

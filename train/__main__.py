@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import torch
 from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.cli import LightningCLI
@@ -14,7 +17,22 @@ import train.poses  # noqa: F401  for the class paths of the configs
 
 
 class CommandLine(LightningCLI):
-    """Lightning's, with a word before hours are lost."""
+    """Lightning's, that finds the last checkpoint, and has a word before hours are lost."""
+
+    def before_instantiate_classes(self) -> None:
+        """``--ckpt_path last`` is the newest in the run's folder; Lightning looks in a version just begun."""
+        config = self.config[str(self.subcommand)]
+        if config.get("ckpt_path") != "last":
+            return
+        logger = config.trainer.logger
+        folder = Path(logger.init_args.save_dir) / logger.init_args.name
+        found = sorted(folder.glob("version_*/checkpoints/last.ckpt"), key=lambda path: path.stat().st_mtime)
+        if not found:
+            self.parser.error(
+                f"ckpt_path: expected a last.ckpt of a run in {folder}/version_*/checkpoints, got none; "
+                "give its path, or leave ckpt_path out to begin"
+            )
+        config.ckpt_path = str(found[-1])
 
     def before_fit(self) -> None:
         """bfloat16 that a CPU only emulates takes ten times as long as float32."""
@@ -30,7 +48,14 @@ class CommandLine(LightningCLI):
 def main(args: list[str] | None = None) -> None:
     """Command line."""
     torch.set_float32_matmul_precision("high")
-    CommandLine(seed_everything_default=0, args=args, save_config_kwargs={"overwrite": True})
+    try:
+        CommandLine(seed_everything_default=0, args=args, save_config_kwargs={"overwrite": True})
+    except (ValueError, OSError) as error:
+        cause: BaseException = error
+        while "\n" in str(cause) and cause.__cause__ is not None:  # the parser wraps what constructors raise
+            cause = cause.__cause__
+        print(f"error: {cause}", file=sys.stderr)
+        sys.exit(2)
 
 
 if __name__ == "__main__":

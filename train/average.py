@@ -46,6 +46,8 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("weights", type=Path, nargs="+", help="weights files or checkpoints")
     args = parser.parse_args()
+    if args.out.exists():
+        parser.error(f"out: expected a new file, which comes first, got {args.out}, which is there")
     try:
         segmenters, training = zip(*map(trained_segmenter, args.weights), strict=True)
         names = [path.name for path in args.weights]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -14,7 +15,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from lanebev.render import render_views
 from train.labels import LabelledImage, LabelledView, ViewConfig, full_view, random_view
-from train.pool import Shard, labelled_images, read_shard
+from train.pool import Pose, camera_poses, labelled_images, read_shard, shard_size
 
 
 class Batch(NamedTuple):
@@ -36,16 +37,22 @@ class Batch(NamedTuple):
         return cls(*(torch.from_numpy(np.stack(field)) for field in zip(*views, strict=True)))
 
 
+Seed = tuple[int, ...]
+"""Of a stream: the run's seed, the process's rank and the worker's number."""
+
+Posed = tuple[LabelledImage, Pose]
+
+
 class Frames(Protocol):
     """A source of labelled images."""
 
-    def __call__(self, rng: np.random.Generator) -> Iterator[LabelledImage]:
-        """Endless, in an order that the generator decides."""
+    def __call__(self, seed: Seed, first: int = 0) -> Iterator[LabelledImage]:
+        """Endless, in an order that the seed decides, from the ``first``-th on."""
         ...
 
 
 class PoolFrames:
-    """Frames of a pool that may still be growing, in random order, a few shards at a time."""
+    """Frames of a pool in random order, a few shards at a time. Added shards come with the next round."""
 
     def __init__(self, folder: str | Path, pattern: str = "*.npz", resident: int = 12) -> None:
         self.folder, self.pattern, self.resident = Path(folder), pattern, resident
@@ -64,28 +71,44 @@ class PoolFrames:
             )
         return paths
 
-    def __call__(self, rng: np.random.Generator) -> Iterator[LabelledImage]:
+    def posed(self, seed: Seed, first: int = 0) -> Iterator[Posed]:
         """Endless: a shuffled mix over ``resident`` shards, each seen once, then the next ones."""
+        rng = np.random.default_rng(seed)
         while True:
-            paths = [path for path in rng.permutation(np.array(self.paths()))][: self.resident]
-            shards: list[Shard] = [read_shard(path) for path in paths]
-            order = [(s, i) for s, shard in enumerate(shards) for i in range(len(shard))]
-            rng.shuffle(order)
-            for s, i in order:
-                yield shards[s].frame(i)
+            paths = rng.permutation(np.array(self.paths()))
+            for start in range(0, len(paths), self.resident):
+                some = paths[start : start + self.resident]
+                order = [(s, i) for s, path in enumerate(some) for i in range(shard_size(path))]
+                rng.shuffle(order)
+                if first < len(order):
+                    shards = [read_shard(path) for path in some]
+                    yield from ((shards[s].frame(i), shards[s].pose(i)) for s, i in order[first:])
+                first = max(0, first - len(order))
+
+    def __call__(self, seed: Seed, first: int = 0) -> Iterator[LabelledImage]:
+        """The images alone."""
+        return (image for image, _ in self.posed(seed, first))
 
 
 class LiveFrames:
-    """Frames rendered on demand."""
+    """Frames rendered on demand, ``batch`` at once."""
 
     def __init__(self, size: tuple[int, int] = (360, 640), batch: int = 4) -> None:
         self.size, self.batch = size, batch
 
-    def __call__(self, rng: np.random.Generator) -> Iterator[LabelledImage]:
-        """Endless; the same generator gives the same frames."""
-        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-        while True:
-            yield from labelled_images(render_views(self.batch, self.size, generator))
+    def posed(self, seed: Seed, first: int = 0) -> Iterator[Posed]:
+        """Endless; the same seed gives the same frames."""
+        for block in itertools.count(first // self.batch):
+            number = int(np.random.default_rng((*seed, block)).integers(2**62))
+            rendered = render_views(self.batch, self.size, torch.Generator().manual_seed(number))
+            poses = camera_poses([rendered])
+            for i, image in enumerate(labelled_images(rendered)):
+                if block * self.batch + i >= first:
+                    yield image, Pose(*(field[i] for field in poses))
+
+    def __call__(self, seed: Seed, first: int = 0) -> Iterator[LabelledImage]:
+        """The images alone."""
+        return (image for image, _ in self.posed(seed, first))
 
 
 class ViewBatches(IterableDataset[Batch]):
@@ -97,6 +120,7 @@ class ViewBatches(IterableDataset[Batch]):
         sizes: (height, width) of the views; one is drawn for each batch.
         view: how views are drawn.
         seed: with the worker's number, decides everything.
+        first: batches that an interrupted run had; this one has those that would have followed.
     """
 
     def __init__(
@@ -105,18 +129,23 @@ class ViewBatches(IterableDataset[Batch]):
         batch_size: int,
         sizes: list[tuple[int, int]],
         view: ViewConfig,
-        seed: int,
+        seed: Seed,
+        first: int = 0,
     ) -> None:
         super().__init__()
-        self.frames, self.batch_size, self.sizes, self.view, self.seed = frames, batch_size, sizes, view, seed
+        self.frames, self.batch_size, self.sizes, self.view = frames, batch_size, sizes, view
+        self.seed, self.first = seed, first
 
     def __iter__(self) -> Iterator[Batch]:
         """Draw."""
-        torch.set_num_threads(1)
         worker = get_worker_info()
-        rng = np.random.default_rng((self.seed, 0 if worker is None else worker.id))
-        frames = self.frames(rng)
-        while True:
+        if worker is not None:
+            torch.set_num_threads(1)
+        count, number = (1, self.first) if worker is None else (worker.num_workers, self.first + worker.id)
+        seed, done = (*self.seed, number % count), number // count  # batches come from the workers in turn
+        frames = self.frames(seed, done * self.batch_size)
+        for batch in itertools.count(done):
+            rng = np.random.default_rng((*seed, batch))
             size = tuple(self.sizes[rng.integers(len(self.sizes))])
             yield Batch.stack(
                 [random_view(next(frames), size, self.view, rng) for _ in range(self.batch_size)]
@@ -141,9 +170,17 @@ class FullBatches(IterableDataset[Batch]):
 
     def __iter__(self) -> Iterator[Batch]:
         """Draw."""
-        frames = self.frames(np.random.default_rng(self.seed))
+        frames = self.frames((self.seed,))
         for _ in range(self.batches):
             yield Batch.stack([full_view(next(frames), self.size, self.view) for _ in range(self.batch_size)])
+
+
+def run_position(module: L.LightningDataModule) -> tuple[int, int]:
+    """Rank of this process, and batches that the run had before it was interrupted."""
+    trainer = module.trainer
+    if trainer is None:
+        return 0, 0
+    return trainer.global_rank, trainer.global_step * trainer.accumulate_grad_batches
 
 
 class RenderedRoads(L.LightningDataModule):
@@ -186,7 +223,9 @@ class RenderedRoads(L.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Endless."""
-        data = ViewBatches(self._frames(self.pool), self.batch_size, self.sizes, self.view, self.seed)
+        rank, first = run_position(self)
+        frames, seed = self._frames(self.pool), (self.seed, rank)
+        data = ViewBatches(frames, self.batch_size, self.sizes, self.view, seed, first)
         return DataLoader(
             data, batch_size=None, num_workers=self.workers, prefetch_factor=4 if self.workers else None
         )

@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from lanebev.io.lane_order import boundary_indices
 from lanebev.io.lanes import FrameLines, read_culane, read_openlane, read_tusimple
 from lanebev.types import NUM_BOUNDARIES
-from train.data import Batch, ViewBatches
+from train.data import Batch, Seed, ViewBatches, run_position
 from train.labels import LabelledImage, ViewConfig, full_view
 
 Format = Literal["tusimple", "culane", "openlane"]
@@ -112,11 +112,13 @@ class EntryFrames:
     def __init__(self, entries: list[Entry]) -> None:
         self.entries = entries
 
-    def __call__(self, rng: np.random.Generator) -> Iterator[LabelledImage]:
-        """Each entry once, then again in another order."""
+    def __call__(self, seed: Seed, first: int = 0) -> Iterator[LabelledImage]:
+        """Each entry once, then again in another order; from the ``first``-th on."""
+        rng = np.random.default_rng(seed)
         while True:
-            for i in rng.permutation(len(self.entries)):
-                yield labelled_image(self.entries[i])
+            order = rng.permutation(len(self.entries))
+            yield from (labelled_image(self.entries[i]) for i in order[first:])
+            first = max(0, first - len(order))
 
 
 class ScoredBatches(IterableDataset[ScoredBatch]):
@@ -181,8 +183,9 @@ class LaneFiles(L.LightningDataModule):
     def train_dataloader(self) -> DataLoader[Batch]:
         """Endless random views."""
         frames = EntryFrames(read_entries(self.layout, self.root, self.train))
+        rank, first = run_position(self)
         return DataLoader(
-            ViewBatches(frames, self.batch_size, self.sizes, self.view, self.seed),
+            ViewBatches(frames, self.batch_size, self.sizes, self.view, (self.seed, rank), first),
             batch_size=None,
             num_workers=self.workers,
         )

@@ -56,7 +56,7 @@ class EndToEnd(Segmentation):
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:  # type: ignore[override]
         """Augment, segment, compare maps and poses."""
-        loss, logits = self.map_loss(batch)
+        loss, logits = self.map_loss(batch, batch_idx)
         if self.settings["pose_weight"] > 0:
             fit = self._fit(logits + unweighted_bias(self.class_weight).view(1, -1, 1, 1), batch)
             truth = batch.extrinsics.double()

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import scipy.stats
 import torch
+from jsonargparse.typing import PositiveInt
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -115,8 +116,8 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("weights", type=Path, nargs="+")
-    parser.add_argument("--drives", type=int, default=12)
-    parser.add_argument("--frames", type=int, help="of each drive: 12, a second apart, or online 40")
+    parser.add_argument("--drives", type=PositiveInt, default=12)
+    parser.add_argument("--frames", type=PositiveInt, help="of each drive: 12, a second apart, or online 40")
     parser.add_argument(
         "--size", type=int, nargs=2, default=(192, 320), metavar=("HEIGHT", "WIDTH"), help="not online"
     )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,12 +26,23 @@ def checkpoint_weights(path: Path) -> dict[str, Tensor]:
     Raises:
         ValueError: no segmenter in it.
     """
-    checkpoint = torch.load(path, map_location="cpu", weights_only=False)
+    return _read_checkpoint(path)[0]
+
+
+def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Weights and settings."""
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=False)
+        state, settings = checkpoint["state_dict"], checkpoint["settings"]
+    except OSError as error:
+        raise ValueError(f"{path}: expected a checkpoint, got: {error.strerror}") from error
+    except (pickle.UnpicklingError, EOFError, KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"{path}: expected a checkpoint of python -m train, got: {error}") from error
     prefix = "segmenter."
-    weights = {k.removeprefix(prefix): v for k, v in checkpoint["state_dict"].items() if k.startswith(prefix)}
+    weights = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
     if not weights:
         raise ValueError(f"{path}: expected weights named {prefix}*, found none")
-    return weights
+    return weights, settings
 
 
 def load_weights(segmenter: LaneSegmenter, path: Path, class_weight: Tensor) -> None:
@@ -92,8 +104,7 @@ def checkpoint_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
     Raises:
         ValueError: no segmenter in it.
     """
-    weights = checkpoint_weights(path)
-    settings = torch.load(path, map_location="cpu", weights_only=False)["settings"]
+    weights, settings = _read_checkpoint(path)
     segmenter = LaneSegmenter(SegmenterConfig(**settings["network"]))
     segmenter.load_state_dict(weights, strict=True)
     if settings["class_weight"] is not None:

@@ -11,6 +11,7 @@ import json
 from typing import NamedTuple
 
 import torch
+from jsonargparse.typing import PositiveInt
 from torch import Tensor
 
 from lanebev.geometry.camera import distort_points
@@ -78,10 +79,12 @@ def join(errors: list[ExtractionError]) -> ExtractionError:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=64)
+    parser.add_argument("--frames", type=PositiveInt, default=64)
     parser.add_argument("--size", type=int, nargs=2, default=(144, 256), metavar=("HEIGHT", "WIDTH"))
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
+    if args.frames % 8:
+        parser.error(f"--frames: expected a multiple of 8, got {args.frames}")
     generator, size = torch.Generator().manual_seed(args.seed), tuple(args.size)
     image_size = (size[0] // 2, size[1] // 2)  # only the truth is used
     batches = [render_views(8, image_size, generator) for _ in range(args.frames // 8)]

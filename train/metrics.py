@@ -140,16 +140,17 @@ def culane_counts(
     """CULane's matches of one image.
 
     Source: Pan et al. 2018 and the CULane evaluation: lanes are splines drawn 30 px wide, matched one to one
-    for the largest sum of intersection over union, and found above 0.5.
+    for the largest sum of intersection over union, and found above 0.5. OpenLane's evaluation of lanes in the
+    image is the same with other numbers.
 
     Args:
-        predicted: (P, 2) px points of each lane, in order along it; lanes of one point are dropped.
+        predicted: (P, 2) px points of each lane, in order along it; one of a single point matches none.
         labelled: the same.
         image_size: (height, width).
         width: of the drawn lanes, px.
         threshold: of the intersection over union.
     """
-    p, g = ([lane for lane in lanes if len(lane) > 1] for lanes in (predicted, labelled))
+    p, g = ([lane for lane in lanes if len(lane)] for lanes in (predicted, labelled))
     masks_p, masks_g = ([_lane_mask(lane, image_size, width) for lane in lanes] for lanes in (p, g))
     overlap = np.array([[_iou(a, b) for b in masks_g] for a in masks_p]).reshape(len(p), len(g))
     found = int((overlap[linear_sum_assignment(-overlap)] > threshold).sum())
@@ -166,6 +167,8 @@ def _lane_mask(points: Points, image_size: tuple[int, int], width: int) -> npt.N
         fine = np.interp(np.arange(50 * (keep.sum() - 1) + 1) / 50, np.arange(keep.sum()), chord[keep])
         points = spline(fine)
     mask = np.zeros(image_size, np.uint8)
+    if len(points) < 2:
+        return mask > 0
     cv2.polylines(mask, [np.rint(points).astype(np.int32)], False, 1, width)
     return mask > 0
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
+import os
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
 import lightning as L
+import numpy as np
 import torch
 from torch import Tensor
-from torchmetrics.segmentation import MeanIoU
+from torchmetrics.classification import MulticlassJaccardIndex
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from train.augment import Photometric
@@ -18,6 +23,8 @@ from train.datasets import ScoredBatch
 from train.losses import boundary_cross_entropy, row_cross_entropy, unweighted_bias
 from train.metrics import point_recall
 from train.scores import BenchmarkScores
+
+_NOT_LABELLED = -1  # class of a pixel without weight
 
 
 class Segmentation(L.LightningModule):
@@ -81,13 +88,13 @@ class Segmentation(L.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Augment, segment, compare."""
-        return self.map_loss(batch)[0]
+        return self.map_loss(batch, batch_idx)[0]
 
-    def map_loss(self, batch: Any) -> tuple[Tensor, Tensor]:
+    def map_loss(self, batch: Any, batch_idx: int) -> tuple[Tensor, Tensor]:
         """Loss of the maps, and the logits, class weights not undone, of an augmented batch."""
         image, target, weight = unpack(batch)
         if self.photometric is not None:
-            with torch.no_grad():
+            with torch.no_grad(), self._own_randomness(batch_idx):
                 image = self.photometric(image)
         logits = self.segmenter(
             image.contiguous(memory_format=self.layout)
@@ -96,6 +103,14 @@ class Segmentation(L.LightningModule):
         rows = row_cross_entropy(logits, target, weight)
         self.log_dict({"loss/pixels": pixels, "loss/rows": rows}, prog_bar=True)
         return pixels + self.settings["row_weight"] * rows, logits
+
+    @contextlib.contextmanager
+    def _own_randomness(self, batch_idx: int) -> Iterator[None]:
+        """Random numbers by seed, process and batch: a resumed run draws what it would have in one piece."""
+        entropy = (int(os.environ.get("PL_GLOBAL_SEED", "0")), self.global_rank, batch_idx)
+        with torch.random.fork_rng(devices=[self.device] if self.device.type == "cuda" else []):
+            torch.manual_seed(int(np.random.default_rng(entropy).integers(2**62)))
+            yield
 
     def validation_step(self, batch: Batch | ScoredBatch, batch_idx: int) -> None:
         """Loss, and recall of each boundary's points."""
@@ -118,12 +133,12 @@ class Segmentation(L.LightningModule):
         self.log("val/recall", self.val_found.sum() / self.val_there.sum().clamp(min=1), prog_bar=True)
 
     def on_test_start(self) -> None:
-        """Intersection over union besides, and a benchmark's scores where the data come with one."""
-        self.iou = MeanIoU(
+        """Intersection over union of all labelled pixels besides, and a benchmark's scores on its data."""
+        self.iou = MulticlassJaccardIndex(
             1 + self.segmenter.config.num_boundaries,
-            include_background=False,
-            per_class=True,
-            input_format="index",
+            average=None,
+            ignore_index=_NOT_LABELLED,
+            zero_division=math.nan,
         ).to(self.device)
         self.scores = BenchmarkScores()
 
@@ -133,13 +148,15 @@ class Segmentation(L.LightningModule):
         image, target, weight = unpack(views)
         logits = self(image)
         self.log("test/loss", boundary_cross_entropy(logits, target, weight), batch_size=len(image))
-        self.iou.update(logits.argmax(1), target.argmax(1))
+        self.iou.update(logits.argmax(1), torch.where(weight > 0, target.argmax(1), _NOT_LABELLED))
         if isinstance(batch, ScoredBatch):
             self.scores.update(logits, (image.shape[-2], image.shape[-1]), batch)
 
     def on_test_epoch_end(self) -> None:
         """Report."""
-        self.log_dict({f"test/iou_{k}": value for k, value in enumerate(self.iou.compute())})
+        boundaries = self.iou.compute()[1:]  # NaN: not once there
+        self.log_dict({f"test/iou_{k}": value for k, value in enumerate(boundaries)})
+        self.log("test/iou", boundaries.nanmean())
         self.log_dict({f"test/{name}": value for name, value in self.scores.compute().items()})
 
     def predict_step(self, batch: Batch | ScoredBatch, batch_idx: int) -> Tensor:

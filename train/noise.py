@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from jsonargparse.typing import PositiveInt
 from torch import Tensor
 
 from train.drives import Seen, follow, watch
@@ -58,8 +59,8 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("weights", type=Path)
-    parser.add_argument("--drives", type=int, default=12)
-    parser.add_argument("--frames", type=int, default=90, help="of each drive")
+    parser.add_argument("--drives", type=PositiveInt, default=12)
+    parser.add_argument("--frames", type=PositiveInt, default=90, help="of each drive")
     parser.add_argument("--fps", type=float, default=20.0)
     parser.add_argument("--seed", type=int, default=81_000)
     args = parser.parse_args()

@@ -9,14 +9,16 @@ from __future__ import annotations
 import argparse
 import os
 import time
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
+from jsonargparse.typing import PositiveInt
 
 from lanebev.geometry.camera import denormalise_points, distort_points
 from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
@@ -132,26 +134,41 @@ def read_shard(path: Path) -> Shard:
     Raises:
         ValueError: not a shard.
     """
+    own, poses = Shard._fields[:-1], Pose._fields
+    fields = _read_fields(path, (*own, *poses))
+    return Shard(*fields[: len(own)], poses=Pose(*fields[len(own) :]))
+
+
+def shard_size(path: Path) -> int:
+    """Number of a shard's frames, without reading them.
+
+    Raises:
+        ValueError: not a shard.
+    """
+    return len(_read_fields(path, ("ends",))[0])
+
+
+def _read_fields(path: Path, names: tuple[str, ...]) -> list[npt.NDArray[Any]]:
     try:
         with np.load(path) as file:
-            own = (file[name] for name in Shard._fields[:-1])
-            return Shard(*own, poses=Pose(*(file[name] for name in Pose._fields)))
-    except (OSError, KeyError, ValueError) as error:
-        names = ", ".join((*Shard._fields[:-1], *Pose._fields))
-        raise ValueError(f"{path}: expected a pool shard with {names}: {error}") from error
+            return [file[name] for name in names]
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: expected a pool shard with {', '.join(names)}: {error}") from error
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--shards", type=int, default=10)
-    parser.add_argument("--frames", type=int, default=64, help="per shard")
-    parser.add_argument("--batch", type=int, default=8, help="rendered together")
+    parser.add_argument("--shards", type=PositiveInt, default=10)
+    parser.add_argument("--frames", type=PositiveInt, default=64, help="per shard")
+    parser.add_argument("--batch", type=PositiveInt, default=8, help="rendered together")
     parser.add_argument("--size", type=int, nargs=2, default=(360, 640), metavar=("HEIGHT", "WIDTH"))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--prefix", default="shard")
     args = parser.parse_args()
+    if args.frames % args.batch:
+        parser.error(f"--frames: expected a multiple of --batch {args.batch}, got {args.frames}")
     args.out.mkdir(parents=True, exist_ok=True)
     for index in range(args.shards):
         path = args.out / f"{args.prefix}-{args.seed}-{index:05d}.npz"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -13,10 +14,9 @@ from torch.utils.data import DataLoader, IterableDataset
 from lanebev.estimation.single_frame import SingleFrameFit, fit_single_frame
 from lanebev.geometry.camera import undistort_points
 from lanebev.observation.lines import LineExtractor
-from lanebev.render import render_views
-from train.data import Batch, LiveFrames, PoolFrames, RenderedRoads
+from train.data import Batch, LiveFrames, PoolFrames, RenderedRoads, Seed, run_position
 from train.labels import LabelledImage, ViewConfig, full_view
-from train.pool import Pose, camera_poses, labelled_images, read_shard
+from train.pool import Pose
 
 
 class PoseBatch(NamedTuple):
@@ -53,25 +53,6 @@ class PoseBatch(NamedTuple):
         return cls(*views, *(torch.from_numpy(field) for field in resized))
 
 
-def pool_frames(frames: PoolFrames, rng: np.random.Generator) -> Iterator[tuple[LabelledImage, Pose]]:
-    """Endless, shard after shard in random order."""
-    while True:
-        for path in rng.permutation(np.array(frames.paths())):
-            shard = read_shard(path)
-            for i in rng.permutation(len(shard)):
-                yield shard.frame(i), shard.pose(i)
-
-
-def live_frames(frames: LiveFrames, rng: np.random.Generator) -> Iterator[tuple[LabelledImage, Pose]]:
-    """Endless, rendered on demand."""
-    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-    while True:
-        rendered = render_views(frames.batch, frames.size, generator)
-        poses = camera_poses([rendered])
-        for i, sample in enumerate(labelled_images(rendered)):
-            yield sample, Pose(*(field[i] for field in poses))
-
-
 class PoseBatches(IterableDataset[PoseBatch]):
     """Batches of whole frames; ``batches`` of them, or endless with None."""
 
@@ -81,21 +62,18 @@ class PoseBatches(IterableDataset[PoseBatch]):
         batch_size: int,
         size: tuple[int, int],
         view: ViewConfig,
-        seed: int,
+        seed: Seed,
         batches: int | None = None,
+        first: int = 0,
     ) -> None:
         super().__init__()
         self.frames, self.batch_size, self.size = frames, batch_size, size
-        self.view, self.seed, self.batches = view, seed, batches
+        self.view, self.seed, self.batches, self.first = view, seed, batches, first
 
     def __iter__(self) -> Iterator[PoseBatch]:
         """Draw."""
-        rng = np.random.default_rng(self.seed)
-        samples = pool_frames(self.frames, rng) if isinstance(self.frames, PoolFrames) else None
-        samples = samples or live_frames(self.frames, rng)  # type: ignore[arg-type]
-        drawn = 0
-        while self.batches is None or drawn < self.batches:
-            drawn += 1
+        samples = self.frames.posed(self.seed, self.first * self.batch_size)
+        for _ in itertools.count() if self.batches is None else range(self.batches):
             yield PoseBatch.stack([next(samples) for _ in range(self.batch_size)], self.size, self.view)
 
 
@@ -104,15 +82,18 @@ class RenderedPoses(RenderedRoads):
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:  # type: ignore[override]
         """Endless."""
-        return self._batches(self.pool, self.seed, None)
+        rank, first = run_position(self)
+        return self._batches(self.pool, (self.seed, rank), None, first)
 
     def val_dataloader(self) -> DataLoader[PoseBatch]:  # type: ignore[override]
         """Held-out frames."""
-        return self._batches(self.val_pool, self.seed + 7_919, self.val_batches)
+        return self._batches(self.val_pool, (self.seed + 7_919,), self.val_batches)
 
-    def _batches(self, pool: str | None, seed: int, batches: int | None) -> DataLoader[PoseBatch]:
+    def _batches(
+        self, pool: str | None, seed: Seed, batches: int | None, first: int = 0
+    ) -> DataLoader[PoseBatch]:
         frames = self._frames(pool)
-        data = PoseBatches(frames, self.batch_size, self.val_size, self.view, seed, batches)
+        data = PoseBatches(frames, self.batch_size, self.val_size, self.view, seed, batches, first)
         return DataLoader(data, batch_size=None)
 
     test_dataloader = val_dataloader

@@ -1,26 +1,49 @@
-"""Scores of TuSimple and CULane from logits, over a data set."""
+"""Scores of TuSimple, CULane and OpenLane from logits, over a data set."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from torch import Tensor
 
 from lanebev.geometry.camera import Camera
 from lanebev.io.lane_rows import BoundaryRows, rows_from_segments
+from lanebev.io.lanes import FrameLines
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.vertices import LineConfig
 from train.datasets import ScoredBatch
 from train.metrics import CULaneCounts, culane_counts, tusimple_score
 
-_CULANE_HEIGHT, _CULANE_LINE = 590, 30  # px: the benchmark's images, and how wide it draws lanes on them
+
+class DrawnLanes(NamedTuple):
+    """How a benchmark that draws lanes compares them.
+
+    Attributes:
+        height: px, of its images.
+        line: px, width of a lane drawn on them.
+        overlap: intersection over union above which a lane is found.
+        middle: boundaries about the ego lane that it labels, at most.
+    """
+
+    height: int
+    line: int
+    overlap: float
+    middle: int
+
+
+DRAWN = {
+    "culane": DrawnLanes(590, 30, 0.5, 4),  # Pan et al. 2018
+    "openlane": DrawnLanes(1280, 30, 0.3, 6),  # Chen et al. 2022, its LANE_evaluation
+}
 
 
 class BenchmarkScores:
-    """Collects images, then gives the benchmark's figures: TuSimple's accuracy, FP and FN, or CULane's F1."""
+    """Collects images, then gives the benchmark's figures: TuSimple's accuracy, FP and FN, the others' F1."""
 
     def __init__(self) -> None:
         self.tusimple: list[tuple[float, float, float]] = []
-        self.culane = CULaneCounts(0, 0, 0)
+        self.drawn = CULaneCounts(0, 0, 0)
 
     def update(self, logits: Tensor, network_size: tuple[int, int], batch: ScoredBatch) -> None:
         """Add images: logits (B, 1+L, h, w) of the images resized to the network's (height, width)."""
@@ -29,11 +52,8 @@ class BenchmarkScores:
             if batch.benchmark == "tusimple":
                 self.tusimple.append(tusimple_score(rows.x, rows.rows, lines))
                 continue
-            found = [np.stack([x, rows.rows], axis=-1)[np.isfinite(x)] for x in rows.x]
-            labelled = [line.points[np.isfinite(line.points).all(-1)] for line in lines.lines]
-            width = round(_CULANE_LINE * size[0] / _CULANE_HEIGHT)
-            counts = culane_counts(found, labelled, size, width)
-            self.culane = CULaneCounts(*(a + b for a, b in zip(self.culane, counts, strict=True)))
+            counts = drawn_counts(rows, lines, size, batch.benchmark)
+            self.drawn = CULaneCounts(*(a + b for a, b in zip(self.drawn, counts, strict=True)))
 
     def compute(self) -> dict[str, float]:
         """Named figures; none where there was nothing to score."""
@@ -41,9 +61,21 @@ class BenchmarkScores:
         if self.tusimple:
             names = ("accuracy", "false_positives", "false_negatives")
             figures |= dict(zip(names, np.mean(self.tusimple, axis=0).tolist(), strict=True))
-        if any(self.culane):
-            figures["f1"] = self.culane.f1()
+        if any(self.drawn):
+            figures["f1"] = self.drawn.f1()
         return figures
+
+
+def drawn_counts(
+    rows: BoundaryRows, label: FrameLines, image_size: tuple[int, int], benchmark: str
+) -> CULaneCounts:
+    """One image's matches by the rules of a benchmark that draws lanes, scaled to the image's height."""
+    rules = DRAWN[benchmark]
+    beside = max(0, len(rows.x) - rules.middle) // 2
+    found = [np.stack([x, rows.rows], -1)[np.isfinite(x)] for x in rows.x[beside : len(rows.x) - beside]]
+    labelled = [line.points[np.isfinite(line.points).all(-1)] for line in label.lines]
+    width = round(rules.line * image_size[0] / rules.height)
+    return culane_counts(found, labelled, image_size, width, rules.overlap)
 
 
 def boundary_rows(logits: Tensor, network_size: tuple[int, int], image_size: tuple[int, int]) -> BoundaryRows:

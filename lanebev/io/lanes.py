@@ -11,13 +11,14 @@ import math
 import sys
 from collections import defaultdict
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lanebev.io.video import IMAGE_SUFFIXES, natural_order
 from lanebev.types import NUM_BOUNDARIES
 
 _OPENLANE_CURBS = (20, 21)  # left and right kerb: no lane ends there, so no lane width holds
@@ -71,9 +72,13 @@ def read_lanes(path: str | Path) -> list[FrameLines]:
 
 
 def lane_files(path: str | Path) -> list[Path]:
-    """The files that :func:`read_lanes` reads: those of a folder, or the file itself."""
+    """The files that :func:`read_lanes` reads: the file itself, or a folder's in natural order."""
     path = Path(path)
-    return sorted([*path.rglob("*.lines.txt"), *path.rglob("*.json")]) if path.is_dir() else [path]
+    if not path.is_dir():
+        return [path]
+    return sorted(
+        [*path.rglob("*.lines.txt"), *path.rglob("*.json")], key=lambda file: natural_order(str(file))
+    )
 
 
 def read_tusimple(path: str | Path) -> list[FrameLines]:
@@ -93,7 +98,10 @@ def read_tusimple(path: str | Path) -> list[FrameLines]:
 
 
 def read_culane(path: str | Path) -> FrameLines:
-    """Read CULane's ``.lines.txt``, a line of ``x y x y ...`` per lane; the path without suffix names it."""
+    """Read CULane's ``.lines.txt``, a line of ``x y x y ...`` per lane; the path without suffix names it.
+
+    A point that is repeated right after itself counts once.
+    """
     path = Path(path)
     lines = []
     for number, text in enumerate(_text(path).splitlines(), start=1):
@@ -101,7 +109,8 @@ def read_culane(path: str | Path) -> FrameLines:
             values = _floats("points", text.split())
             if len(values) % 2:
                 raise ValueError(f"expected x y pairs, got {len(values)} numbers; is the file cut?")
-            points = np.array(values).reshape(-1, 2)
+            pairs = zip(values[::2], values[1::2], strict=True)
+            points = np.array([point for point, _ in groupby(pairs)]).reshape(-1, 2)
             _check_culane_rows(points[:, 1])
             if len(points):
                 lines.append(LaneLine(points))
@@ -164,8 +173,9 @@ def _written(values: NDArray[np.float64]) -> list[float]:
 def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int | None]:
     """Which lane entry belongs to each image: the one that shares the longest tail of its path.
 
-    Compared are whole path components from the end, the last without suffix. An entry goes to the image
-    that shares most with it, so an image without an entry of its own gets None rather than a stranger's.
+    Compared are whole path components from the end, the last without an image's suffix. An entry goes
+    to the image that shares most with it, so an image without an entry of its own gets None rather than a
+    stranger's.
 
     Args:
         names: paths of the images.
@@ -217,7 +227,9 @@ def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int
 
 def _parts(name: str) -> tuple[str, ...]:
     path = PurePath(name.replace("\\", "/"))
-    return tuple(part for part in path.with_suffix("").parts if part not in ("/", "."))
+    if path.suffix.lower() in IMAGE_SUFFIXES:  # what follows the last dot may be part of the name
+        path = path.with_suffix("")
+    return tuple(part for part in path.parts if part not in ("/", "."))
 
 
 def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:

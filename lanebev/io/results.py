@@ -8,6 +8,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterable
+from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
@@ -183,6 +184,13 @@ class OutputFolder:
     def __truediv__(self, name: str) -> Path:
         """Where to write the file of this name until the work is done."""
         return self._partial / name
+
+    def keep(self, name: str, why: str) -> str:
+        """Have an earlier run's file stay as ``name.why``, numbered if there is one; the name it got."""
+        names = (f"{name}.{why}{number or ''}" for number in count())
+        kept = next(free for free in names if not os.path.lexists(self._target / free))
+        shutil.copy2(self._target / name, self / kept)
+        return kept
 
     def _publish(self) -> None:
         if not self._target.exists():
