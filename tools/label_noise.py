@@ -88,12 +88,17 @@ def main() -> int:
     if not labels.exists():
         print(f"{labels}: missing; give the folder with --data", file=sys.stderr)
         return 2
+    try:
+        model = lanebev.LaneBEV.from_pretrained(options.weights)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     images, segments = tusimple_segments(options.data)
     camera = tusimple_camera()
     intrinsics = camera.intrinsics.expand(len(images), 3, 3)
     pose = calibrate_still(lanebev.TwoStageCalibrator(), segments, intrinsics, TUSIMPLE_LANE_WIDTH).extrinsics
     horizons = (camera.intrinsics[1, 2] - camera.intrinsics[1, 1] * pose.pitch.tan()).tolist()
-    observer = NetworkObserver(lanebev.LaneBEV.from_pretrained(options.weights), camera, TUSIMPLE_LANE_WIDTH)
+    observer = NetworkObserver(model, camera, TUSIMPLE_LANE_WIDTH)
     offsets = []
     for image, entry, horizon in zip(images, read_lanes(labels), horizons, strict=True):
         frame = next(iter(open_source(image)))
