@@ -22,9 +22,9 @@ class CommandLine(LightningCLI):
     def before_instantiate_classes(self) -> None:
         """``--ckpt_path last`` is the newest in the run's folder; Lightning looks in a version just begun."""
         config = self.config[str(self.subcommand)]
-        if config.get("ckpt_path") != "last":
-            return
         logger = config.trainer.logger
+        if config.get("ckpt_path") != "last" or not hasattr(logger, "init_args"):  # without one, Lightning's
+            return
         folder = Path(logger.init_args.save_dir) / logger.init_args.name
         found = sorted(folder.glob("version_*/checkpoints/last.ckpt"), key=lambda path: path.stat().st_mtime)
         if not found:
