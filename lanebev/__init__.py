@@ -5,7 +5,12 @@ from lanebev.estimation.joint import JointCalibrator
 from lanebev.estimation.mount import MountEstimator
 from lanebev.estimation.two_stage import TwoStageCalibrator
 from lanebev.geometry.camera import Camera
-from lanebev.geometry.road import image_from_road_points, road_covariance, road_from_image_points
+from lanebev.geometry.road import (
+    image_covariance,
+    image_from_road_points,
+    road_covariance,
+    road_from_image_points,
+)
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.pipeline import LaneBEV, LaneBEVOutput
@@ -31,6 +36,7 @@ __all__ = [
     "Status",
     "TwoStageCalibrator",
     "bev_from_image",
+    "image_covariance",
     "image_from_road_points",
     "road_covariance",
     "road_from_image_points",

@@ -10,11 +10,12 @@ from torch import Tensor, nn
 
 from lanebev.geometry.camera import undistort_points
 from lanebev.geometry.precision import autocast_off, common_dtype
-from lanebev.types import Calibration, LaneSegments
+from lanebev.types import Calibration, LaneSegments, saved_by_name
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
 
 
+@saved_by_name
 class LaneBEVOutput(NamedTuple):
     """What one frame, or with (B, T) input every frame, gives.
 
@@ -135,6 +136,8 @@ class LaneBEV(nn.Module):
             raise ValueError(f"image: expected (B, 3, H, W) or (B, T, 3, H, W), got {tuple(image.shape)}")
         if not image.is_floating_point():
             raise ValueError(f"image: expected floating point in [0, 1], got {image.dtype}")
+        if 0 in image.shape[1:]:  # B may be 0
+            raise ValueError(f"image: expected frames with pixels, got {tuple(image.shape)}")
         if state is None:
             state = self.initial_state(image.shape[0], common_dtype(intrinsics), image.device)
         frames = image if image.ndim == 5 else image.unsqueeze(1)
@@ -188,9 +191,14 @@ class LaneBEV(nn.Module):
         rows = max(32, 32 * round(height * self.network_width / width / 32))
         if (rows, self.network_width) == (height, width):
             return image
-        return nn.functional.interpolate(
-            image, size=(rows, self.network_width), mode="bilinear", antialias=True, align_corners=False
+        resized = nn.functional.interpolate(
+            image.to(common_dtype(image)),  # of half precision there is no kernel on the CPU
+            size=(rows, self.network_width),
+            mode="bilinear",
+            antialias=True,
+            align_corners=False,
         )
+        return resized.to(image.dtype)
 
 
 def _intervals(dt: float | Tensor, batch: int, steps: int, like: Tensor) -> Tensor:

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree
+
+Tuple = TypeVar("Tuple", bound=type)
 
 NUM_BOUNDARIES = 6
 """Semantic lane boundaries by default: 0, 1, 2 left of the ego lane's middle, 3, 4, 5 right of it."""
+
+
+def saved_by_name(cls: Tuple) -> Tuple:
+    """Decorator of a NamedTuple of tensors that ``torch.export.save`` and ``torch.load`` shall know."""
+    _pytree._register_namedtuple(cls, serialized_type_name=f"lanebev.{cls.__name__}")
+    torch.serialization.add_safe_globals([cls])
+    return cls
 
 
 class Status(IntEnum):
@@ -21,6 +31,7 @@ class Status(IntEnum):
     LOST = 3  # too long without support: the extrinsics are the last that were believed
 
 
+@saved_by_name
 class LaneSegments(NamedTuple):
     """Line segments on lane boundaries, padded to N per image.
 
@@ -37,6 +48,7 @@ class LaneSegments(NamedTuple):
     sigma: Tensor
 
 
+@saved_by_name
 class Extrinsics(NamedTuple):
     """Camera pose over the road, each (B,): rad, rad, rad, m; always in this order.
 
@@ -61,6 +73,7 @@ class Extrinsics(NamedTuple):
         return cls(*values.unbind(-1))
 
 
+@saved_by_name
 class Calibration(NamedTuple):
     """One frame's estimate.
 

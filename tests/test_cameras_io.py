@@ -217,7 +217,14 @@ def test_calibration_file_is_read_by_others(tmp_path):
     assert fields["mount"]["reasons"] == ["SLOW", "FEW_BLOCKS"]
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     assert storage.getNode("mount").getNode("height_m").real() == 1.5
-    assert storage.getNode("camera_matrix").getNode("data").at(0).real() == 1150.0
+    np.testing.assert_allclose(storage.getNode("camera_matrix").mat(), LENS.intrinsics)
+    np.testing.assert_allclose(storage.getNode("distortion_coefficients").mat()[0], LENS.distortion)
+    np.testing.assert_allclose(storage.getNode("vehicle_from_camera").mat(), vehicle_from_camera(mount)[0])
+
+
+def test_cameras_compare_as_objects():
+    assert LENS == LENS
+    assert Camera.from_parameters(**SHORT) != Camera.from_parameters(**SHORT)
 
 
 def test_convention_vehicle_from_camera():

@@ -488,13 +488,24 @@ def test_straight_road_does_not_tell_the_speed():
     assert state.mean[:, SPEED].abs().max() < 4.0
 
 
-def test_exports_and_equals_eager():
+def test_exports_saves_takes_any_batch_and_equals_eager(tmp_path):
     frames = drive(4)
     calibrator = JointCalibrator(iterations=1, start_iterations=1)  # a smaller graph, traced faster
     _, state = run(calibrator, frames[:3])
     dt = torch.full((2,), 1 / FPS, dtype=DOUBLE)
     arguments = (frames[3][1], cameras(2), state, dt)
-    exported = torch.export.export(calibrator, arguments).module()
+    any_batch = {0: torch.export.Dim("batch", min=1, max=8)}
+    shapes = [
+        type(part)(*(any_batch for _ in part)) if isinstance(part, tuple) else any_batch for part in arguments
+    ]
+    program = torch.export.export(calibrator, arguments, dynamic_shapes=tuple(shapes))
+    torch.export.save(program, tmp_path / "joint.pt2")
+    exported = torch.export.load(tmp_path / "joint.pt2").module()
+    three = torch.tensor([1, 0, 1])
+    arguments = tuple(
+        type(part)(*(each[three] for each in part)) if isinstance(part, tuple) else part[three]
+        for part in arguments
+    )
     expected, after = calibrator(*arguments)
     found, after_exported = exported(*arguments)
     torch.testing.assert_close(found.extrinsics.stack(), expected.extrinsics.stack())

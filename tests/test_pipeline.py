@@ -12,6 +12,7 @@ from lanebev import (
     LaneSegmenter,
     LaneSegments,
     LineExtractor,
+    MountEstimator,
     Status,
     TwoStageCalibrator,
 )
@@ -167,6 +168,22 @@ def test_calibrators_take_an_empty_batch(calibrator):
     assert state.status.shape == (0,)
 
 
+@pytest.mark.parametrize("shape", [(0,), (0, 2)])
+def test_an_empty_batch_goes_all_the_way(shape):
+    out, state = small()(images(*shape).float(), INTRINSICS.expand(0, 3, 3))
+    assert out.bev.shape == (*shape, 3, *GRID.shape)
+    assert out.calibration.covariance.shape == (*shape, 4, 4)
+    assert state.status.shape == (0,)
+
+
+def test_a_model_of_half_precision_resizes_too():
+    net = small().bfloat16()
+    net.network_width = 96
+    out, _ = net(images(1).bfloat16(), INTRINSICS[None].float())
+    assert out.bev.dtype == out.logits.dtype == torch.bfloat16
+    assert out.calibration.covariance.dtype == torch.float32
+
+
 def test_gradients_flow_under_autocast():
     net, frames = model().float(), images(1).float().requires_grad_()
     with torch.autocast("cpu", torch.bfloat16):
@@ -184,20 +201,34 @@ def test_a_camera_in_double_precision_goes_with_single_precision_images():
     assert kept.calibration.covariance.dtype == torch.float32
 
 
-def test_exports_and_equals_eager():
+def test_exports_saves_and_equals_eager(tmp_path):
     net, dt = small(), torch.tensor([0.05])
     arguments = (images(1).float(), INTRINSICS[None].float(), net.initial_state(1), dt)
     with torch.no_grad():
-        exported = torch.export.export(net, arguments).module()
-        (found, _), (expected, _) = exported(*arguments), net(*arguments)
+        torch.export.save(torch.export.export(net, arguments), tmp_path / "net.pt2")
+        exported = torch.export.load(tmp_path / "net.pt2").module()
+        (found, state), (expected, _) = exported(*arguments), net(*arguments)
+    assert type(state) is type(arguments[2])
     torch.testing.assert_close(found.bev, expected.bev)
     torch.testing.assert_close(found.calibration.covariance, expected.calibration.covariance)
+
+
+@pytest.mark.parametrize("part", [TwoStageCalibrator(), JointCalibrator(), MountEstimator()])
+def test_states_are_loaded_by_torch_as_they_were_saved(part, tmp_path):
+    state = part.initial_state(2)
+    torch.save(state, tmp_path / "state.pt")
+    loaded = torch.load(tmp_path / "state.pt", weights_only=True)
+    assert type(loaded) is type(state)
+    assert all(map(torch.equal, loaded, state))
 
 
 def test_arguments_are_checked():
     for bad in (torch.ones(3), torch.ones(2, 2), torch.ones(1, 2, 3)):
         with pytest.raises(ValueError, match=r"dt: expected a float, \(2,\) or \(2, 3\), got"):
             model()(images(2, 3), INTRINSICS.expand(2, 3, 3), None, bad)
+    for nothing in ((1, 0, 3, 72, 128), (1, 3, 0, 128)):
+        with pytest.raises(ValueError, match="image: expected frames with pixels, got"):
+            model()(torch.zeros(nothing), INTRINSICS[None])
     with pytest.raises(ValueError, match=r"image: expected floating point in \[0, 1\], got torch.uint8"):
         model()((255 * images(1)).to(torch.uint8), INTRINSICS[None])
     with pytest.raises(ValueError, match=r"distortion: expected \(1, D\) like the points, got \(5,\)"):

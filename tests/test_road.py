@@ -6,7 +6,14 @@ import math
 import pytest
 import torch
 
-from lanebev import BEVGrid, Extrinsics, bev_from_image, image_from_road_points, road_covariance
+from lanebev import (
+    BEVGrid,
+    Extrinsics,
+    bev_from_image,
+    image_covariance,
+    image_from_road_points,
+    road_covariance,
+)
 from lanebev.geometry.road import great_circle_normals, road_from_image_points
 from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
 
@@ -91,8 +98,41 @@ def test_road_covariance_equals_monte_carlo():
     road, _ = road_from_image_points(pixels + noise, K.expand(n, 3, 3), Extrinsics.unstack(poses))
     for k in range(3):
         torch.testing.assert_close(torch.cov(road[:, k].T), cov[0, k], rtol=0.1, atol=2e-4)
-    bev = BEVGrid(resolution=0.1).bev_from_road_covariance(cov)
+    grid = BEVGrid(resolution=0.1)
+    bev = grid.bev_from_road_covariance(cov)
     torch.testing.assert_close(bev[0, :, 0, 1], -100 * cov[0, :, 0, 1])
+    torch.testing.assert_close(grid.road_from_bev_covariance(bev), cov)
+
+
+def test_image_covariance_equals_monte_carlo_and_leads_back():
+    e = pose(0.02, 0.01, -0.01, 1.5)
+    pixels, _ = image_from_road_points(ROAD, K, e)
+    road_cov = torch.tensor([[0.01, 0.002], [0.002, 0.02]], dtype=torch.float64).expand(1, 3, 2, 2)
+    pose_std = torch.tensor([5e-4, 1e-3, 1e-3, 0.01], dtype=torch.float64)
+    cov = image_covariance(ROAD, K, e, road_cov, torch.diag(pose_std**2)[None])
+    generator = torch.Generator().manual_seed(0)
+    n = 20000
+    noise = (
+        torch.randn(n, 3, 2, generator=generator, dtype=torch.float64)
+        @ torch.linalg.cholesky(road_cov[0, 0]).T
+    )
+    poses = e.stack() + torch.randn(n, 4, generator=generator, dtype=torch.float64) * pose_std
+    found, _ = image_from_road_points(ROAD + noise, K.expand(n, 3, 3), Extrinsics.unstack(poses))
+    for k in range(3):
+        torch.testing.assert_close(torch.cov(found[:, k].T), cov[0, k], rtol=0.1, atol=0.02)
+    exact = image_covariance(ROAD, K, e, road_cov)
+    torch.testing.assert_close(road_covariance(pixels, K, e, exact), road_cov)
+    behind = image_covariance(torch.tensor([[[0.0, -5.0]]], dtype=torch.float64), K, e, road_cov[:, :1])
+    assert behind[0, 0].tolist() == [[math.inf, 0.0], [0.0, math.inf]]
+
+
+def test_a_camera_below_the_road_sees_none_of_it():
+    assert not image_from_road_points(ROAD, K, pose(0.02, 0.01, -0.01, -1.5))[1].any()
+
+
+def test_the_homography_asks_for_a_camera_to_every_pose():
+    with pytest.raises(ValueError, match=r"intrinsics: expected \(1, 3, 3\) like the pose, got \(2, 3, 3\)"):
+        bev_from_image(pose(), K.expand(2, 3, 3), BEVGrid())
 
 
 def test_grid_shape_and_cells():
@@ -104,8 +144,9 @@ def test_grid_shape_and_cells():
     assert cells[-1, -1].tolist() == pytest.approx([9.95, 3.05])
     with pytest.raises(ValueError, match="resolution: expected > 0"):
         BEVGrid(resolution=0.0)
-    with pytest.raises(ValueError, match="x: expected"):
-        BEVGrid(x=(5.0, -5.0))
+    for x in ((5.0, -5.0), (5.0, math.inf)):
+        with pytest.raises(ValueError, match="x: expected"):
+            BEVGrid(x=x)
     assert math.isclose(float(grid.bev_from_road_points(torch.tensor([0.0, 60.0]))[1]), 0.0)
 
 

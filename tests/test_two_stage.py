@@ -275,10 +275,14 @@ def test_float32_follows_float64():
         assert (gap.abs() < 0.05 * results[1].covariance[0].diagonal().sqrt()).all()
 
 
-def test_export_equals_eager():
+@pytest.mark.parametrize("count", [24, 48])  # all pairs of them are tried, and some
+def test_export_equals_eager(count):
     calibrator = TwoStageCalibrator()
     state = calibrator.initial_state(2, dtype=torch.float64)
     segments = rows(lanes(seed=0), lanes(seed=1))
+    every = segments.weight.shape[1] // count
+    segments = LaneSegments(*(part[:, ::every] for part in segments))
+    assert segments.weight.shape == (2, count)
 
     class Step(torch.nn.Module):
         def __init__(self):
@@ -424,6 +428,11 @@ def test_what_does_not_fit_the_batch_is_named(calibrator):
             calibrator(segments, cameras, calibrator.initial_state(count, dtype=torch.float64), 0.1)
     with pytest.raises(ValueError, match=f"state.{name}: expected float32 or float64, got torch.bfloat16"):
         calibrator(segments, cameras, state._replace(**{name: state[0].bfloat16()}), 0.1)
+    other = TwoStageCalibrator() if isinstance(calibrator, JointCalibrator) else JointCalibrator()
+    for wrong in (None, other.initial_state(2, dtype=torch.float64)):
+        message = rf"state: expected {type(state).__name__}, begun by .*, got {type(wrong).__name__}"
+        with pytest.raises(ValueError, match=message):
+            calibrator(segments, cameras, wrong, 0.1)
     with pytest.raises(ValueError, match=r"dt: expected a float or \(2,\), got \(3,\)"):
         calibrator(segments, cameras, state, torch.ones(3))
     with pytest.raises(ValueError, match="lane_width: expected a positive width in m, got inf"):

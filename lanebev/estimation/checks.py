@@ -30,7 +30,7 @@ def calibrates(forward: Forward) -> Forward:
     that sees nothing, and N may be 0.
 
     Args:
-        forward: method of a module with ``config.num_boundaries``, as in
+        forward: method of a module with ``config.num_boundaries`` and ``state_type``, as in
             :meth:`lanebev.TwoStageCalibrator.forward`.
 
     Returns:
@@ -48,6 +48,7 @@ def calibrates(forward: Forward) -> Forward:
     ) -> tuple[Calibration, Any]:
         check_segments(segments, intrinsics)
         count = segments.weight.shape[1]
+        _check_kind(state, self.state_type)
         like = check_state(state, intrinsics.shape[0])
         segments, intrinsics = cast_floating(segments, like.dtype), intrinsics.to(like.dtype)
         widths = as_lane_width(lane_width, like, self.config.num_boundaries)
@@ -97,6 +98,13 @@ def check_state(state: Any, rows: int) -> Tensor:
     if like.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"state.{state._fields[0]}: expected float32 or float64, got {like.dtype}")
     return like
+
+
+def _check_kind(state: object, kind: type) -> None:
+    if not isinstance(state, kind):
+        raise ValueError(
+            f"state: expected {kind.__name__}, begun by initial_state(batch_size), got {type(state).__name__}"
+        )
 
 
 def clean_segments(segments: LaneSegments, num_boundaries: int) -> LaneSegments:

@@ -48,7 +48,14 @@ from lanebev.estimation.joint_motion import (
 from lanebev.estimation.joint_road import come_nearer, straight_or_bend
 from lanebev.estimation.single_frame import FramePrior, fit_single_frame
 from lanebev.rows import flag, where
-from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status
+from lanebev.types import (
+    NUM_BOUNDARIES,
+    Calibration,
+    Extrinsics,
+    LaneSegments,
+    Status,
+    saved_by_name,
+)
 
 _NO_BOUNDARY = 0.36  # m out of place, three sigmas of what lanes differ, from which a line bounds no lane
 _DOUBTFUL = 0.6  # m out of place, below which a boundary let go alone may stand for several
@@ -124,6 +131,7 @@ class JointConfig:
             raise ValueError(f"bends: expected a probability between 0 and 1, got {self.bends}")
 
 
+@saved_by_name
 class JointState(NamedTuple):
     """Everything the calibrator remembers, tensors only.
 
@@ -165,6 +173,8 @@ class JointCalibrator(nn.Module):
     Args:
         config: the numbers, or keywords of :class:`JointConfig`.
     """
+
+    state_type = JointState
 
     def __init__(self, config: JointConfig | None = None, **numbers: object) -> None:
         super().__init__()

@@ -52,7 +52,7 @@ def come_nearer(
     change = _change_per_metre(shape, cov[:, SHAPE, SHAPE])
     by_speed = dt.unsqueeze(-1) * (moved @ change.unsqueeze(-1)).squeeze(-1)  # (B, 1 + NUM_STEPS)
 
-    transition = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device).repeat(len(dt), 1, 1)
+    transition = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device).repeat(dt.shape[0], 1, 1)
     transition[:, SHAPE, SHAPE] = moved
     transition[:, SHAPE, SPEED] = by_speed
     noise = torch.zeros_like(mean)

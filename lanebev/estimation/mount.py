@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from lanebev.estimation.checks import as_batch
 from lanebev.rows import flag, where
-from lanebev.types import Calibration, Extrinsics, Status
+from lanebev.types import Calibration, Extrinsics, Status, saved_by_name
 
 
 class MountStatus(IntEnum):
@@ -100,6 +100,7 @@ class MountConfig:
             raise ValueError(f"block_time: expected a positive time in s, got {self.block_time}")
 
 
+@saved_by_name
 class MountState(NamedTuple):
     """Everything the estimator remembers, tensors only. K blocks, the newest first.
 
@@ -130,6 +131,7 @@ class MountState(NamedTuple):
     reasons: Tensor
 
 
+@saved_by_name
 class MountCalibration(NamedTuple):
     """The mount as it is known now.
 

@@ -13,7 +13,14 @@ from lanebev.estimation.direction_stage import track_direction
 from lanebev.estimation.lane_width import boundary_angles
 from lanebev.estimation.roll_height_stage import track_roll_height
 from lanebev.geometry.road import rays_from_pixels
-from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status
+from lanebev.types import (
+    NUM_BOUNDARIES,
+    Calibration,
+    Extrinsics,
+    LaneSegments,
+    Status,
+    saved_by_name,
+)
 
 
 @dataclass(frozen=True)
@@ -48,6 +55,7 @@ class TwoStageConfig:
             raise ValueError(f"num_hypotheses: expected at least 1, got {self.num_hypotheses}")
 
 
+@saved_by_name
 class TwoStageState(NamedTuple):
     """Everything the calibrator remembers, tensors only.
 
@@ -78,6 +86,8 @@ class TwoStageCalibrator(nn.Module):
     Args:
         config: the numbers, or keywords of :class:`TwoStageConfig`.
     """
+
+    state_type = TwoStageState
 
     def __init__(self, config: TwoStageConfig | None = None, **numbers: object) -> None:
         super().__init__()

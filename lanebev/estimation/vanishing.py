@@ -92,7 +92,7 @@ def segment_pairs(weight: Tensor, draws: Tensor) -> Tensor:
     """
     num_segments = weight.shape[-1]
     if num_segments * (num_segments - 1) // 2 <= draws.shape[0]:
-        pairs = torch.combinations(torch.arange(num_segments, device=weight.device))
+        pairs = torch.triu_indices(num_segments, num_segments, 1, device=weight.device).T
         return pairs.expand(weight.shape[0], -1, -1)
     present = weight > 0
     order = torch.argsort((~present).to(torch.int8), dim=-1, stable=True)  # the present ones first

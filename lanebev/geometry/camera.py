@@ -188,7 +188,7 @@ def max_undistorted_radius(distortion: Tensor, model: str = "pinhole", limit: fl
     return reach.to(distortion.dtype)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
     """One camera's lens.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -77,13 +79,13 @@ def image_from_road_points(
         extrinsics: each (B,).
 
     Returns:
-        (B, N, 2) px, and (B, N) bool, false behind the camera.
+        (B, N, 2) px, and (B, N) bool, false behind the camera, and for one that is not above the road.
     """
     x, z = points.unbind(-1)
     road = torch.stack([x, extrinsics.height.unsqueeze(-1).expand_as(x), z], dim=-1)
     pixels = road @ _road_from_cam(extrinsics) @ intrinsics.mT  # rows: (K R_cam_from_road p)ᵀ
     depth = pixels[..., 2]
-    valid = depth > 1e-3
+    valid = (depth > 1e-3) & (extrinsics.height > 0).unsqueeze(-1)
     return pixels[..., :2] / torch.where(valid, depth, 1.0).unsqueeze(-1), valid
 
 
@@ -108,20 +110,55 @@ def road_covariance(
         (B, N, 2, 2) m² of (X, Z). Where the pixel is not on the road, above the horizon or behind, variances
         are infinite and covariances zero.
     """
+    return _propagated(road_from_image_points, points, intrinsics, extrinsics, pixel_cov, extrinsics_cov)
 
-    def to_road(pixel: Tensor, pose: Tensor, matrix: Tensor) -> Tensor:
+
+@full_precision
+def image_covariance(
+    points: Tensor,
+    intrinsics: Tensor,
+    extrinsics: Extrinsics,
+    road_cov: Tensor | None = None,
+    extrinsics_cov: Tensor | None = None,
+) -> Tensor:
+    """Covariance of road points' pixels, to first order, from that of the points and of the pose.
+
+    Args:
+        points: (B, N, 2) m, (X right, Z along the lanes).
+        intrinsics: (B, 3, 3).
+        extrinsics: each (B,).
+        road_cov: (B, N, 2, 2) m² of (X, Z), or None for exact points.
+        extrinsics_cov: (B, 4, 4) of (pitch, yaw, roll, height), or None for an exact pose.
+
+    Returns:
+        (B, N, 2, 2) px² of (x, y). Behind the camera, variances are infinite and covariances zero.
+    """
+    return _propagated(image_from_road_points, points, intrinsics, extrinsics, road_cov, extrinsics_cov)
+
+
+def _propagated(
+    project: Callable[[Tensor, Tensor, Extrinsics], tuple[Tensor, Tensor]],
+    points: Tensor,
+    intrinsics: Tensor,
+    extrinsics: Extrinsics,
+    points_cov: Tensor | None,
+    extrinsics_cov: Tensor | None,
+) -> Tensor:
+    """Covariance (B, N, 2, 2) of what ``project`` makes of points; infinite where that is not valid."""
+
+    def projected(point: Tensor, pose: Tensor, matrix: Tensor) -> Tensor:
         pose_1 = Extrinsics.unstack(pose.unsqueeze(0))
-        return road_from_image_points(pixel[None, None], matrix.unsqueeze(0), pose_1)[0][0, 0]
+        return project(point[None, None], matrix.unsqueeze(0), pose_1)[0][0, 0]
 
-    jacobians = torch.func.jacfwd(to_road, argnums=(0, 1))
+    jacobians = torch.func.jacfwd(projected, argnums=(0, 1))
     over_points = torch.func.vmap(jacobians, in_dims=(0, None, None))
-    by_pixel, by_pose = torch.func.vmap(over_points)(points, extrinsics.stack(), intrinsics)
+    by_point, by_pose = torch.func.vmap(over_points)(points, extrinsics.stack(), intrinsics)
     cov = points.new_zeros(*points.shape, 2)
-    if pixel_cov is not None:
-        cov = cov + by_pixel @ pixel_cov @ by_pixel.mT
+    if points_cov is not None:
+        cov = cov + by_point @ points_cov @ by_point.mT
     if extrinsics_cov is not None:
         cov = cov + by_pose @ extrinsics_cov.unsqueeze(1) @ by_pose.mT
-    _, valid = road_from_image_points(points, intrinsics, extrinsics)
+    _, valid = project(points, intrinsics, extrinsics)
     return torch.where(valid[..., None, None], cov, cov.new_full((2,), torch.inf).diag())
 
 

@@ -300,11 +300,11 @@ def camera_info(camera: Camera, name: str = "camera") -> dict[str, Any]:
         "image_width": width,
         "image_height": height,
         "camera_name": name,
-        "camera_matrix": {"rows": 3, "cols": 3, "data": matrix},
+        "camera_matrix": {"rows": 3, "cols": 3, "dt": "d", "data": matrix},
         "distortion_model": model,
-        "distortion_coefficients": {"rows": 1, "cols": len(coefficients), "data": coefficients},
-        "rectification_matrix": {"rows": 3, "cols": 3, "data": identity},
-        "projection_matrix": {"rows": 3, "cols": 4, "data": projection},
+        "distortion_coefficients": {"rows": 1, "cols": len(coefficients), "dt": "d", "data": coefficients},
+        "rectification_matrix": {"rows": 3, "cols": 3, "dt": "d", "data": identity},
+        "projection_matrix": {"rows": 3, "cols": 4, "dt": "d", "data": projection},
     }
 
 

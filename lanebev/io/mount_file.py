@@ -60,6 +60,6 @@ def write_calibration(path: str | Path, camera: Camera, mounted: MountCalibratio
         **{f"{name}_std_deg": math.degrees(value) for name, value in zip(angles, std[:3], strict=True)},
         "height_std_m": std[3],
     }
-    fields["vehicle_from_camera"] = {"rows": 4, "cols": 4, "data": matrix.flatten().tolist()}
+    fields["vehicle_from_camera"] = {"rows": 4, "cols": 4, "dt": "d", "data": matrix.flatten().tolist()}
     fields["quaternion_xyzw"] = [float(value) for value in quaternion]
     Path(path).write_text(dump_yaml(fields), encoding="utf-8")

@@ -167,6 +167,8 @@ def upsample_aligned(x: Tensor, size: torch.Size | tuple[int, int]) -> Tensor:
 def _fold(x: Tensor, size: torch.Size) -> Tensor:
     """Stride-2 cells (2i, 2i+1) as channels of stride-4 cell i: (B, C, ·, ·) to (B, 4C, *size)."""
     padded = F.pad(x, (0, 2 * size[1] - x.shape[-1], 0, 2 * size[0] - x.shape[-2]))
+    if x.shape[0] == 0:  # of which torch 2.13 makes no channels
+        return padded.reshape(0, 4 * x.shape[1], *size)
     return F.pixel_unshuffle(padded, 2)
 
 

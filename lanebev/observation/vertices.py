@@ -123,14 +123,14 @@ def _scan(probabilities: Tensor, config: LineConfig) -> Vertices:
 
 def _eroded(weight: Tensor) -> Tensor:
     """Least weight within _END scans, (..., h): nothing at the ends of a stripe and of the map."""
-    padded = F.pad(weight.flatten(0, -2), (_END, _END))
+    padded = F.pad(weight.flatten(0, -2), (_END, _END)).unsqueeze(1)  # (M, 1, h), where M may be 0
     least: Tensor = F.max_pool1d(-padded, 2 * _END + 1, 1).view_as(weight)
     return -least
 
 
 def _local_mean(values: Tensor, weight: Tensor) -> Tensor:
     """Weighted mean over _NEIGHBOURS scans on either side, (..., h); 0 where nothing has weight."""
-    both = torch.stack([values * weight, weight]).flatten(0, -2)
+    both = torch.stack([values * weight, weight]).flatten(0, -2).unsqueeze(1)
     pooled: Tensor = F.avg_pool1d(both, 2 * _NEIGHBOURS + 1, 1, _NEIGHBOURS)
     total, mass = pooled.view(2, *values.shape).unbind()
     return total / mass.clamp(min=1e-3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -30,11 +31,11 @@ class BEVGrid:
     resolution: float = 0.05
 
     def __post_init__(self) -> None:
-        if not self.resolution > 0:
-            raise ValueError(f"resolution: expected > 0 m, got {self.resolution}")
+        if not (self.resolution > 0 and math.isfinite(self.resolution)):
+            raise ValueError(f"resolution: expected > 0 m and finite, got {self.resolution}")
         for name, (low, high) in (("x", self.x), ("z", self.z)):
-            if not high - low >= self.resolution:
-                raise ValueError(f"{name}: expected (low, high) with high > low, got {(low, high)}")
+            if not (high - low >= self.resolution and math.isfinite(high - low)):
+                raise ValueError(f"{name}: expected finite (low, high) with high > low, got {(low, high)}")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -57,6 +58,11 @@ class BEVGrid:
     def bev_from_road_covariance(self, cov: Tensor) -> Tensor:
         """(..., 2, 2) m² of (X, Z) to (..., 2, 2) px² of (column, row)."""
         sign = cov.new_tensor([1.0, -1.0]) / self.resolution
+        return cov * sign[:, None] * sign
+
+    def road_from_bev_covariance(self, cov: Tensor) -> Tensor:
+        """(..., 2, 2) px² of (column, row) to (..., 2, 2) m² of (X, Z)."""
+        sign = cov.new_tensor([1.0, -1.0]) * self.resolution
         return cov * sign[:, None] * sign
 
     def cells(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
@@ -84,7 +90,13 @@ def bev_from_image(extrinsics: Extrinsics, intrinsics: Tensor, grid: BEVGrid) ->
 
     Returns:
         (B, 3, 3), pixels to pixels. Not normalised: its last row is the depth below the horizon.
+
+    Raises:
+        ValueError: intrinsics of another batch.
     """
+    expected = (*extrinsics.pitch.shape, 3, 3)
+    if intrinsics.shape != expected:
+        raise ValueError(f"intrinsics: expected {expected} like the pose, got {tuple(intrinsics.shape)}")
     rows = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)
     right, down, forward = rows.unbind(-2)
     plane_from_cam = torch.stack([right, forward, down / extrinsics.height.unsqueeze(-1)], dim=-2)
