@@ -11,6 +11,7 @@ from lanebev.geometry.camera import distort_points
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.render import render_views
+from lanebev.types import Extrinsics
 from lanebev.weights import save_segmenter
 from train import evaluate_poses
 from train.data import LiveFrames, PoolFrames
@@ -114,6 +115,9 @@ def test_pose_loss_counts_what_was_said(batch):
     torch.testing.assert_close(pose_loss(found, shifted, unit), unit.new_tensor(1.0))
     nothing = found._replace(valid=torch.zeros_like(found.valid))
     assert pose_loss(nothing, shifted, unit) == 0
+    torch.testing.assert_close(pose_loss(nothing, shifted, unit, with_prior=True), unit.new_tensor(1.0))
+    broken = Extrinsics(*(torch.full_like(part, torch.nan) for part in found.extrinsics))
+    assert pose_loss(found._replace(extrinsics=broken), truth, unit, with_prior=True) == 0
 
 
 def test_gradient_of_the_pose_lowers_its_error(batch):
@@ -184,14 +188,31 @@ def test_even_gradients_are_no_longer_than_so_many_medians(reach):
     torch.testing.assert_close(x.grad, torch.stack([long, slope[1], long, torch.zeros(2)]))
 
 
-@pytest.mark.parametrize("surprise", [False, True])
-def test_empty_maps_train_on_finite_gradients(batch, surprise):
+@pytest.mark.parametrize(("surprise", "error_weight"), [(False, 0.0), (True, 0.0), (True, 2.0)])
+def test_empty_maps_train_on_finite_gradients(batch, surprise, error_weight):
     torch.manual_seed(0)
     network = SegmenterConfig(base_width=4, decoder_width=4)
-    model = EndToEnd(network=network, augment=0.0, surprise=surprise)
+    model = EndToEnd(network=network, augment=0.0, surprise=surprise, error_weight=error_weight)
     model.log = model.log_dict = lambda *args, **kwargs: None
     model.training_step(batch, 0).backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
+
+
+def test_errors_count_beside_surprise(batch):
+    """Boundaries that are elsewhere: the loss is higher by the errors, as often as they are weighed."""
+    losses = []
+    for error_weight in (0.0, 1.0, 3.0):
+        torch.manual_seed(0)
+        network = SegmenterConfig(base_width=4, decoder_width=4)
+        model = EndToEnd(
+            network=network, augment=0.0, surprise=True, error_weight=error_weight, pose_weight=1.0
+        )
+        model.log = model.log_dict = lambda *args, **kwargs: None
+        losses.append(model.training_step(batch, 0).detach())
+    assert losses[1] > losses[0] + 0.1
+    torch.testing.assert_close(losses[2] - losses[0], 3 * (losses[1] - losses[0]), rtol=1e-3, atol=1e-4)
+    with pytest.raises(ValueError, match="error_weight: expected 0 without surprise"):
+        EndToEnd(error_weight=1.0)
 
 
 def test_evaluate_poses_reports_both(tmp_path, capsys, monkeypatch):

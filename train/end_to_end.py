@@ -25,6 +25,9 @@ class EndToEnd(Segmentation):
         surprise: the loss is how little the fit, with its sigmas, expected the truth; else the error alone.
         pose_unit: deg, deg, deg, m: errors of pitch, yaw, roll and height that count as one; for ``surprise``
             those that are as good as none.
+        error_weight: of the errors beside ``surprise``, of all frames and axes: surprise takes an error well
+            announced for nothing, and the root mean square does not.
+        error_unit: deg, deg, deg, m: what of them counts as one.
         gradient_reach: how many times longer a frame's gradient may be than that of most.
         where_only: the pose's loss moves lines, but does not change how much they count.
         kwargs: as of :class:`~train.module.Segmentation`.
@@ -37,10 +40,14 @@ class EndToEnd(Segmentation):
         where_only: bool = False,
         gradient_reach: float = 1.0,
         surprise: bool = False,
+        error_weight: float = 0.0,
+        error_unit: tuple[float, float, float, float] = (0.2, 0.4, 0.6, 0.03),
         **kwargs: Any,
     ) -> None:
         if not (math.isfinite(gradient_reach) and gradient_reach > 0):
             raise ValueError(f"gradient_reach: expected more than 0 and finite, got {gradient_reach}")
+        if error_weight and not surprise:
+            raise ValueError("error_weight: expected 0 without surprise, whose loss is the errors themselves")
         super().__init__(**kwargs)
         self.settings |= {
             "pose_weight": pose_weight,
@@ -48,11 +55,15 @@ class EndToEnd(Segmentation):
             "where_only": where_only,
             "gradient_reach": gradient_reach,
             "surprise": surprise,
+            "error_weight": error_weight,
+            "error_unit": list(error_unit),
         }
         self.extractor = LineExtractor.for_network(self.segmenter.config)
         self.unit: Tensor
-        unit = torch.tensor([*map(math.radians, pose_unit[:3]), pose_unit[3]], dtype=torch.float64)
-        self.register_buffer("unit", unit, persistent=False)
+        self.error_unit: Tensor
+        for name, unit in (("unit", pose_unit), ("error_unit", error_unit)):
+            inside = torch.tensor([*map(math.radians, unit[:3]), unit[3]], dtype=torch.float64)
+            self.register_buffer(name, inside, persistent=False)
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:  # type: ignore[override]
         """Augment, segment, compare maps and poses."""
@@ -62,6 +73,9 @@ class EndToEnd(Segmentation):
             truth = batch.extrinsics.double()
             if self.settings["surprise"]:
                 pose = pose_surprise(fit, truth, self.unit, self.segmenter.config.pose_factor)
+                if self.settings["error_weight"] > 0:
+                    errors = pose_loss(fit, truth, self.error_unit, with_prior=True)
+                    pose = pose + self.settings["error_weight"] * errors
             else:
                 pose = pose_loss(fit, truth, self.unit)
             self.log("loss/pose", pose, prog_bar=True)
