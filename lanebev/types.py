@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree
 
-Tuple = TypeVar("Tuple", bound=type)
+TupleClass = TypeVar("TupleClass", bound=type)
 
 NUM_BOUNDARIES = 6
 """Semantic lane boundaries by default: 0, 1, 2 left of the ego lane's middle, 3, 4, 5 right of it."""
 
 
-def saved_by_name(cls: Tuple) -> Tuple:
+def saved_by_name(cls: TupleClass) -> TupleClass:
     """Decorator of a NamedTuple of tensors that ``torch.export.save`` and ``torch.load`` shall know."""
     _pytree._register_namedtuple(cls, serialized_type_name=f"lanebev.{cls.__name__}")
     torch.serialization.add_safe_globals([cls])

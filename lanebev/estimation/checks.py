@@ -48,8 +48,7 @@ def calibrates(forward: Forward) -> Forward:
     ) -> tuple[Calibration, Any]:
         check_segments(segments, intrinsics)
         count = segments.weight.shape[1]
-        _check_kind(state, self.state_type)
-        like = check_state(state, intrinsics.shape[0])
+        like = check_state(state, self.state_type, intrinsics.shape[0])
         segments, intrinsics = cast_floating(segments, like.dtype), intrinsics.to(like.dtype)
         widths = as_lane_width(lane_width, like, self.config.num_boundaries)
         segments, intrinsics, widths = _unseen_where_unusable(segments, intrinsics, widths)
@@ -82,8 +81,8 @@ def check_segments(segments: LaneSegments, intrinsics: Tensor) -> None:
         raise ValueError(f"intrinsics: expected ({ends.shape[0]}, 3, 3), got {tuple(intrinsics.shape)}")
 
 
-def check_state(state: Any, rows: int) -> Tensor:
-    """Raise where a state is not that of so many rows.
+def check_state(state: Any, kind: type[Any], rows: int) -> Tensor:
+    """Raise where a state is not of the calibrator's kind and of so many rows.
 
     Returns:
         its first tensor, (B, D), whose dtype and device are those of the calibrator.
@@ -91,6 +90,10 @@ def check_state(state: Any, rows: int) -> Tensor:
     Raises:
         ValueError: naming the tensor, what was expected and what came.
     """
+    if not isinstance(state, kind):
+        raise ValueError(
+            f"state: expected {kind.__name__}, begun by initial_state(batch_size), got {type(state).__name__}"
+        )
     for name, part in zip(state._fields, state, strict=True):
         if part.shape[:1] != (rows,):
             raise ValueError(f"state.{name}: expected ({rows}, ...), got {tuple(part.shape)}")
@@ -98,13 +101,6 @@ def check_state(state: Any, rows: int) -> Tensor:
     if like.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"state.{state._fields[0]}: expected float32 or float64, got {like.dtype}")
     return like
-
-
-def _check_kind(state: object, kind: type) -> None:
-    if not isinstance(state, kind):
-        raise ValueError(
-            f"state: expected {kind.__name__}, begun by initial_state(batch_size), got {type(state).__name__}"
-        )
 
 
 def clean_segments(segments: LaneSegments, num_boundaries: int) -> LaneSegments:

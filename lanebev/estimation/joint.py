@@ -48,14 +48,7 @@ from lanebev.estimation.joint_motion import (
 from lanebev.estimation.joint_road import come_nearer, straight_or_bend
 from lanebev.estimation.single_frame import FramePrior, fit_single_frame
 from lanebev.rows import flag, where
-from lanebev.types import (
-    NUM_BOUNDARIES,
-    Calibration,
-    Extrinsics,
-    LaneSegments,
-    Status,
-    saved_by_name,
-)
+from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status, saved_by_name
 
 _NO_BOUNDARY = 0.36  # m out of place, three sigmas of what lanes differ, from which a line bounds no lane
 _DOUBTFUL = 0.6  # m out of place, below which a boundary let go alone may stand for several

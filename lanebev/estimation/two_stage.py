@@ -13,14 +13,7 @@ from lanebev.estimation.direction_stage import track_direction
 from lanebev.estimation.lane_width import boundary_angles
 from lanebev.estimation.roll_height_stage import track_roll_height
 from lanebev.geometry.road import rays_from_pixels
-from lanebev.types import (
-    NUM_BOUNDARIES,
-    Calibration,
-    Extrinsics,
-    LaneSegments,
-    Status,
-    saved_by_name,
-)
+from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status, saved_by_name
 
 
 @dataclass(frozen=True)
