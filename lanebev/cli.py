@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
+import signal
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn
 
@@ -54,20 +58,47 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
+class _Stopped(KeyboardInterrupt):
+    """By another signal than Ctrl-C's, its number the argument."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; 0 when it is done, 2 with one line on bad input, 130 when interrupted."""
+    """Run a command; 0 when it is done, 2 with one line on bad input, 128 + the signal that stopped it."""
     options = vars(parser().parse_args(arguments))
     command = options.pop("command")
     try:
-        report = _run(options) if command == "run" else _demo(options)
+        with _signals_unwind():
+            report = _run(options) if command == "run" else _demo(options)
     except (ValueError, OSError) as error:
         print(f"lanebev {command}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stopped:
         print(f"lanebev {command}: interrupted, nothing written", file=sys.stderr)
-        return 130
+        return 128 + int(stopped.args[0] if isinstance(stopped, _Stopped) else signal.SIGINT)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # of signs that a terminal's encoding lacks
     print(report)
     return 0
+
+
+@contextlib.contextmanager
+def _signals_unwind() -> Iterator[None]:
+    """What a job scheduler or a closed terminal sends leaves as Ctrl-C does: outputs are undone."""
+
+    def stop(number: int, _: object) -> NoReturn:
+        raise _Stopped(number)
+
+    known = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    own = [each for each in known if signal.getsignal(each) is signal.SIG_DFL]  # not what nohup ignores
+    if threading.current_thread() is not threading.main_thread():
+        own = []  # Python lets no other thread set them
+    for each in own:
+        signal.signal(each, stop)
+    try:
+        yield
+    finally:
+        for each in own:
+            signal.signal(each, signal.SIG_DFL)
 
 
 def _run(options: dict[str, Any]) -> str:

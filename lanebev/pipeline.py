@@ -47,7 +47,11 @@ class LaneBEV(nn.Module):
         warp: default :class:`BEVWarp` on the default grid.
         network_width: px, the image is resized to this width, its aspect kept to the next multiple of 32,
             before the segmenter; None leaves it as it is.
-        pose_factor: of the pose's sigmas, as measured for the segmenter (:class:`SegmenterConfig`).
+        pose_factor: of the pose's sigmas, as measured for the segmenter; None is what its ``config`` says
+            (:class:`SegmenterConfig`), 1 if it says nothing.
+
+    Raises:
+        ValueError: segmenter and calibrator that number other boundaries.
     """
 
     def __init__(
@@ -57,9 +61,17 @@ class LaneBEV(nn.Module):
         calibrator: nn.Module,
         warp: BEVWarp | None = None,
         network_width: int | None = None,
-        pose_factor: float = 1.0,
+        pose_factor: float | None = None,
     ) -> None:
         super().__init__()
+        seen, known = (_configured(part, "num_boundaries") for part in (segmenter, calibrator))
+        if seen != known and None not in (seen, known):
+            raise ValueError(
+                f"num_boundaries: expected the same of both, got {seen} of the segmenter and {known} of the "
+                f"calibrator; make the calibrator with num_boundaries={seen}"
+            )
+        if pose_factor is None:
+            pose_factor = _configured(segmenter, "pose_factor", 1.0)
         self.segmenter = segmenter
         self.extractor = extractor
         self.calibrator = calibrator
@@ -93,8 +105,7 @@ class LaneBEV(nn.Module):
         segmenter = load_segmenter(weights)
         width = network_width or int(segmenter.image_size[1])
         extractor = LineExtractor.for_network(segmenter.config)
-        factor = segmenter.config.pose_factor
-        return cls(segmenter, extractor, calibrator or JointCalibrator(), BEVWarp(grid), width, factor)
+        return cls(segmenter, extractor, calibrator or JointCalibrator(), BEVWarp(grid), width)
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
@@ -199,6 +210,11 @@ class LaneBEV(nn.Module):
             align_corners=False,
         )
         return resized.to(image.dtype)
+
+
+def _configured(part: nn.Module, name: str, default: Any = None) -> Any:
+    """A setting of a module's ``config``, if it has one."""
+    return getattr(getattr(part, "config", None), name, default)
 
 
 def _intervals(dt: float | Tensor, batch: int, steps: int, like: Tensor) -> Tensor:

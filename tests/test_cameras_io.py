@@ -90,6 +90,20 @@ def test_kitti_object_file_knows_the_recording_day(tmp_path):
     _assert_same(camera, expected)
 
 
+def test_resized_kitti_images_need_their_own_camera(tmp_path):
+    path = _write(tmp_path / "calib.txt", P2)
+    assert read_camera(path, image_size=(370, 1240)).image_size == (370, 1240)
+    with pytest.raises(ValueError, match=r"expected images of about 1242 x 375 px.* got 621 x 188;"):
+        read_camera(path, image_size=(188, 621))
+
+
+def test_what_ros2_topic_echo_prints(tmp_path):
+    matrix = "[500.0, 0.0, 320.0, 0.0, 500.0, 180.0, 0.0, 0.0, 1.0]"
+    text = f"width: 640\nheight: 360\ndistortion_model: plumb_bob\nd: []\nk: {matrix}\n"
+    camera = read_camera(_write(tmp_path / "info.yaml", f"{text}---\n"))
+    _assert_same(camera, Camera.from_parameters(500, 500, 320, 180, 640, 360))
+
+
 def test_kitti_raw_file_prefers_its_own_size(tmp_path):
     text = "calib_time: 09-Jan-2012\nS_rect_02: 1.242e+03 3.75e+02\nP_rect_02:" + P2[3:].replace(
         "721.5377", "700"

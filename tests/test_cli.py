@@ -1,11 +1,15 @@
 """The command line as a person uses it: outputs as promised, one clear line and status 2 on bad input."""
 
 import csv
+import io
 import json
 import math
+import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from fractions import Fraction
 
 import av
@@ -442,6 +446,34 @@ def test_an_interrupted_run_leaves_nothing(data, tmp_path, capsys, monkeypatch):
     assert _run(data, out=tmp_path / "out") == 130
     assert capsys.readouterr().err == "lanebev run: interrupted, nothing written\n"
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_run_stopped_by_the_system_leaves_nothing(data, tmp_path, capsys, monkeypatch, number):
+    def stop(*_):
+        os.kill(os.getpid(), number)
+        time.sleep(10)
+
+    before = signal.getsignal(number)
+    monkeypatch.setattr("lanebev.run.calibrate", stop)
+    assert _run(data, out=tmp_path / "out") == 128 + number
+    assert capsys.readouterr().err == "lanebev run: interrupted, nothing written\n"
+    assert list(tmp_path.iterdir()) == []
+    assert signal.getsignal(number) == before
+
+
+def test_names_and_terminals_without_the_signs(data, tmp_path, monkeypatch):
+    images = tmp_path / "images"
+    images.mkdir()
+    shutil.copy(data / "images" / "0.png", os.fsencode(images) + b"/0\xff.png")
+    lanes = tmp_path / "lanes.json"
+    lanes.write_text(_lane_lines([os.fsdecode(b"0\xff.png")])[0])
+    stdout = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr("sys.stdout", stdout)
+    assert _run(data, source=images, lanes=lanes, out=tmp_path / "out") == 0
+    stdout.flush()
+    assert b"1 TRACKING" in stdout.buffer.getvalue()
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"extrinsics.csv", "report.html"}
 
 
 def test_module_is_the_command():

@@ -60,13 +60,23 @@ def test_tusimple_lines(tmp_path):
     np.testing.assert_array_equal(frame.lines[1].points, [[7, 100], [np.nan, 110], [9, 120]])
 
 
+@pytest.mark.parametrize(("count", "first"), [(56, 160), (48, 240)])
+def test_predictions_for_tusimples_benchmark_leave_the_rows_out(tmp_path, count, first):
+    lines = [{"raw_file": "a", "lanes": [[5.0] * count], "run_time": 10}, {"raw_file": "b", "lanes": []}]
+    frames = read_tusimple(_write(tmp_path / "pred.json", "\n".join(map(json.dumps, lines))))
+    np.testing.assert_array_equal(frames[0].lines[0].points[:, 1], np.arange(first, 711, 10))
+    assert frames[1].lines == []
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "line 1"),
         ('{"raw_file": "a', "line 2: expected JSON, got a line that breaks off"),
         ("[1, 2]", "line 2: expected a JSON object, got list"),
-        (json.dumps({"raw_file": "b", "lanes": []}), "line 2: h_samples: expected a list, got none"),
+        (json.dumps({"raw_file": "b", "lanes": [[1, 2]]}), "line 2: h_samples: expected a list, got none"),
+        (json.dumps({**_tusimple("b"), "h_samples": 3}), "line 2: h_samples: expected a list, got int"),
+        (json.dumps({"raw_file": "b", "lanes": 5}), "line 2: lanes: expected a list, got int"),
         (json.dumps({**_tusimple("b"), "raw_file": 3}), "line 2: raw_file: expected a str, got int"),
         (
             json.dumps({**_tusimple("b"), "lanes": [[1, 2]]}),

@@ -275,6 +275,14 @@ def test_errors(call, match):
         call()
 
 
+def test_maps_of_another_stride_are_refused():
+    logits = torch.zeros(1, 7, 48, 80)
+    with pytest.raises(ValueError, match=r"maps: expected 24 x 40, .* stride of 4, got 48 x 80; see"):
+        LineExtractor(LineConfig(stride=4))(logits, (360, 640), (96, 160))
+    found = LineExtractor(LineConfig(stride=4))(logits[..., :24, :40], (360, 640), (93, 157))  # rounded up
+    assert found.weight.shape[0] == 1
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_logits_of_half_precision_and_autocast_give_float32_segments(fans, dtype):
     maps = fans[0][:2]

@@ -1,5 +1,7 @@
 """LaneBEV as a layer: shapes, batches over time, gradients from the view back to the image."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import nn
@@ -129,6 +131,14 @@ def test_the_pose_is_less_sure_by_the_networks_factor():
     widened, _ = model(pose_factor=2.0)(images(1), INTRINSICS[None], None)
     torch.testing.assert_close(widened.calibration.covariance, 4 * plain.calibration.covariance)
     assert torch.equal(widened.calibration.extrinsics.stack(), plain.calibration.extrinsics.stack())
+    assert small().pose_factor == 1.6  # as the segmenter says
+
+
+def test_parts_that_number_other_boundaries_are_refused():
+    net = LaneSegmenter(replace(SMALL, num_boundaries=4))
+    with pytest.raises(ValueError, match=r"num_boundaries: expected the same of both, got 4 .* and 6 of"):
+        LaneBEV(net, LineExtractor(), JointCalibrator())
+    LaneBEV(net, LineExtractor(), JointCalibrator(num_boundaries=4))
 
 
 def test_shapes_are_checked():
@@ -136,7 +146,7 @@ def test_shapes_are_checked():
         model()(torch.zeros(3, 72, 128), INTRINSICS[None], None)
 
 
-SMALL = SegmenterConfig(base_width=8, decoder_width=8)
+SMALL = SegmenterConfig(base_width=8, decoder_width=8, pose_factor=1.6)
 
 
 def small(calibrator=None):

@@ -118,6 +118,16 @@ def test_overlay_of_an_empty_frame_and_of_a_wide_lens():
         )
 
 
+@pytest.mark.parametrize("shape", [(40, 2000), (2000, 40)])
+def test_overlay_of_a_strip_is_no_wider_than_video_codecs_take(shape):
+    camera = Camera.from_parameters(1000, 1000, shape[1] / 2, shape[0] / 2, shape[1], shape[0])
+    view = Panel("after", np.zeros((*BEVGrid().shape, 3), np.uint8), POSE)
+    image = np.full((*shape, 3), 90, np.uint8)
+    picture = draw_frame(image, camera, _segments(), _calibration(_segments()), "f", (view,), BEVGrid())
+    assert picture.shape[0] == PANEL_HEIGHT
+    assert picture.shape[1] < 4096
+
+
 @pytest.mark.parametrize("stills", [False, True])
 def test_plots_are_png(stills):
     rows = _rows(30) if stills else _rows(5, "UNINITIALISED")

@@ -41,6 +41,13 @@ def test_csv_is_as_promised(tmp_path):
     assert len(CSV_COLUMNS) == 13
 
 
+def test_csv_keeps_a_file_name_that_is_no_text(tmp_path):
+    name = os.fsdecode(b"b\xffd.jpg")
+    write_extrinsics(tmp_path / "e.csv", [_row(0, name)])
+    assert b"b\xffd.jpg" in (tmp_path / "e.csv").read_bytes()
+    assert read_extrinsics(tmp_path / "e.csv")[0].image == name
+
+
 def test_csv_round_trip(tmp_path):
     write_extrinsics(tmp_path / "e.csv", [_row(0), _row(1, "a,b.jpg")])
     rows = read_extrinsics(tmp_path / "e.csv")

@@ -49,8 +49,12 @@ def test_truncated_file_is_reported_and_ignored(tmp_path, states, length):
     assert "\n" not in loaded.problem
 
 
-def test_missing_foreign_and_non_finite_files(tmp_path, states):
+def test_missing_foreign_and_non_finite_files(tmp_path, states, monkeypatch):
     assert "no such file" in load_state(tmp_path / "none", like=states).problem
+    save_state(tmp_path / "shut", states)
+    with monkeypatch.context() as patched:
+        patched.setattr("os.access", lambda *_: False)
+        assert "no permission to read it" in load_state(tmp_path / "shut", like=states).problem
     save_file({"weights": torch.ones(3)}, tmp_path / "foreign")
     assert "not written by lanebev" in load_state(tmp_path / "foreign", like=states).problem
     (tmp_path / "text").write_text("pitch: 1\n")

@@ -1,12 +1,15 @@
 """Frames from videos, folders, globs and single images; H.264 out; work side by side."""
 
+import struct
 import threading
 import time
 from fractions import Fraction
 
 import av
+import cv2
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from lanebev.io.overlap import Background, prefetch
@@ -308,3 +311,36 @@ def test_background_runs_in_order_and_raises():
 
     with pytest.raises(OSError, match="disk full"):
         run()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_images_are_upright_as_opencv_reads_them(tmp_path, orientation):
+    image = Image.fromarray(_picture(200))
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = tmp_path / "a.png"
+    image.save(path, exif=exif)
+    np.testing.assert_array_equal(read_image(path), cv2.imread(str(path), cv2.IMREAD_COLOR_RGB))
+    assert open_source(str(path)).image_size == ((64, 48) if orientation > 4 else (48, 64))
+
+
+@pytest.mark.parametrize("matrix", [(0, 1, -1, 0), (-1, 0, 0, -1), (0, -1, 1, 0)])
+def test_videos_are_upright_as_opencv_reads_them(tmp_path, matrix):
+    path = _video(tmp_path / "v.mp4", count=2)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"tkhd") + 44  # of the track's display matrix, 16.16 but its last column
+    a, b, c, d = (value << 16 for value in matrix)
+    data[at : at + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(data)
+    source = open_source(str(path))
+    _, expected = cv2.VideoCapture(str(path)).read()
+    frames = list(source)
+    assert source.image_size == frames[0].image.shape[:2] == expected.shape[:2]
+    np.testing.assert_allclose(frames[0].image, expected[..., ::-1], atol=12)
+    torch.from_numpy(frames[0].image)  # of no negative strides
+
+
+def test_a_colon_in_a_videos_name_is_no_protocol(tmp_path, monkeypatch):
+    _video(tmp_path / "2024-01-01T10:00:00.mp4")
+    monkeypatch.chdir(tmp_path)
+    assert open_source("2024-01-01T10:00:00.mp4").count == 5

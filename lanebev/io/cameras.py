@@ -49,6 +49,7 @@ _KITTI_SIZES = {  # focal length of the rectified cameras of each recording day 
     707.0912: (370, 1226),
     718.856: (376, 1241),
 }
+_KITTI_SPREAD = 8  # px, more than rectified images of one camera differ by
 _FOCAL_RANGE = (0.1, 20.0)  # times the longer image side: 160 deg fisheye to 3 deg telephoto
 
 
@@ -105,7 +106,8 @@ def _parse_yaml(text: str) -> dict[str, Any]:
     if lines and lines[0].startswith("%YAML"):  # OpenCV writes %YAML:1.0, which YAML does not allow
         lines[0] = ""
     try:
-        fields = yaml.load("\n".join(lines), Loader=_StrictLoader)
+        documents = yaml.load_all("\n".join(lines), Loader=_StrictLoader)
+        fields = next((each for each in documents if each is not None), None)  # ros2 topic echo ends with ---
     except (yaml.YAMLError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f" at line {mark.line + 1}" if mark else ""
@@ -136,11 +138,16 @@ def _parse_kitti(
     if name is None:
         raise ValueError("expected a KITTI projection matrix (P_rect_02 or P2), got none of them")
     projection = _numbers(name, entries[name].split(), 12)
-    size = image_size
+    known = next((s for f, s in _KITTI_SIZES.items() if abs(f - projection[0]) < 1e-3), None)
+    size = image_size or known
     if (size_name := name.replace("P", "S", 1)) in entries:
         width, height = _numbers(size_name, entries[size_name].split(), 2)
         size = (round(height), round(width))
-    size = size or next((s for f, s in _KITTI_SIZES.items() if abs(f - projection[0]) < 1e-3), None)
+    elif size and known and max(abs(size[0] - known[0]), abs(size[1] - known[1])) > _KITTI_SPREAD:
+        raise ValueError(
+            f"expected images of about {known[1]} x {known[0]} px, KITTI's of this focal length, got "
+            f"{size[1]} x {size[0]}; give them as they came, or the short YAML for the resized"
+        )
     if size is None:
         raise ValueError(
             "expected the image size, got none, and the focal length is none of KITTI's; "

@@ -22,6 +22,7 @@ from lanebev.io.video import IMAGE_SUFFIXES, natural_order
 from lanebev.types import NUM_BOUNDARIES
 
 _OPENLANE_CURBS = (20, 21)  # left and right kerb: no lane ends there, so no lane width holds
+_TUSIMPLE_ROWS = {56: range(160, 720, 10), 48: range(240, 720, 10)}  # of the benchmark's labels, by number
 
 
 class LaneLine(NamedTuple):
@@ -82,7 +83,10 @@ def lane_files(path: str | Path) -> list[Path]:
 
 
 def read_tusimple(path: str | Path) -> list[FrameLines]:
-    """Read TuSimple JSON lines: ``lanes``, ``h_samples``, ``raw_file``, and what ours say besides."""
+    """Read TuSimple JSON lines: ``lanes``, ``h_samples``, ``raw_file``, and what ours say besides.
+
+    Predictions for TuSimple's benchmark leave ``h_samples`` out; theirs are the rows of its labels.
+    """
     frames = []
     for number, text in enumerate(_text(Path(path)).splitlines(), start=1):
         if text.strip():
@@ -236,7 +240,10 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
     name = _field(fields, "raw_file", str)
     if not name:
         raise ValueError("raw_file: expected the image's path, got an empty string")
-    rows = _floats("h_samples", _field(fields, "h_samples", list))
+    if "h_samples" in fields:
+        rows = _floats("h_samples", _field(fields, "h_samples", list))
+    else:
+        rows = _benchmark_rows(_field(fields, "lanes", list))
     if any(b <= a for a, b in pairwise(rows)):
         raise ValueError("h_samples: expected rising rows, got others")
     pose_factor = fields.get("pose_factor", 1.0)
@@ -266,6 +273,17 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
         if np.isfinite(x).any():
             lines.append(LaneLine(np.stack([x, np.array(rows)], axis=-1), index, sigma))
     return FrameLines(name, lines, float(pose_factor))
+
+
+def _benchmark_rows(lanes: list[Any]) -> list[float]:
+    """Of a prediction as TuSimple's benchmark takes it, without ``h_samples``: their number says which."""
+    count = len(lanes[0]) if lanes and isinstance(lanes[0], list) else 0
+    if lanes and count not in _TUSIMPLE_ROWS:
+        known = " or ".join(map(str, _TUSIMPLE_ROWS))
+        raise ValueError(
+            f"h_samples: expected a list, got none, and not lanes of TuSimple's {known} rows; add them, in px"
+        )
+    return [float(row) for row in _TUSIMPLE_ROWS.get(count, ())]
 
 
 def _on_h_samples(name: str, values: Any, count: int) -> NDArray[np.float64]:

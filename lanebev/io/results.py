@@ -82,7 +82,7 @@ def extrinsics_row(
 
 def write_extrinsics(path: str | Path, rows: list[ExtrinsicsRow]) -> None:
     """Write ``extrinsics.csv``: a header and one row per frame."""
-    with open(path, "w", newline="", encoding="utf-8") as file:
+    with open(path, "w", newline="", encoding="utf-8", errors="surrogateescape") as file:  # names of files
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(CSV_COLUMNS)
         for row in rows:
@@ -96,7 +96,7 @@ def read_extrinsics(path: str | Path) -> list[ExtrinsicsRow]:
         ValueError: the file is missing, or its header or a row is not ours.
     """
     try:
-        with open(path, newline="", encoding="utf-8") as file:
+        with open(path, newline="", encoding="utf-8", errors="surrogateescape") as file:
             header, *rows = list(csv.reader(file)) or [[]]
     except OSError as error:
         raise ValueError(f"{path}: expected a readable extrinsics.csv, got: {error.strerror}") from error

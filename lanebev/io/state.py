@@ -97,6 +97,8 @@ def load_state(
         states, metadata and the problem, if there was one (a missing file is one too).
     """
     like = like or {}
+    if Path(path).exists() and not os.access(path, os.R_OK):  # safetensors says that there is none
+        return _refused(path, "no permission to read it")
     try:
         with safe_open(str(path), framework="pt") as file:
             header = file.metadata() or {}

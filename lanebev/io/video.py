@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import bisect
 import glob
+import os
 import re
+import struct
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +18,7 @@ from typing import NamedTuple
 import av
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm")
 DEFAULT_FPS = Fraction(30)
@@ -138,7 +140,9 @@ def open_source(source: str, fps: Fraction = DEFAULT_FPS) -> FrameSource:
 
 
 def read_image(path: str | Path) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB. A file that is cut is an error, not an image with a grey half.
+    """(H, W, 3) uint8 RGB, upright by its EXIF orientation, as viewers and OpenCV show it.
+
+    A file that is cut is an error, not an image with a grey half.
 
     Raises:
         ValueError: the file is missing, cut or no image.
@@ -146,7 +150,7 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
     try:
         with warnings.catch_warnings(), Image.open(path) as image:
             warnings.simplefilter("ignore")  # of odd EXIF; errors are errors
-            return np.asarray(_eight_bit(image).convert("RGB"))
+            return np.asarray(_eight_bit(_upright(image)).convert("RGB"))
     except (OSError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         if isinstance(error, UnidentifiedImageError):
             reason = "no image or one whose header is cut"
@@ -177,7 +181,7 @@ class VideoWriter:
     """
 
     def __init__(self, path: str | Path, fps: Fraction, crf: int = 21) -> None:
-        self._container = av.open(str(path), "w", options={"movflags": "faststart"})
+        self._container = av.open(os.path.abspath(path), "w", options={"movflags": "faststart"})
         self._stream = self._container.add_stream("libx264", rate=fps.limit_denominator(65535))
         self._stream.pix_fmt = "yuv420p"
         self._stream.options = {"crf": str(crf), "preset": "veryfast"}
@@ -208,6 +212,14 @@ def _is_image(path: str | Path) -> bool:
     return Path(path).suffix.lower() in IMAGE_SUFFIXES and Path(path).is_file()
 
 
+def _upright(image: Image.Image) -> Image.Image:
+    try:
+        turned = image.getexif().get(ExifTags.Base.Orientation, 1) != 1
+    except (SyntaxError, struct.error, ValueError, KeyError, TypeError):  # of odd EXIF
+        turned = False
+    return ImageOps.exif_transpose(image) if turned else image
+
+
 def _eight_bit(image: Image.Image) -> Image.Image:
     """16-bit grey at its own scale; ``convert`` would cut it off at 255."""
     if not image.mode.startswith("I"):
@@ -234,7 +246,7 @@ def _video_source(source: str) -> FrameSource:
             frame = next(frames)
         except (av.error.FFmpegError, StopIteration) as error:
             raise ValueError(f"video {source}: expected at least one whole frame, got none") from error
-        size = (frame.height, frame.width)
+        size = _rgb(frame).shape[:2]
     with _open_video(source) as container:  # the header's count includes frames that an edit list cuts
         stream = container.streams.video[0]
         begin, tick = stream.start_time or 0, stream.time_base or 1 / fps
@@ -292,15 +304,16 @@ def _decoded(
 
 
 def _rgb(decoded: av.VideoFrame | str) -> NDArray[np.uint8]:
+    """Upright, by the container's display matrix, as players and OpenCV show it."""
     if isinstance(decoded, str):
         raise ValueError(f"expected a whole frame, got: {decoded}")
     image: NDArray[np.uint8] = decoded.to_ndarray(format="rgb24")
-    return image
+    return np.ascontiguousarray(np.rot90(image, round(decoded.rotation / 90)))
 
 
 def _open_video(source: str) -> av.container.InputContainer:
     try:
-        container = av.open(source)
+        container = av.open(os.path.abspath(source))  # else what precedes a colon is taken for a protocol
     except (av.error.FFmpegError, OSError) as error:
         reason = error.strerror or "unknown format"
         raise ValueError(f"video {source}: expected a video that opens, got: {reason}; is it cut?") from error

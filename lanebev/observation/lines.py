@@ -49,7 +49,7 @@ class LineExtractor(nn.Module):
             Segments with N = L·S, in pixels of the image as it came (undistorted if that was).
 
         Raises:
-            ValueError: another shape.
+            ValueError: another shape, or a map that is not of the network's input by the stride.
         """
         if logits.ndim != 4 or logits.shape[1] < 2:
             raise ValueError(f"logits: expected (B, 1+L, h, w), got {tuple(logits.shape)}")
@@ -69,6 +69,12 @@ def extract_segments(
     batch, boundaries, rows, columns = probabilities.shape
     if network_size is None:
         network_size = (rows * config.stride, columns * config.stride)
+    expected = tuple(-(-side // config.stride) for side in network_size)
+    if (rows, columns) != expected:
+        raise ValueError(
+            f"maps: expected {expected[0]} x {expected[1]}, the network's input by the extractor's stride of "
+            f"{config.stride}, got {rows} x {columns}; see LineExtractor.for_network"
+        )
     vertices = representative_vertices(scan_vertices(probabilities, config), config)
     scale = probabilities.new_tensor([image_size[1] / network_size[1], image_size[0] / network_size[0]])
     points = (config.stride * vertices.points + 0.5) * scale - 0.5  # network pixel s·j under cell j

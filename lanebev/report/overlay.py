@@ -30,6 +30,7 @@ BOUNDARY_COLOURS = (
 """RGB of boundaries 0..5, told apart also without red and green, on asphalt and on paper."""
 
 PANEL_HEIGHT = 720
+_WIDEST = 4  # times its height, of a picture that fills it
 _HORIZON, _INK, _QUIET, _BACKGROUND = (255, 255, 255), (235, 238, 242), (150, 158, 168), (18, 20, 24)
 _STATUS_COLOURS = {
     Status.TRACKING: (0, 214, 160), Status.COASTING: (255, 190, 0), Status.LOST: (255, 92, 80),
@@ -69,12 +70,14 @@ def draw_frame(
     Returns:
         (720, W', 3).
     """
-    scale = PANEL_HEIGHT / image.shape[0]
-    size = (round(image.shape[1] * scale), PANEL_HEIGHT)
+    scale = PANEL_HEIGHT / max(image.shape[0], image.shape[1] / _WIDEST)
+    size = (round(image.shape[1] * scale), max(1, round(image.shape[0] * scale)))
     shown = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
     _draw_horizon(shown, camera, calibration.extrinsics, scale)
     _draw_boundaries(shown, camera, segments, calibration.inliers, scale)
     _draw_vanishing_point(shown, camera, calibration.extrinsics, scale)
+    below = PANEL_HEIGHT - size[1]
+    shown = cv2.copyMakeBorder(shown, 0, below, 0, 0, cv2.BORDER_CONSTANT, value=_BACKGROUND)
     status = Status(int(calibration.status[0]))
     shown = _banner(shown, headline, status.name, _STATUS_COLOURS.get(status, _QUIET), _numbers(calibration))
     panels = [shown, *(_bev_panel(view, grid, camera, segments) for view in views)]

@@ -100,7 +100,7 @@ def write_report(path: str | Path, report: Report) -> None:
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{_STYLE}</style></head>'
         f"<body>{''.join(parts)}</body></html>"
     )
-    Path(path).write_text(page, encoding="utf-8")
+    Path(path).write_text(page, encoding="utf-8", errors="replace")
 
 
 def summary_facts(report: Report) -> dict[str, str]:
