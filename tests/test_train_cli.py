@@ -2,8 +2,10 @@ import csv
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.weights import load_segmenter, read_metadata, save_segmenter
@@ -90,6 +92,11 @@ def test_fit_resume_test_predict_export(tmp_path):
     run("test", "fast.yaml", tmp_path, f"--ckpt_path={newest}")
     assert any("test/iou_2" in path.read_text() for path in tmp_path.rglob("metrics.csv"))
     run("predict", "fast.yaml", tmp_path, f"--ckpt_path={newest}")
+    predictions = sorted(tmp_path.rglob("predictions/*.png"))
+    assert [path.name for path in predictions] == ["000000.png", "000001.png"]
+    with Image.open(predictions[0]) as image:
+        assert (image.mode, image.size) == ("P", (48, 32))
+        assert int(np.asarray(image).max()) < 7
     exported = export(
         newest, tmp_path / "w.safetensors", {"noise_factor": 2.5}, seed=1, commit="0" * 7, metrics={}
     )
@@ -138,6 +145,38 @@ def test_last_of_nothing_is_an_error(tmp_path, capsys):
         run("fit", "fast.yaml", tmp_path, "--ckpt_path=last")
     assert stop.value.code == 2
     assert "expected a last.ckpt" in capsys.readouterr().err
+
+
+def refused(capsys, *arguments):
+    """The last line that a run which ends with status 2 says."""
+    with pytest.raises(SystemExit) as stop:
+        run(*arguments)
+    assert stop.value.code == 2
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+def test_checkpoints_of_another_kind_are_one_line(tmp_path, capsys):
+    notes = tmp_path / "notes.md"
+    notes.write_text("no checkpoint")
+    assert "expected a checkpoint" in refused(capsys, "test", "fast.yaml", tmp_path, f"--ckpt_path={notes}")
+    run("fit", "fast.yaml", tmp_path, "--trainer.max_steps=1")
+    path, wider = next(tmp_path.rglob("last.ckpt")), "--model.init_args.network.base_width=16"
+    said = refused(capsys, "test", "fast.yaml", tmp_path, f"--ckpt_path={path}", wider)
+    assert said == "error: ckpt_path: expected a network of base_width 16, got 4"
+    said = refused(capsys, "fit", "fast.yaml", tmp_path, f"--model.init_args.init_from={path}", wider)
+    assert "weights do not fit the network" in said
+    with pytest.raises(ValueError, match="expected a file that can be written"):
+        export(path, tmp_path / "none" / "w.safetensors", {})
+    with pytest.raises(ValueError, match=r"image_size: expected \(height, width\) above 0, got \(0, -5\)"):
+        export(path, tmp_path / "w.safetensors", {"image_size": (0, -5)})
+
+
+@pytest.mark.parametrize("option", ["batch_size=0", "sizes=[[0,0]]", "val_size=[64,0]"])
+def test_numbers_that_make_no_batch_are_refused(option, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        run("fit", "fast.yaml", tmp_path, f"--data.init_args.{option}")
+    assert stop.value.code == 2
+    assert option.split("=")[0] in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("content", [None, b"no checkpoint", b""])

@@ -1,19 +1,50 @@
-"""``python -m train fit --config configs/default.yaml``; also ``validate``, ``test`` and ``predict``."""
+"""``python -m train fit --config configs/default.yaml``; also ``validate``, ``test`` and ``predict``.
+
+``predict`` writes each frame's classes as a PNG, 0 where there is no boundary, into the run's folder.
+"""
 
 from __future__ import annotations
 
+import pickle
 import sys
 from pathlib import Path
 
+import lightning as L
 import torch
 from lightning.pytorch.accelerators import CPUAccelerator
+from lightning.pytorch.callbacks import BasePredictionWriter
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.utilities import rank_zero_warn
+from PIL import Image
+from torch import Tensor
 
 import train.datasets
 import train.end_to_end
 import train.module
 import train.poses  # noqa: F401  for the class paths of the configs
+from lanebev.report.overlay import BOUNDARY_COLOURS
+from train.export import checkpoint_weights
+
+
+class ClassWriter(BasePredictionWriter):
+    """Each frame's classes as an indexed PNG, numbered as the data come, by process if there are several."""
+
+    def __init__(self) -> None:
+        super().__init__(write_interval="batch")
+        self.count = 0
+
+    def write_on_batch_end(
+        self, trainer: L.Trainer, module: L.LightningModule, prediction: Tensor, *_: object
+    ) -> None:
+        """Write (B, 1+L, h, w) probabilities."""
+        folder = Path(trainer.log_dir or trainer.default_root_dir) / "predictions"
+        folder.mkdir(parents=True, exist_ok=True)
+        process = f"{trainer.global_rank}-" if trainer.world_size > 1 else ""
+        for classes in prediction.argmax(1).byte().cpu().numpy():
+            image = Image.fromarray(classes, "P")
+            image.putpalette(sum(BOUNDARY_COLOURS, (0, 0, 0)))
+            image.save(folder / f"{process}{self.count:06d}.png")
+            self.count += 1
 
 
 class CommandLine(LightningCLI):
@@ -22,6 +53,10 @@ class CommandLine(LightningCLI):
     def before_instantiate_classes(self) -> None:
         """``--ckpt_path last`` is the newest in the run's folder; Lightning looks in a version just begun."""
         config = self.config[str(self.subcommand)]
+        if self.subcommand == "predict":
+            config.return_predictions = False  # they are written
+        if config.get("ckpt_path") not in (None, "last", "best", "hpc"):
+            checkpoint_weights(Path(config.ckpt_path))  # says what is wrong with it
         logger = config.trainer.logger
         if config.get("ckpt_path") != "last" or not hasattr(logger, "init_args"):  # without one, Lightning's
             return
@@ -49,12 +84,20 @@ def main(args: list[str] | None = None) -> None:
     """Command line."""
     torch.set_float32_matmul_precision("high")
     try:
-        CommandLine(seed_everything_default=0, args=args, save_config_kwargs={"overwrite": True})
+        CommandLine(
+            seed_everything_default=0,
+            args=args,
+            save_config_kwargs={"overwrite": True},
+            trainer_defaults={"callbacks": [ClassWriter()]},
+        )
     except (ValueError, OSError) as error:
         cause: BaseException = error
         while "\n" in str(cause) and cause.__cause__ is not None:  # the parser wraps what constructors raise
             cause = cause.__cause__
         print(f"error: {cause}", file=sys.stderr)
+        sys.exit(2)
+    except (pickle.UnpicklingError, EOFError):  # of Lightning's own look at ckpt_path
+        print("error: ckpt_path: expected a checkpoint, got a file of another kind", file=sys.stderr)
         sys.exit(2)
 
 

@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 import lightning as L
 import numpy as np
 import torch
+from jsonargparse.typing import PositiveInt
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
@@ -203,11 +204,11 @@ class RenderedRoads(L.LightningDataModule):
         self,
         pool: str | None = None,
         val_pool: str | None = None,
-        batch_size: int = 16,
-        sizes: list[tuple[int, int]] | None = None,
-        val_size: tuple[int, int] = (192, 320),
-        val_batches: int = 8,
-        render_size: tuple[int, int] = (360, 640),
+        batch_size: PositiveInt = 16,
+        sizes: list[tuple[PositiveInt, PositiveInt]] | None = None,
+        val_size: tuple[PositiveInt, PositiveInt] = (192, 320),
+        val_batches: PositiveInt = 8,
+        render_size: tuple[PositiveInt, PositiveInt] = (360, 640),
         view: ViewConfig | None = None,
         seed: int = 0,
         workers: int = 1,

@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import cv2
 import lightning as L
 import numpy as np
+from jsonargparse.typing import PositiveInt
 from torch.utils.data import DataLoader, IterableDataset
 
 from lanebev.io.lane_order import boundary_indices
@@ -168,9 +169,9 @@ class LaneFiles(L.LightningDataModule):
         root: str,
         train: list[str] | None = None,
         val: list[str] | None = None,
-        batch_size: int = 8,
-        sizes: list[tuple[int, int]] | None = None,
-        val_size: tuple[int, int] = (192, 320),
+        batch_size: PositiveInt = 8,
+        sizes: list[tuple[PositiveInt, PositiveInt]] | None = None,
+        val_size: tuple[PositiveInt, PositiveInt] = (192, 320),
         view: ViewConfig | None = None,
         seed: int = 0,
         workers: int = 1,

@@ -57,7 +57,11 @@ def load_weights(segmenter: LaneSegmenter, path: Path, class_weight: Tensor) -> 
     weights = load_segmenter(path).state_dict() if exported else checkpoint_weights(path)
     if weights["trunk.conv1.weight"].shape[0] * 2 == segmenter.config.base_width:
         weights = widen(weights, segmenter.state_dict())
-    segmenter.load_state_dict(weights, strict=True)
+    try:
+        segmenter.load_state_dict(weights, strict=True)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"init_from: {path}: weights do not fit the network: {reason}") from error
     if exported:
         add_to_bias(segmenter, -unweighted_bias(class_weight))
 

@@ -48,6 +48,8 @@ class SegmenterConfig:
             raise ValueError(f"num_boundaries: expected at least 1, got {self.num_boundaries}")
         if self.output_stride not in (1, 2, 4):
             raise ValueError(f"output_stride: expected 1, 2 or 4, got {self.output_stride}")
+        if len(self.image_size) != 2 or min(self.image_size) < 1:
+            raise ValueError(f"image_size: expected (height, width) above 0, got {self.image_size}")
         if not self.noise_factor > 0:
             raise ValueError(f"noise_factor: expected more than 0, got {self.noise_factor}")
         if not self.pose_factor > 0:

@@ -56,6 +56,9 @@ def save_segmenter(segmenter: LaneSegmenter, path: str | Path, half: bool = True
         path: of the file.
         half: store weights of convolutions as float16; norms and biases stay float32.
         record: JSON-able facts for the metadata: training, seed, commit, metrics.
+
+    Raises:
+        ValueError: the file cannot be written.
     """
     tensors = {
         name: (value.half() if half and value.ndim > 1 else value).contiguous()
@@ -63,7 +66,10 @@ def save_segmenter(segmenter: LaneSegmenter, path: str | Path, half: bool = True
     }
     facts = {"config": asdict(segmenter.config), **record}
     metadata = {"format": _FORMAT, **{name: json.dumps(value) for name, value in facts.items()}}
-    save_file(tensors, str(path), metadata)
+    try:
+        save_file(tensors, str(path), metadata)
+    except SafetensorError as error:
+        raise ValueError(f"{path}: expected a file that can be written: {error}") from error
 
 
 def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
