@@ -20,6 +20,7 @@ def flag(condition: Tensor, reason: IntFlag) -> Tensor:
 
 def masked_median(values: Tensor, mask: Tensor) -> Tensor:
     """Lower median over the last dimension of the finite entries in the mask; 0 where there are none."""
+    mask = mask & values.isfinite()
     ordered = values.masked_fill(~mask, torch.inf).sort(dim=-1).values
     middle = ((mask.sum(-1, keepdim=True) - 1) // 2).clamp(min=0)
     median = ordered.gather(-1, middle).squeeze(-1)

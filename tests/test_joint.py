@@ -11,8 +11,12 @@ import torch
 from lanebev.estimation.joint import JointCalibrator, JointConfig, Reason
 from lanebev.estimation.joint_filter import iterate
 from lanebev.estimation.joint_model import (
+    CURVATURE,
+    HEIGHT,
     KNOT_SPACING,
     NUM_STEPS,
+    OFFSET,
+    ROLL,
     boundary_places,
     boundary_residuals,
     observe,
@@ -30,12 +34,15 @@ from lanebev.estimation.joint_motion import (
     spring,
 )
 from lanebev.estimation.joint_road import come_nearer, straight_or_bend, turn_along
+from lanebev.estimation.single_frame import FramePrior
 from lanebev.types import LaneSegments, Status
 from tools.scenarios import CAMERA, FPS, PLACES, WIDTH, moments
 from tools.scenarios import observe as see
 
 torch.set_num_threads(1)
 DOUBLE = torch.float64
+OBLIQUE = CAMERA * torch.tensor([[1.1], [0.9], [1.0]]).double()  # pixels that are neither square nor upright
+OBLIQUE[0, 1] = 30.0
 
 
 def drive(frames: int, rows: int = 2, per_boundary: int = 8, sigma: float = 1.0, seed: int = 0):
@@ -234,7 +241,9 @@ def test_order_of_segments_and_of_end_points_does_not_matter():
 def test_spline_jacobian_equals_jacfwd():
     generator = torch.Generator().manual_seed(0)
     moment, segments = drive(1, sigma=0.3)[0]
-    seen = observe(segments, cameras(2), 6)
+    other = OBLIQUE @ CAMERA.inverse()
+    ends = segments.endpoints @ other[:2, :2].mT + other[:2, 2]
+    seen = observe(segments._replace(endpoints=ends), OBLIQUE.expand(2, 3, 3), 6)
     places = boundary_places(WIDTH, 6, seen.sigma).gather(1, seen.boundary)
     params = torch.zeros(2, NUM_SEEN, dtype=DOUBLE)
     params[:, :5] = torch.tensor([*moment.pose, moment.offset], dtype=DOUBLE)
@@ -528,3 +537,103 @@ def test_bad_input_is_named():
         calibrator(segments, cameras(2), state, 0.1, -1.0)
     with pytest.raises(ValueError, match="dt: expected a float"):
         calibrator(segments, cameras(2), state, torch.ones(3), WIDTH)
+    with pytest.raises(ValueError, match=r"straight: expected sigmas between 0 and those of the prior"):
+        JointCalibrator(prior=FramePrior(curvature_std=1e-4))
+    with pytest.raises(ValueError, match="state: expected one of 6 boundaries, got one of 4"):
+        calibrator(segments, cameras(2), JointCalibrator(num_boundaries=4).initial_state(2), 0.1)
+
+
+@pytest.mark.parametrize(("kept", "sigma"), [((2, 3), 0.05), ((2, 3), 0.3), ((2,), 0.3), ((2,), 1.0)])
+def test_float32_bears_one_sharp_lane_beside_a_row_that_sees_all(kept, sigma):
+    """The information about what one lane determines is a million times that about the rest."""
+    calibrator = JointCalibrator()
+    low, high = calibrator.initial_state(2), calibrator.initial_state(2, dtype=DOUBLE)
+    frames = drive(40, per_boundary=30, sigma=sigma)
+    for number, (_, segments) in enumerate(frames):
+        if number > 15:
+            few = torch.isin(segments.boundary[0], torch.tensor(kept)) * segments.weight[0]
+            segments = segments._replace(weight=torch.stack([few, segments.weight[1]]))
+        single = LaneSegments(*(part.float() if part.is_floating_point() else part for part in segments))
+        one, low = calibrator(single, cameras(2).float(), low, 1 / FPS, WIDTH)
+        two, high = calibrator(segments, cameras(2), high, 1 / FPS, WIDTH)
+    std = two.covariance.diagonal(dim1=1, dim2=2).sqrt()
+    error = one.extrinsics.stack().double() - torch.tensor(frames[-1][0].pose, dtype=DOUBLE)
+    assert (error.abs() < 5 * std).all()
+    assert ((one.extrinsics.stack() - two.extrinsics.stack()).abs() < 0.05 * std).all()
+    torch.testing.assert_close(one.covariance.double(), two.covariance, rtol=0.02, atol=1e-9)
+
+
+def test_gradient_by_the_time_is_finite_where_none_passed():
+    frames = drive(2)
+    calibrator = JointCalibrator()
+    _, state = run(calibrator, frames[:1])
+    dt = torch.tensor([0.0, 1 / FPS], dtype=DOUBLE, requires_grad=True)
+    out, _ = calibrator(frames[1][1], cameras(2), state, dt, WIDTH)
+    (slope,) = torch.autograd.grad(out.covariance.sum() + out.extrinsics.stack().sum(), dt)
+    assert slope.isfinite().all()
+    assert slope[0] == 0
+    assert slope[1] != 0
+
+
+def test_nothing_in_sight_is_no_misfit():
+    frames = drive(3)
+    calibrator = JointCalibrator()
+    _, state = run(calibrator, frames)
+    _, state = run(calibrator, [(frames[-1][0], nothing(frames[-1][1]))] * 20, state)
+    assert (state.misfit == 0).all()
+    assert (state.unseen > 0.5).all()
+
+
+@pytest.mark.parametrize("shift", [-1.0, 0.0, 1.0])
+def test_deviations_change_their_numbers_with_the_boundaries(shift, monkeypatch):
+    """Who moves a lane to the right has what was boundary k + 1 for boundary k."""
+    calibrator = JointCalibrator()
+    seen = observe(drive(1)[0][1], cameras(2), 6)
+    state = calibrator.initial_state(2, dtype=DOUBLE)
+    mean = state.mean.clone()
+    mean[:, NUM_COMMON:] = torch.arange(1.0, 7.0)
+    answer = (torch.full((2,), shift, dtype=DOUBLE), torch.ones(2, dtype=DOUBLE))
+    monkeypatch.setattr("lanebev.estimation.joint.best_shift", lambda *_: answer)
+    positions = boundary_places(WIDTH, 6, mean)
+    moved, _, _ = calibrator._follow_lane_change(state._replace(mean=mean), positions, seen)
+    k = torch.arange(6) + int(shift)
+    expected = torch.where((k >= 0) & (k < 6), k + 1.0, 0.0).double()
+    torch.testing.assert_close(moved[:, NUM_COMMON:], expected.expand(2, -1))
+    torch.testing.assert_close(moved[:, OFFSET] - mean[:, OFFSET], answer[0] * WIDTH)
+
+
+def test_a_clothoids_steps_are_its_rate_by_the_knots_spacing():
+    calibrator = JointCalibrator()
+    params = torch.tensor([[0.0, 0, 0, 1.5, 0, 2e-3, 1e-4]], dtype=DOUBLE)
+    mean, _ = calibrator._begin(params, 1e-12 * torch.eye(7, dtype=DOUBLE)[None])
+    torch.testing.assert_close(mean[:, CURVATURE], params[:, 5])
+    torch.testing.assert_close(mean[0, STEPS], torch.full((NUM_STEPS,), 1e-4 * KNOT_SPACING, dtype=DOUBLE))
+
+
+def test_height_doubts_roll_that_is_held_as_the_lane_seen_bends_it():
+    """By the second derivative of the height at which a lane seen as it is has its width."""
+    frames = drive(10)
+    ego = torch.tensor([2, 3])
+    frames = [(moment, s._replace(weight=s.weight * torch.isin(s.boundary, ego))) for moment, s in frames]
+    out, state = run(JointCalibrator(), frames)
+    assert (state.reasons & Reason.ROLL_UNSEEN).all()
+    height, middle = state.mean[0, HEIGHT], state.mean[0, OFFSET]
+    left, right = middle - WIDTH / 2, middle + WIDTH / 2
+
+    def height_at(roll):
+        tangents = [(-(x / height).atan() - roll).tan() for x in (left, right)]
+        return WIDTH / (tangents[0] - tangents[1])
+
+    roll = torch.zeros((), dtype=DOUBLE)
+    bend = torch.func.grad(torch.func.grad(height_at))(roll)
+    more = 3 * (0.5 * bend * state.cov[0, ROLL, ROLL]).square()
+    added = out.covariance[0, 3, 3] - state.cov[0, HEIGHT, HEIGHT]
+    torch.testing.assert_close(added, more, rtol=1e-6, atol=0)
+
+
+def test_speed_wanders_about_its_mean_as_far_as_it_says():
+    cfg = MotionConfig()
+    time, equal = torch.tensor([1 / 30], dtype=DOUBLE), torch.zeros(1, dtype=DOUBLE)
+    transition, noise = motion(time, torch.zeros(1, 4, dtype=torch.bool), equal, 6, cfg)
+    fade, more = transition[0, SPEED, SPEED], noise[0, SPEED, SPEED]
+    assert float(more / (1 - fade**2)) == pytest.approx(cfg.speed_std**2, rel=0.01)

@@ -108,3 +108,10 @@ def test_gate_is_in_standard_deviations():
     jacobian, noise = torch.ones(2, 1, dtype=torch.float64), torch.full((2,), 16.0, dtype=torch.float64)
     innovation = torch.tensor([14.9, -15.1], dtype=torch.float64)  # sigma is 5
     assert kalman.gate(innovation, jacobian, noise, cov, 3.0).tolist() == [True, False]
+
+
+def test_variances_are_limited_and_correlations_kept():
+    cov = torch.tensor([[4.0, 1.0], [1.0, 9.0]], dtype=torch.float64)
+    limited = kalman.limit_variance(cov, torch.tensor([16.0, 1.0], dtype=torch.float64))
+    expected = torch.tensor([[4.0, 1.0 / 3], [1.0 / 3, 1.0]], dtype=torch.float64)
+    torch.testing.assert_close(limited, expected)

@@ -62,7 +62,7 @@ def test_initial_roll_and_height_over_all_signs(roll, height):
 
 
 def test_deviation_a_sum_of_signed_residuals_has_no_minimum():
-    # Eq. (23) as printed falls without end as the height grows; the squares have their minimum at 1.5 m.
+    # Eq. (19) as printed falls without end as the height grows; the squares have their minimum at 1.5 m.
     ends, pose = boundary_segments(0.0, 0.0, 0.0, 1.5)
     angles = angles_of(ends, pose).angles
     heights = torch.linspace(1.0, 3.0, 21, dtype=torch.float64)
@@ -118,6 +118,22 @@ def test_width_noise_equals_monte_carlo():
     cov = torch.cov(torch.stack(samples).T)
     torch.testing.assert_close(cov.diagonal(), noise.diagonal(), rtol=0.12, atol=0)
     assert float(cov[0, 1] / noise[0, 1]) == pytest.approx(1.0, abs=0.25)
+
+
+def test_a_segment_far_off_its_boundary_is_left_out_of_its_angle():
+    ends, pose = boundary_segments(0.03, -0.02, 0.05, 1.5)
+    several = torch.cat([ends.repeat(1, 5, 1, 1), ends[:, :1] + torch.tensor([150.0, 0.0])], dim=1)
+    boundary = torch.cat([torch.arange(4).repeat(5), torch.tensor([0])])[None]
+    torch.testing.assert_close(
+        angles_of(several, pose, boundary=boundary).angles, angles_of(ends, pose).angles
+    )
+
+
+def test_lanes_differ_by_lane_noise():
+    ends, pose = boundary_segments(0.0, 0.0, 0.0, 1.5)
+    found = angles_of(ends, pose)
+    plain, more = (lw.measure_widths(found, pose.roll, pose.height, None, each).noise for each in (0.0, 0.2))
+    torch.testing.assert_close(more - plain, 0.04 * torch.eye(3, dtype=torch.float64)[None])
 
 
 def test_above_the_rolled_horizon_is_not_a_lane():

@@ -99,7 +99,10 @@ def test_bent_line_with_a_gap(gap):
     segments = extract_segments(maps[None, None], (192, 320), LineConfig(segments=3))
     points = segments.endpoints[0][segments.weight[0] > 0] / 2
     assert len(points) == 3
-    assert ((points - torch.tensor([290.0, 48])).norm(dim=-1) - 250).abs().max() < 0.1
+    off = (points - torch.tensor([290.0, 48])).norm(dim=-1) - 250
+    assert off.abs().max() < 0.1
+    if not gap:
+        assert off.mean().abs() < 0.01  # means as they are lie inside the bend, 0.035 px of it
 
 
 def test_scans_that_cross_twice_say_nothing():
@@ -234,6 +237,25 @@ def test_local_line_of_a_straight_line_with_a_gap():
     slope, variance = local_line(torch.where(weight > 0, 3 + 0.7 * rows, 99.0), weight)
     torch.testing.assert_close(slope[weight > 0], torch.full((27,), 0.7, dtype=torch.float64))
     assert variance[weight > 0].max() < 1e-18
+
+
+def test_local_line_has_the_variance_of_its_noise():
+    noise = 0.3 * torch.randn(4000, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rows = torch.arange(40, dtype=torch.float64)
+    _, variance = local_line(3 + 0.7 * rows + noise, torch.ones_like(noise))
+    torch.testing.assert_close(
+        variance[:, 10:30].mean(), torch.tensor(0.09, dtype=torch.float64), rtol=0.02, atol=0
+    )
+
+
+@pytest.mark.parametrize(("start", "end", "factor"), [((80, 10), (80, 90), 3.0), ((20, 48), (140, 48), 1.0)])
+def test_sigma_is_across_the_line_also_where_an_image_is_wider_than_its_map(start, end, factor):
+    """Three times as wide only: a steep line's sigma grows with the width, a level one's does not."""
+    maps = stripe(start, end)[None, None]
+    same = extract_segments(maps, (192, 320), CONFIG)
+    wide = extract_segments(maps, (192, 960), CONFIG, (192, 320))
+    seen = same.weight > 0
+    torch.testing.assert_close(wide.sigma[seen], factor * same.sigma[seen])
 
 
 def test_vertices_count_is_static():

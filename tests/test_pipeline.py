@@ -120,6 +120,17 @@ def test_lens_is_taken_out_of_the_segments():
     )
 
 
+def test_every_frame_has_the_camera_and_the_lens_of_its_row():
+    cameras = torch.stack([INTRINSICS, INTRINSICS * torch.tensor([[1.2], [1.2], [1.0]], dtype=torch.float64)])
+    lenses = torch.tensor([[-0.2, 0.03, 0, 0, 0], [0.1, 0.0, 0, 0, 0]], dtype=torch.float64)
+    net, frames = model(), images(2, 2)
+    both, _ = net(frames, cameras, None, distortion=lenses)
+    for row in range(2):
+        own, _ = net(frames[row, None], cameras[row, None], None, distortion=lenses[row, None])
+        torch.testing.assert_close(both.segments.endpoints[row], own.segments.endpoints[0])
+        torch.testing.assert_close(both.bev[row], own.bev[0])
+
+
 def test_network_sees_its_width_and_the_rest_does_not():
     net = model(network_width=64)
     net(images(1), INTRINSICS[None], None)

@@ -51,7 +51,7 @@ def test_road_image_bev_round_trip(pitch, yaw, roll, height):
 
 
 def test_homography_is_the_papers_for_its_grid():
-    # Eq. (19) with a_X = a_Z = 20 px/m, b_X = 16 m, b_Z = 50 m.
+    # Eq. (23) with a_X = a_Z = 20 px/m, b_X = 16 m, b_Z = 50 m.
     a, b_x, b_z = 20.0, 16.0, 50.0
     e = pose(0.03, -0.02, 0.01, 1.4)
     from lanebev.geometry.rotation import road_from_cam

@@ -72,6 +72,37 @@ def test_residual_jacobian_equals_jacfwd(curved):
     torch.testing.assert_close(found.jacobian.mT, expected.flatten(1, 2), rtol=1e-9, atol=1e-6)
 
 
+def test_distance_is_that_in_pixels_also_where_they_are_oblique():
+    """A point moved by a pixel across its boundary's image is a pixel off it."""
+    oblique = CAMERA * torch.tensor([[1.1], [0.9], [1.0]]).double()
+    oblique[0, 1] = 30.0
+    params = torch.tensor([[0.05, -0.03, 0.02, 1.5, 0.3, 0.0, 0.0]], dtype=DOUBLE)
+    places = boundary_places(3.7, 6, params)
+    z = torch.tensor([8.0, 20.0], dtype=DOUBLE)
+    road = torch.stack([(places[0, 3] + 0.3).expand(2), z], dim=-1)[None]
+    ends, _ = image_from_road_points(road, oblique[None], Extrinsics.unstack(params[:, :4]))
+    along = torch.nn.functional.normalize(ends[0, 1] - ends[0, 0], dim=0)
+    ends = ends + torch.stack([-along[1], along[0]])
+    one = torch.ones(1, 1, dtype=DOUBLE)
+    seen = observe(LaneSegments(ends[None], torch.tensor([[3]]), one, one), oblique[None], 6)
+    distance = boundary_residuals(params, places[:, 3:4], seen).distance
+    torch.testing.assert_close(distance.abs(), torch.ones_like(distance))
+
+
+def test_a_row_without_a_lane_width_has_the_priors_numbers():
+    params = random_params(2, 0, (2, 2, 2))
+    segments = drive_frames(params, 0.5, 1)
+    width = torch.full((2, 5), 3.7, dtype=DOUBLE)
+    alone = fit_single_frame(segments, cameras(2), width)
+    width[0, 4] = math.nan
+    fit = fit_single_frame(segments, cameras(2), width)
+    assert fit.valid.tolist() == [False, True]
+    prior = FramePrior()
+    torch.testing.assert_close(fit.params()[0], prior.mean(params))
+    torch.testing.assert_close(fit.covariance[0].diagonal().sqrt(), prior.std(params))
+    torch.testing.assert_close(fit.params()[1], alone.params()[1])
+
+
 def test_distance_of_a_straight_boundary_is_exact():
     params = torch.tensor([[0.0, 0.0, 0.0, 1.5, 0.0, 0.0, 0.0]], dtype=DOUBLE)
     segments = drive_frames(params, 0.0, 0, per_boundary=2, boundaries=(3,))

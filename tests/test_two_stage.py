@@ -14,7 +14,9 @@ from lanebev import (
     TwoStageCalibrator,
     image_from_road_points,
 )
+from lanebev.estimation.direction_stage import incidence
 from lanebev.estimation.two_stage import TwoStageConfig
+from lanebev.geometry.road import great_circle_normals, rays_from_pixels
 from tools.reproduce_table1 import run, table
 from tools.synthetic import Experiment
 
@@ -240,6 +242,81 @@ def test_strange_time_steps_are_survived(dt):
     assert out.extrinsics.stack()[0].tolist() == pytest.approx(POSE, abs=0.01)
 
 
+@pytest.mark.parametrize("dt", [0.0, -0.05])
+def test_a_frame_given_again_says_nothing_new(dt):
+    calibrator = TwoStageCalibrator()
+    outputs, state = drive(calibrator, [lanes(seed=s) for s in range(3)])
+    out, after = calibrator(lanes(seed=2), K[None], state, dt)
+    assert all(map(torch.equal, after, state))
+    assert torch.equal(out.covariance, outputs[-1].covariance)
+    assert out.inliers.sum() > 40
+
+
+@pytest.mark.parametrize("dt", [float("nan"), float("inf"), -float("inf")])
+def test_a_time_that_is_not_known_is_guessed(dt):
+    calibrator = TwoStageCalibrator()
+    _, state = drive(calibrator, [lanes(seed=s) for s in range(3)])
+    guessed, _ = calibrator(lanes(seed=9), K[None], state, dt)
+    given, _ = calibrator(lanes(seed=9), K[None], state, 1 / 30)
+    assert torch.equal(guessed.covariance, given.covariance)
+
+
+def test_incidence_jacobian_and_noise_equal_autograd():
+    """Of a camera whose pixels are not square, at a pose off the axis."""
+    camera = torch.tensor([[[900.0, 5.0, 640], [0, 1300, 360], [0, 0, 1]]], dtype=torch.float64)
+    segments = lanes(per=2)
+    mean = torch.tensor([[0.2, -0.3, 0.1, 0.0]], dtype=torch.float64)
+
+    def residual(mean, ends):
+        normals = great_circle_normals(ends, camera)
+        rays = rays_from_pixels(ends.flatten(1, 2), camera).view(*ends.shape[:3], 3)
+        return incidence(mean, normals, rays, segments.sigma, camera)
+
+    by_mean, by_ends = torch.func.jacfwd(lambda *x: residual(*x)[0][0], (0, 1))(mean, segments.endpoints)
+    _, jacobian, noise = residual(mean, segments.endpoints)
+    torch.testing.assert_close(jacobian[0], by_mean[:, 0])
+    exact = by_ends[:, 0].square().sum((1, 2, 3)) * segments.sigma[0].square()
+    torch.testing.assert_close(noise[0], exact, rtol=0.02, atol=0)  # skew is left out
+
+
+def test_a_starts_pitch_and_yaw_err_together_as_it_says():
+    """Boundaries on one side alone: what tilts the lines' meeting point up moves it sideways."""
+    frames = rows(*(lanes(boundaries=(0, 1, 2), seed=seed, noise=1.0) for seed in range(300)))
+    outputs, _ = drive(TwoStageCalibrator(), [frames])
+    errors = outputs[0].extrinsics.stack()[:, :2] - torch.tensor(POSE[:2], dtype=torch.float64)
+    cov = outputs[0].covariance[:, :2, :2].mean(0)
+    said = cov[0, 1] / (cov[0, 0] * cov[1, 1]).sqrt()
+    found = torch.corrcoef(errors.T)[0, 1]
+    assert said.abs() > 0.5
+    assert found == pytest.approx(float(said), abs=0.15)
+
+
+def test_in_a_gap_the_pose_goes_on_for_a_fifth_of_a_second_and_then_holds_still():
+    calibrator = TwoStageCalibrator()
+    turning = [lanes((0.03 + 0.002 * i, -0.02, 0.015, 1.45), seed=i) for i in range(20)]
+    outputs, state = drive(calibrator, turning)
+    pitches = [outputs[-1].extrinsics.pitch[0]]
+    for _ in range(15):
+        out, state = calibrator(nothing(), K[None], state, 1 / 30)
+        pitches.append(out.extrinsics.pitch[0])
+    steps = torch.stack(pitches).diff()
+    assert (steps[:5] > 0.001).all()
+    assert steps[7:].abs().max() < 1e-12
+
+
+def test_a_wide_prediction_searches_instead_of_gating():
+    """Too wide to tell right segments from wrong ones, though the gap is a short one."""
+    calibrator = TwoStageCalibrator(angular_acceleration_density=4.0)
+    _, state = drive(calibrator, [lanes(seed=s) for s in range(5)])
+    wild = lanes(seed=8)
+    aside = 40 * torch.randn(wild.endpoints.shape, generator=torch.Generator().manual_seed(0)).double()
+    wild = wild._replace(endpoints=wild.endpoints + aside)
+    both = LaneSegments(*(torch.cat(parts, 1) for parts in zip(lanes(seed=7), wild, strict=True)))
+    out, _ = calibrator(both, K[None], state, 0.19)
+    assert out.inliers[0, :48].mean() > 0.9
+    assert out.inliers[0, 48:].mean() < 0.3
+
+
 @pytest.mark.parametrize("width", [3.5, torch.tensor([3.5]), torch.full((1, 5), 3.5)])
 def test_lane_width_scales_height_and_per_lane_widths_are_taken(width):
     outputs, _ = drive(TwoStageCalibrator(), [lanes(noise=0.0, width=3.5)] * 2, lane_width=width)
@@ -248,9 +325,10 @@ def test_lane_width_scales_height_and_per_lane_widths_are_taken(width):
     assert float(wrong[-1].extrinsics.height[0]) == pytest.approx(POSE[3] * 3.7 / 3.5, abs=1e-5)
 
 
-def test_lane_width_uncertainty_reaches_the_covariance():
-    plain, _ = drive(TwoStageCalibrator(), [lanes()] * 3)
-    unsure, _ = drive(TwoStageCalibrator(lane_width_std=0.1), [lanes()] * 3)
+@pytest.mark.parametrize("kind", [TwoStageCalibrator, JointCalibrator])
+def test_lane_width_uncertainty_reaches_the_covariance(kind):
+    plain, _ = drive(kind(), [lanes()] * 3)
+    unsure, _ = drive(kind(lane_width_std=0.1), [lanes()] * 3)
     added = unsure[-1].covariance[0, 3, 3] - plain[-1].covariance[0, 3, 3]
     assert float(added.sqrt()) == pytest.approx(float(plain[-1].extrinsics.height[0]) * 0.1 / 3.7, rel=1e-6)
 
@@ -357,6 +435,21 @@ def test_autocast_changes_nothing_and_gradients_flow(calibrator):
         found.append((*out.extrinsics, torch.autograd.grad(out.extrinsics.pitch.sum(), ends)[0]))
     assert found[1][-1].abs().sum() > 0
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+@BOTH
+@pytest.mark.parametrize("kind", ["nan", "index", "weight"])
+def test_what_cannot_be_used_keeps_no_row_from_starting(calibrator, kind):
+    junk = lanes(per=40)
+    junk = {
+        "nan": junk._replace(endpoints=junk.endpoints * torch.nan),
+        "index": junk._replace(boundary=junk.boundary + 99),
+        "weight": junk._replace(weight=junk.weight * torch.inf),
+    }[kind]
+    both = LaneSegments(*(torch.cat(parts, 1) for parts in zip(lanes(), junk, strict=True)))
+    outputs, _ = drive(calibrator, [both])
+    assert outputs[0].status.tolist() == [Status.TRACKING]
+    assert outputs[0].extrinsics.stack()[0].tolist() == pytest.approx(POSE, abs=0.02)
 
 
 BAD_ROWS = {

@@ -2,7 +2,7 @@
 
     python -m tools.bench_filter --out out/bench_filter.json
 
-Source of the gain form: Eqs. (15)-(18) as printed, with an inverse of the N × N innovation covariance.
+Source of the gain form: Eqs. (15)-(17) as printed, with an inverse of the N × N innovation covariance.
 """
 
 from __future__ import annotations

@@ -25,8 +25,10 @@ _HARMLESS_WIDTH = 3.7  # m
 def calibrates(forward: Forward) -> Forward:
     """The border of a calibrator: its ``forward`` gets what fits together, whatever came.
 
-    Shapes are checked. Everything is cast to the state's floating dtype, in which the calibrator computes and
-    gives its results, with autocast off. A row whose intrinsics or lane widths can't be used counts as one
+    Shapes are checked. All is computed in double precision, autocast off, and given in the state's dtype:
+    in single precision a lane seen sharply and alone leaves information matrices with a condition number
+    beyond 1e7, which are not positive definite any more. Only where a device has no double precision (MPS)
+    is it computed in the state's dtype. A row whose intrinsics or lane widths can't be used counts as one
     that sees nothing, and N may be 0.
 
     Args:
@@ -48,15 +50,17 @@ def calibrates(forward: Forward) -> Forward:
     ) -> tuple[Calibration, Any]:
         check_segments(segments, intrinsics)
         count = segments.weight.shape[1]
-        like = check_state(state, self.state_type, intrinsics.shape[0])
-        segments, intrinsics = cast_floating(segments, like.dtype), intrinsics.to(like.dtype)
+        given = check_state(state, self.state_type, intrinsics.shape[0])
+        like = given if given.device.type == "mps" else given.double()
+        segments, intrinsics, state = (cast_floating(x, like.dtype) for x in (segments, intrinsics, state))
         widths = as_lane_width(lane_width, like, self.config.num_boundaries)
-        segments, intrinsics, widths = _unseen_where_unusable(segments, intrinsics, widths)
+        segments, intrinsics, widths = usable(
+            _padded(segments), intrinsics, widths, self.config.num_boundaries
+        )
         with autocast_off(like.device):
-            calibration, state = forward(
-                self, _padded(segments), intrinsics, state, as_batch(dt, like), widths
-            )
-        return calibration._replace(inliers=calibration.inliers[:, :count]), state
+            calibration, state = forward(self, segments, intrinsics, state, as_batch(dt, like), widths)
+        calibration = calibration._replace(inliers=calibration.inliers[:, :count])
+        return cast_floating(calibration, given.dtype), cast_floating(state, given.dtype)
 
     return cast(Forward, checked)
 
@@ -130,18 +134,26 @@ def clean_segments(segments: LaneSegments, num_boundaries: int) -> LaneSegments:
     )
 
 
-def _unseen_where_unusable(
-    segments: LaneSegments, intrinsics: Tensor, lane_width: Tensor
+def usable(
+    segments: LaneSegments, intrinsics: Tensor, lane_width: Tensor, num_boundaries: int
 ) -> tuple[LaneSegments, Tensor, Tensor]:
-    """Weight zero, and harmless numbers, in rows of impossible (B, 3, 3) intrinsics or (B, L-1) widths."""
+    """Cleaned segments; of weight zero, with harmless numbers, in rows of an impossible camera or lane.
+
+    Args:
+        segments: as they came, see :func:`clean_segments`.
+        intrinsics: (B, 3, 3), unusable where not finite or without a positive focal length.
+        lane_width: (B, M) m, unusable where one is not finite and positive.
+        num_boundaries: L.
+    """
+    segments = clean_segments(segments, num_boundaries)
     camera = intrinsics.isfinite().all(-1).all(-1) & (intrinsics[:, 0, 0] > 0) & (intrinsics[:, 1, 1] > 0)
-    usable = camera & (lane_width.isfinite() & (lane_width > 0)).all(-1)  # (B,)
+    good = camera & (lane_width.isfinite() & (lane_width > 0)).all(-1)  # (B,)
     harmless = torch.diag(intrinsics.new_tensor([_HARMLESS_FOCAL, _HARMLESS_FOCAL, 1.0]))
-    weight = torch.where(usable.unsqueeze(-1), segments.weight, 0.0)
+    weight = torch.where(good.unsqueeze(-1), segments.weight, 0.0)
     return (
         segments._replace(weight=weight),
-        torch.where(usable[:, None, None], intrinsics, harmless),
-        torch.where(usable.unsqueeze(-1), lane_width, _HARMLESS_WIDTH),
+        torch.where(good[:, None, None], intrinsics, harmless),
+        torch.where(good.unsqueeze(-1), lane_width, _HARMLESS_WIDTH),
     )
 
 

@@ -51,7 +51,7 @@ def track_direction(
 ) -> DirectionStep:
     """Predict, gate and update pitch and yaw; start over where that fails.
 
-    Source: Sec. III-D, Eqs. (9)-(18).
+    Source: Sec. III-D, Eqs. (9)-(17).
 
     Args:
         segments: cleaned, see :func:`lanebev.estimation.checks.clean_segments`.
@@ -166,7 +166,7 @@ def incidence(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """How far each great circle misses the vanishing direction.
 
-    Source: Eq. (14), h = d_Zᵀ R_CWᵀ n, with its derivatives by pitch and yaw.
+    Source: Eq. (11), h = d_Zᵀ R_CWᵀ n, with its derivatives by pitch and yaw.
 
     Args:
         mean: (B, D), pitch and yaw first.

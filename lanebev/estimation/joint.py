@@ -31,7 +31,7 @@ from lanebev.estimation.joint_model import (
     ROLL,
     Observations,
     boundary_places,
-    observe,
+    observations,
 )
 from lanebev.estimation.joint_motion import (
     MEANS,
@@ -77,7 +77,7 @@ class JointConfig:
         num_boundaries: L.
         iterations: Gauss-Newton steps a frame.
         start_iterations: likewise of every start that is tried on a first frame.
-        lane_width_std: relative sigma of the lane width prior, a common scale of height; 0: as given.
+        lane_width_std: m, sigma of the lane width prior, a common scale of height; 0: as given.
         motion: how the state moves.
         prior: where a start is searched, and what holds before it.
         open_pose: rad (and 10 of these in m of height), jump admitted where one frame contradicts the motion,
@@ -120,6 +120,11 @@ class JointConfig:
         if self.iterations < 1 or self.start_iterations < 1:
             got = min(self.iterations, self.start_iterations)
             raise ValueError(f"iterations: expected at least 1, got {got}")
+        bend = (self.prior.curvature_std, self.prior.curvature_rate_std)
+        if not all(0 < sharp < wide for sharp, wide in zip(self.straight, bend, strict=True)):
+            raise ValueError(
+                f"straight: expected sigmas between 0 and those of the prior, {bend}, got {self.straight}"
+            )
         if not 0 < self.bends < 1:
             raise ValueError(f"bends: expected a probability between 0 and 1, got {self.bends}")
 
@@ -209,7 +214,7 @@ class JointCalibrator(nn.Module):
         dt: float | Tensor,
         lane_width: float | Tensor = 3.7,
     ) -> tuple[Calibration, JointState]:
-        """One frame, computed in the state's dtype, in which the results are.
+        """One frame; the results have the state's dtype.
 
         Args:
             segments: of this frame, N per row; weight 0 is not there, non-finite counts as not there.
@@ -227,7 +232,10 @@ class JointCalibrator(nn.Module):
             ValueError: a shape that doesn't fit.
         """
         cfg = self.config
-        seen = observe(segments, intrinsics, cfg.num_boundaries)
+        if state.mean.shape[-1] != NUM_COMMON + cfg.num_boundaries:
+            got = state.mean.shape[-1] - NUM_COMMON
+            raise ValueError(f"state: expected one of {cfg.num_boundaries} boundaries, got one of {got}")
+        seen = observations(segments, intrinsics)
         positions = boundary_places(lane_width, cfg.num_boundaries, seen.sigma)  # (B, L)
         places = positions.gather(1, seen.boundary)  # (B, N)
         step, skip, early, guessed = self._elapsed(as_batch(dt, seen.sigma), state)
@@ -301,7 +309,7 @@ class JointCalibrator(nn.Module):
         believed = 2 * (seen.weight * first.trust)
         count = cov.new_zeros(cov.shape[0], cfg.num_boundaries).scatter_add(1, seen.boundary, believed)
         news = surprise(first, index, count)
-        slow = predicted.evidence * fade + (1 - fade * fade).sqrt() * news
+        slow = predicted.evidence * fade + (1 - fade * fade).clamp(min=1e-12).sqrt() * news
         evidence = torch.cat([news[:, :NUM_POSE], slow[:, NUM_POSE:]], dim=-1)
         cov = cov + self._opened(evidence, cov)
         return iterate(mean, cov, first.mean, first.scale, places, seen, phase, 1, first.cov), evidence
@@ -403,8 +411,7 @@ class JointCalibrator(nn.Module):
             cfg.num_boundaries,
             iterations=cfg.start_iterations,
         )
-        weight = segments.weight.nan_to_num()
-        share = (fit.inliers * weight).sum(-1) / weight.sum(-1).clamp(min=1e-6)
+        share = (fit.inliers * segments.weight).sum(-1) / segments.weight.sum(-1).clamp(min=1e-6)
         fresh = wanted & fit.valid & (share >= cfg.enter_share)
         mean, cov = self._begin(fit.params(), fit.covariance)
         zero = torch.zeros_like(state.unseen)
@@ -468,7 +475,8 @@ class JointCalibrator(nn.Module):
         left, right = (positions[:, ego : ego + 2] + state.mean[:, OFFSET, None]).unbind(-1)
         bend = height - left * right / height.clamp(min=0.1)
         more = 3.0 * (bend * cov[:, ROLL, ROLL]).square() * _held(state.reasons)[:, ROLL]
-        more = more + (self.config.lane_width_std * height).square()
+        width = positions.diff(dim=-1).mean(-1)
+        more = more + (self.config.lane_width_std / width * height).square()
         by_lanes = self._one_out_of_place(state.mean)[:, None, None] * state.mimicry
         only_height = torch.arange(NUM_POSE, device=cov.device) == HEIGHT
         cov = cov + by_lanes @ by_lanes.mT + (only_height * more.unsqueeze(-1)).diag_embed()

@@ -24,19 +24,15 @@ class Boundaries(NamedTuple):
     Attributes:
         offset: (B, L) m, X at Z = 0, right of the camera.
         heading: (B, L) rad (tangent), own deviation from the common direction.
-        std: (B, L) m, of the offset.
         extent: (B, L, 2) m, nearest and farthest Z of believed end points; (0, 0) where not present.
         present: (B, L) bool, enough believed segments.
-        support: (B, L) sum of the believed segments' weights.
         curvature: (B, 2), c0 and c1, common to all.
     """
 
     offset: Tensor
     heading: Tensor
-    std: Tensor
     extent: Tensor
     present: Tensor
-    support: Tensor
     curvature: Tensor
 
 
@@ -91,10 +87,8 @@ def fit_boundaries(
         far_off = residual * per_metre / (_TOLERANCE * focal.unsqueeze(-1))
         trust = (1 + far_off.square()).square().reciprocal()
         precision = member * trust * (per_metre / sigma.unsqueeze(1)).square()  # 1/m²
-        offset, heading, variance = _fit_line(z, lateral, precision)
-    believed = member * trust
-    support = 0.5 * believed.sum(-1)
-    present = support >= least_support
+        offset, heading = _fit_line(z, lateral, precision)
+    present = 0.5 * (member * trust).sum(-1) >= least_support
     reached = (member > 0) & (trust > 0.25)
     near = z.unsqueeze(1).masked_fill(~reached, torch.inf).amin(-1)
     far = z.unsqueeze(1).masked_fill(~reached, -torch.inf).amax(-1)
@@ -102,10 +96,8 @@ def fit_boundaries(
     return Boundaries(
         offset=offset,
         heading=heading,
-        std=variance.sqrt(),
         extent=extent,
         present=present,
-        support=support,
         curvature=curvature,
     )
 
@@ -115,26 +107,20 @@ def boundary_polylines(
     intrinsics: Tensor,
     extrinsics: Extrinsics,
     num_points: int = 64,
-    nearest: float | None = None,
-    farthest: float | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Boundaries as polylines in the undistorted image, from near to far, about evenly spaced in its rows.
+    """Where boundaries were seen, as polylines in the undistorted image, evenly spaced in rows, near to far.
 
     Args:
         boundaries: from :func:`fit_boundaries`.
         intrinsics: (B, 3, 3).
         extrinsics: each (B,).
         num_points: P.
-        nearest: Z of the first point, m; default where each boundary was first seen.
-        farthest: Z of the last point, m; default where each was last seen.
 
     Returns:
         (B, L, P, 2) px, and (B, L, P) bool: boundary present and point before the camera. Points may lie
         outside the image, whose size is not known here.
     """
     first, last = boundaries.extent.unbind(-1)  # (B, L)
-    first = first if nearest is None else torch.full_like(first, nearest)
-    last = last if farthest is None else torch.full_like(last, farthest)
     first = torch.where(boundaries.present, first, 1.0).clamp(min=0.5)
     last = torch.maximum(torch.where(boundaries.present, last, 1.0), first)
     steps = torch.linspace(0, 1, num_points, dtype=first.dtype, device=first.device)
@@ -158,7 +144,7 @@ def _pixels_per_metre(offset: Tensor, down: Tensor, height: Tensor, focal: Tenso
     return (down * focal / height).unsqueeze(1) * steepness.unsqueeze(-1)
 
 
-def _fit_line(z: Tensor, lateral: Tensor, precision: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _fit_line(z: Tensor, lateral: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
     """Weighted line through (z, lateral), (B, M) each, for weights (B, L, M); heading held near zero."""
     total = precision.sum(-1)
     some = total > 0
@@ -168,5 +154,4 @@ def _fit_line(z: Tensor, lateral: Tensor, precision: Tensor) -> tuple[Tensor, Te
     centred = z.unsqueeze(1) - mean_z.unsqueeze(-1)
     spread = (precision * centred * centred).sum(-1) + _HEADING_STD**-2
     heading = (precision * centred * (lateral.unsqueeze(1) - mean_x.unsqueeze(-1))).sum(-1) / spread
-    variance = safe.reciprocal() + mean_z.square() / spread
-    return mean_x - heading * mean_z, heading, variance
+    return mean_x - heading * mean_z, heading

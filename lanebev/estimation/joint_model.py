@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.estimation.checks import as_lane_width, check_segments, clean_segments
+from lanebev.estimation.checks import as_lane_width, check_segments, usable
 from lanebev.geometry.road import rays_from_pixels
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import LaneSegments
@@ -90,18 +90,19 @@ def observe(segments: LaneSegments, intrinsics: Tensor, num_boundaries: int) -> 
         ValueError: shapes that do not fit.
     """
     check_segments(segments, intrinsics)
-    segments = clean_segments(segments, num_boundaries)
-    camera_ok = intrinsics.isfinite().all(-1).all(-1)
-    camera_ok = camera_ok & (intrinsics[:, 0, 0] > 0) & (intrinsics[:, 1, 1] > 0)  # (B,)
-    harmless = torch.diag(intrinsics.new_tensor([1000.0, 1000.0, 1.0]))
-    matrix = torch.where(camera_ok[:, None, None], intrinsics, harmless)
-    rays = rays_from_pixels(segments.endpoints.flatten(1, 2), matrix)
+    anything = intrinsics.new_ones(intrinsics.shape[0], 1)  # lane widths don't matter here
+    return observations(*usable(segments, intrinsics, anything, num_boundaries)[:2])
+
+
+def observations(segments: LaneSegments, intrinsics: Tensor) -> Observations:
+    """Of segments and intrinsics that are :func:`~lanebev.estimation.checks.usable`."""
+    rays = rays_from_pixels(segments.endpoints.flatten(1, 2), intrinsics)
     return Observations(
         rays=rays.mT.contiguous(),
         boundary=segments.boundary,
-        weight=segments.weight * camera_ok.unsqueeze(-1),
+        weight=segments.weight,
         sigma=segments.sigma,
-        intrinsics=matrix,
+        intrinsics=intrinsics,
     )
 
 

@@ -1,7 +1,7 @@
 """Batched Kalman prediction and update. Knows nothing of lanes or cameras.
 
 The update is in information form: N scalar measurements enter as a D × D matrix and a D-vector, so it
-costs O(N D²) where the gain form inverts an N × N matrix (Eq. (16)), and a measurement of weight zero is
+costs O(N D²) where the gain form inverts an N × N matrix (Eq. (15)), and a measurement of weight zero is
 simply not there.
 """
 
@@ -56,7 +56,7 @@ def information(
 def update(mean: Tensor, cov: Tensor, info_matrix: Tensor, info_vector: Tensor) -> tuple[Tensor, Tensor]:
     """Update with the information of any number of measurements.
 
-    Source: Eqs. (16)-(18). Deviation: information form instead of the gain form, equal to rounding, since
+    Source: Eqs. (15)-(17). Deviation: information form instead of the gain form, equal to rounding, since
     S is N × N; and Joseph form of the covariance, since (I - G H) P loses symmetry and, in float32, sign.
 
     With P = L Lᵀ: P⁺ = L (I + Lᵀ Λ L)⁻¹ Lᵀ, which needs no inverse of P; then
@@ -103,7 +103,7 @@ def gate(
 def constant_velocity(dt: Tensor, spectral_density: Tensor) -> tuple[Tensor, Tensor]:
     """Transition and process noise of D/2 positions followed by their D/2 rates.
 
-    Source: Eqs. (10), (11); Bar-Shalom, Li, Kirubarajan 2001, Sec. 6.2.2. Deviation: the noise is a white
+    Source: Eqs. (9), (10); Bar-Shalom, Li, Kirubarajan 2001, Sec. 6.2.2. Deviation: the noise is a white
     acceleration integrated over dt, which reaches the positions too, so that frames of any spacing agree.
 
     Args:

@@ -36,7 +36,7 @@ def line_angles(normals: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
     """Angles of boundary planes from the camera's vertical, seen along the lanes.
 
     Source: Fig. 6(c), α. Deviation: the normal is rotated into the frame of the vanishing direction and
-    α = atan(n_y / n_x), positive to the left; only so is Eq. (21) exact (PAPER_NOTES 3).
+    α = atan(n_y / n_x), positive to the left; only so is Eq. (18) exact (PAPER_NOTES 3).
 
     Args:
         normals: (B, N, 3) great-circle normals, camera frame.
@@ -55,7 +55,7 @@ def line_angles(normals: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
 def lane_widths(line_angles: Tensor, roll: Tensor, height: Tensor) -> Tensor:
     """Distances between adjacent boundaries on the road.
 
-    Source: Eq. (21), w = h (tan(α_L - ψ) - tan(α_R - ψ)). Deviation: adjacent boundary indices instead of
+    Source: Eq. (18), w = h (tan(α_L - ψ) - tan(α_R - ψ)). Deviation: adjacent boundary indices instead of
     any two sides, since a missed boundary would double the width (PAPER_NOTES 7).
 
     Args:
@@ -82,7 +82,7 @@ def boundary_angles(
 ) -> BoundaryAngles:
     """One angle α per boundary from all its segments, and what it is worth.
 
-    Source: Eq. (21) takes α of single line pairs. Deviation: one α per boundary, the least-squares plane
+    Source: Eq. (18) takes α of single line pairs. Deviation: one α per boundary, the least-squares plane
     through the vanishing direction and the boundary's end points, as pairs that share a segment are not
     independent and a single segment's own direction ignores the known vanishing point. Segments off their
     boundary's median by more than 4 sigma and a degree are left out.
@@ -153,7 +153,7 @@ def measure_widths(
 ) -> WidthMeasurement:
     """Widths of the lanes whose two boundaries are present, with Jacobian and covariance.
 
-    Source: Eq. (21) and its derivatives.
+    Source: Eq. (18) and its derivatives.
 
     Args:
         boundaries: from :func:`boundary_angles`.
@@ -197,7 +197,7 @@ def initial_roll_height(
 ) -> tuple[Tensor, Tensor]:
     """Roll and height that make the observed widths most alike the prior's.
 
-    Source: Sec. IV-A, Eqs. (22)-(23): exhaustive search, then Gauss-Newton. Deviation: the energy is a sum
+    Source: Sec. IV-A, Eqs. (19)-(20): exhaustive search, then Gauss-Newton. Deviation: the energy is a sum
     of squares, as a sum of signed residuals has no minimum (PAPER_NOTES 4); for each roll of the search
     the best height is in closed form; with one lane roll stays at the guess (PAPER_NOTES 6).
 

@@ -44,7 +44,7 @@ def track_roll_height(
 ) -> RollHeightStep:
     """Predict and update roll and height; start where nothing is known; one lane moves height only.
 
-    Source: Sec. IV-B, with the measurement of Eq. (22).
+    Source: Sec. IV-B, with the measurement of Eq. (20).
 
     Args:
         boundaries: angles about the direction of stage 1.

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lanebev.estimation.checks import as_lane_width, check_segments, usable
 from lanebev.estimation.joint_model import (
     HEIGHT,
     NUM_PARAMS,
@@ -20,7 +21,7 @@ from lanebev.estimation.joint_model import (
     Observations,
     boundary_places,
     boundary_residuals,
-    observe,
+    observations,
 )
 from lanebev.estimation.joint_robust import inlier_weights, log_likelihood, noise_scale
 from lanebev.geometry.precision import full_precision
@@ -137,8 +138,11 @@ def fit_single_frame(
         ValueError: shapes that do not fit.
     """
     prior = prior or FramePrior()
-    seen = observe(segments, intrinsics, num_boundaries)
-    places = boundary_places(lane_width, num_boundaries, intrinsics).gather(1, seen.boundary)  # (B, N)
+    check_segments(segments, intrinsics)
+    widths = as_lane_width(lane_width, intrinsics, num_boundaries)
+    segments, intrinsics, widths = usable(segments, intrinsics, widths, num_boundaries)
+    seen = observations(segments, intrinsics)
+    places = boundary_places(widths, num_boundaries, intrinsics).gather(1, seen.boundary)  # (B, N)
     with torch.no_grad():
         fewer, fewer_places = _subset(seen, places, start_segments)
         starts = _linear_starts(fewer, fewer_places, prior)  # (B, S, 7)
@@ -222,7 +226,10 @@ def normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tupl
 
 
 def _student_weight(squared: Tensor) -> Tensor:
-    """Weight of a prior at a squared normalised distance, for Student's t with 4 degrees of freedom."""
+    """Weight of a prior at a squared normalised distance, for Student's t with 4 degrees of freedom.
+
+    One at its mean, not 5/4: near it the prior counts as the Gaussian that it is given as.
+    """
     return (1 + squared / 4).reciprocal()
 
 
@@ -331,14 +338,18 @@ def _best_start(
 
 
 def _solve(information: Tensor, gradient: Tensor) -> Tensor:
-    """Symmetric positive solve, equilibrated: curvatures and metres differ by 1e5 in float32."""
-    size = information.diagonal(dim1=-2, dim2=-1).rsqrt()
-    factor = torch.linalg.cholesky_ex(size.unsqueeze(-1) * information * size.unsqueeze(-2)).L
+    """Symmetric positive solve."""
+    size, factor = _factor(information)
     return size * torch.cholesky_solve((size * gradient).unsqueeze(-1), factor).squeeze(-1)
 
 
 def _inverse(information: Tensor) -> Tensor:
-    """Covariance from an information matrix, equilibrated as in :func:`_solve`."""
-    size = information.diagonal(dim1=-2, dim2=-1).rsqrt()
-    factor = torch.linalg.cholesky_ex(size.unsqueeze(-1) * information * size.unsqueeze(-2)).L
+    """Covariance from an information matrix."""
+    size, factor = _factor(information)
     return size.unsqueeze(-1) * torch.cholesky_inverse(factor) * size.unsqueeze(-2)
+
+
+def _factor(information: Tensor) -> tuple[Tensor, Tensor]:
+    """Sizes (B, P) and the Cholesky factor in their units: curvatures and metres differ by 1e5 in float32."""
+    size = information.diagonal(dim1=-2, dim2=-1).rsqrt()
+    return size, torch.linalg.cholesky_ex(size.unsqueeze(-1) * information * size.unsqueeze(-2)).L

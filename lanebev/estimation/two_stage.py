@@ -8,11 +8,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lanebev.estimation.checks import as_batch, as_lane_width, calibrates, clean_segments
+from lanebev.estimation.checks import as_batch, as_lane_width, calibrates
 from lanebev.estimation.direction_stage import track_direction
 from lanebev.estimation.lane_width import boundary_angles
 from lanebev.estimation.roll_height_stage import track_roll_height
 from lanebev.geometry.road import rays_from_pixels
+from lanebev.rows import where
 from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status, saved_by_name
 
 
@@ -38,6 +39,7 @@ class TwoStageConfig:
     reacquire_after: float = 0.2  # s without support before the search starts over
     reacquire_spread: float = 0.013  # rad, sigma of the predicted direction at which it does, too
     lost_after: float = 1.5  # s without support
+    assumed_dt: float = 1 / 30  # s between frames where it is not finite
     lane_noise: float = 0.0  # m, how far single lanes differ from the prior
     lane_width_std: float = 0.0  # m, how far the prior itself may be off: a common scale of height
 
@@ -124,13 +126,14 @@ class TwoStageCalibrator(nn.Module):
         dt: float | Tensor,
         lane_width: float | Tensor = 3.7,
     ) -> tuple[Calibration, TwoStageState]:
-        """One frame, computed in the state's dtype, in which the results are.
+        """One frame; the results have the state's dtype.
 
         Args:
             segments: of this frame, N per row; weight 0 is not there, non-finite counts as not there.
             intrinsics: (B, 3, 3) px. A row where they or the widths are not finite and positive sees nothing.
             state: of the frame before, or :meth:`initial_state`.
-            dt: s since that frame, float or (B,); negative or non-finite counts as 0.
+            dt: s since that frame, float or (B,). A started row skips a frame that is not later (0 or
+                negative). Where not finite, an interval is assumed.
             lane_width: m, float, (B,) or (B, L-1) per lane.
 
         Returns:
@@ -139,9 +142,11 @@ class TwoStageCalibrator(nn.Module):
         Raises:
             ValueError: a shape that doesn't fit.
         """
-        segments = clean_segments(segments, self.config.num_boundaries)
         dt = as_batch(dt, segments.sigma)
-        dt = torch.where(dt.isfinite(), dt, 0.0).clamp(0.0, 60.0)
+        dt = torch.where(dt.isfinite(), dt, self.config.assumed_dt)
+        running = (state.status == int(Status.TRACKING)) | (state.status == int(Status.COASTING))
+        before, skip = state, (dt <= 0) & running
+        dt = dt.clamp(0.0, 60.0)
         widths = as_lane_width(lane_width, segments.sigma, self.config.num_boundaries)
         rays = rays_from_pixels(segments.endpoints.flatten(1, 2), intrinsics)
         rays = rays.reshape(*segments.endpoints.shape[:-1], 3)  # (B, N, 2, 3)
@@ -163,7 +168,8 @@ class TwoStageCalibrator(nn.Module):
         two = track_roll_height(boundaries, widths, one.cov[:, :2, :2], state, dt, one.fresh, self.config)
         unseen = torch.where(one.seen, 0.0, state.unseen + dt)
         status = _status(state.status, one.seen, unseen, self.config.lost_after)
-        state = TwoStageState(one.mean, one.cov, *two, unseen, status)
+        after = TwoStageState(one.mean, one.cov, *two, unseen, status)
+        state = TwoStageState(*(where(skip, old, new) for old, new in zip(before, after, strict=True)))
         return self._calibration(state, widths, one.inliers), state
 
     def _calibration(self, state: TwoStageState, lane_width: Tensor, inliers: Tensor) -> Calibration:

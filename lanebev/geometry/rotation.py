@@ -38,7 +38,7 @@ def cam_from_world(pitch: Tensor, yaw: Tensor) -> Tensor:
 def road_from_cam(pitch: Tensor, yaw: Tensor, roll: Tensor) -> Tensor:
     """Rotation from the camera to the road.
 
-    Source: Eq. (20), R(θ, φ, ψ) = R(ψ) R_CW(θ, φ)ᵀ.
+    Source: Eq. (24), R(θ, φ, ψ) = R(ψ) R_CW(θ, φ)ᵀ.
 
     Args:
         pitch: (...,) rad, positive nose down.

@@ -18,7 +18,7 @@ class BEVGrid:
     """A rectangle of the road and its resolution.
 
     Pixel (column, row) with centres at integers lies at X = x[0] + column · resolution,
-    Z = z[1] - row · resolution: rows run far to near, columns left to right (Eq. (19)'s convention).
+    Z = z[1] - row · resolution: rows run far to near, columns left to right (Eq. (23)'s convention).
 
     Attributes:
         x: (left, right) m.
@@ -80,7 +80,7 @@ class BEVGrid:
 def bev_from_image(extrinsics: Extrinsics, intrinsics: Tensor, grid: BEVGrid) -> Tensor:
     """Homography from undistorted image pixels to BEV pixels.
 
-    Source: Eq. (19), H_WC = S [r₁; r₃; r₂/h] K⁻¹ with r_i the rows of R(θ, φ, ψ). S is the paper's for a
+    Source: Eq. (23), H_WC = S [r₁; r₃; r₂/h] K⁻¹ with r_i the rows of R(θ, φ, ψ). S is the paper's for a
     grid x = (-b_X/2, b_X/2), z = (0, b_Z); other rectangles shift it.
 
     Args:

@@ -16,7 +16,7 @@ from lanebev.view.grid import BEVGrid
 class BEVWarp(nn.Module):
     """Inverse perspective mapping of images or feature maps, differentiable in everything but the grid.
 
-    Source: Sec. V; the homography of Eq. (19) applied cell by cell, with the lens distortion folded into the
+    Source: Sec. V; the homography of Eq. (23) applied cell by cell, with the lens distortion folded into the
     same single bilinear resampling. Geometry is float32 at least, also under autocast and for images of half
     precision; so is the resampling, and its result has the image's dtype.
 
