@@ -55,15 +55,6 @@ def test_row_loss_says_where():
     assert row_cross_entropy(flat, 0 * target, torch.ones(1, 2, 4)).item() == 0
 
 
-def test_rows_count_by_their_frames_importance():
-    target = torch.zeros(2, 2, 1, 4)
-    target[:, 1, 0, 2] = 1
-    logits, weight = torch.randn(2, 2, 1, 4, generator=torch.Generator().manual_seed(0)), torch.ones(2, 1, 4)
-    first, second = (row_cross_entropy(logits[i, None], target[i, None], weight[i, None]) for i in range(2))
-    both = row_cross_entropy(logits, target, weight, importance=torch.tensor([3.0, 1.0]))
-    torch.testing.assert_close(both, (3 * first + second) / 4)
-
-
 def test_drawn_stripe_is_centred_and_as_wide_as_asked():
     points = np.full((2, 2, 2), np.nan, np.float32)
     points[0] = [[20.3, -5], [25.9, 70]]

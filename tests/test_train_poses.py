@@ -24,7 +24,6 @@ from train.poses import (
     PoseBatch,
     PoseBatches,
     fit_poses,
-    frame_errors,
     pose_loss,
     pose_surprise,
 )
@@ -214,29 +213,6 @@ def test_errors_count_beside_surprise(batch):
     torch.testing.assert_close(losses[2] - losses[0], 3 * (losses[1] - losses[0]), rtol=1e-3, atol=1e-4)
     with pytest.raises(ValueError, match="error_weight: expected 0 without surprise"):
         EndToEnd(error_weight=1.0)
-
-
-def test_frames_with_a_wrong_pose_weigh_more_in_the_maps(batch, monkeypatch):
-    torch.manual_seed(0)
-    network = SegmenterConfig(base_width=4, decoder_width=4)
-    model = EndToEnd(network=network, augment=0.0, surprise=True, hard_weight=0.5)
-    model.log = model.log_dict = lambda *args, **kwargs: None
-    given = []
-    monkeypatch.setattr(model, "map_loss", lambda logits, _, by: given.append(by) or logits.sum())
-    wrong = torch.zeros(len(batch.image), dtype=torch.float64)
-    wrong[:2] = torch.tensor([3.0, 100.0])
-    monkeypatch.setattr("train.end_to_end.frame_errors", lambda *_: wrong)
-    model.training_step(batch, 0)
-    assert given[0][:2].tolist() == [2.5, 5.0]  # at most 8 units
-    assert (given[0][2:] == 1).all()
-
-
-def test_frame_errors_add_up_to_the_loss(batch):
-    found = fit(logits_of(batch), batch)
-    unit = torch.tensor([0.001, 0.001, 0.001, 0.01], dtype=torch.float64)
-    errors = frame_errors(found, batch.extrinsics.double(), unit)
-    assert errors.shape == found.valid.shape
-    torch.testing.assert_close(pose_loss(found, batch.extrinsics.double(), unit), errors[found.valid].mean())
 
 
 def test_evaluate_poses_reports_both(tmp_path, capsys, monkeypatch):

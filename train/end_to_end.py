@@ -11,7 +11,7 @@ from torch import Tensor
 from lanebev.observation.lines import LineExtractor
 from train.losses import unweighted_bias
 from train.module import Segmentation, unpack
-from train.poses import PoseBatch, fit_poses, frame_errors, pose_loss, pose_surprise
+from train.poses import PoseBatch, fit_poses, pose_loss, pose_surprise
 
 
 class EndToEnd(Segmentation):
@@ -28,10 +28,6 @@ class EndToEnd(Segmentation):
         error_weight: of the errors beside ``surprise``, of all frames and axes: surprise takes an error well
             announced for nothing, and the root mean square does not.
         error_unit: deg, deg, deg, m: what of them counts as one.
-        hard_weight: how much more a frame's maps count for each unit of error of its pose, up to 8 units:
-            the few frames with a wrong boundary make most of the mean square, and what they need is the right
-            boundary, which is far from the wrong one and so not where the pose's gradient points (as online
-            hard example mining, Shrivastava et al. 2016).
         gradient_reach: how many times longer a frame's gradient may be than that of most.
         where_only: the pose's loss moves lines, but does not change how much they count.
         kwargs: as of :class:`~train.module.Segmentation`.
@@ -46,7 +42,6 @@ class EndToEnd(Segmentation):
         surprise: bool = False,
         error_weight: float = 0.0,
         error_unit: tuple[float, float, float, float] = (0.2, 0.4, 0.6, 0.03),
-        hard_weight: float = 0.0,
         **kwargs: Any,
     ) -> None:
         if not (math.isfinite(gradient_reach) and gradient_reach > 0):
@@ -62,7 +57,6 @@ class EndToEnd(Segmentation):
             "surprise": surprise,
             "error_weight": error_weight,
             "error_unit": list(error_unit),
-            "hard_weight": hard_weight,
         }
         self.extractor = LineExtractor.for_network(self.segmenter.config)
         self.unit: Tensor
@@ -73,22 +67,20 @@ class EndToEnd(Segmentation):
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:  # type: ignore[override]
         """Augment, segment, compare maps and poses."""
-        logits = self.augmented_logits(batch, batch_idx)
-        if self.settings["pose_weight"] == 0:
-            return self.map_loss(logits, batch)
-        fit = self._fit(logits + unweighted_bias(self.class_weight).view(1, -1, 1, 1), batch)
-        truth = batch.extrinsics.double()
-        if self.settings["surprise"]:
-            pose = pose_surprise(fit, truth, self.unit, self.segmenter.config.pose_factor)
-            if self.settings["error_weight"] > 0:
-                errors = pose_loss(fit, truth, self.error_unit, with_prior=True)
-                pose = pose + self.settings["error_weight"] * errors
-        else:
-            pose = pose_loss(fit, truth, self.unit)
-        self.log("loss/pose", pose, prog_bar=True)
-        hard = frame_errors(fit, truth, self.error_unit).detach().clamp(max=8).to(logits)
-        maps = self.map_loss(logits, batch, 1 + self.settings["hard_weight"] * hard)
-        return maps + self.settings["pose_weight"] * pose.to(maps.dtype)
+        loss, logits = self.map_loss(batch, batch_idx)
+        if self.settings["pose_weight"] > 0:
+            fit = self._fit(logits + unweighted_bias(self.class_weight).view(1, -1, 1, 1), batch)
+            truth = batch.extrinsics.double()
+            if self.settings["surprise"]:
+                pose = pose_surprise(fit, truth, self.unit, self.segmenter.config.pose_factor)
+                if self.settings["error_weight"] > 0:
+                    errors = pose_loss(fit, truth, self.error_unit, with_prior=True)
+                    pose = pose + self.settings["error_weight"] * errors
+            else:
+                pose = pose_loss(fit, truth, self.unit)
+            self.log("loss/pose", pose, prog_bar=True)
+            loss = loss + self.settings["pose_weight"] * pose.to(loss.dtype)
+        return loss
 
     def validation_step(self, batch: PoseBatch, batch_idx: int) -> None:  # type: ignore[override]
         """As ever, and the errors of the pose."""

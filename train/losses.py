@@ -25,9 +25,7 @@ def boundary_cross_entropy(
     return -((scaled * log_p).sum(1) * weight).sum() / weight.sum().clamp(min=1)
 
 
-def row_cross_entropy(
-    logits: Tensor, target: Tensor, weight: Tensor, least: float = 0.5, importance: Tensor | None = None
-) -> Tensor:
+def row_cross_entropy(logits: Tensor, target: Tensor, weight: Tensor, least: float = 0.5) -> Tensor:
     """How far each boundary's share of a row's probability is from where the boundary crosses the row.
 
     Each row of each boundary that is there counts the same, however thin its stripe: this says where, the
@@ -38,7 +36,6 @@ def row_cross_entropy(
         target: (B, 1+L, h, w).
         weight: (B, h, w).
         least: label mass below which a row does not count.
-        importance: (B,) of each frame's rows, or None for ones.
 
     Returns:
         Mean Kullback-Leibler divergence over counting rows.
@@ -46,9 +43,7 @@ def row_cross_entropy(
     log_p = (logits.log_softmax(1)[:, 1:] + (weight.unsqueeze(1) - 1) * 30).log_softmax(-1)  # over columns
     share = target[:, 1:] * weight.unsqueeze(1)
     mass = share.sum(-1, keepdim=True)
-    counts = (mass > least).squeeze(-1).to(log_p)
-    if importance is not None:
-        counts = counts * importance.view(-1, 1, 1)
+    counts = (mass > least).squeeze(-1)
     share = share / mass.clamp(min=least)
     divergence = (torch.special.xlogy(share, share) - share * log_p).sum(-1)
     return (divergence * counts).sum() / counts.sum().clamp(min=1)

@@ -95,25 +95,21 @@ class Segmentation(L.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Augment, segment, compare."""
-        return self.map_loss(self.augmented_logits(batch, batch_idx), batch)
+        return self.map_loss(batch, batch_idx)[0]
 
-    def augmented_logits(self, batch: Any, batch_idx: int) -> Tensor:
-        """Logits, class weights not undone, of the augmented images."""
-        image = unpack(batch)[0]
+    def map_loss(self, batch: Any, batch_idx: int) -> tuple[Tensor, Tensor]:
+        """Loss of the maps, and the logits, class weights not undone, of an augmented batch."""
+        image, target, weight = unpack(batch)
         if self.photometric is not None:
             with torch.no_grad(), self._own_randomness(batch_idx):
                 image = self.photometric(image)
-        logits = self.segmenter(image.contiguous(memory_format=self.layout))
-        return logits.float()  # type: ignore[no-any-return]  # sums need it under bf16
-
-    def map_loss(self, logits: Tensor, batch: Any, importance: Tensor | None = None) -> Tensor:
-        """Loss of the maps; a frame's pixels and rows count by its importance (B,)."""
-        _, target, weight = unpack(batch)
-        counted = weight if importance is None else weight * importance.view(-1, 1, 1)
-        pixels = boundary_cross_entropy(logits, target, counted, self.class_weight)
-        rows = row_cross_entropy(logits, target, weight, importance=importance)
+        logits = self.segmenter(
+            image.contiguous(memory_format=self.layout)
+        ).float()  # sums need it under bf16
+        pixels = boundary_cross_entropy(logits, target, weight, self.class_weight)
+        rows = row_cross_entropy(logits, target, weight)
         self.log_dict({"loss/pixels": pixels, "loss/rows": rows}, prog_bar=True)
-        return pixels + self.settings["row_weight"] * rows
+        return pixels + self.settings["row_weight"] * rows, logits
 
     @contextlib.contextmanager
     def _own_randomness(self, batch_idx: int) -> Iterator[None]:

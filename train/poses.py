@@ -149,25 +149,20 @@ class EvenGradients(torch.autograd.Function):
         return gradient.nan_to_num(0, 0, 0) * factor.view(-1, *[1] * (gradient.ndim - 1)), None
 
 
-def frame_errors(fit: SingleFrameFit, truth: Tensor, unit: Tensor, with_prior: bool = False) -> Tensor:
-    """Charbonnier errors of what each frame says of its pose, summed over axes: (B,).
+def pose_loss(fit: SingleFrameFit, truth: Tensor, unit: Tensor, with_prior: bool = False) -> Tensor:
+    """Charbonnier loss of what the frame says of its pose, summed over axes, mean over frames with a fit.
 
     Args:
-        fit: of B frames; one without a fit has no error.
+        fit: of B frames.
         truth: (B, 4).
         unit: (4,) rad, rad, rad, m: errors that count as one; far larger ones count linearly.
         with_prior: what the fit took from the prior (roll on one lane) counts too, and frames without a fit.
     """
-    said = with_prior | (fit.observed & fit.valid.unsqueeze(-1))
+    counted = fit.valid | with_prior
+    said = (fit.observed | with_prior) & counted.unsqueeze(-1)
     error = (fit.extrinsics.stack() - truth) / unit
     error = torch.where(said & error.isfinite(), error, 0.0)
-    return ((1 + error.square()).sqrt() - 1).sum(-1)
-
-
-def pose_loss(fit: SingleFrameFit, truth: Tensor, unit: Tensor, with_prior: bool = False) -> Tensor:
-    """Mean of :func:`frame_errors` over frames with a fit, or with the prior's over all."""
-    counted = fit.valid | with_prior
-    return frame_errors(fit, truth, unit, with_prior).sum() / counted.sum().clamp(min=1)
+    return ((1 + error.square()).sqrt() - 1).sum() / counted.sum().clamp(min=1)
 
 
 def pose_surprise(fit: SingleFrameFit, truth: Tensor, floor: Tensor, factor: float = 1.0) -> Tensor:
