@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from lanebev.estimation.joint import JointCalibrator
 from lanebev.estimation.mount import MountEstimator, MountReason, MountState, MountStatus
 from lanebev.types import Calibration, Extrinsics, Status
 
@@ -182,8 +183,10 @@ def test_bad_numbers_are_named():
     with pytest.raises(ValueError, match="block_time: expected a positive"):
         MountEstimator(block_time=0.0)
     mount = MountEstimator()
-    with pytest.raises(ValueError, match="state: expected 2 rows, got 1"):
+    with pytest.raises(ValueError, match=r"state.blocks: expected \(2, ...\), got \(1, "):
         mount(fast(POSE, 2), start(mount), 0.1)
+    with pytest.raises(ValueError, match=r"state: expected MountState, begun by .* got JointState"):
+        mount(fast(POSE, 2), JointCalibrator().initial_state(2), 0.1)
 
 
 def test_exports_and_equals_eager():

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lanebev.estimation.checks import as_batch
+from lanebev.estimation.checks import as_batch, check_state
 from lanebev.rows import flag, where
 from lanebev.types import Calibration, Extrinsics, Status, saved_by_name
 
@@ -207,11 +207,10 @@ class MountEstimator(nn.Module):
             the mount and the state after the frame.
 
         Raises:
-            ValueError: a shape that doesn't fit.
+            ValueError: a shape that doesn't fit, or another estimator's state.
         """
-        pose = calibration.extrinsics.stack().to(state.pose_sum.dtype)
-        if state.pose_sum.shape != pose.shape:
-            raise ValueError(f"state: expected {pose.shape[0]} rows, got {state.pose_sum.shape[0]}")
+        pose = calibration.extrinsics.stack()
+        pose = pose.to(check_state(state, MountState, pose.shape[0]).dtype)
         variance = calibration.covariance.diagonal(dim1=-2, dim2=-1).to(pose.dtype)
         step = as_batch(dt, pose)
         why = self._gates(calibration.status, pose, variance, step, speed, yaw_rate, curvature)
