@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lanebev.geometry.precision import autocast_off, cast_floating
-from lanebev.types import Calibration, LaneSegments
+from lanebev.types import Calibration, LaneSegments, Status
 
 Forward = TypeVar("Forward", bound=Callable[..., Any])
 
@@ -165,6 +165,11 @@ def _padded(segments: LaneSegments) -> LaneSegments:
     return LaneSegments(
         *(torch.cat([part, part.new_zeros(part.shape[0], missing, *part.shape[2:])], 1) for part in segments)
     )
+
+
+def is_running(status: Tensor) -> Tensor:
+    """(B,) bool: started and not lost."""
+    return (status == int(Status.TRACKING)) | (status == int(Status.COASTING))
 
 
 def as_batch(value: float | Tensor, like: Tensor, name: str = "dt") -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation import kalman
+from lanebev.estimation.checks import is_running
 from lanebev.estimation.vanishing import (
     gate_angles,
     incidence_noise,
@@ -17,7 +18,7 @@ from lanebev.estimation.vanishing import (
     vanishing_dir_least_squares,
 )
 from lanebev.geometry.rotation import pitch_yaw_from_vanishing_dir, vanishing_dir_from_pitch_yaw
-from lanebev.types import LaneSegments, Status
+from lanebev.types import LaneSegments
 
 if TYPE_CHECKING:
     from lanebev.estimation.two_stage import TwoStageConfig, TwoStageState
@@ -79,7 +80,7 @@ def track_direction(
     inliers = (near & there).to(mean.dtype)
     supported = is_supported(segments, inliers, cfg)
 
-    tracking = (state.status == int(Status.TRACKING)) | (state.status == int(Status.COASTING))
+    tracking = is_running(state.status)
     # After a gap the prediction is too wide to tell right segments from wrong: search instead of gating.
     spread = cov[:, :2, :2].diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()
     start = ~tracking | (state.unseen + dt > cfg.reacquire_after) | (spread > cfg.reacquire_spread)
@@ -106,7 +107,7 @@ def predict_direction(state: TwoStageState, dt: Tensor, cfg: TwoStageConfig) -> 
     """
     density = dt.new_full((2,), cfg.angular_acceleration_density)
     moving = torch.minimum(dt, (cfg.reacquire_after - state.unseen).clamp_min(0.0))
-    tracking = (state.status == int(Status.TRACKING)) | (state.status == int(Status.COASTING))
+    tracking = is_running(state.status)
     transition, _ = kalman.constant_velocity(torch.where(tracking, moving, 0.0), density)
     _, noise = kalman.constant_velocity(torch.where(tracking, dt, 0.0), density)
     mean, cov = kalman.predict(state.direction_mean, state.direction_cov, transition, noise)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.estimation import kalman
-from lanebev.estimation.checks import as_batch, calibrates
+from lanebev.estimation.checks import as_batch, calibrates, is_running
 from lanebev.estimation.joint_filter import (
     UNSEEN,
     Update,
@@ -271,7 +271,7 @@ class JointCalibrator(nn.Module):
         due = dt - state.early
         guessed = ~(due > -1.0) | ~dt.isfinite()
         due = torch.where(guessed, self.config.assumed_dt, due)
-        skip = (due <= 0) & _running(state.status)
+        skip = (due <= 0) & is_running(state.status)
         return due.clamp(0.0, 60.0), skip, torch.where(skip, -due, 0.0), guessed
 
     def _follow_lane_change(
@@ -356,7 +356,7 @@ class JointCalibrator(nn.Module):
         Without support the predicted state stands.
         """
         cfg = self.config
-        running = _running(state.status)
+        running = is_running(state.status)
         support = (seen.weight * update.trust).sum(-1)
         total = seen.weight.sum(-1)
         share = support / total.clamp(min=1e-6)
@@ -400,7 +400,7 @@ class JointCalibrator(nn.Module):
     ) -> tuple[JointState, Tensor]:
         """Rows that have nothing, or nothing that fits, start from this frame alone if it allows that."""
         cfg = self.config
-        wanted = ~_running(state.status) | (~supported & (state.misfit > cfg.restart_after))
+        wanted = ~is_running(state.status) | (~supported & (state.misfit > cfg.restart_after))
         if not torch.compiler.is_compiling() and not bool(wanted.any()):
             return state, agreed  # the same result: every row would discard the search
         fit = fit_single_frame(
@@ -488,10 +488,6 @@ class JointCalibrator(nn.Module):
         worst = mean[:, NUM_COMMON:].abs().amax(-1)
         alone = (worst > 0.1 * size) & (worst < _DOUBTFUL) & (self._inequality(mean) == 0)
         return torch.where(alone, worst.clamp(max=size), 0.0)
-
-
-def _running(status: Tensor) -> Tensor:
-    return (status == int(Status.TRACKING)) | (status == int(Status.COASTING))
 
 
 def _held(reasons: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lanebev.estimation.checks import as_batch, as_lane_width, calibrates
+from lanebev.estimation.checks import as_batch, as_lane_width, calibrates, is_running
 from lanebev.estimation.direction_stage import track_direction
 from lanebev.estimation.lane_width import boundary_angles
 from lanebev.estimation.roll_height_stage import track_roll_height
@@ -144,8 +144,7 @@ class TwoStageCalibrator(nn.Module):
         """
         dt = as_batch(dt, segments.sigma)
         dt = torch.where(dt.isfinite(), dt, self.config.assumed_dt)
-        running = (state.status == int(Status.TRACKING)) | (state.status == int(Status.COASTING))
-        before, skip = state, (dt <= 0) & running
+        before, skip = state, (dt <= 0) & is_running(state.status)
         dt = dt.clamp(0.0, 60.0)
         widths = as_lane_width(lane_width, segments.sigma, self.config.num_boundaries)
         rays = rays_from_pixels(segments.endpoints.flatten(1, 2), intrinsics)
