@@ -2,6 +2,7 @@ import json
 import math
 import sys
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from lanebev.types import Extrinsics
 from lanebev.weights import save_segmenter
 from train import evaluate_poses
 from train.data import LiveFrames, PoolFrames
-from train.end_to_end import EndToEnd
+from train.end_to_end import EndToEnd, gradient_ratio
 from train.labels import ViewConfig
 from train.module import unpack
 from train.pool import read_shard, write_shard
@@ -43,6 +44,12 @@ def batch():
 
 def logits_of(batch):
     return unpack(batch)[1].clamp(min=1e-4).log()
+
+
+@pytest.fixture
+def trainer():
+    """Of which a step asks how often to log."""
+    return SimpleNamespace(log_every_n_steps=1)
 
 
 def fit(logits, batch, **options):
@@ -189,16 +196,17 @@ def test_even_gradients_are_no_longer_than_so_many_medians(reach):
 
 
 @pytest.mark.parametrize(("surprise", "error_weight"), [(False, 0.0), (True, 0.0), (True, 2.0)])
-def test_empty_maps_train_on_finite_gradients(batch, surprise, error_weight):
+def test_empty_maps_train_on_finite_gradients(batch, trainer, surprise, error_weight):
     torch.manual_seed(0)
     network = SegmenterConfig(base_width=4, decoder_width=4)
     model = EndToEnd(network=network, augment=0.0, surprise=surprise, error_weight=error_weight)
+    model.trainer = trainer
     model.log = model.log_dict = lambda *args, **kwargs: None
     model.training_step(batch, 0).backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
 
 
-def test_errors_count_beside_surprise(batch):
+def test_errors_count_beside_surprise(batch, trainer):
     """Boundaries that are elsewhere: the loss is higher by the errors, as often as they are weighed."""
     losses = []
     for error_weight in (0.0, 1.0, 3.0):
@@ -207,12 +215,43 @@ def test_errors_count_beside_surprise(batch):
         model = EndToEnd(
             network=network, augment=0.0, surprise=True, error_weight=error_weight, pose_weight=1.0
         )
+        model.trainer = trainer
         model.log = model.log_dict = lambda *args, **kwargs: None
         losses.append(model.training_step(batch, 0).detach())
     assert losses[1] > losses[0] + 0.1
     torch.testing.assert_close(losses[2] - losses[0], 3 * (losses[1] - losses[0]), rtol=1e-3, atol=1e-4)
     with pytest.raises(ValueError, match="error_weight: expected 0 without surprise"):
         EndToEnd(error_weight=1.0)
+
+
+@pytest.mark.parametrize(("every", "logged"), [(1, True), (3, True), (2, False)])
+def test_the_share_of_the_poses_gradient_is_logged_with_the_rest(batch, every, logged):
+    """Of step 2, the third, in as many as are logged; twice the weight is twice the ratio."""
+    ratios = []
+    for pose_weight in (0.01, 0.02):
+        network = SegmenterConfig(base_width=4, decoder_width=4)
+        model = EndToEnd(network=network, pose_weight=pose_weight)
+        model.trainer = SimpleNamespace(log_every_n_steps=every)
+        seen = {}
+        model.log = lambda name, value, seen=seen, **kwargs: seen.update({name: value})
+        logits = (0.9 * logits_of(batch)).requires_grad_()
+        model.map_loss = lambda batch, number, logits=logits: (logits.square().mean(), logits)
+        model.training_step(batch, 2).backward()
+        assert ("gradient/pose_by_maps" in seen) == logged
+        ratios.append(seen.get("gradient/pose_by_maps"))
+    if logged:
+        assert ratios[0] > 0
+        torch.testing.assert_close(ratios[1], 2 * ratios[0])
+
+
+def test_gradient_ratio():
+    """Of 6 x and 3 x at (3, 4): lengths 5 by 6 and 3."""
+    x = torch.tensor([[3.0, 4.0]], requires_grad=True)
+    loss, by = 3 * x.square().sum(), 1.5 * x.square().sum()
+    torch.testing.assert_close(gradient_ratio(loss, by, x), torch.tensor(2.0))
+    assert gradient_ratio(0 * loss, by, x) == 0
+    (loss + by).backward()  # the graph is still there
+    torch.testing.assert_close(x.grad, 9 * x.detach())
 
 
 def test_evaluate_poses_reports_both(tmp_path, capsys, monkeypatch):

@@ -21,7 +21,9 @@ class EndToEnd(Segmentation):
     joint single-frame fit to the extracted segments. All of it is differentiable.
 
     Args:
-        pose_weight: of the pose's loss; 0 trains on the same frames with cross-entropy alone.
+        pose_weight: of the pose's loss; 0 trains on the same frames with cross-entropy alone. The logged
+            ``gradient/pose_by_maps`` should stay within a few: an adaptive optimizer divides by the size of
+            all gradients, so a pose's that are far longer leave the maps no step to learn by.
         surprise: the loss is how little the fit, with its sigmas, expected the truth; else the error alone.
         pose_unit: deg, deg, deg, m: errors of pitch, yaw, roll and height that count as one; for ``surprise``
             those that are as good as none.
@@ -79,7 +81,10 @@ class EndToEnd(Segmentation):
             else:
                 pose = pose_loss(fit, truth, self.unit)
             self.log("loss/pose", pose, prog_bar=True)
-            loss = loss + self.settings["pose_weight"] * pose.to(loss.dtype)
+            weighted = self.settings["pose_weight"] * pose.to(loss.dtype)
+            if (batch_idx + 1) % self.trainer.log_every_n_steps == 0:
+                self.log("gradient/pose_by_maps", gradient_ratio(weighted, loss, logits))
+            loss = loss + weighted
         return loss
 
     def validation_step(self, batch: PoseBatch, batch_idx: int) -> None:  # type: ignore[override]
@@ -116,3 +121,9 @@ class EndToEnd(Segmentation):
             self.settings["where_only"],
             self.settings["gradient_reach"],
         )
+
+
+def gradient_ratio(loss: Tensor, by: Tensor, logits: Tensor) -> Tensor:
+    """How many times longer the gradient of one loss on the logits is than that of another."""
+    one, other = (torch.autograd.grad(each, logits, retain_graph=True)[0].norm() for each in (loss, by))
+    return one / other.clamp(min=torch.finfo(other.dtype).tiny)
