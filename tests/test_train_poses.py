@@ -265,13 +265,16 @@ def test_evaluate_poses_reports_both(tmp_path, capsys, monkeypatch):
     evaluate_poses.main()
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["weights"] for line in lines] == ["before.safetensors", "after.safetensors"]
-    assert set(evaluate_poses.AXES) < set(lines[0])
-    assert set(lines[1]) - set(lines[0]) == {"rmse_below_first_by"}
+    for counted in ("observed", "every_frame"):
+        assert set(lines[0][counted]) == set(evaluate_poses.AXES)
+        assert set(lines[1][counted]) == {*evaluate_poses.AXES, "rmse_below_first_by"}
+    assert lines[0]["observed"]["roll_deg"]["frames"] < lines[0]["every_frame"]["roll_deg"]["frames"] == 2
     online = ["--online", "--drives", "1", "--frames", "12"]
     monkeypatch.setattr(sys, "argv", ["evaluate_poses", paths[0], *online])
     evaluate_poses.main()
     line = json.loads(capsys.readouterr().out)
-    assert line["pitch_deg"]["frames"] == 2  # after ten frames of warm-up
+    assert "observed" not in line
+    assert line["every_frame"]["pitch_deg"]["frames"] == 2  # after ten frames of warm-up
     monkeypatch.setattr(sys, "argv", ["evaluate_poses", str(tmp_path / "none.safetensors")])
     with pytest.raises(SystemExit) as stop:
         evaluate_poses.main()

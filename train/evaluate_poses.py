@@ -1,9 +1,10 @@
 """Errors of the pose on held-out rendered drives: ``python -m train.evaluate_poses BEFORE AFTER``.
 
 Every weights file (safetensors, or a Lightning checkpoint) sees the same frames. Each frame is taken on its
-own, an axis counting where every network's fit is valid and observes it; or, with ``--online``, the joint
-calibrator follows each drive, and all frames after its warm-up count, whatever their status. Of every network
-but the first, the 95 % interval of how far its RMSE is below the first's is printed too.
+own, an axis counting where every network's fit is valid and observes it, and once more, as ``every_frame``,
+counting all, the prior answering for what is not observed; or, with ``--online``, the joint calibrator
+follows each drive, and all frames after its warm-up count, whatever their status. Of every network but the
+first, the 95 % interval of how far its RMSE is below the first's is printed too.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import argparse
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.stats
@@ -101,7 +103,7 @@ def gain(before: Tensor, after: Tensor, counted: Tensor, drives: int) -> dict[st
     return report
 
 
-def summary(error: Tensor, counted: Tensor) -> dict[str, dict[str, float]]:
+def summary(error: Tensor, counted: Tensor) -> dict[str, Any]:
     """Root mean square and median of the absolute error per axis, in degrees and centimetres."""
     unit = error.new_tensor(UNIT)
     report = {}
@@ -132,19 +134,22 @@ def main() -> None:
         networks = [trained_segmenter(path)[0] for path in args.weights]
     except (ValueError, OSError) as error:
         parser.exit(2, f"error: {error}\n")
+    counted = {}
     if args.online:
         errors = online_errors(networks, args.drives, args.frames, args.fps, args.seed)
-        common = torch.ones_like(errors[0]).bool()
-        shares = [{} for _ in errors]
+        shares: list[dict[str, Any]] = [{} for _ in errors]
     else:
-        frames = held_out_frames(args.drives, args.frames, tuple(args.size), args.seed)
-        errors, said = zip(*(pose_errors(network, frames) for network in networks), strict=True)
-        common = torch.stack(said).all(0)
+        held_out = held_out_frames(args.drives, args.frames, tuple(args.size), args.seed)
+        errors, said = zip(*(pose_errors(network, held_out) for network in networks), strict=True)
         shares = [{"valid": round(float(own[:, 0].double().mean()), 3)} for own in said]
+        counted["observed"] = torch.stack(said).all(0)
+    counted["every_frame"] = torch.ones_like(errors[0]).bool()
     for path, share, error in zip(args.weights, shares, errors, strict=True):
-        line = {"weights": path.name, **share, **summary(error, common)}
-        if error is not errors[0] and args.drives > 1:
-            line["rmse_below_first_by"] = gain(errors[0], error, common, args.drives)
+        line: dict[str, Any] = {"weights": path.name, **share}
+        for name, frames in counted.items():
+            line[name] = summary(error, frames)
+            if error is not errors[0] and args.drives > 1:
+                line[name]["rmse_below_first_by"] = gain(errors[0], error, frames, args.drives)
         print(json.dumps(line))
 
 
