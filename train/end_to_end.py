@@ -22,8 +22,8 @@ class EndToEnd(Segmentation):
 
     Args:
         pose_weight: of the pose's loss; 0 trains on the same frames with cross-entropy alone. The logged
-            ``gradient/pose_by_maps`` should stay within a few: an adaptive optimizer divides by the size of
-            all gradients, so a pose's that are far longer leave the maps no step to learn by.
+            ``gradient/pose_by_maps`` is best below ten, not tens: an adaptive optimizer divides by the size
+            of all gradients, so a pose's that are far longer leave the maps no step to learn by.
         surprise: the loss is how little the fit, with its sigmas, expected the truth; else the error alone.
         pose_unit: deg, deg, deg, m: errors of pitch, yaw, roll and height that count as one; for ``surprise``
             those that are as good as none.
