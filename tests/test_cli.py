@@ -454,12 +454,15 @@ def test_a_run_stopped_by_the_system_leaves_nothing(data, tmp_path, capsys, monk
         os.kill(os.getpid(), number)
         time.sleep(10)
 
-    before = signal.getsignal(number)
+    before = signal.signal(number, signal.SIG_DFL)  # the tests may run under nohup
     monkeypatch.setattr("lanebev.run.calibrate", stop)
-    assert _run(data, out=tmp_path / "out") == 128 + number
-    assert capsys.readouterr().err == "lanebev run: interrupted, nothing written\n"
-    assert list(tmp_path.iterdir()) == []
-    assert signal.getsignal(number) == before
+    try:
+        assert _run(data, out=tmp_path / "out") == 128 + number
+        assert capsys.readouterr().err == "lanebev run: interrupted, nothing written\n"
+        assert list(tmp_path.iterdir()) == []
+        assert signal.getsignal(number) == signal.SIG_DFL
+    finally:
+        signal.signal(number, before)
 
 
 def test_names_and_terminals_without_the_signs(data, tmp_path, monkeypatch):
