@@ -304,6 +304,18 @@ def test_in_a_gap_the_pose_goes_on_for_a_fifth_of_a_second_and_then_holds_still(
     assert steps[7:].abs().max() < 1e-12
 
 
+@pytest.mark.parametrize("dt", [0.5, 0.9, 1.2])
+def test_across_one_long_interval_roll_and_height_hold_still(dt):
+    """Their rates times a second would lead to where the widths are another pose's."""
+    calibrator = TwoStageCalibrator()
+    turning = [lanes((0.03, -0.02, 0.015 + 0.003 * i, 1.45 + 0.01 * i), seed=i) for i in range(12)]
+    _, state = drive(calibrator, turning)
+    out, _ = calibrator(lanes((0.03, -0.02, 0.048, 1.56), seed=12), K[None], state, dt)
+    assert int(out.status[0]) == Status.TRACKING
+    assert abs(float(out.extrinsics.roll[0]) - 0.048) < math.radians(0.15)
+    assert abs(float(out.extrinsics.height[0]) - 1.56) < 0.01
+
+
 def test_a_wide_prediction_searches_instead_of_gating():
     """Too wide to tell right segments from wrong ones, though the gap is a short one."""
     calibrator = TwoStageCalibrator(angular_acceleration_density=4.0)

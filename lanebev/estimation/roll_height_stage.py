@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from lanebev.estimation.two_stage import TwoStageConfig, TwoStageState
 
 
+_NUM_LINEARISATIONS = 2
 LARGEST_ROLL = 0.8  # rad
 LEAST_HEIGHT, LARGEST_HEIGHT = 0.1, 20.0  # m
 
@@ -73,18 +74,8 @@ def track_roll_height(
     wide = mean.new_tensor([*cfg.initial_pose_std[2:], *cfg.initial_rate_std[2:]]).square().diag()
     cov = torch.where((first.unsqueeze(-1) | first.unsqueeze(-2)), wide, cov)
 
-    measured = measure_widths(boundaries, mean[:, 0], mean[:, 1], direction_cov, cfg.lane_noise)
-    whiten = torch.linalg.cholesky_ex(measured.noise).L
-    error = torch.where(measured.present, lane_width - measured.widths, 0.0)
-    jacobian = torch.where(measured.present.unsqueeze(-1), measured.jacobian, 0.0)
-    jacobian = jacobian * torch.stack([roll_seen, height_seen], dim=-1).unsqueeze(1)
-    jacobian = torch.cat([jacobian, torch.zeros_like(jacobian)], dim=-1)  # (B, L-1, 4)
-    white = torch.linalg.solve_triangular(
-        whiten, torch.cat([jacobian, error.unsqueeze(-1)], dim=-1), upper=False
-    )
-    mean, cov = kalman.update(
-        mean, cov, *kalman.information(white[..., -1], white[..., :-1], torch.ones_like(error))
-    )
+    seen = torch.stack([roll_seen, height_seen], dim=-1)
+    mean, cov = update_by_widths(boundaries, lane_width, direction_cov, mean, cov, seen, cfg.lane_noise)
     # Nothing says that widths of wrong boundaries lead anywhere: what has run away starts over.
     possible = (mean[:, 0].abs() < LARGEST_ROLL) & (mean[:, 1] > LEAST_HEIGHT) & (mean[:, 1] < LARGEST_HEIGHT)
     prior = torch.cat([mean.new_tensor(cfg.initial_pose[2:]), mean.new_zeros(2)])
@@ -94,15 +85,61 @@ def track_roll_height(
     return RollHeightStep(mean, cov, roll_known, (state.height_known | height_seen) & possible)
 
 
+def update_by_widths(
+    boundaries: BoundaryAngles,
+    lane_width: Tensor,
+    direction_cov: Tensor,
+    mean: Tensor,
+    cov: Tensor,
+    seen: Tensor,
+    lane_noise: float,
+) -> tuple[Tensor, Tensor]:
+    """Iterated EKF update of roll and height by the lanes' widths.
+
+    Source: Eqs. (15)-(17) with the measurement of Eq. (20); iterated as in Bell and Cathey 1993.
+    Deviation: linearised twice, the second time about the first's result: widths are curved in roll by so
+    much that after a fifth of a second one update is seven sigmas off. And Q is not constant: a width is as
+    good as its boundaries' pixels and as pitch and yaw, whose errors widths of one frame share.
+
+    Args:
+        boundaries: angles about the direction of stage 1.
+        lane_width: (B, L-1) m, the prior.
+        direction_cov: (B, 2, 2) of pitch and yaw.
+        mean: (B, 4) predicted roll, height and their rates; cov: (B, 4, 4).
+        seen: (B, 2) bool, whether widths may move roll and height.
+        lane_noise: m, standard deviation of a lane's width about the prior.
+
+    Returns:
+        mean (B, 4) and covariance (B, 4, 4).
+    """
+    at, after = mean, cov
+    for _ in range(_NUM_LINEARISATIONS):
+        measured = measure_widths(boundaries, at[:, 0], at[:, 1], direction_cov, lane_noise)
+        error = torch.where(measured.present, lane_width - measured.widths, 0.0)
+        jacobian = torch.where(measured.present.unsqueeze(-1), measured.jacobian, 0.0) * seen.unsqueeze(1)
+        jacobian = torch.cat([jacobian, torch.zeros_like(jacobian)], dim=-1)  # (B, L-1, 4)
+        innovation = error + (jacobian @ (at - mean).unsqueeze(-1)).squeeze(-1)
+        white = torch.linalg.solve_triangular(
+            torch.linalg.cholesky_ex(measured.noise).L,
+            torch.cat([jacobian, innovation.unsqueeze(-1)], dim=-1),
+            upper=False,
+        )
+        info = kalman.information(white[..., -1], white[..., :-1], torch.ones_like(error))
+        at, after = kalman.update(mean, cov, *info)
+    return at, after
+
+
 def predict_roll_height(
     state: TwoStageState, dt: Tensor, roll_seen: Tensor, height_seen: Tensor, cfg: TwoStageConfig
 ) -> tuple[Tensor, Tensor]:
-    """Constant velocity, but what is not observed in this frame holds still while its sigma grows.
+    """Constant velocity for no longer than ``reacquire_after``; what this frame does not observe holds still.
 
-    Deviation: the paper would extrapolate roll on one lane for ever (PAPER_NOTES 6).
+    Deviation: the paper would extrapolate roll on one lane for ever (PAPER_NOTES 6), and across any gap, to
+    where one linearised update does not lead back from. Sigma grows with the whole gap.
     """
     density = dt.new_tensor([cfg.angular_acceleration_density, cfg.height_acceleration_density])
-    transition, noise = kalman.constant_velocity(dt, density)
+    transition, _ = kalman.constant_velocity(dt.clamp(max=cfg.reacquire_after), density)
+    _, noise = kalman.constant_velocity(dt, density)
     moving = torch.stack([roll_seen & state.roll_known, height_seen & state.height_known], dim=-1)
     moving = torch.cat([moving, moving], dim=-1)  # (B, 4) of position and rate
     eye = torch.eye(4, dtype=dt.dtype, device=dt.device)
