@@ -45,7 +45,7 @@ class LaneBEV(nn.Module):
             image's pixels.
         calibrator: e.g. :class:`lanebev.JointCalibrator`.
         warp: default :class:`BEVWarp` on the default grid.
-        network_width: px, the image is resized to this width, its aspect kept to the next multiple of 32,
+        network_width: px, the image is resized to this width, its aspect kept to the nearest multiple of 32,
             before the segmenter; None leaves it as it is.
         pose_factor: of the pose's sigmas, as measured for the segmenter; None is what its ``config`` says
             (:class:`SegmenterConfig`), 1 if it says nothing.
@@ -92,7 +92,7 @@ class LaneBEV(nn.Module):
         Args:
             weights: another file in the same format; None is the shipped one.
             grid: of the view.
-            calibrator: None is :class:`lanebev.JointCalibrator` with default settings.
+            calibrator: None is a default :class:`lanebev.JointCalibrator` of the network's boundaries.
             network_width: px; None is what the weights were trained for.
 
         Raises:
@@ -105,7 +105,8 @@ class LaneBEV(nn.Module):
         segmenter = load_segmenter(weights)
         width = network_width or int(segmenter.image_size[1])
         extractor = LineExtractor.for_network(segmenter.config)
-        return cls(segmenter, extractor, calibrator or JointCalibrator(), BEVWarp(grid), width)
+        calibrator = calibrator or JointCalibrator(num_boundaries=segmenter.config.num_boundaries)
+        return cls(segmenter, extractor, calibrator, BEVWarp(grid), width)
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None

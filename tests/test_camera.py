@@ -7,6 +7,8 @@ import torch
 
 from lanebev import Camera
 from lanebev.geometry import camera as lens
+from lanebev.geometry.camera import cam_from_image
+from lanebev.geometry.road import rays_from_pixels
 
 BROWN = {
     4: [-0.25, 0.05, -0.0007, 0.0001],
@@ -73,6 +75,16 @@ def test_rays_project_back():
     assert inside.all()
     _, behind = cam.project(-cam.rays(points))
     assert not behind.any()
+
+
+def test_the_matrix_of_the_inverse_camera_has_skew():
+    intrinsics = torch.tensor(
+        [[[900.0, 3.0, 640.0], [0.0, 800.0, 360.0], [0.0, 0.0, 1.0]]], dtype=torch.float64
+    )
+    torch.testing.assert_close(cam_from_image(intrinsics), torch.linalg.inv(intrinsics))
+    rays = rays_from_pixels(torch.tensor([[[10.0, 20.0]]], dtype=torch.float64), intrinsics)
+    pixel = torch.tensor([10.0, 20.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close((cam_from_image(intrinsics) @ pixel)[0], rays[0, 0])
 
 
 def test_points_beyond_the_fold_of_the_lens_are_not_seen():

@@ -290,6 +290,7 @@ def test_export_equals_eager(fans):
         (lambda: extract_segments(torch.zeros(7, 8), (16, 16), CONFIG), "probabilities: expected"),
         (lambda: LineConfig(segments=0), "segments: expected"),
         (lambda: LineConfig(absent=0.7), "present: expected"),
+        (lambda: LineConfig(half_width=0.0), "half_width: expected more than 0"),
     ],
 )
 def test_errors(call, match):

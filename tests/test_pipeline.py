@@ -21,6 +21,7 @@ from lanebev import (
 from lanebev.geometry.camera import distort_points
 from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.types import Extrinsics
+from lanebev.weights import save_segmenter
 from tests.test_two_stage import K, lanes
 
 GRID = BEVGrid(x=(-6.0, 6.0), z=(6.0, 30.0), resolution=0.5)
@@ -150,6 +151,39 @@ def test_parts_that_number_other_boundaries_are_refused():
     with pytest.raises(ValueError, match=r"num_boundaries: expected the same of both, got 4 .* and 6 of"):
         LaneBEV(net, LineExtractor(), JointCalibrator())
     LaneBEV(net, LineExtractor(), JointCalibrator(num_boundaries=4))
+
+
+def test_pretrained_of_any_number_of_boundaries_gets_a_calibrator_of_as_many(tmp_path):
+    net = LaneSegmenter(replace(SMALL, num_boundaries=4))
+    save_segmenter(net, tmp_path / "four.safetensors")
+    made = LaneBEV.from_pretrained(tmp_path / "four.safetensors")
+    assert made.calibrator.config.num_boundaries == 4
+    assert LaneBEV.from_pretrained().calibrator.config.num_boundaries == 6
+
+
+@pytest.mark.parametrize("calibrator", [TwoStageCalibrator, JointCalibrator])
+def test_no_part_needs_a_device_with_double_precision(calibrator):
+    made = LaneBEV.from_pretrained(calibrator=calibrator())
+    assert {name for name, part in made.named_buffers() if part.dtype == torch.float64} == set()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("calibrator", [TwoStageCalibrator(), JointCalibrator()])
+def test_what_is_done_to_the_output_is_not_done_to_the_state(calibrator, dtype):
+    state = calibrator.initial_state(1, dtype=dtype)
+    for seed in range(3):
+        out, state = calibrator(lanes(seed=seed), K[None], state, 1 / 30)
+    before = [part.clone() for part in state]
+    for part in (*out.extrinsics, out.covariance, out.status, out.inliers):
+        part.fill_(7)
+    for old, new in zip(before, state, strict=True):
+        torch.testing.assert_close(new, old, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("calibrator", [TwoStageCalibrator(), JointCalibrator()])
+def test_cameras_of_whole_numbers_are_named(calibrator):
+    with pytest.raises(ValueError, match=r"intrinsics: expected floating point, got torch.int64"):
+        calibrator(lanes(), K[None].long(), calibrator.initial_state(1), 1 / 30)
 
 
 def test_shapes_are_checked():

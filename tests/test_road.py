@@ -131,7 +131,7 @@ def test_a_camera_below_the_road_sees_none_of_it():
 
 
 def test_the_homography_asks_for_a_camera_to_every_pose():
-    with pytest.raises(ValueError, match=r"intrinsics: expected \(1, 3, 3\) like the pose, got \(2, 3, 3\)"):
+    with pytest.raises(ValueError, match=r"intrinsics: expected \(1, 3, 3\), got \(2, 3, 3\)"):
         bev_from_image(pose(), K.expand(2, 3, 3), BEVGrid())
 
 

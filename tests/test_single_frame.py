@@ -211,6 +211,28 @@ def test_gradient_reaches_the_endpoints():
     torch.testing.assert_close((gradient * direction).sum(), numeric, rtol=0.02, atol=0)
 
 
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"pitch_std": 0.0}, "pitch_std: expected more than 0, got 0.0"),
+        ({"roll_steps": 0}, "roll_steps: expected at least 1, got 0"),
+        ({"roll": math.nan}, "roll: expected a finite number, got nan"),
+        ({"height": 0.0}, "height: expected more than 0 m, got 0.0"),
+    ],
+)
+def test_a_prior_that_is_none_is_refused(numbers, message):
+    with pytest.raises(ValueError, match=message):
+        FramePrior(**numbers)
+
+
+def test_a_search_of_one_step_is_at_the_mean():
+    prior = FramePrior(pitch=0.03, roll=0.01, pitch_steps=1, roll_steps=1)
+    truth = torch.tensor([[0.03, 0.02, 0.01, 1.5, 0.0, 0.0, 0.0]], dtype=DOUBLE)
+    fit = fit_single_frame(drive_frames(truth, 0.5, 3), cameras(1), prior=prior)
+    assert bool(fit.valid[0])
+    assert (fit.extrinsics.stack() - truth[:, :4]).abs().max() < 0.01
+
+
 def test_wrong_shapes_are_one_clear_line():
     segments = drive_frames(random_params(2, 18, (1, 1, 1)), 1.0, 19, per_boundary=2)
     with pytest.raises(ValueError, match=r"segments.weight: expected \(2, 12\)"):

@@ -110,7 +110,7 @@ def test_gradcheck_through_pose_lens_and_image():
 def test_shapes_are_checked():
     with pytest.raises(ValueError, match=r"image: expected \(B, C, h, w\)"):
         BEVWarp(GRID)(torch.zeros(3, 4, 5), CAMERA.intrinsics[None], pose([0.0, 0.0, 0.0, 1.5]))
-    with pytest.raises(ValueError, match="for 2 images"):
+    with pytest.raises(ValueError, match=r"intrinsics: expected \(2, 3, 3\), got"):
         BEVWarp(GRID)(smooth_image(2), CAMERA.intrinsics[None], pose([0.0, 0.0, 0.0, 1.5]))
 
 
@@ -167,3 +167,20 @@ def test_whole_numbers_and_lenses_that_do_not_fit_are_named():
     for shape in ((5,), (3, 5)):
         with pytest.raises(ValueError, match=r"distortion: expected \(2, D\) like the points, got \("):
             BEVWarp(GRID)(smooth_image(2), *args, torch.zeros(shape, dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"extrinsics: expected \(2,\) each, got \(1,\)"):
+        BEVWarp(GRID)(smooth_image(2), args[0], pose([0.0, 0.0, 0.0, 1.5]))
+    whole, message = args[0].long(), r"intrinsics: expected floating point, got torch.int64"
+    with pytest.raises(ValueError, match=message):
+        BEVWarp(GRID)(smooth_image(2), whole, args[1])
+    with pytest.raises(ValueError, match=message):
+        bev_from_image(args[1], whole, GRID)
+
+
+def test_a_camera_that_cannot_be_used_leaves_the_other_rows_alone():
+    both = torch.stack([CAMERA.intrinsics, torch.zeros(3, 3).double()])
+    two = pose([0.05, 0.02, 0.01, 1.5], [0.05, 0.02, 0.01, 1.5])
+    homography = bev_from_image(two, both, GRID)
+    bev, _ = BEVWarp(GRID)(smooth_image(2), both, two)
+    one = Extrinsics(*(part[:1] for part in two))
+    torch.testing.assert_close(homography[:1], bev_from_image(one, both[:1], GRID))
+    torch.testing.assert_close(bev[:1], BEVWarp(GRID)(smooth_image(), both[:1], one)[0])

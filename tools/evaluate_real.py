@@ -18,16 +18,6 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
-from real_figures import (
-    Figure,
-    carla_drive,
-    carla_stills,
-    tusimple_camera,
-    tusimple_labels,
-    tusimple_pixels,
-    tusimple_segments,
-    udacity,
-)
 from rich.console import Console
 from rich.table import Table
 
@@ -37,6 +27,16 @@ from lanebev.io.video import open_source
 from lanebev.report.measure import pose
 from lanebev.report.overlay import Panel, draw_frame
 from lanebev.run import bird_view, calibrate_still, make_calibrator
+from tools.real_figures import (
+    Figure,
+    carla_drive,
+    carla_stills,
+    tusimple_camera,
+    tusimple_labels,
+    tusimple_pixels,
+    tusimple_segments,
+    udacity,
+)
 
 NEEDED = {
     "tusimple": "label_data.json",

@@ -52,7 +52,8 @@ def watch(segmenters: Sequence[LaneSegmenter], seed: int, frames: int, fps: floa
 def _observer(segmenter: LaneSegmenter) -> LaneBEV:
     config = segmenter.config
     extractor = LineExtractor.for_network(config)
-    return LaneBEV(segmenter, extractor, JointCalibrator(), network_width=config.image_size[1]).eval()
+    calibrator = JointCalibrator(num_boundaries=config.num_boundaries)
+    return LaneBEV(segmenter, extractor, calibrator, network_width=config.image_size[1]).eval()
 
 
 class Followed(NamedTuple):

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lanebev.geometry.precision import widest_dtype
 from lanebev.observation.lines import LineExtractor
 from train.losses import unweighted_bias
 from train.module import Segmentation, unpack
@@ -64,7 +65,7 @@ class EndToEnd(Segmentation):
         self.unit: Tensor
         self.error_unit: Tensor
         for name, unit in (("unit", pose_unit), ("error_unit", error_unit)):
-            inside = torch.tensor([*map(math.radians, unit[:3]), unit[3]], dtype=torch.float64)
+            inside = torch.tensor([*map(math.radians, unit[:3]), unit[3]])
             self.register_buffer(name, inside, persistent=False)
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:  # type: ignore[override]
@@ -72,7 +73,7 @@ class EndToEnd(Segmentation):
         loss, logits = self.map_loss(batch, batch_idx)
         if self.settings["pose_weight"] > 0:
             fit = self._fit(logits + unweighted_bias(self.class_weight).view(1, -1, 1, 1), batch)
-            truth = batch.extrinsics.double()
+            truth = batch.extrinsics.to(widest_dtype(logits.device))
             if self.settings["surprise"]:
                 pose = pose_surprise(fit, truth, self.unit, self.segmenter.config.pose_factor)
                 if self.settings["error_weight"] > 0:

@@ -13,6 +13,7 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from lanebev.estimation.single_frame import SingleFrameFit, fit_single_frame
 from lanebev.geometry.camera import undistort_points
+from lanebev.geometry.precision import cast_floating, widest_dtype
 from lanebev.observation.lines import LineExtractor
 from train.data import Batch, LiveFrames, PoolFrames, RenderedRoads, Seed, run_position
 from train.labels import LabelledImage, ViewConfig, full_view
@@ -117,14 +118,15 @@ def fit_poses(
     With ``where_only`` gradients reach where lines lie, not how much they count: a network cannot get a
     better pose by seeing fewer of them.
     """
-    even: Tensor = EvenGradients.apply(logits.double(), reach)
+    dtype = widest_dtype(logits.device)
+    even: Tensor = EvenGradients.apply(logits.to(dtype), reach)
     segments = extractor(even, size, size)
-    intrinsics, distortion = intrinsics.double(), distortion.double()
+    intrinsics, distortion = intrinsics.to(dtype), distortion.to(dtype)
     ends = undistort_points(segments.endpoints.flatten(1, 2), intrinsics, distortion)
     segments = segments._replace(endpoints=ends.view_as(segments.endpoints))
     if where_only:
         segments = segments._replace(weight=segments.weight.detach(), sigma=segments.sigma.detach())
-    width = lane_width.double() if isinstance(lane_width, Tensor) else lane_width
+    width = cast_floating(lane_width, dtype)
     return fit_single_frame(segments, intrinsics, width)
 
 

@@ -10,7 +10,8 @@ from typing import Any, TypeVar, cast
 import torch
 from torch import Tensor
 
-from lanebev.geometry.precision import autocast_off, cast_floating
+from lanebev.geometry.camera import check_intrinsics
+from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.types import Calibration, LaneSegments, Status
 
 Forward = TypeVar("Forward", bound=Callable[..., Any])
@@ -51,7 +52,7 @@ def calibrates(forward: Forward) -> Forward:
         check_segments(segments, intrinsics)
         count = segments.weight.shape[1]
         given = check_state(state, self.state_type, intrinsics.shape[0])
-        like = given if given.device.type == "mps" else given.double()
+        like = given.to(widest_dtype(given.device))
         segments, intrinsics, state = (cast_floating(x, like.dtype) for x in (segments, intrinsics, state))
         widths = as_lane_width(lane_width, like, self.config.num_boundaries)
         segments, intrinsics, widths = usable(
@@ -60,13 +61,14 @@ def calibrates(forward: Forward) -> Forward:
         with autocast_off(like.device):
             calibration, state = forward(self, segments, intrinsics, state, as_batch(dt, like), widths)
         calibration = calibration._replace(inliers=calibration.inliers[:, :count])
-        return cast_floating(calibration, given.dtype), cast_floating(state, given.dtype)
+        # In memory of its own: what a caller does to it in place is not done to the state.
+        return _copied(cast_floating(calibration, given.dtype)), cast_floating(state, given.dtype)
 
     return cast(Forward, checked)
 
 
 def check_segments(segments: LaneSegments, intrinsics: Tensor) -> None:
-    """Raise on shapes that don't fit each other.
+    """Raise on shapes that don't fit each other, and on whole numbers.
 
     Raises:
         ValueError: naming the tensor, what was expected and what came.
@@ -81,8 +83,7 @@ def check_segments(segments: LaneSegments, intrinsics: Tensor) -> None:
             raise ValueError(f"segments.{name}: expected {shape} like the end points, got {got}")
     if segments.boundary.dtype != torch.int64:
         raise ValueError(f"segments.boundary: expected int64 indices, got {segments.boundary.dtype}")
-    if intrinsics.shape != (ends.shape[0], 3, 3):
-        raise ValueError(f"intrinsics: expected ({ends.shape[0]}, 3, 3), got {tuple(intrinsics.shape)}")
+    check_intrinsics(intrinsics, ends.shape[0])
 
 
 def check_state(state: Any, kind: type[Any], rows: int) -> Tensor:
@@ -165,6 +166,11 @@ def _padded(segments: LaneSegments) -> LaneSegments:
     return LaneSegments(
         *(torch.cat([part, part.new_zeros(part.shape[0], missing, *part.shape[2:])], 1) for part in segments)
     )
+
+
+def _copied(value: Any) -> Any:
+    """A tensor, or every one in a NamedTuple, in memory of its own."""
+    return value.clone() if isinstance(value, Tensor) else type(value)(*map(_copied, value))
 
 
 def is_running(status: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.checks import as_lane_width, check_segments, usable
+from lanebev.geometry.camera import cam_from_image
 from lanebev.geometry.road import rays_from_pixels
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import LaneSegments
@@ -144,7 +145,7 @@ def boundary_residuals(
         Distances, zero where not valid, Jacobian, validity.
     """
     rotation = road_from_cam(*params[:, :HEIGHT].unbind(-1))  # (B, 3, 3)
-    direction_by_pixel = rotation @ _ray_by_pixel(seen.intrinsics)  # (B, 3, 2)
+    direction_by_pixel = rotation @ cam_from_image(seen.intrinsics)[..., :2]  # (B, 3, 2)
     directions, valid = _on_road(rotation @ seen.rays, params)
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (B, M)
     value, by_direction, _ = _implicit(directions, x_k, params, phase)
@@ -183,21 +184,13 @@ def boundary_distances(
         (H, B, N, 2) px, zero where not valid, and (B, N) bool.
     """
     rotation = road_from_cam(*params[:, :HEIGHT].unbind(-1))
-    direction_by_pixel = rotation @ _ray_by_pixel(seen.intrinsics)
+    direction_by_pixel = rotation @ cam_from_image(seen.intrinsics)[..., :2]
     directions, valid = _on_road(rotation @ seen.rays, params)
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (H, B, M)
     value, by_direction, _ = _implicit(directions, x_k, params, phase)
     distance = value / torch.hypot(*(direction_by_pixel.mT @ by_direction).unbind(-2))
     both = valid.unflatten(-1, (-1, 2)).all(-1)
     return torch.where(both.unsqueeze(-1), distance.unflatten(-1, (-1, 2)), 0.0), both
-
-
-def _ray_by_pixel(intrinsics: Tensor) -> Tensor:
-    """(B, 3, 2): the first columns of K⁻¹, with skew."""
-    fx, fy, skew = intrinsics[:, 0, 0], intrinsics[:, 1, 1], intrinsics[:, 0, 1]
-    zero = torch.zeros_like(fx)
-    entries = [1 / fx, -skew / (fx * fy), zero, 1 / fy, zero, zero]
-    return torch.stack(entries, dim=-1).view(-1, 3, 2)
 
 
 def _axes(rotation: Tensor, roll: Tensor) -> Tensor:

@@ -7,7 +7,8 @@ every roll starts a robust Gauss-Newton on perpendicular pixel distances whose n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import torch
@@ -48,7 +49,7 @@ class FramePrior:
         curvature_std: 1/m.
         curvature_rate_std: 1/m².
         pitch_range, roll_range: half widths of the search about the means, rad.
-        pitch_steps, roll_steps: hypotheses across each.
+        pitch_steps, roll_steps: hypotheses across each; 1 is the mean alone.
     """
 
     pitch: float = 0.0
@@ -66,6 +67,18 @@ class FramePrior:
     roll_range: float = 0.4
     pitch_steps: int = 13
     roll_steps: int = 9
+
+    def __post_init__(self) -> None:
+        for part in fields(self):
+            value = getattr(self, part.name)
+            if not math.isfinite(value):
+                raise ValueError(f"{part.name}: expected a finite number, got {value}")
+            if part.name.endswith("_std") and value <= 0:
+                raise ValueError(f"{part.name}: expected more than 0, got {value}")
+            if part.name.endswith("_steps") and value < 1:
+                raise ValueError(f"{part.name}: expected at least 1, got {value}")
+        if self.height <= 0:
+            raise ValueError(f"height: expected more than 0 m, got {self.height}")
 
     def mean(self, like: Tensor) -> Tensor:
         """(7,) in the order of ``joint_model``."""
@@ -243,8 +256,8 @@ def _subset(seen: Observations, places: Tensor, count: int) -> tuple[Observation
     total = seen.boundary.shape[1]
     if total <= count:
         return seen, places
-    order = torch.arange(total, dtype=torch.float64, device=places.device) * 0.6180339887498949 % 1.0
-    index = ((seen.weight > 0).to(torch.float64) + order).topk(count, dim=-1).indices  # (B, count)
+    order = torch.arange(total, dtype=places.dtype, device=places.device) * 0.6180339887498949 % 1.0
+    index = ((seen.weight > 0).to(places.dtype) + order).topk(count, dim=-1).indices  # (B, count)
     ends = torch.stack([2 * index, 2 * index + 1], dim=-1).flatten(1)  # (B, 2 count)
     picked = seen._replace(
         rays=seen.rays.gather(2, ends.unsqueeze(1).expand(-1, 3, -1)),
@@ -253,6 +266,12 @@ def _subset(seen: Observations, places: Tensor, count: int) -> tuple[Observation
         sigma=seen.sigma.gather(1, index),
     )
     return picked, places.gather(1, index)
+
+
+def _spread(steps: int, like: Tensor) -> Tensor:
+    """(steps,) evenly from -1 to 1; 0 where there is but one."""
+    end = 1.0 if steps > 1 else 0.0
+    return torch.linspace(-end, end, steps, dtype=like.dtype, device=like.device)
 
 
 def _linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Tensor:
@@ -265,8 +284,8 @@ def _linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Ten
         (B, S, 7), S the number of rolls.
     """
     like = places
-    pitch = prior.pitch + prior.pitch_range * torch.linspace(-1, 1, prior.pitch_steps).to(like)
-    roll = prior.roll + prior.roll_range * torch.linspace(-1, 1, prior.roll_steps).to(like)
+    pitch = prior.pitch + prior.pitch_range * _spread(prior.pitch_steps, like)
+    roll = prior.roll + prior.roll_range * _spread(prior.roll_steps, like)
     pitch, roll = (grid.flatten() for grid in torch.meshgrid(pitch, roll, indexing="ij"))  # (H,)
     axes = road_from_cam(pitch, torch.zeros_like(pitch), roll)  # (H, 3, 3) rows right, down, forward
     right, below, ahead = torch.einsum("hij,bjm->ibhm", axes, seen.rays).unbind(0)  # each (B, H, M)

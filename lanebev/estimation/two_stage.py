@@ -90,9 +90,9 @@ class TwoStageCalibrator(nn.Module):
             raise ValueError("config: expected either a TwoStageConfig or its keywords, got both")
         self.config = config or TwoStageConfig(**numbers)  # type: ignore[arg-type]
         generator = torch.Generator().manual_seed(self.config.seed)
-        draws = torch.rand(self.config.num_hypotheses, 2, generator=generator, dtype=torch.float64)
         self.draws: Tensor
-        self.register_buffer("draws", draws, persistent=False)
+        draws = torch.rand(self.config.num_hypotheses, 2, generator=generator, dtype=torch.float64)
+        self.register_buffer("draws", draws.float(), persistent=False)  # some devices have no float64
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None

@@ -39,6 +39,18 @@ def check_rows(distortion: Tensor, points: Tensor) -> None:
         raise ValueError(f"distortion: expected ({rows}D) like the points, got {tuple(distortion.shape)}")
 
 
+def check_intrinsics(intrinsics: Tensor, *rows: int) -> None:
+    """Raise unless these are (*rows, 3, 3) matrices of floating point.
+
+    Raises:
+        ValueError: saying what was expected and what came.
+    """
+    if intrinsics.shape != (*rows, 3, 3):
+        raise ValueError(f"intrinsics: expected {(*rows, 3, 3)}, got {tuple(intrinsics.shape)}")
+    if not intrinsics.is_floating_point():
+        raise ValueError(f"intrinsics: expected floating point, got {intrinsics.dtype}")
+
+
 def _check_points(points: Tensor, size: int = 2) -> None:
     if points.ndim < 2 or points.shape[-1] != size:
         raise ValueError(f"points: expected (..., N, {size}), got {tuple(points.shape)}")
@@ -68,6 +80,26 @@ def denormalise_points(points: Tensor, intrinsics: Tensor) -> Tensor:
     skew, cx, cy = intrinsics[..., None, 0, 1], intrinsics[..., None, 0, 2], intrinsics[..., None, 1, 2]
     x, y = points.unbind(-1)
     return torch.stack([fx * x + skew * y + cx, fy * y + cy], dim=-1)
+
+
+def cam_from_image(intrinsics: Tensor) -> Tensor:
+    """K⁻¹, undistorted pixels to the z = 1 plane as a matrix.
+
+    In closed form: a row whose camera can't be used is not finite, where a solver would raise for all.
+
+    Args:
+        intrinsics: (..., 3, 3), with skew.
+
+    Returns:
+        (..., 3, 3).
+    """
+    fx, fy, skew = intrinsics[..., 0, 0], intrinsics[..., 1, 1], intrinsics[..., 0, 1]
+    cx, cy = intrinsics[..., 0, 2], intrinsics[..., 1, 2]
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    along = -skew / (fx * fy)
+    entries = [1 / fx, along, -cx / fx - along * cy, zero, 1 / fy, -cy / fy, zero, zero, one]
+    inverse: Tensor = torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+    return inverse
 
 
 @full_precision

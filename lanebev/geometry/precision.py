@@ -42,6 +42,11 @@ def common_dtype(*tensors: Tensor) -> torch.dtype:
     return reduce(torch.promote_types, (tensor.dtype for tensor in tensors), torch.float32)
 
 
+def widest_dtype(device: torch.device) -> torch.dtype:
+    """Double precision, but single where a device has no double (MPS)."""
+    return torch.float32 if device.type == "mps" else torch.float64
+
+
 def cast_floating(value: Any, dtype: torch.dtype) -> Any:
     """A floating tensor, or those of a NamedTuple, to a dtype; anything else as it is."""
     if isinstance(value, Tensor):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lanebev.geometry.camera import cam_from_image
 from lanebev.geometry.precision import full_precision
 from lanebev.types import Extrinsics
 
@@ -118,6 +119,6 @@ def horizon_line(extrinsics: Extrinsics, intrinsics: Tensor) -> Tensor:
         (B, 3) homogeneous line: a x + b y + c = 0, with (a, b) of unit length and positive on the road.
     """
     down = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)[..., 1, :]
-    line = torch.linalg.solve(intrinsics.mT, down.unsqueeze(-1)).squeeze(-1)
+    line = (down.unsqueeze(-2) @ cam_from_image(intrinsics)).squeeze(-2)
     unit: Tensor = line / line[..., :2].norm(dim=-1, keepdim=True)
     return unit

@@ -58,8 +58,9 @@ class LineConfig:
         for name in ("stride", "segments", "window", "min_vertices"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
-        if not self.noise_factor > 0:
-            raise ValueError(f"noise_factor: expected more than 0, got {self.noise_factor}")
+        for name in ("half_width", "noise_factor"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected more than 0 and finite, got {getattr(self, name)}")
         if not 0 <= self.absent < self.present:
             raise ValueError(f"present: expected more than absent ({self.absent}), got {self.present}")
         if not self.present < self.twice:

@@ -178,8 +178,7 @@ def _bev_panel(view: Panel, grid: BEVGrid, camera: Camera, segments: LaneSegment
     for metres in range(10 * math.ceil(grid.z[0] / 10), math.floor(grid.z[1]) + 1, 10):
         y = head + (grid.z[1] - metres) / (grid.z[1] - grid.z[0]) * height
         drawing.line([(left - 6, y), (left, y)], fill=_QUIET, width=1)
-        label = f"{metres} m" if metres >= 60 else f"{metres}"
-        drawing.text((left - 8, max(y, head + 8)), label[:2], fill=_QUIET, font=_font(13), anchor="rm")
+        drawing.text((left - 8, max(y, head + 8)), str(metres), fill=_QUIET, font=_font(13), anchor="rm")
     drawing.text((left - 8, PANEL_HEIGHT - 10), "m", fill=_QUIET, font=_font(13), anchor="rm")
     return np.asarray(picture)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from lanebev.geometry.camera import cam_from_image, check_intrinsics
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import Extrinsics
@@ -35,7 +36,10 @@ class BEVGrid:
             raise ValueError(f"resolution: expected > 0 m and finite, got {self.resolution}")
         for name, (low, high) in (("x", self.x), ("z", self.z)):
             if not (high - low >= self.resolution and math.isfinite(high - low)):
-                raise ValueError(f"{name}: expected finite (low, high) with high > low, got {(low, high)}")
+                raise ValueError(
+                    f"{name}: expected finite (low, high), high above low by {self.resolution} m, a cell, at "
+                    f"least, got {(low, high)}"
+                )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -67,13 +71,11 @@ class BEVGrid:
 
     def cells(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
         """(U, V, 2) road coordinates (X, Z) of every pixel centre, m."""
-        rows, columns = self.shape
-        row, column = torch.meshgrid(
-            torch.arange(rows, dtype=dtype, device=device),
-            torch.arange(columns, dtype=dtype, device=device),
-            indexing="ij",
-        )
-        return self.road_from_bev_points(torch.stack([column, row], dim=-1))
+        row, column = (torch.arange(size, dtype=dtype, device=device) for size in self.shape)
+        z = self.road_from_bev_points(torch.stack([row, row], dim=-1))[:, 1]
+        x = self.road_from_bev_points(torch.stack([column, column], dim=-1))[:, 0]
+        z, x = torch.meshgrid(z, x, indexing="ij")
+        return torch.stack([x, z], dim=-1)
 
 
 @full_precision
@@ -89,14 +91,13 @@ def bev_from_image(extrinsics: Extrinsics, intrinsics: Tensor, grid: BEVGrid) ->
         grid: the BEV rectangle.
 
     Returns:
-        (B, 3, 3), pixels to pixels. Not normalised: its last row is the depth below the horizon.
+        (B, 3, 3), pixels to pixels. Not normalised: its last row is the depth below the horizon. Not finite
+        in rows whose focal lengths are zero.
 
     Raises:
-        ValueError: intrinsics of another batch.
+        ValueError: intrinsics of another batch, or of whole numbers.
     """
-    expected = (*extrinsics.pitch.shape, 3, 3)
-    if intrinsics.shape != expected:
-        raise ValueError(f"intrinsics: expected {expected} like the pose, got {tuple(intrinsics.shape)}")
+    check_intrinsics(intrinsics, *extrinsics.pitch.shape)
     rows = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)
     right, down, forward = rows.unbind(-2)
     plane_from_cam = torch.stack([right, forward, down / extrinsics.height.unsqueeze(-1)], dim=-2)
@@ -104,6 +105,4 @@ def bev_from_image(extrinsics: Extrinsics, intrinsics: Tensor, grid: BEVGrid) ->
     bev_from_plane = intrinsics.new_tensor(
         [[scale, 0.0, -grid.x[0] * scale], [0.0, -scale, grid.z[1] * scale], [0.0, 0.0, 1.0]]
     )
-    cam_from_image = torch.linalg.inv(intrinsics)
-    homography: Tensor = bev_from_plane @ plane_from_cam @ cam_from_image
-    return homography
+    return bev_from_plane @ plane_from_cam @ cam_from_image(intrinsics)

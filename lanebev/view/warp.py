@@ -6,7 +6,13 @@ import torch
 from kornia.geometry.transform import remap
 from torch import Tensor, nn
 
-from lanebev.geometry.camera import check_rows, distort_points, max_undistorted_radius, normalise_points
+from lanebev.geometry.camera import (
+    check_intrinsics,
+    check_rows,
+    distort_points,
+    max_undistorted_radius,
+    normalise_points,
+)
 from lanebev.geometry.precision import common_dtype, full_precision
 from lanebev.geometry.road import image_from_road_points
 from lanebev.types import Extrinsics
@@ -27,8 +33,6 @@ class BEVWarp(nn.Module):
     def __init__(self, grid: BEVGrid | None = None) -> None:
         super().__init__()
         self.grid = grid or BEVGrid()
-        self.cells: Tensor
-        self.register_buffer("cells", self.grid.cells(torch.float64), persistent=False)
 
     def forward(
         self,
@@ -55,18 +59,16 @@ class BEVWarp(nn.Module):
             inside the image.
 
         Raises:
-            ValueError: shapes that don't fit, or an image of whole numbers.
+            ValueError: shapes that don't fit, or an image or intrinsics of whole numbers.
         """
         if image.ndim != 4:
             raise ValueError(f"image: expected (B, C, h, w), got {tuple(image.shape)}")
         if not image.is_floating_point():
             raise ValueError(f"image: expected floating point, got {image.dtype}")
         batch = image.shape[0]
-        if intrinsics.shape != (batch, 3, 3) or extrinsics.pitch.shape != (batch,):
-            raise ValueError(
-                f"intrinsics, extrinsics: expected ({batch}, 3, 3) and ({batch},) for {batch} images, "
-                f"got {tuple(intrinsics.shape)} and {tuple(extrinsics.pitch.shape)}"
-            )
+        check_intrinsics(intrinsics, batch)
+        if extrinsics.pitch.shape != (batch,):
+            raise ValueError(f"extrinsics: expected ({batch},) each, got {tuple(extrinsics.pitch.shape)}")
         height, width = image_size or (image.shape[-2], image.shape[-1])
         pixels, valid = self.image_points(intrinsics, extrinsics, distortion, model)
         x, y = pixels.unbind(-1)
@@ -92,9 +94,8 @@ class BEVWarp(nn.Module):
         model: str = "pinhole",
     ) -> tuple[Tensor, Tensor]:
         """Where every cell is seen: (B, U·V, 2) px of the image as taken, and (B, U·V) bool in front."""
-        rounded = self.cells.dtype.itemsize < 4  # by a network's half(), to 3 cm or worse
-        cells = self.grid.cells(device=intrinsics.device) if rounded else self.cells
-        cells = cells.to(intrinsics.dtype).reshape(1, -1, 2).expand(intrinsics.shape[0], -1, -1)
+        cells = self.grid.cells(intrinsics.dtype, intrinsics.device).reshape(1, -1, 2)
+        cells = cells.expand(intrinsics.shape[0], -1, -1)
         pixels, valid = image_from_road_points(cells, intrinsics, extrinsics)
         if distortion is None or distortion.shape[-1] == 0:
             return pixels, valid
