@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from jsonargparse.typing import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from lanebev.estimation.joint import JointCalibrator
@@ -34,6 +35,7 @@ from lanebev.estimation.two_stage import TwoStageCalibrator
 from lanebev.types import LaneSegments, Status
 from tools.scenarios import CAMERA, FPS, PLACES, SCENARIOS, WIDTH, Moment, moments, observe
 from tools.textbook_ekf import TextbookEKF
+from train.commands import one_line_errors
 
 NAMES = ("pitch_deg", "yaw_deg", "roll_deg", "height_cm")
 UNITS = torch.tensor([180 / math.pi] * 3 + [100.0], dtype=torch.float64)
@@ -304,17 +306,18 @@ def speed(calibrator: Any, frames: int = 60) -> dict[str, float]:
     return {"median_ms": middle, "quartile_ms": low, "upper_quartile_ms": high}
 
 
+@one_line_errors()
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--calibrators", nargs="+", choices=list(CALIBRATORS), default=list(CALIBRATORS))
     parser.add_argument("--scenarios", nargs="+", choices=list(SCENARIOS), default=list(SCENARIOS))
-    parser.add_argument("--rows", type=int, default=32, help="Monte Carlo runs")
-    parser.add_argument("--sigma", type=float, default=1.0, help="noise of an end point, px")
+    parser.add_argument("--rows", type=PositiveInt, default=32, help="Monte Carlo runs")
+    parser.add_argument("--sigma", type=PositiveFloat, default=1.0, help="noise of an end point, px")
     parser.add_argument("--quick", action="store_true", help="2 rows, 1.5 s of the first two scenarios")
-    parser.add_argument("--stream", type=int, metavar="N", help="stream N frames instead")
-    parser.add_argument("--stream-rows", type=int, default=2, help="vehicles streamed side by side")
+    parser.add_argument("--stream", type=PositiveInt, metavar="N", help="stream N frames instead")
+    parser.add_argument("--stream-rows", type=PositiveInt, default=2, help="vehicles streamed side by side")
     parser.add_argument("--out", type=Path, default=Path("out/bench"))
     args = parser.parse_args(arguments)
     names = [n for n in args.calibrators if n != "textbook EKF" or importlib.util.find_spec("filterpy")]

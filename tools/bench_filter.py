@@ -13,10 +13,12 @@ import platform
 from pathlib import Path
 
 import torch
+from jsonargparse.typing import PositiveFloat, PositiveInt
 from torch import Tensor
 from torch.utils.benchmark import Timer
 
 from lanebev.estimation import kalman
+from train.commands import one_line_errors
 
 
 def gain_form(
@@ -69,14 +71,16 @@ def measure(rows: int, seconds: float) -> dict[str, float]:
     }
 
 
+@one_line_errors()
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--rows", type=int, nargs="+", default=[60, 180, 408, 816])
-    parser.add_argument("--seconds", type=float, default=1.0, help="per measurement")
+    parser.add_argument("--rows", type=PositiveInt, nargs="+", default=[60, 180, 408, 816])
+    parser.add_argument("--seconds", type=PositiveFloat, default=1.0, help="per measurement")
     parser.add_argument("--out", type=Path, default=Path("out/bench_filter.json"))
     args = parser.parse_args()
+    args.out.parent.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)  # small matrices: more threads only wait for each other
     results = [measure(rows, args.seconds) for rows in args.rows]
     print(f"{'rows':>5} {'gain ms':>9} {'information ms':>15} {'ratio':>6} {'difference':>11}")
@@ -85,7 +89,6 @@ def main() -> None:
             f"{r['rows']:>5.0f} {r['gain_ms']:>9.3f} {r['information_ms']:>15.3f} {r['ratio']:>6.1f} "
             f"{r['largest_relative_difference']:>11.1e}"
         )
-    args.out.parent.mkdir(parents=True, exist_ok=True)
     setup = {
         "torch": torch.__version__,
         "python": platform.python_version(),

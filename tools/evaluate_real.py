@@ -37,6 +37,7 @@ from tools.real_figures import (
     tusimple_segments,
     udacity,
 )
+from train.commands import one_line_errors
 
 NEEDED = {
     "tusimple": "label_data.json",
@@ -46,7 +47,8 @@ NEEDED = {
 SHEET = tuple(range(0, 88, 8))  # and the last: a dozen
 
 
-def main() -> int:
+@one_line_errors()
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     default = Path(__file__).resolve().parents[2] / "shared" / "data"
     parser.add_argument("--data", type=Path, default=default, help="folder of the data (../shared/data)")
@@ -57,14 +59,9 @@ def main() -> int:
     options = parser.parse_args()
     missing = [f"{name}/{file}" for name, file in NEEDED.items() if not (options.data / name / file).exists()]
     if missing:
-        print(f"{options.data}: missing {', '.join(missing)}; give the folder with --data", file=sys.stderr)
-        return 2
+        raise ValueError(f"{options.data}: missing {', '.join(missing)}; give the folder with --data")
     calibrators = {name: make_calibrator(name) for name in ("two-stage", "joint")}
-    try:
-        model = lanebev.LaneBEV.from_pretrained(options.weights)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    model = lanebev.LaneBEV.from_pretrained(options.weights)
     start = time.monotonic()
     figures = [figure for part in parts(options, model, calibrators) for figure in part]
     print_table(figures)
@@ -72,7 +69,6 @@ def main() -> int:
         write_sheet(options.sheet, options.data, calibrators["joint"])
     if options.json:
         options.json.write_text(json.dumps(as_json(figures, options, time.monotonic() - start), indent=1))
-    return 0
 
 
 def parts(options: Any, model: Any, calibrators: dict[str, Any]) -> Any:
@@ -140,4 +136,4 @@ def as_json(figures: list[Figure], options: Any, seconds: float) -> dict[str, An
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

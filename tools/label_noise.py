@@ -12,7 +12,6 @@ and the distance at the horizon by a straight line through all distances.
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +25,7 @@ from lanebev.io.video import open_source
 from lanebev.observers import NetworkObserver
 from lanebev.run import calibrate_still
 from tools.real_figures import TUSIMPLE_FOCAL, TUSIMPLE_LANE_WIDTH, tusimple_camera, tusimple_segments
+from train.commands import one_line_errors
 
 REACH = 30  # px about a line in which its stripe is looked for
 APART = 25.0  # px, label and network mean the same stripe if nearer
@@ -78,7 +78,8 @@ def line_offsets(
     return first, second
 
 
-def main() -> int:
+@one_line_errors()
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     default = Path(__file__).resolve().parents[2] / "shared" / "data"
     parser.add_argument("--data", type=Path, default=default, help="folder of the data (../shared/data)")
@@ -86,13 +87,8 @@ def main() -> int:
     options = parser.parse_args()
     labels = options.data / "tusimple" / "label_data.json"
     if not labels.exists():
-        print(f"{labels}: missing; give the folder with --data", file=sys.stderr)
-        return 2
-    try:
-        model = lanebev.LaneBEV.from_pretrained(options.weights)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        raise ValueError(f"{labels}: missing; give the folder with --data")
+    model = lanebev.LaneBEV.from_pretrained(options.weights)
     images, segments = tusimple_segments(options.data)
     camera = tusimple_camera()
     intrinsics = camera.intrinsics.expand(len(images), 3, 3)
@@ -114,8 +110,7 @@ def main() -> int:
     for name, (mean, horizon) in zip(("labels", "network"), both, strict=True):
         yaw = np.degrees(np.arctan(horizon / TUSIMPLE_FOCAL))
         print(f"{name}: median distance {mean:.2f} px, at the horizon {horizon:.2f} px ({yaw:.3f} deg)")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -13,13 +13,13 @@ from __future__ import annotations
 import argparse
 import csv
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from jsonargparse.typing import PositiveFloat
 from torch import Tensor
 
 from lanebev import Camera, Extrinsics, LaneSegments
@@ -31,6 +31,7 @@ from lanebev.io.lane_rows import rows_from_lines, segments_from_rows
 from lanebev.io.lanes import FrameLines, match_frames, read_lanes
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
 from lanebev.types import NUM_BOUNDARIES
+from train.commands import one_line_errors
 
 COLUMNS = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
 
@@ -124,24 +125,21 @@ def plot(table: np.ndarray, estimate: np.ndarray | None, path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def main() -> int:
+@one_line_errors()
+def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("lanes", type=Path, help="TuSimple JSON lines, CULane .lines.txt or OpenLane JSON")
     parser.add_argument("--camera", type=Path, required=True)
-    parser.add_argument("--lane-width", type=float, default=3.7, help="m")
+    parser.add_argument("--lane-width", type=PositiveFloat, default=3.7, help="m")
     parser.add_argument("--estimate", type=Path, help="extrinsics.csv of a run over the same frames")
     parser.add_argument("--out", type=Path, default=Path("out/pseudo_ground_truth.csv"))
     args = parser.parse_args()
-    try:
-        camera = Camera.from_file(args.camera)
-        frames = read_lanes(args.lanes)
-        rows = [rows_from_lines(frame.lines, camera) for frame in frames]
-        estimate = estimate_table(read_extrinsics(args.estimate), frames) if args.estimate else None
-    except ValueError as error:
-        print(f"pseudo_ground_truth: {error}", file=sys.stderr)
-        return 2
+    camera = Camera.from_file(args.camera)
+    frames = read_lanes(args.lanes)
+    rows = [rows_from_lines(frame.lines, camera) for frame in frames]
+    estimate = estimate_table(read_extrinsics(args.estimate), frames) if args.estimate else None
     segments = segments_from_rows(rows, camera)
     intrinsics = camera.intrinsics.expand(len(frames), 3, 3)
     table = as_table(pseudo_ground_truth(segments, intrinsics, args.lane_width))
@@ -163,8 +161,7 @@ def main() -> int:
             f"rms difference of the estimate, {np.isfinite(estimate).all(-1).sum()} frames: "
             + ", ".join(f"{n} {r:.3f}" for n, r in zip(COLUMNS, rms, strict=True))
         )
-    return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

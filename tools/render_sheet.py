@@ -12,9 +12,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from jsonargparse.typing import PositiveInt
 
 from lanebev.geometry.camera import distort_points
 from lanebev.render import RenderedFrame, render_views
+from train.commands import one_line_errors
 
 COLOURS = [(255, 80, 80), (255, 160, 0), (60, 220, 60), (60, 200, 255), (120, 120, 255), (255, 90, 255)]
 
@@ -40,14 +42,15 @@ def real_frames(folder: Path, count: int, size: tuple[int, int]) -> list[np.ndar
     return [cv2.resize(p, size[::-1], interpolation=cv2.INTER_AREA)[..., ::-1] for p in pictures]
 
 
+@one_line_errors()
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--count", type=int, default=100)
-    parser.add_argument("--columns", type=int, default=10)
+    parser.add_argument("--count", type=PositiveInt, default=100)
+    parser.add_argument("--columns", type=PositiveInt, default=10)
     parser.add_argument("--size", type=int, nargs=2, default=(180, 320), metavar=("H", "W"))
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--batch", type=int, default=4)
+    parser.add_argument("--batch", type=PositiveInt, default=4)
     parser.add_argument("--real", type=Path, help="folder of real pictures: every second one of the sheet")
     parser.add_argument("--truth", action="store_true", help="draw the boundaries")
     args = parser.parse_args()

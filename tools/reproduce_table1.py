@@ -17,11 +17,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
+from jsonargparse.typing import PositiveInt
 
 import lanebev
 from lanebev.estimation.kalman import symmetrise
 from lanebev.types import Status
 from tools.synthetic import Experiment, frames
+from train.commands import one_line_errors
 
 VARIANCES = (0.5, 1.0, 2.0, 4.0, 9.0)
 PAPER = {  # Table I: pitch, yaw, roll in degrees, height in centimetres
@@ -143,14 +145,15 @@ def plot(result: dict[str, torch.Tensor], exp: Experiment, path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
+@one_line_errors()
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--calibrator", choices=("two-stage", "joint"), default="two-stage")
-    parser.add_argument("--runs", type=int, default=100, help="Monte Carlo runs per noise level")
-    parser.add_argument("--frames", type=int, default=300)
-    parser.add_argument("--segments", type=int, nargs="+", default=[30, 68], help="per boundary")
+    parser.add_argument("--runs", type=PositiveInt, default=100, help="Monte Carlo runs per noise level")
+    parser.add_argument("--frames", type=PositiveInt, default=300)
+    parser.add_argument("--segments", type=PositiveInt, nargs="+", default=[30, 68], help="per boundary")
     parser.add_argument("--float32", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/table1"))

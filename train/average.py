@@ -14,6 +14,7 @@ import torch
 
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.weights import save_segmenter
+from train.commands import one_line_errors
 from train.export import trained_segmenter
 
 
@@ -40,6 +41,7 @@ def average(segmenters: list[LaneSegmenter]) -> LaneSegmenter:
     return result.eval()
 
 
+@one_line_errors()
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -48,12 +50,9 @@ def main() -> None:
     args = parser.parse_args()
     if args.out.exists():
         parser.error(f"out: expected a new file, which comes first, got {args.out}, which is there")
-    try:
-        segmenters, training = zip(*map(trained_segmenter, args.weights), strict=True)
-        names = [path.name for path in args.weights]
-        save_segmenter(average(list(segmenters)), args.out, training={**training[-1], "average_of": names})
-    except (ValueError, OSError) as error:
-        parser.exit(2, f"error: {error}\n")
+    segmenters, training = zip(*map(trained_segmenter, args.weights), strict=True)
+    names = [path.name for path in args.weights]
+    save_segmenter(average(list(segmenters)), args.out, training={**training[-1], "average_of": names})
 
 
 if __name__ == "__main__":

@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 import scipy.stats
 import torch
-from jsonargparse.typing import PositiveInt
+from jsonargparse.typing import PositiveFloat, PositiveInt
 from numpy.typing import NDArray
 from torch import Tensor
 
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.render import Drive
+from train.commands import one_line_errors
 from train.drives import WARM_UP, follow, watch
 from train.export import trained_segmenter
 from train.poses import fit_poses
@@ -114,6 +115,7 @@ def summary(error: Tensor, counted: Tensor) -> dict[str, Any]:
     return report
 
 
+@one_line_errors()
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -125,15 +127,12 @@ def main() -> None:
     )
     parser.add_argument("--seed", type=int, default=70_000)
     parser.add_argument("--online", action="store_true", help="follow each drive with the joint calibrator")
-    parser.add_argument("--fps", type=float, default=10.0, help="of the drives followed online")
+    parser.add_argument("--fps", type=PositiveFloat, default=10.0, help="of the drives followed online")
     args = parser.parse_args()
     args.frames = args.frames or (40 if args.online else 12)
     if args.online and args.frames <= WARM_UP:
         parser.error(f"--frames: expected more than the warm-up of {WARM_UP}, got {args.frames}")
-    try:
-        networks = [trained_segmenter(path)[0] for path in args.weights]
-    except (ValueError, OSError) as error:
-        parser.exit(2, f"error: {error}\n")
+    networks = [trained_segmenter(path)[0] for path in args.weights]
     counted = {}
     if args.online:
         errors = online_errors(networks, args.drives, args.frames, args.fps, args.seed)

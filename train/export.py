@@ -17,6 +17,7 @@ from torch import Tensor
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.weights import load_segmenter, read_metadata, save_segmenter
+from train.commands import one_line_errors
 from train.losses import unweighted_bias
 
 
@@ -109,8 +110,11 @@ def checkpoint_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
         ValueError: no segmenter in it.
     """
     weights, settings = _read_checkpoint(path)
-    segmenter = LaneSegmenter(SegmenterConfig(**settings["network"]))
-    segmenter.load_state_dict(weights, strict=True)
+    try:
+        segmenter = LaneSegmenter(SegmenterConfig(**settings["network"]))
+        segmenter.load_state_dict(weights, strict=True)
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"{path}: expected a network of this version, got: {error}") from error
     if settings["class_weight"] is not None:
         add_to_bias(segmenter, unweighted_bias(torch.tensor(settings["class_weight"])))
     return segmenter, settings
@@ -146,6 +150,7 @@ def export(checkpoint: Path, out: Path, changes: dict[str, Any], **record: Any) 
     return segmenter
 
 
+@one_line_errors()
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -159,18 +164,15 @@ def main() -> None:
     parser.add_argument("--pose-factor", type=float, help="likewise")
     parser.add_argument("--note", default="", help="what else there is to know")
     args = parser.parse_args()
-    try:
-        metrics = json.loads(args.metrics)
-        given = {
-            "image_size": args.image_size and tuple(args.image_size),
-            "noise_factor": args.noise_factor,
-            "pose_factor": args.pose_factor,
-        }
-        changes = {name: value for name, value in given.items() if value is not None}
-        record = {"seed": args.seed, "commit": args.commit, "metrics": metrics, "note": args.note}
-        export(args.checkpoint, args.out, changes, **record)
-    except (ValueError, OSError) as error:
-        parser.exit(2, f"error: {error}\n")
+    metrics = json.loads(args.metrics)
+    given = {
+        "image_size": args.image_size and tuple(args.image_size),
+        "noise_factor": args.noise_factor,
+        "pose_factor": args.pose_factor,
+    }
+    changes = {name: value for name, value in given.items() if value is not None}
+    record = {"seed": args.seed, "commit": args.commit, "metrics": metrics, "note": args.note}
+    export(args.checkpoint, args.out, changes, **record)
 
 
 if __name__ == "__main__":

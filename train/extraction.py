@@ -18,6 +18,7 @@ from lanebev.geometry.camera import distort_points
 from lanebev.observation.lines import extract_segments
 from lanebev.observation.vertices import LineConfig
 from lanebev.render import RenderedFrame, boundary_masks, render_views
+from train.commands import one_line_errors
 
 
 class ExtractionError(NamedTuple):
@@ -76,6 +77,7 @@ def join(errors: list[ExtractionError]) -> ExtractionError:
     return ExtractionError(torch.cat(distance), torch.cat(sigma), sum(missed) / len(missed))
 
 
+@one_line_errors()
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)

@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from jsonargparse.typing import PositiveInt
+from jsonargparse.typing import PositiveFloat, PositiveInt
 from torch import Tensor
 
+from train.commands import one_line_errors
 from train.drives import Seen, follow, watch
 from train.evaluate_poses import AXES
 from train.export import trained_segmenter
@@ -55,19 +56,17 @@ def compare(drives: list[Seen], factors: tuple[float, ...] = FACTORS) -> dict[fl
     return report
 
 
+@one_line_errors()
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("weights", type=Path)
     parser.add_argument("--drives", type=PositiveInt, default=12)
     parser.add_argument("--frames", type=PositiveInt, default=90, help="of each drive")
-    parser.add_argument("--fps", type=float, default=20.0)
+    parser.add_argument("--fps", type=PositiveFloat, default=20.0)
     parser.add_argument("--seed", type=int, default=81_000)
     args = parser.parse_args()
-    try:
-        segmenter, _ = trained_segmenter(args.weights)
-    except (ValueError, OSError) as error:
-        parser.exit(2, f"error: {error}\n")
+    segmenter, _ = trained_segmenter(args.weights)
     drives = [watch([segmenter], args.seed + i, args.frames, args.fps)[0] for i in range(args.drives)]
     report = compare(drives)
     for factor, (rmse, nees) in report.items():

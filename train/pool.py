@@ -23,6 +23,7 @@ from jsonargparse.typing import PositiveInt
 from lanebev.geometry.camera import denormalise_points, distort_points
 from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
 from lanebev.render import RenderedFrame, render_views
+from train.commands import one_line_errors
 from train.labels import LabelledImage
 
 
@@ -156,6 +157,7 @@ def _read_fields(path: Path, names: tuple[str, ...]) -> list[npt.NDArray[Any]]:
         raise ValueError(f"{path}: expected a pool shard with {', '.join(names)}: {error}") from error
 
 
+@one_line_errors()
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
