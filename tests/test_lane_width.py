@@ -8,7 +8,8 @@ import torch
 
 from lanebev import Extrinsics, image_from_road_points
 from lanebev.estimation import lane_width as lw
-from lanebev.geometry.road import great_circle_normals, rays_from_pixels
+from lanebev.geometry.road import rays_from_pixels
+from lanebev.geometry.rotation import cam_from_world
 
 K = torch.tensor([[[1000.0, 0, 640], [0, 1000, 360], [0, 0, 1]]], dtype=torch.float64)
 EDGES = torch.tensor([-5.8, -2.1, 1.6, 5.3], dtype=torch.float64)  # 3.7 m apart, camera off the middle
@@ -40,14 +41,17 @@ def angles_of(ends, pose, sigma=1.0, boundary=None):
 )
 def test_deviation_angle_positive_to_the_left_makes_widths_exact(pitch, yaw, roll, height):
     ends, pose = boundary_segments(pitch, yaw, roll, height)
-    angles = lw.line_angles(great_circle_normals(ends, K), pose.pitch, pose.yaw)
+    rays = rays_from_pixels(ends.flatten(1, 2), K).reshape(1, -1, 2, 3)
+    near, far = lw.line_angles(rays @ cam_from_world(pose.pitch, pose.yaw)).unbind(-1)
+    torch.testing.assert_close(near, far)  # in one plane with the vanishing direction
+    angles = near
     widths = lw.lane_widths(angles, pose.roll, pose.height)
     torch.testing.assert_close(widths, torch.full((1, 3), 3.7, dtype=torch.float64))
     found = angles_of(ends, pose)
     torch.testing.assert_close(found.angles.tan(), angles.tan())
     # The other sign, or no rotation into the frame of the vanishing direction, is not exact:
     assert (lw.lane_widths(-angles, pose.roll, pose.height) - 3.7).abs().max() > 0.5
-    raw = lw.line_angles(great_circle_normals(ends, K), *t(0.0, 0.0))
+    raw = lw.line_angles(rays)[..., 0]
     assert (lw.lane_widths(raw, pose.roll, pose.height) - 3.7).abs().max() > 1e-4
 
 

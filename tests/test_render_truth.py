@@ -79,7 +79,7 @@ def test_points_lie_on_the_centre_of_the_painted_stripe(model: str, seed: int) -
     lens = Lens(intrinsics, sample_distortion(dice, intrinsics, SIZE, model), model, sample_extrinsics(dice))
     rays, steps = pixel_rays(lens, SIZE)
     light = light_of(world.weather, place.heading)
-    solids = place_solids(world.traffic, alignment, place.along, place.across, place.moved)
+    solids = place_solids(world.traffic, alignment, place.along, place.across)
     points, marked, hidden = boundary_points(world.layout, place, alignment, lens, torch.full((batch,), 3.0))
     _, taken, inside = project(points.flatten(1, 2), lens, SIZE)
     shape = marked.shape

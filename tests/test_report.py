@@ -9,7 +9,7 @@ import torch
 
 from lanebev import BEVGrid, Calibration, Camera, Extrinsics, LaneSegments, Status, image_from_road_points
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.measure import direction_spread, measure_boundaries, pose, width_spread
+from lanebev.report.measure import measure_boundaries, pose, spread
 from lanebev.report.overlay import BOUNDARY_COLOURS, PANEL_HEIGHT, Panel, draw_frame
 from lanebev.report.page import Report, write_report
 from lanebev.report.plots import plot_estimates, plot_widths, width_deviation
@@ -54,14 +54,14 @@ def test_measured_widths_are_those_of_the_road(bend):
     measured = measure_boundaries(_segments(bend), INTRINSICS, POSE)
     np.testing.assert_allclose(measured.widths[1:4], [3.6, 3.7, 3.7], atol=0.01)
     assert np.isnan(measured.widths[[0, 4]]).all()
-    assert direction_spread(measured.direction) < 1e-3
-    assert abs(width_spread(measured.widths) - 0.1) < 0.01
+    assert spread(measured.direction) < 1e-3
+    assert abs(spread(measured.widths) - 0.1) < 0.01
 
 
 def test_a_wrong_pitch_fans_the_boundaries_out():
     wrong = POSE._replace(pitch=POSE.pitch - math.radians(1))
     measured = measure_boundaries(_segments(), INTRINSICS, wrong)
-    assert direction_spread(measured.direction) > math.radians(5)
+    assert spread(measured.direction) > math.radians(5)
 
 
 def test_a_wrong_height_scales_the_widths():
@@ -77,7 +77,7 @@ def test_measuring_survives_noise_outliers_and_nothing():
     np.testing.assert_allclose(widths[1:4], [3.6, 3.7, 3.7], atol=0.12)
     nothing = measure_boundaries(segments._replace(weight=torch.zeros(1, 32)), INTRINSICS, POSE)
     assert np.isnan(nothing.widths).all()
-    assert np.isnan(direction_spread(nothing.direction))
+    assert np.isnan(spread(nothing.direction))
     broken = segments._replace(endpoints=segments.endpoints * math.nan)
     assert np.isnan(measure_boundaries(broken, INTRINSICS, POSE).widths).all()
 

@@ -217,6 +217,19 @@ def test_garbage_never_runs_away_and_is_recovered_from():
     torch.testing.assert_close(poses[-1], poses[0], atol=0.05, rtol=0.0)
 
 
+def test_deviation_lines_of_another_direction_do_not_turn_what_tracks():
+    """Algorithm 1 would: they are more."""
+    wrong = (POSE[0] + 0.03, POSE[1] + 0.08, *POSE[2:])
+    few, many = lanes(per=5, seed=1), lanes(wrong, per=20, seed=2)
+    both = LaneSegments(*(torch.cat(parts, 1) for parts in zip(few, many, strict=True)))
+    begun, _ = drive(TwoStageCalibrator(), [both])
+    assert begun[0].extrinsics.stack()[0, :2].tolist() == pytest.approx(wrong[:2], abs=2e-3)
+    calibrator = TwoStageCalibrator(min_inlier_share=0.15)
+    tracked, _ = drive(calibrator, [lanes(seed=s) for s in range(3, 8)] + [both])
+    assert tracked[-1].extrinsics.stack()[0, :2].tolist() == pytest.approx(POSE[:2], abs=2e-3)
+    assert int(tracked[-1].status[0]) == Status.TRACKING
+
+
 def test_gross_outliers_are_left_out():
     generator = torch.Generator().manual_seed(3)
     outputs = []

@@ -16,7 +16,7 @@ from lanebev.io.lane_rows import rows_from_lines, segments_from_rows
 from lanebev.io.lanes import match_frames, read_lanes
 from lanebev.io.video import open_source
 from lanebev.observers import NetworkObserver
-from lanebev.report.measure import believed, direction_spread, measure_boundaries, width_spread
+from lanebev.report.measure import believed, measure_boundaries, spread
 from lanebev.report.plots import width_deviation
 from lanebev.run import calibrate_still
 
@@ -84,8 +84,8 @@ def tusimple_labels(data: Path, calibrators: dict[str, Any]) -> Iterable[Figure]
             one = LaneSegments(*(part[i : i + 1] for part in segments))
             pose = Extrinsics(*(value[i : i + 1] for value in calibration.extrinsics))
             measured = measure_boundaries(one, intrinsics[:1], pose)
-            directions.append(direction_spread(measured.direction))
-            widths.append(width_spread(measured.widths))
+            directions.append(spread(measured.direction))
+            widths.append(spread(measured.widths))
         height = calibration.extrinsics.height.numpy()
         tracking = int((calibration.status == Status.TRACKING).sum())
         part = "tusimple, labels"

@@ -96,7 +96,6 @@ def curves(moment: Moment, num: int = 400) -> tuple[Tensor, Tensor]:
     """(6, G, 2) px of the boundaries from near to far, and (6, G) bool: in the image."""
     inverse = torch.linspace(1 / moment.near, 1 / moment.far, num, dtype=torch.float64)
     z = 1 / inverse
-    x_mid, heading = torch.zeros_like(z), torch.zeros_like(z)
     if moment.curvature is not None:
         fine = torch.linspace(0, moment.far * 1.1, 2000, dtype=torch.float64)
         step = fine[1] - fine[0]
@@ -117,7 +116,6 @@ def curves(moment: Moment, num: int = 400) -> tuple[Tensor, Tensor]:
         x = torch.stack(points)
     else:
         x = (moment.places + moment.offset).unsqueeze(-1) + moment.headings.unsqueeze(-1) * z
-        x = x + x_mid + heading
     road = torch.stack([x, z.expand_as(x)], dim=-1)
     pose = Extrinsics.unstack(torch.tensor([moment.pose], dtype=torch.float64))
     pixels, ahead_ok = image_from_road_points(road.flatten(0, 1)[None], CAMERA[None], pose)

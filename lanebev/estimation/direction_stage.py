@@ -17,6 +17,7 @@ from lanebev.estimation.vanishing import (
     segment_angles,
     vanishing_dir_least_squares,
 )
+from lanebev.geometry.road import great_circle_normals
 from lanebev.geometry.rotation import pitch_yaw_from_vanishing_dir, vanishing_dir_from_pitch_yaw
 from lanebev.types import LaneSegments
 
@@ -52,7 +53,9 @@ def track_direction(
 ) -> DirectionStep:
     """Predict, gate and update pitch and yaw; start over where that fails.
 
-    Source: Sec. III-D, Eqs. (9)-(17).
+    Source: Sec. III-D, Eqs. (9)-(17). Deviation: the paper takes L_c from Algorithm 1 in every frame; here
+    that searches only at a start and after a gap, and a row that tracks takes what agrees with its
+    prediction, so that lines of another direction, however many, do not turn it.
 
     Args:
         segments: cleaned, see :func:`lanebev.estimation.checks.clean_segments`.
@@ -67,7 +70,7 @@ def track_direction(
         the step; a row that is neither supported nor started keeps its prediction.
     """
     mean, cov = predict_direction(state, dt, cfg)
-    normals = torch.linalg.cross(rays[:, :, 0], rays[:, :, 1])
+    normals = great_circle_normals(segments.endpoints, intrinsics)
 
     residual, jacobian, noise = incidence(mean, normals, rays, segments.sigma, intrinsics)
     there = segments.weight > 0

@@ -32,24 +32,19 @@ class BoundaryAngles(NamedTuple):
     present: Tensor
 
 
-def line_angles(normals: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
+def line_angles(rays: Tensor) -> Tensor:
     """Angles of boundary planes from the camera's vertical, seen along the lanes.
 
-    Source: Fig. 6(c), α. Deviation: the normal is rotated into the frame of the vanishing direction and
-    α = atan(n_y / n_x), positive to the left; only so is Eq. (18) exact (PAPER_NOTES 3).
+    Source: Fig. 6(c), α. Deviation: of the plane through the vanishing direction and a ray, both in the frame
+    of the vanishing direction, and positive to the left; only so is Eq. (18) exact (PAPER_NOTES 3).
 
     Args:
-        normals: (B, N, 3) great-circle normals, camera frame.
-        pitch: (B,) rad.
-        yaw: (B,) rad.
+        rays: (..., 3) in the lane-aligned frame without roll, R_WC r.
 
     Returns:
-        (B, N) rad in (-pi/2, pi/2).
+        (...,) rad in (-pi, pi], beyond ±pi/2 above the level.
     """
-    world = normals @ cam_from_world(pitch, yaw)  # rows: (R_WC n)ᵀ
-    x = world[..., 0]
-    x = torch.where(x.abs() < 1e-12, 1e-12, x)
-    return torch.atan(world[..., 1] / x)
+    return torch.atan2(-rays[..., 0], rays[..., 1])
 
 
 def lane_widths(line_angles: Tensor, roll: Tensor, height: Tensor) -> Tensor:
@@ -101,12 +96,12 @@ def boundary_angles(
         angles with noise, Jacobian and presence.
     """
     world = rays @ cam_from_world(pitch, yaw).unsqueeze(1)  # (B, N, 2, 3)
+    far = (world[..., :2].square().sum(-1) > _MIN_RADIUS**2).all(-1) & (weight > 0)  # (B, N)
+    world = torch.where(far[..., None, None], world, world.new_tensor([0.0, 1.0, 1.0]))
     x, y, z = world.unbind(-1)
-    far = (x * x + y * y > _MIN_RADIUS**2).all(-1) & (weight > 0)  # (B, N)
-    y = torch.where(far.unsqueeze(-1), y, 1.0)
     radius = x * x + y * y
     pull = radius.sum(-1)  # (B, N), how strongly a segment's ends fix the angle
-    angle = (radius * torch.atan2(-x, y)).sum(-1) / pull
+    angle = (radius * line_angles(world)).sum(-1) / pull
     focal = 0.5 * (intrinsics[:, 0, 0] + intrinsics[:, 1, 1]).unsqueeze(-1)
     variance = (sigma / focal).square() / pull
     index = torch.arange(num_boundaries, device=boundary.device)[:, None]

@@ -45,7 +45,8 @@ def track_roll_height(
 ) -> RollHeightStep:
     """Predict and update roll and height; start where nothing is known; one lane moves height only.
 
-    Source: Sec. IV-B, with the measurement of Eq. (20).
+    Source: Sec. IV-B, with the measurement of Eq. (20). Deviation: a roll or height that no car has
+    (``LARGEST_ROLL``, ``LEAST_HEIGHT``, ``LARGEST_HEIGHT``) is back at the prior and unknown.
 
     Args:
         boundaries: angles about the direction of stage 1.

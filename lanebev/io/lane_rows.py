@@ -124,9 +124,9 @@ def segments_from_rows(
 ) -> LaneSegments:
     """Vertices of each boundary, paired to segments, one frame a row of the batch.
 
-    Source: Sect. III-A, representative vertices sampled and paired. Deviation: not at random, which uses some
-    vertices often and many never: vertex i goes with vertex i + K/2, each once, so that all baselines are
-    long and the end points' errors independent.
+    Source: Sects. VI-A and VI-B, representative vertices sampled and paired. Deviation: not at random, which
+    uses some vertices often and many never: vertex i goes with vertex i + K/2, each once, so that all
+    baselines are long and the end points' errors independent.
 
     Args:
         frames: B frames.

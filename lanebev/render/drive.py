@@ -216,8 +216,8 @@ class Drive:
             valid[0, :NUM_VEHICLES] &= ~(beside & (along < 16.0) & (along > -14.0))
         return world._replace(traffic=traffic._replace(speed=speed, valid=valid))
 
-    def _world_at(self, arc: float, time: float) -> tuple[World, Tensor]:
-        """The world with its scenery wrapped about the camera, and how far each vehicle went, (1, M)."""
+    def _world_at(self, arc: float, time: float) -> World:
+        """The world, its traffic where it is by then and its scenery wrapped about the camera."""
         traffic = self.world.traffic
         ahead = traffic.along + traffic.speed * time  # of the camera
         oncoming, still = traffic.speed < -20, traffic.speed == 0
@@ -228,7 +228,7 @@ class Drive:
         shift = torch.where(begin.isfinite(), shift, math.inf) + self.start + arc
         traffic = traffic._replace(along=ahead + self.start + arc)
         bridge = torch.stack([shift, shift + torch.where(begin.isfinite(), end - begin, 0.0)], dim=1)
-        return self.world._replace(traffic=traffic, bridge=bridge), torch.zeros_like(ahead)
+        return self.world._replace(traffic=traffic, bridge=bridge)
 
     def alignment_at(self, arc: float) -> Alignment:
         """The road's course from ``arc`` m after the start on."""
@@ -246,13 +246,12 @@ class Drive:
             raise IndexError(f"index: expected 0..{len(self) - 1}, got {index}")
         time = float(self.times[index])
         arc, across = self.speed * time, self._across(time)
-        world, moved = self._world_at(arc, time)
+        world = self._world_at(arc, time)
         place = Place(
             along=torch.tensor([self.start + arc]),
             across=torch.tensor([across]),
             ego_lane=torch.tensor([self._ego_lane(across)]),
             heading=torch.tensor([self._heading_at(arc)]),
-            moved=moved,
         )
         camera = self.camera
         lens = Lens(camera.intrinsics[None], camera.distortion[None], camera.model, self.extrinsics_at(time))

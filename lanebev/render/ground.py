@@ -100,15 +100,13 @@ def ground_radiance(
         retro = 1 + 2.5 * coverage + 8.0 * studs
         beam = headlight_irradiance(ground.x, ground.z) * light.headlight[:, None] * retro
         lit = lit + beam[:, None] * lit.new_tensor([1.0, 0.95, 0.85])[:, None]
-    return (
-        albedo * lit + _gloss(world, light, ground, swing, drop, sunlit, open_sky, blotch[2]) * paved[:, None]
-    )
+    gloss = _gloss(world, light, swing, drop, sunlit, open_sky, blotch[2])
+    return albedo * lit + gloss * paved[:, None]
 
 
 def _gloss(
     world: World,
     light: Light,
-    ground: Ground,
     swing: Tensor,
     drop: Tensor,
     sunlit: Tensor,

@@ -20,7 +20,6 @@ from lanebev.render.dice import Dice
 from lanebev.types import Extrinsics
 
 _COARSE = 4  # px between exactly undistorted pixels; bilinear in between errs by less than 0.005 px
-_NUM_COEFFICIENTS = 5
 
 
 class Lens(NamedTuple):

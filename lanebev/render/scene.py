@@ -49,14 +49,12 @@ class Place(NamedTuple):
         across: (B,) m in the layout's frame.
         ego_lane: (B,) int64, slot of the boundary on the ego lane's left.
         heading: (B,) rad, of the road there in the world.
-        moved: (B, M) m, how far each thing of the traffic went.
     """
 
     along: Tensor
     across: Tensor
     ego_lane: Tensor
     heading: Tensor
-    moved: Tensor
 
 
 def sample_ego_lane(dice: Dice, layout: Layout) -> Tensor:

@@ -226,9 +226,7 @@ def _sample_props(dice: Dice, left: Tensor, right: Tensor, bridge_at: Tensor, br
     return Traffic(along, across, 0.0 * along, shape, kind.expand_as(along), colour, off, valid)
 
 
-def place_solids(
-    traffic: Traffic, alignment: Alignment, start: Tensor, side: Tensor, moved: Tensor
-) -> Solids:
+def place_solids(traffic: Traffic, alignment: Alignment, start: Tensor, side: Tensor) -> Solids:
     """Traffic in the local road frame.
 
     Args:
@@ -236,9 +234,8 @@ def place_solids(
         alignment: seen from the camera's foot.
         start: (B,) m, the camera's arc length in the world.
         side: (B,) m, the camera's place across.
-        moved: (B, M) m along the road since time zero.
     """
-    arc = traffic.along + moved - start[:, None]
+    arc = traffic.along - start[:, None]
     across = traffic.across - side[:, None]
     x, z, _ = local_from_road(alignment, z_from_arc(alignment, arc), across)
     point = road_from_local(alignment, x, z)

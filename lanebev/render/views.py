@@ -39,7 +39,7 @@ def render_place(
         generator: of the sensor's noise.
         ideal_sensor: leave out blur, noise and compression.
     """
-    solids = place_solids(world.traffic, alignment, place.along, place.across, place.moved)
+    solids = place_solids(world.traffic, alignment, place.along, place.across)
     light = light_of(world.weather, place.heading)
     rays, steps = pixel_rays(lens, size)
     images, covers, nearest = [], [], []
@@ -80,13 +80,11 @@ def sample_place(dice: Dice, world: World, ego_lane: Tensor) -> tuple[World, Pla
     changing = dice.chance(0.15)
     centred = dice.normal(0.25).clamp(-0.8, 0.8)
     anywhere = dice.uniform(-0.5, 0.5) * (right - left)
-    things = world.traffic.along.shape[1]
     place = Place(
         along=start,
         across=0.5 * (left + right) + torch.where(changing, anywhere, centred),
         ego_lane=ego_lane,
         heading=dice.uniform(-math.pi, math.pi),
-        moved=torch.zeros(dice.batch_size, things),
     )
     return moved_along(world, start), place
 

@@ -14,7 +14,7 @@ from lanebev.types import NUM_BOUNDARIES, Extrinsics, LaneSegments
 
 _MIN_VERTICES = 4
 _MIN_STRETCH = 5.0  # m of road that a boundary must cover
-_MIN_PARTICULAR = 1e-9
+_LEAST_SIGMA = 1e-9  # like rad
 
 
 class RoadBoundaries(NamedTuple):
@@ -68,7 +68,7 @@ def measure_boundaries(
     for _ in range(3):
         offset, slope, bend = _fit(x[seen], z[seen], boundary[seen], num_boundaries)
         residual = (x - offset[boundary] - slope[boundary] * z - bend * z**2) / z  # like rad
-        sigma = 1.4826 * np.median(np.abs(residual[seen])) + _MIN_PARTICULAR
+        sigma = 1.4826 * np.median(np.abs(residual[seen])) + _LEAST_SIGMA
         seen &= np.abs(residual) < 3 * sigma
     present = np.array([(seen & (boundary == k)).sum() >= _MIN_VERTICES for k in range(num_boundaries)])
     direction = np.where(present, np.arctan(slope + 2 * bend * near), np.nan)
@@ -84,15 +84,10 @@ def measure_boundaries(
     return RoadBoundaries(direction, widths)
 
 
-def direction_spread(directions: NDArray[np.float64]) -> float:
-    """Largest difference between the directions of a frame's boundaries, rad; NaN with fewer than two."""
-    seen = directions[np.isfinite(directions)]
+def spread(values: NDArray[np.float64]) -> float:
+    """Largest difference between a frame's directions, or widths, in their unit; NaN with fewer than two."""
+    seen = values[np.isfinite(values)]
     return float(np.ptp(seen)) if len(seen) > 1 else float("nan")
-
-
-def width_spread(widths: NDArray[np.float64]) -> float:
-    """Largest difference between the widths of a frame's lanes, m; NaN with fewer than two."""
-    return direction_spread(widths)
 
 
 def pose(pitch: float, yaw: float, roll: float, height: float, like: Tensor) -> Extrinsics:

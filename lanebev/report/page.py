@@ -71,7 +71,7 @@ def write_report(path: str | Path, report: Report) -> None:
     share = f"{tracking} of {len(rows)} {'images' if report.is_stills else 'frames'} TRACKING"
     after_title = "calibrated" if report.is_stills else "online"
     parts = [f"<h1>{html.escape(report.title)}</h1>", f'<p class="sub">{share}</p>']
-    parts += [_pose_table(rows, report.is_stills), "<h2>Run</h2>", _facts(report.facts)]
+    parts += [_pose_table(rows), "<h2>Run</h2>", _facts(report.facts)]
     if report.problems:
         items = "".join(f"<li>{html.escape(problem)}</li>" for problem in report.problems)
         parts.append(f'<h2>Problems</h2><ul class="problems">{items}</ul>')
@@ -113,7 +113,7 @@ def summary_facts(report: Report) -> dict[str, str]:
     }
 
 
-def _pose_table(rows: Sequence[ExtrinsicsRow], is_stills: bool) -> str:
+def _pose_table(rows: Sequence[ExtrinsicsRow]) -> str:
     good = [row for row in rows if row.status == "TRACKING"]
     if not good:
         return "<p>No frame was calibrated.</p>"

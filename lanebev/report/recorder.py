@@ -22,7 +22,7 @@ from lanebev.io.video import Frame, VideoWriter, write_png
 from lanebev.report.measure import believed, measure_boundaries
 from lanebev.report.overlay import Panel, Picture, draw_frame
 from lanebev.report.page import Report, summary_facts, write_report
-from lanebev.types import Calibration, Extrinsics, LaneSegments
+from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments
 from lanebev.view.grid import BEVGrid
 
 REPORT_STILLS = 6
@@ -160,7 +160,7 @@ class Recorder:
         self, segments: LaneSegments, intrinsics: Tensor, pose: Extrinsics | None
     ) -> NDArray[np.float64]:
         if pose is None:
-            return np.full(5, np.nan)
+            return np.full(NUM_BOUNDARIES - 1, np.nan)
         return measure_boundaries(segments, intrinsics, pose).widths
 
 
