@@ -13,6 +13,14 @@ def where(row: Tensor, yes: Tensor, no: Tensor) -> Tensor:
     return torch.where(row.view(-1, *[1] * (yes.ndim - 1)), yes, no)
 
 
+def may_skip(wanted: Tensor) -> bool:
+    """Whether no row wants what is costly, such as a search: every row would discard its result.
+
+    The one place where the maths asks the device. A compiled or exported program cannot, and always searches.
+    """
+    return not torch.compiler.is_compiling() and not bool(wanted.any())
+
+
 def flag(condition: Tensor, reason: IntFlag) -> Tensor:
     """The reason's bit as int64 where the condition holds, else 0."""
     return condition.to(torch.int64) * int(reason)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lanebev.estimation.joint import JointCalibrator, JointConfig, Reason
+from lanebev.estimation.joint import JointCalibrator, follow_lane_change
 from lanebev.estimation.joint_filter import iterate
 from lanebev.estimation.joint_model import (
     CURVATURE,
@@ -34,6 +34,7 @@ from lanebev.estimation.joint_motion import (
     spring,
 )
 from lanebev.estimation.joint_road import come_nearer, straight_or_bend, turn_along
+from lanebev.estimation.joint_state import JointConfig, Reason, begin
 from lanebev.estimation.single_frame import FramePrior
 from lanebev.types import LaneSegments, Status
 from tools.scenarios import CAMERA, FPS, PLACES, WIDTH, moments
@@ -595,7 +596,7 @@ def test_deviations_change_their_numbers_with_the_boundaries(shift, monkeypatch)
     answer = (torch.full((2,), shift, dtype=DOUBLE), torch.ones(2, dtype=DOUBLE))
     monkeypatch.setattr("lanebev.estimation.joint.best_shift", lambda *_: answer)
     positions = boundary_places(WIDTH, 6, mean)
-    moved, _, _ = calibrator._follow_lane_change(state._replace(mean=mean), positions, seen)
+    moved, _, _ = follow_lane_change(state._replace(mean=mean), positions, seen, calibrator.config)
     k = torch.arange(6) + int(shift)
     expected = torch.where((k >= 0) & (k < 6), k + 1.0, 0.0).double()
     torch.testing.assert_close(moved[:, NUM_COMMON:], expected.expand(2, -1))
@@ -605,7 +606,7 @@ def test_deviations_change_their_numbers_with_the_boundaries(shift, monkeypatch)
 def test_a_clothoids_steps_are_its_rate_by_the_knots_spacing():
     calibrator = JointCalibrator()
     params = torch.tensor([[0.0, 0, 0, 1.5, 0, 2e-3, 1e-4]], dtype=DOUBLE)
-    mean, _ = calibrator._begin(params, 1e-12 * torch.eye(7, dtype=DOUBLE)[None])
+    mean, _ = begin(params, 1e-12 * torch.eye(7, dtype=DOUBLE)[None], calibrator.config)
     torch.testing.assert_close(mean[:, CURVATURE], params[:, 5])
     torch.testing.assert_close(mean[0, STEPS], torch.full((NUM_STEPS,), 1e-4 * KNOT_SPACING, dtype=DOUBLE))
 

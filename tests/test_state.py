@@ -6,7 +6,8 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from lanebev.estimation.joint import JointCalibrator, JointState
+from lanebev.estimation.joint import JointCalibrator
+from lanebev.estimation.joint_state import JointState
 from lanebev.estimation.mount import MountEstimator
 from lanebev.estimation.two_stage import TwoStageCalibrator
 from lanebev.io.state import VERSION, load_state, save_state

@@ -15,7 +15,7 @@ from lanebev import (
     image_from_road_points,
 )
 from lanebev.estimation.direction_stage import incidence
-from lanebev.estimation.two_stage import TwoStageConfig
+from lanebev.estimation.two_stage_state import TwoStageConfig
 from lanebev.geometry.road import great_circle_normals, rays_from_pixels
 from tools.reproduce_table1 import run, table
 from tools.synthetic import Experiment

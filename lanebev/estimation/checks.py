@@ -3,68 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import wraps
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from lanebev.geometry.camera import check_intrinsics
-from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
-from lanebev.types import Calibration, LaneSegments, Status
-
-Forward = TypeVar("Forward", bound=Callable[..., Any])
+from lanebev.types import LaneSegments, Status
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
 _MIN_SIGMA = 1e-3  # px; nothing is known better
 _MIN_SEGMENTS = 2  # that the estimators' reductions and pairs ask for; the rest is padding
 _HARMLESS_FOCAL = 1000.0  # px
 _HARMLESS_WIDTH = 3.7  # m
-
-
-def calibrates(forward: Forward) -> Forward:
-    """The border of a calibrator: its ``forward`` gets what fits together, whatever came.
-
-    Shapes are checked. All is computed in double precision, autocast off, and given in the state's dtype:
-    in single precision a lane seen sharply and alone leaves information matrices with a condition number
-    beyond 1e7, which are not positive definite any more. Only where a device has no double precision (MPS)
-    is it computed in the state's dtype. A row whose intrinsics or lane widths can't be used counts as one
-    that sees nothing, and N may be 0.
-
-    Args:
-        forward: method of a module with ``config.num_boundaries`` and ``state_type``, as in
-            :meth:`lanebev.TwoStageCalibrator.forward`.
-
-    Returns:
-        the method that asks first.
-    """
-
-    @wraps(forward)
-    def checked(
-        self: Any,
-        segments: LaneSegments,
-        intrinsics: Tensor,
-        state: Any,
-        dt: float | Tensor,
-        lane_width: float | Tensor = 3.7,
-    ) -> tuple[Calibration, Any]:
-        check_segments(segments, intrinsics)
-        count = segments.weight.shape[1]
-        given = check_state(state, self.state_type, intrinsics.shape[0])
-        like = given.to(widest_dtype(given.device))
-        segments, intrinsics, state = (cast_floating(x, like.dtype) for x in (segments, intrinsics, state))
-        widths = as_lane_width(lane_width, like, self.config.num_boundaries)
-        segments, intrinsics, widths = usable(
-            _padded(segments), intrinsics, widths, self.config.num_boundaries
-        )
-        with autocast_off(like.device):
-            calibration, state = forward(self, segments, intrinsics, state, as_batch(dt, like), widths)
-        calibration = calibration._replace(inliers=calibration.inliers[:, :count])
-        # In memory of its own: what a caller does to it in place is not done to the state.
-        return _copied(cast_floating(calibration, given.dtype)), cast_floating(state, given.dtype)
-
-    return cast(Forward, checked)
 
 
 def check_segments(segments: LaneSegments, intrinsics: Tensor) -> None:
@@ -158,7 +109,7 @@ def usable(
     )
 
 
-def _padded(segments: LaneSegments) -> LaneSegments:
+def padded(segments: LaneSegments) -> LaneSegments:
     """With segments of weight zero where there are fewer than the estimators ask for."""
     missing = _MIN_SEGMENTS - segments.weight.shape[1]
     if missing <= 0:
@@ -166,11 +117,6 @@ def _padded(segments: LaneSegments) -> LaneSegments:
     return LaneSegments(
         *(torch.cat([part, part.new_zeros(part.shape[0], missing, *part.shape[2:])], 1) for part in segments)
     )
-
-
-def _copied(value: Any) -> Any:
-    """A tensor, or every one in a NamedTuple, in memory of its own."""
-    return value.clone() if isinstance(value, Tensor) else type(value)(*map(_copied, value))
 
 
 def is_running(status: Tensor) -> Tensor:

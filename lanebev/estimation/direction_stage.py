@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from lanebev.estimation import kalman
 from lanebev.estimation.checks import is_running
+from lanebev.estimation.two_stage_state import TwoStageConfig, TwoStageState
 from lanebev.estimation.vanishing import (
     gate_angles,
     incidence_noise,
@@ -19,10 +20,8 @@ from lanebev.estimation.vanishing import (
 )
 from lanebev.geometry.road import great_circle_normals
 from lanebev.geometry.rotation import pitch_yaw_from_vanishing_dir, vanishing_dir_from_pitch_yaw
+from lanebev.rows import may_skip
 from lanebev.types import LaneSegments
-
-if TYPE_CHECKING:
-    from lanebev.estimation.two_stage import TwoStageConfig, TwoStageState
 
 
 class DirectionStep(NamedTuple):
@@ -139,8 +138,7 @@ def start_direction(
     cfg: TwoStageConfig,
 ) -> DirectionStep:
     """Algorithm 1 and the least-squares vanishing direction, Sec. III-B and III-C."""
-    if not torch.compiler.is_compiling() and not bool(wanted.any()):
-        # Same result, without the search; every row's start is discarded by the caller.
+    if may_skip(wanted):
         nothing = torch.zeros_like(segments.weight)
         no = torch.zeros_like(wanted)
         return DirectionStep(mean, torch.zeros_like(mean).diag_embed(), nothing, no, no)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from lanebev.estimation import kalman
 from lanebev.estimation.lane_width import BoundaryAngles, initial_roll_height, measure_widths
+from lanebev.estimation.two_stage_state import TwoStageConfig, TwoStageState
+from lanebev.rows import may_skip
 from lanebev.types import Status
-
-if TYPE_CHECKING:
-    from lanebev.estimation.two_stage import TwoStageConfig, TwoStageState
-
 
 _NUM_LINEARISATIONS = 2
 LARGEST_ROLL = 0.8  # rad
@@ -68,7 +66,7 @@ def track_roll_height(
     start_roll = roll_seen & (~state.roll_known | lost)
     start_height = height_seen & (~state.height_known | lost | start_roll)
     first = torch.stack([start_roll, start_height, start_roll, start_height], dim=-1)
-    if torch.compiler.is_compiling() or bool(first.any()):
+    if not may_skip(first):
         roll, height = initial_roll_height(boundaries, lane_width, mean[:, 0])
         started = torch.stack([roll, height, torch.zeros_like(roll), torch.zeros_like(roll)], dim=-1)
         mean = torch.where(first, started, mean)

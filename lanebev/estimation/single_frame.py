@@ -150,12 +150,18 @@ def fit_single_frame(
     Raises:
         ValueError: shapes that do not fit.
     """
-    prior = prior or FramePrior()
     check_segments(segments, intrinsics)
     widths = as_lane_width(lane_width, intrinsics, num_boundaries)
     segments, intrinsics, widths = usable(segments, intrinsics, widths, num_boundaries)
     seen = observations(segments, intrinsics)
     places = boundary_places(widths, num_boundaries, intrinsics).gather(1, seen.boundary)  # (B, N)
+    return fit_observations(seen, places, prior or FramePrior(), start_segments, iterations)
+
+
+def fit_observations(
+    seen: Observations, places: Tensor, prior: FramePrior, start_segments: int = 96, iterations: int = 8
+) -> SingleFrameFit:
+    """As :func:`fit_single_frame`, of segments made ready and places (B, N) of their boundaries, m."""
     with torch.no_grad():
         fewer, fewer_places = _subset(seen, places, start_segments)
         starts = _linear_starts(fewer, fewer_places, prior)  # (B, S, 7)

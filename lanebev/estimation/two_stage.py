@@ -2,77 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
-
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from lanebev.estimation.checks import as_batch, as_lane_width, calibrates, is_running
+from lanebev.estimation.calibrator import Calibrator
+from lanebev.estimation.checks import is_running
 from lanebev.estimation.direction_stage import track_direction
 from lanebev.estimation.lane_width import boundary_angles
 from lanebev.estimation.roll_height_stage import track_roll_height
+from lanebev.estimation.two_stage_state import TwoStageConfig, TwoStageState
 from lanebev.geometry.road import rays_from_pixels
 from lanebev.rows import where
-from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status, saved_by_name
+from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
 
 
-@dataclass(frozen=True)
-class TwoStageConfig:
-    """Numbers of :class:`TwoStageCalibrator`; angles in rad, lengths in m, times in s.
-
-    The paper gives none of Q, W, N_loop or the search range (PAPER_NOTES 13). W here admits ±1.5 deg and
-    ±5 cm at 1 Hz.
-    """
-
-    num_boundaries: int = NUM_BOUNDARIES
-    num_hypotheses: int = 300  # N_loop, at most
-    seed: int = 0  # of the hypotheses
-    gate_sigmas: float = 3.5  # 0 is the paper's fixed gate of 0.7 deg
-    angular_acceleration_density: float = 0.25  # rad² / s³, of pitch, yaw and roll
-    height_acceleration_density: float = 1.0  # m² / s³
-    initial_pose: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.5)
-    initial_pose_std: tuple[float, float, float, float] = (0.1, 0.1, 0.05, 0.5)
-    initial_rate_std: tuple[float, float, float, float] = (0.2, 0.2, 0.2, 0.5)  # per second
-    min_segments: int = 4  # for a vanishing point to be believed
-    min_inlier_share: float = 0.3
-    reacquire_after: float = 0.2  # s without support before the search starts over
-    reacquire_spread: float = 0.013  # rad, sigma of the predicted direction at which it does, too
-    lost_after: float = 1.5  # s without support
-    assumed_dt: float = 1 / 30  # s between frames where it is not finite
-    lane_noise: float = 0.0  # m, how far single lanes differ from the prior
-    lane_width_std: float = 0.0  # m, how far the prior itself may be off: a common scale of height
-
-    def __post_init__(self) -> None:
-        if self.num_boundaries < 2:
-            raise ValueError(f"num_boundaries: expected at least 2, got {self.num_boundaries}")
-        if self.num_hypotheses < 1:
-            raise ValueError(f"num_hypotheses: expected at least 1, got {self.num_hypotheses}")
-
-
-@saved_by_name
-class TwoStageState(NamedTuple):
-    """Everything the calibrator remembers, tensors only.
-
-    Attributes:
-        direction_mean: (B, 4) pitch, yaw and their rates; direction_cov: (B, 4, 4).
-        roll_height_mean: (B, 4) roll, height and their rates; roll_height_cov: (B, 4, 4).
-        roll_known, height_known: (B,) bool, initialised from lane widths.
-        unseen: (B,) s since the vanishing point was last supported.
-        status: (B,) int64.
-    """
-
-    direction_mean: Tensor
-    direction_cov: Tensor
-    roll_height_mean: Tensor
-    roll_height_cov: Tensor
-    roll_known: Tensor
-    height_known: Tensor
-    unseen: Tensor
-    status: Tensor
-
-
-class TwoStageCalibrator(nn.Module):
+class TwoStageCalibrator(Calibrator):
     """Online calibration in the paper's two stages, per row of a batch, state in and state out.
 
     Source: Secs. III and IV. Assumes a straight flat road, parallel boundaries and equal known lane widths:
@@ -117,36 +61,18 @@ class TwoStageCalibrator(nn.Module):
             direction, direction_cov, roll_height, roll_height_cov, no, no.clone(), unseen, status
         )
 
-    @calibrates
-    def forward(
+    def step(
         self,
         segments: LaneSegments,
         intrinsics: Tensor,
         state: TwoStageState,
-        dt: float | Tensor,
-        lane_width: float | Tensor = 3.7,
+        dt: Tensor,
+        lane_width: Tensor,
     ) -> tuple[Calibration, TwoStageState]:
-        """One frame; the results have the state's dtype.
-
-        Args:
-            segments: of this frame, N per row; weight 0 is not there, non-finite counts as not there.
-            intrinsics: (B, 3, 3) px. A row where they or the widths are not finite and positive sees nothing.
-            state: of the frame before, or :meth:`initial_state`.
-            dt: s since that frame, float or (B,). A started row skips a frame that is not later (0 or
-                negative). Where not finite, an interval is assumed.
-            lane_width: m, float, (B,) or (B, L-1) per lane.
-
-        Returns:
-            calibration of this frame and the state after it.
-
-        Raises:
-            ValueError: a shape that doesn't fit.
-        """
-        dt = as_batch(dt, segments.sigma)
+        """One frame, see :meth:`~lanebev.estimation.calibrator.Calibrator.forward`."""
         dt = torch.where(dt.isfinite(), dt, self.config.assumed_dt)
         before, skip = state, (dt <= 0) & is_running(state.status)
         dt = dt.clamp(0.0, 60.0)
-        widths = as_lane_width(lane_width, segments.sigma, self.config.num_boundaries)
         rays = rays_from_pixels(segments.endpoints.flatten(1, 2), intrinsics)
         rays = rays.reshape(*segments.endpoints.shape[:-1], 3)  # (B, N, 2, 3)
 
@@ -164,12 +90,12 @@ class TwoStageCalibrator(nn.Module):
             one.mean[:, 1],
             self.config.num_boundaries,
         )
-        two = track_roll_height(boundaries, widths, one.cov[:, :2, :2], state, dt, one.fresh, self.config)
+        two = track_roll_height(boundaries, lane_width, one.cov[:, :2, :2], state, dt, one.fresh, self.config)
         unseen = torch.where(one.seen, 0.0, state.unseen + dt)
         status = _status(state.status, one.seen, unseen, self.config.lost_after)
         after = TwoStageState(one.mean, one.cov, *two, unseen, status)
         state = TwoStageState(*(where(skip, old, new) for old, new in zip(before, after, strict=True)))
-        return self._calibration(state, widths, one.inliers), state
+        return self._calibration(state, lane_width, one.inliers), state
 
     def _calibration(self, state: TwoStageState, lane_width: Tensor, inliers: Tensor) -> Calibration:
         pose = torch.cat([state.direction_mean[:, :2], state.roll_height_mean[:, :2]], dim=-1)
