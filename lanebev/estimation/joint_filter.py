@@ -18,7 +18,7 @@ from lanebev.estimation.joint_model import (
     boundary_residuals,
 )
 from lanebev.estimation.joint_motion import MEANS, NUM_COMMON, NUM_POSE, NUM_SEEN, RATES
-from lanebev.estimation.joint_robust import inlier_weights, log_likelihood, noise_scale, start_scale
+from lanebev.estimation.joint_robust import inlier_weights, log_likelihood, lowered, noise_scale, start_scale
 from lanebev.estimation.single_frame import normal_equations
 
 _LOOSE = (0.3, 0.3, 0.3, 1.0, 2.0)  # rad, m: sigmas before a frame, to ask what it alone determines
@@ -102,7 +102,7 @@ def iterate(
         gate = (seen.sigma.square() + unsure).sqrt()
         trust = inlier_weights(residuals.distance, residuals.valid, gate, scale, focal)
         fitted = noise_scale(residuals.distance, seen.sigma, trust * seen.weight)
-        scale = torch.minimum(torch.maximum(fitted, 0.5 * scale), scale)
+        scale = lowered(scale, fitted)
         by_noise = trust * there / (seen.sigma * scale.unsqueeze(-1)).square()
         info, pull = _information(jacobian, residuals.distance, by_noise)
         known = info.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:]

@@ -63,6 +63,11 @@ def noise_scale(distance: Tensor, sigma: Tensor, weight: Tensor) -> Tensor:
     return (total / (SCALE_PRIOR + weight.sum(-1))).sqrt().clamp(min=1.0)
 
 
+def lowered(scale: Tensor, fitted: Tensor) -> Tensor:
+    """(B,) noise scale after a reweighting: as fitted, but no higher than it was, nor lower than half."""
+    return torch.minimum(torch.maximum(fitted, 0.5 * scale), scale)
+
+
 def start_scale(distance: Tensor, sigma: Tensor, weight: Tensor) -> Tensor:
     """Scale to begin reweighting with, from the 30 % quantile: right with up to two outliers in three.
 

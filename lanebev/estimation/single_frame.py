@@ -24,7 +24,7 @@ from lanebev.estimation.joint_model import (
     boundary_residuals,
     observations,
 )
-from lanebev.estimation.joint_robust import inlier_weights, log_likelihood, noise_scale
+from lanebev.estimation.joint_robust import inlier_weights, log_likelihood, lowered, noise_scale
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import angles_from_matrix, road_from_cam
 from lanebev.types import NUM_BOUNDARIES, Extrinsics, LaneSegments
@@ -222,7 +222,7 @@ def refine(
         sigma = (seen.sigma.square() + (blur / scale).square().unsqueeze(-1)).sqrt()
         trust = inlier_weights(residuals.distance, residuals.valid, sigma, scale, focal) * seen.weight
         fitted = noise_scale(residuals.distance, seen.sigma, trust)
-        scale = torch.minimum(torch.maximum(fitted, 0.5 * scale), scale)
+        scale = lowered(scale, fitted)
         by_noise = trust / ((seen.sigma * scale.unsqueeze(-1)).square() + blur.square().unsqueeze(-1))
         blur = 0.5 * blur
         information, gradient = normal_equations(

@@ -39,6 +39,12 @@ def check_rows(distortion: Tensor, points: Tensor) -> None:
         raise ValueError(f"distortion: expected ({rows}D) like the points, got {tuple(distortion.shape)}")
 
 
+def _check(points: Tensor, distortion: Tensor, model: str) -> None:
+    _check_points(points)
+    _check_lens(distortion, model)
+    check_rows(distortion, points)
+
+
 def check_intrinsics(intrinsics: Tensor, *rows: int) -> None:
     """Raise unless these are (*rows, 3, 3) matrices of floating point.
 
@@ -121,9 +127,7 @@ def distort_points(points: Tensor, intrinsics: Tensor, distortion: Tensor, model
     Raises:
         ValueError: unknown model, a number of coefficients that it does not have, or of rows.
     """
-    _check_points(points)
-    _check_lens(distortion, model)
-    check_rows(distortion, points)
+    _check(points, distortion, model)
     if distortion.shape[-1] == 0:
         return points
     if model == "fisheye":
@@ -160,9 +164,7 @@ def undistort_points(
     Raises:
         ValueError: unknown model, a number of coefficients that it does not have, or of rows.
     """
-    _check_points(points)
-    _check_lens(distortion, model)
-    check_rows(distortion, points)
+    _check(points, distortion, model)
     if distortion.shape[-1] == 0:
         return points
     if model == "fisheye":

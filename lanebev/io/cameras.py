@@ -15,6 +15,7 @@ import torch
 import yaml
 
 from lanebev.geometry.camera import DISTORTION_LENGTHS, Camera
+from lanebev.io.numbers import finite_numbers
 
 _SHORT_KEYS = {"fx", "fy", "cx", "cy", "width", "height", "distortion", "model"}
 _MATRIX_KEYS = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "k")
@@ -137,11 +138,11 @@ def _parse_kitti(
     name = next((n for n in names if n in entries), None)
     if name is None:
         raise ValueError("expected a KITTI projection matrix (P_rect_02 or P2), got none of them")
-    projection = _numbers(name, entries[name].split(), 12)
+    projection = finite_numbers(name, entries[name].split(), 12)
     known = next((s for f, s in _KITTI_SIZES.items() if abs(f - projection[0]) < 1e-3), None)
     size = image_size or known
     if (size_name := name.replace("P", "S", 1)) in entries:
-        width, height = _numbers(size_name, entries[size_name].split(), 2)
+        width, height = finite_numbers(size_name, entries[size_name].split(), 2)
         size = (round(height), round(width))
     elif size and known and max(abs(size[0] - known[0]), abs(size[1] - known[1])) > _KITTI_SPREAD:
         raise ValueError(
@@ -169,10 +170,10 @@ def _normalise(fields: Mapping[str, Any]) -> tuple[list[float], list[float], str
     width, height = (_integer(fields, keys) for keys in sizes)
     if short:
         fx, fy, cx, cy = (
-            _numbers(key, [_required(fields, (key,))], 1)[0] for key in ("fx", "fy", "cx", "cy")
+            finite_numbers(key, [_required(fields, (key,))], 1)[0] for key in ("fx", "fy", "cx", "cy")
         )
         matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
-        distortion = _numbers("distortion", _sequence("distortion", fields.get("distortion") or []))
+        distortion = finite_numbers("distortion", _sequence("distortion", fields.get("distortion") or []))
     else:
         matrix = _matrix_entries(fields, _MATRIX_KEYS, 9)
         distortion = _matrix_entries(fields, _DISTORTION_KEYS)
@@ -237,7 +238,7 @@ def _required(fields: Mapping[str, Any], keys: Sequence[str]) -> Any:
 
 
 def _integer(fields: Mapping[str, Any], keys: Sequence[str]) -> int:
-    (value,) = _numbers(keys[0], [_required(fields, keys)], 1)
+    (value,) = finite_numbers(keys[0], [_required(fields, keys)], 1)
     if value != round(value):
         raise ValueError(f"{keys[0]}: expected whole pixels, got {value:g}")
     return round(value)
@@ -247,8 +248,10 @@ def _matrix_entries(fields: Mapping[str, Any], keys: Sequence[str], count: int |
     """Entries of ``{rows, cols, data}`` or of a (nested) list, row by row."""
     value = _required(fields, keys)
     if isinstance(value, Mapping):
-        return _numbers(keys[0], *_opencv_data(keys[0], value, count))
-    return _numbers(keys[0], [entry for row in _sequence(keys[0], value) for entry in _flat(row)], count)
+        return finite_numbers(keys[0], *_opencv_data(keys[0], value, count))
+    return finite_numbers(
+        keys[0], [entry for row in _sequence(keys[0], value) for entry in _flat(row)], count
+    )
 
 
 def _opencv_data(name: str, value: Mapping[str, Any], count: int | None) -> tuple[list[Any], int]:
@@ -258,7 +261,7 @@ def _opencv_data(name: str, value: Mapping[str, Any], count: int | None) -> tupl
         raise ValueError(f"{name}: expected rows, cols, dt, data, got the key {unknown[0]!r}")
     as_list = {key: field.split() if isinstance(field, str) else field for key, field in value.items()}
     shape = as_list.get("sizes") or [entry for key in ("rows", "cols") for entry in _flat(as_list.get(key))]
-    sizes = _numbers(f"{name}.rows and .cols", _sequence(name, shape))
+    sizes = finite_numbers(f"{name}.rows and .cols", _sequence(name, shape))
     if not sizes:
         raise ValueError(f"{name}: expected rows and cols, got neither")
     return _sequence(name, as_list.get("data") or []), count or round(min(math.prod(sizes), 1e6))
@@ -272,19 +275,6 @@ def _sequence(name: str, value: Any) -> list[Any]:
     if not isinstance(value, list):
         raise ValueError(f"{name}: expected a list of numbers, got {value!r}")
     return value
-
-
-def _numbers(name: str, values: Sequence[Any], count: int | None = None) -> list[float]:
-    if count is not None and len(values) != count:
-        raise ValueError(f"{name}: expected {count} number{'s'[: count != 1]}, got {len(values)}")
-    try:
-        numbers = [float(value) for value in values if not isinstance(value, bool)]
-    except (TypeError, ValueError, OverflowError):
-        numbers = []
-    if len(numbers) != len(values) or not all(map(math.isfinite, numbers)):
-        shown = ", ".join(str(value) for value in values)[:60]
-        raise ValueError(f"{name}: expected finite numbers, got {shown}")
-    return numbers
 
 
 def camera_info(camera: Camera, name: str = "camera") -> dict[str, Any]:

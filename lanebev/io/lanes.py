@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lanebev.io.numbers import finite_numbers
 from lanebev.io.video import IMAGE_SUFFIXES, natural_order
 from lanebev.types import NUM_BOUNDARIES
 
@@ -110,7 +111,7 @@ def read_culane(path: str | Path) -> FrameLines:
     lines = []
     for number, text in enumerate(_text(path).splitlines(), start=1):
         with _Where(path, number):
-            values = _floats("points", text.split())
+            values = finite_numbers("points", text.split())
             if len(values) % 2:
                 raise ValueError(f"expected x y pairs, got {len(values)} numbers; is the file cut?")
             pairs = zip(values[::2], values[1::2], strict=True)
@@ -133,7 +134,9 @@ def read_openlane(path: str | Path) -> FrameLines:
             if len(uv) != 2 or not all(isinstance(axis, list) for axis in uv) or len(uv[0]) != len(uv[1]):
                 raise ValueError(f"lane_lines[{i}].uv: expected two lists of one length, got {uv!r:.60}")
             if lane.get("category") not in _OPENLANE_CURBS and len(uv[0]):
-                lines.append(LaneLine(np.array([_floats(f"lane_lines[{i}].uv", axis) for axis in uv]).T))
+                lines.append(
+                    LaneLine(np.array([finite_numbers(f"lane_lines[{i}].uv", axis) for axis in uv]).T)
+                )
     return FrameLines(name, lines)
 
 
@@ -241,7 +244,7 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
     if not name:
         raise ValueError("raw_file: expected the image's path, got an empty string")
     if "h_samples" in fields:
-        rows = _floats("h_samples", _field(fields, "h_samples", list))
+        rows = finite_numbers("h_samples", _field(fields, "h_samples", list))
     else:
         rows = _benchmark_rows(_field(fields, "lanes", list))
     if any(b <= a for a, b in pairwise(rows)):
@@ -290,7 +293,7 @@ def _on_h_samples(name: str, values: Any, count: int) -> NDArray[np.float64]:
     if not isinstance(values, list) or len(values) != count:
         got = len(values) if isinstance(values, list) else repr(values)
         raise ValueError(f"{name}: expected {count} numbers, one per h_sample, got {got}")
-    x = np.array(_floats(name, values))
+    x = np.array(finite_numbers(name, values))
     x[x < 0] = np.nan  # -2 is "not there"
     return x
 
@@ -347,13 +350,3 @@ def _field(fields: Any, key: str, kind: type) -> Any:
         got = type(fields.get(key)).__name__ if isinstance(fields, dict) and key in fields else "none"
         raise ValueError(f"{key}: expected a {kind.__name__}, got {got}; formats: TuSimple, CULane, OpenLane")
     return fields[key]
-
-
-def _floats(name: str, values: Sequence[Any]) -> list[float]:
-    try:
-        numbers = [float(value) for value in values if not isinstance(value, bool)]
-    except (TypeError, ValueError, OverflowError):
-        numbers = []
-    if len(numbers) != len(values) or not all(map(math.isfinite, numbers)):
-        raise ValueError(f"{name}: expected finite numbers, got {str(list(values))[:60]}")
-    return numbers

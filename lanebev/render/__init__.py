@@ -1,4 +1,7 @@
-"""The rendered road: textures, scene, camera, drive."""
+"""The rendered road: textures, scene, camera, drive.
+
+Rendering is on the CPU, in the workers of a data loader; frames go to a device as batches do.
+"""
 
 from lanebev.render.drive import Drive
 from lanebev.render.frame import RenderedFrame

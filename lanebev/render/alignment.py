@@ -164,7 +164,7 @@ def z_from_arc(alignment: Alignment, arc: Tensor) -> Tensor:
     """(B, N) arc length to Z of the centreline; behind the camera the road is straight."""
     index = torch.searchsorted(alignment.arc, arc.contiguous()).clamp(1, NUM_KNOTS - 1)
     low, high = alignment.arc.gather(1, index - 1), alignment.arc.gather(1, index)
-    z = knots().float().to(arc.device)
+    z = knots().float()
     part = (arc - low) / (high - low)
     return torch.where(arc < 0, arc, z[index - 1] + part * (z[index] - z[index - 1]))
 
@@ -189,7 +189,7 @@ def ground_hit(alignment: Alignment, height: Tensor, drop: Tensor) -> tuple[Tens
     Returns:
         (B, N) Z, m, infinite where the ray meets nothing; and (B, N) the road's own slope dE/dZ there.
     """
-    z = knots().float().to(drop.device)
+    z = knots().float()
     elevation = alignment.elevation
     needed = (height[:, None] - elevation[:, 1:]) / z[1:]  # drop of a ray to each knot
     lowest = needed.cummin(1).values
@@ -205,7 +205,7 @@ def ground_hit(alignment: Alignment, height: Tensor, drop: Tensor) -> tuple[Tens
 
 def hidden_by_crest(alignment: Alignment, height: Tensor, z: Tensor) -> Tensor:
     """(B, N) bool: the road at z lies behind a crest."""
-    table = knots().float().to(z.device)
+    table = knots().float()
     lowest = ((height[:, None] - alignment.elevation[:, 1:]) / table[1:]).cummin(1).values
     index = torch.searchsorted(table, z.contiguous()).clamp(1, NUM_KNOTS - 1) - 1
     before = lowest.gather(1, (index - 1).clamp(min=0))
@@ -224,7 +224,7 @@ def wall_hit(alignment: Alignment, across: Tensor, swing: Tensor) -> tuple[Tenso
     Returns:
         (B, N) Z, m, infinite where the ray meets nothing; and (B, N) arc length, m.
     """
-    z_centre = knots().float().to(swing.device).expand_as(alignment.x)
+    z_centre = knots().float().expand_as(alignment.x)
     x, z, arc = local_from_road(alignment, z_centre, across[:, None].expand_as(z_centre))
     side = across.sign()[:, None]
     needed = torch.where(z > 0.05, x * side / z.clamp(min=0.05), 1e4)

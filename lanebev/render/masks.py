@@ -58,13 +58,13 @@ def boundary_masks(
     start, end = (t.flatten(0, 1)[layer, part] for t in (start, end))
     strength = strength.flatten(0, 1)[layer, part]
     count = int(((end - start).norm(dim=-1).max() / _PIECE).ceil().clamp(1, 64))
-    steps = torch.arange(count + 1) / count
+    steps = torch.arange(count + 1, device=points.device) / count
     nodes = start[:, None] + (end - start)[:, None] * steps[:, None]  # (S, count + 1, 2)
     start, end = nodes[:, :-1].flatten(0, 1), nodes[:, 1:].flatten(0, 1)
     layer, strength = layer.repeat_interleave(count), strength.repeat_interleave(count)
 
     reach = int(half_width_px + 0.5 + 0.5 * _PIECE) + 1
-    offset = torch.arange(-reach, reach + 1)
+    offset = torch.arange(-reach, reach + 1, device=points.device)
     window = torch.stack(torch.meshgrid(offset, offset, indexing="xy"), dim=-1).flatten(0, 1)  # (K, 2) x, y
     pixel = (0.5 * (start + end)).round().long()[:, None] + window
     along = (end - start)[:, None]

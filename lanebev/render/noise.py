@@ -67,7 +67,7 @@ def sample_noise(channel: int, u: Tensor, v: Tensor) -> Tensor:
     u, v = torch.broadcast_tensors(u, v)
     grid = torch.stack([u, v], dim=-1)
     grid = (grid - grid.floor()) * 2 - 1
-    tile = noise_tile()[channel : channel + 1].to(u.device)
+    tile = noise_tile()[channel : channel + 1]
     values = functional.grid_sample(
         tile[None], grid.reshape(1, 1, -1, 2), align_corners=True, padding_mode="border"
     )
@@ -77,7 +77,7 @@ def sample_noise(channel: int, u: Tensor, v: Tensor) -> Tensor:
 def sample_grain(channel: int, u: Tensor, v: Tensor) -> Tensor:
     """As :func:`sample_noise`, the nearest texel: for grain that is finer than a pixel, four times faster."""
     row, column = (v * TILE).long() & (TILE - 1), (u * TILE).long() & (TILE - 1)
-    return noise_tile()[channel].to(u.device).take(row * (TILE + 1) + column)
+    return noise_tile()[channel].take(row * (TILE + 1) + column)
 
 
 @lru_cache(maxsize=1)
@@ -93,7 +93,7 @@ def blotches(along: Tensor, across: Tensor) -> Tensor:
     grid = torch.stack([along * (1 / 173.0), across * (1 / 61.0)], dim=-1)
     grid = (grid - grid.floor()) * 2 - 1
     values = functional.grid_sample(
-        _blotch_tile().to(along.device), grid.reshape(1, 1, -1, 2), align_corners=True, padding_mode="border"
+        _blotch_tile(), grid.reshape(1, 1, -1, 2), align_corners=True, padding_mode="border"
     )
     return values.reshape(4, *along.shape)
 
@@ -109,7 +109,7 @@ def _line_table() -> Tensor:
 
 def sample_line(u: Tensor) -> Tensor:
     """A periodic noise over a line, u (...,) in periods."""
-    return _line_table().to(u.device).take((u * (16 * TILE)).long() & (16 * TILE - 1))
+    return _line_table().take((u * (16 * TILE)).long() & (16 * TILE - 1))
 
 
 def hash01(a: Tensor, b: Tensor, salt: float) -> Tensor:
