@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import os
 import signal
 import sys
 import threading
@@ -59,7 +60,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 class _Stopped(KeyboardInterrupt):
-    """By another signal than Ctrl-C's, its number the argument."""
+    """By a signal, its number the argument."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -77,28 +78,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 128 + int(stopped.args[0] if isinstance(stopped, _Stopped) else signal.SIGINT)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # of signs that a terminal's encoding lacks
-    print(report)
+    with contextlib.suppress(OSError):  # nobody reads it; the outputs are there
+        print(report, flush=True)
+        return 0
+    sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - else closing it at exit fails once more
     return 0
 
 
 @contextlib.contextmanager
 def _signals_unwind() -> Iterator[None]:
-    """What a job scheduler or a closed terminal sends leaves as Ctrl-C does: outputs are undone."""
-
-    def stop(number: int, _: object) -> NoReturn:
-        raise _Stopped(number)
-
-    known = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    own = [each for each in known if signal.getsignal(each) is signal.SIG_DFL]  # not what nohup ignores
+    """Ctrl-C, a job scheduler, a closed terminal: outputs are undone, and a second signal waits for that."""
+    known = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {each: signal.getsignal(each) for each in known}
+    usual = (signal.SIG_DFL, signal.default_int_handler)
+    own = [each for each, handler in before.items() if handler in usual]  # not what nohup ignores
     if threading.current_thread() is not threading.main_thread():
         own = []  # Python lets no other thread set them
+
+    def stop(number: int, _: object) -> NoReturn:
+        for each in own:
+            signal.signal(each, signal.SIG_IGN)
+        raise _Stopped(number)
+
     for each in own:
         signal.signal(each, stop)
     try:
         yield
     finally:
         for each in own:
-            signal.signal(each, signal.SIG_DFL)
+            signal.signal(each, before[each])
 
 
 def _run(options: dict[str, Any]) -> str:

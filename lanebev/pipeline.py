@@ -184,12 +184,15 @@ class LaneBEV(nn.Module):
             model: "pinhole" or "fisheye".
 
         Returns:
-            logits (B, 1 + L, h, w) and segments in undistorted pixels of the image.
+            logits (B, 1 + L, h, w) and segments in undistorted pixels of the image. A row whose image is not
+            finite counts as black and has none, so that it spoils neither other rows nor gradients.
         """
         resized = self._resize(image)
-        logits = self.segmenter(resized)
+        finite = resized.isfinite().flatten(1).all(1)  # (B,)
+        logits = self.segmenter(torch.where(finite[:, None, None, None], resized, 0.0))
         height, width = image.shape[-2:]
         segments = self.extractor(logits, (height, width), tuple(resized.shape[-2:]))
+        segments = segments._replace(weight=torch.where(finite.unsqueeze(-1), segments.weight, 0.0))
         if distortion is not None and distortion.shape[-1]:
             ends = segments.endpoints
             flat = undistort_points(ends.flatten(1, 2), intrinsics, distortion, model)

@@ -104,7 +104,7 @@ def run(
     check_image_size(camera, source)
     observer = make_observer(config, source, camera)
     calibrator, mount = make_calibrator(config.calibrator), MountEstimator()
-    states, problem = begin(config, calibrator, mount)
+    states, problem = begin(config, calibrator, mount, camera)
     frames: Iterator[Frame] = prefetch(source)
     frames = progress(frames, source.count) if progress else frames
     warp, coarse = BEVWarp(BEVGrid()), BEVWarp(BEVGrid(resolution=_BEFORE_RESOLUTION))
@@ -147,17 +147,19 @@ def run(
                 )
         facts = run_facts(config, source, camera)
         if not config.stills:
-            save_state(out / STATE_FILE, states)
+            save_state(out / STATE_FILE, {**states, "camera": lens(camera)})
             facts |= mount_facts(mounted)
             write_calibration(out / CALIBRATION_FILE, camera, mounted)
         return recorder.finish(facts, Path(source.source).name, truth)
 
 
-def begin(config: RunConfig, calibrator: Any, mount: MountEstimator) -> tuple[dict[str, Any], str | None]:
+def begin(
+    config: RunConfig, calibrator: Any, mount: MountEstimator, camera: Camera
+) -> tuple[dict[str, Any], str | None]:
     """The states to begin with, by name, and why they are not those asked for, if they aren't.
 
     Raises:
-        ValueError: ``resume`` is not the folder of an earlier run, or of one with another calibrator.
+        ValueError: ``resume`` is no earlier run's folder, or of one with another calibrator or camera.
     """
     fresh = {
         "calibrator": calibrator.initial_state(1, dtype=torch.float64),
@@ -178,7 +180,22 @@ def begin(config: RunConfig, calibrator: Any, mount: MountEstimator) -> tuple[di
                 f"resume: expected a state of the {config.calibrator} calibrator, got one of the {name} "
                 f"calibrator in {config.resume}; give --calibrator {name} or leave out --resume"
             )
+    if loaded.problem is None and loaded.metadata.get("camera", lens(camera)) != lens(camera):
+        raise ValueError(
+            f"resume: expected a state of the camera in {config.camera}, got another camera's in "
+            f"{config.resume}; give its camera file or leave out --resume"
+        )
     return fresh | loaded.states, loaded.problem
+
+
+def lens(camera: Camera) -> dict[str, Any]:
+    """What tells one camera from another, in values that JSON can hold."""
+    return {
+        "image_size": list(camera.image_size),
+        "model": camera.model,
+        "intrinsics": camera.intrinsics.tolist(),
+        "distortion": camera.distortion.tolist(),
+    }
 
 
 def keep_refused(resume: str, out: OutputFolder) -> str:

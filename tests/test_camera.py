@@ -98,6 +98,12 @@ def test_points_beyond_the_fold_of_the_lens_are_not_seen():
     assert float(lens.max_undistorted_radius(none)[0]) == pytest.approx(10.0)
 
 
+def test_points_that_the_lens_folds_back_into_the_image_are_not_seen():
+    wide = Camera.from_parameters(560, 560, 640, 400, 1280, 800, [-0.28, 0.07, 0.0, 0.0, -0.008])
+    points = torch.tensor([[2.4, 0.0, 1.0], [2.6, 0.3, 1.0], [1.0, 0.2, 1.0]], dtype=torch.float64)
+    assert wide.project(points)[1].tolist() == [False, False, True]
+
+
 @pytest.mark.parametrize("size", [(360, 640), (500, 1280)])
 def test_scaled_camera_sees_the_resized_image(size):
     cam = camera([])
@@ -120,7 +126,10 @@ def test_cropped_camera_shifts():
         ({"distortion": [0.1, 0.2, 0.3]}, "expected 0, 4, 5, 8, 12 coefficients for a pinhole lens, got 3"),
         ({"model": "ball"}, "model: expected one of pinhole, fisheye, got 'ball'"),
         ({"fx": -1.0}, "expected positive focal lengths, got fx -1"),
-        ({"width": 0}, "image_size: expected positive"),
+        ({"width": 0}, "image_size: expected whole positive"),
+        ({"width": 1280.5}, "image_size: expected whole positive"),
+        ({"cx": float("nan")}, "intrinsics: expected finite numbers"),
+        ({"distortion": [0.1, float("inf"), 0.0, 0.0]}, "distortion: expected finite numbers"),
     ],
 )
 def test_impossible_cameras_are_refused(arguments, message):

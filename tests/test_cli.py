@@ -1,5 +1,6 @@
 """The command line as a person uses it: outputs as promised, one clear line and status 2 on bad input."""
 
+import contextlib
 import csv
 import io
 import json
@@ -161,7 +162,11 @@ def test_pseudo_ground_truth_compares_the_same_frames(data, tmp_path, capsys, mo
     def command(*extra):
         arguments = [tmp_path / "cul", "--camera", data / "camera.yaml", "--out", tmp_path / "pseudo.csv"]
         monkeypatch.setattr(sys, "argv", ["pseudo_ground_truth", *map(str, (*arguments, *extra))])
-        return pseudo_ground_truth.main(), capsys.readouterr()
+        try:
+            pseudo_ground_truth.main()
+        except SystemExit as stopped:
+            return stopped.code, capsys.readouterr()
+        return 0, capsys.readouterr()
 
     def estimate(images, heights):
         degrees = [math.degrees(angle) for angle in POSE[:3]]
@@ -283,6 +288,53 @@ def test_the_state_of_the_other_calibrator_is_a_mistake(data, tmp_path, capsys):
             )
         assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
         assert not (tmp_path / "next").exists()
+
+
+def test_the_state_of_another_camera_is_a_mistake(data, tmp_path, capsys):
+    assert _run(data, out=tmp_path / "out") == 0
+    fields = yaml.safe_load((data / "camera.yaml").read_text())
+    other = tmp_path / "other.yaml"
+    other.write_text(yaml.safe_dump(fields | {"fx": fields["fx"] + 40}))
+    arguments = ["run", data / "images", "--camera", other, "--lanes", data / "lanes.json"]
+    arguments += ["--calibrator", "two-stage", "--resume", tmp_path / "out", "--out", tmp_path / "next"]
+    capsys.readouterr()
+    _fails(capsys, arguments, "resume: expected a state of the camera in", "got another camera's")
+    assert not (tmp_path / "next").exists()
+
+
+def test_a_report_that_nobody_reads_is_no_error(data, tmp_path, monkeypatch):
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr("sys.stdout", full)
+        assert _run(data, out=tmp_path / "out") == 0
+        monkeypatch.undo()
+        with contextlib.suppress(OSError):
+            full.close()
+    assert (tmp_path / "out" / "extrinsics.csv").exists()
+
+
+def test_a_second_ctrl_c_waits_until_the_first_has_cleaned_up(data, tmp_path, capsys, monkeypatch):
+    def stop(*_):
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(10)
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr("lanebev.run.calibrate", stop)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert _run(data, out=tmp_path / "out") == 130
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert capsys.readouterr().err == "lanebev run: interrupted, nothing written\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lane_file_may_begin_with_a_byte_order_mark(data, tmp_path):
+    lanes = tmp_path / "lanes.json"
+    lanes.write_bytes(b"\xef\xbb\xbf" + (data / "lanes.json").read_bytes())
+    assert _run(data, lanes=lanes, out=tmp_path / "out") == 0
 
 
 def test_a_refused_state_is_kept_beside_what_replaces_it(data, tmp_path, capsys):

@@ -180,6 +180,20 @@ def test_what_is_done_to_the_output_is_not_done_to_the_state(calibrator, dtype):
         torch.testing.assert_close(new, old, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_an_image_that_is_not_finite_spoils_no_other_row_and_no_gradient(value):
+    made = small().double()
+    image = images(2)
+    image[0, 1, 3, 5] = value
+    out, _ = made(image, INTRINSICS.expand(2, 3, 3), made.initial_state(2, dtype=torch.float64))
+    out.logits[1].square().mean().backward()
+    assert all(bool(part.grad.isfinite().all()) for part in made.parameters() if part.grad is not None)
+    assert not out.segments.weight[0].any()
+    assert int(out.calibration.status[0]) == Status.UNINITIALISED
+    alone, _ = made(image[1:], INTRINSICS[None], made.initial_state(1, dtype=torch.float64))
+    torch.testing.assert_close(alone.bev, out.bev[1:])
+
+
 @pytest.mark.parametrize("calibrator", [TwoStageCalibrator(), JointCalibrator()])
 def test_cameras_of_whole_numbers_are_named(calibrator):
     with pytest.raises(ValueError, match=r"intrinsics: expected floating point, got torch.int64"):

@@ -105,6 +105,23 @@ def test_labels_as_logits_score_full_marks(root, layout, name):
     assert BenchmarkScores().compute() == {}
 
 
+@pytest.mark.parametrize("stated", [(1, 3), (1,), (4,)])
+def test_boundaries_that_a_file_states_are_taken(root, stated):
+    """As a run takes them: nobody else knows that an inner one was not seen."""
+    entry = read_entries("tusimple", root, ["label.json"])[0]
+    lines = [line._replace(boundary=k) for line, k in zip(entry.lines.lines, stated, strict=False)]
+    found = labelled_image(entry._replace(lines=entry.lines._replace(lines=lines)))
+    assert np.flatnonzero(np.isfinite(found.points).any((1, 2))).tolist() == list(stated)
+
+
+def test_a_cut_image_is_refused(root):
+    entry = read_entries("tusimple", root, ["label.json"])[0]
+    whole = entry.image.read_bytes()
+    entry.image.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match="expected a whole image"):
+        labelled_image(entry)
+
+
 @pytest.mark.parametrize(("layout", "found"), [("culane", 0), ("openlane", 1)])
 def test_lanes_are_drawn_and_matched_as_their_benchmarks_do(layout, found):
     """Stripes 30 px wide that lie 15 px apart overlap by a third; a sixth boundary is not CULane's."""
@@ -162,7 +179,7 @@ def test_errors(root):
         read_entries("bdd", root, ["label.json"])
     (root / "clips/a/0.jpg").write_bytes(b"cut")
     entry = read_entries("tusimple", root, ["label.json"])[0]
-    with pytest.raises(ValueError, match="expected an image"):
+    with pytest.raises(ValueError, match="expected a whole image, got: no image"):
         labelled_image(entry)
     line = LaneLine(np.zeros((0, 2)))
     blank = labelled_image(entry._replace(image=root / "driver/0.jpg", lines=FrameLines("a", [line])))

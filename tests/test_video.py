@@ -51,6 +51,33 @@ def test_folder_frames_come_in_natural_order(tmp_path):
     np.testing.assert_array_equal(frames[2].image, _picture(10))
 
 
+def test_hidden_files_are_no_frames(tmp_path):
+    _folder(tmp_path, ["1.png", "._1.png", ".2.jpg"])
+    assert [frame.name for frame in open_source(str(tmp_path))] == [str(tmp_path / "1.png")]
+
+
+@pytest.mark.parametrize(("name", "codec"), [("raw.h264", "libx264"), ("x.webm", "libvpx")])
+def test_frames_are_counted_where_packets_do_not_tell(tmp_path, name, codec):
+    """Raw streams have no times, and VP8 has packets that show nothing."""
+    with av.open(str(tmp_path / name), "w") as container:
+        stream = container.add_stream(codec, rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        if codec == "libvpx":
+            stream.options = {"auto-alt-ref": "1", "lag-in-frames": "16"}
+        for i in range(40):
+            frame = av.VideoFrame.from_ndarray(np.roll(_picture(200), i, axis=1), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    source = open_source(str(tmp_path / name))
+    assert source.count == len(list(source)) == 40
+
+
+def test_an_image_of_floating_point_is_refused(tmp_path):
+    Image.fromarray(np.full((48, 64), 0.5, np.float32)).save(tmp_path / "x.tif")
+    with pytest.raises(ValueError, match="floating point, expected 8 or 16 bits"):
+        read_image(tmp_path / "x.tif")
+
+
 def test_recursive_glob(tmp_path):
     _folder(tmp_path, ["a/1/20.png", "a/2/20.png", "b/20.jpg"])
     source = open_source(f"{tmp_path}/**/*.png")

@@ -94,7 +94,10 @@ def main(args: list[str] | None = None) -> None:
         cause: BaseException = error
         while "\n" in str(cause) and cause.__cause__ is not None:  # the parser wraps what constructors raise
             cause = cause.__cause__
-        print(f"error: {cause}", file=sys.stderr)
+        said = str(cause)
+        if "Original Traceback" in said:  # of a loader's worker: its last line says what
+            said = said.rstrip().splitlines()[-1].partition(": ")[2]
+        print(f"error: {said}", file=sys.stderr)
         sys.exit(2)
     except (pickle.UnpicklingError, EOFError):  # of Lightning's own look at ckpt_path
         print("error: ckpt_path: expected a checkpoint, got a file of another kind", file=sys.stderr)

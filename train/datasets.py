@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import cv2
 import lightning as L
 import numpy as np
 from jsonargparse.typing import PositiveInt
@@ -14,6 +13,7 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from lanebev.io.lane_order import boundary_indices
 from lanebev.io.lanes import FrameLines, read_culane, read_openlane, read_tusimple
+from lanebev.io.video import read_image
 from lanebev.types import NUM_BOUNDARIES
 from train.data import Batch, Seed, ViewBatches, run_position
 from train.labels import LabelledImage, ViewConfig, full_view
@@ -90,18 +90,21 @@ def _culane_entry(root: Path, line: str) -> Entry:
 def labelled_image(entry: Entry, num_boundaries: int = NUM_BOUNDARIES) -> LabelledImage:
     """Decode an image and give its lines their boundary; lines beyond the outermost are left out.
 
+    Boundaries are those that the file states, as in a ``lanes.json`` of our own, else by their order.
+
     Raises:
-        ValueError: the image is missing or does not decode.
+        ValueError: the image is missing, cut, or does not decode.
     """
-    image = cv2.imread(str(entry.image), cv2.IMREAD_COLOR_RGB)
-    if image is None:
-        raise ValueError(f"{entry.image}: expected an image, got none that decodes")
-    drawn = [line.points[np.isfinite(line.points).all(-1)] for line in entry.lines.lines]
+    image = read_image(entry.image)
+    lines = entry.lines.lines
+    drawn = [line.points[np.isfinite(line.points).all(-1)] for line in lines]
     drawn = [points[np.argsort(-points[:, 1])] for points in drawn]  # near to far
     count = max([len(points) for points in drawn] + [2])
     points = np.full((num_boundaries, count, 2), np.nan, np.float32)
-    for line, index in zip(drawn, boundary_indices(drawn, num_boundaries), strict=True):
-        if index is not None:
+    told = all(line.boundary is not None for line in lines)
+    indices = [line.boundary for line in lines] if told else boundary_indices(drawn, num_boundaries)
+    for line, index in zip(drawn, indices, strict=True):
+        if index is not None and index < num_boundaries:
             points[index, : len(line)] = line
     there = np.isfinite(points).all(-1)
     return LabelledImage(image, points, there, there, np.full(2, np.nan, np.float32))

@@ -86,7 +86,8 @@ def track_direction(
     # After a gap the prediction is too wide to tell right segments from wrong: search instead of gating.
     spread = cov[:, :2, :2].diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()
     start = ~tracking | (state.unseen + dt > cfg.reacquire_after) | (spread > cfg.reacquire_spread)
-    started = start_direction(segments, rays, normals, intrinsics, mean, start, draws, cfg)
+    wanted = start & there.any(-1)
+    started = start_direction(segments, rays, normals, intrinsics, mean, wanted, draws, cfg)
     fresh = start & started.seen
     seen = torch.where(start, fresh, supported)
     inliers = torch.where(fresh.unsqueeze(-1), started.inliers, inliers * supported.unsqueeze(-1))

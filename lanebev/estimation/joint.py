@@ -197,6 +197,7 @@ def _restart(
 ) -> tuple[JointState, Tensor]:
     """Rows that have nothing, or nothing that fits, start from this frame alone if it allows that."""
     wanted = ~is_running(state.status) | (~supported & (state.misfit > cfg.restart_after))
+    wanted = wanted & (seen.weight > 0).any(-1)
     if may_skip(wanted):
         return state, agreed
     fit = fit_observations(seen, places, cfg.prior, iterations=cfg.start_iterations)

@@ -244,9 +244,12 @@ class Camera:
         if self.distortion.ndim != 1:
             raise ValueError(f"distortion: expected (D,), got {tuple(self.distortion.shape)}")
         _check_lens(self.distortion, self.model)
-        height, width = self.image_size
-        if height <= 0 or width <= 0:
-            raise ValueError(f"image_size: expected positive (height, width), got {self.image_size}")
+        if not all(isinstance(side, int) and side > 0 for side in self.image_size):
+            raise ValueError(f"image_size: expected whole positive (height, width), got {self.image_size}")
+        for name in ("intrinsics", "distortion"):
+            value = getattr(self, name)
+            if not bool(value.isfinite().all()):
+                raise ValueError(f"{name}: expected finite numbers, got {value.flatten().tolist()}")
         fx, fy = float(self.intrinsics[0, 0]), float(self.intrinsics[1, 1])
         if not (fx > 0 and fy > 0):
             raise ValueError(f"intrinsics: expected positive focal lengths, got fx {fx:g}, fy {fy:g}")
@@ -324,15 +327,18 @@ class Camera:
             points: (N, 3) m.
 
         Returns:
-            (N, 2) px, and (N,) bool: in front of the camera and inside the image.
+            (N, 2) px, and (N,) bool: in front of the camera, inside the image, and where the lens does not
+            fold over.
         """
         _check_points(points, 3)
         front = points[..., 2] > 1e-6
         depth = torch.where(front, points[..., 2], 1.0)
-        pixels = self.distort_points(
-            denormalise_points(points[..., :2] / depth.unsqueeze(-1), self.intrinsics)
-        )
+        plane = points[..., :2] / depth.unsqueeze(-1)
+        pixels = self.distort_points(denormalise_points(plane, self.intrinsics))
         height, width = self.image_size
         x, y = pixels.unbind(-1)
         inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
-        return pixels, front & inside
+        if not self.distortion.shape[-1]:
+            return pixels, front & inside
+        reach = max_undistorted_radius(self.distortion[None], self.model)
+        return pixels, front & inside & (plane.norm(dim=-1) < reach)

@@ -169,6 +169,9 @@ def natural_order(path: str) -> list[tuple[int, int, str]]:
     return [(0, int(part), part) if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", path)]
 
 
+_HIDING = ("vp8", "libvpx")  # codecs with frames that are decoded and not shown, in packets of their own
+
+
 class VideoWriter:
     """H.264, yuv420p, the index in front: plays in browsers. Frames are padded to even sides.
 
@@ -209,7 +212,9 @@ class VideoWriter:
 
 
 def _is_image(path: str | Path) -> bool:
-    return Path(path).suffix.lower() in IMAGE_SUFFIXES and Path(path).is_file()
+    """By its name; a hidden file (macOS's ``._*``) is none, as in a glob."""
+    path = Path(path)
+    return path.suffix.lower() in IMAGE_SUFFIXES and path.name[0] != "." and path.is_file()
 
 
 def _upright(image: Image.Image) -> Image.Image:
@@ -221,7 +226,13 @@ def _upright(image: Image.Image) -> Image.Image:
 
 
 def _eight_bit(image: Image.Image) -> Image.Image:
-    """16-bit grey at its own scale; ``convert`` would cut it off at 255."""
+    """16-bit grey at its own scale; ``convert`` would cut it off at 255.
+
+    Raises:
+        OSError: of floating point, whose scale nobody says.
+    """
+    if image.mode == "F":
+        raise OSError("floating point, expected 8 or 16 bits")
     if not image.mode.startswith("I"):
         return image
     return Image.fromarray((np.asarray(image).clip(0, 65535) / 257).round().astype(np.uint8))
@@ -251,11 +262,16 @@ def _video_source(source: str) -> FrameSource:
         stream = container.streams.video[0]
         begin, tick = stream.start_time or 0, stream.time_base or 1 / fps
         count, end = 0, Fraction(0)
+        telling = stream.codec_context.name not in _HIDING
         for packet in container.demux(stream):
+            telling = telling and (packet.pts is not None or not packet.size)
             if packet.pts is not None:
                 count += not packet.is_discard
                 end = max(end, packet.pts - begin + max(packet.duration or 0, 1 / fps / tick))
         declared, got = _declared_duration(stream, begin * tick), float(end * tick)
+    if not telling:
+        with _open_video(source) as container:
+            count = sum(1 for _ in _decoded(container, container.streams.video[0]))
     cut = declared - got > 0.5 / fps
     problem = f"video {source}: expected {declared:.2f} s as it declares, got {got:.2f} s; is it cut?"
     return FrameSource(source, (), fps, count, size, problem if cut else "")
