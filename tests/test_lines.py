@@ -320,3 +320,21 @@ def test_logits_of_half_precision_and_autocast_give_float32_segments(fans, dtype
     found.endpoints.sum().backward()
     assert logits.grad.dtype == dtype
     assert logits.grad.abs().sum() > 0
+
+
+def test_a_networks_line_is_as_sure_as_the_rows_it_crosses():
+    """Vertices nearer together than the correlation count for fewer; far apart they are as they were."""
+    y, x = torch.meshgrid(torch.arange(96.0), torch.arange(160.0), indexing="ij")
+    steep, shallow = (8 * ((x - 40 - s * (y - 40)).abs() < 1.5 * (1 + s * s) ** 0.5) - 4 for s in (0.2, 4.0))
+    logits = torch.stack([torch.zeros_like(x), steep, shallow])[None].double()
+    logits[:, 1:, :40] = logits[:, 1:, 60:] = -9.0
+    plain = LineExtractor(LineConfig(stride=2))(logits, (192, 320))
+    raised = LineExtractor(LineConfig(stride=2, correlation=10.0))(logits, (192, 320))
+    for k in range(2):
+        mine = (plain.boundary[0] == k) & (plain.weight[0] > 0)
+        ends = plain.endpoints[0, mine, :, 1]
+        expected = (2 * mine.sum() * 10.0 / (ends.max() - ends.min())).clamp(min=1.0).sqrt()
+        assert expected > 1.5
+        torch.testing.assert_close(raised.sigma[0, mine], plain.sigma[0, mine] * expected)
+    far = LineExtractor(LineConfig(stride=2, correlation=0.5))(logits, (192, 320))
+    torch.testing.assert_close(far.sigma, plain.sigma)

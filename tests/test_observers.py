@@ -5,7 +5,9 @@ import pytest
 import torch
 
 from lanebev import Camera, LaneSegments, image_from_road_points
-from lanebev.io.lane_rows import image_rows
+from lanebev.io.lane_rows import image_rows, rows_from_segments, segments_from_rows
+from lanebev.observation.lines import NETWORK_CORRELATION, LineExtractor
+from lanebev.observation.vertices import LineConfig
 from lanebev.observers import fitted_rows
 from lanebev.report.measure import pose
 
@@ -56,3 +58,21 @@ def test_what_is_no_road_gives_no_lanes(weight):
     zero = torch.zeros(1, 12, dtype=torch.float64)
     segments = LaneSegments(ends, torch.arange(12)[None] % 6, zero + weight, zero + 1)
     assert np.isnan(fitted_rows(segments, image_rows(720), CAMERA, 3.7)).all()
+
+
+def test_a_run_and_lanebev_are_told_as_much_by_a_line():
+    """The sum of weights by variances of a boundary's segments, by rows and without."""
+    camera = Camera.from_parameters(600.0, 600.0, 640.0, 360.0, 1280, 720)
+    y, x = torch.meshgrid(torch.arange(96.0), torch.arange(160.0), indexing="ij")
+    lines = ((80, 0.1), (60, -0.6), (90, 2.0), (100, 4.0))
+    maps = [8 * ((x - at - s * (y - 40)).abs() < 1.1 * (1 + s * s) ** 0.5) - 4 for at, s in lines]
+    logits = torch.stack([torch.zeros_like(x), *maps])[None].double()
+    logits[:, 1:, :40] = logits[:, 1:, 60:] = -9.0
+    direct = LineExtractor(LineConfig(stride=2, correlation=NETWORK_CORRELATION))(logits, (720, 1280))
+    by_rows = segments_from_rows([rows_from_segments(direct, camera)], camera)
+    for k in range(4):
+        one, other = (
+            float((torch.where(part.boundary == k, part.weight, 0.0) / part.sigma.square()).sum())
+            for part in (direct, by_rows)
+        )
+        assert 0.75 < other / one < 1.25

@@ -61,7 +61,7 @@ class EndToEnd(Segmentation):
             "error_weight": error_weight,
             "error_unit": list(error_unit),
         }
-        self.extractor = LineExtractor.for_network(self.segmenter.config)
+        self.extractor = LineExtractor.for_network(self.segmenter.config, correlation=0)
         self.unit: Tensor
         self.error_unit: Tensor
         for name, unit in (("unit", pose_unit), ("error_unit", error_unit)):

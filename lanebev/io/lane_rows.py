@@ -86,8 +86,8 @@ def rows_from_lines(
 def rows_from_segments(segments: LaneSegments, camera: Camera) -> BoundaryRows:
     """Sample the vertices of a network's segments on the rows of ``lanes.json``.
 
-    A row lies between two vertices and takes both their errors; where rows are denser than vertices its
-    variance is raised by their ratio, so that all rows together say no more than the vertices did.
+    A row lies between two vertices and takes both their errors, its variance by the ratio of rows to
+    vertices, so that all rows together say no more and no less than the vertices did.
 
     Args:
         segments: of batch size 1, in pixels of the image as it came.
@@ -109,7 +109,7 @@ def rows_from_segments(segments: LaneSegments, camera: Camera) -> BoundaryRows:
         inside = (on_rows >= 0) & (on_rows <= width - 1)
         count = int(inside.sum())
         if count >= 2:
-            between = np.interp(rows, vertices[order, 1], own[order]) * np.sqrt(max(1.0, count / len(own)))
+            between = np.interp(rows, vertices[order, 1], own[order]) * np.sqrt(count / len(own))
             x[index] = np.where(inside, on_rows.round(_DIGITS), np.nan)
             sigma[index] = np.where(inside, np.maximum(between, _LEAST_SIGMA).round(_DIGITS), np.nan)
     return BoundaryRows(rows, x, sigma)

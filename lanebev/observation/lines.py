@@ -10,6 +10,9 @@ from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.observation.vertices import LineConfig, representative_vertices, scan_vertices, take
 from lanebev.types import LaneSegments
 
+NETWORK_CORRELATION = 10.0
+"""``LineConfig.correlation``, px: what rows of ``lanes.json`` are apart, so that LaneBEV and a run agree."""
+
 
 class LineExtractor(nn.Module):
     """Logits to :class:`~lanebev.LaneSegments`.
@@ -29,9 +32,10 @@ class LineExtractor(nn.Module):
         self.config = config or LineConfig()
 
     @classmethod
-    def for_network(cls, network: SegmenterConfig) -> LineExtractor:
-        """As a network's maps are to be read."""
-        return cls(LineConfig(stride=network.output_stride, noise_factor=network.noise_factor))
+    def for_network(cls, network: SegmenterConfig, correlation: float = NETWORK_CORRELATION) -> LineExtractor:
+        """As a network's maps are to be read; single frames, where nothing lasts, want no ``correlation``."""
+        stride, factor = network.output_stride, network.noise_factor
+        return cls(LineConfig(stride=stride, noise_factor=factor, correlation=correlation))
 
     @full_precision
     def forward(
@@ -90,6 +94,8 @@ def extract_segments(
     variance = vertices.common_var + vertices.own_var
     sigma = (0.5 * (variance.gather(-1, first) + variance.gather(-1, second))).sqrt() * stretch
     sigma = config.noise_factor * sigma
+    if config.correlation > 0:
+        sigma = sigma * _redundancy(points[..., 1], vertices.density > 0, config.correlation).unsqueeze(-1)
     seen = weight > 0
     index = torch.arange(boundaries, device=points.device).view(1, -1, 1).expand_as(first)
     return LaneSegments(
@@ -98,3 +104,10 @@ def extract_segments(
         weight=weight.flatten(1),
         sigma=torch.where(seen, sigma, 1.0).flatten(1),
     )
+
+
+def _redundancy(y: Tensor, there: Tensor, correlation: float) -> Tensor:
+    """(B, L) at least 1, by which V vertices (B, L, V) of a line are less sure than independent ones."""
+    low, high = (torch.where(there, y.detach(), end) for end in (torch.inf, -torch.inf))
+    extent = (high.amax(-1) - low.amin(-1)).clamp(min=0.5 * correlation)  # also where there are none
+    return (there.sum(-1) * correlation / extent).clamp(min=1.0).sqrt()

@@ -41,6 +41,8 @@ class LineConfig:
         min_vertices: a boundary with fewer is not seen.
         sigma_floor: least standard deviation of a vertex, label px: what correlates along the line.
         noise_factor: of all standard deviations; 1 where the maps are true.
+        correlation: px of the image, vertically, over which a line's errors are one error: vertices nearer
+            together than this say no more than so many farther apart; 0 where the maps are true.
     """
 
     stride: int = 2
@@ -53,6 +55,7 @@ class LineConfig:
     min_vertices: int = 8
     sigma_floor: float = 0.004
     noise_factor: float = 1.0
+    correlation: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("stride", "segments", "window", "min_vertices"):
@@ -61,6 +64,8 @@ class LineConfig:
         for name in ("half_width", "noise_factor"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected more than 0 and finite, got {getattr(self, name)}")
+        if not 0 <= self.correlation < math.inf:
+            raise ValueError(f"correlation: expected 0 px or more, got {self.correlation}")
         if not 0 <= self.absent < self.present:
             raise ValueError(f"present: expected more than absent ({self.absent}), got {self.present}")
         if not self.present < self.twice:
