@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lanebev.geometry.camera import undistort_points
 from lanebev.geometry.precision import autocast_off, common_dtype
+from lanebev.observation.lines import undistort_segments
 from lanebev.types import Calibration, LaneSegments, saved_by_name
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
@@ -193,11 +193,7 @@ class LaneBEV(nn.Module):
         height, width = image.shape[-2:]
         segments = self.extractor(logits, (height, width), tuple(resized.shape[-2:]))
         segments = segments._replace(weight=torch.where(finite.unsqueeze(-1), segments.weight, 0.0))
-        if distortion is not None and distortion.shape[-1]:
-            ends = segments.endpoints
-            flat = undistort_points(ends.flatten(1, 2), intrinsics, distortion, model)
-            segments = segments._replace(endpoints=flat.reshape(ends.shape))
-        return logits, segments
+        return logits, undistort_segments(segments, intrinsics, distortion, model)
 
     def _resize(self, image: Tensor) -> Tensor:
         if self.network_width is None:

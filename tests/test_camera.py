@@ -7,7 +7,7 @@ import torch
 
 from lanebev import Camera
 from lanebev.geometry import camera as lens
-from lanebev.geometry.camera import cam_from_image
+from lanebev.geometry.camera import cam_from_image, distort_points, undistort_points, undistorted_sigma
 from lanebev.geometry.road import rays_from_pixels
 
 BROWN = {
@@ -136,3 +136,27 @@ def test_impossible_cameras_are_refused(arguments, message):
     values = {"fx": 1000.0, "fy": 1000.0, "cx": 640.0, "cy": 360.0, "width": 1280, "height": 720} | arguments
     with pytest.raises(ValueError, match=message):
         Camera.from_parameters(**values)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "model", "focal"),
+    [((-0.28, 0.07, 0.001, -0.001, -0.008), "pinhole", 560.0), ((0.02, -0.01, 0.0, 0.0), "fisheye", 420.0)],
+)
+def test_sigma_across_a_line_goes_through_the_lens(distortion, model, focal):
+    """As noise across the line as taken, undistorted, spreads across the line undistorted."""
+    wide = Camera.from_parameters(focal, focal, 640, 400, 1280, 800, list(distortion), model)
+    lens = (wide.intrinsics[None], wide.distortion[None], model)
+    t = torch.linspace(0, 1, 9, dtype=torch.float64)
+    line = torch.stack([200 + 300 * t, 760 - 250 * t], dim=-1)[None]  # undistorted
+    along = torch.tensor([300.0, -250.0], dtype=torch.float64).expand_as(line)
+    seen = [distort_points(line + sign * 1e-3 * along, *lens) for sign in (-1, 1)]
+    across = (seen[1] - seen[0]).flip(-1) * torch.tensor([1.0, -1.0])
+    across = across / across.norm(dim=-1, keepdim=True)
+    noise = torch.randn(4000, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    noisy = distort_points(line, *lens)[0, :, None] + 0.2 * noise * across[0, :, None]  # (9, 4000, 2)
+    back = undistort_points(noisy.flatten(0, 1)[None], *lens)[0].unflatten(0, (9, -1))
+    normal = torch.tensor([250.0, 300.0], dtype=torch.float64) / (250**2 + 300**2) ** 0.5
+    spread = ((back - line[0, :, None]) @ normal).square().mean(1).sqrt()
+    said = undistorted_sigma(torch.full((1, 9), 0.2, dtype=torch.float64), line, along, *lens)[0]
+    assert (said / 0.2 - 1).abs().max() > 0.2  # not nothing
+    torch.testing.assert_close(said, spread, rtol=0.05, atol=0)

@@ -176,6 +176,43 @@ def undistort_points(
     return undistorted
 
 
+@full_precision
+def undistorted_sigma(
+    sigma: Tensor,
+    points: Tensor,
+    along: Tensor,
+    intrinsics: Tensor,
+    distortion: Tensor,
+    model: str = "pinhole",
+) -> Tensor:
+    """Standard deviation across a line, from pixels of the image as taken to undistorted ones.
+
+    Source: first-order propagation. With F the Jacobian of :func:`distort_points`, a line along the unit
+    vector τ appears along F τ, and a pixel across it there is |F τ| / |det F| here.
+
+    Args:
+        sigma: (B, N) px as taken.
+        points: (B, N, 2) px, undistorted, where it holds.
+        along: (B, N, 2) direction of the line there, undistorted, of any length.
+        intrinsics: (B, 3, 3).
+        distortion: (B, D).
+        model: "pinhole" or "fisheye".
+
+    Returns:
+        (B, N) px, undistorted; ``sigma`` where the line has no direction.
+    """
+    if distortion.shape[-1] == 0:
+        return sigma
+    steps = points.new_tensor([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+    moved = (points.unsqueeze(-2) + steps).flatten(-3, -2)  # (B, 4 N, 2)
+    seen = distort_points(moved, intrinsics, distortion, model).unflatten(-2, (-1, 4))
+    by_x, by_y = seen[..., 0, :] - seen[..., 1, :], seen[..., 2, :] - seen[..., 3, :]
+    size = (by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0]).abs()
+    length = along.norm(dim=-1)
+    stretch = (along[..., :1] * by_x + along[..., 1:] * by_y).norm(dim=-1) / length.clamp(min=1e-9)
+    return torch.where((length > 1e-9) & (size > 1e-6), sigma * stretch / size.clamp(min=1e-6), sigma)
+
+
 def _undistort_plane_kannala_brandt(plane: Tensor, distortion: Tensor) -> Tensor:
     """Kannala-Brandt inverse on the z = 1 plane, (B, N, 2): theta_d = theta (1 + k1 theta^2 + ...)."""
     k1, k2, k3, k4 = distortion[..., None, :].unbind(-1)  # each (B, 1)

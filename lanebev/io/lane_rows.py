@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lanebev.geometry.camera import Camera
+from lanebev.geometry.camera import Camera, undistorted_sigma
 from lanebev.io.lane_order import boundary_indices
 from lanebev.io.lanes import LaneLine
 from lanebev.types import NUM_BOUNDARIES, LaneSegments
@@ -191,9 +191,16 @@ def _vertices(frame: BoundaryRows, sigma: NDArray[np.float64], camera: Camera) -
     """Vertices (K, 3) of each boundary: undistorted x, y and sigma, px; those the lens can have imaged."""
     points = np.stack([frame.x, np.broadcast_to(frame.rows, frame.x.shape)], axis=-1)
     undistorted, valid = camera.undistort_points(torch.from_numpy(points).flatten(0, 1).to(camera.intrinsics))
-    vertices = np.concatenate([undistorted.double().numpy(), sigma.reshape(-1, 1)], axis=-1)
-    kept = valid.numpy().reshape(frame.x.shape)
-    return [own[seen] for own, seen in zip(vertices.reshape(*frame.x.shape, 3), kept, strict=True)]
+    undistorted = undistorted.double().reshape(*frame.x.shape, 2)
+    kept, noise = valid.reshape(frame.x.shape), torch.from_numpy(sigma)
+    lens = (camera.intrinsics[None].double(), camera.distortion[None].double(), camera.model)
+    vertices = []
+    for points, seen, own in zip(undistorted, kept, noise, strict=True):
+        line = points[seen]
+        along = torch.gradient(line, dim=0)[0] if len(line) > 1 else torch.zeros_like(line)
+        across = undistorted_sigma(own[seen][None], line[None], along[None], *lens)[0]
+        vertices.append(torch.cat([line, across.unsqueeze(-1)], dim=-1).numpy())
+    return vertices
 
 
 def _undistorted(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from lanebev.geometry.camera import undistort_points, undistorted_sigma
 from lanebev.geometry.precision import full_precision
 from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.observation.vertices import LineConfig, representative_vertices, scan_vertices, take
@@ -104,6 +105,29 @@ def extract_segments(
         weight=weight.flatten(1),
         sigma=torch.where(seen, sigma, 1.0).flatten(1),
     )
+
+
+def undistort_segments(
+    segments: LaneSegments, intrinsics: Tensor, distortion: Tensor | None, model: str = "pinhole"
+) -> LaneSegments:
+    """Segments in pixels of the image as it came to undistorted ones, their sigmas too.
+
+    Args:
+        segments: (B, N).
+        intrinsics: (B, 3, 3) px.
+        distortion: (B, D), or None for an ideal lens.
+        model: "pinhole" or "fisheye".
+    """
+    if distortion is None or distortion.shape[-1] == 0:
+        return segments
+    lens = (intrinsics, distortion, model)
+    flat = undistort_points(segments.endpoints.flatten(1, 2), *lens)
+    ends = flat.reshape(segments.endpoints.shape)
+    along = (ends[..., 1, :] - ends[..., 0, :]).repeat_interleave(2, dim=1)
+    sigma = undistorted_sigma(segments.sigma.repeat_interleave(2, dim=1), flat, along, *lens)
+    variance = sigma.square().unflatten(1, (-1, 2)).mean(-1)  # of both ends
+    variance = torch.where(segments.weight > 0, variance, segments.sigma.square())
+    return segments._replace(endpoints=ends, sigma=variance.sqrt())
 
 
 def _redundancy(y: Tensor, there: Tensor, correlation: float) -> Tensor:
