@@ -12,9 +12,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
 from lanebev.estimation.single_frame import SingleFrameFit, fit_single_frame
-from lanebev.geometry.camera import undistort_points
 from lanebev.geometry.precision import cast_floating, widest_dtype
-from lanebev.observation.lines import LineExtractor
+from lanebev.observation.lines import LineExtractor, undistort_segments
 from train.data import Batch, LiveFrames, PoolFrames, RenderedRoads, Seed, run_position
 from train.labels import LabelledImage, ViewConfig, full_view
 from train.pool import Pose
@@ -120,10 +119,8 @@ def fit_poses(
     """
     dtype = widest_dtype(logits.device)
     even: Tensor = EvenGradients.apply(logits.to(dtype), reach)
-    segments = extractor(even, size, size)
     intrinsics, distortion = intrinsics.to(dtype), distortion.to(dtype)
-    ends = undistort_points(segments.endpoints.flatten(1, 2), intrinsics, distortion)
-    segments = segments._replace(endpoints=ends.view_as(segments.endpoints))
+    segments = undistort_segments(extractor(even, size, size), intrinsics, distortion)
     if where_only:
         segments = segments._replace(weight=segments.weight.detach(), sigma=segments.sigma.detach())
     width = cast_floating(lane_width, dtype)
