@@ -80,6 +80,20 @@ def test_feature_maps_of_any_stride_land_where_the_image_does(stride):
     assert (coarse - full)[inner.expand_as(full)].abs().max() < 1e-3
 
 
+@pytest.mark.parametrize("stride", [2, 4, 8])
+def test_maps_of_a_trunk_land_where_the_image_does_by_intrinsics_of_their_stride(stride):
+    """Cell j of a trunk with symmetric padding is centred on pixel s · j, as the README says."""
+    x, y = torch.meshgrid(torch.arange(320.0), torch.arange(180.0), indexing="xy")
+    ramp = torch.stack([x, y])[None].double()
+    extrinsics, intrinsics = pose([0.05, 0.02, 0.01, 1.5]), CAMERA.intrinsics[None]
+    coarse = torch.diag(torch.tensor([1 / stride, 1 / stride, 1.0], dtype=torch.float64)) @ intrinsics
+    seen, valid = BEVWarp(GRID)(ramp, intrinsics, extrinsics)
+    features, there = BEVWarp(GRID)(ramp[..., ::stride, ::stride], coarse, extrinsics)
+    inner = (features < ramp[..., ::stride, ::stride].amax((2, 3))[..., None, None]) & there & valid
+    assert inner.double().mean() > 0.3
+    torch.testing.assert_close(features[inner], seen[inner])
+
+
 def test_rows_are_independent_and_cameras_per_sample():
     extrinsics = pose([0.03, 0.02, -0.05, 1.4], [-0.02, 0.0, 0.1, 2.0])
     intrinsics = torch.stack(
