@@ -51,6 +51,17 @@ def test_folder_frames_come_in_natural_order(tmp_path):
     np.testing.assert_array_equal(frames[2].image, _picture(10))
 
 
+def test_frames_are_shown_at_their_times(tmp_path):
+    times = [0.0, 0.033, 0.033, 4.0, 4.5]  # one given again
+    with VideoWriter(tmp_path / "x.mp4", Fraction(30)) as writer:
+        for i, time in enumerate(times):
+            writer.write(_picture(40 * i), time)
+        writer.write(_picture(0))
+    shown = [frame.time for frame in open_source(str(tmp_path / "x.mp4"))]
+    assert shown == pytest.approx([*times, 4.5 + 1 / 30], abs=1e-3)
+    assert np.diff(shown).min() > 0
+
+
 def test_hidden_files_are_no_frames(tmp_path):
     _folder(tmp_path, ["1.png", "._1.png", ".2.jpg"])
     assert [frame.name for frame in open_source(str(tmp_path))] == [str(tmp_path / "1.png")]

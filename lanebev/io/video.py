@@ -172,6 +172,9 @@ def natural_order(path: str) -> list[tuple[int, int, str]]:
 _HIDING = ("vp8", "libvpx")  # codecs with frames that are decoded and not shown, in packets of their own
 
 
+_TICK = Fraction(1, 90_000)  # s, of what is written
+
+
 class VideoWriter:
     """H.264, yuv420p, the index in front: plays in browsers. Frames are padded to even sides.
 
@@ -187,6 +190,8 @@ class VideoWriter:
         self._container = av.open(os.path.abspath(path), "w", options={"movflags": "faststart"})
         self._stream = self._container.add_stream("libx264", rate=fps.limit_denominator(65535))
         self._stream.pix_fmt = "yuv420p"
+        self._stream.codec_context.time_base = _TICK
+        self._interval, self._next = 1 / fps, Fraction(0)
         self._stream.options = {"crf": str(crf), "preset": "veryfast"}
 
     def __enter__(self) -> VideoWriter:
@@ -200,14 +205,18 @@ class VideoWriter:
                 self._container.mux(packet)
         self._container.close()
 
-    def write(self, image: NDArray[np.uint8]) -> None:
-        """(H, W, 3) uint8 RGB, the same size every time."""
+    def write(self, image: NDArray[np.uint8], time: float | None = None) -> None:
+        """(H, W, 3) uint8 RGB, the same size every time; shown at ``time`` s, or a frame after the last."""
         height, width = image.shape[:2]
         if height % 2 or width % 2:
             image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         if not self._stream.codec_context.is_open:
             self._stream.height, self._stream.width = image.shape[:2]
-        for packet in self._stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")):
+        frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+        shown = self._next if time is None else max(Fraction(time), self._next - self._interval + _TICK)
+        frame.pts, frame.time_base = round(shown / _TICK), _TICK
+        self._next = shown + self._interval
+        for packet in self._stream.encode(frame):
             self._container.mux(packet)
 
 

@@ -153,8 +153,8 @@ class Recorder:
             write_png(self.path("bev.png"), done.bev_after)
             write_png(self.path("overlay.png"), picture)
         else:
-            self._bev.write(done.bev_after)
-            self._overlay.write(picture)
+            self._bev.write(done.bev_after, done.frame.time)
+            self._overlay.write(picture, done.frame.time)
 
     def _measure(
         self, segments: LaneSegments, intrinsics: Tensor, pose: Extrinsics | None
