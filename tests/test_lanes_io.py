@@ -223,6 +223,12 @@ def test_a_folder_is_read_as_its_images_are(tmp_path):
     assert [frame.lines[0].points[0, 0] for frame in read_lanes(tmp_path)] == [2, 9, 10]
 
 
+def test_match_of_names_that_differ_in_their_suffix_alone():
+    """A run's own lanes.json names its images as they are."""
+    names = ["a/0000.jpg", "a/0000.png"]
+    assert match_frames(names, [FrameLines(name, []) for name in reversed(names)]) == [1, 0]
+
+
 def test_match_of_names_with_dots(tmp_path):
     for name in ("1494452385.593783", "1494452385.627116"):
         _write(tmp_path / f"{name}.lines.txt", "10 590 12 580\n")

@@ -149,7 +149,8 @@ def _alone(info: Tensor) -> tuple[Tensor, Tensor]:
     """
     loose = info.new_tensor(_LOOSE)
     scaled = loose.unsqueeze(-1) * info[:, :NUM_STRAIGHT, :NUM_STRAIGHT] * loose
-    factor = torch.linalg.cholesky_ex(scaled + torch.eye(NUM_STRAIGHT).to(info)).L
+    eye = torch.eye(NUM_STRAIGHT, dtype=info.dtype, device=info.device)
+    factor = torch.linalg.cholesky_ex(scaled + eye).L
     cov = loose.unsqueeze(-1) * torch.cholesky_inverse(factor) * loose
     return cov.diagonal(dim1=1, dim2=2).sqrt(), cov[:, :NUM_POSE] @ info[:, :NUM_STRAIGHT, NUM_COMMON:]
 

@@ -180,9 +180,9 @@ def _written(values: NDArray[np.float64]) -> list[float]:
 def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int | None]:
     """Which lane entry belongs to each image: the one that shares the longest tail of its path.
 
-    Compared are whole path components from the end, the last without an image's suffix. An entry goes
-    to the image that shares most with it, so an image without an entry of its own gets None rather than a
-    stranger's.
+    An entry of the image's very name is its own. Else whole path components are compared from the end, the
+    last without an image's suffix. An entry goes to the image that shares most with it, so an image without
+    an entry of its own gets None rather than a stranger's.
 
     Args:
         names: paths of the images.
@@ -199,9 +199,14 @@ def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int
         parts = _parts(frame.name)
         for start in range(len(parts)):
             by_tail[parts[start:]].append(i)
+    exact = {frame.name: i for i, frame in enumerate(frames)}
+    exact = exact if len(exact) == len(frames) else {}  # a name given twice is nobody's own
     matches: list[tuple[int, int] | None] = []  # (length of the common tail, entry)
     for name in names:
         parts = _parts(name)
+        if name in exact:
+            matches.append((len(parts) + 1, exact[name]))
+            continue
         tail = next((parts[k:] for k in range(len(parts)) if parts[k:] in by_tail), None)
         matches.append(None if tail is None else (len(tail), by_tail[tail][0]))
         if tail is not None and len(by_tail[tail]) > 1:
