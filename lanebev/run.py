@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from lanebev.io.mount_file import write_calibration
 from lanebev.io.overlap import prefetch
 from lanebev.io.results import ExtrinsicsRow, OutputFolder, check_inputs_stay
 from lanebev.io.state import load_state, save_state
-from lanebev.io.video import DEFAULT_FPS, Frame, FrameSource, open_source
+from lanebev.io.video import DEFAULT_FPS, Frame, FrameSource, image_size, open_source
 from lanebev.observers import LaneFileObserver, NetworkObserver, Observer
 from lanebev.pipeline import LaneBEV
 from lanebev.report.measure import pose
@@ -38,6 +38,7 @@ CALIBRATORS = ("joint", "two-stage")
 STATE_FILE, CALIBRATION_FILE = "state.safetensors", "calibration.yaml"
 STILLS_FPS = Fraction(2)  # of the videos that show images one after another
 STILL_PASSES = 4  # updates on one image: the linearisation settles
+_LOOKED_AT = 20  # images of a folder, for one of the camera's size
 _NOMINAL_HEIGHT = 1.5  # m, of the view before anything is known
 
 _BEFORE_RESOLUTION = 0.1  # m, of the view before: it is only shown small
@@ -101,7 +102,7 @@ def run(
     source = open_source(config.source, Fraction(config.fps).limit_denominator(1000))
     check_inputs_stay(config.out, inputs(config, source))
     camera = read_camera(config.camera, source.image_size)
-    check_image_size(camera, source)
+    source = of_camera(camera, source)
     observer = make_observer(config, source, camera)
     calibrator, mount = make_calibrator(config.calibrator), MountEstimator()
     states, problem = begin(config, calibrator, mount, camera)
@@ -225,18 +226,21 @@ def make_calibrator(name: str) -> Any:
     return TwoStageCalibrator() if name == "two-stage" else JointCalibrator()
 
 
-def check_image_size(camera: Camera, source: FrameSource) -> None:
-    """The camera file must be for images of this size.
+def of_camera(camera: Camera, source: FrameSource) -> FrameSource:
+    """The source with the camera's image size, which is its first frame's or, if that is a stray, another's.
 
     Raises:
-        ValueError: it is not.
+        ValueError: the camera file is for images of another size.
     """
-    if camera.image_size != source.image_size:
-        (height, width), (rows, columns) = camera.image_size, source.image_size
-        raise ValueError(
-            f"camera: expected one for the source's {columns} x {rows} px, got one for {width} x {height}; "
-            "give the calibration of these images or resize them"
-        )
+    if camera.image_size == source.image_size:
+        return source
+    if any(image_size(path) == camera.image_size for path in source.paths[1:_LOOKED_AT]):
+        return replace(source, image_size=camera.image_size)
+    (height, width), (rows, columns) = camera.image_size, source.image_size
+    raise ValueError(
+        f"camera: expected one for the source's {columns} x {rows} px, got one for {width} x {height}; "
+        "give the calibration of these images or resize them"
+    )
 
 
 def calibrate(

@@ -367,6 +367,15 @@ def test_a_damaged_image_in_a_drive_is_a_row(data, tmp_path, capsys):
     assert "truncated" in (tmp_path / "out" / "report.html").read_text()
 
 
+def test_a_stray_first_image_is_a_row(data, tmp_path):
+    images = shutil.copytree(data / "images", tmp_path / "images")
+    Image.new("RGB", (32, 18)).save(images / "0.png")
+    assert _run(data, source=images, out=tmp_path / "out") == 0
+    rows = _table(tmp_path / "out")
+    assert rows[0]["status"] == "UNINITIALISED"
+    assert {row["status"] for row in rows[1:]} == {"TRACKING"}
+
+
 def test_frames_without_lanes_are_rows(data, tmp_path):
     (data / "some.json").write_text("\n".join(_lane_lines(["images/1.png"])))
     assert _run(data, lanes="some.json", out=tmp_path / "out") == 0

@@ -159,6 +159,15 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
         raise ValueError(f"image {path}: expected a whole image, got: {reason}") from error
 
 
+def image_size(path: str | Path) -> tuple[int, int] | None:
+    """(height, width) of an image, None if it does not decode."""
+    try:
+        height, width = read_image(path).shape[:2]
+    except ValueError:
+        return None
+    return height, width
+
+
 def write_png(path: str | Path, image: NDArray[np.uint8]) -> None:
     """(H, W, 3) uint8 RGB to a PNG."""
     Image.fromarray(image).save(path)
