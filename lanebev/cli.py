@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import itertools
 import os
 import signal
 import sys
@@ -87,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 @contextlib.contextmanager
 def _signals_unwind() -> Iterator[None]:
-    """Ctrl-C, a job scheduler, a closed terminal: outputs are undone, and a second signal waits for that."""
+    """Ctrl-C, a job scheduler, a closed terminal: outputs are undone, for which a second signal waits."""
     known = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     before = {each: signal.getsignal(each) for each in known}
     usual = (signal.SIG_DFL, signal.default_int_handler)
@@ -95,10 +96,11 @@ def _signals_unwind() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         own = []  # Python lets no other thread set them
 
-    def stop(number: int, _: object) -> NoReturn:
-        for each in own:
-            signal.signal(each, signal.SIG_IGN)
-        raise _Stopped(number)
+    sent = itertools.count(1)
+
+    def stop(number: int, _: object) -> None:
+        if next(sent) != 2:  # the first may have been swallowed, or what it undoes may hang
+            raise _Stopped(number)
 
     for each in own:
         signal.signal(each, stop)

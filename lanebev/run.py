@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from lanebev.estimation.joint import JointCalibrator
 from lanebev.estimation.mount import MountCalibration, MountEstimator, MountReason, MountStatus
 from lanebev.estimation.two_stage import TwoStageCalibrator
-from lanebev.geometry.camera import Camera
+from lanebev.geometry.camera import DISTORTION_LENGTHS, Camera
 from lanebev.io.cameras import read_camera
 from lanebev.io.lanes import lane_files, read_lanes
 from lanebev.io.mount_file import write_calibration
@@ -190,12 +190,13 @@ def begin(
 
 
 def lens(camera: Camera) -> dict[str, Any]:
-    """What tells one camera from another, in values that JSON can hold."""
+    """What tells one camera from another, in values that JSON can hold; of any number of coefficients."""
+    missing = max(map(max, DISTORTION_LENGTHS.values())) - len(camera.distortion)
     return {
         "image_size": list(camera.image_size),
         "model": camera.model,
         "intrinsics": camera.intrinsics.tolist(),
-        "distortion": camera.distortion.tolist(),
+        "distortion": [*camera.distortion.tolist(), *[0.0] * missing],
     }
 
 

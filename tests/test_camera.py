@@ -1,5 +1,7 @@
 """Lenses against OpenCV, and their round trips."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -96,6 +98,22 @@ def test_points_beyond_the_fold_of_the_lens_are_not_seen():
     assert not inside.any()
     none = torch.zeros(1, 0, dtype=torch.float64)
     assert float(lens.max_undistorted_radius(none)[0]) == pytest.approx(10.0)
+
+
+def test_a_fisheye_sees_to_the_side():
+    wide = Camera.from_parameters(300, 300, 640, 360, 1280, 720, [0.0] * 4, "fisheye")
+    angle = torch.tensor([85.0, 88.0], dtype=torch.float64).deg2rad()
+    pixels, seen = wide.project(torch.stack([angle.sin(), torch.zeros(2).double(), angle.cos()], -1))
+    torch.testing.assert_close(pixels[:, 0], 640 + 300 * angle)
+    assert seen.all()
+
+
+def test_image_size_is_two_whole_numbers_of_any_kind():
+    made = Camera.from_parameters(500, 500, 320, 240, np.int64(640), np.int64(480))
+    assert json.dumps(made.image_size) == "[480, 640]"
+    for size in ((480, 640, 3), (480,), ()):
+        with pytest.raises(ValueError, match="image_size: expected whole positive"):
+            Camera(made.intrinsics, made.distortion, "pinhole", size)
 
 
 def test_points_that_the_lens_folds_back_into_the_image_are_not_seen():

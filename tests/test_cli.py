@@ -25,7 +25,7 @@ from lanebev.cli import main
 from lanebev.estimation.mount import MountReason
 from lanebev.io.results import CSV_COLUMNS, ExtrinsicsRow, write_extrinsics
 from lanebev.io.state import load_state
-from lanebev.io.video import VideoWriter
+from lanebev.io.video import VideoWriter, open_source
 from lanebev.report.measure import pose
 from lanebev.run import RunConfig
 from tools import pseudo_ground_truth
@@ -223,6 +223,8 @@ def test_folder_glob_and_stills(data, tmp_path):
     stills = _table(tmp_path / "stills")
     assert len(stills) == FRAMES
     assert len({row["pitch_deg"] for row in stills}) == 1  # each on its own, and all the same
+    shown = [frame.time for frame in open_source(str(tmp_path / "stills" / "bev.mp4"))]
+    assert shown == pytest.approx([0.5 * i for i in range(FRAMES)], abs=1e-3)  # long enough to be looked at
     assert float(stills[0]["pitch_deg"]) == pytest.approx(np.degrees(POSE[0]), abs=0.1)
 
 
@@ -300,6 +302,17 @@ def test_the_state_of_another_camera_is_a_mistake(data, tmp_path, capsys):
     capsys.readouterr()
     _fails(capsys, arguments, "resume: expected a state of the camera in", "got another camera's")
     assert not (tmp_path / "next").exists()
+
+
+def test_resuming_with_the_camera_that_a_run_wrote(data, tmp_path):
+    fields = yaml.safe_load((data / "camera.yaml").read_text())
+    camera = tmp_path / "camera.yaml"
+    camera.write_text(yaml.safe_dump(fields | {"distortion": [-0.001, 0.0001, 0.0, 0.0]}))
+    fixed = ["--lanes", str(data / "lanes.json"), "--calibrator", "two-stage"]
+    first = ["run", str(data / "images"), "--camera", str(camera), "--out", str(tmp_path / "one"), *fixed]
+    assert main(first) == 0
+    again = ["--camera", str(tmp_path / "one" / "calibration.yaml"), "--resume", str(tmp_path / "one")]
+    assert main(["run", str(data / "images"), *again, "--out", str(tmp_path / "two"), *fixed]) == 0
 
 
 def test_a_report_that_nobody_reads_is_no_error(data, tmp_path, monkeypatch):

@@ -194,6 +194,18 @@ def test_an_image_that_is_not_finite_spoils_no_other_row_and_no_gradient(value):
     torch.testing.assert_close(alone.bev, out.bev[1:])
 
 
+@pytest.mark.parametrize("value", [float("nan"), 0.0])
+@pytest.mark.parametrize("calibrator", [TwoStageCalibrator(), JointCalibrator()])
+def test_a_camera_that_cannot_be_used_spoils_no_gradient_behind_a_lens(calibrator, value):
+    made, bad = small(calibrator).double(), torch.full((3, 3), value).double()
+    lens = torch.tensor([[-0.1, 0.01, 0.0, 0.0]] * 2, dtype=torch.float64)
+    state = made.initial_state(2, dtype=torch.float64)
+    out, _ = made(images(2), torch.stack([bad, INTRINSICS]), state, distortion=lens)
+    (out.segments.endpoints[1].sum() + out.segments.sigma[1].sum() + out.bev[1].sum()).backward()
+    assert all(bool(part.grad.isfinite().all()) for part in made.parameters() if part.grad is not None)
+    assert not out.segments.weight[0].any()
+
+
 @pytest.mark.parametrize("calibrator", [TwoStageCalibrator(), JointCalibrator()])
 def test_cameras_of_whole_numbers_are_named(calibrator):
     with pytest.raises(ValueError, match=r"intrinsics: expected floating point, got torch.int64"):

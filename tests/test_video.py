@@ -52,19 +52,37 @@ def test_folder_frames_come_in_natural_order(tmp_path):
 
 
 def test_frames_are_shown_at_their_times(tmp_path):
-    times = [0.0, 0.033, 0.033, 4.0, 4.5]  # one given again
+    times = [0.0, 0.033, 0.033, 4.0, 9.0]  # one given again, a late gap
     with VideoWriter(tmp_path / "x.mp4", Fraction(30)) as writer:
         for i, time in enumerate(times):
             writer.write(_picture(40 * i), time)
         writer.write(_picture(0))
     shown = [frame.time for frame in open_source(str(tmp_path / "x.mp4"))]
-    assert shown == pytest.approx([*times, 4.5 + 1 / 30], abs=1e-3)
+    assert shown == pytest.approx([*times, 9.0 + 1 / 30], abs=1e-3)
     assert np.diff(shown).min() > 0
+    with av.open(str(tmp_path / "x.mp4")) as container:
+        stream = container.streams.video[0]
+        assert float(stream.duration * stream.time_base) == pytest.approx(9.0 + 2 / 30, abs=0.05)
+
+
+def test_frames_of_an_avi_are_evenly_spaced(tmp_path):
+    """It keeps no times of display, and B-frames come with another's."""
+    with av.open(str(tmp_path / "x.avi"), "w") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt, stream.options = 64, 48, "yuv420p", {"bf": "2"}
+        for i in range(20):
+            container.mux(
+                stream.encode(av.VideoFrame.from_ndarray(np.roll(_picture(99), i, 1), format="rgb24"))
+            )
+        container.mux(stream.encode())
+    assert min(frame.dt for frame in open_source(str(tmp_path / "x.avi"))) > 0
 
 
 def test_hidden_files_are_no_frames(tmp_path):
     _folder(tmp_path, ["1.png", "._1.png", ".2.jpg"])
     assert [frame.name for frame in open_source(str(tmp_path))] == [str(tmp_path / "1.png")]
+    assert open_source(str(tmp_path / ".2.jpg")).is_single  # asked for by its name
+    assert len(open_source(f"{tmp_path}/.*.jpg").paths) == 1
 
 
 @pytest.mark.parametrize(("name", "codec"), [("raw.h264", "libx264"), ("x.webm", "libvpx")])

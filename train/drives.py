@@ -14,7 +14,7 @@ from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.pipeline import LaneBEV
 from lanebev.render import Drive
-from lanebev.types import LaneSegments, Status
+from lanebev.types import NUM_BOUNDARIES, LaneSegments, Status
 
 WARM_UP = 10  # frames
 
@@ -51,9 +51,12 @@ def watch(segmenters: Sequence[LaneSegmenter], seed: int, frames: int, fps: floa
 
 def _observer(segmenter: LaneSegmenter) -> LaneBEV:
     config = segmenter.config
+    if config.num_boundaries != NUM_BOUNDARIES:
+        raise ValueError(
+            f"num_boundaries: expected the drives' {NUM_BOUNDARIES}, got {config.num_boundaries}"
+        )
     extractor = LineExtractor.for_network(config)
-    calibrator = JointCalibrator(num_boundaries=config.num_boundaries)
-    return LaneBEV(segmenter, extractor, calibrator, network_width=config.image_size[1]).eval()
+    return LaneBEV(segmenter, extractor, JointCalibrator(), network_width=config.image_size[1]).eval()
 
 
 class Followed(NamedTuple):

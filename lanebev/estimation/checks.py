@@ -8,13 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lanebev.geometry.camera import check_intrinsics
+from lanebev.geometry.camera import check_intrinsics, harmless_camera, usable_cameras
 from lanebev.types import LaneSegments, Status
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
 _MIN_SIGMA = 1e-3  # px; nothing is known better
 _MIN_SEGMENTS = 2  # that the estimators' reductions and pairs ask for; the rest is padding
-_HARMLESS_FOCAL = 1000.0  # px
 _HARMLESS_WIDTH = 3.7  # m
 
 
@@ -98,13 +97,11 @@ def usable(
         num_boundaries: L.
     """
     segments = clean_segments(segments, num_boundaries)
-    camera = intrinsics.isfinite().all(-1).all(-1) & (intrinsics[:, 0, 0] > 0) & (intrinsics[:, 1, 1] > 0)
-    good = camera & (lane_width.isfinite() & (lane_width > 0)).all(-1)  # (B,)
-    harmless = torch.diag(intrinsics.new_tensor([_HARMLESS_FOCAL, _HARMLESS_FOCAL, 1.0]))
+    good = usable_cameras(intrinsics) & (lane_width.isfinite() & (lane_width > 0)).all(-1)  # (B,)
     weight = torch.where(good.unsqueeze(-1), segments.weight, 0.0)
     return (
         segments._replace(weight=weight),
-        torch.where(good[:, None, None], intrinsics, harmless),
+        torch.where(good[:, None, None], intrinsics, harmless_camera(intrinsics)),
         torch.where(good.unsqueeze(-1), lane_width, _HARMLESS_WIDTH),
     )
 

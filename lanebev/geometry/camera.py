@@ -6,8 +6,11 @@ camera with the same intrinsics.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from numbers import Integral
 from pathlib import Path
+from typing import Any
 
 import torch
 from kornia.geometry import calibration
@@ -18,6 +21,7 @@ from lanebev.geometry.precision import full_precision
 
 MODELS = ("pinhole", "fisheye")
 DISTORTION_LENGTHS = {"pinhole": (0, 4, 5, 8, 12), "fisheye": (4,)}
+_HARMLESS_FOCAL = 1000.0  # px
 _UNDISTORT_ITERATIONS = 20  # kornia's default of 5 leaves 1e-2 px at the corners of a wide lens
 _KB_NEWTON_ITERATIONS = 10  # quadratic from theta = theta_d: 1e-12 rad below 80 deg
 
@@ -55,6 +59,17 @@ def check_intrinsics(intrinsics: Tensor, *rows: int) -> None:
         raise ValueError(f"intrinsics: expected {(*rows, 3, 3)}, got {tuple(intrinsics.shape)}")
     if not intrinsics.is_floating_point():
         raise ValueError(f"intrinsics: expected floating point, got {intrinsics.dtype}")
+
+
+def usable_cameras(intrinsics: Tensor) -> Tensor:
+    """(...,) bool of (..., 3, 3): finite, and with positive focal lengths."""
+    finite = intrinsics.isfinite().all(-1).all(-1)
+    return finite & (intrinsics[..., 0, 0] > 0) & (intrinsics[..., 1, 1] > 0)
+
+
+def harmless_camera(like: Tensor) -> Tensor:
+    """(3, 3) to put in place of one that can't be used, so that no number or gradient turns NaN."""
+    return torch.diag(like.new_tensor([_HARMLESS_FOCAL, _HARMLESS_FOCAL, 1.0]))
 
 
 def _check_points(points: Tensor, size: int = 2) -> None:
@@ -238,25 +253,26 @@ def max_undistorted_radius(distortion: Tensor, model: str = "pinhole", limit: fl
     Args:
         distortion: (B, D), OpenCV's order.
         model: "pinhole" or "fisheye".
-        limit: the largest radius looked at; 10 is 84 deg off the axis.
+        limit: the largest radius looked at of a pinhole; 10 is 84 deg off the axis. A fisheye's is 90 deg.
 
     Returns:
         (B,) radius on the undistorted z = 1 plane.
     """
     _check_lens(distortion, model)
-    radius = torch.linspace(0.0, limit, 2001, dtype=distortion.dtype, device=distortion.device)
+    steps = torch.linspace(0.0, 1.0, 2001, dtype=distortion.dtype, device=distortion.device)
     k = torch.nn.functional.pad(distortion, (0, 12 - distortion.shape[-1])).unsqueeze(-1)  # (B, 12, 1)
     if model == "fisheye":
-        x = radius.atan()
-        t = x * x
+        x = 0.9999 * 0.5 * math.pi * steps
+        radius, t = x.tan(), x * x
         value = x * (1 + t * (k[:, 0] + t * (k[:, 1] + t * (k[:, 2] + t * k[:, 3]))))
     else:
+        radius = limit * steps
         r = radius * radius
         numerator = 1 + r * (k[:, 0] + r * (k[:, 1] + r * k[:, 4]))
         value = radius * numerator / (1 + r * (k[:, 5] + r * (k[:, 6] + r * k[:, 7])))
     grows = (value.diff(dim=-1) > 0).to(torch.int8).cumprod(-1)  # 1 up to the first step that doesn't
-    reach: Tensor = grows.sum(-1) * (limit / 2000)
-    return reach.to(distortion.dtype)
+    reach: Tensor = radius[grows.sum(-1)]
+    return reach
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,8 +297,10 @@ class Camera:
         if self.distortion.ndim != 1:
             raise ValueError(f"distortion: expected (D,), got {tuple(self.distortion.shape)}")
         _check_lens(self.distortion, self.model)
-        if not all(isinstance(side, int) and side > 0 for side in self.image_size):
+        sides: tuple[Any, ...] = tuple(self.image_size)
+        if len(sides) != 2 or not all(isinstance(side, Integral) and int(side) > 0 for side in sides):
             raise ValueError(f"image_size: expected whole positive (height, width), got {self.image_size}")
+        object.__setattr__(self, "image_size", (int(sides[0]), int(sides[1])))
         for name in ("intrinsics", "distortion"):
             value = getattr(self, name)
             if not bool(value.isfinite().all()):

@@ -92,6 +92,8 @@ class FrameSource:
             stream = container.streams.video[0]
             for index, (pts, decoded) in enumerate(_decoded(container, stream)):
                 time = (first or 0) + index / self.fps if pts is None else pts * stream.time_base
+                if before is not None and time <= before:  # AVI has no times of display
+                    time = before + 1 / self.fps
                 first = time if first is None else first
                 dt = float(1 / self.fps) if before is None else float(time - before)
                 image, problem = None, ""
@@ -122,7 +124,8 @@ def open_source(source: str, fps: Fraction = DEFAULT_FPS) -> FrameSource:
     """
     path = Path(source)
     if path.is_dir():
-        paths = sorted((str(p) for p in path.iterdir() if _is_image(p)), key=natural_order)
+        there = (p for p in path.iterdir() if _is_image(p) and p.name[0] != ".")  # macOS leaves ._ files
+        paths = sorted(map(str, there), key=natural_order)
         if not paths:
             raise ValueError(
                 f"{source}: expected images in the folder, got none; for those in folders below it give "
@@ -201,7 +204,7 @@ class VideoWriter:
         self._stream.pix_fmt = "yuv420p"
         self._stream.codec_context.time_base = _TICK
         self._interval, self._next = 1 / fps, Fraction(0)
-        self._stream.options = {"crf": str(crf), "preset": "veryfast"}
+        self._stream.options = {"crf": str(crf), "preset": "veryfast", "bf": "0"}  # else a late gap is cut
 
     def __enter__(self) -> VideoWriter:
         return self
@@ -230,9 +233,7 @@ class VideoWriter:
 
 
 def _is_image(path: str | Path) -> bool:
-    """By its name; a hidden file (macOS's ``._*``) is none, as in a glob."""
-    path = Path(path)
-    return path.suffix.lower() in IMAGE_SUFFIXES and path.name[0] != "." and path.is_file()
+    return Path(path).suffix.lower() in IMAGE_SUFFIXES and Path(path).is_file()
 
 
 def _upright(image: Image.Image) -> Image.Image:
@@ -309,7 +310,7 @@ def _declared_duration(stream: av.VideoStream, begin: Fraction) -> float:
 def _decoded(
     container: av.container.InputContainer, stream: av.VideoStream
 ) -> Iterator[tuple[int | None, av.VideoFrame | str]]:
-    """Frames with their presentation times, rising; of one that was lost, what was got instead of it.
+    """Frames as they are shown, with the times that the file gives; of a lost one, what was got instead.
 
     A packet whose frame does not come is lost if the file is damaged up to there; in a sound one it shows
     nothing. No frame threads: they drop what follows the last error.

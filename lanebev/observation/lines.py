@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from lanebev.geometry.camera import undistort_points, undistorted_sigma
+from lanebev.geometry.camera import harmless_camera, undistort_points, undistorted_sigma, usable_cameras
 from lanebev.geometry.precision import full_precision
 from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.observation.vertices import LineConfig, representative_vertices, scan_vertices, take
@@ -112,6 +112,8 @@ def undistort_segments(
 ) -> LaneSegments:
     """Segments in pixels of the image as it came to undistorted ones, their sigmas too.
 
+    In a row whose lens can't be used all have weight zero, and the gradient of the others stays finite.
+
     Args:
         segments: (B, N).
         intrinsics: (B, 3, 3) px.
@@ -120,6 +122,10 @@ def undistort_segments(
     """
     if distortion is None or distortion.shape[-1] == 0:
         return segments
+    good = usable_cameras(intrinsics) & distortion.isfinite().all(-1)  # (B,)
+    segments = segments._replace(weight=torch.where(good.unsqueeze(-1), segments.weight, 0.0))
+    intrinsics = torch.where(good[:, None, None], intrinsics, harmless_camera(intrinsics))
+    distortion = torch.where(good.unsqueeze(-1), distortion, 0.0)
     lens = (intrinsics, distortion, model)
     flat = undistort_points(segments.endpoints.flatten(1, 2), *lens)
     ends = flat.reshape(segments.endpoints.shape)

@@ -153,8 +153,9 @@ class Recorder:
             write_png(self.path("bev.png"), done.bev_after)
             write_png(self.path("overlay.png"), picture)
         else:
-            self._bev.write(done.bev_after, done.frame.time)
-            self._overlay.write(picture, done.frame.time)
+            shown = None if self.stills else done.frame.time
+            self._bev.write(done.bev_after, shown)
+            self._overlay.write(picture, shown)
 
     def _measure(
         self, segments: LaneSegments, intrinsics: Tensor, pose: Extrinsics | None
