@@ -4,8 +4,12 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
-from tools.label_noise import line_offsets, stripe_centre
+from lanebev import LaneSegments
+from lanebev.estimation.single_frame import FramePrior, fit_single_frame
+from tests.test_two_stage import K, lanes
+from tools.label_noise import line_offsets, split_half_yaw, stripe_centre
 
 
 def row_with(*stripes: tuple[int, int]) -> np.ndarray:
@@ -41,3 +45,20 @@ def test_lines_without_enough_paint_do_not_count():
     assert line_offsets(grey, rows, x, x, 240.0) is None  # 90 px only
     rows, x = np.arange(300, 500, 10.0), np.full(20, 99.0)
     assert line_offsets(grey, rows, x + 40, x, 240.0) is None  # another stripe
+
+
+def test_halves_of_lines_differ_by_twice_what_all_of_them_err():
+    """And exact ones not at all."""
+    pose, straight = (0.03, -0.02, 0.015, 1.5), FramePrior(curvature_std=1e-6, curvature_rate_std=1e-8)
+    drawn = [lanes(pose, (1, 2, 3, 4), per=24, noise=4.0, seed=seed) for seed in range(60)]
+    noisy, cameras = (
+        LaneSegments(*(torch.cat(parts) for parts in zip(*drawn, strict=True))),
+        K.expand(60, 3, 3),
+    )
+    halves = split_half_yaw(noisy, cameras, straight)
+    error = fit_single_frame(noisy, cameras, prior=straight).extrinsics.yaw - pose[1]
+    assert len(halves) == 60
+    assert 0.7 < float(halves.square().mean().sqrt() / error.square().mean().sqrt()) < 1.4
+    exact, three = (lanes(pose, boundaries, noise=0.0) for boundaries in ((1, 2, 3, 4), (1, 2, 3)))
+    assert float(split_half_yaw(exact, K[None], FramePrior()).max()) < 1e-6
+    assert len(split_half_yaw(three, K[None], FramePrior())) == 0

@@ -7,6 +7,9 @@ image: the centroid of what is brighter than halfway between the ground and the 
 from the paint shrinks to nothing at the horizon lies beside it on the road and says the same of the yaw; what
 is left of it there is an error of the yaw. Prints medians over lines, in px of the image: the mean distance,
 and the distance at the horizon by a straight line through all distances.
+
+And how far the labels agree with themselves: the yaw by two of an image's lines against that by two others.
+Half of the difference estimates, in the median over images, the error of the yaw by all four.
 """
 
 from __future__ import annotations
@@ -17,9 +20,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 import lanebev
+from lanebev import LaneSegments
+from lanebev.estimation.single_frame import FramePrior, fit_single_frame
 from lanebev.io.lanes import read_lanes
 from lanebev.io.video import open_source
 from lanebev.observers import NetworkObserver
@@ -32,6 +39,7 @@ APART = 25.0  # px, label and network mean the same stripe if nearer
 WIDTHS = (2, 40)  # px, of a stripe
 CONTRAST = 20.0  # grey levels
 FIRST_ROW = 340  # px; above it stripes are too thin to be measured
+STRAIGHT = FramePrior(curvature_std=1e-6, curvature_rate_std=1e-8)
 LEAST_ROWS, LEAST_SPAN = 6, 100  # rows with paint, and px from the first to the last, of a line that counts
 
 
@@ -78,6 +86,25 @@ def line_offsets(
     return first, second
 
 
+def split_half_yaw(segments: LaneSegments, intrinsics: Tensor, prior: FramePrior) -> Tensor:
+    """(n,) rad, half of how far yaws by boundaries 1 and 3 and by 2 and 4 differ, of images with all four.
+
+    Args:
+        segments: (B, N).
+        intrinsics: (B, 3, 3).
+        prior: of the fits.
+    """
+    yaws, told = [], []
+    for half in ((1, 3), (2, 4)):
+        mine = torch.stack([segments.boundary == k for k in half]).any(0)
+        part = segments._replace(weight=segments.weight * mine)
+        fit = fit_single_frame(part, intrinsics, TUSIMPLE_LANE_WIDTH, prior)
+        seen = [((segments.boundary == k) & (segments.weight > 0)).any(1) for k in half]
+        yaws.append(fit.extrinsics.yaw)
+        told.append(fit.valid & fit.observed[:, 1] & seen[0] & seen[1])
+    return 0.5 * (yaws[0] - yaws[1]).abs()[told[0] & told[1]]
+
+
 @one_line_errors()
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -110,6 +137,9 @@ def main() -> None:
     for name, (mean, horizon) in zip(("labels", "network"), both, strict=True):
         yaw = np.degrees(np.arctan(horizon / TUSIMPLE_FOCAL))
         print(f"{name}: median distance {mean:.2f} px, at the horizon {horizon:.2f} px ({yaw:.3f} deg)")
+    for name, prior in (("as ever", FramePrior()), ("curvature held at zero", STRAIGHT)):
+        halves = split_half_yaw(segments, intrinsics, prior).rad2deg()
+        print(f"labels' own yaw, {name}: off by {float(halves.median()):.3f} deg, {len(halves)} images")
 
 
 if __name__ == "__main__":
