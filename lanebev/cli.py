@@ -79,10 +79,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 128 + int(stopped.args[0] if isinstance(stopped, _Stopped) else signal.SIGINT)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # of signs that a terminal's encoding lacks
-    with contextlib.suppress(OSError):  # nobody reads it; the outputs are there
+    try:
         print(report, flush=True)
-        return 0
-    sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - else closing it at exit fails once more
+    except OSError:  # nobody reads it; the outputs are there
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - else closing it at exit fails once more
     return 0
 
 
@@ -95,7 +95,6 @@ def _signals_unwind() -> Iterator[None]:
     own = [each for each, handler in before.items() if handler in usual]  # not what nohup ignores
     if threading.current_thread() is not threading.main_thread():
         own = []  # Python lets no other thread set them
-
     sent = itertools.count(1)
 
     def stop(number: int, _: object) -> None:

@@ -8,7 +8,7 @@ import torch
 
 from lanebev import Extrinsics, image_from_road_points
 from lanebev.estimation import lane_width as lw
-from lanebev.geometry.road import rays_from_pixels
+from lanebev.geometry.road import segment_rays
 from lanebev.geometry.rotation import cam_from_world
 
 K = torch.tensor([[[1000.0, 0, 640], [0, 1000, 360], [0, 0, 1]]], dtype=torch.float64)
@@ -29,7 +29,7 @@ def boundary_segments(pitch, yaw, roll, height, edges=EDGES):
 
 def angles_of(ends, pose, sigma=1.0, boundary=None):
     n = ends.shape[1]
-    rays = rays_from_pixels(ends.flatten(1, 2), K).reshape(1, n, 2, 3)
+    rays = segment_rays(ends, K)
     boundary = torch.arange(n)[None] if boundary is None else boundary
     weight = torch.ones(1, n, dtype=torch.float64)
     return lw.boundary_angles(rays, boundary, weight, sigma * weight, K, pose.pitch, pose.yaw, 4)
@@ -41,7 +41,7 @@ def angles_of(ends, pose, sigma=1.0, boundary=None):
 )
 def test_deviation_angle_positive_to_the_left_makes_widths_exact(pitch, yaw, roll, height):
     ends, pose = boundary_segments(pitch, yaw, roll, height)
-    rays = rays_from_pixels(ends.flatten(1, 2), K).reshape(1, -1, 2, 3)
+    rays = segment_rays(ends, K)
     near, far = lw.line_angles(rays @ cam_from_world(pose.pitch, pose.yaw)).unbind(-1)
     torch.testing.assert_close(near, far)  # in one plane with the vanishing direction
     angles = near

@@ -14,7 +14,7 @@ from lanebev import (
     image_from_road_points,
     road_covariance,
 )
-from lanebev.geometry.road import great_circle_normals, road_from_image_points
+from lanebev.geometry.road import great_circle_normals, road_from_image_points, segment_rays
 from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
 
 K = torch.tensor([[[1000.0, 0.0, 640.0], [0.0, 980.0, 360.0], [0.0, 0.0, 1.0]]], dtype=torch.float64)
@@ -75,7 +75,7 @@ def test_great_circles_of_parallel_lines_meet_in_the_vanishing_direction():
     near = torch.tensor([[[-5.0, 8.0], [-1.0, 8.0], [4.0, 9.0]]], dtype=torch.float64)
     far = near + torch.tensor([0.0, 25.0], dtype=torch.float64)
     ends = torch.stack([image_from_road_points(p, K, e)[0] for p in (near, far)], dim=2)
-    normals = great_circle_normals(ends, K)
+    normals = great_circle_normals(segment_rays(ends, K))
     v = vanishing_dir_from_pitch_yaw(e.pitch, e.yaw)
     torch.testing.assert_close((normals @ v[..., None]).abs().max(), torch.zeros((), dtype=torch.float64))
 

@@ -16,7 +16,7 @@ from lanebev import (
 )
 from lanebev.estimation.direction_stage import incidence
 from lanebev.estimation.two_stage_state import TwoStageConfig
-from lanebev.geometry.road import great_circle_normals, rays_from_pixels
+from lanebev.geometry.road import great_circle_normals, segment_rays
 from tools.reproduce_table1 import run, table
 from tools.synthetic import Experiment
 
@@ -281,9 +281,8 @@ def test_incidence_jacobian_and_noise_equal_autograd():
     mean = torch.tensor([[0.2, -0.3, 0.1, 0.0]], dtype=torch.float64)
 
     def residual(mean, ends):
-        normals = great_circle_normals(ends, camera)
-        rays = rays_from_pixels(ends.flatten(1, 2), camera).view(*ends.shape[:3], 3)
-        return incidence(mean, normals, rays, segments.sigma, camera)
+        rays = segment_rays(ends, camera)
+        return incidence(mean, great_circle_normals(rays), rays, segments.sigma, camera)
 
     by_mean, by_ends = torch.func.jacfwd(lambda *x: residual(*x)[0][0], (0, 1))(mean, segments.endpoints)
     _, jacobian, noise = residual(mean, segments.endpoints)

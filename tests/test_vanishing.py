@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lanebev.estimation import vanishing
-from lanebev.geometry.road import great_circle_normals, rays_from_pixels
+from lanebev.geometry.road import great_circle_normals, segment_rays
 from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
 
 K = torch.tensor([[1000.0, 0, 640], [0, 1000, 360], [0, 0, 1]], dtype=torch.float64)
@@ -86,8 +86,8 @@ def test_deviation_noise_aware_gate_keeps_what_the_papers_gate_throws_away():
 
 
 def least_squares(ends, sigma, weight, prior=(0.0, 0.0, 1.0)):
-    normals = great_circle_normals(ends, K[None])
-    rays = rays_from_pixels(ends.flatten(1, 2), K[None]).reshape(*ends.shape[:-1], 3)
+    rays = segment_rays(ends, K[None])
+    normals = great_circle_normals(rays)
     direction = torch.tensor([prior], dtype=torch.float64)
     for _ in range(3):
         noise = vanishing.incidence_noise(rays, direction, sigma, K[None])
@@ -98,7 +98,7 @@ def least_squares(ends, sigma, weight, prior=(0.0, 0.0, 1.0)):
 def test_deviation_least_squares_equals_svd_without_noise_and_has_z_positive():
     ends = segments_to()
     direction, _ = least_squares(ends, ones(ends), ones(ends))
-    svd = torch.linalg.svd(great_circle_normals(ends, K[None])[0]).Vh[-1]
+    svd = torch.linalg.svd(great_circle_normals(segment_rays(ends, K[None]))[0]).Vh[-1]
     torch.testing.assert_close(direction[0], svd / svd[2], atol=1e-9, rtol=0)
     assert direction[0, 2] == 1
     expected = vanishing_dir_from_pitch_yaw(*(torch.tensor(a, dtype=torch.float64) for a in PITCH_YAW))
@@ -113,7 +113,7 @@ def test_least_squares_covariance_is_honest_and_beats_normalised_normals():
         error = direction[0, :2] - (VP - K[:2, 2]) / 1000
         errors.append(float(error @ torch.linalg.solve(cov[0], error)))
         plain.append(float(error.norm()))
-        unit = torch.nn.functional.normalize(great_circle_normals(ends, K[None]), dim=-1)
+        unit = torch.nn.functional.normalize(great_circle_normals(segment_rays(ends, K[None])), dim=-1)
         svd = torch.linalg.svd(unit[0]).Vh[-1]
         normalised.append(float((svd[:2] / svd[2] - (VP - K[:2, 2]) / 1000).norm()))
     assert 0.8 < sum(errors) / 2 / 300 < 1.25

@@ -25,7 +25,7 @@ from torch import Tensor
 from lanebev import Camera, Extrinsics, LaneSegments
 from lanebev.estimation.lane_width import boundary_angles, initial_roll_height
 from lanebev.estimation.vanishing import incidence_noise, vanishing_dir_least_squares
-from lanebev.geometry.road import great_circle_normals, rays_from_pixels
+from lanebev.geometry.road import great_circle_normals, segment_rays
 from lanebev.geometry.rotation import pitch_yaw_from_vanishing_dir
 from lanebev.io.lane_rows import rows_from_lines, segments_from_rows
 from lanebev.io.lanes import FrameLines, match_frames, read_lanes
@@ -61,8 +61,8 @@ def pseudo_ground_truth(
     """
     ends, boundary, weight, sigma = segments
     batch = ends.shape[0]
-    normals = great_circle_normals(ends, intrinsics)
-    rays = rays_from_pixels(ends.flatten(1, 2), intrinsics).reshape(*ends.shape[:-1], 3)
+    rays = segment_rays(ends, intrinsics)
+    normals = great_circle_normals(rays)
     forward = ends.new_tensor([0.0, 0.0, 1.0]).expand(batch, 3)
     direction = forward
     for _ in range(iterations):

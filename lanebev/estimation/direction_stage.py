@@ -69,7 +69,7 @@ def track_direction(
         the step; a row that is neither supported nor started keeps its prediction.
     """
     mean, cov = predict_direction(state, dt, cfg)
-    normals = great_circle_normals(segments.endpoints, intrinsics)
+    normals = great_circle_normals(rays)
 
     residual, jacobian, noise = incidence(mean, normals, rays, segments.sigma, intrinsics)
     there = segments.weight > 0

@@ -11,7 +11,7 @@ from lanebev.estimation.direction_stage import track_direction
 from lanebev.estimation.lane_width import boundary_angles
 from lanebev.estimation.roll_height_stage import track_roll_height
 from lanebev.estimation.two_stage_state import TwoStageConfig, TwoStageState
-from lanebev.geometry.road import rays_from_pixels
+from lanebev.geometry.road import segment_rays
 from lanebev.rows import where
 from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
 
@@ -73,8 +73,7 @@ class TwoStageCalibrator(Calibrator):
         dt = torch.where(dt.isfinite(), dt, self.config.assumed_dt)
         before, skip = state, (dt <= 0) & is_running(state.status)
         dt = dt.clamp(0.0, 60.0)
-        rays = rays_from_pixels(segments.endpoints.flatten(1, 2), intrinsics)
-        rays = rays.reshape(*segments.endpoints.shape[:-1], 3)  # (B, N, 2, 3)
+        rays = segment_rays(segments.endpoints, intrinsics)  # (B, N, 2, 3)
 
         known = state.status != int(Status.UNINITIALISED)
         stale = known & (state.unseen + dt > self.config.lost_after)

@@ -27,21 +27,32 @@ def rays_from_pixels(points: Tensor, intrinsics: Tensor) -> Tensor:
     return torch.cat([plane, torch.ones_like(plane[..., :1])], dim=-1)
 
 
-def great_circle_normals(endpoints: Tensor, intrinsics: Tensor) -> Tensor:
-    """Normals of the planes through the camera and each segment, not normalised.
-
-    Source: Eq. (3), n = (K⁻¹ p₁) × (K⁻¹ p₂). Left unnormalised because |n| grows with the segment's
-    length, and with it the segment's say (PAPER_NOTES 9).
+def segment_rays(endpoints: Tensor, intrinsics: Tensor) -> Tensor:
+    """Camera rays to both ends of segments, K⁻¹ p₁ and K⁻¹ p₂.
 
     Args:
         endpoints: (..., N, 2, 2) px, undistorted.
         intrinsics: (..., 3, 3).
 
     Returns:
+        (..., N, 2, 3), z = 1.
+    """
+    rays: Tensor = rays_from_pixels(endpoints.flatten(-3, -2), intrinsics).unflatten(-2, (-1, 2))
+    return rays
+
+
+def great_circle_normals(rays: Tensor) -> Tensor:
+    """Normals of the planes through the camera and each segment, not normalised.
+
+    Source: Eq. (3), n = (K⁻¹ p₁) × (K⁻¹ p₂). Left unnormalised because |n| grows with the segment's
+    length, and with it the segment's say (PAPER_NOTES 9).
+
+    Args:
+        rays: (..., N, 2, 3), see :func:`segment_rays`.
+
+    Returns:
         (..., N, 3).
     """
-    rays = rays_from_pixels(endpoints.flatten(-3, -2), intrinsics)
-    rays = rays.reshape(*endpoints.shape[:-1], 3)  # (..., N, 2, 3)
     normals: Tensor = torch.linalg.cross(rays[..., 0, :], rays[..., 1, :])
     return normals
 

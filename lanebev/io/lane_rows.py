@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from lanebev.geometry.camera import Camera, undistorted_sigma
 from lanebev.io.lane_order import boundary_indices
 from lanebev.io.lanes import LaneLine
+from lanebev.observation.lines import NETWORK_CORRELATION
 from lanebev.types import NUM_BOUNDARIES, LaneSegments
 
-ROW_STEP = 10
-"""Rows of ``lanes.json`` are this many pixels apart."""
+ROW_STEP = round(NETWORK_CORRELATION)
+"""Rows of ``lanes.json`` are this many pixels apart, as far as a network's line errs alike."""
 
 SEGMENTS_PER_BOUNDARY = 30
 LINE_SIGMA = 1.5
@@ -189,18 +190,18 @@ def _with_gaps(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _vertices(frame: BoundaryRows, sigma: NDArray[np.float64], camera: Camera) -> list[NDArray[np.float64]]:
     """Vertices (K, 3) of each boundary: undistorted x, y and sigma, px; those the lens can have imaged."""
-    points = np.stack([frame.x, np.broadcast_to(frame.rows, frame.x.shape)], axis=-1)
-    undistorted, valid = camera.undistort_points(torch.from_numpy(points).flatten(0, 1).to(camera.intrinsics))
+    on_rows = np.stack([frame.x, np.broadcast_to(frame.rows, frame.x.shape)], axis=-1)
+    as_taken = torch.from_numpy(on_rows).flatten(0, 1).to(camera.intrinsics)
+    undistorted, valid = camera.undistort_points(as_taken)
     undistorted = undistorted.double().reshape(*frame.x.shape, 2)
     kept, noise = valid.reshape(frame.x.shape), torch.from_numpy(sigma)
     lens = (camera.intrinsics[None].double(), camera.distortion[None].double(), camera.model)
-    vertices = []
-    for points, seen, own in zip(undistorted, kept, noise, strict=True):
-        line = points[seen]
-        along = torch.gradient(line, dim=0)[0] if len(line) > 1 else torch.zeros_like(line)
-        across = undistorted_sigma(own[seen][None], line[None], along[None], *lens)[0]
-        vertices.append(torch.cat([line, across.unsqueeze(-1)], dim=-1).numpy())
-    return vertices
+    lines = [points[seen] for points, seen in zip(undistorted, kept, strict=True)]
+    along = [torch.gradient(line, dim=0)[0] if len(line) > 1 else torch.zeros_like(line) for line in lines]
+    points = torch.cat(lines)
+    across = undistorted_sigma(noise[kept][None], points[None], torch.cat(along)[None], *lens)[0]
+    vertices = torch.cat([points, across.unsqueeze(-1)], dim=-1).numpy()
+    return np.split(vertices, np.cumsum([len(line) for line in lines])[:-1])
 
 
 def _undistorted(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
