@@ -1,10 +1,10 @@
 """lanebev: how a camera looks at the road, frame by frame, from lane boundaries alone."""
 
 from lanebev import weights as weights
-from lanebev.estimation.joint import JointCalibrator
+from lanebev.camera.model import Camera
+from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.mount import MountEstimator
-from lanebev.estimation.two_stage import TwoStageCalibrator
-from lanebev.geometry.camera import Camera
+from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.geometry.road import (
     image_covariance,
     image_from_road_points,

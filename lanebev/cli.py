@@ -111,14 +111,14 @@ def _signals_unwind() -> Iterator[None]:
 
 
 def _run(options: dict[str, Any]) -> str:
-    from lanebev.run import RunConfig, run, summary
+    from lanebev.app.run import RunConfig, run, summary
 
     config = RunConfig(**options)
     return summary(run(config, _progress("calibrating")), config)
 
 
 def _demo(options: dict[str, Any]) -> str:
-    from lanebev.demo import demo
+    from lanebev.app.demo import demo
 
     return str(demo(options["out"], _progress))
 

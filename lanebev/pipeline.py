@@ -98,7 +98,7 @@ class LaneBEV(nn.Module):
         Raises:
             ValueError: a weights file that doesn't fit the network.
         """
-        from lanebev.estimation.joint import JointCalibrator
+        from lanebev.estimation.joint.calibrator import JointCalibrator
         from lanebev.observation.lines import LineExtractor
         from lanebev.weights import load_segmenter
 

@@ -8,8 +8,13 @@ import pytest
 import torch
 
 from lanebev import Camera
-from lanebev.geometry import camera as lens
-from lanebev.geometry.camera import cam_from_image, distort_points, undistort_points, undistorted_sigma
+from lanebev.geometry import lens
+from lanebev.geometry.lens import (
+    cam_from_image,
+    distort_points,
+    undistort_points,
+    undistorted_sigma,
+)
 from lanebev.geometry.road import rays_from_pixels
 
 BROWN = {

@@ -10,8 +10,7 @@ import yaml
 
 from lanebev import Camera, Extrinsics
 from lanebev.estimation.mount import MountCalibration, MountReason
-from lanebev.io.cameras import read_camera, write_camera
-from lanebev.io.mount_file import vehicle_from_camera, write_calibration
+from lanebev.io.calibration_file import vehicle_from_camera, write_calibration
 
 DISTORTION = [-0.25, 0.04, -0.0007, 0.0001, -0.115]
 SHORT = {"fx": 1150.0, "fy": 1148.0, "cx": 650.0, "cy": 370.0, "width": 1280, "height": 720}
@@ -48,7 +47,7 @@ def test_opencv_file_storage(tmp_path, suffix, shape):
     storage.write("distortion_coefficients", np.array(DISTORTION).reshape(shape))
     storage.write("avg_reprojection_error", 0.3)
     storage.release()
-    _assert_same(read_camera(path), LENS)
+    _assert_same(Camera.from_file(path), LENS)
 
 
 @pytest.mark.parametrize(
@@ -69,21 +68,21 @@ def test_ros_camera_info(tmp_path, name, coefficients, model):
         "distortion_model": name,
         "distortion_coefficients": {"rows": 1, "cols": len(coefficients), "data": coefficients},
     }
-    camera = read_camera(_write(tmp_path / "c.yaml", yaml.safe_dump(fields)))
+    camera = Camera.from_file(_write(tmp_path / "c.yaml", yaml.safe_dump(fields)))
     _assert_same(camera, Camera.from_parameters(**SHORT, distortion=coefficients, model=model))
 
 
 def test_ros_message_dump(tmp_path):
     fields = {"width": 1280, "height": 720, "distortion_model": "plumb_bob"}
     fields |= {"K": LENS.intrinsics.flatten().tolist(), "D": DISTORTION}
-    _assert_same(read_camera(_write(tmp_path / "c.yaml", yaml.safe_dump(fields))), LENS)
+    _assert_same(Camera.from_file(_write(tmp_path / "c.yaml", yaml.safe_dump(fields))), LENS)
 
 
 P2 = "P2: 721.5377 0 609.5593 44.85728 0 721.5377 172.854 0.2163791 0 0 1 0.002745884\n"
 
 
 def test_kitti_object_file_knows_the_recording_day(tmp_path):
-    camera = read_camera(
+    camera = Camera.from_file(
         _write(tmp_path / "calib.txt", "P0: " + P2[4:] + P2 + "R0_rect: 1 0 0 0 1 0 0 0 1\n")
     )
     expected = Camera.from_parameters(721.5377, 721.5377, 609.5593, 172.854, 1242, 375)
@@ -92,15 +91,15 @@ def test_kitti_object_file_knows_the_recording_day(tmp_path):
 
 def test_resized_kitti_images_need_their_own_camera(tmp_path):
     path = _write(tmp_path / "calib.txt", P2)
-    assert read_camera(path, image_size=(370, 1240)).image_size == (370, 1240)
+    assert Camera.from_file(path, image_size=(370, 1240)).image_size == (370, 1240)
     with pytest.raises(ValueError, match=r"expected images of about 1242 x 375 px.* got 621 x 188;"):
-        read_camera(path, image_size=(188, 621))
+        Camera.from_file(path, image_size=(188, 621))
 
 
 def test_what_ros2_topic_echo_prints(tmp_path):
     matrix = "[500.0, 0.0, 320.0, 0.0, 500.0, 180.0, 0.0, 0.0, 1.0]"
     text = f"width: 640\nheight: 360\ndistortion_model: plumb_bob\nd: []\nk: {matrix}\n"
-    camera = read_camera(_write(tmp_path / "info.yaml", f"{text}---\n"))
+    camera = Camera.from_file(_write(tmp_path / "info.yaml", f"{text}---\n"))
     _assert_same(camera, Camera.from_parameters(500, 500, 320, 180, 640, 360))
 
 
@@ -108,7 +107,7 @@ def test_kitti_raw_file_prefers_its_own_size(tmp_path):
     text = "calib_time: 09-Jan-2012\nS_rect_02: 1.242e+03 3.75e+02\nP_rect_02:" + P2[3:].replace(
         "721.5377", "700"
     )
-    camera = read_camera(_write(tmp_path / "calib_cam_to_cam.txt", text), image_size=(10, 10))
+    camera = Camera.from_file(_write(tmp_path / "calib_cam_to_cam.txt", text), image_size=(10, 10))
     assert camera.image_size == (375, 1242)
     assert float(camera.intrinsics[0, 0]) == 700
 
@@ -116,8 +115,8 @@ def test_kitti_raw_file_prefers_its_own_size(tmp_path):
 def test_kitti_file_of_an_unknown_camera_needs_a_size(tmp_path):
     path = _write(tmp_path / "calib.txt", P2.replace("721.5377", "700"))
     with pytest.raises(ValueError, match=r"image size.*S_rect_02: WIDTH HEIGHT"):
-        read_camera(path)
-    assert read_camera(path, image_size=(370, 1224)).image_size == (370, 1224)
+        Camera.from_file(path)
+    assert Camera.from_file(path, image_size=(370, 1224)).image_size == (370, 1224)
 
 
 @pytest.mark.parametrize(
@@ -148,7 +147,7 @@ def test_bad_entries_are_one_clear_line(tmp_path, change, message):
     fields = {key: value for key, value in {**SHORT, **change}.items() if value is not None}
     path = _write(tmp_path / "c.yaml", yaml.safe_dump(fields))
     with pytest.raises(ValueError, match=message) as error:
-        read_camera(path)
+        Camera.from_file(path)
     assert "\n" not in str(error.value)
     assert str(path) in str(error.value)
 
@@ -182,7 +181,7 @@ def test_bad_entries_are_one_clear_line(tmp_path, change, message):
 )
 def test_malformed_files_are_one_clear_line(tmp_path, name, text, message):
     with pytest.raises(ValueError, match=message) as error:
-        read_camera(_write(tmp_path / name, text))
+        Camera.from_file(_write(tmp_path / name, text))
     assert "\n" not in str(error.value)
 
 
@@ -193,15 +192,15 @@ def test_matrix_cut_short(tmp_path):
         "camera_matrix": {"rows": 3, "cols": 3, "data": [1.0] * 8},
     }
     with pytest.raises(ValueError, match="camera_matrix: expected 9 numbers, got 8"):
-        read_camera(_write(tmp_path / "c.yaml", yaml.safe_dump(fields)))
+        Camera.from_file(_write(tmp_path / "c.yaml", yaml.safe_dump(fields)))
 
 
 def test_missing_file(tmp_path):
     with pytest.raises(ValueError, match="No such file"):
-        read_camera(tmp_path / "none.yaml")
+        Camera.from_file(tmp_path / "none.yaml")
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xd8\xff\xe0")
     with pytest.raises(ValueError, match="not a text file"):
-        read_camera(tmp_path / "binary.yaml")
+        Camera.from_file(tmp_path / "binary.yaml")
 
 
 @pytest.mark.parametrize(
@@ -210,8 +209,8 @@ def test_missing_file(tmp_path):
 )
 def test_write_camera_round_trip(tmp_path, distortion, model):
     camera = Camera.from_parameters(**SHORT, distortion=distortion, model=model)
-    write_camera(tmp_path / "c.yaml", camera)
-    again = read_camera(tmp_path / "c.yaml")
+    camera.to_file(tmp_path / "c.yaml")
+    again = Camera.from_file(tmp_path / "c.yaml")
     padded = distortion + [0.0] * (5 - len(distortion)) if distortion and model == "pinhole" else distortion
     _assert_same(again, Camera.from_parameters(**SHORT, distortion=padded, model=model))
 
@@ -223,7 +222,7 @@ def test_calibration_file_is_read_by_others(tmp_path):
     reasons = torch.tensor([int(MountReason.FEW_BLOCKS | MountReason.SLOW)])
     status, progress = torch.tensor([0]), torch.tensor([40.0])
     write_calibration(path, LENS, MountCalibration(mount, variances.diag()[None], status, progress, reasons))
-    _assert_same(read_camera(path), LENS)
+    _assert_same(Camera.from_file(path), LENS)
     fields = yaml.safe_load(path.read_text())
     assert fields["mount"]["pitch_deg"] == pytest.approx(math.degrees(0.05), abs=1e-12)
     assert fields["mount"]["roll_std_deg"] == pytest.approx(math.degrees(0.03), abs=1e-12)

@@ -21,13 +21,13 @@ import yaml
 from PIL import Image
 
 from lanebev import Camera, JointCalibrator, image_from_road_points
+from lanebev.app.run import RunConfig
 from lanebev.cli import main
 from lanebev.estimation.mount import MountReason
 from lanebev.io.results import CSV_COLUMNS, ExtrinsicsRow, write_extrinsics
 from lanebev.io.state import load_state
 from lanebev.io.video import VideoWriter, open_source
 from lanebev.report.measure import pose
-from lanebev.run import RunConfig
 from tools import pseudo_ground_truth
 
 HEIGHT, WIDTH, FRAMES = 240, 416, 6
@@ -333,7 +333,7 @@ def test_a_second_ctrl_c_waits_until_the_first_has_cleaned_up(data, tmp_path, ca
         finally:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("lanebev.run.calibrate", stop)
+    monkeypatch.setattr("lanebev.app.run.calibrate", stop)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         assert _run(data, out=tmp_path / "out") == 130
@@ -516,7 +516,7 @@ def test_an_interrupted_run_leaves_nothing(data, tmp_path, capsys, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lanebev.run.calibrate", interrupt)
+    monkeypatch.setattr("lanebev.app.run.calibrate", interrupt)
     assert _run(data, out=tmp_path / "out") == 130
     assert capsys.readouterr().err == "lanebev run: interrupted, nothing written\n"
     assert list(tmp_path.iterdir()) == []
@@ -529,7 +529,7 @@ def test_a_run_stopped_by_the_system_leaves_nothing(data, tmp_path, capsys, monk
         time.sleep(10)
 
     before = signal.signal(number, signal.SIG_DFL)  # the tests may run under nohup
-    monkeypatch.setattr("lanebev.run.calibrate", stop)
+    monkeypatch.setattr("lanebev.app.run.calibrate", stop)
     try:
         assert _run(data, out=tmp_path / "out") == 128 + number
         assert capsys.readouterr().err == "lanebev run: interrupted, nothing written\n"

@@ -8,20 +8,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lanebev.estimation.joint import JointCalibrator, follow_lane_change
-from lanebev.estimation.joint_filter import iterate
-from lanebev.estimation.joint_model import (
-    CURVATURE,
-    HEIGHT,
-    KNOT_SPACING,
-    NUM_STEPS,
-    OFFSET,
-    ROLL,
-    boundary_places,
-    boundary_residuals,
-    observe,
-)
-from lanebev.estimation.joint_motion import (
+from lanebev.estimation.joint.calibrator import JointCalibrator, follow_lane_change
+from lanebev.estimation.joint.dynamics import (
     MEANS,
     NUM_COMMON,
     NUM_SEEN,
@@ -33,9 +21,21 @@ from lanebev.estimation.joint_motion import (
     motion,
     spring,
 )
-from lanebev.estimation.joint_road import come_nearer, straight_or_bend, turn_along
-from lanebev.estimation.joint_state import JointConfig, Reason, begin
-from lanebev.estimation.single_frame import FramePrior
+from lanebev.estimation.joint.measurement import (
+    CURVATURE,
+    HEIGHT,
+    KNOT_SPACING,
+    NUM_STEPS,
+    OFFSET,
+    ROLL,
+    boundary_places,
+    boundary_residuals,
+    observe,
+)
+from lanebev.estimation.joint.road import come_nearer, straight_or_bend, turn_along
+from lanebev.estimation.joint.single_frame import FramePrior
+from lanebev.estimation.joint.state import JointConfig, Reason, begin
+from lanebev.estimation.joint.update import iterate
 from lanebev.types import LaneSegments, Status
 from tools.scenarios import CAMERA, FPS, PLACES, WIDTH, moments
 from tools.scenarios import observe as see
@@ -594,7 +594,7 @@ def test_deviations_change_their_numbers_with_the_boundaries(shift, monkeypatch)
     mean = state.mean.clone()
     mean[:, NUM_COMMON:] = torch.arange(1.0, 7.0)
     answer = (torch.full((2,), shift, dtype=DOUBLE), torch.ones(2, dtype=DOUBLE))
-    monkeypatch.setattr("lanebev.estimation.joint.best_shift", lambda *_: answer)
+    monkeypatch.setattr("lanebev.estimation.joint.calibrator.best_shift", lambda *_: answer)
     positions = boundary_places(WIDTH, 6, mean)
     moved, _, _ = follow_lane_change(state._replace(mean=mean), positions, seen, calibrator.config)
     k = torch.arange(6) + int(shift)

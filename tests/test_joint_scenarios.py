@@ -12,8 +12,8 @@ from functools import lru_cache
 import pytest
 import torch
 
-from lanebev.estimation.joint import JointCalibrator
-from lanebev.estimation.two_stage import TwoStageCalibrator
+from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.types import Status
 from tools.bench_calibration import UNITS, WARM_UP, Track, summarise, track
 from tools.reproduce_table1 import VARIANCES, run, table

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lanebev import LaneSegments
-from lanebev.estimation.single_frame import FramePrior, fit_single_frame
+from lanebev.estimation.joint.single_frame import FramePrior, fit_single_frame
 from tests.test_two_stage import K, lanes
 from tools.label_noise import line_offsets, split_half_yaw, stripe_centre
 

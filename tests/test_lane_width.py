@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lanebev import Extrinsics, image_from_road_points
-from lanebev.estimation import lane_width as lw
+from lanebev.estimation.two_stage import lane_width as lw
 from lanebev.geometry.road import segment_rays
 from lanebev.geometry.rotation import cam_from_world
 

@@ -9,15 +9,6 @@ import pytest
 import torch
 
 from lanebev import Camera, LaneSegments
-from lanebev.io.lane_order import boundary_indices
-from lanebev.io.lane_rows import (
-    BoundaryRows,
-    image_rows,
-    paired,
-    rows_from_lines,
-    rows_from_segments,
-    segments_from_rows,
-)
 from lanebev.io.lanes import (
     FrameLines,
     LaneLine,
@@ -26,6 +17,15 @@ from lanebev.io.lanes import (
     read_lanes,
     read_tusimple,
     tusimple_line,
+)
+from lanebev.observation.boundary_order import boundary_indices
+from lanebev.observation.polylines import (
+    BoundaryRows,
+    image_rows,
+    paired,
+    rows_from_lines,
+    rows_from_segments,
+    segments_from_rows,
 )
 
 CAMERA = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720)

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from lanebev.estimation.joint import JointCalibrator
+from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.mount import MountEstimator, MountReason, MountState, MountStatus
 from lanebev.types import Calibration, Extrinsics, Status
 

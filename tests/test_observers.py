@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from lanebev import Camera, LaneSegments, image_from_road_points
-from lanebev.io.lane_rows import image_rows, rows_from_segments, segments_from_rows
+from lanebev.app.observers import fitted_rows
 from lanebev.observation.lines import NETWORK_CORRELATION, LineExtractor
+from lanebev.observation.polylines import image_rows, rows_from_segments, segments_from_rows
 from lanebev.observation.vertices import LineConfig
-from lanebev.observers import fitted_rows
 from lanebev.report.measure import pose
 
 DISTORTION = (-0.2, 0.05, 0.0, 0.0, 0.0)

@@ -18,7 +18,7 @@ from lanebev import (
     Status,
     TwoStageCalibrator,
 )
-from lanebev.geometry.camera import distort_points
+from lanebev.geometry.lens import distort_points
 from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.types import Extrinsics
 from lanebev.weights import save_segmenter

@@ -7,15 +7,21 @@ import math
 import pytest
 import torch
 
-from lanebev.render.alignment import (
+from lanebev.render.raster.lens import (
+    Lens,
+    pixel_rays,
+    sample_distortion,
+    sample_extrinsics,
+    sample_intrinsics,
+)
+from lanebev.render.raster.paint import paint_view
+from lanebev.render.raster.photometry import light_of
+from lanebev.render.scene.alignment import (
     build_alignment,
 )
-from lanebev.render.dice import Dice, row_of
-from lanebev.render.lens import Lens, pixel_rays, sample_distortion, sample_extrinsics, sample_intrinsics
-from lanebev.render.paint import paint_view
-from lanebev.render.photometry import light_of
-from lanebev.render.scene import World, sample_course, sample_world
-from lanebev.render.traffic import place_solids
+from lanebev.render.scene.sampler import Dice, row_of
+from lanebev.render.scene.traffic import place_solids
+from lanebev.render.scene.world import World, sample_course, sample_world
 from lanebev.render.truth import boundary_points, project
 from lanebev.render.views import sample_place
 

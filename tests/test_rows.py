@@ -2,7 +2,7 @@
 
 import torch
 
-from lanebev.rows import masked_median
+from lanebev.batch import masked_median
 
 
 def test_masked_median_is_the_lower_one_of_what_is_finite_and_in_the_mask():

@@ -8,17 +8,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint import JointCalibrator
-from lanebev.estimation.joint_boundaries import boundary_polylines, fit_boundaries
-from lanebev.estimation.joint_model import (
+from lanebev.app.run import calibrate_still
+from lanebev.estimation.joint.boundary_curves import boundary_polylines, fit_boundaries
+from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.measurement import (
     NUM_PARAMS,
     boundary_places,
     boundary_residuals,
     observe,
 )
-from lanebev.estimation.single_frame import FramePrior, fit_single_frame
+from lanebev.estimation.joint.single_frame import FramePrior, fit_single_frame
 from lanebev.geometry.road import image_from_road_points
-from lanebev.run import calibrate_still
 from lanebev.types import Extrinsics, LaneSegments
 
 torch.set_num_threads(1)

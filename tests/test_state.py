@@ -6,10 +6,10 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from lanebev.estimation.joint import JointCalibrator
-from lanebev.estimation.joint_state import JointState
+from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.mount import MountEstimator
-from lanebev.estimation.two_stage import TwoStageCalibrator
+from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.io.state import VERSION, load_state, save_state
 from tools.scenarios import CAMERA, FPS, moments, observe
 

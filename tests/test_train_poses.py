@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lanebev.geometry.camera import distort_points
+from lanebev.geometry.lens import distort_points
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.render import render_views

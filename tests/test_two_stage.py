@@ -14,8 +14,8 @@ from lanebev import (
     TwoStageCalibrator,
     image_from_road_points,
 )
-from lanebev.estimation.direction_stage import incidence
-from lanebev.estimation.two_stage_state import TwoStageConfig
+from lanebev.estimation.two_stage.direction import incidence
+from lanebev.estimation.two_stage.state import TwoStageConfig
 from lanebev.geometry.road import great_circle_normals, segment_rays
 from tools.reproduce_table1 import run, table
 from tools.synthetic import Experiment

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from lanebev.estimation import vanishing
+from lanebev.estimation.two_stage import vanishing
 from lanebev.geometry.road import great_circle_normals, segment_rays
 from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from lanebev.io.overlap import Background, prefetch
+from lanebev.app.concurrency import Background, prefetch
 from lanebev.io.video import VideoWriter, natural_order, open_source, read_image, write_png
 
 

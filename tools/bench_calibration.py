@@ -27,11 +27,11 @@ import torch
 from jsonargparse.typing import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from lanebev.estimation.joint import JointCalibrator
-from lanebev.estimation.joint_model import NUM_PARAMS, boundary_residuals
-from lanebev.estimation.joint_model import observe as make_ready
-from lanebev.estimation.single_frame import normal_equations
-from lanebev.estimation.two_stage import TwoStageCalibrator
+from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.measurement import NUM_PARAMS, boundary_residuals
+from lanebev.estimation.joint.measurement import observe as make_ready
+from lanebev.estimation.joint.single_frame import normal_equations
+from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.types import LaneSegments, Status
 from tools.scenarios import CAMERA, FPS, PLACES, SCENARIOS, WIDTH, Moment, moments, observe
 from tools.textbook_ekf import TextbookEKF

@@ -23,10 +23,10 @@ from rich.table import Table
 
 import lanebev
 from lanebev import BEVGrid, BEVWarp, LaneSegments
+from lanebev.app.run import bird_view, calibrate_still, make_calibrator
 from lanebev.io.video import open_source
 from lanebev.report.measure import pose
 from lanebev.report.overlay import Panel, draw_frame
-from lanebev.run import bird_view, calibrate_still, make_calibrator
 from tools.real_figures import (
     Figure,
     carla_drive,

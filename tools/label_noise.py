@@ -26,11 +26,11 @@ from torch import Tensor
 
 import lanebev
 from lanebev import LaneSegments
-from lanebev.estimation.single_frame import FramePrior, fit_single_frame
+from lanebev.app.observers import NetworkObserver
+from lanebev.app.run import calibrate_still
+from lanebev.estimation.joint.single_frame import FramePrior, fit_single_frame
 from lanebev.io.lanes import read_lanes
 from lanebev.io.video import open_source
-from lanebev.observers import NetworkObserver
-from lanebev.run import calibrate_still
 from tools.real_figures import TUSIMPLE_FOCAL, TUSIMPLE_LANE_WIDTH, tusimple_camera, tusimple_segments
 from train.commands import one_line_errors
 

@@ -23,13 +23,13 @@ from jsonargparse.typing import PositiveFloat
 from torch import Tensor
 
 from lanebev import Camera, Extrinsics, LaneSegments
-from lanebev.estimation.lane_width import boundary_angles, initial_roll_height
-from lanebev.estimation.vanishing import incidence_noise, vanishing_dir_least_squares
+from lanebev.estimation.two_stage.lane_width import boundary_angles, initial_roll_height
+from lanebev.estimation.two_stage.vanishing import incidence_noise, vanishing_dir_least_squares
 from lanebev.geometry.road import great_circle_normals, segment_rays
 from lanebev.geometry.rotation import pitch_yaw_from_vanishing_dir
-from lanebev.io.lane_rows import rows_from_lines, segments_from_rows
 from lanebev.io.lanes import FrameLines, match_frames, read_lanes
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
+from lanebev.observation.polylines import rows_from_lines, segments_from_rows
 from lanebev.types import NUM_BOUNDARIES
 from train.commands import one_line_errors
 

@@ -13,13 +13,13 @@ import numpy as np
 import torch
 
 from lanebev import Camera, Extrinsics, LaneSegments, Status
-from lanebev.io.lane_rows import rows_from_lines, segments_from_rows
+from lanebev.app.observers import NetworkObserver
+from lanebev.app.run import calibrate_still
 from lanebev.io.lanes import match_frames, read_lanes
 from lanebev.io.video import open_source
-from lanebev.observers import NetworkObserver
+from lanebev.observation.polylines import rows_from_lines, segments_from_rows
 from lanebev.report.measure import believed, measure_boundaries, spread
 from lanebev.report.plots import width_deviation
-from lanebev.run import calibrate_still
 
 TUSIMPLE_FOCAL = 1000.0  # px, assumed: the camera is not published
 UDACITY_LANE_WIDTH, CARLA_LANE_WIDTH, TUSIMPLE_LANE_WIDTH = 3.66, 3.5, 3.7

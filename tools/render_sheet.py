@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from jsonargparse.typing import PositiveInt
 
-from lanebev.geometry.camera import distort_points
+from lanebev.geometry.lens import distort_points
 from lanebev.render import RenderedFrame, render_views
 from train.commands import one_line_errors
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint_model import NUM_PARAMS, boundary_places, boundary_residuals, observe
+from lanebev.estimation.joint.measurement import NUM_PARAMS, boundary_places, boundary_residuals, observe
 from lanebev.estimation.kalman import constant_velocity
 from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status
 

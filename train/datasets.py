@@ -11,9 +11,9 @@ import numpy as np
 from jsonargparse.typing import PositiveInt
 from torch.utils.data import DataLoader, IterableDataset
 
-from lanebev.io.lane_order import boundary_indices
 from lanebev.io.lanes import FrameLines, read_culane, read_openlane, read_tusimple
 from lanebev.io.video import read_image
+from lanebev.observation.boundary_order import boundary_indices
 from lanebev.types import NUM_BOUNDARIES
 from train.data import Batch, Seed, ViewBatches, run_position
 from train.labels import LabelledImage, ViewConfig, full_view

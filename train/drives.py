@@ -8,9 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint import JointCalibrator
-from lanebev.io.lane_rows import rows_from_segments, segments_from_rows
+from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.observation.lines import LineExtractor
+from lanebev.observation.polylines import rows_from_segments, segments_from_rows
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.pipeline import LaneBEV
 from lanebev.render import Drive

@@ -14,7 +14,7 @@ import torch
 from jsonargparse.typing import PositiveInt
 from torch import Tensor
 
-from lanebev.geometry.camera import distort_points
+from lanebev.geometry.lens import distort_points
 from lanebev.observation.lines import extract_segments
 from lanebev.observation.vertices import LineConfig
 from lanebev.render import RenderedFrame, boundary_masks, render_views

@@ -20,7 +20,7 @@ import numpy.typing as npt
 import torch
 from jsonargparse.typing import PositiveInt
 
-from lanebev.geometry.camera import denormalise_points, distort_points
+from lanebev.geometry.lens import denormalise_points, distort_points
 from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
 from lanebev.render import RenderedFrame, render_views
 from train.commands import one_line_errors

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
-from lanebev.estimation.single_frame import SingleFrameFit, fit_single_frame
+from lanebev.estimation.joint.single_frame import SingleFrameFit, fit_single_frame
 from lanebev.geometry.precision import cast_floating, widest_dtype
 from lanebev.observation.lines import LineExtractor, undistort_segments
 from train.data import Batch, LiveFrames, PoolFrames, RenderedRoads, Seed, run_position

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
-from lanebev.geometry.camera import Camera
-from lanebev.io.lane_rows import BoundaryRows, rows_from_segments
+from lanebev.camera.model import Camera
 from lanebev.io.lanes import FrameLines
 from lanebev.observation.lines import LineExtractor
+from lanebev.observation.polylines import BoundaryRows, rows_from_segments
 from lanebev.observation.vertices import LineConfig
 from train.datasets import ScoredBatch
 from train.metrics import CULaneCounts, culane_counts, tusimple_score

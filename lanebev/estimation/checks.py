@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lanebev.geometry.camera import check_intrinsics, harmless_camera, usable_cameras
+from lanebev.geometry.lens import check_intrinsics, harmless_camera, usable_cameras
 from lanebev.types import LaneSegments, Status
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction

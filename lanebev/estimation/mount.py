@@ -14,8 +14,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from lanebev.batch import flag, where
 from lanebev.estimation.checks import as_batch, check_state
-from lanebev.rows import flag, where
 from lanebev.types import Calibration, Extrinsics, Status, saved_by_name
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from lanebev.geometry.camera import normalise_points
+from lanebev.geometry.lens import normalise_points
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import Extrinsics

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.geometry.camera import cam_from_image
+from lanebev.geometry.lens import cam_from_image
 from lanebev.geometry.precision import full_precision
 from lanebev.types import Extrinsics
 

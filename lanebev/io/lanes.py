@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.io.numbers import finite_numbers
 from lanebev.io.video import IMAGE_SUFFIXES, natural_order
+from lanebev.numbers import finite_numbers
 from lanebev.types import NUM_BOUNDARIES
 
 _OPENLANE_CURBS = (20, 21)  # left and right kerb: no lane ends there, so no lane width holds

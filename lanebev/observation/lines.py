@@ -5,7 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from lanebev.geometry.camera import harmless_camera, undistort_points, undistorted_sigma, usable_cameras
+from lanebev.geometry.lens import (
+    harmless_camera,
+    undistort_points,
+    undistorted_sigma,
+    usable_cameras,
+)
 from lanebev.geometry.precision import full_precision
 from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.observation.vertices import LineConfig, representative_vertices, scan_vertices, take

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lanebev.rows import masked_median
+from lanebev.batch import masked_median
 
 _FLOOR = 0.01  # probability that background noise has everywhere; counts as nothing
 _PEAK = 2  # half-width of the box whose largest sum is a scan's peak, label px

@@ -7,14 +7,14 @@ import math
 import torch
 from torch import Tensor
 
-from lanebev.geometry.camera import Camera
-from lanebev.render.alignment import Alignment, arc_nodes, build_alignment
-from lanebev.render.dice import Dice
+from lanebev.camera.model import Camera
 from lanebev.render.frame import RenderedFrame
-from lanebev.render.lens import Lens
-from lanebev.render.photometry import CLEAR
-from lanebev.render.scene import Place, World, sample_world
-from lanebev.render.traffic import NUM_VEHICLES
+from lanebev.render.raster.lens import Lens
+from lanebev.render.raster.photometry import CLEAR
+from lanebev.render.scene.alignment import Alignment, arc_nodes, build_alignment
+from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.traffic import NUM_VEHICLES
+from lanebev.render.scene.world import Place, World, sample_world
 from lanebev.render.views import render_place
 from lanebev.types import Extrinsics
 

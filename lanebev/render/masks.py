@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.geometry.camera import distort_points
+from lanebev.geometry.lens import distort_points
 from lanebev.render.frame import RenderedFrame
 
 _PIECE = 3.0  # px, longest piece of a boundary that is drawn at once

@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.geometry.camera import denormalise_points, distort_points
-from lanebev.render.alignment import Alignment, elevation_at, hidden_by_crest, local_from_road
+from lanebev.geometry.lens import denormalise_points, distort_points
 from lanebev.render.frame import RenderedFrame
-from lanebev.render.layout import MAX_BOUNDARIES, Layout, labelled_slots, presence
-from lanebev.render.lens import Lens
-from lanebev.render.scene import Place
-from lanebev.render.solids import Solids
-from lanebev.render.traffic import NUM_ONCOMING, NUM_VEHICLES
+from lanebev.render.raster.lens import Lens
+from lanebev.render.raster.solids import Solids
+from lanebev.render.scene.alignment import Alignment, elevation_at, hidden_by_crest, local_from_road
+from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout, labelled_slots, presence
+from lanebev.render.scene.traffic import NUM_ONCOMING, NUM_VEHICLES
+from lanebev.render.scene.world import Place
 from lanebev.types import NUM_BOUNDARIES
 
 NUM_POINTS = 72

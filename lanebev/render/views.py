@@ -7,15 +7,21 @@ import math
 import torch
 from torch import Tensor
 
-from lanebev.render.alignment import Alignment, build_alignment
-from lanebev.render.dice import Dice, row_of
-from lanebev.render.effects import rain
 from lanebev.render.frame import RenderedFrame
-from lanebev.render.lens import Lens, pixel_rays, sample_distortion, sample_extrinsics, sample_intrinsics
-from lanebev.render.paint import paint_view
-from lanebev.render.photometry import add_bonnet, add_noise, blur, compress, expose, light_of
-from lanebev.render.scene import Place, World, moved_along, sample_course, sample_world
-from lanebev.render.traffic import place_solids
+from lanebev.render.raster.effects import rain
+from lanebev.render.raster.lens import (
+    Lens,
+    pixel_rays,
+    sample_distortion,
+    sample_extrinsics,
+    sample_intrinsics,
+)
+from lanebev.render.raster.paint import paint_view
+from lanebev.render.raster.photometry import add_bonnet, add_noise, blur, compress, expose, light_of
+from lanebev.render.scene.alignment import Alignment, build_alignment
+from lanebev.render.scene.sampler import Dice, row_of
+from lanebev.render.scene.traffic import place_solids
+from lanebev.render.scene.world import Place, World, moved_along, sample_course, sample_world
 from lanebev.render.truth import frame_truth
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from lanebev.geometry.camera import Camera
+from lanebev.camera.model import Camera
 from lanebev.geometry.road import road_from_image_points
 from lanebev.geometry.rotation import horizon_line, vanishing_dir_from_pitch_yaw
 from lanebev.types import Calibration, Extrinsics, LaneSegments, Status

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lanebev.geometry.camera import cam_from_image, check_intrinsics
+from lanebev.geometry.lens import cam_from_image, check_intrinsics
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import Extrinsics

@@ -6,7 +6,7 @@ import torch
 from kornia.geometry.transform import remap
 from torch import Tensor, nn
 
-from lanebev.geometry.camera import (
+from lanebev.geometry.lens import (
     check_intrinsics,
     check_rows,
     distort_points,

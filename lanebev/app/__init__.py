@@ -1,0 +1,1 @@
+"""The main job: settings, the run over a source, its records, the demo."""

@@ -1,0 +1,116 @@
+"""``lanebev demo``: a rendered drive through the main job, with the truth beside what was found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lanebev.app.concurrency import Background
+from lanebev.app.run import RunConfig, run, summary
+from lanebev.io.lanes import LaneLine, tusimple_line
+from lanebev.io.results import ExtrinsicsRow, OutputFolder, extrinsics_row, write_extrinsics
+from lanebev.io.video import VideoWriter
+from lanebev.observation.polylines import BoundaryRows, rows_from_lines
+from lanebev.render import Drive, RenderedFrame
+from lanebev.types import Calibration, Extrinsics, Status
+
+SEED, FRAMES, FPS, IMAGE_SIZE = 10, 200, 20, (360, 640)
+_RENDERED_CRF = 16  # nearly as rendered
+
+ProgressOf = Callable[[str], Callable[[Any, int], Any]]
+
+
+def demo(out: str, progress: ProgressOf | None = None, frames: int = FRAMES) -> str:
+    """Render a drive into ``out/drive``, run on it, and compare with the truth.
+
+    Args:
+        out: output folder; the drive itself goes to ``drive`` in it, see :func:`write_drive`.
+        progress: makes a wrapper of frames from a label, see :func:`lanebev.app.run.run`.
+        frames: length of the drive.
+
+    Returns:
+        what to print.
+
+    Raises:
+        ValueError: the folder cannot be written.
+    """
+    drive = Drive(SEED, IMAGE_SIZE, frames, float(FPS))
+    folder = Path(out) / "drive"
+    with OutputFolder(folder) as inside:
+        truth, lane_width = write_drive(drive, inside.__truediv__, progress and progress("rendering"))
+    config = RunConfig(str(folder / "drive.mp4"), str(folder / "camera.yaml"), out, lane_width)
+    report = run(config, progress and progress("calibrating"), truth)
+    return "\n".join([summary(report, config), against_truth(report.rows, truth)])
+
+
+def write_drive(
+    drive: Drive, path: Callable[[str], Path], progress: Callable[[Any, int], Any] | None = None
+) -> tuple[list[ExtrinsicsRow], float]:
+    """Render a drive to ``drive.mp4``, ``camera.yaml``, ``truth.csv`` and ``lanes.json``.
+
+    Args:
+        drive: what to render.
+        path: gives the path to write a name to.
+        progress: wraps the frame numbers, told how many there are.
+
+    Returns:
+        the truth, a row per frame, and the mean lane width (m).
+    """
+    numbers: Any = range(len(drive))
+    rows, widths, lines = [], [], []
+    drive.camera.to_file(path("camera.yaml"))
+    with VideoWriter(path("drive.mp4"), Fraction(FPS), _RENDERED_CRF) as video, Background() as background:
+        for number in progress(iter(numbers), len(drive)) if progress else numbers:
+            frame = drive.frame(number)
+            picture = (255 * frame.image[0].permute(1, 2, 0)).round().byte().contiguous().numpy()
+            background.submit(partial(video.write, picture))
+            rows.append(_truth_row(number, float(drive.times[number]), frame))
+            widths.append(float(frame.lane_width.mean()))
+            lines.append(tusimple_line(f"drive.mp4/{number:06d}", *true_lanes(drive, frame)))
+    write_extrinsics(path("truth.csv"), rows)
+    path("lanes.json").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return rows, float(np.mean(widths))
+
+
+def true_lanes(drive: Drive, frame: RenderedFrame) -> BoundaryRows:
+    """What a perfect detector would see of a rendered frame, on image rows."""
+    lines = []
+    for index, (points, visible) in enumerate(zip(frame.boundaries[0], frame.visible[0], strict=True)):
+        as_taken = drive.camera.distort_points(points).double()
+        as_taken[visible < 0.5] = torch.nan
+        as_taken[:, 1] = points[:, 1]  # rows of the gaps
+        if (visible >= 0.5).any():
+            lines.append(LaneLine(as_taken.numpy(), index))
+    return rows_from_lines(lines, drive.camera)
+
+
+def against_truth(found: Any, truth: list[ExtrinsicsRow]) -> str:
+    """Root mean square errors of the tracked frames, in a line."""
+    tracked = [(row, true) for row, true in zip(found, truth, strict=True) if row.status == "TRACKING"]
+    if not tracked:
+        return "RMSE against the truth: no frame was tracked"
+    error = np.array([pose_of(row) - pose_of(true) for row, true in tracked])
+    pitch, yaw, roll, height = np.sqrt((error**2).mean(0))
+    return (
+        f"RMSE against the truth: pitch {pitch:.3f} deg  yaw {yaw:.3f} deg  roll {roll:.3f} deg  "
+        f"height {100 * height:.1f} cm"
+    )
+
+
+def pose_of(row: ExtrinsicsRow) -> NDArray[np.float64]:
+    """(4,) deg, deg, deg, m."""
+    return np.array([row.pitch_deg, row.yaw_deg, row.roll_deg, row.height_m])
+
+
+def _truth_row(number: int, time: float, frame: RenderedFrame) -> ExtrinsicsRow:
+    pose: Extrinsics = frame.extrinsics
+    status = torch.tensor([int(Status.TRACKING)])
+    calibration = Calibration(pose, torch.zeros(1, 4, 4), status, torch.zeros(1, 0))
+    return extrinsics_row(number, time, calibration, (frame.visible > 0.5).any(-1).float(), "")

@@ -1,0 +1,5 @@
+"""A camera and its files."""
+
+from lanebev.camera.model import Camera
+
+__all__ = ["Camera"]

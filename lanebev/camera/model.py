@@ -1,0 +1,163 @@
+"""One camera's lens, image size and file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from numbers import Integral
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lanebev.camera.files import CameraParameters, read_camera, write_camera
+from lanebev.geometry.lens import (
+    check_lens,
+    check_points,
+    denormalise_points,
+    distort_points,
+    max_undistorted_radius,
+    normalise_points,
+    undistort_points,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One camera's lens.
+
+    Attributes:
+        intrinsics: (3, 3) px.
+        distortion: (D,), OpenCV's order; empty for an ideal lens.
+        model: "pinhole" (Brown-Conrady, D = 0, 4, 5, 8, 12) or "fisheye" (Kannala-Brandt, D = 4).
+        image_size: (height, width) px.
+    """
+
+    intrinsics: Tensor
+    distortion: Tensor
+    model: str
+    image_size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        if self.intrinsics.shape != (3, 3):
+            raise ValueError(f"intrinsics: expected (3, 3), got {tuple(self.intrinsics.shape)}")
+        if self.distortion.ndim != 1:
+            raise ValueError(f"distortion: expected (D,), got {tuple(self.distortion.shape)}")
+        check_lens(self.distortion, self.model)
+        sides: tuple[Any, ...] = tuple(self.image_size)
+        if len(sides) != 2 or not all(isinstance(side, Integral) and int(side) > 0 for side in sides):
+            raise ValueError(f"image_size: expected whole positive (height, width), got {self.image_size}")
+        object.__setattr__(self, "image_size", (int(sides[0]), int(sides[1])))
+        for name in ("intrinsics", "distortion"):
+            value = getattr(self, name)
+            if not bool(value.isfinite().all()):
+                raise ValueError(f"{name}: expected finite numbers, got {value.flatten().tolist()}")
+        fx, fy = float(self.intrinsics[0, 0]), float(self.intrinsics[1, 1])
+        if not (fx > 0 and fy > 0):
+            raise ValueError(f"intrinsics: expected positive focal lengths, got fx {fx:g}, fy {fy:g}")
+
+    @classmethod
+    def from_parameters(
+        cls,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        width: int,
+        height: int,
+        distortion: tuple[float, ...] | list[float] = (),
+        model: str = "pinhole",
+        dtype: torch.dtype = torch.float64,
+    ) -> Camera:
+        """From plain numbers, in pixels."""
+        intrinsics = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=dtype)
+        return cls(intrinsics, torch.tensor(list(distortion), dtype=dtype), model, (height, width))
+
+    @classmethod
+    def from_file(cls, path: str | Path, image_size: tuple[int, int] | None = None) -> Camera:
+        """Read OpenCV FileStorage or ROS ``camera_info`` YAML, KITTI ``calib.txt`` or our short YAML.
+
+        Args:
+            path: the file.
+            image_size: (height, width) px of the images, for a KITTI file without a size. Not used otherwise.
+
+        Raises:
+            ValueError: the file is missing, cut, or holds an absurd value; one line says which.
+        """
+        read = read_camera(path, image_size)
+        return cls(
+            torch.tensor(read.matrix, dtype=torch.float64).reshape(3, 3),
+            torch.tensor(read.distortion, dtype=torch.float64),
+            read.model,
+            read.image_size,
+        )
+
+    def parameters(self) -> CameraParameters:
+        """Return the camera as plain numbers."""
+        matrix, distortion = self.intrinsics.flatten().tolist(), self.distortion.tolist()
+        return CameraParameters(matrix, distortion, self.model, self.image_size)
+
+    def to_file(self, path: str | Path, name: str = "camera") -> None:
+        """Write the camera as a ROS ``camera_info`` YAML, which :meth:`from_file` reads as well."""
+        write_camera(path, self.parameters(), name)
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
+        """The same camera on another device or in another precision."""
+        return replace(
+            self,
+            intrinsics=self.intrinsics.to(device=device, dtype=dtype),
+            distortion=self.distortion.to(device=device, dtype=dtype),
+        )
+
+    def scaled(self, image_size: tuple[int, int]) -> Camera:
+        """The camera of the image resized to (height, width); pixel centres at integers on both sides."""
+        sy, sx = image_size[0] / self.image_size[0], image_size[1] / self.image_size[1]
+        resize = self.intrinsics.new_tensor(
+            [[sx, 0.0, 0.5 * (sx - 1)], [0.0, sy, 0.5 * (sy - 1)], [0.0, 0.0, 1.0]]
+        )
+        return replace(self, intrinsics=resize @ self.intrinsics, image_size=(image_size[0], image_size[1]))
+
+    def cropped(self, top: int, left: int, height: int, width: int) -> Camera:
+        """The camera of ``image[top:top+height, left:left+width]``; may reach beyond the image."""
+        shift = self.intrinsics.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+        return replace(self, intrinsics=self.intrinsics - shift, image_size=(height, width))
+
+    def distort_points(self, points: Tensor) -> Tensor:
+        """(N, 2) px undistorted to (N, 2) px as taken."""
+        return distort_points(points[None], self.intrinsics[None], self.distortion[None], self.model)[0]
+
+    def undistort_points(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 2) px as taken to (N, 2) px undistorted and (N,) bool, false where no such point exists."""
+        undistorted = undistort_points(
+            points[None], self.intrinsics[None], self.distortion[None], self.model
+        )[0]
+        error = (self.distort_points(undistorted) - points).norm(dim=-1)
+        return undistorted, error < 0.05  # NaN and Inf compare false
+
+    def rays(self, points: Tensor) -> Tensor:
+        """(N, 2) px as taken to (N, 3) camera rays with z = 1."""
+        plane = normalise_points(self.undistort_points(points)[0], self.intrinsics)
+        return torch.cat([plane, torch.ones_like(plane[..., :1])], dim=-1)
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Camera-frame points to pixels as taken.
+
+        Args:
+            points: (N, 3) m.
+
+        Returns:
+            (N, 2) px, and (N,) bool: in front of the camera, inside the image, and where the lens does not
+            fold over.
+        """
+        check_points(points, 3)
+        front = points[..., 2] > 1e-6
+        depth = torch.where(front, points[..., 2], 1.0)
+        plane = points[..., :2] / depth.unsqueeze(-1)
+        pixels = self.distort_points(denormalise_points(plane, self.intrinsics))
+        height, width = self.image_size
+        x, y = pixels.unbind(-1)
+        inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
+        if not self.distortion.shape[-1]:
+            return pixels, front & inside
+        reach = max_undistorted_radius(self.distortion[None], self.model)
+        return pixels, front & inside & (plane.norm(dim=-1) < reach)

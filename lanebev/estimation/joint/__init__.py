@@ -1,0 +1,1 @@
+"""The default calibrator: one filter over pose, lane position, curvature and lane widths."""

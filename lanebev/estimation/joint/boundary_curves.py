@@ -1,0 +1,157 @@
+"""The boundaries of a frame as curves: each with its own offset and heading, on a pose known from all."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.batch import masked_median
+from lanebev.estimation.joint.measurement import FARTHEST, observe
+from lanebev.geometry.road import image_from_road_points
+from lanebev.geometry.rotation import road_from_cam
+from lanebev.types import NUM_BOUNDARIES, Extrinsics, LaneSegments
+
+_HEADING_STD = 0.02  # rad; real boundaries differ by about a degree in direction
+_TOLERANCE = 0.008  # of the focal length: distance at which a segment's say has fallen to a quarter
+_REWEIGHTINGS = 5
+
+
+class Boundaries(NamedTuple):
+    """Curves X(Z) = offset + heading Z + c0 Z²/2 + c1 Z³/6 on the road, one a boundary.
+
+    Attributes:
+        offset: (B, L) m, X at Z = 0, right of the camera.
+        heading: (B, L) rad (tangent), own deviation from the common direction.
+        extent: (B, L, 2) m, nearest and farthest Z of believed end points; (0, 0) where not present.
+        present: (B, L) bool, enough believed segments.
+        curvature: (B, 2), c0 and c1, common to all.
+    """
+
+    offset: Tensor
+    heading: Tensor
+    extent: Tensor
+    present: Tensor
+    curvature: Tensor
+
+
+def fit_boundaries(
+    segments: LaneSegments,
+    intrinsics: Tensor,
+    extrinsics: Extrinsics,
+    curvature: Tensor | None = None,
+    num_boundaries: int = NUM_BOUNDARIES,
+    least_support: float = 2.0,
+) -> Boundaries:
+    """Every boundary's own offset and heading, by robust least squares on perpendicular pixel distances.
+
+    Real lanes are neither equally wide nor parallel: nothing ties the boundaries here but pose and
+    curvature. The start is the median offset of a boundary's end points.
+
+    Args:
+        segments: (B, N) line segments.
+        intrinsics: (B, 3, 3).
+        extrinsics: each (B,), of this frame.
+        curvature: (B, 2), c0 and c1, or None for a straight road.
+        num_boundaries: L.
+        least_support: sum of the believed segments' weights from which a boundary is present.
+
+    Returns:
+        The curves.
+
+    Raises:
+        ValueError: shapes that do not fit.
+    """
+    seen = observe(segments, intrinsics, num_boundaries)
+    curvature = intrinsics.new_zeros(intrinsics.shape[0], 2) if curvature is None else curvature
+    rotation = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)
+    x, down, ahead = (rotation @ seen.rays).unbind(1)  # each (B, 2N)
+    height = extrinsics.height.unsqueeze(-1)
+    on_road = (down * FARTHEST > height * ahead) & (ahead > 1e-3)
+    down = torch.where(on_road, down, 1.0)
+    z = height * ahead / down
+    lateral = height * x / down - _bend(z, curvature)  # (B, 2N) m
+    focal = seen.intrinsics[:, :1, 0]
+    boundary = seen.boundary.repeat_interleave(2, dim=1)
+    member = torch.nn.functional.one_hot(boundary, num_boundaries).mT.to(z.dtype)  # (B, L, 2N)
+    weight = seen.weight.repeat_interleave(2, dim=1) * on_road
+    member = member * weight.unsqueeze(1)
+    sigma = seen.sigma.repeat_interleave(2, dim=1)
+
+    offset = masked_median(lateral.unsqueeze(1).expand_as(member), member > 0)  # (B, L)
+    heading = torch.zeros_like(offset)
+    for _ in range(_REWEIGHTINGS):
+        residual = lateral.unsqueeze(1) - offset.unsqueeze(-1) - heading.unsqueeze(-1) * z.unsqueeze(1)
+        per_metre = _pixels_per_metre(offset, down, height, focal)  # (B, L, 2N)
+        far_off = residual * per_metre / (_TOLERANCE * focal.unsqueeze(-1))
+        trust = (1 + far_off.square()).square().reciprocal()
+        precision = member * trust * (per_metre / sigma.unsqueeze(1)).square()  # 1/m²
+        offset, heading = _fit_line(z, lateral, precision)
+    present = 0.5 * (member * trust).sum(-1) >= least_support
+    reached = (member > 0) & (trust > 0.25)
+    near = z.unsqueeze(1).masked_fill(~reached, torch.inf).amin(-1)
+    far = z.unsqueeze(1).masked_fill(~reached, -torch.inf).amax(-1)
+    extent = torch.where(present.unsqueeze(-1), torch.stack([near, far], dim=-1), 0.0)
+    return Boundaries(
+        offset=offset,
+        heading=heading,
+        extent=extent,
+        present=present,
+        curvature=curvature,
+    )
+
+
+def boundary_polylines(
+    boundaries: Boundaries,
+    intrinsics: Tensor,
+    extrinsics: Extrinsics,
+    num_points: int = 64,
+) -> tuple[Tensor, Tensor]:
+    """Where boundaries were seen, as polylines in the undistorted image, evenly spaced in rows, near to far.
+
+    Args:
+        boundaries: from :func:`fit_boundaries`.
+        intrinsics: (B, 3, 3).
+        extrinsics: each (B,).
+        num_points: P.
+
+    Returns:
+        (B, L, P, 2) px, and (B, L, P) bool: boundary present and point before the camera. Points may lie
+        outside the image, whose size is not known here.
+    """
+    first, last = boundaries.extent.unbind(-1)  # (B, L)
+    first = torch.where(boundaries.present, first, 1.0).clamp(min=0.5)
+    last = torch.maximum(torch.where(boundaries.present, last, 1.0), first)
+    steps = torch.linspace(0, 1, num_points, dtype=first.dtype, device=first.device)
+    inverse = first.reciprocal().unsqueeze(-1) * (1 - steps) + last.reciprocal().unsqueeze(-1) * steps
+    z = inverse.reciprocal()  # (B, L, P)
+    x = boundaries.offset.unsqueeze(-1) + boundaries.heading.unsqueeze(-1) * z
+    x = x + _bend(z.flatten(1), boundaries.curvature).view_as(z)
+    pixels, ahead = image_from_road_points(torch.stack([x, z], dim=-1).flatten(1, 2), intrinsics, extrinsics)
+    return pixels.view(*z.shape, 2), ahead.view_as(z) & boundaries.present.unsqueeze(-1)
+
+
+def _bend(z: Tensor, curvature: Tensor) -> Tensor:
+    """c0 Z²/2 + c1 Z³/6, (B, M) m."""
+    c0, c1 = curvature.unsqueeze(-1).unbind(1)
+    return z * z * (c0 / 2 + c1 * z / 6)
+
+
+def _pixels_per_metre(offset: Tensor, down: Tensor, height: Tensor, focal: Tensor) -> Tensor:
+    """(B, L, 2N): perpendicular pixels in the image per lateral metre on the road."""
+    steepness = (1 + (offset / height).square()).rsqrt()
+    return (down * focal / height).unsqueeze(1) * steepness.unsqueeze(-1)
+
+
+def _fit_line(z: Tensor, lateral: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted line through (z, lateral), (B, M) each, for weights (B, L, M); heading held near zero."""
+    total = precision.sum(-1)
+    some = total > 0
+    safe = torch.where(some, total, 1.0)
+    mean_z = (precision * z.unsqueeze(1)).sum(-1) / safe
+    mean_x = (precision * lateral.unsqueeze(1)).sum(-1) / safe
+    centred = z.unsqueeze(1) - mean_z.unsqueeze(-1)
+    spread = (precision * centred * centred).sum(-1) + _HEADING_STD**-2
+    heading = (precision * centred * (lateral.unsqueeze(1) - mean_x.unsqueeze(-1))).sum(-1) / spread
+    return mean_x - heading * mean_z, heading

@@ -1,0 +1,380 @@
+"""Pose, lateral offset and curvature from one frame: all boundaries fitted jointly, from anywhere.
+
+A nonlinear fit from one start gets stuck. So a grid over the horizon (pitch and roll) is tried with a
+robust fit inside that is linear, u = a_k V + u0 + b / V with V below the horizon, and the best pitch for
+every roll starts a robust Gauss-Newton on perpendicular pixel distances whose noise scale is annealed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.estimation.checks import as_lane_width, check_segments, usable
+from lanebev.estimation.joint.measurement import (
+    HEIGHT,
+    NUM_PARAMS,
+    OFFSET,
+    Observations,
+    boundary_places,
+    boundary_residuals,
+    observations,
+)
+from lanebev.estimation.joint.robust import inlier_weights, log_likelihood, lowered, noise_scale
+from lanebev.geometry.precision import full_precision
+from lanebev.geometry.rotation import angles_from_matrix, road_from_cam
+from lanebev.types import NUM_BOUNDARIES, Extrinsics, LaneSegments
+
+_ANNEALING = (0.1, 0.06, 0.035, 0.02, 0.02)  # scales of the linear fits, of the focal length
+_OBSERVED = 0.2  # a parameter is observed if its sigma fell below this part of the prior's
+
+
+@dataclass(frozen=True)
+class FramePrior:
+    """What is known before looking, as Student's t distributions, and where the search starts.
+
+    Heavy tails: a camera rolled by 20 deg is found, and not pulled back. They decide only what the
+    observations leave open (roll on one lane, all but two numbers on one boundary).
+
+    Attributes:
+        pitch, yaw, roll: means, rad.
+        height: mean, m.
+        pitch_std, yaw_std, roll_std: rad.
+        height_std: m.
+        offset_std: m, of the ego lane's middle from the camera.
+        curvature_std: 1/m.
+        curvature_rate_std: 1/m².
+        pitch_range, roll_range: half widths of the search about the means, rad.
+        pitch_steps, roll_steps: hypotheses across each; 1 is the mean alone.
+    """
+
+    pitch: float = 0.0
+    yaw: float = 0.0
+    roll: float = 0.0
+    height: float = 1.5
+    pitch_std: float = 0.12
+    yaw_std: float = 0.15
+    roll_std: float = 0.05
+    height_std: float = 0.5
+    offset_std: float = 1.5
+    curvature_std: float = 2e-3
+    curvature_rate_std: float = 2e-5
+    pitch_range: float = 0.24
+    roll_range: float = 0.4
+    pitch_steps: int = 13
+    roll_steps: int = 9
+
+    def __post_init__(self) -> None:
+        for part in fields(self):
+            value = getattr(self, part.name)
+            if not math.isfinite(value):
+                raise ValueError(f"{part.name}: expected a finite number, got {value}")
+            if part.name.endswith("_std") and value <= 0:
+                raise ValueError(f"{part.name}: expected more than 0, got {value}")
+            if part.name.endswith("_steps") and value < 1:
+                raise ValueError(f"{part.name}: expected at least 1, got {value}")
+        if self.height <= 0:
+            raise ValueError(f"height: expected more than 0 m, got {self.height}")
+
+    def mean(self, like: Tensor) -> Tensor:
+        """(7,) in the order of ``joint_model``."""
+        return like.new_tensor([self.pitch, self.yaw, self.roll, self.height, 0.0, 0.0, 0.0])
+
+    def std(self, like: Tensor) -> Tensor:
+        """(7,) in the order of ``joint_model``."""
+        angles = (self.pitch_std, self.yaw_std, self.roll_std)
+        shape = (self.curvature_std, self.curvature_rate_std)
+        return like.new_tensor([*angles, self.height_std, self.offset_std, *shape])
+
+
+class SingleFrameFit(NamedTuple):
+    """One frame's fit. Parameters: pitch, yaw, roll, height, offset, c0 (1/m), c1 (1/m²).
+
+    Attributes:
+        extrinsics: each (B,).
+        offset: (B,) m, X of the ego lane's middle, positive right of the camera.
+        curvature: (B, 2), c0 (1/m, positive to the right) and c1 (1/m²) of X(Z) = x_k + c0 Z²/2 + c1 Z³/6.
+        covariance: (B, 7, 7) of all parameters, prior included, noise scaled to the residuals.
+        inliers: (B, N) in [0, 1]; 0 for padding.
+        scale: (B,) >= 1, factor by which residuals exceed the given sigmas.
+        observed: (B, 4) bool, of pitch, yaw, roll, height: said by the frame rather than by the prior.
+        valid: (B,) bool: enough believed segments, pitch and yaw observed.
+    """
+
+    extrinsics: Extrinsics
+    offset: Tensor
+    curvature: Tensor
+    covariance: Tensor
+    inliers: Tensor
+    scale: Tensor
+    observed: Tensor
+    valid: Tensor
+
+    def params(self) -> Tensor:
+        """(B, 7) vector of parameters."""
+        return torch.cat([self.extrinsics.stack(), self.offset.unsqueeze(-1), self.curvature], dim=-1)
+
+
+@full_precision
+def fit_single_frame(
+    segments: LaneSegments,
+    intrinsics: Tensor,
+    lane_width: float | Tensor = 3.7,
+    prior: FramePrior | None = None,
+    num_boundaries: int = NUM_BOUNDARIES,
+    start_segments: int = 96,
+    iterations: int = 8,
+) -> SingleFrameFit:
+    """Robust maximum a posteriori fit of one frame, each row of the batch on its own.
+
+    Survives 50 % gross outliers with 5 % wrong boundary indices. What the boundaries in sight do not
+    determine stays at the prior with the prior's covariance. Never raises on contents: a row without
+    usable data has ``valid`` false and the prior's numbers.
+
+    Args:
+        segments: (B, N) line segments.
+        intrinsics: (B, 3, 3).
+        lane_width: float, (B,) or (B, L-1) m.
+        prior: means, sigmas and search range; default :class:`FramePrior`.
+        num_boundaries: L, the ego lane being between L/2 - 1 and L/2.
+        start_segments: segments used to choose the start.
+        iterations: Gauss-Newton steps of every start.
+
+    Returns:
+        The fit. Gradients flow through the last two Gauss-Newton steps, which are all of it at the optimum.
+
+    Raises:
+        ValueError: shapes that do not fit.
+    """
+    check_segments(segments, intrinsics)
+    widths = as_lane_width(lane_width, intrinsics, num_boundaries)
+    segments, intrinsics, widths = usable(segments, intrinsics, widths, num_boundaries)
+    seen = observations(segments, intrinsics)
+    places = boundary_places(widths, num_boundaries, intrinsics).gather(1, seen.boundary)  # (B, N)
+    return fit_observations(seen, places, prior or FramePrior(), start_segments, iterations)
+
+
+def fit_observations(
+    seen: Observations, places: Tensor, prior: FramePrior, start_segments: int = 96, iterations: int = 8
+) -> SingleFrameFit:
+    """As :func:`fit_single_frame`, of segments made ready and places (B, N) of their boundaries, m."""
+    with torch.no_grad():
+        fewer, fewer_places = _subset(seen, places, start_segments)
+        starts = _linear_starts(fewer, fewer_places, prior)  # (B, S, 7)
+        params, scale = _best_start(starts, fewer, fewer_places, prior, iterations)
+        params, scale, _ = refine(params, scale, places, seen, prior, iterations=3)
+    params, scale, information = refine(params, scale, places, seen, prior, iterations=2)
+
+    residuals = boundary_residuals(params, places, seen)
+    trust = inlier_weights(residuals.distance, residuals.valid, seen.sigma, scale, seen.intrinsics[:, 0, 0])
+    covariance = _inverse(information)
+    std = covariance.diagonal(dim1=-2, dim2=-1)[:, :OFFSET].sqrt()
+    observed = std < _OBSERVED * prior.std(params)[:OFFSET]
+    support = (trust * seen.weight).sum(-1)
+    valid = (support >= 2.5) & observed[:, :2].all(-1) & params.isfinite().all(-1)
+    return SingleFrameFit(
+        extrinsics=Extrinsics.unstack(params[:, :OFFSET]),
+        offset=params[:, OFFSET],
+        curvature=params[:, OFFSET + 1 :],
+        covariance=covariance,
+        inliers=torch.where(seen.weight > 0, trust, 0.0),
+        scale=scale,
+        observed=observed,
+        valid=valid,
+    )
+
+
+def refine(
+    params: Tensor,
+    scale: Tensor,
+    places: Tensor,
+    seen: Observations,
+    prior: FramePrior,
+    iterations: int,
+    blur: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Reweighted Gauss-Newton on perpendicular distances, the noise scale falling by half at most each step.
+
+    Args:
+        params: (B, 7) start.
+        scale: (B,) noise scale to start with.
+        places: (B, N) m, see :func:`boundary_residuals`.
+        seen: what was observed.
+        prior: prior.
+        iterations: number of steps.
+        blur: (B,) px or None, of a start that is not good yet: added to every segment's noise, sharp or
+            vague, and halved each step.
+
+    Returns:
+        params (B, 7), scale (B,), and the information matrix (B, 7, 7) at the last step.
+    """
+    mean, precision = prior.mean(params), prior.std(params).square().reciprocal()
+    largest_step = prior.std(params)
+    focal = seen.intrinsics[:, 0, 0]
+    blur = torch.zeros_like(focal) if blur is None else blur
+    information = precision.diag().expand(*params.shape, NUM_PARAMS)  # overwritten unless iterations == 0
+    for _ in range(iterations):
+        residuals = boundary_residuals(params, places, seen)
+        sigma = (seen.sigma.square() + (blur / scale).square().unsqueeze(-1)).sqrt()
+        trust = inlier_weights(residuals.distance, residuals.valid, sigma, scale, focal) * seen.weight
+        fitted = noise_scale(residuals.distance, seen.sigma, trust)
+        scale = lowered(scale, fitted)
+        by_noise = trust / ((seen.sigma * scale.unsqueeze(-1)).square() + blur.square().unsqueeze(-1))
+        blur = 0.5 * blur
+        information, gradient = normal_equations(
+            residuals.jacobian, residuals.distance, by_noise * residuals.valid
+        )
+        held = precision * _student_weight((params - mean).square() * precision)
+        information = information + held.diag_embed()
+        gradient = gradient + held * (params - mean)
+        step = _solve(information, gradient)
+        params = params - torch.maximum(torch.minimum(step, largest_step), -largest_step)
+        height = params[:, HEIGHT : HEIGHT + 1].clamp(min=0.2)
+        params = torch.cat([params[:, :HEIGHT], height, params[:, HEIGHT + 1 :]], dim=-1)
+    return params, scale, information
+
+
+def normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Jᵀ W J (B, P, P) and Jᵀ W r (B, P), from (B, P, 2N), (B, N, 2) and a weight (B, N) per segment."""
+    weighted = jacobian * weight.repeat_interleave(2, dim=1).unsqueeze(1)
+    return weighted @ jacobian.mT, (weighted @ distance.flatten(1).unsqueeze(-1)).squeeze(-1)
+
+
+def _student_weight(squared: Tensor) -> Tensor:
+    """Weight of a prior at a squared normalised distance, for Student's t with 4 degrees of freedom.
+
+    One at its mean, not 5/4: near it the prior counts as the Gaussian that it is given as.
+    """
+    return (1 + squared / 4).reciprocal()
+
+
+def _student_log(squared: Tensor) -> Tensor:
+    """Its log density, (…, P) to (…), the constant left out."""
+    return -2.5 * (squared / 4).log1p().sum(-1)
+
+
+def _subset(seen: Observations, places: Tensor, count: int) -> tuple[Observations, Tensor]:
+    """At most ``count`` segments, those with weight first, spread evenly over the list."""
+    total = seen.boundary.shape[1]
+    if total <= count:
+        return seen, places
+    order = torch.arange(total, dtype=places.dtype, device=places.device) * 0.6180339887498949 % 1.0
+    index = ((seen.weight > 0).to(places.dtype) + order).topk(count, dim=-1).indices  # (B, count)
+    ends = torch.stack([2 * index, 2 * index + 1], dim=-1).flatten(1)  # (B, 2 count)
+    picked = seen._replace(
+        rays=seen.rays.gather(2, ends.unsqueeze(1).expand(-1, 3, -1)),
+        boundary=seen.boundary.gather(1, index),
+        weight=seen.weight.gather(1, index),
+        sigma=seen.sigma.gather(1, index),
+    )
+    return picked, places.gather(1, index)
+
+
+def _spread(steps: int, like: Tensor) -> Tensor:
+    """(steps,) evenly from -1 to 1; 0 where there is but one."""
+    end = 1.0 if steps > 1 else 0.0
+    return torch.linspace(-end, end, steps, dtype=like.dtype, device=like.device)
+
+
+def _linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Tensor:
+    """Best pitch for every roll of the grid, by robust linear fits.
+
+    With the road's axes right, down, forward for yaw 0, ray·right = a V + g x_k V + t F + b F² / (2 V),
+    V = ray·down, F = ray·forward: linear in a = offset / h', g = 1 / h', t = tan(heading), b = c0 h.
+
+    Returns:
+        (B, S, 7), S the number of rolls.
+    """
+    like = places
+    pitch = prior.pitch + prior.pitch_range * _spread(prior.pitch_steps, like)
+    roll = prior.roll + prior.roll_range * _spread(prior.roll_steps, like)
+    pitch, roll = (grid.flatten() for grid in torch.meshgrid(pitch, roll, indexing="ij"))  # (H,)
+    axes = road_from_cam(pitch, torch.zeros_like(pitch), roll)  # (H, 3, 3) rows right, down, forward
+    right, below, ahead = torch.einsum("hij,bjm->ibhm", axes, seen.rays).unbind(0)  # each (B, H, M)
+    valid = (below > 0.005) & (ahead > 0.1)
+    below = torch.where(valid, below, 1.0)
+    bend = ahead * ahead / (2 * below)
+    place = places.repeat_interleave(2, dim=1).unsqueeze(1)  # (B, 1, M)
+    weight = seen.weight.repeat_interleave(2, dim=1).unsqueeze(1) * valid
+    regressors = torch.stack([below, place * below, ahead, bend], dim=-1)  # (B, H, M, 4)
+
+    mean = like.new_tensor([0.0, 1.0 / prior.height, 0.0, 0.0])
+    slack = prior.height_std / prior.height / prior.height
+    lateral, bent = prior.offset_std / prior.height, prior.curvature_std * prior.height
+    std = like.new_tensor([lateral, slack, prior.yaw_std, bent])
+    precision = (std / 0.02).square().reciprocal()
+    solution = mean.expand(*right.shape[:2], 4)
+    for scale in _ANNEALING:
+        residual = right - (regressors @ solution.unsqueeze(-1)).squeeze(-1)
+        across = solution[..., :1] + solution[..., 1:2] * place  # (B, H, M) slope of the boundary
+        residual = residual * (1 + across * across).rsqrt()  # rad, perpendicular
+        trust = weight * (1 + (residual / scale).square()).square().reciprocal()
+        weighted = (regressors * (trust / (1 + across * across)).unsqueeze(-1)).mT  # (B, H, 4, M)
+        information = weighted @ regressors + precision.diag()
+        gradient = (weighted @ right.unsqueeze(-1)).squeeze(-1) + precision * mean
+        solution = _solve(information, gradient)
+    squared = (residual / _ANNEALING[-1]).square()
+    cost = 1 - weight + weight * squared / (1 + squared)  # 1 for what is not explained at all
+    away = torch.stack([(pitch - prior.pitch) / prior.pitch_std, (roll - prior.roll) / prior.roll_std], -1)
+    total = cost.sum(-1) - _student_log(((solution - mean) / std).square()) - _student_log(away.square())
+
+    best = total.view(-1, prior.pitch_steps, prior.roll_steps).argmin(1)  # (B, S)
+    hypothesis = best * prior.roll_steps + torch.arange(prior.roll_steps, device=like.device)
+    chosen = solution.gather(1, hypothesis.unsqueeze(-1).expand(-1, -1, 4))  # (B, S, 4)
+    return _params_from_linear(chosen, axes[hypothesis])
+
+
+def _params_from_linear(solution: Tensor, axes: Tensor) -> Tensor:
+    """(…, 7) parameters from the linear solution (…, 4) and the axes (…, 3, 3) it was found in."""
+    across, per_metre, tangent, bend = solution.unbind(-1)
+    cos = (1 + tangent * tangent).rsqrt().unsqueeze(-1)
+    sin = tangent.unsqueeze(-1) * cos
+    right, below, ahead = axes.unbind(-2)
+    turned = torch.stack([cos * right - sin * ahead, below, cos * ahead + sin * right], dim=-2)
+    scale = per_metre.clamp(min=0.2).reciprocal()
+    height = (scale * cos.squeeze(-1)).clamp(0.4, 4.0)
+    angles = torch.stack(angles_from_matrix(turned), dim=-1)
+    rest = torch.stack([height, across * scale, bend / height, torch.zeros_like(height)], dim=-1)
+    return torch.cat([angles, rest], dim=-1)
+
+
+def _best_start(
+    starts: Tensor, seen: Observations, places: Tensor, prior: FramePrior, iterations: int
+) -> tuple[Tensor, Tensor]:
+    """Refine (B, S, 7) starts and keep the likeliest: (B, 7), and its noise scale (B,)."""
+    batch, count, _ = starts.shape
+    many = Observations(*(tensor.repeat_interleave(count, dim=0) for tensor in seen))
+    many_places = places.repeat_interleave(count, dim=0)
+    focal = many.intrinsics[:, 0, 0]
+    sigma = (many.sigma * many.weight).sum(-1) / many.weight.sum(-1).clamp(min=1e-3)
+    scale = (_ANNEALING[-1] * focal / sigma.clamp(min=1e-3)).clamp(min=1.0)
+    blur = _ANNEALING[-1] * focal
+    params, scale, _ = refine(starts.flatten(0, 1), scale, many_places, many, prior, iterations, blur)
+    residuals = boundary_residuals(params, many_places, many)
+    score = log_likelihood(residuals.distance, residuals.valid, many.weight, many.sigma, scale, focal)
+    away = (params - prior.mean(params)) / prior.std(params)
+    score = torch.where(params.isfinite().all(-1), score + _student_log(away.square()), -torch.inf)
+    best = score.view(batch, count).argmax(-1) + count * torch.arange(batch, device=score.device)
+    return params[best], scale[best]
+
+
+def _solve(information: Tensor, gradient: Tensor) -> Tensor:
+    """Symmetric positive solve."""
+    size, factor = _factor(information)
+    return size * torch.cholesky_solve((size * gradient).unsqueeze(-1), factor).squeeze(-1)
+
+
+def _inverse(information: Tensor) -> Tensor:
+    """Covariance from an information matrix."""
+    size, factor = _factor(information)
+    return size.unsqueeze(-1) * torch.cholesky_inverse(factor) * size.unsqueeze(-2)
+
+
+def _factor(information: Tensor) -> tuple[Tensor, Tensor]:
+    """Sizes (B, P) and the Cholesky factor in their units: curvatures and metres differ by 1e5 in float32."""
+    size = information.diagonal(dim1=-2, dim2=-1).rsqrt()
+    return size, torch.linalg.cholesky_ex(size.unsqueeze(-1) * information * size.unsqueeze(-2)).L

@@ -1,0 +1,173 @@
+"""What the joint filter remembers, its numbers, and how a state begins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntFlag
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.estimation.joint.dynamics import (
+    MEANS,
+    NUM_COMMON,
+    NUM_POSE,
+    NUM_SEEN,
+    RATES,
+    SHAPE,
+    SPEED,
+    STEPS,
+    MotionConfig,
+)
+from lanebev.estimation.joint.measurement import CURVATURE, KNOT_SPACING, NUM_PARAMS, NUM_STRAIGHT
+from lanebev.estimation.joint.road import straight_or_bend
+from lanebev.estimation.joint.single_frame import FramePrior
+from lanebev.types import NUM_BOUNDARIES, saved_by_name
+
+
+class Reason(IntFlag):
+    """Why a row is not (fully) tracking; several may hold at once."""
+
+    NONE = 0
+    NO_SEGMENTS = 1  # nothing was seen in this frame
+    FEW_INLIERS = 2  # what was seen does not fit the road that is believed
+    TIME = 4  # not later than the last frame, and not used; or the time unknown, and one guessed
+    NO_START = 8  # no start found yet: pitch and yaw not determined by this frame
+    ROLL_UNSEEN = 16  # one lane or less, or the frame was not used: roll holds with growing sigma
+    HEIGHT_UNSEEN = 32  # no lane, or not used: height holds with growing sigma
+    LANE_CHANGE = 64  # the boundary indices moved by one in this frame
+    RESTARTED = 128  # started, or started anew, in this frame
+    DIRECTION_UNSEEN = 256  # one boundary or less, or not used: pitch and yaw hold with growing sigma
+
+
+@dataclass(frozen=True)
+class JointConfig:
+    """Numbers of :class:`lanebev.JointCalibrator`; angles in rad, lengths in m, times in s.
+
+    Attributes:
+        num_boundaries: L.
+        iterations: Gauss-Newton steps a frame.
+        start_iterations: likewise of every start that is tried on a first frame.
+        lane_width_std: m, sigma of the lane width prior, a common scale of height; 0: as given.
+        motion: how the state moves.
+        prior: where a start is searched, and what holds before it.
+        open_pose: rad (and 10 of these in m of height), jump admitted where one frame contradicts the motion,
+            at evidence of ten sigmas; as many times more at more.
+        open_curvature, open_step: 1/m, likewise, change of the knots when a bend begins or ends.
+        straight: 1/m and 1/m², sigmas of c0 and c1 of a straight road.
+        bends: how probable it is that a start is on a bend, one of the curvatures of ``prior``.
+        open_deviation: m, sigma of a boundary's deviation on a road of unequal lanes; 0: there are none.
+        evidence_time: s over which a bend's or unequal lanes' evidence is summed.
+        min_support: inlier segments (weights summed) of a usable frame.
+        min_share, enter_share: share of inliers to go on tracking, and to begin again.
+        assumed_dt: s between frames where it is not finite, or the clock jumped back by more than a second.
+        restart_after: s of segments that don't fit before the search starts over.
+        lost_after: s without support.
+    """
+
+    num_boundaries: int = NUM_BOUNDARIES
+    iterations: int = 2
+    start_iterations: int = 8
+    lane_width_std: float = 0.0
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    prior: FramePrior = field(default_factory=FramePrior)
+    open_pose: float = 0.01
+    open_curvature: float = 3e-4
+    open_step: float = 1e-3
+    straight: tuple[float, float] = (1e-4, 3e-6)
+    bends: float = 0.2
+    open_deviation: float = 0.12
+    evidence_time: float = 0.15
+    min_support: float = 3.0
+    min_share: float = 0.15
+    enter_share: float = 0.25
+    assumed_dt: float = 1 / 30
+    restart_after: float = 0.3
+    lost_after: float = 5.0
+
+    def __post_init__(self) -> None:
+        if self.num_boundaries < 2 or self.num_boundaries % 2:
+            raise ValueError(f"num_boundaries: expected an even number >= 2, got {self.num_boundaries}")
+        if self.iterations < 1 or self.start_iterations < 1:
+            got = min(self.iterations, self.start_iterations)
+            raise ValueError(f"iterations: expected at least 1, got {got}")
+        bend = (self.prior.curvature_std, self.prior.curvature_rate_std)
+        if not all(0 < sharp < wide for sharp, wide in zip(self.straight, bend, strict=True)):
+            raise ValueError(
+                f"straight: expected sigmas between 0 and those of the prior, {bend}, got {self.straight}"
+            )
+        if not 0 < self.bends < 1:
+            raise ValueError(f"bends: expected a probability between 0 and 1, got {self.bends}")
+
+
+@saved_by_name
+class JointState(NamedTuple):
+    """Everything the calibrator remembers, tensors only.
+
+    Attributes:
+        mean: (B, D), see ``joint_motion``.
+        cov: (B, D, D).
+        phase: (B,) m, how far the first knot of the road's curvature lies behind the camera.
+        evidence: (B, 10 + L) evidence against the motion, unit variance: the last frame's of the pose, summed
+            of shape and deviations.
+        mimicry: (B, 4, L) change of the pose by a metre that a boundary is out of place, by the last frame
+            that determined the pose.
+        early: (B,) s by which the state is ahead of the last frame, which came out of order.
+        unseen: (B,) s since the last usable frame.
+        misfit: (B,) s for which there were segments that did not fit.
+        status: (B,) int64, values of Status.
+        reasons: (B,) int64, :class:`Reason` flags of the last frame; those of what is unseen decide how the
+            next prediction moves.
+    """
+
+    mean: Tensor
+    cov: Tensor
+    phase: Tensor
+    evidence: Tensor
+    mimicry: Tensor
+    early: Tensor
+    unseen: Tensor
+    misfit: Tensor
+    status: Tensor
+    reasons: Tensor
+
+
+def begin(params: Tensor, param_cov: Tensor, cfg: JointConfig) -> tuple[Tensor, Tensor]:
+    """State (B, D) and covariance (B, D, D) around one frame's parameters and their covariance."""
+    batch, num = params.shape[0], cfg.num_boundaries
+    angle, height = (
+        density / (4 * cfg.motion.spring**3)
+        for density in (cfg.motion.angular_density, cfg.motion.height_density)
+    )
+    swing = params.new_tensor([angle, angle, angle, height])  # stationary variances
+    rates = torch.cat([swing * cfg.motion.spring**2, params.new_tensor([0.5**2])])
+    straight, bend = params.new_tensor(cfg.straight), cfg.prior.std(params)[CURVATURE:]
+    params, param_cov = straight_or_bend(params, param_cov, straight, bend, cfg.bends)
+    spread = params.new_zeros(NUM_SEEN, NUM_PARAMS)  # c0 and c1 to the knots
+    spread[:NUM_STRAIGHT, :NUM_STRAIGHT] = torch.eye(NUM_STRAIGHT)
+    spread[CURVATURE, CURVATURE] = 1.0
+    spread[STEPS, CURVATURE + 1] = KNOT_SPACING
+    seen, seen_cov = params @ spread.mT, spread @ param_cov @ spread.mT
+    zero, own = params.new_zeros(batch, 5), params.new_zeros(batch, num)
+    mean = torch.cat([seen, zero, params[:, :NUM_POSE], own[:, :1], own], dim=-1)
+    cov = params.new_zeros(batch, NUM_COMMON + num, NUM_COMMON + num)
+    cov[:, :NUM_SEEN, :NUM_SEEN] = seen_cov
+    cov[:, :NUM_SEEN, MEANS] = seen_cov[:, :, :NUM_POSE]
+    cov[:, MEANS, :NUM_SEEN] = seen_cov[:, :NUM_POSE]
+    cov[:, MEANS, MEANS] = param_cov[:, :NUM_POSE, :NUM_POSE] + swing.diag()
+    cov[:, RATES, RATES] = rates.diag()
+    own_variance = params.new_zeros(NUM_COMMON + num)
+    own_variance[SHAPE] = cfg.motion.curvature_step**2
+    own_variance[SPEED] = cfg.motion.speed_std**2
+    own_variance[NUM_COMMON:] = cfg.motion.deviation_walk**2
+    return mean, cov + own_variance.diag()
+
+
+def held(reasons: Tensor) -> Tensor:
+    """(B, 4) bool, what of pitch, yaw, roll and height the frame with these reasons did not determine."""
+    direction, roll, height = (
+        (reasons & int(reason)) != 0
+        for reason in (Reason.DIRECTION_UNSEEN, Reason.ROLL_UNSEEN, Reason.HEIGHT_UNSEEN)
+    )
+    return torch.stack([direction, direction, roll, height], dim=-1)

@@ -1,0 +1,1 @@
+"""The paper's calibrator: vanishing direction, then lane width."""

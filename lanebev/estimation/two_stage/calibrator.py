@@ -1,0 +1,115 @@
+"""The paper's calibrator: pitch and yaw from the vanishing direction, roll and height from lane widths."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lanebev.batch import where
+from lanebev.estimation.calibrator import Calibrator
+from lanebev.estimation.checks import is_running
+from lanebev.estimation.two_stage.direction import track_direction
+from lanebev.estimation.two_stage.lane_width import boundary_angles
+from lanebev.estimation.two_stage.roll_height import track_roll_height
+from lanebev.estimation.two_stage.state import TwoStageConfig, TwoStageState
+from lanebev.geometry.road import segment_rays
+from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
+
+
+class TwoStageCalibrator(Calibrator):
+    """Online calibration in the paper's two stages, per row of a batch, state in and state out.
+
+    Source: Secs. III and IV. Assumes a straight flat road, parallel boundaries and equal known lane widths:
+    at R = 860 m its yaw is 1.3 deg off (PAPER_NOTES 17).
+
+    Args:
+        config: the numbers, or keywords of :class:`TwoStageConfig`.
+    """
+
+    state_type = TwoStageState
+
+    def __init__(self, config: TwoStageConfig | None = None, **numbers: object) -> None:
+        super().__init__()
+        if config is not None and numbers:
+            raise ValueError("config: expected either a TwoStageConfig or its keywords, got both")
+        self.config = config or TwoStageConfig(**numbers)  # type: ignore[arg-type]
+        generator = torch.Generator().manual_seed(self.config.seed)
+        self.draws: Tensor
+        draws = torch.rand(self.config.num_hypotheses, 2, generator=generator, dtype=torch.float64)
+        self.register_buffer("draws", draws.float(), persistent=False)  # some devices have no float64
+
+    def initial_state(
+        self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
+    ) -> TwoStageState:
+        """State before the first frame: the initial pose with its uncertainty, UNINITIALISED."""
+        cfg = self.config
+        pose, pose_std = cfg.initial_pose, cfg.initial_pose_std
+        rate_std = cfg.initial_rate_std
+
+        def part(indices: tuple[int, int]) -> tuple[Tensor, Tensor]:
+            mean = torch.tensor([pose[i] for i in indices] + [0.0, 0.0], dtype=dtype, device=device)
+            std = [pose_std[i] for i in indices] + [rate_std[i] for i in indices]
+            cov = torch.diag(torch.tensor(std, dtype=dtype, device=device).square())
+            return mean.repeat(batch_size, 1), cov.repeat(batch_size, 1, 1)
+
+        direction, direction_cov = part((0, 1))
+        roll_height, roll_height_cov = part((2, 3))
+        no = torch.zeros(batch_size, dtype=torch.bool, device=device)
+        unseen = torch.zeros(batch_size, dtype=dtype, device=device)
+        status = torch.full((batch_size,), int(Status.UNINITIALISED), dtype=torch.int64, device=device)
+        return TwoStageState(
+            direction, direction_cov, roll_height, roll_height_cov, no, no.clone(), unseen, status
+        )
+
+    def step(
+        self,
+        segments: LaneSegments,
+        intrinsics: Tensor,
+        state: TwoStageState,
+        dt: Tensor,
+        lane_width: Tensor,
+    ) -> tuple[Calibration, TwoStageState]:
+        """One frame, see :meth:`~lanebev.estimation.calibrator.Calibrator.forward`."""
+        dt = torch.where(dt.isfinite(), dt, self.config.assumed_dt)
+        before, skip = state, (dt <= 0) & is_running(state.status)
+        dt = dt.clamp(0.0, 60.0)
+        rays = segment_rays(segments.endpoints, intrinsics)  # (B, N, 2, 3)
+
+        known = state.status != int(Status.UNINITIALISED)
+        stale = known & (state.unseen + dt > self.config.lost_after)
+        state = state._replace(status=torch.where(stale, int(Status.LOST), state.status))
+        one = track_direction(segments, rays, intrinsics, state, dt, self.draws, self.config)
+        boundaries = boundary_angles(
+            rays,
+            segments.boundary,
+            segments.weight * one.inliers,
+            segments.sigma,
+            intrinsics,
+            one.mean[:, 0],
+            one.mean[:, 1],
+            self.config.num_boundaries,
+        )
+        two = track_roll_height(boundaries, lane_width, one.cov[:, :2, :2], state, dt, one.fresh, self.config)
+        unseen = torch.where(one.seen, 0.0, state.unseen + dt)
+        status = _status(state.status, one.seen, unseen, self.config.lost_after)
+        after = TwoStageState(one.mean, one.cov, *two, unseen, status)
+        state = TwoStageState(*(where(skip, old, new) for old, new in zip(before, after, strict=True)))
+        return self._calibration(state, lane_width, one.inliers), state
+
+    def _calibration(self, state: TwoStageState, lane_width: Tensor, inliers: Tensor) -> Calibration:
+        pose = torch.cat([state.direction_mean[:, :2], state.roll_height_mean[:, :2]], dim=-1)
+        cov = torch.zeros(*pose.shape, 4, dtype=pose.dtype, device=pose.device)
+        upper = torch.cat([state.direction_cov[:, :2, :2], cov[:, :2, 2:]], dim=-1)
+        lower = torch.cat([cov[:, 2:, :2], state.roll_height_cov[:, :2, :2]], dim=-1)
+        scale = pose[:, 3] * self.config.lane_width_std / lane_width.mean(-1)
+        prior = torch.stack([torch.zeros_like(scale)] * 3 + [scale.square()], dim=-1).diag_embed()
+        cov = torch.cat([upper, lower], dim=-2) + prior
+        return Calibration(Extrinsics.unstack(pose), cov, state.status, inliers)
+
+
+def _status(before: Tensor, seen: Tensor, unseen: Tensor, lost_after: float) -> Tensor:
+    """initialise -> track -> coast -> lost -> re-initialise, per row."""
+    coasting = torch.where(unseen > lost_after, int(Status.LOST), int(Status.COASTING))
+    idle = (before == int(Status.UNINITIALISED)) | (before == int(Status.LOST))
+    unsupported = torch.where(idle, before, coasting)
+    return torch.where(seen, int(Status.TRACKING), unsupported)

@@ -1,0 +1,247 @@
+"""Roll and height from the equality of lane widths."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.batch import masked_median
+from lanebev.geometry.rotation import cam_from_world
+
+_MIN_RADIUS = 1e-3  # a ray closer than 0.06 deg to the vanishing direction says nothing about its boundary
+_MIN_COSINE = 0.02  # 1.1 deg: a boundary plane closer to the road's own has no foot on it
+
+
+class BoundaryAngles(NamedTuple):
+    """Where each boundary's plane stands around the vanishing direction.
+
+    Attributes:
+        angles: (B, L) rad, α of Fig. 6(c), positive left of the camera; beyond ±pi/2 where roll lifts a
+            boundary above the level.
+        noise: (B, L) rad², variances from the pixels.
+        jacobian: (B, L, 2), by pitch and yaw.
+        present: (B, L) bool.
+    """
+
+    angles: Tensor
+    noise: Tensor
+    jacobian: Tensor
+    present: Tensor
+
+
+def line_angles(rays: Tensor) -> Tensor:
+    """Angles of boundary planes from the camera's vertical, seen along the lanes.
+
+    Source: Fig. 6(c), α. Deviation: of the plane through the vanishing direction and a ray, both in the frame
+    of the vanishing direction, and positive to the left; only so is Eq. (18) exact (PAPER_NOTES 3).
+
+    Args:
+        rays: (..., 3) in the lane-aligned frame without roll, R_WC r.
+
+    Returns:
+        (...,) rad in (-pi, pi], beyond ±pi/2 above the level.
+    """
+    return torch.atan2(-rays[..., 0], rays[..., 1])
+
+
+def lane_widths(line_angles: Tensor, roll: Tensor, height: Tensor) -> Tensor:
+    """Distances between adjacent boundaries on the road.
+
+    Source: Eq. (18), w = h (tan(α_L - ψ) - tan(α_R - ψ)). Deviation: adjacent boundary indices instead of
+    any two sides, since a missed boundary would double the width (PAPER_NOTES 7).
+
+    Args:
+        line_angles: (B, L) rad, left to right.
+        roll: (B,) rad.
+        height: (B,) m.
+
+    Returns:
+        (B, L-1) m, positive.
+    """
+    tangents = (line_angles - roll.unsqueeze(-1)).tan()
+    return height.unsqueeze(-1) * (tangents[..., :-1] - tangents[..., 1:])
+
+
+def boundary_angles(
+    rays: Tensor,
+    boundary: Tensor,
+    weight: Tensor,
+    sigma: Tensor,
+    intrinsics: Tensor,
+    pitch: Tensor,
+    yaw: Tensor,
+    num_boundaries: int,
+) -> BoundaryAngles:
+    """One angle α per boundary from all its segments, and what it is worth.
+
+    Source: Eq. (18) takes α of single line pairs. Deviation: one α per boundary, the least-squares plane
+    through the vanishing direction and the boundary's end points, as pairs that share a segment are not
+    independent and a single segment's own direction ignores the known vanishing point. Segments off their
+    boundary's median by more than 4 sigma and a degree are left out.
+
+    Args:
+        rays: (B, N, 2, 3) of both end points.
+        boundary: (B, N) int64.
+        weight: (B, N) in [0, 1].
+        sigma: (B, N) px.
+        intrinsics: (B, 3, 3).
+        pitch: (B,) rad.
+        yaw: (B,) rad.
+        num_boundaries: L.
+
+    Returns:
+        angles with noise, Jacobian and presence.
+    """
+    world = rays @ cam_from_world(pitch, yaw).unsqueeze(1)  # (B, N, 2, 3)
+    far = (world[..., :2].square().sum(-1) > _MIN_RADIUS**2).all(-1) & (weight > 0)  # (B, N)
+    world = torch.where(far[..., None, None], world, world.new_tensor([0.0, 1.0, 1.0]))
+    x, y, z = world.unbind(-1)
+    radius = x * x + y * y
+    pull = radius.sum(-1)  # (B, N), how strongly a segment's ends fix the angle
+    angle = (radius * line_angles(world)).sum(-1) / pull
+    focal = 0.5 * (intrinsics[:, 0, 0] + intrinsics[:, 1, 1]).unsqueeze(-1)
+    variance = (sigma / focal).square() / pull
+    index = torch.arange(num_boundaries, device=boundary.device)[:, None]
+    member = (boundary.unsqueeze(1) == index) & far.unsqueeze(1)  # (B, L, N)
+    centre = masked_median(angle.unsqueeze(1).expand(member.shape), member)
+    off = (angle.unsqueeze(1) - centre.unsqueeze(-1)).abs()
+    member = member & (off < 4.0 * variance.sqrt().unsqueeze(1) + math.radians(1.0))
+    precision = torch.where(member, (weight / variance).unsqueeze(1), 0.0)
+    total = precision.sum(-1)
+    present = total > 0
+    share = precision / torch.where(present, total, 1.0).unsqueeze(-1)
+
+    # How the angle changes as the camera pitches and yaws: d(R_WC r) is -(cosφ, 0, sinφ) × and -(0, 1, 0) ×.
+    sy, cy = yaw.sin()[:, None, None], yaw.cos()[:, None, None]
+    by_pitch = (x * (cy * z - sy * x) - sy * y * y).sum(-1) / pull
+    by_yaw = (z * y).sum(-1) / pull
+    by_pose = torch.stack([by_pitch, by_yaw], dim=-1)  # (B, N, 2)
+    angles = (share @ angle.unsqueeze(-1)).squeeze(-1)
+    return BoundaryAngles(angles, 1.0 / torch.where(present, total, 1.0), share @ by_pose, present)
+
+
+class WidthMeasurement(NamedTuple):
+    """Lane widths, linearised in (roll, height).
+
+    Attributes:
+        widths: (B, L-1) m.
+        jacobian: (B, L-1, 2), by roll and height.
+        noise: (B, L-1, L-1) m², identity where a lane is not there.
+        present: (B, L-1) bool.
+    """
+
+    widths: Tensor
+    jacobian: Tensor
+    noise: Tensor
+    present: Tensor
+
+
+def measure_widths(
+    boundaries: BoundaryAngles,
+    roll: Tensor,
+    height: Tensor,
+    direction_cov: Tensor | None = None,
+    lane_noise: float = 0.0,
+) -> WidthMeasurement:
+    """Widths of the lanes whose two boundaries are present, with Jacobian and covariance.
+
+    Source: Eq. (18) and its derivatives.
+
+    Args:
+        boundaries: from :func:`boundary_angles`.
+        roll: (B,) rad.
+        height: (B,) m.
+        direction_cov: (B, 2, 2) of pitch and yaw, or None where they are exact.
+        lane_noise: m, standard deviation of a lane's width about the prior.
+
+    Returns:
+        the measurement.
+    """
+    relative = boundaries.angles - roll.unsqueeze(-1)
+    facing = boundaries.present & (relative.cos() > _MIN_COSINE)
+    relative = torch.where(facing, relative, 0.0)
+    tangents, h = relative.tan(), height.unsqueeze(-1)
+    present = facing[..., :-1] & facing[..., 1:]
+    widths = lane_widths(relative, torch.zeros_like(roll), height)
+    by_roll = h * (tangents[..., 1:].square() - tangents[..., :-1].square())
+    jacobian = torch.stack([by_roll, widths / h], dim=-1)
+
+    by_angle = h * (1 + tangents.square())  # (B, L)
+    eye = torch.eye(widths.shape[-1] + 1, dtype=widths.dtype, device=widths.device)
+    difference = (eye[:-1] - eye[1:]) * by_angle.unsqueeze(1)  # (B, L-1, L) d widths / d angles
+    noise = difference @ (boundaries.noise.unsqueeze(-1) * difference.mT)
+    if direction_cov is not None:
+        by_direction = difference @ boundaries.jacobian  # (B, L-1, 2)
+        noise = noise + by_direction @ direction_cov @ by_direction.mT
+    both = present.unsqueeze(-1) & present.unsqueeze(-2)
+    lanes = eye[:-1, :-1]
+    noise = torch.where(both, noise + lane_noise**2 * lanes, lanes)
+    return WidthMeasurement(widths, jacobian, noise, present)
+
+
+def initial_roll_height(
+    boundaries: BoundaryAngles,
+    lane_width: Tensor,
+    roll_guess: Tensor,
+    search_range: float = math.radians(30.0),
+    num_steps: int = 121,
+    num_iterations: int = 5,
+) -> tuple[Tensor, Tensor]:
+    """Roll and height that make the observed widths most alike the prior's.
+
+    Source: Sec. IV-A, Eqs. (19)-(20): exhaustive search, then Gauss-Newton. Deviation: the energy is a sum
+    of squares, as a sum of signed residuals has no minimum (PAPER_NOTES 4); for each roll of the search
+    the best height is in closed form; with one lane roll stays at the guess (PAPER_NOTES 6).
+
+    Args:
+        boundaries: from :func:`boundary_angles`.
+        lane_width: (B, L-1) m, the prior.
+        roll_guess: (B,) rad, the middle of the search, and the answer where roll is not observable.
+        search_range: rad to either side.
+        num_steps: of the search.
+        num_iterations: of Gauss-Newton.
+
+    Returns:
+        roll (B,) rad and height (B,) m. Height is 1 where no lane is present.
+    """
+    rolls = torch.linspace(
+        -search_range, search_range, num_steps, dtype=lane_width.dtype, device=lane_width.device
+    )
+    rolls = roll_guess.unsqueeze(-1) + rolls  # (B, G)
+    repeated = BoundaryAngles(*(part.repeat_interleave(num_steps, 0) for part in boundaries))
+    unit = measure_widths(repeated, rolls.flatten(), torch.ones_like(rolls.flatten()))
+    shape = (*rolls.shape, -1)
+    widths, present = unit.widths.reshape(shape), unit.present.reshape(shape)  # (B, G, L-1) at height 1
+    prior = lane_width.unsqueeze(1)
+    widths = torch.where(present, widths, 0.0)
+    heights = (widths * prior).sum(-1) / widths.square().sum(-1).clamp_min(1e-9)
+    error = torch.where(present, prior - heights.unsqueeze(-1) * widths, 0.0)
+    possible = (present.sum(-1) == present.sum(-1).amax(-1, keepdim=True)) & (heights > 0)
+    energy = torch.where(possible, error.square().sum(-1), torch.inf)
+    best = energy.argmin(-1, keepdim=True)
+    observable = present.sum(-1).amax(-1) >= 2
+    middle = torch.full_like(best, num_steps // 2)
+    best = torch.where(observable.unsqueeze(-1), best, middle)
+    roll, height = rolls.gather(-1, best).squeeze(-1), heights.gather(-1, best).squeeze(-1)
+    height = torch.where(height > 0, height, 1.0)
+    for _ in range(num_iterations):
+        roll, height = _gauss_newton_step(boundaries, lane_width, roll, height, observable)
+    return roll, height
+
+
+def _gauss_newton_step(
+    boundaries: BoundaryAngles, lane_width: Tensor, roll: Tensor, height: Tensor, observable: Tensor
+) -> tuple[Tensor, Tensor]:
+    measured = measure_widths(boundaries, roll, height)
+    there = measured.present.unsqueeze(-1)
+    jacobian = torch.where(there, measured.jacobian, 0.0)
+    held = torch.stack([observable, torch.ones_like(observable)], dim=-1)  # roll only where it shows
+    jacobian = jacobian * held.unsqueeze(1)
+    error = torch.where(there, (lane_width - measured.widths).unsqueeze(-1), 0.0)
+    eye = torch.eye(2, dtype=roll.dtype, device=roll.device)
+    normal = jacobian.mT @ jacobian + 1e-9 * eye
+    step = torch.cholesky_solve(jacobian.mT @ error, torch.linalg.cholesky_ex(normal).L).squeeze(-1)
+    return roll + step[..., 0].clamp(-0.1, 0.1), (height + step[..., 1]).clamp(0.1, 10.0)

@@ -1,0 +1,157 @@
+"""Stage 2: roll and height from lane widths, by EKF."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.batch import may_skip
+from lanebev.estimation import kalman
+from lanebev.estimation.two_stage.lane_width import BoundaryAngles, initial_roll_height, measure_widths
+from lanebev.estimation.two_stage.state import TwoStageConfig, TwoStageState
+from lanebev.types import Status
+
+_NUM_LINEARISATIONS = 2
+LARGEST_ROLL = 0.8  # rad
+LEAST_HEIGHT, LARGEST_HEIGHT = 0.1, 20.0  # m
+
+
+class RollHeightStep(NamedTuple):
+    """Stage 2 after a frame.
+
+    Attributes:
+        mean: (B, 4) roll, height and their rates; cov: (B, 4, 4).
+        roll_known: (B,) bool; height_known: (B,) bool.
+    """
+
+    mean: Tensor
+    cov: Tensor
+    roll_known: Tensor
+    height_known: Tensor
+
+
+def track_roll_height(
+    boundaries: BoundaryAngles,
+    lane_width: Tensor,
+    direction_cov: Tensor,
+    state: TwoStageState,
+    dt: Tensor,
+    fresh: Tensor,
+    cfg: TwoStageConfig,
+) -> RollHeightStep:
+    """Predict and update roll and height; start where nothing is known; one lane moves height only.
+
+    Source: Sec. IV-B, with the measurement of Eq. (20). Deviation: a roll or height that no car has
+    (``LARGEST_ROLL``, ``LEAST_HEIGHT``, ``LARGEST_HEIGHT``) is back at the prior and unknown.
+
+    Args:
+        boundaries: angles about the direction of stage 1.
+        lane_width: (B, L-1) m, the prior.
+        direction_cov: (B, 2, 2) of pitch and yaw.
+        state: of the frame before.
+        dt: (B,) s.
+        fresh: (B,) bool, stage 1 started over.
+        cfg: the numbers.
+
+    Returns:
+        the step.
+    """
+    num_lanes = (boundaries.present[:, :-1] & boundaries.present[:, 1:]).sum(-1)
+    height_seen, roll_seen = num_lanes >= 1, num_lanes >= 2
+    mean, cov = predict_roll_height(state, dt, roll_seen, height_seen, cfg)
+
+    lost = fresh & (state.status == int(Status.LOST))
+    start_roll = roll_seen & (~state.roll_known | lost)
+    start_height = height_seen & (~state.height_known | lost | start_roll)
+    first = torch.stack([start_roll, start_height, start_roll, start_height], dim=-1)
+    if not may_skip(first):
+        roll, height = initial_roll_height(boundaries, lane_width, mean[:, 0])
+        started = torch.stack([roll, height, torch.zeros_like(roll), torch.zeros_like(roll)], dim=-1)
+        mean = torch.where(first, started, mean)
+    wide = mean.new_tensor([*cfg.initial_pose_std[2:], *cfg.initial_rate_std[2:]]).square().diag()
+    cov = torch.where((first.unsqueeze(-1) | first.unsqueeze(-2)), wide, cov)
+
+    seen = torch.stack([roll_seen, height_seen], dim=-1)
+    mean, cov = update_by_widths(boundaries, lane_width, direction_cov, mean, cov, seen, cfg.lane_noise)
+    # Nothing says that widths of wrong boundaries lead anywhere: what has run away starts over.
+    possible = (mean[:, 0].abs() < LARGEST_ROLL) & (mean[:, 1] > LEAST_HEIGHT) & (mean[:, 1] < LARGEST_HEIGHT)
+    prior = torch.cat([mean.new_tensor(cfg.initial_pose[2:]), mean.new_zeros(2)])
+    mean = torch.where(possible.unsqueeze(-1), mean, prior)
+    cov = torch.where(possible[:, None, None], cov, wide)
+    roll_known = (state.roll_known | roll_seen) & possible
+    return RollHeightStep(mean, cov, roll_known, (state.height_known | height_seen) & possible)
+
+
+def update_by_widths(
+    boundaries: BoundaryAngles,
+    lane_width: Tensor,
+    direction_cov: Tensor,
+    mean: Tensor,
+    cov: Tensor,
+    seen: Tensor,
+    lane_noise: float,
+) -> tuple[Tensor, Tensor]:
+    """Iterated EKF update of roll and height by the lanes' widths.
+
+    Source: Eqs. (15)-(17) with the measurement of Eq. (20); iterated as in Bell and Cathey 1993.
+    Deviation: linearised twice, the second time about the first's result: widths are curved in roll by so
+    much that after a fifth of a second one update is seven sigmas off. And Q is not constant: a width is as
+    good as its boundaries' pixels and as pitch and yaw, whose errors widths of one frame share.
+
+    Args:
+        boundaries: angles about the direction of stage 1.
+        lane_width: (B, L-1) m, the prior.
+        direction_cov: (B, 2, 2) of pitch and yaw.
+        mean: (B, 4) predicted roll, height and their rates; cov: (B, 4, 4).
+        seen: (B, 2) bool, whether widths may move roll and height.
+        lane_noise: m, standard deviation of a lane's width about the prior.
+
+    Returns:
+        mean (B, 4) and covariance (B, 4, 4).
+    """
+    at, after = mean, cov
+    for _ in range(_NUM_LINEARISATIONS):
+        measured = measure_widths(boundaries, at[:, 0], at[:, 1], direction_cov, lane_noise)
+        error = torch.where(measured.present, lane_width - measured.widths, 0.0)
+        jacobian = torch.where(measured.present.unsqueeze(-1), measured.jacobian, 0.0) * seen.unsqueeze(1)
+        jacobian = torch.cat([jacobian, torch.zeros_like(jacobian)], dim=-1)  # (B, L-1, 4)
+        innovation = error + (jacobian @ (at - mean).unsqueeze(-1)).squeeze(-1)
+        white = torch.linalg.solve_triangular(
+            torch.linalg.cholesky_ex(measured.noise).L,
+            torch.cat([jacobian, innovation.unsqueeze(-1)], dim=-1),
+            upper=False,
+        )
+        info = kalman.information(white[..., -1], white[..., :-1], torch.ones_like(error))
+        at, after = kalman.update(mean, cov, *info)
+    return at, after
+
+
+def predict_roll_height(
+    state: TwoStageState, dt: Tensor, roll_seen: Tensor, height_seen: Tensor, cfg: TwoStageConfig
+) -> tuple[Tensor, Tensor]:
+    """Constant velocity for no longer than ``reacquire_after``; what this frame does not observe holds still.
+
+    Deviation: the paper would extrapolate roll on one lane for ever (PAPER_NOTES 6), and across any gap, to
+    where one linearised update does not lead back from. Sigma grows with the whole gap.
+    """
+    density = dt.new_tensor([cfg.angular_acceleration_density, cfg.height_acceleration_density])
+    transition, _ = kalman.constant_velocity(dt.clamp(max=cfg.reacquire_after), density)
+    _, noise = kalman.constant_velocity(dt, density)
+    moving = torch.stack([roll_seen & state.roll_known, height_seen & state.height_known], dim=-1)
+    moving = torch.cat([moving, moving], dim=-1)  # (B, 4) of position and rate
+    eye = torch.eye(4, dtype=dt.dtype, device=dt.device)
+    still = eye * dt.new_tensor([1.0, 1.0, 0.0, 0.0])
+    transition = torch.where(moving.unsqueeze(-1), transition, still)
+    # What is not known yet stays at its prior; what was known and is not seen forgets at its noise.
+    known = torch.stack([state.roll_known, state.height_known] * 2, dim=-1)
+    known = known.unsqueeze(-1) & known.unsqueeze(-2)
+    mean, cov = kalman.predict(state.roll_height_mean, state.roll_height_cov, transition, noise * known)
+    limit = dt.new_tensor([*cfg.initial_pose_std[2:], *cfg.initial_rate_std[2:]]).square()
+    cov = kalman.limit_variance(cov, limit)
+    rates = torch.where(moving[:, 2:], 0.0, limit[2:])
+    cov = cov + torch.cat([torch.zeros_like(rates), rates], dim=-1).diag_embed()
+    # Without roll in the measurement, its correlation with height would still move it: cut it.
+    together = moving.unsqueeze(-1) == moving.unsqueeze(-2)
+    return mean, torch.where(together, cov, 0.0)

@@ -1,0 +1,1 @@
+"""How a camera sees it: rays, surfaces, light, sensor."""

@@ -1,0 +1,197 @@
+"""Which boundaries a road has, where they lie and how they are painted."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.render.scene.sampler import Dice
+from lanebev.types import NUM_BOUNDARIES
+
+MAX_BOUNDARIES = 8  # painted on the road; six of them, about the ego lane, are the labelled ones
+WHITE, YELLOW = (0.80, 0.80, 0.78), (0.72, 0.46, 0.06)
+DASHES = [  # (length, period) m: US, California, Germany twice, UK, France, Japan, China, exits, towns
+    (3.05, 12.19),
+    (3.05, 12.19),
+    (2.13, 7.32),
+    (6.0, 18.0),
+    (6.0, 12.0),
+    (2.0, 9.0),
+    (3.0, 13.0),
+    (8.0, 20.0),
+    (6.0, 15.0),
+    (0.91, 3.66),
+    (3.0, 4.5),
+    (3.0, 9.0),
+    (4.0, 12.0),
+]
+NONE, SOLID, DASHED, DOUBLE, STUDS, SOLID_DASHED = range(6)
+
+
+class Layout(NamedTuple):
+    """A road's boundaries, (B, K) each unless said otherwise, left to right.
+
+    Attributes:
+        across: m, place of each boundary; the first is at 0. Slots beyond the last lie far away.
+        exists: bool.
+        marked: bool; an unmarked boundary is an edge nobody painted.
+        lane_width: (B,) m, nominal.
+        stripe_width: m.
+        separation: m between the centres of a double's two stripes; 0 for a single one.
+        dash: (B, K, 2, 2) m, (length, period) of the left and the right stripe; length = period is solid.
+        dash_phase: m.
+        colour: (B, K, 3) linear reflectance.
+        opacity: [0, 1], how much paint is left.
+        wear: [0, 1], how unevenly it went.
+        stud_period: m; 0 is none. A group of four dots, 1.22 m apart, then a gap, as in California.
+        stud_group: m, length of a group.
+        missing_period: m; the boundary is not painted over the first ``missing_length`` of it.
+        missing_length: m; 0 is none.
+        missing_phase: m.
+        ghost: [0, 1] strength of an old line, repainted beside this one.
+        ghost_shift: m from the boundary to it.
+        symbol: int64, what is painted in the lane right of each boundary, see symbols.py; 0 is nothing.
+        symbol_period: (B,) m.
+        symbol_phase: (B,) m.
+        symbol_opacity: (B,) in [0, 1].
+    """
+
+    across: Tensor
+    exists: Tensor
+    marked: Tensor
+    lane_width: Tensor
+    stripe_width: Tensor
+    separation: Tensor
+    dash: Tensor
+    dash_phase: Tensor
+    colour: Tensor
+    opacity: Tensor
+    wear: Tensor
+    stud_period: Tensor
+    stud_group: Tensor
+    missing_period: Tensor
+    missing_length: Tensor
+    missing_phase: Tensor
+    ghost: Tensor
+    ghost_shift: Tensor
+    symbol: Tensor
+    symbol_period: Tensor
+    symbol_phase: Tensor
+    symbol_opacity: Tensor
+
+
+def sample_layout(dice: Dice, dotted: Tensor, faint: Tensor) -> Layout:
+    """A random road.
+
+    Args:
+        dice: the randomness.
+        dotted: (B,) bool, lanes are divided by studs as in California.
+        faint: (B,) bool, thin worn paint of little contrast.
+    """
+    slots = MAX_BOUNDARIES
+    few_or_many, many = dice.pick([0, 0, 1, 2, 3, 3, 3, 0.6, 0.6]), dice.pick([0, 0, 0, 0.2, 1, 2, 2, 1, 0.5])
+    count = torch.where(dotted, many, few_or_many)  # boundaries
+    lane_width = torch.where(dice.chance(0.6), dice.uniform(3.4, 3.8), dice.uniform(2.7, 4.0))
+    uneven = torch.where(dice.chance(0.45), 0.09, 0.0)[:, None] * dice.normal(1.0, slots - 1).clamp(-2, 2)
+    widths = (lane_width[:, None] + uneven).clamp(2.6, 4.2)
+    across = torch.nn.functional.pad(widths.cumsum(1), (1, 0))
+    index = torch.arange(slots)
+    exists = index < count[:, None]
+    across = torch.where(exists, across, 1e3 + 10.0 * index)
+
+    last = (count - 1)[:, None]
+    outer = (index == 0) | (index == last)
+    edge = dice.pick([0.09, 0.66, 0.06, 0.12, 0.03, 0.04], slots)
+    divider = torch.where(
+        dotted[:, None],
+        dice.pick([0.0, 0.01, 0.30, 0.02, 0.67, 0.0], 1),
+        dice.pick([0.0, 0.05, 0.83, 0.03, 0.05, 0.04], 1),
+    )
+    odd_one = dice.pick([0.0, 0.3, 0.25, 0.2, 0.2, 0.05], slots)
+    divider = torch.where(dice.chance(0.12, slots), odd_one, divider)
+    kind = torch.where(outer, edge, divider)
+
+    dashes = dice.pick_from(DASHES, 1).expand(-1, slots, -1).clone()
+    other = dice.pick_from(DASHES, slots)
+    dashes = torch.where(dice.chance(0.1, slots)[..., None], other, dashes)
+    dashes = dashes * dice.uniform(0.9, 1.1, 1, 1)
+    solid = dashes[..., 1:].expand_as(dashes)
+    is_dashed, mixed = (kind == DASHED)[..., None], (kind == SOLID_DASHED)[..., None]
+    dash = torch.stack(
+        [torch.where(is_dashed | mixed, dashes, solid), torch.where(is_dashed, dashes, solid)], dim=2
+    )
+    double = (kind == DOUBLE) | (kind == SOLID_DASHED)
+
+    width = torch.where(dice.chance(0.75), dice.uniform(0.10, 0.16), dice.uniform(0.14, 0.30))[:, None]
+    width = width * torch.where(outer, dice.uniform(1.0, 1.35, 1), torch.ones(1))
+    width = torch.where(faint[:, None], dice.uniform(0.09, 0.14, 1), width)
+    yellow = ((index == 0) & dice.chance(0.6, 1)) | dice.chance(0.03, slots)
+    colour = torch.where(yellow[..., None], torch.tensor(YELLOW), torch.tensor(WHITE))
+    colour = colour * dice.uniform(0.85, 1.1, 1, 1) + dice.normal(0.015, 1, 3)
+    opacity = torch.where(dice.chance(0.55), dice.uniform(0.75, 1.0), dice.uniform(0.4, 0.85))[:, None]
+    opacity = (opacity * dice.uniform(0.75, 1.15, slots)).clamp(0.3, 1.0)
+    opacity = torch.where(faint[:, None], dice.uniform(0.4, 0.9, 1), opacity)
+
+    stud = kind == STUDS
+    reflectors = dice.chance(0.35, 1) & (dice.chance(0.8, slots)) & (kind != NONE)
+    fraction = dice.uniform(0.0, 1.0)[:, None]
+    stud_period = torch.where(stud | reflectors, torch.where(fraction < 0.85, 14.63, 7.32), 0.0)
+    stud_group = torch.where(stud, torch.where(fraction < 0.85, 4.6, 7.4), 0.3)
+    missing = dice.chance(0.07, slots) & (kind != NONE)
+    return Layout(
+        across=across,
+        exists=exists,
+        marked=exists & (kind != NONE),
+        lane_width=lane_width,
+        stripe_width=width.expand(-1, slots).contiguous(),
+        separation=torch.where(double, width * dice.uniform(1.6, 2.6, 1), 0.0),
+        dash=dash.contiguous(),
+        dash_phase=dice.uniform(0, 20, 1) + torch.where(dice.chance(0.2, 1), dice.uniform(0, 20, slots), 0.0),
+        colour=colour.clamp(0.02, 0.95).expand(-1, slots, -1).contiguous(),
+        opacity=torch.where(stud | (kind == NONE), 0.0, opacity),
+        wear=torch.where(dice.chance(0.5), dice.uniform(0.0, 0.3), dice.uniform(0.2, 0.65))[:, None].repeat(
+            1, slots
+        ),
+        stud_period=stud_period.contiguous(),
+        stud_group=stud_group.expand(-1, slots).contiguous(),
+        missing_period=dice.uniform(150, 500, slots),
+        missing_length=torch.where(missing, dice.uniform(15, 90, slots), 0.0),
+        missing_phase=dice.uniform(-60, 40, slots),
+        ghost=torch.where(dice.chance(0.1, 1), dice.uniform(0.1, 0.45, 1), 0.0)
+        .expand(-1, slots)
+        .contiguous(),
+        ghost_shift=dice.uniform(-0.5, 0.5, slots),
+        symbol=torch.where(
+            dice.chance(0.15, 1) & dice.chance(0.6, slots), dice.pick([0, 3, 1, 2, 1], slots), 0
+        ),
+        symbol_period=dice.uniform(25, 150),
+        symbol_phase=dice.uniform(0, 150),
+        symbol_opacity=dice.uniform(0.5, 1.0),
+    )
+
+
+def presence(layout: Layout, slot: Tensor, along: Tensor) -> Tensor:
+    """(B, N) in {0, 1}: boundary ``slot`` (B, N) is marked at arc length ``along`` (B, N) of the world."""
+    period, length, phase, marked = (
+        t.gather(1, slot)
+        for t in (layout.missing_period, layout.missing_length, layout.missing_phase, layout.marked.float())
+    )
+    return marked * (((along + phase) % period) >= length)
+
+
+def labelled_slots(layout: Layout, ego_lane: Tensor) -> tuple[Tensor, Tensor]:
+    """Slots of the six labelled boundaries about the ego lane.
+
+    Args:
+        layout: the road.
+        ego_lane: (B,) int64, index of the boundary on the ego lane's left.
+
+    Returns:
+        (B, L) int64 slots, clamped; (B, L) bool, there is such a boundary.
+    """
+    slot = ego_lane[:, None] + torch.arange(NUM_BOUNDARIES) - (NUM_BOUNDARIES // 2 - 1)
+    inside = (slot >= 0) & (slot < MAX_BOUNDARIES)
+    slot = slot.clamp(0, MAX_BOUNDARIES - 1)
+    return slot, inside & layout.exists.gather(1, slot)

@@ -1,0 +1,153 @@
+"""A whole world: everything along one road, and where the camera is in it."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.render.raster.photometry import (
+    CLEAR,
+    DUSK,
+    NIGHT,
+    RAIN,
+    Sensor,
+    Weather,
+    sample_sensor,
+    sample_weather,
+)
+from lanebev.render.scene.alignment import arc_nodes
+from lanebev.render.scene.layout import Layout, sample_layout
+from lanebev.render.scene.pavement import Pavement, sample_pavement
+from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.surroundings import Surroundings, sample_surroundings
+from lanebev.render.scene.traffic import Traffic, sample_traffic
+
+
+class World(NamedTuple):
+    """Everything but the camera's place, B of them.
+
+    Attributes:
+        layout: the boundaries.
+        pavement: the surface.
+        surroundings: beside and above it.
+        traffic: what stands and drives on it.
+        weather: light and air.
+        sensor: the camera's own faults.
+        bridge: (B, 2) m along, where a bridge begins and ends; infinite: none.
+        shade: (B,) strength of tree shadows on the road.
+    """
+
+    layout: Layout
+    pavement: Pavement
+    surroundings: Surroundings
+    traffic: Traffic
+    weather: Weather
+    sensor: Sensor
+    bridge: Tensor
+    shade: Tensor
+
+
+class Place(NamedTuple):
+    """Where the camera is.
+
+    Attributes:
+        along: (B,) m, arc length in the world.
+        across: (B,) m in the layout's frame.
+        ego_lane: (B,) int64, slot of the boundary on the ego lane's left.
+        heading: (B,) rad, of the road there in the world.
+    """
+
+    along: Tensor
+    across: Tensor
+    ego_lane: Tensor
+    heading: Tensor
+
+
+def sample_ego_lane(dice: Dice, layout: Layout) -> Tensor:
+    """(B,) int64, any lane; the leftmost, beside the median, more often."""
+    lanes = (layout.exists.sum(1) - 1).clamp(min=1)
+    share = torch.where(dice.chance(0.2), 0.0, dice.uniform(0, 1))
+    return (share * lanes).long().clamp(max=7)
+
+
+def sample_world(dice: Dice) -> tuple[World, Tensor]:
+    """Random worlds and an ego lane in each, (B,) int64."""
+    dotted = dice.chance(0.35)
+    bright = dice.chance(0.12) & ~dotted
+    faint = bright | dice.chance(0.12)
+    layout = sample_layout(dice, dotted, faint)
+    median = dice.chance(0.15)
+    ego_lane = torch.where(median & dice.chance(0.7), 0, sample_ego_lane(dice, layout))
+    weather = sample_weather(dice)
+    sunny = bright | (dotted & dice.chance(0.7))
+    weather = weather._replace(
+        kind=torch.where(sunny, CLEAR, weather.kind), grey=torch.where(sunny, 0.1, weather.grey)
+    )
+    pavement = sample_pavement(dice, layout, dotted, bright, weather.wet, median)
+    opposite = torch.where(dice.chance(0.5), pavement.left - dice.uniform(0.8, 9.0), -math.inf)
+    surroundings = sample_surroundings(dice, pavement.left, pavement.right, weather.grey, opposite, median)
+    surroundings = _tinted(surroundings, weather)
+    begin = torch.where(dice.chance(0.25), dice.uniform(-6, 140), math.inf)
+    extent = dice.uniform(6, 30)
+    bridge = torch.stack([begin, begin + extent], dim=1)
+    traffic = sample_traffic(dice, layout, ego_lane, opposite, pavement.left, pavement.right, begin, extent)
+    sensor = sample_sensor(dice, weather, bright)
+    shade = torch.where(dice.chance(0.22), dice.uniform(0.3, 1.0), 0.0)
+    return World(layout, pavement, surroundings, traffic, weather, sensor, bridge, shade), ego_lane
+
+
+def moved_along(world: World, start: Tensor) -> World:
+    """The same worlds with everything that was placed from zero on placed from ``start`` (B,) m on."""
+    shift = start[:, None]
+    return world._replace(
+        layout=world.layout._replace(missing_phase=world.layout.missing_phase - shift),
+        pavement=world.pavement._replace(deck_phase=world.pavement.deck_phase - start),
+        traffic=world.traffic._replace(along=world.traffic.along + shift),
+        bridge=world.bridge + shift,
+    )
+
+
+def _tinted(surroundings: Surroundings, weather: Weather) -> Surroundings:
+    """The sky of dusk and night."""
+    night, dusk = (weather.kind == NIGHT)[:, None], (weather.kind == DUSK)[:, None]
+    zenith = torch.where(night, surroundings.zenith * 0.012, surroundings.zenith)
+    skyline = torch.where(night, surroundings.skyline * 0.02, surroundings.skyline)
+    zenith = torch.where(dusk, zenith * torch.tensor([0.6, 0.5, 0.5]), zenith)
+    skyline = torch.where(dusk, skyline * torch.tensor([1.1, 0.75, 0.5]), skyline)
+    dim = torch.where((weather.kind == RAIN)[:, None], 0.75, 1.0)
+    return surroundings._replace(zenith=zenith * dim, skyline=skyline * dim)
+
+
+def sample_course(dice: Dice) -> tuple[Tensor, Tensor]:
+    """Sample curvature and elevation of random roads, (B, A) both, at the arc lengths of :func:`arc_nodes`.
+
+    Half of them straight; the others chains of clothoids, curvature linear between nodes 40 to 120 m apart.
+    A third goes over a crest or through a dip that begins at or beyond the camera.
+    """
+    nodes = 24
+    straight = dice.chance(0.45)
+    sharp = torch.where(dice.chance(0.25), 1 / 250, 1 / 900)[:, None]
+    knots = dice.normal(0.6, nodes).clamp(-1.3, 1.3) * sharp
+    keep = dice.chance(0.4, nodes)
+    for i in range(1, nodes):
+        knots[:, i] = torch.where(keep[:, i], knots[:, i - 1], knots[:, i])
+    knots = torch.where(straight[:, None], 0.0, knots).double()
+    spacing = dice.uniform(40, 120, 1).double()
+    shift = dice.uniform(0, 1, 1).double()
+    arc = arc_nodes()
+    position = (arc / spacing + shift).clamp(max=nodes - 1.001)
+    index = position.long()
+    low, high = knots.gather(1, index), knots.gather(1, index + 1)
+    curvature = low + (high - low) * (position - index)
+
+    bend = torch.where(dice.chance(0.3), dice.uniform(-1, 1) / dice.uniform(1500, 5000), 0.0)[
+        :, None
+    ].double()
+    onset, extent = dice.uniform(0, 80, 1).double(), dice.uniform(20, 120, 1).double()
+    inside = (arc - onset).clamp(min=0).minimum(extent)
+    beyond = (arc - onset - extent).clamp(min=0)
+    elevation = bend * (0.5 * inside * inside + extent * beyond)
+    return curvature, elevation
