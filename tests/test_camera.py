@@ -183,3 +183,36 @@ def test_sigma_across_a_line_goes_through_the_lens(distortion, model, focal):
     said = undistorted_sigma(torch.full((1, 9), 0.2, dtype=torch.float64), line, along, *lens)[0]
     assert (said / 0.2 - 1).abs().max() > 0.2  # not nothing
     torch.testing.assert_close(said, spread, rtol=0.05, atol=0)
+
+
+def test_field_of_view_spans_the_outer_columns():
+    view = Camera.from_fov(90.0, 1280, 720)
+    edges = torch.tensor([[-0.5, 359.5], [1279.5, 359.5], [639.5, 359.5]], dtype=torch.float64)
+    rays = view.rays(edges)
+    torch.testing.assert_close(rays[:, 0], torch.tensor([-1.0, 1.0, 0.0], dtype=torch.float64))
+    assert rays[2, 1] == 0
+    assert view.image_size == (720, 1280)
+    assert float(Camera.from_fov(60, 640, 480).intrinsics[0, 0]) == pytest.approx(320 * 3**0.5)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 180.0, -60.0, float("nan"), float("inf")])
+def test_impossible_fields_of_view_are_refused(degrees):
+    with pytest.raises(ValueError, match="fov: expected a horizontal field of view of 0 to 180 degrees"):
+        Camera.from_fov(degrees, 640, 480)
+
+
+def test_a_fingerprint_tells_cameras_apart_and_nothing_else():
+    cam = camera(BROWN[5])
+    same = [cam.to(dtype=torch.float32), camera([*BROWN[5], 0.0, 0.0, 0.0]), camera(BROWN[5])]
+    assert {each.fingerprint() for each in same} == {cam.fingerprint()}
+    others = [
+        camera(BROWN[4]),
+        camera([]),
+        camera([0.0] * 4, "fisheye"),
+        camera(BROWN[5], focal=1100.01),
+        cam.cropped(0, 1, 720, 1280),
+        cam.cropped(0, 0, 721, 1280),
+    ]
+    assert len({each.fingerprint() for each in [cam, *others]}) == 7
+    assert cam.fingerprint().isprintable()
+    assert camera([-0.0] * 5).fingerprint() == camera([]).fingerprint()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from numbers import Integral
 from pathlib import Path
@@ -74,6 +75,29 @@ class Camera:
         return cls(intrinsics, torch.tensor(list(distortion), dtype=dtype), model, (height, width))
 
     @classmethod
+    def from_fov(cls, degrees: float, width: int, height: int, dtype: torch.dtype = torch.float64) -> Camera:
+        """Make an ideal camera of a horizontal field of view, for those who know nothing else.
+
+        Pixels are square and the principal point is the image's centre, as hardly any real camera's is
+        exactly: poses are off by what that is wrong.
+
+        Args:
+            degrees: angle between the outer edges of the leftmost and the rightmost column.
+            width: px.
+            height: px.
+            dtype: of the tensors.
+
+        Raises:
+            ValueError: an angle that is not between 0 and 180 degrees, or an impossible image size.
+        """
+        if not 0.0 < degrees < 180.0:  # NaN is not
+            raise ValueError(f"fov: expected a horizontal field of view of 0 to 180 degrees, got {degrees!r}")
+        focal = 0.5 * width / math.tan(math.radians(0.5 * degrees))
+        return cls.from_parameters(
+            focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), width, height, dtype=dtype
+        )
+
+    @classmethod
     def from_file(cls, path: str | Path, image_size: tuple[int, int] | None = None) -> Camera:
         """Read OpenCV FileStorage or ROS ``camera_info`` YAML, KITTI ``calib.txt`` or our short YAML.
 
@@ -96,6 +120,21 @@ class Camera:
         """Return the camera as plain numbers."""
         matrix, distortion = self.intrinsics.flatten().tolist(), self.distortion.tolist()
         return CameraParameters(matrix, distortion, self.model, self.image_size)
+
+    def fingerprint(self) -> str:
+        """Return a text that tells this camera from others: model, image size, intrinsics, distortion.
+
+        It is the same on any device and in any floating dtype, and does not depend on how many zeros follow
+        the distortion's last coefficient. State files keep it.
+        """
+        height, width = self.image_size
+        matrix, distortion = (
+            [f"{value + 0.0:.9g}" for value in part.flatten().to(torch.float32).tolist()]
+            for part in (self.intrinsics, self.distortion)
+        )
+        while distortion and distortion[-1] == "0":
+            distortion.pop()
+        return f"{self.model} {width}x{height} K {' '.join(matrix)} D {' '.join(distortion)}".rstrip()
 
     def to_file(self, path: str | Path, name: str = "camera") -> None:
         """Write the camera as a ROS ``camera_info`` YAML, which :meth:`from_file` reads as well."""
