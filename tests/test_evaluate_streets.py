@@ -1,0 +1,38 @@
+"""The truth of the street images and what is made of the estimates."""
+
+import math
+
+import pytest
+import torch
+
+from lanebev.geometry.rotation import road_from_cam
+from tools.evaluate_streets import Answer, kitti_truth, plane_angles, summarise
+
+
+@pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (0.03, -0.05), (-0.1, 0.2)])
+def test_plane_angles_are_those_of_the_pose_at_zero_yaw(pitch, roll):
+    angles = (torch.tensor([value], dtype=torch.float64) for value in (pitch, 0.0, roll))
+    found = plane_angles(road_from_cam(*angles)[0, 1])
+    assert found.tolist() == pytest.approx([pitch, roll], abs=1e-12)
+
+
+def test_the_truth_is_the_second_row_of_the_calibration(tmp_path):
+    file = tmp_path / "calib.txt"
+    down = [math.sin(0.02), math.cos(0.02), 0.0]
+    matrix = [1, 0, 0, 0, *down, -1.6, 0, 0, 1, 0]
+    file.write_text("P2: 1 2 3\nTr_cam_to_road: " + " ".join(map(str, matrix)) + "\n")
+    assert kitti_truth(file).tolist() == pytest.approx([0.0, -0.02])
+
+
+def test_summary_counts_images_within_three_sigma():
+    def answer(pitch, roll, sigma):
+        plane = torch.tensor([pitch, roll], dtype=torch.float64)
+        return Answer("", plane, torch.full((2,), sigma, dtype=torch.float64), 1.5, 0.1, sigma < 0.5)
+
+    answers = [answer(0.1, 0.0, 0.1), answer(0.4, 0.2, 0.1), answer(0.5, 2.0, 1.0)]
+    figures = summarise(answers, torch.zeros(3, 2, dtype=torch.float64))
+    assert figures["tracking"] == 2
+    assert figures["pitch_median_deg"] == pytest.approx(0.4)
+    assert figures["pitch_within_3_sigma"] == pytest.approx(2 / 3)
+    assert figures["roll_within_3_sigma"] == pytest.approx(1.0)
+    assert figures["roll_worst_deg"] == pytest.approx(2.0)

@@ -1,0 +1,227 @@
+"""Figures on single images of streets, by day and by night, from pixels.
+
+    python -m tools.evaluate_streets [--data ../shared/data] [--weights FILE] [--json FILE] [--sheets FOLDER]
+
+``kitti_road``: the road plane of the lidar is the truth of pitch and roll (0.1 to 0.2 degrees), yaw has none.
+``culane``: frames at night whose camera is not published; a field of view of 60 degrees is assumed, and only
+the number of calibrated frames counts. ``streets``: two images with a known pose. Nothing here is trained on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+import lanebev
+from lanebev import Camera, JointCalibrator, LaneBEV, LaneSegments, Status
+from lanebev.app.run import calibrate_still
+from lanebev.geometry.rotation import road_from_cam
+from train.commands import one_line_errors
+
+KITTI_LANE_WIDTH = 3.5  # m
+SIGMAS = 3.0
+COLOURS = ((255, 80, 80), (255, 170, 0), (60, 230, 60), (0, 220, 255), (90, 110, 255), (230, 80, 255))
+
+
+class Answer(NamedTuple):
+    """One image's estimate: angles of the road plane (pitch, roll) and their sigmas, deg; height, m."""
+
+    name: str
+    plane: Tensor
+    sigma: Tensor
+    height: float
+    height_sigma: float
+    tracking: bool
+
+
+def plane_angles(normal: Tensor) -> Tensor:
+    """Compute the pitch and roll (..., 2), rad, of a camera at zero yaw over a road plane.
+
+    Args:
+        normal: (..., 3) of the plane in camera axes, pointing down.
+    """
+    x, y, z = normal.unbind(-1)
+    return torch.stack([torch.atan2(z, y), torch.atan2(-x, torch.hypot(y, z))], dim=-1)
+
+
+def kitti_truth(path: Path) -> Tensor:
+    """Read the road plane's pitch and roll (2,), rad, from a KITTI road calibration file."""
+    lines = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
+    matrix = torch.tensor([float(value) for value in lines["Tr_cam_to_road"].split()]).double()
+    return plane_angles(matrix.reshape(3, 4)[1, :3])
+
+
+def calibrate(
+    model: LaneBEV, path: Path, camera: Camera, lane_width: float
+) -> tuple[Answer, NDArray[np.uint8]]:
+    """Calibrate one image; also return it with its segments drawn."""
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
+    if image is None:
+        raise ValueError(f"{path}: expected an image")
+    tensor = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
+    lens = (camera.intrinsics[None].float(), camera.distortion[None].float(), camera.model)
+    with torch.inference_mode():
+        _, segments = model.observe(tensor, *lens)
+        segments = LaneSegments(*(t.double() if t.is_floating_point() else t for t in segments))
+        calibration = calibrate_still(JointCalibrator(), segments, lens[0].double(), lane_width)
+        calibration = calibration.widened(model.pose_factor)
+    pitch, yaw, roll, height = calibration.extrinsics
+    down = road_from_cam(pitch, yaw, roll)[0, 1]
+    sigma = calibration.covariance[0].diagonal().sqrt()
+    answer = Answer(
+        path.name,
+        plane_angles(down).rad2deg(),
+        sigma[[0, 2]].rad2deg(),
+        float(height[0]),
+        float(sigma[3]),
+        int(calibration.status[0]) == Status.TRACKING,
+    )
+    return answer, draw(image, segments, camera, answer)
+
+
+def draw(
+    image: NDArray[np.uint8], segments: LaneSegments, camera: Camera, answer: Answer
+) -> NDArray[np.uint8]:
+    """Draw segments by boundary, brighter where they weigh more, and the estimate."""
+    picture = image.copy()
+    ends = camera.distort_points(segments.endpoints[0].double().flatten(0, 1)).reshape(-1, 2, 2)
+    for (start, end), index, weight in zip(
+        ends.tolist(), segments.boundary[0].tolist(), segments.weight[0].tolist(), strict=True
+    ):
+        if weight > 0.05:
+            colour = tuple(int((0.4 + 0.6 * weight) * c) for c in COLOURS[index % len(COLOURS)])
+            for x, y in (start, end):
+                cv2.circle(picture, (round(x), round(y)), max(2, image.shape[1] // 500), colour, -1)
+    text = (
+        f"{answer.name}  pitch {answer.plane[0]:.2f} +- {answer.sigma[0]:.2f}  roll {answer.plane[1]:.2f} +- "
+        f"{answer.sigma[1]:.2f} deg  height {answer.height:.2f} +- {answer.height_sigma:.2f} m"
+        f"{'' if answer.tracking else '  NOT TRACKING'}"
+    )
+    scale = image.shape[1] / 1600
+    for colour, thick in (((0, 0, 0), 4), ((255, 255, 255), 1)):
+        place = (8, round(36 * scale) + 4)
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thick, cv2.LINE_AA)
+    return picture
+
+
+def summarise(answers: list[Answer], truth: Tensor) -> dict[str, float]:
+    """Return median errors, how many were calibrated, and the share within three sigma (all images)."""
+    plane = torch.stack([answer.plane for answer in answers])
+    sigma = torch.stack([answer.sigma for answer in answers])
+    error = (plane - truth.rad2deg()).abs()
+    tracking = torch.tensor([answer.tracking for answer in answers])
+    inside = (error <= SIGMAS * sigma).double().mean(0)
+    middle = error.median(0).values
+    return {
+        "images": len(answers),
+        "tracking": int(tracking.sum()),
+        "pitch_median_deg": float(middle[0]),
+        "roll_median_deg": float(middle[1]),
+        "pitch_within_3_sigma": float(inside[0]),
+        "roll_within_3_sigma": float(inside[1]),
+        "pitch_worst_deg": float(error[:, 0].max()),
+        "roll_worst_deg": float(error[:, 1].max()),
+    }
+
+
+def kitti_road(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
+    """German city streets against the lidar's road plane."""
+    answers, truth, pictures = [], [], []
+    for path in sorted((data / "kitti_road" / "image_2").glob("*.png")):
+        calib = data / "kitti_road" / "calib" / f"{path.stem}.txt"
+        size = cv2.imread(str(path)).shape[:2]
+        camera = Camera.from_file(calib, image_size=(size[0], size[1]))
+        answer, picture = calibrate(model, path, camera, KITTI_LANE_WIDTH)
+        answers.append(answer)
+        truth.append(kitti_truth(calib))
+        pictures.append(picture)
+    save_sheet(sheets, "kitti_road", pictures, 2, 900)
+    return summarise(answers, torch.stack(truth))
+
+
+def culane(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
+    """Night frames: how many are calibrated."""
+    paths = sorted((data / "culane").rglob("*.jpg"))
+    height, width = cv2.imread(str(paths[0])).shape[:2]
+    focal = 0.5 * width / np.tan(np.radians(30.0))
+    camera = Camera.from_parameters(focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
+    seen = [calibrate(model, path, camera, 3.7) for path in paths]
+    save_sheet(sheets, "culane", [picture for _, picture in seen], 2, 900)
+    return {"images": len(seen), "tracking": sum(answer.tracking for answer, _ in seen)}
+
+
+def streets(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
+    """Two images with a known pose, in sigmas, and six to look at."""
+    lines = (data / "streets" / "truth.csv").read_text().splitlines()
+    rows = {row["image"]: row for row in csv.DictReader(line for line in lines if not line.startswith("#"))}
+    figures: dict[str, float] = {}
+    pictures = []
+    for path in sorted(p for p in (data / "streets").iterdir() if p.suffix in (".jpg", ".png")):
+        file = path.with_suffix(".yaml")
+        height, width = cv2.imread(str(path)).shape[:2]
+        focal = 0.5 * width / np.tan(np.radians(30.0))
+        centred = (focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
+        camera = Camera.from_file(file) if file.exists() else Camera.from_parameters(*centred)
+        answer, picture = calibrate(model, path, camera, KITTI_LANE_WIDTH)
+        pictures.append(picture)
+        if path.name in rows:
+            row = rows[path.name]
+            truth = torch.tensor([float(row["pitch_deg"]), float(row["roll_deg"])]).double()
+            pitch, roll = ((answer.plane - truth).abs() / answer.sigma).tolist()
+            tall = abs(answer.height - float(row["height_m"])) / answer.height_sigma
+            for axis, value in (("pitch", pitch), ("roll", roll), ("height", tall)):
+                figures[f"{path.stem}_{axis}_error_in_sigma"] = value
+    save_sheet(sheets, "streets", pictures, 2, 900)
+    return figures
+
+
+def save_sheet(
+    folder: Path | None, name: str, pictures: list[NDArray[np.uint8]], columns: int, width: int
+) -> None:
+    """Write a contact sheet as a JPEG, if a folder is given."""
+    if folder is None or not pictures:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    small = [cv2.resize(p, (width, round(width * p.shape[0] / p.shape[1]))) for p in pictures]
+    tall = max(p.shape[0] for p in small)
+    padded = [cv2.copyMakeBorder(p, 0, tall - p.shape[0], 0, 0, cv2.BORDER_CONSTANT) for p in small]
+    padded += [np.zeros_like(padded[0])] * (-len(padded) % columns)
+    rows = [np.hstack(padded[i : i + columns]) for i in range(0, len(padded), columns)]
+    for page, start in enumerate(range(0, len(rows), 8)):
+        sheet = cv2.cvtColor(np.vstack(rows[start : start + 8]), cv2.COLOR_RGB2BGR)
+        cv2.imwrite(str(folder / f"{name}-{page}.jpg"), sheet)
+
+
+@one_line_errors()
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    default = Path(__file__).resolve().parents[2] / "shared" / "data"
+    parser.add_argument("--data", type=Path, default=default, help="folder of the data (../shared/data)")
+    parser.add_argument("--weights", type=Path, help="other weights than the shipped")
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--sheets", type=Path, help="write contact sheets with the segments into this folder")
+    options = parser.parse_args()
+    for name in ("kitti_road", "culane", "streets"):
+        if not (options.data / name).is_dir():
+            raise ValueError(f"{options.data}: expected the folder {name}, got none; give --data")
+    model = LaneBEV.from_pretrained(options.weights).eval()
+    figures = {
+        part.__name__: part(model, options.data, options.sheets) for part in (kitti_road, culane, streets)
+    }
+    print(json.dumps(figures, indent=1))
+    if options.json is not None:
+        options.json.write_text(json.dumps({"lanebev": lanebev.__version__, **figures}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
