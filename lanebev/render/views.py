@@ -21,8 +21,15 @@ from lanebev.render.raster.photometry import add_bonnet, add_noise, blur, compre
 from lanebev.render.scene.alignment import Alignment, build_alignment
 from lanebev.render.scene.sampler import Dice, row_of
 from lanebev.render.scene.traffic import place_solids
+from lanebev.render.scene.window import (
+    WindowConfig,
+    sample_window_scale,
+    vanishing_pixel,
+    window_from_native,
+)
 from lanebev.render.scene.world import Place, World, moved_along, sample_course, sample_world
 from lanebev.render.truth import frame_truth
+from lanebev.types import Extrinsics
 
 
 def render_place(
@@ -101,6 +108,8 @@ def render_views(
     image_size: tuple[int, int],
     generator: torch.Generator,
     *,
+    device: torch.device | str | None = None,
+    window: WindowConfig | None = None,
     model: str = "pinhole",
     ideal_sensor: bool = False,
 ) -> RenderedFrame:
@@ -110,6 +119,9 @@ def render_views(
         batch_size: B.
         image_size: (H, W).
         generator: the only source of randomness.
+        device: where to render, and where the result is; by default the CPU.
+        window: render windows about the horizon of images with more pixels; by default whole images. The
+            intrinsics are then those of the window; a lens's distortion is the same on the z = 1 plane.
         model: "pinhole" (Brown-Conrady, D = 5) or "fisheye" (Kannala-Brandt, D = 4) lenses.
         ideal_sensor: leave out blur, noise and compression.
 
@@ -127,4 +139,22 @@ def render_views(
     intrinsics = sample_intrinsics(dice, image_size)
     distortion = sample_distortion(dice, intrinsics, image_size, model)
     lens = Lens(intrinsics, distortion, model, sample_extrinsics(dice))
-    return render_place(world, place, alignment, lens, image_size, generator, ideal_sensor)
+    if window is not None:
+        scale = sample_window_scale(dice, window)
+        horizon = vanishing_pixel(intrinsics, distortion, model, lens.extrinsics)
+        matrix = window_from_native(dice, window, scale, image_size, horizon)
+        lens = lens._replace(intrinsics=matrix @ intrinsics)
+        zoom = scale.clamp(max=1.0) ** -dice.uniform(
+            0.0, 1.0
+        )  # from a native image of more, or as few, pixels
+        world = world._replace(sensor=world.sensor._replace(blur=world.sensor.blur * zoom))
+    frame = render_place(world, place, alignment, lens, image_size, generator, ideal_sensor)
+    return _on_device(frame, device)
+
+
+def _on_device(frame: RenderedFrame, device: torch.device | str | None) -> RenderedFrame:
+    parts = [
+        Extrinsics(*(t.to(device) for t in part)) if isinstance(part, Extrinsics) else part.to(device)
+        for part in frame
+    ]
+    return RenderedFrame(*parts)
