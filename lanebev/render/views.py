@@ -19,7 +19,7 @@ from lanebev.render.raster.lens import (
 from lanebev.render.raster.paint import paint_view
 from lanebev.render.raster.photometry import add_bonnet, add_noise, blur, compress, expose, light_of
 from lanebev.render.scene.alignment import Alignment, build_alignment
-from lanebev.render.scene.sampler import Dice, row_of
+from lanebev.render.scene.sampler import Dice, map_tensors, row_of
 from lanebev.render.scene.traffic import place_solids
 from lanebev.render.scene.window import (
     WindowConfig,
@@ -29,7 +29,6 @@ from lanebev.render.scene.window import (
 )
 from lanebev.render.scene.world import Place, World, moved_along, sample_course, sample_world
 from lanebev.render.truth import frame_truth
-from lanebev.types import Extrinsics
 
 
 def render_place(
@@ -149,12 +148,4 @@ def render_views(
         )  # from a native image of more, or as few, pixels
         world = world._replace(sensor=world.sensor._replace(blur=world.sensor.blur * zoom))
     frame = render_place(world, place, alignment, lens, image_size, generator, ideal_sensor)
-    return _on_device(frame, device)
-
-
-def _on_device(frame: RenderedFrame, device: torch.device | str | None) -> RenderedFrame:
-    parts = [
-        Extrinsics(*(t.to(device) for t in part)) if isinstance(part, Extrinsics) else part.to(device)
-        for part in frame
-    ]
-    return RenderedFrame(*parts)
+    return map_tensors(lambda tensor: tensor.to(device), frame)

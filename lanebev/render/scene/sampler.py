@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -46,7 +46,15 @@ class Dice:
         return torch.tensor(values)[self.pick([1.0] * len(values), *shape)]
 
 
+def map_tensors(function: Callable[[Tensor], Tensor], values: T) -> T:
+    """Apply a function to every tensor of a nested NamedTuple; what is neither stays."""
+    parts = [
+        map_tensors(function, v) if isinstance(v, tuple) else function(v) if isinstance(v, Tensor) else v
+        for v in values
+    ]
+    return type(values)(*parts)
+
+
 def row_of(values: T, index: int) -> T:
     """Row ``index`` of a (nested) NamedTuple of (B, ...) tensors, the batch dimension kept."""
-    parts = [row_of(v, index) if isinstance(v, tuple) else v[index : index + 1] for v in values]
-    return type(values)(*parts)
+    return map_tensors(lambda tensor: tensor[index : index + 1], values)

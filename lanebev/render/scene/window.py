@@ -77,7 +77,8 @@ def window_from_native(
     zero, one = torch.zeros_like(across), torch.ones_like(across)
     shift_x, shift_y = middle - across * 0.5 * (width - 1), horizon - down * vanishing_point[:, 1]
     entries = [across, zero, shift_x, zero, down, shift_y, zero, zero, one]
-    return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+    matrix: Tensor = torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+    return matrix
 
 
 def vanishing_pixel(intrinsics: Tensor, distortion: Tensor, model: str, extrinsics: Extrinsics) -> Tensor:
