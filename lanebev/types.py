@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from enum import IntEnum
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar, cast
 
 import torch
 from torch import Tensor
 from torch.utils import _pytree
 
+T = TypeVar("T")
 TupleClass = TypeVar("TupleClass", bound=type)
 
 NUM_BOUNDARIES = 6
@@ -20,6 +22,21 @@ def saved_by_name(cls: TupleClass) -> TupleClass:
     _pytree._register_namedtuple(cls, serialized_type_name=f"lanebev.{cls.__name__}")
     torch.serialization.add_safe_globals([cls])
     return cls
+
+
+class TensorTuple(Protocol):
+    """Any NamedTuple of tensors."""
+
+    def _asdict(self) -> Mapping[str, Tensor]: ...
+
+
+def map_tensors(function: Callable[[Tensor], Tensor], value: T) -> T:
+    """Apply a function to a tensor, or to every tensor of a NamedTuple; return anything else as it is."""
+    if isinstance(value, Tensor):
+        return cast(T, function(value))
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return cast(T, type(value)(*(map_tensors(function, part) for part in value)))
+    return value
 
 
 class Status(IntEnum):

@@ -128,3 +128,20 @@ def test_resuming_gives_bit_for_bit_what_an_uninterrupted_run_gives(tmp_path):
     for name in fresh:
         for one, other in zip(parts[2][name], whole[2][name], strict=True):
             assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("calibrator", [JointCalibrator(), TwoStageCalibrator()], ids=["joint", "two-stage"])
+def test_every_calibrator_answers_its_interface(calibrator):
+    """Callers need no type of their own: passes on a still, curvature or None, a state that detaches."""
+    [(_, segments)] = observe(moments(1 / FPS), 2, 1.0, 8, 0, torch.float64)
+    ends = segments.endpoints.requires_grad_()
+    state = calibrator.initial_state(2, dtype=torch.float64)
+    out, after = calibrator(segments._replace(endpoints=ends), CAMERA.expand(2, 3, 3), state, 1 / FPS)
+    assert out.extrinsics.pitch.requires_grad
+    cut = after.detach()
+    assert type(cut) is type(after)
+    assert not any(part.requires_grad for part in cut)
+    assert all(map(torch.equal, cut, after))
+    bend = calibrator.curvature(after)
+    assert bend is None or bend.shape == (2,)
+    assert calibrator.still_passes >= 1

@@ -1,36 +1,66 @@
-"""What online calibrators have in common: the border at which anything may come."""
+"""The interface of all online calibrators, and the checks and casts that every one of them needs."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Generic, Protocol, Self, TypeVar
 
+import torch
 from torch import Tensor, nn
 
 from lanebev.estimation.checks import as_batch, as_lane_width, check_segments, check_state, padded, usable
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
-from lanebev.types import Calibration, LaneSegments
+from lanebev.types import Calibration, LaneSegments, TensorTuple, map_tensors
 
 
-class Calibrator(nn.Module):
-    """Per row of a batch, state in and state out; a subclass gives ``initial_state`` and :meth:`step`.
+class CalibratorState(TensorTuple, Protocol):
+    """A NamedTuple of tensors, (B, ...) each; the first is floating point."""
+
+    def detach(self) -> Self:
+        """Return the state without the graph that computed it, as truncated backpropagation needs."""
+        ...
+
+
+StateT = TypeVar("StateT", bound=CalibratorState)
+
+
+class Calibrator(nn.Module, Generic[StateT]):
+    """Estimate the pose frame by frame, per row of a batch: state in, state out.
+
+    A subclass sets the attributes and defines :meth:`initial_state`, :meth:`step` and, where it estimates
+    the road's curvature, :meth:`curvature`.
 
     Attributes:
-        config: the numbers, ``num_boundaries`` among them.
-        state_type: NamedTuple of the state, its first tensor (B, D).
+        state_type: the class of the state.
+        num_boundaries: L.
+        still_passes: updates that a single image needs, see
+            :func:`~lanebev.app.run.calibrate_still`: 1 for a calibrator that starts by a search.
     """
 
-    config: Any
-    state_type: type[Any]
+    state_type: type[StateT]
+    num_boundaries: int
+    still_passes: int = 1
+
+    def initial_state(
+        self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
+    ) -> StateT:
+        """Return the state before the first frame, UNINITIALISED.
+
+        Args:
+            batch_size: B.
+            dtype: of the state and so of all results, float32 or float64.
+            device: of the state; None is the default device.
+        """
+        raise NotImplementedError
 
     def forward(
         self,
         segments: LaneSegments,
         intrinsics: Tensor,
-        state: Any,
+        state: StateT,
         dt: float | Tensor,
         lane_width: float | Tensor = 3.7,
-    ) -> tuple[Calibration, Any]:
-        """One frame; the results have the state's dtype.
+    ) -> tuple[Calibration, StateT]:
+        """Estimate the pose of one frame; the results have the state's dtype.
 
         All is computed in double precision, autocast off: in single precision a lane seen sharply and alone
         leaves information matrices with a condition number beyond 1e7, which are not positive definite any
@@ -54,23 +84,23 @@ class Calibrator(nn.Module):
         count = segments.weight.shape[1]
         given = check_state(state, self.state_type, intrinsics.shape[0])
         like = given.to(widest_dtype(given.device))
-        segments, intrinsics, state = (cast_floating(x, like.dtype) for x in (segments, intrinsics, state))
-        widths = as_lane_width(lane_width, like, self.config.num_boundaries)
-        segments, intrinsics, widths = usable(
-            padded(segments), intrinsics, widths, self.config.num_boundaries
-        )
+        segments, intrinsics = cast_floating(segments, like.dtype), cast_floating(intrinsics, like.dtype)
+        widths = as_lane_width(lane_width, like, self.num_boundaries)
+        segments, intrinsics, widths = usable(padded(segments), intrinsics, widths, self.num_boundaries)
         with autocast_off(like.device):
-            calibration, state = self.step(segments, intrinsics, state, as_batch(dt, like), widths)
+            calibration, state = self.step(
+                segments, intrinsics, cast_floating(state, like.dtype), as_batch(dt, like), widths
+            )
         calibration = calibration._replace(inliers=calibration.inliers[:, :count])
-        return _copied(cast_floating(calibration, given.dtype)), cast_floating(state, given.dtype)
+        calibration = map_tensors(torch.clone, cast_floating(calibration, given.dtype))
+        return calibration, cast_floating(state, given.dtype)
 
     def step(
-        self, segments: LaneSegments, intrinsics: Tensor, state: Any, dt: Tensor, lane_width: Tensor
-    ) -> tuple[Calibration, Any]:
-        """As :meth:`forward`, of what can be used, in one dtype, with dt (B,) and lane_width (B, L-1)."""
+        self, segments: LaneSegments, intrinsics: Tensor, state: StateT, dt: Tensor, lane_width: Tensor
+    ) -> tuple[Calibration, StateT]:
+        """Estimate as :meth:`forward`, from usable input of one dtype; dt is (B,), lane_width (B, L-1)."""
         raise NotImplementedError
 
-
-def _copied(value: Any) -> Any:
-    """A tensor, or every one in a NamedTuple, in memory of its own."""
-    return value.clone() if isinstance(value, Tensor) else type(value)(*map(_copied, value))
+    def curvature(self, state: StateT) -> Tensor | None:
+        """Return the road's curvature at the camera, (B,) 1/m, positive to the right, or None."""
+        return None

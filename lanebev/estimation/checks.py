@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from lanebev.geometry.lens import check_intrinsics, harmless_camera, usable_cameras
-from lanebev.types import LaneSegments, Status
+from lanebev.types import LaneSegments, Status, TensorTuple
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
 _MIN_SIGMA = 1e-3  # px; nothing is known better
@@ -36,8 +35,13 @@ def check_segments(segments: LaneSegments, intrinsics: Tensor) -> None:
     check_intrinsics(intrinsics, ends.shape[0])
 
 
-def check_state(state: Any, kind: type[Any], rows: int) -> Tensor:
-    """Raise where a state is not of the calibrator's kind and of so many rows.
+def check_state(state: TensorTuple, kind: type[TensorTuple], rows: int) -> Tensor:
+    """Check that a state is a NamedTuple of the expected class with so many rows.
+
+    Args:
+        state: as the caller gave it.
+        kind: the expected class.
+        rows: B.
 
     Returns:
         its first tensor, (B, D), whose dtype and device are those of the calibrator.
@@ -49,12 +53,13 @@ def check_state(state: Any, kind: type[Any], rows: int) -> Tensor:
         raise ValueError(
             f"state: expected {kind.__name__}, begun by initial_state(batch_size), got {type(state).__name__}"
         )
-    for name, part in zip(state._fields, state, strict=True):
+    parts = state._asdict()
+    for name, part in parts.items():
         if part.shape[:1] != (rows,):
             raise ValueError(f"state.{name}: expected ({rows}, ...), got {tuple(part.shape)}")
-    like: Tensor = state[0]
+    first, like = next(iter(parts.items()))
     if like.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"state.{state._fields[0]}: expected float32 or float64, got {like.dtype}")
+        raise ValueError(f"state.{first}: expected float32 or float64, got {like.dtype}")
     return like
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from functools import reduce, wraps
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor
 
+from lanebev.types import map_tensors
+
 P = ParamSpec("P")
 R = TypeVar("R")
+T = TypeVar("T")
 
 
 def full_precision(function: Callable[P, R]) -> Callable[P, R]:
@@ -47,18 +50,15 @@ def widest_dtype(device: torch.device) -> torch.dtype:
     return torch.float32 if device.type == "mps" else torch.float64
 
 
-def cast_floating(value: Any, dtype: torch.dtype) -> Any:
-    """A floating tensor, or those of a NamedTuple, to a dtype; anything else as it is."""
-    if isinstance(value, Tensor):
-        return value.to(dtype) if value.is_floating_point() else value
-    if hasattr(value, "_fields"):
-        return type(value)(*(cast_floating(part, dtype) for part in value))
-    return value
+def cast_floating(value: T, dtype: torch.dtype) -> T:
+    """Cast a floating tensor, or those of a NamedTuple, to a dtype; return anything else as it is."""
+    return map_tensors(lambda part: part.to(dtype) if part.is_floating_point() else part, value)
 
 
-def _floating(values: Iterable[Any]) -> Iterator[Tensor]:
+def _floating(values: Iterable[object]) -> Iterator[Tensor]:
     for value in values:
-        if isinstance(value, Tensor) and value.is_floating_point():
-            yield value
-        elif hasattr(value, "_fields"):
+        if isinstance(value, Tensor):
+            if value.is_floating_point():
+                yield value
+        elif isinstance(value, tuple) and hasattr(value, "_fields"):
             yield from _floating(value)

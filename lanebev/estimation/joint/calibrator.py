@@ -43,7 +43,7 @@ from lanebev.types import Calibration, LaneSegments, Status
 _NO_BOUNDARY = 0.36  # m out of place, three sigmas of what lanes differ, from which a line bounds no lane
 
 
-class JointCalibrator(Calibrator):
+class JointCalibrator(Calibrator[JointState]):
     """Online calibration by one iterated filter, per row of a batch, state in and state out.
 
     Deviation from the paper: one stage instead of two, so that roll and height profit from what pitch and
@@ -61,6 +61,7 @@ class JointCalibrator(Calibrator):
         if config is not None and numbers:
             raise ValueError("config: expected either a JointConfig or its keywords, got both")
         self.config = config or JointConfig(**numbers)  # type: ignore[arg-type]
+        self.num_boundaries = self.config.num_boundaries
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
@@ -131,7 +132,7 @@ class JointCalibrator(Calibrator):
         return as_calibration(after, inliers, positions, cfg), after
 
     def curvature(self, state: JointState) -> Tensor:
-        """Curvature of the road at the camera, (B,) 1/m, positive to the right."""
+        """Return the road's curvature at the camera, (B,) 1/m, positive to the right."""
         share = (state.phase / KNOT_SPACING).unsqueeze(-1)
         first, steps = state.mean[:, CURVATURE], state.mean[:, STEPS]
         return first + (share * steps)[:, 0]

@@ -23,7 +23,7 @@ from lanebev.estimation.joint.dynamics import (
 from lanebev.estimation.joint.measurement import CURVATURE, KNOT_SPACING, NUM_PARAMS, NUM_STRAIGHT
 from lanebev.estimation.joint.road import straight_or_bend
 from lanebev.estimation.joint.single_frame import FramePrior
-from lanebev.types import NUM_BOUNDARIES, saved_by_name
+from lanebev.types import NUM_BOUNDARIES, map_tensors, saved_by_name
 
 
 class Reason(IntFlag):
@@ -131,6 +131,10 @@ class JointState(NamedTuple):
     misfit: Tensor
     status: Tensor
     reasons: Tensor
+
+    def detach(self) -> JointState:
+        """Return the state without the graph that computed it."""
+        return map_tensors(Tensor.detach, self)
 
 
 def begin(params: Tensor, param_cov: Tensor, cfg: JointConfig) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,7 @@ from lanebev.geometry.road import segment_rays
 from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
 
 
-class TwoStageCalibrator(Calibrator):
+class TwoStageCalibrator(Calibrator[TwoStageState]):
     """Online calibration in the paper's two stages, per row of a batch, state in and state out.
 
     Source: Secs. III and IV. Assumes a straight flat road, parallel boundaries and equal known lane widths:
@@ -27,12 +27,14 @@ class TwoStageCalibrator(Calibrator):
     """
 
     state_type = TwoStageState
+    still_passes = 4  # it starts from a guess of roll and height, and its linearisation has to settle
 
     def __init__(self, config: TwoStageConfig | None = None, **numbers: object) -> None:
         super().__init__()
         if config is not None and numbers:
             raise ValueError("config: expected either a TwoStageConfig or its keywords, got both")
         self.config = config or TwoStageConfig(**numbers)  # type: ignore[arg-type]
+        self.num_boundaries = self.config.num_boundaries
         generator = torch.Generator().manual_seed(self.config.seed)
         self.draws: Tensor
         draws = torch.rand(self.config.num_hypotheses, 2, generator=generator, dtype=torch.float64)

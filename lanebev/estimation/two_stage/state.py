@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from lanebev.types import NUM_BOUNDARIES, saved_by_name
+from lanebev.types import NUM_BOUNDARIES, map_tensors, saved_by_name
 
 
 @dataclass(frozen=True)
@@ -63,3 +63,7 @@ class TwoStageState(NamedTuple):
     height_known: Tensor
     unseen: Tensor
     status: Tensor
+
+    def detach(self) -> TwoStageState:
+        """Return the state without the graph that computed it."""
+        return map_tensors(Tensor.detach, self)
