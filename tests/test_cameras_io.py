@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from scipy.spatial.transform import Rotation
 
 from lanebev import Camera, Extrinsics
 from lanebev.estimation.mount import MountCalibration, MountReason
@@ -232,7 +233,10 @@ def test_calibration_file_is_read_by_others(tmp_path):
     assert storage.getNode("mount").getNode("height_m").real() == 1.5
     np.testing.assert_allclose(storage.getNode("camera_matrix").mat(), LENS.intrinsics)
     np.testing.assert_allclose(storage.getNode("distortion_coefficients").mat()[0], LENS.distortion)
-    np.testing.assert_allclose(storage.getNode("vehicle_from_camera").mat(), vehicle_from_camera(mount)[0])
+    matrix = vehicle_from_camera(mount)[0]
+    np.testing.assert_allclose(storage.getNode("vehicle_from_camera").mat(), matrix)
+    rotation = Rotation.from_quat(fields["quaternion_xyzw"])
+    np.testing.assert_allclose(rotation.as_matrix(), matrix[:3, :3], atol=1e-14)
 
 
 def test_cameras_compare_as_objects():

@@ -291,9 +291,8 @@ def test_segments_lie_on_the_lines_of_an_ideal_pinhole():
         1000, 1000, 639.5, 359.5, 1280, 720, distortion=[-0.25, 0.04, 1e-4, -1e-4, 0]
     )
     offsets = [-5.4, -1.8, 1.8, 5.4]
-    lines = []
-    for line in _fan(offsets):
-        lines.append(LaneLine(distorted.distort_points(torch.from_numpy(line)).numpy()))
+    fan = map(torch.from_numpy, _fan(offsets))
+    lines = [LaneLine(distorted.distort_points(line).numpy()) for line in fan]
     segments = segments_from_rows([rows_from_lines(lines, distorted)], distorted)
     assert segments.endpoints.shape == (1, 180, 2, 2)
     seen = segments.weight[0] > 0

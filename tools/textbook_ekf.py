@@ -44,7 +44,7 @@ class TextbookEKF:
         """One frame of every row."""
         seen = observe(segments, intrinsics, NUM_BOUNDARIES)
         places = boundary_places(lane_width, NUM_BOUNDARIES, seen.sigma).gather(1, seen.boundary)
-        step = torch.full((1,), dt if dt == dt and dt > 0 else 0.0, dtype=torch.float64)
+        step = torch.full((1,), dt if dt > 0 else 0.0, dtype=torch.float64)
         transition, noise = (
             part[0].numpy() for part in constant_velocity(step, torch.tensor(_DENSITY, dtype=torch.float64))
         )

@@ -83,7 +83,7 @@ def _lines(path: Path) -> list[str]:
 
 
 def _culane_entry(root: Path, line: str) -> Entry:
-    image = root / line.split()[0].lstrip("/")
+    image = root / line.split(maxsplit=1)[0].lstrip("/")
     return Entry(image, read_culane(image.with_suffix(".lines.txt")))
 
 

@@ -80,7 +80,8 @@ def gain(before: Tensor, after: Tensor, counted: Tensor, drives: int) -> dict[st
     Source: paired bootstrap (Efron and Tibshirani 1993) over drives, whose frames are not independent.
 
     Args:
-        before, after: (N, 4) errors in rad and m, drive after drive.
+        before: (N, 4) errors in rad and m, drive after drive.
+        after: (N, 4) errors of the other network on the same frames.
         counted: (N, 4) bool.
         drives: number of them.
     """

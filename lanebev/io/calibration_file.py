@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 import torch
+from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
 from lanebev.camera.files import camera_info, dump_yaml
 from lanebev.camera.model import Camera
@@ -43,10 +44,8 @@ def write_calibration(path: str | Path, camera: Camera, mounted: MountCalibratio
         camera: the lens.
         mounted: of batch size 1.
     """
-    from scipy.spatial.transform import Rotation  # its import is slow, and only this needs it
-
     matrix = vehicle_from_camera(mounted.extrinsics)[0].double()
-    quaternion = Rotation.from_matrix(matrix[:3, :3].numpy()).as_quat()
+    w, *xyz = rotation_matrix_to_quaternion(matrix[:3, :3]).tolist()
     pose = mounted.extrinsics.stack()[0].tolist()
     std = mounted.covariance[0].diagonal().clamp(min=0).sqrt().tolist()
     angles = ("pitch", "yaw", "roll")
@@ -61,5 +60,5 @@ def write_calibration(path: str | Path, camera: Camera, mounted: MountCalibratio
         "height_std_m": std[3],
     }
     fields["vehicle_from_camera"] = {"rows": 4, "cols": 4, "dt": "d", "data": matrix.flatten().tolist()}
-    fields["quaternion_xyzw"] = [float(value) for value in quaternion]
+    fields["quaternion_xyzw"] = [*xyz, w]
     Path(path).write_text(dump_yaml(fields), encoding="utf-8")

@@ -104,7 +104,8 @@ def update_by_widths(
         boundaries: angles about the direction of stage 1.
         lane_width: (B, L-1) m, the prior.
         direction_cov: (B, 2, 2) of pitch and yaw.
-        mean: (B, 4) predicted roll, height and their rates; cov: (B, 4, 4).
+        mean: (B, 4) predicted roll, height and their rates.
+        cov: (B, 4, 4) their covariance.
         seen: (B, 2) bool, whether widths may move roll and height.
         lane_noise: m, standard deviation of a lane's width about the prior.
 
