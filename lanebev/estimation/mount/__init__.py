@@ -1,0 +1,16 @@
+"""How the camera is mounted in the vehicle: a slow estimate behind the fast pose, axis by axis."""
+
+from lanebev.estimation.mount.config import MountConfig
+from lanebev.estimation.mount.estimator import MountEstimator
+from lanebev.estimation.mount.results import MountCalibration, MountReason, MountState, MountStatus
+from lanebev.estimation.mount.words import describe_mount
+
+__all__ = [
+    "MountCalibration",
+    "MountConfig",
+    "MountEstimator",
+    "MountReason",
+    "MountState",
+    "MountStatus",
+    "describe_mount",
+]

@@ -1,0 +1,65 @@
+"""The numbers of the mount estimator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+PerAxis = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class MountConfig:
+    """Numbers of :class:`MountEstimator`; rad, m, s, in the order pitch, yaw, roll, height.
+
+    Attributes:
+        block_time: s of accepted frames in a block.
+        num_blocks: kept.
+        needed: blocks for a valid estimate.
+        lower, upper: validity limits of the mount.
+        margin: hysteresis of the limits.
+        largest_std: of the fast pose, for a frame to be used on that axis.
+        block_std: expected scatter of blocks, worth ``prior_blocks`` blocks of evidence.
+        prior_blocks: see above.
+        block_correlation: of neighbouring blocks, which slow motion shares.
+        prior_pose, prior_std: before anything is seen.
+        moved_least: smallest change that counts as a moved camera.
+        moved_sigmas: and it must exceed so many sigmas of a block.
+        moved_blocks: in so many blocks in a row that agree.
+        blend_steps: accepted frames over which a new estimate takes over from the old.
+        drift_std: of the mount's random walk, per square root of an hour without a new block.
+        stale_time: s without a new block after which an axis is reported as stale.
+        min_speed: m/s.
+        max_yaw_rate: rad/s.
+        max_curvature: 1/m.
+    """
+
+    block_time: float = 4.0
+    num_blocks: int = 50
+    needed: int = 5
+    lower: PerAxis = (-0.09, -0.07, -0.35, 0.4)
+    upper: PerAxis = (0.17, 0.07, 0.35, 4.0)
+    margin: PerAxis = (0.003, 0.003, 0.005, 0.02)
+    largest_std: PerAxis = (0.01, 0.01, 0.02, 0.1)
+    block_std: PerAxis = (0.004, 0.006, 0.004, 0.01)
+    prior_blocks: float = 4.0
+    block_correlation: float = 0.2
+    prior_pose: PerAxis = (0.0, 0.0, 0.0, 1.5)
+    prior_std: PerAxis = (0.12, 0.15, 0.05, 0.5)
+    moved_least: PerAxis = (0.015, 0.02, 0.02, 0.06)
+    moved_sigmas: float = 5.0
+    moved_blocks: int = 3
+    blend_steps: int = 10
+    drift_std: PerAxis = (0.003, 0.003, 0.003, 0.01)
+    stale_time: float = 1800.0
+    min_speed: float = 6.7
+    max_yaw_rate: float = 0.035
+    max_curvature: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.moved_blocks < self.needed <= self.num_blocks:
+            raise ValueError(
+                "moved_blocks, needed, num_blocks: expected 1 <= moved_blocks < needed <= num_blocks, got "
+                f"{self.moved_blocks}, {self.needed}, {self.num_blocks}"
+            )
+        if not self.block_time > 0:
+            raise ValueError(f"block_time: expected a positive time in s, got {self.block_time}")

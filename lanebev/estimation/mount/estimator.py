@@ -1,0 +1,325 @@
+"""The slow calibration behind the fast pose: how the camera is mounted in the vehicle.
+
+The fast pose is the mount plus what the suspension and the driver's heading add. Accepted frames are
+averaged in blocks of some seconds, blocks in a running estimate whose uncertainty is their scatter. Each
+axis has its own blocks, so that an axis that the road does not determine does not hold up the others. The
+blocks, limits and gates are those of openpilot's calibrationd; axes, hysteresis, ageing and reasons are ours.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from lanebev.batch import flag
+from lanebev.estimation.checks import as_batch, check_state
+from lanebev.estimation.mount.config import MountConfig
+from lanebev.estimation.mount.results import MountCalibration, MountReason, MountState, MountStatus
+from lanebev.types import Calibration, Extrinsics, Status
+
+_LIMIT_REASONS = (
+    MountReason.PITCH_LIMIT,
+    MountReason.YAW_LIMIT,
+    MountReason.ROLL_LIMIT,
+    MountReason.HEIGHT_LIMIT,
+)
+_HOUR = 3600.0  # s
+
+
+class MountEstimator(nn.Module):
+    """Estimate the mount from the fast calibration, per row of a batch and axis by axis.
+
+    Args:
+        config: the numbers, or keywords of :class:`MountConfig`.
+    """
+
+    def __init__(self, config: MountConfig | None = None, **numbers: object) -> None:
+        super().__init__()
+        if config is not None and numbers:
+            raise ValueError("config: expected either a MountConfig or its keywords, got both")
+        self.config = config or MountConfig(**numbers)  # type: ignore[arg-type]
+
+    def initial_state(
+        self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
+    ) -> MountState:
+        """Return the state before the first frame: no blocks, UNCALIBRATED."""
+        zero = torch.zeros(batch_size, 4, dtype=dtype, device=device)
+        blocks = torch.zeros(batch_size, self.config.num_blocks, 4, dtype=dtype, device=device)
+        none = torch.zeros(batch_size, 4, dtype=torch.int64, device=device)
+        return MountState(
+            blocks=blocks,
+            variances=blocks.clone(),
+            filled=blocks.clone(),
+            ages=blocks.clone(),
+            pose_sum=zero,
+            variance_sum=zero.clone(),
+            seconds=zero.clone(),
+            begun=zero.clone(),
+            suspect=none,
+            contradicted=zero.clone(),
+            former=zero.clone(),
+            blend=zero.clone(),
+            status=none + int(MountStatus.UNCALIBRATED),
+            reasons=none + int(MountReason.FEW_BLOCKS),
+        )
+
+    def forward(
+        self,
+        calibration: Calibration,
+        state: MountState,
+        dt: float | Tensor,
+        speed: Tensor | None = None,
+        yaw_rate: Tensor | None = None,
+        curvature: Tensor | None = None,
+    ) -> tuple[MountCalibration, MountState]:
+        """Take in one frame, computed in the state's dtype.
+
+        Args:
+            calibration: of this frame, from any calibrator.
+            state: of the frame before, or :meth:`initial_state`.
+            dt: s since that frame, float or (B,).
+            speed: (B,) m/s of the vehicle, or None if not known.
+            yaw_rate: (B,) rad/s of the vehicle, or None.
+            curvature: (B,) 1/m of the road, or None.
+
+        Returns:
+            the mount and the state after the frame.
+
+        Raises:
+            ValueError: a shape that doesn't fit, or another estimator's state.
+        """
+        cfg = self.config
+        pose = calibration.extrinsics.stack()
+        pose = pose.to(check_state(state, MountState, pose.shape[0]).dtype)
+        variance = calibration.covariance.diagonal(dim1=-2, dim2=-1).to(pose.dtype)
+        step = as_batch(dt, pose)
+        frame_why = self._frame_gates(calibration.status, pose, step, speed, yaw_rate, curvature)
+        known = pose.isfinite().all(-1, keepdim=True) & variance.isfinite()
+        sure = known & (variance < variance.new_tensor(cfg.largest_std).square())
+        why = frame_why.unsqueeze(-1) | flag(~sure, MountReason.UNSURE)  # (B, 4)
+
+        used = why == 0
+        elapsed = torch.where(step.isfinite() & (step > 0), step, 0.0).unsqueeze(-1)  # (B, 1)
+        state = _add(state, used, pose, variance, elapsed, cfg.block_time)
+        doubtful = (frame_why == 0).unsqueeze(-1) & known & ~sure
+        state = self._weigh_doubtful(state, doubtful, used, pose, variance, elapsed)
+        shown_before, *_ = self._estimate(state)
+        state, moved = self._close_blocks(state)
+        state, withdrawn = self._withdraw(state, moved)
+        again = moved | withdrawn
+        faded = (state.blend - 1 / cfg.blend_steps).clamp(min=0.0)
+        state = state._replace(
+            former=torch.where(again, shown_before, state.former),
+            blend=torch.where(again, 1.0, torch.where(used, faded, state.blend)),
+        )
+
+        mean, var, count = self._estimate(state)
+        limits, outside = self._limits(mean, state.status == int(MountStatus.INVALID))
+        enough = count >= cfg.needed
+        again = again | (state.status == int(MountStatus.RECALIBRATING))
+        waiting = torch.where(again, int(MountStatus.RECALIBRATING), int(MountStatus.UNCALIBRATED))
+        valid = torch.where(outside, int(MountStatus.INVALID), int(MountStatus.CALIBRATED))
+        status = torch.where(enough, valid, waiting)
+        suspect = (state.suspect > 0) | (state.contradicted > 0)
+        why = why | flag(~enough, MountReason.FEW_BLOCKS) | torch.where(enough, limits, 0)
+        why = why | flag(suspect, MountReason.SUSPECT) | flag(moved, MountReason.MOVED)
+        why = why | flag(withdrawn, MountReason.WITHDRAWN)
+        why = why | flag(_newest_age(state) > cfg.stale_time, MountReason.STALE)
+        state = state._replace(status=status, reasons=why)
+
+        shown = state.blend * state.former + (1 - state.blend) * mean
+        var = var + (shown - mean).square()  # a blended estimate is wrong by what is not yet handed over
+        progress = 100 * (count / cfg.needed).clamp(max=1.0)
+        return _answer(shown, var, status, progress, why), state
+
+    def _frame_gates(
+        self,
+        status: Tensor,
+        pose: Tensor,
+        step: Tensor,
+        speed: Tensor | None,
+        yaw_rate: Tensor | None,
+        curvature: Tensor | None,
+    ) -> Tensor:
+        """Return the flags (B,) of what speaks against using this frame on any axis."""
+        cfg = self.config
+        why = flag(status != int(Status.TRACKING), MountReason.NOT_TRACKING)
+        why = why | flag(~(step.isfinite() & (step > 0)), MountReason.TIME)
+        if speed is not None:
+            why = why | flag(~(as_batch(speed, pose, "speed") >= cfg.min_speed), MountReason.SLOW)
+        turns = (("yaw_rate", yaw_rate, cfg.max_yaw_rate), ("curvature", curvature, cfg.max_curvature))
+        for name, turn, most in turns:
+            if turn is not None:
+                why = why | flag(~(as_batch(turn, pose, name).abs() <= most), MountReason.TURNING)
+        return why
+
+    def _bound(self, scatter: Tensor, noise: Tensor) -> Tensor:
+        """Return the deviation (B, 4) from the estimate that counts as a moved camera."""
+        least = scatter.new_tensor(self.config.moved_least)
+        return torch.maximum(least, self.config.moved_sigmas * (scatter + noise).sqrt())
+
+    def _weigh_doubtful(
+        self,
+        state: MountState,
+        doubtful: Tensor,
+        used: Tensor,
+        pose: Tensor,
+        variance: Tensor,
+        elapsed: Tensor,
+    ) -> MountState:
+        """Count the time for which frames too unsure to be used contradict the estimate by many sigmas."""
+        mean, scatter, count = self._scatter(state)
+        far = (pose - mean).abs() > self._bound(scatter, variance)
+        against = doubtful & far & (count >= self.config.moved_blocks)
+        agrees = (doubtful & ~far) | used  # the blocks judge the frames that are used
+        seconds = torch.where(against, state.contradicted + elapsed, state.contradicted)
+        return state._replace(contradicted=torch.where(agrees, 0.0, seconds))
+
+    def _close_blocks(self, state: MountState) -> tuple[MountState, Tensor]:
+        """Push each axis' full block and judge it by the others; (B, 4) bool where the camera was moved."""
+        cfg = self.config
+        full = state.seconds >= cfg.block_time - 1e-4  # rounding of the summed steps
+        time = torch.where(full, state.seconds, 1.0)
+        block, noise = state.pose_sum / time, state.variance_sum / time
+
+        mean, scatter, count = self._scatter(state)
+        bound = self._bound(scatter, noise)
+        against = ((block - mean).abs() > bound) & (count >= cfg.moved_blocks)
+        agrees = (block - state.blocks[:, 0]).abs() <= bound
+        suspect = torch.where(agrees, state.suspect + 1, 1)
+        suspect = torch.where(full, torch.where(against, suspect, 0), state.suspect)
+        moved = full & (suspect >= cfg.moved_blocks)
+
+        # blocks that were suspected and then not confirmed are dropped
+        index = _index(state)
+        dropped = full & (suspect <= 1) & (state.suspect > 0)
+        kept = torch.where(dropped.unsqueeze(1) & (index < state.suspect.unsqueeze(1)), 0.0, state.filled)
+        state = state._replace(filled=torch.where(full.unsqueeze(1), kept, state.filled))
+        empty = torch.where(full, 0.0, 1.0)
+        return state._replace(
+            blocks=_push(state.blocks, block, full),
+            variances=_push(state.variances, noise, full),
+            filled=_push(state.filled, torch.ones_like(block), full),
+            ages=_push(state.ages, state.begun, full),
+            pose_sum=state.pose_sum * empty,
+            variance_sum=state.variance_sum * empty,
+            seconds=state.seconds * empty,
+            begun=state.begun * empty,
+            suspect=torch.where(moved, 0, suspect),
+        ), moved
+
+    def _withdraw(self, state: MountState, moved: Tensor) -> tuple[MountState, Tensor]:
+        """Drop what dates from before a move, on every axis, and what unsure frames contradicted for long.
+
+        Returns:
+            the state and (B, 4) bool, axes other than the moved ones that lost blocks.
+        """
+        cfg = self.config
+        recent = state.ages[:, cfg.moved_blocks - 1]  # (B, 4) s since the first block after a move
+        window = torch.where(moved, recent, 0.0).amax(-1, keepdim=True).unsqueeze(1)  # (B, 1, 1)
+        before = (state.ages > window + 1e-6) & moved.any(-1)[:, None, None]
+        contradicted = state.contradicted >= cfg.moved_blocks * cfg.block_time
+        gone = (before | contradicted.unsqueeze(1)) & (state.filled > 0)
+        withdrawn = gone.any(1) & ~moved
+        return state._replace(
+            filled=torch.where(gone, 0.0, state.filled),
+            suspect=torch.where(withdrawn, 0, state.suspect),
+            contradicted=torch.where(contradicted | moved, 0.0, state.contradicted),
+        ), withdrawn
+
+    def _trusted(self, state: MountState) -> Tensor:
+        """Return the weights (B, K, 4) of the blocks that nothing contradicts."""
+        return state.filled * (_index(state) >= state.suspect.unsqueeze(1))
+
+    def _scatter(self, state: MountState) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the mean of the trusted blocks, one block's variance about it, their number, (B, 4) each."""
+        cfg = self.config
+        trusted = self._trusted(state)
+        count = trusted.sum(1)
+        mean = (trusted * state.blocks).sum(1) / count.clamp(min=1.0)
+        squared = (trusted * (state.blocks - mean.unsqueeze(1)).square()).sum(1)
+        prior = cfg.prior_blocks * mean.new_tensor(cfg.block_std).square()
+        return mean, (squared + prior) / (count - 1 + cfg.prior_blocks), count
+
+    def _estimate(self, state: MountState) -> tuple[Tensor, Tensor, Tensor]:
+        """Return mean, variance and number of blocks, (B, 4) each, the current one counted in part."""
+        cfg = self.config
+        mean, scatter, count = self._scatter(state)
+        clean = torch.where(state.suspect > 0, 0.0, 1 / cfg.block_time)
+        part, now = state.seconds * clean, state.pose_sum * clean
+        some = count + part
+        noise_now = state.variance_sum / state.seconds.clamp(min=1e-6)
+        noise = (self._trusted(state) * state.variances).sum(1) + part * noise_now
+        safe = some.clamp(min=1e-3)
+        prior, prior_var = mean.new_tensor(cfg.prior_pose), mean.new_tensor(cfg.prior_std).square()
+        both = (count * mean + now) / safe
+        # errors of the fast pose are common to all blocks (lane width), so they do not average out
+        variance = (1 + 2 * cfg.block_correlation) * scatter / safe + noise / safe
+        variance = variance + mean.new_tensor(cfg.drift_std).square() * _newest_age(state) / _HOUR
+        return (
+            torch.where(some > 1e-3, both, prior),
+            torch.where(some > 1e-3, torch.minimum(variance, prior_var), prior_var),
+            some,
+        )
+
+    def _limits(self, mean: Tensor, invalid: Tensor) -> tuple[Tensor, Tensor]:
+        """Return flags and bools (B, 4) of limits that are broken; the margin keeps them from flickering."""
+        cfg = self.config
+        lower, upper, margin = (mean.new_tensor(v) for v in (cfg.lower, cfg.upper, cfg.margin))
+        slack = torch.where(invalid, -margin, margin)
+        broken = (mean < lower - slack) | (mean > upper + slack)
+        flags = torch.tensor([int(name) for name in _LIMIT_REASONS], device=mean.device)
+        return broken * flags, broken
+
+
+def _answer(
+    pose: Tensor, variance: Tensor, status: Tensor, progress: Tensor, why: Tensor
+) -> MountCalibration:
+    """Sum up the axes: calibrated if all are, otherwise the gravest status of any."""
+    calibrated = status == int(MountStatus.CALIBRATED)
+    whole = torch.where(calibrated.any(-1), int(MountStatus.PARTIAL), int(MountStatus.UNCALIBRATED))
+    for grave in (MountStatus.RECALIBRATING, MountStatus.INVALID):
+        whole = torch.where((status == int(grave)).any(-1), int(grave), whole)
+    whole = torch.where(calibrated.all(-1), int(MountStatus.CALIBRATED), whole)
+    reasons = why[:, 0] | why[:, 1] | why[:, 2] | why[:, 3]
+    return MountCalibration(
+        extrinsics=Extrinsics.unstack(pose),
+        covariance=variance.diag_embed(),
+        status=whole,
+        progress=progress.amin(-1),
+        reasons=reasons,
+        axis_status=status,
+        axis_progress=progress,
+        axis_reasons=why,
+    )
+
+
+def _index(state: MountState) -> Tensor:
+    """Return the blocks' numbers, (1, K, 1), the newest first."""
+    return torch.arange(state.blocks.shape[1], device=state.blocks.device).view(1, -1, 1)
+
+
+def _newest_age(state: MountState) -> Tensor:
+    """Return the s (B, 4) since the newest block was begun; 0 where there is none."""
+    ages = torch.where(state.filled > 0, state.ages, torch.inf).amin(1)
+    return torch.where(ages.isfinite(), ages, 0.0)
+
+
+def _push(values: Tensor, new: Tensor, full: Tensor) -> Tensor:
+    """Put (B, 4) in front of (B, K, 4) where ``full`` (B, 4) holds; the last falls out."""
+    return torch.where(full.unsqueeze(1), torch.cat([new.unsqueeze(1), values[:, :-1]], 1), values)
+
+
+def _add(
+    state: MountState, used: Tensor, pose: Tensor, variance: Tensor, elapsed: Tensor, longest: float
+) -> MountState:
+    """Add the frame, weighted by its time, to the current block of each axis that uses it; let time pass."""
+    part = torch.where(used, elapsed.clamp(max=longest), 0.0)
+    open_block = (state.seconds > 0) | used
+    return state._replace(
+        ages=state.ages + elapsed.unsqueeze(1),
+        pose_sum=state.pose_sum + part * torch.where(used, pose, 0.0),
+        variance_sum=state.variance_sum + part * torch.where(used, variance, 0.0),
+        seconds=state.seconds + part,
+        begun=torch.where(open_block, state.begun + elapsed, 0.0),
+    )

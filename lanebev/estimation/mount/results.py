@@ -1,0 +1,105 @@
+"""What the mount estimator remembers and what it answers."""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+from typing import NamedTuple
+
+from torch import Tensor
+
+from lanebev.types import Extrinsics, saved_by_name
+
+AXES = ("pitch", "yaw", "roll", "height")
+
+
+class MountStatus(IntEnum):
+    """What a mount estimate, or one axis of it, is worth. A new meaning is a new value."""
+
+    UNCALIBRATED = 0  # not enough blocks yet
+    CALIBRATED = 1
+    INVALID = 2  # enough blocks, but outside the limits: mount the camera anew
+    RECALIBRATING = 3  # the camera was moved, or the estimate was contradicted; begun anew
+    PARTIAL = 4  # of the mount as a whole: some axes are calibrated, others are not yet
+
+
+class MountReason(IntFlag):
+    """Why an estimate is not (yet) valid, or this frame was not used; several may hold at once."""
+
+    NONE = 0
+    NOT_TRACKING = 1  # the fast calibration had no support in this frame
+    UNSURE = 2  # its sigma was too large
+    SLOW = 4  # the vehicle was too slow to follow the lane
+    TURNING = 8  # yaw rate or curvature too high
+    FEW_BLOCKS = 16  # progress below 100 %
+    PITCH_LIMIT = 32
+    YAW_LIMIT = 64
+    ROLL_LIMIT = 128
+    HEIGHT_LIMIT = 256
+    SUSPECT = 512  # the latest evidence contradicts the estimate
+    MOVED = 1024  # the camera was moved: begun anew in this frame
+    TIME = 2048  # dt not positive or not finite
+    WITHDRAWN = 4096  # dropped in this frame: it dates from before a move, or was contradicted
+    STALE = 8192  # no new block for a long time
+
+
+@saved_by_name
+class MountState(NamedTuple):
+    """Everything the estimator remembers, tensors only. K blocks of each axis, the newest first.
+
+    Attributes:
+        blocks: (B, K, 4) mean pose of each.
+        variances: (B, K, 4) mean variance of the fast pose in each.
+        filled: (B, K, 4) 1 where there is a block.
+        ages: (B, K, 4) s since the block was begun.
+        pose_sum: (B, 4) of the current block, times seconds.
+        variance_sum: (B, 4) likewise.
+        seconds: (B, 4) of accepted frames in the current block.
+        begun: (B, 4) s since the current block was begun.
+        suspect: (B, 4) int64, newest blocks that contradict the others.
+        contradicted: (B, 4) s for which frames that are too unsure to be used have contradicted the estimate.
+        former: (B, 4) estimate before the last restart.
+        blend: (B, 4) in [0, 1], its share in what is given out.
+        status: (B, 4) int64, values of MountStatus.
+        reasons: (B, 4) int64, MountReason flags of the last frame.
+    """
+
+    blocks: Tensor
+    variances: Tensor
+    filled: Tensor
+    ages: Tensor
+    pose_sum: Tensor
+    variance_sum: Tensor
+    seconds: Tensor
+    begun: Tensor
+    suspect: Tensor
+    contradicted: Tensor
+    former: Tensor
+    blend: Tensor
+    status: Tensor
+    reasons: Tensor
+
+
+@saved_by_name
+class MountCalibration(NamedTuple):
+    """The mount as it is known now.
+
+    Attributes:
+        extrinsics: pitch, yaw, roll, height of the camera in the vehicle, each (B,).
+        covariance: (B, 4, 4).
+        status: (B,) int64, values of :class:`MountStatus`, of the mount as a whole: CALIBRATED where every
+            axis is.
+        progress: (B,) per cent of the blocks needed, of the axis that has the fewest.
+        reasons: (B,) int64, :class:`MountReason` flags of all axes together.
+        axis_status: (B, 4) int64, values of :class:`MountStatus` of pitch, yaw, roll, height.
+        axis_progress: (B, 4) per cent.
+        axis_reasons: (B, 4) int64, :class:`MountReason` flags.
+    """
+
+    extrinsics: Extrinsics
+    covariance: Tensor
+    status: Tensor
+    progress: Tensor
+    reasons: Tensor
+    axis_status: Tensor
+    axis_progress: Tensor
+    axis_reasons: Tensor
