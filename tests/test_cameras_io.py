@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from scipy.spatial.transform import Rotation
 
 from lanebev import Camera, Extrinsics
-from lanebev.estimation.mount import MountCalibration, MountReason
-from lanebev.io.calibration_file import vehicle_from_camera, write_calibration
+from lanebev.estimation.mount import MountCalibration, MountReason, MountStatus
+from lanebev.io.calibration_file import read_mount, vehicle_from_camera, write_calibration
 
 DISTORTION = [-0.25, 0.04, -0.0007, 0.0001, -0.115]
 SHORT = {"fx": 1150.0, "fy": 1148.0, "cx": 650.0, "cy": 370.0, "width": 1280, "height": 720}
@@ -216,27 +215,82 @@ def test_write_camera_round_trip(tmp_path, distortion, model):
     _assert_same(again, Camera.from_parameters(**SHORT, distortion=padded, model=model))
 
 
-def test_calibration_file_is_read_by_others(tmp_path):
-    mount = Extrinsics(*(torch.tensor([value], dtype=torch.float64) for value in (0.05, -0.02, 0.01, 1.5)))
-    path = tmp_path / "calibration.yaml"
+POSE = Extrinsics(*(torch.tensor([value], dtype=torch.float64) for value in (0.05, -0.02, 0.01, 1.5)))
+
+
+def mounted(status: list[int], progress: list[float], reasons: list[int]) -> MountCalibration:
     variances = torch.tensor([0.01, 0.02, 0.03, 0.04], dtype=torch.float64).square()
-    reasons = torch.tensor([int(MountReason.FEW_BLOCKS | MountReason.SLOW)])
-    status, progress = torch.tensor([0]), torch.tensor([40.0])
-    write_calibration(path, LENS, MountCalibration(mount, variances.diag()[None], status, progress, reasons))
+    axes = (torch.tensor([status]), torch.tensor([progress]), torch.tensor([reasons]))
+    whole = MountStatus.CALIBRATED if set(status) == {1} else MountStatus.PARTIAL
+    least = torch.tensor([min(progress)])
+    why = torch.tensor([reasons[0] | reasons[1] | reasons[2] | reasons[3]])
+    return MountCalibration(POSE, variances.diag()[None], torch.tensor([int(whole)]), least, why, *axes)
+
+
+def test_calibration_file_is_read_by_others(tmp_path):
+    path = tmp_path / "calibration.yaml"
+    write_calibration(path, LENS, mounted([1] * 4, [100.0] * 4, [0, int(MountReason.SLOW), 0, 0]))
     _assert_same(Camera.from_file(path), LENS)
     fields = yaml.safe_load(path.read_text())
     assert fields["mount"]["pitch_deg"] == pytest.approx(math.degrees(0.05), abs=1e-12)
     assert fields["mount"]["roll_std_deg"] == pytest.approx(math.degrees(0.03), abs=1e-12)
-    assert (fields["mount"]["status"], fields["mount"]["progress_percent"]) == ("UNCALIBRATED", 40.0)
-    assert fields["mount"]["reasons"] == ["SLOW", "FEW_BLOCKS"]
+    assert (fields["mount"]["valid"], fields["mount"]["status"]) == (True, "CALIBRATED")
+    assert fields["mount"]["reasons"] == fields["mount"]["axes"]["yaw"]["reasons"] == ["SLOW"]
+    assert "needs" not in fields["mount"]
+    rotation = torch.tensor(fields["vehicle_from_camera"]["data"]).reshape(4, 4)[:3, :3]
+    x, y, z, w = fields["quaternion_xyzw"]
+    turned = [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)]  # the camera's x axis
+    np.testing.assert_allclose(rotation[:, 0], turned, atol=1e-6)
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     assert storage.getNode("mount").getNode("height_m").real() == 1.5
     np.testing.assert_allclose(storage.getNode("camera_matrix").mat(), LENS.intrinsics)
     np.testing.assert_allclose(storage.getNode("distortion_coefficients").mat()[0], LENS.distortion)
-    matrix = vehicle_from_camera(mount)[0]
-    np.testing.assert_allclose(storage.getNode("vehicle_from_camera").mat(), matrix)
-    rotation = Rotation.from_quat(fields["quaternion_xyzw"])
-    np.testing.assert_allclose(rotation.as_matrix(), matrix[:3, :3], atol=1e-14)
+    np.testing.assert_allclose(storage.getNode("vehicle_from_camera").mat(), vehicle_from_camera(POSE)[0])
+    prior = read_mount(path)
+    torch.testing.assert_close(prior.pose, POSE.stack()[0])
+    torch.testing.assert_close(prior.std, torch.tensor([0.01, 0.02, 0.03, 0.04], dtype=torch.float64))
+
+
+def test_what_is_not_calibrated_cannot_be_mistaken_for_a_pose(tmp_path):
+    path = tmp_path / "calibration.yaml"
+    few = int(MountReason.FEW_BLOCKS)
+    write_calibration(path, LENS, mounted([1, 1, 0, 3], [100.0, 100.0, 40.0, 60.0], [0, 0, few, few]))
+    fields = yaml.safe_load(path.read_text())
+    mount = fields["mount"]
+    assert not mount["valid"]
+    assert "vehicle_from_camera" not in fields
+    assert "quaternion_xyzw" not in fields
+    assert mount.keys() & {"pitch_deg", "yaw_deg", "roll_deg", "height_m"} == {"pitch_deg", "yaw_deg"}
+    assert mount["preliminary"].keys() == {"roll_deg", "roll_std_deg", "height_m", "height_std_m"}
+    assert mount["axes"]["roll"] == {
+        "status": "UNCALIBRATED",
+        "progress_percent": 40.0,
+        "reasons": ["FEW_BLOCKS"],
+    }
+    assert mount["needs"][0].startswith(
+        "roll: needs 20 s of straight driving with two lanes in view; 8 s so far"
+    )
+    assert cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ).getNode("mount").isMap()
+    prior = read_mount(path)
+    assert prior.std.isfinite().tolist() == [True, True, False, False]
+
+
+def test_a_mount_that_cannot_be_used_is_one_clear_line(tmp_path):
+    path = tmp_path / "calibration.yaml"
+    write_calibration(path, LENS, mounted([0] * 4, [40.0] * 4, [16] * 4))
+    with pytest.raises(ValueError, match=r"expected a calibrated axis, got none: pitch: needs 20 s"):
+        read_mount(path)
+    for text, said in (
+        ("fx: 3", "the key mount"),
+        ("mount: {pitch_deg: a}", "pitch_deg"),
+        ("a: [1", "readable"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=said) as caught:
+            read_mount(path)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match="readable"):
+        read_mount(tmp_path / "none.yaml")
 
 
 def test_cameras_compare_as_objects():

@@ -127,8 +127,9 @@ def test_every_output_is_there_and_whole(drive):
     promised = {"extrinsics.csv", "lanes.json", "bev.mp4", "overlay.mp4", "report.html"}
     assert names == promised | {"state.safetensors", "calibration.yaml"}
     mount = yaml.safe_load((drive / "calibration.yaml").read_text())["mount"]
-    assert mount["height_m"] == pytest.approx(POSE[3], abs=0.02)
-    assert mount["status"] == "UNCALIBRATED"  # 0.24 s
+    assert mount["preliminary"]["height_m"] == pytest.approx(POSE[3], abs=0.02)
+    assert (mount["valid"], mount["status"]) == (False, "UNCALIBRATED")  # 0.24 s
+    assert mount["needs"][0].startswith("pitch: needs 20 s of straight driving; 0 s so far")
     for name, size in (("bev.mp4", (1140, 400)), ("overlay.mp4", None)):
         with av.open(str(drive / name)) as video:
             stream = video.streams.video[0]

@@ -18,7 +18,13 @@ from lanebev.app.observers import LaneFileObserver, NetworkObserver, Observer
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.mount import MountCalibration, MountEstimator, MountReason, MountStatus
+from lanebev.estimation.mount import (
+    MountCalibration,
+    MountEstimator,
+    MountReason,
+    MountStatus,
+    describe_mount,
+)
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.geometry.lens import DISTORTION_LENGTHS
 from lanebev.io.calibration_file import write_calibration
@@ -335,7 +341,8 @@ def mount_facts(mounted: MountCalibration) -> dict[str, str]:
     status = MountStatus(int(mounted.status[0])).name
     reasons = MountReason(int(mounted.reasons[0]))
     why = f" ({reasons.name})" if reasons else ""
-    return {"mount": f"{status}, {float(mounted.progress[0]):.0f} %{why}"}
+    words = "; ".join(describe_mount(mounted))
+    return {"mount": f"{status}, {float(mounted.progress[0]):.0f} %{why}", "mount, axis by axis": words}
 
 
 def summary(report: Report, config: RunConfig) -> str:

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
+import yaml
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
+from torch import Tensor
 
 from lanebev.camera.files import camera_info, dump_yaml
 from lanebev.camera.model import Camera
-from lanebev.estimation.mount import MountCalibration, MountReason, MountStatus
+from lanebev.estimation.mount import MountCalibration, MountReason, MountStatus, describe_mount
+from lanebev.estimation.mount.results import AXES
 from lanebev.geometry.rotation import road_from_cam
+from lanebev.numbers import finite_numbers
 from lanebev.types import Extrinsics
+
+_USED_BY_AXIS = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
 
 
 def vehicle_from_camera(mount: Extrinsics) -> torch.Tensor:
@@ -32,33 +39,103 @@ def vehicle_from_camera(mount: Extrinsics) -> torch.Tensor:
     return matrix
 
 
+class MountPrior(NamedTuple):
+    """A mount as read from a file.
+
+    Attributes:
+        pose: (4,) pitch, yaw, roll (rad) and height (m).
+        std: (4,) rad, rad, rad, m; infinite on an axis that is not calibrated.
+    """
+
+    pose: Tensor
+    std: Tensor
+
+
 def write_calibration(path: str | Path, camera: Camera, mounted: MountCalibration) -> None:
     """Write ``calibration.yaml``: a ROS ``camera_info`` with the mount's pose beside it.
 
-    The pose is there as angles and height in our signs, as a 4 x 4 camera-to-vehicle matrix in the axes of
-    ROS and OpenLane (x forward, y left, z up), and as that rotation's quaternion. PyYAML, ROS's camera
-    calibration parsers and ``cv2.FileStorage`` read the file; so does :func:`read_camera`.
+    ``mount.valid`` says whether every axis is calibrated. ``pitch_deg``, ``yaw_deg``, ``roll_deg`` and
+    ``height_m`` hold calibrated axes only; what is known of the others is under ``preliminary``, and
+    ``needs`` says in words what is missing. Where all four are calibrated, the pose is there too as a 4 x 4
+    camera-to-vehicle matrix in the axes of ROS and OpenLane (x forward, y left, z up), and as that rotation's
+    quaternion. PyYAML, ROS's camera calibration parsers and ``cv2.FileStorage`` read the file; so does
+    :meth:`Camera.from_file`.
 
     Args:
         path: the file.
         camera: the lens.
         mounted: of batch size 1.
     """
-    matrix = vehicle_from_camera(mounted.extrinsics)[0].double()
-    w, *xyz = rotation_matrix_to_quaternion(matrix[:3, :3]).tolist()
-    pose = mounted.extrinsics.stack()[0].tolist()
-    std = mounted.covariance[0].diagonal().clamp(min=0).sqrt().tolist()
-    angles = ("pitch", "yaw", "roll")
-    fields = camera_info(camera.parameters(), "camera")
-    fields["mount"] = {
+    pose = mounted.extrinsics.stack()[0].double()
+    std = mounted.covariance[0].diagonal().clamp(min=0).sqrt().double()
+    values = [*pose[:3].rad2deg().tolist(), float(pose[3])]
+    sigmas = [*std[:3].rad2deg().tolist(), float(std[3])]
+    calibrated = [int(status) == MountStatus.CALIBRATED for status in mounted.axis_status[0]]
+    known: dict[str, Any] = {}
+    preliminary: dict[str, Any] = {}
+    axes: dict[str, Any] = {}
+    for axis, name in enumerate(AXES):
+        unit = "m" if name == "height" else "deg"
+        kind = known if calibrated[axis] else preliminary
+        kind[f"{name}_{unit}"], kind[f"{name}_std_{unit}"] = values[axis], sigmas[axis]
+        axes[name] = {
+            "status": MountStatus(int(mounted.axis_status[0, axis])).name,
+            "progress_percent": float(mounted.axis_progress[0, axis]),
+            "reasons": _names(int(mounted.axis_reasons[0, axis])),
+        }
+    mount: dict[str, Any] = {
+        "valid": all(calibrated),
         "status": MountStatus(int(mounted.status[0])).name,
         "progress_percent": float(mounted.progress[0]),
-        "reasons": [flag.name for flag in MountReason(int(mounted.reasons[0]))],
-        **{f"{name}_deg": math.degrees(value) for name, value in zip(angles, pose[:3], strict=True)},
-        "height_m": pose[3],
-        **{f"{name}_std_deg": math.degrees(value) for name, value in zip(angles, std[:3], strict=True)},
-        "height_std_m": std[3],
+        "reasons": _names(int(mounted.reasons[0])),
+        **known,
+        "axes": axes,
     }
-    fields["vehicle_from_camera"] = {"rows": 4, "cols": 4, "dt": "d", "data": matrix.flatten().tolist()}
-    fields["quaternion_xyzw"] = [*xyz, w]
+    if preliminary:
+        mount["preliminary"] = preliminary
+        words = describe_mount(mounted)
+        mount["needs"] = [text for text, good in zip(words, calibrated, strict=True) if not good]
+    fields = camera_info(camera.parameters(), "camera")
+    fields["mount"] = mount
+    if all(calibrated):
+        matrix = vehicle_from_camera(mounted.extrinsics)[0].double()
+        w, x, y, z = rotation_matrix_to_quaternion(matrix[:3, :3].contiguous()).tolist()
+        fields["vehicle_from_camera"] = {"rows": 4, "cols": 4, "dt": "d", "data": matrix.flatten().tolist()}
+        fields["quaternion_xyzw"] = [x, y, z, w]
     Path(path).write_text(dump_yaml(fields), encoding="utf-8")
+
+
+def read_mount(path: str | Path) -> MountPrior:
+    """Read the mount of a ``calibration.yaml`` that :func:`write_calibration` wrote.
+
+    Raises:
+        ValueError: the file cannot be read, has no mount, or no calibrated axis.
+    """
+    try:
+        fields = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ValueError(f"mount file {path}: expected a readable calibration.yaml") from error
+    mount = fields.get("mount") if isinstance(fields, dict) else None
+    if not isinstance(mount, dict):
+        raise ValueError(
+            f"mount file {path}: expected the key mount, got none; give a run's calibration.yaml"
+        )
+    pose, std = torch.zeros(4, dtype=torch.float64), torch.full((4,), torch.inf, dtype=torch.float64)
+    for axis, key in enumerate(_USED_BY_AXIS):
+        if key in mount:
+            name, unit = key.rsplit("_", 1)
+            scale = 1.0 if unit == "m" else math.pi / 180
+            try:
+                (value,) = finite_numbers(key, [mount[key]], 1)
+                (sigma,) = finite_numbers(f"{name}_std_{unit}", [mount.get(f"{name}_std_{unit}")], 1)
+            except ValueError as error:
+                raise ValueError(f"mount file {path}: {error}") from error
+            pose[axis], std[axis] = scale * value, scale * abs(sigma)
+    if not std.isfinite().any():
+        needs = mount.get("needs") or ["no axis is calibrated"]
+        raise ValueError(f"mount file {path}: expected a calibrated axis, got none: {needs[0]}")
+    return MountPrior(pose, std)
+
+
+def _names(reasons: int) -> list[str]:
+    return [str(flag.name) for flag in MountReason(reasons)]
