@@ -99,7 +99,8 @@ def track(
             (error, cov.diagonal(dim1=1, dim2=2), nees, calibration.status, frame_bound(moment, segments))
         )
     hard = torch.tensor([bool(moment.tag) for moment in drive])
-    return Track(*(torch.stack(part) for part in zip(*found, strict=True)), hard)
+    errors, variances, nees, status, bounds = (torch.stack(part) for part in zip(*found, strict=True))
+    return Track(errors, variances, nees, status, bounds, hard)
 
 
 def frame_bound(moment: Moment, segments: LaneSegments) -> Tensor:

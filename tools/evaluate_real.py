@@ -12,6 +12,7 @@ import json
 import platform
 import sys
 import time
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -71,15 +72,17 @@ def main() -> None:
         options.json.write_text(json.dumps(as_json(figures, options, time.monotonic() - start), indent=1))
 
 
-def parts(options: Any, model: Any, calibrators: dict[str, Any]) -> Any:
+def parts(options: Any, model: Any, calibrators: dict[str, Any]) -> Iterator[Iterable[Figure]]:
     """The parts asked for, each an iterable of figures."""
-    chosen = [("tusimple labels", lambda: tusimple_labels(options.data, calibrators))]
+
+    def wanted(name: str) -> bool:
+        return not options.only or options.only in name
+
+    if wanted("tusimple labels"):
+        yield tusimple_labels(options.data, calibrators)
     for function in (carla_stills, carla_drive, udacity, tusimple_pixels):
-        name = function.__name__.replace("_", " ")
-        chosen.append((name, lambda f=function: f(options.data, model, calibrators)))
-    for name, run in chosen:
-        if not options.only or options.only in name:
-            yield run()
+        if wanted(function.__name__.replace("_", " ")):
+            yield function(options.data, model, calibrators)
 
 
 def print_table(figures: list[Figure]) -> None:

@@ -25,6 +25,7 @@ import lanebev
 from lanebev import Camera, JointCalibrator, LaneBEV, LaneSegments, Status
 from lanebev.app.run import calibrate_still
 from lanebev.geometry.rotation import road_from_cam
+from lanebev.io.video import read_image
 from train.commands import one_line_errors
 
 KITTI_LANE_WIDTH = 3.5  # m
@@ -138,8 +139,8 @@ def kitti_road(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, flo
     answers, truth, pictures = [], [], []
     for path in sorted((data / "kitti_road" / "image_2").glob("*.png")):
         calib = data / "kitti_road" / "calib" / f"{path.stem}.txt"
-        size = cv2.imread(str(path)).shape[:2]
-        camera = Camera.from_file(calib, image_size=(size[0], size[1]))
+        height, width = read_image(path).shape[:2]
+        camera = Camera.from_file(calib, image_size=(height, width))
         answer, picture = calibrate(model, path, camera, KITTI_LANE_WIDTH)
         answers.append(answer)
         truth.append(kitti_truth(calib))
@@ -151,7 +152,7 @@ def kitti_road(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, flo
 def culane(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
     """Night frames: how many are calibrated."""
     paths = sorted((data / "culane").rglob("*.jpg"))
-    height, width = cv2.imread(str(paths[0])).shape[:2]
+    height, width = read_image(paths[0]).shape[:2]
     focal = 0.5 * width / np.tan(np.radians(30.0))
     camera = Camera.from_parameters(focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
     seen = [calibrate(model, path, camera, 3.7) for path in paths]
@@ -167,7 +168,7 @@ def streets(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]
     pictures = []
     for path in sorted(p for p in (data / "streets").iterdir() if p.suffix in (".jpg", ".png")):
         file = path.with_suffix(".yaml")
-        height, width = cv2.imread(str(path)).shape[:2]
+        height, width = read_image(path).shape[:2]
         focal = 0.5 * width / np.tan(np.radians(30.0))
         centred = (focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
         camera = Camera.from_file(file) if file.exists() else Camera.from_parameters(*centred)

@@ -172,6 +172,8 @@ def by_lanebev(source: str, camera: Camera, model: Any, lane_width: float, count
     """(count, 4) poses of a video's first frames by the module itself, no lane file's rows in between."""
     state, poses = model.initial_state(1, dtype=torch.float64), []
     for frame in itertools.islice(open_source(source), count):
+        if frame.image is None:
+            raise ValueError(f"{source}: frame {frame.number} does not decode: {frame.problem}")
         image = torch.from_numpy(frame.image.copy()).permute(2, 0, 1)[None].float() / 255
         lens = (camera.distortion[None].float(), camera.model)
         with torch.inference_mode():

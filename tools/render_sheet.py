@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import torch
 from jsonargparse.typing import PositiveInt
+from numpy.typing import NDArray
 
 from lanebev.geometry.lens import distort_points
 from lanebev.render import RenderedFrame, render_views
@@ -58,7 +59,8 @@ def main() -> None:
 
     size, generator = tuple(args.size), torch.Generator().manual_seed(args.seed)
     real = real_frames(args.real, args.count // 2, size) if args.real else []
-    wanted, pictures = args.count - len(real), []
+    wanted = args.count - len(real)
+    pictures: list[NDArray[np.uint8]] = []
     start = time.perf_counter()
     while len(pictures) < wanted:
         frame = render_views(min(args.batch, wanted - len(pictures)), size, generator)

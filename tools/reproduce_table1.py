@@ -15,11 +15,13 @@ import platform
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jsonargparse.typing import PositiveInt
 
 import lanebev
+from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.kalman import symmetrise
 from lanebev.types import Status
 from tools.synthetic import Experiment, frames
@@ -37,16 +39,16 @@ UNITS = torch.tensor([180 / math.pi] * 3 + [100.0], dtype=torch.float64)
 NAMES = ("pitch", "yaw", "roll", "height")
 
 
-def calibrator_named(name: str) -> torch.nn.Module:
+def calibrator_named(name: str) -> Calibrator[Any]:
     """A calibrator with its default settings."""
-    calibrator: torch.nn.Module = getattr(
-        lanebev, {"two-stage": "TwoStageCalibrator", "joint": "JointCalibrator"}[name]
-    )()
+    calibrator: Calibrator[Any] = (
+        lanebev.JointCalibrator() if name == "joint" else lanebev.TwoStageCalibrator()
+    )
     return calibrator
 
 
 def run(
-    calibrator: torch.nn.Module, exp: Experiment, runs: int, dtype: torch.dtype, seed: int
+    calibrator: Calibrator[Any], exp: Experiment, runs: int, dtype: torch.dtype, seed: int
 ) -> dict[str, torch.Tensor]:
     """Every noise level times every run is one row of the batch.
 

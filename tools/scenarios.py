@@ -213,8 +213,8 @@ def _lane_change(t: float, moment: Moment) -> Moment:
 def _bumps(t: float, moment: Moment) -> Moment:
     phase = (t % 2.0) - 1.0
     bump = math.radians(1.0) * math.sin(math.pi * phase / 0.2) if 0 <= phase < 0.2 else 0.0
-    pitch, *rest = moment.pose
-    return replace(moment, pose=(pitch + bump, *rest), tag="bump" if 0 <= phase < 0.3 else "")
+    pitch, yaw, roll, height = moment.pose
+    return replace(moment, pose=(pitch + bump, yaw, roll, height), tag="bump" if 0 <= phase < 0.3 else "")
 
 
 def _brake(t: float, moment: Moment) -> Moment:
@@ -223,8 +223,8 @@ def _brake(t: float, moment: Moment) -> Moment:
         * min(max((t - 3.0) / 0.3, 0.0), 1.0)
         * (1.0 if t < 5.0 else max(0.0, 1 - (t - 5) / 0.3))
     )
-    pitch, *rest = moment.pose
-    return replace(moment, pose=(pitch + dive, *rest))
+    pitch, yaw, roll, height = moment.pose
+    return replace(moment, pose=(pitch + dive, yaw, roll, height))
 
 
 def _exit(t: float, moment: Moment) -> Moment:

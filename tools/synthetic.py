@@ -73,8 +73,9 @@ def boundary_lines(pose: Tensor, positions: Tensor, intrinsics: Tensor) -> Tenso
     ones = torch.ones_like(x)
     # The plane through the camera and the boundary: normal to (0, 0, 1) and to (x, h, 0) in the road frame.
     normals = torch.stack([pose[3] * ones, -x, torch.zeros_like(x)], dim=-1) @ rotation
-    lines = normals @ torch.linalg.inv(intrinsics)
-    return lines / lines[:, :2].norm(dim=-1, keepdim=True)
+    lines: Tensor = normals @ torch.linalg.inv(intrinsics)
+    length: Tensor = lines[:, :2].norm(dim=-1, keepdim=True)
+    return lines / length
 
 
 def boundary_spans(pose: Tensor, positions: Tensor, intrinsics: Tensor, exp: Experiment) -> Tensor:
@@ -143,11 +144,12 @@ def cramer_rao_cov(
     Returns:
         (4, 4).
     """
-    jacobian = torch.func.jacfwd(lambda p: boundary_lines(p, positions, intrinsics))(pose)  # (L, 3, 5)
+    jacobian: Tensor = torch.func.jacfwd(boundary_lines)(pose, positions, intrinsics)  # (L, 3, 5)
     ones = torch.ones_like(endpoints[..., :1])
     points = torch.cat([endpoints, ones], dim=-1)  # (N, 2, 3)
     rows = torch.einsum("nec,ncd->ned", points, jacobian[boundary]).flatten(0, 1)
-    return torch.linalg.inv(rows.T @ rows / variance)[:4, :4]
+    covariance: Tensor = torch.linalg.inv(rows.T @ rows / variance)
+    return covariance[:4, :4]
 
 
 @dataclass(frozen=True)
