@@ -26,7 +26,7 @@ lint: $(VENV)/ready
 	$(BIN)/ruff format --check .
 
 types: $(VENV)/ready
-	$(BIN)/mypy --strict lanebev
+	$(BIN)/mypy --strict lanebev train tools
 
 coverage: $(VENV)/ready  ## all tests with the lines that they run, into out/coverage
 	$(TEST) --cov=lanebev --cov-report=term:skip-covered --cov-report=html:out/coverage

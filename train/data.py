@@ -147,9 +147,9 @@ class ViewBatches(IterableDataset[Batch]):
         frames = self.frames(seed, done * self.batch_size)
         for batch in itertools.count(done):
             rng = np.random.default_rng((*seed, batch))
-            size = tuple(self.sizes[rng.integers(len(self.sizes))])
+            height, width = self.sizes[rng.integers(len(self.sizes))]
             yield Batch.stack(
-                [random_view(next(frames), size, self.view, rng) for _ in range(self.batch_size)]
+                [random_view(next(frames), (height, width), self.view, rng) for _ in range(self.batch_size)]
             )
 
 

@@ -37,12 +37,12 @@ def watch(segmenters: Sequence[LaneSegmenter], seed: int, frames: int, fps: floa
     widths, poses = [], []
     for i in range(frames):
         frame = drive.frame(i)
-        for model, own in zip(models, segments, strict=True):
+        for model, segmenter, own in zip(models, segmenters, segments, strict=True):
             with torch.inference_mode():
                 _, found = model.observe(frame.image, frame.intrinsics)
             rows = rows_from_segments(found, drive.camera)
             taken = segments_from_rows([rows], drive.camera)
-            own.append(taken._replace(sigma=taken.sigma / model.segmenter.config.noise_factor))
+            own.append(taken._replace(sigma=taken.sigma / segmenter.config.noise_factor))
         widths.append(frame.lane_width.double())
         poses.append(frame.extrinsics.stack()[0].double())
     truth = (widths, torch.stack(poses), frame.intrinsics.double(), 1 / fps)

@@ -83,7 +83,7 @@ class EndToEnd(Segmentation):
                 pose = pose_loss(fit, truth, self.unit)
             self.log("loss/pose", pose, prog_bar=True)
             weighted = self.settings["pose_weight"] * pose.to(loss.dtype)
-            if (batch_idx + 1) % self.trainer.log_every_n_steps == 0:
+            if (batch_idx + 1) % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
                 self.log("gradient/pose_by_maps", gradient_ratio(weighted, loss, logits))
             loss = loss + weighted
         return loss
@@ -91,7 +91,7 @@ class EndToEnd(Segmentation):
     def validation_step(self, batch: PoseBatch, batch_idx: int) -> None:  # type: ignore[override]
         """As ever, and the errors of the pose."""
         super().validation_step(batch, batch_idx)  # type: ignore[arg-type]
-        fit = self._fit(self(unpack(batch)[0]), batch)
+        fit = self._fit(self(unpack(batch)[0]), batch)  # type: ignore[arg-type]
         said = fit.observed & fit.valid.unsqueeze(-1)
         error = fit.extrinsics.stack() - batch.extrinsics
         self.val_squares += torch.where(said, error, 0.0).square().sum(0)
@@ -127,4 +127,5 @@ class EndToEnd(Segmentation):
 def gradient_ratio(loss: Tensor, by: Tensor, logits: Tensor) -> Tensor:
     """How many times longer the gradient of one loss on the logits is than that of another."""
     one, other = (torch.autograd.grad(each, logits, retain_graph=True)[0].norm() for each in (loss, by))
-    return one / other.clamp(min=torch.finfo(other.dtype).tiny)
+    ratio: Tensor = one / other.clamp(min=torch.finfo(other.dtype).tiny)
+    return ratio

@@ -94,7 +94,8 @@ def gain(before: Tensor, after: Tensor, counted: Tensor, drives: int) -> dict[st
     def lower_by(*parts: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
         first, second, number = (part.sum(axis) for part in parts)
         count = np.maximum(number, 1)
-        return np.sqrt(first / count) - np.sqrt(second / count)
+        lower: NDArray[np.float64] = np.sqrt(first / count) - np.sqrt(second / count)
+        return lower
 
     report = {}
     for name, *data in zip(AXES, *sums, strict=True):
@@ -140,7 +141,8 @@ def main() -> None:
         shares: list[dict[str, Any]] = [{} for _ in errors]
     else:
         held_out = held_out_frames(args.drives, args.frames, tuple(args.size), args.seed)
-        errors, said = zip(*(pose_errors(network, held_out) for network in networks), strict=True)
+        found = [pose_errors(network, held_out) for network in networks]
+        errors, said = [error for error, _ in found], [observed for _, observed in found]
         shares = [{"valid": round(float(own[:, 0].double().mean()), 3)} for own in said]
         counted["observed"] = torch.stack(said).all(0)
     counted["every_frame"] = torch.ones_like(errors[0]).bool()

@@ -69,8 +69,10 @@ def load_weights(segmenter: LaneSegmenter, path: Path, class_weight: Tensor) -> 
 
 def add_to_bias(segmenter: LaneSegmenter, bias: Tensor) -> None:
     """Add (1+L,) to the logits, in pixel_shuffle's order of channels."""
+    head = segmenter.head.bias
+    assert head is not None  # the head is built with a bias
     with torch.no_grad():
-        segmenter.head.bias += bias.repeat_interleave(segmenter.shuffle**2)
+        head += bias.repeat_interleave(segmenter.shuffle**2)
 
 
 def widen(narrow: dict[str, Tensor], wide: dict[str, Tensor], noise: float = 0.02) -> dict[str, Tensor]:

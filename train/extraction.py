@@ -68,7 +68,8 @@ def distance_to_polyline(points: Tensor, line: Tensor) -> Tensor:
     start, along = line[..., None, :-1, :], line.diff(dim=-2).unsqueeze(-3)  # (..., 1, P - 1, 2)
     away = points.unsqueeze(-2) - start
     part = (away * along).sum(-1) / along.square().sum(-1).clamp(min=1e-12)
-    return (away - part.clamp(0, 1).unsqueeze(-1) * along).norm(dim=-1).amin(-1)
+    distance: Tensor = (away - part.clamp(0, 1).unsqueeze(-1) * along).norm(dim=-1)
+    return distance.amin(-1)
 
 
 def join(errors: list[ExtractionError]) -> ExtractionError:

@@ -176,7 +176,7 @@ def _view(
         image, matrix[:2], (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
     )
     stride = config.output_stride
-    points = (sample.points @ matrix[:2, :2].T + matrix[:2, 2]).astype(np.float32) / stride
+    points = (sample.points @ matrix[:2, :2].T + matrix[:2, 2]).astype(np.float32) / np.float32(stride)
     exists = separated(points, sample.painted & np.isfinite(points).all(-1), config.gap)
     label_size = (-(-height // stride), -(-width // stride))
     target = draw_boundaries(points, exists & sample.visible, label_size, config.half_width)

@@ -46,7 +46,8 @@ def row_cross_entropy(logits: Tensor, target: Tensor, weight: Tensor, least: flo
     counts = (mass > least).squeeze(-1)
     share = share / mass.clamp(min=least)
     divergence = (torch.special.xlogy(share, share) - share * log_p).sum(-1)
-    return (divergence * counts).sum() / counts.sum().clamp(min=1)
+    mean: Tensor = (divergence * counts).sum() / counts.sum().clamp(min=1)
+    return mean
 
 
 def unweighted_bias(class_weight: Tensor) -> Tensor:

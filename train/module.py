@@ -63,7 +63,8 @@ class Segmentation(L.LightningModule):
         self.settings = {"network": asdict(network), **{name: given[name] for name in _SETTINGS}}
         # torch 2.13 corrupts memory in the backward pass of channels-last convolutions of 4 channels
         self.layout = torch.channels_last if network.base_width % 8 == 0 else torch.contiguous_format
-        self.segmenter = LaneSegmenter(network).to(memory_format=self.layout)
+        self.segmenter = LaneSegmenter(network)
+        self.segmenter.to(memory_format=self.layout)  # type: ignore[call-overload]  # torch declares it not
         weights = torch.tensor(class_weight or [1.0] * (1 + network.num_boundaries))
         if weights.numel() != 1 + network.num_boundaries:
             raise ValueError(
@@ -175,7 +176,7 @@ class Segmentation(L.LightningModule):
         settings = self.settings
         decayed = [p for p in self.segmenter.parameters() if p.ndim > 1]
         others = [p for p in self.segmenter.parameters() if p.ndim <= 1]
-        groups = [{"params": decayed}, {"params": others, "weight_decay": 0.0}]
+        groups: list[dict[str, Any]] = [{"params": decayed}, {"params": others, "weight_decay": 0.0}]
         kwargs = {"lr": settings["learning_rate"], "weight_decay": settings["weight_decay"]}
         optimizer: torch.optim.Optimizer
         if settings["optimizer"] == "sgd":
@@ -185,8 +186,8 @@ class Segmentation(L.LightningModule):
         total = self.trainer.max_steps
 
         def rate(step: int) -> float:
-            warm = min(1.0, (step + 1) / max(1, settings["warmup_steps"]))
-            left = (total - step) / max(1, settings["decay_steps"]) if total > 0 else 1.0
+            warm = min(1.0, (step + 1) / max(1, int(settings["warmup_steps"])))
+            left = (total - step) / max(1, int(settings["decay_steps"])) if total > 0 else 1.0
             return warm * min(1.0, max(0.0, left))
 
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, rate)

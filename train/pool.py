@@ -71,6 +71,8 @@ class Shard(NamedTuple):
         """Decode one frame."""
         start = 0 if index == 0 else int(self.ends[index - 1])
         image = cv2.imdecode(self.jpeg[start : int(self.ends[index])], cv2.IMREAD_COLOR_RGB)
+        if image is None:
+            raise ValueError(f"frame {index} of a shard: expected a JPEG image, it does not decode")
         return LabelledImage(
             image,
             self.points[index],
@@ -136,8 +138,8 @@ def read_shard(path: Path) -> Shard:
         ValueError: not a shard.
     """
     own, poses = Shard._fields[:-1], Pose._fields
-    fields = _read_fields(path, (*own, *poses))
-    return Shard(*fields[: len(own)], poses=Pose(*fields[len(own) :]))
+    jpeg, ends, points, painted, visible, vanishing_point, *pose = _read_fields(path, (*own, *poses))
+    return Shard(jpeg, ends, points, painted, visible, vanishing_point, Pose(*pose))
 
 
 def shard_size(path: Path) -> int:

@@ -96,8 +96,8 @@ class RenderedPoses(RenderedRoads):
         data = PoseBatches(frames, self.batch_size, self.val_size, self.view, seed, batches, first)
         return DataLoader(data, batch_size=None)
 
-    test_dataloader = val_dataloader
-    predict_dataloader = val_dataloader
+    test_dataloader = val_dataloader  # type: ignore[assignment]
+    predict_dataloader = val_dataloader  # type: ignore[assignment]
 
 
 def fit_poses(
@@ -118,7 +118,7 @@ def fit_poses(
     better pose by seeing fewer of them.
     """
     dtype = widest_dtype(logits.device)
-    even: Tensor = EvenGradients.apply(logits.to(dtype), reach)
+    even: Tensor = EvenGradients.apply(logits.to(dtype), reach)  # type: ignore[no-untyped-call]
     intrinsics, distortion = intrinsics.to(dtype), distortion.to(dtype)
     segments = undistort_segments(extractor(even, size, size), intrinsics, distortion)
     if where_only:

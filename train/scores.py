@@ -57,7 +57,7 @@ class BenchmarkScores:
 
     def compute(self) -> dict[str, float]:
         """Named figures; none where there was nothing to score."""
-        figures = {}
+        figures: dict[str, float] = {}
         if self.tusimple:
             names = ("accuracy", "false_positives", "false_negatives")
             figures |= dict(zip(names, np.mean(self.tusimple, axis=0).tolist(), strict=True))
