@@ -31,6 +31,15 @@ def _path(text: str) -> str:
     return text
 
 
+def _size(text: str) -> tuple[int, int]:
+    from lanebev.io.lane_size import parse_size
+
+    try:
+        return parse_size(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
 def parser() -> argparse.ArgumentParser:
     """The parser of ``lanebev``."""
     top = _Parser(prog="lanebev", description=DESCRIPTION, allow_abbrev=False)
@@ -47,6 +56,8 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument("--lanes", type=_path, metavar="FILE",
                      help="lanes of another detector: TuSimple JSON lines, CULane .lines.txt, OpenLane JSON, "
                      "or a folder of them")  # fmt: skip
+    run.add_argument("--lanes-size", type=_size, metavar="WxH",
+                     help="size of the images that --lanes was drawn on, if not the source's")  # fmt: skip
     run.add_argument("--stills", action="store_true", help="every image on its own, not frames of a drive")
     run.add_argument(
         "--out", type=_path, default="lanebev-out", metavar="DIR", help="output folder (%(default)s)"

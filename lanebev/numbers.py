@@ -1,10 +1,44 @@
-"""Numbers from files."""
+"""Texts and numbers from files."""
 
 from __future__ import annotations
 
+import codecs
 import math
+import reprlib
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
+
+_BYTE_ORDER_MARKS = {
+    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF16_LE: "utf-16",  # what PowerShell's > writes
+    codecs.BOM_UTF16_BE: "utf-16",
+}
+_REPR = reprlib.Repr()
+_REPR.maxlist = _REPR.maxdict = _REPR.maxtuple = 4
+_REPR.maxlevel = 3
+
+
+def read_text(path: Path) -> str:
+    """Return a text file's content: UTF-8, or UTF-16 where a byte order mark says so.
+
+    Raises:
+        ValueError: why the file can't be read, in a few words; the caller says which file.
+    """
+    try:
+        data = path.read_bytes()
+        mark = next((each for each in _BYTE_ORDER_MARKS if data.startswith(each)), b"")
+        return data.decode(_BYTE_ORDER_MARKS.get(mark, "utf-8"))
+    except UnicodeDecodeError as error:
+        raise ValueError("not a text file") from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
+        raise ValueError(getattr(error, "strerror", None) or str(error)) from error
+
+
+def shown(value: Any, most: int = 60) -> str:
+    """Return a value as it is shown in a message: on one line, cut, and quickly also of deep or huge ones."""
+    text = " ".join(_REPR.repr(value).split())
+    return text if len(text) <= most else text[: most - 1] + "…"
 
 
 def finite_numbers(name: str, values: Sequence[Any], count: int | None = None) -> list[float]:
@@ -15,11 +49,35 @@ def finite_numbers(name: str, values: Sequence[Any], count: int | None = None) -
     """
     if count is not None and len(values) != count:
         raise ValueError(f"{name}: expected {count} number{'s'[: count != 1]}, got {len(values)}")
-    try:
-        numbers = [float(value) for value in values if not isinstance(value, bool)]
-    except (TypeError, ValueError, OverflowError):
-        numbers = []
-    if len(numbers) != len(values) or not all(map(math.isfinite, numbers)):
-        shown = ", ".join(str(value) for value in values)[:60]
-        raise ValueError(f"{name}: expected finite numbers, got {shown}")
+    numbers = _floats(values)
+    if numbers is None or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{name}: expected finite numbers, got {_listed(values)}")
     return numbers
+
+
+def numbers_or_gaps(name: str, values: Sequence[Any]) -> list[float]:
+    """Texts or numbers to floats, NaN where there is none: ``null``, ``nan`` or NaN.
+
+    Raises:
+        ValueError: one that is none of these, or infinite.
+    """
+    numbers = _floats([math.nan if value is None else value for value in values])
+    if numbers is None or any(map(math.isinf, numbers)):
+        raise ValueError(
+            f"{name}: expected finite numbers, or null where there is none, got {_listed(values)}"
+        )
+    return numbers
+
+
+def _floats(values: Sequence[Any]) -> list[float] | None:
+    """The values as floats, None if one is no number."""
+    if any(isinstance(value, bool) for value in values):
+        return None
+    try:
+        return [float(value) for value in values]
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
+def _listed(values: Sequence[Any]) -> str:
+    return ", ".join(shown(value).strip("'\"") for value in values[:60])[:60]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.boundary_curves import boundary_polylines, fit_boundaries
 from lanebev.estimation.joint.single_frame import fit_single_frame
+from lanebev.io.lane_size import size_remark
 from lanebev.io.lanes import FrameLines, match_frames
 from lanebev.io.video import Frame, FrameSource
 from lanebev.observation.polylines import (
@@ -25,7 +26,13 @@ from lanebev.types import LaneSegments
 
 
 class Observer(Protocol):
-    """Finds the lanes of a frame; of one that did not decode it finds none."""
+    """Finds the lanes of a frame; of one that did not decode it finds none.
+
+    Attributes:
+        remark: what should be said of all lanes together, else empty.
+    """
+
+    remark: str
 
     def __call__(self, frame: Frame) -> tuple[BoundaryRows, LaneSegments]:
         """Boundaries on image rows, and segments of batch size 1 in undistorted pixels, float64."""
@@ -46,6 +53,7 @@ class LaneFileObserver:
 
     def __init__(self, entries: Sequence[FrameLines], source: FrameSource, camera: Camera) -> None:
         self.entries, self.camera = entries, camera
+        self.remark = size_remark(entries, camera.image_size)
         if source.is_video:
             if len(entries) != source.count:
                 raise ValueError(
@@ -80,6 +88,8 @@ class NetworkObserver:
         camera: the lens.
         lane_width: m.
     """
+
+    remark = ""
 
     def __init__(self, model: LaneBEV, camera: Camera, lane_width: float) -> None:
         self.model, self.camera, self.lane_width = model.eval(), camera, lane_width

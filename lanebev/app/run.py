@@ -28,6 +28,7 @@ from lanebev.estimation.mount import (
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.geometry.lens import DISTORTION_LENGTHS
 from lanebev.io.calibration_file import write_calibration
+from lanebev.io.lane_size import resized_lanes
 from lanebev.io.lanes import lane_files, read_lanes
 from lanebev.io.results import ExtrinsicsRow, OutputFolder, check_inputs_stay
 from lanebev.io.state import load_state, save_state
@@ -66,6 +67,7 @@ class RunConfig:
         resume: output folder of an earlier run, with the same calibrator, whose state to begin with.
         calibrator: one of CALIBRATORS.
         fps: of a folder or glob; a video knows its own.
+        lanes_size: (height, width) px of the images that ``lanes`` was drawn on; None is the source's own.
     """
 
     source: str
@@ -77,6 +79,7 @@ class RunConfig:
     resume: str | None = None
     calibrator: str = "joint"
     fps: float = float(DEFAULT_FPS)
+    lanes_size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.lane_width) and 1.0 < self.lane_width < 10.0):
@@ -128,7 +131,7 @@ def run(
             source.is_single,
             config.stills,
         )
-        recorder.problems += filter(None, (source.problem, problem))
+        recorder.problems += filter(None, (source.problem, problem, observer.remark))
         before = None
         with recorder:
             for frame in frames:
@@ -224,7 +227,10 @@ def inputs(config: RunConfig, source: FrameSource) -> list[str | Path]:
 def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Observer:
     """Lanes from a file if one is given, else from the network."""
     if config.lanes is not None:
-        return LaneFileObserver(read_lanes(config.lanes), source, camera)
+        entries = read_lanes(config.lanes, camera.intrinsics.double().numpy())
+        if config.lanes_size is not None:
+            entries = resized_lanes(entries, config.lanes_size, camera.image_size)
+        return LaneFileObserver(entries, source, camera)
     return NetworkObserver(LaneBEV.from_pretrained(), camera, config.lane_width)
 
 

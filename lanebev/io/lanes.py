@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from itertools import groupby, pairwise
 from pathlib import Path, PurePath
@@ -18,11 +18,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lanebev.io.openlane import (
+    camera_from_ground_points,
+    camera_from_label_points,
+    image_from_camera_points,
+)
 from lanebev.io.video import IMAGE_SUFFIXES, natural_order
-from lanebev.numbers import finite_numbers
+from lanebev.numbers import finite_numbers, numbers_or_gaps, read_text, shown
 from lanebev.types import NUM_BOUNDARIES
 
 _OPENLANE_CURBS = (20, 21)  # left and right kerb: no lane ends there, so no lane width holds
+_GAP = 2.5  # times the usual distance of rows: from there on a line is not seen in between
+_FARTHEST = 1e6  # px, of any coordinate
 _TUSIMPLE_ROWS = {56: range(160, 720, 10), 48: range(240, 720, 10)}  # of the benchmark's labels, by number
 
 
@@ -54,23 +61,27 @@ class FrameLines(NamedTuple):
     pose_factor: float = 1.0
 
 
-def read_lanes(path: str | Path) -> list[FrameLines]:
+def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) -> list[FrameLines]:
     """Read a TuSimple, CULane or OpenLane file, or a folder of the latter two.
+
+    Args:
+        path: of the file or folder.
+        intrinsics: (3, 3) px of the camera, for OpenLane's 3D points in a file without ``intrinsic``.
 
     Raises:
         ValueError: there is no such file, or it is cut, malformed or of no known format.
     """
     path = Path(path)
     if path.is_dir():
-        frames = [frame for file in lane_files(path) for frame in read_lanes(file)]
+        frames = [frame for file in lane_files(path) for frame in read_lanes(file, intrinsics)]
         if not frames:
             raise ValueError(f"lane folder {path}: expected .lines.txt or .json files, got none")
         return frames
     if path.name.endswith(".txt"):
         return [read_culane(path)]
     text = _text(path)
-    start = next((line for line in text.splitlines() if line.strip()), "")
-    return [read_openlane(path)] if _is_openlane(start, text) else read_tusimple(path)
+    start = next((line for line in text.split("\n") if line.strip()), "")
+    return [read_openlane(path, intrinsics)] if _is_openlane(start, text) else read_tusimple(path)
 
 
 def lane_files(path: str | Path) -> list[Path]:
@@ -89,7 +100,7 @@ def read_tusimple(path: str | Path) -> list[FrameLines]:
     Predictions for TuSimple's benchmark leave ``h_samples`` out; theirs are the rows of its labels.
     """
     frames = []
-    for number, text in enumerate(_text(Path(path)).splitlines(), start=1):
+    for number, text in enumerate(_text(Path(path)).split("\n"), start=1):
         if text.strip():
             with _Where(path, number):
                 frames.append(_tusimple_frame(_json(text)))
@@ -97,46 +108,55 @@ def read_tusimple(path: str | Path) -> list[FrameLines]:
         raise ValueError(f"lane file {path}: expected TuSimple JSON lines, got an empty file")
     names = [frame.name for frame in frames]
     if len(set(names)) < len(names):
-        twice = next(name for i, name in enumerate(names) if name in names[:i])
-        raise ValueError(f"lane file {path}: expected each raw_file once, got {twice!r} again")
+        twice = next(name for name, count in Counter(names).items() if count > 1)
+        raise ValueError(f"lane file {path}: expected each raw_file once, got {shown(twice)} again")
     return frames
 
 
 def read_culane(path: str | Path) -> FrameLines:
     """Read CULane's ``.lines.txt``, a line of ``x y x y ...`` per lane; the path without suffix names it.
 
-    A point that is repeated right after itself counts once.
+    A point that is repeated right after itself counts once; ``nan`` is a point that is not there. Where rows
+    are left out, the line is not seen.
     """
     path = Path(path)
     lines = []
-    for number, text in enumerate(_text(path).splitlines(), start=1):
+    content = _text(path)
+    rows = content.split("\n")
+    for number, text in enumerate(rows, start=1):
         with _Where(path, number):
-            values = finite_numbers("points", text.split())
+            texts = text.split()
+            values = numbers_or_gaps("points", texts)
             if len(values) % 2:
                 raise ValueError(f"expected x y pairs, got {len(values)} numbers; is the file cut?")
-            pairs = zip(values[::2], values[1::2], strict=True)
+            pairs = (pair for pair in zip(values[::2], values[1::2], strict=True) if pair[1] == pair[1])
             points = np.array([point for point, _ in groupby(pairs)]).reshape(-1, 2)
-            _check_culane_rows(points[:, 1])
-            if len(points):
-                lines.append(LaneLine(points))
+            _check_culane_rows(points[:, 1], texts[-1] if number == len(rows) and texts else "")
+            if np.isfinite(points).all(-1).any():
+                lines.append(LaneLine(_with_gaps(_pixels("points", points))))
     return FrameLines(str(path).removesuffix(".txt").removesuffix(".lines"), lines)
 
 
-def read_openlane(path: str | Path) -> FrameLines:
-    """Read an OpenLane 2D or 3D JSON: the ``uv`` of its lane lines, kerbs left out."""
+def read_openlane(path: str | Path, intrinsics: NDArray[np.float64] | None = None) -> FrameLines:
+    """Read an OpenLane 2D or 3D JSON, kerbs left out: the ``uv`` of its lane lines, else their ``xyz``.
+
+    Points ``xyz`` alone, as predictions have them, are projected by the file's ``intrinsic``. Three lists of
+    P numbers are in the camera's frame, as labels are; P lists of three are in the ground frame of the
+    benchmark's predictions if the file has the camera's ``extrinsic``, else in the camera's.
+
+    Args:
+        path: of the file.
+        intrinsics: (3, 3) px, for a file that has 3D points and no ``intrinsic``.
+    """
     path = Path(path)
     with _Where(path, None):
         fields = _json(_text(path))
         name = _field(fields, "file_path", str)
         lines = []
         for i, lane in enumerate(_field(fields, "lane_lines", list)):
-            uv = _field(lane, "uv", list)
-            if len(uv) != 2 or not all(isinstance(axis, list) for axis in uv) or len(uv[0]) != len(uv[1]):
-                raise ValueError(f"lane_lines[{i}].uv: expected two lists of one length, got {uv!r:.60}")
-            if lane.get("category") not in _OPENLANE_CURBS and len(uv[0]):
-                lines.append(
-                    LaneLine(np.array([finite_numbers(f"lane_lines[{i}].uv", axis) for axis in uv]).T)
-                )
+            points = _openlane_points(f"lane_lines[{i}]", lane, fields, intrinsics)
+            if lane.get("category") not in _OPENLANE_CURBS and np.isfinite(points).any():
+                lines.append(LaneLine(points))
     return FrameLines(name, lines)
 
 
@@ -254,9 +274,10 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
         rows = _benchmark_rows(_field(fields, "lanes", list))
     if any(b <= a for a, b in pairwise(rows)):
         raise ValueError("h_samples: expected rising rows, got others")
+    _pixels("h_samples", np.array(rows))
     pose_factor = fields.get("pose_factor", 1.0)
     if type(pose_factor) not in (int, float) or not 0 < pose_factor <= sys.float_info.max:
-        raise ValueError(f"pose_factor: expected a finite number above 0, got {pose_factor!r:.60}")
+        raise ValueError(f"pose_factor: expected a finite number above 0, got {shown(pose_factor)}")
     if "seen" in fields:
         fields = _field(fields, "seen", dict)
     lanes = _field(fields, "lanes", list)
@@ -267,7 +288,7 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
         if not (valid and len(indices) == len(lanes) == len(set(indices))):
             raise ValueError(
                 f"boundary: expected one different index of 0..{NUM_BOUNDARIES - 1} per lane, got "
-                f"{fields['boundary']!r:.60}"
+                f"{shown(fields['boundary'])}"
             )
     sigmas = fields.get("sigma") or [None] * len(lanes)
     if not isinstance(sigmas, list) or len(sigmas) != len(lanes):
@@ -277,7 +298,7 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
         x = _on_h_samples(f"lanes[{i}]", lane, len(rows))
         sigma = None if noise is None else _on_h_samples(f"sigma[{i}]", noise, len(rows))
         if sigma is not None and not (sigma[np.isfinite(x)] > 0).all():
-            raise ValueError(f"sigma[{i}]: expected px above 0 where the lane is, got {noise!r:.60}")
+            raise ValueError(f"sigma[{i}]: expected px above 0 where the lane is, got {shown(noise)}")
         if np.isfinite(x).any():
             lines.append(LaneLine(np.stack([x, np.array(rows)], axis=-1), index, sigma))
     return FrameLines(name, lines, float(pose_factor))
@@ -296,19 +317,90 @@ def _benchmark_rows(lanes: list[Any]) -> list[float]:
 
 def _on_h_samples(name: str, values: Any, count: int) -> NDArray[np.float64]:
     if not isinstance(values, list) or len(values) != count:
-        got = len(values) if isinstance(values, list) else repr(values)
+        got = len(values) if isinstance(values, list) else shown(values)
         raise ValueError(f"{name}: expected {count} numbers, one per h_sample, got {got}")
-    x = np.array(finite_numbers(name, values))
-    x[x < 0] = np.nan  # -2 is "not there"
+    x = _pixels(name, np.array(numbers_or_gaps(name, values)))
+    x[x < 0] = np.nan  # -2 is "not there", as null and NaN are
     return x
 
 
-def _check_culane_rows(y: NDArray[np.float64]) -> None:
+def _check_culane_rows(y: NDArray[np.float64], last: str) -> None:
+    """Raise unless rows go one way, and the text of the file's last number is not the start of the next row.
+
+    Rows may be left out anywhere. A file that is cut within a number ends with the first digits of a row
+    that would have been the next: 560 became 56.
+    """
     steps = np.diff(y)
     if len(steps) and not (np.all(steps > 0) or np.all(steps < 0)):
         raise ValueError("expected rows in one direction, got others; is the file cut?")
-    if len(steps) > 2 and abs(steps[-1]) > 5 * np.median(np.abs(steps)):
-        raise ValueError(f"expected evenly spaced rows, got {y[-2]:g} then {y[-1]:g}; is the file cut?")
+    if len(steps) > 2 and abs(steps[-1]) > _GAP * np.median(np.abs(steps)):
+        expected = f"{y[-2] + np.median(steps[:-1]):g}"
+        if expected != last and expected.startswith(last.removesuffix(".")) and last:
+            raise ValueError(f"expected evenly spaced rows, got {y[-2]:g} then {y[-1]:g}; is the file cut?")
+
+
+def _with_gaps(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points (P, 2) in order of rows, with a NaN put where rows were left out."""
+    steps = np.abs(np.diff(points[:, 1]))
+    if not len(steps):
+        return points
+    gaps = np.flatnonzero(steps > _GAP * np.median(steps))
+    middle = 0.5 * (points[gaps, 1] + points[gaps + 1, 1])
+    return np.insert(points, gaps + 1, np.stack([np.full(len(gaps), np.nan), middle], axis=-1), axis=0)
+
+
+def _pixels(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The values, if they can be pixels."""
+    if (np.abs(values) > _FARTHEST).any():  # NaN is not
+        raise ValueError(f"{name}: expected pixels, got {np.nanmax(np.abs(values)):g}")
+    return values
+
+
+def _openlane_points(
+    name: str, lane: Any, fields: dict[str, Any], intrinsics: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """(P, 2) px of a lane line, by its ``uv`` if it has any, else by its ``xyz``."""
+    if not isinstance(lane, dict):
+        raise ValueError(f"{name}: expected an object, got {shown(lane)}")
+    if lane.get("uv") is not None or lane.get("xyz") is None:
+        return _pixels(f"{name}.uv", _columns(f"{name}.uv", _field(lane, "uv", list), 2).T)
+    xyz = _field(lane, "xyz", list)
+    rows_of_three = len(xyz) != 3 and all(isinstance(point, list) and len(point) == 3 for point in xyz)
+    columns = [list(axis) for axis in zip(*xyz, strict=True)] if rows_of_three and xyz else xyz
+    points = _columns(f"{name}.xyz", columns or [[], [], []], 3).T
+    if (visibility := lane.get("visibility")) is not None:
+        seen = _columns(f"{name}.visibility", [visibility], 1)[0]
+        if len(seen) != len(points):
+            raise ValueError(f"{name}.visibility: expected {len(points)} numbers, got {len(seen)}")
+        points = points[seen > 0.5]
+    if rows_of_three and fields.get("extrinsic") is not None:
+        camera = camera_from_ground_points(points, _square(fields, "extrinsic", 4))
+    else:
+        camera = camera_from_label_points(points)
+        if len(camera) and not (camera[:, 2] > 0).any():
+            raise ValueError(f"{name}.xyz: expected points before the camera (x forward, y left, z up)")
+    matrix = intrinsics if fields.get("intrinsic") is None else _square(fields, "intrinsic", 3)
+    if matrix is None:
+        raise ValueError(f"intrinsic: expected the camera matrix of {name}.xyz, got none")
+    pixels = image_from_camera_points(camera, matrix)
+    return pixels[(np.abs(pixels) < _FARTHEST).all(-1)]
+
+
+def _columns(name: str, values: list[Any], count: int) -> NDArray[np.float64]:
+    """(count, P) of ``count`` lists of one length; NaN where there is no number."""
+    lists = len(values) == count and all(isinstance(axis, list) for axis in values)
+    if not lists or len({len(axis) for axis in values}) != 1:
+        many = {1: "one list", 2: "two lists", 3: "three lists"}[count]
+        raise ValueError(f"{name}: expected {many} of one length, got {shown(values)}")
+    return np.array([numbers_or_gaps(name, axis) for axis in values])
+
+
+def _square(fields: dict[str, Any], name: str, size: int) -> NDArray[np.float64]:
+    """(size, size) matrix of finite numbers."""
+    rows = _field(fields, name, list)
+    if len(rows) != size or not all(isinstance(row, list) for row in rows):
+        raise ValueError(f"{name}: expected {size} x {size} numbers, got {shown(rows)}")
+    return np.array([finite_numbers(name, row, size) for row in rows])
 
 
 def _is_openlane(first_line: str, text: str) -> bool:
@@ -334,10 +426,9 @@ class _Where:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise ValueError(f"lane file {path}: expected a readable file, got: {reason}") from error
+        return read_text(path)
+    except ValueError as error:
+        raise ValueError(f"lane file {path}: expected a readable file, got: {error}") from error
 
 
 def _json(text: str) -> dict[str, Any]:

@@ -1,0 +1,93 @@
+"""Lanes in pixels of images of another size: brought to the right one, or noticed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanebev.io.lanes import FrameLines, LaneLine
+
+_OUTSIDE = 0.1  # share of points below or far beside the images, of which more are of another size
+_BESIDE = 0.5  # image widths beside an image that lines are drawn on to
+_REACHED = 0.7  # of both sides, one of which a drive's lanes reach: they leave images at the bottom
+_REACHED_DOWN = 0.55  # of the height, likewise; what is higher is the horizon
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Return (height, width) of a text such as ``1280x720``, width first.
+
+    Raises:
+        ValueError: another text, or sides that are no image's.
+    """
+    match = re.fullmatch(r"\s*(\d{1,6})\s*[x×X]\s*(\d{1,6})\s*", text, re.ASCII)
+    if match is None or 0 in (size := (int(match[2]), int(match[1]))):
+        raise ValueError(f"lanes size: expected WIDTHxHEIGHT in px, such as 1280x720, got {text!r}")
+    return size
+
+
+def resized_lanes(
+    frames: Sequence[FrameLines], size: tuple[int, int], image_size: tuple[int, int]
+) -> list[FrameLines]:
+    """Return the lanes of images resized from ``size`` to ``image_size``, pixel centres at integers.
+
+    Args:
+        frames: lanes in pixels of images of ``size``.
+        size: (height, width) px.
+        image_size: (height, width) px of the result.
+    """
+    scale = np.array([image_size[1] / size[1], image_size[0] / size[0]])  # of x and y
+    return [
+        frame._replace(
+            lines=[
+                LaneLine(
+                    (line.points + 0.5) * scale - 0.5,
+                    line.boundary,
+                    None if line.sigma is None else line.sigma * scale[0],
+                )
+                for line in frame.lines
+            ]
+        )
+        for frame in frames
+    ]
+
+
+def size_remark(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> str:
+    """Return what speaks for lanes in pixels of smaller images; empty if nothing does.
+
+    Args:
+        frames: of one drive.
+        image_size: (height, width) px of its images.
+
+    Raises:
+        ValueError: lanes lie outside the images, so that they are in pixels of larger ones.
+    """
+    points = _all_points(frames)
+    if not len(points):
+        return ""
+    height, width = image_size
+    x, y = points.T
+    outside = (y >= height) | (x < -_BESIDE * width) | (x > (1 + _BESIDE) * width)
+    if outside.mean() > _OUTSIDE:
+        raise ValueError(
+            f"lanes: expected points in images of {width} x {height} px, got {outside.mean():.0%} outside of "
+            f"them, the farthest at {x.max():.0f}, {y.max():.0f}; of images of another size? state it "
+            "with --lanes-size WIDTHxHEIGHT"
+        )
+    low = y.max() < _REACHED * height and x.max() < _REACHED * width
+    if low or y.max() < _REACHED_DOWN * height:
+        return (
+            f"lanes: none of them reaches beyond {x.max():.0f}, {y.max():.0f} in images of "
+            f"{width} x {height} px; of smaller images? state their size with --lanes-size WIDTHxHEIGHT"
+        )
+    return ""
+
+
+def _all_points(frames: Sequence[FrameLines]) -> NDArray[np.float64]:
+    """(P, 2) px of all lines that are there."""
+    points = [line.points for frame in frames for line in frame.lines]
+    together = np.concatenate(points) if points else np.empty((0, 2))
+    there: NDArray[np.float64] = together[np.isfinite(together).all(-1)]
+    return there
