@@ -1,20 +1,33 @@
-"""Small operations on the rows of a batch that all rooms share."""
+"""Operations on the rows of a batch that all packages share."""
 
 from __future__ import annotations
 
 from enum import IntFlag
+from typing import TypeVar, cast
 
 import torch
 from torch import Tensor
 
+T = TypeVar("T")
 
-def where(row: Tensor, yes: Tensor, no: Tensor) -> Tensor:
-    """(B, ...) whole rows of ``yes`` where ``row`` (B,) holds, else of ``no``."""
-    return torch.where(row.view(-1, *[1] * (yes.ndim - 1)), yes, no)
+
+def select_rows(rows: Tensor, yes: T, no: T) -> T:
+    """Take whole rows of ``yes`` where ``rows`` holds and of ``no`` elsewhere.
+
+    Args:
+        rows: (B,) bool.
+        yes: (B, ...) tensor, or a NamedTuple of such.
+        no: of the same shapes.
+    """
+    if isinstance(yes, Tensor):
+        mask = rows.view(-1, *[1] * (yes.ndim - 1))
+        return cast(T, torch.where(mask, yes, cast(Tensor, no)))
+    pairs = zip(cast("tuple[Tensor, ...]", yes), cast("tuple[Tensor, ...]", no), strict=True)
+    return type(yes)(*(select_rows(rows, *pair) for pair in pairs))
 
 
 def may_skip(wanted: Tensor) -> bool:
-    """Whether no row wants what is costly, such as a search: every row would discard its result.
+    """Tell whether a costly step, such as a search, can be left out because no row wants its result.
 
     The one place where the maths asks the device. A compiled or exported program cannot, and always searches.
     """
@@ -22,12 +35,12 @@ def may_skip(wanted: Tensor) -> bool:
 
 
 def flag(condition: Tensor, reason: IntFlag) -> Tensor:
-    """The reason's bit as int64 where the condition holds, else 0."""
+    """Return the reason's bit as int64 where the condition holds, else 0."""
     return condition.to(torch.int64) * int(reason)
 
 
 def masked_median(values: Tensor, mask: Tensor) -> Tensor:
-    """Lower median over the last dimension of the finite entries in the mask; 0 where there are none."""
+    """Compute the lower median over the last dimension of the finite entries in the mask, or 0."""
     mask = mask & values.isfinite()
     ordered = values.masked_fill(~mask, torch.inf).sort(dim=-1).values
     middle = ((mask.sum(-1, keepdim=True) - 1) // 2).clamp(min=0)

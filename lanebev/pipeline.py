@@ -10,12 +10,12 @@ from torch import Tensor, nn
 
 from lanebev.geometry.precision import autocast_off, common_dtype
 from lanebev.observation.lines import undistort_segments
-from lanebev.types import Calibration, LaneSegments, saved_by_name
+from lanebev.types import Calibration, LaneSegments, register_pytree
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
 
 
-@saved_by_name
+@register_pytree
 class LaneBEVOutput(NamedTuple):
     """What one frame, or with (B, T) input every frame, gives.
 
@@ -47,8 +47,8 @@ class LaneBEV(nn.Module):
         warp: default :class:`BEVWarp` on the default grid.
         network_width: px, the image is resized to this width, its aspect kept to the nearest multiple of 32,
             before the segmenter; None leaves it as it is.
-        pose_factor: of the pose's sigmas, as measured for the segmenter; None is what its ``config`` says
-            (:class:`SegmenterConfig`), 1 if it says nothing.
+        pose_sigma_scale: factor on the standard deviations of the pose; None takes the segmenter's
+            (:class:`SegmenterConfig`), or 1 where it has none.
 
     Raises:
         ValueError: segmenter and calibrator that number other boundaries.
@@ -61,7 +61,7 @@ class LaneBEV(nn.Module):
         calibrator: nn.Module,
         warp: BEVWarp | None = None,
         network_width: int | None = None,
-        pose_factor: float | None = None,
+        pose_sigma_scale: float | None = None,
     ) -> None:
         super().__init__()
         seen, known = (_configured(part, "num_boundaries") for part in (segmenter, calibrator))
@@ -70,14 +70,14 @@ class LaneBEV(nn.Module):
                 f"num_boundaries: expected the same of both, got {seen} of the segmenter and {known} of the "
                 f"calibrator; make the calibrator with num_boundaries={seen}"
             )
-        if pose_factor is None:
-            pose_factor = _configured(segmenter, "pose_factor", 1.0)
+        if pose_sigma_scale is None:
+            pose_sigma_scale = _configured(segmenter, "pose_sigma_scale", 1.0)
         self.segmenter = segmenter
         self.extractor = extractor
         self.calibrator = calibrator
         self.warp = warp or BEVWarp()
         self.network_width = network_width
-        self.pose_factor = pose_factor
+        self.pose_sigma_scale = pose_sigma_scale
 
     @classmethod
     def from_pretrained(
@@ -165,7 +165,7 @@ class LaneBEV(nn.Module):
         for step in range(steps):
             now = LaneSegments(*(part.reshape(batch, steps, *part.shape[1:])[:, step] for part in segments))
             calibration, state = self.calibrator(now, intrinsics, state, intervals[:, step], lane_width)
-            calibration = calibration.widened(self.pose_factor)
+            calibration = calibration.with_std_scaled(self.pose_sigma_scale)
             bev, valid = self.warp(frames[:, step], intrinsics, calibration.extrinsics, distortion, model)
             homography = bev_from_image(calibration.extrinsics, intrinsics, self.warp.grid)
             logits_now = logits.reshape(batch, steps, *logits.shape[1:])[:, step]

@@ -17,8 +17,8 @@ NUM_BOUNDARIES = 6
 """Semantic lane boundaries by default: 0, 1, 2 left of the ego lane's middle, 3, 4, 5 right of it."""
 
 
-def saved_by_name(cls: TupleClass) -> TupleClass:
-    """Decorator of a NamedTuple of tensors that ``torch.export.save`` and ``torch.load`` shall know."""
+def register_pytree(cls: TupleClass) -> TupleClass:
+    """Register a NamedTuple of tensors, so that ``torch.export.save`` and ``torch.load`` accept it."""
     _pytree._register_namedtuple(cls, serialized_type_name=f"lanebev.{cls.__name__}")
     torch.serialization.add_safe_globals([cls])
     return cls
@@ -48,7 +48,7 @@ class Status(IntEnum):
     LOST = 3  # too long without support: the extrinsics are the last that were believed
 
 
-@saved_by_name
+@register_pytree
 class LaneSegments(NamedTuple):
     """Line segments on lane boundaries, padded to N per image.
 
@@ -65,7 +65,7 @@ class LaneSegments(NamedTuple):
     sigma: Tensor
 
 
-@saved_by_name
+@register_pytree
 class Extrinsics(NamedTuple):
     """Camera pose over the road, each (B,): rad, rad, rad, m; always in this order.
 
@@ -90,7 +90,7 @@ class Extrinsics(NamedTuple):
         return cls(*values.unbind(-1))
 
 
-@saved_by_name
+@register_pytree
 class Calibration(NamedTuple):
     """One frame's estimate.
 
@@ -106,10 +106,11 @@ class Calibration(NamedTuple):
     status: Tensor
     inliers: Tensor
 
-    def widened(self, factor: float) -> Calibration:
-        """The same with all sigmas times ``factor``: of segments whose errors last over frames.
+    def with_std_scaled(self, factor: float) -> Calibration:
+        """Return the calibration with all standard deviations times ``factor``.
 
-        Source: covariance inflation (Anderson and Anderson 1999); Guo et al. 2017 do so with a network's
-        probabilities. A filter takes errors of two frames as independent, and a network repeats its own.
+        A filter takes the errors of two frames as independent, but a network repeats its own: its errors are
+        correlated over frames and do not average out. Source: covariance inflation (Anderson and Anderson
+        1999); Guo et al. 2017 scale a network's probabilities alike.
         """
         return self._replace(covariance=factor**2 * self.covariance)

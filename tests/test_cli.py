@@ -196,7 +196,7 @@ def test_pseudo_ground_truth_compares_the_same_frames(data, tmp_path, capsys, mo
 
 def test_a_lane_file_says_how_much_less_sure_its_pose_is(data, drive, tmp_path):
     lines = [json.loads(line) for line in (data / "video_lanes.json").read_text().splitlines()]
-    wide = "\n".join(json.dumps({**line, "pose_factor": 2.0}) for line in lines)
+    wide = "\n".join(json.dumps({**line, "pose_sigma_scale": 2.0}) for line in lines)
     (data / "wide.json").write_text(wide)
     assert _run(data, source="drive.mp4", lanes="wide.json", out=tmp_path / "out") == 0
     for row, plain in zip(_table(tmp_path / "out"), _table(drive), strict=True):
@@ -205,7 +205,7 @@ def test_a_lane_file_says_how_much_less_sure_its_pose_is(data, drive, tmp_path):
                 assert float(value) == pytest.approx(2 * float(plain[name]), abs=2e-6)
             else:
                 assert value == plain[name]
-    assert '"pose_factor": 2.0' in (tmp_path / "out" / "lanes.json").read_text()
+    assert '"pose_sigma_scale": 2.0' in (tmp_path / "out" / "lanes.json").read_text()
 
 
 def test_lanes_json_gives_the_same_calibration(data, drive, tmp_path):

@@ -104,14 +104,17 @@ def test_predictions_for_tusimples_benchmark_leave_the_rows_out(tmp_path, count,
             json.dumps({**_tusimple("b"), "lanes": [[1, 10**400, 3]]}),
             r"line 2: lanes\[0\]: expected finite",
         ),
-        (json.dumps({**_tusimple("b"), "pose_factor": 10**400}), "line 2: pose_factor: expected a finite"),
+        (
+            json.dumps({**_tusimple("b"), "pose_sigma_scale": 10**400}),
+            "line 2: pose_sigma_scale: expected a finite",
+        ),
         ("[" * 100_000, "line 2: expected JSON"),
         (json.dumps({**_tusimple("b"), "sigma": [[1], [1]]}), r"line 2: sigma\[0\]: expected 3 numbers"),
         (
-            json.dumps({**_tusimple("b"), "pose_factor": 0}),
-            "line 2: pose_factor: expected a finite number above 0",
+            json.dumps({**_tusimple("b"), "pose_sigma_scale": 0}),
+            "line 2: pose_sigma_scale: expected a finite number above 0",
         ),
-        (json.dumps({**_tusimple("b"), "pose_factor": "2"}), "line 2: pose_factor: .* got '2'"),
+        (json.dumps({**_tusimple("b"), "pose_sigma_scale": "2"}), "line 2: pose_sigma_scale: .* got '2'"),
         (json.dumps(_tusimple()), "each raw_file once, got 'a/20.jpg' again"),
     ],
 )
@@ -350,10 +353,10 @@ def test_a_networks_segments_go_through_the_file_bit_for_bit(tmp_path, seed):
     sigma = 0.3 + torch.rand(1, 96, generator=draw).double()
     segments = LaneSegments(torch.cat(ends)[None], torch.tensor(boundary)[None], weight, sigma)
     first = rows_from_segments(segments, CAMERA)
-    first = first._replace(fitted=first.x[:5] + 3.0, pose_factor=1.7)  # what others read, and do not
+    first = first._replace(fitted=first.x[:5] + 3.0, pose_sigma_scale=1.7)  # what others read, and do not
     path = _write(tmp_path / "lanes.json", tusimple_line("1.jpg", *first) + "\n")
     assert json.loads(path.read_text())["boundary"] == [0, 1, 2, 3, 4]
-    assert read_lanes(path)[0].pose_factor == 1.7
+    assert read_lanes(path)[0].pose_sigma_scale == 1.7
     again = rows_from_lines(read_lanes(path)[0].lines, CAMERA)
     np.testing.assert_array_equal(again.x, first.x)
     np.testing.assert_array_equal(again.sigma, first.sigma)

@@ -140,10 +140,10 @@ def test_network_sees_its_width_and_the_rest_does_not():
 
 def test_the_pose_is_less_sure_by_the_networks_factor():
     plain, _ = model()(images(1), INTRINSICS[None], None)
-    widened, _ = model(pose_factor=2.0)(images(1), INTRINSICS[None], None)
+    widened, _ = model(pose_sigma_scale=2.0)(images(1), INTRINSICS[None], None)
     torch.testing.assert_close(widened.calibration.covariance, 4 * plain.calibration.covariance)
     assert torch.equal(widened.calibration.extrinsics.stack(), plain.calibration.extrinsics.stack())
-    assert small().pose_factor == 1.6  # as the segmenter says
+    assert small().pose_sigma_scale == 1.6  # as the segmenter says
 
 
 def test_parts_that_number_other_boundaries_are_refused():
@@ -217,7 +217,7 @@ def test_shapes_are_checked():
         model()(torch.zeros(3, 72, 128), INTRINSICS[None], None)
 
 
-SMALL = SegmenterConfig(base_width=8, decoder_width=8, pose_factor=1.6)
+SMALL = SegmenterConfig(base_width=8, decoder_width=8, pose_sigma_scale=1.6)
 
 
 def small(calibrator=None):

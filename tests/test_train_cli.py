@@ -98,15 +98,17 @@ def test_fit_resume_test_predict_export(tmp_path):
         assert (image.mode, image.size) == ("P", (48, 32))
         assert int(np.asarray(image).max()) < 7
     exported = export(
-        newest, tmp_path / "w.safetensors", {"noise_factor": 2.5}, seed=1, commit="0" * 7, metrics={}
+        newest, tmp_path / "w.safetensors", {"sigma_scale": 2.5}, seed=1, commit="0" * 7, metrics={}
     )
     loaded = load_segmenter(tmp_path / "w.safetensors")
     torch.testing.assert_close(loaded.head.bias, exported.head.bias)
     assert read_metadata(tmp_path / "w.safetensors")["training"]["optimizer"] == "adamw"
     again = tmp_path / "again.safetensors"
-    export(tmp_path / "w.safetensors", again, {"pose_factor": 2.0}, seed=1, commit="0" * 7, metrics={"a": 1})
+    export(
+        tmp_path / "w.safetensors", again, {"pose_sigma_scale": 2.0}, seed=1, commit="0" * 7, metrics={"a": 1}
+    )
     facts = read_metadata(again)
-    assert (facts["config"]["noise_factor"], facts["config"]["pose_factor"]) == (2.5, 2.0)
+    assert (facts["config"]["sigma_scale"], facts["config"]["pose_sigma_scale"]) == (2.5, 2.0)
     assert (facts["training"]["optimizer"], facts["metrics"]) == ("adamw", {"a": 1})
     torch.testing.assert_close(load_segmenter(again).head.bias, exported.head.bias)
 

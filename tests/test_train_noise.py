@@ -33,7 +33,7 @@ def test_sigmas_half_as_large_as_the_errors_are_found_out(drive):
 
 def test_watches_a_rendered_drive_through_a_network_without_its_factor():
     torch.manual_seed(0)
-    config = SegmenterConfig(base_width=4, decoder_width=4, image_size=(64, 96), noise_factor=3.0)
+    config = SegmenterConfig(base_width=4, decoder_width=4, image_size=(64, 96), sigma_scale=3.0)
     (seen,) = watch([LaneSegmenter(config).eval()], 5, 2, 20.0)
     assert len(seen.segments) == 2
     assert seen.poses.shape == (2, 4)

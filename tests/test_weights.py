@@ -10,7 +10,7 @@ import torch.nn.functional as F
 import lanebev
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.render import Drive, boundary_masks
-from lanebev.weights import SHIPPED, load_segmenter, read_metadata, save_segmenter
+from lanebev.weights import SHIPPED, load_segmenter, read_metadata, save_segmenter, segmenter_config
 from train.metrics import point_recall
 
 
@@ -50,13 +50,19 @@ def test_from_pretrained_reads_lines_as_the_network_draws_them(tmp_path, stride)
         output_stride=stride,
         decoder_width=8,
         image_size=(64, 96),
-        noise_factor=2.0,
-        pose_factor=1.5,
+        sigma_scale=2.0,
+        pose_sigma_scale=1.5,
     )
     save_segmenter(LaneSegmenter(config), tmp_path / "w.safetensors")
     model = lanebev.LaneBEV.from_pretrained(tmp_path / "w.safetensors")
-    assert (model.extractor.config.stride, model.extractor.config.noise_factor) == (stride, 2.0)
-    assert model.pose_factor == 1.5
+    assert (model.extractor.config.stride, model.extractor.config.sigma_scale) == (stride, 2.0)
+    assert model.pose_sigma_scale == 1.5
+
+
+def test_the_former_names_of_sigma_scales_are_read():
+    """Weights files and checkpoints that were written before the names changed."""
+    config = segmenter_config({"image_size": [64, 96], "noise_factor": 2.25, "pose_factor": 1.6})
+    assert (config.sigma_scale, config.pose_sigma_scale, config.image_size) == (2.25, 1.6, (64, 96))
 
 
 def test_sees_the_ego_lane_of_rendered_drives(segmenter):

@@ -74,7 +74,7 @@ def calibrate(
         _, segments = model.observe(tensor, *lens)
         segments = LaneSegments(*(t.double() if t.is_floating_point() else t for t in segments))
         calibration = calibrate_still(JointCalibrator(), segments, lens[0].double(), lane_width)
-        calibration = calibration.widened(model.pose_factor)
+        calibration = calibration.with_std_scaled(model.pose_sigma_scale)
     pitch, yaw, roll, height = calibration.extrinsics
     down = road_from_cam(pitch, yaw, roll)[0, 1]
     sigma = calibration.covariance[0].diagonal().sqrt()

@@ -42,7 +42,7 @@ def watch(segmenters: Sequence[LaneSegmenter], seed: int, frames: int, fps: floa
                 _, found = model.observe(frame.image, frame.intrinsics)
             rows = rows_from_segments(found, drive.camera)
             taken = segments_from_rows([rows], drive.camera)
-            own.append(taken._replace(sigma=taken.sigma / segmenter.config.noise_factor))
+            own.append(taken._replace(sigma=taken.sigma / segmenter.config.sigma_scale))
         widths.append(frame.lane_width.double())
         poses.append(frame.extrinsics.stack()[0].double())
     truth = (widths, torch.stack(poses), frame.intrinsics.double(), 1 / fps)

@@ -75,7 +75,7 @@ class EndToEnd(Segmentation):
             fit = self._fit(logits + unweighted_bias(self.class_weight).view(1, -1, 1, 1), batch)
             truth = batch.extrinsics.to(widest_dtype(logits.device))
             if self.settings["surprise"]:
-                pose = pose_surprise(fit, truth, self.unit, self.segmenter.config.pose_factor)
+                pose = pose_surprise(fit, truth, self.unit, self.segmenter.config.pose_sigma_scale)
                 if self.settings["error_weight"] > 0:
                     errors = pose_loss(fit, truth, self.error_unit, with_prior=True)
                     pose = pose + self.settings["error_weight"] * errors

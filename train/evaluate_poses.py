@@ -70,7 +70,7 @@ def online_errors(
     for number in range(drives):
         all_seen = watch(segmenters, seed + number, frames, fps)
         for segmenter, seen, own in zip(segmenters, all_seen, errors, strict=True):
-            own.append(follow(seen, segmenter.config.noise_factor).error)
+            own.append(follow(seen, segmenter.config.sigma_scale).error)
     return [torch.cat(own) for own in errors]
 
 

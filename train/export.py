@@ -15,8 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
-from lanebev.weights import load_segmenter, read_metadata, save_segmenter
+from lanebev.observation.segmenter import LaneSegmenter
+from lanebev.weights import load_segmenter, read_metadata, save_segmenter, segmenter_config
 from train.commands import one_line_errors
 from train.losses import unweighted_bias
 
@@ -113,7 +113,7 @@ def checkpoint_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
     """
     weights, settings = _read_checkpoint(path)
     try:
-        segmenter = LaneSegmenter(SegmenterConfig(**settings["network"]))
+        segmenter = LaneSegmenter(segmenter_config(settings["network"]))
         segmenter.load_state_dict(weights, strict=True)
     except (KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"{path}: expected a network of this version, got: {error}") from error
@@ -143,7 +143,8 @@ def export(checkpoint: Path, out: Path, changes: dict[str, Any], **record: Any) 
     Args:
         checkpoint: of Lightning, or a weights file.
         out: the weights file.
-        changes: of the configuration: ``image_size`` to run at by default, ``noise_factor``, ``pose_factor``.
+        changes: of the configuration: ``image_size`` to run at by default, ``sigma_scale`` or
+            ``pose_sigma_scale``.
         record: further facts for the file's metadata.
     """
     segmenter, training = trained_segmenter(checkpoint)
@@ -162,15 +163,15 @@ def main() -> None:
     parser.add_argument("--commit", required=True, help="of the code that trained")
     parser.add_argument("--metrics", default="{}", help="JSON, measured on these weights")
     parser.add_argument("--image-size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="to run at")
-    parser.add_argument("--noise-factor", type=float, help="as train.noise measured it")
-    parser.add_argument("--pose-factor", type=float, help="likewise")
+    parser.add_argument("--sigma-scale", type=float, help="as train.noise measured it")
+    parser.add_argument("--pose-sigma-scale", type=float, help="likewise")
     parser.add_argument("--note", default="", help="what else there is to know")
     args = parser.parse_args()
     metrics = json.loads(args.metrics)
     given = {
         "image_size": args.image_size and tuple(args.image_size),
-        "noise_factor": args.noise_factor,
-        "pose_factor": args.pose_factor,
+        "sigma_scale": args.sigma_scale,
+        "pose_sigma_scale": args.pose_sigma_scale,
     }
     changes = {name: value for name, value in given.items() if value is not None}
     record = {"seed": args.seed, "commit": args.commit, "metrics": metrics, "note": args.note}

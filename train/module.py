@@ -90,7 +90,7 @@ class Segmentation(L.LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse another network's in one line, not in one of each weight."""
         own, other = self.settings["network"], checkpoint["settings"]["network"]
-        for name in sorted(own.keys() - {"image_size", "noise_factor", "pose_factor"}):
+        for name in sorted(own.keys() - {"image_size", "sigma_scale", "pose_sigma_scale"}):
             if own[name] != other[name]:
                 raise ValueError(f"ckpt_path: expected a network of {name} {own[name]}, got {other[name]}")
 

@@ -5,7 +5,7 @@ all sigmas that is worth: for each factor the calibrator's errors, median over t
 which is 1 where its covariance is as large as its errors. A drive alone would take a factor of 4; but with
 sigmas as large as that an outlier is no longer told from a vertex, and single frames lean on the
 prior (``python -m train.evaluate_poses``), so the shipped weights have 2.25 (``python -m train.export
---noise-factor``). By the square root of the NEES that is left there, their ``--pose-factor``, the pose's
+--sigma-scale``). By the square root of the NEES that is left there, their ``--pose-sigma-scale``, the pose's
 sigmas are widened.
 """
 
@@ -72,7 +72,7 @@ def main() -> None:
     for factor, (rmse, nees) in report.items():
         errors = dict(zip(AXES, (round(value, 3) for value in rmse.tolist()), strict=True))
         line = {"weights": args.weights.name, "factor": factor, **errors}
-        left = {"nees_per_dof": round(float(nees), 2), "pose_factor": round(float(nees) ** 0.5, 2)}
+        left = {"nees_per_dof": round(float(nees), 2), "pose_sigma_scale": round(float(nees) ** 0.5, 2)}
         print(json.dumps({**line, **left}))
 
 

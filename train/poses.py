@@ -175,7 +175,7 @@ def pose_surprise(fit: SingleFrameFit, truth: Tensor, floor: Tensor, factor: flo
         fit: of B frames; where one does not observe an axis, its prior answers for it.
         truth: (B, 4).
         floor: (4,) rad, rad, rad, m, added to the sigmas in quadrature: smaller errors are as good as none.
-        factor: on the fit's sigmas, see ``SegmenterConfig.pose_factor``.
+        factor: on the fit's sigmas, see ``SegmenterConfig.pose_sigma_scale``.
     """
     error = fit.extrinsics.stack() - truth
     variance = factor**2 * fit.covariance.diagonal(dim1=-2, dim2=-1)[:, :4] + floor.square()

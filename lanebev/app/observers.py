@@ -69,7 +69,7 @@ class LaneFileObserver:
         entry = self.matches[frame.number] if frame.number < len(self.matches) else None
         found = FrameLines(frame.name, []) if entry is None else self.entries[entry]
         lines = [] if frame.image is None else found.lines
-        rows = rows_from_lines(lines, self.camera)._replace(pose_factor=found.pose_factor)
+        rows = rows_from_lines(lines, self.camera)._replace(pose_sigma_scale=found.pose_sigma_scale)
         return rows, segments_from_rows([rows], self.camera, dtype=torch.float64)
 
 
@@ -105,7 +105,7 @@ class NetworkObserver:
             rows = rows_from_segments(segments, self.camera)
         seen = segments_from_rows([rows], self.camera, dtype=torch.float64)
         fitted = fitted_rows(seen, rows.rows, self.camera, self.lane_width)
-        return rows._replace(fitted=fitted, pose_factor=self.model.pose_factor), seen
+        return rows._replace(fitted=fitted, pose_sigma_scale=self.model.pose_sigma_scale), seen
 
 
 def fitted_rows(

@@ -139,7 +139,7 @@ def run(
                 calibration, states["calibrator"] = calibrate(
                     calibrator, segments, camera, states["calibrator"], frame, config
                 )
-                calibration = calibration.widened(rows.pose_factor)
+                calibration = calibration.with_std_scaled(rows.pose_sigma_scale)
                 bend = curvature(calibrator, states["calibrator"])
                 mounted, states["mount"] = mount(calibration, states["mount"], frame.dt, curvature=bend)
                 before = pose_before(before, calibration, config.stills or source.is_single, camera)

@@ -7,7 +7,14 @@ from typing import Generic, Protocol, Self, TypeVar
 import torch
 from torch import Tensor, nn
 
-from lanebev.estimation.checks import as_batch, as_lane_width, check_segments, check_state, padded, usable
+from lanebev.estimation.checks import (
+    as_batch,
+    as_lane_width,
+    check_segments,
+    check_state,
+    mask_invalid_rows,
+    padded,
+)
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.types import Calibration, LaneSegments, TensorTuple, map_tensors
 
@@ -86,7 +93,9 @@ class Calibrator(nn.Module, Generic[StateT]):
         like = given.to(widest_dtype(given.device))
         segments, intrinsics = cast_floating(segments, like.dtype), cast_floating(intrinsics, like.dtype)
         widths = as_lane_width(lane_width, like, self.num_boundaries)
-        segments, intrinsics, widths = usable(padded(segments), intrinsics, widths, self.num_boundaries)
+        segments, intrinsics, widths = mask_invalid_rows(
+            padded(segments), intrinsics, widths, self.num_boundaries
+        )
         with autocast_off(like.device):
             calibration, state = self.step(
                 segments, intrinsics, cast_floating(state, like.dtype), as_batch(dt, like), widths

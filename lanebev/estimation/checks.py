@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from lanebev.geometry.lens import check_intrinsics, harmless_camera, usable_cameras
+from lanebev.geometry.lens import check_intrinsics, placeholder_intrinsics, usable_cameras
 from lanebev.types import LaneSegments, Status, TensorTuple
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
@@ -90,10 +90,12 @@ def clean_segments(segments: LaneSegments, num_boundaries: int) -> LaneSegments:
     )
 
 
-def usable(
+def mask_invalid_rows(
     segments: LaneSegments, intrinsics: Tensor, lane_width: Tensor, num_boundaries: int
 ) -> tuple[LaneSegments, Tensor, Tensor]:
-    """Cleaned segments; of weight zero, with harmless numbers, in rows of an impossible camera or lane.
+    """Clean the segments, and set weight zero in rows whose intrinsics or lane widths cannot be used.
+
+    Such rows get placeholder intrinsics and widths, so that all numbers and gradients stay finite.
 
     Args:
         segments: as they came, see :func:`clean_segments`.
@@ -106,7 +108,7 @@ def usable(
     weight = torch.where(good.unsqueeze(-1), segments.weight, 0.0)
     return (
         segments._replace(weight=weight),
-        torch.where(good[:, None, None], intrinsics, harmless_camera(intrinsics)),
+        torch.where(good[:, None, None], intrinsics, placeholder_intrinsics(intrinsics)),
         torch.where(good.unsqueeze(-1), lane_width, _HARMLESS_WIDTH),
     )
 

@@ -64,7 +64,7 @@ def usable_cameras(intrinsics: Tensor) -> Tensor:
     return finite & (intrinsics[..., 0, 0] > 0) & (intrinsics[..., 1, 1] > 0)
 
 
-def harmless_camera(like: Tensor) -> Tensor:
+def placeholder_intrinsics(like: Tensor) -> Tensor:
     """(3, 3) to put in place of one that can't be used, so that no number or gradient turns NaN."""
     return torch.diag(like.new_tensor([_HARMLESS_FOCAL, _HARMLESS_FOCAL, 1.0]))
 

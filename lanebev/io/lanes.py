@@ -53,12 +53,12 @@ class FrameLines(NamedTuple):
     Attributes:
         name: of the frame in the file.
         lines: as they were drawn.
-        pose_factor: of the sigmas of the pose that they lead to, 1 unless the file says so.
+        pose_sigma_scale: factor on the standard deviations of the pose estimated from them; 1 unless stated.
     """
 
     name: str
     lines: list[LaneLine]
-    pose_factor: float = 1.0
+    pose_sigma_scale: float = 1.0
 
 
 def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) -> list[FrameLines]:
@@ -166,7 +166,7 @@ def tusimple_line(
     x: NDArray[np.float64],
     sigma: NDArray[np.float64] | None = None,
     fitted: NDArray[np.float64] | None = None,
-    pose_factor: float = 1.0,
+    pose_sigma_scale: float = 1.0,
 ) -> str:
     """One frame's boundaries as a line of TuSimple JSON, with each lane's ``boundary``.
 
@@ -177,14 +177,14 @@ def tusimple_line(
         sigma: (L, R) px, written as another key that other readers pass over; None leaves it out.
         fitted: (L, R) px, the same boundaries as curves; then these are the ``lanes``, and what was seen
             goes to another key, ``seen``, which :func:`read_tusimple` prefers. None leaves it out.
-        pose_factor: of the sigmas of the pose that they lead to; 1 leaves it out.
+        pose_sigma_scale: factor on the standard deviations of the pose estimated from them; 1 is left out.
     """
     fields: dict[str, Any] = {"raw_file": name, "h_samples": [round(row) for row in rows.tolist()]}
     if fitted is None:
         fields |= _lane_fields(x, sigma)
     else:
         fields |= {**_lane_fields(fitted, None), "seen": _lane_fields(x, sigma)}
-    return json.dumps(fields if pose_factor == 1.0 else {**fields, "pose_factor": pose_factor})
+    return json.dumps(fields if pose_sigma_scale == 1.0 else {**fields, "pose_sigma_scale": pose_sigma_scale})
 
 
 def _lane_fields(x: NDArray[np.float64], sigma: NDArray[np.float64] | None) -> dict[str, Any]:
@@ -275,9 +275,9 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
     if any(b <= a for a, b in pairwise(rows)):
         raise ValueError("h_samples: expected rising rows, got others")
     _pixels("h_samples", np.array(rows))
-    pose_factor = fields.get("pose_factor", 1.0)
-    if type(pose_factor) not in (int, float) or not 0 < pose_factor <= sys.float_info.max:
-        raise ValueError(f"pose_factor: expected a finite number above 0, got {shown(pose_factor)}")
+    pose_sigma_scale = fields.get("pose_sigma_scale", fields.get("pose_factor", 1.0))  # its former name
+    if type(pose_sigma_scale) not in (int, float) or not 0 < pose_sigma_scale <= sys.float_info.max:
+        raise ValueError(f"pose_sigma_scale: expected a finite number above 0, got {shown(pose_sigma_scale)}")
     if "seen" in fields:
         fields = _field(fields, "seen", dict)
     lanes = _field(fields, "lanes", list)
@@ -301,7 +301,7 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
             raise ValueError(f"sigma[{i}]: expected px above 0 where the lane is, got {shown(noise)}")
         if np.isfinite(x).any():
             lines.append(LaneLine(np.stack([x, np.array(rows)], axis=-1), index, sigma))
-    return FrameLines(name, lines, float(pose_factor))
+    return FrameLines(name, lines, float(pose_sigma_scale))
 
 
 def _benchmark_rows(lanes: list[Any]) -> list[float]:

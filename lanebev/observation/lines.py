@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.geometry.lens import (
-    harmless_camera,
+    placeholder_intrinsics,
     undistort_points,
     undistorted_sigma,
     usable_cameras,
@@ -40,8 +40,8 @@ class LineExtractor(nn.Module):
     @classmethod
     def for_network(cls, network: SegmenterConfig, correlation: float = NETWORK_CORRELATION) -> LineExtractor:
         """As a network's maps are to be read; single frames, where nothing lasts, want no ``correlation``."""
-        stride, factor = network.output_stride, network.noise_factor
-        return cls(LineConfig(stride=stride, noise_factor=factor, correlation=correlation))
+        stride, factor = network.output_stride, network.sigma_scale
+        return cls(LineConfig(stride=stride, sigma_scale=factor, correlation=correlation))
 
     @full_precision
     def forward(
@@ -99,7 +99,7 @@ def extract_segments(
     stretch = config.stride * scale.prod() * shrink.clamp(min=1e-12).sqrt()  # areas keep their ratio
     variance = vertices.common_var + vertices.own_var
     sigma = (0.5 * (variance.gather(-1, first) + variance.gather(-1, second))).sqrt() * stretch
-    sigma = config.noise_factor * sigma
+    sigma = config.sigma_scale * sigma
     if config.correlation > 0:
         sigma = sigma * _redundancy(points[..., 1], vertices.density > 0, config.correlation).unsqueeze(-1)
     seen = weight > 0
@@ -129,7 +129,7 @@ def undistort_segments(
         return segments
     good = usable_cameras(intrinsics) & distortion.isfinite().all(-1)  # (B,)
     segments = segments._replace(weight=torch.where(good.unsqueeze(-1), segments.weight, 0.0))
-    intrinsics = torch.where(good[:, None, None], intrinsics, harmless_camera(intrinsics))
+    intrinsics = torch.where(good[:, None, None], intrinsics, placeholder_intrinsics(intrinsics))
     distortion = torch.where(good.unsqueeze(-1), distortion, 0.0)
     lens = (intrinsics, distortion, model)
     flat = undistort_points(segments.endpoints.flatten(1, 2), *lens)

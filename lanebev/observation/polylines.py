@@ -41,14 +41,15 @@ class BoundaryRows(NamedTuple):
         x: (L, R) px; NaN where a boundary was not seen.
         sigma: (L, R) px, standard deviation across the line; None if nobody said, then it is LINE_SIGMA.
         fitted: (L, R) px, the same boundaries fitted together; None where they are taken as they came.
-        pose_factor: of the sigmas of the pose that they lead to, see :meth:`lanebev.Calibration.widened`.
+        pose_sigma_scale: factor on the standard deviations of the pose estimated from them, see
+            :meth:`lanebev.Calibration.with_std_scaled`.
     """
 
     rows: NDArray[np.float64]
     x: NDArray[np.float64]
     sigma: NDArray[np.float64] | None = None
     fitted: NDArray[np.float64] | None = None
-    pose_factor: float = 1.0
+    pose_sigma_scale: float = 1.0
 
 
 def image_rows(height: int) -> NDArray[np.float64]:

@@ -27,10 +27,11 @@ class SegmenterConfig:
         decoder_width: channels of the decoder.
         context: reach, in cells of stride 8, of each message passing step along the lanes.
         image_size: (height, width) that the weights were trained for; any other runs, with less accuracy.
-        noise_factor: of the maps' sigmas, as measured for the weights: a network errs alike along a line and
-            from frame to frame, so its vertices together say less than each by itself.
-        pose_factor: of the pose's sigmas that its segments lead to, likewise: what of those errors lasts is
-            not averaged out by a filter, and with larger sigmas an outlier would not be told from a vertex.
+        sigma_scale: factor on the standard deviation of every line vertex, measured for the weights. A
+            network's errors are correlated along a line, so vertices say less together than each alone.
+        pose_sigma_scale: factor on the standard deviations of the estimated pose, measured likewise. The
+            network's errors are correlated over frames, which a filter takes as independent. Larger vertex
+            sigmas are no substitute: they would also hide outliers.
     """
 
     num_boundaries: int = NUM_BOUNDARIES
@@ -40,8 +41,8 @@ class SegmenterConfig:
     decoder_width: int = 48
     context: tuple[int, ...] = (1, 2, 4, 8)
     image_size: tuple[int, int] = (192, 320)
-    noise_factor: float = 1.0
-    pose_factor: float = 1.0
+    sigma_scale: float = 1.0
+    pose_sigma_scale: float = 1.0
 
     def __post_init__(self) -> None:
         if self.num_boundaries < 1:
@@ -50,10 +51,10 @@ class SegmenterConfig:
             raise ValueError(f"output_stride: expected 1, 2 or 4, got {self.output_stride}")
         if len(self.image_size) != 2 or min(self.image_size) < 1:
             raise ValueError(f"image_size: expected (height, width) above 0, got {self.image_size}")
-        if not self.noise_factor > 0:
-            raise ValueError(f"noise_factor: expected more than 0, got {self.noise_factor}")
-        if not self.pose_factor > 0:
-            raise ValueError(f"pose_factor: expected more than 0, got {self.pose_factor}")
+        if not self.sigma_scale > 0:
+            raise ValueError(f"sigma_scale: expected more than 0, got {self.sigma_scale}")
+        if not self.pose_sigma_scale > 0:
+            raise ValueError(f"pose_sigma_scale: expected more than 0, got {self.pose_sigma_scale}")
         if self.decoder_width < 4:
             raise ValueError(f"decoder_width: expected at least 4, got {self.decoder_width}")
 

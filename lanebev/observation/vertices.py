@@ -40,7 +40,7 @@ class LineConfig:
             at the horizon, and says nothing; it says less from ``_FADE`` below.
         min_vertices: a boundary with fewer is not seen.
         sigma_floor: least standard deviation of a vertex, label px: what correlates along the line.
-        noise_factor: of all standard deviations; 1 where the maps are true.
+        sigma_scale: of all standard deviations; 1 where the maps are true.
         correlation: px of the image, vertically, over which a line's errors are one error: vertices nearer
             together than this say no more than so many farther apart; 0 where the maps are true.
     """
@@ -54,14 +54,14 @@ class LineConfig:
     twice: float = 1.4
     min_vertices: int = 8
     sigma_floor: float = 0.004
-    noise_factor: float = 1.0
+    sigma_scale: float = 1.0
     correlation: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("stride", "segments", "window", "min_vertices"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
-        for name in ("half_width", "noise_factor"):
+        for name in ("half_width", "sigma_scale"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected more than 0 and finite, got {getattr(self, name)}")
         if not 0 <= self.correlation < math.inf:

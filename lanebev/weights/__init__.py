@@ -8,6 +8,7 @@ in single.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 
 SHIPPED = Path(__file__).with_name("lane_segmenter.safetensors")
 _FORMAT = "lanebev.LaneSegmenter/1"
+_FORMER_NAMES = {"noise_factor": "sigma_scale", "pose_factor": "pose_sigma_scale"}
 
 
 def load_segmenter(path: str | Path | None = None) -> LaneSegmenter:
@@ -34,7 +36,7 @@ def load_segmenter(path: str | Path | None = None) -> LaneSegmenter:
     path = SHIPPED if path is None else Path(path)
     metadata, tensors = _read(path)
     try:
-        segmenter = LaneSegmenter(_config(json.loads(metadata["config"])))
+        segmenter = LaneSegmenter(segmenter_config(json.loads(metadata["config"])))
         segmenter.load_state_dict(tensors, strict=True)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:200]
@@ -87,6 +89,10 @@ def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, t
     return metadata, {k: v.float() if v.is_floating_point() else v for k, v in values.items()}
 
 
-def _config(values: dict[str, Any]) -> SegmenterConfig:
-    arguments: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+def segmenter_config(values: Mapping[str, Any]) -> SegmenterConfig:
+    """Return the configuration that a file holds, also under the names that its keys had before 0.1.0."""
+    arguments: dict[str, Any] = {
+        _FORMER_NAMES.get(name, name): tuple(value) if isinstance(value, list) else value
+        for name, value in values.items()
+    }
     return SegmenterConfig(**arguments)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.batch import flag, may_skip, where
+from lanebev.batch import flag, may_skip, select_rows
 from lanebev.estimation import kalman
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.checks import is_running
@@ -123,7 +123,7 @@ class JointCalibrator(Calibrator[JointState]):
         after = after._replace(reasons=after.reasons | flag(guessed, Reason.TIME))
 
         skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=early)
-        after = JointState(*(where(skip, old, new) for old, new in zip(skipped, after, strict=True)))
+        after = select_rows(skip, skipped, after)
         begun = (after.reasons & int(Reason.RESTARTED)) != 0
         now = torch.where(begun.unsqueeze(-1), 0.0, update.apart)
         apart = torch.maximum(after.mean[:, NUM_COMMON:].abs(), now.abs())
@@ -220,5 +220,5 @@ def _restart(
         | flag(~fit.observed[:, ROLL], Reason.ROLL_UNSEEN)
         | flag(~fit.observed[:, HEIGHT], Reason.HEIGHT_UNSEEN),
     )
-    after = JointState(*(where(fresh, new, old) for new, old in zip(begun, state, strict=True)))
+    after = select_rows(fresh, begun, state)
     return after, torch.where(fresh.unsqueeze(-1), fit.inliers, agreed)

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.estimation.checks import as_lane_width, check_segments, usable
+from lanebev.estimation.checks import as_lane_width, check_segments, mask_invalid_rows
 from lanebev.geometry.lens import cam_from_image
 from lanebev.geometry.road import rays_from_pixels
 from lanebev.geometry.rotation import road_from_cam
@@ -92,11 +92,11 @@ def observe(segments: LaneSegments, intrinsics: Tensor, num_boundaries: int) -> 
     """
     check_segments(segments, intrinsics)
     anything = intrinsics.new_ones(intrinsics.shape[0], 1)  # lane widths don't matter here
-    return observations(*usable(segments, intrinsics, anything, num_boundaries)[:2])
+    return observations(*mask_invalid_rows(segments, intrinsics, anything, num_boundaries)[:2])
 
 
 def observations(segments: LaneSegments, intrinsics: Tensor) -> Observations:
-    """Of segments and intrinsics that are :func:`~lanebev.estimation.checks.usable`."""
+    """Of segments and intrinsics that are :func:`~lanebev.estimation.checks.mask_invalid_rows`."""
     rays = rays_from_pixels(segments.endpoints.flatten(1, 2), intrinsics)
     return Observations(
         rays=rays.mT.contiguous(),

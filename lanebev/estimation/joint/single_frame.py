@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.estimation.checks import as_lane_width, check_segments, usable
+from lanebev.estimation.checks import as_lane_width, check_segments, mask_invalid_rows
 from lanebev.estimation.joint.measurement import (
     HEIGHT,
     NUM_PARAMS,
@@ -152,7 +152,7 @@ def fit_single_frame(
     """
     check_segments(segments, intrinsics)
     widths = as_lane_width(lane_width, intrinsics, num_boundaries)
-    segments, intrinsics, widths = usable(segments, intrinsics, widths, num_boundaries)
+    segments, intrinsics, widths = mask_invalid_rows(segments, intrinsics, widths, num_boundaries)
     seen = observations(segments, intrinsics)
     places = boundary_places(widths, num_boundaries, intrinsics).gather(1, seen.boundary)  # (B, N)
     return fit_observations(seen, places, prior or FramePrior(), start_segments, iterations)

@@ -23,7 +23,7 @@ from lanebev.estimation.joint.dynamics import (
 from lanebev.estimation.joint.measurement import CURVATURE, KNOT_SPACING, NUM_PARAMS, NUM_STRAIGHT
 from lanebev.estimation.joint.road import straight_or_bend
 from lanebev.estimation.joint.single_frame import FramePrior
-from lanebev.types import NUM_BOUNDARIES, map_tensors, saved_by_name
+from lanebev.types import NUM_BOUNDARIES, map_tensors, register_pytree
 
 
 class Reason(IntFlag):
@@ -101,7 +101,7 @@ class JointConfig:
             raise ValueError(f"bends: expected a probability between 0 and 1, got {self.bends}")
 
 
-@saved_by_name
+@register_pytree
 class JointState(NamedTuple):
     """Everything the calibrator remembers, tensors only.
 

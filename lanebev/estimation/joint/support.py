@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.batch import flag, where
+from lanebev.batch import flag, select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.dynamics import NUM_COMMON, NUM_POSE, NUM_SEEN
 from lanebev.estimation.joint.measurement import HEIGHT, NUM_STEPS, OFFSET, ROLL, Observations
@@ -86,11 +86,11 @@ def judge(
     reasons = reasons | flag(blind[:, ROLL], Reason.ROLL_UNSEEN)
     reasons = reasons | flag(blind[:, HEIGHT], Reason.HEIGHT_UNSEEN)
     after = JointState(
-        mean=where(supported, update.mean, state.mean),
-        cov=where(supported, update.cov, state.cov),
+        mean=select_rows(supported, update.mean, state.mean),
+        cov=select_rows(supported, update.cov, state.cov),
         phase=state.phase,
-        evidence=where(supported, evidence, torch.zeros_like(evidence)),
-        mimicry=where(supported & ~blind.any(-1), update.mimicry, state.mimicry),
+        evidence=select_rows(supported, evidence, torch.zeros_like(evidence)),
+        mimicry=select_rows(supported & ~blind.any(-1), update.mimicry, state.mimicry),
         early=torch.zeros_like(unseen),
         unseen=unseen,
         misfit=misfit,

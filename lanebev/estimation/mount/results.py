@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from lanebev.types import Extrinsics, saved_by_name
+from lanebev.types import Extrinsics, register_pytree
 
 AXES = ("pitch", "yaw", "roll", "height")
 
@@ -42,7 +42,7 @@ class MountReason(IntFlag):
     STALE = 8192  # no new block for a long time
 
 
-@saved_by_name
+@register_pytree
 class MountState(NamedTuple):
     """Everything the estimator remembers, tensors only. K blocks of each axis, the newest first.
 
@@ -79,7 +79,7 @@ class MountState(NamedTuple):
     reasons: Tensor
 
 
-@saved_by_name
+@register_pytree
 class MountCalibration(NamedTuple):
     """The mount as it is known now.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.batch import where
+from lanebev.batch import select_rows
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.two_stage.direction import track_direction
@@ -95,7 +95,7 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
         unseen = torch.where(one.seen, 0.0, state.unseen + dt)
         status = _status(state.status, one.seen, unseen, self.config.lost_after)
         after = TwoStageState(one.mean, one.cov, *two, unseen, status)
-        state = TwoStageState(*(where(skip, old, new) for old, new in zip(before, after, strict=True)))
+        state = select_rows(skip, before, after)
         return self._calibration(state, lane_width, one.inliers), state
 
     def _calibration(self, state: TwoStageState, lane_width: Tensor, inliers: Tensor) -> Calibration:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from lanebev.types import NUM_BOUNDARIES, map_tensors, saved_by_name
+from lanebev.types import NUM_BOUNDARIES, map_tensors, register_pytree
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class TwoStageConfig:
             raise ValueError(f"num_hypotheses: expected at least 1, got {self.num_hypotheses}")
 
 
-@saved_by_name
+@register_pytree
 class TwoStageState(NamedTuple):
     """Everything the calibrator remembers, tensors only.
 
