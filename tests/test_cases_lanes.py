@@ -206,7 +206,7 @@ def test_resized_lanes_come_back(scale, width, height):
     (back,) = resized_lanes(there, (height, width), size)
     np.testing.assert_allclose(back.lines[0].points, first[0].lines[0].points, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(back.lines[0].sigma, 1.0)
-    assert (back.pose_factor, back.lines[0].boundary) == (1.5, 2)
+    assert (back.pose_sigma_scale, back.lines[0].boundary) == (1.5, 2)
     corner = resized_lanes([FrameLines("0", [LaneLine(np.array([[-0.5, -0.5]]))])], size, (height, width))
     np.testing.assert_allclose(corner[0].lines[0].points, -0.5)  # the image's corner stays it
 
