@@ -18,11 +18,13 @@ def _devices(choice):
 
 
 def pytest_generate_tests(metafunc):
-    """Run a test once per device and dtype that the options name, if it asks for them."""
-    if "device" in metafunc.fixturenames:
+    """Run a test once per device and dtype that the options name, if it asks for them by itself."""
+    own = " ".join(str(mark.args[0]) for mark in metafunc.definition.iter_markers("parametrize"))
+    wanted = {name for name in ("device", "dtype") if name in metafunc.fixturenames and name not in own}
+    if "device" in wanted:
         devices = _devices(metafunc.config.getoption("--device"))
         metafunc.parametrize("device", [torch.device(name) for name in devices], ids=str)
-    if "dtype" in metafunc.fixturenames:
+    if "dtype" in wanted:
         choice = metafunc.config.getoption("--dtype")
         names = DTYPES if choice == "all" else [choice]
         metafunc.parametrize("dtype", [DTYPES[name] for name in names], ids=names)

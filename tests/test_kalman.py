@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from lanebev.estimation import kalman
 from tools.bench_filter import gain_form, information_form, measure, problem
@@ -15,9 +16,33 @@ def test_information_form_equals_the_papers_gain_form(rows):
         assert (ours - paper).abs().max() < 1e-9
 
 
-def test_information_form_is_much_faster_at_408_rows():
-    # 20 is claimed, by tools/bench_filter.py on an idle machine; here others may be running.
-    assert measure(408, 0.2)["ratio"] > 5
+class LargestTensor(TorchDispatchMode):
+    """Largest number of elements that an operation returned."""
+
+    elements = 0
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        result = operation(*args, **(kwargs or {}))
+        if isinstance(result, torch.Tensor):
+            self.elements = max(self.elements, result.numel())
+        return result
+
+
+def test_information_form_makes_no_matrix_of_rows_by_rows():
+    # That is why it is faster: by how much on an idle machine, tools/bench_filter.py prints.
+    largest = {}
+    for form in (gain_form, information_form):
+        with LargestTensor() as made:
+            form(*problem(408))
+        largest[form] = made.elements
+    assert largest[gain_form] == 408 * 408
+    assert largest[information_form] == 408 * 4
+
+
+def test_the_bench_measures_both_forms():
+    found = measure(8, 0.01)
+    assert found["ratio"] == pytest.approx(found["gain_ms"] / found["information_ms"])
+    assert found["largest_relative_difference"] < 1e-9
 
 
 def test_one_step_equals_ten_lines_of_numpy():

@@ -28,11 +28,12 @@ def boundary_segments(pitch, yaw, roll, height, edges=EDGES):
 
 
 def angles_of(ends, pose, sigma=1.0, boundary=None):
-    n = ends.shape[1]
-    rays = segment_rays(ends, K)
-    boundary = torch.arange(n)[None] if boundary is None else boundary
-    weight = torch.ones(1, n, dtype=torch.float64)
-    return lw.boundary_angles(rays, boundary, weight, sigma * weight, K, pose.pitch, pose.yaw, 4)
+    rows, n = ends.shape[:2]
+    intrinsics = K.expand(rows, 3, 3)
+    rays = segment_rays(ends, intrinsics)
+    boundary = torch.arange(n).expand(rows, n) if boundary is None else boundary
+    weight = torch.ones(rows, n, dtype=torch.float64)
+    return lw.boundary_angles(rays, boundary, weight, sigma * weight, intrinsics, pose.pitch, pose.yaw, 4)
 
 
 @pytest.mark.parametrize(
@@ -115,11 +116,10 @@ def test_width_noise_equals_monte_carlo():
     ends, pose = boundary_segments(0.02, 0.01, 0.03, 1.5)
     noise = lw.measure_widths(angles_of(ends, pose, 0.5), pose.roll, pose.height).noise[0]
     generator = torch.Generator().manual_seed(0)
-    samples = []
-    for _ in range(3000):
-        noisy = ends + 0.5 * torch.randn(ends.shape, generator=generator, dtype=torch.float64)
-        samples.append(lw.measure_widths(angles_of(noisy, pose, 0.5), pose.roll, pose.height).widths[0])
-    cov = torch.cov(torch.stack(samples).T)
+    runs = 3000
+    noisy = ends + 0.5 * torch.randn((runs, *ends.shape[1:]), generator=generator, dtype=torch.float64)
+    poses = Extrinsics(*(each.expand(runs) for each in pose))
+    cov = torch.cov(lw.measure_widths(angles_of(noisy, poses, 0.5), poses.roll, poses.height).widths.T)
     torch.testing.assert_close(cov.diagonal(), noise.diagonal(), rtol=0.12, atol=0)
     assert float(cov[0, 1] / noise[0, 1]) == pytest.approx(1.0, abs=0.25)
 
