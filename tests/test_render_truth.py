@@ -30,7 +30,7 @@ SIZE = (360, 640)
 
 def bare_world(dice: Dice) -> tuple[World, torch.Tensor]:
     """Solid white single stripes on an even black road, nothing else, in even light."""
-    world, ego_lane = sample_world(dice)
+    world, ego_lane = sample_world(dice, "highway")
     layout, pavement = world.layout, world.pavement
     zero, solid = torch.zeros_like(layout.opacity), torch.full_like(layout.dash, 10.0)
     layout = layout._replace(

@@ -1,6 +1,6 @@
 """A sheet of rendered frames as a PNG, with real ones beside them if a folder of them is given.
 
-python tools/render_sheet.py --out sheet.png [--count 100] [--real FOLDER] [--truth]
+python tools/render_sheet.py --out sheet.png [--count 100] [--kind city] [--real FOLDER] [--truth]
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from lanebev.geometry.lens import distort_points
 from lanebev.render import RenderedFrame, render_views
+from lanebev.render.scene.kinds import KINDS
 from train.commands import one_line_errors
 
 COLOURS = [(255, 80, 80), (255, 160, 0), (60, 220, 60), (60, 200, 255), (120, 120, 255), (255, 90, 255)]
@@ -51,6 +52,7 @@ def main() -> None:
     parser.add_argument("--columns", type=PositiveInt, default=10)
     parser.add_argument("--size", type=int, nargs=2, default=(180, 320), metavar=("H", "W"))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--kind", choices=KINDS, default="any", help="what the worlds show")
     parser.add_argument("--batch", type=PositiveInt, default=4)
     parser.add_argument("--real", type=Path, help="folder of real pictures: every second one of the sheet")
     parser.add_argument("--truth", action="store_true", help="draw the boundaries")
@@ -63,7 +65,7 @@ def main() -> None:
     pictures: list[NDArray[np.uint8]] = []
     start = time.perf_counter()
     while len(pictures) < wanted:
-        frame = render_views(min(args.batch, wanted - len(pictures)), size, generator)
+        frame = render_views(min(args.batch, wanted - len(pictures)), size, generator, kind=args.kind)
         for row, image in enumerate(frame.image):
             picture = np.ascontiguousarray((image.permute(1, 2, 0) * 255).round().byte().numpy())
             if args.truth:

@@ -62,6 +62,7 @@ class Drive:
         hills: factor of the crests; 0 is a flat road.
         lane_changes: whether there are any.
         weather: "any", or "clear" for a clear day.
+        kind: what the world shows, one of :data:`~lanebev.render.scene.kinds.KINDS`.
         ideal_sensor: leave out blur, noise and compression.
 
     Attributes:
@@ -87,6 +88,7 @@ class Drive:
         hills: float = 1.0,
         lane_changes: bool = True,
         weather: str = "any",
+        kind: str = "highway",
         ideal_sensor: bool = False,
     ) -> None:
         if num_frames < 1 or not fps > 0 or not speed > 0:
@@ -99,7 +101,7 @@ class Drive:
         self.camera = (camera or _default_camera(image_size)).to(dtype=torch.float32)
         self.times = torch.arange(num_frames, dtype=torch.float64) / fps
         dice = Dice(1, torch.Generator().manual_seed(seed))
-        self.world, first_lane = _sample_drive_world(dice, weather)
+        self.world, first_lane = _sample_drive_world(dice, weather, kind)
         self.start = float(dice.uniform(0, 2000))
         duration = num_frames / fps
         self._sample_course(dice, duration, curves, hills)
@@ -267,9 +269,9 @@ def _default_camera(image_size: tuple[int, int]) -> Camera:
     return Camera.from_parameters(focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
 
 
-def _sample_drive_world(dice: Dice, weather: str) -> tuple[World, Tensor]:
+def _sample_drive_world(dice: Dice, weather: str, kind: str) -> tuple[World, Tensor]:
     """Any world, or the first on a clear day."""
     while True:
-        world, lane = sample_world(dice)
+        world, lane = sample_world(dice, kind)
         if weather == "any" or int(world.weather.kind) == CLEAR:
             return world, lane

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lanebev.render.frame import RenderedFrame
 from lanebev.render.raster.effects import rain
+from lanebev.render.raster.glass import behind_glass, recorded
 from lanebev.render.raster.lens import (
     Lens,
     pixel_rays,
@@ -16,11 +17,13 @@ from lanebev.render.raster.lens import (
     sample_extrinsics,
     sample_intrinsics,
 )
+from lanebev.render.raster.night import add_lights, night_light, sprites
 from lanebev.render.raster.paint import paint_view
 from lanebev.render.raster.photometry import add_bonnet, add_noise, blur, compress, expose, light_of
 from lanebev.render.scene.alignment import Alignment, build_alignment
 from lanebev.render.scene.sampler import Dice, map_tensors, row_of
 from lanebev.render.scene.traffic import place_solids
+from lanebev.render.scene.varied import varied_extrinsics, varied_intrinsics
 from lanebev.render.scene.window import (
     WindowConfig,
     sample_window_scale,
@@ -52,7 +55,7 @@ def render_place(
         ideal_sensor: leave out blur, noise and compression.
     """
     solids = place_solids(world.traffic, alignment, place.along, place.across)
-    light = light_of(world.weather, place.heading)
+    light = night_light(light_of(world.weather, place.heading), world.lights)
     rays, steps = pixel_rays(lens, size)
     images, covers, nearest = [], [], []
     for b in range(len(place.along)):  # one scene at a time: see paint_view
@@ -69,14 +72,21 @@ def render_place(
             rays[cut],
             steps[cut],
         )
+        if bool(one.lights.on > 0):
+            lights = sprites(one.lights, row_of(place, b), row_of(alignment, b), lens_b, row_of(solids, b))
+            lit = add_lights(painted.radiance, painted.blocked, one.lights, lights, lens_b, rays[cut])
+            painted = painted._replace(radiance=lit)
         if bool(sensor.bonnet > 0):
             add_bonnet(painted.radiance, painted.blocked, sensor, lamp, one.surroundings.skyline)
         image = expose(painted.radiance, sensor, painted.road_level)
         if not ideal_sensor:
             if bool(one.weather.wet > 0):
                 image = rain(image, float(one.weather.wet), generator)
+            changed = bool((one.kinds.camera | one.kinds.night).any())
+            image = behind_glass(image, one.glass) if changed else image
             image = blur(image, float(sensor.blur) * size[1] / 640)
-            image = compress(add_noise(image, sensor, generator), sensor.jpeg)
+            image = add_noise(image, sensor, generator)
+            image = compress(recorded(image, one.glass) if changed else image, sensor.jpeg)
         images.append(image)
         covers.append(painted.blocked)
         nearest.append(painted.nearest)
@@ -110,6 +120,7 @@ def render_views(
     device: torch.device | str | None = None,
     window: WindowConfig | None = None,
     model: str = "pinhole",
+    kind: str = "any",
     ideal_sensor: bool = False,
 ) -> RenderedFrame:
     """Random scenes, poses, lenses and weather, one image each.
@@ -122,22 +133,24 @@ def render_views(
         window: render windows about the horizon of images with more pixels; by default whole images. The
             intrinsics are then those of the window; a lens's distortion is the same on the z = 1 plane.
         model: "pinhole" (Brown-Conrady, D = 5) or "fisheye" (Kannala-Brandt, D = 4) lenses.
+        kind: what the worlds show, one of :data:`~lanebev.render.scene.kinds.KINDS`.
         ideal_sensor: leave out blur, noise and compression.
 
     Raises:
-        ValueError: no images asked for, an image smaller than 16 px, or an unknown lens model.
+        ValueError: no images asked for, an image smaller than 16 px, an unknown lens model or kind.
     """
     if batch_size < 1 or min(image_size) < 16:
         raise ValueError(
             f"expected batch_size >= 1 and image_size >= (16, 16), got {batch_size} and {tuple(image_size)}"
         )
     dice = Dice(batch_size, generator)
-    world, ego_lane = sample_world(dice)
+    world, ego_lane = sample_world(dice, kind)
     world, place = sample_place(dice, world, ego_lane)
     alignment = build_alignment(*sample_course(dice))
-    intrinsics = sample_intrinsics(dice, image_size)
+    intrinsics = varied_intrinsics(dice, world.kinds.camera, sample_intrinsics(dice, image_size), image_size)
     distortion = sample_distortion(dice, intrinsics, image_size, model)
-    lens = Lens(intrinsics, distortion, model, sample_extrinsics(dice))
+    pose = varied_extrinsics(dice, world.kinds.camera, sample_extrinsics(dice))
+    lens = Lens(intrinsics, distortion, model, pose)
     if window is not None:
         scale = sample_window_scale(dice, window)
         horizon = vanishing_pixel(intrinsics, distortion, model, lens.extrinsics)

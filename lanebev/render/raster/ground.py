@@ -8,10 +8,12 @@ import torch
 from torch import Tensor
 
 from lanebev.render.raster.markings import paint
+from lanebev.render.raster.night import night_irradiance, smeared
 from lanebev.render.raster.noise import blotches, smoothstep
 from lanebev.render.raster.photometry import headlight_irradiance
 from lanebev.render.raster.shadows import shadows
 from lanebev.render.raster.solids import Light, Solids
+from lanebev.render.raster.street import street_ground
 from lanebev.render.raster.symbols import symbols
 from lanebev.render.scene.alignment import Alignment, road_from_local
 from lanebev.render.scene.pavement import pavement_albedo
@@ -59,6 +61,7 @@ def ground_under(
 
 def ground_radiance(
     world: World,
+    place: Place,
     light: Light,
     ground: Ground,
     solids: Solids,
@@ -67,8 +70,9 @@ def ground_radiance(
     drop: Tensor,
 ) -> Tensor:
     """(1, 3, N) linear radiance of the ground."""
+    ground = ground._replace(reach_along=smeared(ground.reach_along, world.lights))
     blotch = blotches(ground.along, ground.across)
-    ragged = 0.15 * blotch[3]
+    ragged = 0.15 * blotch[3] * (1 - world.street.kerbed[:, None])
     inside = torch.minimum(ground.across - world.pavement.left, world.pavement.right - ground.across)
     paved = ((inside + ragged) / ground.reach_across + 0.5).clamp(0, 1)
     albedo = torch.empty(1, 3, ground.z.shape[1])
@@ -93,13 +97,22 @@ def ground_radiance(
         share = paved[:, None, beside]
         albedo[:, :, beside] = torch.where(share > 0, verge + (albedo[:, :, beside] - verge) * share, verge)
 
+    here = (ground.along, ground.across, ground.reach_along, ground.reach_across)
+    albedo, coverage = street_ground(
+        world, place.across, camera_height, *here, albedo, paved, coverage, blotch[2]
+    )
     sunlit, open_sky = shadows(world, light, ground, solids)
     lit = light.direct[..., None] * (light.sun[:, 1, None] * sunlit)[:, None]
     lit = lit + light.ambient[..., None] * open_sky[:, None]
     if bool(light.headlight > 0):
         retro = 1 + 2.5 * coverage + 8.0 * studs
         beam = headlight_irradiance(ground.x, ground.z) * light.headlight[:, None] * retro
-        lit = lit + beam[:, None] * lit.new_tensor([1.0, 0.95, 0.85])[:, None]
+        lit = (
+            lit
+            + ((1 - world.lights.on)[:, None] * beam)[:, None] * lit.new_tensor([1.0, 0.95, 0.85])[:, None]
+        )
+        lamps, own = night_irradiance(world.lights, ground.x, ground.z, ground.along, ground.across)
+        lit = lit + lamps + own * retro[:, None]
     gloss = _gloss(world, light, swing, drop, sunlit, open_sky, blotch[2])
     return albedo * lit + gloss * paved[:, None]
 

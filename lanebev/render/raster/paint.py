@@ -79,7 +79,7 @@ def paint_view(
         slope[:, below],
         steps.flatten(2)[:, :, below],
     )
-    lit = ground_radiance(world, light, ground, solids, camera_height, swing[:, below], drop[:, below])
+    lit = ground_radiance(world, place, light, ground, solids, camera_height, swing[:, below], drop[:, below])
     haze = world.surroundings.skyline
     clear = torch.exp(-ground.z / world.weather.visibility[:, None])[:, None]
     radiance[:, :, below] = haze[..., None] * (1 - clear) + lit * clear

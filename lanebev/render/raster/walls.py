@@ -5,10 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lanebev.render.raster.houses import lit_windows
 from lanebev.render.raster.photometry import headlight_irradiance
 from lanebev.render.raster.solids import Light
 from lanebev.render.scene.alignment import Alignment, elevation_at, wall_hit
-from lanebev.render.scene.surroundings import NOTHING, NUM_WALLS, SLOPE, TREES, wall_texture
+from lanebev.render.scene.surroundings import HOUSES, NOTHING, NUM_WALLS, SLOPE, TREES, wall_texture
 from lanebev.render.scene.world import Place, World
 
 
@@ -59,17 +60,19 @@ def add_walls(
         along = arc + place.along[:, None]
         albedo, alpha = wall_texture(surroundings, wall, along, up, (pixel[:, part] * z).clamp(min=1e-3))
         faces = (-side * light.sun[:, 0]).clamp(min=0)[:, None]
-        if kind >= TREES and kind != SLOPE:
+        if kind >= TREES and kind not in (SLOPE, HOUSES):
             away = (-light.sun[:, 2, None]).clamp(min=0)  # sun from behind lights what the camera sees
             faces = 0.10 + 0.3 * light.sun[:, 1, None] * away + 0.35 * away + 0.35 * faces
         lit = light.direct[..., None] * faces[:, None] + light.ambient[..., None] * (
-            0.35 if kind >= TREES and kind != SLOPE else 0.62
+            0.35 if kind >= TREES and kind not in (SLOPE, HOUSES) else 0.62
         )
         if bool(light.headlight > 0):
             lit = (
                 lit + 0.6 * (headlight_irradiance(swing[:, part] * z, z) * light.headlight[:, None])[:, None]
             )
         lit = albedo * lit
+        if kind == HOUSES and bool(world.lights.on > 0):
+            lit = lit + lit_windows(surroundings, wall, along, up, (pixel[:, part] * z).clamp(min=1e-3))
         clear = torch.exp(-z / world.weather.visibility[:, None])[:, None]
         lit = surroundings.skyline[..., None] * (1 - clear) + lit * clear
         radiance[:, :, part] += (lit - radiance[:, :, part]) * alpha[:, None]

@@ -23,6 +23,11 @@ class Dice:
         self.batch_size = batch_size
         self.generator = generator
 
+    def beside(self) -> Dice:
+        """Dice with numbers of their own, always the same, for what is not used."""
+        generator = torch.Generator(self.generator.device).manual_seed(0)
+        return Dice(self.batch_size, generator)
+
     def uniform(self, low: float, high: float, *shape: int) -> Tensor:
         """(B, *shape) uniform in [low, high)."""
         return low + (high - low) * torch.rand(self.batch_size, *shape, generator=self.generator)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lanebev.render.raster.houses import house_front
 from lanebev.render.raster.noise import (
     CLOUD,
     GRAIN,
@@ -19,7 +20,7 @@ from lanebev.render.raster.noise import (
 from lanebev.render.scene.sampler import Dice
 
 NUM_WALLS = 6  # left and right, from the outside inwards
-NOTHING, CONCRETE, RAIL, TREES, FENCE, SLOPE, HEDGE = range(7)
+NOTHING, CONCRETE, RAIL, TREES, FENCE, SLOPE, HEDGE, HOUSES = range(8)
 
 GREENS = [
     (0.05, 0.10, 0.025),
@@ -175,6 +176,8 @@ def wall_texture(
         return ((top - up) / footprint + 0.5).clamp(0, 1)
 
     inside = (up / footprint + 0.5).clamp(0, 1)
+    if kind == HOUSES:
+        return house_front(colour, height, seed, along, up, footprint)[:2]
     if kind == CONCRETE:
         panel = dash_like(along, 0.03, 6.0, footprint)
         stain = sample_noise(CLOUD, along / 30.0 + seed, up / 9.0)

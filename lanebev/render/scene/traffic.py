@@ -57,7 +57,7 @@ class Traffic(NamedTuple):
     valid: Tensor
 
 
-def _vehicle_shapes(dice: Dice, count: int, truck: Tensor) -> Tensor:
+def vehicle_shapes(dice: Dice, count: int, truck: Tensor) -> Tensor:
     """(B, count, 2, 8): a body and what is above it."""
     length = dice.uniform(3.9, 5.1, count)
     half = dice.uniform(0.86, 0.98, count)
@@ -130,7 +130,7 @@ def _sample_vehicles(dice: Dice, layout: Layout, ego_lane: Tensor, opposite: Ten
     near = torch.where(dice.chance(0.3, 1), -2.0, 3.0)
     along = near + 6.5 * torch.exp(0.27 * torch.arange(ahead) + 0.12 * dice.uniform(0, 1, ahead))
     truck = dice.chance(0.16, count)
-    shape = _vehicle_shapes(dice, count, truck)
+    shape = vehicle_shapes(dice, count, truck)
     half_length = 0.5 * (shape[..., 0, 3] - shape[..., 0, 2])
     middle = 0.5 * (layout.across.gather(1, lane) + layout.across.gather(1, lane + 1))
     across = middle + dice.normal(0.2, ahead)

@@ -19,11 +19,17 @@ from lanebev.render.raster.photometry import (
     sample_weather,
 )
 from lanebev.render.scene.alignment import arc_nodes
+from lanebev.render.scene.glass import Glass, sample_glass
+from lanebev.render.scene.kinds import Kinds, choose, sample_kinds
 from lanebev.render.scene.layout import Layout, sample_layout
+from lanebev.render.scene.night import Lights, sample_lights
 from lanebev.render.scene.pavement import Pavement, sample_pavement
 from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.street import Street, no_street, sample_city_layout, sample_street
 from lanebev.render.scene.surroundings import Surroundings, sample_surroundings
+from lanebev.render.scene.town import city_traffic, street_edges, street_surroundings
 from lanebev.render.scene.traffic import Traffic, sample_traffic
+from lanebev.render.scene.varied import varied_camera, varied_weather
 
 
 class World(NamedTuple):
@@ -38,6 +44,10 @@ class World(NamedTuple):
         sensor: the camera's own faults.
         bridge: (B, 2) m along, where a bridge begins and ends; infinite: none.
         shade: (B,) strength of tree shadows on the road.
+        kinds: what each world has besides the plain road.
+        street: what a city street has.
+        lights: of the night.
+        glass: faults of windscreen, lens and recorder.
     """
 
     layout: Layout
@@ -48,6 +58,10 @@ class World(NamedTuple):
     sensor: Sensor
     bridge: Tensor
     shade: Tensor
+    kinds: Kinds
+    street: Street
+    lights: Lights
+    glass: Glass
 
 
 class Place(NamedTuple):
@@ -73,30 +87,65 @@ def sample_ego_lane(dice: Dice, layout: Layout) -> Tensor:
     return (share * lanes).long().clamp(max=7)
 
 
-def sample_world(dice: Dice) -> tuple[World, Tensor]:
-    """Random worlds and an ego lane in each, (B,) int64."""
+def sample_world(dice: Dice, kind: str = "any") -> tuple[World, Tensor]:
+    """Random worlds and an ego lane in each, (B,) int64.
+
+    Args:
+        dice: the randomness.
+        kind: see :func:`~lanebev.render.scene.kinds.sample_kinds`.
+    """
+    more = dice if kind != "highway" else dice.beside()  # a highway's own draws are what they were
+    kinds = sample_kinds(more, kind)
     dotted = dice.chance(0.35)
     bright = dice.chance(0.12) & ~dotted
     faint = bright | dice.chance(0.12)
     layout = sample_layout(dice, dotted, faint)
-    median = dice.chance(0.15)
+    median = dice.chance(0.15) & ~kinds.city
     ego_lane = torch.where(median & dice.chance(0.7), 0, sample_ego_lane(dice, layout))
+    layout, ego_lane, street = _with_street(more, kinds, layout, ego_lane)
     weather = sample_weather(dice)
     sunny = bright | (dotted & dice.chance(0.7))
     weather = weather._replace(
         kind=torch.where(sunny, CLEAR, weather.kind), grey=torch.where(sunny, 0.1, weather.grey)
     )
+    weather = varied_weather(more, kinds, weather)
     pavement = sample_pavement(dice, layout, dotted, bright, weather.wet, median)
+    pavement = street_edges(more, kinds.city, street, layout, pavement)
     opposite = torch.where(dice.chance(0.5), pavement.left - dice.uniform(0.8, 9.0), -math.inf)
     surroundings = sample_surroundings(dice, pavement.left, pavement.right, weather.grey, opposite, median)
-    surroundings = _tinted(surroundings, weather)
+    surroundings = street_surroundings(more, kinds.city, street, pavement, surroundings)
+    lights = sample_lights(more, kinds.night, pavement.left, pavement.right)
+    surroundings = _tinted(surroundings, weather, lights)
     begin = torch.where(dice.chance(0.25), dice.uniform(-6, 140), math.inf)
+    begin = torch.where(kinds.city & more.chance(0.75), math.inf, begin)
     extent = dice.uniform(6, 30)
     bridge = torch.stack([begin, begin + extent], dim=1)
-    traffic = sample_traffic(dice, layout, ego_lane, opposite, pavement.left, pavement.right, begin, extent)
-    sensor = sample_sensor(dice, weather, bright)
+    traffic = sample_traffic(
+        dice, layout, ego_lane, surroundings.opposite, pavement.left, pavement.right, begin, extent
+    )
+    traffic = city_traffic(more, kinds.city, street, layout, pavement, traffic)
+    sensor = varied_camera(more, kinds, sample_sensor(dice, weather, bright))
     shade = torch.where(dice.chance(0.22), dice.uniform(0.3, 1.0), 0.0)
-    return World(layout, pavement, surroundings, traffic, weather, sensor, bridge, shade), ego_lane
+    glass = sample_glass(more, kinds.camera, kinds.night)
+    return World(
+        layout, pavement, surroundings, traffic, weather, sensor, bridge, shade, kinds, street, lights, glass
+    ), ego_lane
+
+
+def _with_street(dice: Dice, kinds: Kinds, layout: Layout, ego_lane: Tensor) -> tuple[Layout, Tensor, Street]:
+    """Streets instead of highways where a world is in a city."""
+    city, lane, first, own = sample_city_layout(dice, layout)
+    street = sample_street(dice, city, lane, first, own)
+    city = city._replace(
+        missing_period=street.junction_period[:, None].expand_as(city.across),
+        missing_length=street.junction_length[:, None].expand_as(city.across),
+        missing_phase=street.phase[:, None].expand_as(city.across),
+    )
+    return (
+        choose(kinds.city, city, layout),
+        torch.where(kinds.city, lane, ego_lane),
+        choose(kinds.city, street, no_street(dice)),
+    )
 
 
 def moved_along(world: World, start: Tensor) -> World:
@@ -107,10 +156,11 @@ def moved_along(world: World, start: Tensor) -> World:
         pavement=world.pavement._replace(deck_phase=world.pavement.deck_phase - start),
         traffic=world.traffic._replace(along=world.traffic.along + shift),
         bridge=world.bridge + shift,
+        street=world.street._replace(phase=world.street.phase - start),
     )
 
 
-def _tinted(surroundings: Surroundings, weather: Weather) -> Surroundings:
+def _tinted(surroundings: Surroundings, weather: Weather, lights: Lights) -> Surroundings:
     """The sky of dusk and night."""
     night, dusk = (weather.kind == NIGHT)[:, None], (weather.kind == DUSK)[:, None]
     zenith = torch.where(night, surroundings.zenith * 0.012, surroundings.zenith)
@@ -118,6 +168,7 @@ def _tinted(surroundings: Surroundings, weather: Weather) -> Surroundings:
     zenith = torch.where(dusk, zenith * torch.tensor([0.6, 0.5, 0.5]), zenith)
     skyline = torch.where(dusk, skyline * torch.tensor([1.1, 0.75, 0.5]), skyline)
     dim = torch.where((weather.kind == RAIN)[:, None], 0.75, 1.0)
+    dim = torch.where((lights.on > 0)[:, None], lights.dark[:, None], dim)
     return surroundings._replace(zenith=zenith * dim, skyline=skyline * dim)
 
 

@@ -1,0 +1,78 @@
+"""Which kinds of road a world shows: independent draws, so that kinds combine."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from lanebev.render.scene.sampler import Dice
+
+T = TypeVar("T", bound=tuple[Any, ...])
+
+KINDS = ("any", "highway", "varied", "city", "country", "night", "snow", "tunnel", "works", "camera")
+_VARIED = 0.43  # share of the worlds of "any" that are not the plain highway
+
+
+class Kinds(NamedTuple):
+    """What a world has besides the plain road, (B,) bool each.
+
+    Attributes:
+        city: a street with kerbs, pavements, parked cars and all that is painted in towns.
+        country: a narrow road, mostly without any paint.
+        night: no daylight; headlights, at times street lamps and lights of the town.
+        snow: snow or slush at the edges and between the wheel tracks.
+        tunnel: walls, a ceiling and its lamps.
+        works: road works: yellow lines over white ones, cones, barriers.
+        camera: faults of windscreen, lens and recorder.
+    """
+
+    city: Tensor
+    country: Tensor
+    night: Tensor
+    snow: Tensor
+    tunnel: Tensor
+    works: Tensor
+    camera: Tensor
+
+
+def sample_kinds(dice: Dice, kind: str) -> Kinds:
+    """Draw what each world shows.
+
+    Args:
+        dice: the randomness.
+        kind: one of ``KINDS``: "any" is mostly plain highways, "varied" never draws on purpose a plain one,
+            any other name is that kind alone.
+
+    Raises:
+        ValueError: an unknown kind.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
+    if kind not in ("any", "varied"):
+        nothing = dice.chance(0.0)
+        return Kinds(**{name: ~nothing if name == kind else nothing for name in Kinds._fields})
+    varied = dice.chance(_VARIED if kind == "any" else 1.0)
+    place = dice.pick([0.55, 0.11, 0.34])
+    city, country = varied & (place == 0), varied & (place == 1)
+    return Kinds(
+        city=city,
+        country=country,
+        night=varied & dice.chance(0.33),
+        snow=varied & dice.chance(0.08),
+        tunnel=varied & dice.chance(0.07),
+        works=varied & ~country & dice.chance(0.13),
+        camera=varied & dice.chance(0.5),
+    )
+
+
+def choose(mask: Tensor, first: T, second: T) -> T:
+    """Rows of ``first`` where the mask (B,) holds, else of ``second``: (nested) NamedTuples of tensors."""
+    parts = []
+    for one, other in zip(first, second, strict=True):
+        if isinstance(one, tuple):
+            parts.append(choose(mask, one, other))
+        else:
+            parts.append(torch.where(mask.reshape(-1, *[1] * (one.dim() - 1)), one, other))
+    return type(first)(*parts)

@@ -1,0 +1,298 @@
+"""City streets: lanes, what is painted between them, and the strips beside the carriageway."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.render.raster.glyphs import ARROWS, BICYCLE, CROSS, WORDS
+from lanebev.render.scene.layout import (
+    DASHED,
+    DOUBLE,
+    MAX_BOUNDARIES,
+    NONE,
+    SOLID_DASHED,
+    WHITE,
+    YELLOW,
+    Layout,
+)
+from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.surroundings import GREENS
+
+PLAIN, PARKING, CYCLING = range(3)  # strips between the outer boundary and the kerb
+NO_CROSSING, ZEBRA, FORD = range(3)  # a ford: two dashed lines
+KERB, GREEN, PATH, WALK = range(4)  # strips from the kerb outwards
+DASHES = [  # (length, period) m in towns
+    (3.0, 9.0),
+    (3.0, 9.0),
+    (3.0, 4.5),
+    (6.0, 12.0),
+    (2.0, 6.0),
+    (4.0, 10.0),
+    (1.5, 4.5),
+    (0.91, 3.66),
+    (3.05, 12.19),
+]
+BLOCKS = [(0.5, 0.7), (0.5, 1.0), (1.0, 2.0), (1.5, 3.0)]  # broad dashes beside cycle and bus lanes
+
+
+class Street(NamedTuple):
+    """What a street has besides lane boundaries, (B,) unless said otherwise; strengths are in [0, 1].
+
+    Attributes:
+        kerbed: 1 where kerbs bound the carriageway; 0: the pavement's edge is ragged.
+        own: int64, number of lanes of the own direction.
+        first: int64, slot of the own direction's leftmost boundary.
+        strip: (B, 2) int64, PLAIN, PARKING or CYCLING, left and right.
+        strip_colour: (B, 2, 3) linear reflectance.
+        strip_opacity: (B, 2) of that colour.
+        bay: (B, 2) m, length of a parking bay along the road.
+        kerb_height: (B, 2) m.
+        kerb_shade: (B, 2) factor of the kerb's vertical face.
+        kerb_blocks: m, length of alternately painted pieces; 0: not painted.
+        strips: (B, 2, 4) m, widths of KERB, GREEN, PATH and WALK.
+        colours: (B, 2, 4, 3) linear reflectance of them.
+        slab: m, size of the walk's slabs; 0: none.
+        path_line: (B, 2) strength of a line along the path's outer edge.
+        junction_period: m.
+        junction_length: m; 0 is none.
+        phase: m; a junction begins where along + phase is a multiple of the period.
+        stop_width: m; 0 is none.
+        crossing: int64, NO_CROSSING, ZEBRA or FORD.
+        box: strength of a grid of yellow lines on the junction.
+        glyph: (B, K) int64, painted in the lane right of each boundary; negative: nothing.
+        glyph_period: m.
+        glyph_scale: factor of a glyph's size.
+        hatch: (B, K) strength of hatching right of each boundary.
+        hatch_width: m, of a stripe.
+        hatch_period: m.
+        hatch_slope: m along per metre across.
+        hatch_chevron: 1: stripes meet in the middle.
+        hatch_length: m of every ``hatch_every``; beyond it the lane is plain.
+        hatch_every: m.
+        hatch_taper: m across per metre along by which the hatching grows; 0: it fills the lane at once.
+        tram: strength of rails.
+        tram_across: m, middle of the track.
+        tram_bed: strength of the track's own bed.
+        tram_colour: (B, 3) linear reflectance of it.
+        paint: (B, 3) linear reflectance.
+        opacity: of the paint.
+        wear: [0, 1].
+    """
+
+    kerbed: Tensor
+    own: Tensor
+    first: Tensor
+    strip: Tensor
+    strip_colour: Tensor
+    strip_opacity: Tensor
+    bay: Tensor
+    kerb_height: Tensor
+    kerb_shade: Tensor
+    kerb_blocks: Tensor
+    strips: Tensor
+    colours: Tensor
+    slab: Tensor
+    path_line: Tensor
+    junction_period: Tensor
+    junction_length: Tensor
+    phase: Tensor
+    stop_width: Tensor
+    crossing: Tensor
+    box: Tensor
+    glyph: Tensor
+    glyph_period: Tensor
+    glyph_scale: Tensor
+    hatch: Tensor
+    hatch_width: Tensor
+    hatch_period: Tensor
+    hatch_slope: Tensor
+    hatch_chevron: Tensor
+    hatch_length: Tensor
+    hatch_every: Tensor
+    hatch_taper: Tensor
+    tram: Tensor
+    tram_across: Tensor
+    tram_bed: Tensor
+    tram_colour: Tensor
+    paint: Tensor
+    opacity: Tensor
+    wear: Tensor
+
+
+def sample_city_layout(dice: Dice, base: Layout) -> tuple[Layout, Tensor, Tensor, Tensor]:
+    """A street's boundaries, narrow or wide lanes of unequal width, mostly two-way.
+
+    Args:
+        dice: the randomness.
+        base: of the same batch; gives what streets share with highways.
+
+    Returns:
+        the layout; (B,) int64 the ego lane, the own direction's first lane, and its number of lanes.
+    """
+    slots = MAX_BOUNDARIES
+    own, other = dice.pick([0, 0.42, 0.38, 0.2]), dice.pick([0.35, 0.42, 0.23])
+    right_hand = dice.chance(0.85)
+    first = torch.where(right_hand, other, 0)  # lane, and slot of its left boundary
+    centre = torch.where(right_hand, other, own)[:, None]
+    count = own + other + 1
+    index = torch.arange(slots, device=own.device)
+    exists = index < count[:, None]
+    last = (count - 1)[:, None]
+    outer = (index == 0) | (index == last)
+    middle = (index == centre) & ~outer
+
+    lane_width = dice.uniform(2.6, 3.3)
+    lane_width = torch.where(dice.chance(0.3), dice.uniform(3.0, 3.75), lane_width)
+    lane_width = torch.where(dice.chance(0.15), dice.uniform(3.5, 3.95), lane_width)
+    uneven = dice.normal(0.2, slots - 1).clamp(-0.5, 0.5) * dice.chance(0.7, 1)
+    widths = (lane_width[:, None] + uneven).clamp(2.4, 4.3)
+    across = torch.nn.functional.pad(widths.cumsum(1), (1, 0))
+    across = torch.where(exists, across, 1e3 + 10.0 * index)
+
+    kind = dice.pick([0.0, 0.12, 0.88, 0, 0, 0], slots)
+    kind = torch.where(middle, dice.pick([0.04, 0.24, 0.42, 0.22, 0, 0.08], slots), kind)
+    kind = torch.where(outer, dice.pick([0.42, 0.38, 0.17, 0.03, 0, 0], slots), kind)
+    dashes = dice.pick_from(DASHES, 1).expand(-1, slots, -1)
+    dashes = torch.where(dice.chance(0.15, slots)[..., None], dice.pick_from(DASHES, slots), dashes)
+    blocks = outer & dice.chance(0.6, slots)
+    dashes = torch.where(blocks[..., None], dice.pick_from(BLOCKS, slots), dashes)
+    dashes = dashes * dice.uniform(0.9, 1.1, 1, 1)
+    solid = dashes[..., 1:].expand_as(dashes)
+    is_dashed, mixed = (kind == DASHED)[..., None], (kind == SOLID_DASHED)[..., None]
+    dash = torch.stack(
+        [torch.where(is_dashed | mixed, dashes, solid), torch.where(is_dashed, dashes, solid)], dim=2
+    )
+    double = (kind == DOUBLE) | (kind == SOLID_DASHED)
+    width = torch.where(dice.chance(0.8), dice.uniform(0.09, 0.15), dice.uniform(0.12, 0.2))[:, None]
+    width = torch.where(blocks & (kind == DASHED), dice.uniform(0.15, 0.3, slots), width)
+    yellow = (middle & dice.chance(0.3, 1)) | (outer & dice.chance(0.05, slots))
+    white, gold = dash.new_tensor(WHITE), dash.new_tensor(YELLOW)
+    colour = torch.where(yellow[..., None], gold, white) * dice.uniform(0.85, 1.1, 1, 1)
+    opacity = torch.where(dice.chance(0.7), dice.uniform(0.75, 1.0), dice.uniform(0.35, 0.85))[:, None]
+    opacity = (opacity * dice.uniform(0.8, 1.15, slots)).clamp(0.3, 1.0)
+    layout = base._replace(
+        across=across,
+        exists=exists,
+        marked=exists & (kind != NONE),
+        lane_width=lane_width,
+        stripe_width=width.expand(-1, slots).contiguous(),
+        separation=torch.where(double, width * dice.uniform(1.7, 3.0, 1), 0.0),
+        dash=dash.contiguous(),
+        colour=colour.expand(-1, slots, -1).contiguous(),
+        opacity=torch.where(kind == NONE, 0.0, opacity),
+        stud_period=torch.zeros_like(width).expand(-1, slots).contiguous(),
+        symbol=torch.zeros_like(base.symbol),
+    )
+    ego_lane = first + (dice.uniform(0, 1) * own).long().minimum(own - 1)
+    return layout, ego_lane, first, own
+
+
+def sample_street(dice: Dice, layout: Layout, ego_lane: Tensor, first: Tensor, own: Tensor) -> Street:
+    """What is painted between a street's boundaries and what lies beside it.
+
+    Args:
+        dice: the randomness.
+        layout: the boundaries.
+        ego_lane: (B,) int64.
+        first: (B,) int64, the own direction's first lane.
+        own: (B,) int64, its number of lanes.
+    """
+    slots = MAX_BOUNDARIES
+    index = torch.arange(slots, device=own.device)
+    strip = dice.pick([0.5, 0.27, 0.23], 2)
+    tints = dice.pick_from(
+        [(0.22, 0.06, 0.045), (0.17, 0.05, 0.05), (0.05, 0.14, 0.07), (0.04, 0.09, 0.2)], 2
+    )
+    stone = dice.uniform(0.1, 0.45, 2, 1) * (1 + dice.normal(0.03, 2, 3))
+    path = torch.where(dice.chance(0.5, 2)[..., None], tints, dice.uniform(0.06, 0.25, 2, 1))
+    walk = dice.uniform(0.07, 0.38, 2, 1) * (1 + dice.normal(0.04, 2, 3))
+    green = dice.pick_from(GREENS, 2) * dice.uniform(0.7, 1.4, 2, 1)
+    walks, paths, greens = dice.chance(0.75, 2), dice.chance(0.3, 2), dice.chance(0.4, 2)
+    kerb = torch.where(dice.chance(0.9, 2), dice.uniform(0.1, 0.32, 2), 0.0)
+    strips = torch.stack(
+        [
+            kerb,
+            torch.where(greens, dice.uniform(0.3, 3.5, 2), 0.0),
+            torch.where(paths, dice.uniform(1.0, 2.2, 2), 0.0),
+            torch.where(walks, dice.uniform(0.9, 4.5, 2), 0.0),
+        ],
+        dim=2,
+    )
+    signed = dice.chance(0.55, 1)
+    lane_in = (index >= ego_lane[:, None] - 3) & (index < layout.exists.sum(1, keepdim=True) - 1)
+    glyph = dice.pick([1.0] * len(ARROWS), slots)
+    other = dice.pick_from([float(g) for g in (*WORDS, BICYCLE, CROSS)], slots).long()
+    glyph = torch.where(dice.chance(0.15, slots), other, glyph)
+    glyph = torch.where(signed & lane_in & dice.chance(0.75, slots), glyph, -1)
+
+    beside = ego_lane[:, None] + torch.where(dice.chance(0.65), -1, 1)[:, None]
+    lanes = layout.exists.sum(1, keepdim=True) - 1
+    hatched = (index == beside) & (beside >= 0) & (beside < lanes) & dice.chance(0.3, 1)
+    track = dice.chance(0.13)
+    lane = first + torch.where(dice.chance(0.6), 0, -1)  # in the own direction's first lane or beside it
+    low, high = (layout.across.gather(1, (lane + i).clamp(min=0)[:, None])[:, 0] for i in (0, 1))
+    junction = dice.chance(0.55)
+    return Street(
+        kerbed=dice.uniform(1.0, 1.0),
+        own=own,
+        first=first,
+        strip=strip,
+        strip_colour=tints,
+        strip_opacity=torch.where((strip == CYCLING) & dice.chance(0.45, 2), dice.uniform(0.4, 1.0, 2), 0.0),
+        bay=torch.where(dice.chance(0.75, 2), dice.uniform(5.0, 7.0, 2), dice.uniform(2.3, 2.8, 2)),
+        kerb_height=torch.where(dice.chance(0.8, 2), dice.uniform(0.05, 0.18, 2), dice.uniform(0.0, 0.05, 2)),
+        kerb_shade=dice.uniform(0.35, 1.2, 2),
+        kerb_blocks=torch.where(dice.chance(0.08), dice.uniform(0.5, 1.5), 0.0),
+        strips=strips,
+        colours=torch.stack([stone, green, path.expand(-1, -1, 3), walk], dim=2),
+        slab=torch.where(dice.chance(0.5), dice.uniform(0.3, 1.2), 0.0),
+        path_line=torch.where(dice.chance(0.5, 2), dice.uniform(0.5, 1.0, 2), 0.0),
+        junction_period=dice.uniform(90, 320),
+        junction_length=torch.where(junction, dice.uniform(7, 25), 0.0),
+        phase=dice.uniform(-70, 15),
+        stop_width=torch.where(dice.chance(0.6), dice.uniform(0.25, 0.6), 0.0),
+        crossing=dice.pick([0.45, 0.25, 0.3]),
+        box=torch.where(dice.chance(0.12), dice.uniform(0.5, 1.0), 0.0),
+        glyph=glyph,
+        glyph_period=dice.uniform(14, 60),
+        glyph_scale=dice.uniform(0.7, 1.3),
+        hatch=torch.where(hatched, dice.uniform(0.7, 1.0, 1), 0.0),
+        hatch_width=dice.uniform(0.25, 0.7),
+        hatch_period=dice.uniform(1.4, 4.0),
+        hatch_slope=dice.uniform(0.5, 2.5) * torch.where(dice.chance(0.5), 1.0, -1.0),
+        hatch_chevron=dice.chance(0.3).float(),
+        hatch_length=dice.uniform(25, 120),
+        hatch_every=dice.uniform(120, 300),
+        hatch_taper=torch.where(dice.chance(0.5), dice.uniform(0.03, 0.12), 0.0),
+        tram=torch.where(track, dice.uniform(0.5, 1.0), 0.0),
+        tram_across=torch.where(dice.chance(0.65), 0.5 * (low + high), low - dice.uniform(2.0, 4.5)),
+        tram_bed=torch.where(dice.chance(0.6), dice.uniform(0.4, 1.0), 0.0),
+        tram_colour=torch.where(
+            dice.chance(0.3, 1), dice.pick_from(GREENS), dice.uniform(0.06, 0.3, 1).expand(-1, 3)
+        ),
+        paint=layout.colour.new_tensor(WHITE) * dice.uniform(0.8, 1.1, 1),
+        opacity=dice.uniform(0.55, 1.0),
+        wear=layout.wear[:, 0],
+    )
+
+
+def no_street(dice: Dice) -> Street:
+    """Nothing of a street, (B,) of it."""
+    layoutless = torch.zeros_like
+    zero = dice.uniform(0.0, 0.0)
+    two, slots = zero[:, None].repeat(1, 2), zero[:, None].repeat(1, MAX_BOUNDARIES)
+    whole, colour = layoutless(zero, dtype=torch.long), zero[:, None].repeat(1, 3)
+    fields = {name: zero for name in Street._fields}
+    fields |= {"own": whole, "first": whole, "crossing": whole, "hatch": slots}
+    fields |= {"glyph": torch.full_like(slots, -1, dtype=torch.long)}
+    fields |= {"strip": layoutless(two, dtype=torch.long), "paint": colour, "tram_colour": colour}
+    fields |= {name: two for name in ("strip_opacity", "bay", "kerb_height", "kerb_shade", "path_line")}
+    fields |= {"strip_colour": zero[:, None, None].repeat(1, 2, 3)}
+    fields |= {"strips": zero[:, None, None].repeat(1, 2, 4)}
+    fields |= {"colours": zero[:, None, None, None].repeat(1, 2, 4, 3)}
+    fields |= {name: zero + 100.0 for name in ("junction_period", "glyph_period", "hatch_every")}
+    fields |= {name: zero + 1.0 for name in ("glyph_scale", "hatch_period", "hatch_width")}
+    return Street(**fields)

@@ -1,0 +1,186 @@
+"""Kinds of road: what each adds to the image, and that it adds nothing to the labels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from lanebev.render import RenderedFrame, render_views
+from lanebev.render.raster.glyphs import AHEAD, CROSS, GLYPH_LENGTH, LEFT, NUM_GLYPHS, RIGHT, glyph_coverage
+from lanebev.render.raster.lens import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
+from lanebev.render.raster.night import lamp_light, low_beam
+from lanebev.render.raster.street import roadside
+from lanebev.render.scene.alignment import build_alignment
+from lanebev.render.scene.glass import sample_glass
+from lanebev.render.scene.kinds import KINDS, sample_kinds
+from lanebev.render.scene.night import sample_lights
+from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.street import no_street
+from lanebev.render.scene.world import World, sample_course, sample_world
+from lanebev.render.views import render_place, sample_place
+
+SIZE = (48, 96)
+
+
+def dice_of(batch: int, seed: int) -> Dice:
+    return Dice(batch, torch.Generator().manual_seed(seed))
+
+
+def seen(kind: str, seed: int, **without: Any) -> RenderedFrame:
+    """Worlds of a kind, parts of them replaced, from the same places, without the sensor's noise."""
+    batch = 3
+    dice = dice_of(batch, seed)
+    world, ego_lane = sample_world(dice, kind)
+    world, place = sample_place(dice, world, ego_lane)
+    alignment = build_alignment(*sample_course(dice))
+    intrinsics = sample_intrinsics(dice, SIZE)
+    lens = Lens(
+        intrinsics, sample_distortion(dice, intrinsics, SIZE, "pinhole"), "pinhole", sample_extrinsics(dice)
+    )
+    world = world._replace(**without)
+    return render_place(
+        world, place, alignment, lens, SIZE, torch.Generator().manual_seed(1), kind != "camera"
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_images_are_finite_and_repeat_by_seed(kind: str) -> None:
+    frames = [render_views(2, SIZE, torch.Generator().manual_seed(7), kind=kind) for _ in range(2)]
+    image = frames[0].image
+    assert image.isfinite().all()
+    assert image.min() >= 0
+    assert image.max() <= 1
+    for first, second in zip(*frames, strict=True):
+        if isinstance(first, torch.Tensor):
+            assert torch.equal(first, second)
+
+
+def test_an_unknown_kind_is_refused() -> None:
+    with pytest.raises(ValueError, match="kind: expected one of any, highway"):
+        sample_kinds(dice_of(2, 0), "moon")
+
+
+def test_most_worlds_are_plain_highways() -> None:
+    kinds = torch.stack(sample_kinds(dice_of(20000, 0), "any"))
+    assert 0.55 < 1 - kinds.any(0).float().mean() < 0.65
+    assert (kinds.float().mean(1) > 0.02).all()
+    city, night = kinds[0], kinds[2]
+    assert (city & night).float().mean() > 0.05  # they combine
+
+
+def test_a_highway_takes_no_number_from_the_sequence_for_other_kinds() -> None:
+    """The same seed gives the highway that it gave before there were other kinds."""
+    dice = dice_of(2, 3)
+    world, _ = sample_world(dice, "highway")
+    assert not torch.stack(world.kinds).any()
+    dice = dice_of(2, 3)
+    assert torch.equal(world.layout.dash_phase, sample_world(dice, "highway")[0].layout.dash_phase)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_streets_own_paint_and_kerbs_change_the_image_and_no_label(seed: int) -> None:
+    plain = seen("city", seed, street=no_street(dice_of(3, 0)))
+    street = seen("city", seed)
+    assert (street.image - plain.image).abs().amax((1, 2, 3)).min() > 0.02
+    for name in ("boundaries", "painted", "visible", "lane_width", "offset"):
+        assert torch.equal(getattr(street, name), getattr(plain, name)), name
+
+
+def test_lights_of_the_night_change_the_image_and_no_label() -> None:
+    dark = sample_lights(dice_of(3, 0), torch.zeros(3).bool(), torch.zeros(3), torch.zeros(3))
+    day, night = seen("night", 2, lights=dark), seen("night", 2)
+    assert (night.image - day.image).abs().amax((1, 2, 3)).min() > 0.02
+    assert torch.equal(night.visible, day.visible)
+
+
+def test_a_clean_camera_leaves_the_image_as_it_is() -> None:
+    """All strengths zero is the identity, also beside rows that are not."""
+    none = sample_glass(dice_of(3, 0), torch.zeros(3).bool(), torch.zeros(3).bool())
+    clean = seen("camera", 4, glass=none)
+    dirty = seen("camera", 4)
+    assert torch.equal(clean.visible, dirty.visible)
+    assert not torch.equal(clean.image, dirty.image)
+
+
+def test_glyph_coverage_is_the_mean_over_the_footprint() -> None:
+    """Fine pixels that tile a glyph have the same mean as one coarse pixel over all of it."""
+    axis = (torch.arange(200) + 0.5) / 200
+    x, y = torch.meshgrid(2 * axis - 1, GLYPH_LENGTH * axis, indexing="ij")
+    for glyph in range(NUM_GLYPHS):
+        which = torch.full_like(x, glyph, dtype=torch.long)
+        fine = glyph_coverage(which, x, y, torch.full_like(x, 0.01), torch.full_like(x, 0.025)).mean()
+        one = torch.tensor([0.5 * GLYPH_LENGTH])
+        coarse = glyph_coverage(which[0, :1], 0 * one, one, 0 * one + 2.0, 0 * one + GLYPH_LENGTH)
+        assert 0.02 < float(coarse) < 0.6
+        torch.testing.assert_close(fine[None], coarse, atol=2e-3, rtol=0.02)
+
+
+def test_glyphs_point_where_their_names_say() -> None:
+    def at(glyph: int, x: float, y: float) -> float:
+        value = glyph_coverage(*(torch.tensor([v]) for v in (glyph, x, y, 0.02, 0.05)))
+        return float(value)
+
+    assert at(AHEAD, 0.0, 4.5) == pytest.approx(1.0)
+    assert at(AHEAD, 0.4, 4.5) == 0.0
+    assert at(LEFT, -0.6, 3.7) == pytest.approx(1.0)
+    assert at(LEFT, 0.6, 3.7) == 0.0
+    assert at(RIGHT, 0.6, 3.7) == pytest.approx(1.0)
+    assert at(CROSS, 0.0, 2.5) == pytest.approx(1.0)
+    assert at(-1, 0.0, 2.5) == 0.0
+
+
+def test_the_low_beam_is_bright_ahead_and_ends() -> None:
+    lights = sample_lights(dice_of(64, 0), torch.ones(64).bool(), torch.zeros(64), torch.zeros(64))
+    lights = lights._replace(beam_rays=0 * lights.beam_rays)
+    x = torch.zeros(64, 4)
+    z = torch.tensor([8.0, 20.0, 60.0, 160.0]).expand(64, 4)
+    ahead = low_beam(lights, x, z)
+    assert (ahead[:, 0] > ahead[:, 2]).all()
+    assert (ahead[:, 3] == 0).all()  # beyond every cut-off
+    assert (low_beam(lights, x + 15, z)[:, 0] < 0.2 * ahead[:, 0]).all()
+
+
+def test_lamp_light_is_one_below_a_lamp_of_unit_power_far_from_others() -> None:
+    lights = sample_lights(dice_of(1, 0), torch.ones(1).bool(), torch.zeros(1), torch.zeros(1))
+    lights = lights._replace(
+        lamp=torch.tensor([[1.0, 0.0]]),
+        lamp_period=torch.tensor([1e4]),
+        lamp_phase=torch.tensor([3.0]),
+        lamp_across=torch.tensor([[-2.0, 5.0]]),
+        lamp_height=torch.tensor([8.0]),
+    )
+    along, across = torch.tensor([[3.0, 11.0, 1e4 + 3.0]]), torch.full((1, 3), -2.0)
+    expected = torch.tensor([[1.0, 2**-1.5, 1.0]])  # (h / distance)³ at 45 degrees
+    torch.testing.assert_close(lamp_light(lights, along, across), expected, atol=1e-4, rtol=0)
+
+
+def test_a_kerbs_top_is_seen_farther_out_by_h_over_h_minus_its_height() -> None:
+    """Eye 1.5 m high, 3 m from a kerb of 0.15 m: its face reaches from 3 m to 3.333 m on the plane."""
+    world, _ = sample_world(dice_of(1, 0), "city")
+    strips = torch.tensor([[[0.2, 0.0, 0.0, 2.0]] * 2])
+    street = world.street._replace(
+        kerb_height=torch.full((1, 2), 0.15),
+        kerb_shade=torch.zeros(1, 2),
+        kerb_blocks=torch.zeros(1),
+        strips=strips,
+        colours=torch.full((1, 2, 4, 3), 0.3),
+        junction_length=torch.zeros(1),
+    )
+    pavement = world.pavement._replace(left=torch.tensor([-50.0]), right=torch.tensor([3.0]))
+    across = torch.tensor([[2.9, 3.05, 3.3, 3.4, 5.7, 5.9]])
+    fine = torch.full_like(across, 0.01)
+    eye = (torch.tensor([0.0]), torch.tensor([1.5]))
+    colour, there = roadside(street, pavement, torch.full_like(across, 0.5), across, fine, fine, *eye)
+    dark = colour[0, 0] < 0.05
+    assert dark[1:4].tolist() == [True, True, False]
+    # 2.2 m of strips on the raised plane end at (3 + 2.2) · 1.5 / 1.35 = 5.78 m
+    assert there[0].round().tolist() == [0, 1, 1, 1, 1, 0]
+
+
+def test_worlds_without_a_street_have_no_kerbs_or_paint() -> None:
+    world: World = sample_world(dice_of(4, 1), "highway")[0]
+    assert not world.street.kerbed.any()
+    assert (world.street.glyph < 0).all()
+    assert not world.street.hatch.any()
