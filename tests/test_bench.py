@@ -7,7 +7,8 @@ import json
 import pytest
 import torch
 
-from tools.bench_calibration import Track, main, recovery, smallest_eigenvalue, stream, summarise
+from lanebev.testing.evaluation import Track, recovery, summarise
+from tools.bench_calibration import main, smallest_eigenvalue, stream
 
 
 def test_quick_bench_writes_json_and_a_table(tmp_path):

@@ -5,8 +5,9 @@ import torch
 
 from lanebev import JointCalibrator, Status, TwoStageCalibrator
 from lanebev.estimation.mount import MountEstimator
+from lanebev.testing.segments import INTRINSICS as K
+from lanebev.testing.segments import lanes, no_lanes, stack_rows
 from lanebev.types import Calibration, Extrinsics
-from tests.test_two_stage import K, lanes, nothing, rows
 
 
 @pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
@@ -22,9 +23,9 @@ def test_calibrators(calibrator):
     state = other = calibrator.initial_state(2, dtype=torch.float64)
     dt = torch.full((2,), 1 / 30, dtype=torch.float64)
     frames = [
-        rows(lanes(seed=0), nothing()),
-        rows(lanes(seed=1), lanes(seed=2)),
-        rows(nothing(), lanes(seed=3)),
+        stack_rows(lanes(seed=0), no_lanes()),
+        stack_rows(lanes(seed=1), lanes(seed=2)),
+        stack_rows(no_lanes(), lanes(seed=3)),
     ]
     for segments in frames:
         expected, state = calibrator(segments, K.expand(2, 3, 3), state, dt)

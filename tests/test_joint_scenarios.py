@@ -14,11 +14,11 @@ import torch
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
+from lanebev.testing.evaluation import UNITS, WARM_UP, Track, summarise, track
+from lanebev.testing.experiment import Experiment
+from lanebev.testing.scenarios import CAMERA, PLACES, SCENARIOS, WIDTH, Moment, moments, observe
 from lanebev.types import Status
-from tools.bench_calibration import UNITS, WARM_UP, Track, summarise, track
 from tools.reproduce_table1 import VARIANCES, run, table
-from tools.scenarios import CAMERA, PLACES, SCENARIOS, WIDTH, Moment, moments, observe
-from tools.synthetic import Experiment
 
 torch.set_num_threads(1)
 ROWS = 4

@@ -8,7 +8,8 @@ import torch
 
 from lanebev import LaneSegments
 from lanebev.estimation.joint.single_frame import FramePrior, fit_single_frame
-from tests.test_two_stage import K, lanes
+from lanebev.testing.segments import INTRINSICS as K
+from lanebev.testing.segments import lanes
 from tools.label_noise import line_offsets, split_half_yaw, stripe_centre
 
 

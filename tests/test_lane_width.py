@@ -6,25 +6,27 @@ import math
 import pytest
 import torch
 
-from lanebev import Extrinsics, image_from_road_points
+from lanebev import Extrinsics
 from lanebev.estimation.two_stage import lane_width as lw
 from lanebev.geometry.road import segment_rays
 from lanebev.geometry.rotation import cam_from_world
+from lanebev.testing.segments import project_boundaries
 
 K = torch.tensor([[[1000.0, 0, 640], [0, 1000, 360], [0, 0, 1]]], dtype=torch.float64)
-EDGES = torch.tensor([-5.8, -2.1, 1.6, 5.3], dtype=torch.float64)  # 3.7 m apart, camera off the middle
+OFFSET = -0.25  # m, of the middle of four boundaries 3.7 m apart
 
 
 def t(*values):
     return [torch.tensor([v], dtype=torch.float64) for v in values]
 
 
-def boundary_segments(pitch, yaw, roll, height, edges=EDGES):
-    near = torch.stack([edges, torch.full_like(edges, 9.0)], dim=-1)[None]
-    far = torch.stack([edges, torch.full_like(edges, 30.0)], dim=-1)[None]
-    pose = Extrinsics(*t(pitch, yaw, roll, height))
-    ends = torch.stack([image_from_road_points(p, K, pose)[0] for p in (near, far)], dim=2)
-    return ends, pose
+def boundary_segments(pitch, yaw, roll, height, boundaries=(0, 1, 2, 3)):
+    """A segment from 9 to 30 m of each boundary, (1, N, 2, 2), and the pose."""
+    params = torch.tensor([[pitch, yaw, roll, height, OFFSET, 0.0, 0.0]], dtype=torch.float64)
+    index = torch.tensor([boundaries])
+    z = torch.tensor([9.0, 30.0], dtype=torch.float64).expand(1, len(boundaries), 2)
+    ends = project_boundaries(params, index, z, K, num_boundaries=4)
+    return ends, Extrinsics(*t(pitch, yaw, roll, height))
 
 
 def angles_of(ends, pose, sigma=1.0, boundary=None):
@@ -77,7 +79,7 @@ def test_deviation_a_sum_of_signed_residuals_has_no_minimum():
 
 
 def test_one_lane_leaves_roll_at_the_guess():
-    ends, pose = boundary_segments(0.0, 0.0, 0.1, 1.5, EDGES[1:3])
+    ends, pose = boundary_segments(0.0, 0.0, 0.1, 1.5, (1, 2))
     found = angles_of(ends, pose)
     prior = torch.full((1, 3), 3.7, dtype=torch.float64)
     roll, height = lw.initial_roll_height(found, prior, *t(0.07))
@@ -86,7 +88,7 @@ def test_one_lane_leaves_roll_at_the_guess():
 
 
 def test_a_missed_boundary_is_two_lanes_missed_not_one_twice_as_wide():
-    ends, pose = boundary_segments(0.0, 0.0, 0.0, 1.5, EDGES[[0, 2, 3]])
+    ends, pose = boundary_segments(0.0, 0.0, 0.0, 1.5, (0, 2, 3))
     measured = lw.measure_widths(
         angles_of(ends, pose, boundary=torch.tensor([[0, 2, 3]])), pose.roll, pose.height
     )

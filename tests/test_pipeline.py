@@ -20,9 +20,10 @@ from lanebev import (
 )
 from lanebev.geometry.lens import distort_points
 from lanebev.observation.segmenter import SegmenterConfig
+from lanebev.testing.segments import INTRINSICS as K
+from lanebev.testing.segments import lanes
 from lanebev.types import Extrinsics
 from lanebev.weights import save_segmenter
-from tests.test_two_stage import K, lanes
 
 GRID = BEVGrid(x=(-6.0, 6.0), z=(6.0, 30.0), resolution=0.5)
 SIZE = (72, 128)

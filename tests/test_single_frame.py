@@ -19,6 +19,7 @@ from lanebev.estimation.joint.measurement import (
 )
 from lanebev.estimation.joint.single_frame import FramePrior, fit_single_frame
 from lanebev.geometry.road import image_from_road_points
+from lanebev.testing.segments import noisy_segments, project_boundaries
 from lanebev.types import Extrinsics, LaneSegments
 
 torch.set_num_threads(1)
@@ -29,23 +30,11 @@ CAMERA = torch.tensor([[1050.0, 0.0, 959.5], [0.0, 1050.0, 509.5], [0.0, 0.0, 1.
 def drive_frames(params: Tensor, sigma: float, seed: int, per_boundary: int = 30, boundaries=range(6)):
     """Segments between random points at 5-60 m of every boundary, for (B, 7) parameters."""
     generator = torch.Generator().manual_seed(seed)
-    batch, num = params.shape[0], len(boundaries)
-    index = torch.tensor(list(boundaries)).repeat_interleave(per_boundary).expand(batch, -1)
-    inverse = torch.rand(batch, num * per_boundary, 2, generator=generator, dtype=DOUBLE)
+    index = torch.tensor(list(boundaries)).repeat_interleave(per_boundary).expand(params.shape[0], -1)
+    inverse = torch.rand(*index.shape, 2, generator=generator, dtype=DOUBLE)
     z = 1 / (1 / 5.0 + (1 / 60.0 - 1 / 5.0) * inverse)
-    places = boundary_places(3.7, 6, params).gather(1, index) + params[:, 4:5]
-    c0, c1 = params[:, 5, None, None], params[:, 6, None, None]
-    heading = c0 * z + c1 * z**2 / 2  # parallel curves, to second order
-    x = places.unsqueeze(-1) * (1 + heading**2 / 2) + c0 * z**2 / 2 + c1 * z**3 / 6
-    points, _ = image_from_road_points(
-        torch.stack([x, z], dim=-1).flatten(1, 2),
-        CAMERA.expand(batch, 3, 3),
-        Extrinsics.unstack(params[:, :4]),
-    )
-    points = points.unflatten(1, (-1, 2))
-    points = points + sigma * torch.randn(points.shape, generator=generator, dtype=DOUBLE)
-    weight = torch.ones(index.shape, dtype=DOUBLE)
-    return LaneSegments(points, index.clone(), weight, torch.full_like(weight, max(sigma, 0.1)))
+    endpoints = project_boundaries(params, index, z, cameras(params.shape[0]))
+    return noisy_segments(endpoints, index, sigma, generator)
 
 
 def random_params(batch: int, seed: int, degrees: tuple[float, float, float], curvature: float = 0.0):

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
-from tools.scenarios import CAMERA, FPS, WIDTH, moments
-from tools.scenarios import observe as see
+from lanebev.testing.scenarios import CAMERA, FPS, WIDTH, moments
+from lanebev.testing.scenarios import observe as see
 from train.drives import Seen, watch
 from train.noise import compare, outcome
 

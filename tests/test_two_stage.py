@@ -7,54 +7,18 @@ import pytest
 import torch
 
 from lanebev import (
-    Extrinsics,
     JointCalibrator,
     LaneSegments,
     Status,
     TwoStageCalibrator,
-    image_from_road_points,
 )
 from lanebev.estimation.two_stage.direction import incidence
 from lanebev.estimation.two_stage.state import TwoStageConfig
 from lanebev.geometry.road import great_circle_normals, segment_rays
+from lanebev.testing.experiment import Experiment
+from lanebev.testing.segments import INTRINSICS as K
+from lanebev.testing.segments import POSE, lanes, no_lanes, stack_rows
 from tools.reproduce_table1 import run, table
-from tools.synthetic import Experiment
-
-K = torch.tensor([[1000.0, 0, 640], [0, 1000, 360], [0, 0, 1]], dtype=torch.float64)
-POSE = (0.03, -0.02, 0.015, 1.45)
-
-
-def lanes(
-    pose=POSE, boundaries=(0, 1, 2, 3, 4, 5), per=8, noise=0.5, seed=0, width=3.7, offset=0.3, bend=0.0
-):
-    """LaneSegments (1, N) of boundaries seen from a pose, with pixel noise."""
-    generator = torch.Generator().manual_seed(seed)
-    index = torch.tensor(boundaries).repeat_interleave(per)
-    x = (index - 2.5) * width - offset
-    z = torch.rand(len(index), 2, generator=generator, dtype=torch.float64) * 10
-    z = z + torch.tensor([7.0, 25.0])
-    road = torch.stack([x[:, None] + 0.5 * bend * z * z, z], dim=-1).reshape(1, -1, 2)
-    extrinsics = Extrinsics(*(torch.tensor([v], dtype=torch.float64) for v in pose))
-    ends = image_from_road_points(road, K[None], extrinsics)[0].reshape(1, -1, 2, 2)
-    ends = ends + noise * torch.randn(ends.shape, generator=generator, dtype=torch.float64)
-    ones = torch.ones(1, len(index), dtype=torch.float64)
-    return LaneSegments(ends, index[None], ones, max(noise, 0.1) * ones)
-
-
-def nothing(n=48):
-    segments = lanes(per=n // 6)
-    return segments._replace(weight=segments.weight * 0)
-
-
-def rows(*parts):
-    """Rows of a batch, padded to the longest."""
-    longest = max(p.weight.shape[1] for p in parts)
-
-    def pad(value):
-        shape = (1, longest - value.shape[1], *value.shape[2:])
-        return torch.cat([value, torch.zeros(shape, dtype=value.dtype)], dim=1)
-
-    return LaneSegments(*(torch.cat([pad(v) for v in values]) for values in zip(*parts, strict=True)))
 
 
 def drive(calibrator, frames, dt=1 / 30, lane_width=3.7):
@@ -101,7 +65,7 @@ def test_invariant_to_order_and_end_point_swap():
 DEGENERATE = {
     "one lane": lanes(boundaries=(2, 3)),
     "one boundary": lanes(boundaries=(2,)),
-    "empty": nothing(),
+    "empty": no_lanes(),
     "nan": lanes()._replace(endpoints=lanes().endpoints * torch.nan),
     "duplicates": LaneSegments(*(v[:, :1].repeat(1, 48, *([1] * (v.ndim - 2))) for v in lanes())),
     "points": lanes()._replace(endpoints=lanes().endpoints[:, :, :1].repeat(1, 1, 2, 1)),
@@ -115,7 +79,7 @@ DEGENERATE = {
 def test_bad_rows_give_a_status_and_finite_numbers_and_touch_no_other(kind):
     good, bad = [lanes(seed=s) for s in range(4)], DEGENERATE[kind]
     alone, _ = drive(TwoStageCalibrator(), good)
-    beside, _ = drive(TwoStageCalibrator(), [rows(bad, g, bad) for g in good])
+    beside, _ = drive(TwoStageCalibrator(), [stack_rows(bad, g, bad) for g in good])
     for a, b in zip(alone, beside, strict=True):
         assert finite(b)
         torch.testing.assert_close(a.extrinsics.stack()[0], b.extrinsics.stack()[1], atol=1e-10, rtol=0)
@@ -128,7 +92,7 @@ def test_bad_rows_give_a_status_and_finite_numbers_and_touch_no_other(kind):
 
 
 def test_bad_rows_carry_no_nan_gradient():
-    segments = rows(lanes(), DEGENERATE["nan"], DEGENERATE["one boundary"])
+    segments = stack_rows(lanes(), DEGENERATE["nan"], DEGENERATE["one boundary"])
     ends = segments.endpoints.detach().clone().requires_grad_()
     calibrator = TwoStageCalibrator()
     state = calibrator.initial_state(3, dtype=torch.float64)
@@ -156,7 +120,7 @@ def test_gradcheck_through_start_and_update():
 
 def test_life_cycle_track_coast_lost_and_back():
     calibrator = TwoStageCalibrator(lost_after=0.5)
-    frames = [nothing()] * 2 + [lanes(seed=s) for s in range(10)] + [nothing()] * 30
+    frames = [no_lanes()] * 2 + [lanes(seed=s) for s in range(10)] + [no_lanes()] * 30
     outputs, state = drive(calibrator, frames)
     statuses = [int(o.status[0]) for o in outputs]
     assert statuses[:2] == [Status.UNINITIALISED] * 2
@@ -293,7 +257,7 @@ def test_incidence_jacobian_and_noise_equal_autograd():
 
 def test_a_starts_pitch_and_yaw_err_together_as_it_says():
     """Boundaries on one side alone: what tilts the lines' meeting point up moves it sideways."""
-    frames = rows(*(lanes(boundaries=(0, 1, 2), seed=seed, noise=1.0) for seed in range(300)))
+    frames = stack_rows(*(lanes(boundaries=(0, 1, 2), seed=seed, noise=1.0) for seed in range(300)))
     outputs, _ = drive(TwoStageCalibrator(), [frames])
     errors = outputs[0].extrinsics.stack()[:, :2] - torch.tensor(POSE[:2], dtype=torch.float64)
     cov = outputs[0].covariance[:, :2, :2].mean(0)
@@ -309,7 +273,7 @@ def test_in_a_gap_the_pose_goes_on_for_a_fifth_of_a_second_and_then_holds_still(
     outputs, state = drive(calibrator, turning)
     pitches = [outputs[-1].extrinsics.pitch[0]]
     for _ in range(15):
-        out, state = calibrator(nothing(), K[None], state, 1 / 30)
+        out, state = calibrator(no_lanes(), K[None], state, 1 / 30)
         pitches.append(out.extrinsics.pitch[0])
     steps = torch.stack(pitches).diff()
     assert (steps[:5] > 0.001).all()
@@ -381,7 +345,7 @@ def test_float32_follows_float64():
 def test_export_equals_eager(count):
     calibrator = TwoStageCalibrator()
     state = calibrator.initial_state(2, dtype=torch.float64)
-    segments = rows(lanes(seed=0), lanes(seed=1))
+    segments = stack_rows(lanes(seed=0), lanes(seed=1))
     every = segments.weight.shape[1] // count
     segments = LaneSegments(*(part[:, ::every] for part in segments))
     assert segments.weight.shape == (2, count)
@@ -491,8 +455,8 @@ BAD_ROWS = {
 def test_a_row_without_camera_or_lane_width_sees_nothing(calibrator, kind):
     factor, width = BAD_ROWS[kind]
     good = torch.ones(2, 1, 1, dtype=torch.float64) * K
-    _, state = drive(calibrator, [rows(lanes(seed=s), lanes(seed=s)) for s in range(3)])
-    segments = rows(lanes(seed=4), lanes(seed=4))
+    _, state = drive(calibrator, [stack_rows(lanes(seed=s), lanes(seed=s)) for s in range(3)])
+    segments = stack_rows(lanes(seed=4), lanes(seed=4))
     expected, _ = calibrator(segments, good, state, 1 / 30)
     bad = torch.cat([good[:1] * factor, good[1:]])
     out, after = calibrator(segments, bad, state, 1 / 30, torch.tensor([width, 3.7], dtype=torch.float64))
@@ -510,7 +474,7 @@ def test_frames_of_no_or_one_segment_are_as_padded_ones(calibrator, count):
     for state in (calibrator.initial_state(1, dtype=torch.float64), started):
         few = LaneSegments(*(v[:, :count] for v in lanes(seed=5)))
         one, _ = calibrator(few, K[None], state, 1 / 30)
-        padded, _ = calibrator(rows(few, nothing()), K.expand(2, 3, 3), twice(state), 1 / 30)
+        padded, _ = calibrator(stack_rows(few, no_lanes()), K.expand(2, 3, 3), twice(state), 1 / 30)
         assert one.inliers.shape == (1, count)
         assert one.status[0] == padded.status[0]
         assert one.status[0] in (Status.UNINITIALISED, Status.COASTING)
@@ -537,7 +501,7 @@ def test_results_have_the_dtype_of_the_state_whatever_comes(calibrator, dtype):
 
 @BOTH
 def test_what_does_not_fit_the_batch_is_named(calibrator):
-    segments, cameras = rows(lanes(), lanes()), K.expand(2, 3, 3)
+    segments, cameras = stack_rows(lanes(), lanes()), K.expand(2, 3, 3)
     state = calibrator.initial_state(2, dtype=torch.float64)
     name = state._fields[0]
     for count in (1, 3):

@@ -23,8 +23,8 @@ from jsonargparse.typing import PositiveInt
 import lanebev
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.kalman import symmetrise
+from lanebev.testing.experiment import Experiment, frames
 from lanebev.types import Status
-from tools.synthetic import Experiment, frames
 from train.commands import one_line_errors
 
 VARIANCES = (0.5, 1.0, 2.0, 4.0, 9.0)

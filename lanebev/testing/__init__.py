@@ -1,0 +1,1 @@
+"""Lane segments with known truth, for tests and benchmarks."""

@@ -1,0 +1,143 @@
+"""A calibrator on a drive of known truth: errors, covariance, status, and the figures made of them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.estimation.joint.measurement import NUM_PARAMS, boundary_residuals
+from lanebev.estimation.joint.measurement import observe as make_ready
+from lanebev.estimation.joint.single_frame import normal_equations
+from lanebev.testing.scenarios import CAMERA, FPS, PLACES, WIDTH, Moment, observe
+from lanebev.types import LaneSegments, Status
+
+NAMES = ("pitch_deg", "yaw_deg", "roll_deg", "height_cm")
+UNITS = torch.tensor([180 / math.pi] * 3 + [100.0], dtype=torch.float64)
+WARM_UP = 15  # frames left out
+
+
+class Track(NamedTuple):
+    """What a calibrator made of a drive of T frames in R rows.
+
+    Attributes:
+        errors: (T, R, 4) rad and m.
+        variances: (T, R, 4).
+        nees: (T, R).
+        status: (T, R) int64.
+        bounds: (T, R, 4) variances of the per-frame Cramér-Rao bound, inf where there is none.
+        hard: (T,) bool, frames that the scenario names.
+    """
+
+    errors: Tensor
+    variances: Tensor
+    nees: Tensor
+    status: Tensor
+    bounds: Tensor
+    hard: Tensor
+
+
+def track(
+    calibrator: Any,
+    drive: list[Moment],
+    rows: int,
+    sigma: float = 1.0,
+    per_boundary: int = 30,
+    seed: int = 0,
+    dtype: torch.dtype = torch.float64,
+) -> Track:
+    """Run a calibrator over a drive.
+
+    Args:
+        calibrator: with ``initial_state`` and a call as ``JointCalibrator``.
+        drive: from ``lanebev.testing.scenarios.moments``.
+        rows: R Monte Carlo runs.
+        sigma: px, noise of an end point.
+        per_boundary: segments of each boundary.
+        seed: of pairs and noise.
+        dtype: of the calibrator.
+    """
+    state = calibrator.initial_state(rows, dtype=dtype)
+    intrinsics = CAMERA.to(dtype).expand(rows, 3, 3)
+    found = []
+    for moment, segments in observe(drive, rows, sigma, per_boundary, seed, dtype):
+        calibration, state = calibrator(segments, intrinsics, state, moment.dt, WIDTH)
+        error = calibration.extrinsics.stack().double() - torch.tensor(moment.pose, dtype=torch.float64)
+        cov = calibration.covariance.double()
+        nees = (error * torch.linalg.solve(cov, error)).sum(-1)
+        found.append(
+            (error, cov.diagonal(dim1=1, dim2=2), nees, calibration.status, frame_bound(moment, segments))
+        )
+    hard = torch.tensor([bool(moment.tag) for moment in drive])
+    errors, variances, nees, status, bounds = (torch.stack(part) for part in zip(*found, strict=True))
+    return Track(errors, variances, nees, status, bounds, hard)
+
+
+def frame_bound(moment: Moment, segments: LaneSegments) -> Tensor:
+    """Variances (R, 4) of the per-frame bound with the offset unknown, or inf where roll is not determined.
+
+    Source: Kay 1993, Sec. 3.9. Wrong segments count as if they were right ones, which only lowers it.
+    """
+    rows = segments.boundary.shape[0]
+    seen = make_ready(LaneSegments(*(_double(part) for part in segments)), CAMERA.expand(rows, 3, 3), 6)
+    params = torch.zeros(rows, NUM_PARAMS, dtype=torch.float64)
+    params[:, :5] = torch.tensor([*moment.pose, moment.offset], dtype=torch.float64)
+    at = boundary_residuals(params, PLACES[segments.boundary], seen)
+    weight = seen.weight * at.valid / seen.sigma.square()
+    info, _ = normal_equations(at.jacobian[:, :5], at.distance, weight)
+    cov = torch.linalg.inv(info + 1e-6 * torch.eye(5, dtype=torch.float64))
+    variances = cov.diagonal(dim1=1, dim2=2)[:, :4]
+    return torch.where((variances[:, 2:3] < 0.01), variances, torch.inf)
+
+
+def _double(part: Tensor) -> Tensor:
+    return part.double() if part.is_floating_point() else part
+
+
+def summarise(run: Track, usual: Tensor | None = None) -> dict[str, Any]:
+    """Figures of one track; ``usual`` (4,) is the RMSE on the straight road, for the time to recover."""
+    later = torch.arange(len(run.hard)) >= WARM_UP
+    easy, hard = later & ~run.hard, later & run.hard
+    known = run.bounds.isfinite().all(-1) & easy.unsqueeze(-1)
+    bound = run.bounds[known].mean(0).sqrt()
+    figures: dict[str, Any] = {
+        "rmse": (rms(run.errors[easy]) * UNITS).tolist(),
+        "ratio_to_bound": (rms(run.errors[known]) / bound).tolist(),
+        "nees_per_dof": float(run.nees[easy].mean() / 4),
+        "time_in_status": {s.name: float((run.status[later] == s).double().mean()) for s in Status},
+    }
+    if hard.any():
+        figures["hard"] = {
+            "rmse": (rms(run.errors[hard]) * UNITS).tolist(),
+            "largest": (run.errors[hard].abs().amax((0, 1)) * UNITS).tolist(),
+            "largest_sigma": (run.variances[hard].amax((0, 1)).sqrt() * UNITS).tolist(),
+            "nees_per_dof": float(run.nees[hard].mean() / 4),
+        }
+        if usual is not None:
+            figures["recovery_s"] = recovery(run, usual)
+    return figures
+
+
+def recovery(run: Track, usual: Tensor) -> float | None:
+    """Longest time, s, from the end of hard frames until the error of all rows is back at twice the usual.
+
+    None if it never comes back before the next hard frames or the end.
+    """
+    fine = (run.errors.square().mean(1).sqrt() <= 2 * usual).all(-1)  # (T,)
+    ends = [k + 1 for k in range(len(fine) - 1) if run.hard[k] and not run.hard[k + 1]]
+    longest = 0.0
+    for end in ends:
+        until = end
+        while until < len(fine) and not fine[until] and not run.hard[until]:
+            until += 1
+        if until == len(fine) or run.hard[until]:
+            return None
+        longest = max(longest, (until - end) / FPS)
+    return longest
+
+
+def rms(values: Tensor) -> Tensor:
+    """Over all dimensions but the last."""
+    return values.flatten(0, -2).square().mean(0).sqrt()
