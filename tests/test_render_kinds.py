@@ -17,7 +17,7 @@ from lanebev.render.scene.glass import sample_glass
 from lanebev.render.scene.kinds import KINDS, sample_kinds
 from lanebev.render.scene.night import sample_lights
 from lanebev.render.scene.sampler import Dice
-from lanebev.render.scene.street import no_street
+from lanebev.render.scene.street import PLAIN, no_street
 from lanebev.render.scene.world import World, sample_course, sample_world
 from lanebev.render.views import render_place, sample_place
 
@@ -184,3 +184,19 @@ def test_worlds_without_a_street_have_no_kerbs_or_paint() -> None:
     assert not world.street.kerbed.any()
     assert (world.street.glyph < 0).all()
     assert not world.street.hatch.any()
+
+
+def test_a_kerb_is_the_boundary_where_nothing_is_painted_and_no_strip_lies_between() -> None:
+    world, _ = sample_world(dice_of(64, 3), "city")
+    layout, pavement, street = world.layout, world.pavement, world.street
+    last = layout.exists.sum(1) - 1
+    rows = torch.arange(64)
+    sides = ((torch.zeros_like(last), pavement.left), (last, pavement.right))
+    kerbs = 0
+    for side, (slot, edge) in enumerate(sides):
+        at_edge = layout.across[rows, slot] == edge
+        bare = layout.marked[rows, slot] & (layout.opacity[rows, slot] == 0)
+        assert torch.equal(at_edge, bare)  # an unpainted boundary is a kerb, a painted one lies off it
+        assert (street.strip[at_edge, side] == PLAIN).all()
+        kerbs += int(at_edge.sum())
+    assert 10 < kerbs < 64

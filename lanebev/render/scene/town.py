@@ -11,7 +11,7 @@ from lanebev.render.scene.kinds import choose
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
 from lanebev.render.scene.pavement import Pavement
 from lanebev.render.scene.sampler import Dice
-from lanebev.render.scene.street import CYCLING, PARKING, PLAIN, Street
+from lanebev.render.scene.street import CYCLING, KERB, PARKING, PLAIN, Street
 from lanebev.render.scene.surroundings import (
     FENCE,
     GREENS,
@@ -48,6 +48,26 @@ def street_edges(dice: Dice, city: Tensor, street: Street, layout: Layout, pavem
         gutter=dice.uniform(0.5, 1.8, 2),
     )
     return choose(city, edged, pavement)
+
+
+def kerb_boundaries(city: Tensor, street: Street, layout: Layout, pavement: Pavement) -> Layout:
+    """Make a kerb the lane's boundary where it bounds a lane with nothing painted and no strip between.
+
+    Without it most narrow streets have one boundary, the painted line in their middle, and no pose.
+    """
+    index = torch.arange(MAX_BOUNDARIES, device=city.device)
+    last = layout.exists.sum(1, keepdim=True) - 1
+    bare = (street.strip == PLAIN) & (street.strips[:, :, KERB] > 0)  # (B, 2)
+    left, right = (index == 0) & bare[:, :1], (index == last) & bare[:, 1:]
+    kerb = (left | right) & layout.exists & ~layout.marked & city[:, None]
+    foot = torch.where(left, pavement.left[:, None], pavement.right[:, None])
+    return layout._replace(
+        across=torch.where(kerb, foot, layout.across),
+        marked=layout.marked | kerb,
+        opacity=torch.where(kerb, 0.0, layout.opacity),
+        ghost=torch.where(kerb, 0.0, layout.ghost),
+        stud_period=torch.where(kerb, 0.0, layout.stud_period),
+    )
 
 
 def street_surroundings(

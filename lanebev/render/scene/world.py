@@ -27,7 +27,7 @@ from lanebev.render.scene.pavement import Pavement, sample_pavement
 from lanebev.render.scene.sampler import Dice
 from lanebev.render.scene.street import Street, no_street, sample_city_layout, sample_street
 from lanebev.render.scene.surroundings import Surroundings, sample_surroundings
-from lanebev.render.scene.town import city_traffic, street_edges, street_surroundings
+from lanebev.render.scene.town import city_traffic, kerb_boundaries, street_edges, street_surroundings
 from lanebev.render.scene.traffic import Traffic, sample_traffic
 from lanebev.render.scene.varied import varied_camera, varied_weather
 
@@ -111,6 +111,7 @@ def sample_world(dice: Dice, kind: str = "any") -> tuple[World, Tensor]:
     weather = varied_weather(more, kinds, weather)
     pavement = sample_pavement(dice, layout, dotted, bright, weather.wet, median)
     pavement = street_edges(more, kinds.city, street, layout, pavement)
+    layout = kerb_boundaries(kinds.city, street, layout, pavement)
     opposite = torch.where(dice.chance(0.5), pavement.left - dice.uniform(0.8, 9.0), -math.inf)
     surroundings = sample_surroundings(dice, pavement.left, pavement.right, weather.grey, opposite, median)
     surroundings = street_surroundings(more, kinds.city, street, pavement, surroundings)
