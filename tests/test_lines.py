@@ -73,7 +73,7 @@ def test_vertices_lie_on_rendered_boundaries_to_a_tenth_of_a_pixel(fans):
 @pytest.mark.parametrize("size", [(144, 256), (96, 160)])
 def test_extraction_on_masks_of_rendered_roads(size):
     """Curves, hills, hidden stretches and lenses included: every vertex within 0.1 px."""
-    frame = render_views(24, (64, 112), torch.Generator().manual_seed(0))
+    frame = render_views(24, (64, 112), torch.Generator().manual_seed(0), kind="highway")
     error = extraction_error(frame, size, LineConfig(stride=1))
     assert len(error.distance) > 1000
     assert error.missed == 0
