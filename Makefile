@@ -6,7 +6,7 @@ WORKERS ?= 2
 # One thread a process: the tests run in several.
 TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
 
-.PHONY: help demo test check lint types coverage bench build format clean
+.PHONY: help demo test check lint types docs coverage bench build format clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -15,7 +15,7 @@ help:  ## this list
 demo: $(VENV)/ready  ## a rendered drive end to end, into out/demo
 	$(BIN)/lanebev demo --out out/demo
 
-test: lint types  ## the gate: ruff, mypy --strict and all tests
+test: lint types docs  ## the gate: ruff, mypy --strict, docs and all tests
 	$(TEST)
 
 check: lint types  ## for every save: ruff, mypy --strict and the tests that are not slow
@@ -27,6 +27,9 @@ lint: $(VENV)/ready
 
 types: $(VENV)/ready
 	$(BIN)/mypy --strict lanebev train tools
+
+docs: $(VENV)/ready  ## the documentation as a site, built strictly, into site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 coverage: $(VENV)/ready  ## all tests with the lines that they run, into out/coverage
 	$(TEST) --cov=lanebev --cov-report=term:skip-covered --cov-report=html:out/coverage

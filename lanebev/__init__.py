@@ -1,18 +1,22 @@
-"""lanebev: how a camera looks at the road, frame by frame, from lane boundaries alone."""
+"""lanebev: the pose of a camera over the road, frame by frame, from lane boundaries alone."""
 
 from lanebev import weights as weights
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.mount import MountEstimator
+from lanebev.estimation.joint.state import JointConfig, Reason
+from lanebev.estimation.mount import MountCalibration, MountConfig, MountEstimator, MountReason, MountStatus
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
+from lanebev.estimation.two_stage.state import TwoStageConfig
 from lanebev.geometry.road import (
     image_covariance,
     image_from_road_points,
     road_covariance,
     road_from_image_points,
 )
+from lanebev.io.state import load_state, save_state
 from lanebev.observation.lines import LineExtractor
-from lanebev.observation.segmenter import LaneSegmenter
+from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
+from lanebev.observation.vertices import LineConfig
 from lanebev.pipeline import LaneBEV, LaneBEVOutput
 from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
 from lanebev.view.grid import BEVGrid, bev_from_image
@@ -27,17 +31,28 @@ __all__ = [
     "Camera",
     "Extrinsics",
     "JointCalibrator",
+    "JointConfig",
     "LaneBEV",
     "LaneBEVOutput",
     "LaneSegmenter",
     "LaneSegments",
+    "LineConfig",
     "LineExtractor",
+    "MountCalibration",
+    "MountConfig",
     "MountEstimator",
+    "MountReason",
+    "MountStatus",
+    "Reason",
+    "SegmenterConfig",
     "Status",
     "TwoStageCalibrator",
+    "TwoStageConfig",
     "bev_from_image",
     "image_covariance",
     "image_from_road_points",
+    "load_state",
     "road_covariance",
     "road_from_image_points",
+    "save_state",
 ]

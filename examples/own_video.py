@@ -1,0 +1,9 @@
+"""Calibrate on a video: the same as ``lanebev run drive.mp4 --camera camera.yaml --out out``."""
+
+import sys
+
+from lanebev.app.run import RunConfig, run, summary
+
+video, camera, out = sys.argv[1:]
+config = RunConfig(source=video, camera=camera, out=out, lane_width=3.7)
+print(summary(run(config), config))

@@ -1,0 +1,104 @@
+"""README and docs say what is so: their Python runs, their commands parse, their links lead somewhere."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import yaml
+
+import lanebev
+from lanebev.cli import parser
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+SLOW = {"export.md"}
+
+
+def _blocks(page, language):
+    return re.findall(
+        rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
+    )
+
+
+def _name(page):
+    return page.relative_to(ROOT).as_posix()
+
+
+def _python_pages():
+    for page in PAGES:
+        blocks = [block for block in _blocks(page, "python") if "--8<--" not in block]
+        if blocks:
+            marks = pytest.mark.slow if page.name in SLOW else ()
+            yield pytest.param(page, blocks, id=_name(page), marks=marks)
+
+
+@pytest.mark.parametrize(("page", "blocks"), [*_python_pages()])
+def test_python_runs(page, blocks, tmp_path, monkeypatch):
+    """The blocks of a page run one after the other, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for block in blocks:
+        exec(compile(block, str(page), "exec"), names)
+
+
+def _commands():
+    found = {}
+    for page in PAGES:
+        lines = "\n".join(_blocks(page, "sh")).replace("\\\n", " ").splitlines()
+        for line in lines:
+            if command := line.split("#")[0].strip():
+                found.setdefault(command, _name(page))
+    return found
+
+
+@pytest.mark.parametrize("command", [*_commands()])
+def test_command_is_one(command):
+    words = shlex.split(command)
+    if words[0] == "make":
+        makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+        assert all(re.search(rf"^{word}:", makefile, re.MULTILINE) for word in words[1:] if "=" not in word)
+    elif words[0] == "lanebev":
+        parser().parse_args(words[1:])
+    elif words[0] in ("pip", "pre-commit"):
+        assert words[1] == "install"
+    else:
+        assert words[:2] in (["python", "-m"], [".venv/bin/python", "-m"]) or words[0] == "python", command
+        module = words[2] if words[1] == "-m" else words[1].removesuffix(".py")
+        if module == "pytest":
+            return
+        path = ROOT / Path(*re.split(r"[./]", module))
+        assert path.with_suffix(".py").exists() or (path / "__main__.py").exists(), command
+        for word in words[3:]:
+            if word.startswith("configs/"):
+                assert (ROOT / word).exists(), command
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        path = target.split("#")[0]
+        assert target.startswith("https://") or (page.parent / path).exists(), target
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
+
+
+def test_every_page_is_in_the_navigation():
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    listed = set(re.findall(r"[\w/]+\.md", text.split("\nnav:")[1]))
+    assert listed == {page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")}
+
+
+def test_the_version_is_one():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == lanebev.__version__
+    assert f"## [{lanebev.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.py")), ids=_name)
+def test_examples_are_short(example):
+    lines = example.read_text(encoding="utf-8").splitlines()
+    if example.name != "onnx_only.py":
+        assert sum(bool(line.strip()) and not line.startswith("#") for line in lines) <= 20
