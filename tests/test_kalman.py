@@ -6,13 +6,13 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from lanebev.estimation import kalman
-from tools.bench_filter import gain_form, information_form, measure, problem
+from tools.bench_filter import information_form, measure, problem
 
 
 @pytest.mark.parametrize("rows", [1, 30, 408])
 def test_information_form_equals_the_papers_gain_form(rows):
     inputs = problem(rows)
-    for ours, paper in zip(information_form(*inputs), gain_form(*inputs), strict=True):
+    for ours, paper in zip(information_form(*inputs), kalman.update_gain_form(*inputs), strict=True):
         assert (ours - paper).abs().max() < 1e-9
 
 
@@ -31,11 +31,11 @@ class LargestTensor(TorchDispatchMode):
 def test_information_form_makes_no_matrix_of_rows_by_rows():
     # That is why it is faster: by how much on an idle machine, tools/bench_filter.py prints.
     largest = {}
-    for form in (gain_form, information_form):
+    for form in (kalman.update_gain_form, information_form):
         with LargestTensor() as made:
             form(*problem(408))
         largest[form] = made.elements
-    assert largest[gain_form] == 408 * 408
+    assert largest[kalman.update_gain_form] == 408 * 408
     assert largest[information_form] == 408 * 4
 
 

@@ -78,6 +78,14 @@ def test_deviation_a_sum_of_signed_residuals_has_no_minimum():
     assert float(heights[errors.square().sum(-1).argmin()]) == pytest.approx(1.5)
 
 
+def test_energy_is_that_of_the_lanes_in_sight():
+    """Eqs. (19), (20) by hand: lanes of 3.5 and 3.8 m count, the one that is not there does not."""
+    widths, there = torch.tensor([[3.5, 3.8, 9.0]]).double(), torch.tensor([[True, True, False]])
+    residuals = lw.width_residuals(widths, torch.full((1, 3), 3.7).double(), there)
+    assert residuals[0].tolist() == pytest.approx([0.2, -0.1, 0.0])
+    assert float(lw.width_energy(residuals)) == pytest.approx(0.05)
+
+
 def test_one_lane_leaves_roll_at_the_guess():
     ends, pose = boundary_segments(0.0, 0.0, 0.1, 1.5, (1, 2))
     found = angles_of(ends, pose)

@@ -12,14 +12,18 @@ from lanebev.render.raster.glyphs import AHEAD, CROSS, GLYPH_LENGTH, LEFT, NUM_G
 from lanebev.render.raster.lens import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
 from lanebev.render.raster.night import lamp_light, low_beam
 from lanebev.render.raster.street import roadside
-from lanebev.render.scene.alignment import build_alignment
+from lanebev.render.raster.tunnel import add_ceiling
+from lanebev.render.raster.winter import snow_cover
+from lanebev.render.scene.alignment import arc_nodes, build_alignment
 from lanebev.render.scene.glass import sample_glass
 from lanebev.render.scene.kinds import KINDS, sample_kinds
+from lanebev.render.scene.layout import presence
 from lanebev.render.scene.night import sample_lights
 from lanebev.render.scene.sampler import Dice
 from lanebev.render.scene.street import PLAIN, no_street
-from lanebev.render.scene.world import World, sample_course, sample_world
+from lanebev.render.scene.world import Place, World, sample_course, sample_world
 from lanebev.render.views import render_place, sample_place
+from lanebev.types import Extrinsics
 
 SIZE = (48, 96)
 
@@ -200,3 +204,65 @@ def test_a_kerb_is_the_boundary_where_nothing_is_painted_and_no_strip_lies_betwe
         assert (street.strip[at_edge, side] == PLAIN).all()
         kerbs += int(at_edge.sum())
     assert 10 < kerbs < 64
+
+
+def test_old_lines_of_road_works_change_the_image_and_no_label() -> None:
+    world = sample_world(dice_of(3, 5), "works")[0]
+    clean = world.works._replace(strength=0 * world.works.strength, scar=0 * world.works.scar)
+    old, new = seen("works", 5), seen("works", 5, works=clean)
+    assert not torch.equal(old.image, new.image)
+    assert torch.equal(old.visible, new.visible)
+    assert old.visible.sum() > 20
+
+
+def test_snow_covers_no_paint_that_is_labelled_and_all_that_is_not() -> None:
+    """Over every boundary: bare where it is marked as present, covered where snow took it away."""
+    batch = 16
+    world, _ = sample_world(dice_of(batch, 2), "snow")
+    layout = world.layout._replace(marked=world.layout.exists)
+    winter = world.winter._replace(line=torch.full((batch,), 0.4), ragged=torch.zeros(batch))
+    pavement = world.pavement._replace(left=world.pavement.left - 20, right=world.pavement.right + 20)
+    along = torch.linspace(0, 300, 400).expand(batch, -1)
+    across = layout.across[:, 1:2].expand_as(along)
+    fine = torch.full_like(along, 0.05)
+    cover = snow_cover(winter, layout, pavement, along, across, fine, fine, torch.zeros_like(along))
+    marked = presence(layout, torch.ones_like(along, dtype=torch.long), along) > 0
+    exists = layout.exists[:, 1:2].expand_as(marked)
+    assert (cover[marked & exists] == 0).all()
+    assert (~marked & exists).any()
+    assert (cover[~marked & exists] > 0.4).all()
+
+
+def test_country_roads_mostly_have_nothing_to_find() -> None:
+    world, ego_lane = sample_world(dice_of(2000, 0), "country")
+    assert 0.65 < float((~world.layout.marked.any(1)).float().mean()) < 0.85
+    assert ((ego_lane == 0) | (ego_lane == 1)).all()
+
+
+def test_a_tunnels_lamp_is_seen_where_it_hangs() -> None:
+    """A ceiling 4 m above the camera is 10 m ahead under a rise of 0.4: a lamp is there, one every 20 m."""
+    world, _ = sample_world(dice_of(1, 0), "tunnel")
+    one, zero = torch.ones(1), torch.zeros(1)
+    tunnel = world.tunnel._replace(
+        ceiling=5.5 * one,
+        exit=1e5 * one,
+        lamp=3.0 * one,
+        lamp_across=torch.tensor([[0.0, 50.0]]),
+        lamp_size=torch.tensor([[1.0, 0.5]]),
+        lamp_period=20.0 * one,
+        lamp_colour=torch.ones(1, 3),
+        tone=torch.full((1, 3), 0.1),
+        level=torch.full((1, 3), 0.1),
+    )
+    place = Place(along=zero, across=zero, ego_lane=zero.long(), heading=zero)
+    straight = torch.zeros(1, len(arc_nodes()), dtype=torch.float64)
+    intrinsics = torch.tensor([[[1e4, 0, 0], [0, 1e4, 0], [0, 0, 1]]])
+    lens = Lens(intrinsics, torch.zeros(1, 5), "pinhole", Extrinsics(zero, zero, zero, 1.5 * one))
+    rays = torch.tensor([[[[0.0, 0.0, 0.3]], [[0.4, 0.2, 0.4]]]])  # lamp at 10 m; none at 20 m; 3 m aside
+    dark, free = torch.zeros(1, 3, 1, 3), torch.full((1, 1, 3), float("inf"))
+    course = build_alignment(straight, straight)
+    ceiling = add_ceiling(dark, free, tunnel, place, course, lens, rays)[0, 0, 0]
+    assert ceiling[0] == pytest.approx(3.0)
+    assert ceiling[1:].max() < 0.05
+    blocked = add_ceiling(dark, torch.full((1, 1, 3), 5.0), tunnel, place, course, lens, rays)
+    assert (blocked == 0).all()

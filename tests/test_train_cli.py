@@ -77,9 +77,9 @@ def test_emulated_bfloat16_is_pointed_out(native, tmp_path, monkeypatch):
 
 
 def test_every_config_is_tested():
-    """Here, and tusimple.yaml, which needs data, beside its data module."""
-    names = {"default.yaml", "paper.yaml", "end_to_end.yaml", "fast.yaml", "refine.yaml", "tusimple.yaml"}
-    assert {path.name for path in CONFIGS.glob("*.yaml")} == names
+    """Here, and tusimple.yaml and gpu.yaml beside their data modules."""
+    here = {"default.yaml", "paper.yaml", "end_to_end.yaml", "fast.yaml", "refine.yaml"}
+    assert {path.name for path in CONFIGS.glob("*.yaml")} == here | {"tusimple.yaml", "gpu.yaml"}
 
 
 def test_fit_resume_test_predict_export(tmp_path):
@@ -140,6 +140,21 @@ def test_an_interrupted_run_ends_as_one_in_a_piece(tmp_path, monkeypatch):
     assert whole["global_step"] == parts["global_step"] == 4
     assert whole["state_dict"].keys() == parts["state_dict"].keys()
     assert all(torch.equal(value, parts["state_dict"][name]) for name, value in whole["state_dict"].items())
+
+
+def test_a_finished_run_goes_on_at_its_own_rate(tmp_path, monkeypatch):
+    """Its checkpoint was written when the rate had come to its end, 0."""
+    rates = []
+    step = Segmentation.training_step
+
+    def noted(self, batch, batch_idx):
+        rates.append(self.trainer.optimizers[0].param_groups[0]["lr"])
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(Segmentation, "training_step", noted)
+    run("fit", "fast.yaml", tmp_path)
+    run("fit", "fast.yaml", tmp_path, "--trainer.max_steps=4", "--ckpt_path=last")
+    assert rates == [2e-3] * 4
 
 
 def test_last_of_nothing_is_an_error(tmp_path, capsys):

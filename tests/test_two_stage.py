@@ -322,7 +322,7 @@ def test_lane_width_uncertainty_reaches_the_covariance(kind):
 
 
 def test_documented_bias_on_a_curve():
-    """PAPER_NOTES 17: the paper assumes a straight road; R = 860 m costs about a degree of yaw."""
+    """paper.md D17: the paper assumes a straight road; R = 860 m costs about a degree of yaw."""
     outputs, _ = drive(TwoStageCalibrator(), [lanes((0.0, 0.0, 0.0, 1.5), noise=0.0, bend=1 / 860)] * 5)
     assert 0.7 < abs(math.degrees(float(outputs[-1].extrinsics.yaw[0]))) < 2.0
 

@@ -42,6 +42,17 @@ def test_angle_by_hand():
     assert angles == pytest.approx([math.pi / 2, math.pi / 4, math.pi / 4])
 
 
+def test_lines_intersect_by_hand():
+    """Eq. (1): y = x and x + y = 4 meet at (2, 2); parallels meet at infinity."""
+    ends = torch.tensor(
+        [[[0.0, 0.0], [1.0, 1.0]], [[0.0, 4.0], [4.0, 0.0]], [[0.0, 1.0], [1.0, 2.0]]]
+    ).double()
+    rising, falling, parallel = vanishing.line_through(ends)
+    point = vanishing.intersect_lines(rising, falling)
+    assert (point / point[2]).tolist() == pytest.approx([2.0, 2.0, 1.0])
+    assert float(vanishing.intersect_lines(rising, parallel)[2]) == pytest.approx(0.0, abs=1e-12)
+
+
 def test_score_by_hand():
     gate = vanishing.GATE_ANGLE
     angles = torch.tensor([0.0, gate / 2, 2 * gate], dtype=torch.float64)

@@ -2,7 +2,7 @@
 
     python -m tools.bench_filter --out out/bench_filter.json
 
-Source of the gain form: Eqs. (15)-(17) as printed, with an inverse of the N × N innovation covariance.
+The gain form is Eqs. (15)-(17) as printed, which solves for the N × N innovation covariance.
 """
 
 from __future__ import annotations
@@ -19,16 +19,6 @@ from torch.utils.benchmark import Timer
 
 from lanebev.estimation import kalman
 from train.commands import one_line_errors
-
-
-def gain_form(
-    mean: Tensor, cov: Tensor, innovation: Tensor, jacobian: Tensor, measurement_noise: Tensor
-) -> tuple[Tensor, Tensor]:
-    """The update as the paper prints it."""
-    innovation_cov = jacobian @ cov @ jacobian.mT + torch.diag_embed(measurement_noise)
-    gain = cov @ jacobian.mT @ torch.linalg.inv(innovation_cov)
-    eye = torch.eye(mean.shape[-1], dtype=mean.dtype)
-    return mean + (gain @ innovation.unsqueeze(-1)).squeeze(-1), (eye - gain @ jacobian) @ cov
 
 
 def information_form(
@@ -55,12 +45,12 @@ def measure(rows: int, seconds: float) -> dict[str, float]:
     inputs = problem(rows)
     names = dict(zip(("m", "p", "y", "h", "q"), inputs, strict=True))
     milliseconds = {}
-    for name, form in (("gain", gain_form), ("information", information_form)):
+    for name, form in (("gain", kalman.update_gain_form), ("information", information_form)):
         timer = Timer(
             "form(m, p, y, h, q)", globals={"form": form, **names}, num_threads=torch.get_num_threads()
         )
         milliseconds[name] = timer.blocked_autorange(min_run_time=seconds).median * 1e3
-    pairs = zip(gain_form(*inputs), information_form(*inputs), strict=True)
+    pairs = zip(kalman.update_gain_form(*inputs), information_form(*inputs), strict=True)
     difference = max(float((a - b).abs().max() / a.abs().max()) for a, b in pairs)
     return {
         "rows": rows,

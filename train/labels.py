@@ -105,7 +105,7 @@ class ViewConfig:
 
     Attributes:
         output_stride: of the network whose labels these are.
-        half_width: of the stripes, label px (TRIALS 3).
+        half_width: of the stripes, label px (paper.md T3).
         gap: least distance of neighbouring boundaries, label px.
         scale: range of the view's width as a share of the image's.
         rotation_deg: standard deviation of the rotation.

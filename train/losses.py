@@ -51,7 +51,7 @@ def row_cross_entropy(logits: Tensor, target: Tensor, weight: Tensor, least: flo
 
 
 def unweighted_bias(class_weight: Tensor) -> Tensor:
-    """What to add to logits trained with class weights, so that their softmax is a frequency (TRIALS 4).
+    """What to add to logits trained with class weights, so that their softmax is a frequency (paper.md T4).
 
     With weights w the loss is least at p ∝ w q; adding -log w makes it p = q.
     """

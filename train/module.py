@@ -18,6 +18,7 @@ from torchmetrics.classification import MulticlassJaccardIndex
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from train.augment import Photometric
+from train.budget import rate_factor, used_share
 from train.data import Batch
 from train.datasets import ScoredBatch
 from train.losses import boundary_cross_entropy, row_cross_entropy, unweighted_bias
@@ -38,10 +39,12 @@ class Segmentation(L.LightningModule):
         warmup_steps: of linear growth.
         decay_steps: the last steps of the run, in which the rate falls linearly to zero; before them it
             stays, so that a run can be prolonged at any time (warm-up, stable, decay).
+        decay_share: the same as a share of the run's steps or, with ``max_time``, minutes; 0 for none.
         class_weight: (1+L,) of the cross-entropy, or None for ones; undone on export.
         row_weight: of :func:`row_cross_entropy` beside the cross-entropy; the paper's is 0.
         augment: strength of the photometric augmentation, 0 for none.
         init_from: checkpoint or weights file to begin with; a network of half the width is widened.
+        compiled: compile the network; worth it in runs of hours.
     """
 
     def __init__(
@@ -52,10 +55,12 @@ class Segmentation(L.LightningModule):
         weight_decay: float = 0.02,
         warmup_steps: int = 100,
         decay_steps: int = 0,
+        decay_share: float = 0.0,
         class_weight: list[float] | None = None,
         row_weight: float = 0.03,
         augment: float = 1.0,
         init_from: str | None = None,
+        compiled: bool = False,
     ) -> None:
         super().__init__()
         network = network or SegmenterConfig()
@@ -73,6 +78,7 @@ class Segmentation(L.LightningModule):
         self.class_weight: Tensor
         self.register_buffer("class_weight", weights, persistent=False)
         self.photometric = Photometric(augment) if augment > 0 else None
+        self.compiled = compiled
         if init_from is not None:
             from train.export import load_weights
 
@@ -109,7 +115,7 @@ class Segmentation(L.LightningModule):
         ).float()  # sums need it under bf16
         pixels = boundary_cross_entropy(logits, target, weight, self.class_weight)
         rows = row_cross_entropy(logits, target, weight)
-        self.log_dict({"loss/pixels": pixels, "loss/rows": rows}, prog_bar=True)
+        self.log_dict({"loss/pixels": pixels.detach(), "loss/rows": rows.detach()}, prog_bar=True)
         return pixels + self.settings["row_weight"] * rows, logits
 
     @contextlib.contextmanager
@@ -183,19 +189,28 @@ class Segmentation(L.LightningModule):
             optimizer = torch.optim.SGD(groups, momentum=0.9, nesterov=True, **kwargs)
         else:
             optimizer = torch.optim.AdamW(groups, betas=(0.9, 0.99), **kwargs)
-        total = self.trainer.max_steps
-
-        def rate(step: int) -> float:
-            warm = min(1.0, (step + 1) / max(1, int(settings["warmup_steps"])))
-            left = (total - step) / max(1, int(settings["decay_steps"])) if total > 0 else 1.0
-            return warm * min(1.0, max(0.0, left))
-
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, rate)
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, self._rate)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def _rate(self, step: int) -> float:
+        names = ("warmup_steps", "decay_steps", "decay_share")
+        schedule = {name: self.settings[name] for name in names}
+        return rate_factor(step, self.trainer.max_steps, used_share(self.trainer, step), **schedule)
+
+    def on_train_start(self) -> None:
+        """Set the rate anew: a checkpoint has that of the run as long as it was, a finished one's is 0."""
+        for schedule in self.trainer.lr_scheduler_configs:
+            factor = self._rate(self.trainer.global_step)
+            for group, base in zip(
+                schedule.scheduler.optimizer.param_groups, schedule.scheduler.base_lrs, strict=True
+            ):
+                group["lr"] = base * factor
+        if self.compiled:
+            self.segmenter.compile()  # in place: weights keep their names
 
 
 _SETTINGS = (
-    "optimizer", "learning_rate", "weight_decay", "warmup_steps", "decay_steps",
+    "optimizer", "learning_rate", "weight_decay", "warmup_steps", "decay_steps", "decay_share",
     "class_weight", "row_weight", "augment", "init_from",
 )  # fmt: skip
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lanebev.geometry.linalg import cholesky, solve_lower
+
 
 def predict(mean: Tensor, cov: Tensor, transition: Tensor, process_noise: Tensor) -> tuple[Tensor, Tensor]:
     """Prediction of a linear system model.
@@ -27,6 +29,21 @@ def predict(mean: Tensor, cov: Tensor, transition: Tensor, process_noise: Tensor
     """
     predicted = (transition @ mean.unsqueeze(-1)).squeeze(-1)
     return predicted, symmetrise(transition @ cov @ transition.mT + process_noise)
+
+
+def innovation(predicted: Tensor, measured: float | Tensor = 0.0) -> Tensor:
+    """Compute the innovation, measured minus predicted.
+
+    Source: Eq. (14), whose measurements are all zero: y = -h(x̂).
+
+    Args:
+        predicted: (..., N), the measurement model at the predicted state.
+        measured: (..., N), or a number.
+
+    Returns:
+        (..., N).
+    """
+    return measured - predicted
 
 
 def information(
@@ -53,6 +70,30 @@ def information(
     return scaled.mT @ jacobian, vector.squeeze(-1)
 
 
+def update_gain_form(
+    mean: Tensor, cov: Tensor, innovation: Tensor, jacobian: Tensor, measurement_noise: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Update with N independent scalar measurements as the paper prints it.
+
+    Source: Eqs. (15)-(17), S = H P Hᵀ + Q, G = P Hᵀ S⁻¹, x + G y and (I - G H) P. S is N × N: the calibrators
+    use :func:`update`, which is equal to rounding.
+
+    Args:
+        mean: (..., D), predicted.
+        cov: (..., D, D), predicted.
+        innovation: (..., N), y.
+        jacobian: (..., N, D), H.
+        measurement_noise: (..., N) variances, the diagonal of Q.
+
+    Returns:
+        mean (..., D) and covariance (..., D, D).
+    """
+    innovation_cov = jacobian @ cov @ jacobian.mT + measurement_noise.diag_embed()
+    gain = torch.linalg.solve(innovation_cov, jacobian @ cov).mT  # P Hᵀ S⁻¹, S being symmetric
+    eye = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
+    return mean + (gain @ innovation.unsqueeze(-1)).squeeze(-1), (eye - gain @ jacobian) @ cov
+
+
 def update(mean: Tensor, cov: Tensor, info_matrix: Tensor, info_vector: Tensor) -> tuple[Tensor, Tensor]:
     """Update with the information of any number of measurements.
 
@@ -71,10 +112,9 @@ def update(mean: Tensor, cov: Tensor, info_matrix: Tensor, info_vector: Tensor) 
     Returns:
         mean (..., D) and covariance (..., D, D).
     """
-    root = torch.linalg.cholesky_ex(cov).L
+    root = cholesky(cov)
     eye = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
-    inner = torch.linalg.cholesky_ex(eye + root.mT @ info_matrix @ root).L
-    half = torch.linalg.solve_triangular(inner, root.mT, upper=False)  # (..., D, D)
+    half = solve_lower(cholesky(eye + root.mT @ info_matrix @ root), root.mT)  # (..., D, D)
     posterior = half.mT @ half
     keep = eye - posterior @ info_matrix
     joseph = keep @ cov @ keep.mT + posterior @ info_matrix @ posterior

@@ -18,8 +18,30 @@ def _rotation(rows: list[list[Tensor]]) -> Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
+def rotation_x(pitch: Tensor) -> Tensor:
+    """Return R(θ), (..., 3, 3): the first factor of Eq. (6)."""
+    s, c = pitch.sin(), pitch.cos()
+    zero, one = torch.zeros_like(s), torch.ones_like(s)
+    return _rotation([[one, zero, zero], [zero, c, -s], [zero, s, c]])
+
+
+def rotation_y(yaw: Tensor) -> Tensor:
+    """Return R(φ), (..., 3, 3): the second factor of Eq. (6)."""
+    s, c = yaw.sin(), yaw.cos()
+    zero, one = torch.zeros_like(s), torch.ones_like(s)
+    return _rotation([[c, zero, s], [zero, one, zero], [-s, zero, c]])
+
+
+def rotation_z(roll: Tensor) -> Tensor:
+    """Return R(ψ), (..., 3, 3): the first factor of Eq. (24)."""
+    s, c = roll.sin(), roll.cos()
+    zero, one = torch.zeros_like(s), torch.ones_like(s)
+    return _rotation([[c, s, zero], [-s, c, zero], [zero, zero, one]])
+
+
+@full_precision
 def cam_from_world(pitch: Tensor, yaw: Tensor) -> Tensor:
-    """Rotation from the lane-aligned frame without roll to the camera.
+    """Compute the rotation from the lane-aligned frame without roll to the camera.
 
     Source: Eq. (6), R_CW(θ, φ) = R(θ) R(φ).
 
@@ -30,14 +52,12 @@ def cam_from_world(pitch: Tensor, yaw: Tensor) -> Tensor:
     Returns:
         (..., 3, 3) rotation.
     """
-    sp, cp, sy, cy = pitch.sin(), pitch.cos(), yaw.sin(), yaw.cos()
-    zero = torch.zeros_like(sp)
-    return _rotation([[cy, zero, sy], [sp * sy, cp, -sp * cy], [-cp * sy, sp, cp * cy]])
+    return rotation_x(pitch) @ rotation_y(yaw)
 
 
 @full_precision
 def road_from_cam(pitch: Tensor, yaw: Tensor, roll: Tensor) -> Tensor:
-    """Rotation from the camera to the road.
+    """Compute the rotation from the camera to the road.
 
     Source: Eq. (24), R(θ, φ, ψ) = R(ψ) R_CW(θ, φ)ᵀ.
 
@@ -49,15 +69,12 @@ def road_from_cam(pitch: Tensor, yaw: Tensor, roll: Tensor) -> Tensor:
     Returns:
         (..., 3, 3) rotation.
     """
-    s, c = roll.sin(), roll.cos()
-    zero, one = torch.zeros_like(s), torch.ones_like(s)
-    road_from_world = _rotation([[c, s, zero], [-s, c, zero], [zero, zero, one]])
-    return road_from_world @ cam_from_world(pitch, yaw).mT
+    return rotation_z(roll) @ cam_from_world(pitch, yaw).mT
 
 
 @full_precision
 def angles_from_matrix(road_from_cam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Inverse of :func:`road_from_cam`.
+    """Compute pitch, yaw and roll from a rotation, the inverse of :func:`road_from_cam`.
 
     Args:
         road_from_cam: (..., 3, 3) rotation whose third row, the lanes' direction, has z > 0.
@@ -72,7 +89,7 @@ def angles_from_matrix(road_from_cam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def vanishing_dir_from_pitch_yaw(pitch: Tensor, yaw: Tensor) -> Tensor:
-    """Direction of the lanes in the camera frame.
+    """Compute the direction of the lanes in the camera frame.
 
     Source: Eq. (5), v = R_CW(θ, φ) [0, 0, 1]ᵀ.
 
@@ -87,7 +104,7 @@ def vanishing_dir_from_pitch_yaw(pitch: Tensor, yaw: Tensor) -> Tensor:
 
 
 def pitch_yaw_from_vanishing_dir(vanishing_dir: Tensor) -> tuple[Tensor, Tensor]:
-    """Camera pitch and yaw that explain a vanishing direction.
+    """Compute the camera pitch and yaw that explain a vanishing direction.
 
     Source: Eqs. (7)-(8). Deviation: yaw divides by hypot(y, z), since atan2(x, z) is tan(yaw) /
     cos(pitch), exact only at zero pitch (0.02 deg off at 5 deg pitch and yaw).
@@ -109,7 +126,7 @@ def pitch_yaw_from_vanishing_dir(vanishing_dir: Tensor) -> tuple[Tensor, Tensor]
 
 @full_precision
 def horizon_line(extrinsics: Extrinsics, intrinsics: Tensor) -> Tensor:
-    """Image of the road's horizon.
+    """Compute the image line of the road's horizon.
 
     Args:
         extrinsics: each (B,).

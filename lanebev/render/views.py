@@ -20,6 +20,7 @@ from lanebev.render.raster.lens import (
 from lanebev.render.raster.night import add_lights, night_light, sprites
 from lanebev.render.raster.paint import paint_view
 from lanebev.render.raster.photometry import add_bonnet, add_noise, blur, compress, expose, light_of
+from lanebev.render.raster.tunnel import add_ceiling, tunnel_light
 from lanebev.render.scene.alignment import Alignment, build_alignment
 from lanebev.render.scene.sampler import Dice, map_tensors, row_of
 from lanebev.render.scene.traffic import place_solids
@@ -56,6 +57,7 @@ def render_place(
     """
     solids = place_solids(world.traffic, alignment, place.along, place.across)
     light = night_light(light_of(world.weather, place.heading), world.lights)
+    light = tunnel_light(light, world.tunnel)
     rays, steps = pixel_rays(lens, size)
     images, covers, nearest = [], [], []
     for b in range(len(place.along)):  # one scene at a time: see paint_view
@@ -72,6 +74,11 @@ def render_place(
             rays[cut],
             steps[cut],
         )
+        if bool(one.tunnel.on > 0):
+            course = (row_of(place, b), row_of(alignment, b), lens_b, rays[cut])
+            painted = painted._replace(
+                radiance=add_ceiling(painted.radiance, painted.blocked, one.tunnel, *course)
+            )
         if bool(one.lights.on > 0):
             lights = sprites(one.lights, row_of(place, b), row_of(alignment, b), lens_b, row_of(solids, b))
             lit = add_lights(painted.radiance, painted.blocked, one.lights, lights, lens_b, rays[cut])

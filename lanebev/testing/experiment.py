@@ -19,7 +19,7 @@ from lanebev.types import Extrinsics, LaneSegments
 
 @dataclass(frozen=True)
 class Experiment:
-    """What the paper leaves open is ours: focal length, rate, motion, range (PAPER_NOTES 13)."""
+    """What the paper leaves open is ours: focal length, rate, motion, range (paper.md D13)."""
 
     width: int = 1920
     height: int = 1020

@@ -16,6 +16,7 @@ from torch import Tensor
 from lanebev.estimation import kalman
 from lanebev.estimation.joint.dynamics import SHAPE, SPEED, STEPS, MotionConfig
 from lanebev.estimation.joint.measurement import CURVATURE, KNOT_SPACING, NUM_STEPS
+from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
 
 CLEAR_BEND = (20.0, 40.0)  # chi-square of the five steps of curvature between which they come to tell speed
 ENTRY = KNOT_SPACING / 3  # m, way over which a step comes into view
@@ -111,14 +112,16 @@ def straight_or_bend(
     """
     noise = 1 / (straight.square().reciprocal() - bend.square().reciprocal())
     curvature, gain = params[:, CURVATURE:], cov[:, :, CURVATURE:]
-    factor = torch.linalg.cholesky_ex(cov[:, CURVATURE:, CURVATURE:] + noise.diag()).L
-    solved = torch.cholesky_solve(curvature.unsqueeze(-1), factor)  # (B, 2, 1)
+    predicted = cov[:, CURVATURE:, CURVATURE:] + noise.diag()
+    inverse = inverse_spd(predicted)
+    solved = inverse @ curvature.unsqueeze(-1)  # (B, 2, 1)
     chi2 = (curvature.unsqueeze(1) @ solved).flatten()
-    sharper = 0.5 * (bend.square() + noise).log().sum() - factor.diagonal(dim1=1, dim2=2).log().sum(-1)
+    sharper = 0.5 * (bend.square() + noise).log().sum()
+    sharper = sharper - cholesky(predicted).diagonal(dim1=1, dim2=2).log().sum(-1)
     odds = math.log((1 - share) / share) + sharper - 0.5 * chi2
     is_straight = odds.sigmoid()[:, None, None]
     pull = gain @ solved  # (B, 7, 1), from the bend to the straight road
-    known = gain @ torch.cholesky_solve(gain.mT, factor)
+    known = gain @ inverse @ gain.mT
     spread = is_straight * (1 - is_straight) * (pull @ pull.mT)
     return params - (is_straight * pull).squeeze(-1), kalman.symmetrise(cov - is_straight * known + spread)
 
@@ -132,8 +135,8 @@ def _change_per_metre(shape: Tensor, cov: Tensor) -> Tensor:
     change: Tensor = (torch.as_tensor(_CHANGE).to(shape) @ shape.unsqueeze(-1)).squeeze(-1)
     steps, spread = shape[:, 1:], cov[:, 1:, 1:]
     size = spread.diagonal(dim1=1, dim2=2).rsqrt()  # (B, NUM_STEPS)
-    factor = torch.linalg.cholesky_ex(size.unsqueeze(-1) * spread * size.unsqueeze(-2)).L
-    white = torch.linalg.solve_triangular(factor, (size * steps).unsqueeze(-1), upper=False)
+    factor = cholesky(size.unsqueeze(-1) * spread * size.unsqueeze(-2))
+    white = solve_lower(factor, (size * steps).unsqueeze(-1))
     chi2, (least, clear) = white.square().sum((1, 2)), CLEAR_BEND
     known: Tensor = ((chi2 - least) / (clear - least)).clamp(0, 1)  # (B,)
     return change * known.unsqueeze(-1)

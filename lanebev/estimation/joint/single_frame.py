@@ -25,6 +25,7 @@ from lanebev.estimation.joint.measurement import (
     observations,
 )
 from lanebev.estimation.joint.robust import inlier_weights, log_likelihood, lowered, noise_scale
+from lanebev.geometry.linalg import inverse_spd, solve_spd
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import angles_from_matrix, road_from_cam
 from lanebev.types import NUM_BOUNDARIES, Extrinsics, LaneSegments
@@ -171,7 +172,7 @@ def fit_observations(
 
     residuals = boundary_residuals(params, places, seen)
     trust = inlier_weights(residuals.distance, residuals.valid, seen.sigma, scale, seen.intrinsics[:, 0, 0])
-    covariance = _inverse(information)
+    covariance = inverse_spd(information)
     std = covariance.diagonal(dim1=-2, dim2=-1)[:, :OFFSET].sqrt()
     observed = std < _OBSERVED * prior.std(params)[:OFFSET]
     support = (trust * seen.weight).sum(-1)
@@ -231,7 +232,7 @@ def refine(
         held = precision * _student_weight((params - mean).square() * precision)
         information = information + held.diag_embed()
         gradient = gradient + held * (params - mean)
-        step = _solve(information, gradient)
+        step = solve_spd(information, gradient.unsqueeze(-1)).squeeze(-1)
         params = params - torch.maximum(torch.minimum(step, largest_step), -largest_step)
         height = params[:, HEIGHT : HEIGHT + 1].clamp(min=0.2)
         params = torch.cat([params[:, :HEIGHT], height, params[:, HEIGHT + 1 :]], dim=-1)
@@ -316,7 +317,7 @@ def _linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Ten
         weighted = (regressors * (trust / (1 + across * across)).unsqueeze(-1)).mT  # (B, H, 4, M)
         information = weighted @ regressors + precision.diag()
         gradient = (weighted @ right.unsqueeze(-1)).squeeze(-1) + precision * mean
-        solution = _solve(information, gradient)
+        solution = solve_spd(information, gradient.unsqueeze(-1)).squeeze(-1)
     squared = (residual / _ANNEALING[-1]).square()
     cost = 1 - weight + weight * squared / (1 + squared)  # 1 for what is not explained at all
     away = torch.stack([(pitch - prior.pitch) / prior.pitch_std, (roll - prior.roll) / prior.roll_std], -1)
@@ -360,21 +361,3 @@ def _best_start(
     score = torch.where(params.isfinite().all(-1), score + _student_log(away.square()), -torch.inf)
     best = score.view(batch, count).argmax(-1) + count * torch.arange(batch, device=score.device)
     return params[best], scale[best]
-
-
-def _solve(information: Tensor, gradient: Tensor) -> Tensor:
-    """Symmetric positive solve."""
-    size, factor = _factor(information)
-    return size * torch.cholesky_solve((size * gradient).unsqueeze(-1), factor).squeeze(-1)
-
-
-def _inverse(information: Tensor) -> Tensor:
-    """Covariance from an information matrix."""
-    size, factor = _factor(information)
-    return size.unsqueeze(-1) * torch.cholesky_inverse(factor) * size.unsqueeze(-2)
-
-
-def _factor(information: Tensor) -> tuple[Tensor, Tensor]:
-    """Sizes (B, P) and the Cholesky factor in their units: curvatures and metres differ by 1e5 in float32."""
-    size = information.diagonal(dim1=-2, dim2=-1).rsqrt()
-    return size, torch.linalg.cholesky_ex(size.unsqueeze(-1) * information * size.unsqueeze(-2)).L

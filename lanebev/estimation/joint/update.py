@@ -20,6 +20,7 @@ from lanebev.estimation.joint.measurement import (
 )
 from lanebev.estimation.joint.robust import inlier_weights, log_likelihood, lowered, noise_scale, start_scale
 from lanebev.estimation.joint.single_frame import normal_equations
+from lanebev.geometry.linalg import inverse_spd
 
 _LOOSE = (0.3, 0.3, 0.3, 1.0, 2.0)  # rad, m: sigmas before a frame, to ask what it alone determines
 _KNOWN = 1e-4  # share of its sigma that roll keeps where it is held: as good as known, yet not singular
@@ -150,8 +151,7 @@ def _alone(info: Tensor) -> tuple[Tensor, Tensor]:
     loose = info.new_tensor(_LOOSE)
     scaled = loose.unsqueeze(-1) * info[:, :NUM_STRAIGHT, :NUM_STRAIGHT] * loose
     eye = torch.eye(NUM_STRAIGHT, dtype=info.dtype, device=info.device)
-    factor = torch.linalg.cholesky_ex(scaled + eye).L
-    cov = loose.unsqueeze(-1) * torch.cholesky_inverse(factor) * loose
+    cov = loose.unsqueeze(-1) * inverse_spd(scaled + eye) * loose
     return cov.diagonal(dim1=1, dim2=2).sqrt(), cov[:, :NUM_POSE] @ info[:, :NUM_STRAIGHT, NUM_COMMON:]
 
 

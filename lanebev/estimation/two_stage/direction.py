@@ -72,13 +72,14 @@ def track_direction(
     normals = great_circle_normals(rays)
 
     residual, jacobian, noise = incidence(mean, normals, rays, segments.sigma, intrinsics)
+    innovation = kalman.innovation(residual)
     there = segments.weight > 0
     gates = gate_angles(segments.endpoints, segments.sigma, cfg.gate_sigmas)
     vanishing = vanishing_dir_from_pitch_yaw(mean[:, 0], mean[:, 1])
     point = (intrinsics @ vanishing.unsqueeze(-1)).squeeze(-1)
     near = segment_angles(segments.endpoints, point) < gates
     if cfg.gate_sigmas > 0:
-        near = near | kalman.gate(-residual, jacobian, noise, cov, cfg.gate_sigmas)
+        near = near | kalman.gate(innovation, jacobian, noise, cov, cfg.gate_sigmas)
     inliers = (near & there).to(mean.dtype)
     supported = is_supported(segments, inliers, cfg)
 
@@ -93,17 +94,17 @@ def track_direction(
     inliers = torch.where(fresh.unsqueeze(-1), started.inliers, inliers * supported.unsqueeze(-1))
 
     use = segments.weight * inliers * (seen & ~fresh).unsqueeze(-1)
-    mean, cov = kalman.update(mean, cov, *kalman.information(-residual, jacobian, noise, use))
+    mean, cov = kalman.update(mean, cov, *kalman.information(innovation, jacobian, noise, use))
     mean = torch.where(fresh.unsqueeze(-1), started.mean, mean)
     cov = torch.where(fresh[:, None, None], started.cov, cov)
     return DirectionStep(mean, cov, inliers, seen, fresh)
 
 
 def predict_direction(state: TwoStageState, dt: Tensor, cfg: TwoStageConfig) -> tuple[Tensor, Tensor]:
-    """Constant velocity of pitch and yaw, for no longer than a gap of ``reacquire_after``.
+    """Predict pitch and yaw at constant velocity, for ``reacquire_after`` at most.
 
-    Deviation: the paper extrapolates for ever; after a gap the pose holds still and only its sigma grows, up
-    to that of the initial guess.
+    Source: Eqs. (9), (10), (12), (13). Deviation: the paper extrapolates for ever; after a gap the pose keeps
+    its value and only its variance grows, up to that of the initial guess.
 
     Returns:
         mean (B, 4) and covariance (B, 4, 4).
@@ -119,7 +120,7 @@ def predict_direction(state: TwoStageState, dt: Tensor, cfg: TwoStageConfig) -> 
 
 
 def is_supported(segments: LaneSegments, inliers: Tensor, cfg: TwoStageConfig) -> Tensor:
-    """(B,) bool: enough segments agree, on two boundaries at least."""
+    """Tell which rows have enough segments that agree, on two boundaries at least, (B,) bool."""
     weight = segments.weight * inliers
     member = torch.nn.functional.one_hot(segments.boundary, cfg.num_boundaries).to(weight.dtype)
     boundaries = ((weight.unsqueeze(1) @ member).squeeze(1) > 0).sum(-1)
@@ -138,7 +139,10 @@ def start_direction(
     draws: Tensor,
     cfg: TwoStageConfig,
 ) -> DirectionStep:
-    """Algorithm 1 and the least-squares vanishing direction, Sec. III-B and III-C."""
+    """Start pitch and yaw from the vanishing direction.
+
+    Source: Algorithm 1 and Eqs. (3), (4), (7), (8).
+    """
     if may_skip(wanted):
         nothing = torch.zeros_like(segments.weight)
         no = torch.zeros_like(wanted)
@@ -167,7 +171,7 @@ def start_direction(
 def incidence(
     mean: Tensor, normals: Tensor, rays: Tensor, sigma: Tensor, intrinsics: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """How far each great circle misses the vanishing direction.
+    """Compute the incidence of great circles and vanishing direction, with Jacobian and variance.
 
     Source: Eq. (11), h = d_Zᵀ R_CWᵀ n, with its derivatives by pitch and yaw.
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import masked_median
+from lanebev.geometry.linalg import solve_spd
 from lanebev.geometry.rotation import cam_from_world
 
 _MIN_RADIUS = 1e-3  # a ray closer than 0.06 deg to the vanishing direction says nothing about its boundary
@@ -33,10 +34,10 @@ class BoundaryAngles(NamedTuple):
 
 
 def line_angles(rays: Tensor) -> Tensor:
-    """Angles of boundary planes from the camera's vertical, seen along the lanes.
+    """Compute the angles of boundary planes from the camera's vertical, seen along the lanes.
 
     Source: Fig. 6(c), α. Deviation: of the plane through the vanishing direction and a ray, both in the frame
-    of the vanishing direction, and positive to the left; only so is Eq. (18) exact (PAPER_NOTES 3).
+    of the vanishing direction, and positive to the left; only so is Eq. (18) exact (paper.md D3).
 
     Args:
         rays: (..., 3) in the lane-aligned frame without roll, R_WC r.
@@ -48,10 +49,10 @@ def line_angles(rays: Tensor) -> Tensor:
 
 
 def lane_widths(line_angles: Tensor, roll: Tensor, height: Tensor) -> Tensor:
-    """Distances between adjacent boundaries on the road.
+    """Compute the widths of lanes, the distances between adjacent boundaries on the road.
 
     Source: Eq. (18), w = h (tan(α_L - ψ) - tan(α_R - ψ)). Deviation: adjacent boundary indices instead of
-    any two sides, since a missed boundary would double the width (PAPER_NOTES 7).
+    any two sides, since a missed boundary would double the width (paper.md D7).
 
     Args:
         line_angles: (B, L) rad, left to right.
@@ -65,6 +66,37 @@ def lane_widths(line_angles: Tensor, roll: Tensor, height: Tensor) -> Tensor:
     return height.unsqueeze(-1) * (tangents[..., :-1] - tangents[..., 1:])
 
 
+def width_residuals(widths: Tensor, lane_width: Tensor, present: Tensor) -> Tensor:
+    """Compute by how much observed lane widths differ from the prior.
+
+    Source: Eq. (20), C = w_p - w(ψ, h).
+
+    Args:
+        widths: (..., L-1) m, from :func:`lane_widths`.
+        lane_width: (..., L-1) m, the prior.
+        present: (..., L-1) bool; a lane that is not there has residual 0.
+
+    Returns:
+        (..., L-1) m.
+    """
+    return torch.where(present, lane_width - widths, 0.0)
+
+
+def width_energy(residuals: Tensor) -> Tensor:
+    """Compute the energy that roll and height minimise.
+
+    Source: Eq. (19), E_RH = Σ C. Deviation: a sum of squares, as a sum of signed residuals has no minimum
+    (paper.md D4).
+
+    Args:
+        residuals: (..., L-1) m, from :func:`width_residuals`.
+
+    Returns:
+        (...,) m².
+    """
+    return residuals.square().sum(-1)
+
+
 def boundary_angles(
     rays: Tensor,
     boundary: Tensor,
@@ -75,7 +107,7 @@ def boundary_angles(
     yaw: Tensor,
     num_boundaries: int,
 ) -> BoundaryAngles:
-    """One angle α per boundary from all its segments, and what it is worth.
+    """Compute one angle α per boundary from all its segments, with variance and Jacobian.
 
     Source: Eq. (18) takes α of single line pairs. Deviation: one α per boundary, the least-squares plane
     through the vanishing direction and the boundary's end points, as pairs that share a segment are not
@@ -146,7 +178,7 @@ def measure_widths(
     direction_cov: Tensor | None = None,
     lane_noise: float = 0.0,
 ) -> WidthMeasurement:
-    """Widths of the lanes whose two boundaries are present, with Jacobian and covariance.
+    """Compute the widths of the lanes whose two boundaries are present, with Jacobian and covariance.
 
     Source: Eq. (18) and its derivatives.
 
@@ -190,11 +222,10 @@ def initial_roll_height(
     num_steps: int = 121,
     num_iterations: int = 5,
 ) -> tuple[Tensor, Tensor]:
-    """Roll and height that make the observed widths most alike the prior's.
+    """Find the roll and height of least :func:`width_energy`.
 
-    Source: Sec. IV-A, Eqs. (19)-(20): exhaustive search, then Gauss-Newton. Deviation: the energy is a sum
-    of squares, as a sum of signed residuals has no minimum (PAPER_NOTES 4); for each roll of the search
-    the best height is in closed form; with one lane roll stays at the guess (PAPER_NOTES 6).
+    Source: Sec. IV-A, Eqs. (18)-(20): exhaustive search, then Gauss-Newton. Deviation: for each roll of the
+    search the best height is in closed form; with one lane roll stays at the guess (paper.md D6).
 
     Args:
         boundaries: from :func:`boundary_angles`.
@@ -218,9 +249,9 @@ def initial_roll_height(
     prior = lane_width.unsqueeze(1)
     widths = torch.where(present, widths, 0.0)
     heights = (widths * prior).sum(-1) / widths.square().sum(-1).clamp_min(1e-9)
-    error = torch.where(present, prior - heights.unsqueeze(-1) * widths, 0.0)
+    residuals = width_residuals(heights.unsqueeze(-1) * widths, prior, present)
     possible = (present.sum(-1) == present.sum(-1).amax(-1, keepdim=True)) & (heights > 0)
-    energy = torch.where(possible, error.square().sum(-1), torch.inf)
+    energy = torch.where(possible, width_energy(residuals), torch.inf)
     best = energy.argmin(-1, keepdim=True)
     observable = present.sum(-1).amax(-1) >= 2
     middle = torch.full_like(best, num_steps // 2)
@@ -240,8 +271,8 @@ def _gauss_newton_step(
     jacobian = torch.where(there, measured.jacobian, 0.0)
     held = torch.stack([observable, torch.ones_like(observable)], dim=-1)  # roll only where it shows
     jacobian = jacobian * held.unsqueeze(1)
-    error = torch.where(there, (lane_width - measured.widths).unsqueeze(-1), 0.0)
+    error = width_residuals(measured.widths, lane_width, measured.present).unsqueeze(-1)
     eye = torch.eye(2, dtype=roll.dtype, device=roll.device)
     normal = jacobian.mT @ jacobian + 1e-9 * eye
-    step = torch.cholesky_solve(jacobian.mT @ error, torch.linalg.cholesky_ex(normal).L).squeeze(-1)
+    step = solve_spd(normal, jacobian.mT @ error).squeeze(-1)
     return roll + step[..., 0].clamp(-0.1, 0.1), (height + step[..., 1]).clamp(0.1, 10.0)

@@ -9,8 +9,14 @@ from torch import Tensor
 
 from lanebev.batch import may_skip
 from lanebev.estimation import kalman
-from lanebev.estimation.two_stage.lane_width import BoundaryAngles, initial_roll_height, measure_widths
+from lanebev.estimation.two_stage.lane_width import (
+    BoundaryAngles,
+    initial_roll_height,
+    measure_widths,
+    width_residuals,
+)
 from lanebev.estimation.two_stage.state import TwoStageConfig, TwoStageState
+from lanebev.geometry.linalg import cholesky, solve_lower
 from lanebev.types import Status
 
 _NUM_LINEARISATIONS = 2
@@ -41,10 +47,10 @@ def track_roll_height(
     fresh: Tensor,
     cfg: TwoStageConfig,
 ) -> RollHeightStep:
-    """Predict and update roll and height; start where nothing is known; one lane moves height only.
+    """Predict and update roll and height, or start them; one lane alone updates height only.
 
-    Source: Sec. IV-B, with the measurement of Eq. (20). Deviation: a roll or height that no car has
-    (``LARGEST_ROLL``, ``LEAST_HEIGHT``, ``LARGEST_HEIGHT``) is back at the prior and unknown.
+    Source: Sec. IV-B, state of Eqs. (21)-(22), measurement of Eq. (20). Deviation: a roll or height that no
+    car has (``LARGEST_ROLL``, ``LEAST_HEIGHT``, ``LARGEST_HEIGHT``) is back at the prior and unknown.
 
     Args:
         boundaries: angles about the direction of stage 1.
@@ -93,7 +99,7 @@ def update_by_widths(
     seen: Tensor,
     lane_noise: float,
 ) -> tuple[Tensor, Tensor]:
-    """Iterated EKF update of roll and height by the lanes' widths.
+    """Update roll and height by the lanes' widths in an iterated extended Kalman filter.
 
     Source: Eqs. (15)-(17) with the measurement of Eq. (20); iterated as in Bell and Cathey 1993.
     Deviation: linearised twice, the second time about the first's result: widths are curved in roll by so
@@ -115,15 +121,12 @@ def update_by_widths(
     at, after = mean, cov
     for _ in range(_NUM_LINEARISATIONS):
         measured = measure_widths(boundaries, at[:, 0], at[:, 1], direction_cov, lane_noise)
-        error = torch.where(measured.present, lane_width - measured.widths, 0.0)
+        error = width_residuals(measured.widths, lane_width, measured.present)
         jacobian = torch.where(measured.present.unsqueeze(-1), measured.jacobian, 0.0) * seen.unsqueeze(1)
         jacobian = torch.cat([jacobian, torch.zeros_like(jacobian)], dim=-1)  # (B, L-1, 4)
         innovation = error + (jacobian @ (at - mean).unsqueeze(-1)).squeeze(-1)
-        white = torch.linalg.solve_triangular(
-            torch.linalg.cholesky_ex(measured.noise).L,
-            torch.cat([jacobian, innovation.unsqueeze(-1)], dim=-1),
-            upper=False,
-        )
+        both = torch.cat([jacobian, innovation.unsqueeze(-1)], dim=-1)
+        white = solve_lower(cholesky(measured.noise), both)
         info = kalman.information(white[..., -1], white[..., :-1], torch.ones_like(error))
         at, after = kalman.update(mean, cov, *info)
     return at, after
@@ -132,10 +135,11 @@ def update_by_widths(
 def predict_roll_height(
     state: TwoStageState, dt: Tensor, roll_seen: Tensor, height_seen: Tensor, cfg: TwoStageConfig
 ) -> tuple[Tensor, Tensor]:
-    """Constant velocity for no longer than ``reacquire_after``; what this frame does not observe holds still.
+    """Predict roll and height at constant velocity, for ``reacquire_after`` at most.
 
-    Deviation: the paper would extrapolate roll on one lane for ever (PAPER_NOTES 6), and across any gap, to
-    where one linearised update does not lead back from. Sigma grows with the whole gap.
+    Source: Eqs. (21)-(22). Deviation: what this frame does not observe keeps its value, and only its variance
+    grows. The paper extrapolates roll on one lane for ever (paper.md D6), and across any gap, so
+    far that one linearised update does not lead back.
     """
     density = dt.new_tensor([cfg.angular_acceleration_density, cfg.height_acceleration_density])
     transition, _ = kalman.constant_velocity(dt.clamp(max=cfg.reacquire_after), density)

@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from lanebev.geometry.linalg import inverse_spd
+
 SCORE_ANGLE_WEIGHT = 0.8  # λ₁
 SCORE_LENGTH_WEIGHT = 0.2  # λ₂
 GATE_ANGLE = math.radians(0.7)  # θ_th
@@ -14,7 +16,7 @@ _EPS = 1e-12
 
 
 def segment_angles(endpoints: Tensor, vanishing_points: Tensor) -> Tensor:
-    """Angle between each segment and the line from its centre to a vanishing point.
+    """Compute the angle between each segment and the line from its centre to a vanishing point.
 
     Source: Rother 2002 as in Fig. 5, θ(v, l).
 
@@ -36,10 +38,10 @@ def segment_angles(endpoints: Tensor, vanishing_points: Tensor) -> Tensor:
 
 
 def gate_angles(endpoints: Tensor, sigma: Tensor, gate_sigmas: float) -> Tensor:
-    """Largest angle at which a segment still counts as pointing to the vanishing point.
+    """Compute the largest angle at which a segment still counts as pointing to the vanishing point.
 
     Source: Sec. III-B, θ_th = 0.7°. Deviation: never less than ``gate_sigmas`` of the angle's own standard
-    deviation √2 σ / length, since 0.7° throws away half of the true segments at σ² = 9 (PAPER_NOTES 10).
+    deviation √2 σ / length, since 0.7° throws away half of the true segments at σ² = 9 (paper.md D10).
     ``gate_sigmas=0`` is the paper.
 
     Args:
@@ -55,13 +57,13 @@ def gate_angles(endpoints: Tensor, sigma: Tensor, gate_sigmas: float) -> Tensor:
 
 
 def segment_lengths(endpoints: Tensor) -> Tensor:
-    """(..., N, 2, 2) px to (..., N) px."""
+    """Compute the lengths of segments (..., N, 2, 2), (..., N) px."""
     squared = (endpoints[..., 1, :] - endpoints[..., 0, :]).square().sum(-1)
     return squared.clamp_min(_EPS).sqrt()
 
 
 def rother_score(angles: Tensor, gates: Tensor, lengths: Tensor, weight: Tensor) -> Tensor:
-    """Support of a vanishing point.
+    """Compute the score of a vanishing point.
 
     Source: Eq. (2), Σ λ₁ (1 - θ/θ_th) + λ₂ l / l_m over segments with θ < θ_th.
 
@@ -80,7 +82,7 @@ def rother_score(angles: Tensor, gates: Tensor, lengths: Tensor, weight: Tensor)
 
 
 def segment_pairs(weight: Tensor, draws: Tensor) -> Tensor:
-    """Pairs of segments to intersect: all of them when there are few, the given draws otherwise.
+    """Choose pairs of segments to intersect: all pairs if they are few, random pairs otherwise.
 
     Args:
         weight: (B, N); only segments of positive weight are drawn where a row has two of them.
@@ -103,6 +105,37 @@ def segment_pairs(weight: Tensor, draws: Tensor) -> Tensor:
     return torch.stack([order.gather(1, first), order.gather(1, second)], dim=-1)
 
 
+def line_through(endpoints: Tensor) -> Tensor:
+    """Compute the image line through both ends of each segment.
+
+    Args:
+        endpoints: (..., 2, 2) px, [end, (x, y)].
+
+    Returns:
+        (..., 3) homogeneous lines with (a, b) of unit length, zero where a segment has no length.
+    """
+    ends = torch.cat([endpoints, torch.ones_like(endpoints[..., :1])], dim=-1)
+    lines = torch.linalg.cross(ends[..., 0, :], ends[..., 1, :])
+    unit: Tensor = lines / lines[..., :2].norm(dim=-1, keepdim=True).clamp_min(_EPS)
+    return unit
+
+
+def intersect_lines(first: Tensor, second: Tensor) -> Tensor:
+    """Compute the intersection of two image lines, a vanishing point hypothesis.
+
+    Source: Eq. (1), v = l_j × l_k.
+
+    Args:
+        first: (..., 3) homogeneous line.
+        second: (..., 3) homogeneous line.
+
+    Returns:
+        (..., 3) homogeneous point; its third entry is zero where the lines are parallel.
+    """
+    point: Tensor = torch.linalg.cross(first, second)
+    return point
+
+
 def ransac_vanishing_point(
     endpoints: Tensor,
     weight: Tensor,
@@ -110,7 +143,7 @@ def ransac_vanishing_point(
     draws: Tensor,
     gate_sigmas: float = 3.0,
 ) -> tuple[Tensor, Tensor]:
-    """The hypothesis with the highest score, and the segments that agree with it.
+    """Find the vanishing point hypothesis with the highest score, and the segments that agree with it.
 
     Source: Algorithm 1 with Eqs. (1), (2).
 
@@ -125,13 +158,10 @@ def ransac_vanishing_point(
         (B, 3) homogeneous px of the best hypothesis and (B, N) bool inliers, L_c. No inliers where no
         hypothesis is supported by any segment.
     """
-    ones = torch.ones_like(endpoints[..., :1])
-    ends = torch.cat([endpoints, ones], dim=-1)
-    lines = torch.linalg.cross(ends[..., 0, :], ends[..., 1, :])  # (B, N, 3)
-    lines = lines / lines[..., :2].norm(dim=-1, keepdim=True).clamp_min(_EPS)
+    lines = line_through(endpoints)  # (B, N, 3)
     pairs = segment_pairs(weight, draws)  # (B, M, 2)
     rows = torch.arange(weight.shape[0], device=weight.device)[:, None]
-    hypotheses = torch.linalg.cross(lines[rows, pairs[..., 0]], lines[rows, pairs[..., 1]])
+    hypotheses = intersect_lines(lines[rows, pairs[..., 0]], lines[rows, pairs[..., 1]])
     usable = (weight[rows.unsqueeze(-1), pairs] > 0).all(-1) & (hypotheses.abs().amax(-1) > 1e-6)
     lengths, gates = segment_lengths(endpoints), gate_angles(endpoints, sigma, gate_sigmas)
     angles = segment_angles(endpoints.unsqueeze(1), hypotheses)  # (B, M, N)
@@ -144,10 +174,10 @@ def ransac_vanishing_point(
 
 
 def incidence_noise(rays: Tensor, vanishing_dir: Tensor, sigma: Tensor, intrinsics: Tensor) -> Tensor:
-    """Variance of the residual n·v for end points with pixel noise.
+    """Compute the variance of the residual n·v for end points with pixel noise.
 
     Source: first-order propagation through Eq. (3). Deviation: the paper's Q_PY is one constant, but the
-    variance grows as σ² (d₁² + d₂²), d the distances end point to vanishing point (PAPER_NOTES 9).
+    variance grows as σ² (d₁² + d₂²), d the distances end point to vanishing point (paper.md D9).
 
     Args:
         rays: (B, N, 2, 3), K⁻¹ p of both end points.
@@ -167,11 +197,11 @@ def incidence_noise(rays: Tensor, vanishing_dir: Tensor, sigma: Tensor, intrinsi
 def vanishing_dir_least_squares(
     normals: Tensor, noise: Tensor, weight: Tensor, prior_dir: Tensor, prior_std: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """Vanishing direction from great-circle normals, with its covariance.
+    """Estimate the vanishing direction from great-circle normals, with its covariance.
 
     Source: Eq. (4), A v = 0. Deviation: solved as 2 × 2 normal equations for v = (x, y, 1) with a weak
-    prior instead of an SVD: no sign to guess (PAPER_NOTES 2), each row weighted by its noise, and value
-    and gradient stay finite when the normals don't determine v (PAPER_NOTES 16).
+    prior instead of an SVD: no sign to guess (paper.md D2), each row weighted by its noise, and value
+    and gradient stay finite when the normals don't determine v (paper.md D16).
 
     Args:
         normals: (B, N, 3), not normalised.
@@ -191,7 +221,6 @@ def vanishing_dir_least_squares(
     eye = torch.eye(2, dtype=normals.dtype, device=normals.device)
     matrix = moments[..., :2, :2] + eye / prior_std**2
     vector = prior / prior_std**2 - moments[..., :2, 2]
-    root = torch.linalg.cholesky_ex(matrix).L
-    solution = torch.cholesky_solve(vector.unsqueeze(-1), root).squeeze(-1)
-    cov = torch.cholesky_solve(eye.expand_as(matrix), root)
+    cov = inverse_spd(matrix)
+    solution = (cov @ vector.unsqueeze(-1)).squeeze(-1)
     return torch.cat([solution, torch.ones_like(solution[..., :1])], dim=-1), cov

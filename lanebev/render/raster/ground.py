@@ -13,8 +13,8 @@ from lanebev.render.raster.noise import blotches, smoothstep
 from lanebev.render.raster.photometry import headlight_irradiance
 from lanebev.render.raster.shadows import shadows
 from lanebev.render.raster.solids import Light, Solids
-from lanebev.render.raster.street import street_ground
 from lanebev.render.raster.symbols import symbols
+from lanebev.render.raster.varied import varied_ground
 from lanebev.render.scene.alignment import Alignment, road_from_local
 from lanebev.render.scene.pavement import pavement_albedo
 from lanebev.render.scene.surroundings import verge_albedo
@@ -98,7 +98,7 @@ def ground_radiance(
         albedo[:, :, beside] = torch.where(share > 0, verge + (albedo[:, :, beside] - verge) * share, verge)
 
     here = (ground.along, ground.across, ground.reach_along, ground.reach_across)
-    albedo, coverage = street_ground(
+    albedo, coverage = varied_ground(
         world, place.across, camera_height, *here, albedo, paved, coverage, blotch[2]
     )
     sunlit, open_sky = shadows(world, light, ground, solids)

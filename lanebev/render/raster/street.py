@@ -11,7 +11,6 @@ from lanebev.render.raster.noise import GRAIN, hash01, sample_grain, smoothstep
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
 from lanebev.render.scene.pavement import Pavement
 from lanebev.render.scene.street import CYCLING, FORD, KERB, PARKING, PATH, WALK, ZEBRA, Street
-from lanebev.render.scene.world import World
 
 RAIL_GAUGE = 1.435  # m
 
@@ -309,49 +308,3 @@ def _bays(
         bicycle = glyph_coverage(bicycle, across - middle, position, reach_across, reach_along)
         marks = torch.maximum(marks, torch.maximum(torch.maximum(bays, line), bicycle))
     return marks * (1 - junction_coverage(street, along, reach_along))
-
-
-def street_ground(
-    world: World,
-    eye_across: Tensor,
-    eye_height: Tensor,
-    along: Tensor,
-    across: Tensor,
-    reach_along: Tensor,
-    reach_across: Tensor,
-    albedo: Tensor,
-    paved: Tensor,
-    painted: Tensor,
-    blotch: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """A street's ground over that of a plain road.
-
-    Args:
-        world: has the street.
-        eye_across: (B,) m, the camera's place.
-        eye_height: (B,) m.
-        along: (B, N) m in the world.
-        across: (B, N) m in the layout's frame.
-        reach_along: (B, N) m per pixel.
-        reach_across: (B, N) m per pixel.
-        albedo: (B, 3, N) linear reflectance of the plain road and its verge.
-        paved: (B, N) share of the pixel on the carriageway.
-        painted: (B, N) share of it under the boundaries' paint.
-        blotch: (B, N) slow noise.
-
-    Returns:
-        albedo and painted, as the street has them.
-    """
-    street, layout, pavement = world.street, world.layout, world.pavement
-    if along.device.type == "cpu" and not bool(world.kinds.city.any()):  # asking costs nothing there
-        return albedo, painted
-    reach = (reach_along, reach_across)
-    beside, share = roadside(street, pavement, along, across, *reach, eye_across, eye_height)
-    share = share * (1 - paved)
-    albedo = albedo + (beside - albedo) * share[:, None]
-    coloured = strips(street, layout, pavement, across, reach_across, albedo)
-    albedo = albedo + (coloured - albedo) * (1 - painted)[:, None]
-    albedo = tracks(street, across, reach_across, albedo)
-    marks = street_paint(street, layout, pavement, along, across, *reach, blotch)
-    albedo = albedo + (street.paint[..., None] - albedo) * marks[:, None]
-    return albedo, torch.maximum(painted, marks)

@@ -12,13 +12,16 @@ from lanebev.types import Extrinsics
 
 
 def varied_weather(dice: Dice, kinds: Kinds, weather: Weather) -> Weather:
-    """Night where it is night, at times with a wet road."""
+    """Night where it is night, at times with a wet road; dull days of snow; clear air in tunnels."""
     wet = torch.where(dice.chance(0.3), dice.uniform(0.1, 1.0), 0.0)
     night = kinds.night
+    dull = kinds.snow & dice.chance(0.7)
+    visibility = torch.where(kinds.tunnel, 1e4, weather.visibility)
     return weather._replace(
+        grey=torch.where(dull, dice.uniform(0.5, 1.0), weather.grey),
         kind=torch.where(night, NIGHT, weather.kind),
         wet=torch.where(night, wet, weather.wet),
-        visibility=torch.where(night, weather.visibility.clamp(min=300.0), weather.visibility),
+        visibility=torch.where(night, visibility.clamp(min=300.0), visibility),
     )
 
 

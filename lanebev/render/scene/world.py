@@ -19,6 +19,7 @@ from lanebev.render.raster.photometry import (
     sample_weather,
 )
 from lanebev.render.scene.alignment import arc_nodes
+from lanebev.render.scene.country import country_layout, country_pavement, country_surroundings
 from lanebev.render.scene.glass import Glass, sample_glass
 from lanebev.render.scene.kinds import Kinds, choose, sample_kinds
 from lanebev.render.scene.layout import Layout, sample_layout
@@ -27,9 +28,18 @@ from lanebev.render.scene.pavement import Pavement, sample_pavement
 from lanebev.render.scene.sampler import Dice
 from lanebev.render.scene.street import Street, no_street, sample_city_layout, sample_street
 from lanebev.render.scene.surroundings import Surroundings, sample_surroundings
-from lanebev.render.scene.town import city_traffic, kerb_boundaries, street_edges, street_surroundings
+from lanebev.render.scene.town import (
+    NUM_PARKED,
+    city_traffic,
+    kerb_boundaries,
+    street_edges,
+    street_surroundings,
+)
 from lanebev.render.scene.traffic import Traffic, sample_traffic
+from lanebev.render.scene.tunnel import Tunnel, sample_tunnel, tunnel_surroundings, tunnel_traffic
 from lanebev.render.scene.varied import varied_camera, varied_weather
+from lanebev.render.scene.winter import Winter, sample_winter, snowed_layout
+from lanebev.render.scene.works import Works, sample_works, works_traffic
 
 
 class World(NamedTuple):
@@ -48,6 +58,9 @@ class World(NamedTuple):
         street: what a city street has.
         lights: of the night.
         glass: faults of windscreen, lens and recorder.
+        winter: snow on the ground.
+        works: old lines at road works.
+        tunnel: about the road.
     """
 
     layout: Layout
@@ -62,6 +75,9 @@ class World(NamedTuple):
     street: Street
     lights: Lights
     glass: Glass
+    winter: Winter
+    works: Works
+    tunnel: Tunnel
 
 
 class Place(NamedTuple):
@@ -103,6 +119,9 @@ def sample_world(dice: Dice, kind: str = "any") -> tuple[World, Tensor]:
     median = dice.chance(0.15) & ~kinds.city
     ego_lane = torch.where(median & dice.chance(0.7), 0, sample_ego_lane(dice, layout))
     layout, ego_lane, street = _with_street(more, kinds, layout, ego_lane)
+    layout, ego_lane = country_layout(more, kinds.country, layout, ego_lane)
+    layout, works = sample_works(more, kinds.works, layout)
+    layout = snowed_layout(more, kinds.snow, layout)
     weather = sample_weather(dice)
     sunny = bright | (dotted & dice.chance(0.7))
     weather = weather._replace(
@@ -111,26 +130,47 @@ def sample_world(dice: Dice, kind: str = "any") -> tuple[World, Tensor]:
     weather = varied_weather(more, kinds, weather)
     pavement = sample_pavement(dice, layout, dotted, bright, weather.wet, median)
     pavement = street_edges(more, kinds.city, street, layout, pavement)
+    pavement = country_pavement(more, kinds.country, layout, pavement)
     layout = kerb_boundaries(kinds.city, street, layout, pavement)
     opposite = torch.where(dice.chance(0.5), pavement.left - dice.uniform(0.8, 9.0), -math.inf)
     surroundings = sample_surroundings(dice, pavement.left, pavement.right, weather.grey, opposite, median)
     surroundings = street_surroundings(more, kinds.city, street, pavement, surroundings)
+    surroundings = country_surroundings(more, kinds.country, pavement, surroundings)
+    tunnel = sample_tunnel(more, kinds.tunnel, pavement)
+    surroundings = tunnel_surroundings(more, kinds.tunnel, tunnel, pavement, surroundings)
     lights = sample_lights(more, kinds.night, pavement.left, pavement.right)
     surroundings = _tinted(surroundings, weather, lights)
     begin = torch.where(dice.chance(0.25), dice.uniform(-6, 140), math.inf)
-    begin = torch.where(kinds.city & more.chance(0.75), math.inf, begin)
+    begin = torch.where((kinds.city & more.chance(0.75)) | kinds.country | kinds.tunnel, math.inf, begin)
     extent = dice.uniform(6, 30)
     bridge = torch.stack([begin, begin + extent], dim=1)
     traffic = sample_traffic(
         dice, layout, ego_lane, surroundings.opposite, pavement.left, pavement.right, begin, extent
     )
     traffic = city_traffic(more, kinds.city, street, layout, pavement, traffic)
+    traffic = works_traffic(more, kinds.works, layout, traffic, NUM_PARKED)
+    traffic = tunnel_traffic(kinds.tunnel, traffic)
     sensor = varied_camera(more, kinds, sample_sensor(dice, weather, bright))
     shade = torch.where(dice.chance(0.22), dice.uniform(0.3, 1.0), 0.0)
     glass = sample_glass(more, kinds.camera, kinds.night)
-    return World(
-        layout, pavement, surroundings, traffic, weather, sensor, bridge, shade, kinds, street, lights, glass
-    ), ego_lane
+    world = World(
+        layout=layout,
+        pavement=pavement,
+        surroundings=surroundings,
+        traffic=traffic,
+        weather=weather,
+        sensor=sensor,
+        bridge=bridge,
+        shade=torch.where(kinds.tunnel, 0.0, shade),
+        kinds=kinds,
+        street=street,
+        lights=lights,
+        glass=glass,
+        winter=sample_winter(more, kinds.snow),
+        works=works,
+        tunnel=tunnel,
+    )
+    return world, ego_lane
 
 
 def _with_street(dice: Dice, kinds: Kinds, layout: Layout, ego_lane: Tensor) -> tuple[Layout, Tensor, Street]:
@@ -158,6 +198,8 @@ def moved_along(world: World, start: Tensor) -> World:
         traffic=world.traffic._replace(along=world.traffic.along + shift),
         bridge=world.bridge + shift,
         street=world.street._replace(phase=world.street.phase - start),
+        works=world.works._replace(phase=world.works.phase - start),
+        tunnel=world.tunnel._replace(exit=world.tunnel.exit + start),
     )
 
 

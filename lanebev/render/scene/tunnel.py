@@ -1,0 +1,94 @@
+"""Tunnels: walls on both sides, a ceiling with its lamps, no daylight."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.render.scene.kinds import choose
+from lanebev.render.scene.pavement import Pavement
+from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.surroundings import CONCRETE, NOTHING, NUM_WALLS, Surroundings
+from lanebev.render.scene.traffic import NUM_ONCOMING, NUM_VEHICLES, Traffic
+
+_LAMP_COLOURS = [(1.0, 0.6, 0.2), (1.0, 0.75, 0.4), (1.0, 0.95, 0.85), (0.85, 0.95, 1.0)]
+
+
+class Tunnel(NamedTuple):
+    """A tunnel about the road, (B,) unless said otherwise.
+
+    Attributes:
+        on: 1 where there is one.
+        ceiling: m above the road.
+        exit: m along, where it ends.
+        tone: (B, 3) linear reflectance of the ceiling.
+        level: (B, 3) irradiance over pi on the road.
+        lamp: radiance of the lamps.
+        lamp_across: (B, 2) m, rows of lamps in the layout's frame.
+        lamp_size: (B, 2) m along and across.
+        lamp_period: m.
+        lamp_colour: (B, 3).
+    """
+
+    on: Tensor
+    ceiling: Tensor
+    exit: Tensor
+    tone: Tensor
+    level: Tensor
+    lamp: Tensor
+    lamp_across: Tensor
+    lamp_size: Tensor
+    lamp_period: Tensor
+    lamp_colour: Tensor
+
+
+def sample_tunnel(dice: Dice, tunnel: Tensor, pavement: Pavement) -> Tunnel:
+    """Random tunnels where tunnel (B,) holds."""
+    hue = dice.pick_from(_LAMP_COLOURS) * dice.uniform(0.9, 1.1, 1)
+    rows = torch.stack([pavement.left, pavement.right], 1)
+    middle = rows.mean(1, keepdim=True)
+    near_walls = dice.chance(0.5, 1)
+    share = torch.where(near_walls, dice.uniform(0.8, 0.97, 1), dice.uniform(0.0, 0.5, 1))
+    return Tunnel(
+        on=tunnel.float(),
+        ceiling=dice.uniform(4.8, 7.5),
+        exit=torch.where(dice.chance(0.5), dice.uniform(60, 500), 1e5),
+        tone=dice.uniform(0.04, 0.4, 1) * (1 + dice.normal(0.05, 3)),
+        level=dice.uniform(0.02, 0.25, 1) * hue,
+        lamp=dice.uniform(0.3, 4.0),
+        lamp_across=middle + (rows - middle) * share,
+        lamp_size=torch.stack([dice.uniform(0.4, 4.0), dice.uniform(0.1, 0.5)], 1),
+        lamp_period=dice.uniform(4.5, 16.0),
+        lamp_colour=hue,
+    )
+
+
+def tunnel_surroundings(
+    dice: Dice, tunnel: Tensor, inside: Tunnel, pavement: Pavement, around: Surroundings
+) -> Surroundings:
+    """Walls up to the ceiling, where tunnel (B,) holds."""
+    edge = torch.stack([pavement.left, pavement.right], 1).repeat(1, 3)
+    gap = torch.cat([dice.uniform(30, 31, 4), dice.uniform(0.1, 1.0, 2)], 1)
+    near = torch.arange(NUM_WALLS, device=tunnel.device) >= NUM_WALLS - 2
+    walled = around._replace(
+        wall_across=edge + gap * gap.new_tensor([-1.0, 1.0] * 3),
+        wall_kind=torch.where(near, CONCRETE, NOTHING).expand_as(around.wall_kind),
+        wall_height=(inside.ceiling[:, None] + 0.15).expand_as(around.wall_height),
+        wall_colour=(dice.uniform(0.05, 0.5, 1, 1) * (1 + dice.normal(0.06, 1, 3))).expand_as(
+            around.wall_colour
+        ),
+        wall_toe=torch.ones_like(around.wall_toe),
+        verge=pavement.base[:, None].expand(-1, 2, -1),
+        opposite=torch.full_like(around.opposite, -math.inf),
+    )
+    return choose(tunnel, walled, around)
+
+
+def tunnel_traffic(tunnel: Tensor, traffic: Traffic) -> Traffic:
+    """Vehicles alone: no bridges, signs and lamp posts where tunnel (B,) holds."""
+    index = torch.arange(traffic.valid.shape[1], device=tunnel.device)
+    vehicle = index < NUM_VEHICLES + NUM_ONCOMING
+    return traffic._replace(valid=traffic.valid & (vehicle | ~tunnel[:, None]))

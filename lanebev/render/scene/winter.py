@@ -1,0 +1,64 @@
+"""Snow and slush: at the edges, over stretches of the lines, between the wheel tracks."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
+from lanebev.render.scene.sampler import Dice
+
+
+class Winter(NamedTuple):
+    """Snow on the ground, (B,) unless said otherwise.
+
+    Attributes:
+        on: 1 where there is any.
+        colour: (B, 3) linear reflectance of it on the road.
+        verge: cover of the ground beside the road, [0, 1].
+        edge: (B, 2) m by which it reaches in from the pavement's edges, left and right.
+        ragged: m of that edge's waves.
+        line: half width, m, of the snow that lies over a boundary where its paint is not seen.
+        film: cover between the wheel tracks, [0, 1].
+        track: half width of a wheel track, m.
+    """
+
+    on: Tensor
+    colour: Tensor
+    verge: Tensor
+    edge: Tensor
+    ragged: Tensor
+    line: Tensor
+    film: Tensor
+    track: Tensor
+
+
+def sample_winter(dice: Dice, snow: Tensor) -> Winter:
+    """Random snow where snow (B,) bool holds."""
+    level = torch.where(dice.chance(0.6), dice.uniform(0.45, 0.85), dice.uniform(0.18, 0.45))
+    blue = dice.uniform(-0.02, 0.06)
+    return Winter(
+        on=snow.float(),
+        colour=level[:, None] * torch.stack([1 - blue, 1 + 0 * blue, 1 + blue], 1),
+        verge=torch.where(dice.chance(0.85), dice.uniform(0.6, 1.0), 0.1),
+        edge=dice.uniform(-0.5, 1.6, 2),
+        ragged=dice.uniform(0.05, 0.5),
+        line=dice.uniform(0.15, 0.7),
+        film=torch.where(dice.chance(0.6), dice.uniform(0.1, 0.8), 0.0),
+        track=dice.uniform(0.25, 0.55),
+    )
+
+
+def snowed_layout(dice: Dice, snow: Tensor, layout: Layout) -> Layout:
+    """A layout whose boundaries are not seen over long stretches, where snow (B,) holds."""
+    slots = MAX_BOUNDARIES
+    long = dice.uniform(10, 60, slots)
+    covered = snow[:, None] & dice.chance(0.6, slots)
+    period = long / dice.uniform(0.25, 0.9, 1)
+    return layout._replace(
+        missing_period=torch.where(covered, period, layout.missing_period),
+        missing_length=torch.where(covered, long, layout.missing_length),
+        missing_phase=torch.where(covered, dice.uniform(0, 60, slots), layout.missing_phase),
+    )

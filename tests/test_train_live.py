@@ -1,0 +1,189 @@
+"""Rendering where the network trains: batches, schedules by the share of the budget, resumption."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import lightning as L
+import pytest
+import torch
+from lightning.pytorch.callbacks import Timer
+
+import train.live
+from lanebev.render import WindowConfig
+from train.__main__ import main
+from train.budget import Stage, rate_factor, stage_at, used_share
+from train.labels import ViewConfig
+from train.live import HeldOutBatches, LiveBatches, Views, labelled, mirrored, rendered
+from train.maps import separated
+from train.module import Segmentation
+from train.stopwatch import Stopwatch
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # of Lightning about itself
+
+CPU = torch.device("cpu")
+STAGES = [Stage(0.5, (48, 80), 4), Stage(1.0, (64, 96), 2)]
+
+
+@pytest.fixture(scope="module")
+def views():
+    return rendered(2, (64, 96), (5,), CPU, WindowConfig(), 64)
+
+
+@pytest.fixture
+def instant(monkeypatch):
+    """Views of noise, by the same seeds, in no time."""
+
+    def noise(count, size, seed, *_):
+        generator = torch.Generator().manual_seed(train.live.drawn(seed))
+        image = torch.randint(256, (count, 3, *size), generator=generator, dtype=torch.uint8)
+        points = torch.rand(count, 6, 12, 2, generator=generator) * size[0]
+        there = torch.ones(count, 6, 12, dtype=torch.bool)
+        return Views(image, points, there, there)
+
+    monkeypatch.setattr(train.live, "rendered", noise)
+
+
+def batches(first, repeats=2, flip=0.5):
+    view = ViewConfig(flip=flip)
+    return LiveBatches(lambda n: n / 6, STAGES, repeats, view, WindowConfig(), (3, 0), first, CPU, 64)
+
+
+def taken(first, count, **kwargs):
+    return list(itertools.islice(batches(first, **kwargs), count))
+
+
+def test_mirroring_twice_is_nothing_and_once_renumbers(views):
+    which = torch.tensor([True, False])
+    once = mirrored(views, which)
+    assert torch.equal(once.points[1], views.points[1])
+    torch.testing.assert_close(once.points[0, 2, :, 0], 95 - views.points[0, 3, :, 0])
+    twice = mirrored(once, which)
+    assert all(torch.allclose(a.float(), b.float(), atol=1e-4) for a, b in zip(twice, views, strict=True))
+
+
+def test_labels_go_with_their_image(views):
+    """Each label pixel (i, j) is on image pixel (2 i, 2 j), mirrored or not."""
+    config = ViewConfig()
+    for which in (False, True):
+        moved = mirrored(views, torch.tensor([which, which]))
+        batch = labelled(moved, config)
+        assert batch.target.shape == (2, 6, 32, 48)
+        row, line, point = (separated(moved.points / 2, moved.visible, config.gap)).nonzero().unbind(-1)
+        x, y = (moved.points[row, line, point] / 2).round().long().unbind(-1)
+        assert (batch.target[row, line, y.clamp(0, 31), x.clamp(0, 47)] > 200).float().mean() > 0.8
+
+
+@pytest.mark.usefixtures("instant")
+def test_a_view_is_in_two_batches_on_end_and_sizes_follow_the_share():
+    found = taken(0, 6, flip=0.0)
+    assert [tuple(batch.image.shape) for batch in found] == [(4, 3, 48, 80)] * 3 + [(2, 3, 64, 96)] * 3
+    assert torch.equal(found[0].image[2:], found[1].image[:2])  # new ones become old ones
+    assert not torch.equal(found[0].image[:2], found[1].image[2:])
+
+
+@pytest.mark.usefixtures("instant")
+def test_an_interrupted_stream_goes_on_where_it_was():
+    whole = taken(0, 5)
+    for first in (2, 3, 4):
+        (next_one,) = taken(first, 1)
+        assert all(torch.equal(a, b) for a, b in zip(next_one, whole[first], strict=True))
+
+
+def test_held_out_frames_are_the_same_each_time():
+    data = HeldOutBatches(1, 2, (48, 80), ViewConfig(), 7, CPU)
+    (one,), (again,) = data, data
+    assert torch.equal(one.image, again.image)
+    assert one.target.any()
+
+
+def test_rate_warms_up_stays_and_falls_to_zero_by_share_and_by_steps():
+    by_share = {"warmup_steps": 10, "decay_steps": 0, "decay_share": 0.5}
+    assert rate_factor(0, -1, 0.0, **by_share) == pytest.approx(0.1)
+    assert rate_factor(50, -1, 0.4, **by_share) == 1.0
+    assert rate_factor(50, -1, 0.75, **by_share) == pytest.approx(0.5)
+    assert rate_factor(99, -1, 1.0, **by_share) == 0.0
+    by_steps = {"warmup_steps": 1, "decay_steps": 4, "decay_share": 0.0}
+    assert [rate_factor(step, 10, step / 10, **by_steps) for step in (5, 8, 10)] == [1.0, 0.5, 0.0]
+
+
+def test_stages_end_at_their_share():
+    assert [stage_at(STAGES, share).size[0] for share in (0.0, 0.49, 0.5, 1.0)] == [48, 48, 64, 64]
+
+
+def test_share_is_of_minutes_where_there_is_no_number_of_steps(monkeypatch):
+    timer = Timer({"seconds": 40})
+    trainer = L.Trainer(max_epochs=-1, logger=False, callbacks=[timer], accelerator="cpu")
+    monkeypatch.setattr(timer, "time_elapsed", lambda *_: 10.0)
+    assert used_share(trainer) == pytest.approx(0.25)
+    trainer = L.Trainer(max_steps=8, logger=False, callbacks=[timer], accelerator="cpu")
+    assert used_share(trainer, 4) == pytest.approx(0.5)  # the larger one
+
+
+def test_stopwatch_forgets_what_was_read():
+    watch = Stopwatch(CPU)
+    with watch.time("a"):
+        pass
+    assert watch.read()["a"] >= 0
+    assert watch.read() == {}
+
+
+SMALL = [
+    "--trainer.accelerator=cpu",
+    "--trainer.precision=32-true",
+    "--trainer.callbacks.every=0.001",
+    "--model.init_args.network.base_width=4",
+    "--model.init_args.network.decoder_width=4",
+    "--model.init_args.init_from=null",
+    "--data.init_args.stages=[{until: 0.5, size: [48, 80], batch_size: 4},"
+    " {until: 1.0, size: [64, 96], batch_size: 2}]",
+]
+
+
+def fit(folder, *extra):
+    here = [f"--trainer.default_root_dir={folder}", f"--trainer.logger.init_args.save_dir={folder}"]
+    config = Path(__file__).parents[1] / "configs" / "gpu.yaml"
+    main(["fit", "--config", str(config), *here, *SMALL, *extra])
+
+
+@pytest.mark.usefixtures("instant")
+def test_gpu_config_trains_by_steps_and_an_interrupted_run_ends_as_one_in_a_piece(tmp_path, monkeypatch):
+    each = "--trainer.callbacks+={class_path: lightning.pytorch.callbacks.ModelCheckpoint, " + (
+        "init_args: {every_n_train_steps: 1, filename: 'each-{step}', save_top_k: -1}}"
+    )
+    steps = ["--trainer.max_steps=6", each]
+    fit(tmp_path / "whole", *steps)
+    step = Segmentation.training_step
+
+    def until_the_fourth(self, batch, batch_idx):
+        if batch_idx == 3:
+            raise RuntimeError("power cut")
+        return step(self, batch, batch_idx)
+
+    with monkeypatch.context() as cut:
+        cut.setattr(Segmentation, "training_step", until_the_fourth)
+        with pytest.raises(RuntimeError, match="power cut"):
+            fit(tmp_path / "parts", *steps)
+    (begun,) = (tmp_path / "parts").rglob("each-step=3.ckpt")
+    fit(tmp_path / "parts", *steps, f"--ckpt_path={begun}")
+    whole, parts = (
+        torch.load(next((tmp_path / name).rglob("each-step=6.ckpt")), weights_only=False)
+        for name in ("whole", "parts")
+    )
+    assert all(torch.equal(value, parts["state_dict"][name]) for name, value in whole["state_dict"].items())
+    views = [each["callbacks"]["Throughput"]["views"] for each in (whole, parts)]
+    assert views == [3 * 4 + 3 * 2] * 2
+    table = next((tmp_path / "whole").rglob("throughput.csv")).read_text().splitlines()
+    assert table[0].startswith("step,used,views,views_per_s")
+    assert len(table) > 3
+
+
+@pytest.mark.usefixtures("instant")
+def test_gpu_config_ends_after_its_minutes_with_a_checkpoint(tmp_path):
+    fit(tmp_path, "--trainer.max_time=00:00:00:05")
+    checkpoint = torch.load(next(tmp_path.rglob("last.ckpt")), weights_only=False)
+    assert checkpoint["global_step"] > 0
+    assert checkpoint["callbacks"]["Timer"]["time_elapsed"]["train"] >= 5
+    (rate,) = {group["lr"] for group in checkpoint["optimizer_states"][0]["param_groups"]}
+    assert rate < 1.5e-3  # it falls by the clock

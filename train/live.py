@@ -1,0 +1,250 @@
+"""Views rendered where the network trains, in the training step's own process."""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import lightning as L
+import numpy as np
+import torch
+from jsonargparse.typing import PositiveFloat, PositiveInt
+from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset
+
+from lanebev.render import WindowConfig, render_views
+from train.budget import Stage, stage_at, used_share
+from train.data import Batch, Seed, run_position
+from train.labels import ViewConfig
+from train.maps import boundaries_as_taken, label_maps
+from train.stopwatch import Stopwatch
+
+
+class Views(NamedTuple):
+    """Rendered images and their boundaries.
+
+    Attributes:
+        image: (B, 3, H, W) uint8 RGB.
+        points: (B, L, P, 2) px as taken.
+        painted: (B, L, P) bool, the boundary exists and is marked there.
+        visible: (B, L, P) bool, and nothing stands in front of it.
+    """
+
+    image: Tensor
+    points: Tensor
+    painted: Tensor
+    visible: Tensor
+
+
+def drawn(seed: Seed) -> int:
+    """Return one number drawn by several."""
+    return int(np.random.default_rng(seed).integers(2**62))
+
+
+def rendered(
+    count: int,
+    size: tuple[int, int],
+    seed: Seed,
+    device: torch.device,
+    window: WindowConfig | None,
+    most: int,
+) -> Views:
+    """Render views.
+
+    Args:
+        count: B.
+        size: (height, width).
+        seed: decides everything, on one kind of device.
+        device: where to render.
+        window: of the views; None for whole images.
+        most: views rendered at once.
+    """
+    generator = torch.Generator().manual_seed(drawn(seed))
+    parts = []
+    for start in range(0, count, most):
+        frame = render_views(min(most, count - start), size, generator, device=device, window=window)
+        image = (255 * frame.image).round_().clamp_(0, 255).byte()
+        parts.append(Views(image, boundaries_as_taken(frame), frame.painted > 0.5, frame.visible > 0.5))
+    return Views(*(torch.cat(field) for field in zip(*parts, strict=True)))
+
+
+def mirrored(views: Views, which: Tensor) -> Views:
+    """Mirror some images and renumber their boundaries.
+
+    Args:
+        views: B of them.
+        which: (B,) bool.
+    """
+    width = views.image.shape[-1]
+    across = torch.cat([width - 1 - views.points[..., :1], views.points[..., 1:]], dim=-1)
+    other = Views(views.image.flip(-1), across.flip(1), views.painted.flip(1), views.visible.flip(1))
+    return Views(
+        *(torch.where(which.view(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(views, other, strict=True))
+    )
+
+
+def labelled(views: Views, config: ViewConfig) -> Batch:
+    """Draw the views' labels."""
+    size = (views.image.shape[-2], views.image.shape[-1])
+    maps = label_maps(views.points, views.painted, views.visible, size, config)
+    return Batch(views.image, (255 * maps.target).round_().byte(), maps.weight.byte())
+
+
+class LiveBatches(IterableDataset[Batch]):
+    """Endless batches of new views; with ``repeats`` each view is in that many batches on end.
+
+    Of a batch, one ``repeats``-th is new. So a view comes again beside others, and mirrored or not anew.
+
+    Args:
+        share: of the run's budget that is used at a step.
+        stages: sizes of views and batches by that share.
+        repeats: batches that have each view.
+        view: stride and stripes of the labels, and the probability of mirroring.
+        window: of the views; None for whole images.
+        seed: with the number of the batch, decides everything.
+        first: number of the first batch.
+        device: where to render.
+        most: views rendered at once.
+    """
+
+    def __init__(
+        self,
+        share: Callable[[int], float],
+        stages: list[Stage],
+        repeats: int,
+        view: ViewConfig,
+        window: WindowConfig | None,
+        seed: Seed,
+        first: int,
+        device: torch.device,
+        most: int,
+    ) -> None:
+        super().__init__()
+        self.share, self.stages, self.repeats = share, stages, repeats
+        self.view, self.window, self.seed, self.first = view, window, seed, first
+        self.device, self.most = device, most
+        self.watch = Stopwatch(device)
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Render, mirror, label."""
+        recent: deque[tuple[Stage, Views]] = deque(maxlen=self.repeats)
+        for number in itertools.count(self.first):
+            stage = stage_at(self.stages, self.share(number))
+            with self.watch.time("rendering"):
+                if any(earlier is not stage for earlier, _ in recent):
+                    recent.clear()
+                for missing in range(self.repeats - 1 - len(recent), 0, -1):  # of a run's or a stage's start
+                    recent.append((stage, self._render(stage, number - missing)))
+                recent.append((stage, self._render(stage, number)))
+                views = Views(*(torch.cat(field) for field in zip(*(v for _, v in recent), strict=True)))
+            with self.watch.time("labelling"):
+                rng = np.random.default_rng((*self.seed, number))
+                which = torch.from_numpy(rng.random(len(views.image)) < self.view.flip)
+                batch = labelled(mirrored(views, which.to(self.device)), self.view)
+            yield batch
+
+    def _render(self, stage: Stage, number: int) -> Views:
+        count = max(1, stage.batch_size // self.repeats)
+        seed = (*self.seed, number + self.repeats)  # not negative
+        return rendered(count, stage.size, seed, self.device, self.window, self.most)
+
+
+class HeldOutBatches(IterableDataset[Batch]):
+    """A fixed number of whole frames, the same every time on one kind of device."""
+
+    def __init__(
+        self,
+        batches: int,
+        batch_size: int,
+        size: tuple[int, int],
+        view: ViewConfig,
+        seed: int,
+        device: torch.device,
+    ) -> None:
+        super().__init__()
+        self.batches, self.batch_size, self.size = batches, batch_size, size
+        self.view, self.seed, self.device = view, seed, device
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Render and label."""
+        for number in range(self.batches):
+            seed = (self.seed, number)
+            yield labelled(
+                rendered(self.batch_size, self.size, seed, self.device, None, self.batch_size), self.view
+            )
+
+
+class LiveRoads(L.LightningDataModule):
+    """Rendered roads, on the device that trains.
+
+    Args:
+        stages: sizes of views and batches, by the share of the run's steps or minutes that is used.
+        batch_share: of all batch sizes; halve it where memory does not suffice.
+        repeats: batches that have each view; more than 1 where rendering takes longer than training.
+        most: views rendered at once, for the memory's sake.
+        window: how windows about the horizon are drawn; None for whole images.
+        view: stride and stripes of the labels, and the probability of mirroring; the rest of it is not used.
+        val_size: (height, width) of whole frames in validation.
+        val_batch_size: frames per batch in validation.
+        val_batches: of them.
+        seed: of the views; validation uses another stream.
+    """
+
+    def __init__(
+        self,
+        stages: list[Stage],
+        batch_share: PositiveFloat = 1.0,
+        repeats: PositiveInt = 1,
+        most: PositiveInt = 64,
+        window: WindowConfig | None = None,
+        view: ViewConfig | None = None,
+        val_size: tuple[PositiveInt, PositiveInt] = (320, 576),
+        val_batch_size: PositiveInt = 32,
+        val_batches: PositiveInt = 4,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        if not stages:
+            raise ValueError("stages: expected at least one, got none")
+        self.stages = [
+            Stage(stage.until, stage.size, max(repeats, round(batch_share * stage.batch_size)))
+            for stage in stages
+        ]
+        self.repeats, self.most, self.window, self.view = repeats, most, window, view or ViewConfig()
+        self.val_size, self.val_batch_size, self.val_batches = val_size, val_batch_size, val_batches
+        self.seed = seed
+        self.batches: LiveBatches | None = None  # of the training under way
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        """Endless."""
+        trainer = self._trainer()
+        rank, first = run_position(self)
+        every = trainer.accumulate_grad_batches
+        self.batches = LiveBatches(
+            lambda number: used_share(trainer, number // every),
+            self.stages,
+            self.repeats,
+            self.view,
+            self.window,
+            (self.seed, rank),
+            first,
+            trainer.strategy.root_device,
+            self.most,
+        )
+        return DataLoader(self.batches, batch_size=None)
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        """Held-out frames."""
+        device = self._trainer().strategy.root_device
+        frames = (self.val_batches, self.val_batch_size, self.val_size)
+        return DataLoader(HeldOutBatches(*frames, self.view, self.seed + 7_919, device), batch_size=None)
+
+    test_dataloader = val_dataloader
+    predict_dataloader = val_dataloader
+
+    def _trainer(self) -> L.Trainer:
+        if self.trainer is None:
+            raise RuntimeError("LiveRoads renders on the device of its trainer: expected one, got none")
+        return self.trainer
