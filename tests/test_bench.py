@@ -11,6 +11,7 @@ from lanebev.testing.evaluation import Track, recovery, summarise
 from tools.bench_calibration import main, smallest_eigenvalue, stream
 
 
+@pytest.mark.slow
 def test_quick_bench_writes_json_and_a_table(tmp_path):
     report = main(["--quick", "--calibrators", "joint", "two-stage", "--out", str(tmp_path)])
     written = json.loads((tmp_path / "bench.json").read_text())
@@ -25,6 +26,7 @@ def test_quick_bench_writes_json_and_a_table(tmp_path):
     assert written["speed"]["joint"]["median_ms"] > 0
 
 
+@pytest.mark.slow
 def test_stream_reports_drift_memory_and_precision():
     found = stream(60, rows=2)
     assert found["rows_not_tracking"] == 0

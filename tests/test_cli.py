@@ -145,6 +145,7 @@ def test_every_output_is_there_and_whole(drive):
     assert 'src="http' not in page
 
 
+@pytest.mark.slow
 def test_pseudo_ground_truth_compares_the_same_frames(data, tmp_path, capsys, monkeypatch):
     names = ("10", "11", "2")  # a run over images may have another order than the lanes, which have 2, 10, 11
     (tmp_path / "cul").mkdir()
@@ -215,6 +216,7 @@ def test_lanes_json_gives_the_same_calibration(data, drive, tmp_path):
     assert (tmp_path / "out" / "lanes.json").read_text() == (drive / "lanes.json").read_text()
 
 
+@pytest.mark.slow
 def test_folder_glob_and_stills(data, tmp_path):
     assert _run(data, "--fps", "10", out=tmp_path / "folder") == 0
     folder = _table(tmp_path / "folder")
@@ -237,6 +239,7 @@ def test_one_image_gives_pictures(data, tmp_path):
     assert len(_table(tmp_path / "out")) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("calibrator", ["two-stage", "joint"])
 def test_resuming_gives_what_an_uninterrupted_run_gives(data, tmp_path, calibrator):
     for part, numbers in (("whole", range(6)), ("first", range(3)), ("second", range(3, 6))):
@@ -305,6 +308,7 @@ def test_the_state_of_another_camera_is_a_mistake(data, tmp_path, capsys):
     assert not (tmp_path / "next").exists()
 
 
+@pytest.mark.slow
 def test_resuming_with_the_camera_that_a_run_wrote(data, tmp_path):
     fields = yaml.safe_load((data / "camera.yaml").read_text())
     camera = tmp_path / "camera.yaml"
@@ -351,6 +355,7 @@ def test_a_lane_file_may_begin_with_a_byte_order_mark(data, tmp_path):
     assert _run(data, lanes=lanes, out=tmp_path / "out") == 0
 
 
+@pytest.mark.slow
 def test_a_refused_state_is_kept_beside_what_replaces_it(data, tmp_path, capsys):
     out, names = tmp_path / "out", ("state.safetensors", "calibration.yaml")
     (tmp_path / "link").symlink_to(out, target_is_directory=True)
@@ -448,6 +453,7 @@ def test_an_undecodable_single_image_writes_nothing(data, tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["1.jpg"]
 
 
+@pytest.mark.slow
 def test_a_run_does_not_replace_what_it_reads(data, drive, tmp_path, capsys):
     out = tmp_path / "out"
     shutil.copytree(drive, out)
@@ -477,6 +483,7 @@ def test_a_run_does_not_replace_what_it_reads(data, drive, tmp_path, capsys):
     assert (out / "images").is_dir()
 
 
+@pytest.mark.slow
 def test_a_cut_video_is_reported_and_takes_its_own_lanes(data, tmp_path, capsys):
     with av.open(str(data / "drive.mp4")) as container:
         end = [packet.pos + packet.size for packet in container.demux(video=0) if packet.size][3]
@@ -496,6 +503,7 @@ def test_a_cut_video_is_reported_and_takes_its_own_lanes(data, tmp_path, capsys)
     assert first.read_text() == again.read_text()
 
 
+@pytest.mark.slow
 def test_the_mount_does_not_learn_in_a_bend(data, tmp_path, monkeypatch):
     monkeypatch.setattr(JointCalibrator, "curvature", lambda _, state: 0.002 + 0 * state.mean[:, 0])
     for name, turning in (("joint", True), ("two-stage", False)):  # which knows no curvature
@@ -554,6 +562,7 @@ def test_names_and_terminals_without_the_signs(data, tmp_path, monkeypatch):
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {"extrinsics.csv", "report.html"}
 
 
+@pytest.mark.slow
 def test_module_is_the_command():
     done = subprocess.run(
         [sys.executable, "-m", "lanebev", "--help"], capture_output=True, text=True, check=True

@@ -10,6 +10,7 @@ from lanebev.testing.segments import lanes, no_lanes, stack_rows
 from lanebev.types import Calibration, Extrinsics
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
 @pytest.mark.parametrize(
     "calibrator",

@@ -408,6 +408,7 @@ def test_gradient_flows_from_the_pose_to_the_end_points():
     assert (slope * direction).sum().item() == pytest.approx(numeric.item(), rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed_std", [MotionConfig.speed_std, 1e-3])
 def test_float32_follows_float64_within_a_hundredth_of_a_sigma(speed_std):
     """With the speed held at 20 m/s a knot is due every 15 frames to rounding: passed in either frame."""
@@ -492,12 +493,14 @@ def test_single_images_of_bends_with_vague_lines_are_honest(radius):
     assert 0.5 < torch.cat(errors).mean() < 2.0
 
 
+@pytest.mark.slow
 def test_straight_road_does_not_tell_the_speed():
     """Noise of the road's curvature stands still in the image; taken for a bend it would stop the car."""
     _, state = run(JointCalibrator(), drive(300, rows=4))
     assert state.mean[:, SPEED].abs().max() < 4.0
 
 
+@pytest.mark.slow
 def test_exports_saves_takes_any_batch_and_equals_eager(tmp_path):
     frames = drive(4)
     calibrator = JointCalibrator(iterations=1, start_iterations=1)  # a smaller graph, traced faster
@@ -544,6 +547,7 @@ def test_bad_input_is_named():
         calibrator(segments, cameras(2), JointCalibrator(num_boundaries=4).initial_state(2), 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kept", "sigma"), [((2, 3), 0.05), ((2, 3), 0.3), ((2,), 0.3), ((2,), 1.0)])
 def test_float32_bears_one_sharp_lane_beside_a_row_that_sees_all(kept, sigma):
     """The information about what one lane determines is a million times that about the rest."""

@@ -47,6 +47,7 @@ def hard_part(run: Track) -> tuple[torch.Tensor, torch.Tensor, float]:
     return torch.tensor(hard["rmse"]), torch.tensor(hard["largest_sigma"]), hard["nees_per_dof"]
 
 
+@pytest.mark.slow
 def test_table1_is_at_the_bound_with_an_honest_covariance():
     """8 runs of 50 frames: 400 errors a cell, so three standard errors above the target pass."""
     runs, count = 8, 50
@@ -65,6 +66,7 @@ def test_table1_is_at_the_bound_with_an_honest_covariance():
         assert row["tracking"] == 1.0
 
 
+@pytest.mark.slow
 def test_half_of_all_segments_wrong_costs_at_most_half_more():
     clean = bench("straight", last=2.2)
     dirty = bench("50 % outliers, 5 % wrong index", last=2.2)
@@ -73,6 +75,7 @@ def test_half_of_all_segments_wrong_costs_at_most_half_more():
     assert summarise(dirty)["nees_per_dof"] < 1.25
 
 
+@pytest.mark.slow
 def test_curves_cost_at_most_the_double_and_bias_the_two_stages():
     """From the straight through a 60 m clothoid into R = 300 m at 30 m/s, segments at 5-40 m."""
     straight, curved = bench("straight 5-40 m", last=2.2), bench("curves R 300 m, 5-40 m", 0.5, 4.5)
@@ -82,6 +85,7 @@ def test_curves_cost_at_most_the_double_and_bias_the_two_stages():
     assert rmse(biased)[1] > 20 * rmse(curved)[1]
 
 
+@pytest.mark.slow
 def test_a_sharp_bend_turns_the_curvature_and_neither_roll_nor_height():
     """From the straight through a 20 m clothoid into R = 60 m at 15 m/s, three boundaries in sight.
 
@@ -96,6 +100,7 @@ def test_a_sharp_bend_turns_the_curvature_and_neither_roll_nor_height():
     assert (bent.status == Status.TRACKING).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "first", "last"),
     [("lane change", 3.2, 5.0), ("bumps 1 deg in 0.2 s", 0.0, 1.8), ("exit", 2.4, 4.8)],
@@ -109,6 +114,7 @@ def test_lane_changes_bumps_and_exits_leave_no_trace(name, first, last):
     assert (run.status == Status.TRACKING).all()
 
 
+@pytest.mark.slow
 def test_two_seconds_of_nothing_stay_within_sigmas_that_stop_growing():
     """The pose swings by 1.5 deg: error below 2 deg and 5 cm RMS, sigma below 2 deg and 5 cm, no drift."""
     run = bench("2 s of nothing", 2.4, 5.4)
@@ -123,6 +129,7 @@ def test_two_seconds_of_nothing_stay_within_sigmas_that_stop_growing():
     assert (again < 1.5 * rmse(bench("straight", last=2.2))).all()
 
 
+@pytest.mark.slow
 def test_one_lane_holds_roll_with_growing_sigma():
     """Pitch and yaw as ever; roll's error is the swing of 1 deg that cannot be seen, and no drift."""
     run = bench("one lane for 4 s", 2.4, 6.0)
@@ -136,6 +143,7 @@ def test_one_lane_holds_roll_with_growing_sigma():
     assert (run.status == Status.TRACKING).all()
 
 
+@pytest.mark.slow
 def test_one_boundary_is_within_its_sigmas():
     run = bench("one boundary for 2 s", 2.3, 5.0)
     error, sigma, nees = hard_part(run)
@@ -144,6 +152,7 @@ def test_one_boundary_is_within_its_sigmas():
     assert nees < 1.25
 
 
+@pytest.mark.slow
 def test_garbage_neither_starts_nor_moves_the_filter():
     run = bench("garbage at first and in between", 0.0, 3.7, rows=2)
     assert (run.status[:9] == Status.UNINITIALISED).all()
@@ -153,6 +162,7 @@ def test_garbage_neither_starts_nor_moves_the_filter():
     assert hard_part(run)[2] < 1.25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["wrong boundaries", "whole frames misnumbered", "short dashes", "bad clock", "braking"]
 )
@@ -163,12 +173,14 @@ def test_other_hard_roads_stay_near_the_straight_one(name):
     assert (run.status == Status.TRACKING).all()
 
 
+@pytest.mark.slow
 def test_far_start_is_found_in_the_first_frame():
     run = bench("far start", last=0.8)
     assert (run.status == Status.TRACKING).all()
     assert (rmse(run) < 1.5 * rmse(bench("straight", last=2.2))).all()
 
 
+@pytest.mark.slow
 def test_unequal_lanes_show_in_the_covariance_of_height():
     """Boundaries up to 15 cm off: height cannot be known to a millimetre, and does not pretend to be."""
     run = bench("unequal lanes", last=1.5)
@@ -178,6 +190,7 @@ def test_unequal_lanes_show_in_the_covariance_of_height():
     assert summarise(run)["nees_per_dof"] < 1.25
 
 
+@pytest.mark.slow
 def test_a_boundary_where_none_can_be_is_not_believed_for_a_frame():
     """A vague detector takes the foot of a barrier for a lane's edge once: its sigmas would let it pass."""
     places = PLACES + torch.tensor([0.0, 1.0, 0, 0, 0, 0], dtype=torch.float64)
@@ -192,6 +205,7 @@ def test_a_boundary_where_none_can_be_is_not_believed_for_a_frame():
     assert believed[-1] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.03, 0.1])
 def test_unequal_lanes_are_honest_on_most_roads(size):
     """After a second the median NEES/dof is below 1.25, and one road in eight at most is above 2.
@@ -208,6 +222,7 @@ def test_unequal_lanes_are_honest_on_most_roads(size):
     assert (torch.stack(nees) > 2).sum() <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [1.0, 8.0])
 def test_a_boundary_where_none_can_be_is_not_believed(sigma):
     """The foot of a barrier, a metre nearer than a lane's edge, by a sharp detector or by a vague one."""
@@ -224,6 +239,7 @@ def test_a_boundary_where_none_can_be_is_not_believed(sigma):
     assert (error < 4 * out.covariance.diagonal(dim1=1, dim2=2).sqrt()).all()
 
 
+@pytest.mark.slow
 def test_lost_after_long_nothing_and_recovers_without_help():
     def change(t: float, moment: Moment) -> Moment:
         return replace(moment, visible=() if 0.5 <= t < 1.5 else moment.visible)

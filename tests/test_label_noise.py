@@ -48,6 +48,7 @@ def test_lines_without_enough_paint_do_not_count():
     assert line_offsets(grey, rows, x + 40, x, 240.0) is None  # another stripe
 
 
+@pytest.mark.slow
 def test_halves_of_lines_differ_by_twice_what_all_of_them_err():
     """And exact ones not at all."""
     pose, straight = (0.03, -0.02, 0.015, 1.5), FramePrior(curvature_std=1e-6, curvature_rate_std=1e-8)

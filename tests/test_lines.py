@@ -265,6 +265,7 @@ def test_vertices_count_is_static():
     assert segments.endpoints.shape == (2, 3 * CONFIG.segments, 2, 2)
 
 
+@pytest.mark.slow
 def test_export_equals_eager(fans):
     logits = torch.log(
         torch.cat([(1 - fans[0].sum(1, keepdim=True)).clamp(min=1e-3), fans[0].clamp(min=1e-3)], 1)

@@ -33,6 +33,7 @@ class SeeAndWarp(nn.Module):
         return *segments, bev
 
 
+@pytest.mark.slow
 def test_observation_and_warp_export_to_onnx(tmp_path):
     torch.manual_seed(0)
     net = SeeAndWarp().eval()

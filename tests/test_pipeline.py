@@ -283,6 +283,7 @@ def test_a_camera_in_double_precision_goes_with_single_precision_images():
     assert kept.calibration.covariance.dtype == torch.float32
 
 
+@pytest.mark.slow
 def test_exports_saves_and_equals_eager(tmp_path):
     net, dt = small(), torch.tensor([0.05])
     arguments = (images(1).float(), INTRINSICS[None].float(), net.initial_state(1), dt)

@@ -73,6 +73,7 @@ def bare_world(dice: Dice) -> tuple[World, torch.Tensor]:
     return world._replace(shade=none), ego_lane
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "seed"), [("pinhole", 0), ("pinhole", 1), ("fisheye", 2)])
 def test_points_lie_on_the_centre_of_the_painted_stripe(model: str, seed: int) -> None:
     """The stripe's centroid across the boundary, measured in the radiance, is the point, to 0.05 px."""

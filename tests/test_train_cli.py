@@ -82,6 +82,7 @@ def test_every_config_is_tested():
     assert {path.name for path in CONFIGS.glob("*.yaml")} == here | {"tusimple.yaml", "gpu.yaml"}
 
 
+@pytest.mark.slow
 def test_fit_resume_test_predict_export(tmp_path):
     run("fit", "fast.yaml", tmp_path)
     last = next(tmp_path.rglob("last.ckpt"))
@@ -113,6 +114,7 @@ def test_fit_resume_test_predict_export(tmp_path):
     torch.testing.assert_close(load_segmenter(again).head.bias, exported.head.bias)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_ends_as_one_in_a_piece(tmp_path, monkeypatch):
     """Bit for bit: views, augmentation, optimiser, rate and averaged weights, from the last checkpoint."""
     averaged = "--trainer.callbacks+=lightning.pytorch.callbacks.EMAWeightAveraging"

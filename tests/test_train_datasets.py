@@ -137,6 +137,7 @@ def test_lanes_are_drawn_and_matched_as_their_benchmarks_do(layout, found):
     assert counts == (found, 1 - found + outer, 1 - found)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of Lightning about itself
 def test_config_trains_and_prints_the_benchmarks_figures(root):
     here = [f"--trainer.default_root_dir={root}", f"--trainer.logger.init_args.save_dir={root}"]

@@ -254,6 +254,7 @@ def test_gradient_ratio():
     torch.testing.assert_close(x.grad, 9 * x.detach())
 
 
+@pytest.mark.slow
 def test_evaluate_poses_reports_both(tmp_path, capsys, monkeypatch):
     torch.manual_seed(0)
     for name in ("before", "after"):

@@ -103,6 +103,7 @@ def test_bad_rows_carry_no_nan_gradient():
     assert ends.grad[0].abs().sum() > 0
 
 
+@pytest.mark.slow
 def test_gradcheck_through_start_and_update():
     segments = lanes(per=3)
     calibrator = TwoStageCalibrator()
@@ -341,6 +342,7 @@ def test_float32_follows_float64():
         assert (gap.abs() < 0.05 * results[1].covariance[0].diagonal().sqrt()).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [24, 48])  # all pairs of them are tried, and some
 def test_export_equals_eager(count):
     calibrator = TwoStageCalibrator()

@@ -107,6 +107,7 @@ def test_rows_are_independent_and_cameras_per_sample():
         torch.testing.assert_close(both[row : row + 1], alone)
 
 
+@pytest.mark.slow
 def test_gradcheck_through_pose_lens_and_image():
     grid = BEVGrid(x=(-2.0, 2.0), z=(6.0, 12.0), resolution=1.0)
     small = Camera.from_parameters(30.0, 30.0, 16.0, 9.0, 32, 18)

@@ -65,6 +65,7 @@ def test_the_former_names_of_sigma_scales_are_read():
     assert (config.sigma_scale, config.pose_sigma_scale, config.image_size) == (2.25, 1.6, (64, 96))
 
 
+@pytest.mark.slow
 def test_sees_the_ego_lane_of_rendered_drives(segmenter):
     """Six clear drives, one frame each: most of both boundaries of the ego lane is found."""
     height, width = segmenter.image_size
