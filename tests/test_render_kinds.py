@@ -8,21 +8,23 @@ import pytest
 import torch
 
 from lanebev.render import RenderedFrame, render_views
-from lanebev.render.raster.glyphs import AHEAD, CROSS, GLYPH_LENGTH, LEFT, NUM_GLYPHS, RIGHT, glyph_coverage
-from lanebev.render.raster.lens import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
+from lanebev.render.raster.glyphs import GLYPH_LENGTH, glyph_coverage
 from lanebev.render.raster.night import lamp_light, low_beam
+from lanebev.render.raster.rays import View
 from lanebev.render.raster.street import roadside
 from lanebev.render.raster.tunnel import add_ceiling
 from lanebev.render.raster.winter import snow_cover
 from lanebev.render.scene.alignment import arc_nodes, build_alignment
+from lanebev.render.scene.camera import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
 from lanebev.render.scene.glass import sample_glass
+from lanebev.render.scene.glyphs import AHEAD, CROSS, LEFT, NUM_GLYPHS, RIGHT
 from lanebev.render.scene.kinds import KINDS, sample_kinds
 from lanebev.render.scene.layout import presence
 from lanebev.render.scene.night import sample_lights
 from lanebev.render.scene.sampler import Dice
 from lanebev.render.scene.street import PLAIN, no_street
-from lanebev.render.scene.world import Place, World, sample_course, sample_world
-from lanebev.render.views import render_place, sample_place
+from lanebev.render.scene.world import Place, World, sample_course, sample_world, scene_at
+from lanebev.render.views import render_scenes, sample_place
 from lanebev.types import Extrinsics
 
 SIZE = (48, 96)
@@ -44,9 +46,8 @@ def seen(kind: str, seed: int, **without: Any) -> RenderedFrame:
         intrinsics, sample_distortion(dice, intrinsics, SIZE, "pinhole"), "pinhole", sample_extrinsics(dice)
     )
     world = world._replace(**without)
-    return render_place(
-        world, place, alignment, lens, SIZE, torch.Generator().manual_seed(1), kind != "camera"
-    )
+    scene = scene_at(world, place, alignment, lens)
+    return render_scenes(scene, SIZE, [1, 2, 3], ideal_sensor=kind != "camera")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -258,7 +259,8 @@ def test_a_tunnels_lamp_is_seen_where_it_hangs() -> None:
     straight = torch.zeros(1, len(arc_nodes()), dtype=torch.float64)
     intrinsics = torch.tensor([[[1e4, 0, 0], [0, 1e4, 0], [0, 0, 1]]])
     lens = Lens(intrinsics, torch.zeros(1, 5), "pinhole", Extrinsics(zero, zero, zero, 1.5 * one))
-    rays = torch.tensor([[[[0.0, 0.0, 0.3]], [[0.4, 0.2, 0.4]]]])  # lamp at 10 m; none at 20 m; 3 m aside
+    ray_x, ray_y = torch.tensor([[0.0, 0.0, 0.3]]), -torch.tensor([[0.4, 0.2, 0.4]])
+    rays = View((1, 3), ray_x, ray_y, torch.zeros(4, 1, 3))  # lamp at 10 m; none at 20 m; 3 m aside
     dark, free = torch.zeros(1, 3, 1, 3), torch.full((1, 1, 3), float("inf"))
     course = build_alignment(straight, straight)
     ceiling = add_ceiling(dark, free, tunnel, place, course, lens, rays)[0, 0, 0]

@@ -7,30 +7,22 @@ import math
 import pytest
 import torch
 
-from lanebev.render.raster.lens import (
-    Lens,
-    pixel_rays,
-    sample_distortion,
-    sample_extrinsics,
-    sample_intrinsics,
-)
+from lanebev.render.raster.features import features_of
 from lanebev.render.raster.paint import paint_view
-from lanebev.render.raster.photometry import light_of
-from lanebev.render.scene.alignment import (
-    build_alignment,
-)
-from lanebev.render.scene.sampler import Dice, row_of
-from lanebev.render.scene.traffic import place_solids
-from lanebev.render.scene.world import World, sample_course, sample_world
+from lanebev.render.raster.rays import pixel_rays
+from lanebev.render.scene.alignment import build_alignment
+from lanebev.render.scene.camera import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
+from lanebev.render.scene.sampler import BatchSampler
+from lanebev.render.scene.world import World, sample_course, sample_world, scene_at
 from lanebev.render.truth import boundary_points, project
 from lanebev.render.views import sample_place
 
 SIZE = (360, 640)
 
 
-def bare_world(dice: Dice) -> tuple[World, torch.Tensor]:
+def bare_world(sampler: BatchSampler) -> tuple[World, torch.Tensor]:
     """Solid white single stripes on an even black road, nothing else, in even light."""
-    world, ego_lane = sample_world(dice, "highway")
+    world, ego_lane = sample_world(sampler, "highway")
     layout, pavement = world.layout, world.pavement
     zero, solid = torch.zeros_like(layout.opacity), torch.full_like(layout.dash, 10.0)
     layout = layout._replace(
@@ -78,30 +70,25 @@ def bare_world(dice: Dice) -> tuple[World, torch.Tensor]:
 def test_points_lie_on_the_centre_of_the_painted_stripe(model: str, seed: int) -> None:
     """The stripe's centroid across the boundary, measured in the radiance, is the point, to 0.05 px."""
     batch = 4
-    dice = Dice(batch, torch.Generator().manual_seed(seed))
-    world, ego_lane = bare_world(dice)
-    world, place = sample_place(dice, world, ego_lane)
-    alignment = build_alignment(*sample_course(dice))
-    intrinsics = sample_intrinsics(dice, SIZE)
-    lens = Lens(intrinsics, sample_distortion(dice, intrinsics, SIZE, model), model, sample_extrinsics(dice))
-    rays, steps = pixel_rays(lens, SIZE)
-    light = light_of(world.weather, place.heading)
-    solids = place_solids(world.traffic, alignment, place.along, place.across)
+    sampler = BatchSampler(batch, torch.Generator().manual_seed(seed))
+    world, ego_lane = bare_world(sampler)
+    world, place = sample_place(sampler, world, ego_lane)
+    alignment = build_alignment(*sample_course(sampler))
+    intrinsics = sample_intrinsics(sampler, SIZE)
+    lens = Lens(
+        intrinsics, sample_distortion(sampler, intrinsics, SIZE, model), model, sample_extrinsics(sampler)
+    )
+    scene = scene_at(world, place, alignment, lens)
     points, marked, hidden = boundary_points(world.layout, place, alignment, lens, torch.full((batch,), 3.0))
     _, taken, inside = project(points.flatten(1, 2), lens, SIZE)
     shape = marked.shape
     taken, usable = taken.unflatten(1, shape[1:]), inside.reshape(shape) & (marked > 0) & ~hidden
     usable &= points[..., 2] < 80.0  # beyond, a pixel is longer than what the chord of three points follows
 
+    painted = paint_view(scene, pixel_rays(lens, SIZE), features_of(scene))
     errors = []
     for b in range(batch):
-        cut = slice(b, b + 1)
-        one = Lens(intrinsics[cut], lens.distortion[cut], model, row_of(lens.extrinsics, b))
-        painted = paint_view(
-            row_of(world, b), row_of(place, b), row_of(alignment, b), one, row_of(solids, b),
-            row_of(light, b), rays[cut], steps[cut],
-        )  # fmt: skip
-        errors += _centroid_errors(painted.radiance[0, 1], taken[b], usable[b])
+        errors += _centroid_errors(painted.radiance[b, 1], taken[b], usable[b])
     assert len(errors) > 150
     worst = torch.tensor(errors).abs()
     assert worst.median() < 0.01

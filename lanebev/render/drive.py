@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from lanebev.camera.model import Camera
 from lanebev.render.frame import RenderedFrame
-from lanebev.render.raster.lens import Lens
-from lanebev.render.raster.photometry import CLEAR
 from lanebev.render.scene.alignment import Alignment, arc_nodes, build_alignment
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.camera import Lens
+from lanebev.render.scene.sampler import BatchSampler, concatenate_rows
 from lanebev.render.scene.traffic import NUM_VEHICLES
-from lanebev.render.scene.world import Place, World, sample_world
-from lanebev.render.views import render_place
+from lanebev.render.scene.weather import CLEAR
+from lanebev.render.scene.world import Place, Scene, World, sample_world, scene_at
+from lanebev.render.views import render_scenes
 from lanebev.types import Extrinsics
 
 _SCENERY_PERIOD = 450.0  # m; bridges, signs and lamps come again
@@ -29,15 +30,17 @@ class SmoothNoise:
     """A sum of sinusoids: a repeatable, band-limited signal at any time.
 
     Args:
-        dice: the randomness, one row.
+        sampler: the randomness, one row.
         amplitude: about the largest value.
         low: Hz, lowest frequency.
         high: Hz, highest frequency.
     """
 
-    def __init__(self, dice: Dice, amplitude: float, low: float, high: float, terms: int = 6) -> None:
-        self.rate = 2 * math.pi * low * (high / low) ** dice.uniform(0, 1, terms)[0].double()
-        self.phase = dice.uniform(0, 2 * math.pi, terms)[0].double()
+    def __init__(
+        self, sampler: BatchSampler, amplitude: float, low: float, high: float, terms: int = 6
+    ) -> None:
+        self.rate = 2 * math.pi * low * (high / low) ** sampler.uniform(0, 1, terms)[0].double()
+        self.phase = sampler.uniform(0, 2 * math.pi, terms)[0].double()
         weight = self.rate**-0.5
         self.weight = amplitude * weight / weight.norm() / math.sqrt(2)
 
@@ -100,26 +103,26 @@ class Drive:
         self.seed, self.speed, self.ideal_sensor = seed, speed, ideal_sensor
         self.camera = (camera or _default_camera(image_size)).to(dtype=torch.float32)
         self.times = torch.arange(num_frames, dtype=torch.float64) / fps
-        dice = Dice(1, torch.Generator().manual_seed(seed))
-        self.world, first_lane = _sample_drive_world(dice, weather, kind)
-        self.start = float(dice.uniform(0, 2000))
+        sampler = BatchSampler(1, torch.Generator().manual_seed(seed))
+        self.world, first_lane = _sample_drive_world(sampler, weather, kind)
+        self.start = float(sampler.uniform(0, 2000))
         duration = num_frames / fps
-        self._sample_course(dice, duration, curves, hills)
-        self._sample_lanes(dice, int(first_lane), duration, lane_changes)
-        self._sample_motion(dice, duration, motion, mount)
+        self._sample_course(sampler, duration, curves, hills)
+        self._sample_lanes(sampler, int(first_lane), duration, lane_changes)
+        self._sample_motion(sampler, duration, motion, mount)
         self.world = self._without_collisions(self.world)
 
     def __len__(self) -> int:
         return len(self.times)
 
-    def _sample_course(self, dice: Dice, duration: float, curves: float, hills: float) -> None:
+    def _sample_course(self, sampler: BatchSampler, duration: float, curves: float, hills: float) -> None:
         count = int((duration * self.speed + 2600) / 90) + 3
-        value = dice.uniform(-1, 1, count)[0].double() * dice.chance(0.65, count)[0]
-        value[: 1 + int(dice.uniform(1, 4))] = 0.0  # the first hundreds of metres are straight
+        value = sampler.uniform(-1, 1, count)[0].double() * sampler.chance(0.65, count)[0]
+        value[: 1 + int(sampler.uniform(1, 4))] = 0.0  # the first hundreds of metres are straight
         self._curvature = value * curves / 300.0
-        self._wave = 2 * math.pi / dice.uniform(250, 700, 3)[0].double()
-        self._wave_phase = dice.uniform(0, 2 * math.pi, 3)[0].double()
-        self._wave_bend = hills * dice.uniform(0, 1, 3)[0].double() / 9000.0
+        self._wave = 2 * math.pi / sampler.uniform(250, 700, 3)[0].double()
+        self._wave_phase = sampler.uniform(0, 2 * math.pi, 3)[0].double()
+        self._wave_bend = hills * sampler.uniform(0, 1, 3)[0].double() / 9000.0
 
     def curvature_at(self, arc: Tensor) -> Tensor:
         """Curvature of the road, 1/m, at arc lengths from the drive's start, m: linear between nodes."""
@@ -140,17 +143,17 @@ class Drive:
         tangent = angle.sin() + self._wave * angle.cos() * ahead[..., None]
         return (amplitude * (there - tangent)).sum(-1)
 
-    def _sample_lanes(self, dice: Dice, first: int, duration: float, lane_changes: bool) -> None:
+    def _sample_lanes(self, sampler: BatchSampler, first: int, duration: float, lane_changes: bool) -> None:
         """Lane changes as (start time, from lane, to lane)."""
         lanes = int(self.world.layout.exists.sum()) - 1
         self._changes: list[tuple[float, int, int]] = []
         self._first_lane = lane = min(first, max(lanes - 1, 0))
-        time = float(dice.uniform(3.0, 7.0))
+        time = float(sampler.uniform(3.0, 7.0))
         while lane_changes and lanes > 1 and time + _LANE_CHANGE < duration:
-            step = 1 if bool(dice.chance(0.5)) else -1
+            step = 1 if bool(sampler.chance(0.5)) else -1
             target = lane + step if 0 <= lane + step < lanes else lane - step
             self._changes.append((time, lane, target))
-            lane, time = target, time + float(dice.uniform(7.0, 16.0))
+            lane, time = target, time + float(sampler.uniform(7.0, 16.0))
 
     def _lane_middle(self, lane: int) -> float:
         return float(self.world.layout.across[0, lane : lane + 2].mean())
@@ -170,21 +173,23 @@ class Drive:
         lane = int((layout.across[0] <= across).sum()) - 1
         return min(max(lane, 0), last)
 
-    def _sample_motion(self, dice: Dice, duration: float, motion: float, mount: Extrinsics | None) -> None:
+    def _sample_motion(
+        self, sampler: BatchSampler, duration: float, motion: float, mount: Extrinsics | None
+    ) -> None:
         degree = math.pi / 180 * motion
-        self._wander = SmoothNoise(dice, 0.25, 0.05, 0.25)
+        self._wander = SmoothNoise(sampler, 0.25, 0.05, 0.25)
         self._noises = (
-            SmoothNoise(dice, 0.45 * degree, 0.15, 2.0),  # pitch
-            SmoothNoise(dice, 0.15 * degree, 0.1, 0.8),  # yaw, beside that of the path
-            SmoothNoise(dice, 0.35 * degree, 0.1, 1.5),  # roll
-            SmoothNoise(dice, 0.015 * motion, 0.2, 2.0),  # height
+            SmoothNoise(sampler, 0.45 * degree, 0.15, 2.0),  # pitch
+            SmoothNoise(sampler, 0.15 * degree, 0.1, 0.8),  # yaw, beside that of the path
+            SmoothNoise(sampler, 0.35 * degree, 0.1, 1.5),  # roll
+            SmoothNoise(sampler, 0.015 * motion, 0.2, 2.0),  # height
         )
         bumps = max(1, int(duration / 6))
-        self._bump_times = dice.uniform(1.0, max(duration, 1.5), bumps)[0].double()
-        self._bump_sizes = dice.uniform(-1.0, 1.0, bumps)[0].double() * degree
+        self._bump_times = sampler.uniform(1.0, max(duration, 1.5), bumps)[0].double()
+        self._bump_sizes = sampler.uniform(-1.0, 1.0, bumps)[0].double() * degree
         if mount is None:
-            angles = dice.normal(1.0, 3)[0].clamp(-2, 2) * torch.tensor([1.5, 1.0, 0.6]) * (math.pi / 180)
-            self._mount = [*angles.tolist(), float(dice.uniform(1.25, 1.6))]
+            angles = sampler.normal(1.0, 3)[0].clamp(-2, 2) * torch.tensor([1.5, 1.0, 0.6]) * (math.pi / 180)
+            self._mount = [*angles.tolist(), float(sampler.uniform(1.25, 1.6))]
         else:
             self._mount = [float(value) for value in mount]
 
@@ -237,18 +242,11 @@ class Drive:
         ahead = arc_nodes()
         return build_alignment(self.curvature_at(ahead + arc)[None], self._elevation_about(arc, ahead)[None])
 
-    @torch.no_grad()
-    def frame(self, index: int) -> RenderedFrame:
-        """One frame with its truth, B = 1; frames can be asked for in any order.
-
-        Raises:
-            IndexError: there is no such frame.
-        """
+    def _scene_at(self, index: int) -> Scene:
         if not 0 <= index < len(self):
             raise IndexError(f"index: expected 0..{len(self) - 1}, got {index}")
         time = float(self.times[index])
         arc, across = self.speed * time, self._across(time)
-        world = self._world_at(arc, time)
         place = Place(
             along=torch.tensor([self.start + arc]),
             across=torch.tensor([across]),
@@ -257,10 +255,38 @@ class Drive:
         )
         camera = self.camera
         lens = Lens(camera.intrinsics[None], camera.distortion[None], camera.model, self.extrinsics_at(time))
-        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + index)
-        return render_place(
-            world, place, self.alignment_at(arc), lens, camera.image_size, generator, self.ideal_sensor
-        )
+        return scene_at(self._world_at(arc, time), place, self.alignment_at(arc), lens)
+
+    def frame(self, index: int, *, device: torch.device | str | None = None) -> RenderedFrame:
+        """Render one frame with its truth, B = 1; frames can be asked for in any order.
+
+        Args:
+            index: of the frame.
+            device: where to render, and where the result is; by default the CPU.
+
+        Raises:
+            IndexError: there is no such frame.
+        """
+        return self.frames([index], device=device)
+
+    @torch.no_grad()
+    def frames(
+        self, indices: Sequence[int], *, device: torch.device | str | None = None, rows: int | None = None
+    ) -> RenderedFrame:
+        """Render frames with their truth, B of them; each is the same whichever are asked for with it.
+
+        Args:
+            indices: of the frames, at least one.
+            device: where to render, and where the result is; by default the CPU.
+            rows: how many are rendered together, see :func:`~lanebev.render.views.render_scenes`.
+
+        Raises:
+            IndexError: there is no such frame.
+        """
+        scenes = concatenate_rows([self._scene_at(index) for index in indices])
+        seeds = [self.seed * 1_000_003 + index for index in indices]
+        size = self.camera.image_size
+        return render_scenes(scenes, size, seeds, device=device, rows=rows, ideal_sensor=self.ideal_sensor)
 
 
 def _default_camera(image_size: tuple[int, int]) -> Camera:
@@ -269,9 +295,9 @@ def _default_camera(image_size: tuple[int, int]) -> Camera:
     return Camera.from_parameters(focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
 
 
-def _sample_drive_world(dice: Dice, weather: str, kind: str) -> tuple[World, Tensor]:
+def _sample_drive_world(sampler: BatchSampler, weather: str, kind: str) -> tuple[World, Tensor]:
     """Any world, or the first on a clear day."""
     while True:
-        world, lane = sample_world(dice, kind)
+        world, lane = sample_world(sampler, kind)
         if weather == "any" or int(world.weather.kind) == CLEAR:
             return world, lane

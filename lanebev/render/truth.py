@@ -7,17 +7,17 @@ from torch import Tensor
 
 from lanebev.geometry.lens import denormalise_points, distort_points
 from lanebev.render.frame import RenderedFrame
-from lanebev.render.raster.lens import Lens
-from lanebev.render.raster.solids import Solids
+from lanebev.render.raster.constants import constant
 from lanebev.render.scene.alignment import Alignment, elevation_at, hidden_by_crest, local_from_road
+from lanebev.render.scene.camera import Lens
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout, labelled_slots, presence
 from lanebev.render.scene.traffic import NUM_ONCOMING, NUM_VEHICLES
-from lanebev.render.scene.world import Place
+from lanebev.render.scene.world import Place, Scene
 from lanebev.types import NUM_BOUNDARIES
 
 NUM_POINTS = 72
 FARTHEST = 150.0  # m
-_ROOM = 0.3  # m; nearer to a boundary than this does not hide it
+_SLACK = 0.3  # m; nearer to a boundary than this does not hide it
 
 
 def boundary_points(
@@ -37,7 +37,7 @@ def boundary_points(
         behind a crest.
     """
     slot, exists = labelled_slots(layout, place.ego_lane)
-    part = torch.linspace(0, 1, NUM_POINTS)
+    part = torch.linspace(0, 1, NUM_POINTS, device=nearest.device)
     z_centre = 1 / ((1 - part) / nearest[:, None] + part / FARTHEST)  # (B, P)
     z_centre = z_centre[:, None].expand(-1, NUM_BOUNDARIES, -1).flatten(1)
     across = (layout.across.gather(1, slot) - place.across[:, None]).where(exists, 0.0)
@@ -57,11 +57,11 @@ def project(points: Tensor, lens: Lens, size: tuple[int, int]) -> tuple[Tensor, 
     Returns:
         (B, N, 2) px undistorted, (B, N, 2) px as taken, (B, N) bool: inside the image.
     """
-    camera = points @ lens.road_from_cam()
+    camera = lens.in_camera(points)
     depth = camera[..., 2:]
     front = depth[..., 0] > 0.05
     ideal = denormalise_points(camera[..., :2] / depth.clamp(min=0.05), lens.intrinsics)
-    limit = ideal.new_tensor([size[1], size[0]])
+    limit = constant(ideal.device, size[1], size[0])
     near = ((ideal > -0.6 * limit) & (ideal < 1.6 * limit)).all(-1)
     tame = torch.where(near[..., None], ideal, 0.5 * limit)
     taken = distort_points(tame, lens.intrinsics, lens.distortion, lens.model)
@@ -69,54 +69,47 @@ def project(points: Tensor, lens: Lens, size: tuple[int, int]) -> tuple[Tensor, 
     return ideal.clamp(-1e5, 1e5), taken, front & near & inside
 
 
-def frame_truth(
-    image: Tensor,
-    blocked: Tensor,
-    layout: Layout,
-    place: Place,
-    alignment: Alignment,
-    lens: Lens,
-    solids: Solids,
-    nearest: Tensor,
-) -> RenderedFrame:
-    """The image with its truth.
+def frame_truth(image: Tensor, blocked: Tensor, scene: Scene, nearest: Tensor) -> RenderedFrame:
+    """Images with what is true of them.
 
     Args:
         image: (B, 3, H, W).
         blocked: (B, H, W) m, Z of the nearest thing that is not the road.
-        layout: of the road.
-        place: of the camera.
-        alignment: seen from there.
-        lens: the cameras.
-        solids: in the local road frame.
+        scene: B of them.
         nearest: (B,) m, Z of the first boundary point.
     """
+    layout, place, alignment, lens = scene.world.layout, scene.place, scene.alignment, scene.lens
+    objects = scene.objects
     size = (image.shape[2], image.shape[3])
     points, marked, hidden = boundary_points(layout, place, alignment, lens, nearest)
     ideal, taken, inside = project(points.flatten(1, 2), lens, size)
     pixel = taken.round().long()
     flat = pixel[..., 1].clamp(0, size[0] - 1) * size[1] + pixel[..., 0].clamp(0, size[1] - 1)
-    clear = blocked.flatten(1).gather(1, flat) > points[..., 2].flatten(1) - _ROOM
+    clear = blocked.flatten(1).gather(1, flat) > points[..., 2].flatten(1) - _SLACK
     shape = marked.shape
     painted = marked * inside.reshape(shape)
     visible = painted * clear.reshape(shape) * ~hidden
 
-    slot = place.ego_lane[:, None] + torch.arange(NUM_BOUNDARIES - 1) - (NUM_BOUNDARIES // 2 - 1)
+    slot = (
+        place.ego_lane[:, None]
+        + torch.arange(NUM_BOUNDARIES - 1, device=image.device)
+        - (NUM_BOUNDARIES // 2 - 1)
+    )
     here = slot.clamp(0, MAX_BOUNDARIES - 2)
     widths = layout.across.diff(dim=1).gather(1, here)
     real = (slot == here) & layout.exists.gather(1, here + 1)
     middle = 0.5 * sum(layout.across.gather(1, (place.ego_lane + i)[:, None])[:, 0] for i in (0, 1))
 
     vehicles = slice(0, NUM_VEHICLES + NUM_ONCOMING)
-    body = solids.shape[:, vehicles]
+    body = objects.shape[:, vehicles]
     rear = torch.minimum(body[..., 0, 2], body[..., 1, 2])
     front = torch.maximum(body[..., 0, 3], body[..., 1, 3])
-    heading = solids.heading[:, vehicles]
+    heading = objects.heading[:, vehicles]
     shift = 0.5 * (rear + front)  # from the vehicle's origin to the middle of its outline
     boxes = torch.stack(
         [
-            solids.x[:, vehicles] + shift * heading.sin(),
-            solids.z[:, vehicles] + shift * heading.cos(),
+            objects.x[:, vehicles] + shift * heading.sin(),
+            objects.z[:, vehicles] + shift * heading.cos(),
             front - rear,
             2 * body[..., :2].amax((-1, -2)),
             heading,
@@ -137,5 +130,5 @@ def frame_truth(
         offset=place.across - middle,
         curvature=torch.stack([curvature, change], dim=1),
         boxes=boxes,
-        box_valid=solids.valid[:, vehicles],
+        box_valid=objects.valid[:, vehicles],
     )

@@ -7,23 +7,15 @@ import math
 import torch
 from torch import Tensor
 
+from lanebev.geometry.precision import autocast_off
 from lanebev.render.frame import RenderedFrame
-from lanebev.render.raster.effects import rain
-from lanebev.render.raster.glass import behind_glass, recorded
-from lanebev.render.raster.lens import (
-    Lens,
-    pixel_rays,
-    sample_distortion,
-    sample_extrinsics,
-    sample_intrinsics,
-)
-from lanebev.render.raster.night import add_lights, night_light, sprites
+from lanebev.render.raster.features import features_of
 from lanebev.render.raster.paint import paint_view
-from lanebev.render.raster.photometry import add_bonnet, add_noise, blur, compress, expose, light_of
-from lanebev.render.raster.tunnel import add_ceiling, tunnel_light
-from lanebev.render.scene.alignment import Alignment, build_alignment
-from lanebev.render.scene.sampler import Dice, map_tensors, row_of
-from lanebev.render.scene.traffic import place_solids
+from lanebev.render.raster.rays import pixel_rays
+from lanebev.render.raster.sensor import take_image
+from lanebev.render.scene.alignment import build_alignment
+from lanebev.render.scene.camera import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
+from lanebev.render.scene.sampler import BatchSampler, concatenate_rows, map_tensors, select_rows
 from lanebev.render.scene.varied import varied_extrinsics, varied_intrinsics
 from lanebev.render.scene.window import (
     WindowConfig,
@@ -31,89 +23,68 @@ from lanebev.render.scene.window import (
     vanishing_pixel,
     window_from_native,
 )
-from lanebev.render.scene.world import Place, World, moved_along, sample_course, sample_world
+from lanebev.render.scene.world import (
+    Place,
+    Scene,
+    World,
+    moved_along,
+    sample_course,
+    sample_world,
+    scene_at,
+)
 from lanebev.render.truth import frame_truth
 
+_ROWS_ON_CPU, _ROWS_ELSEWHERE = 1, 64  # scenes rendered together: on a processor, what its cache holds
 
-def render_place(
-    world: World,
-    place: Place,
-    alignment: Alignment,
-    lens: Lens,
+
+def render_scenes(
+    host: Scene,
     size: tuple[int, int],
-    generator: torch.Generator,
+    seeds: list[int],
+    *,
+    device: torch.device | str | None = None,
+    rows: int | None = None,
     ideal_sensor: bool = False,
 ) -> RenderedFrame:
-    """Cameras at places in worlds.
+    """Render scenes, and state what is true of the images.
 
     Args:
-        world: B of them.
-        place: of the cameras.
-        alignment: the road's course, seen from there.
-        lens: the cameras.
+        host: B scenes on the CPU.
         size: image (height, width).
-        generator: of the sensor's noise.
-        ideal_sensor: leave out blur, noise and compression.
+        seeds: B of them, of each image's rain and noise.
+        device: where to render, by default the CPU.
+        rows: how many scenes are rendered together; by default 1 on a CPU, whose cache then holds them, and
+            64 elsewhere.
+        ideal_sensor: leave out rain, blur, noise and compression.
     """
-    solids = place_solids(world.traffic, alignment, place.along, place.across)
-    light = night_light(light_of(world.weather, place.heading), world.lights)
-    light = tunnel_light(light, world.tunnel)
-    rays, steps = pixel_rays(lens, size)
-    images, covers, nearest = [], [], []
-    for b in range(len(place.along)):  # one scene at a time: see paint_view
-        one, sensor, lamp = row_of(world, b), row_of(world.sensor, b), row_of(light, b)
-        cut = slice(b, b + 1)
-        lens_b = Lens(lens.intrinsics[cut], lens.distortion[cut], lens.model, row_of(lens.extrinsics, b))
-        painted = paint_view(
-            one,
-            row_of(place, b),
-            row_of(alignment, b),
-            lens_b,
-            row_of(solids, b),
-            lamp,
-            rays[cut],
-            steps[cut],
-        )
-        if bool(one.tunnel.on > 0):
-            course = (row_of(place, b), row_of(alignment, b), lens_b, rays[cut])
-            painted = painted._replace(
-                radiance=add_ceiling(painted.radiance, painted.blocked, one.tunnel, *course)
-            )
-        if bool(one.lights.on > 0):
-            lights = sprites(one.lights, row_of(place, b), row_of(alignment, b), lens_b, row_of(solids, b))
-            lit = add_lights(painted.radiance, painted.blocked, one.lights, lights, lens_b, rays[cut])
-            painted = painted._replace(radiance=lit)
-        if bool(sensor.bonnet > 0):
-            add_bonnet(painted.radiance, painted.blocked, sensor, lamp, one.surroundings.skyline)
-        image = expose(painted.radiance, sensor, painted.road_level)
-        if not ideal_sensor:
-            if bool(one.weather.wet > 0):
-                image = rain(image, float(one.weather.wet), generator)
-            changed = bool((one.kinds.camera | one.kinds.night).any())
-            image = behind_glass(image, one.glass) if changed else image
-            image = blur(image, float(sensor.blur) * size[1] / 640)
-            image = add_noise(image, sensor, generator)
-            image = compress(recorded(image, one.glass) if changed else image, sensor.jpeg)
-        images.append(image)
-        covers.append(painted.blocked)
-        nearest.append(painted.nearest)
-    image, blocked = torch.cat(images), torch.cat(covers)
-    return frame_truth(image, blocked, world.layout, place, alignment, lens, solids, torch.cat(nearest))
+    where = torch.device(device or "cpu")
+    rows = rows or (_ROWS_ON_CPU if where.type == "cpu" else _ROWS_ELSEWHERE)
+    frames = []
+    with autocast_off(where):
+        for start in range(0, len(host.place.along), rows):
+            part = select_rows(host, slice(start, start + rows))
+            scene = map_tensors(lambda tensor: tensor.to(where, non_blocking=True), part)
+            features = features_of(part)
+            generators = [torch.Generator(where).manual_seed(seed) for seed in seeds[start : start + rows]]
+            painted = paint_view(scene, pixel_rays(scene.lens, size, features.distorted), features)
+            image = take_image(painted, scene, part, features.rows.glass, generators, ideal_sensor)
+            frames.append(frame_truth(image, painted.blocked, scene, painted.nearest))
+    return frames[0] if len(frames) == 1 else concatenate_rows(frames)
 
 
-def sample_place(dice: Dice, world: World, ego_lane: Tensor) -> tuple[World, Place]:
+def sample_place(sampler: BatchSampler, world: World, ego_lane: Tensor) -> tuple[World, Place]:
     """Random places in the ego lane, at times close to its border or over it, and the worlds about them."""
     across = world.layout.across
     left, right = (across.gather(1, ego_lane[:, None] + i)[:, 0] for i in (0, 1))
-    start = dice.uniform(0, 3000)  # elsewhere in the endless textures
-    changing = dice.chance(0.15)
-    centred = dice.normal(0.25).clamp(-0.8, 0.8)
-    anywhere = dice.uniform(-0.5, 0.5) * (right - left)
+    start = sampler.uniform(0, 3000)  # elsewhere in the endless textures
+    changing = sampler.chance(0.15)
+    centred = sampler.normal(0.25).clamp(-0.8, 0.8)
+    anywhere = sampler.uniform(-0.5, 0.5) * (right - left)
     place = Place(
         along=start,
         across=0.5 * (left + right) + torch.where(changing, anywhere, centred),
         ego_lane=ego_lane,
-        heading=dice.uniform(-math.pi, math.pi),
+        heading=sampler.uniform(-math.pi, math.pi),
     )
     return moved_along(world, start), place
 
@@ -129,19 +100,24 @@ def render_views(
     model: str = "pinhole",
     kind: str = "any",
     ideal_sensor: bool = False,
+    rows: int | None = None,
 ) -> RenderedFrame:
     """Random scenes, poses, lenses and weather, one image each.
+
+    The same state of the generator gives the same scenes on every device, and on one device the same images
+    bit for bit. What a row shows depends on the batch size, since all rows draw from one generator.
 
     Args:
         batch_size: B.
         image_size: (H, W).
-        generator: the only source of randomness.
+        generator: the only source of randomness, of any device.
         device: where to render, and where the result is; by default the CPU.
         window: render windows about the horizon of images with more pixels; by default whole images. The
             intrinsics are then those of the window; a lens's distortion is the same on the z = 1 plane.
         model: "pinhole" (Brown-Conrady, D = 5) or "fisheye" (Kannala-Brandt, D = 4) lenses.
         kind: what the worlds show, one of :data:`~lanebev.render.scene.kinds.KINDS`.
-        ideal_sensor: leave out blur, noise and compression.
+        ideal_sensor: leave out rain, blur, noise and compression.
+        rows: how many scenes are rendered together, see :func:`render_scenes`.
 
     Raises:
         ValueError: no images asked for, an image smaller than 16 px, an unknown lens model or kind.
@@ -150,22 +126,38 @@ def render_views(
         raise ValueError(
             f"expected batch_size >= 1 and image_size >= (16, 16), got {batch_size} and {tuple(image_size)}"
         )
-    dice = Dice(batch_size, generator)
-    world, ego_lane = sample_world(dice, kind)
-    world, place = sample_place(dice, world, ego_lane)
-    alignment = build_alignment(*sample_course(dice))
-    intrinsics = varied_intrinsics(dice, world.kinds.camera, sample_intrinsics(dice, image_size), image_size)
-    distortion = sample_distortion(dice, intrinsics, image_size, model)
-    pose = varied_extrinsics(dice, world.kinds.camera, sample_extrinsics(dice))
+    sampler = BatchSampler(batch_size, _on_cpu(generator))
+    world, ego_lane = sample_world(sampler, kind)
+    world, place = sample_place(sampler, world, ego_lane)
+    alignment = build_alignment(*sample_course(sampler))
+    faulty = world.kinds.camera
+    intrinsics = sample_intrinsics(sampler, image_size)
+    intrinsics = varied_intrinsics(sampler, faulty, intrinsics, image_size)
+    distortion = sample_distortion(sampler, intrinsics, image_size, model)
+    pose = varied_extrinsics(sampler, faulty, sample_extrinsics(sampler))
     lens = Lens(intrinsics, distortion, model, pose)
     if window is not None:
-        scale = sample_window_scale(dice, window)
-        horizon = vanishing_pixel(intrinsics, distortion, model, lens.extrinsics)
-        matrix = window_from_native(dice, window, scale, image_size, horizon)
-        lens = lens._replace(intrinsics=matrix @ intrinsics)
-        zoom = scale.clamp(max=1.0) ** -dice.uniform(
-            0.0, 1.0
-        )  # from a native image of more, or as few, pixels
-        world = world._replace(sensor=world.sensor._replace(blur=world.sensor.blur * zoom))
-    frame = render_place(world, place, alignment, lens, image_size, generator, ideal_sensor)
-    return map_tensors(lambda tensor: tensor.to(device), frame)
+        world, lens = _through_window(sampler, window, image_size, world, lens)
+    scene = scene_at(world, place, alignment, lens)
+    seeds: list[int] = torch.randint(2**62, (batch_size,), generator=sampler.generator).tolist()
+    return render_scenes(scene, image_size, seeds, device=device, rows=rows, ideal_sensor=ideal_sensor)
+
+
+def _through_window(
+    sampler: BatchSampler, config: WindowConfig, size: tuple[int, int], world: World, lens: Lens
+) -> tuple[World, Lens]:
+    """Look through windows: other intrinsics, and blur that is as much larger as the native pixels are."""
+    scale = sample_window_scale(sampler, config)
+    horizon = vanishing_pixel(lens.intrinsics, lens.distortion, lens.model, lens.extrinsics)
+    matrix = window_from_native(sampler, config, scale, size, horizon)
+    zoom = scale.clamp(max=1.0) ** -sampler.uniform(0.0, 1.0)  # of native images with more, or as few, pixels
+    sensor = world.sensor._replace(blur=world.sensor.blur * zoom)
+    return world._replace(sensor=sensor), lens._replace(intrinsics=matrix @ lens.intrinsics)
+
+
+def _on_cpu(generator: torch.Generator) -> torch.Generator:
+    """The generator itself, or one of the CPU with a seed drawn from one of another device."""
+    if generator.device.type == "cpu":
+        return generator
+    seed = torch.randint(2**62, (), generator=generator, device=generator.device)
+    return torch.Generator().manual_seed(int(seed))

@@ -1,61 +1,100 @@
-"""What lies between the scene and the sensor: bloom of bright light, rain in the air, drops on the glass."""
+"""What lies between the scene and the sensor: the own bonnet, rain in the air, drops on the glass."""
 
 from __future__ import annotations
 
-import cv2
-import numpy as np
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
-_BLOOM_SCALE = 8
+from lanebev.render.raster.filters import gaussian_blur
+from lanebev.render.raster.noise import CLOUD, sample_noise
+from lanebev.render.raster.randomness import uniform_rows
+from lanebev.render.raster.select import choose
+from lanebev.render.scene.sensor import Sensor
+from lanebev.render.scene.weather import Light
+
+_MOST_DROPS = 18
 
 
-def bloom(radiance: Tensor, white: float, strength: float) -> Tensor:
-    """Light that spills from what is brighter than white.
-
-    Args:
-        radiance: (1, 3, H, W) linear.
-        white: radiance that saturates the sensor.
-        strength: share of the excess that is spread.
-    """
-    _, _, height, width = radiance.shape
-    excess = (radiance[0] - white).clamp(0, 6 * white)
-    if strength <= 0 or not bool((excess > 0).any()):
-        return radiance
-    pixels = excess.permute(1, 2, 0).contiguous().numpy()
-    small = cv2.resize(pixels, (width // _BLOOM_SCALE, height // _BLOOM_SCALE), interpolation=cv2.INTER_AREA)
-    spread = cv2.GaussianBlur(small, (0, 0), 2.0) + 0.6 * cv2.GaussianBlur(
-        small, (0, 0), 0.06 * small.shape[1]
-    )
-    veil = torch.from_numpy(cv2.resize(spread, (width, height), interpolation=cv2.INTER_LINEAR))
-    return radiance + strength * veil.permute(2, 0, 1)
-
-
-def rain(image: Tensor, wet: float, generator: torch.Generator) -> Tensor:
-    """Streaks of falling rain, and drops on the windscreen that show a small blurred piece of the image.
+def add_bonnet(
+    radiance: Tensor, blocked: Tensor, rows: Tensor, tallest: float, sensor: Sensor, light: Light, sky: Tensor
+) -> None:
+    """Paint own vehicles' bonnets at the bottom of images; changes radiance and blocked.
 
     Args:
-        image: (1, 3, H, W) display values.
-        wet: in (0, 1].
-        generator: the randomness.
+        radiance: (B, 3, H, W).
+        blocked: (B, H, W) m.
+        rows: (R,) int64, which have a bonnet.
+        tallest: the largest share of the image's height of any of them.
+        sensor: R of them.
+        light: R rows, falls on the bonnets.
+        sky: (R, 3) radiance that they reflect.
     """
-    _, _, height, width = image.shape
-    pixels = image[0].permute(1, 2, 0).contiguous().numpy()
-    grain = (torch.rand(height, width, generator=generator) > 0.997).float().numpy()
+    height, width = radiance.shape[2:]
+    top = int(height * (1 - tallest)) - 1
+    y = torch.arange(top, height, device=radiance.device)[:, None] / height
+    x = (torch.arange(width, device=radiance.device) + 0.5) / width - 0.5
+    share = sensor.bonnet[:, None, None]
+    edge = 1 - share + 4 * sensor.bonnet_bow[:, None, None] * x * x  # (R, 1, W)
+    alpha = ((y - edge) * height + 0.5).clamp(0, 1)
+    below = ((y - edge) / share.clamp(min=0.02)).clamp(0, 1)
+    gloss = (0.30 - 0.22 * below + 0.05 * sample_noise(CLOUD, x * 0.5, 0.2 * y)).clamp(0.02)
+    colour = (sensor.bonnet_colour * (light.ambient + 0.6 * light.direct + 0.02))[..., None, None]
+    paint = colour * (1.1 - 0.3 * below)[:, None] + gloss[:, None] * sky[..., None, None]
+    under = radiance[:, :, top:].index_select(0, rows)
+    radiance[:, :, top:].index_copy_(0, rows, under + (paint - under) * alpha[:, None])
+    hidden = blocked[:, top:].index_select(0, rows).masked_fill(alpha > 0.5, 0.0)
+    blocked[:, top:].index_copy_(0, rows, hidden)
+
+
+def rain(image: Tensor, wet: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
+    """Draw streaks of falling rain, and drops on the windscreen that show a small blurred piece of the image.
+
+    Args:
+        image: (R, 3, H, W) display values.
+        wet: (R,) in (0, 1].
+        generators: R of them, on the images' device.
+    """
+    batch, _, height, width = image.shape
+    grain = uniform_rows((1, height, width), generators) > 0.997
+    lean = uniform_rows((), generators) * 0.4 - 0.2
+    falling = _streaks(grain.float(), lean) * (0.9 * wet)[:, None, None, None]
+    image = image + falling * (0.9 - image)
+
+    wide = 0.012 * width
+    blurred = gaussian_blur(image, image.new_full((batch,), wide), wide)
+    mask = _drops(wet, uniform_rows((_MOST_DROPS, 3), generators), (height, width))
+    narrow = 0.0025 * width
+    mask = gaussian_blur(mask[:, None], image.new_full((batch,), narrow), narrow)
+    shifted = blurred.roll(-(height // 12), dims=2) * 1.05
+    return (image + mask * (shifted - image) * 0.8).clamp(0, 1)
+
+
+def _streaks(grain: Tensor, lean: Tensor) -> Tensor:
+    """(R, 1, H, W) grains drawn out along lines that lean by (R,) px to the right per px down."""
+    height, width = grain.shape[2:]
     length = max(3, height // 18)
-    kernel = np.zeros((length, length), np.float32)
-    lean = int(torch.randint(-length // 5, length // 5 + 1, (1,), generator=generator))
-    cv2.line(kernel, (length // 2 - lean, 0), (length // 2 + lean, length - 1), 1.0)
-    streaks = cv2.filter2D(grain, -1, kernel / kernel.sum()) * 0.9 * wet
-    pixels = pixels + streaks[..., None] * (0.9 - pixels)
+    total = torch.zeros_like(grain)
+    column = torch.arange(width, device=grain.device)
+    for k in range(length):
+        down = k - length // 2
+        source = (column - (lean * down).round()[:, None].long()).clamp(0, width - 1)
+        total += grain.roll(down, dims=2).gather(3, source[:, None, None].expand_as(grain))
+    return total / length
 
-    blurred = cv2.GaussianBlur(pixels, (0, 0), 0.012 * width)
-    mask = np.zeros((height, width), np.float32)
-    for x, y, size in torch.rand(int(4 + 14 * wet), 3, generator=generator).tolist():
-        radius = (0.004 + 0.014 * size * size) * width
-        axes = (max(1, int(radius)), max(1, int(radius * (0.9 + 0.5 * size))))
-        cv2.ellipse(mask, (int(x * width), int(y * height)), axes, 0, 0, 360, 1.0, -1)
-    mask = cv2.GaussianBlur(mask, (0, 0), 0.0025 * width)[..., None]
-    shifted = np.roll(blurred, -height // 12, axis=0) * 1.05
-    pixels = pixels + mask * (shifted - pixels) * 0.8
-    return torch.from_numpy(pixels.clip(0, 1)).permute(2, 0, 1)[None]
+
+def _drops(wet: Tensor, draw: Tensor, size: tuple[int, int]) -> Tensor:
+    """(R, H, W) 1 on drops, 4 to 18 of them, of random places and sizes (R, 18, 3)."""
+    height, width = size
+    y = torch.arange(height, device=wet.device)[:, None]
+    x = torch.arange(width, device=wet.device)
+    nearest = torch.full((len(wet), height, width), 2.0, device=wet.device)
+    for number in range(_MOST_DROPS):
+        place_x, place_y, large = (v[:, None, None] for v in draw[:, number].unbind(1))
+        radius = (0.004 + 0.014 * large * large) * width
+        across = (x - place_x * width) / radius.clamp(min=1.0)
+        down = (y - place_y * height) / (radius * (0.9 + 0.5 * large)).clamp(min=1.0)
+        there = (number < 4 + 14 * wet)[:, None, None]
+        nearest = torch.minimum(nearest, choose(there, across * across + down * down, 2.0))
+    return (nearest < 1).float()

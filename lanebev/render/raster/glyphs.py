@@ -10,15 +10,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from lanebev.render.scene.glyphs import TEXTS
+
 GLYPH_LENGTH, GLYPH_WIDTH = 5.0, 2.0  # m of a picture along and across the road
 _ROWS, _COLUMNS, _FINE = 200, 80, 4  # texels of 2.5 cm, drawn four times finer
-
-AHEAD, AHEAD_SLIM, LEFT, RIGHT, AHEAD_LEFT, AHEAD_RIGHT, LEFT_RIGHT, MERGE_LEFT, MERGE_RIGHT = range(9)
-ARROWS = (AHEAD, AHEAD_SLIM, LEFT, RIGHT, AHEAD_LEFT, AHEAD_RIGHT, LEFT_RIGHT, MERGE_LEFT, MERGE_RIGHT)
-TEETH, BICYCLE, DIAMOND, CROSS = range(9, 13)
-_TEXTS = ("BUS", "30", "50", "STOP", "SLOW", "P", "TAXI", "SCHOOL")
-WORDS = tuple(range(13, 13 + len(_TEXTS)))
-NUM_GLYPHS = 13 + len(_TEXTS)
 
 Picture = npt.NDArray[np.uint8]
 Outline = list[tuple[float, float]]
@@ -105,7 +100,7 @@ def _pictures() -> list[Picture]:
         _stroked(bicycle, 14, [(-0.45, 0.9, 0.3, 0.75), (0.45, 0.9, 0.3, 0.75)]),
         _stroked(diamond, 20, []),
         _stroked([*cross, *rim], 18, []),
-        *(_written(text) for text in _TEXTS),
+        *(_written(text) for text in TEXTS),
     ]
 
 

@@ -1,137 +1,191 @@
-"""The ground in the image: where every pixel meets it, and how bright it is there."""
+"""How bright the ground is under pixels."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.markings import paint
-from lanebev.render.raster.night import night_irradiance, smeared
+from lanebev.render.raster.blocks import Blocks, make_blocks
+from lanebev.render.raster.constants import colour
+from lanebev.render.raster.features import Features
+from lanebev.render.raster.footprint import Ground
+from lanebev.render.raster.markings import near_marking, paint
+from lanebev.render.raster.night import night_irradiance
 from lanebev.render.raster.noise import blotches, smoothstep
-from lanebev.render.raster.photometry import headlight_irradiance
+from lanebev.render.raster.select import put, take, take_channels
 from lanebev.render.raster.shadows import shadows
-from lanebev.render.raster.solids import Light, Solids
+from lanebev.render.raster.surface import LanePlace, pavement_albedo, place_in_lanes
 from lanebev.render.raster.symbols import symbols
-from lanebev.render.raster.varied import varied_ground
-from lanebev.render.scene.alignment import Alignment, road_from_local
-from lanebev.render.scene.pavement import pavement_albedo
-from lanebev.render.scene.surroundings import verge_albedo
-from lanebev.render.scene.world import Place, World
+from lanebev.render.raster.varied import city_ground, snow_ground, works_ground
+from lanebev.render.raster.verge import verge_albedo
+from lanebev.render.scene.sampler import select_rows
+from lanebev.render.scene.world import Scene
 
 STUD_ALBEDO = 0.62
 
 
-class Ground(NamedTuple):
-    """Ground under pixels, each (1, N)."""
-
-    x: Tensor
-    z: Tensor
-    along: Tensor  # m in the world
-    across: Tensor  # m in the layout's frame
-    reach_along: Tensor
-    reach_across: Tensor
+def headlight_irradiance(x: Tensor, z: Tensor) -> Tensor:
+    """(B, N) relative irradiance of dipped headlights on the road at (x, z) m."""
+    distance = z.clamp(min=0.5)
+    spread = torch.exp(-(((x - 0.02 * distance) / (1.8 + 0.22 * distance)) ** 2))
+    pools = 1 + 0.5 * torch.exp(-(((x.abs() - 0.9 - 0.05 * distance) / (0.7 + 0.05 * distance)) ** 2))
+    reach = (1 - torch.exp(-((distance / 5.0) ** 2))) / (1 + (distance / 14.0) ** 2)
+    return 1.2 * spread * pools * reach
 
 
-def ground_under(
-    place: Place, alignment: Alignment, swing: Tensor, drop: Tensor, z: Tensor, slope: Tensor, steps: Tensor
-) -> Ground:
-    """Road coordinates and, from the rays' change per pixel, the pixels' footprints."""
-    x = swing * z
-    point = road_from_local(alignment, x, z)
-    fall = -z / (drop + slope)
+def ground_radiance(scene: Scene, below: Blocks, ground: Ground, features: Features) -> Tensor:
+    """Compute the linear radiance of the ground, (T, 3, N).
 
-    def footprint(d_swing: Tensor, d_up: Tensor) -> tuple[Tensor, Tensor]:
-        dz = -fall * d_up
-        dx = z * d_swing + swing * dz
-        return point.sin * dx + point.cos * dz, point.cos * dx - point.sin * dz
-
-    along_x, across_x = footprint(steps[:, 0], steps[:, 1])
-    along_y, across_y = footprint(steps[:, 2], steps[:, 3])
-    return Ground(
-        x=x,
-        z=z,
-        along=point.along + place.along[:, None],
-        across=point.across + place.across[:, None],
-        reach_along=torch.hypot(along_x, along_y).clamp(min=1e-3),
-        reach_across=torch.hypot(across_x, across_y).clamp(min=1e-4),
-    )
-
-
-def ground_radiance(
-    world: World,
-    place: Place,
-    light: Light,
-    ground: Ground,
-    solids: Solids,
-    camera_height: Tensor,
-    swing: Tensor,
-    drop: Tensor,
-) -> Tensor:
-    """(1, 3, N) linear radiance of the ground."""
-    ground = ground._replace(reach_along=smeared(ground.reach_along, world.lights))
+    Args:
+        scene: B of them.
+        below: the pixels on the ground, in blocks.
+        ground: (T, N) points in them.
+        features: what any of the scenes has.
+    """
+    row, world = below.row, scene.world
+    if features.night:
+        smear = (world.lights.on * world.lights.smear)[row, None]
+        ground = ground._replace(reach_along=torch.hypot(ground.reach_along, smear))
+    pavement, light = scene.world.pavement, select_rows(scene.light, row)
     blotch = blotches(ground.along, ground.across)
-    ragged = 0.15 * blotch[3] * (1 - world.street.kerbed[:, None])
-    inside = torch.minimum(ground.across - world.pavement.left, world.pavement.right - ground.across)
-    paved = ((inside + ragged) / ground.reach_across + 0.5).clamp(0, 1)
-    albedo = torch.empty(1, 3, ground.z.shape[1])
-    coverage, studs = torch.zeros_like(ground.z), torch.zeros_like(ground.z)
-    road = (paved[0] > 0).nonzero()[:, 0]
-    if len(road):
-        part, stain = Ground(*(t[:, road] for t in ground)), blotch[:, :, road]
-        reach = (part.reach_along, part.reach_across)
-        bare = pavement_albedo(world.pavement, world.layout, part.along, part.across, *reach, stain)
-        grazing = part.z / camera_height[:, None]
-        paint_on, studs_on, colour = paint(world.layout, part.along, part.across, *reach, grazing, stain[2])
-        studs_on = studs_on * (1 - paint_on)
-        paint_on = torch.maximum(paint_on, symbols(world.layout, part.along, part.across, *reach))
-        bare = bare + (colour - bare) * paint_on[:, None] + (STUD_ALBEDO - bare) * studs_on[:, None]
-        albedo[:, :, road], coverage[:, road], studs[:, road] = bare, paint_on, studs_on
-    beside = (paved[0] < 1).nonzero()[:, 0]
-    if len(beside):
-        part = Ground(*(t[:, beside] for t in ground))
-        verge = verge_albedo(
-            world.surroundings, part.along, part.across, part.reach_along, blotch[0][:, beside]
-        )
-        share = paved[:, None, beside]
-        albedo[:, :, beside] = torch.where(share > 0, verge + (albedo[:, :, beside] - verge) * share, verge)
+    left, right = pavement.left[row, None], pavement.right[row, None]
+    inside = torch.minimum(ground.across - left, right - ground.across)
+    inside = inside + 0.15 * blotch[3] * (1 - world.street.kerbed[row, None])
+    paved = (inside / ground.reach_across + 0.5).clamp(0, 1)
+    albedo, coverage = _albedo(scene, row, ground, paved, blotch, features)
+    _add_kinds(scene, below, ground, albedo, coverage, paved, blotch[2], features)
+    shape = (3, *paved.shape)
+    albedo, (coverage, studs) = albedo.view(shape).transpose(0, 1), coverage.view(2, *paved.shape)
 
-    here = (ground.along, ground.across, ground.reach_along, ground.reach_across)
-    albedo, coverage = varied_ground(
-        world, place.across, camera_height, *here, albedo, paved, coverage, blotch[2]
-    )
-    sunlit, open_sky = shadows(world, light, ground, solids)
+    sunlit, open_sky = shadows(scene, row, ground, features)
     lit = light.direct[..., None] * (light.sun[:, 1, None] * sunlit)[:, None]
     lit = lit + light.ambient[..., None] * open_sky[:, None]
-    if bool(light.headlight > 0):
+    if features.headlight:
         retro = 1 + 2.5 * coverage + 8.0 * studs
-        beam = headlight_irradiance(ground.x, ground.z) * light.headlight[:, None] * retro
-        lit = (
-            lit
-            + ((1 - world.lights.on)[:, None] * beam)[:, None] * lit.new_tensor([1.0, 0.95, 0.85])[:, None]
-        )
-        lamps, own = night_irradiance(world.lights, ground.x, ground.z, ground.along, ground.across)
-        lit = lit + lamps + own * retro[:, None]
-    gloss = _gloss(world, light, swing, drop, sunlit, open_sky, blotch[2])
+        beam = headlight_irradiance(ground.x, ground.z) * retro
+        beam = beam * (light.headlight * (1 - world.lights.on[row]))[:, None]
+        lit = lit + beam[:, None] * colour(beam.device, 1.0, 0.95, 0.85)
+        if features.night:
+            lights = select_rows(world.lights, row)
+            lamps, own = night_irradiance(lights, ground.x, ground.z, ground.along, ground.across)
+            lit = lit + lamps + own * retro[:, None]
+    gloss = _gloss(scene, row, ground, sunlit, open_sky, blotch[2], features)
     return albedo * lit + gloss * paved[:, None]
 
 
+def _albedo(
+    scene: Scene, row: Tensor, ground: Ground, paved: Tensor, blotch: Tensor, features: Features
+) -> tuple[Tensor, Tensor]:
+    """(3, T·N) linear reflectance of a plain road; (2, T·N) coverage by paint, and by studs."""
+    batch, planes = len(scene.place.along), paved.numel()
+    albedo = paved.new_zeros(3, planes)
+    coverage = paved.new_zeros(2, planes)  # by paint, by studs
+
+    road = make_blocks(paved > 0, row=row, num_rows=batch)
+    part, stain = Ground(*(take(t, road.place) for t in ground)), take_channels(blotch.flatten(1), road.place)
+    layout = select_rows(scene.world.layout, road.row)
+    pavement = select_rows(scene.world.pavement, road.row)
+    lanes = place_in_lanes(layout, part.across)
+    bare = pavement_albedo(pavement, layout, part, lanes, stain, features)
+    put(albedo, road.place, bare.transpose(0, 1))
+    _add_paint(scene, road.row, road.place, part, lanes, stain[2], features, albedo, coverage)
+
+    beside = make_blocks(paved < 1, row=row, num_rows=batch)
+    part = Ground(*(take(t, beside.place) for t in ground))
+    verge = verge_albedo(
+        select_rows(scene.world.surroundings, beside.row), part, take(blotch[0], beside.place)
+    ).transpose(0, 1)
+    share = take(paved, beside.place)
+    inner = take_channels(albedo, beside.place)
+    put(albedo, beside.place, verge + (inner - verge) * share)
+    return albedo, coverage
+
+
+def _add_kinds(
+    scene: Scene,
+    below: Blocks,
+    ground: Ground,
+    albedo: Tensor,
+    coverage: Tensor,
+    paved: Tensor,
+    stain: Tensor,
+    features: Features,
+) -> None:
+    """Put what only some kinds of road have on their ground; changes albedo and coverage."""
+    kinds = features.rows
+    for name, rows in (("city", kinds.city), ("works", kinds.works), ("snow", kinds.snow)):
+        index = below.of_rows(rows)
+        if not len(index):
+            continue
+        row = below.row.index_select(0, index)
+        part = select_rows(ground, index)
+        own, painted = (t.view(len(t), *paved.shape) for t in (albedo, coverage))
+        base, paint_on = own.index_select(1, index).transpose(0, 1), painted[0].index_select(0, index)
+        road, blotch = paved.index_select(0, index), stain.index_select(0, index)
+        if name == "city":
+            eye, height = scene.place.across[row], scene.lens.extrinsics.height[row]
+            world = select_rows(scene.world, row)
+            base, paint_on = city_ground(world, eye, height, part, base, road, paint_on, blotch)
+        elif name == "works":
+            base, paint_on = works_ground(select_rows(scene.world.works, row), part, base, road, paint_on)
+        else:
+            world = select_rows(scene.world, row)
+            base, paint_on = snow_ground(world, part, base, road, paint_on, blotch)
+        own.index_copy_(1, index, base.transpose(0, 1))
+        painted[0].index_copy_(0, index, paint_on)
+
+
+def _add_paint(
+    scene: Scene,
+    row: Tensor,
+    place: Tensor,
+    road: Ground,
+    lanes: LanePlace,
+    stain: Tensor,
+    features: Features,
+    albedo: Tensor,
+    coverage: Tensor,
+) -> None:
+    """Paint markings on the road; changes albedo (3, M) and coverage by paint and by studs (2, M)."""
+    layout = scene.world.layout
+    near = near_marking(select_rows(layout, row), road, lanes.slot)
+    if features.symbols:
+        covered = symbols(select_rows(layout, row), road, lanes.lane)
+        near |= covered > 0
+    marked = make_blocks(near, row=row, num_rows=len(layout.across))
+    part = Ground(*(take(t, marked.place) for t in road))
+    slot, where = take(lanes.slot, marked.place), take(place, marked.place)
+    grazing = part.z / scene.lens.extrinsics.height[marked.row, None]
+    own = select_rows(layout, marked.row)
+    paint_on, studs_on, tone = paint(own, part, slot, grazing, take(stain, marked.place), features)
+    studs_on = studs_on * (1 - paint_on)
+    if features.symbols:
+        paint_on = torch.maximum(paint_on, take(covered, marked.place))
+    bare = take_channels(albedo, where)
+    put(albedo, where, bare + (tone.transpose(0, 1) - bare) * paint_on + (STUD_ALBEDO - bare) * studs_on)
+    put(coverage, where, torch.stack([paint_on, studs_on]))
+
+
 def _gloss(
-    world: World,
-    light: Light,
-    swing: Tensor,
-    drop: Tensor,
+    scene: Scene,
+    row: Tensor,
+    ground: Ground,
     sunlit: Tensor,
     open_sky: Tensor,
     puddle: Tensor,
+    features: Features,
 ) -> Tensor:
-    """Mirrored sun and, on wet roads, sky; (1, 3, N)."""
-    norm = (1 + swing * swing + drop * drop).rsqrt()
-    sun = (swing * light.sun[:, 0:1] + drop * light.sun[:, 1:2] + light.sun[:, 2:3]) * norm
-    sparkle = 0.35 * sun.clamp(min=0) ** 24 * sunlit
-    puddles = smoothstep(-0.5, 1.2, puddle)
-    mirror = world.pavement.wet[:, None] * (0.05 + 0.3 * (1 - drop * norm) ** 8) * (0.35 + 0.65 * puddles)
-    sky = world.surroundings.skyline[..., None]
-    shine = light.direct[..., None] * (sparkle * (0.4 + world.pavement.wet[:, None]))[:, None]
-    return shine + sky * (mirror * (0.3 + 0.7 * open_sky))[:, None]
+    """Mirrored sun and, on wet roads, sky; (T, 3, N)."""
+    light, wet = select_rows(scene.light, row), scene.world.pavement.wet[row, None]
+    norm = (1 + ground.ray_x.square() + ground.ray_y.square()).rsqrt()
+    sun_right, sun_up, sun_ahead = light.sun.unsqueeze(-1).unbind(1)
+    sun = (ground.ray_x * sun_right + ground.ray_y * sun_up + sun_ahead) * norm
+    eighth = sun.clamp(min=0).square().square().square()
+    sparkle = 0.35 * eighth.square() * eighth * sunlit
+    gloss = light.direct[..., None] * (sparkle * (0.4 + wet))[:, None]
+    if features.wet:
+        puddles = 0.35 + 0.65 * smoothstep(-0.5, 1.2, puddle)
+        mirror = wet * (0.05 + 0.3 * (1 - ground.ray_y * norm).square().square().square()) * puddles
+        sky = scene.world.surroundings.skyline[row, :, None]
+        gloss = gloss + sky * (mirror * (0.3 + 0.7 * open_sky))[:, None]
+    return gloss

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
+from lanebev.render.raster.constants import colour as colour_of
 from lanebev.render.raster.noise import CLOUD, hash01, sample_noise, smoothstep
-
-if TYPE_CHECKING:
-    from lanebev.render.scene.surroundings import Surroundings
+from lanebev.render.scene.surroundings import Wall
 
 _FLOOR = 3.1  # m
 
@@ -46,7 +43,7 @@ def house_front(
     gone = hash01(house, row, 2.0) < 0.16
     inside = (along / wide + 7 * seed - house) * wide
     tone = 0.65 + 0.6 * hash01(house, row, 3.0)
-    warm = (hash01(house, row, 4.0) - 0.5)[:, None] * colour.new_tensor([0.5, 0.1, -0.4])[:, None]
+    warm = (hash01(house, row, 4.0) - 0.5)[:, None] * colour_of(colour.device, 0.5, 0.1, -0.4)
     stain = 1 + 0.08 * sample_noise(CLOUD, along / 40.0 + seed, up / 25.0)
     albedo = colour * (tone * stain)[:, None] * (1 + warm)
 
@@ -60,7 +57,7 @@ def house_front(
     tint = 0.03 + 0.10 * hash01((inside / spacing).floor(), (up / _FLOOR).floor(), 8.0)
     albedo = albedo + (tint[:, None] - albedo) * (0.92 * glass)[:, None]
     roof = (hash01(house, row, 9.0) < 0.5) * smoothstep(0.0, 0.1, up - 0.82 * tall)
-    tiles = albedo.new_tensor([0.10, 0.05, 0.04])[:, None] * (0.4 + 0.7 * tone)[:, None]
+    tiles = colour_of(albedo.device, 0.10, 0.05, 0.04) * (0.4 + 0.7 * tone)[:, None]
     albedo = albedo + (tiles - albedo) * roof[:, None]
 
     cell = (inside / torch.where(shop, 4.2, spacing)).floor() + 31.0 * house
@@ -70,11 +67,8 @@ def house_front(
     return albedo.clamp(0.01, 0.85), covered, glass * lit * (1 - roof)
 
 
-def lit_windows(
-    surroundings: Surroundings, wall: int, along: Tensor, up: Tensor, footprint: Tensor
-) -> Tensor:
-    """(B, 3, N) radiance of the windows of one wall of houses at night."""
-    height, seed = surroundings.wall_height[:, wall, None], surroundings.wall_seed[:, wall, None]
-    colour = surroundings.wall_colour[:, wall, :, None]
-    _, _, lit = house_front(colour, height, seed, along, up, footprint)
-    return 0.5 * seed * lit[:, None] * lit.new_tensor([1.0, 0.8, 0.5])[:, None]
+def lit_windows(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> Tensor:
+    """(B, 3, N) radiance of the windows of walls of houses at night."""
+    height, seed = wall.height[:, None], wall.seed[:, None]
+    _, _, lit = house_front(wall.colour[..., None], height, seed, along, up, footprint)
+    return (0.5 * seed * lit)[:, None] * colour_of(lit.device, 1.0, 0.8, 0.5)

@@ -5,105 +5,93 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lanebev.render.raster.coverage import dash_coverage, stripe_coverage
+from lanebev.render.raster.features import Features
+from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.noise import GRAIN, sample_grain, smoothstep
+from lanebev.render.raster.select import as_float, remainder
 from lanebev.render.scene.layout import Layout, presence
 
-PSF = 0.5  # px, standard deviation of the pixel's Gaussian: keeps thin stripes' centroids unbiased
 STUD_SPACING, STUD_SIZE, STUD_HEIGHT = 1.22, 0.11, 0.020  # m, Botts' dots
+_TAIL = 2.5  # px beside a stripe at which nothing is left of it: five standard deviations of the pixel
 
 
-def stripe_coverage(distance: Tensor, width: Tensor, footprint: Tensor) -> Tensor:
-    """Share of a pixel that a stripe covers: a box of the stripe's width under a Gaussian pixel.
+def near_marking(layout: Layout, ground: Ground, slot: Tensor) -> Tensor:
+    """(B, N) bool: points that any paint or stud of the nearest boundary can reach.
 
     Args:
-        distance: m from the stripe's centre line.
-        width: m.
-        footprint: m per pixel, across the stripe.
+        layout: the road's boundaries.
+        ground: the points.
+        slot: (B, N) the nearest boundary.
     """
-    scale = 1 / (PSF * 2**0.5 * footprint)
-    half = 0.5 * width
-    return 0.5 * (torch.erf((distance + half) * scale) - torch.erf((distance - half) * scale))
-
-
-def dash_coverage(along: Tensor, length: Tensor, period: Tensor, footprint: Tensor) -> Tensor:
-    """Share of a pixel that a periodic dash covers, exactly integrated over the footprint along the road."""
-    reach = 0.5 * footprint.clamp(min=1e-3)
-
-    def painted_up_to(s: Tensor) -> Tensor:
-        whole = (s / period).floor()
-        return whole * length + torch.minimum(s - whole * period, length)
-
-    return (painted_up_to(along + reach) - painted_up_to(along - reach)) / (2 * reach)
-
-
-def nearest_slot(layout: Layout, across: Tensor) -> Tensor:
-    """(B, N) int64: the boundary nearest to ``across`` (B, N) m."""
-    middles = 0.5 * (layout.across[:, 1:] + layout.across[:, :-1])
-    return torch.searchsorted(middles, across.contiguous())
+    stripe = 0.5 * (layout.stripe_width + layout.separation)
+    ghost = torch.where(layout.ghost > 0, layout.ghost_shift.abs() + 0.5 * layout.stripe_width, 0.0)
+    reach = torch.maximum(stripe, ghost).clamp(min=STUD_SIZE)
+    distance = (ground.across - layout.across.gather(1, slot)).abs()
+    return distance < reach.gather(1, slot) + _TAIL * ground.reach_across
 
 
 def paint(
-    layout: Layout,
-    along: Tensor,
-    across: Tensor,
-    reach_along: Tensor,
-    reach_across: Tensor,
-    grazing: Tensor,
-    blotch: Tensor,
+    layout: Layout, ground: Ground, slot: Tensor, grazing: Tensor, blotch: Tensor, features: Features
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Paint and studs over road points.
 
     Args:
         layout: the road's boundaries.
-        along: (B, N) m, arc length in the world.
-        across: (B, N) m, in the layout's frame.
-        reach_along: (B, N) m per pixel.
-        reach_across: (B, N) m per pixel.
+        ground: the points.
+        slot: (B, N) the nearest boundary.
         grazing: (B, N) distance over camera height: how much longer a raised stud looks.
         blotch: (B, N) slow noise: where the paint is worn.
+        features: what any of the roads has.
 
     Returns:
         coverage of paint and of studs (B, N) each in [0, 1], and the paint's colour (B, 3, N).
     """
-    slot = nearest_slot(layout, across)
 
     def of(values: Tensor) -> Tensor:
         return values.gather(1, slot)
 
-    distance = across - of(layout.across)
-    width, apart = of(layout.stripe_width), 0.5 * of(layout.separation)
-    phase = along + of(layout.dash_phase)
-    dash = layout.dash.flatten(2).gather(1, slot[..., None].expand(-1, -1, 4))  # (B, N, 4)
-    left, right = (
-        stripe_coverage(distance + shift, width, reach_across)
-        * dash_coverage(phase, dash[..., i], dash[..., i + 1], reach_along)
-        for shift, i in ((apart, 0), (-apart, 2))
-    )
-    here = presence(layout, slot, along)
-    worn = _wear(along, across, of(layout.wear), reach_along, blotch)
-    stripes = torch.where(apart > 0, left + right, left).clamp(max=1) * of(layout.opacity) * worn
-    ghost = of(layout.ghost) * stripe_coverage(distance - of(layout.ghost_shift), width, reach_across)
-    ghost = (
-        ghost * dash_coverage(phase + 3.7, dash[..., 0], dash[..., 1], reach_along) * (worn - 0.3).clamp(0)
-    )
+    reach_along, reach_across = ground.reach_along, ground.reach_across
+    distance, width = ground.across - of(layout.across), of(layout.stripe_width)
+    phase = ground.along + of(layout.dash_phase)
 
-    period = of(layout.stud_period)
-    studs = stripe_coverage(distance, period.new_tensor(STUD_SIZE), reach_across)
-    studs = studs * _stud_pattern(phase, period, of(layout.stud_group), reach_along, grazing)
-    colour = layout.colour.gather(1, slot[..., None].expand(-1, -1, 3)).mT  # (B, 3, N)
-    return torch.maximum(stripes, ghost) * here, studs * here * (period > 0), colour
+    def stripe(shift: Tensor | float, index: int) -> Tensor:
+        length, period = (of(layout.dash[:, :, index, i]) for i in (0, 1))
+        along = dash_coverage(phase, length, period, reach_along)
+        return stripe_coverage(distance + shift, width, reach_across) * along
+
+    if features.double:
+        apart = 0.5 * of(layout.separation)
+        left = stripe(apart, 0)
+        stripes = (left + stripe(-apart, 1) * as_float(apart > 0)).clamp(max=1)
+    else:
+        stripes = stripe(0.0, 0)
+    worn = _wear(ground, of(layout.wear), blotch)
+    covered = stripes * of(layout.opacity) * worn
+    if features.ghost:
+        old = of(layout.ghost) * stripe_coverage(distance - of(layout.ghost_shift), width, reach_across)
+        length, period = (of(layout.dash[:, :, 0, i]) for i in (0, 1))
+        old = old * dash_coverage(phase + 3.7, length, period, reach_along)
+        covered = torch.maximum(covered, old * (worn - 0.3).clamp(0))
+    here = presence(layout, slot, ground.along)
+    studs = torch.zeros_like(distance)
+    if features.studs:
+        period = of(layout.stud_period)
+        pattern = _stud_pattern(phase, period, of(layout.stud_group), reach_along, grazing)
+        across = stripe_coverage(distance, distance.new_full((), STUD_SIZE), reach_across)
+        studs = across * pattern * here * as_float(period > 0)
+    colour = torch.stack([of(layout.colour[..., i]) for i in range(3)], dim=1)
+    return covered * here, studs, colour
 
 
 def _stud_pattern(along: Tensor, period: Tensor, group: Tensor, reach: Tensor, grazing: Tensor) -> Tensor:
     period = period.clamp(min=1.0)
-    seen = STUD_SIZE + STUD_HEIGHT * grazing
-    spacing = torch.full_like(along, STUD_SPACING)
-    position = along % period
-    dots = dash_coverage(position, torch.minimum(seen, 0.8 * spacing), spacing, reach)
+    seen = (STUD_SIZE + STUD_HEIGHT * grazing).clamp(max=0.8 * STUD_SPACING)
+    dots = dash_coverage(remainder(along, period), seen, seen.new_full((), STUD_SPACING), reach)
     return dots * dash_coverage(along, group, period, reach)
 
 
-def _wear(along: Tensor, across: Tensor, wear: Tensor, reach: Tensor, patches: Tensor) -> Tensor:
+def _wear(ground: Ground, wear: Tensor, patches: Tensor) -> Tensor:
     """(B, N) in [0, 1] remaining paint: patches worn off by the tyres, grain showing through."""
-    grain = sample_grain(GRAIN, along / 5.0, across / 2.5) / (1 + reach / 0.05)
+    grain = sample_grain(GRAIN, ground.along / 5.0, ground.across / 2.5) / (1 + ground.reach_along / 0.05)
     return smoothstep(-0.6, 0.5, patches * 0.5 + grain * 0.45 + 0.95 - 1.6 * wear)

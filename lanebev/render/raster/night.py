@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from lanebev.render.raster.lens import Lens
 from lanebev.render.raster.noise import sample_line, smoothstep
-from lanebev.render.raster.solids import TRUCK, Light, Solids
+from lanebev.render.raster.rays import View
 from lanebev.render.scene.alignment import Alignment, elevation_at, local_from_road, z_from_arc
+from lanebev.render.scene.camera import Lens
 from lanebev.render.scene.night import NUM_LAMPS, Lights
+from lanebev.render.scene.objects import TRUCK, SceneObjects
 from lanebev.render.scene.world import Place
 
 _GLARE_GRID, _MIRROR_GRID = (8, 8), (4, 2)  # px of the image to one of the coarse pictures
@@ -65,16 +66,6 @@ def lamp_light(lights: Lights, along: Tensor, across: Tensor) -> Tensor:
     return total
 
 
-def night_light(light: Light, lights: Lights) -> Light:
-    """The illumination on a night of these lights."""
-    lamps = 0.25 * lights.lamp.sum(1, keepdim=True) * lights.lamp_colour
-    on = (lights.on > 0)[:, None]
-    return light._replace(
-        ambient=torch.where(on, light.ambient * lights.dark[:, None] + lamps, light.ambient),
-        headlight=torch.where(on[:, 0], 0.7 * lights.beam, light.headlight),
-    )
-
-
 def night_irradiance(
     lights: Lights, x: Tensor, z: Tensor, along: Tensor, across: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -84,9 +75,9 @@ def night_irradiance(
     return lamps, beam
 
 
-def sprites(lights: Lights, place: Place, alignment: Alignment, lens: Lens, solids: Solids) -> Sprites:
+def sprites(lights: Lights, place: Place, alignment: Alignment, lens: Lens, objects: SceneObjects) -> Sprites:
     """All lights that a camera may see."""
-    parts = [_street_lamps(lights, place, alignment, lens), _vehicle_lamps(lights, lens, solids)]
+    parts = [_street_lamps(lights, place, alignment, lens), _vehicle_lamps(lights, lens, objects)]
     parts.append(_town(lights, place))
     return Sprites(*(torch.cat(values, dim=1) for values in zip(*parts, strict=True)))
 
@@ -103,25 +94,25 @@ def _street_lamps(lights: Lights, place: Place, alignment: Alignment, lens: Lens
     return Sprites(torch.stack([x, down, z], -1), 0 * z + 0.25, shine, 0.6 + 0.4 * power)
 
 
-def _vehicle_lamps(lights: Lights, lens: Lens, solids: Solids) -> Sprites:
+def _vehicle_lamps(lights: Lights, lens: Lens, objects: SceneObjects) -> Sprites:
     """Two lamps of every vehicle: red ones of those ahead, white ones of those that come."""
-    body = solids.shape[..., 0, :]
-    sin, cos = solids.heading.sin(), solids.heading.cos()
+    body = objects.shape[..., 0, :]
+    sin, cos = objects.heading.sin(), objects.heading.cos()
     coming = cos < 0
     end = torch.where(coming, body[..., 3] + 0.05, body[..., 2] - 0.05)
     points, shines = [], []
-    shown = solids.valid & (solids.kind <= TRUCK)
+    shown = objects.valid & (objects.kind <= TRUCK)
     red, white = body.new_tensor([1.0, 0.03, 0.02]), body.new_tensor([1.0, 0.93, 0.8])
     for side in (-0.8, 0.8):
         aside = side * body[..., 0]
-        x, z = solids.x + aside * cos + end * sin, solids.z - aside * sin + end * cos
-        down = lens.extrinsics.height[:, None] - solids.ground - torch.where(coming, 0.68, 0.85)
+        x, z = objects.x + aside * cos + end * sin, objects.z - aside * sin + end * cos
+        down = lens.extrinsics.height[:, None] - objects.ground - torch.where(coming, 0.68, 0.85)
         points.append(torch.stack([x, down, z], -1))
-        tail = 0.25 + 0.6 * solids.braking.float()
+        tail = 0.25 + 0.6 * objects.braking.float()
         strength = torch.where(coming, 1.5, tail) * shown * lights.on[:, None]
         shines.append(_BRIGHT * strength[..., None] * torch.where(coming[..., None], white, red))
     shine = torch.cat(shines, 1)
-    glare = torch.where(coming, 1.0, 0.25 + 0.25 * solids.braking.float()).repeat(1, 2)
+    glare = torch.where(coming, 1.0, 0.25 + 0.25 * objects.braking.float()).repeat(1, 2)
     return Sprites(torch.cat(points, 1), 0 * glare + 0.08, shine, glare)
 
 
@@ -133,7 +124,7 @@ def _town(lights: Lights, place: Place) -> Sprites:
 
 
 def add_lights(
-    radiance: Tensor, blocked: Tensor, lights: Lights, sprites: Sprites, lens: Lens, rays: Tensor
+    radiance: Tensor, blocked: Tensor, lights: Lights, sprites: Sprites, lens: Lens, view: View
 ) -> Tensor:
     """Put lights, their glare and their mirror images into the radiance.
 
@@ -143,7 +134,7 @@ def add_lights(
         lights: of the night.
         sprites: the lights.
         lens: the cameras.
-        rays: (B, 2, H, W) right and up per metre forward.
+        view: the pixels' rays.
 
     Returns:
         (B, 3, H, W).
@@ -169,7 +160,7 @@ def add_lights(
     eye = lens.extrinsics.height[:, None]
     mirrored = mirrored + torch.stack([0 * z, 2 * eye.expand_as(z), 0 * z], -1)
     below = lens.pixels_as_taken(mirrored, size)
-    road = ((rays[:, 1] < -0.004) & blocked.isinf())[:, None]
+    road = ((view.ray_y > 0.004).view(blocked.shape) & blocked.isinf())[:, None]
     return radiance + _mirror(colour * lights.mirror[:, None, None], below, radius, size) * road
 
 
@@ -221,8 +212,3 @@ def _mirror(colour: Tensor, pixel: Tensor, radius: Tensor, size: tuple[int, int]
     value = 0.05 * torch.exp(-((dx / wide) ** 2)) / (1 + (dy / tall) ** 2) ** 1.5
     picture = torch.einsum("bsc,bshw->bchw", colour, value)
     return functional.interpolate(picture, size, mode="bilinear", align_corners=False)
-
-
-def smeared(reach_along: Tensor, lights: Lights) -> Tensor:
-    """(B, N) m per pixel along the road, longer where the road moves while the shutter is open."""
-    return torch.hypot(reach_along, (lights.on * lights.smear)[:, None])

@@ -8,13 +8,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from lanebev.render.raster.select import take
+
 TILE = 512
 GRAIN, CLOUD, CRACK, SECOND = 0, 1, 2, 3  # channels of the tile
 _TILE_SEED = 20261122
 
 
 @lru_cache(maxsize=1)
-def noise_tile() -> Tensor:
+def _tile_on_host() -> Tensor:
     """(4, TILE + 1, TILE + 1) periodic tile: grain and its like of unit variance, about four texels wide;
     cloud, 1/f noise of unit variance; crack, 1 on the edges of irregular cells and 0 elsewhere.
     """
@@ -53,6 +55,28 @@ def _cracks(warp: Tensor, generator: torch.Generator, cells: int = 9) -> Tensor:
     return torch.exp(-(((nearest[1] - nearest[0]) / 0.03) ** 2))
 
 
+@lru_cache(maxsize=32)
+def noise_tile(device: torch.device, channel: int) -> Tensor:
+    """(TILE + 1, TILE + 1) one channel of the tile."""
+    return _tile_on_host()[channel].contiguous().to(device)
+
+
+@lru_cache(maxsize=8)
+def _blotch_tile(device: torch.device) -> Tensor:
+    """(1, 4, TILE + 1, TILE + 1) four independent clouds."""
+    cloud = _tile_on_host()[CLOUD, :-1, :-1]
+    moved = [cloud.roll((151 * i, 97 * i), (0, 1)) for i in range(4)]
+    return functional.pad(torch.stack(moved)[None], (0, 1, 0, 1), mode="circular").to(device)
+
+
+@lru_cache(maxsize=8)
+def _line_table(device: torch.device) -> Tensor:
+    """(16 · TILE,) a periodic cloud over a line, finely sampled."""
+    row = _tile_on_host()[CLOUD, 77]
+    fine = functional.interpolate(row[None, None], 16 * TILE + 1, mode="linear", align_corners=True)
+    return fine[0, 0, :-1].contiguous().to(device)
+
+
 def sample_noise(channel: int, u: Tensor, v: Tensor) -> Tensor:
     """The tile at (u, v), bilinear and periodic.
 
@@ -65,51 +89,33 @@ def sample_noise(channel: int, u: Tensor, v: Tensor) -> Tensor:
         (...,).
     """
     u, v = torch.broadcast_tensors(u, v)
-    grid = torch.stack([u, v], dim=-1)
-    grid = (grid - grid.floor()) * 2 - 1
-    tile = noise_tile()[channel : channel + 1]
-    values = functional.grid_sample(
-        tile[None], grid.reshape(1, 1, -1, 2), align_corners=True, padding_mode="border"
-    )
-    return values.reshape(u.shape)
-
-
-def sample_grain(channel: int, u: Tensor, v: Tensor) -> Tensor:
-    """As :func:`sample_noise`, the nearest texel: for grain that is finer than a pixel, four times faster."""
-    row, column = (v * TILE).long() & (TILE - 1), (u * TILE).long() & (TILE - 1)
-    return noise_tile()[channel].take(row * (TILE + 1) + column)
-
-
-@lru_cache(maxsize=1)
-def _blotch_tile() -> Tensor:
-    """(1, 4, TILE + 1, TILE + 1) four independent clouds."""
-    cloud = noise_tile()[CLOUD, :-1, :-1]
-    moved = [cloud.roll((151 * i, 97 * i), (0, 1)) for i in range(4)]
-    return functional.pad(torch.stack(moved)[None], (0, 1, 0, 1), mode="circular")
+    return _bilinear(noise_tile(u.device, channel)[None, None], u, v)[0]
 
 
 def blotches(along: Tensor, across: Tensor) -> Tensor:
     """Four slow noises over the road in one look-up, (4, B, N): 1/f, features up to 60 m by 20 m."""
-    grid = torch.stack([along * (1 / 173.0), across * (1 / 61.0)], dim=-1)
-    grid = (grid - grid.floor()) * 2 - 1
+    return _bilinear(_blotch_tile(along.device), along * (1 / 173.0), across * (1 / 61.0))
+
+
+def _bilinear(tile: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """(1, C, TILE + 1, TILE + 1) periodic tiles at (u, v) (...,) periods, (C, ...)."""
+    grid = torch.view_as_real(torch.complex(u, v))  # a fast stack
+    grid = grid.sub_(grid.floor()).mul_(2).sub_(1)
     values = functional.grid_sample(
-        _blotch_tile(), grid.reshape(1, 1, -1, 2), align_corners=True, padding_mode="border"
+        tile, grid.reshape(1, 1, -1, 2), align_corners=True, padding_mode="border"
     )
-    return values.reshape(4, *along.shape)
+    return values.reshape(tile.shape[1], *u.shape)
 
 
-@lru_cache(maxsize=1)
-def _line_table() -> Tensor:
-    """(16 · TILE,) a periodic cloud over a line, finely sampled."""
-    row = noise_tile()[CLOUD, 77]
-    return functional.interpolate(row[None, None], 16 * TILE + 1, mode="linear", align_corners=True)[
-        0, 0, :-1
-    ]
+def sample_grain(channel: int, u: Tensor, v: Tensor) -> Tensor:
+    """As :func:`sample_noise`, the nearest texel: for grain that is finer than a pixel, four times faster."""
+    row, column = (v * TILE).int() & (TILE - 1), (u * TILE).int() & (TILE - 1)
+    return take(noise_tile(u.device, channel), row * (TILE + 1) + column)
 
 
 def sample_line(u: Tensor) -> Tensor:
     """A periodic noise over a line, u (...,) in periods."""
-    return _line_table().take((u * (16 * TILE)).long() & (16 * TILE - 1))
+    return take(_line_table(u.device), (u * (16 * TILE)).int() & (16 * TILE - 1))
 
 
 def hash01(a: Tensor, b: Tensor, salt: float) -> Tensor:

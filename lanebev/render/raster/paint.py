@@ -1,32 +1,39 @@
-"""Linear radiance of every pixel: sky, ground, walls, things, in the order of their distance."""
+"""Linear radiance of every pixel: sky, ground, walls, objects, in the order of their distance."""
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.ground import ground_radiance, ground_under
-from lanebev.render.raster.lens import Lens
-from lanebev.render.raster.solids import Light, Solids, draw
+from lanebev.render.raster.blocks import Blocks, make_blocks
+from lanebev.render.raster.canvas import Canvas, empty_canvas
+from lanebev.render.raster.features import Features
+from lanebev.render.raster.footprint import Ground, ground_under
+from lanebev.render.raster.ground import ground_radiance
+from lanebev.render.raster.night import add_lights, sprites
+from lanebev.render.raster.objects import add_objects
+from lanebev.render.raster.rays import View
+from lanebev.render.raster.select import as_float, put, take, take_channels
+from lanebev.render.raster.sky import sky_along
+from lanebev.render.raster.tunnel import add_ceiling
 from lanebev.render.raster.walls import add_walls
-from lanebev.render.scene.alignment import Alignment, ground_hit
-from lanebev.render.scene.surroundings import sky_radiance
-from lanebev.render.scene.world import Place, World
+from lanebev.render.scene.alignment import ground_hit, lowest_slopes
+from lanebev.render.scene.sampler import select_rows
+from lanebev.render.scene.world import Scene
 
-_GROUND_LIMIT = 1800.0  # m; beyond, everything is air
+_METERED = 40.0  # m of road by which the exposure is set
 
 
 class Painted(NamedTuple):
-    """A painted view of one scene.
+    """Painted views of B scenes.
 
     Attributes:
-        radiance: (1, 3, H, W) linear.
-        blocked: (1, H, W) m, Z of the nearest thing that is not the road; infinite: none.
-        road_level: (1,) radiance of the road before the camera.
-        nearest: (1,) m, Z of the nearest road in the image.
+        radiance: (B, 3, H, W) linear.
+        blocked: (B, H, W) m, Z of the nearest thing that is not the road; infinite: none.
+        road_level: (B,) radiance of the road before the camera.
+        nearest: (B,) m, Z of the nearest road in the image.
     """
 
     radiance: Tensor
@@ -35,89 +42,99 @@ class Painted(NamedTuple):
     nearest: Tensor
 
 
-def paint_view(
-    world: World,
-    place: Place,
-    alignment: Alignment,
-    lens: Lens,
-    solids: Solids,
-    light: Light,
-    rays: Tensor,
-    steps: Tensor,
-) -> Painted:
-    """One scene, B = 1: a row at a time stays in the processor's cache and skips what it has not.
+def paint_view(scene: Scene, view: View, features: Features) -> Painted:
+    """Paint scenes.
 
     Args:
-        world: of the scene.
-        place: of the camera.
-        alignment: seen from there.
-        lens: the camera.
-        solids: things in the local road frame.
-        light: in the local road frame.
-        rays: (1, 2, H, W), see :func:`~lanebev.render.raster.lens.pixel_rays`.
-        steps: (1, 4, H, W).
+        scene: B of them.
+        view: the pixels' rays.
+        features: what the scenes have.
     """
-    height, width = rays.shape[2:]
-    size = (height, width)
-    swing, drop = rays[:, 0].flatten(1), -rays[:, 1].flatten(1)  # (1, H·W)
-    camera_height = lens.extrinsics.height
-
-    radiance = torch.zeros(1, 3, height * width)
-    depth, slope = ground_hit(alignment, camera_height, drop)
-    depth = torch.where(depth < _GROUND_LIMIT, depth, math.inf)
-    blocked = torch.full_like(depth, math.inf)
-
-    above = depth[0].isinf().nonzero()[:, 0]
-    radiance[:, :, above] = _sky(world, place, light, swing[:, above], -drop[:, above])
-    below = depth[0].isfinite().nonzero()[:, 0]
-    ground = ground_under(
-        place,
-        alignment,
-        swing[:, below],
-        drop[:, below],
-        depth[:, below],
-        slope[:, below],
-        steps.flatten(2)[:, :, below],
-    )
-    lit = ground_radiance(world, place, light, ground, solids, camera_height, swing[:, below], drop[:, below])
-    haze = world.surroundings.skyline
-    clear = torch.exp(-ground.z / world.weather.visibility[:, None])[:, None]
-    radiance[:, :, below] = haze[..., None] * (1 - clear) + lit * clear
-
-    near = (
-        (ground.z[0] < 40)
-        & (ground.across[0] > world.pavement.left)
-        & (ground.across[0] < world.pavement.right)
-    )
-    metered = lit.mean(1)[:, near] if bool(near.any()) else lit.mean(1)
-    road_level = metered.square().mean(1).sqrt()  # the root mean square: bright parts count for more
-    ahead = ground.across.new_zeros(1, height * width)
-    ahead[:, below] = ground.across
-    add_walls(
-        world, place, alignment, light, camera_height, swing, drop, ahead, radiance, depth, blocked, steps
+    canvas = empty_canvas(view.ray_y.numel(), view.ray_y.device)
+    lowest = lowest_slopes(scene.alignment, scene.lens.extrinsics.height)[:, -1:]
+    on_ground = view.ray_y > lowest
+    _add_sky(scene, view, canvas, make_blocks(~on_ground), features)
+    below = make_blocks(on_ground)
+    ground, lit = _add_ground(scene, view, canvas, below, features)
+    across = torch.zeros_like(canvas.depth)
+    put(across[None], below.place, ground.across[None])
+    add_walls(scene, view, canvas, across.view_as(view.ray_x), features)
+    add_objects(scene, view, canvas)
+    shape = (len(lowest), *view.size)
+    radiance, blocked = canvas.radiance.view(3, *shape).transpose(0, 1), canvas.blocked.view(shape)
+    _add_tunnels(scene, view, radiance, blocked, features.rows.tunnel)
+    _add_lights(scene, view, radiance, blocked, features.rows.night)
+    return Painted(
+        radiance=radiance,
+        blocked=blocked,
+        road_level=_road_level(scene, below, ground, lit, view),
+        nearest=_nearest(below, ground, len(lowest)),
     )
 
-    radiance, blocked = radiance.unflatten(2, size), blocked.unflatten(1, size)
-    draw(
-        radiance,
-        depth.unflatten(1, size),
-        blocked,
-        solids,
-        rays,
-        steps,
-        lens,
-        camera_height,
-        light,
-        haze,
-        world.weather.visibility,
-    )
-    nearest = ground.z.amin(1).clamp(0.8, 8.0) if len(below) else torch.full((1,), 3.0)
-    return Painted(radiance, blocked, road_level, nearest)
+
+def _add_sky(scene: Scene, view: View, canvas: Canvas, above: Blocks, features: Features) -> None:
+    ray_x, rise = take(view.ray_x, above.place), -take(view.ray_y, above.place)
+    put(canvas.radiance, above.place, sky_along(scene, above.row, ray_x, rise, features).transpose(0, 1))
 
 
-def _sky(world: World, place: Place, light: Light, swing: Tensor, rise: Tensor) -> Tensor:
-    norm = (1 + swing * swing + rise * rise).rsqrt()
-    sun = (swing * light.sun[:, 0:1] + rise * light.sun[:, 1:2] + light.sun[:, 2:3]) * norm
-    sun = torch.where(light.direct.amax(1, keepdim=True) > 0.3, sun, -2.0)
-    level = rise / (1 + swing * swing).sqrt()
-    return sky_radiance(world.surroundings, swing.atan() + place.heading[:, None], level, sun)
+def _add_ground(
+    scene: Scene, view: View, canvas: Canvas, below: Blocks, features: Features
+) -> tuple[Ground, Tensor]:
+    """Paint the ground; returns where it is and its radiance (T, 3, S) before the air's."""
+    alignment, place = select_rows(scene.alignment, below.row), select_rows(scene.place, below.row)
+    ray_x, ray_y = take(view.ray_x, below.place), take(view.ray_y, below.place)
+    z, slope = ground_hit(alignment, scene.lens.extrinsics.height[below.row], ray_y)
+    steps = take_channels(view.steps.flatten(1), below.place)
+    ground = ground_under(place, alignment, ray_x, ray_y, z, slope, steps)
+    lit = ground_radiance(scene, below, ground, features)
+    clear = torch.exp(-z / scene.world.weather.visibility[below.row, None])[:, None]
+    haze = scene.world.surroundings.skyline[below.row, :, None]
+    put(canvas.radiance, below.place, (haze + (lit - haze) * clear).transpose(0, 1))
+    put(canvas.distance[:1], below.place, z[None])
+    return ground, lit
+
+
+def _add_tunnels(scene: Scene, view: View, radiance: Tensor, blocked: Tensor, rows: list[int]) -> None:
+    """Put ceilings in the place of the sky on some rows; changes radiance."""
+    if not rows:
+        return
+    index = torch.tensor(rows).to(radiance.device, non_blocking=True)
+    tunnel, lens = select_rows(scene.world.tunnel, index), select_rows(scene.lens, index)
+    place, alignment = select_rows(scene.place, index), select_rows(scene.alignment, index)
+    own = view._replace(ray_x=view.ray_x.index_select(0, index), ray_y=view.ray_y.index_select(0, index))
+    under, hidden = radiance.index_select(0, index), blocked.index_select(0, index)
+    radiance.index_copy_(0, index, add_ceiling(under, hidden, tunnel, place, alignment, lens, own))
+
+
+def _add_lights(scene: Scene, view: View, radiance: Tensor, blocked: Tensor, rows: list[int]) -> None:
+    """Put lights of the night, their glare and their mirror images in on some rows; changes radiance."""
+    if not rows:
+        return
+    index = torch.tensor(rows).to(radiance.device, non_blocking=True)
+    lights, lens = select_rows(scene.world.lights, index), select_rows(scene.lens, index)
+    place, alignment = select_rows(scene.place, index), select_rows(scene.alignment, index)
+    shining = sprites(lights, place, alignment, lens, select_rows(scene.objects, index))
+    own = view._replace(ray_x=view.ray_x.index_select(0, index), ray_y=view.ray_y.index_select(0, index))
+    under, hidden = radiance.index_select(0, index), blocked.index_select(0, index)
+    radiance.index_copy_(0, index, add_lights(under, hidden, lights, shining, lens, own))
+
+
+def _road_level(scene: Scene, below: Blocks, ground: Ground, lit: Tensor, view: View) -> Tensor:
+    """(B,) root mean square radiance of the road before the camera: bright parts count for more."""
+    pavement = scene.world.pavement
+    left, right = pavement.left[below.row, None], pavement.right[below.row, None]
+    near = (ground.z < _METERED) & (ground.across > left) & (ground.across < right)
+    grey = lit.mean(1).square()
+    planes = torch.zeros(4, view.ray_x.numel(), device=grey.device)
+    on_road = as_float(near)
+    put(planes, below.place, torch.stack([grey * on_road, on_road, grey, torch.ones_like(grey)]))
+    road, road_count, all_of_it, count = planes.view(4, *view.ray_x.shape).sum(2)
+    mean = torch.where(road_count > 0, road / road_count.clamp(min=1), all_of_it / count.clamp(min=1))
+    return mean.sqrt()
+
+
+def _nearest(below: Blocks, ground: Ground, batch: int) -> Tensor:
+    """(B,) m, Z of the nearest road in the image; 3 where there is none."""
+    nearest = ground.z.new_full((batch,), torch.inf)
+    nearest = nearest.scatter_reduce(0, below.row, ground.z.amin(1).clamp(0.8, 8.0), "amin")
+    return nearest.where(nearest.isfinite(), 3.0)

@@ -2,115 +2,150 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from lanebev.render.raster.features import Features
+from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.noise import CLOUD, sample_line, sample_noise, smoothstep
-from lanebev.render.raster.solids import TRUCK, Light, Solids
-from lanebev.render.scene.surroundings import FENCE, HEDGE, NOTHING, NUM_WALLS, RAIL, SLOPE, TREES
-from lanebev.render.scene.world import World
-
-if TYPE_CHECKING:
-    from lanebev.render.raster.ground import Ground
+from lanebev.render.raster.select import as_float, choose, indices_where, take
+from lanebev.render.scene.objects import TRUCK, SceneObjects
+from lanebev.render.scene.sampler import select_rows
+from lanebev.render.scene.surroundings import FENCE, HEDGE, NOTHING, RAIL, SLOPE, TREES, Surroundings
+from lanebev.render.scene.weather import Light
+from lanebev.render.scene.world import Scene, World
 
 BRIDGE_UNDERSIDE = 6.2  # m, of all bridges as far as their shadows go
+_PIECE = 64  # pixels that are looked at together for a vehicle's shadow
+_STEEPEST = 0.12  # sine of the lowest sun that casts shadows
 
 
-def shadows(world: World, light: Light, ground: Ground, solids: Solids) -> tuple[Tensor, Tensor]:
-    """Share of the sun, and of the sky, that reaches the ground, (1, N) both."""
-    sunlit, open_sky = torch.ones_like(ground.z), torch.ones_like(ground.z)
-    sunny = bool((light.direct > 0.02).any())
-    if bool(world.bridge.isfinite().all()):
-        shade, under = _bridge_shadow(world, light, ground)
+def shadows(scene: Scene, row: Tensor, ground: Ground, features: Features) -> tuple[Tensor, Tensor]:
+    """Share of the sun, and of the sky, that reaches the ground, (T, N) both.
+
+    Args:
+        scene: B of them.
+        row: (T,) which scene each row of the points belongs to.
+        ground: (T, N) points.
+        features: what any of the scenes has.
+    """
+    light, world = select_rows(scene.light, row), scene.world
+    sunlit, open_sky = _vehicle_shadows(scene.light, row, ground, scene.objects)
+    if features.bridge:
+        shade, under = _bridge_shadow(world.bridge[row], light, ground)
         sunlit, open_sky = sunlit * (1 - shade), open_sky * (1 - 0.8 * under)
-    if bool((world.shade > 0).all()) and sunny:
-        sunlit = sunlit * (1 - world.shade[:, None] * _crown_shadow(world, ground))
-    if sunny:
-        sunlit = sunlit * _wall_shadows(world, light, ground)
-    lit, contact = _vehicle_shadows(light, ground, solids)
-    return sunlit * lit, open_sky * contact
+    if features.sun:
+        if features.crowns:
+            sunlit = sunlit * (1 - world.shade[row, None] * _crown_shadow(world, row, ground))
+        around = select_rows(world.surroundings, row)
+        for wall in sorted({wall for _, wall in features.walls}):
+            sunlit = sunlit * _wall_shadow(around, wall, light, ground)
+    return sunlit, open_sky
 
 
-def _bridge_shadow(world: World, light: Light, ground: Ground) -> tuple[Tensor, Tensor]:
-    climb = light.sun[:, 1, None].clamp(min=0.12)
+def _bridge_shadow(bridge: Tensor, light: Light, ground: Ground) -> tuple[Tensor, Tensor]:
+    """Shade of bridges (B, 2) m along, infinite where there is none, and how far points are below them."""
+    climb = light.sun[:, 1, None].clamp(min=_STEEPEST)
     soft = 0.15 + ground.reach_along
-    begin, end = world.bridge[:, 0, None], world.bridge[:, 1, None]
+    begin, end = bridge.clamp(max=1e6).unsqueeze(-1).unbind(1)
     shift = ground.along + BRIDGE_UNDERSIDE * light.sun[:, 2, None] / climb
     shade = ((shift - begin) / soft + 0.5).clamp(0, 1) * ((end - shift) / soft + 0.5).clamp(0, 1)
     under = smoothstep(begin - 5, begin + 4, ground.along) * smoothstep(end + 5, end - 4, ground.along)
     return shade, under
 
 
-def _crown_shadow(world: World, ground: Ground) -> Tensor:
+def _crown_shadow(world: World, row: Tensor, ground: Ground) -> Tensor:
     """Dappled shade of trees that reach over the road, thicker towards its edges."""
     crown = sample_noise(CLOUD, ground.along / 110.0, ground.across / 70.0)
     gaps = sample_noise(CLOUD, ground.along / 21.0, ground.across / 16.0)
-    edge = torch.minimum(ground.across - world.pavement.left, world.pavement.right - ground.across)
+    left, right = world.pavement.left[row, None], world.pavement.right[row, None]
+    edge = torch.minimum(ground.across - left, right - ground.across)
     return smoothstep(0.2, 0.75, crown + 0.35 * gaps - 0.09 * edge.clamp(min=0) + 0.25)
 
 
-def _wall_shadows(world: World, light: Light, ground: Ground) -> Tensor:
-    """Bands along the road beside walls that stand between it and the sun."""
-    sunlit = torch.ones_like(ground.z)
-    slant = light.sun[:, 0] / light.sun[:, 1].clamp(min=0.12)  # sideways per metre of height
-    around = world.surroundings
-    for wall in range(NUM_WALLS):
-        kind = int(around.wall_kind[0, wall])
-        side = 1.0 if wall % 2 else -1.0
-        length = around.wall_height[:, wall] * slant * side
-        if kind in (NOTHING, SLOPE) or float(length) < 0.05:
-            continue
-        inward = (around.wall_across[:, wall, None] - ground.across) * side  # m from the wall's foot
-        if kind in (TREES, HEDGE):
-            length = length * (
-                0.55 + 0.2 * sample_line(ground.along / 60.0 + around.wall_seed[:, wall, None])
-            )
-        soft = 0.05 + 0.04 * length + ground.reach_across
-        shade = ((length - inward) / soft + 0.5).clamp(0, 1) * (inward / ground.reach_across + 0.5).clamp(
-            0, 1
-        )
-        if kind == RAIL:
-            shade = shade * (inward > 0.45 * length)
-        sunlit = sunlit * (1 - (0.85 if kind in (TREES, HEDGE, FENCE) else 0.95) * shade)
-    return sunlit
+def _wall_shadow(around: Surroundings, wall: int, light: Light, ground: Ground) -> Tensor:
+    """A band along the road beside a wall that stands between it and the sun; 1 where none does."""
+    slant = light.sun[:, 0] / light.sun[:, 1].clamp(min=_STEEPEST)  # sideways per metre of height
+    kind, side = around.wall_kind[:, wall, None], 1.0 if wall % 2 else -1.0
+    length = (around.wall_height[:, wall] * slant * side)[:, None]
+    casts = (kind != NOTHING) & (kind != SLOPE) & (length > 0.05) & (light.direct > 0.02).any(1, keepdim=True)
+    leafy = (kind == TREES) | (kind == HEDGE)
+    crowns = 0.55 + 0.2 * sample_line(ground.along / 60.0 + around.wall_seed[:, wall, None])
+    reach = choose(leafy, length * crowns, length)
+    inward = (around.wall_across[:, wall, None] - ground.across) * side  # m from the wall's foot
+    soft = (0.05 + 0.04 * reach + ground.reach_across).clamp(min=0.01)
+    shade = ((reach - inward) / soft + 0.5).clamp(0, 1) * (inward / ground.reach_across + 0.5).clamp(0, 1)
+    shade = shade * as_float((kind != RAIL) | (inward > 0.45 * reach))
+    strength = torch.where(leafy | (kind == FENCE), 0.85, 0.95) * casts
+    return 1 - strength * shade
 
 
-def _vehicle_shadows(light: Light, ground: Ground, solids: Solids) -> tuple[Tensor, Tensor]:
-    """What vehicles leave of the sun (a swept rectangle) and of the sky (dark below them), (1, N) both."""
-    lit, contact = torch.ones_like(ground.z), torch.ones_like(ground.z)
-    casts = (solids.valid & (solids.kind <= TRUCK) & (solids.z < 260) & (solids.z > -15)).nonzero()[:, 1]
-    if not len(casts):
-        return lit, contact
-    shape, heading = solids.shape[0, casts], solids.heading[0, casts]  # (V, 2, 8), (V,)
-    half, rear, front = shape[:, 0, 0], shape[:, :, 2].amin(1), shape[:, :, 3].amax(1)
-    tall = shape[:, :, 7].amax(1) * 0.9
-    sin, cos = heading.sin(), heading.cos()
-    sun = light.sun[0] / light.sun[0, 1].clamp(min=0.12)
-    sun_x, sun_z = (sun[0] * cos - sun[2] * sin) * tall, (sun[0] * sin + sun[2] * cos) * tall
+class _Outline(NamedTuple):
+    """A vehicle's outline on the ground and where the sun moves it, (...) each, m."""
+
+    x: Tensor
+    z: Tensor
+    sin: Tensor
+    cos: Tensor
+    half: Tensor
+    rear: Tensor
+    front: Tensor
+    sun_x: Tensor
+    sun_z: Tensor
+    length: Tensor
+
+
+def _outlines(light: Light, objects: SceneObjects) -> tuple[_Outline, Tensor]:
+    """(B, M) outlines of vehicles, and (B, M) m, how far in X and in Z they cast any."""
+    shape, x, z = objects.shape, objects.x, objects.z
+    sin, cos = objects.heading.sin(), objects.heading.cos()
+    tall = shape[..., 7].amax(2) * 0.9
+    sun = light.sun / light.sun[:, 1:2].clamp(min=_STEEPEST)
+    sun_right, sun_ahead = sun[:, 0, None], sun[:, 2, None]
+    sun_x, sun_z = (sun_right * cos - sun_ahead * sin) * tall, (sun_right * sin + sun_ahead * cos) * tall
+    rear, front = shape[..., 2].amin(2), shape[..., 3].amax(2)
     length = torch.hypot(sun_x, sun_z).clamp(min=0.5)
+    casts = objects.valid & (objects.kind <= TRUCK) & (z < 260) & (z > -15)
+    reach = (front + 1.5 + length).where(casts, -1.0)
+    return _Outline(x, z, sin, cos, shape[..., 0, 0], rear, front, sun_x, sun_z, length), reach
 
-    dx, dz = ground.x - solids.x[0, casts, None], ground.z - solids.z[0, casts, None]  # (V, N)
-    which, at = (torch.maximum(dx.abs(), dz.abs()) < (front + 1.5 + length)[:, None]).nonzero(as_tuple=True)
-    dx, dz, blur = dx[which, at], dz[which, at], 0.08 + ground.reach_along[0, at]
-    table = torch.stack([sin, cos, half, rear, front, sun_x, sun_z, length])[:, which]
-    sin, cos, half, rear, front, sun_x, sun_z, length = table
-    right, ahead = dx * cos - dz * sin, dx * sin + dz * cos
-    low_x, high_x = _slab(right, sun_x, -half, half)
-    low_z, high_z = _slab(ahead, sun_z, rear, front)
-    enter = torch.maximum(low_x, low_z).clamp(min=0)
-    leave = torch.minimum(high_x, high_z).clamp(max=1)
-    sunlit = 1 - ((leave - enter) * length / blur + 0.3).clamp(0, 1)
-    gap = torch.maximum(right.abs() - half, torch.maximum(rear - ahead, ahead - front))
+
+def _vehicle_shadows(
+    light: Light, row: Tensor, ground: Ground, objects: SceneObjects
+) -> tuple[Tensor, Tensor]:
+    """What vehicles leave of the sun (a swept rectangle) and of the sky (dark below them), (T, N) both."""
+    shape = ground.z.shape
+    x, z, reach_along = (t.reshape(-1, _PIECE) for t in (ground.x, ground.z, ground.reach_along))
+    lit, contact = torch.ones_like(x), torch.ones_like(x)
+    outline, reach = _outlines(light, objects)
+    row = row.repeat_interleave(shape[1] // _PIECE)
+    own_x, own_z, reach = (t.index_select(0, row) for t in (outline.x, outline.z, reach))  # (pieces, M)
+    near = (x.amin(1, keepdim=True) < own_x + reach) & (x.amax(1, keepdim=True) > own_x - reach)
+    near &= (z.amin(1, keepdim=True) < own_z + reach) & (z.amax(1, keepdim=True) > own_z - reach)
+    found = indices_where(near & (reach > 0))
+    vehicles = reach.shape[1]
+    piece = found // vehicles
+    owner = row[piece] * vehicles + found % vehicles
+    pair = _Outline(*(take(t, owner)[:, None] for t in outline))
+    x, z, reach_along = (t.index_select(0, piece) for t in (x, z, reach_along))
+    dx, dz, blur = x - pair.x, z - pair.z, 0.08 + reach_along
+    right, ahead = dx * pair.cos - dz * pair.sin, dx * pair.sin + dz * pair.cos
+    low_x, high_x = _slab(right, pair.sun_x, -pair.half, pair.half)
+    low_z, high_z = _slab(ahead, pair.sun_z, pair.rear, pair.front)
+    enter, leave = torch.maximum(low_x, low_z).clamp(min=0), torch.minimum(high_x, high_z).clamp(max=1)
+    sunlit = 1 - ((leave - enter) * pair.length / blur + 0.3).clamp(0, 1)
+    gap = torch.maximum(right.abs() - pair.half, torch.maximum(pair.rear - ahead, ahead - pair.front))
     open_sky = 1 - 0.85 * smoothstep(0.45 + blur, -0.25, gap)
-    lit[0].scatter_reduce_(0, at, sunlit, "amin")
-    contact[0].scatter_reduce_(0, at, open_sky, "amin")
-    return lit, contact
+    index = piece[:, None].expand_as(dx)
+    lit.scatter_reduce_(0, index, sunlit, "amin")
+    contact.scatter_reduce_(0, index, open_sky, "amin")
+    return lit.reshape(shape), contact.reshape(shape)
 
 
 def _slab(position: Tensor, speed: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     """Times at which position + t · speed enters and leaves [low, high]."""
-    speed = torch.where(speed.abs() < 1e-3, 1e-3, speed)
+    speed = choose(speed.abs() < 1e-3, 1e-3, speed)
     first, second = (low - position) / speed, (high - position) / speed
     return torch.minimum(first, second), torch.maximum(first, second)

@@ -9,36 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.stamp import LETTERS
 
-STAMP_LENGTH = 24  # letters
-_LETTERS = "0123456789:/-. KMHNEAP"
-_PATTERNS = (  # 0 stands for any digit, * for any letter
-    "0000-00-00 00:00:00     ",
-    "00/00/0000 00:00:00 000 ",
-    "000 KM/H  00:00:00      ",
-    "00:00:00                ",
-    "N00.00000 E000.00000 000",
-    "*********  0000-00-00   ",
-)
 _HIGH, _WIDE, _FONTS = 24, 16, (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX)
-
-
-def sample_text(dice: Dice, length: int) -> Tensor:
-    """(B, length) int64 indices of letters."""
-    blank, first = _LETTERS.index(" "), _LETTERS.index("K")
-    codes = [[{"0": -1.0, "*": -2.0}.get(c, float(_LETTERS.find(c))) for c in p] for p in _PATTERNS]
-    pattern = dice.pick_from([tuple(c) for c in codes]).long()[:, :length]
-    digit, letter = dice.pick([1.0] * 10, length), first + dice.pick([1.0] * (len(_LETTERS) - first), length)
-    text = torch.where(pattern == -1, digit, torch.where(pattern == -2, letter, pattern))
-    return text.where(text >= 0, blank)
 
 
 @lru_cache(maxsize=8)
 def _letters(device: torch.device) -> Tensor:
     """(2, G · HIGH · WIDE) the letters, and the letters with their rims."""
     cells, thick = [], []
-    for letter in _LETTERS:
+    for letter in LETTERS:
         canvas = np.zeros((4 * _HIGH, 4 * _WIDE), np.uint8)
         cv2.putText(canvas, letter, (6, 4 * _HIGH - 18), _FONTS[0], 2.3, 255, 9, cv2.LINE_AA)
         cells.append(cv2.resize(canvas, (_WIDE, _HIGH), interpolation=cv2.INTER_AREA))
@@ -61,7 +41,7 @@ def stamp(
 
     Args:
         image: (B, 3, H, W) display values.
-        text: (B, T) int64, see :func:`sample_text`.
+        text: (B, T) int64, see :func:`~lanebev.render.scene.stamp.sample_text`.
         place: (B, 2) of its upper left corner, shares of width and height.
         high: (B,) of a letter, share of the height.
         colour: (B, 3).

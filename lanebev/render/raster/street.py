@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.glyphs import GLYPH_LENGTH, GLYPH_WIDTH, NUM_GLYPHS, glyph_coverage
-from lanebev.render.raster.markings import dash_coverage, stripe_coverage
+from lanebev.render.raster.coverage import dash_coverage, stripe_coverage
+from lanebev.render.raster.glyphs import GLYPH_LENGTH, GLYPH_WIDTH, glyph_coverage
 from lanebev.render.raster.noise import GRAIN, hash01, sample_grain, smoothstep
+from lanebev.render.scene.glyphs import NUM_GLYPHS
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
 from lanebev.render.scene.pavement import Pavement
 from lanebev.render.scene.street import CYCLING, FORD, KERB, PARKING, PATH, WALK, ZEBRA, Street

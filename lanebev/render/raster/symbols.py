@@ -5,8 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.markings import stripe_coverage
+from lanebev.render.raster.coverage import stripe_coverage
+from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.noise import hash01
+from lanebev.render.raster.select import remainder
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
 
 NO_SYMBOL, ARROW, TURN, WORD, DIAMOND = range(5)
@@ -14,34 +16,28 @@ _LENGTH = 5.0  # m, of a symbol along the road
 _LETTER = (0.42, 2.4)  # m, a letter's pitch across and its height along the road
 
 
-def symbols(
-    layout: Layout, along: Tensor, across: Tensor, reach_along: Tensor, reach_across: Tensor
-) -> Tensor:
+def symbols(layout: Layout, ground: Ground, lane: Tensor) -> Tensor:
     """Coverage of a pixel by symbols, (B, N).
 
     Args:
         layout: of the road; the symbol of lane k stands between boundaries k and k + 1.
-        along: (B, N) m in the world.
-        across: (B, N) m in the layout's frame.
-        reach_along: (B, N) m per pixel.
-        reach_across: (B, N) m per pixel.
+        ground: the points.
+        lane: (B, N) int64, number of boundaries to their left.
     """
-    covered = torch.zeros_like(along)
-    if not bool((layout.symbol > NO_SYMBOL).any()):
-        return covered
-    lane = (torch.searchsorted(layout.across, across.contiguous()) - 1).clamp(0, MAX_BOUNDARIES - 2)
-    low, high = layout.across.gather(1, lane), layout.across.gather(1, lane + 1)
-    period = layout.symbol_period[:, None]
-    position = (along + layout.symbol_phase[:, None]) % period
-    kind = layout.symbol.gather(1, lane)
-    there = (kind > NO_SYMBOL) & (position < _LENGTH + 2) & (across > low) & (across < high)
+    covered = torch.zeros_like(ground.along)
+    between = (lane - 1).clamp(0, MAX_BOUNDARIES - 2)
+    period, phase = layout.symbol_period[:, None], layout.symbol_phase[:, None]
+    position = remainder(ground.along + phase, period)
+    inner = (lane >= 1) & (lane < MAX_BOUNDARIES)
+    there = (layout.symbol > NO_SYMBOL).gather(1, between) & (position < _LENGTH + 2) & inner
     row, at = there.nonzero(as_tuple=True)
     if not len(at):
         return covered
-    x = (across - 0.5 * (low + high))[row, at]
+    lane = between[row, at]
+    x = ground.across[row, at] - 0.5 * (layout.across[row, lane] + layout.across[row, lane + 1])
     y = position[row, at] - 1.0
-    kind, wide, far = kind[row, at], reach_across[row, at], reach_along[row, at]
-    seed = ((along + layout.symbol_phase[:, None]) / period).floor()[row, at] + 7.0 * lane[row, at]
+    kind, wide, far = layout.symbol[row, lane], ground.reach_across[row, at], ground.reach_along[row, at]
+    seed = ((ground.along + phase) / period)[row, at].floor() + 7.0 * lane
     shapes = torch.stack(
         [
             _arrow(x, y, wide, far),
@@ -60,8 +56,8 @@ def _arrow(x: Tensor, y: Tensor, wide: Tensor, far: Tensor) -> Tensor:
     stem = stripe_coverage(x, torch.full_like(x, 0.16), wide) * stripe_coverage(
         y - 1.5, torch.full_like(x, 3.0), far
     )
-    room = 0.42 * (4.6 - y) / 1.6 - x.abs()
-    head = (room / wide + 0.5).clamp(0, 1) * ((y - 3.0) / far + 0.5).clamp(0, 1)
+    gap = 0.42 * (4.6 - y) / 1.6 - x.abs()
+    head = (gap / wide + 0.5).clamp(0, 1) * ((y - 3.0) / far + 0.5).clamp(0, 1)
     return torch.maximum(stem, head)
 
 
@@ -73,8 +69,8 @@ def _turn(x: Tensor, y: Tensor, wide: Tensor, far: Tensor) -> Tensor:
     bar = stripe_coverage(x - 0.0, torch.full_like(x, 0.6), wide) * stripe_coverage(
         y - 3.0, torch.full_like(x, 0.5), far
     )
-    room = 1.1 * (0.75 - x) / 0.5 - (y - 3.0).abs()
-    head = (room / far + 0.5).clamp(0, 1) * ((x - 0.25) / wide + 0.5).clamp(0, 1)
+    gap = 1.1 * (0.75 - x) / 0.5 - (y - 3.0).abs()
+    head = (gap / far + 0.5).clamp(0, 1) * ((x - 0.25) / wide + 0.5).clamp(0, 1)
     return torch.maximum(torch.maximum(stem, bar), head)
 
 

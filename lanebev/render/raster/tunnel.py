@@ -5,22 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.lens import Lens
-from lanebev.render.raster.solids import Light
+from lanebev.render.raster.rays import View
 from lanebev.render.scene.alignment import Alignment, road_from_local
+from lanebev.render.scene.camera import Lens
 from lanebev.render.scene.tunnel import Tunnel
 from lanebev.render.scene.world import Place
 
 _NO_CEILING = 900.0  # m; beyond, nothing of it is drawn
-
-
-def tunnel_light(light: Light, tunnel: Tunnel) -> Light:
-    """The illumination inside: that of the lamps alone."""
-    on = (tunnel.on > 0)[:, None]
-    return light._replace(
-        direct=torch.where(on, 0.0, light.direct),
-        ambient=torch.where(on, tunnel.level, light.ambient),
-    )
 
 
 def add_ceiling(
@@ -30,7 +21,7 @@ def add_ceiling(
     place: Place,
     alignment: Alignment,
     lens: Lens,
-    rays: Tensor,
+    view: View,
 ) -> Tensor:
     """Put the ceiling in the place of the sky.
 
@@ -41,17 +32,17 @@ def add_ceiling(
         place: of the cameras.
         alignment: seen from there.
         lens: the cameras.
-        rays: (B, 2, H, W) right and up per metre forward.
+        view: the pixels' rays.
 
     Returns:
         (B, 3, H, W).
     """
-    swing, rise = rays[:, 0].flatten(1), rays[:, 1].flatten(1)
+    rise = -view.ray_y
     gap = (tunnel.ceiling - lens.extrinsics.height).clamp(min=0.5)[:, None]
     z = gap / rise.clamp(min=1e-3)
     there = (rise > 1e-3) & (z < _NO_CEILING) & blocked.flatten(1).isinf() & (tunnel.on > 0)[:, None]
     z = z.clamp(max=_NO_CEILING)
-    point = road_from_local(alignment, swing * z, z)
+    point = road_from_local(alignment, view.ray_x * z, z)
     along = point.along + place.along[:, None]
     there = there & (along < tunnel.exit[:, None])
     across = point.across + place.across[:, None]

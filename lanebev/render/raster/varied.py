@@ -5,74 +5,71 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.markings import dash_coverage, stripe_coverage
+from lanebev.render.raster.coverage import dash_coverage, stripe_coverage
+from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.street import roadside, street_paint, strips, tracks
 from lanebev.render.raster.winter import snow_cover
 from lanebev.render.scene.works import NUM_OLD, Works
 from lanebev.render.scene.world import World
 
 
-def varied_ground(
+def city_ground(
     world: World,
     eye_across: Tensor,
     eye_height: Tensor,
-    along: Tensor,
-    across: Tensor,
-    reach_along: Tensor,
-    reach_across: Tensor,
+    ground: Ground,
     albedo: Tensor,
     paved: Tensor,
     painted: Tensor,
     blotch: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """The ground of all kinds of road over that of a plain one.
+    """Put a street's ground over that of a plain road.
 
     Args:
         world: what there is.
         eye_across: (B,) m, the camera's place.
         eye_height: (B,) m.
-        along: (B, N) m in the world.
-        across: (B, N) m in the layout's frame.
-        reach_along: (B, N) m per pixel.
-        reach_across: (B, N) m per pixel.
+        ground: (B, N) points.
         albedo: (B, 3, N) linear reflectance of the plain road and its verge.
         paved: (B, N) share of the pixel on the carriageway.
         painted: (B, N) share of it under the boundaries' paint.
         blotch: (B, N) slow noise.
 
     Returns:
-        albedo and painted, as these kinds have them.
+        albedo and painted of the street.
     """
-    layout, pavement = world.layout, world.pavement
-    reach = (reach_along, reach_across)
-    if somewhere(world.kinds.city):
-        street = world.street
-        beside, share = roadside(street, pavement, along, across, *reach, eye_across, eye_height)
-        albedo = albedo + (beside - albedo) * (share * (1 - paved))[:, None]
-        coloured = strips(street, layout, pavement, across, reach_across, albedo)
-        albedo = albedo + (coloured - albedo) * (1 - painted)[:, None]
-        albedo = tracks(street, across, reach_across, albedo)
-        marks = street_paint(street, layout, pavement, along, across, *reach, blotch)
-        albedo = albedo + (street.paint[..., None] - albedo) * marks[:, None]
-        painted = torch.maximum(painted, marks)
-    if somewhere(world.kinds.works):
-        old, scars = old_lines(world.works, along, across, *reach)
-        old, scars = (part * paved * (1 - painted) for part in (old, scars))
-        albedo = albedo * (1 - scars)[:, None]
-        albedo = albedo + (world.works.colour[..., None] - albedo) * old[:, None]
-        painted = torch.maximum(painted, old)
-    if somewhere(world.kinds.snow):
-        cover = snow_cover(world.winter, layout, pavement, along, across, *reach, blotch)
-        field = world.winter.on[:, None] * world.winter.verge[:, None] * (1 - paved)
-        cover = torch.maximum(cover * paved, field * (0.85 + 0.15 * blotch).clamp(0, 1))
-        albedo = albedo + (world.winter.colour[..., None] - albedo) * cover[:, None]
-        painted = painted * (1 - cover)
-    return albedo, painted
+    street, layout, pavement = world.street, world.layout, world.pavement
+    here = (ground.along, ground.across, ground.reach_along, ground.reach_across)
+    beside, share = roadside(street, pavement, *here, eye_across, eye_height)
+    albedo = albedo + (beside - albedo) * (share * (1 - paved))[:, None]
+    coloured = strips(street, layout, pavement, ground.across, ground.reach_across, albedo)
+    albedo = albedo + (coloured - albedo) * (1 - painted)[:, None]
+    albedo = tracks(street, ground.across, ground.reach_across, albedo)
+    marks = street_paint(street, layout, pavement, *here, blotch)
+    albedo = albedo + (street.paint[..., None] - albedo) * marks[:, None]
+    return albedo, torch.maximum(painted, marks)
 
 
-def somewhere(mask: Tensor) -> bool:
-    """Whether a mask holds anywhere, on the CPU, where asking costs nothing; elsewhere it is taken to."""
-    return mask.device.type != "cpu" or bool(mask.any())
+def works_ground(
+    works: Works, ground: Ground, albedo: Tensor, paved: Tensor, painted: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Put old lines on the ground of road works; for the arguments see :func:`city_ground`."""
+    old, scars = old_lines(works, ground.along, ground.across, ground.reach_along, ground.reach_across)
+    old, scars = (part * paved * (1 - painted) for part in (old, scars))
+    albedo = albedo * (1 - scars)[:, None]
+    albedo = albedo + (works.colour[..., None] - albedo) * old[:, None]
+    return albedo, torch.maximum(painted, old)
+
+
+def snow_ground(
+    world: World, ground: Ground, albedo: Tensor, paved: Tensor, painted: Tensor, blotch: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Put snow on the ground; for the arguments see :func:`city_ground`."""
+    winter, here = world.winter, (ground.along, ground.across, ground.reach_along, ground.reach_across)
+    cover = snow_cover(winter, world.layout, world.pavement, *here, blotch)
+    field = winter.on[:, None] * winter.verge[:, None] * (1 - paved)
+    cover = torch.maximum(cover * paved, field * (0.85 + 0.15 * blotch).clamp(0, 1))
+    return albedo + (winter.colour[..., None] - albedo) * cover[:, None], painted * (1 - cover)
 
 
 def old_lines(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.markings import nearest_slot
 from lanebev.render.raster.noise import CLOUD, GRAIN, SECOND, sample_grain, sample_noise, smoothstep
+from lanebev.render.raster.surface import nearest_slot
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout, presence
 from lanebev.render.scene.pavement import Pavement
 from lanebev.render.scene.winter import Winter

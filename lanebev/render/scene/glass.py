@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.stamp import STAMP_LENGTH, sample_text
 from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.stamp import STAMP_LENGTH, sample_text
 
 
 class Glass(NamedTuple):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
 from lanebev.types import NUM_BOUNDARIES
 
 MAX_BOUNDARIES = 8  # painted on the road; six of them, about the ego lane, are the labelled ones
@@ -82,19 +82,24 @@ class Layout(NamedTuple):
     symbol_opacity: Tensor
 
 
-def sample_layout(dice: Dice, dotted: Tensor, faint: Tensor) -> Layout:
+def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layout:
     """A random road.
 
     Args:
-        dice: the randomness.
+        sampler: the randomness.
         dotted: (B,) bool, lanes are divided by studs as in California.
         faint: (B,) bool, thin worn paint of little contrast.
     """
     slots = MAX_BOUNDARIES
-    few_or_many, many = dice.pick([0, 0, 1, 2, 3, 3, 3, 0.6, 0.6]), dice.pick([0, 0, 0, 0.2, 1, 2, 2, 1, 0.5])
+    few_or_many, many = (
+        sampler.pick([0, 0, 1, 2, 3, 3, 3, 0.6, 0.6]),
+        sampler.pick([0, 0, 0, 0.2, 1, 2, 2, 1, 0.5]),
+    )
     count = torch.where(dotted, many, few_or_many)  # boundaries
-    lane_width = torch.where(dice.chance(0.6), dice.uniform(3.4, 3.8), dice.uniform(2.7, 4.0))
-    uneven = torch.where(dice.chance(0.45), 0.09, 0.0)[:, None] * dice.normal(1.0, slots - 1).clamp(-2, 2)
+    lane_width = torch.where(sampler.chance(0.6), sampler.uniform(3.4, 3.8), sampler.uniform(2.7, 4.0))
+    uneven = torch.where(sampler.chance(0.45), 0.09, 0.0)[:, None] * sampler.normal(1.0, slots - 1).clamp(
+        -2, 2
+    )
     widths = (lane_width[:, None] + uneven).clamp(2.6, 4.2)
     across = torch.nn.functional.pad(widths.cumsum(1), (1, 0))
     index = torch.arange(slots)
@@ -103,20 +108,20 @@ def sample_layout(dice: Dice, dotted: Tensor, faint: Tensor) -> Layout:
 
     last = (count - 1)[:, None]
     outer = (index == 0) | (index == last)
-    edge = dice.pick([0.09, 0.66, 0.06, 0.12, 0.03, 0.04], slots)
+    edge = sampler.pick([0.09, 0.66, 0.06, 0.12, 0.03, 0.04], slots)
     divider = torch.where(
         dotted[:, None],
-        dice.pick([0.0, 0.01, 0.30, 0.02, 0.67, 0.0], 1),
-        dice.pick([0.0, 0.05, 0.83, 0.03, 0.05, 0.04], 1),
+        sampler.pick([0.0, 0.01, 0.30, 0.02, 0.67, 0.0], 1),
+        sampler.pick([0.0, 0.05, 0.83, 0.03, 0.05, 0.04], 1),
     )
-    odd_one = dice.pick([0.0, 0.3, 0.25, 0.2, 0.2, 0.05], slots)
-    divider = torch.where(dice.chance(0.12, slots), odd_one, divider)
+    odd_one = sampler.pick([0.0, 0.3, 0.25, 0.2, 0.2, 0.05], slots)
+    divider = torch.where(sampler.chance(0.12, slots), odd_one, divider)
     kind = torch.where(outer, edge, divider)
 
-    dashes = dice.pick_from(DASHES, 1).expand(-1, slots, -1).clone()
-    other = dice.pick_from(DASHES, slots)
-    dashes = torch.where(dice.chance(0.1, slots)[..., None], other, dashes)
-    dashes = dashes * dice.uniform(0.9, 1.1, 1, 1)
+    dashes = sampler.pick_from(DASHES, 1).expand(-1, slots, -1).clone()
+    other = sampler.pick_from(DASHES, slots)
+    dashes = torch.where(sampler.chance(0.1, slots)[..., None], other, dashes)
+    dashes = dashes * sampler.uniform(0.9, 1.1, 1, 1)
     solid = dashes[..., 1:].expand_as(dashes)
     is_dashed, mixed = (kind == DASHED)[..., None], (kind == SOLID_DASHED)[..., None]
     dash = torch.stack(
@@ -124,51 +129,56 @@ def sample_layout(dice: Dice, dotted: Tensor, faint: Tensor) -> Layout:
     )
     double = (kind == DOUBLE) | (kind == SOLID_DASHED)
 
-    width = torch.where(dice.chance(0.75), dice.uniform(0.10, 0.16), dice.uniform(0.14, 0.30))[:, None]
-    width = width * torch.where(outer, dice.uniform(1.0, 1.35, 1), torch.ones(1))
-    width = torch.where(faint[:, None], dice.uniform(0.09, 0.14, 1), width)
-    yellow = ((index == 0) & dice.chance(0.6, 1)) | dice.chance(0.03, slots)
+    width = torch.where(sampler.chance(0.75), sampler.uniform(0.10, 0.16), sampler.uniform(0.14, 0.30))[
+        :, None
+    ]
+    width = width * torch.where(outer, sampler.uniform(1.0, 1.35, 1), torch.ones(1))
+    width = torch.where(faint[:, None], sampler.uniform(0.09, 0.14, 1), width)
+    yellow = ((index == 0) & sampler.chance(0.6, 1)) | sampler.chance(0.03, slots)
     colour = torch.where(yellow[..., None], torch.tensor(YELLOW), torch.tensor(WHITE))
-    colour = colour * dice.uniform(0.85, 1.1, 1, 1) + dice.normal(0.015, 1, 3)
-    opacity = torch.where(dice.chance(0.55), dice.uniform(0.75, 1.0), dice.uniform(0.4, 0.85))[:, None]
-    opacity = (opacity * dice.uniform(0.75, 1.15, slots)).clamp(0.3, 1.0)
-    opacity = torch.where(faint[:, None], dice.uniform(0.4, 0.9, 1), opacity)
+    colour = colour * sampler.uniform(0.85, 1.1, 1, 1) + sampler.normal(0.015, 1, 3)
+    opacity = torch.where(sampler.chance(0.55), sampler.uniform(0.75, 1.0), sampler.uniform(0.4, 0.85))[
+        :, None
+    ]
+    opacity = (opacity * sampler.uniform(0.75, 1.15, slots)).clamp(0.3, 1.0)
+    opacity = torch.where(faint[:, None], sampler.uniform(0.4, 0.9, 1), opacity)
 
     stud = kind == STUDS
-    reflectors = dice.chance(0.35, 1) & (dice.chance(0.8, slots)) & (kind != NONE)
-    fraction = dice.uniform(0.0, 1.0)[:, None]
+    reflectors = sampler.chance(0.35, 1) & (sampler.chance(0.8, slots)) & (kind != NONE)
+    fraction = sampler.uniform(0.0, 1.0)[:, None]
     stud_period = torch.where(stud | reflectors, torch.where(fraction < 0.85, 14.63, 7.32), 0.0)
     stud_group = torch.where(stud, torch.where(fraction < 0.85, 4.6, 7.4), 0.3)
-    missing = dice.chance(0.07, slots) & (kind != NONE)
+    missing = sampler.chance(0.07, slots) & (kind != NONE)
     return Layout(
         across=across,
         exists=exists,
         marked=exists & (kind != NONE),
         lane_width=lane_width,
         stripe_width=width.expand(-1, slots).contiguous(),
-        separation=torch.where(double, width * dice.uniform(1.6, 2.6, 1), 0.0),
+        separation=torch.where(double, width * sampler.uniform(1.6, 2.6, 1), 0.0),
         dash=dash.contiguous(),
-        dash_phase=dice.uniform(0, 20, 1) + torch.where(dice.chance(0.2, 1), dice.uniform(0, 20, slots), 0.0),
+        dash_phase=sampler.uniform(0, 20, 1)
+        + torch.where(sampler.chance(0.2, 1), sampler.uniform(0, 20, slots), 0.0),
         colour=colour.clamp(0.02, 0.95).expand(-1, slots, -1).contiguous(),
         opacity=torch.where(stud | (kind == NONE), 0.0, opacity),
-        wear=torch.where(dice.chance(0.5), dice.uniform(0.0, 0.3), dice.uniform(0.2, 0.65))[:, None].repeat(
-            1, slots
-        ),
+        wear=torch.where(sampler.chance(0.5), sampler.uniform(0.0, 0.3), sampler.uniform(0.2, 0.65))[
+            :, None
+        ].repeat(1, slots),
         stud_period=stud_period.contiguous(),
         stud_group=stud_group.expand(-1, slots).contiguous(),
-        missing_period=dice.uniform(150, 500, slots),
-        missing_length=torch.where(missing, dice.uniform(15, 90, slots), 0.0),
-        missing_phase=dice.uniform(-60, 40, slots),
-        ghost=torch.where(dice.chance(0.1, 1), dice.uniform(0.1, 0.45, 1), 0.0)
+        missing_period=sampler.uniform(150, 500, slots),
+        missing_length=torch.where(missing, sampler.uniform(15, 90, slots), 0.0),
+        missing_phase=sampler.uniform(-60, 40, slots),
+        ghost=torch.where(sampler.chance(0.1, 1), sampler.uniform(0.1, 0.45, 1), 0.0)
         .expand(-1, slots)
         .contiguous(),
-        ghost_shift=dice.uniform(-0.5, 0.5, slots),
+        ghost_shift=sampler.uniform(-0.5, 0.5, slots),
         symbol=torch.where(
-            dice.chance(0.15, 1) & dice.chance(0.6, slots), dice.pick([0, 3, 1, 2, 1], slots), 0
+            sampler.chance(0.15, 1) & sampler.chance(0.6, slots), sampler.pick([0, 3, 1, 2, 1], slots), 0
         ),
-        symbol_period=dice.uniform(25, 150),
-        symbol_phase=dice.uniform(0, 150),
-        symbol_opacity=dice.uniform(0.5, 1.0),
+        symbol_period=sampler.uniform(25, 150),
+        symbol_phase=sampler.uniform(0, 150),
+        symbol_opacity=sampler.uniform(0.5, 1.0),
     )
 
 
@@ -191,7 +201,8 @@ def labelled_slots(layout: Layout, ego_lane: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         (B, L) int64 slots, clamped; (B, L) bool, there is such a boundary.
     """
-    slot = ego_lane[:, None] + torch.arange(NUM_BOUNDARIES) - (NUM_BOUNDARIES // 2 - 1)
+    index = torch.arange(NUM_BOUNDARIES, device=ego_lane.device)
+    slot = ego_lane[:, None] + index - (NUM_BOUNDARIES // 2 - 1)
     inside = (slot >= 0) & (slot < MAX_BOUNDARIES)
     slot = slot.clamp(0, MAX_BOUNDARIES - 1)
     return slot, inside & layout.exists.gather(1, slot)

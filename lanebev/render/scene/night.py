@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.weather import Light
 
 NUM_LAMPS = 10  # street lamps ahead on each side
 NUM_SPOTS = 28  # distant lights of the town
@@ -130,4 +131,14 @@ def sample_lights(dice: Dice, night: Tensor, left: Tensor, right: Tensor) -> Lig
         ),
         mirror=on * wet,
         smear=on * torch.where(dice.chance(0.7), dice.uniform(0.0, 0.8), dice.uniform(0.5, 2.0)),
+    )
+
+
+def night_light(light: Light, lights: Lights) -> Light:
+    """The illumination on a night of these lights."""
+    lamps = 0.25 * lights.lamp.sum(1, keepdim=True) * lights.lamp_colour
+    on = (lights.on > 0)[:, None]
+    return light._replace(
+        ambient=torch.where(on, light.ambient * lights.dark[:, None] + lamps, light.ambient),
+        headlight=torch.where(on[:, 0], 0.7 * lights.beam, light.headlight),
     )

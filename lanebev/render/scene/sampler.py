@@ -1,4 +1,4 @@
-"""Random numbers for whole batches, from one generator; rows of nested tuples of tensors."""
+"""Random numbers for whole batches, from one generator; nested tuples of tensors, row by row."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from torch import Tensor
 T = TypeVar("T", bound=tuple[Any, ...])
 
 
-class Dice:
-    """Draws (B, ...) tensors.
+class BatchSampler:
+    """Draws (B, ...) tensors on the CPU: the same scenes on every device.
 
     Args:
         batch_size: B.
-        generator: the only source of randomness.
+        generator: the only source of randomness, of the CPU.
     """
 
     def __init__(self, batch_size: int, generator: torch.Generator) -> None:
         self.batch_size = batch_size
         self.generator = generator
 
-    def beside(self) -> Dice:
-        """Dice with numbers of their own, always the same, for what is not used."""
+    def beside(self) -> BatchSampler:
+        """Return a sampler with numbers of its own, always the same, for what is not used."""
         generator = torch.Generator(self.generator.device).manual_seed(0)
-        return Dice(self.batch_size, generator)
+        return BatchSampler(self.batch_size, generator)
 
     def uniform(self, low: float, high: float, *shape: int) -> Tensor:
         """(B, *shape) uniform in [low, high)."""
@@ -51,6 +51,9 @@ class Dice:
         return torch.tensor(values)[self.pick([1.0] * len(values), *shape)]
 
 
+Dice = BatchSampler
+
+
 def map_tensors(function: Callable[[Tensor], Tensor], values: T) -> T:
     """Apply a function to every tensor of a nested NamedTuple; what is neither stays."""
     parts = [
@@ -60,6 +63,26 @@ def map_tensors(function: Callable[[Tensor], Tensor], values: T) -> T:
     return type(values)(*parts)
 
 
+def select_rows(values: T, rows: Tensor | slice) -> T:
+    """Rows of a (nested) NamedTuple of (B, ...) tensors: an index tensor (R,) or a slice."""
+    return map_tensors(
+        lambda tensor: tensor.index_select(0, rows) if isinstance(rows, Tensor) else tensor[rows], values
+    )
+
+
 def row_of(values: T, index: int) -> T:
     """Row ``index`` of a (nested) NamedTuple of (B, ...) tensors, the batch dimension kept."""
-    return map_tensors(lambda tensor: tensor[index : index + 1], values)
+    return select_rows(values, slice(index, index + 1))
+
+
+def concatenate_rows(parts: Sequence[T]) -> T:
+    """Concatenate (nested) NamedTuples of (B, ...) tensors along the batch; all else is the first's."""
+    joined = [
+        concatenate_rows(group)
+        if isinstance(group[0], tuple)
+        else torch.cat(group)
+        if isinstance(group[0], Tensor)
+        else group[0]
+        for group in zip(*parts, strict=True)
+    ]
+    return type(parts[0])(*joined)

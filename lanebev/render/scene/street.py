@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.glyphs import ARROWS, BICYCLE, CROSS, WORDS
+from lanebev.render.scene.glyphs import ARROWS, BICYCLE, CROSS, WORDS
 from lanebev.render.scene.layout import (
     DASHED,
     DOUBLE,

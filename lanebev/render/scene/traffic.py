@@ -8,7 +8,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.solids import BRIDGE, CAR, POLE, SIGN, TRUCK, Solids
 from lanebev.render.scene.alignment import (
     Alignment,
     elevation_at,
@@ -17,7 +16,8 @@ from lanebev.render.scene.alignment import (
     z_from_arc,
 )
 from lanebev.render.scene.layout import Layout
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.objects import BRIDGE, CAR, POLE, SIGN, TRUCK, SceneObjects
+from lanebev.render.scene.sampler import BatchSampler
 
 NUM_VEHICLES, NUM_ONCOMING = 14, 5
 CAR_COLOURS = [
@@ -40,7 +40,7 @@ class Traffic(NamedTuple):
         along: m in the world at time zero.
         across: m in the layout's frame.
         speed: m/s along the road; oncoming ones are negative, what stands has none.
-        shape: (B, M, 2, 8), see :class:`Solids`.
+        shape: (B, M, 2, 8), see :class:`SceneObjects`.
         kind: int64.
         colour: (B, M, 3).
         braking: bool.
@@ -57,13 +57,13 @@ class Traffic(NamedTuple):
     valid: Tensor
 
 
-def vehicle_shapes(dice: Dice, count: int, truck: Tensor) -> Tensor:
+def vehicle_shapes(sampler: BatchSampler, count: int, truck: Tensor) -> Tensor:
     """(B, count, 2, 8): a body and what is above it."""
-    length = dice.uniform(3.9, 5.1, count)
-    half = dice.uniform(0.86, 0.98, count)
-    tall = dice.chance(0.35, count)  # SUVs and vans
-    waist = torch.where(tall, dice.uniform(1.05, 1.2, count), dice.uniform(0.88, 1.0, count))
-    roof = torch.where(tall, dice.uniform(1.65, 1.95, count), dice.uniform(1.38, 1.5, count))
+    length = sampler.uniform(3.9, 5.1, count)
+    half = sampler.uniform(0.86, 0.98, count)
+    tall = sampler.chance(0.35, count)  # SUVs and vans
+    waist = torch.where(tall, sampler.uniform(1.05, 1.2, count), sampler.uniform(0.88, 1.0, count))
+    roof = torch.where(tall, sampler.uniform(1.65, 1.95, count), sampler.uniform(1.38, 1.5, count))
     one = torch.ones_like(half)
     rear, front = -0.5 * length, 0.5 * length
     body = [half, half * 0.97, rear, front, rear + 0.05, front - 0.15, 0.10 * one, waist]
@@ -71,9 +71,9 @@ def vehicle_shapes(dice: Dice, count: int, truck: Tensor) -> Tensor:
     glass_low = [half * 0.95, half * 0.76, rear + 0.3 * back, front - 0.9 * one]
     cabin = [*glass_low, rear + back + 0.2, front - 1.9 * one, waist, roof]
     car = torch.stack([torch.stack(body, -1), torch.stack(cabin, -1)], dim=2)
-    long = dice.uniform(5.0, 13.0, count)
+    long = sampler.uniform(5.0, 13.0, count)
     box = [1.25 * one, 1.25 * one, -0.5 * long, 0.5 * long - 1.8, -0.5 * long, 0.5 * long - 1.8, 0.3 * one]
-    box = [*box, dice.uniform(2.6, 4.0, count)]
+    box = [*box, sampler.uniform(2.6, 4.0, count)]
     cab = [
         1.2 * one,
         1.1 * one,
@@ -93,7 +93,7 @@ def _box(half: Tensor, rear: Tensor, front: Tensor, low: Tensor, high: Tensor) -
 
 
 def sample_traffic(
-    dice: Dice,
+    sampler: BatchSampler,
     layout: Layout,
     ego_lane: Tensor,
     opposite: Tensor,
@@ -105,7 +105,7 @@ def sample_traffic(
     """Random things along the road.
 
     Args:
-        dice: the randomness.
+        sampler: the randomness.
         layout: the boundaries.
         ego_lane: (B,) int64.
         opposite: (B,) m, the opposite carriageway's right edge; -infinite: none.
@@ -114,84 +114,90 @@ def sample_traffic(
         bridge_at: (B,) m along, where a bridge begins; infinite: none.
         bridge_long: (B,) m, its extent along the road.
     """
-    vehicles = _sample_vehicles(dice, layout, ego_lane, opposite)
-    props = _sample_props(dice, left, right, bridge_at, bridge_long)
+    vehicles = _sample_vehicles(sampler, layout, ego_lane, opposite)
+    props = _sample_props(sampler, left, right, bridge_at, bridge_long)
     return Traffic(*(torch.cat(pair, dim=1) for pair in zip(vehicles, props, strict=True)))
 
 
-def _sample_vehicles(dice: Dice, layout: Layout, ego_lane: Tensor, opposite: Tensor) -> Traffic:
+def _sample_vehicles(sampler: BatchSampler, layout: Layout, ego_lane: Tensor, opposite: Tensor) -> Traffic:
     ahead, count = NUM_VEHICLES, NUM_VEHICLES + NUM_ONCOMING
     lanes = (layout.exists.sum(1) - 1).clamp(min=1)[:, None]
     start, hop = (
-        dice.uniform(0, 8, 1).long(),
-        1 + (dice.uniform(0, 1, ahead) * (lanes - 1).clamp(min=1)).long(),
+        sampler.uniform(0, 8, 1).long(),
+        1 + (sampler.uniform(0, 1, ahead) * (lanes - 1).clamp(min=1)).long(),
     )
     lane = (start + hop.cumsum(1)) % lanes
-    near = torch.where(dice.chance(0.3, 1), -2.0, 3.0)
-    along = near + 6.5 * torch.exp(0.27 * torch.arange(ahead) + 0.12 * dice.uniform(0, 1, ahead))
-    truck = dice.chance(0.16, count)
-    shape = vehicle_shapes(dice, count, truck)
+    near = torch.where(sampler.chance(0.3, 1), -2.0, 3.0)
+    along = near + 6.5 * torch.exp(0.27 * torch.arange(ahead) + 0.12 * sampler.uniform(0, 1, ahead))
+    truck = sampler.chance(0.16, count)
+    shape = vehicle_shapes(sampler, count, truck)
     half_length = 0.5 * (shape[..., 0, 3] - shape[..., 0, 2])
     middle = 0.5 * (layout.across.gather(1, lane) + layout.across.gather(1, lane + 1))
-    across = middle + dice.normal(0.2, ahead)
-    wanted = dice.chance(0.75, 1) & (dice.uniform(0, 1, ahead) < dice.uniform(0.1, 1.0, 1))
+    across = middle + sampler.normal(0.2, ahead)
+    wanted = sampler.chance(0.75, 1) & (sampler.uniform(0, 1, ahead) < sampler.uniform(0.1, 1.0, 1))
     ahead_of_ego = lane == ego_lane[:, None]
     tail = along - half_length[:, :ahead]
-    clear = ~ahead_of_ego | (tail > 22.0) | ((tail > 6.0) & dice.chance(0.3, ahead))
+    clear = ~ahead_of_ego | (tail > 22.0) | ((tail > 6.0) & sampler.chance(0.3, ahead))
     overlap = (lane[:, :, None] == lane[:, None, :]) & (
         (along[:, :, None] - along[:, None, :]).abs()
         < half_length[:, :ahead, None] + half_length[:, None, :ahead] + 1.5
     )
     first = torch.tril(overlap, diagonal=-1).any(2)
-    oncoming_along = dice.uniform(10, 200, NUM_ONCOMING)
-    oncoming_across = opposite[:, None].clamp(min=-500) - 2.85 - 3.7 * dice.pick([1, 1, 1], NUM_ONCOMING)
+    oncoming_along = sampler.uniform(10, 200, NUM_ONCOMING)
+    oncoming_across = opposite[:, None].clamp(min=-500) - 2.85 - 3.7 * sampler.pick([1, 1, 1], NUM_ONCOMING)
     return Traffic(
         along=torch.cat([along, oncoming_along], 1),
         across=torch.cat([across, oncoming_across], 1),
-        speed=torch.cat([dice.uniform(-3, 3, ahead), -dice.uniform(48, 60, NUM_ONCOMING)], 1),
+        speed=torch.cat([sampler.uniform(-3, 3, ahead), -sampler.uniform(48, 60, NUM_ONCOMING)], 1),
         shape=shape,
         kind=torch.where(truck, TRUCK, CAR),
         colour=torch.where(
             truck[..., None],
-            dice.uniform(0.15, 0.75, count, 1) * torch.tensor([1.0, 0.98, 0.95]),
-            dice.pick_from(CAR_COLOURS, count) * dice.uniform(0.7, 1.2, count, 1),
+            sampler.uniform(0.15, 0.75, count, 1) * torch.tensor([1.0, 0.98, 0.95]),
+            sampler.pick_from(CAR_COLOURS, count) * sampler.uniform(0.7, 1.2, count, 1),
         ),
-        braking=dice.chance(0.2, count),
+        braking=sampler.chance(0.2, count),
         valid=torch.cat(
-            [wanted & clear & ~first, opposite.isfinite()[:, None] & dice.chance(0.6, NUM_ONCOMING)], 1
+            [wanted & clear & ~first, opposite.isfinite()[:, None] & sampler.chance(0.6, NUM_ONCOMING)], 1
         ),
     )
 
 
-def _sample_props(dice: Dice, left: Tensor, right: Tensor, bridge_at: Tensor, bridge_long: Tensor) -> Traffic:
+def _sample_props(
+    sampler: BatchSampler, left: Tensor, right: Tensor, bridge_at: Tensor, bridge_long: Tensor
+) -> Traffic:
     """A bridge with its piers, a gantry with its legs, three signs, four lamp posts."""
     one = torch.ones_like(left)[:, None]
     width, middle = (right - left)[:, None], 0.5 * (left + right)[:, None]
     bridge, reach = bridge_at.isfinite()[:, None], 0.5 * bridge_long[:, None]
     bridge_z = torch.where(bridge, bridge_at[:, None], 0.0) + reach
-    low = dice.uniform(4.9, 6.5, 1)
-    deck = _box(0.5 * width + 25, -reach, reach, low, low + dice.uniform(1.0, 2.4, 1))
-    pier = _box(dice.uniform(0.4, 0.9, 1), -0.7 * reach, 0.7 * reach, 0 * one, low).expand(-1, 2, -1)
-    pier_across = torch.cat([left[:, None] - 1.5, right[:, None] + dice.uniform(1.5, 6, 1)], dim=1)
+    low = sampler.uniform(4.9, 6.5, 1)
+    deck = _box(0.5 * width + 25, -reach, reach, low, low + sampler.uniform(1.0, 2.4, 1))
+    pier = _box(sampler.uniform(0.4, 0.9, 1), -0.7 * reach, 0.7 * reach, 0 * one, low).expand(-1, 2, -1)
+    pier_across = torch.cat([left[:, None] - 1.5, right[:, None] + sampler.uniform(1.5, 6, 1)], dim=1)
 
-    gantry = dice.chance(0.25, 1)
-    gantry_z, clearance = dice.uniform(25, 180, 1), dice.uniform(5.6, 6.5, 1)
+    gantry = sampler.chance(0.25, 1)
+    gantry_z, clearance = sampler.uniform(25, 180, 1), sampler.uniform(5.6, 6.5, 1)
     beam = _box(0.5 * width + 1.5, -0.15 * one, 0.15 * one, clearance + 0.8, clearance + 1.1)
     board = _box(
-        dice.uniform(1.5, 4.0, 1), -0.3 * one, -0.16 * one, clearance, clearance + dice.uniform(1.5, 3.2, 1)
+        sampler.uniform(1.5, 4.0, 1),
+        -0.3 * one,
+        -0.16 * one,
+        clearance,
+        clearance + sampler.uniform(1.5, 3.2, 1),
     )
     leg = _box(0.18 * one, -0.18 * one, 0.18 * one, 0 * one, clearance + 1.1)
     legs_across = torch.cat([left[:, None] - 1.5, right[:, None] + 1.5], dim=1)
 
     post = _box(0.05 * one, -0.05 * one, 0.05 * one, 0 * one, 3 * one)
-    bottom, half = dice.uniform(1.2, 2.2, 3), dice.uniform(0.3, 1.3, 3)
+    bottom, half = sampler.uniform(1.2, 2.2, 3), sampler.uniform(0.3, 1.3, 3)
     panel = _box(half, -0.09 + 0 * half, -0.05 + 0 * half, bottom, bottom + 2 * half.clamp(max=0.8))
-    lamp_high = dice.uniform(8.0, 12.0, 1)
+    lamp_high = sampler.uniform(8.0, 12.0, 1)
     pole = _box(0.09 * one, -0.09 * one, 0.09 * one, 0 * one, lamp_high)
     arm = _box(1.7 * one, -0.1 * one, 0.1 * one, lamp_high, lamp_high + 0.14)
-    lamp_side = torch.where(dice.chance(0.5, 1), left[:, None] - 0.8, right[:, None] + 1.5)
-    lamp_gap = dice.uniform(28, 55, 1)
-    lamp_z = dice.uniform(5, 30, 1) + lamp_gap * torch.arange(4)
+    lamp_side = torch.where(sampler.chance(0.5, 1), left[:, None] - 0.8, right[:, None] + 1.5)
+    lamp_gap = sampler.uniform(28, 55, 1)
+    lamp_z = sampler.uniform(5, 30, 1) + lamp_gap * torch.arange(4)
 
     flat = torch.zeros_like(deck)
     shape = torch.cat(
@@ -205,17 +211,17 @@ def _sample_props(dice: Dice, left: Tensor, right: Tensor, bridge_at: Tensor, br
         ],
         dim=1,
     )
-    sign_across = torch.where(dice.chance(0.75, 3), right[:, None] + 1.8, left[:, None] - 1.2)
+    sign_across = torch.where(sampler.chance(0.75, 3), right[:, None] + 1.8, left[:, None] - 1.2)
     across = torch.cat(
         [middle, pier_across, middle, legs_across, sign_across, lamp_side.expand(-1, 4)], dim=1
     )
     along = torch.cat(
-        [bridge_z.expand(-1, 3), gantry_z.expand(-1, 3), dice.uniform(12, 160, 3), lamp_z], dim=1
+        [bridge_z.expand(-1, 3), gantry_z.expand(-1, 3), sampler.uniform(12, 160, 3), lamp_z], dim=1
     )
     kind = torch.tensor([BRIDGE, POLE, POLE, SIGN, POLE, POLE, SIGN, SIGN, SIGN, POLE, POLE, POLE, POLE])
-    concrete = dice.uniform(0.15, 0.4, 1, 1) * torch.tensor([1.0, 0.97, 0.93])
-    steel = dice.uniform(0.1, 0.4, 1, 1) * torch.ones(3)
-    signs = dice.pick_from(SIGN_COLOURS, 4)
+    concrete = sampler.uniform(0.15, 0.4, 1, 1) * torch.tensor([1.0, 0.97, 0.93])
+    steel = sampler.uniform(0.1, 0.4, 1, 1) * torch.ones(3)
+    signs = sampler.pick_from(SIGN_COLOURS, 4)
     colour = torch.cat(
         [
             concrete.expand(-1, 3, -1),
@@ -226,13 +232,13 @@ def _sample_props(dice: Dice, left: Tensor, right: Tensor, bridge_at: Tensor, br
         ],
         1,
     )
-    lamps = dice.chance(0.3, 1).expand(-1, 4)
-    valid = torch.cat([bridge.expand(-1, 3), gantry.expand(-1, 3), dice.chance(0.35, 3), lamps], dim=1)
+    lamps = sampler.chance(0.3, 1).expand(-1, 4)
+    valid = torch.cat([bridge.expand(-1, 3), gantry.expand(-1, 3), sampler.chance(0.35, 3), lamps], dim=1)
     off = torch.zeros_like(valid)
     return Traffic(along, across, 0.0 * along, shape, kind.expand_as(along), colour, off, valid)
 
 
-def place_solids(traffic: Traffic, alignment: Alignment, start: Tensor, side: Tensor) -> Solids:
+def place_objects(traffic: Traffic, alignment: Alignment, start: Tensor, side: Tensor) -> SceneObjects:
     """Traffic in the local road frame.
 
     Args:
@@ -246,7 +252,7 @@ def place_solids(traffic: Traffic, alignment: Alignment, start: Tensor, side: Te
     x, z, _ = local_from_road(alignment, z_from_arc(alignment, arc), across)
     point = road_from_local(alignment, x, z)
     heading = torch.atan2(point.sin, point.cos) + math.pi * (traffic.speed < -20)
-    return Solids(
+    return SceneObjects(
         x=x,
         z=z,
         ground=elevation_at(alignment, z),

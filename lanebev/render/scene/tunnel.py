@@ -13,6 +13,7 @@ from lanebev.render.scene.pavement import Pavement
 from lanebev.render.scene.sampler import Dice
 from lanebev.render.scene.surroundings import CONCRETE, NOTHING, NUM_WALLS, Surroundings
 from lanebev.render.scene.traffic import NUM_ONCOMING, NUM_VEHICLES, Traffic
+from lanebev.render.scene.weather import Light
 
 _LAMP_COLOURS = [(1.0, 0.6, 0.2), (1.0, 0.75, 0.4), (1.0, 0.95, 0.85), (0.85, 0.95, 1.0)]
 
@@ -92,3 +93,12 @@ def tunnel_traffic(tunnel: Tensor, traffic: Traffic) -> Traffic:
     index = torch.arange(traffic.valid.shape[1], device=tunnel.device)
     vehicle = index < NUM_VEHICLES + NUM_ONCOMING
     return traffic._replace(valid=traffic.valid & (vehicle | ~tunnel[:, None]))
+
+
+def tunnel_light(light: Light, tunnel: Tunnel) -> Light:
+    """The illumination inside: that of the lamps alone."""
+    on = (tunnel.on > 0)[:, None]
+    return light._replace(
+        direct=torch.where(on, 0.0, light.direct),
+        ambient=torch.where(on, tunnel.level, light.ambient),
+    )

@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.photometry import NIGHT, Sensor, Weather
 from lanebev.render.scene.kinds import Kinds
 from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sensor import Sensor
+from lanebev.render.scene.weather import NIGHT, Weather
 from lanebev.types import Extrinsics
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lanebev.geometry.lens import denormalise_points, distort_points
 from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
 from lanebev.types import Extrinsics
 
 
@@ -44,13 +44,13 @@ class WindowConfig:
             raise ValueError(f"expected stretch, shift >= 0, got {self.stretch} and {self.shift}")
 
 
-def sample_window_scale(sampler: Dice, config: WindowConfig) -> Tensor:
+def sample_window_scale(sampler: BatchSampler, config: WindowConfig) -> Tensor:
     """Sample the width of windows as a share of the native image's, (B,)."""
     return sampler.uniform(*config.scale)
 
 
 def window_from_native(
-    sampler: Dice,
+    sampler: BatchSampler,
     config: WindowConfig,
     scale: Tensor,
     size: tuple[int, int],

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.solids import POLE
 from lanebev.render.scene.kinds import choose
 from lanebev.render.scene.layout import DASHED, MAX_BOUNDARIES, NONE, SOLID, WHITE, Layout
+from lanebev.render.scene.objects import POLE
 from lanebev.render.scene.sampler import Dice
 from lanebev.render.scene.traffic import Traffic
 

@@ -8,24 +8,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.photometry import (
-    CLEAR,
-    DUSK,
-    NIGHT,
-    RAIN,
-    Sensor,
-    Weather,
-    sample_sensor,
-    sample_weather,
-)
-from lanebev.render.scene.alignment import arc_nodes
+from lanebev.render.scene.alignment import Alignment, arc_nodes
+from lanebev.render.scene.camera import Lens
 from lanebev.render.scene.country import country_layout, country_pavement, country_surroundings
 from lanebev.render.scene.glass import Glass, sample_glass
 from lanebev.render.scene.kinds import Kinds, choose, sample_kinds
 from lanebev.render.scene.layout import Layout, sample_layout
-from lanebev.render.scene.night import Lights, sample_lights
+from lanebev.render.scene.night import Lights, night_light, sample_lights
+from lanebev.render.scene.objects import SceneObjects
 from lanebev.render.scene.pavement import Pavement, sample_pavement
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
+from lanebev.render.scene.sensor import Sensor, sample_sensor
 from lanebev.render.scene.street import Street, no_street, sample_city_layout, sample_street
 from lanebev.render.scene.surroundings import Surroundings, sample_surroundings
 from lanebev.render.scene.town import (
@@ -35,9 +28,16 @@ from lanebev.render.scene.town import (
     street_edges,
     street_surroundings,
 )
-from lanebev.render.scene.traffic import Traffic, sample_traffic
-from lanebev.render.scene.tunnel import Tunnel, sample_tunnel, tunnel_surroundings, tunnel_traffic
+from lanebev.render.scene.traffic import Traffic, place_objects, sample_traffic
+from lanebev.render.scene.tunnel import (
+    Tunnel,
+    sample_tunnel,
+    tunnel_light,
+    tunnel_surroundings,
+    tunnel_traffic,
+)
 from lanebev.render.scene.varied import varied_camera, varied_weather
+from lanebev.render.scene.weather import CLEAR, DUSK, NIGHT, RAIN, Light, Weather, light_of, sample_weather
 from lanebev.render.scene.winter import Winter, sample_winter, snowed_layout
 from lanebev.render.scene.works import Works, sample_works, works_traffic
 
@@ -96,62 +96,89 @@ class Place(NamedTuple):
     heading: Tensor
 
 
-def sample_ego_lane(dice: Dice, layout: Layout) -> Tensor:
+class Scene(NamedTuple):
+    """All that a batch of images shows, and from where.
+
+    Attributes:
+        world: B of them.
+        place: of the cameras.
+        alignment: the road's course, seen from there.
+        lens: the cameras.
+        objects: what stands on the road, in the local road frame.
+        light: in the local road frame.
+    """
+
+    world: World
+    place: Place
+    alignment: Alignment
+    lens: Lens
+    objects: SceneObjects
+    light: Light
+
+
+def scene_at(world: World, place: Place, alignment: Alignment, lens: Lens) -> Scene:
+    """Bring worlds into the local road frames of cameras."""
+    objects = place_objects(world.traffic, alignment, place.along, place.across)
+    light = night_light(light_of(world.weather, place.heading), world.lights)
+    return Scene(world, place, alignment, lens, objects, tunnel_light(light, world.tunnel))
+
+
+def sample_ego_lane(sampler: BatchSampler, layout: Layout) -> Tensor:
     """(B,) int64, any lane; the leftmost, beside the median, more often."""
     lanes = (layout.exists.sum(1) - 1).clamp(min=1)
-    share = torch.where(dice.chance(0.2), 0.0, dice.uniform(0, 1))
+    share = torch.where(sampler.chance(0.2), 0.0, sampler.uniform(0, 1))
     return (share * lanes).long().clamp(max=7)
 
 
-def sample_world(dice: Dice, kind: str = "any") -> tuple[World, Tensor]:
+def sample_world(sampler: BatchSampler, kind: str = "any") -> tuple[World, Tensor]:
     """Random worlds and an ego lane in each, (B,) int64.
 
     Args:
-        dice: the randomness.
+        sampler: the randomness.
         kind: see :func:`~lanebev.render.scene.kinds.sample_kinds`.
     """
-    more = dice if kind != "highway" else dice.beside()  # a highway's own draws are what they were
+    more = sampler if kind != "highway" else sampler.beside()  # a highway's own draws are what they were
     kinds = sample_kinds(more, kind)
-    dotted = dice.chance(0.35)
-    bright = dice.chance(0.12) & ~dotted
-    faint = bright | dice.chance(0.12)
-    layout = sample_layout(dice, dotted, faint)
-    median = dice.chance(0.15) & ~kinds.city
-    ego_lane = torch.where(median & dice.chance(0.7), 0, sample_ego_lane(dice, layout))
+    dotted = sampler.chance(0.35)
+    bright = sampler.chance(0.12) & ~dotted
+    faint = bright | sampler.chance(0.12)
+    layout = sample_layout(sampler, dotted, faint)
+    median = sampler.chance(0.15) & ~kinds.city
+    ego_lane = torch.where(median & sampler.chance(0.7), 0, sample_ego_lane(sampler, layout))
     layout, ego_lane, street = _with_street(more, kinds, layout, ego_lane)
     layout, ego_lane = country_layout(more, kinds.country, layout, ego_lane)
     layout, works = sample_works(more, kinds.works, layout)
     layout = snowed_layout(more, kinds.snow, layout)
-    weather = sample_weather(dice)
-    sunny = bright | (dotted & dice.chance(0.7))
+    weather = sample_weather(sampler)
+    sunny = bright | (dotted & sampler.chance(0.7))
     weather = weather._replace(
         kind=torch.where(sunny, CLEAR, weather.kind), grey=torch.where(sunny, 0.1, weather.grey)
     )
     weather = varied_weather(more, kinds, weather)
-    pavement = sample_pavement(dice, layout, dotted, bright, weather.wet, median)
+    pavement = sample_pavement(sampler, layout, dotted, bright, weather.wet, median)
     pavement = street_edges(more, kinds.city, street, layout, pavement)
     pavement = country_pavement(more, kinds.country, layout, pavement)
     layout = kerb_boundaries(kinds.city, street, layout, pavement)
-    opposite = torch.where(dice.chance(0.5), pavement.left - dice.uniform(0.8, 9.0), -math.inf)
-    surroundings = sample_surroundings(dice, pavement.left, pavement.right, weather.grey, opposite, median)
+    opposite = torch.where(sampler.chance(0.5), pavement.left - sampler.uniform(0.8, 9.0), -math.inf)
+    surroundings = sample_surroundings(sampler, pavement.left, pavement.right, weather.grey, opposite, median)
     surroundings = street_surroundings(more, kinds.city, street, pavement, surroundings)
     surroundings = country_surroundings(more, kinds.country, pavement, surroundings)
     tunnel = sample_tunnel(more, kinds.tunnel, pavement)
     surroundings = tunnel_surroundings(more, kinds.tunnel, tunnel, pavement, surroundings)
     lights = sample_lights(more, kinds.night, pavement.left, pavement.right)
     surroundings = _tinted(surroundings, weather, lights)
-    begin = torch.where(dice.chance(0.25), dice.uniform(-6, 140), math.inf)
+    begin = torch.where(sampler.chance(0.25), sampler.uniform(-6, 140), math.inf)
     begin = torch.where((kinds.city & more.chance(0.75)) | kinds.country | kinds.tunnel, math.inf, begin)
-    extent = dice.uniform(6, 30)
+    extent = sampler.uniform(6, 30)
     bridge = torch.stack([begin, begin + extent], dim=1)
     traffic = sample_traffic(
-        dice, layout, ego_lane, surroundings.opposite, pavement.left, pavement.right, begin, extent
+        sampler, layout, ego_lane, surroundings.opposite, pavement.left, pavement.right, begin, extent
     )
     traffic = city_traffic(more, kinds.city, street, layout, pavement, traffic)
     traffic = works_traffic(more, kinds.works, layout, traffic, NUM_PARKED)
     traffic = tunnel_traffic(kinds.tunnel, traffic)
-    sensor = varied_camera(more, kinds, sample_sensor(dice, weather, bright))
-    shade = torch.where(dice.chance(0.22), dice.uniform(0.3, 1.0), 0.0)
+    sensor = varied_camera(more, kinds, sample_sensor(sampler, weather, bright))
+    shade = torch.where(sampler.chance(0.22), sampler.uniform(0.3, 1.0), 0.0)
     glass = sample_glass(more, kinds.camera, kinds.night)
     world = World(
         layout=layout,
@@ -173,10 +200,12 @@ def sample_world(dice: Dice, kind: str = "any") -> tuple[World, Tensor]:
     return world, ego_lane
 
 
-def _with_street(dice: Dice, kinds: Kinds, layout: Layout, ego_lane: Tensor) -> tuple[Layout, Tensor, Street]:
+def _with_street(
+    sampler: BatchSampler, kinds: Kinds, layout: Layout, ego_lane: Tensor
+) -> tuple[Layout, Tensor, Street]:
     """Streets instead of highways where a world is in a city."""
-    city, lane, first, own = sample_city_layout(dice, layout)
-    street = sample_street(dice, city, lane, first, own)
+    city, lane, first, own = sample_city_layout(sampler, layout)
+    street = sample_street(sampler, city, lane, first, own)
     city = city._replace(
         missing_period=street.junction_period[:, None].expand_as(city.across),
         missing_length=street.junction_length[:, None].expand_as(city.across),
@@ -185,7 +214,7 @@ def _with_street(dice: Dice, kinds: Kinds, layout: Layout, ego_lane: Tensor) -> 
     return (
         choose(kinds.city, city, layout),
         torch.where(kinds.city, lane, ego_lane),
-        choose(kinds.city, street, no_street(dice)),
+        choose(kinds.city, street, no_street(sampler)),
     )
 
 
@@ -215,32 +244,32 @@ def _tinted(surroundings: Surroundings, weather: Weather, lights: Lights) -> Sur
     return surroundings._replace(zenith=zenith * dim, skyline=skyline * dim)
 
 
-def sample_course(dice: Dice) -> tuple[Tensor, Tensor]:
+def sample_course(sampler: BatchSampler) -> tuple[Tensor, Tensor]:
     """Sample curvature and elevation of random roads, (B, A) both, at the arc lengths of :func:`arc_nodes`.
 
     Half of them straight; the others chains of clothoids, curvature linear between nodes 40 to 120 m apart.
     A third goes over a crest or through a dip that begins at or beyond the camera.
     """
     nodes = 24
-    straight = dice.chance(0.45)
-    sharp = torch.where(dice.chance(0.25), 1 / 250, 1 / 900)[:, None]
-    knots = dice.normal(0.6, nodes).clamp(-1.3, 1.3) * sharp
-    keep = dice.chance(0.4, nodes)
+    straight = sampler.chance(0.45)
+    sharp = torch.where(sampler.chance(0.25), 1 / 250, 1 / 900)[:, None]
+    knots = sampler.normal(0.6, nodes).clamp(-1.3, 1.3) * sharp
+    keep = sampler.chance(0.4, nodes)
     for i in range(1, nodes):
         knots[:, i] = torch.where(keep[:, i], knots[:, i - 1], knots[:, i])
     knots = torch.where(straight[:, None], 0.0, knots).double()
-    spacing = dice.uniform(40, 120, 1).double()
-    shift = dice.uniform(0, 1, 1).double()
+    spacing = sampler.uniform(40, 120, 1).double()
+    shift = sampler.uniform(0, 1, 1).double()
     arc = arc_nodes()
     position = (arc / spacing + shift).clamp(max=nodes - 1.001)
     index = position.long()
     low, high = knots.gather(1, index), knots.gather(1, index + 1)
     curvature = low + (high - low) * (position - index)
 
-    bend = torch.where(dice.chance(0.3), dice.uniform(-1, 1) / dice.uniform(1500, 5000), 0.0)[
+    bend = torch.where(sampler.chance(0.3), sampler.uniform(-1, 1) / sampler.uniform(1500, 5000), 0.0)[
         :, None
     ].double()
-    onset, extent = dice.uniform(0, 80, 1).double(), dice.uniform(20, 120, 1).double()
+    onset, extent = sampler.uniform(0, 80, 1).double(), sampler.uniform(20, 120, 1).double()
     inside = (arc - onset).clamp(min=0).minimum(extent)
     beyond = (arc - onset - extent).clamp(min=0)
     elevation = bend * (0.5 * inside * inside + extent * beyond)

@@ -1,0 +1,70 @@
+"""Pixels in blocks: what a mask selects of a whole batch, in pieces of equal length, each of one row.
+
+A function of (B, N) pixels with parameters (B, ...) serves unchanged: its rows are then the blocks, its
+parameters those of each block's row. So a batch is shaded at once, without a loop over its rows and
+without work on pixels that have not what is shaded.
+"""
+
+from __future__ import annotations
+
+from itertools import accumulate
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.render.raster.select import indices_where
+
+BLOCK = 1024  # pixels
+
+
+class Blocks(NamedTuple):
+    """Selected elements of R rows, in T blocks of S; the last block of a row repeats the row's last one.
+
+    Attributes:
+        row: (T,) int64, of each block.
+        place: (T, S) int64, row-major place of each element in the mask that selected it.
+        real: (T, S) bool, false for repeated ones.
+        counts: number of blocks of each of the R rows, on the host.
+    """
+
+    row: Tensor
+    place: Tensor
+    real: Tensor
+    counts: list[int]
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def of_rows(self, rows: list[int]) -> Tensor:
+        """(T',) int64: which blocks belong to some of the rows."""
+        ends = list(accumulate(self.counts))
+        chosen = [t for r in rows for t in range(ends[r] - self.counts[r], ends[r])]
+        return torch.tensor(chosen, dtype=torch.long).to(self.row.device, non_blocking=True)
+
+
+def make_blocks(mask: Tensor, size: int = BLOCK, row: Tensor | None = None, num_rows: int = 0) -> Blocks:
+    """Select the elements where a mask holds. Waits for the device twice.
+
+    Args:
+        mask: (M, N) bool.
+        size: S.
+        row: (M,) int64, not decreasing, which row each line of the mask belongs to; by default each is one.
+        num_rows: R; given with ``row``.
+    """
+    device = mask.device
+    place = indices_where(mask)
+    count = mask.sum(1)
+    if row is not None:
+        count = count.new_zeros(num_rows).index_add_(0, row, count)
+    blocks = (count + (size - 1)) // size
+    counts: list[int] = blocks.tolist()
+    total = sum(counts)
+    rows = torch.arange(len(counts), device=device).repeat_interleave(blocks, output_size=total)
+    first, start = blocks.cumsum(0) - blocks, count.cumsum(0) - count
+    within = (torch.arange(total, device=device) - first[rows])[:, None] * size
+    within = within + torch.arange(size, device=device)
+    last = (count[rows] - 1)[:, None]
+    source = start[rows][:, None] + torch.minimum(within, last)
+    chosen = place.index_select(0, source.flatten()).view(source.shape)
+    return Blocks(rows, chosen, within <= last, counts)

@@ -1,0 +1,32 @@
+"""Shares of pixels that stripes and dashes cover, integrated over the pixel's footprint."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+PSF = 0.5  # px, standard deviation of the pixel's Gaussian: keeps thin stripes' centroids unbiased
+
+
+def stripe_coverage(distance: Tensor, width: Tensor, footprint: Tensor) -> Tensor:
+    """Share of a pixel that a stripe covers: a box of the stripe's width under a Gaussian pixel.
+
+    Args:
+        distance: m from the stripe's centre line.
+        width: m.
+        footprint: m per pixel, across the stripe.
+    """
+    scale = 1 / (PSF * 2**0.5 * footprint)
+    half = 0.5 * width
+    return 0.5 * (torch.erf((distance + half) * scale) - torch.erf((distance - half) * scale))
+
+
+def dash_coverage(along: Tensor, length: Tensor, period: Tensor, footprint: Tensor) -> Tensor:
+    """Share of a pixel that a periodic dash covers, exactly integrated over the footprint along the road."""
+    reach = 0.5 * footprint.clamp(min=1e-3)
+
+    def painted_up_to(s: Tensor) -> Tensor:
+        whole = (s / period).floor()
+        return whole * length + torch.minimum(s - whole * period, length)
+
+    return (painted_up_to(along + reach) - painted_up_to(along - reach)) / (2 * reach)

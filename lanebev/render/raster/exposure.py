@@ -1,0 +1,96 @@
+"""From linear radiance to display values: metering, veils of light, and the tone curve."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from lanebev.render.raster.select import indices_where
+from lanebev.render.scene.sensor import Sensor
+
+_BLOOM_SCALE = 8
+_SHOULDER = 0.6  # display-linear level above which highlights are compressed
+_MIDDLE = 0.45  # display level that the contrast leaves as it is
+
+
+def expose(radiance: Tensor, sensor: Sensor, road_level: Tensor) -> Tensor:
+    """Expose images, before noise.
+
+    Args:
+        radiance: (B, 3, H, W) linear.
+        sensor: the cameras.
+        road_level: (B,) radiance of the road; the exposure is set for it, and less for all the rest.
+
+    Returns:
+        (B, 3, H, W) display values in [0, 1].
+    """
+    height, width = radiance.shape[2:]
+    mean = radiance.mean((1, 2, 3))
+    metered = road_level.clamp(min=1e-4) ** 0.7 * mean.clamp(min=1e-4) ** 0.3
+    gain = (sensor.exposure / metered)[:, None] * sensor.tint
+    value = radiance * gain[..., None, None]
+    _add_bloom(value, gain, sensor.bloom)
+    y = torch.arange(height, device=value.device)[:, None] / height - 0.5
+    x = torch.arange(width, device=value.device) / width - 0.5
+    value *= 1 - (2 * sensor.vignette)[:, None, None, None] * (x * x + y * y)
+    value += (sensor.glare * value.mean((1, 2, 3)))[:, None, None, None]
+    value = tone_curve(value, sensor.contrast[:, None, None, None])
+    grey = value.mean(1, keepdim=True)
+    value = grey + (value - grey) * sensor.saturation[:, None, None, None]
+    return (value + sensor.black[:, None, None, None]).clamp_(0, 1)
+
+
+def tone_curve(value: Tensor, contrast: Tensor) -> Tensor:
+    """Map linear values, 1 is the middle of the highlights, to display values.
+
+    A soft shoulder above 0.6, a power of 1 / 2.2, and an S-shaped curve through 0, 0.45 and 1 whose slope in
+    the middle is the contrast.
+
+    Args:
+        value: (B, 3, H, W) linear.
+        contrast: broadcasts.
+    """
+    over = (value - _SHOULDER).clamp_(min=0)
+    value = value.clamp(1e-4, _SHOULDER).add_(0.4 * (1 - torch.exp(-over / 0.4)))
+    value = value ** (1 / 2.2)
+    low = (value.clamp(max=_MIDDLE) / _MIDDLE) ** contrast
+    high = ((1 - value).clamp(0, 1 - _MIDDLE) / (1 - _MIDDLE)) ** contrast
+    return _MIDDLE * low + (1 - _MIDDLE) * (1 - high)
+
+
+def _add_bloom(value: Tensor, gain: Tensor, strength: Tensor) -> None:
+    """Spread light from what is brighter than white over its neighbourhood; changes ``value``."""
+    height, width = value.shape[2:]
+    small = (max(1, height // _BLOOM_SCALE), max(1, width // _BLOOM_SCALE))
+    white = gain / gain.amax(1, keepdim=True)  # of each channel, where the first saturates
+    bright = (value - white[..., None, None]).clamp_(min=0)
+    bright = torch.minimum(bright, 6 * white[..., None, None])
+    excess = torch.nn.functional.adaptive_avg_pool2d(bright, small)
+    rows = indices_where((strength > 0) & (excess.amax((1, 2, 3)) > 0))
+    if not len(rows):
+        return
+    excess = excess.index_select(0, rows) * strength.index_select(0, rows)[:, None, None, None]
+    veil = torch.zeros_like(value[:1])
+    for std, share in ((2.0, 1.0), (0.06 * small[1], 0.6)):
+        down = _spread(small[0], height, std, value.device)
+        across = _spread(small[1], width, std, value.device)
+        veil = veil + share * (down @ (excess @ across.T))
+    value.index_add_(0, rows, veil)
+
+
+@lru_cache(maxsize=64)
+def _spread(small: int, large: int, std: float, device: torch.device) -> Tensor:
+    """(large, small): a Gaussian blur of samples, the border repeated, then linear interpolation."""
+    index = torch.arange(small, dtype=torch.float64)
+    reach = int(4 * std + 0.5)
+    shifts = torch.arange(-reach, reach + 1, dtype=torch.float64)
+    weight = torch.exp(-0.5 * (shifts / std) ** 2)
+    source = (index[:, None] + shifts).clamp(0, small - 1).long()
+    blur = torch.zeros(small, small, dtype=torch.float64)
+    blur.scatter_add_(1, source, (weight / weight.sum()).expand_as(source))
+    place = ((torch.arange(large, dtype=torch.float64) + 0.5) * small / large - 0.5).clamp(0, small - 1)
+    low = place.long().clamp(max=max(small - 2, 0))
+    share = (place - low)[:, None]
+    return (blur[low] * (1 - share) + blur[(low + 1).clamp(max=small - 1)] * share).float().to(device)

@@ -1,0 +1,136 @@
+"""What is anywhere in a batch of scenes, read on the host: what is in none of them costs nothing."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.render.scene.layout import Layout
+from lanebev.render.scene.pavement import Pavement
+from lanebev.render.scene.surroundings import NOTHING, STYLES, TREES
+from lanebev.render.scene.world import Scene
+
+
+class KindRows(NamedTuple):
+    """Rows of a batch with what only some kinds of road have.
+
+    Attributes:
+        city: streets.
+        works: road works.
+        snow: snow.
+        tunnel: tunnels.
+        night: nights with lights.
+        glass: faults of windscreen, lens and recorder.
+    """
+
+    city: list[int]
+    works: list[int]
+    snow: list[int]
+    tunnel: list[int]
+    night: list[int]
+    glass: list[int]
+
+
+class Features(NamedTuple):
+    """True where at least one scene of the batch has it.
+
+    Attributes:
+        distorted: a lens with distortion.
+        sun: direct light that casts shadows.
+        headlight: the camera's own headlights.
+        wet: wet ground.
+        cloud: clouds.
+        bridge: a bridge.
+        crowns: trees that shade the road.
+        deck: stretches of another material.
+        middle_seam: seams inside lanes.
+        joint: transverse joints.
+        crack: cracks.
+        skid: tyre skids.
+        patch: patches.
+        gutter: strips along the left and along the right edge.
+        studs: studs.
+        double: double stripes.
+        ghost: old lines beside the new ones.
+        symbols: arrows, words, diamonds.
+        night: a night of the kinds of road.
+        rows: on which rows there are which kinds.
+        walls: (row, wall) of each wall that is there.
+        looks: (kind, style) of each of these; trees come in several styles.
+    """
+
+    distorted: bool
+    sun: bool
+    headlight: bool
+    wet: bool
+    cloud: bool
+    bridge: bool
+    crowns: bool
+    deck: bool
+    middle_seam: bool
+    joint: bool
+    crack: bool
+    skid: bool
+    patch: bool
+    gutter: tuple[bool, bool]
+    studs: bool
+    double: bool
+    ghost: bool
+    symbols: bool
+    night: bool
+    rows: KindRows
+    walls: list[list[int]]
+    looks: list[list[int]]
+
+
+def features_of(scene: Scene) -> Features:
+    """Read what the scenes have; these should be on the host, or each answer waits for the device."""
+    world = scene.world
+    pavement: Pavement = world.pavement
+    layout: Layout = world.layout
+
+    def some(strength: Tensor) -> bool:
+        return bool((strength != 0).any())
+
+    around, kinds = world.surroundings, world.kinds
+    there = around.wall_kind != NOTHING
+    style = torch.where(around.wall_kind == TREES, (around.wall_seed * 97).long() % STYLES, 0)
+    return Features(
+        distorted=bool(scene.lens.distortion.any()),
+        sun=bool((scene.light.direct > 0.02).any()),
+        headlight=some(scene.light.headlight),
+        wet=some(pavement.wet),
+        cloud=some(world.surroundings.cloud),
+        bridge=bool(world.bridge.isfinite().any()),
+        crowns=some(world.shade),
+        deck=some(pavement.deck_length),
+        middle_seam=some(pavement.middle_seam),
+        joint=some(pavement.joint),
+        crack=some(pavement.crack),
+        skid=some(pavement.skid),
+        patch=some(pavement.patch),
+        gutter=(some(pavement.gutter_width[:, 0]), some(pavement.gutter_width[:, 1])),
+        studs=some(layout.stud_period),
+        double=some(layout.separation),
+        ghost=some(layout.ghost),
+        symbols=some(layout.symbol),
+        night=some(world.lights.on),
+        rows=KindRows(
+            city=_rows(kinds.city),
+            works=_rows(kinds.works),
+            snow=_rows(kinds.snow),
+            tunnel=_rows(world.tunnel.on > 0),
+            night=_rows(world.lights.on > 0),
+            glass=_rows(kinds.camera | kinds.night),
+        ),
+        walls=there.nonzero().tolist(),
+        looks=torch.stack([around.wall_kind, style], dim=-1)[there].tolist(),
+    )
+
+
+def _rows(mask: Tensor) -> list[int]:
+    """Rows where a mask (B,) holds."""
+    rows: list[int] = mask.nonzero()[:, 0].tolist()
+    return rows

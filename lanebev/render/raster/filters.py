@@ -1,0 +1,39 @@
+"""Blurring images, each row of a batch by its own width."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+def gaussian_blur(image: Tensor, std: Tensor, largest: float) -> Tensor:
+    """Blur images by Gaussians, the border repeated outside.
+
+    A sum of shifted images, since depthwise convolutions are slow on processors.
+
+    Args:
+        image: (B, C, H, W).
+        std: (B,) px; 0 leaves a row as it is.
+        largest: of ``std``, px, on the host.
+    """
+    reach = max(1, math.ceil(3.5 * largest))
+    place = torch.arange(reach + 1, device=image.device, dtype=image.dtype)
+    weight = torch.exp(-0.5 * (place / std.clamp(min=1e-3)[:, None]).square())
+    weight = weight / (2 * weight.sum(1, keepdim=True) - weight[:, :1])
+    weight = weight.T[..., None, None, None]  # (reach + 1, B, 1, 1, 1)
+    return _weighted(_weighted(image, weight, 3), weight, 2)
+
+
+def _weighted(image: Tensor, weight: Tensor, dim: int) -> Tensor:
+    """Sum of an image shifted along a dimension both ways by k, times the k-th weight."""
+    reach, size = len(weight) - 1, image.shape[dim]
+    padding = (reach, reach, 0, 0) if dim == 3 else (0, 0, reach, reach)
+    padded = functional.pad(image, padding, mode="replicate")
+    total = padded.narrow(dim, reach, size) * weight[0]
+    for k in range(1, reach + 1):
+        pair = padded.narrow(dim, reach - k, size) + padded.narrow(dim, reach + k, size)
+        total.addcmul_(pair, weight[k])
+    return total

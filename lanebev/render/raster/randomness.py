@@ -1,0 +1,24 @@
+"""Random pixels, each row of a batch from its own generator: a row's noise does not depend on the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+def normal_rows(shape: tuple[int, ...], generators: Sequence[torch.Generator]) -> Tensor:
+    """Draw (R, *shape) standard normal values on the generators' device."""
+    values = torch.empty(len(generators), *shape, device=generators[0].device)
+    for row, generator in zip(values, generators, strict=True):
+        row.normal_(generator=generator)
+    return values
+
+
+def uniform_rows(shape: tuple[int, ...], generators: Sequence[torch.Generator]) -> Tensor:
+    """Draw (R, *shape) uniform values in [0, 1) on the generators' device."""
+    values = torch.empty(len(generators), *shape, device=generators[0].device)
+    for row, generator in zip(values, generators, strict=True):
+        row.uniform_(generator=generator)
+    return values

@@ -1,0 +1,52 @@
+"""Selecting and choosing among pixels, by the operations that are fast on processors as well.
+
+PyTorch's advanced indexing, ``where`` and ``nonzero`` take 4 to 30 times as long there as what is here
+(measured: 92,000 of 184,000 pixels, one thread).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lanebev.render.raster.constants import constant
+
+
+def indices_where(mask: Tensor) -> Tensor:
+    """(N,) int64: row-major places where a mask holds, in order. Waits for the device."""
+    if mask.device.type == "cpu":
+        return torch.from_numpy(np.flatnonzero(mask.numpy()))
+    return mask.flatten().nonzero()[:, 0]
+
+
+def take(values: Tensor, place: Tensor) -> Tensor:
+    """Elements of a tensor at row-major places, in the shape of ``place``."""
+    return values.flatten().index_select(0, place.flatten()).view(place.shape)
+
+
+def take_channels(values: Tensor, place: Tensor) -> Tensor:
+    """(C, P) values at places in P, (C, *place.shape)."""
+    return values.index_select(1, place.flatten()).view(-1, *place.shape)
+
+
+def put(values: Tensor, place: Tensor, new: Tensor) -> None:
+    """Write (C, *place.shape) values at places in P; changes ``values`` (C, P)."""
+    index = place.flatten().expand(len(values), -1)
+    values.scatter_(1, index, new.reshape(len(values), -1))
+
+
+def as_float(mask: Tensor) -> Tensor:
+    """1 where a mask holds, else 0, float32."""
+    return mask.contiguous().view(torch.uint8).float()
+
+
+def choose(mask: Tensor, yes: Tensor | float, no: Tensor | float) -> Tensor:
+    """``yes`` where a mask holds, else ``no``, exactly, like ``torch.where``; both finite, float32."""
+    yes, no = (v if isinstance(v, Tensor) else constant(mask.device, v)[0] for v in (yes, no))
+    return torch.lerp(no, yes, as_float(mask))
+
+
+def remainder(value: Tensor, period: Tensor | float) -> Tensor:
+    """``value % period`` but for rounding."""
+    return value - (value / period).floor() * period

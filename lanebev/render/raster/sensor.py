@@ -1,0 +1,91 @@
+"""A camera's image of painted views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lanebev.render.raster.effects import add_bonnet, rain
+from lanebev.render.raster.exposure import expose
+from lanebev.render.raster.filters import gaussian_blur
+from lanebev.render.raster.glass import behind_glass, recorded
+from lanebev.render.raster.jpeg import compress
+from lanebev.render.raster.paint import Painted
+from lanebev.render.raster.randomness import normal_rows
+from lanebev.render.scene.sampler import select_rows
+from lanebev.render.scene.sensor import Sensor
+from lanebev.render.scene.world import Scene
+
+_REFERENCE_WIDTH = 640  # px, at which the blur is stated
+_SHARP = 0.2  # px of blur that nobody sees
+
+
+def take_image(
+    painted: Painted,
+    scene: Scene,
+    host: Scene,
+    faulty: list[int],
+    generators: Sequence[torch.Generator],
+    ideal: bool,
+) -> Tensor:
+    """Make images of painted views; changes ``painted`` where bonnets are.
+
+    Args:
+        painted: B views.
+        scene: of the views.
+        host: the same on the host, where it is read which rows have what.
+        faulty: rows with faults of windscreen, lens and recorder.
+        generators: B of them, of rain and noise, on the views' device.
+        ideal: leave out rain, blur, noise and compression.
+
+    Returns:
+        (B, 3, H, W) in [0, 1].
+    """
+    sensor, device = scene.world.sensor, painted.radiance.device
+
+    def rows_with(mask: Tensor) -> Tensor:
+        return mask.nonzero()[:, 0].to(device, non_blocking=True)
+
+    bonnet = host.world.sensor.bonnet
+    if bool((bonnet > 0).any()):
+        rows = rows_with(bonnet > 0)
+        own, light = select_rows(sensor, rows), select_rows(scene.light, rows)
+        sky = scene.world.surroundings.skyline.index_select(0, rows)
+        add_bonnet(painted.radiance, painted.blocked, rows, float(bonnet.amax()), own, light, sky)
+    image = expose(painted.radiance, sensor, painted.road_level)
+    if ideal:
+        return image
+    raining = host.world.weather.wet > 0
+    if bool(raining.any()):
+        rows = rows_with(raining)
+        wet = scene.world.weather.wet.index_select(0, rows)
+        drawn = [g for g, wet_row in zip(generators, raining.tolist(), strict=True) if wet_row]
+        image.index_copy_(0, rows, rain(image.index_select(0, rows), wet, drawn))
+    windscreens = torch.tensor(faulty, dtype=torch.long).to(device, non_blocking=True)
+    glass = select_rows(scene.world.glass, windscreens)
+    if faulty:
+        image.index_copy_(0, windscreens, behind_glass(image.index_select(0, windscreens), glass))
+    scale = image.shape[3] / _REFERENCE_WIDTH
+    largest = float(host.world.sensor.blur.amax()) * scale
+    if largest >= _SHARP:
+        std = sensor.blur * scale
+        image = gaussian_blur(image, std * (std >= _SHARP), largest)
+    image = add_noise(image, sensor, generators)
+    if faulty:
+        image.index_copy_(0, windscreens, recorded(image.index_select(0, windscreens), glass))
+    squeezed = host.world.sensor.jpeg > 0
+    if bool(squeezed.any()):
+        rows = rows_with(squeezed)
+        quality = sensor.jpeg.index_select(0, rows)
+        image.index_copy_(0, rows, compress(image.index_select(0, rows), quality))
+    return image
+
+
+def add_noise(image: Tensor, sensor: Sensor, generators: Sequence[torch.Generator]) -> Tensor:
+    """Add shot and read noise to display values, (B, 3, H, W)."""
+    noise = normal_rows(tuple(image.shape[1:]), generators)
+    read, shot = (v.square()[:, None, None, None] for v in (sensor.read_noise, sensor.shot_noise))
+    level = (read + image * shot).sqrt_()
+    return noise.mul_(level).add_(image).clamp_(0, 1)

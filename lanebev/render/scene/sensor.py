@@ -1,0 +1,75 @@
+"""What a camera does to the light: exposure, colours, blur, noise, compression, its own bonnet."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.render.scene.sampler import BatchSampler
+from lanebev.render.scene.weather import DUSK, NIGHT, Weather
+
+
+class Sensor(NamedTuple):
+    """What the camera does to the light, each (B,) unless said otherwise.
+
+    Attributes:
+        exposure: linear level that the road's mean is brought to.
+        tint: (B, 3) white balance.
+        contrast: slope at middle grey.
+        saturation: factor.
+        black: offset.
+        blur: px at 640 px width, standard deviation.
+        read_noise: standard deviation, of full scale.
+        shot_noise: standard deviation at full scale.
+        vignette: loss in the corners.
+        glare: veil over the image.
+        bloom: share of saturated light that spills.
+        jpeg: quality, 0 for none.
+        bonnet: share of the image's height, 0 for none.
+        bonnet_colour: (B, 3).
+        bonnet_bow: share of the height by which its edge falls to the sides.
+    """
+
+    exposure: Tensor
+    tint: Tensor
+    contrast: Tensor
+    saturation: Tensor
+    black: Tensor
+    blur: Tensor
+    read_noise: Tensor
+    shot_noise: Tensor
+    vignette: Tensor
+    glare: Tensor
+    bloom: Tensor
+    jpeg: Tensor
+    bonnet: Tensor
+    bonnet_colour: Tensor
+    bonnet_bow: Tensor
+
+
+def sample_sensor(sampler: BatchSampler, weather: Weather, bright: Tensor) -> Sensor:
+    """A random camera; ``bright`` (B,) bool overexposes."""
+    usual = torch.where(sampler.chance(0.8), sampler.uniform(0.055, 0.22), sampler.uniform(0.2, 0.34))
+    exposure = torch.where(bright, sampler.uniform(0.3, 0.75), usual)
+    dark = (weather.kind == NIGHT) | (weather.kind == DUSK)
+    exposure = torch.where(dark, sampler.uniform(0.03, 0.2), exposure)
+    noisy = torch.where(weather.kind == NIGHT, 2.5, 1.0)
+    return Sensor(
+        exposure=exposure,
+        tint=1 + sampler.normal(0.03, 3),
+        contrast=sampler.uniform(0.9, 1.5),
+        saturation=torch.where(sampler.chance(0.05), 0.0, sampler.uniform(0.6, 1.6)),
+        black=sampler.uniform(-0.02, 0.04),
+        blur=torch.where(sampler.chance(0.8), sampler.uniform(0.2, 0.8), sampler.uniform(0.8, 2.0)),
+        read_noise=sampler.uniform(0.001, 0.012) * noisy,
+        shot_noise=sampler.uniform(0.002, 0.022) * noisy,
+        vignette=torch.where(sampler.chance(0.5), sampler.uniform(0.0, 0.4), 0.0),
+        glare=torch.where(sampler.chance(0.3), sampler.uniform(0.0, 0.2), 0.0),
+        bloom=torch.where(sampler.chance(0.6), sampler.uniform(0.0, 0.35), 0.0),
+        jpeg=torch.where(sampler.chance(0.7), sampler.uniform(35, 95), 0.0),
+        bonnet=torch.where(sampler.chance(0.3), sampler.uniform(0.02, 0.14), 0.0),
+        bonnet_colour=sampler.uniform(0.01, 0.25, 1) * (1 + sampler.normal(0.2, 3)).clamp(0.4, 1.6),
+        bonnet_bow=sampler.uniform(0.0, 0.12),
+    )
