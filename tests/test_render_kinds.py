@@ -11,7 +11,7 @@ from lanebev.render import RenderedFrame, render_views
 from lanebev.render.raster.glyphs import GLYPH_LENGTH, glyph_coverage
 from lanebev.render.raster.night import lamp_light, low_beam
 from lanebev.render.raster.rays import View
-from lanebev.render.raster.street import roadside
+from lanebev.render.raster.roadside import roadside
 from lanebev.render.raster.tunnel import add_ceiling
 from lanebev.render.raster.winter import snow_cover
 from lanebev.render.scene.alignment import arc_nodes, build_alignment
@@ -169,6 +169,7 @@ def test_a_kerbs_top_is_seen_farther_out_by_h_over_h_minus_its_height() -> None:
         kerb_height=torch.full((1, 2), 0.15),
         kerb_shade=torch.zeros(1, 2),
         kerb_blocks=torch.zeros(1),
+        weeds=torch.zeros(1),
         strips=strips,
         colours=torch.full((1, 2, 4, 3), 0.3),
         junction_length=torch.zeros(1),

@@ -7,7 +7,9 @@ from torch import Tensor
 
 from lanebev.render.raster.coverage import dash_coverage, stripe_coverage
 from lanebev.render.raster.footprint import Ground
-from lanebev.render.raster.street import roadside, street_paint, strips, tracks
+from lanebev.render.raster.roadside import roadside
+from lanebev.render.raster.street import lane_coordinates, street_paint
+from lanebev.render.raster.street_surface import ironwork, strips, tracks
 from lanebev.render.raster.winter import snow_cover
 from lanebev.render.scene.works import NUM_OLD, Works
 from lanebev.render.scene.world import World
@@ -44,7 +46,10 @@ def city_ground(
     albedo = albedo + (beside - albedo) * (share * (1 - paved))[:, None]
     coloured = strips(street, layout, pavement, ground.across, ground.reach_across, albedo)
     albedo = albedo + (coloured - albedo) * (1 - painted)[:, None]
-    albedo = tracks(street, ground.across, ground.reach_across, albedo)
+    lane, inside, _, on_lane = lane_coordinates(layout, ground.across)
+    reach = (ground.reach_along, ground.reach_across)
+    dark = ironwork(street, lane, ground.along, inside, *reach) * on_lane * (1 - painted)
+    albedo = tracks(street, *here, albedo * (1 - dark)[:, None])
     marks = street_paint(street, layout, pavement, *here, blotch)
     albedo = albedo + (street.paint[..., None] - albedo) * marks[:, None]
     return albedo, torch.maximum(painted, marks)

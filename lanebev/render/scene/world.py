@@ -10,6 +10,7 @@ from torch import Tensor
 
 from lanebev.render.scene.alignment import Alignment, arc_nodes
 from lanebev.render.scene.camera import Lens
+from lanebev.render.scene.city_layout import sample_city_layout
 from lanebev.render.scene.country import country_layout, country_pavement, country_surroundings
 from lanebev.render.scene.glass import Glass, sample_glass
 from lanebev.render.scene.kinds import Kinds, choose, sample_kinds
@@ -19,7 +20,7 @@ from lanebev.render.scene.objects import SceneObjects
 from lanebev.render.scene.pavement import Pavement, sample_pavement
 from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.sensor import Sensor, sample_sensor
-from lanebev.render.scene.street import Street, no_street, sample_city_layout, sample_street
+from lanebev.render.scene.street import Street, no_street, sample_street
 from lanebev.render.scene.surroundings import Surroundings, sample_surroundings
 from lanebev.render.scene.town import (
     NUM_PARKED,
@@ -179,6 +180,7 @@ def sample_world(sampler: BatchSampler, kind: str = "any") -> tuple[World, Tenso
     traffic = tunnel_traffic(kinds.tunnel, traffic)
     sensor = varied_camera(more, kinds, sample_sensor(sampler, weather, bright))
     shade = torch.where(sampler.chance(0.22), sampler.uniform(0.3, 1.0), 0.0)
+    shade = torch.where(kinds.city & more.chance(0.25), more.uniform(0.4, 1.0), shade)
     glass = sample_glass(more, kinds.camera, kinds.night)
     world = World(
         layout=layout,
