@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import pickle
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +36,10 @@ def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Weights and settings."""
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=False)
-        state, settings = checkpoint["state_dict"], checkpoint["settings"]
+        state, settings = checkpoint["state_dict"], dict(checkpoint["settings"])
+        settings["steps"] = checkpoint["global_step"]
+        if (seen := checkpoint.get("callbacks", {}).get("Throughput")) is not None:
+            settings["views"] = seen["views"]
     except OSError as error:
         raise ValueError(f"{path}: expected a checkpoint, got: {error.strerror}") from error
     except (pickle.UnpicklingError, EOFError, KeyError, TypeError, RuntimeError) as error:
@@ -137,7 +142,26 @@ def trained_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
     return segmenter.eval(), training
 
 
-def export(checkpoint: Path, out: Path, changes: dict[str, Any], **record: Any) -> LaneSegmenter:
+def checkout_commit() -> str:
+    """Return the commit of the code: ``LANEBEV_COMMIT`` of the environment, else of this checkout.
+
+    Raises:
+        ValueError: neither is there.
+    """
+    if given := os.environ.get("LANEBEV_COMMIT"):
+        return given
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise ValueError(
+            "commit: expected a git checkout, got none; give --commit or set LANEBEV_COMMIT"
+        ) from error
+
+
+def export(
+    checkpoint: Path, out: Path, changes: dict[str, Any], compact: bool = True, **record: Any
+) -> LaneSegmenter:
     """Write a checkpoint's averaged weights as lanebev loads them, with the settings they were trained with.
 
     Args:
@@ -145,11 +169,12 @@ def export(checkpoint: Path, out: Path, changes: dict[str, Any], **record: Any) 
         out: the weights file.
         changes: of the configuration: ``image_size`` to run at by default, ``sigma_scale`` or
             ``pose_sigma_scale``.
+        compact: store the largest convolutions as 8-bit numbers: 14.5 MB instead of 22.8.
         record: further facts for the file's metadata.
     """
     segmenter, training = trained_segmenter(checkpoint)
     segmenter.config = replace(segmenter.config, **changes)
-    save_segmenter(segmenter, out, training=training, **record)
+    save_segmenter(segmenter, out, compact=compact, training=training, **record)
     return segmenter
 
 
@@ -160,7 +185,12 @@ def main() -> None:
     parser.add_argument("checkpoint", type=Path, help="or weights file")
     parser.add_argument("out", type=Path)
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--commit", required=True, help="of the code that trained")
+    parser.add_argument(
+        "--commit", help="of the code that trained; by default LANEBEV_COMMIT, or the checkout's"
+    )
+    parser.add_argument(
+        "--half", action="store_true", help="all convolutions as float16, none as 8-bit numbers"
+    )
     parser.add_argument("--metrics", default="{}", help="JSON, measured on these weights")
     parser.add_argument("--image-size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="to run at")
     parser.add_argument("--sigma-scale", type=float, help="as train.noise measured it")
@@ -174,8 +204,9 @@ def main() -> None:
         "pose_sigma_scale": args.pose_sigma_scale,
     }
     changes = {name: value for name, value in given.items() if value is not None}
-    record = {"seed": args.seed, "commit": args.commit, "metrics": metrics, "note": args.note}
-    export(args.checkpoint, args.out, changes, **record)
+    commit = args.commit or checkout_commit()
+    record = {"seed": args.seed, "commit": commit, "metrics": metrics, "note": args.note}
+    export(args.checkpoint, args.out, changes, compact=not args.half, **record)
 
 
 if __name__ == "__main__":

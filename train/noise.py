@@ -14,6 +14,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,13 +50,21 @@ def outcome(seen: Seen, factor: float) -> Outcome:
     return Outcome(torch.cat([rmse[:3].rad2deg(), 100 * rmse[3:]]), nees.mean())
 
 
-def compare(drives: list[Seen], factors: tuple[float, ...] = FACTORS) -> dict[float, Outcome]:
-    """Median outcome over the drives, for every factor."""
+def compare(
+    drives: list[Seen], factors: tuple[float, ...] = FACTORS, over: Callable[..., Iterable[Outcome]] = map
+) -> dict[float, Outcome]:
+    """Median outcome over the drives, for every factor; ``over`` is :func:`map` or a pool's."""
+    pairs = [(seen, factor) for factor in factors for seen in drives]
+    outcomes = list(over(outcome, *zip(*pairs, strict=True)))
     report = {}
-    for factor in factors:
-        rmse, nees = zip(*(outcome(seen, factor) for seen in drives), strict=True)
+    for number, factor in enumerate(factors):
+        rmse, nees = zip(*outcomes[number * len(drives) : (number + 1) * len(drives)], strict=True)
         report[factor] = Outcome(torch.stack(rmse).nanmedian(0).values, torch.stack(nees).nanmedian())
     return report
+
+
+def _watch_one(weights: Path, frames: int, fps: float, seed: int) -> Seen:
+    return watch([trained_segmenter(weights)[0]], seed, frames, fps)[0]
 
 
 @one_line_errors()
@@ -65,10 +76,18 @@ def main() -> None:
     parser.add_argument("--frames", type=PositiveInt, default=90, help="of each drive")
     parser.add_argument("--fps", type=PositiveFloat, default=20.0)
     parser.add_argument("--seed", type=int, default=81_000)
+    parser.add_argument("--jobs", type=PositiveInt, default=1, help="processes")
     args = parser.parse_args()
-    segmenter, _ = trained_segmenter(args.weights)
-    drives = [watch([segmenter], args.seed + i, args.frames, args.fps)[0] for i in range(args.drives)]
-    report = compare(drives)
+    one = partial(_watch_one, args.weights, args.frames, args.fps)
+    seeds = range(args.seed, args.seed + args.drives)
+    if args.jobs == 1:
+        report = compare([one(seed) for seed in seeds])
+    else:
+        context = torch.multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(
+            args.jobs, context, initializer=torch.set_num_threads, initargs=(1,)
+        ) as pool:
+            report = compare(list(pool.map(one, seeds)), over=pool.map)
     for factor, (rmse, nees) in report.items():
         errors = dict(zip(AXES, (round(value, 3) for value in rmse.tolist()), strict=True))
         line = {"weights": args.weights.name, "factor": factor, **errors}

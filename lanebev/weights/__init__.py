@@ -1,8 +1,8 @@
 """The shipped weights, and the one way to load weights: strictly.
 
 A weights file is safetensors with JSON metadata: ``config`` (:class:`SegmenterConfig`), and for the record
-``training``, ``seed``, ``commit`` and ``metrics``. Tensors may be stored in half precision; they are loaded
-in single.
+``training``, ``seed``, ``commit`` and ``metrics``. Tensors may be stored in half precision, or as 8-bit
+numbers with a scale per output channel; they are loaded in single precision.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 
 SHIPPED = Path(__file__).with_name("lane_segmenter.safetensors")
 _FORMAT = "lanebev.LaneSegmenter/1"
+_COMPACT_FORMAT = "lanebev.LaneSegmenter/2"  # some tensors are int8 and have a scale beside them
+_SCALE = ".scale"
+_LARGE = 2**20  # weights; larger ones are 8-bit numbers in a compact file
 _FORMER_NAMES = {"noise_factor": "sigma_scale", "pose_factor": "pose_sigma_scale"}
 
 
@@ -50,43 +53,81 @@ def read_metadata(path: str | Path | None = None) -> dict[str, Any]:
     return {name: json.loads(value) for name, value in metadata.items() if name != "format"}
 
 
-def save_segmenter(segmenter: LaneSegmenter, path: str | Path, half: bool = True, **record: Any) -> None:
+def save_segmenter(
+    segmenter: LaneSegmenter, path: str | Path, half: bool = True, compact: bool = False, **record: Any
+) -> None:
     """Write a segmenter's weights.
 
     Args:
         segmenter: whose weights.
         path: of the file.
         half: store weights of convolutions as float16; norms and biases stay float32.
+        compact: store convolutions of more than 2²⁰ weights as :func:`quantised`.
         record: JSON-able facts for the metadata: training, seed, commit, metrics.
 
     Raises:
         ValueError: the file cannot be written.
     """
-    tensors = {
-        name: (value.half() if half and value.ndim > 1 else value).contiguous()
-        for name, value in segmenter.state_dict().items()
-    }
+    tensors = {}
+    for name, value in segmenter.state_dict().items():
+        if compact and value.ndim > 1 and value.numel() > _LARGE:
+            tensors[name], tensors[name + _SCALE] = quantised(value)
+        else:
+            tensors[name] = value.half() if half and value.ndim > 1 else value
+    tensors = {name: value.cpu().contiguous() for name, value in tensors.items()}
     facts = {"config": asdict(segmenter.config), **record}
-    metadata = {"format": _FORMAT, **{name: json.dumps(value) for name, value in facts.items()}}
+    metadata = {
+        "format": _COMPACT_FORMAT if compact else _FORMAT,
+        **{name: json.dumps(value) for name, value in facts.items()},
+    }
     try:
         save_file(tensors, str(path), metadata)
     except SafetensorError as error:
         raise ValueError(f"{path}: expected a file that can be written: {error}") from error
 
 
+def quantised(weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Round weights to 8-bit numbers, symmetric, with a scale for each output channel.
+
+    Source: Krishnamoorthi 2018, "Quantizing deep convolutional networks for efficient inference", sect. 2.
+
+    Args:
+        weight: (O, ...).
+
+    Returns:
+        (O, ...) int8 and (O, 1, ...) float32, whose product is the weight but for half a scale.
+    """
+    weight = weight.float()
+    largest = weight.abs().amax(dim=tuple(range(1, weight.ndim)), keepdim=True)
+    scale = largest.clamp(min=torch.finfo(torch.float32).tiny) / 127
+    return (weight / scale).round().clamp(-127, 127).to(torch.int8), scale
+
+
 def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
     """Metadata, and every tensor in single precision (counters as they are)."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a weights file, there is none")
+    if path.suffix == ".ckpt":
+        name = path.with_suffix(".safetensors").name
+        raise ValueError(
+            f"{path}: expected a weights file, got a checkpoint of training; "
+            f"make one with: python -m train.export {path} {name} --seed SEED"
+        )
     try:
         with safe_open(str(path), framework="pt") as file:
             metadata = file.metadata() or {}
             values = {name: file.get_tensor(name) for name in file.keys()} if tensors else {}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{path}: expected a whole safetensors file: {error}") from error
-    if metadata.get("format") != _FORMAT:
+    if metadata.get("format") not in (_FORMAT, _COMPACT_FORMAT):
         raise ValueError(f"{path}: expected format {_FORMAT}, got {metadata.get('format')}")
-    return metadata, {k: v.float() if v.is_floating_point() else v for k, v in values.items()}
+    scales = {name: values.pop(name + _SCALE) for name in list(values) if name + _SCALE in values}
+    return metadata, {
+        name: value.float() * scales[name]
+        if name in scales
+        else (value.float() if value.is_floating_point() else value)
+        for name, value in values.items()
+    }
 
 
 def segmenter_config(values: Mapping[str, Any]) -> SegmenterConfig:
