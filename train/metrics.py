@@ -18,10 +18,10 @@ from lanebev.io.lanes import FrameLines
 Points = npt.NDArray[np.float64]
 
 
-def point_recall(
+def row_recall(
     probabilities: Tensor, target: Tensor, tolerance: float = 2.5, least: float = 0.5
 ) -> tuple[Tensor, Tensor]:
-    """Rows of each boundary that are found.
+    """Return the rows in which each boundary is found.
 
     A row where a boundary's stripe has its mass is found if at least half of that mass of probability lies
     within the tolerance of the stripe's centre.
@@ -33,14 +33,21 @@ def point_recall(
         least: mass, in label px, below which a row has no boundary.
 
     Returns:
-        found, there: (B, L) counts of rows.
+        found, there: (B, L, h) bool.
     """
     columns = torch.arange(target.shape[-1], dtype=target.dtype, device=target.device)
     mass = target.sum(-1)
     centre = (target * columns).sum(-1) / mass.clamp(min=1e-6)
     near = (columns - centre.unsqueeze(-1)).abs() <= tolerance
     there = mass > least
-    found = there & ((probabilities * near).sum(-1) >= 0.5 * (target * near).sum(-1))
+    return there & ((probabilities * near).sum(-1) >= 0.5 * (target * near).sum(-1)), there
+
+
+def point_recall(
+    probabilities: Tensor, target: Tensor, tolerance: float = 2.5, least: float = 0.5
+) -> tuple[Tensor, Tensor]:
+    """Count the rows of :func:`row_recall`: found, there, (B, L) each."""
+    found, there = row_recall(probabilities, target, tolerance, least)
     return found.sum(-1).to(target.dtype), there.sum(-1).to(target.dtype)
 
 

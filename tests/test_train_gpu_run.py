@@ -1,0 +1,117 @@
+"""What ten minutes of a GPU survive, without one."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from train import gpu_run
+from train.gpu_run import Measurement, Training, pose_scale, train_until
+
+
+class Clock:
+    """Time that passes only in sleep."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def monotonic(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.now += seconds
+
+
+class Breaking(Training):
+    """A training that ends as told: (after seconds, status, of memory)."""
+
+    def __init__(self, clock, ends, tmp_path):
+        super().__init__(tmp_path / "c.yaml", tmp_path, tmp_path / "log", [])
+        self.clock, self.ends, self.begun, self.shares, self.killed = clock, list(ends), [], [], False
+
+    def start(self, seconds):
+        self.begun.append(seconds)
+        self.shares.append(self.batch_share)
+        self.current = self.ends.pop(0)
+        self.since = self.clock.now
+
+    def ended(self):
+        after, status, _ = self.current
+        return status if self.clock.now - self.since >= after else None
+
+    def out_of_memory(self):
+        return self.current[2]
+
+    def stop(self):
+        self.killed = True
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(gpu_run, "time", clock)
+    return clock
+
+
+def run(clock, ends, tmp_path, deadline=325.0):
+    training, snapshots = Breaking(clock, ends, tmp_path), []
+    train_until(training, deadline, lambda number: snapshots.append((number, clock.now)))
+    return training, snapshots
+
+
+def test_a_run_that_goes_well_leaves_two_snapshots(clock, tmp_path):
+    training, snapshots = run(clock, [(320, 0, False)], tmp_path)
+    assert training.begun == [300.0]  # 25 s to start
+    assert [number for number, _ in snapshots] == [1, 2]
+    assert snapshots[0][1] == pytest.approx(125, abs=1)
+    assert not training.killed
+
+
+def test_out_of_memory_goes_on_with_half_the_batch(clock, tmp_path):
+    training, _ = run(clock, [(30, 1, True), (20, 1, True), (1e9, 0, False)], tmp_path)
+    assert training.shares == [1.0, 0.5, 0.25]
+    assert training.begun[1] == pytest.approx(325 - 30 - 25)
+
+
+def test_what_breaks_for_other_reasons_goes_on_as_it_was_but_not_for_ever(clock, tmp_path):
+    training, _ = run(clock, [(1, 1, False)] * 20, tmp_path)
+    assert training.shares == [1.0] * 7
+
+
+def test_a_run_that_does_not_end_is_ended(clock, tmp_path):
+    training, _ = run(clock, [(1e9, 0, False)], tmp_path)
+    assert training.killed
+    assert clock.now < 325 + 22
+
+
+def test_training_hears_its_process(tmp_path, monkeypatch, capsys):
+    command = [sys.executable, "-c", "print('CUDA out of memory'); raise SystemExit(1)"]
+    popen = gpu_run.subprocess.Popen
+    monkeypatch.setattr(gpu_run.subprocess, "Popen", lambda _, **kwargs: popen(command, **kwargs))
+    training = Training(tmp_path / "c.yaml", tmp_path, tmp_path / "fit.log", [])
+    training.start(5)
+    training._process.wait(30)
+    assert training.ended() == 1
+    assert training.out_of_memory()
+    assert "out of memory" in (tmp_path / "fit.log").read_text()
+    assert "out of memory" in capsys.readouterr().out
+    assert training.checkpoint() is None
+
+
+def test_measurements_are_lines_of_json_and_end_in_time(tmp_path, monkeypatch):
+    (tmp_path / "says.py").write_text("print('a table'); print('{\"a\": 1}')")
+    (tmp_path / "hangs.py").write_text("import time; print('{\"a\": 2}', flush=True); time.sleep(1000)")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    assert Measurement("says").result(60) == [{"a": 1}]
+    assert Measurement("hangs").result(1) in ([{"a": 2}], [])
+
+
+def test_scale_of_the_pose_is_that_measured_with_the_sigma_scale_and_never_below_one():
+    noise = [
+        {"factor": 1.0, "pose_sigma_scale": 3.0},
+        {"factor": 2.25, "pose_sigma_scale": 0.7},
+    ]
+    assert pose_scale(noise) == {"sigma_scale": 2.25, "pose_sigma_scale": 1.0}
+    assert pose_scale([]) == {}
+    assert pose_scale([{"factor": 2.25, "pose_sigma_scale": float("nan")}]) == {}

@@ -1,0 +1,277 @@
+"""The weights that a GPU makes in a few minutes: ``python -m train.gpu_run --minutes 9 --out OUT``.
+
+Trains (``configs/gpu.yaml``), exports, measures, and is done in time:
+
+    OUT/weights.safetensors      averaged weights of the end, with the pose's sigma scale measured
+    OUT/snapshot-1, -2           the same after a third and two thirds of the training
+    OUT/figures.json             views, noise and held-out recall
+    OUT/throughput.csv, fit.log  what the run did with its time
+
+Training is a process of its own. One that runs out of memory goes on from its last checkpoint with half the
+batch; one that breaks goes on as it was; one that does not end is ended. Whatever happens, the newest
+checkpoint is exported. The noise is that of the second snapshot, on the CPU's cores while training goes on:
+measure the final weights' with ``python -m train.noise`` where there is time. ``--smoke --minutes 1.5`` does
+all of it once, after ``python -m train.smoke``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from datetime import timedelta
+from pathlib import Path
+from typing import IO, Any
+
+import torch
+from jsonargparse.typing import PositiveFloat, PositiveInt
+
+from train.commands import one_line_errors
+from train.export import checkout_commit, export
+
+START = 25.0  # s, imports and the first batch
+EXPORT = 6.0  # s, reading a checkpoint and writing weights
+RECALL = 25.0  # s at most
+GRACE = 20.0  # s, a training may take to end by itself
+SHARES = (1 / 3, 2 / 3)
+RESTARTS = 6
+SIGMA_SCALE = 2.25  # see train.noise
+
+
+class Training:
+    """A training process and its checkpoints.
+
+    Args:
+        config: of ``python -m train fit``.
+        folder: of the run.
+        log: file of what it says; that is printed too.
+        options: further ones of the command line.
+    """
+
+    def __init__(self, config: Path, folder: Path, log: Path, options: Sequence[str]) -> None:
+        self.config, self.folder, self.log, self.options = config, folder, log, list(options)
+        self.batch_share = 1.0
+        self._process: subprocess.Popen[str] | None = None
+        self._echo: threading.Thread | None = None
+        self._tail = ""
+
+    def start(self, seconds: float) -> None:
+        """Begin, or go on from the newest checkpoint, for so long in all."""
+        duration = timedelta(seconds=max(1, round(seconds)))
+        clock = f"{duration.days:02d}:" + str(duration - timedelta(days=duration.days)).zfill(8)
+        command = [sys.executable, "-u", "-m", "train", "fit", "--config", str(self.config)]
+        command += [f"--trainer.max_time={clock}", f"--trainer.default_root_dir={self.folder}"]
+        command += [f"--trainer.logger.init_args.save_dir={self.folder}"]
+        command += [f"--data.init_args.batch_share={self.batch_share}", *self.options]
+        if (newest := self.checkpoint()) is not None:
+            command.append(f"--ckpt_path={newest}")
+        self._tail = ""
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        assert self._process.stdout is not None
+        self._echo = threading.Thread(target=self._listen, args=(self._process.stdout,), daemon=True)
+        self._echo.start()
+
+    def _listen(self, pipe: IO[str]) -> None:
+        with self.log.open("a") as log:
+            for line in pipe:
+                print(line, end="", flush=True)
+                log.write(line)
+                self._tail = (self._tail + line)[-4000:]
+
+    def ended(self) -> int | None:
+        """Return the exit status, or None while it runs."""
+        assert self._process is not None
+        status = self._process.poll()
+        if status is not None and self._echo is not None:
+            self._echo.join(5)
+        return status
+
+    def stop(self) -> None:
+        """End it."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.kill()
+            self._process.wait(10)
+
+    def out_of_memory(self) -> bool:
+        """Return whether the last words were of memory."""
+        return "out of memory" in self._tail.lower() or "OutOfMemoryError" in self._tail
+
+    def checkpoint(self) -> Path | None:
+        """Return the newest checkpoint."""
+        found = [path for path in self.folder.rglob("*.ckpt") if path.is_file()]
+        return max(found, key=lambda path: path.stat().st_mtime, default=None)
+
+    def trained(self) -> float:
+        """Return the seconds of training that the newest checkpoint has had."""
+        newest = self.checkpoint()
+        if newest is None:
+            return 0.0
+        timer = torch.load(newest, map_location="cpu", weights_only=False)["callbacks"].get("Timer", {})
+        return float(timer.get("time_elapsed", {}).get("train", 0.0))
+
+
+class Measurement:
+    """A command beside the training that prints lines of JSON."""
+
+    def __init__(self, *command: str) -> None:
+        self._name = command[0]
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", *command],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment,
+            start_new_session=True,  # so that its own processes end with it
+        )
+
+    def result(self, seconds: float) -> list[dict[str, Any]]:
+        """Return what it printed, after so long at most."""
+        complaint = ""
+        try:
+            said, complaint = self._process.communicate(timeout=max(0.1, seconds))
+        except subprocess.TimeoutExpired:
+            os.killpg(self._process.pid, signal.SIGKILL)
+            said, _ = self._process.communicate()
+            complaint = "took too long"
+        if self._process.returncode:
+            print(f"gpu_run: {self._name}: {complaint[-1500:]}", flush=True)
+        lines = [line for line in said.splitlines() if line.startswith("{") and line.endswith("}")]
+        return [json.loads(line) for line in lines]
+
+
+def train_until(
+    training: Training,
+    deadline: float,
+    snapshot: Callable[[int], None],
+) -> None:
+    """Train to the deadline (of ``time.monotonic``), with snapshots 1 and 2 on the way, whatever breaks."""
+    begin = time.monotonic()
+    budget = deadline - begin - START
+    training.start(budget)
+    wanted = [begin + START + share * budget for share in SHARES]
+    restarts = 0
+    while True:
+        time.sleep(0.5)
+        now = time.monotonic()
+        status = training.ended()
+        if status == 0:
+            return
+        if status is not None:
+            restarts += 1
+            left = deadline - now - START
+            if restarts > RESTARTS or left < 5:
+                print(f"gpu_run: training ended with status {status}, and is not begun again", flush=True)
+                return
+            if training.out_of_memory():
+                training.batch_share /= 2
+            print(f"gpu_run: status {status}, on with {training.batch_share} of the batch", flush=True)
+            training.start(training.trained() + left)
+        elif now > deadline + GRACE:
+            print("gpu_run: training did not end in time and is ended", flush=True)
+            training.stop()
+            return
+        if wanted and now >= wanted[0]:
+            wanted.pop(0)
+            snapshot(len(SHARES) - len(wanted))
+
+
+def save(training: Training, path: Path, changes: dict[str, Any], record: dict[str, Any]) -> bool:
+    """Export the newest checkpoint, and return whether there was one. What goes wrong is printed."""
+    newest = training.checkpoint()
+    if newest is None:
+        print(f"gpu_run: no checkpoint for {path.name} yet", flush=True)
+        return False
+    try:
+        partial = path.with_suffix(".part")
+        export(newest, partial, changes, **record)
+        os.replace(partial, path)
+    except (ValueError, OSError, RuntimeError) as error:  # a run goes on without it
+        print(f"gpu_run: {path.name}: {error}", flush=True)
+        return False
+    print(f"gpu_run: {path.name} of {newest.name}, {path.stat().st_size / 1e6:.1f} MB", flush=True)
+    return True
+
+
+def pose_scale(noise: list[dict[str, Any]]) -> dict[str, float]:
+    """Return the sigma scale of the shipped weights and the pose's that was measured with it, or nothing."""
+    return next(
+        (
+            {"sigma_scale": SIGMA_SCALE, "pose_sigma_scale": max(1.0, line["pose_sigma_scale"])}
+            for line in noise
+            if line["factor"] == SIGMA_SCALE and math.isfinite(line["pose_sigma_scale"])
+        ),
+        {},
+    )
+
+
+def _commit() -> str:
+    try:
+        return checkout_commit()
+    except ValueError as error:
+        print(f"gpu_run: {error}", flush=True)
+        return "unknown"
+
+
+@one_line_errors()
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--minutes", type=PositiveFloat, default=9.0, help="of the whole command")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the results")
+    parser.add_argument("--work", type=Path, help="folder of the checkpoints; a temporary one by default")
+    parser.add_argument("--config", type=Path, default=Path("configs/gpu.yaml"))
+    parser.add_argument("--seed", type=int, default=21)
+    parser.add_argument("--views", type=PositiveInt, default=384, help="held-out, for the recall")
+    parser.add_argument("--smoke", action="store_true", help="time the parts first")
+    args, options = parser.parse_known_args()
+    begin = time.monotonic()
+    args.out.mkdir(parents=True, exist_ok=True)
+    work = args.work or Path(tempfile.mkdtemp(prefix="lanebev-"))
+    if args.smoke:
+        subprocess.run(
+            [sys.executable, "-m", "train.smoke", "--out", str(args.out)], timeout=120, check=False
+        )
+    end = time.monotonic() + 60 * args.minutes
+    record = {"seed": args.seed, "commit": _commit()}
+    seeds = [f"--seed_everything={args.seed}", f"--data.init_args.seed={args.seed}"]
+    training = Training(args.config, work, args.out / "fit.log", [*seeds, *options])
+    weights = args.out / "weights.safetensors"
+    noise: list[Measurement] = []
+
+    def snapshot(number: int) -> None:
+        path = args.out / f"snapshot-{number}.safetensors"
+        if save(training, path, {}, record) and number == len(SHARES):
+            jobs = max(1, (os.cpu_count() or 2) - 4)
+            amount = [f"--drives={max(12, jobs)}", "--frames=40", f"--jobs={jobs}"]
+            noise.append(Measurement("train.noise", str(path), *amount))
+
+    try:
+        train_until(training, end - RECALL - 2 * EXPORT, snapshot)
+    finally:
+        training.stop()
+        there = save(training, weights, {}, record)
+        for table in sorted(work.rglob("throughput.csv")):
+            shutil.copy(table, args.out / "throughput.csv")
+    if not there:
+        raise ValueError(f"{work}: expected a checkpoint, got none; see {args.out / 'fit.log'}")
+    recall = Measurement("train.evaluate_roads", str(weights), f"--views={args.views}", "--json")
+    until = end - EXPORT
+    figures = {"recall": recall.result(until - time.monotonic())}
+    figures["noise"] = noise[0].result(until - time.monotonic()) if noise else []
+    (args.out / "figures.json").write_text(json.dumps(figures, indent=1))
+    save(training, weights, pose_scale(figures["noise"]), {**record, "metrics": figures["recall"]})
+    print(f"gpu_run: done in {time.monotonic() - begin:.0f} s: {sorted(p.name for p in args.out.iterdir())}")
+
+
+if __name__ == "__main__":
+    main()

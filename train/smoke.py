@@ -1,0 +1,117 @@
+"""How fast a device renders, labels and trains: ``python -m train.smoke --out OUT``, in half a minute.
+
+Prints frames a second of rendering, of labelling and augmenting, and of training alone, and the peak memory;
+saves a sheet of labelled views. A batch that does not fit in memory is said and passed over.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from jsonargparse.typing import PositiveInt
+
+from lanebev.observation.segmenter import SegmenterConfig
+from lanebev.render import WindowConfig
+from train.commands import one_line_errors
+from train.labels import ViewConfig
+from train.live import labelled, rendered
+from train.module import Segmentation, unpack
+from train.sheet import labelled_view, save_sheet
+
+
+def seconds(work: Callable[[], Any], device: torch.device, repeats: int) -> float:
+    """Time a call on a device, the least of several, after one that is not counted."""
+    taken = []
+    for _ in range(repeats + 1):
+        _wait(device)
+        begin = time.perf_counter()
+        work()
+        _wait(device)
+        taken.append(time.perf_counter() - begin)
+    return min(taken[1:])
+
+
+def report(name: str, count: int, work: Callable[[], Any], device: torch.device, repeats: int) -> None:
+    """Print frames a second and the peak memory of a call on ``count`` frames."""
+    cuda = device.type == "cuda"
+    if cuda:
+        torch.cuda.reset_peak_memory_stats(device)
+    try:
+        each = seconds(work, device, repeats)
+    except torch.OutOfMemoryError:
+        print(f"{name} B={count}: out of memory", flush=True)
+        torch.cuda.empty_cache()
+        return
+    peak = torch.cuda.max_memory_allocated(device) / 2**30 if cuda else 0.0
+    print(
+        f"{name} B={count}: {count / each:.0f} frames/s, {1e3 * each:.1f} ms, peak {peak:.1f} GiB", flush=True
+    )
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+@one_line_errors()
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--size", type=int, nargs=2, default=(320, 576), metavar=("HEIGHT", "WIDTH"))
+    parser.add_argument("--batches", type=PositiveInt, nargs="+", default=(32, 64, 128))
+    parser.add_argument("--repeats", type=PositiveInt, default=3)
+    parser.add_argument("--base-width", type=PositiveInt, default=64)
+    args = parser.parse_args()
+    device, size, repeats = torch.device(args.device), tuple(args.size), args.repeats
+    torch.set_float32_matmul_precision("high")
+    torch.backends.cudnn.benchmark = True
+    args.out.mkdir(parents=True, exist_ok=True)
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
+    print(f"{name}, torch {torch.__version__}, {size[0]} x {size[1]}", flush=True)
+
+    view, window = ViewConfig(), WindowConfig()
+    for count in args.batches:
+        report(
+            "rendering",
+            count,
+            partial(rendered, count, size, (count,), device, window, count),
+            device,
+            repeats,
+        )
+    count = args.batches[len(args.batches) // 2]
+    views = rendered(count, size, (1,), device, window, min(args.batches))
+    report("labelling", count, lambda: labelled(views, view), device, repeats)
+    batch = labelled(views, view)
+    save_sheet(labelled_view(type(batch)(*(field[:24] for field in batch))), args.out / "sheet.png")
+
+    config = SegmenterConfig(base_width=args.base_width, image_size=size)
+    model = Segmentation(network=config, class_weight=None).to(device)
+    model.log_dict = lambda *_, **__: None  # type: ignore[method-assign]
+    optimizer = torch.optim.AdamW(model.parameters(), 1e-5)
+    photometric = model.photometric
+    assert photometric is not None
+    report("augmenting", count, lambda: photometric(unpack(batch)[0]), device, repeats)
+    model.photometric = None
+
+    def step(batch: Any) -> None:
+        with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
+            loss = model.map_loss(batch, 0)[0]
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+    for count in sorted({len(batch.image), min(args.batches)}):
+        part = type(batch)(*(field[:count] for field in batch))
+        report("training", count, partial(step, part), device, repeats)
+
+
+if __name__ == "__main__":
+    main()
