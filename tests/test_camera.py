@@ -146,8 +146,11 @@ def test_cropped_camera_shifts():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"distortion": [0.1, 0.2, 0.3]}, "expected 0, 4, 5, 8, 12 coefficients for a pinhole lens, got 3"),
-        ({"model": "ball"}, "model: expected one of pinhole, fisheye, got 'ball'"),
+        (
+            {"distortion": [0.1, 0.2, 0.3]},
+            "expected 0, 4, 5, 8, 12, 14 coefficients for a pinhole lens",
+        ),
+        ({"model": "ball"}, "model: expected one of pinhole, fisheye, omni, got 'ball'"),
         ({"fx": -1.0}, "expected positive focal lengths, got fx -1"),
         ({"width": 0}, "image_size: expected whole positive"),
         ({"width": 1280.5}, "image_size: expected whole positive"),

@@ -135,7 +135,7 @@ def test_kitti_file_of_an_unknown_camera_needs_a_size(tmp_path):
         ({"width": 640.5}, "whole pixels"),
         ({"height": None}, "yaml: height: expected a value"),
         ({"fx": 10**400}, "fx: expected finite numbers, got 1000"),
-        ({"distortion": [0.1, 0.2]}, "distortion: expected 0 or 4 or 5 or 8 or 12 coefficients"),
+        ({"distortion": [0.1, 0.2]}, "distortion: expected 0 or 4 or 5 or 8 or 12 or 14 coefficients"),
         ({"distortion": [0.1] * 5, "model": "fisheye"}, r"expected 4 coefficients \(fisheye\), got 5"),
         ({"distortion": 0.3}, "distortion: expected a list"),
         ({"distortion": [-900.0, 0, 0, 0]}, "lens that can be inverted"),

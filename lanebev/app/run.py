@@ -131,7 +131,7 @@ def run(
             source.is_single,
             config.stills,
         )
-        recorder.problems += filter(None, (source.problem, problem, observer.remark))
+        recorder.problems += filter(None, (source.problem, problem, observer.remark, lens_remark(camera)))
         before = None
         with recorder:
             for frame in frames:
@@ -237,6 +237,14 @@ def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Obs
 def make_calibrator(name: str) -> Any:
     """The calibrator of this name with default settings."""
     return TwoStageCalibrator() if name == "two-stage" else JointCalibrator()
+
+
+def lens_remark(camera: Camera) -> str:
+    """Say at how many of its pixels the camera's lens images nothing; empty if there are none."""
+    share = camera.share_without_rays()
+    if share == 0:
+        return ""
+    return f"camera: {share:.2%} of the pixels cannot be undistorted by the lens; lanes there are left out"
 
 
 def of_camera(camera: Camera, source: FrameSource) -> FrameSource:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from numbers import Integral
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,10 @@ from lanebev.geometry.lens import (
     check_points,
     denormalise_points,
     distort_points,
+    invert_distortion,
+    lens_model,
     max_undistorted_radius,
     normalise_points,
-    undistort_points,
 )
 
 
@@ -29,8 +31,10 @@ class Camera:
 
     Attributes:
         intrinsics: (3, 3) px.
-        distortion: (D,), OpenCV's order; empty for an ideal lens.
-        model: "pinhole" (Brown-Conrady, D = 0, 4, 5, 8, 12) or "fisheye" (Kannala-Brandt, D = 4).
+        distortion: (D,), OpenCV's order, see :mod:`lanebev.geometry.distortion`; empty for an ideal lens.
+        model: "pinhole" (Brown-Conrady, D = 0, 4, 5, 8, 12, or 14 with a tilted sensor), "fisheye"
+            (Kannala and Brandt 2006, D = 4) or "omni" (Mei and Rives 2007, D = 5: ξ k1 k2 p1 p2), which may
+            be given as "mei".
         image_size: (height, width) px.
     """
 
@@ -45,6 +49,7 @@ class Camera:
         if self.distortion.ndim != 1:
             raise ValueError(f"distortion: expected (D,), got {tuple(self.distortion.shape)}")
         check_lens(self.distortion, self.model)
+        object.__setattr__(self, "model", lens_model(self.model))
         sides: tuple[Any, ...] = tuple(self.image_size)
         if len(sides) != 2 or not all(isinstance(side, Integral) and int(side) > 0 for side in sides):
             raise ValueError(f"image_size: expected whole positive (height, width), got {self.image_size}")
@@ -165,13 +170,29 @@ class Camera:
         """(N, 2) px undistorted to (N, 2) px as taken."""
         return distort_points(points[None], self.intrinsics[None], self.distortion[None], self.model)[0]
 
+    @cached_property
+    def max_radius(self) -> Tensor:
+        """() radius on the undistorted z = 1 plane up to which the lens images anything."""
+        return max_undistorted_radius(self.distortion[None], self.model)[0]
+
     def undistort_points(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) px as taken to (N, 2) px undistorted and (N,) bool, false where no such point exists."""
-        undistorted = undistort_points(
-            points[None], self.intrinsics[None], self.distortion[None], self.model
-        )[0]
-        error = (self.distort_points(undistorted) - points).norm(dim=-1)
-        return undistorted, error < 0.05  # NaN and Inf compare false
+        lens = (self.intrinsics[None], self.distortion[None], self.model)
+        undistorted, valid = invert_distortion(points[None], *lens, reach=self.max_radius[None])
+        return undistorted[0], valid[0]
+
+    def share_without_rays(self) -> float:
+        """Return the share of the image's pixels that have no ray: the lens images nothing there.
+
+        It is that of a grid of 64 x 64 pixels. Lanes there are left out.
+        """
+        height, width = self.image_size
+        rows, columns = (
+            torch.linspace(0, side - 1, 64, dtype=self.intrinsics.dtype, device=self.intrinsics.device)
+            for side in (height, width)
+        )
+        points = torch.cartesian_prod(columns, rows)
+        return 1.0 - float(self.undistort_points(points)[1].double().mean())
 
     def rays(self, points: Tensor) -> Tensor:
         """(N, 2) px as taken to (N, 3) camera rays with z = 1."""
@@ -198,5 +219,4 @@ class Camera:
         inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
         if not self.distortion.shape[-1]:
             return pixels, front & inside
-        reach = max_undistorted_radius(self.distortion[None], self.model)
-        return pixels, front & inside & (plane.norm(dim=-1) < reach)
+        return pixels, front & inside & (plane.norm(dim=-1) < self.max_radius)

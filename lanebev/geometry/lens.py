@@ -6,31 +6,41 @@ camera with the same intrinsics.
 
 from __future__ import annotations
 
-import math
-
 import torch
-from kornia.geometry import calibration
-from kornia.geometry.camera import distort_points_kannala_brandt
 from torch import Tensor
 
+from lanebev.geometry.distortion import (
+    DISTORTION_LENGTHS,
+    MODELS,
+    check_lens,
+    distort_plane,
+    lens_model,
+    max_undistorted_radius,
+)
 from lanebev.geometry.precision import full_precision
+from lanebev.geometry.undistortion import undistort_plane
 
-MODELS = ("pinhole", "fisheye")
-DISTORTION_LENGTHS = {"pinhole": (0, 4, 5, 8, 12), "fisheye": (4,)}
+__all__ = [
+    "DISTORTION_LENGTHS",
+    "MODELS",
+    "cam_from_image",
+    "check_intrinsics",
+    "check_lens",
+    "check_points",
+    "check_rows",
+    "denormalise_points",
+    "distort_points",
+    "invert_distortion",
+    "lens_model",
+    "max_undistorted_radius",
+    "normalise_points",
+    "placeholder_intrinsics",
+    "undistort_points",
+    "undistorted_sigma",
+    "usable_cameras",
+]
+
 _HARMLESS_FOCAL = 1000.0  # px
-_UNDISTORT_ITERATIONS = 20  # kornia's default of 5 leaves 1e-2 px at the corners of a wide lens
-_KB_NEWTON_ITERATIONS = 10  # quadratic from theta = theta_d: 1e-12 rad below 80 deg
-
-
-def check_lens(distortion: Tensor, model: str) -> None:
-    """Raise unless the lens model exists and has as many coefficients as (..., D) are given."""
-    if model not in MODELS:
-        raise ValueError(f"model: expected one of {', '.join(MODELS)}, got {model!r}")
-    if distortion.shape[-1] not in DISTORTION_LENGTHS[model]:
-        expected = ", ".join(map(str, DISTORTION_LENGTHS[model]))
-        raise ValueError(
-            f"distortion: expected {expected} coefficients for a {model} lens, got {distortion.shape[-1]}"
-        )
 
 
 def check_rows(distortion: Tensor, points: Tensor) -> None:
@@ -123,16 +133,14 @@ def cam_from_image(intrinsics: Tensor) -> Tensor:
 
 @full_precision
 def distort_points(points: Tensor, intrinsics: Tensor, distortion: Tensor, model: str = "pinhole") -> Tensor:
-    """Undistorted pixels to pixels of the image as it was taken.
-
-    Source: Brown-Conrady as in OpenCV ``calib3d`` (kornia.geometry.calibration); Kannala and Brandt 2006
-    (kornia.geometry.camera).
+    """Compute where undistorted pixels are in the image as it was taken.
 
     Args:
         points: (B, N, 2) px, undistorted.
         intrinsics: (B, 3, 3).
-        distortion: (B, D), D in 0, 4, 5, 8, 12 (pinhole) or 4 (fisheye), OpenCV's order.
-        model: "pinhole" or "fisheye".
+        distortion: (B, D) in OpenCV's order, see :mod:`lanebev.geometry.distortion`: D in 0, 4, 5, 8, 12, 14
+            (pinhole), 4 (fisheye) or 5 (omni: ξ k1 k2 p1 p2).
+        model: "pinhole", "fisheye" or "omni" ("mei").
 
     Returns:
         (B, N, 2) px, distorted. Differentiable in all tensors.
@@ -143,33 +151,23 @@ def distort_points(points: Tensor, intrinsics: Tensor, distortion: Tensor, model
     _check(points, distortion, model)
     if distortion.shape[-1] == 0:
         return points
-    if model == "fisheye":
-        plane = normalise_points(points, intrinsics)
-        unit = distortion.new_tensor([1.0, 1.0, 0.0, 0.0]).expand(*distortion.shape[:-1], 4)
-        params = torch.cat([unit, distortion], dim=-1)  # (B, 8) of an ideal focal length: stays on the plane
-        return denormalise_points(
-            distort_points_kannala_brandt(plane, params.unsqueeze(-2).expand(*plane.shape[:-1], 8)),
-            intrinsics,
-        )
-    distorted: Tensor = calibration.distort_points(points, intrinsics, distortion)
-    return distorted
+    plane = distort_plane(normalise_points(points, intrinsics), distortion, lens_model(model))
+    return denormalise_points(plane, intrinsics)
 
 
 @full_precision
 def undistort_points(
     points: Tensor, intrinsics: Tensor, distortion: Tensor, model: str = "pinhole"
 ) -> Tensor:
-    """Pixels of the image as it was taken to those of the ideal pinhole.
+    """Compute where pixels of the image as it was taken would be without a lens.
 
-    Inverse of :func:`distort_points`, by fixed-point iteration (pinhole) or Newton's method on the polar
-    angle (fisheye). Where the lens polynomial folds over, far outside the image, the result is not a
-    solution; :meth:`Camera.undistort_points` reports such points.
+    The points alone of :func:`invert_distortion`, which also says which of them are none.
 
     Args:
         points: (B, N, 2) px, distorted.
         intrinsics: (B, 3, 3).
         distortion: (B, D).
-        model: "pinhole" or "fisheye".
+        model: "pinhole", "fisheye" or "omni" ("mei").
 
     Returns:
         (B, N, 2) px, undistorted.
@@ -177,16 +175,44 @@ def undistort_points(
     Raises:
         ValueError: unknown model, a number of coefficients that it does not have, or of rows.
     """
+    return invert_distortion(points, intrinsics, distortion, model)[0]
+
+
+@full_precision
+def invert_distortion(
+    points: Tensor,
+    intrinsics: Tensor,
+    distortion: Tensor,
+    model: str = "pinhole",
+    reach: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Compute where pixels of the image as it was taken would be without a lens, and which would be.
+
+    Inverse of :func:`distort_points`: radially by Newton's method in a bracket, then in the plane by damped
+    Newton, each a fixed number of steps; the gradient is the solution's own. A pixel that the lens images
+    from nowhere within its reach, outside of the image circle as a rule, has no such point.
+
+    Args:
+        points: (B, N, 2) px, distorted.
+        intrinsics: (B, 3, 3).
+        distortion: (B, D).
+        model: "pinhole", "fisheye" or "omni" ("mei").
+        reach: (B,) of :func:`max_undistorted_radius`, for those who call often; None computes it.
+
+    Returns:
+        (B, N, 2) px, undistorted, and (B, N) bool, false where there is no such point; what is returned
+        there is near where the lens folds over and has no gradient.
+
+    Raises:
+        ValueError: unknown model, a number of coefficients that it does not have, or of rows.
+    """
     _check(points, distortion, model)
     if distortion.shape[-1] == 0:
-        return points
-    if model == "fisheye":
-        plane = normalise_points(points, intrinsics)
-        return denormalise_points(_undistort_plane_kannala_brandt(plane, distortion), intrinsics)
-    undistorted: Tensor = calibration.undistort_points(
-        points, intrinsics, distortion, num_iters=_UNDISTORT_ITERATIONS
-    )
-    return undistorted
+        return points, points.isfinite().all(-1)
+    if reach is None:
+        reach = max_undistorted_radius(distortion, model)
+    plane, valid = undistort_plane(normalise_points(points, intrinsics), distortion, lens_model(model), reach)
+    return denormalise_points(plane, intrinsics), valid
 
 
 @full_precision
@@ -209,7 +235,7 @@ def undistorted_sigma(
         along: (B, N, 2) direction of the line there, undistorted, of any length.
         intrinsics: (B, 3, 3).
         distortion: (B, D).
-        model: "pinhole" or "fisheye".
+        model: "pinhole", "fisheye" or "omni".
 
     Returns:
         (B, N) px, undistorted; ``sigma`` where the line has no direction.
@@ -224,50 +250,3 @@ def undistorted_sigma(
     length = along.norm(dim=-1)
     stretch = (along[..., :1] * by_x + along[..., 1:] * by_y).norm(dim=-1) / length.clamp(min=1e-9)
     return torch.where((length > 1e-9) & (size > 1e-6), sigma * stretch / size.clamp(min=1e-6), sigma)
-
-
-def _undistort_plane_kannala_brandt(plane: Tensor, distortion: Tensor) -> Tensor:
-    """Kannala-Brandt inverse on the z = 1 plane, (B, N, 2): theta_d = theta (1 + k1 theta^2 + ...)."""
-    k1, k2, k3, k4 = distortion[..., None, :].unbind(-1)  # each (B, 1)
-    squared = (plane * plane).sum(-1)
-    centre = squared < 1e-16  # sqrt has no gradient there, and the lens no effect
-    theta_d = torch.where(centre, 1.0, squared).sqrt()
-    theta = theta_d
-    for _ in range(_KB_NEWTON_ITERATIONS):
-        t2 = theta * theta
-        value = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-        slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-        theta = theta - (value - theta_d) / slope
-    scale = torch.where(centre, 1.0, theta.tan() / theta_d)
-    return plane * scale.unsqueeze(-1)
-
-
-def max_undistorted_radius(distortion: Tensor, model: str = "pinhole", limit: float = 10.0) -> Tensor:
-    """How far from the axis a lens polynomial still grows.
-
-    Beyond it the polynomial folds over and maps points that the camera can't see back into the image.
-    Tangential and thin-prism terms, small in comparison, are left out.
-
-    Args:
-        distortion: (B, D), OpenCV's order.
-        model: "pinhole" or "fisheye".
-        limit: the largest radius looked at of a pinhole; 10 is 84 deg off the axis. A fisheye's is 90 deg.
-
-    Returns:
-        (B,) radius on the undistorted z = 1 plane.
-    """
-    check_lens(distortion, model)
-    steps = torch.linspace(0.0, 1.0, 2001, dtype=distortion.dtype, device=distortion.device)
-    k = torch.nn.functional.pad(distortion, (0, 12 - distortion.shape[-1])).unsqueeze(-1)  # (B, 12, 1)
-    if model == "fisheye":
-        x = 0.9999 * 0.5 * math.pi * steps
-        radius, t = x.tan(), x * x
-        value = x * (1 + t * (k[:, 0] + t * (k[:, 1] + t * (k[:, 2] + t * k[:, 3]))))
-    else:
-        radius = limit * steps
-        r = radius * radius
-        numerator = 1 + r * (k[:, 0] + r * (k[:, 1] + r * k[:, 4]))
-        value = radius * numerator / (1 + r * (k[:, 5] + r * (k[:, 6] + r * k[:, 7])))
-    grows = (value.diff(dim=-1) > 0).to(torch.int8).cumprod(-1)  # 1 up to the first step that doesn't
-    reach: Tensor = radius[grows.sum(-1)]
-    return reach

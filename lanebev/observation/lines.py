@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.geometry.lens import (
+    invert_distortion,
     placeholder_intrinsics,
-    undistort_points,
     undistorted_sigma,
     usable_cameras,
 )
@@ -117,13 +117,14 @@ def undistort_segments(
 ) -> LaneSegments:
     """Segments in pixels of the image as it came to undistorted ones, their sigmas too.
 
-    In a row whose lens can't be used all have weight zero, and the gradient of the others stays finite.
+    Segments with an end that the lens cannot have imaged have weight zero. In a row whose lens can't be used
+    all have weight zero, and the gradient of the others stays finite.
 
     Args:
         segments: (B, N).
         intrinsics: (B, 3, 3) px.
         distortion: (B, D), or None for an ideal lens.
-        model: "pinhole" or "fisheye".
+        model: "pinhole", "fisheye" or "omni".
     """
     if distortion is None or distortion.shape[-1] == 0:
         return segments
@@ -132,7 +133,9 @@ def undistort_segments(
     intrinsics = torch.where(good[:, None, None], intrinsics, placeholder_intrinsics(intrinsics))
     distortion = torch.where(good.unsqueeze(-1), distortion, 0.0)
     lens = (intrinsics, distortion, model)
-    flat = undistort_points(segments.endpoints.flatten(1, 2), *lens)
+    flat, valid = invert_distortion(segments.endpoints.flatten(1, 2), *lens)
+    whole = valid.unflatten(1, (-1, 2)).all(-1)
+    segments = segments._replace(weight=torch.where(whole, segments.weight, 0.0))
     ends = flat.reshape(segments.endpoints.shape)
     along = (ends[..., 1, :] - ends[..., 0, :]).repeat_interleave(2, dim=1)
     sigma = undistorted_sigma(segments.sigma.repeat_interleave(2, dim=1), flat, along, *lens)
