@@ -195,6 +195,7 @@ def test_pseudo_ground_truth_compares_the_same_frames(data, tmp_path, capsys, mo
     assert "expected an entry for at least one image" in output.err
 
 
+@pytest.mark.slow
 def test_a_lane_file_says_how_much_less_sure_its_pose_is(data, drive, tmp_path):
     lines = [json.loads(line) for line in (data / "video_lanes.json").read_text().splitlines()]
     wide = "\n".join(json.dumps({**line, "pose_sigma_scale": 2.0}) for line in lines)
@@ -266,6 +267,7 @@ def test_resuming_gives_what_an_uninterrupted_run_gives(data, tmp_path, calibrat
         assert all(torch.equal(one[name][field], other[name][field]) for field in one[name])
 
 
+@pytest.mark.slow
 def test_a_damaged_state_is_reported_and_a_missing_one_refused(data, tmp_path, capsys):
     assert _run(data, source="images/3.png", out=tmp_path / "out") == 0
     state = tmp_path / "out" / "state.safetensors"
@@ -278,6 +280,7 @@ def test_a_damaged_state_is_reported_and_a_missing_one_refused(data, tmp_path, c
     assert not (tmp_path / "third").exists()
 
 
+@pytest.mark.slow
 def test_the_state_of_the_other_calibrator_is_a_mistake(data, tmp_path, capsys):
     for one, other in (("joint", "two-stage"), ("two-stage", "joint")):
         folder = tmp_path / one
@@ -571,6 +574,7 @@ def test_module_is_the_command():
     assert "run" in done.stdout
 
 
+@pytest.mark.slow
 def test_weights_are_there_after_one_import():
     script = "import lanebev; print(lanebev.weights.read_metadata()['seed'])"
     subprocess.run([sys.executable, "-c", script], capture_output=True, check=True)

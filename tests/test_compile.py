@@ -37,6 +37,7 @@ def test_calibrators(calibrator):
     assert expected.status.tolist() == [Status.COASTING, Status.TRACKING]
 
 
+@pytest.mark.slow
 def test_mount():
     torch.compiler.reset()
     mount = MountEstimator(block_time=1.0, needed=4)

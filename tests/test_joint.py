@@ -479,6 +479,7 @@ def test_what_is_clearly_straight_or_bent_is_taken_as_that():
         torch.testing.assert_close(got.double(), expected, rtol=1e-3, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [math.inf, 2000.0, 1000.0, 500.0])
 def test_single_images_of_bends_with_vague_lines_are_honest(radius):
     """Two lanes' boundaries to 40 m at 2.5 px: whether R = 1,000 m is a bend cannot be told for sure."""

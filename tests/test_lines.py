@@ -70,6 +70,7 @@ def test_vertices_lie_on_rendered_boundaries_to_a_tenth_of_a_pixel(fans):
     assert abs(errors[seen].mean()) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(144, 256), (96, 160)])
 def test_extraction_on_masks_of_rendered_roads(size):
     """Curves, hills, hidden stretches and lenses included: every vertex within 0.1 px."""

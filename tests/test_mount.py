@@ -288,6 +288,7 @@ def test_bad_numbers_are_named():
         mount(fast(POSE, 2), JointCalibrator().initial_state(2), 0.1)
 
 
+@pytest.mark.slow
 def test_exports_and_equals_eager():
     mount = MountEstimator()
     _, state = run(mount, start(mount, 2), 4.0)

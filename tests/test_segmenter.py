@@ -89,6 +89,7 @@ def test_rows_of_a_batch_are_alone(small):
     torch.testing.assert_close(small(image)[1:2], small(image[1:2]), atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_overfits_one_image():
     torch.manual_seed(0)
     model = LaneSegmenter(SMALL).train()

@@ -43,6 +43,7 @@ def run(subcommand, config, tmp_path, *extra):
     main([subcommand, "--config", str(CONFIGS / config), *here, *extra])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", ["default.yaml", "paper.yaml", "end_to_end.yaml"])
 def test_every_config_trains_a_step(config, tmp_path):
     run("fit", config, tmp_path, *TINY, *VIEWS)
@@ -144,6 +145,7 @@ def test_an_interrupted_run_ends_as_one_in_a_piece(tmp_path, monkeypatch):
     assert all(torch.equal(value, parts["state_dict"][name]) for name, value in whole["state_dict"].items())
 
 
+@pytest.mark.slow
 def test_a_finished_run_goes_on_at_its_own_rate(tmp_path, monkeypatch):
     """Its checkpoint was written when the rate had come to its end, 0."""
     rates = []
@@ -174,6 +176,7 @@ def refused(capsys, *arguments):
     return capsys.readouterr().err.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_checkpoints_of_another_kind_are_one_line(tmp_path, capsys):
     notes = tmp_path / "notes.md"
     notes.write_text("no checkpoint")

@@ -24,6 +24,7 @@ def drive():
     return Seen(segments, width, poses, CAMERA[None], 1 / FPS)
 
 
+@pytest.mark.slow
 def test_sigmas_half_as_large_as_the_errors_are_found_out(drive):
     report = compare([drive], (1.0, 2.0, 8.0))
     assert 0.5 < report[2.0].nees < 1.6  # one second is some ten independent errors an axis

@@ -127,6 +127,7 @@ def test_pose_loss_counts_what_was_said(batch):
     assert pose_loss(found._replace(extrinsics=broken), truth, unit, with_prior=True) == 0
 
 
+@pytest.mark.slow
 def test_gradient_of_the_pose_lowers_its_error(batch):
     """Maps shifted sideways by a label pixel: following the gradient for a few steps turns the pose back."""
     logits = logits_of(batch).roll(1, dims=-1).double().requires_grad_()

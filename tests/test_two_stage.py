@@ -44,6 +44,7 @@ def test_one_exact_frame_gives_the_pose_over_all_signs(pose):
     assert outputs[0].status.tolist() == [Status.TRACKING]
 
 
+@pytest.mark.slow
 def test_table_one_fast():
     exp = Experiment(num_frames=60, segments_per_boundary=30)
     for row in table(run(TwoStageCalibrator(), exp, 4, torch.float64, 0)):
@@ -161,6 +162,7 @@ def test_one_lane_never_moves_roll_and_says_so():
     assert float(never[-1].covariance[0, 2, 2].sqrt()) == pytest.approx(0.05, rel=0.01)
 
 
+@pytest.mark.slow
 def test_garbage_never_runs_away_and_is_recovered_from():
     generator = torch.Generator().manual_seed(3)
     shape = lanes().weight.shape[1]
