@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from lanebev.render import RenderedFrame, render_views
+from lanebev.render.raster.effects import add_bonnet
 from lanebev.render.raster.glyphs import GLYPH_LENGTH, glyph_coverage
 from lanebev.render.raster.night import lamp_light, low_beam
 from lanebev.render.raster.rays import View
@@ -21,8 +22,9 @@ from lanebev.render.scene.glyphs import AHEAD, CROSS, LEFT, NUM_GLYPHS, RIGHT
 from lanebev.render.scene.kinds import KINDS, sample_kinds
 from lanebev.render.scene.layout import presence
 from lanebev.render.scene.night import sample_lights
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.street import PLAIN, no_street
+from lanebev.render.scene.weather import Light
 from lanebev.render.scene.world import Place, World, sample_course, sample_world, scene_at
 from lanebev.render.views import render_scenes, sample_place
 from lanebev.types import Extrinsics
@@ -30,20 +32,23 @@ from lanebev.types import Extrinsics
 SIZE = (48, 96)
 
 
-def dice_of(batch: int, seed: int) -> Dice:
-    return Dice(batch, torch.Generator().manual_seed(seed))
+def sampler_of(batch: int, seed: int) -> BatchSampler:
+    return BatchSampler(batch, torch.Generator().manual_seed(seed))
 
 
 def seen(kind: str, seed: int, **without: Any) -> RenderedFrame:
     """Worlds of a kind, parts of them replaced, from the same places, without the sensor's noise."""
     batch = 3
-    dice = dice_of(batch, seed)
-    world, ego_lane = sample_world(dice, kind)
-    world, place = sample_place(dice, world, ego_lane)
-    alignment = build_alignment(*sample_course(dice))
-    intrinsics = sample_intrinsics(dice, SIZE)
+    sampler = sampler_of(batch, seed)
+    world, ego_lane = sample_world(sampler, kind)
+    world, place = sample_place(sampler, world, ego_lane)
+    alignment = build_alignment(*sample_course(sampler))
+    intrinsics = sample_intrinsics(sampler, SIZE)
     lens = Lens(
-        intrinsics, sample_distortion(dice, intrinsics, SIZE, "pinhole"), "pinhole", sample_extrinsics(dice)
+        intrinsics,
+        sample_distortion(sampler, intrinsics, SIZE, "pinhole"),
+        "pinhole",
+        sample_extrinsics(sampler),
     )
     world = world._replace(**without)
     scene = scene_at(world, place, alignment, lens)
@@ -64,11 +69,11 @@ def test_images_are_finite_and_repeat_by_seed(kind: str) -> None:
 
 def test_an_unknown_kind_is_refused() -> None:
     with pytest.raises(ValueError, match="kind: expected one of any, highway"):
-        sample_kinds(dice_of(2, 0), "moon")
+        sample_kinds(sampler_of(2, 0), "moon")
 
 
 def test_most_worlds_are_plain_highways() -> None:
-    kinds = torch.stack(sample_kinds(dice_of(20000, 0), "any"))
+    kinds = torch.stack(sample_kinds(sampler_of(20000, 0), "any"))
     assert 0.55 < 1 - kinds.any(0).float().mean() < 0.65
     assert (kinds.float().mean(1) > 0.02).all()
     city, night = kinds[0], kinds[2]
@@ -77,16 +82,16 @@ def test_most_worlds_are_plain_highways() -> None:
 
 def test_a_highway_takes_no_number_from_the_sequence_for_other_kinds() -> None:
     """The same seed gives the highway that it gave before there were other kinds."""
-    dice = dice_of(2, 3)
-    world, _ = sample_world(dice, "highway")
+    sampler = sampler_of(2, 3)
+    world, _ = sample_world(sampler, "highway")
     assert not torch.stack(world.kinds).any()
-    dice = dice_of(2, 3)
-    assert torch.equal(world.layout.dash_phase, sample_world(dice, "highway")[0].layout.dash_phase)
+    sampler = sampler_of(2, 3)
+    assert torch.equal(world.layout.dash_phase, sample_world(sampler, "highway")[0].layout.dash_phase)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_streets_own_paint_and_kerbs_change_the_image_and_no_label(seed: int) -> None:
-    plain = seen("city", seed, street=no_street(dice_of(3, 0)))
+    plain = seen("city", seed, street=no_street(sampler_of(3, 0)))
     street = seen("city", seed)
     assert (street.image - plain.image).abs().amax((1, 2, 3)).min() > 0.02
     for name in ("boundaries", "painted", "visible", "lane_width", "offset"):
@@ -94,7 +99,7 @@ def test_a_streets_own_paint_and_kerbs_change_the_image_and_no_label(seed: int) 
 
 
 def test_lights_of_the_night_change_the_image_and_no_label() -> None:
-    dark = sample_lights(dice_of(3, 0), torch.zeros(3).bool(), torch.zeros(3), torch.zeros(3))
+    dark = sample_lights(sampler_of(3, 0), torch.zeros(3).bool(), torch.zeros(3), torch.zeros(3))
     day, night = seen("night", 2, lights=dark), seen("night", 2)
     assert (night.image - day.image).abs().amax((1, 2, 3)).min() > 0.02
     assert torch.equal(night.visible, day.visible)
@@ -102,7 +107,7 @@ def test_lights_of_the_night_change_the_image_and_no_label() -> None:
 
 def test_a_clean_camera_leaves_the_image_as_it_is() -> None:
     """All strengths zero is the identity, also beside rows that are not."""
-    none = sample_glass(dice_of(3, 0), torch.zeros(3).bool(), torch.zeros(3).bool())
+    none = sample_glass(sampler_of(3, 0), torch.zeros(3).bool(), torch.zeros(3).bool())
     clean = seen("camera", 4, glass=none)
     dirty = seen("camera", 4)
     assert torch.equal(clean.visible, dirty.visible)
@@ -137,7 +142,7 @@ def test_glyphs_point_where_their_names_say() -> None:
 
 
 def test_the_low_beam_is_bright_ahead_and_ends() -> None:
-    lights = sample_lights(dice_of(64, 0), torch.ones(64).bool(), torch.zeros(64), torch.zeros(64))
+    lights = sample_lights(sampler_of(64, 0), torch.ones(64).bool(), torch.zeros(64), torch.zeros(64))
     lights = lights._replace(beam_rays=0 * lights.beam_rays)
     x = torch.zeros(64, 4)
     z = torch.tensor([8.0, 20.0, 60.0, 160.0]).expand(64, 4)
@@ -148,7 +153,7 @@ def test_the_low_beam_is_bright_ahead_and_ends() -> None:
 
 
 def test_lamp_light_is_one_below_a_lamp_of_unit_power_far_from_others() -> None:
-    lights = sample_lights(dice_of(1, 0), torch.ones(1).bool(), torch.zeros(1), torch.zeros(1))
+    lights = sample_lights(sampler_of(1, 0), torch.ones(1).bool(), torch.zeros(1), torch.zeros(1))
     lights = lights._replace(
         lamp=torch.tensor([[1.0, 0.0]]),
         lamp_period=torch.tensor([1e4]),
@@ -163,7 +168,7 @@ def test_lamp_light_is_one_below_a_lamp_of_unit_power_far_from_others() -> None:
 
 def test_a_kerbs_top_is_seen_farther_out_by_h_over_h_minus_its_height() -> None:
     """Eye 1.5 m high, 3 m from a kerb of 0.15 m: its face reaches from 3 m to 3.333 m on the plane."""
-    world, _ = sample_world(dice_of(1, 0), "city")
+    world, _ = sample_world(sampler_of(1, 0), "city")
     strips = torch.tensor([[[0.2, 0.0, 0.0, 2.0]] * 2])
     street = world.street._replace(
         kerb_height=torch.full((1, 2), 0.15),
@@ -186,14 +191,14 @@ def test_a_kerbs_top_is_seen_farther_out_by_h_over_h_minus_its_height() -> None:
 
 
 def test_worlds_without_a_street_have_no_kerbs_or_paint() -> None:
-    world: World = sample_world(dice_of(4, 1), "highway")[0]
+    world: World = sample_world(sampler_of(4, 1), "highway")[0]
     assert not world.street.kerbed.any()
     assert (world.street.glyph < 0).all()
     assert not world.street.hatch.any()
 
 
 def test_a_kerb_is_the_boundary_where_nothing_is_painted_and_no_strip_lies_between() -> None:
-    world, _ = sample_world(dice_of(64, 3), "city")
+    world, _ = sample_world(sampler_of(64, 3), "city")
     layout, pavement, street = world.layout, world.pavement, world.street
     last = layout.exists.sum(1) - 1
     rows = torch.arange(64)
@@ -209,7 +214,7 @@ def test_a_kerb_is_the_boundary_where_nothing_is_painted_and_no_strip_lies_betwe
 
 
 def test_old_lines_of_road_works_change_the_image_and_no_label() -> None:
-    world = sample_world(dice_of(3, 5), "works")[0]
+    world = sample_world(sampler_of(3, 5), "works")[0]
     clean = world.works._replace(strength=0 * world.works.strength, scar=0 * world.works.scar)
     old, new = seen("works", 5), seen("works", 5, works=clean)
     assert not torch.equal(old.image, new.image)
@@ -220,7 +225,7 @@ def test_old_lines_of_road_works_change_the_image_and_no_label() -> None:
 def test_snow_covers_no_paint_that_is_labelled_and_all_that_is_not() -> None:
     """Over every boundary: bare where it is marked as present, covered where snow took it away."""
     batch = 16
-    world, _ = sample_world(dice_of(batch, 2), "snow")
+    world, _ = sample_world(sampler_of(batch, 2), "snow")
     layout = world.layout._replace(marked=world.layout.exists)
     winter = world.winter._replace(line=torch.full((batch,), 0.4), ragged=torch.zeros(batch))
     pavement = world.pavement._replace(left=world.pavement.left - 20, right=world.pavement.right + 20)
@@ -236,14 +241,14 @@ def test_snow_covers_no_paint_that_is_labelled_and_all_that_is_not() -> None:
 
 
 def test_country_roads_mostly_have_nothing_to_find() -> None:
-    world, ego_lane = sample_world(dice_of(2000, 0), "country")
+    world, ego_lane = sample_world(sampler_of(2000, 0), "country")
     assert 0.65 < float((~world.layout.marked.any(1)).float().mean()) < 0.85
     assert ((ego_lane == 0) | (ego_lane == 1)).all()
 
 
 def test_a_tunnels_lamp_is_seen_where_it_hangs() -> None:
     """A ceiling 4 m above the camera is 10 m ahead under a rise of 0.4: a lamp is there, one every 20 m."""
-    world, _ = sample_world(dice_of(1, 0), "tunnel")
+    world, _ = sample_world(sampler_of(1, 0), "tunnel")
     one, zero = torch.ones(1), torch.zeros(1)
     tunnel = world.tunnel._replace(
         ceiling=5.5 * one,
@@ -269,3 +274,32 @@ def test_a_tunnels_lamp_is_seen_where_it_hangs() -> None:
     assert ceiling[1:].max() < 0.05
     blocked = add_ceiling(dark, torch.full((1, 1, 3), 5.0), tunnel, place, course, lens, rays)
     assert (blocked == 0).all()
+
+
+def test_a_tilted_bonnet_hides_more_on_one_side_and_mirrors_the_sky() -> None:
+    """The edge is at 1 - 0.2 + 0.2 x of the height, x from -0.5 to 0.5."""
+    one, zero = torch.ones(1), torch.zeros(1)
+    sensor = sample_world(sampler_of(1, 0), "highway")[0].sensor
+    sensor = sensor._replace(
+        bonnet=0.2 * one, bonnet_bow=zero, bonnet_tilt=0.2 * one, bonnet_ridge=zero, bonnet_mirror=one
+    )
+    dark = Light(torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1, 3), zero, zero)
+    radiance, blocked = torch.zeros(1, 3, 96, 64), torch.full((1, 96, 64), float("inf"))
+    radiance[:, :, :30] = 2.0  # a bright sky; the road is dark
+    add_bonnet(radiance, blocked, torch.tensor([0]), 0.3, sensor, dark, torch.zeros(1, 3))
+    hidden = (blocked[0] == 0).sum(0)
+    assert hidden[0] == pytest.approx(96 * 0.3, abs=1)
+    assert hidden[-1] == pytest.approx(96 * 0.1, abs=1)
+    assert radiance[0, 0, 80, 5] > 0.2
+    assert (radiance[0, 0, 40:60] == 0).all()
+
+
+def test_a_black_frame_hides_what_is_under_it() -> None:
+    """With a frame of 20 % no boundary is visible in the outermost columns."""
+    kinds = sample_world(sampler_of(3, 4), "camera")[0]
+    framed = seen("camera", 4, glass=kinds.glass._replace(frame=torch.full((3,), 0.2), veil=torch.zeros(3)))
+    open_sides = seen("camera", 4, glass=kinds.glass._replace(frame=torch.zeros(3)))
+    points = framed.boundaries[..., 0]
+    outer = (points < 0.04 * SIZE[1]) | (points > 0.96 * SIZE[1])
+    assert (open_sides.visible * outer).sum() > 0
+    assert (framed.visible * outer).sum() == 0

@@ -14,6 +14,7 @@ from lanebev.render.scene.alignment import Alignment, arc_nodes, build_alignment
 from lanebev.render.scene.camera import Lens
 from lanebev.render.scene.sampler import BatchSampler, concatenate_rows
 from lanebev.render.scene.traffic import NUM_VEHICLES
+from lanebev.render.scene.tunnel import endless
 from lanebev.render.scene.weather import CLEAR
 from lanebev.render.scene.world import Place, Scene, World, sample_world, scene_at
 from lanebev.render.views import render_scenes
@@ -105,6 +106,7 @@ class Drive:
         self.times = torch.arange(num_frames, dtype=torch.float64) / fps
         sampler = BatchSampler(1, torch.Generator().manual_seed(seed))
         self.world, first_lane = _sample_drive_world(sampler, weather, kind)
+        self.world = self.world._replace(tunnel=endless(self.world.tunnel))
         self.start = float(sampler.uniform(0, 2000))
         duration = num_frames / fps
         self._sample_course(sampler, duration, curves, hills)

@@ -82,7 +82,7 @@ def sample_place(sampler: BatchSampler, world: World, ego_lane: Tensor) -> tuple
     anywhere = sampler.uniform(-0.5, 0.5) * (right - left)
     place = Place(
         along=start,
-        across=0.5 * (left + right) + torch.where(changing, anywhere, centred),
+        across=0.5 * (left + right) + torch.where(changing, anywhere, centred) + world.glass.side,
         ego_lane=ego_lane,
         heading=sampler.uniform(-math.pi, math.pi),
     )

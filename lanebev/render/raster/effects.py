@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from lanebev.render.raster.filters import gaussian_blur
 from lanebev.render.raster.noise import CLOUD, sample_noise
@@ -37,11 +38,19 @@ def add_bonnet(
     x = (torch.arange(width, device=radiance.device) + 0.5) / width - 0.5
     share = sensor.bonnet[:, None, None]
     edge = 1 - share + 4 * sensor.bonnet_bow[:, None, None] * x * x  # (R, 1, W)
+    edge = edge + sensor.bonnet_tilt[:, None, None] * x
     alpha = ((y - edge) * height + 0.5).clamp(0, 1)
     below = ((y - edge) / share.clamp(min=0.02)).clamp(0, 1)
     gloss = (0.30 - 0.22 * below + 0.05 * sample_noise(CLOUD, x * 0.5, 0.2 * y)).clamp(0.02)
     colour = (sensor.bonnet_colour * (light.ambient + 0.6 * light.direct + 0.02))[..., None, None]
-    paint = colour * (1.1 - 0.3 * below)[:, None] + gloss[:, None] * sky[..., None, None]
+    aside = (x.abs() - 0.22 - 0.1 * below) / (0.006 + 0.012 * below)
+    ridges = 1 + sensor.bonnet_ridge[:, None, None] * (aside * torch.exp(-aside * aside))
+    mirror = sensor.bonnet_mirror[:, None, None] * (1 - 0.75 * below)
+    paint = colour * ((1.1 - 0.3 * below) * ridges)[:, None]
+    paint = paint + (gloss * (1 - mirror).clamp(min=0))[:, None] * sky[..., None, None]
+    above = radiance[:, :, : max(1, top // 2)].index_select(0, rows).flip(2)  # it faces the sky
+    above = functional.interpolate(above, (height - top, width), mode="bilinear", align_corners=False)
+    paint = paint + (mirror * ridges)[:, None] * above.clamp(max=4.0)
     under = radiance[:, :, top:].index_select(0, rows)
     radiance[:, :, top:].index_copy_(0, rows, under + (paint - under) * alpha[:, None])
     hidden = blocked[:, top:].index_select(0, rows).masked_fill(alpha > 0.5, 0.0)

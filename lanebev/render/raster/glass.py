@@ -77,6 +77,15 @@ def shaken(image: Tensor, shake: Tensor) -> Tensor:
     return torch.where((shake.abs().amax(1) > 0)[:, None, None, None], total / _SHAKES, image)
 
 
+def frame_cover(glass: Glass, size: tuple[int, int]) -> Tensor:
+    """(B, H, W) share of each pixel under black rounded corners at the image's sides."""
+    height, width = size
+    y = ((torch.arange(height, device=glass.frame.device) + 0.5) / height * 2 - 1)[None, :, None]
+    x = ((torch.arange(width, device=glass.frame.device) + 0.5) / width * 2 - 1)[None, None, :]
+    bow = 1 - glass.frame[:, None, None] * (0.4 + 1.6 * y * y)
+    return smoothstep(0.995, 1.0, x.abs() / bow.clamp(min=0.5)) * (glass.frame > 0)[:, None, None]
+
+
 def recorded(image: Tensor, glass: Glass) -> Tensor:
     """An image with what the recorder puts over it, and what its codec loses."""
     height, width = image.shape[2:]
@@ -90,10 +99,7 @@ def recorded(image: Tensor, glass: Glass) -> Tensor:
     rim = (distance > 0.8 * radius)[:, None] * 0.85 + (distance <= 0.8 * radius)[:, None] * 0.0
     colour = glass.sticker_colour[..., None, None] * (1 - (rim > 0.5).float()) + rim
     image = image + (colour - image) * on
-    aside = ((x + 0.5) / width - 0.5).abs() * 2
-    bow = 1 - glass.frame[:, None, None] * (0.4 + 1.6 * (2 * (y + 0.5) / height - 1) ** 2)
-    shut = smoothstep(0.995, 1.0, aside / bow.clamp(min=0.5)) * (glass.frame > 0)[:, None, None]
-    image = image * (1 - shut)[:, None]
+    image = image * (1 - frame_cover(glass, (height, width)))[:, None]
     image = stamp(
         image,
         glass.text,

@@ -10,7 +10,7 @@ from torch import Tensor
 from lanebev.render.raster.effects import add_bonnet, rain
 from lanebev.render.raster.exposure import expose
 from lanebev.render.raster.filters import gaussian_blur
-from lanebev.render.raster.glass import behind_glass, recorded
+from lanebev.render.raster.glass import behind_glass, frame_cover, recorded
 from lanebev.render.raster.jpeg import compress
 from lanebev.render.raster.paint import Painted
 from lanebev.render.raster.randomness import normal_rows
@@ -30,7 +30,7 @@ def take_image(
     generators: Sequence[torch.Generator],
     ideal: bool,
 ) -> Tensor:
-    """Make images of painted views; changes ``painted`` where bonnets are.
+    """Make images of painted views; changes ``painted`` where bonnets and black frames hide the road.
 
     Args:
         painted: B views.
@@ -52,8 +52,10 @@ def take_image(
     if bool((bonnet > 0).any()):
         rows = rows_with(bonnet > 0)
         own, light = select_rows(sensor, rows), select_rows(scene.light, rows)
-        sky = scene.world.surroundings.skyline.index_select(0, rows)
-        add_bonnet(painted.radiance, painted.blocked, rows, float(bonnet.amax()), own, light, sky)
+        open_air = (1 - 0.95 * scene.world.tunnel.on)[:, None]
+        sky = (scene.world.surroundings.skyline * open_air).index_select(0, rows)
+        tallest = float((bonnet + 0.5 * host.world.sensor.bonnet_tilt.abs()).amax())
+        add_bonnet(painted.radiance, painted.blocked, rows, tallest, own, light, sky)
     image = expose(painted.radiance, sensor, painted.road_level)
     if ideal:
         return image
@@ -75,6 +77,9 @@ def take_image(
     image = add_noise(image, sensor, generators)
     if faulty:
         image.index_copy_(0, windscreens, recorded(image.index_select(0, windscreens), glass))
+        shut = frame_cover(glass, (image.shape[2], image.shape[3])) > 0.5
+        seen = painted.blocked.index_select(0, windscreens).masked_fill(shut, 0.0)
+        painted.blocked.index_copy_(0, windscreens, seen)
     squeezed = host.world.sensor.jpeg > 0
     if bool(squeezed.any()):
         rows = rows_with(squeezed)

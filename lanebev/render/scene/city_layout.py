@@ -15,7 +15,7 @@ from lanebev.render.scene.layout import (
     YELLOW,
     Layout,
 )
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
 
 DASHES = [  # (length, period) m in towns
     (3.0, 9.0),
@@ -31,19 +31,19 @@ DASHES = [  # (length, period) m in towns
 BLOCKS = [(0.5, 0.7), (0.5, 1.0), (1.0, 2.0), (1.5, 3.0)]  # broad dashes beside cycle and bus lanes
 
 
-def sample_city_layout(dice: Dice, base: Layout) -> tuple[Layout, Tensor, Tensor, Tensor]:
+def sample_city_layout(sampler: BatchSampler, base: Layout) -> tuple[Layout, Tensor, Tensor, Tensor]:
     """A street's boundaries, narrow or wide lanes of unequal width, mostly two-way.
 
     Args:
-        dice: the randomness.
+        sampler: the randomness.
         base: of the same batch; gives what streets share with highways.
 
     Returns:
         the layout; (B,) int64 the ego lane, the own direction's first lane, and its number of lanes.
     """
     slots = MAX_BOUNDARIES
-    own, other = dice.pick([0, 0.42, 0.38, 0.2]), dice.pick([0.35, 0.42, 0.23])
-    right_hand = dice.chance(0.85)
+    own, other = sampler.pick([0, 0.42, 0.38, 0.2]), sampler.pick([0.35, 0.42, 0.23])
+    right_hand = sampler.chance(0.85)
     first = torch.where(right_hand, other, 0)  # lane, and slot of its left boundary
     centre = torch.where(right_hand, other, own)[:, None]
     count = own + other + 1
@@ -53,47 +53,49 @@ def sample_city_layout(dice: Dice, base: Layout) -> tuple[Layout, Tensor, Tensor
     outer = (index == 0) | (index == last)
     middle = (index == centre) & ~outer
 
-    lane_width = dice.uniform(2.6, 3.3)
-    lane_width = torch.where(dice.chance(0.3), dice.uniform(3.0, 3.75), lane_width)
-    lane_width = torch.where(dice.chance(0.15), dice.uniform(3.5, 3.95), lane_width)
-    uneven = dice.normal(0.2, slots - 1).clamp(-0.5, 0.5) * dice.chance(0.7, 1)
+    lane_width = sampler.uniform(2.6, 3.3)
+    lane_width = torch.where(sampler.chance(0.3), sampler.uniform(3.0, 3.75), lane_width)
+    lane_width = torch.where(sampler.chance(0.15), sampler.uniform(3.5, 3.95), lane_width)
+    uneven = sampler.normal(0.2, slots - 1).clamp(-0.5, 0.5) * sampler.chance(0.7, 1)
     widths = (lane_width[:, None] + uneven).clamp(2.4, 4.3)
     across = torch.nn.functional.pad(widths.cumsum(1), (1, 0))
     across = torch.where(exists, across, 1e3 + 10.0 * index)
 
-    kind = dice.pick([0.0, 0.12, 0.88, 0, 0, 0], slots)
-    kind = torch.where(middle, dice.pick([0.04, 0.24, 0.42, 0.22, 0, 0.08], slots), kind)
-    kind = torch.where(outer, dice.pick([0.42, 0.38, 0.17, 0.03, 0, 0], slots), kind)
-    dashes = dice.pick_from(DASHES, 1).expand(-1, slots, -1)
-    dashes = torch.where(dice.chance(0.15, slots)[..., None], dice.pick_from(DASHES, slots), dashes)
-    blocks = outer & dice.chance(0.6, slots)
-    dashes = torch.where(blocks[..., None], dice.pick_from(BLOCKS, slots), dashes)
-    dashes = dashes * dice.uniform(0.9, 1.1, 1, 1)
+    kind = sampler.pick([0.0, 0.12, 0.88, 0, 0, 0], slots)
+    kind = torch.where(middle, sampler.pick([0.04, 0.24, 0.42, 0.22, 0, 0.08], slots), kind)
+    kind = torch.where(outer, sampler.pick([0.42, 0.38, 0.17, 0.03, 0, 0], slots), kind)
+    dashes = sampler.pick_from(DASHES, 1).expand(-1, slots, -1)
+    dashes = torch.where(sampler.chance(0.15, slots)[..., None], sampler.pick_from(DASHES, slots), dashes)
+    blocks = outer & sampler.chance(0.6, slots)
+    dashes = torch.where(blocks[..., None], sampler.pick_from(BLOCKS, slots), dashes)
+    dashes = dashes * sampler.uniform(0.9, 1.1, 1, 1)
     solid = dashes[..., 1:].expand_as(dashes)
     is_dashed, mixed = (kind == DASHED)[..., None], (kind == SOLID_DASHED)[..., None]
     dash = torch.stack(
         [torch.where(is_dashed | mixed, dashes, solid), torch.where(is_dashed, dashes, solid)], dim=2
     )
     double = (kind == DOUBLE) | (kind == SOLID_DASHED)
-    width = torch.where(dice.chance(0.8), dice.uniform(0.09, 0.15), dice.uniform(0.12, 0.2))[:, None]
-    width = torch.where(blocks & (kind == DASHED), dice.uniform(0.15, 0.3, slots), width)
-    yellow = (middle & dice.chance(0.3, 1)) | (outer & dice.chance(0.05, slots))
+    width = torch.where(sampler.chance(0.8), sampler.uniform(0.09, 0.15), sampler.uniform(0.12, 0.2))[:, None]
+    width = torch.where(blocks & (kind == DASHED), sampler.uniform(0.15, 0.3, slots), width)
+    yellow = (middle & sampler.chance(0.3, 1)) | (outer & sampler.chance(0.05, slots))
     white, gold = dash.new_tensor(WHITE), dash.new_tensor(YELLOW)
-    colour = torch.where(yellow[..., None], gold, white) * dice.uniform(0.85, 1.1, 1, 1)
-    opacity = torch.where(dice.chance(0.7), dice.uniform(0.75, 1.0), dice.uniform(0.35, 0.85))[:, None]
-    opacity = (opacity * dice.uniform(0.8, 1.15, slots)).clamp(0.3, 1.0)
+    colour = torch.where(yellow[..., None], gold, white) * sampler.uniform(0.85, 1.1, 1, 1)
+    opacity = torch.where(sampler.chance(0.7), sampler.uniform(0.75, 1.0), sampler.uniform(0.35, 0.85))[
+        :, None
+    ]
+    opacity = (opacity * sampler.uniform(0.8, 1.15, slots)).clamp(0.3, 1.0)
     layout = base._replace(
         across=across,
         exists=exists,
         marked=exists & (kind != NONE),
         lane_width=lane_width,
         stripe_width=width.expand(-1, slots).contiguous(),
-        separation=torch.where(double, width * dice.uniform(1.7, 3.0, 1), 0.0),
+        separation=torch.where(double, width * sampler.uniform(1.7, 3.0, 1), 0.0),
         dash=dash.contiguous(),
         colour=colour.expand(-1, slots, -1).contiguous(),
         opacity=torch.where(kind == NONE, 0.0, opacity),
         stud_period=torch.zeros_like(width).expand(-1, slots).contiguous(),
         symbol=torch.zeros_like(base.symbol),
     )
-    ego_lane = first + (dice.uniform(0, 1) * own).long().minimum(own - 1)
+    ego_lane = first + (sampler.uniform(0, 1) * own).long().minimum(own - 1)
     return layout, ego_lane, first, own

@@ -10,7 +10,7 @@ from torch import Tensor
 from lanebev.render.scene.kinds import choose
 from lanebev.render.scene.layout import DASHED, MAX_BOUNDARIES, NONE, SOLID, Layout
 from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.surroundings import (
     EARTHS,
     FENCE,
@@ -27,83 +27,87 @@ from lanebev.render.scene.surroundings import (
 _BARE, _MIDDLE, _EDGES = range(3)  # what is painted
 
 
-def country_layout(dice: Dice, country: Tensor, layout: Layout, ego_lane: Tensor) -> tuple[Layout, Tensor]:
+def country_layout(
+    sampler: BatchSampler, country: Tensor, layout: Layout, ego_lane: Tensor
+) -> tuple[Layout, Tensor]:
     """One or two narrow lanes, where country (B,) holds: three in four without paint."""
-    lanes = 1 + dice.chance(0.7).long()
+    lanes = 1 + sampler.chance(0.7).long()
     index = torch.arange(MAX_BOUNDARIES, device=lanes.device)
     exists = index <= lanes[:, None]
-    width = torch.where(lanes == 1, dice.uniform(2.6, 4.2), dice.uniform(2.2, 3.2))
+    width = torch.where(lanes == 1, sampler.uniform(2.6, 4.2), sampler.uniform(2.2, 3.2))
     across = torch.where(exists, width[:, None] * index, 1e3 + 10.0 * index)
-    style = dice.pick([0.74, 0.14, 0.12])[:, None]
+    style = sampler.pick([0.74, 0.14, 0.12])[:, None]
     middle = (index == 1) & (lanes == 2)[:, None]
     outer = (index == 0) | (index == lanes[:, None])
-    kind = torch.where((style == _MIDDLE) & middle, torch.where(dice.chance(0.7, 1), DASHED, SOLID), NONE)
-    kind = torch.where((style == _EDGES) & outer, torch.where(dice.chance(0.7, 1), SOLID, DASHED), kind)
+    kind = torch.where((style == _MIDDLE) & middle, torch.where(sampler.chance(0.7, 1), DASHED, SOLID), NONE)
+    kind = torch.where((style == _EDGES) & outer, torch.where(sampler.chance(0.7, 1), SOLID, DASHED), kind)
     solid = layout.dash[..., 1:].expand_as(layout.dash)
-    dashed = torch.stack([dice.uniform(1.5, 5.0), dice.uniform(6.0, 12.0)], 1)[:, None, None]
+    dashed = torch.stack([sampler.uniform(1.5, 5.0), sampler.uniform(6.0, 12.0)], 1)[:, None, None]
     dash = torch.where((kind == DASHED)[..., None, None], dashed.expand_as(layout.dash), solid)
     narrow = layout._replace(
         across=across,
         exists=exists,
         marked=exists & (kind != NONE),
         lane_width=width,
-        stripe_width=dice.uniform(0.08, 0.14, 1).expand(-1, MAX_BOUNDARIES).contiguous(),
+        stripe_width=sampler.uniform(0.08, 0.14, 1).expand(-1, MAX_BOUNDARIES).contiguous(),
         separation=torch.zeros_like(layout.separation),
         dash=dash,
-        opacity=torch.where(kind == NONE, 0.0, dice.uniform(0.4, 1.0, 1)),
+        opacity=torch.where(kind == NONE, 0.0, sampler.uniform(0.4, 1.0, 1)),
         stud_period=torch.zeros_like(layout.stud_period),
         ghost=torch.zeros_like(layout.ghost),
         symbol=torch.zeros_like(layout.symbol),
     )
-    lane = (dice.chance(0.85) & (lanes == 2)).long()
+    lane = (sampler.chance(0.85) & (lanes == 2)).long()
     return choose(country, narrow, layout), torch.where(country, lane, ego_lane)
 
 
-def country_pavement(dice: Dice, country: Tensor, layout: Layout, pavement: Pavement) -> Pavement:
+def country_pavement(sampler: BatchSampler, country: Tensor, layout: Layout, pavement: Pavement) -> Pavement:
     """Old asphalt up to the grass, at times gravel or earth, where country (B,) holds."""
     last = layout.across.masked_fill(~layout.exists, 0.0).amax(1)
-    shoulder = dice.uniform(0.0, 0.5, 2)
-    gravel = dice.chance(0.2)[:, None]
-    base = torch.where(gravel, dice.pick_from(EARTHS) * dice.uniform(0.7, 1.4, 1), pavement.base)
+    shoulder = sampler.uniform(0.0, 0.5, 2)
+    gravel = sampler.chance(0.2)[:, None]
+    base = torch.where(gravel, sampler.pick_from(EARTHS) * sampler.uniform(0.7, 1.4, 1), pavement.base)
     old = pavement._replace(
         left=-shoulder[:, 0],
         right=last + shoulder[:, 1],
         base=base,
-        shoulder=base * dice.uniform(0.8, 1.2, 1),
+        shoulder=base * sampler.uniform(0.8, 1.2, 1),
         gutter_width=torch.zeros_like(pavement.gutter_width),
-        crack=dice.uniform(0.0, 0.7),
-        patch=torch.where(dice.chance(0.6), dice.uniform(0.05, 0.35), 0.0),
-        tracks=dice.uniform(-0.25, 0.3),
-        mottle=dice.uniform(0.03, 0.14),
+        crack=sampler.uniform(0.0, 0.7),
+        patch=torch.where(sampler.chance(0.6), sampler.uniform(0.05, 0.35), 0.0),
+        tracks=sampler.uniform(-0.25, 0.3),
+        mottle=sampler.uniform(0.03, 0.14),
         deck_length=torch.zeros_like(pavement.deck_length),
     )
     return choose(country, old, pavement)
 
 
 def country_surroundings(
-    dice: Dice, country: Tensor, pavement: Pavement, around: Surroundings
+    sampler: BatchSampler, country: Tensor, pavement: Pavement, around: Surroundings
 ) -> Surroundings:
     """Fields, hedges and trees near a narrow road, where country (B,) holds."""
-    near = dice.pick([0.55, 0.2, 0.15, 0.1], 2)
+    near = sampler.pick([0.55, 0.2, 0.15, 0.1], 2)
     near = near.new_tensor([NOTHING, HEDGE, RAIL, FENCE])[near]
-    middle = near.new_tensor([NOTHING, TREES, HEDGE, SLOPE])[dice.pick([0.35, 0.35, 0.15, 0.15], 2)]
-    far = near.new_tensor([NOTHING, TREES, SLOPE])[dice.pick([0.25, 0.55, 0.2], 2)]
+    middle = near.new_tensor([NOTHING, TREES, HEDGE, SLOPE])[sampler.pick([0.35, 0.35, 0.15, 0.15], 2)]
+    far = near.new_tensor([NOTHING, TREES, SLOPE])[sampler.pick([0.25, 0.55, 0.2], 2)]
     kind = torch.cat([far, middle, near], 1)
-    gap = torch.cat([dice.uniform(12, 40, 2), dice.uniform(2, 9, 2), dice.uniform(0.3, 1.5, 2)], 1)
+    gap = torch.cat([sampler.uniform(12, 40, 2), sampler.uniform(2, 9, 2), sampler.uniform(0.3, 1.5, 2)], 1)
     edge = torch.stack([pavement.left, pavement.right], 1).repeat(1, 3)
-    height = torch.where(kind == TREES, dice.uniform(5, 15, NUM_WALLS), dice.uniform(0.7, 3.0, NUM_WALLS))
-    height = torch.where(kind == SLOPE, dice.uniform(1.0, 8.0, NUM_WALLS), height)
+    height = torch.where(
+        kind == TREES, sampler.uniform(5, 15, NUM_WALLS), sampler.uniform(0.7, 3.0, NUM_WALLS)
+    )
+    height = torch.where(kind == SLOPE, sampler.uniform(1.0, 8.0, NUM_WALLS), height)
     height = torch.where(kind == RAIL, 0.75, height)
     earth = (kind == SLOPE) | (kind == FENCE)
     colour = torch.where(
-        earth[..., None], dice.pick_from(EARTHS, NUM_WALLS), dice.pick_from(GREENS, NUM_WALLS)
+        earth[..., None], sampler.pick_from(EARTHS, NUM_WALLS), sampler.pick_from(GREENS, NUM_WALLS)
     )
-    colour = torch.where((kind == RAIL)[..., None], dice.uniform(0.1, 0.4, NUM_WALLS, 1), colour)
+    colour = torch.where((kind == RAIL)[..., None], sampler.uniform(0.1, 0.4, NUM_WALLS, 1), colour)
     fields = around._replace(
         wall_across=edge + gap * gap.new_tensor([-1.0, 1.0] * 3),
         wall_kind=kind,
         wall_height=height,
-        wall_colour=colour * dice.uniform(0.7, 1.3, NUM_WALLS, 1),
+        wall_colour=colour * sampler.uniform(0.7, 1.3, NUM_WALLS, 1),
         opposite=torch.full_like(around.opposite, -math.inf),
     )
     return choose(country, fields, around)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.stamp import STAMP_LENGTH, sample_text
 
 
@@ -15,6 +15,7 @@ class Glass(NamedTuple):
     """Faults of windscreen, lens and recorder, (B,) unless said otherwise; 0 is none.
 
     Attributes:
+        side: m, how far the camera sits right of the vehicle's middle.
         veil: strength of the dashboard's reflection in the windscreen.
         veil_colour: (B, 3).
         veil_seed: shifts its pattern.
@@ -36,6 +37,7 @@ class Glass(NamedTuple):
         block: strength of 16 px blocks of one brightness.
     """
 
+    side: Tensor
     veil: Tensor
     veil_colour: Tensor
     veil_seed: Tensor
@@ -57,50 +59,54 @@ class Glass(NamedTuple):
     block: Tensor
 
 
-def sample_glass(dice: Dice, camera: Tensor, night: Tensor) -> Glass:
+def sample_glass(sampler: BatchSampler, camera: Tensor, night: Tensor) -> Glass:
     """Random faults.
 
     Args:
-        dice: the randomness.
+        sampler: the randomness.
         camera: (B,) bool; elsewhere there are none but a shaken image.
         night: (B,) bool; a long exposure shakes more.
     """
     here = camera.float()
 
     def some(probability: float, low: float, high: float) -> Tensor:
-        return here * torch.where(dice.chance(probability), dice.uniform(low, high), 0.0)
+        return here * torch.where(sampler.chance(probability), sampler.uniform(low, high), 0.0)
 
-    amount = torch.where(night, dice.uniform(0.0, 1.0) ** 2, 0.35 * dice.uniform(0.0, 1.0) ** 3)
-    amount = amount * torch.maximum(here, night.float()) * dice.chance(0.6)
-    shake = torch.stack([dice.normal(4.0), dice.normal(3.0), dice.normal(0.012)], dim=1) * amount[:, None]
-    below = dice.chance(0.6)
-    high = dice.uniform(0.03, 0.075)
-    top = torch.where(below, 1.0 - high * dice.uniform(0.8, 1.6), dice.uniform(-0.01, 0.03))
-    warm = dice.pick_from(
+    amount = torch.where(night, sampler.uniform(0.0, 1.0) ** 2, 0.35 * sampler.uniform(0.0, 1.0) ** 3)
+    amount = amount * torch.maximum(here, night.float()) * sampler.chance(0.6)
+    shake = (
+        torch.stack([sampler.normal(4.0), sampler.normal(3.0), sampler.normal(0.012)], dim=1)
+        * amount[:, None]
+    )
+    below = sampler.chance(0.6)
+    high = sampler.uniform(0.03, 0.075)
+    top = torch.where(below, 1.0 - high * sampler.uniform(0.8, 1.6), sampler.uniform(-0.01, 0.03))
+    warm = sampler.pick_from(
         [(1.0, 1.0, 1.0), (1.0, 1.0, 1.0), (1.0, 0.9, 0.1), (0.9, 0.1, 0.1), (0.1, 1.0, 0.2)]
     )
     return Glass(
+        side=some(0.3, -0.7, 0.7),
         veil=some(0.35, 0.05, 0.45),
-        veil_colour=dice.uniform(0.6, 1.0, 1) * (1 + dice.normal(0.12, 3)).clamp(0.6, 1.4),
-        veil_seed=dice.uniform(0, 1),
-        dirt=some(0.3, 0.15, 0.8),
-        dirt_cover=dice.uniform(0.02, 0.3),
+        veil_colour=sampler.uniform(0.6, 1.0, 1) * (1 + sampler.normal(0.12, 3)).clamp(0.6, 1.4),
+        veil_seed=sampler.uniform(0, 1),
+        dirt=some(0.25, 0.15, 0.7),
+        dirt_cover=sampler.uniform(0.02, 0.2),
         drops=some(0.2, 0.3, 1.0),
         shake=shake,
         frame=some(0.12, 0.005, 0.03),
         sticker=torch.stack(
-            [some(0.15, 0.02, 0.07), dice.uniform(0.0, 1.0), dice.uniform(-0.02, 0.02)], dim=1
+            [some(0.15, 0.02, 0.07), sampler.uniform(0.0, 1.0), sampler.uniform(-0.02, 0.02)], dim=1
         ),
-        sticker_colour=dice.uniform(0.0, 1.0, 3) ** 2,
+        sticker_colour=sampler.uniform(0.0, 1.0, 3) ** 2,
         stamp=some(0.4, 0.6, 1.0),
-        text=sample_text(dice, STAMP_LENGTH),
+        text=sample_text(sampler, STAMP_LENGTH),
         stamp_place=torch.stack(
-            [torch.where(dice.chance(0.5), dice.uniform(0.0, 0.06), dice.uniform(0.1, 0.7)), top], 1
+            [torch.where(sampler.chance(0.5), sampler.uniform(0.0, 0.06), sampler.uniform(0.1, 0.7)), top], 1
         ),
         stamp_height=high,
         stamp_colour=warm,
-        stamp_outline=torch.where(dice.chance(0.5), dice.uniform(0.4, 1.0), 0.0),
+        stamp_outline=torch.where(sampler.chance(0.5), sampler.uniform(0.4, 1.0), 0.0),
         chroma=some(0.4, 0.4, 1.0),
-        chroma_block=dice.uniform(4.0, 24.0),
-        block=some(0.25, 0.1, 0.55),
+        chroma_block=sampler.uniform(4.0, 24.0),
+        block=some(0.2, 0.1, 0.45),
     )

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
 
 T = TypeVar("T", bound=tuple[Any, ...])
 
@@ -37,11 +37,11 @@ class Kinds(NamedTuple):
     camera: Tensor
 
 
-def sample_kinds(dice: Dice, kind: str) -> Kinds:
+def sample_kinds(sampler: BatchSampler, kind: str) -> Kinds:
     """Draw what each world shows.
 
     Args:
-        dice: the randomness.
+        sampler: the randomness.
         kind: one of ``KINDS``: "any" is mostly plain highways, "varied" never draws on purpose a plain one,
             any other name is that kind alone.
 
@@ -51,19 +51,19 @@ def sample_kinds(dice: Dice, kind: str) -> Kinds:
     if kind not in KINDS:
         raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
     if kind not in ("any", "varied"):
-        nothing = dice.chance(0.0)
+        nothing = sampler.chance(0.0)
         return Kinds(**{name: ~nothing if name == kind else nothing for name in Kinds._fields})
-    varied = dice.chance(_VARIED if kind == "any" else 1.0)
-    place = dice.pick([0.55, 0.11, 0.34])
+    varied = sampler.chance(_VARIED if kind == "any" else 1.0)
+    place = sampler.pick([0.55, 0.11, 0.34])
     city, country = varied & (place == 0), varied & (place == 1)
     return Kinds(
         city=city,
         country=country,
-        night=varied & dice.chance(0.33),
-        snow=varied & dice.chance(0.08),
-        tunnel=varied & dice.chance(0.07),
-        works=varied & ~country & dice.chance(0.13),
-        camera=varied & dice.chance(0.5),
+        night=varied & sampler.chance(0.33),
+        snow=varied & sampler.chance(0.08),
+        tunnel=varied & sampler.chance(0.07),
+        works=varied & ~country & sampler.chance(0.13),
+        camera=varied & sampler.chance(0.5),
     )
 
 

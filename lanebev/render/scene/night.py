@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.weather import Light
 
 NUM_LAMPS = 10  # street lamps ahead on each side
@@ -25,6 +25,7 @@ class Lights(NamedTuple):
     Attributes:
         on: 1 on such a night; 0: nothing of this is there.
         dark: factor of the sky's own light.
+        spill: (B, 3) irradiance over pi by signs and windows of the town.
         beam: strength of the own low beam.
         beam_colour: (B, 3).
         beam_reach: m at which it has fallen to a half.
@@ -39,7 +40,7 @@ class Lights(NamedTuple):
         lamp_height: m.
         lamp_colour: (B, 3).
         spot: (B, S) strength of distant lights.
-        spot_place: (B, S, 2) rad, azimuth in the world and elevation.
+        spot_place: (B, S, 2) rad, azimuth from the road's direction and elevation.
         spot_size: (B, S) rad.
         spot_colour: (B, S, 3).
         halo: strength of the glare about lights.
@@ -51,6 +52,7 @@ class Lights(NamedTuple):
 
     on: Tensor
     dark: Tensor
+    spill: Tensor
     beam: Tensor
     beam_colour: Tensor
     beam_reach: Tensor
@@ -75,68 +77,72 @@ class Lights(NamedTuple):
     smear: Tensor
 
 
-def sample_lights(dice: Dice, night: Tensor, left: Tensor, right: Tensor) -> Lights:
+def sample_lights(sampler: BatchSampler, night: Tensor, left: Tensor, right: Tensor) -> Lights:
     """Random lights of the night.
 
     Args:
-        dice: the randomness.
+        sampler: the randomness.
         night: (B,) bool; elsewhere nothing is on.
         left: (B,) m, the pavement's left edge.
         right: (B,) m, its right edge.
     """
     on = night.float()
-    lit = dice.chance(0.65)
-    one = dice.chance(0.5)
-    sides = torch.stack([one | (dice.chance(0.35)), ~one | dice.chance(0.1)], dim=1)
-    power = torch.where(dice.chance(0.5), dice.uniform(0.03, 0.3), dice.uniform(0.2, 1.4))
-    hue = dice.pick_from(LAMP_COLOURS)
-    white = dice.uniform(0, 1, 1)
+    lit = sampler.chance(0.65)
+    one = sampler.chance(0.5)
+    sides = torch.stack([one | (sampler.chance(0.35)), ~one | sampler.chance(0.1)], dim=1)
+    power = torch.where(sampler.chance(0.5), sampler.uniform(0.03, 0.3), sampler.uniform(0.2, 1.4))
+    hue = sampler.pick_from(LAMP_COLOURS)
+    white = sampler.uniform(0, 1, 1)
     beam_colour = torch.cat([1.0 + 0 * white, 0.78 + 0.2 * white, 0.5 + 0.5 * white], dim=1)
-    town = torch.where(dice.chance(0.75), dice.uniform(0.1, 1.0), 0.0)[:, None]
-    wet = torch.where(dice.chance(0.3), dice.uniform(0.2, 1.0), 0.0)
-    rare = dice.uniform(0, 1, NUM_SPOTS) < 0.6 * town
-    neon = dice.chance(0.12, NUM_SPOTS)
-    across = torch.stack([left, right], 1) + dice.uniform(0.3, 3.0, 2) * left.new_tensor([-1.0, 1.0])
-    across = across + torch.where(dice.chance(0.4, 1), dice.uniform(0.5, 2.5, 1), 0.0) * left.new_tensor(
-        [1.0, -1.0]
-    )
+    town = torch.where(sampler.chance(0.75), sampler.uniform(0.1, 1.0), 0.0)[:, None]
+    wet = torch.where(sampler.chance(0.3), sampler.uniform(0.2, 1.0), 0.0)
+    rare = sampler.uniform(0, 1, NUM_SPOTS) < 0.6 * town
+    neon = sampler.chance(0.12, NUM_SPOTS)
+    across = torch.stack([left, right], 1) + sampler.uniform(0.3, 3.0, 2) * left.new_tensor([-1.0, 1.0])
+    across = across + torch.where(
+        sampler.chance(0.4, 1), sampler.uniform(0.5, 2.5, 1), 0.0
+    ) * left.new_tensor([1.0, -1.0])
     return Lights(
         on=on,
-        dark=on * torch.where(dice.chance(0.75), dice.uniform(0.01, 0.35), dice.uniform(0.2, 1.5)),
-        beam=on * torch.where(dice.chance(0.9), dice.uniform(0.5, 1.6), 0.05),
+        dark=on * torch.where(sampler.chance(0.75), sampler.uniform(0.01, 0.35), sampler.uniform(0.2, 1.5)),
+        spill=(on * torch.where(sampler.chance(0.2), sampler.uniform(0.0, 0.05), 0.0))[:, None]
+        * sampler.pick_from(SPOT_COLOURS),
+        beam=on * torch.where(sampler.chance(0.9), sampler.uniform(0.5, 1.6), 0.05),
         beam_colour=beam_colour,
-        beam_reach=dice.uniform(8, 24),
-        beam_fall=dice.uniform(1.8, 3.5),
-        beam_end=dice.uniform(35, 110),
-        beam_width=torch.stack([dice.uniform(0.7, 2.4), dice.uniform(0.05, 0.3)], dim=1),
-        beam_rays=dice.uniform(0.0, 0.35),
+        beam_reach=sampler.uniform(8, 24),
+        beam_fall=sampler.uniform(1.8, 3.5),
+        beam_end=sampler.uniform(35, 110),
+        beam_width=torch.stack([sampler.uniform(0.7, 2.4), sampler.uniform(0.05, 0.3)], dim=1),
+        beam_rays=sampler.uniform(0.0, 0.35),
         lamp=(on * lit * power)[:, None] * sides,
-        lamp_period=dice.uniform(22, 55),
-        lamp_phase=dice.uniform(0, 55),
+        lamp_period=sampler.uniform(22, 55),
+        lamp_phase=sampler.uniform(0, 55),
         lamp_across=across,
-        lamp_height=dice.uniform(6.0, 12.0),
-        lamp_colour=hue * dice.uniform(0.85, 1.15, 1),
-        spot=on[:, None] * rare * dice.uniform(0.1, 1.0, NUM_SPOTS),
+        lamp_height=sampler.uniform(6.0, 12.0),
+        lamp_colour=hue * sampler.uniform(0.85, 1.15, 1),
+        spot=on[:, None] * rare * sampler.uniform(0.1, 1.0, NUM_SPOTS),
         spot_place=torch.stack(
-            [dice.uniform(-0.8, 0.8, NUM_SPOTS), dice.uniform(0, 1, NUM_SPOTS) ** 3 * 0.14 + 0.002], dim=2
+            [sampler.uniform(-0.8, 0.8, NUM_SPOTS), sampler.uniform(0, 1, NUM_SPOTS) ** 3 * 0.14 + 0.002],
+            dim=2,
         ),
         spot_size=torch.where(
-            neon, dice.uniform(0.004, 0.012, NUM_SPOTS), dice.uniform(0.0008, 0.0035, NUM_SPOTS)
+            neon, sampler.uniform(0.004, 0.012, NUM_SPOTS), sampler.uniform(0.0008, 0.0035, NUM_SPOTS)
         ),
-        spot_colour=dice.pick_from(SPOT_COLOURS, NUM_SPOTS),
-        halo=on * torch.where(dice.chance(0.75), dice.uniform(0.0, 0.12), dice.uniform(0.05, 0.6)),
-        halo_size=dice.uniform(0.008, 0.04),
+        spot_colour=sampler.pick_from(SPOT_COLOURS, NUM_SPOTS),
+        halo=on * torch.where(sampler.chance(0.75), sampler.uniform(0.0, 0.12), sampler.uniform(0.05, 0.6)),
+        halo_size=sampler.uniform(0.008, 0.04),
         streak=torch.stack(
-            [torch.where(dice.chance(0.35), dice.uniform(0.1, 0.8), 0.0), dice.uniform(0.6, 2.5)], dim=1
+            [torch.where(sampler.chance(0.35), sampler.uniform(0.1, 0.8), 0.0), sampler.uniform(0.6, 2.5)],
+            dim=1,
         ),
         mirror=on * wet,
-        smear=on * torch.where(dice.chance(0.7), dice.uniform(0.0, 0.8), dice.uniform(0.5, 2.0)),
+        smear=on * torch.where(sampler.chance(0.7), sampler.uniform(0.0, 0.8), sampler.uniform(0.5, 2.0)),
     )
 
 
 def night_light(light: Light, lights: Lights) -> Light:
     """The illumination on a night of these lights."""
-    lamps = 0.25 * lights.lamp.sum(1, keepdim=True) * lights.lamp_colour
+    lamps = 0.25 * lights.lamp.sum(1, keepdim=True) * lights.lamp_colour + lights.spill
     on = (lights.on > 0)[:, None]
     return light._replace(
         ambient=torch.where(on, light.ambient * lights.dark[:, None] + lamps, light.ambient),

@@ -51,9 +51,6 @@ class BatchSampler:
         return torch.tensor(values)[self.pick([1.0] * len(values), *shape)]
 
 
-Dice = BatchSampler
-
-
 def map_tensors(function: Callable[[Tensor], Tensor], values: T) -> T:
     """Apply a function to every tensor of a nested NamedTuple; what is neither stays."""
     parts = [

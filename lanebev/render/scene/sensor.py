@@ -30,6 +30,9 @@ class Sensor(NamedTuple):
         bonnet: share of the image's height, 0 for none.
         bonnet_colour: (B, 3).
         bonnet_bow: share of the height by which its edge falls to the sides.
+        bonnet_tilt: share of the height by which it falls from left to right.
+        bonnet_ridge: strength of two ridges along it.
+        bonnet_mirror: share of the scene's light that it mirrors.
     """
 
     exposure: Tensor
@@ -47,6 +50,9 @@ class Sensor(NamedTuple):
     bonnet: Tensor
     bonnet_colour: Tensor
     bonnet_bow: Tensor
+    bonnet_tilt: Tensor
+    bonnet_ridge: Tensor
+    bonnet_mirror: Tensor
 
 
 def sample_sensor(sampler: BatchSampler, weather: Weather, bright: Tensor) -> Sensor:
@@ -72,4 +78,7 @@ def sample_sensor(sampler: BatchSampler, weather: Weather, bright: Tensor) -> Se
         bonnet=torch.where(sampler.chance(0.3), sampler.uniform(0.02, 0.14), 0.0),
         bonnet_colour=sampler.uniform(0.01, 0.25, 1) * (1 + sampler.normal(0.2, 3)).clamp(0.4, 1.6),
         bonnet_bow=sampler.uniform(0.0, 0.12),
+        bonnet_tilt=torch.zeros_like(exposure),
+        bonnet_ridge=torch.zeros_like(exposure),
+        bonnet_mirror=torch.zeros_like(exposure),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
 
 STAMP_LENGTH = 24  # letters
 LETTERS = "0123456789:/-. KMHNEAP"
@@ -19,11 +19,14 @@ _PATTERNS = (  # 0 stands for any digit, * for any letter
 )
 
 
-def sample_text(dice: Dice, length: int) -> Tensor:
+def sample_text(sampler: BatchSampler, length: int) -> Tensor:
     """(B, length) int64 indices of letters."""
     blank, first = LETTERS.index(" "), LETTERS.index("K")
     codes = [[{"0": -1.0, "*": -2.0}.get(c, float(LETTERS.find(c))) for c in p] for p in _PATTERNS]
-    pattern = dice.pick_from([tuple(c) for c in codes]).long()[:, :length]
-    digit, letter = dice.pick([1.0] * 10, length), first + dice.pick([1.0] * (len(LETTERS) - first), length)
+    pattern = sampler.pick_from([tuple(c) for c in codes]).long()[:, :length]
+    digit, letter = (
+        sampler.pick([1.0] * 10, length),
+        first + sampler.pick([1.0] * (len(LETTERS) - first), length),
+    )
     text = torch.where(pattern == -1, digit, torch.where(pattern == -2, letter, pattern))
     return text.where(text >= 0, blank)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lanebev.render.scene.glyphs import ARROWS, BICYCLE, CROSS, WORDS
 from lanebev.render.scene.layout import MAX_BOUNDARIES, WHITE, Layout
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.surroundings import GREENS
 
 PLAIN, PARKING, CYCLING = range(3)  # strips between the outer boundary and the kerb
@@ -109,11 +109,13 @@ class Street(NamedTuple):
     wear: Tensor
 
 
-def sample_street(dice: Dice, layout: Layout, ego_lane: Tensor, first: Tensor, own: Tensor) -> Street:
+def sample_street(
+    sampler: BatchSampler, layout: Layout, ego_lane: Tensor, first: Tensor, own: Tensor
+) -> Street:
     """What is painted between a street's boundaries and what lies beside it.
 
     Args:
-        dice: the randomness.
+        sampler: the randomness.
         layout: the boundaries.
         ego_lane: (B,) int64.
         first: (B,) int64, the own direction's first lane.
@@ -121,91 +123,95 @@ def sample_street(dice: Dice, layout: Layout, ego_lane: Tensor, first: Tensor, o
     """
     slots = MAX_BOUNDARIES
     index = torch.arange(slots, device=own.device)
-    strip = dice.pick([0.5, 0.27, 0.23], 2)
-    tints = dice.pick_from(
+    strip = sampler.pick([0.5, 0.27, 0.23], 2)
+    tints = sampler.pick_from(
         [(0.22, 0.06, 0.045), (0.17, 0.05, 0.05), (0.05, 0.14, 0.07), (0.04, 0.09, 0.2)], 2
     )
-    stone = dice.uniform(0.1, 0.45, 2, 1) * (1 + dice.normal(0.03, 2, 3))
-    path = torch.where(dice.chance(0.5, 2)[..., None], tints, dice.uniform(0.06, 0.25, 2, 1))
-    walk = dice.uniform(0.07, 0.38, 2, 1) * (1 + dice.normal(0.04, 2, 3))
-    green = dice.pick_from(GREENS, 2) * dice.uniform(0.7, 1.4, 2, 1)
-    walks, paths, greens = dice.chance(0.75, 2), dice.chance(0.3, 2), dice.chance(0.4, 2)
-    kerb = torch.where(dice.chance(0.9, 2), dice.uniform(0.1, 0.32, 2), 0.0)
+    stone = sampler.uniform(0.1, 0.45, 2, 1) * (1 + sampler.normal(0.03, 2, 3))
+    path = torch.where(sampler.chance(0.5, 2)[..., None], tints, sampler.uniform(0.06, 0.25, 2, 1))
+    walk = sampler.uniform(0.07, 0.38, 2, 1) * (1 + sampler.normal(0.04, 2, 3))
+    green = sampler.pick_from(GREENS, 2) * sampler.uniform(0.7, 1.4, 2, 1)
+    walks, paths, greens = sampler.chance(0.75, 2), sampler.chance(0.3, 2), sampler.chance(0.4, 2)
+    kerb = torch.where(sampler.chance(0.9, 2), sampler.uniform(0.1, 0.32, 2), 0.0)
     strips = torch.stack(
         [
             kerb,
-            torch.where(greens, dice.uniform(0.3, 3.5, 2), 0.0),
-            torch.where(paths, dice.uniform(1.0, 2.2, 2), 0.0),
-            torch.where(walks, dice.uniform(0.9, 4.5, 2), 0.0),
+            torch.where(greens, sampler.uniform(0.3, 3.5, 2), 0.0),
+            torch.where(paths, sampler.uniform(1.0, 2.2, 2), 0.0),
+            torch.where(walks, sampler.uniform(0.9, 4.5, 2), 0.0),
         ],
         dim=2,
     )
-    signed = dice.chance(0.55, 1)
+    signed = sampler.chance(0.55, 1)
     lane_in = (index >= ego_lane[:, None] - 3) & (index < layout.exists.sum(1, keepdim=True) - 1)
-    glyph = dice.pick([1.0] * len(ARROWS), slots)
-    other = dice.pick_from([float(g) for g in (*WORDS, BICYCLE, CROSS)], slots).long()
-    glyph = torch.where(dice.chance(0.15, slots), other, glyph)
-    glyph = torch.where(signed & lane_in & dice.chance(0.75, slots), glyph, -1)
+    glyph = sampler.pick([1.0] * len(ARROWS), slots)
+    other = sampler.pick_from([float(g) for g in (*WORDS, BICYCLE, CROSS)], slots).long()
+    glyph = torch.where(sampler.chance(0.15, slots), other, glyph)
+    glyph = torch.where(signed & lane_in & sampler.chance(0.75, slots), glyph, -1)
 
-    beside = ego_lane[:, None] + torch.where(dice.chance(0.65), -1, 1)[:, None]
+    beside = ego_lane[:, None] + torch.where(sampler.chance(0.65), -1, 1)[:, None]
     lanes = layout.exists.sum(1, keepdim=True) - 1
-    hatched = (index == beside) & (beside >= 0) & (beside < lanes) & dice.chance(0.3, 1)
-    track = dice.chance(0.13)
-    lane = first + torch.where(dice.chance(0.6), 0, -1)  # in the own direction's first lane or beside it
+    hatched = (index == beside) & (beside >= 0) & (beside < lanes) & sampler.chance(0.3, 1)
+    track = sampler.chance(0.13)
+    lane = first + torch.where(sampler.chance(0.6), 0, -1)  # in the own direction's first lane or beside it
     low, high = (layout.across.gather(1, (lane + i).clamp(min=0)[:, None])[:, 0] for i in (0, 1))
-    junction = dice.chance(0.55)
+    junction = sampler.chance(0.55)
     return Street(
-        kerbed=dice.uniform(1.0, 1.0),
+        kerbed=sampler.uniform(1.0, 1.0),
         own=own,
         first=first,
         strip=strip,
         strip_colour=tints,
-        strip_opacity=torch.where((strip == CYCLING) & dice.chance(0.45, 2), dice.uniform(0.4, 1.0, 2), 0.0),
-        bay=torch.where(dice.chance(0.75, 2), dice.uniform(5.0, 7.0, 2), dice.uniform(2.3, 2.8, 2)),
-        kerb_height=torch.where(dice.chance(0.8, 2), dice.uniform(0.05, 0.18, 2), dice.uniform(0.0, 0.05, 2)),
-        kerb_shade=dice.uniform(0.35, 1.2, 2),
-        kerb_blocks=torch.where(dice.chance(0.08), dice.uniform(0.5, 1.5), 0.0),
+        strip_opacity=torch.where(
+            (strip == CYCLING) & sampler.chance(0.45, 2), sampler.uniform(0.4, 1.0, 2), 0.0
+        ),
+        bay=torch.where(sampler.chance(0.75, 2), sampler.uniform(5.0, 7.0, 2), sampler.uniform(2.3, 2.8, 2)),
+        kerb_height=torch.where(
+            sampler.chance(0.8, 2), sampler.uniform(0.05, 0.18, 2), sampler.uniform(0.0, 0.05, 2)
+        ),
+        kerb_shade=sampler.uniform(0.35, 1.2, 2),
+        kerb_blocks=torch.where(sampler.chance(0.08), sampler.uniform(0.5, 1.5), 0.0),
         strips=strips,
         colours=torch.stack([stone, green, path.expand(-1, -1, 3), walk], dim=2),
-        slab=torch.where(dice.chance(0.5), dice.uniform(0.3, 1.2), 0.0),
-        path_line=torch.where(dice.chance(0.5, 2), dice.uniform(0.5, 1.0, 2), 0.0),
-        junction_period=dice.uniform(90, 320),
-        junction_length=torch.where(junction, dice.uniform(7, 25), 0.0),
-        phase=dice.uniform(-70, 15),
-        stop_width=torch.where(dice.chance(0.6), dice.uniform(0.25, 0.6), 0.0),
-        crossing=dice.pick([0.45, 0.25, 0.3]),
-        box=torch.where(dice.chance(0.12), dice.uniform(0.5, 1.0), 0.0),
+        slab=torch.where(sampler.chance(0.5), sampler.uniform(0.3, 1.2), 0.0),
+        path_line=torch.where(sampler.chance(0.5, 2), sampler.uniform(0.5, 1.0, 2), 0.0),
+        junction_period=sampler.uniform(90, 320),
+        junction_length=torch.where(junction, sampler.uniform(7, 25), 0.0),
+        phase=sampler.uniform(-70, 15),
+        stop_width=torch.where(sampler.chance(0.6), sampler.uniform(0.25, 0.6), 0.0),
+        crossing=sampler.pick([0.45, 0.25, 0.3]),
+        box=torch.where(sampler.chance(0.12), sampler.uniform(0.5, 1.0), 0.0),
         glyph=glyph,
-        glyph_period=dice.uniform(14, 60),
-        glyph_scale=dice.uniform(0.7, 1.3),
-        hatch=torch.where(hatched, dice.uniform(0.7, 1.0, 1), 0.0),
-        hatch_width=dice.uniform(0.25, 0.7),
-        hatch_period=dice.uniform(1.4, 4.0),
-        hatch_slope=dice.uniform(0.5, 2.5) * torch.where(dice.chance(0.5), 1.0, -1.0),
-        hatch_chevron=dice.chance(0.3).float(),
-        hatch_length=dice.uniform(25, 120),
-        hatch_every=dice.uniform(120, 300),
-        hatch_taper=torch.where(dice.chance(0.5), dice.uniform(0.03, 0.12), 0.0),
-        tram=torch.where(track, dice.uniform(0.5, 1.0), 0.0),
-        tram_across=torch.where(dice.chance(0.65), 0.5 * (low + high), low - dice.uniform(2.0, 4.5)),
-        tram_bed=torch.where(dice.chance(0.6), dice.uniform(0.4, 1.0), 0.0),
+        glyph_period=sampler.uniform(14, 60),
+        glyph_scale=sampler.uniform(0.7, 1.3),
+        hatch=torch.where(hatched, sampler.uniform(0.7, 1.0, 1), 0.0),
+        hatch_width=sampler.uniform(0.25, 0.7),
+        hatch_period=sampler.uniform(1.4, 4.0),
+        hatch_slope=sampler.uniform(0.5, 2.5) * torch.where(sampler.chance(0.5), 1.0, -1.0),
+        hatch_chevron=sampler.chance(0.3).float(),
+        hatch_length=sampler.uniform(25, 120),
+        hatch_every=sampler.uniform(120, 300),
+        hatch_taper=torch.where(sampler.chance(0.5), sampler.uniform(0.03, 0.12), 0.0),
+        tram=torch.where(track, sampler.uniform(0.5, 1.0), 0.0),
+        tram_across=torch.where(sampler.chance(0.65), 0.5 * (low + high), low - sampler.uniform(2.0, 4.5)),
+        tram_bed=torch.where(sampler.chance(0.6), sampler.uniform(0.4, 1.0), 0.0),
         tram_colour=torch.where(
-            dice.chance(0.3, 1), dice.pick_from(GREENS), dice.uniform(0.06, 0.3, 1).expand(-1, 3)
+            sampler.chance(0.3, 1), sampler.pick_from(GREENS), sampler.uniform(0.06, 0.3, 1).expand(-1, 3)
         ),
-        tram_ballast=torch.where(dice.chance(0.4), dice.uniform(0.4, 1.2), 0.0),
-        manholes=torch.where(dice.chance(0.6), dice.uniform(0.05, 0.4), 0.0),
-        cuts=torch.where(dice.chance(0.45), dice.uniform(0.1, 0.6), 0.0),
-        weeds=torch.where(dice.chance(0.5), dice.uniform(0.2, 1.0), 0.0),
-        paint=layout.colour.new_tensor(WHITE) * dice.uniform(0.8, 1.1, 1),
-        opacity=dice.uniform(0.55, 1.0),
+        tram_ballast=torch.where(sampler.chance(0.4), sampler.uniform(0.4, 1.2), 0.0),
+        manholes=torch.where(sampler.chance(0.6), sampler.uniform(0.05, 0.4), 0.0),
+        cuts=torch.where(sampler.chance(0.45), sampler.uniform(0.1, 0.6), 0.0),
+        weeds=torch.where(sampler.chance(0.5), sampler.uniform(0.2, 1.0), 0.0),
+        paint=layout.colour.new_tensor(WHITE) * sampler.uniform(0.8, 1.1, 1),
+        opacity=sampler.uniform(0.55, 1.0),
         wear=layout.wear[:, 0],
     )
 
 
-def no_street(dice: Dice) -> Street:
+def no_street(sampler: BatchSampler) -> Street:
     """Nothing of a street, (B,) of it."""
     layoutless = torch.zeros_like
-    zero = dice.uniform(0.0, 0.0)
+    zero = sampler.uniform(0.0, 0.0)
     two, slots = zero[:, None].repeat(1, 2), zero[:, None].repeat(1, MAX_BOUNDARIES)
     whole, colour = layoutless(zero, dtype=torch.long), zero[:, None].repeat(1, 3)
     fields = {name: zero for name in Street._fields}

@@ -10,7 +10,7 @@ from torch import Tensor
 from lanebev.render.scene.kinds import choose
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
 from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.street import CYCLING, KERB, PARKING, PLAIN, Street
 from lanebev.render.scene.surroundings import (
     FENCE,
@@ -29,23 +29,25 @@ _COMING = -25.0  # m/s relative to the camera; below -20 a vehicle faces it
 _PLASTER = [(0.5, 0.45, 0.36), (0.42, 0.4, 0.36), (0.22, 0.1, 0.07), (0.3, 0.29, 0.28), (0.5, 0.36, 0.2)]
 
 
-def street_edges(dice: Dice, city: Tensor, street: Street, layout: Layout, pavement: Pavement) -> Pavement:
+def street_edges(
+    sampler: BatchSampler, city: Tensor, street: Street, layout: Layout, pavement: Pavement
+) -> Pavement:
     """Kerbs near the outer boundaries or beyond a strip for parking or cycling, where city (B,) holds."""
-    plain = torch.where(dice.chance(0.7, 2), dice.uniform(0.05, 0.5, 2), dice.uniform(0.3, 1.5, 2))
-    gap = torch.where(street.strip == CYCLING, dice.uniform(1.1, 2.2, 2), plain)
-    bay = torch.where(street.bay > 4.0, dice.uniform(1.9, 2.6, 2), dice.uniform(4.3, 5.2, 2))
+    plain = torch.where(sampler.chance(0.7, 2), sampler.uniform(0.05, 0.5, 2), sampler.uniform(0.3, 1.5, 2))
+    gap = torch.where(street.strip == CYCLING, sampler.uniform(1.1, 2.2, 2), plain)
+    bay = torch.where(street.bay > 4.0, sampler.uniform(1.9, 2.6, 2), sampler.uniform(4.3, 5.2, 2))
     gap = torch.where(street.strip == PARKING, bay, gap)
     last = layout.across.masked_fill(~layout.exists, 0.0).amax(1)
     edged = pavement._replace(
         left=-gap[:, 0],
         right=last + gap[:, 1],
         shoulder=torch.where(
-            dice.chance(0.75, 1), pavement.base * dice.uniform(0.85, 1.15, 1), pavement.shoulder
+            sampler.chance(0.75, 1), pavement.base * sampler.uniform(0.85, 1.15, 1), pavement.shoulder
         ),
-        patch=torch.where(dice.chance(0.5), dice.uniform(0.05, 0.3), pavement.patch),
-        tar=torch.where(dice.chance(0.4), dice.uniform(0.3, 0.9), pavement.tar),
-        gutter_width=torch.where(dice.chance(0.5, 2), dice.uniform(0.1, 0.4, 2), 0.0),
-        gutter=dice.uniform(0.5, 1.8, 2),
+        patch=torch.where(sampler.chance(0.5), sampler.uniform(0.05, 0.3), pavement.patch),
+        tar=torch.where(sampler.chance(0.4), sampler.uniform(0.3, 0.9), pavement.tar),
+        gutter_width=torch.where(sampler.chance(0.5, 2), sampler.uniform(0.1, 0.4, 2), 0.0),
+        gutter=sampler.uniform(0.5, 1.8, 2),
     )
     return choose(city, edged, pavement)
 
@@ -71,37 +73,37 @@ def kerb_boundaries(city: Tensor, street: Street, layout: Layout, pavement: Pave
 
 
 def street_surroundings(
-    dice: Dice, city: Tensor, street: Street, pavement: Pavement, around: Surroundings
+    sampler: BatchSampler, city: Tensor, street: Street, pavement: Pavement, around: Surroundings
 ) -> Surroundings:
     """Houses, hedges and trees beyond the pavements, where city (B,) holds."""
     walks = street.strips.sum(2)
-    divided = (street.first == 0) & dice.chance(0.45)
+    divided = (street.first == 0) & sampler.chance(0.45)
     opposite = torch.where(divided, pavement.left - walks[:, 0], -math.inf)
     near = torch.stack([NOTHING + 0 * street.own] * 2, 1)
-    pick = dice.pick([0.66, 0.16, 0.18], 2)
+    pick = sampler.pick([0.66, 0.16, 0.18], 2)
     near = torch.where(pick == 1, HEDGE, torch.where(pick == 2, FENCE, near))
-    pick = dice.pick([0.25, 0.45, 0.18, 0.12], 2)
+    pick = sampler.pick([0.25, 0.45, 0.18, 0.12], 2)
     middle = torch.where(pick == 1, HOUSES, torch.where(pick == 2, TREES, torch.where(pick == 3, HEDGE, 0)))
-    pick = dice.pick([0.2, 0.4, 0.4], 2)
+    pick = sampler.pick([0.2, 0.4, 0.4], 2)
     far = torch.where(pick == 1, HOUSES, torch.where(pick == 2, TREES, 0))
     kind = torch.cat([far, middle, near], 1)
     left = (torch.arange(NUM_WALLS, device=kind.device) % 2 == 0) & divided[:, None]
     kind = torch.where(left, torch.where(kind == HEDGE, kind, NOTHING), kind)
-    gap = torch.cat([dice.uniform(12, 32, 2), dice.uniform(0.3, 7, 2), dice.uniform(0.1, 0.7, 2)], 1)
+    gap = torch.cat([sampler.uniform(12, 32, 2), sampler.uniform(0.3, 7, 2), sampler.uniform(0.1, 0.7, 2)], 1)
     sides = gap.new_tensor([-1.0, 1.0] * 3)
     edge = torch.stack([pavement.left, pavement.right], 1)
     across = (edge + walks * sides[:2]).repeat(1, 3) + sides * gap
-    height = torch.where(kind == HOUSES, dice.uniform(5, 22, NUM_WALLS), dice.uniform(4, 13, NUM_WALLS))
+    height = torch.where(kind == HOUSES, sampler.uniform(5, 22, NUM_WALLS), sampler.uniform(4, 13, NUM_WALLS))
     low = (kind == HEDGE) | (kind == FENCE)
-    height = torch.where(low, dice.uniform(0.7, 3.0, NUM_WALLS), height)
-    plaster = dice.pick_from(_PLASTER, NUM_WALLS) * dice.uniform(0.4, 1.1, NUM_WALLS, 1)
-    leaves = dice.pick_from(GREENS, NUM_WALLS) * dice.uniform(0.7, 1.3, NUM_WALLS, 1)
+    height = torch.where(low, sampler.uniform(0.7, 3.0, NUM_WALLS), height)
+    plaster = sampler.pick_from(_PLASTER, NUM_WALLS) * sampler.uniform(0.4, 1.1, NUM_WALLS, 1)
+    leaves = sampler.pick_from(GREENS, NUM_WALLS) * sampler.uniform(0.7, 1.3, NUM_WALLS, 1)
     green = ((kind == HEDGE) | (kind == TREES))[..., None]
     ground = torch.where(
-        dice.chance(0.5, 2)[..., None], street.colours[:, :, 1], street.colours[:, :, 3]
+        sampler.chance(0.5, 2)[..., None], street.colours[:, :, 1], street.colours[:, :, 3]
     )  # grass, or as the walk
     town = around._replace(
-        verge=ground * dice.uniform(0.6, 1.2, 2, 1),
+        verge=ground * sampler.uniform(0.6, 1.2, 2, 1),
         wall_across=across,
         wall_kind=kind,
         wall_height=height,
@@ -113,7 +115,7 @@ def street_surroundings(
 
 
 def city_traffic(
-    dice: Dice, city: Tensor, street: Street, layout: Layout, pavement: Pavement, traffic: Traffic
+    sampler: BatchSampler, city: Tensor, street: Street, layout: Layout, pavement: Pavement, traffic: Traffic
 ) -> Traffic:
     """Vehicles that come towards the camera in their own lanes, none on hatching, and parked ones."""
     across = traffic.across[:, :NUM_VEHICLES]
@@ -121,17 +123,19 @@ def city_traffic(
     coming = (lane < street.first[:, None]) | (lane >= (street.first + street.own)[:, None])
     coming = coming & city[:, None]
     speed, valid = traffic.speed.clone(), traffic.valid.clone()
-    pace = dice.uniform(_COMING - 8, _COMING, NUM_VEHICLES)
+    pace = sampler.uniform(_COMING - 8, _COMING, NUM_VEHICLES)
     speed[:, :NUM_VEHICLES] = torch.where(coming, pace, speed[:, :NUM_VEHICLES])
     valid[:, :NUM_VEHICLES] &= ~((street.hatch.gather(1, lane) > 0) & city[:, None])
     gantries = slice(traffic.along.shape[1] - 10, traffic.along.shape[1] - 7)
-    valid[:, gantries] &= ~(city & dice.chance(0.8))[:, None]
+    valid[:, gantries] &= ~(city & sampler.chance(0.8))[:, None]
     moving = traffic._replace(speed=speed, valid=valid)
-    parked = _sample_parked(dice, city, street, layout, pavement)
+    parked = _sample_parked(sampler, city, street, layout, pavement)
     return Traffic(*(torch.cat(pair, dim=1) for pair in zip(moving, parked, strict=True)))
 
 
-def _sample_parked(dice: Dice, city: Tensor, street: Street, layout: Layout, pavement: Pavement) -> Traffic:
+def _sample_parked(
+    sampler: BatchSampler, city: Tensor, street: Street, layout: Layout, pavement: Pavement
+) -> Traffic:
     """Cars in the parking strips, or with two wheels on the kerb; half of the places on either side."""
     one_side = NUM_PARKED // 2
     side = torch.arange(NUM_PARKED, device=city.device) // one_side
@@ -141,20 +145,20 @@ def _sample_parked(dice: Dice, city: Tensor, street: Street, layout: Layout, pav
     on_kerb = torch.stack([pavement.left - 0.4, pavement.right + 0.4], 1)
     across = torch.where(street.strip == PARKING, strip_middle, on_kerb)
     there = ((street.strip == PARKING) & (street.bay > 4.0)) | (
-        (street.strip == PLAIN) & (street.strips.sum(2) > 1.5) & dice.chance(0.2, 2)
+        (street.strip == PLAIN) & (street.strips.sum(2) > 1.5) & sampler.chance(0.2, 2)
     )
     there = there & city[:, None]
     spacing = street.bay.clamp(min=5.2)[:, side]
-    along = dice.uniform(-6, 25, 2)[:, side] + spacing * turn + dice.uniform(-0.3, 0.3, NUM_PARKED)
-    truck = dice.chance(0.06, NUM_PARKED)
+    along = sampler.uniform(-6, 25, 2)[:, side] + spacing * turn + sampler.uniform(-0.3, 0.3, NUM_PARKED)
+    truck = sampler.chance(0.06, NUM_PARKED)
     still = torch.zeros_like(along)
     return Traffic(
         along=along,
-        across=across[:, side] + dice.normal(0.12, NUM_PARKED),
+        across=across[:, side] + sampler.normal(0.12, NUM_PARKED),
         speed=still,
-        shape=vehicle_shapes(dice, NUM_PARKED, truck),
+        shape=vehicle_shapes(sampler, NUM_PARKED, truck),
         kind=truck.long(),
-        colour=dice.pick_from(CAR_COLOURS, NUM_PARKED) * dice.uniform(0.7, 1.2, NUM_PARKED, 1),
+        colour=sampler.pick_from(CAR_COLOURS, NUM_PARKED) * sampler.uniform(0.7, 1.2, NUM_PARKED, 1),
         braking=still.bool(),
-        valid=there[:, side] & (dice.uniform(0, 1, NUM_PARKED) < dice.uniform(0.3, 1.0, 1)),
+        valid=there[:, side] & (sampler.uniform(0, 1, NUM_PARKED) < sampler.uniform(0.3, 1.0, 1)),
     )

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lanebev.render.scene.kinds import choose
 from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.surroundings import CONCRETE, NOTHING, NUM_WALLS, Surroundings
 from lanebev.render.scene.traffic import NUM_ONCOMING, NUM_VEHICLES, Traffic
 from lanebev.render.scene.weather import Light
@@ -46,39 +46,44 @@ class Tunnel(NamedTuple):
     lamp_colour: Tensor
 
 
-def sample_tunnel(dice: Dice, tunnel: Tensor, pavement: Pavement) -> Tunnel:
+def sample_tunnel(sampler: BatchSampler, tunnel: Tensor, pavement: Pavement) -> Tunnel:
     """Random tunnels where tunnel (B,) holds."""
-    hue = dice.pick_from(_LAMP_COLOURS) * dice.uniform(0.9, 1.1, 1)
+    hue = sampler.pick_from(_LAMP_COLOURS) * sampler.uniform(0.9, 1.1, 1)
     rows = torch.stack([pavement.left, pavement.right], 1)
     middle = rows.mean(1, keepdim=True)
-    near_walls = dice.chance(0.5, 1)
-    share = torch.where(near_walls, dice.uniform(0.8, 0.97, 1), dice.uniform(0.0, 0.5, 1))
+    near_walls = sampler.chance(0.5, 1)
+    share = torch.where(near_walls, sampler.uniform(0.8, 0.97, 1), sampler.uniform(0.0, 0.5, 1))
     return Tunnel(
         on=tunnel.float(),
-        ceiling=dice.uniform(4.8, 7.5),
-        exit=torch.where(dice.chance(0.5), dice.uniform(60, 500), 1e5),
-        tone=dice.uniform(0.04, 0.4, 1) * (1 + dice.normal(0.05, 3)),
-        level=dice.uniform(0.02, 0.25, 1) * hue,
-        lamp=dice.uniform(0.3, 4.0),
+        ceiling=sampler.uniform(4.8, 7.5),
+        exit=torch.where(sampler.chance(0.5), sampler.uniform(60, 500), 1e5),
+        tone=sampler.uniform(0.04, 0.4, 1) * (1 + sampler.normal(0.05, 3)),
+        level=sampler.uniform(0.02, 0.25, 1) * hue,
+        lamp=sampler.uniform(0.3, 4.0),
         lamp_across=middle + (rows - middle) * share,
-        lamp_size=torch.stack([dice.uniform(0.4, 4.0), dice.uniform(0.1, 0.5)], 1),
-        lamp_period=dice.uniform(4.5, 16.0),
+        lamp_size=torch.stack([sampler.uniform(0.4, 4.0), sampler.uniform(0.1, 0.5)], 1),
+        lamp_period=sampler.uniform(4.5, 16.0),
         lamp_colour=hue,
     )
 
 
+def endless(tunnel: Tunnel) -> Tunnel:
+    """A tunnel that one does not come out of, for drives."""
+    return tunnel._replace(exit=torch.full_like(tunnel.exit, math.inf))
+
+
 def tunnel_surroundings(
-    dice: Dice, tunnel: Tensor, inside: Tunnel, pavement: Pavement, around: Surroundings
+    sampler: BatchSampler, tunnel: Tensor, inside: Tunnel, pavement: Pavement, around: Surroundings
 ) -> Surroundings:
     """Walls up to the ceiling, where tunnel (B,) holds."""
     edge = torch.stack([pavement.left, pavement.right], 1).repeat(1, 3)
-    gap = torch.cat([dice.uniform(30, 31, 4), dice.uniform(0.1, 1.0, 2)], 1)
+    gap = torch.cat([sampler.uniform(30, 31, 4), sampler.uniform(0.1, 1.0, 2)], 1)
     near = torch.arange(NUM_WALLS, device=tunnel.device) >= NUM_WALLS - 2
     walled = around._replace(
         wall_across=edge + gap * gap.new_tensor([-1.0, 1.0] * 3),
         wall_kind=torch.where(near, CONCRETE, NOTHING).expand_as(around.wall_kind),
         wall_height=(inside.ceiling[:, None] + 0.15).expand_as(around.wall_height),
-        wall_colour=(dice.uniform(0.05, 0.5, 1, 1) * (1 + dice.normal(0.06, 1, 3))).expand_as(
+        wall_colour=(sampler.uniform(0.05, 0.5, 1, 1) * (1 + sampler.normal(0.06, 1, 3))).expand_as(
             around.wall_colour
         ),
         wall_toe=torch.ones_like(around.wall_toe),

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
 
 
 class Winter(NamedTuple):
@@ -35,30 +35,30 @@ class Winter(NamedTuple):
     track: Tensor
 
 
-def sample_winter(dice: Dice, snow: Tensor) -> Winter:
+def sample_winter(sampler: BatchSampler, snow: Tensor) -> Winter:
     """Random snow where snow (B,) bool holds."""
-    level = torch.where(dice.chance(0.6), dice.uniform(0.45, 0.85), dice.uniform(0.18, 0.45))
-    blue = dice.uniform(-0.02, 0.06)
+    level = torch.where(sampler.chance(0.6), sampler.uniform(0.45, 0.85), sampler.uniform(0.18, 0.45))
+    blue = sampler.uniform(-0.02, 0.06)
     return Winter(
         on=snow.float(),
         colour=level[:, None] * torch.stack([1 - blue, 1 + 0 * blue, 1 + blue], 1),
-        verge=torch.where(dice.chance(0.85), dice.uniform(0.6, 1.0), 0.1),
-        edge=dice.uniform(-0.5, 1.6, 2),
-        ragged=dice.uniform(0.05, 0.5),
-        line=dice.uniform(0.15, 0.7),
-        film=torch.where(dice.chance(0.6), dice.uniform(0.1, 0.8), 0.0),
-        track=dice.uniform(0.25, 0.55),
+        verge=torch.where(sampler.chance(0.85), sampler.uniform(0.6, 1.0), 0.1),
+        edge=sampler.uniform(-0.5, 1.6, 2),
+        ragged=sampler.uniform(0.05, 0.5),
+        line=sampler.uniform(0.15, 0.7),
+        film=torch.where(sampler.chance(0.6), sampler.uniform(0.1, 0.8), 0.0),
+        track=sampler.uniform(0.25, 0.55),
     )
 
 
-def snowed_layout(dice: Dice, snow: Tensor, layout: Layout) -> Layout:
+def snowed_layout(sampler: BatchSampler, snow: Tensor, layout: Layout) -> Layout:
     """A layout whose boundaries are not seen over long stretches, where snow (B,) holds."""
     slots = MAX_BOUNDARIES
-    long = dice.uniform(10, 60, slots)
-    covered = snow[:, None] & dice.chance(0.6, slots)
-    period = long / dice.uniform(0.25, 0.9, 1)
+    long = sampler.uniform(10, 60, slots)
+    covered = snow[:, None] & sampler.chance(0.6, slots)
+    period = long / sampler.uniform(0.25, 0.9, 1)
     return layout._replace(
         missing_period=torch.where(covered, period, layout.missing_period),
         missing_length=torch.where(covered, long, layout.missing_length),
-        missing_phase=torch.where(covered, dice.uniform(0, 60, slots), layout.missing_phase),
+        missing_phase=torch.where(covered, sampler.uniform(0, 60, slots), layout.missing_phase),
     )

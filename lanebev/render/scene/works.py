@@ -10,7 +10,7 @@ from torch import Tensor
 from lanebev.render.scene.kinds import choose
 from lanebev.render.scene.layout import DASHED, MAX_BOUNDARIES, NONE, SOLID, WHITE, Layout
 from lanebev.render.scene.objects import POLE
-from lanebev.render.scene.sampler import Dice
+from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.traffic import Traffic
 
 NUM_OLD = 4  # old white lines
@@ -40,20 +40,20 @@ class Works(NamedTuple):
     phase: Tensor
 
 
-def sample_works(dice: Dice, works: Tensor, layout: Layout) -> tuple[Layout, Works]:
+def sample_works(sampler: BatchSampler, works: Tensor, layout: Layout) -> tuple[Layout, Works]:
     """Narrow lanes between yellow lines, and what is left of the old ones, where works (B,) holds."""
     slots = MAX_BOUNDARIES
     index = torch.arange(slots, device=works.device)
     last = layout.exists.sum(1, keepdim=True) - 1
     outer = (index == 0) | (index == last)
-    kind = torch.where(dice.chance(0.45, slots), SOLID, DASHED)
-    kind = torch.where(outer, torch.where(dice.chance(0.85, slots), SOLID, NONE), kind)
-    widths = (dice.uniform(2.6, 3.4, 1) + dice.normal(0.12, slots - 1)).clamp(2.4, 3.7)
+    kind = torch.where(sampler.chance(0.45, slots), SOLID, DASHED)
+    kind = torch.where(outer, torch.where(sampler.chance(0.85, slots), SOLID, NONE), kind)
+    widths = (sampler.uniform(2.6, 3.4, 1) + sampler.normal(0.12, slots - 1)).clamp(2.4, 3.7)
     across = torch.nn.functional.pad(widths.cumsum(1), (1, 0))
     across = torch.where(layout.exists, across, layout.across)
     solid = layout.dash[..., 1:].expand_as(layout.dash)
-    dashed = torch.stack([dice.uniform(1.0, 6.0), dice.uniform(7.0, 14.0)], 1)[:, None, None]
-    gold = dice.chance(0.85, 1)
+    dashed = torch.stack([sampler.uniform(1.0, 6.0), sampler.uniform(7.0, 14.0)], 1)[:, None, None]
+    gold = sampler.chance(0.85, 1)
     colour = torch.where(
         gold[..., None], layout.colour.new_tensor([0.78, 0.52, 0.03]), layout.colour.new_tensor(WHITE)
     )
@@ -61,41 +61,43 @@ def sample_works(dice: Dice, works: Tensor, layout: Layout) -> tuple[Layout, Wor
         across=across,
         marked=layout.exists & (kind != NONE),
         lane_width=widths.mean(1),
-        stripe_width=dice.uniform(0.10, 0.18, 1).expand(-1, slots).contiguous(),
+        stripe_width=sampler.uniform(0.10, 0.18, 1).expand(-1, slots).contiguous(),
         separation=torch.zeros_like(layout.separation),
         dash=torch.where((kind == DASHED)[..., None, None], dashed.expand_as(layout.dash), solid),
-        colour=(colour * dice.uniform(0.8, 1.15, 1, 1)).expand(-1, slots, -1).contiguous(),
-        opacity=torch.where(kind == NONE, 0.0, dice.uniform(0.75, 1.0, 1)),
-        wear=dice.uniform(0.0, 0.25, 1).expand(-1, slots).contiguous(),
+        colour=(colour * sampler.uniform(0.8, 1.15, 1, 1)).expand(-1, slots, -1).contiguous(),
+        opacity=torch.where(kind == NONE, 0.0, sampler.uniform(0.75, 1.0, 1)),
+        wear=sampler.uniform(0.0, 0.25, 1).expand(-1, slots).contiguous(),
         stud_period=torch.zeros_like(layout.stud_period),
         ghost=torch.zeros_like(layout.ghost),
     )
-    first = dice.uniform(-2.5, 2.0, 1)
-    spacing = dice.uniform(3.2, 3.8, 1)
+    first = sampler.uniform(-2.5, 2.0, 1)
+    spacing = sampler.uniform(3.2, 3.8, 1)
     old = torch.arange(NUM_OLD, device=works.device)
-    whole = dice.chance(0.4, NUM_OLD)[..., None]
-    dash = torch.where(whole, dice.uniform(9.0, 9.0, 1, 1), dice.pick_from([3.0, 4.0, 6.0], 1, 1))
-    dash = torch.cat([dash, torch.where(whole, dash, dice.uniform(9.0, 18.0, 1, 1))], 2)
+    whole = sampler.chance(0.4, NUM_OLD)[..., None]
+    dash = torch.where(whole, sampler.uniform(9.0, 9.0, 1, 1), sampler.pick_from([3.0, 4.0, 6.0], 1, 1))
+    dash = torch.cat([dash, torch.where(whole, dash, sampler.uniform(9.0, 18.0, 1, 1))], 2)
     faint = torch.where(gold, 1.0, 0.3)  # white ones in force are not to be told from white ones of old
     left = Works(
         strength=works[:, None]
         * faint
-        * torch.where(dice.chance(0.75, NUM_OLD), dice.uniform(0.25, 1.0, 1), 0.0),
+        * torch.where(sampler.chance(0.75, NUM_OLD), sampler.uniform(0.25, 1.0, 1), 0.0),
         across=first + spacing * old,
-        drift=torch.where(dice.chance(0.4, 1), dice.normal(0.012, 1), 0.0).expand(-1, NUM_OLD),
+        drift=torch.where(sampler.chance(0.4, 1), sampler.normal(0.012, 1), 0.0).expand(-1, NUM_OLD),
         dash=dash,
-        width=dice.uniform(0.10, 0.2, 1).expand(-1, NUM_OLD),
+        width=sampler.uniform(0.10, 0.2, 1).expand(-1, NUM_OLD),
         scar=works[:, None]
-        * torch.where(dice.chance(0.3, 1), dice.uniform(0.2, 0.7, 1), 0.0).expand(-1, NUM_OLD),
-        colour=layout.colour.new_tensor(WHITE) * dice.uniform(0.75, 1.05, 1),
-        phase=dice.uniform(0, 40),
+        * torch.where(sampler.chance(0.3, 1), sampler.uniform(0.2, 0.7, 1), 0.0).expand(-1, NUM_OLD),
+        colour=layout.colour.new_tensor(WHITE) * sampler.uniform(0.75, 1.05, 1),
+        phase=sampler.uniform(0, 40),
     )
     return choose(works, yellow, layout), left
 
 
-def works_traffic(dice: Dice, works: Tensor, layout: Layout, traffic: Traffic, count: int) -> Traffic:
+def works_traffic(
+    sampler: BatchSampler, works: Tensor, layout: Layout, traffic: Traffic, count: int
+) -> Traffic:
     """Cones, beacons or barriers in the last ``count`` places of the traffic, where works (B,) holds."""
-    style = dice.pick([0.4, 0.35, 0.25])[:, None]
+    style = sampler.pick([0.4, 0.35, 0.25])[:, None]
     one = torch.ones_like(traffic.along[:, -count:])
     half = torch.where(style == 0, 0.17, torch.where(style == 1, 0.13, 0.25)) * one
     top = torch.where(style == 0, 0.03, torch.where(style == 1, 0.13, 0.1)) * one
@@ -104,21 +106,21 @@ def works_traffic(dice: Dice, works: Tensor, layout: Layout, traffic: Traffic, c
     high = torch.where(style == 0, 0.75, torch.where(style == 1, 1.15, 0.85)) * one
     body = torch.stack([half, top, -deep, deep, -deep_top, deep_top, 0 * one, high], -1)
     turn = torch.arange(count, device=works.device)
-    spacing = torch.where(style == 2, 2.3, dice.uniform(4.0, 14.0, 1))
+    spacing = torch.where(style == 2, 2.3, sampler.uniform(4.0, 14.0, 1))
     last = layout.across.masked_fill(~layout.exists, 0.0).amax(1)
-    across = torch.where(dice.chance(0.6), last + dice.uniform(0.3, 1.0), -dice.uniform(0.3, 1.0))
+    across = torch.where(sampler.chance(0.6), last + sampler.uniform(0.3, 1.0), -sampler.uniform(0.3, 1.0))
     red = one.new_tensor([0.5, 0.06, 0.02])
     white = one.new_tensor([0.6, 0.6, 0.6])
     colour = torch.where(((turn % 2 == 0) & (style == 2))[..., None], white, red)
     mine = traffic._replace(
-        along=dice.uniform(3, 30, 1) + spacing * turn,
-        across=(across[:, None] + dice.normal(0.06, count)),
+        along=sampler.uniform(3, 30, 1) + spacing * turn,
+        across=(across[:, None] + sampler.normal(0.06, count)),
         speed=0 * one,
         shape=torch.stack([body, torch.zeros_like(body)], 2),
         kind=torch.full_like(one, POLE, dtype=torch.long),
         colour=colour.expand(len(one), count, 3),
         braking=torch.zeros_like(one, dtype=torch.bool),
-        valid=dice.chance(0.75, 1).expand(-1, count),
+        valid=sampler.chance(0.75, 1).expand(-1, count),
     )
     rest = Traffic(*(t[:, :-count] for t in traffic))
     tail = choose(works, mine, Traffic(*(t[:, -count:] for t in traffic)))
