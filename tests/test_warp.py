@@ -1,10 +1,15 @@
 """The resampling against the homography, on lenses, on feature maps, and its gradients."""
 
+import math
+
 import pytest
 import torch
 from kornia.geometry.transform import warp_perspective
 
 from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics, bev_from_image
+from lanebev.geometry.distortion import max_undistorted_radius
+from lanebev.geometry.lens import distort_points, normalise_points
+from lanebev.geometry.road import image_from_road_points
 
 GRID = BEVGrid(x=(-4.0, 4.0), z=(5.0, 25.0), resolution=0.1)
 CAMERA = Camera.from_parameters(300.0, 300.0, 160.0, 90.0, 320, 180)
@@ -199,3 +204,92 @@ def test_a_camera_that_cannot_be_used_leaves_the_other_rows_alone():
     one = Extrinsics(*(part[:1] for part in two))
     torch.testing.assert_close(homography[:1], bev_from_image(one, both[:1], GRID))
     torch.testing.assert_close(bev[:1], BEVWarp(GRID)(smooth_image(), both[:1], one)[0])
+
+
+LENSES = [
+    ((), "pinhole"),
+    ((-0.2, 0.03, 0.001, -0.001), "pinhole"),
+    ((-0.2, 0.03, 0.001, -0.001, 0.01), "pinhole"),
+    ((-0.2, 0.03, 0.001, -0.001, 0.01, 0.1, 0.05, 0.01), "pinhole"),
+    ((-0.2, 0.03, 0.001, -0.001, 0.01, 0.1, 0.05, 0.01, 1e-3, 1e-4, -1e-3, 2e-4), "pinhole"),
+    ((-0.2, 0.03, 1e-3, -1e-3, 0.01, 0.1, 0.05, 0.01, 0.0, 0.0, 0.0, 0.0, 0.02, -0.01), "pinhole"),
+    ((0.9, -0.2, 0.03, 0.001, -0.001), "omni"),
+    ((-0.05, 0.01, -0.003, 0.001), "fisheye"),
+]
+
+
+def cell_by_cell(camera, extrinsics, grid):
+    """Pixels as taken and validity by the functions on points, without this module's arithmetic."""
+    points, front = image_from_road_points(
+        grid.cells(torch.float64).reshape(1, -1, 2), camera.intrinsics[None], extrinsics
+    )
+    pixels = distort_points(points, camera.intrinsics[None], camera.distortion[None], camera.model)
+    x, y = pixels[0].unbind(-1)
+    valid = front[0] & (x >= -0.5) & (x <= 319.5) & (y >= -0.5) & (y <= 179.5)
+    if len(camera.distortion):
+        radius = normalise_points(points, camera.intrinsics[None])[0].norm(dim=-1)
+        valid &= radius < max_undistorted_radius(camera.distortion[None], camera.model)
+    return pixels[0], valid
+
+
+@pytest.mark.parametrize(("distortion", "model"), LENSES)
+@pytest.mark.parametrize("values", [[0.05, 0.02, -0.05, 1.4], [-0.4, 0.3, 0.2, 1.4], [0.2, -1.2, 0.1, 0.02]])
+def test_every_cell_is_seen_where_its_point_projects(distortion, model, values):
+    """Also behind the camera, where a lens folds over, a few cm over the road, in the outermost pixels."""
+    camera = Camera.from_parameters(150.0, 155.0, 160.0, 90.0, 320, 180, distortion, model)
+    grid, extrinsics = BEVGrid(x=(-6.0, 6.0), z=(-8.0, 20.0), resolution=0.1), pose(values)
+    pixels, expected = cell_by_cell(camera, extrinsics, grid)
+    y, x = torch.meshgrid(torch.arange(180.0), torch.arange(320.0), indexing="ij")
+    ramp = torch.stack([x, y])[None].double() + 1
+    lens = (camera.distortion[None], model)
+    bev, valid = BEVWarp(grid)(ramp, camera.intrinsics[None], extrinsics, *lens)
+    assert torch.equal(valid.flatten(), expected)
+    assert 0.01 < expected.double().mean() < 0.9
+    clamped = torch.stack([pixels[:, 0].clamp(0, 319), pixels[:, 1].clamp(0, 179)]) + 1
+    torch.testing.assert_close(bev[0].flatten(1), torch.where(expected, clamped, 0.0), atol=1e-6, rtol=0)
+    single, there = BEVWarp(grid)(ramp.float(), camera.intrinsics[None], extrinsics, *lens)
+    assert (there != valid).double().mean() < 1e-4  # on the edge itself
+    both = (there & valid).expand_as(bev)
+    assert (single.double() - bev)[both].abs().max() < 1e-3  # px
+
+
+def test_blocks_of_rows_change_nothing(monkeypatch):
+    extrinsics, intrinsics = pose([0.03, 0.02, -0.05, 1.4]), LENS.intrinsics[None]
+    args = (smooth_image(), intrinsics, extrinsics, LENS.distortion[None])
+    whole, valid = BEVWarp(GRID)(*args)
+    monkeypatch.setattr("lanebev.view.sampling._BLOCK", 7 * GRID.shape[1])
+    bev, there = BEVWarp(GRID)(*args)
+    assert torch.equal(bev, whole)
+    assert torch.equal(there, valid)
+
+
+def test_a_camera_that_is_not_above_the_road_sees_nothing():
+    bev, valid = BEVWarp(GRID)(
+        smooth_image(2), CAMERA.intrinsics.expand(2, 3, 3), pose([0.1, 0.0, 0.0, 0.0], [0.1, 0.0, 0.0, -1.5])
+    )
+    assert not valid.any()
+    assert (bev == 0).all()
+
+
+def test_a_cell_on_the_axis_behind_the_camera_is_not_seen():
+    """Its image would be the principal point, whatever its depth."""
+    grid = BEVGrid(x=(-1.0, 1.0), z=(-2.0, 2.0), resolution=0.5)
+    up = pose([-math.pi / 4, 0.0, 0.0, 1.0])  # the axis meets the road at Z = -1
+    for dtype in (torch.float32, torch.float64):
+        _, valid = BEVWarp(grid)(smooth_image().to(dtype), CAMERA.intrinsics[None], up)
+        assert not valid.any()
+
+
+def test_gradients_are_zero_outside_and_finite_everywhere():
+    """Also behind the camera, for every lens."""
+    grid = BEVGrid(x=(-6.0, 6.0), z=(-8.0, 20.0), resolution=0.5)
+    for distortion, model in LENSES:
+        values = torch.tensor([[0.05, 0.02, -0.05, 1.4]], requires_grad=True)
+        lens = torch.tensor([distortion], requires_grad=True)
+        bev, valid = BEVWarp(grid)(
+            smooth_image().float(), CAMERA.intrinsics[None].float(), Extrinsics.unstack(values), lens, model
+        )
+        (outside,) = torch.autograd.grad(bev[~valid.expand_as(bev)].sum(), values, retain_graph=True)
+        assert (outside == 0).all()
+        found = torch.autograd.grad(bev.sum(), (values, lens), allow_unused=not distortion)
+        assert all(bool((part != 0).all() and part.isfinite().all()) for part in found if part is not None)

@@ -69,11 +69,16 @@ class BEVGrid:
         sign = cov.new_tensor([1.0, -1.0]) * self.resolution
         return cov * sign[:, None] * sign
 
+    def axes(
+        self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """(V,) X of the columns' centres and (U,) Z of the rows' centres, m."""
+        row, column = (torch.arange(size, dtype=dtype, device=device) for size in self.shape)
+        return self.x[0] + column * self.resolution, self.z[1] - row * self.resolution
+
     def cells(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
         """(U, V, 2) road coordinates (X, Z) of every pixel centre, m."""
-        row, column = (torch.arange(size, dtype=dtype, device=device) for size in self.shape)
-        z = self.road_from_bev_points(torch.stack([row, row], dim=-1))[:, 1]
-        x = self.road_from_bev_points(torch.stack([column, column], dim=-1))[:, 0]
+        x, z = self.axes(dtype, device)
         z, x = torch.meshgrid(z, x, indexing="ij")
         return torch.stack([x, z], dim=-1)
 

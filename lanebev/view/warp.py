@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import torch
-from kornia.geometry.transform import remap
 from torch import Tensor, nn
 
-from lanebev.geometry.lens import (
-    check_intrinsics,
-    check_rows,
-    distort_points,
-    max_undistorted_radius,
-    normalise_points,
-)
-from lanebev.geometry.precision import common_dtype, full_precision
-from lanebev.geometry.road import image_from_road_points
+from lanebev.geometry.distortion import check_lens
+from lanebev.geometry.lens import check_intrinsics
+from lanebev.geometry.precision import common_dtype
 from lanebev.types import Extrinsics
 from lanebev.view.grid import BEVGrid
+from lanebev.view.sampling import (
+    cells_and_lens,
+    image_coordinates,
+    normalised_intrinsics,
+    resample,
+    sampling_maps,
+)
 
 
 class BEVWarp(nn.Module):
@@ -50,7 +49,7 @@ class BEVWarp(nn.Module):
             intrinsics: (B, 3, 3) px of the image.
             extrinsics: each (B,).
             distortion: (B, D) of the lens, or None for an undistorted image.
-            model: "pinhole" or "fisheye", the lens of ``distortion``.
+            model: "pinhole", "fisheye" or "omni", the lens of ``distortion``.
             image_size: (H, W) px of the image that the intrinsics belong to; None where that is ``image``
                 itself. A feature map of stride s is (H / s, W / s) and its cells' centres are evenly spread.
 
@@ -61,31 +60,16 @@ class BEVWarp(nn.Module):
         Raises:
             ValueError: shapes that don't fit, or an image or intrinsics of whole numbers.
         """
-        if image.ndim != 4:
-            raise ValueError(f"image: expected (B, C, h, w), got {tuple(image.shape)}")
-        if not image.is_floating_point():
-            raise ValueError(f"image: expected floating point, got {image.dtype}")
-        batch = image.shape[0]
-        check_intrinsics(intrinsics, batch)
-        if extrinsics.pitch.shape != (batch,):
-            raise ValueError(f"extrinsics: expected ({batch},) each, got {tuple(extrinsics.pitch.shape)}")
-        height, width = image_size or (image.shape[-2], image.shape[-1])
-        pixels, valid = self.image_points(intrinsics, extrinsics, distortion, model)
-        x, y = pixels.unbind(-1)
-        inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
-        valid = valid & inside
-        scale_y, scale_x = image.shape[-2] / height, image.shape[-1] / width
-        map_x = torch.where(valid, (x + 0.5) * scale_x - 0.5, -2.0).reshape(batch, *self.grid.shape)
-        map_y = torch.where(valid, (y + 0.5) * scale_y - 0.5, -2.0).reshape(batch, *self.grid.shape)
-        valid = valid.reshape(batch, 1, *self.grid.shape)
-        dtype = common_dtype(image)
-        bev = remap(
-            image.to(dtype), map_x.to(dtype), map_y.to(dtype), mode="bilinear", padding_mode="border",
-            align_corners=True, normalized_coordinates=False,
-        )  # fmt: skip
-        return torch.where(valid, bev, 0.0).to(image.dtype), valid
+        check_image(image)
+        size = image_size or (image.shape[-2], image.shape[-1])
+        check_cameras(image.shape[0], intrinsics, extrinsics, distortion, model)
+        image_from_cam = normalised_intrinsics(intrinsics, size)
+        sums, lens = cells_and_lens(
+            self.grid, image_from_cam, extrinsics, distortion, model, common_dtype(image)
+        )
+        (sampling_map,), valid = sampling_maps(sums, lens, [(image.shape[-2], image.shape[-1])])
+        return resample(image, sampling_map), valid
 
-    @full_precision
     def image_points(
         self,
         intrinsics: Tensor,
@@ -94,14 +78,30 @@ class BEVWarp(nn.Module):
         model: str = "pinhole",
     ) -> tuple[Tensor, Tensor]:
         """Where every cell is seen: (B, U·V, 2) px of the image as taken, and (B, U·V) bool in front."""
-        cells = self.grid.cells(intrinsics.dtype, intrinsics.device).reshape(1, -1, 2)
-        cells = cells.expand(intrinsics.shape[0], -1, -1)
-        pixels, valid = image_from_road_points(cells, intrinsics, extrinsics)
-        if distortion is None or distortion.shape[-1] == 0:
-            return pixels, valid
-        check_rows(distortion, pixels)
-        radius = normalise_points(pixels, intrinsics).norm(dim=-1)
-        seen = valid & (radius < max_undistorted_radius(distortion, model).unsqueeze(-1))
-        centre = intrinsics[:, None, :2, 2]
-        pixels = torch.where(seen.unsqueeze(-1), pixels, centre)  # no gradient through the folded part
-        return distort_points(pixels, intrinsics, distortion, model), seen
+        sums, lens = cells_and_lens(
+            self.grid, intrinsics, extrinsics, distortion, model, common_dtype(intrinsics)
+        )
+        points, hidden = image_coordinates(sums, lens)
+        return points.flatten(2).mT, hidden.flatten(1) == 0
+
+
+def check_image(image: Tensor) -> None:
+    """Raise ValueError unless this is a (B, C, h, w) map of floating point."""
+    if image.ndim != 4:
+        raise ValueError(f"image: expected (B, C, h, w), got {tuple(image.shape)}")
+    if not image.is_floating_point():
+        raise ValueError(f"image: expected floating point, got {image.dtype}")
+
+
+def check_cameras(
+    batch: int, intrinsics: Tensor, extrinsics: Extrinsics, distortion: Tensor | None, model: str
+) -> None:
+    """Raise ValueError unless there are ``batch`` cameras with poses, and lenses that exist."""
+    check_intrinsics(intrinsics, batch)
+    if extrinsics.pitch.shape != (batch,):
+        raise ValueError(f"extrinsics: expected ({batch},) each, got {tuple(extrinsics.pitch.shape)}")
+    if distortion is None:
+        return
+    if distortion.shape[:-1] != (batch,):
+        raise ValueError(f"distortion: expected ({batch}, D) like the points, got {tuple(distortion.shape)}")
+    check_lens(distortion, model)

@@ -1,0 +1,68 @@
+"""Lens distortion of one point per cell: the models of ``geometry.distortion``, in few passes over memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+_CENTRE = 1e-16  # squared radius below which a fisheye's factor is 1: sqrt has no gradient at 0
+
+
+def distort_planes(points: Tensor, squared_radius: Tensor, distortion: Tensor, model: str) -> Tensor:
+    """Compute where a lens images points of the ideal z = 1 plane, but for the tilt of a sensor.
+
+    Source: :func:`lanebev.geometry.distortion.distort_plane`, to which it is equal; Brown-Conrady distortion
+    is written as x (g + 2 p₁ y + 2 p₂ x) + p₂ r² with the radial factor g, and y likewise.
+
+    Args:
+        points: (B, 2, ...), x and y.
+        squared_radius: (B, ...), x² + y²; a caller clamps it where the lens folds over.
+        distortion: (B, D), D at least 4, OpenCV's order.
+        model: "pinhole", "fisheye" or "omni".
+
+    Returns:
+        (B, 2, ...). Differentiable in all tensors.
+    """
+    k = [each.view(-1, *[1] * (squared_radius.ndim - 1)) for each in distortion.unbind(-1)]  # (B, 1, ...)
+    if model == "fisheye":
+        return points * fisheye_factor(squared_radius, k).unsqueeze(1)
+    if model == "omni":
+        shrink = 1 / (1 + k[0] * (1 + squared_radius).sqrt())
+        return brown_conrady(points * shrink.unsqueeze(1), squared_radius * shrink * shrink, k[1:])
+    return brown_conrady(points, squared_radius, k)
+
+
+def brown_conrady(points: Tensor, squared_radius: Tensor, k: Sequence[Tensor]) -> Tensor:
+    """Apply radial, tangential and thin-prism distortion to (B, 2, ...) points."""
+    x, y = points.unbind(1)
+    p1, p2 = k[2], k[3]
+    factor = torch.addcmul(radial_factor(squared_radius, k), y, 2 * p1)
+    factor = torch.addcmul(factor, x, 2 * p2)
+    offset = torch.stack([p2, p1], dim=1)
+    if len(k) > 8:  # thin prism: s1 r² + s2 r⁴ and s3 r² + s4 r⁴
+        prism = [first + second * squared_radius for first, second in ((k[8], k[9]), (k[10], k[11]))]
+        offset = offset + torch.stack(prism, dim=1)
+    return torch.addcmul(offset * squared_radius.unsqueeze(1), points, factor.unsqueeze(1))
+
+
+def radial_factor(squared_radius: Tensor, k: Sequence[Tensor]) -> Tensor:
+    """Compute (1 + k₁ r² + k₂ r⁴ + k₃ r⁶) / (1 + k₄ r² + k₅ r⁴ + k₆ r⁶), OpenCV's order of coefficients."""
+    factor = _one_plus_polynomial(squared_radius, [*k[:2], *k[4:5]])
+    return factor if len(k) < 8 else factor / _one_plus_polynomial(squared_radius, k[5:8])
+
+
+def fisheye_factor(squared_radius: Tensor, k: Sequence[Tensor]) -> Tensor:
+    """Compute θ (1 + k₁ θ² + k₂ θ⁴ + k₃ θ⁶ + k₄ θ⁸) / r with θ = atan r."""
+    radius = squared_radius.clamp(min=_CENTRE).sqrt()
+    theta = radius.atan()
+    return _one_plus_polynomial(theta * theta, k) * theta / radius
+
+
+def _one_plus_polynomial(variable: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
+    """1 + c₀ v + c₁ v² + …, by Horner's rule."""
+    value = coefficients[-1] * variable
+    for coefficient in reversed(coefficients[:-1]):
+        value = (value + coefficient) * variable
+    return value + 1
