@@ -47,7 +47,7 @@ def instant(monkeypatch):
 
 def batches(first, repeats=2, flip=0.5):
     view = ViewConfig(flip=flip)
-    return LiveBatches(lambda n: n / 6, STAGES, repeats, view, WindowConfig(), (3, 0), first, CPU, 64)
+    return LiveBatches(lambda n: n / 8, STAGES, repeats, 2, view, WindowConfig(), (3, 0), first, CPU, 64)
 
 
 def taken(first, count, **kwargs):
@@ -77,16 +77,19 @@ def test_labels_go_with_their_image(views):
 
 @pytest.mark.usefixtures("instant")
 def test_a_view_is_in_two_batches_on_end_and_sizes_follow_the_share():
-    found = taken(0, 6, flip=0.0)
-    assert [tuple(batch.image.shape) for batch in found] == [(4, 3, 48, 80)] * 3 + [(2, 3, 64, 96)] * 3
-    assert torch.equal(found[0].image[2:], found[1].image[:2])  # new ones become old ones
-    assert not torch.equal(found[0].image[:2], found[1].image[2:])
+    found = taken(0, 7, flip=0.0)
+    small, large = (3, 48, 80), (3, 64, 96)
+    shapes = [(2, *small), *[(4, *small)] * 3, (1, *large), *[(2, *large)] * 2]
+    assert [tuple(batch.image.shape) for batch in found] == shapes
+    for earlier, later in itertools.pairwise(found[1:4]):
+        assert torch.equal(earlier.image[2:], later.image[:2])  # new ones become old ones
+        assert not torch.equal(earlier.image[:2], later.image[2:])
 
 
 @pytest.mark.usefixtures("instant")
 def test_an_interrupted_stream_goes_on_where_it_was():
-    whole = taken(0, 5)
-    for first in (2, 3, 4):
+    whole = taken(0, 7)
+    for first in range(1, 7):
         (next_one,) = taken(first, 1)
         assert all(torch.equal(a, b) for a, b in zip(next_one, whole[first], strict=True))
 
@@ -136,6 +139,7 @@ SMALL = [
     "--model.init_args.network.base_width=4",
     "--model.init_args.network.decoder_width=4",
     "--model.init_args.init_from=null",
+    "--data.init_args.together=1",
     "--data.init_args.stages=[{until: 0.5, size: [48, 80], batch_size: 4},"
     " {until: 1.0, size: [64, 96], batch_size: 2}]",
 ]
@@ -174,7 +178,7 @@ def test_gpu_config_trains_by_steps_and_an_interrupted_run_ends_as_one_in_a_piec
     )
     assert all(torch.equal(value, parts["state_dict"][name]) for name, value in whole["state_dict"].items())
     views = [each["callbacks"]["Throughput"]["views"] for each in (whole, parts)]
-    assert views == [3 * 4 + 3 * 2] * 2
+    assert views == [2 + 2 * 4 + 1 + 2 * 2] * 2
     table = next((tmp_path / "whole").rglob("throughput.csv")).read_text().splitlines()
     assert table[0].startswith("step,used,views,views_per_s")
     assert len(table) > 3

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections import deque
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -49,7 +48,7 @@ def rendered(
     seed: Seed,
     device: torch.device,
     window: WindowConfig | None,
-    most: int,
+    rows: int,
 ) -> Views:
     """Render views.
 
@@ -59,15 +58,12 @@ def rendered(
         seed: decides everything, on one kind of device.
         device: where to render.
         window: of the views; None for whole images.
-        most: views rendered at once.
+        rows: views whose pixels are computed at once.
     """
     generator = torch.Generator().manual_seed(drawn(seed))
-    parts = []
-    for start in range(0, count, most):
-        frame = render_views(min(most, count - start), size, generator, device=device, window=window)
-        image = (255 * frame.image).round_().clamp_(0, 255).byte()
-        parts.append(Views(image, boundaries_as_taken(frame), frame.painted > 0.5, frame.visible > 0.5))
-    return Views(*(torch.cat(field) for field in zip(*parts, strict=True)))
+    frame = render_views(count, size, generator, device=device, window=window, rows=rows)
+    image = (255 * frame.image).round_().clamp_(0, 255).byte()
+    return Views(image, boundaries_as_taken(frame), frame.painted > 0.5, frame.visible > 0.5)
 
 
 def mirrored(views: Views, which: Tensor) -> Views:
@@ -92,21 +88,34 @@ def labelled(views: Views, config: ViewConfig) -> Batch:
     return Batch(views.image, (255 * maps.target).round_().byte(), maps.weight.byte())
 
 
+class Block(NamedTuple):
+    """Views rendered together, which become the new ones of several batches."""
+
+    views: Views
+    fresh: int  # views of each batch that are new
+
+    def part(self, batch: int) -> Views:
+        """Return the new views of the block's batch of this number."""
+        return Views(*(field[batch * self.fresh : (batch + 1) * self.fresh] for field in self.views))
+
+
 class LiveBatches(IterableDataset[Batch]):
     """Endless batches of new views; with ``repeats`` each view is in that many batches on end.
 
     Of a batch, one ``repeats``-th is new. So a view comes again beside others, and mirrored or not anew.
+    Views are rendered for several batches together, since a GPU renders many in little more time than few.
 
     Args:
-        share: of the run's budget that is used at a step.
-        stages: sizes of views and batches by that share.
+        share: of the run's budget that is used at a batch.
+        stages: sizes of views and batches by that share, at the beginning of each block.
         repeats: batches that have each view.
+        together: batches whose new views are rendered together, a block.
         view: stride and stripes of the labels, and the probability of mirroring.
         window: of the views; None for whole images.
         seed: with the number of the batch, decides everything.
         first: number of the first batch.
         device: where to render.
-        most: views rendered at once.
+        rows: views whose pixels are computed at once.
     """
 
     def __init__(
@@ -114,41 +123,43 @@ class LiveBatches(IterableDataset[Batch]):
         share: Callable[[int], float],
         stages: list[Stage],
         repeats: int,
+        together: int,
         view: ViewConfig,
         window: WindowConfig | None,
         seed: Seed,
         first: int,
         device: torch.device,
-        most: int,
+        rows: int,
     ) -> None:
         super().__init__()
-        self.share, self.stages, self.repeats = share, stages, repeats
+        self.share, self.stages, self.repeats, self.together = share, stages, repeats, together
         self.view, self.window, self.seed, self.first = view, window, seed, first
-        self.device, self.most = device, most
+        self.device, self.rows = device, rows
         self.watch = Stopwatch(device)
 
     def __iter__(self) -> Iterator[Batch]:
         """Render, mirror, label."""
-        recent: deque[tuple[Stage, Views]] = deque(maxlen=self.repeats)
+        blocks: dict[int, Block] = {}
         for number in itertools.count(self.first):
-            stage = stage_at(self.stages, self.share(number))
             with self.watch.time("rendering"):
-                if any(earlier is not stage for earlier, _ in recent):
-                    recent.clear()
-                for missing in range(self.repeats - 1 - len(recent), 0, -1):  # of a run's or a stage's start
-                    recent.append((stage, self._render(stage, number - missing)))
-                recent.append((stage, self._render(stage, number)))
-                views = Views(*(torch.cat(field) for field in zip(*(v for _, v in recent), strict=True)))
+                wanted = range(max(0, number - self.repeats + 1), number + 1)
+                needed = sorted({each // self.together for each in wanted})
+                blocks = {each: blocks.get(each) or self._render(each) for each in needed}
+                parts = [blocks[each // self.together].part(each % self.together) for each in wanted]
+                same = [part for part in parts if part.image.shape == parts[-1].image.shape]
+                views = Views(*(torch.cat(field) for field in zip(*same, strict=True)))
             with self.watch.time("labelling"):
                 rng = np.random.default_rng((*self.seed, number))
                 which = torch.from_numpy(rng.random(len(views.image)) < self.view.flip)
                 batch = labelled(mirrored(views, which.to(self.device)), self.view)
             yield batch
 
-    def _render(self, stage: Stage, number: int) -> Views:
-        count = max(1, stage.batch_size // self.repeats)
-        seed = (*self.seed, number + self.repeats)  # not negative
-        return rendered(count, stage.size, seed, self.device, self.window, self.most)
+    def _render(self, block: int) -> Block:
+        stage = stage_at(self.stages, self.share(block * self.together))
+        fresh = max(1, stage.batch_size // self.repeats)
+        seed = (*self.seed, block, 1)
+        views = rendered(fresh * self.together, stage.size, seed, self.device, self.window, self.rows)
+        return Block(views, fresh)
 
 
 class HeldOutBatches(IterableDataset[Batch]):
@@ -183,7 +194,8 @@ class LiveRoads(L.LightningDataModule):
         stages: sizes of views and batches, by the share of the run's steps or minutes that is used.
         batch_share: of all batch sizes; halve it where memory does not suffice.
         repeats: batches that have each view; more than 1 where rendering takes longer than training.
-        most: views rendered at once, for the memory's sake.
+        together: batches whose new views are rendered together.
+        rows: views whose pixels are computed at once, for the memory's sake.
         window: how windows about the horizon are drawn; None for whole images.
         view: stride and stripes of the labels, and the probability of mirroring; the rest of it is not used.
         val_size: (height, width) of whole frames in validation.
@@ -197,7 +209,8 @@ class LiveRoads(L.LightningDataModule):
         stages: list[Stage],
         batch_share: PositiveFloat = 1.0,
         repeats: PositiveInt = 1,
-        most: PositiveInt = 64,
+        together: PositiveInt = 4,
+        rows: PositiveInt = 256,
         window: WindowConfig | None = None,
         view: ViewConfig | None = None,
         val_size: tuple[PositiveInt, PositiveInt] = (320, 576),
@@ -212,7 +225,8 @@ class LiveRoads(L.LightningDataModule):
             Stage(stage.until, stage.size, max(repeats, round(batch_share * stage.batch_size)))
             for stage in stages
         ]
-        self.repeats, self.most, self.window, self.view = repeats, most, window, view or ViewConfig()
+        self.repeats, self.together, self.rows = repeats, together, rows
+        self.window, self.view = window, view or ViewConfig()
         self.val_size, self.val_batch_size, self.val_batches = val_size, val_batch_size, val_batches
         self.seed = seed
         self.batches: LiveBatches | None = None  # of the training under way
@@ -226,12 +240,13 @@ class LiveRoads(L.LightningDataModule):
             lambda number: used_share(trainer, number // every),
             self.stages,
             self.repeats,
+            self.together,
             self.view,
             self.window,
             (self.seed, rank),
             first,
             trainer.strategy.root_device,
-            self.most,
+            self.rows,
         )
         return DataLoader(self.batches, batch_size=None)
 
