@@ -13,6 +13,7 @@ from lanebev.render.raster.rays import pixel_rays
 from lanebev.render.scene.alignment import build_alignment
 from lanebev.render.scene.camera import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
 from lanebev.render.scene.sampler import BatchSampler
+from lanebev.render.scene.street import no_street
 from lanebev.render.scene.world import World, sample_course, sample_world, scene_at
 from lanebev.render.truth import boundary_points, project
 from lanebev.render.views import sample_place
@@ -20,9 +21,9 @@ from lanebev.render.views import sample_place
 SIZE = (360, 640)
 
 
-def bare_world(sampler: BatchSampler) -> tuple[World, torch.Tensor]:
+def bare_world(sampler: BatchSampler, kind: str = "highway") -> tuple[World, torch.Tensor]:
     """Solid white single stripes on an even black road, nothing else, in even light."""
-    world, ego_lane = sample_world(sampler, "highway")
+    world, ego_lane = sample_world(sampler, kind)
     layout, pavement = world.layout, world.pavement
     zero, solid = torch.zeros_like(layout.opacity), torch.full_like(layout.dash, 10.0)
     layout = layout._replace(
@@ -60,18 +61,33 @@ def bare_world(sampler: BatchSampler) -> tuple[World, torch.Tensor]:
     )
     bridge = torch.full_like(world.bridge, math.inf)
     world = world._replace(
-        layout=layout, pavement=pavement, surroundings=around, traffic=traffic, weather=weather, bridge=bridge
+        works=world.works._replace(strength=0 * world.works.strength, scar=0 * world.works.scar),
+        layout=layout,
+        pavement=pavement,
+        surroundings=around,
+        traffic=traffic,
+        weather=weather,
+        bridge=bridge,
     )
-    return world._replace(shade=none), ego_lane
+    return world._replace(shade=none, street=no_street(sampler)), ego_lane
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("model", "seed"), [("pinhole", 0), ("pinhole", 1), ("fisheye", 2)])
-def test_points_lie_on_the_centre_of_the_painted_stripe(model: str, seed: int) -> None:
+@pytest.mark.parametrize(
+    ("model", "seed", "kind"),
+    [
+        ("pinhole", 0, "highway"),
+        ("pinhole", 1, "highway"),
+        ("fisheye", 2, "highway"),
+        ("pinhole", 3, "city"),
+        ("pinhole", 4, "works"),
+    ],
+)
+def test_points_lie_on_the_centre_of_the_painted_stripe(model: str, seed: int, kind: str) -> None:
     """The stripe's centroid across the boundary, measured in the radiance, is the point, to 0.05 px."""
     batch = 4
     sampler = BatchSampler(batch, torch.Generator().manual_seed(seed))
-    world, ego_lane = bare_world(sampler)
+    world, ego_lane = bare_world(sampler, kind)
     world, place = sample_place(sampler, world, ego_lane)
     alignment = build_alignment(*sample_course(sampler))
     intrinsics = sample_intrinsics(sampler, SIZE)

@@ -35,7 +35,8 @@ def varied_camera(sampler: BatchSampler, kinds: Kinds, sensor: Sensor) -> Sensor
     noisy = torch.where(night, sampler.uniform(0.5, 2.5), 1.0)
     noisy = noisy * torch.where(camera & sampler.chance(0.3), sampler.uniform(1.0, 3.0), 1.0)
     crude = camera & sampler.chance(0.35)
-    bonnet = torch.where(sampler.chance(0.5), sampler.uniform(0.03, 0.3), sensor.bonnet)
+    bonnet = torch.where(sampler.chance(0.5), sampler.uniform(0.03, 0.28), sensor.bonnet)
+    bonnet = torch.where(night & sampler.chance(0.2), sampler.uniform(0.2, 0.4), bonnet)
     soft = camera & sampler.chance(0.3)
     return sensor._replace(
         exposure=exposure * over,
