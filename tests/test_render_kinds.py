@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from lanebev.geometry.lens import distort_points
-from lanebev.render import RenderedFrame, render_views
+from lanebev.render import Drive, RenderedFrame, render_views
 from lanebev.render.raster.effects import add_bonnet
 from lanebev.render.raster.glass import behind_glass, recorded
 from lanebev.render.raster.glyphs import GLYPH_LENGTH, glyph_coverage
@@ -26,6 +26,7 @@ from lanebev.render.scene.layout import presence
 from lanebev.render.scene.night import sample_lights
 from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.street import PLAIN, no_street
+from lanebev.render.scene.traffic import NUM_VEHICLES
 from lanebev.render.scene.weather import Light
 from lanebev.render.scene.world import Place, World, sample_course, sample_world, scene_at
 from lanebev.render.views import render_scenes, sample_place
@@ -308,3 +309,16 @@ def test_a_black_frame_hides_what_is_under_it() -> None:
     outer = (points < 0.04 * SIZE[1]) | (points > 0.96 * SIZE[1])
     assert (open_sides.visible * outer).sum() > 0
     assert (framed.visible * outer).sum() == 0
+
+
+def test_on_a_street_lanes_keep_their_directions_as_the_drive_goes_on() -> None:
+    """Vehicles of the own direction drive with the camera, those of the other one towards it."""
+    for seed in range(6):
+        world = Drive(seed, SIZE, num_frames=60, kind="city").world
+        street, traffic = world.street, world.traffic
+        across, speed = traffic.across[0, :NUM_VEHICLES], traffic.speed[0, :NUM_VEHICLES]
+        low = world.layout.across[0, street.first[0]]
+        high = world.layout.across[0, street.first[0] + street.own[0]]
+        own = (across > low) & (across < high)
+        assert (speed[own] >= -3).all()
+        assert (speed[~own] < -20).all()

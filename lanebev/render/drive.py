@@ -22,6 +22,7 @@ from lanebev.types import Extrinsics
 
 _SCENERY_PERIOD = 450.0  # m; bridges, signs and lamps come again
 _ONCOMING_PERIOD = 420.0  # m
+_COMING, _COMING_TOGETHER, _SLOWEST = -20.0, -28.0, -3.0  # m/s relative to the camera: who is faster comes
 _BEHIND = 40.0  # m behind the camera at which things move to the far end
 _LANE_CHANGE = 4.5  # s
 _DAMPING, _BUMP_RATE = 4.0, 9.0  # 1/s and rad/s of a suspension after a bump
@@ -147,13 +148,14 @@ class Drive:
 
     def _sample_lanes(self, sampler: BatchSampler, first: int, duration: float, lane_changes: bool) -> None:
         """Lane changes as (start time, from lane, to lane)."""
-        lanes = int(self.world.layout.exists.sum()) - 1
+        street = self.world.street
+        lowest, lanes = int(street.first), int(street.own) or int(self.world.layout.exists.sum()) - 1
         self._changes: list[tuple[float, int, int]] = []
-        self._first_lane = lane = min(first, max(lanes - 1, 0))
+        self._first_lane = lane = min(first, lowest + max(lanes - 1, 0))
         time = float(sampler.uniform(3.0, 7.0))
         while lane_changes and lanes > 1 and time + _LANE_CHANGE < duration:
             step = 1 if bool(sampler.chance(0.5)) else -1
-            target = lane + step if 0 <= lane + step < lanes else lane - step
+            target = lane + step if lowest <= lane + step < lowest + lanes else lane - step
             self._changes.append((time, lane, target))
             lane, time = target, time + float(sampler.uniform(7.0, 16.0))
 
@@ -214,7 +216,9 @@ class Drive:
         traffic = world.traffic
         lane = torch.tensor([self._ego_lane(a) for a in traffic.across[0, :NUM_VEHICLES].tolist()])
         speed = traffic.speed.clone()
-        speed[0, :NUM_VEHICLES] = speed[0, lane]  # the first few speeds serve as those of the lanes
+        coming = speed[0, :NUM_VEHICLES] < _COMING
+        own = speed[0, lane].clamp(min=_SLOWEST)  # the first few speeds serve as those of the lanes
+        speed[0, :NUM_VEHICLES] = torch.where(coming, _COMING_TOGETHER, own)
         valid = traffic.valid.clone()
         for time in torch.arange(0, float(self.times[-1]) + 0.5, 0.5).tolist():
             across, along = (
@@ -229,7 +233,7 @@ class Drive:
         """The world, its traffic where it is by then and its scenery wrapped about the camera."""
         traffic = self.world.traffic
         ahead = traffic.along + traffic.speed * time  # of the camera
-        oncoming, still = traffic.speed < -20, traffic.speed == 0
+        oncoming, still = traffic.speed < _COMING, traffic.speed == 0
         ahead = torch.where(oncoming, (ahead + _BEHIND) % _ONCOMING_PERIOD - _BEHIND, ahead)
         ahead = torch.where(still, (traffic.along - arc + _BEHIND) % _SCENERY_PERIOD - _BEHIND, ahead)
         begin, end = self.world.bridge.unbind(1)
