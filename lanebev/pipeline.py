@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from lanebev.geometry.lens import check_intrinsics
 from lanebev.geometry.precision import autocast_off, common_dtype
 from lanebev.observation.lines import undistort_segments
-from lanebev.types import Calibration, LaneSegments, register_pytree
+from lanebev.types import Calibration, LaneSegments, check_tensor, register_pytree
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
 
@@ -144,12 +145,14 @@ class LaneBEV(nn.Module):
         Raises:
             ValueError: shapes that don't fit, or an image of whole numbers.
         """
+        check_tensor("image", image)
         if image.ndim not in (4, 5) or image.shape[-3] != 3:
             raise ValueError(f"image: expected (B, 3, H, W) or (B, T, 3, H, W), got {tuple(image.shape)}")
         if not image.is_floating_point():
             raise ValueError(f"image: expected floating point in [0, 1], got {image.dtype}")
         if 0 in image.shape[1:]:  # B may be 0
             raise ValueError(f"image: expected frames with pixels, got {tuple(image.shape)}")
+        check_intrinsics(intrinsics, image.shape[0])
         if state is None:
             state = self.initial_state(image.shape[0], common_dtype(intrinsics), image.device)
         frames = image if image.ndim == 5 else image.unsqueeze(1)

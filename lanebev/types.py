@@ -39,6 +39,18 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: T) -> T:
     return value
 
 
+def check_tensor(name: str, value: object) -> None:
+    """Raise unless an argument is a tensor.
+
+    Raises:
+        TypeError: naming the argument, what came and what to do.
+    """
+    if not isinstance(value, Tensor):
+        kind = f"{type(value).__module__}.{type(value).__qualname__}".removeprefix("builtins.")
+        remedy = "torch.from_numpy(...)" if kind == "numpy.ndarray" else "torch.as_tensor(...)"
+        raise TypeError(f"{name}: expected a torch.Tensor, got {kind}; convert numbers with {remedy}")
+
+
 class Status(IntEnum):
     """What a row of a calibration is worth. A new meaning is a new value."""
 
@@ -64,6 +76,46 @@ class LaneSegments(NamedTuple):
     weight: Tensor
     sigma: Tensor
 
+    def check(self, num_boundaries: int = NUM_BOUNDARIES) -> LaneSegments:
+        """Check what calibrators leave unchecked, since it would wait for the device: the numbers.
+
+        To a calibrator a segment that cannot be used is one that is not there. That is right for a detector's
+        bad frame and hides a mistake of the code that makes segments: check its first ones.
+
+        Args:
+            num_boundaries: L.
+
+        Returns:
+            the segments themselves.
+
+        Raises:
+            TypeError: a part is no tensor.
+            ValueError: a part has another shape or dtype, or a segment that is there has a boundary index
+                outside 0..L-1, a weight outside 0..1, an end point that is not finite or a sigma that is
+                not positive.
+        """
+        for name, part in self._asdict().items():
+            check_tensor(f"segments.{name}", part)
+        rows = self.weight.shape
+        shapes = {"endpoints": (*rows, 2, 2), "boundary": rows, "sigma": rows}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                got = tuple(getattr(self, name).shape)
+                raise ValueError(f"segments.{name}: expected {tuple(shape)}, got {got}")
+        if self.boundary.dtype != torch.int64:
+            raise ValueError(f"segments.boundary: expected int64 indices, got {self.boundary.dtype}")
+        seen, last = self.weight != 0, num_boundaries - 1
+        for name, expected, good in (
+            ("weight", "0 to 1", (self.weight >= 0) & (self.weight <= 1)),
+            ("boundary", f"0 to {last}", (self.boundary >= 0) & (self.boundary <= last)),
+            ("endpoints", "finite px", self.endpoints.isfinite().flatten(2).all(-1)),
+            ("sigma", "positive finite px", (self.sigma > 0) & self.sigma.isfinite()),
+        ):
+            if bool((seen & ~good).any()):
+                got = getattr(self, name)[seen & ~good][0].tolist()
+                raise ValueError(f"segments.{name}: expected {expected}, got {got}")
+        return self
+
 
 @register_pytree
 class Extrinsics(NamedTuple):
@@ -85,9 +137,35 @@ class Extrinsics(NamedTuple):
     @classmethod
     def unstack(cls, values: Tensor) -> Extrinsics:
         """From a (B, 4) tensor of (pitch, yaw, roll, height)."""
+        check_tensor("values", values)
         if values.shape[-1] != 4:
             raise ValueError(f"values: expected (..., 4), got {tuple(values.shape)}")
         return cls(*values.unbind(-1))
+
+
+def check_extrinsics(extrinsics: object, *rows: int) -> None:
+    """Raise unless these are extrinsics of tensors, each of the shape ``rows`` if that is given.
+
+    Raises:
+        TypeError: not :class:`Extrinsics`, or not of tensors.
+        ValueError: another shape.
+    """
+    if not isinstance(extrinsics, Extrinsics):
+        raise TypeError(
+            "extrinsics: expected lanebev.Extrinsics(pitch, yaw, roll, height), each a tensor (B,), got "
+            f"{type(extrinsics).__qualname__}; Extrinsics.unstack makes it of a tensor (B, 4)"
+        )
+    for name, part in extrinsics._asdict().items():
+        check_tensor(f"extrinsics.{name}", part)
+        if rows and part.shape != rows:
+            raise ValueError(f"extrinsics.{name}: expected {rows}, got {tuple(part.shape)}")
+
+
+def check_calibration(calibration: object) -> None:
+    """Raise TypeError unless this is what a calibrator returns."""
+    if not isinstance(calibration, Calibration):
+        got = type(calibration).__qualname__
+        raise TypeError(f"calibration: expected a calibrator's lanebev.Calibration, got {got}")
 
 
 @register_pytree

@@ -538,7 +538,7 @@ def test_bad_input_is_named():
     state = calibrator.initial_state(2, dtype=DOUBLE)
     with pytest.raises(ValueError, match=r"intrinsics: expected \(2, 3, 3\)"):
         calibrator(segments, CAMERA, state, 0.1)
-    with pytest.raises(ValueError, match="lane_width: expected a positive width"):
+    with pytest.raises(ValueError, match="lane_width: expected 1 to 10 m"):
         calibrator(segments, cameras(2), state, 0.1, -1.0)
     with pytest.raises(ValueError, match="dt: expected a float"):
         calibrator(segments, cameras(2), state, torch.ones(3), WIDTH)

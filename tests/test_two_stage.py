@@ -393,7 +393,7 @@ def test_shapes_are_checked(change, message):
 def test_arguments_are_checked():
     calibrator = TwoStageCalibrator()
     state = calibrator.initial_state(1, dtype=torch.float64)
-    with pytest.raises(ValueError, match="lane_width: expected a positive width"):
+    with pytest.raises(ValueError, match="lane_width: expected 1 to 10 m"):
         calibrator(lanes(), K[None], state, 1 / 30, -3.7)
     with pytest.raises(ValueError, match=r"lane_width: expected a float, \(1,\) or \(1, 5\), got \(1, 3\)"):
         calibrator(lanes(), K[None], state, 1 / 30, torch.ones(1, 3))
@@ -520,5 +520,5 @@ def test_what_does_not_fit_the_batch_is_named(calibrator):
             calibrator(segments, cameras, wrong, 0.1)
     with pytest.raises(ValueError, match=r"dt: expected a float or \(2,\), got \(3,\)"):
         calibrator(segments, cameras, state, torch.ones(3))
-    with pytest.raises(ValueError, match="lane_width: expected a positive width in m, got inf"):
+    with pytest.raises(ValueError, match="lane_width: expected 1 to 10 m, got inf"):
         calibrator(segments, cameras, state, 0.1, math.inf)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral
@@ -23,6 +24,7 @@ from lanebev.geometry.lens import (
     max_undistorted_radius,
     normalise_points,
 )
+from lanebev.types import check_tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +46,8 @@ class Camera:
     image_size: tuple[int, int]
 
     def __post_init__(self) -> None:
+        check_tensor("intrinsics", self.intrinsics)
+        check_tensor("distortion", self.distortion)
         if self.intrinsics.shape != (3, 3):
             raise ValueError(f"intrinsics: expected (3, 3), got {tuple(self.intrinsics.shape)}")
         if self.distortion.ndim != 1:
@@ -155,6 +159,8 @@ class Camera:
 
     def scaled(self, image_size: tuple[int, int]) -> Camera:
         """The camera of the image resized to (height, width); pixel centres at integers on both sides."""
+        if not (isinstance(image_size, Sequence) and len(image_size) == 2):
+            raise TypeError(f"image_size: expected (height, width) in px, got {image_size!r}")
         sy, sx = image_size[0] / self.image_size[0], image_size[1] / self.image_size[1]
         resize = self.intrinsics.new_tensor(
             [[sx, 0.0, 0.5 * (sx - 1)], [0.0, sy, 0.5 * (sy - 1)], [0.0, 0.0, 1.0]]

@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
-import math
+from numbers import Integral, Real
 
 import torch
 from torch import Tensor
 
 from lanebev.geometry.lens import check_intrinsics, placeholder_intrinsics, usable_cameras
-from lanebev.types import LaneSegments, Status, TensorTuple
+from lanebev.types import LaneSegments, Status, TensorTuple, check_tensor
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
 _MIN_SIGMA = 1e-3  # px; nothing is known better
 _MIN_SEGMENTS = 2  # that the estimators' reductions and pairs ask for; the rest is padding
 _HARMLESS_WIDTH = 3.7  # m
+LANE_WIDTHS = (1.0, 10.0)  # m, that a lane may have
 
 
 def check_segments(segments: LaneSegments, intrinsics: Tensor) -> None:
     """Raise on shapes that don't fit each other, and on whole numbers.
 
     Raises:
+        TypeError: no :class:`LaneSegments`, or not of tensors.
         ValueError: naming the tensor, what was expected and what came.
     """
+    if not isinstance(segments, LaneSegments):
+        raise TypeError(f"segments: expected lanebev.LaneSegments(...), got {type(segments).__qualname__}")
+    for name, part in segments._asdict().items():
+        check_tensor(f"segments.{name}", part)
     ends = segments.endpoints
     if ends.ndim != 4 or ends.shape[2:] != (2, 2):
         raise ValueError(f"segments.endpoints: expected (B, N, 2, 2), got {tuple(ends.shape)}")
@@ -61,6 +67,21 @@ def check_state(state: TensorTuple, kind: type[TensorTuple], rows: int) -> Tenso
     if like.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"state.{first}: expected float32 or float64, got {like.dtype}")
     return like
+
+
+def check_new_state(batch_size: object, dtype: torch.dtype) -> None:
+    """Raise unless a state can have so many rows and this dtype.
+
+    Raises:
+        TypeError: a batch size that is no whole number.
+        ValueError: a negative batch size, or another dtype than float32 and float64.
+    """
+    if not isinstance(batch_size, (int, torch.SymInt, Integral)) or isinstance(batch_size, bool):
+        raise TypeError(f"batch_size: expected a whole number, got {batch_size!r}")
+    if int(batch_size) < 0:
+        raise ValueError(f"batch_size: expected 0 or more, got {batch_size}")
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")
 
 
 def clean_segments(segments: LaneSegments, num_boundaries: int) -> LaneSegments:
@@ -132,22 +153,33 @@ def as_batch(value: float | Tensor, like: Tensor, name: str = "dt") -> Tensor:
     """A number or a (B,) tensor to (B,), with the dtype and device of ``like`` (B, ...).
 
     Raises:
+        TypeError: neither number nor tensor.
         ValueError: another shape.
     """
+    _check_number(name, value)
     tensor = torch.as_tensor(value, dtype=like.dtype, device=like.device)
     if tensor.ndim > 1 or (tensor.ndim == 1 and tensor.shape[0] not in (1, like.shape[0])):
         raise ValueError(f"{name}: expected a float or ({like.shape[0]},), got {tuple(tensor.shape)}")
     return tensor.expand(like.shape[0])
 
 
+def _check_number(name: str, value: object) -> None:
+    """Raise TypeError unless this is a number, a symbolic one of ``torch.export`` too, or a tensor."""
+    if not isinstance(value, (int, float, torch.Tensor, torch.SymInt, torch.SymFloat, Real)):
+        raise TypeError(f"{name}: expected a number or a torch.Tensor, got {type(value).__qualname__}")
+
+
 def as_lane_width(value: float | Tensor, like: Tensor, num_boundaries: int) -> Tensor:
     """Lane width prior to (B, L-1) m: from a float, (B,) or (B, L-1).
 
     Raises:
-        ValueError: another shape, or a float that is not positive.
+        TypeError: neither number nor tensor.
+        ValueError: another shape, or a number that is no lane's width in metres.
     """
-    if isinstance(value, (int, float)) and not 0 < value < math.inf:
-        raise ValueError(f"lane_width: expected a positive width in m, got {value}")
+    _check_number("lane_width", value)
+    least, most = LANE_WIDTHS
+    if isinstance(value, (int, float)) and not least <= value <= most:
+        raise ValueError(f"lane_width: expected {least:g} to {most:g} m, got {value}")
     width = torch.as_tensor(value, dtype=like.dtype, device=like.device)
     rows, lanes, got = like.shape[0], num_boundaries - 1, tuple(width.shape)
     if width.ndim == 1:

@@ -19,6 +19,7 @@ from lanebev.geometry.distortion import (
 )
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.undistortion import undistort_plane
+from lanebev.types import check_tensor
 
 __all__ = [
     "DISTORTION_LENGTHS",
@@ -52,6 +53,7 @@ def check_rows(distortion: Tensor, points: Tensor) -> None:
 
 def _check(points: Tensor, distortion: Tensor, model: str) -> None:
     check_points(points)
+    check_tensor("distortion", distortion)
     check_lens(distortion, model)
     check_rows(distortion, points)
 
@@ -60,8 +62,10 @@ def check_intrinsics(intrinsics: Tensor, *rows: int) -> None:
     """Raise unless these are (*rows, 3, 3) matrices of floating point.
 
     Raises:
+        TypeError: not a tensor.
         ValueError: saying what was expected and what came.
     """
+    check_tensor("intrinsics", intrinsics)
     if intrinsics.shape != (*rows, 3, 3):
         raise ValueError(f"intrinsics: expected {(*rows, 3, 3)}, got {tuple(intrinsics.shape)}")
     if not intrinsics.is_floating_point():
@@ -81,6 +85,7 @@ def placeholder_intrinsics(like: Tensor) -> Tensor:
 
 def check_points(points: Tensor, size: int = 2) -> None:
     """Raise unless these are (..., N, size) points."""
+    check_tensor("points", points)
     if points.ndim < 2 or points.shape[-1] != size:
         raise ValueError(f"points: expected (..., N, {size}), got {tuple(points.shape)}")
 

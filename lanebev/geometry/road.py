@@ -7,10 +7,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from lanebev.geometry.lens import normalise_points
+from lanebev.geometry.lens import check_points, normalise_points
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import road_from_cam
-from lanebev.types import Extrinsics
+from lanebev.types import Extrinsics, check_extrinsics
 
 
 def rays_from_pixels(points: Tensor, intrinsics: Tensor) -> Tensor:
@@ -71,6 +71,7 @@ def road_from_image_points(
     Returns:
         (B, N, 2) m, (X right, Z along the lanes), and (B, N) bool, false above the horizon or behind.
     """
+    check_points(points)
     rays = rays_from_pixels(points, intrinsics) @ _road_from_cam(extrinsics).mT  # (B, N, 3)
     x, down, z = rays.unbind(-1)
     valid = down > 1e-6
@@ -92,9 +93,11 @@ def image_from_road_points(
     Returns:
         (B, N, 2) px, and (B, N) bool, false behind the camera, and for one that is not above the road.
     """
+    check_points(points)
+    rotation = _road_from_cam(extrinsics)
     x, z = points.unbind(-1)
     road = torch.stack([x, extrinsics.height.unsqueeze(-1).expand_as(x), z], dim=-1)
-    pixels = road @ _road_from_cam(extrinsics) @ intrinsics.mT  # rows: (K R_cam_from_road p)ᵀ
+    pixels = road @ rotation @ intrinsics.mT  # rows: (K R_cam_from_road p)ᵀ
     depth = pixels[..., 2]
     valid = (depth > 1e-3) & (extrinsics.height > 0).unsqueeze(-1)
     return pixels[..., :2] / torch.where(valid, depth, 1.0).unsqueeze(-1), valid
@@ -174,4 +177,5 @@ def _propagated(
 
 
 def _road_from_cam(extrinsics: Extrinsics) -> Tensor:
+    check_extrinsics(extrinsics)
     return road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)

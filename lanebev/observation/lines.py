@@ -14,7 +14,7 @@ from lanebev.geometry.lens import (
 from lanebev.geometry.precision import full_precision
 from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.observation.vertices import LineConfig, representative_vertices, scan_vertices, take
-from lanebev.types import LaneSegments
+from lanebev.types import LaneSegments, check_tensor
 
 NETWORK_CORRELATION = 10.0
 """``LineConfig.correlation``, px: what rows of ``lanes.json`` are apart, so that LaneBEV and a run agree."""
@@ -61,6 +61,7 @@ class LineExtractor(nn.Module):
         Raises:
             ValueError: another shape, or a map that is not of the network's input by the stride.
         """
+        check_tensor("logits", logits)
         if logits.ndim != 4 or logits.shape[1] < 2:
             raise ValueError(f"logits: expected (B, 1+L, h, w), got {tuple(logits.shape)}")
         return extract_segments(logits.softmax(1)[:, 1:], image_size, self.config, network_size)

@@ -9,7 +9,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lanebev.observation.resnet import ResNet18
-from lanebev.types import NUM_BOUNDARIES
+from lanebev.types import NUM_BOUNDARIES, check_tensor
+
+_LARGEST = 8.0  # of an image in [0, 1], whatever was done to its contrast; one in [0, 255] has more
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -106,12 +108,15 @@ class LaneSegmenter(nn.Module):
             (B, 1+L, ceil(H/s), ceil(W/s)) logits: background is channel 0, boundary k is channel 1+k.
 
         Raises:
-            ValueError: another shape, or whole numbers.
+            TypeError: not a tensor.
+            ValueError: another shape, or whole numbers; on the CPU also values far beyond 1.
         """
+        check_tensor("image", image)
         if image.ndim != 4 or image.shape[1] != 3:
             raise ValueError(f"image: expected (B, 3, H, W), got {tuple(image.shape)}")
         if not image.is_floating_point():
             raise ValueError(f"image: expected floating point in [0, 1], got {image.dtype}")
+        _check_scale(image)
         stem, c2, c3, c4, c5 = self.trunk((image - self.mean) / self.std)
         lateral2, lateral3, lateral4, lateral5 = self.lateral
         x = lateral5(c5) + self.position(_positions(c5))
@@ -128,6 +133,18 @@ class LaneSegmenter(nn.Module):
         logits = F.pixel_shuffle(self.head(x), self.shuffle)
         stride = self.config.output_stride
         return logits[..., : -(-image.shape[-2] // stride), : -(-image.shape[-1] // stride)]
+
+
+def _check_scale(image: Tensor) -> None:
+    """Raise ValueError where a finite image is not in [0, 1] but in [0, 255], unless asking is slow.
+
+    To look at the values of another device would wait for it, and a compiled program cannot.
+    """
+    if torch.compiler.is_compiling() or image.device.type != "cpu" or not image.numel():
+        return
+    largest = float(image.detach().nan_to_num(0.0, 0.0, 0.0).amax())
+    if largest > _LARGEST:
+        raise ValueError(f"image: expected values in [0, 1], got {largest:g}; divide bytes by 255")
 
 
 class StripMessage(nn.Module):

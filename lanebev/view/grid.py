@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from lanebev.geometry.lens import cam_from_image, check_intrinsics
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import road_from_cam
-from lanebev.types import Extrinsics
+from lanebev.types import Extrinsics, check_extrinsics
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,10 @@ class BEVGrid:
     def __post_init__(self) -> None:
         if not (self.resolution > 0 and math.isfinite(self.resolution)):
             raise ValueError(f"resolution: expected > 0 m and finite, got {self.resolution}")
-        for name, (low, high) in (("x", self.x), ("z", self.z)):
+        for name, interval in (("x", self.x), ("z", self.z)):
+            if not (isinstance(interval, Sequence) and len(interval) == 2):
+                raise TypeError(f"{name}: expected (low, high) in m, got {interval!r}")
+            low, high = interval
             if not (high - low >= self.resolution and math.isfinite(high - low)):
                 raise ValueError(
                     f"{name}: expected finite (low, high), high above low by {self.resolution} m, a cell, at "
@@ -102,7 +106,10 @@ def bev_from_image(extrinsics: Extrinsics, intrinsics: Tensor, grid: BEVGrid) ->
     Raises:
         ValueError: intrinsics of another batch, or of whole numbers.
     """
+    check_extrinsics(extrinsics)
     check_intrinsics(intrinsics, *extrinsics.pitch.shape)
+    if not isinstance(grid, BEVGrid):
+        raise TypeError(f"grid: expected lanebev.BEVGrid(...), got {type(grid).__qualname__}")
     rows = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)
     right, down, forward = rows.unbind(-2)
     plane_from_cam = torch.stack([right, forward, down / extrinsics.height.unsqueeze(-1)], dim=-2)

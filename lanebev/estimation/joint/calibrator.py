@@ -8,7 +8,7 @@ from torch import Tensor
 from lanebev.batch import flag, may_skip, select_rows
 from lanebev.estimation import kalman
 from lanebev.estimation.calibrator import Calibrator
-from lanebev.estimation.checks import is_running
+from lanebev.estimation.checks import check_new_state, is_running
 from lanebev.estimation.joint.dynamics import (
     NUM_COMMON,
     NUM_POSE,
@@ -67,6 +67,7 @@ class JointCalibrator(Calibrator[JointState]):
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
     ) -> JointState:
         """State before the first frame: the prior, UNINITIALISED."""
+        check_new_state(batch_size, dtype)
         cfg = self.config
         like = torch.zeros((), dtype=dtype, device=device)
         mean, cov = begin(

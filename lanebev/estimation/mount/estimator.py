@@ -12,10 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.batch import flag
-from lanebev.estimation.checks import as_batch, check_state
+from lanebev.estimation.checks import as_batch, check_new_state, check_state
 from lanebev.estimation.mount.config import MountConfig
 from lanebev.estimation.mount.results import MountCalibration, MountReason, MountState, MountStatus
-from lanebev.types import Calibration, Extrinsics, Status
+from lanebev.types import Calibration, Extrinsics, Status, check_calibration
 
 _LIMIT_REASONS = (
     MountReason.PITCH_LIMIT,
@@ -43,6 +43,7 @@ class MountEstimator(nn.Module):
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
     ) -> MountState:
         """Return the state before the first frame: no blocks, UNCALIBRATED."""
+        check_new_state(batch_size, dtype)
         zero = torch.zeros(batch_size, 4, dtype=dtype, device=device)
         blocks = torch.zeros(batch_size, self.config.num_blocks, 4, dtype=dtype, device=device)
         none = torch.zeros(batch_size, 4, dtype=torch.int64, device=device)
@@ -86,9 +87,11 @@ class MountEstimator(nn.Module):
             the mount and the state after the frame.
 
         Raises:
+            TypeError: no :class:`Calibration`.
             ValueError: a shape that doesn't fit, or another estimator's state.
         """
         cfg = self.config
+        check_calibration(calibration)
         pose = calibration.extrinsics.stack()
         pose = pose.to(check_state(state, MountState, pose.shape[0]).dtype)
         variance = calibration.covariance.diagonal(dim1=-2, dim2=-1).to(pose.dtype)

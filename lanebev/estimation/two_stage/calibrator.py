@@ -7,7 +7,7 @@ from torch import Tensor
 
 from lanebev.batch import select_rows
 from lanebev.estimation.calibrator import Calibrator
-from lanebev.estimation.checks import is_running
+from lanebev.estimation.checks import check_new_state, is_running
 from lanebev.estimation.two_stage.direction import track_direction
 from lanebev.estimation.two_stage.lane_width import boundary_angles
 from lanebev.estimation.two_stage.roll_height import track_roll_height
@@ -44,6 +44,7 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
     ) -> TwoStageState:
         """State before the first frame: the initial pose with its uncertainty, UNINITIALISED."""
+        check_new_state(batch_size, dtype)
         cfg = self.config
         pose, pose_std = cfg.initial_pose, cfg.initial_pose_std
         rate_std = cfg.initial_rate_std

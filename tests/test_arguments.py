@@ -1,0 +1,171 @@
+"""A careless caller's mistake is one error that names the argument and what was expected."""
+
+import numpy as np
+import pytest
+import torch
+
+import lanebev
+from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics, LaneSegments
+
+K = torch.tensor([[[500.0, 0, 319.5], [0, 500, 179.5], [0, 0, 1]]])
+POSE = Extrinsics.unstack(torch.tensor([[0.02, 0.01, 0.0, 1.5]]))
+NUMBERS = Extrinsics(0.02, 0.01, 0.0, 1.5)
+POINTS = torch.tensor([[[300.0, 300.0]]])
+GRID = BEVGrid(resolution=1.0)
+SEGMENTS = LaneSegments(
+    torch.rand(1, 8, 2, 2), torch.zeros(1, 8, dtype=torch.int64), torch.ones(1, 8), torch.ones(1, 8)
+)
+IMAGE = torch.rand(1, 3, 64, 96)
+CALIBRATORS = (lanebev.JointCalibrator(), lanebev.TwoStageCalibrator())
+
+
+@pytest.mark.parametrize("calibrator", CALIBRATORS, ids=lambda each: type(each).__name__)
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        (
+            {"segments": tuple(SEGMENTS)},
+            TypeError,
+            r"segments: expected lanebev.LaneSegments\(...\), got tuple",
+        ),
+        (
+            {"segments": LaneSegments(*(part.numpy() for part in SEGMENTS))},
+            TypeError,
+            r"segments.endpoints: expected a torch.Tensor, got numpy.ndarray; .* torch.from_numpy",
+        ),
+        ({"intrinsics": K.numpy()}, TypeError, "intrinsics: expected a torch.Tensor, got numpy.ndarray"),
+        ({"intrinsics": K[0]}, ValueError, r"intrinsics: expected \(1, 3, 3\), got \(3, 3\)"),
+        ({"state": None}, ValueError, r"state: expected \w+, begun by initial_state\(batch_size\)"),
+        ({"dt": None}, TypeError, "dt: expected a number or a torch.Tensor, got NoneType"),
+        ({"dt": "0.1"}, TypeError, "dt: expected a number or a torch.Tensor, got str"),
+        ({"lane_width": 370}, ValueError, "lane_width: expected 1 to 10 m, got 370"),
+        ({"lane_width": 0.3}, ValueError, "lane_width: expected 1 to 10 m, got 0.3"),
+        ({"lane_width": [3.7]}, TypeError, "lane_width: expected a number or a torch.Tensor, got list"),
+    ],
+)
+def test_calibrators(calibrator, arguments, error, message):
+    usual = {"segments": SEGMENTS, "intrinsics": K, "state": calibrator.initial_state(1), "dt": 0.1}
+    with pytest.raises(error, match=message):
+        calibrator(**(usual | arguments))
+
+
+@pytest.mark.parametrize(
+    "part", [*CALIBRATORS, lanebev.MountEstimator()], ids=lambda each: type(each).__name__
+)
+def test_states(part):
+    with pytest.raises(TypeError, match=r"batch_size: expected a whole number, got 0.5"):
+        part.initial_state(0.5)
+    with pytest.raises(ValueError, match="batch_size: expected 0 or more, got -1"):
+        part.initial_state(-1)
+    with pytest.raises(
+        ValueError, match=r"dtype: expected torch.float32 or torch.float64, got torch.float16"
+    ):
+        part.initial_state(1, dtype=torch.float16)
+
+
+def test_mount():
+    mount = lanebev.MountEstimator()
+    with pytest.raises(
+        TypeError, match=r"calibration: expected a calibrator's lanebev.Calibration, got Extrinsics"
+    ):
+        mount(POSE, mount.initial_state(1), 0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"boundary": SEGMENTS.boundary + 6}, ValueError, "segments.boundary: expected 0 to 5, got 6"),
+        ({"boundary": SEGMENTS.boundary - 1}, ValueError, "segments.boundary: expected 0 to 5, got -1"),
+        ({"boundary": SEGMENTS.boundary.float()}, ValueError, "segments.boundary: expected int64"),
+        ({"weight": 2 * SEGMENTS.weight}, ValueError, "segments.weight: expected 0 to 1, got 2"),
+        ({"sigma": 0 * SEGMENTS.sigma}, ValueError, "segments.sigma: expected positive finite px, got 0"),
+        ({"endpoints": SEGMENTS.endpoints / 0}, ValueError, "segments.endpoints: expected finite px, got"),
+        ({"endpoints": SEGMENTS.endpoints[0]}, ValueError, r"expected \(1, 8, 2, 2\), got \(8, 2, 2\)"),
+        (
+            {"weight": np.ones((1, 8))},
+            TypeError,
+            "segments.weight: expected a torch.Tensor, got numpy.ndarray",
+        ),
+    ],
+)
+def test_segments_say_what_is_wrong_with_them(change, error, message):
+    assert SEGMENTS.check() is SEGMENTS
+    with pytest.raises(error, match=message):
+        SEGMENTS._replace(**change).check()
+
+
+def test_padding_may_hold_anything():
+    padding = LaneSegments(
+        SEGMENTS.endpoints * torch.nan, SEGMENTS.boundary - 1, 0 * SEGMENTS.weight, -SEGMENTS.sigma
+    )
+    assert padding.check() is padding
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (
+            lambda: lanebev.bev_from_image(POSE, K.numpy(), GRID),
+            TypeError,
+            "intrinsics: expected a torch.Tensor",
+        ),
+        (lambda: lanebev.bev_from_image(NUMBERS, K, GRID), TypeError, "extrinsics.pitch: .* got float"),
+        (lambda: lanebev.bev_from_image(K, POSE, GRID), TypeError, "extrinsics: expected lanebev.Extrinsics"),
+        (lambda: lanebev.bev_from_image(POSE, K, (10, 10)), TypeError, "grid: expected lanebev.BEVGrid"),
+        (lambda: BEVGrid(x=10), TypeError, r"x: expected \(low, high\) in m, got 10"),
+        (lambda: Extrinsics.unstack([0, 0, 0, 1.5]), TypeError, "values: expected a torch.Tensor, got list"),
+        (
+            lambda: lanebev.road_from_image_points(POINTS.numpy(), K, POSE),
+            TypeError,
+            "points: .* numpy.ndarray",
+        ),
+        (lambda: lanebev.road_from_image_points(POINTS, K, NUMBERS), TypeError, "extrinsics.pitch: .* float"),
+        (lambda: lanebev.image_from_road_points(POINTS, K, NUMBERS), TypeError, "extrinsics.pitch: .* float"),
+        (lambda: Camera(K[0].numpy(), K[0, 0, :0], "pinhole", (360, 640)), TypeError, "intrinsics: .* numpy"),
+        (lambda: Camera(K[0], [], "pinhole", (360, 640)), TypeError, "distortion: .* got list"),
+        (
+            lambda: Camera.from_fov(60, 640, 360).undistort_points(np.ones((5, 2))),
+            TypeError,
+            "points: .* numpy",
+        ),
+        (
+            lambda: Camera.from_fov(60, 640, 360).scaled(2),
+            TypeError,
+            r"image_size: expected \(height, width\)",
+        ),
+    ],
+)
+def test_geometry(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
+
+
+@pytest.fixture(scope="module")
+def model():
+    network = lanebev.LaneSegmenter(lanebev.SegmenterConfig(base_width=4, decoder_width=8)).eval()
+    extractor = lanebev.LineExtractor.for_network(network.config)
+    return lanebev.LaneBEV(network, extractor, lanebev.TwoStageCalibrator(), BEVWarp(GRID))
+
+
+@pytest.mark.parametrize(
+    ("image", "error", "message"),
+    [
+        (IMAGE.numpy(), TypeError, "image: expected a torch.Tensor, got numpy.ndarray"),
+        (255 * IMAGE, ValueError, r"image: expected values in \[0, 1\], got 2\d\d.*; divide bytes by 255"),
+        ((255 * IMAGE).byte(), ValueError, r"image: expected floating point in \[0, 1\], got torch.uint8"),
+        (IMAGE.movedim(1, -1), ValueError, r"image: expected \(B, 3, H, W\) or"),
+        (IMAGE[0], ValueError, r"image: expected \(B, 3, H, W\) or"),
+    ],
+)
+def test_lanebev_images(model, image, error, message):
+    with pytest.raises(error, match=message):
+        model(image, K)
+
+
+def test_lanebev_cameras(model):
+    with pytest.raises(TypeError, match=r"intrinsics: expected a torch.Tensor, got numpy.ndarray"):
+        model(IMAGE, K.numpy())
+    with pytest.raises(ValueError, match=r"intrinsics: expected \(1, 3, 3\), got \(3, 3\)"):
+        model(IMAGE, K[0])
+    with pytest.raises(TypeError, match=r"logits: expected a torch.Tensor, got numpy.ndarray"):
+        model.extractor(np.zeros((1, 7, 16, 24)), (64, 96))
