@@ -72,8 +72,8 @@ class CommandLine(LightningCLI):
     def before_fit(self) -> None:
         """bfloat16 that a CPU only emulates takes ten times as long as float32."""
         on_cpu = isinstance(self.trainer.accelerator, CPUAccelerator)
-        native = torch.ops.mkldnn._is_mkldnn_bf16_supported()
-        if on_cpu and self.trainer.precision.startswith("bf16") and not native:
+        half = on_cpu and self.trainer.precision.startswith("bf16")
+        if half and not torch.ops.mkldnn._is_mkldnn_bf16_supported():
             rank_zero_warn(
                 f"precision: expected one that this CPU has, got {self.trainer.precision}, which it emulates "
                 "some ten times slower than float32; add --trainer.precision 32-true"
