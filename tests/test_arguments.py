@@ -140,6 +140,31 @@ def test_geometry(call, error, message):
         call()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ((IMAGE.numpy(), K, POSE), TypeError, "image: expected a torch.Tensor, got numpy.ndarray"),
+        ((IMAGE, K.numpy(), POSE), TypeError, "intrinsics: expected a torch.Tensor, got numpy.ndarray"),
+        ((IMAGE, K, NUMBERS), TypeError, "extrinsics.pitch: expected a torch.Tensor, got float"),
+        ((IMAGE, K, POSE.stack()), TypeError, r"extrinsics: expected lanebev.Extrinsics\(.* got Tensor"),
+        (
+            (IMAGE, K, Extrinsics(*(each[0] for each in POSE))),
+            ValueError,
+            r"extrinsics.pitch: expected \(1,\)",
+        ),
+        ((IMAGE, K, POSE, [0.1, 0, 0, 0]), TypeError, "distortion: expected a torch.Tensor, got list"),
+        (
+            (IMAGE, K, POSE, None, "pinhole", 96),
+            TypeError,
+            r"image_size: expected \(height, width\) in px, got 96",
+        ),
+    ],
+)
+def test_warp(arguments, error, message):
+    with pytest.raises(error, match=message):
+        BEVWarp(GRID)(*arguments)
+
+
 @pytest.fixture(scope="module")
 def model():
     network = lanebev.LaneSegmenter(lanebev.SegmenterConfig(base_width=4, decoder_width=8)).eval()

@@ -187,7 +187,7 @@ def test_whole_numbers_and_lenses_that_do_not_fit_are_named():
     for shape in ((5,), (3, 5)):
         with pytest.raises(ValueError, match=r"distortion: expected \(2, D\) like the points, got \("):
             BEVWarp(GRID)(smooth_image(2), *args, torch.zeros(shape, dtype=torch.float64))
-    with pytest.raises(ValueError, match=r"extrinsics: expected \(2,\) each, got \(1,\)"):
+    with pytest.raises(ValueError, match=r"extrinsics.pitch: expected \(2,\), got \(1,\)"):
         BEVWarp(GRID)(smooth_image(2), args[0], pose([0.0, 0.0, 0.0, 1.5]))
     whole, message = args[0].long(), r"intrinsics: expected floating point, got torch.int64"
     with pytest.raises(ValueError, match=message):

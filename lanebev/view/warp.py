@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from torch import Tensor, nn
 
 from lanebev.geometry.distortion import check_lens
 from lanebev.geometry.lens import check_intrinsics
 from lanebev.geometry.precision import common_dtype
-from lanebev.types import Extrinsics
+from lanebev.types import Extrinsics, check_extrinsics, check_tensor
 from lanebev.view.grid import BEVGrid
 from lanebev.view.sampling import (
     cells_and_lens,
@@ -62,6 +64,7 @@ class BEVWarp(nn.Module):
         """
         check_image(image)
         size = image_size or (image.shape[-2], image.shape[-1])
+        check_size(size)
         check_cameras(image.shape[0], intrinsics, extrinsics, distortion, model)
         image_from_cam = normalised_intrinsics(intrinsics, size)
         sums, lens = cells_and_lens(
@@ -86,22 +89,29 @@ class BEVWarp(nn.Module):
 
 
 def check_image(image: Tensor) -> None:
-    """Raise ValueError unless this is a (B, C, h, w) map of floating point."""
+    """Raise TypeError or ValueError unless this is a (B, C, h, w) map of floating point."""
+    check_tensor("image", image)
     if image.ndim != 4:
         raise ValueError(f"image: expected (B, C, h, w), got {tuple(image.shape)}")
     if not image.is_floating_point():
         raise ValueError(f"image: expected floating point, got {image.dtype}")
 
 
+def check_size(size: object) -> None:
+    """Raise TypeError unless this is a pair, (height, width)."""
+    if not (isinstance(size, Sequence) and len(size) == 2):
+        raise TypeError(f"image_size: expected (height, width) in px, got {size!r}")
+
+
 def check_cameras(
     batch: int, intrinsics: Tensor, extrinsics: Extrinsics, distortion: Tensor | None, model: str
 ) -> None:
-    """Raise ValueError unless there are ``batch`` cameras with poses, and lenses that exist."""
+    """Raise TypeError or ValueError unless there are ``batch`` cameras with poses, and lenses that exist."""
     check_intrinsics(intrinsics, batch)
-    if extrinsics.pitch.shape != (batch,):
-        raise ValueError(f"extrinsics: expected ({batch},) each, got {tuple(extrinsics.pitch.shape)}")
+    check_extrinsics(extrinsics, batch)
     if distortion is None:
         return
+    check_tensor("distortion", distortion)
     if distortion.shape[:-1] != (batch,):
         raise ValueError(f"distortion: expected ({batch}, D) like the points, got {tuple(distortion.shape)}")
     check_lens(distortion, model)
