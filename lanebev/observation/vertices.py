@@ -16,6 +16,7 @@ from torch import Tensor
 from lanebev.batch import masked_median
 
 _FLOOR = 0.01  # probability that background noise has everywhere; counts as nothing
+_LEAST_MASS = 1e-3  # px, what is divided by of an empty window
 _PEAK = 2  # half-width of the box whose largest sum is a scan's peak, label px
 _END = 3  # scans at either end of a stripe that its round cap makes crooked
 _FADE = 0.2  # of a stripe's mass, over which a scan's weight goes to zero below ``twice``
@@ -97,16 +98,19 @@ def scan_vertices(probabilities: Tensor, config: LineConfig) -> Vertices:
 
     Rows count where a boundary is steep and columns where it is shallow, with a blend about 45 degrees.
     """
-    by_row = _scan(probabilities, config)
-    by_column = _scan(probabilities.mT, config)
+    counted = counted_probability(probabilities)
+    by_row, by_column = (_scan(counted, config, dim) for dim in (-1, -2))
     by_column = by_column._replace(points=by_column.points.flip(-1), normal=by_column.normal.flip(-1))
     return Vertices(*(torch.cat(pair, dim=2) for pair in zip(by_row, by_column, strict=True)))
 
 
-def _scan(probabilities: Tensor, config: LineConfig) -> Vertices:
-    """One vertex a row: (B, L, h, w) to V = h."""
-    position, mass, spread = row_moments(probabilities, config.window)
-    width = probabilities.shape[-1]
+def _scan(counted: Tensor, config: LineConfig, dim: int) -> Vertices:
+    """Find one vertex a row, V = h, by ``dim`` -1 of (B, L, h, w), or one a column, V = w, by ``dim`` -2.
+
+    Points and normals are (along the scan, across scans): (x, y) of rows and (y, x) of columns.
+    """
+    position, mass, spread = scan_moments(counted, config.window, dim)
+    width = counted.shape[dim]
     share = mass / (2 * config.half_width)
     step = ((share - config.absent) / (config.present - config.absent)).clamp(0, 1)
     slope, scatter = local_line(position, step)
@@ -143,39 +147,78 @@ def _local_mean(values: Tensor, weight: Tensor) -> Tensor:
 
 
 def row_moments(probabilities: Tensor, window: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean position, mass and variance of each row's probability about its peak.
-
-    The window is put about the peak, then about the mean within it; where it lies is a constant to the
-    gradient.
+    """Mean position, mass and variance of each row's probability about its peak, see :func:`scan_moments`.
 
     Args:
         probabilities: (..., h, w).
         window: half-width, px.
 
     Returns:
-        position px, mass px, variance px²: each (..., h). Position of an empty row is its window's centre.
+        position px, mass px, variance px²: each (..., h).
     """
-    counted = (probabilities - _FLOOR).clamp(min=0) / (1 - _FLOOR)
-    boxes = F.avg_pool1d(counted.flatten(0, -2).detach().unsqueeze(1), 2 * _PEAK + 1, 1, _PEAK).squeeze(1)
-    peak = boxes.argmax(-1).reshape(counted.shape[:-1]).to(counted.dtype)  # (..., h)
-    for _ in range(2):
-        centre = peak.detach().round()
-        peak, mass, variance = _windowed(counted, centre, window)
-    return peak, mass, variance
+    return scan_moments(counted_probability(probabilities), window, -1)
 
 
-def _windowed(counted: Tensor, centre: Tensor, window: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Moments of (..., h, w) rows within ``window`` of (..., h) centres."""
-    offset = torch.arange(-window, window + 1, device=counted.device)
-    column = centre.long().unsqueeze(-1) + offset  # (..., h, 2·window + 1)
-    inside = (column >= 0) & (column < counted.shape[-1])
-    values = counted.gather(-1, column.clamp(0, counted.shape[-1] - 1)) * inside
-    mass = values.sum(-1)
-    safe = mass.clamp(min=1e-3)
-    step = offset.to(counted.dtype)
-    mean = (values * step).sum(-1) / safe
-    variance = (values * (step - mean.unsqueeze(-1)).square()).sum(-1) / safe
+def counted_probability(probabilities: Tensor) -> Tensor:
+    """Remove the probability that background noise has everywhere; what is certain still counts 1."""
+    return (probabilities - _FLOOR).clamp(min=0) / (1 - _FLOOR)
+
+
+def scan_moments(counted: Tensor, window: int, dim: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute the mean position, mass and variance of each scan's probability about its peak.
+
+    The window is put about the peak, then about the mean within it; where it lies is a constant to the
+    gradient.
+
+    Args:
+        counted: (..., h, w), see :func:`counted_probability`.
+        window: half-width, px.
+        dim: -1 to scan rows, -2 to scan columns.
+
+    Returns:
+        position px, mass px, variance px² along the scan: each (..., h) of rows or (..., w) of columns.
+        Position of an empty scan is its window's centre.
+    """
+    reach, last = max(window, _PEAK), counted.shape[dim] - 1
+    padded = F.pad(counted, (reach, reach) if dim == -1 else (0, 0, reach, reach))
+    centre = box_peak(padded.detach(), reach, dim)
+    values, step = _about(padded, centre + reach, window, dim)
+    first, _ = _mean(values, step, dim)
+    centre = (centre + first.detach()).round().long().clamp(0, last)  # clamp: of NaN anything may come
+    values, step = _about(padded, centre + reach, window, dim)
+    mean, mass = _mean(values, step, dim)
+    variance = (values * (step - mean.unsqueeze(dim)).square()).sum(dim) / mass.clamp(min=_LEAST_MASS)
     return centre + mean, mass, variance
+
+
+def box_peak(padded: Tensor, padding: int, dim: int) -> Tensor:
+    """Find where the sum over _PEAK neighbours on either side is largest.
+
+    Args:
+        padded: (..., h, w) with ``padding`` empty cells, _PEAK at least, at both ends of ``dim``.
+        padding: cells.
+        dim: -1 to scan rows, -2 to scan columns.
+
+    Returns:
+        (..., h) of rows or (..., w) of columns, int64, counted without the padding.
+    """
+    size = padded.shape[dim] - 2 * padding
+    total = padded.narrow(dim, padding - _PEAK, size)
+    for start in range(padding - _PEAK + 1, padding + _PEAK + 1):
+        total = total + padded.narrow(dim, start, size)
+    return total.max(dim).indices
+
+
+def _about(padded: Tensor, centre: Tensor, window: int, dim: int) -> tuple[Tensor, Tensor]:
+    """Values of scans within ``window`` of their centres, 2·window + 1 along ``dim``, and offsets, px."""
+    offset = torch.arange(-window, window + 1, device=padded.device).view((-1,) + (1,) * (-1 - dim))
+    return padded.gather(dim, centre.unsqueeze(dim) + offset), offset.to(padded.dtype)
+
+
+def _mean(values: Tensor, step: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    """Mean offset and mass of windows; an empty one has mean 0."""
+    mass = values.sum(dim)
+    return (values * step).sum(dim) / mass.clamp(min=_LEAST_MASS), mass
 
 
 def local_line(position: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -188,14 +231,11 @@ def local_line(position: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         slope and variance, each (..., h). Fewer than three rows have slope 0 and variance 1.
     """
-    rows = torch.arange(position.shape[-1], dtype=position.dtype, device=position.device)
+    reach, count = _NEIGHBOURS, 2 * _NEIGHBOURS + 1
     # moments about the row itself: sums of weight · r^a · (x - x_row)^b over r = -5..5
-    index = rows.long().unsqueeze(-1) + torch.arange(-_NEIGHBOURS, _NEIGHBOURS + 1, device=position.device)
-    inside = (index >= 0) & (index < len(rows))
-    index = index.clamp(0, len(rows) - 1)
-    w = weight[..., index] * inside  # (..., h, 11)
-    x = position[..., index] - position.unsqueeze(-1)
-    r = torch.arange(-_NEIGHBOURS, _NEIGHBOURS + 1, dtype=position.dtype, device=position.device)
+    w = F.pad(weight, (reach, reach)).unfold(-1, count, 1)  # (..., h, 11)
+    x = F.pad(position, (reach, reach)).unfold(-1, count, 1) - position.unsqueeze(-1)
+    r = torch.arange(-reach, reach + 1, dtype=position.dtype, device=position.device)
     total = w.sum(-1)
     enough = total > 2.5
     safe = torch.where(enough, total, 1.0)
@@ -216,31 +256,46 @@ def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
     The mean of points on a parabola lies off it by half of what it lies off their tangents, on average: by
     that it is moved back. A boundary of n < 2S vertices keeps 2·floor(n/2) of them as they are.
     """
-    points, weight = vertices.points, vertices.weight
-    seen = weight > 0
-    count = seen.sum(-1)
-    bins = 2 * _half_of(count, config)
-    rank = _rank_along(points.detach(), weight.detach())  # (B, L, V)
-    total = count.clamp(min=1).unsqueeze(-1)
-    slot = (rank * bins.unsqueeze(-1)).div(total, rounding_mode="floor")
+    points, normal, weight = vertices.points, vertices.normal, vertices.weight
+    stretch, middle, size = stretches(vertices, config)
+    together = (weight > 0) & _with_the_middle(vertices, middle, size)
     slots = torch.arange(2 * config.segments, device=points.device)
-    member = (slot.unsqueeze(-1) == slots) & seen.unsqueeze(-1)  # (B, L, V, 2S)
-    member = member & _with_the_middle(vertices, rank, member)
-    density = member * vertices.density.unsqueeze(-1)
-    share = density * weight.unsqueeze(-1)
-    mass, counted = share.sum(2), density.sum(2)
-    share = share / mass.clamp(min=1e-6).unsqueeze(2)  # weights of a mean
-    mean = torch.einsum("blvs,blvd->blsd", share, points)
-    normal = vertices.normal
-    away = mean.unsqueeze(2) - points.unsqueeze(3)  # (B, L, V, 2S, 2)
-    along = away @ normal.unsqueeze(-1)  # (B, L, V, 2S, 1) px off tangents
-    mean = mean - 0.5 * torch.einsum("blvs,blvd->blsd", share * along.squeeze(-1), normal)
-    common = torch.einsum("blvs,blv->bls", share, vertices.common_var)
-    own = torch.einsum("blvs,blv->bls", share.square(), vertices.own_var)
-    across = torch.einsum("blvs,blvd->blsd", share, normal)
-    common = common + config.sigma_floor**2
-    sure = mass / counted.clamp(min=1e-6) * _as_sure_as_most(common + own, counted > 0)
-    return Vertices(mean, across, sure, counted, common, own)
+    member = (stretch.unsqueeze(-2) == slots.unsqueeze(-1)).to(points.dtype)  # (B, L, 2S, V)
+    density = vertices.density * together
+    share = (density * weight).unsqueeze(-1)
+    common, own = vertices.common_var.unsqueeze(-1), vertices.own_var.unsqueeze(-1)
+    terms = [density.unsqueeze(-1), share, share * points, share * normal, share * common, share**2 * own]
+    sums = member @ torch.cat(terms, dim=-1)  # (B, L, 2S, 8), over the stretches
+    counted, mass = sums[..., 0], sums[..., 1]
+    safe = mass.clamp(min=1e-6).unsqueeze(-1)  # of weights of a mean
+    mean, across = sums[..., 2:4] / safe, sums[..., 4:6] / safe
+    off_tangent = ((take(mean, stretch) - points) * normal).sum(-1, keepdim=True)  # (B, L, V, 1) px
+    mean = mean - 0.5 * (member @ (share * off_tangent * normal)) / safe
+    common_var = sums[..., 6] / safe[..., 0] + config.sigma_floor**2
+    own_var = sums[..., 7] / safe[..., 0].square()
+    sure = mass / counted.clamp(min=1e-6) * _as_sure_as_most(common_var + own_var, counted > 0)
+    return Vertices(mean, across, sure, counted, common_var, own_var)
+
+
+def stretches(vertices: Vertices, config: LineConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Divide each boundary, along its main direction, into stretches of equally many seen vertices.
+
+    Returns:
+        the stretch of each vertex, 0..2S-1; the index of the middle vertex of that stretch; the number of
+        vertices in it: each (B, L, V) int64. All of a boundary with too few vertices are one stretch; what
+        they are for a vertex that is not seen means nothing.
+    """
+    count = (vertices.weight > 0).sum(-1, keepdim=True)  # (B, L, 1)
+    bins, total = 2 * _half_of(count, config), count.clamp(min=1)
+    order, rank = _order_along(vertices.points.detach(), vertices.weight.detach())
+    stretch = (rank * bins).div(total, rounding_mode="floor").clamp(max=2 * config.segments - 1)
+    some = bins.clamp(min=1)
+    first, last = (  # ranks r with floor(r · bins / total) = stretch
+        (part * total + some - 1).div(some, rounding_mode="floor") for part in (stretch, stretch + 1)
+    )
+    size = last - first
+    middle = (last - 1 - size.div(2, rounding_mode="floor")).clamp(0, order.shape[-1] - 1)
+    return stretch, order.gather(-1, middle), size
 
 
 def _as_sure_as_most(variance: Tensor, there: Tensor) -> Tensor:
@@ -254,24 +309,18 @@ def _as_sure_as_most(variance: Tensor, there: Tensor) -> Tensor:
     return (3.0 - 2.0 * variance.sqrt() / limit).clamp(0, 1)
 
 
-def _with_the_middle(vertices: Vertices, rank: Tensor, member: Tensor) -> Tensor:
-    """Which vertices may be averaged with the middle one of each stretch, (B, L, V, 2S).
+def _with_the_middle(vertices: Vertices, middle: Tensor, size: Tensor) -> Tensor:
+    """Which vertices may be averaged with the middle one of their stretch, (B, L, V).
 
     Not those across a gap, further away than so many scans reach (two for scans that were dropped), nor
     those of another arm of a boundary that turns back: a chord of a circle makes equal angles with the
     tangents at its ends.
     """
     points, normal = vertices.points.detach(), vertices.normal.detach()
-    ranks = torch.where(member, rank.unsqueeze(-1), -1)
-    size = member.sum(2)  # (B, L, 2S)
-    central = ranks.amax(2) - size.div(2, rounding_mode="floor")
-    middle = (ranks == central.unsqueeze(2)).to(torch.uint8).argmax(2)
-    chord = points.unsqueeze(3) - take(points, middle).unsqueeze(2)  # (B, L, V, 2S, 2)
-    other = take(normal, middle).unsqueeze(2)
-    normal = normal.unsqueeze(3)
+    chord, other = points - take(points, middle), take(normal, middle)  # (B, L, V, 2)
     facing = torch.where((normal * other).sum(-1, keepdim=True) < 0, -normal, normal)
     off = 0.5 * ((facing + other) * chord).sum(-1).abs()
-    near: Tensor = chord.norm(dim=-1) < 1.5 * size.unsqueeze(2) + 2
+    near: Tensor = chord.norm(dim=-1) < 1.5 * size + 2
     return near & (off < _TOGETHER)
 
 
@@ -281,16 +330,24 @@ def _half_of(count: Tensor, config: LineConfig) -> Tensor:
     return torch.where(count >= config.min_vertices, half, 0)
 
 
-def _rank_along(points: Tensor, weight: Tensor) -> Tensor:
-    """Place of each vertex in the order along its boundary's main direction; those not seen come last."""
+def _order_along(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Vertices in order along their boundary's main direction, and each one's rank; those not seen come last.
+
+    Args:
+        points: (B, L, V, 2).
+        weight: (B, L, V).
+
+    Returns:
+        indices and ranks, each (B, L, V) int64.
+    """
     total = weight.sum(-1, keepdim=True).clamp(min=1e-6)
     mean = (points * weight.unsqueeze(-1)).sum(-2, keepdim=True) / total.unsqueeze(-1)
     x, y = (points - mean).unbind(-1)
     xx, yy, xy = (weight * x * x).sum(-1), (weight * y * y).sum(-1), (weight * x * y).sum(-1)
     angle = 0.5 * torch.atan2(2 * xy, xx - yy).unsqueeze(-1)
     along = x * angle.cos() + y * angle.sin()
-    along = torch.where(weight > 0, along, math.inf)
-    return along.argsort(dim=-1).argsort(dim=-1)  # ties: vertices that coincide, or are not seen
+    order = torch.where(weight > 0, along, math.inf).argsort(dim=-1)
+    return order, order.argsort(dim=-1)  # ties: vertices that coincide, or are not seen
 
 
 def take(points: Tensor, index: Tensor) -> Tensor:
