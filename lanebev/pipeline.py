@@ -10,7 +10,8 @@ from torch import Tensor, nn
 
 from lanebev.geometry.lens import check_intrinsics
 from lanebev.geometry.precision import autocast_off, common_dtype
-from lanebev.observation.lines import undistort_segments
+from lanebev.observation.lines import LineExtractor
+from lanebev.observation.pairing import BoundaryVertices, segments_from_vertices
 from lanebev.types import Calibration, LaneSegments, check_tensor, register_pytree
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
@@ -42,8 +43,9 @@ class LaneBEV(nn.Module):
 
     Args:
         segmenter: image (B, 3, h, w) in [0, 1] to logits (B, 1 + L, h', w').
-        extractor: logits, the image's (H, W) and the network input's (h, w) to :class:`LaneSegments` in the
-            image's pixels.
+        extractor: its ``vertices`` takes logits, the image's (H, W) and the network input's (h, w) to
+            :class:`~lanebev.observation.pairing.BoundaryVertices` in the image's pixels, as those of a
+            :class:`LineExtractor` do.
         calibrator: e.g. :class:`lanebev.JointCalibrator`.
         warp: default :class:`BEVWarp` on the default grid.
         network_width: px, the image is resized to this width, its aspect kept to the nearest multiple of 32,
@@ -58,7 +60,7 @@ class LaneBEV(nn.Module):
     def __init__(
         self,
         segmenter: nn.Module,
-        extractor: nn.Module,
+        extractor: LineExtractor,
         calibrator: nn.Module,
         warp: BEVWarp | None = None,
         network_width: int | None = None,
@@ -100,7 +102,6 @@ class LaneBEV(nn.Module):
             ValueError: a weights file that doesn't fit the network.
         """
         from lanebev.estimation.joint.calibrator import JointCalibrator
-        from lanebev.observation.lines import LineExtractor
         from lanebev.weights import load_segmenter
 
         segmenter = load_segmenter(weights)
@@ -137,7 +138,7 @@ class LaneBEV(nn.Module):
             dt: s since the frame before: float, (B,) or, with T frames, (B, T).
             lane_width: m: float, (B,) or (B, L-1).
             distortion: (B, D) of the lens, or None.
-            model: "pinhole" or "fisheye".
+            model: "pinhole", "fisheye" or "omni".
 
         Returns:
             the output, every tensor with (B, T, ...) where the image has T, and the state after it.
@@ -178,25 +179,37 @@ class LaneBEV(nn.Module):
     def observe(
         self, image: Tensor, intrinsics: Tensor, distortion: Tensor | None = None, model: str = "pinhole"
     ) -> tuple[Tensor, LaneSegments]:
-        """Network and line extraction only.
+        """Run network, line extraction and pairing only.
 
         Args:
             image: (B, 3, H, W) as taken.
             intrinsics: (B, 3, 3) px.
             distortion: (B, D) or None.
-            model: "pinhole" or "fisheye".
+            model: "pinhole", "fisheye" or "omni".
 
         Returns:
-            logits (B, 1 + L, h, w) and segments in undistorted pixels of the image. A row whose image is not
+            logits (B, 1 + L, h, w) and segments in undistorted pixels of the image.
+        """
+        logits, vertices = self.boundary_vertices(image)
+        return logits, segments_from_vertices(vertices, intrinsics, distortion, model)
+
+    def boundary_vertices(self, image: Tensor) -> tuple[Tensor, BoundaryVertices]:
+        """Run network and line extraction only.
+
+        Args:
+            image: (B, 3, H, W) as taken.
+
+        Returns:
+            logits (B, 1 + L, h, w) and vertices in pixels of the image as taken. A row whose image is not
             finite counts as black and has none, so that it spoils neither other rows nor gradients.
         """
         resized = self._resize(image)
         finite = resized.isfinite().flatten(1).all(1)  # (B,)
         logits = self.segmenter(torch.where(finite[:, None, None, None], resized, 0.0))
-        height, width = image.shape[-2:]
-        segments = self.extractor(logits, (height, width), tuple(resized.shape[-2:]))
-        segments = segments._replace(weight=torch.where(finite.unsqueeze(-1), segments.weight, 0.0))
-        return logits, undistort_segments(segments, intrinsics, distortion, model)
+        (height, width), (rows, columns) = image.shape[-2:], resized.shape[-2:]
+        vertices = self.extractor.vertices(logits, (height, width), (rows, columns))
+        weight = torch.where(finite[:, None, None], vertices.weight, 0.0)
+        return logits, vertices._replace(weight=weight)
 
     def _resize(self, image: Tensor) -> Tensor:
         if self.network_width is None:

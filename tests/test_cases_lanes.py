@@ -12,9 +12,9 @@ from PIL import Image
 from lanebev import Camera
 from lanebev.app.run import RunConfig, run
 from lanebev.io.lane_size import parse_size, resized_lanes, size_remark
-from lanebev.io.lanes import FrameLines, LaneLine, read_culane, read_lanes, tusimple_line
+from lanebev.io.lanes import FrameLines, read_culane, read_lanes, tusimple_line
 from lanebev.io.openlane import camera_from_ground_points
-from lanebev.observation.polylines import rows_from_lines
+from lanebev.observation.polylines import LaneLine, vertices_from_lines
 
 CAMERA = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720)
 OFFSETS = (-5.4, -1.8, 1.8, 5.4)  # m to the right of the camera
@@ -41,8 +41,8 @@ def test_rows_may_be_left_out_anywhere(tmp_path, kept, upwards):
     np.testing.assert_allclose(read.points[there], line, atol=0.01)
     gaps = np.flatnonzero(np.abs(np.diff(line[:, 1])) > 25)
     assert (~there).sum() == len(gaps)  # what was left out is not seen
-    rows = rows_from_lines([LaneLine(read.points, 2)], CAMERA)
-    seen = rows.rows[np.isfinite(rows.x[2])]
+    vertices = vertices_from_lines([LaneLine(read.points, 2)], CAMERA)
+    seen = vertices.points[0, 2, vertices.weight[0, 2] > 0, 1].numpy()
     for gap in gaps:
         low, high = sorted(line[gap : gap + 2, 1])
         assert not ((seen > low) & (seen < high)).any()
@@ -77,7 +77,7 @@ def test_nan_in_culane_and_null_in_openlane_are_gaps(tmp_path):
     (tmp_path / "1.json").write_text(json.dumps(fields))
     (line,) = read_lanes(tmp_path / "1.json")[0].lines
     np.testing.assert_array_equal(line.points, [[1, 590], [np.nan, 580], [3, np.nan]])
-    assert np.isfinite(rows_from_lines([line], CAMERA).x).sum() == 0
+    assert vertices_from_lines([line], CAMERA).weight.sum() == 0
 
 
 @pytest.mark.parametrize(

@@ -61,12 +61,7 @@ def test_every_package_has_a_layer():
 
 @pytest.mark.parametrize(
     "package",
-    [
-        pytest.param(name, marks=pytest.mark.xfail(reason="LaneLine is in io", strict=False))
-        if name == "observation"
-        else name
-        for name in sorted({_package(name) for name in FILES})
-    ],
+    sorted({_package(name) for name in FILES}),
 )
 def test_no_import_runs_upwards(package):
     upwards = [

@@ -19,6 +19,7 @@ from lanebev import (
     TwoStageCalibrator,
 )
 from lanebev.geometry.lens import distort_points
+from lanebev.observation.pairing import BoundaryVertices
 from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes
@@ -45,23 +46,26 @@ class BrightnessSegmenter(nn.Module):
 
 
 class FixedExtractor(nn.Module):
-    """True segments, shifted a little by the logits."""
+    """Vertices of true segments, shifted a little by the logits."""
 
     def __init__(self, distortion=None):
         super().__init__()
         self.distortion = distortion
 
-    def forward(self, logits, image_size, network_size):
+    def vertices(self, logits, image_size, network_size):
         assert image_size == SIZE
         assert network_size in (SIZE, (32, 64))
         batch = logits.shape[0]
         segments = LaneSegments(*(v.expand(batch, *v.shape[1:]) for v in lanes(noise=0.0)))
-        shift = logits.mean((1, 2, 3))[:, None, None, None]
-        ends = segments.endpoints * SCALE
+        points = SCALE * segments.endpoints.unflatten(1, (6, 8)).transpose(2, 3).flatten(
+            2, 3
+        )  # (B, 6, 16, 2)
         if self.distortion is not None:
-            flat = distort_points(ends.flatten(1, 2), INTRINSICS.expand(batch, 3, 3), self.distortion)
-            ends = flat.reshape(ends.shape)
-        return segments._replace(endpoints=ends + 0.01 * shift, sigma=segments.sigma * 0.1)
+            flat = distort_points(points.flatten(1, 2), INTRINSICS.expand(batch, 3, 3), self.distortion)
+            points = flat.view_as(points)
+        points = points + 0.01 * logits.mean((1, 2, 3))[:, None, None, None]
+        weight, sigma = (v.unflatten(1, (6, 8)).repeat(1, 1, 2) for v in (segments.weight, segments.sigma))
+        return BoundaryVertices(points, weight, 0.1 * sigma, segments.boundary.unflatten(1, (6, 8))[..., 0])
 
 
 def model(**kwargs):

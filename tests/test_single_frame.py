@@ -296,3 +296,18 @@ def test_a_still_of_a_bend_says_how_sure_it_is():
     error = found.extrinsics.stack() - params[:, :4]
     nees = (error.unsqueeze(1) @ torch.linalg.solve(found.covariance, error.unsqueeze(-1))).mean() / 4
     assert nees < 2
+
+
+def test_curvature_common_to_all_boundaries_is_fitted_where_it_is_not_given():
+    truth = random_params(8, 22, (2, 2, 2), 1e-3)
+    segments = drive_frames(truth, 0.1, 23)
+    pose = Extrinsics.unstack(truth[:, :4])
+    given = fit_boundaries(segments, cameras(8), pose, truth[:, 5:])
+    found = fit_boundaries(segments, cameras(8), pose)
+    assert truth[:, 5].abs().max() > 5e-4
+    assert (found.curvature[:, 0] - truth[:, 5]).abs().max() < 5e-5
+    assert (found.offset - given.offset).abs().max() < 0.02
+    alone = fit_boundaries(
+        LaneSegments(*(part[3:4] for part in segments)), cameras(1), Extrinsics.unstack(truth[3:4, :4])
+    )
+    torch.testing.assert_close(alone.curvature, found.curvature[3:4])

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from lanebev.io.lanes import FrameLines, LaneLine
-from lanebev.observation.polylines import BoundaryRows
+from lanebev.io.lanes import FrameLines
+from lanebev.observation.polylines import BoundaryRows, LaneLine
 from train.__main__ import main
 from train.data import Batch, ViewBatches
 from train.datasets import EntryFrames, LaneFiles, ScoredBatch, labelled_image, read_entries

@@ -31,6 +31,7 @@ from lanebev.app.run import calibrate_still
 from lanebev.estimation.joint.single_frame import FramePrior, fit_single_frame
 from lanebev.io.lanes import read_lanes
 from lanebev.io.video import open_source
+from lanebev.observation.polylines import rows_from_vertices
 from tools.real_figures import TUSIMPLE_FOCAL, TUSIMPLE_LANE_WIDTH, tusimple_camera, tusimple_segments
 from train.commands import one_line_errors
 
@@ -121,11 +122,11 @@ def main() -> None:
     intrinsics = camera.intrinsics.expand(len(images), 3, 3)
     pose = calibrate_still(lanebev.TwoStageCalibrator(), segments, intrinsics, TUSIMPLE_LANE_WIDTH).extrinsics
     horizons = (camera.intrinsics[1, 2] - camera.intrinsics[1, 1] * pose.pitch.tan()).tolist()
-    observer = NetworkObserver(model, camera, TUSIMPLE_LANE_WIDTH)
+    observer = NetworkObserver(model, camera)
     offsets = []
     for image, entry, horizon in zip(images, read_lanes(labels), horizons, strict=True):
         frame = next(iter(open_source(image)))
-        seen, _ = observer(frame)
+        seen = rows_from_vertices(observer(frame).vertices, camera.image_size)
         grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         for labelled in entry.lines:
             x = np.interp(seen.rows, labelled.points[:, 1], labelled.points[:, 0], np.nan, np.nan)

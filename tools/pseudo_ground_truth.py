@@ -29,7 +29,7 @@ from lanebev.geometry.road import great_circle_normals, segment_rays
 from lanebev.geometry.rotation import pitch_yaw_from_vanishing_dir
 from lanebev.io.lanes import FrameLines, match_frames, read_lanes
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
-from lanebev.observation.polylines import rows_from_lines, segments_from_rows
+from lanebev.observation.polylines import segments_from_lines
 from lanebev.types import NUM_BOUNDARIES
 from train.commands import one_line_errors
 
@@ -138,9 +138,8 @@ def main() -> None:
     args = parser.parse_args()
     camera = Camera.from_file(args.camera)
     frames = read_lanes(args.lanes)
-    rows = [rows_from_lines(frame.lines, camera) for frame in frames]
     estimate = estimate_table(read_extrinsics(args.estimate), frames) if args.estimate else None
-    segments = segments_from_rows(rows, camera)
+    segments = segments_from_lines([frame.lines for frame in frames], camera)
     intrinsics = camera.intrinsics.expand(len(frames), 3, 3)
     table = as_table(pseudo_ground_truth(segments, intrinsics, args.lane_width))
     args.out.parent.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,7 +16,8 @@ from lanebev.app.observers import NetworkObserver
 from lanebev.app.run import calibrate_still
 from lanebev.io.lanes import match_frames, read_lanes
 from lanebev.io.video import open_source
-from lanebev.observation.polylines import rows_from_lines, segments_from_rows
+from lanebev.observation.polylines import camera_segments, segments_from_lines
+from lanebev.report.lane_curves import lane_curves
 from lanebev.report.measure import believed, measure_boundaries, spread
 from lanebev.report.plots import width_deviation
 
@@ -70,7 +70,7 @@ def tusimple_segments(data: Path) -> tuple[list[str], LaneSegments]:
     images = [str(data / "tusimple" / frame.name) for frame in frames]
     match_frames(images, frames)
     camera = tusimple_camera()
-    return images, segments_from_rows([rows_from_lines(frame.lines, camera) for frame in frames], camera)
+    return images, segments_from_lines([frame.lines for frame in frames], camera)
 
 
 def tusimple_labels(data: Path, calibrators: dict[str, Any]) -> Iterable[Figure]:
@@ -104,18 +104,19 @@ def tusimple_pixels(data: Path, model: Any, calibrators: dict[str, Any]) -> Iter
 
     images, labelled = tusimple_segments(data)
     camera = tusimple_camera()
-    observer = NetworkObserver(model, camera, TUSIMPLE_LANE_WIDTH)
-    seen = [observer(next(iter(open_source(image)))) for image in images]
+    seen = still_segments(images, model, camera)
     frames = read_lanes(data / "tusimple" / "label_data.json")
-    scores = [
-        tusimple_score(rows.fitted, rows.rows, frame) for (rows, _), frame in zip(seen, frames, strict=True)
-    ]
+    scores = []
+    for one, frame in zip(seen, frames, strict=True):
+        found = calibrate_still(calibrators["joint"], one, camera.intrinsics[None], TUSIMPLE_LANE_WIDTH)
+        curves = lane_curves(one, found, camera)
+        scores.append(tusimple_score(curves.x, curves.rows, frame))
     accuracy, false_positive, false_negative = np.mean(scores, axis=0)
     part = "tusimple, pixels"
     yield Figure(part, "accuracy", "-", accuracy, 0.92, least=True)
     yield Figure(part, "false positives", "-", false_positive, 0.25)
     yield Figure(part, "false negatives", "-", false_negative, 0.15)
-    segments = LaneSegments(*(torch.cat(parts) for parts in zip(*(s for _, s in seen), strict=True)))
+    segments = LaneSegments(*(torch.cat(parts) for parts in zip(*seen, strict=True)))
     intrinsics = camera.intrinsics.expand(len(images), 3, 3)
     for name, calibrator in calibrators.items():
         pose = calibrate_still(calibrator, segments, intrinsics, TUSIMPLE_LANE_WIDTH).extrinsics.stack()
@@ -126,6 +127,12 @@ def tusimple_pixels(data: Path, model: Any, calibrators: dict[str, Any]) -> Iter
         for axis, value, target in zip(("pitch", "yaw", "roll"), middle, (0.15, 0.15, 0.4), strict=False):
             yield Figure(part, f"{axis} against labels, median", name, np.degrees(value), target, "deg")
         yield Figure(part, "height against labels, median", name, 100 * middle[3], 3, "%")
+
+
+def still_segments(images: list[str], model: Any, camera: Camera) -> list[LaneSegments]:
+    """What the network sees on each image, in double precision."""
+    observer = NetworkObserver(model, camera)
+    return [camera_segments(observer(next(iter(open_source(image)))).vertices, camera) for image in images]
 
 
 def carla_truth(data: Path) -> dict[str, torch.Tensor]:
@@ -141,9 +148,8 @@ def carla_stills(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterabl
     """Five renderings, one frame each."""
     truth = carla_truth(data)
     camera = Camera.from_file(data / "carla" / "camera.yaml")
-    observer = NetworkObserver(model, camera, CARLA_LANE_WIDTH)
     names = [name for name in truth if name.endswith(".png")]
-    seen = [observer(next(iter(open_source(str(data / "carla" / name)))))[1] for name in names]
+    seen = still_segments([str(data / "carla" / name) for name in names], model, camera)
     segments = LaneSegments(*(torch.cat(parts) for parts in zip(*seen, strict=True)))
     intrinsics = camera.intrinsics.expand(len(names), 3, 3)
     expected = torch.stack([truth[name] for name in names])
@@ -163,23 +169,6 @@ def carla_drive(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable
         error = _in_units(drive.poses[10:67] - expected).square().mean(0).sqrt()
         yield from _per_axis("carla drive 10-66", "RMSE", name, error, (0.1, 0.1, 0.2, 3))
         yield from _width_figures("carla drive", name, drive, camera, targets=False)
-    poses = by_lanebev(str(data / "carla" / "drive.mp4"), camera, model, CARLA_LANE_WIDTH, 67)
-    error = _in_units(poses[10:] - expected).square().mean(0).sqrt()
-    yield from _per_axis("carla drive 10-66", "RMSE", "LaneBEV", error, (0.1, 0.1, 0.2, 3))
-
-
-def by_lanebev(source: str, camera: Camera, model: Any, lane_width: float, count: int) -> torch.Tensor:
-    """(count, 4) poses of a video's first frames by the module itself, no lane file's rows in between."""
-    state, poses = model.initial_state(1, dtype=torch.float64), []
-    for frame in itertools.islice(open_source(source), count):
-        if frame.image is None:
-            raise ValueError(f"{source}: frame {frame.number} does not decode: {frame.problem}")
-        image = torch.from_numpy(frame.image.copy()).permute(2, 0, 1)[None].float() / 255
-        lens = (camera.distortion[None].float(), camera.model)
-        with torch.inference_mode():
-            out, state = model(image, camera.intrinsics[None].float(), state, frame.dt, lane_width, *lens)
-        poses.append(out.calibration.extrinsics.stack()[0])
-    return torch.stack(poses)
 
 
 def udacity(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable[Figure]:
@@ -201,7 +190,7 @@ def follow(
     source: str, camera: Camera, model: Any, calibrators: dict[str, Any], lane_width: float
 ) -> dict[str, Drive]:
     """Every calibrator over the same observations of a video."""
-    observer = NetworkObserver(model, camera, lane_width)
+    observer = NetworkObserver(model, camera)
     states = {
         name: calibrator.initial_state(1, dtype=torch.float64) for name, calibrator in calibrators.items()
     }
@@ -210,7 +199,7 @@ def follow(
     lanes: dict[str, list[LaneSegments]] = {name: [] for name in calibrators}
     times, seen = [], []
     for frame in open_source(source):
-        _, segments = observer(frame)
+        segments = camera_segments(observer(frame).vertices, camera)
         times.append(frame.time)
         seen.append(segments)
         for name, calibrator in calibrators.items():

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.observation.lines import LineExtractor
-from lanebev.observation.polylines import rows_from_segments, segments_from_rows
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.pipeline import LaneBEV
 from lanebev.render import Drive
@@ -30,7 +29,7 @@ class Seen(NamedTuple):
 
 
 def watch(segmenters: Sequence[LaneSegmenter], seed: int, frames: int, fps: float) -> list[Seen]:
-    """A rendered drive through each network, its sigmas as the maps say, by way of ``lanes.json``'s rows."""
+    """A rendered drive through each network, its sigmas as the maps say."""
     drive = Drive(seed, num_frames=frames, fps=fps)
     models = [_observer(segmenter) for segmenter in segmenters]
     segments: list[list[LaneSegments]] = [[] for _ in segmenters]
@@ -39,9 +38,7 @@ def watch(segmenters: Sequence[LaneSegmenter], seed: int, frames: int, fps: floa
         frame = drive.frame(i)
         for model, segmenter, own in zip(models, segmenters, segments, strict=True):
             with torch.inference_mode():
-                _, found = model.observe(frame.image, frame.intrinsics)
-            rows = rows_from_segments(found, drive.camera)
-            taken = segments_from_rows([rows], drive.camera)
+                _, taken = model.observe(frame.image, frame.intrinsics.double())
             own.append(taken._replace(sigma=taken.sigma / segmenter.config.sigma_scale))
         widths.append(frame.lane_width.double())
         poses.append(frame.extrinsics.stack()[0].double())

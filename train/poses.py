@@ -13,7 +13,8 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from lanebev.estimation.joint.single_frame import SingleFrameFit, fit_single_frame
 from lanebev.geometry.precision import cast_floating, widest_dtype
-from lanebev.observation.lines import LineExtractor, undistort_segments
+from lanebev.observation.lines import LineExtractor
+from lanebev.observation.pairing import segments_from_vertices
 from train.data import Batch, LiveFrames, PoolFrames, RenderedRoads, Seed, run_position
 from train.labels import LabelledImage, ViewConfig, full_view
 from train.pool import Pose
@@ -120,7 +121,7 @@ def fit_poses(
     dtype = widest_dtype(logits.device)
     even: Tensor = EvenGradients.apply(logits.to(dtype), reach)  # type: ignore[no-untyped-call]
     intrinsics, distortion = intrinsics.to(dtype), distortion.to(dtype)
-    segments = undistort_segments(extractor(even, size, size), intrinsics, distortion)
+    segments = segments_from_vertices(extractor.vertices(even, size, size), intrinsics, distortion)
     if where_only:
         segments = segments._replace(weight=segments.weight.detach(), sigma=segments.sigma.detach())
     width = cast_floating(lane_width, dtype)

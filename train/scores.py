@@ -7,10 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
-from lanebev.camera.model import Camera
 from lanebev.io.lanes import FrameLines
 from lanebev.observation.lines import LineExtractor
-from lanebev.observation.polylines import BoundaryRows, rows_from_segments
+from lanebev.observation.polylines import BoundaryRows, rows_from_vertices
 from lanebev.observation.vertices import LineConfig
 from train.datasets import ScoredBatch
 from train.metrics import CULaneCounts, culane_counts, tusimple_score
@@ -82,7 +81,5 @@ def boundary_rows(logits: Tensor, network_size: tuple[int, int], image_size: tup
     """One image's boundaries on rows of the image as it came."""
     stride = -(-network_size[0] // logits.shape[-2])
     extractor = LineExtractor(LineConfig(stride=stride))
-    segments = extractor(logits.detach().cpu(), image_size, network_size)
-    height, width = image_size
-    camera = Camera.from_parameters(width, width, width / 2, height / 2, width, height)  # its size is used
-    return rows_from_segments(segments, camera)
+    vertices = extractor.vertices(logits.detach().cpu(), image_size, network_size)
+    return rows_from_vertices(vertices, image_size)

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from lanebev.app.concurrency import Background
 from lanebev.app.run import RunConfig, run, summary
-from lanebev.io.lanes import LaneLine, tusimple_line
+from lanebev.io.lanes import tusimple_line
 from lanebev.io.results import ExtrinsicsRow, OutputFolder, extrinsics_row, write_extrinsics
 from lanebev.io.video import VideoWriter
-from lanebev.observation.polylines import BoundaryRows, rows_from_lines
+from lanebev.observation.polylines import BoundaryRows, LaneLine, rows_from_vertices, vertices_from_lines
 from lanebev.render import Drive, RenderedFrame
 from lanebev.types import Calibration, Extrinsics, Status
 
@@ -88,7 +88,7 @@ def true_lanes(drive: Drive, frame: RenderedFrame) -> BoundaryRows:
         as_taken[:, 1] = points[:, 1]  # rows of the gaps
         if (visible >= 0.5).any():
             lines.append(LaneLine(as_taken.numpy(), index))
-    return rows_from_lines(lines, drive.camera)
+    return rows_from_vertices(vertices_from_lines(lines, drive.camera), drive.camera.image_size)
 
 
 def against_truth(found: Any, truth: list[ExtrinsicsRow]) -> str:

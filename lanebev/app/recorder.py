@@ -18,7 +18,8 @@ from lanebev.camera.model import Camera
 from lanebev.io.lanes import tusimple_line
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video import Frame, VideoWriter, write_png
-from lanebev.observation.polylines import BoundaryRows
+from lanebev.observation.pairing import BoundaryVertices
+from lanebev.report.lane_curves import lane_curves
 from lanebev.report.measure import believed, measure_boundaries
 from lanebev.report.overlay import Panel, Picture, draw_frame
 from lanebev.report.page import Report, summary_facts, write_report
@@ -34,7 +35,8 @@ class Recorded(NamedTuple):
     Attributes:
         frame: as it came.
         name: for ``raw_file`` of lanes.json.
-        rows: boundaries on image rows.
+        vertices: of batch size 1, as seen.
+        pose_sigma_scale: of the pose's sigmas.
         segments: of batch size 1, what the calibrator was given.
         calibration: of batch size 1.
         before: pose of the view before, each (1,); None before anything is known.
@@ -43,7 +45,8 @@ class Recorded(NamedTuple):
 
     frame: Frame
     name: str
-    rows: BoundaryRows
+    vertices: BoundaryVertices
+    pose_sigma_scale: float
     segments: LaneSegments
     calibration: Calibration
     before: Extrinsics | None
@@ -132,7 +135,9 @@ class Recorder:
         return report
 
     def _write(self, done: Recorded) -> None:
-        self._lanes.write(tusimple_line(done.name, *done.rows) + "\n")
+        curves = lane_curves(done.segments, done.calibration, self.camera)
+        line = tusimple_line(done.name, *curves, seen=done.vertices, pose_sigma_scale=done.pose_sigma_scale)
+        self._lanes.write(line + "\n")
         intrinsics = self.camera.intrinsics[None].to(done.segments.endpoints)
         lanes = believed(done.segments, done.calibration.inliers)
         poses = (done.before, done.calibration.extrinsics)

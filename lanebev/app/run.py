@@ -33,6 +33,7 @@ from lanebev.io.lanes import lane_files, read_lanes
 from lanebev.io.results import ExtrinsicsRow, OutputFolder, check_inputs_stay
 from lanebev.io.state import load_state, save_state
 from lanebev.io.video import DEFAULT_FPS, Frame, FrameSource, image_size, open_source
+from lanebev.observation.polylines import camera_segments
 from lanebev.pipeline import LaneBEV
 from lanebev.report.measure import pose
 from lanebev.report.overlay import Picture
@@ -135,11 +136,12 @@ def run(
         before = None
         with recorder:
             for frame in frames:
-                rows, segments = observer(frame)
+                vertices, pose_sigma_scale = observer(frame)
+                segments = camera_segments(vertices, camera)
                 calibration, states["calibrator"] = calibrate(
                     calibrator, segments, camera, states["calibrator"], frame, config
                 )
-                calibration = calibration.with_std_scaled(rows.pose_sigma_scale)
+                calibration = calibration.with_std_scaled(pose_sigma_scale)
                 bend = curvature(calibrator, states["calibrator"])
                 mounted, states["mount"] = mount(calibration, states["mount"], frame.dt, curvature=bend)
                 before = pose_before(before, calibration, config.stills or source.is_single, camera)
@@ -147,7 +149,8 @@ def run(
                     Recorded(
                         frame,
                         frame.name or f"{Path(source.source).name}/{frame.number:06d}",
-                        rows,
+                        vertices,
+                        pose_sigma_scale,
                         segments,
                         calibration,
                         before,
@@ -231,7 +234,7 @@ def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Obs
         if config.lanes_size is not None:
             entries = resized_lanes(entries, config.lanes_size, camera.image_size)
         return LaneFileObserver(entries, source, camera)
-    return NetworkObserver(LaneBEV.from_pretrained(), camera, config.lane_width)
+    return NetworkObserver(LaneBEV.from_pretrained(), camera)
 
 
 def make_calibrator(name: str) -> Any:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.io.lanes import FrameLines, LaneLine
+from lanebev.io.lanes import FrameLines
 
 _OUTSIDE = 0.1  # share of points below or far beside the images, of which more are of another size
 _BESIDE = 0.5  # image widths beside an image that lines are drawn on to
@@ -42,10 +42,9 @@ def resized_lanes(
     return [
         frame._replace(
             lines=[
-                LaneLine(
-                    (line.points + 0.5) * scale - 0.5,
-                    line.boundary,
-                    None if line.sigma is None else line.sigma * scale[0],
+                line._replace(
+                    points=(line.points + 0.5) * scale - 0.5,
+                    sigma=None if line.sigma is None else line.sigma * scale[0],
                 )
                 for line in frame.lines
             ]

@@ -25,26 +25,14 @@ from lanebev.io.openlane import (
 )
 from lanebev.io.video import IMAGE_SUFFIXES, natural_order
 from lanebev.numbers import finite_numbers, numbers_or_gaps, read_text, shown
+from lanebev.observation.pairing import BoundaryVertices
+from lanebev.observation.polylines import LaneLine
 from lanebev.types import NUM_BOUNDARIES
 
 _OPENLANE_CURBS = (20, 21)  # left and right kerb: no lane ends there, so no lane width holds
 _GAP = 2.5  # times the usual distance of rows: from there on a line is not seen in between
 _FARTHEST = 1e6  # px, of any coordinate
 _TUSIMPLE_ROWS = {56: range(160, 720, 10), 48: range(240, 720, 10)}  # of the benchmark's labels, by number
-
-
-class LaneLine(NamedTuple):
-    """One line as a detector or a person drew it.
-
-    Attributes:
-        points: (P, 2) px, (x, y) of the image as it came; x is NaN in a gap of the line.
-        boundary: index of the semantic boundary if the file says so, else None.
-        sigma: (P,) px, standard deviation of each point across the line if the file says so, else None.
-    """
-
-    points: NDArray[np.float64]
-    boundary: int | None = None
-    sigma: NDArray[np.float64] | None = None
 
 
 class FrameLines(NamedTuple):
@@ -164,8 +152,7 @@ def tusimple_line(
     name: str,
     rows: NDArray[np.float64],
     x: NDArray[np.float64],
-    sigma: NDArray[np.float64] | None = None,
-    fitted: NDArray[np.float64] | None = None,
+    seen: BoundaryVertices | None = None,
     pose_sigma_scale: float = 1.0,
 ) -> str:
     """One frame's boundaries as a line of TuSimple JSON, with each lane's ``boundary``.
@@ -173,28 +160,35 @@ def tusimple_line(
     Args:
         name: ``raw_file``.
         rows: (R,) px.
-        x: (L, R) px; NaN where a boundary was not seen.
-        sigma: (L, R) px, written as another key that other readers pass over; None leaves it out.
-        fitted: (L, R) px, the same boundaries as curves; then these are the ``lanes``, and what was seen
-            goes to another key, ``seen``, which :func:`read_tusimple` prefers. None leaves it out.
+        x: (L, R) px; NaN where a boundary is not there.
+        seen: of batch size 1, the vertices that the calibrator was given. They go in full precision to the
+            key ``seen``, which other readers pass over and :func:`read_tusimple` prefers. None leaves it out.
         pose_sigma_scale: factor on the standard deviations of the pose estimated from them; 1 is left out.
     """
-    fields: dict[str, Any] = {"raw_file": name, "h_samples": [round(row) for row in rows.tolist()]}
-    if fitted is None:
-        fields |= _lane_fields(x, sigma)
-    else:
-        fields |= {**_lane_fields(fitted, None), "seen": _lane_fields(x, sigma)}
+    there = [index for index in range(len(x)) if np.isfinite(x[index]).any()]
+    fields: dict[str, Any] = {
+        "raw_file": name,
+        "h_samples": [round(row) for row in rows.tolist()],
+        "lanes": [[-2 if math.isnan(value) else round(value, 3) for value in x[i].tolist()] for i in there],
+        "boundary": there,
+    }
+    if seen is not None:
+        fields["seen"] = _vertex_fields(seen)
     return json.dumps(fields if pose_sigma_scale == 1.0 else {**fields, "pose_sigma_scale": pose_sigma_scale})
 
 
-def _lane_fields(x: NDArray[np.float64], sigma: NDArray[np.float64] | None) -> dict[str, Any]:
-    seen = [index for index in range(len(x)) if np.isfinite(x[index]).any()]
-    fields: dict[str, Any] = {"lanes": [_written(x[index]) for index in seen], "boundary": seen}
-    return fields if sigma is None else {**fields, "sigma": [_written(sigma[index]) for index in seen]}
-
-
-def _written(values: NDArray[np.float64]) -> list[float]:
-    return [-2 if math.isnan(value) else round(value, 3) for value in values.tolist()]
+def _vertex_fields(vertices: BoundaryVertices) -> dict[str, Any]:
+    kept = [weight > 0 for weight in vertices.weight[0]]
+    lines = [i for i, there in enumerate(kept) if there.any()]
+    numbers = {
+        name: [part[0, i][kept[i]].double().tolist() for i in lines]
+        for name, part in (
+            ("points", vertices.points),
+            ("sigma", vertices.sigma),
+            ("weight", vertices.weight),
+        )
+    }
+    return {"boundary": vertices.boundary[0, lines].tolist(), **numbers}
 
 
 def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int | None]:
@@ -279,17 +273,9 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
     if type(pose_sigma_scale) not in (int, float) or not 0 < pose_sigma_scale <= sys.float_info.max:
         raise ValueError(f"pose_sigma_scale: expected a finite number above 0, got {shown(pose_sigma_scale)}")
     if "seen" in fields:
-        fields = _field(fields, "seen", dict)
+        return FrameLines(name, _seen_lines(_field(fields, "seen", dict)), float(pose_sigma_scale))
     lanes = _field(fields, "lanes", list)
-    indices: Sequence[int | None] = fields.get("boundary") or [None] * len(lanes)
-    if "boundary" in fields:
-        valid = isinstance(fields["boundary"], list)
-        valid = valid and all(type(i) is int and 0 <= i < NUM_BOUNDARIES for i in indices)
-        if not (valid and len(indices) == len(lanes) == len(set(indices))):
-            raise ValueError(
-                f"boundary: expected one different index of 0..{NUM_BOUNDARIES - 1} per lane, got "
-                f"{shown(fields['boundary'])}"
-            )
+    indices = _boundary_indices(fields, len(lanes))
     sigmas = fields.get("sigma") or [None] * len(lanes)
     if not isinstance(sigmas, list) or len(sigmas) != len(lanes):
         raise ValueError("sigma: expected a list per lane, got another number of them")
@@ -302,6 +288,39 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
         if np.isfinite(x).any():
             lines.append(LaneLine(np.stack([x, np.array(rows)], axis=-1), index, sigma))
     return FrameLines(name, lines, float(pose_sigma_scale))
+
+
+def _boundary_indices(fields: dict[str, Any], count: int) -> Sequence[int | None]:
+    if "boundary" not in fields:
+        return [None] * count
+    indices: Sequence[int] = fields["boundary"]
+    valid = isinstance(indices, list) and all(type(i) is int and 0 <= i < NUM_BOUNDARIES for i in indices)
+    if not (valid and len(indices) == count == len(set(indices))):
+        raise ValueError(
+            f"boundary: expected one different index of 0..{NUM_BOUNDARIES - 1} per lane, got "
+            f"{shown(indices)}"
+        )
+    return indices
+
+
+def _seen_lines(fields: dict[str, Any]) -> list[LaneLine]:
+    """The vertices that a run wrote, boundary by boundary."""
+    points, sigmas, weights = (_field(fields, name, list) for name in ("points", "sigma", "weight"))
+    if not len(points) == len(sigmas) == len(weights):
+        raise ValueError(
+            "seen: expected points, sigma and weight of as many lines, got other numbers of them"
+        )
+    lines = []
+    for i, index in enumerate(_boundary_indices(fields, len(points))):
+        pairs = [_numbers(f"seen.points[{i}]", pair, 2) for pair in _list(f"seen.points[{i}]", points[i])]
+        sigma = _numbers(f"seen.sigma[{i}]", sigmas[i], len(pairs))
+        weight = _numbers(f"seen.weight[{i}]", weights[i], len(pairs))
+        if not (sigma > 0).all():
+            raise ValueError(f"seen.sigma[{i}]: expected px above 0, got {shown(sigmas[i])}")
+        if not ((weight > 0) & (weight <= 1)).all():
+            raise ValueError(f"seen.weight[{i}]: expected 0 to 1, got {shown(weights[i])}")
+        lines.append(LaneLine(np.reshape(pairs, (-1, 2)), index, sigma, weight))
+    return lines
 
 
 def _benchmark_rows(lanes: list[Any]) -> list[float]:
@@ -322,6 +341,16 @@ def _on_h_samples(name: str, values: Any, count: int) -> NDArray[np.float64]:
     x = _pixels(name, np.array(numbers_or_gaps(name, values)))
     x[x < 0] = np.nan  # -2 is "not there", as null and NaN are
     return x
+
+
+def _numbers(name: str, values: Any, count: int) -> NDArray[np.float64]:
+    return np.array(finite_numbers(name, _list(name, values), count), dtype=np.float64)
+
+
+def _list(name: str, values: Any) -> list[Any]:
+    if not isinstance(values, list):
+        raise ValueError(f"{name}: expected a list, got {shown(values)}")
+    return values
 
 
 def _check_culane_rows(y: NDArray[np.float64], last: str) -> None:

@@ -1,36 +1,47 @@
-"""Lane boundaries on image rows: what goes between any detector, ``lanes.json`` and the calibrator.
-
-A :class:`BoundaryRows` is in pixels of the image as it came. Whatever drew the lines, a run calibrates on
-``segments_from_rows`` of it and writes it to ``lanes.json`` as it is, so the file gives the same calibration.
-"""
+"""Polylines of any lane detector, in pixels of the image as it came, to boundary vertices and back."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
 from lanebev.camera.model import Camera
-from lanebev.geometry.lens import undistorted_sigma
-from lanebev.io.lanes import LaneLine
 from lanebev.observation.boundary_order import boundary_indices
-from lanebev.observation.lines import NETWORK_CORRELATION
+from lanebev.observation.pairing import BoundaryVertices, segments_from_vertices
 from lanebev.types import NUM_BOUNDARIES, LaneSegments
 
-ROW_STEP = round(NETWORK_CORRELATION)
-"""Rows of ``lanes.json`` are this many pixels apart, as far as a network's line errs alike."""
+ROW_STEP = 10
+"""px between the rows on which a polyline is sampled: neighbours on one row err alike, and say so once."""
 
-SEGMENTS_PER_BOUNDARY = 30
 LINE_SIGMA = 1.5
 """Standard deviation (px) of a line that comes without one: a careful label or a good detector."""
 
-_DIGITS = 3  # of x in lanes.json; rounded here too, so that file and run see the same
-_LEAST_WEIGHT = 0.15  # of a segment that counts; what is fainter is a foot of a barrier as often as paint
-_LEAST_SIGMA = 0.05  # px
+VERTICES_PER_LINE = 60
+"""At most; more do not make a frame's pose better, only slower."""
+
 _GAP, _GAP_ROWS = 4.0, 30.0  # between vertices: times the usual distance, and px
+
+
+class LaneLine(NamedTuple):
+    """One line as a detector or a person drew it.
+
+    Attributes:
+        points: (P, 2) px, (x, y) of the image as it came; x is NaN in a gap of the line.
+        boundary: index of the semantic boundary if the source says so, else None.
+        sigma: (P,) px, standard deviation of each point across the line if the source says so, else None.
+        weight: (P,) in [0, 1], confidence in each point of a line whose points are vertices with errors of
+            their own; None for a polyline, of which points on rows are taken.
+    """
+
+    points: NDArray[np.float64]
+    boundary: int | None = None
+    sigma: NDArray[np.float64] | None = None
+    weight: NDArray[np.float64] | None = None
 
 
 class BoundaryRows(NamedTuple):
@@ -38,135 +49,125 @@ class BoundaryRows(NamedTuple):
 
     Attributes:
         rows: (R,) px, rising.
-        x: (L, R) px; NaN where a boundary was not seen.
-        sigma: (L, R) px, standard deviation across the line; None if nobody said, then it is LINE_SIGMA.
-        fitted: (L, R) px, the same boundaries fitted together; None where they are taken as they came.
-        pose_sigma_scale: factor on the standard deviations of the pose estimated from them, see
-            :meth:`lanebev.Calibration.with_std_scaled`.
+        x: (L, R) px; NaN where a boundary is not there.
     """
 
     rows: NDArray[np.float64]
     x: NDArray[np.float64]
-    sigma: NDArray[np.float64] | None = None
-    fitted: NDArray[np.float64] | None = None
-    pose_sigma_scale: float = 1.0
 
 
 def image_rows(height: int) -> NDArray[np.float64]:
-    """(R,) the rows of ``lanes.json`` in an image of this height."""
+    """Return the rows of ``lanes.json`` in an image of this height, (R,)."""
     return np.arange(0, height, ROW_STEP, dtype=np.float64)
 
 
-def rows_from_lines(
+def vertices_from_lines(
     lines: Sequence[LaneLine], camera: Camera, num_boundaries: int = NUM_BOUNDARIES
-) -> BoundaryRows:
-    """Sample a detector's lines on the rows of ``lanes.json``.
+) -> BoundaryVertices:
+    """Convert one frame's lines to boundary vertices.
 
     Lines without a boundary index get one by :func:`boundary_indices`; those beyond the outermost boundary,
     and those that cross fewer than two rows, are left out.
-    """
-    height, width = camera.image_size
-    rows = image_rows(height)
-    x = np.full((num_boundaries, len(rows)), np.nan)
-    sigma = np.full_like(x, np.nan)
-    told = any(line.sigma is not None for line in lines)
-    if all(line.boundary is not None for line in lines):
-        indices: list[int | None] = [line.boundary for line in lines]
-    else:
-        indices = boundary_indices([_undistorted(line.points, camera) for line in lines], num_boundaries)
-    for line, index in zip(lines, indices, strict=True):
-        if index is not None and index < num_boundaries:
-            on_rows = _on_rows(line.points, rows)
-            inside = (on_rows >= 0) & (on_rows <= width - 1)
-            if inside.sum() >= 2:
-                x[index] = np.where(inside, on_rows.round(_DIGITS), np.nan)
-                said = np.full(len(line.points), LINE_SIGMA) if line.sigma is None else line.sigma
-                noise = _on_rows(np.stack([said, line.points[:, 1]], axis=-1), rows)
-                sigma[index] = np.where(inside, np.maximum(noise.round(_DIGITS), 10.0**-_DIGITS), np.nan)
-    return BoundaryRows(rows, x, sigma if told and np.isfinite(sigma).any() else None)
-
-
-def rows_from_segments(segments: LaneSegments, camera: Camera) -> BoundaryRows:
-    """Sample the vertices of a network's segments on the rows of ``lanes.json``.
-
-    A row lies between two vertices and takes both their errors, its variance by the ratio of rows to
-    vertices, so that all rows together say no more and no less than the vertices did.
 
     Args:
-        segments: of batch size 1, in pixels of the image as it came.
+        lines: of one frame.
         camera: the lens.
-    """
-    height, width = camera.image_size
-    rows = image_rows(height)
-    num_boundaries = int(segments.boundary.max()) + 1
-    x = np.full((num_boundaries, len(rows)), np.nan)
-    sigma = np.full_like(x, np.nan)
-    weight = segments.weight[0].double().numpy()
-    noise = segments.sigma[0].double().numpy() / np.sqrt(np.maximum(weight, _LEAST_WEIGHT))
-    ends = segments.endpoints[0].double().numpy()
-    for index in range(num_boundaries):
-        mine = (segments.boundary[0].numpy() == index) & (weight > _LEAST_WEIGHT)
-        vertices, own = ends[mine].reshape(-1, 2), noise[mine].repeat(2)
-        order = np.argsort(vertices[:, 1])
-        on_rows = _on_rows(_with_gaps(vertices[order]), rows)
-        inside = (on_rows >= 0) & (on_rows <= width - 1)
-        count = int(inside.sum())
-        if count >= 2:
-            between = np.interp(rows, vertices[order, 1], own[order]) * np.sqrt(count / len(own))
-            x[index] = np.where(inside, on_rows.round(_DIGITS), np.nan)
-            sigma[index] = np.where(inside, np.maximum(between, _LEAST_SIGMA).round(_DIGITS), np.nan)
-    return BoundaryRows(rows, x, sigma)
-
-
-def segments_from_rows(
-    frames: Sequence[BoundaryRows],
-    camera: Camera,
-    sigma: float = LINE_SIGMA,
-    per_boundary: int = SEGMENTS_PER_BOUNDARY,
-    dtype: torch.dtype = torch.float64,
-) -> LaneSegments:
-    """Vertices of each boundary, paired to segments, one frame a row of the batch.
-
-    Source: Sects. VI-A and VI-B, representative vertices sampled and paired. Deviation: not at random, which
-    uses some vertices often and many never: vertex i goes with vertex i + K/2, each once, so that all
-    baselines are long and the end points' errors independent.
-
-    Args:
-        frames: B frames.
-        camera: the lens that took them; points that it cannot have imaged are left out.
-        sigma: px, standard deviation of a vertex across its line where the frame does not know it.
-        per_boundary: most segments on one boundary.
-        dtype: of the result.
+        num_boundaries: L.
 
     Returns:
-        segments padded to N = L · per_boundary.
+        (1, L, VERTICES_PER_LINE) in double precision, boundary 0..L-1.
     """
-    num_boundaries = frames[0].x.shape[0]
-    endpoints = np.zeros((len(frames), num_boundaries, per_boundary, 2, 2))
-    weight = np.zeros((len(frames), num_boundaries, per_boundary))
-    noise = np.full_like(weight, sigma)
-    for row, frame in enumerate(frames):
-        known = np.full_like(frame.x, sigma) if frame.sigma is None else frame.sigma
-        for index, vertices in enumerate(_vertices(frame, known, camera)):
-            pairs = paired(vertices, per_boundary)
-            endpoints[row, index, : len(pairs)] = pairs[..., :2]
-            weight[row, index, : len(pairs)] = 1.0
-            noise[row, index, : len(pairs)] = np.sqrt((pairs[..., 2] ** 2).mean(-1))
-    boundary = torch.arange(num_boundaries).repeat_interleave(per_boundary).repeat(len(frames), 1)
-    return LaneSegments(
-        torch.from_numpy(endpoints).flatten(1, 2).to(dtype),
-        boundary,
-        torch.from_numpy(weight).flatten(1).to(dtype),
-        torch.from_numpy(noise).flatten(1).to(dtype),
-    )
+    shape = (1, num_boundaries, VERTICES_PER_LINE)
+    points, weight, sigma = np.zeros((*shape, 2)), np.zeros(shape), np.ones(shape)
+    for line, index in zip(lines, _indices(lines, camera, num_boundaries), strict=True):
+        if index is not None and index < num_boundaries:
+            found = _line_vertices(line, camera.image_size)
+            if len(found) >= 2:
+                kept = found[_spread(len(found), VERTICES_PER_LINE)]
+                points[0, index, : len(kept)] = kept[:, :2]
+                sigma[0, index, : len(kept)], weight[0, index, : len(kept)] = kept[:, 2:].T
+    parts = map(torch.from_numpy, (points, weight, sigma))
+    return BoundaryVertices._make([*parts, torch.arange(num_boundaries)[None]])
 
 
-def paired(vertices: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """(K, D) vertices along a line to (M, 2, D) segments, M = min(K // 2, most), i with i + ceil(K / 2)."""
-    if len(vertices) > 2 * most:
-        vertices = vertices[np.linspace(0, len(vertices) - 1, 2 * most).round().astype(int)]
-    count = len(vertices) // 2
-    return np.stack([vertices[:count], vertices[len(vertices) - count :]], axis=1)
+def camera_segments(vertices: BoundaryVertices, camera: Camera) -> LaneSegments:
+    """Pair the vertices of B images that one camera took, see :func:`segments_from_vertices`."""
+    rows = vertices.weight.shape[0]
+    intrinsics, distortion = camera.intrinsics.expand(rows, 3, 3), camera.distortion.expand(rows, -1)
+    return segments_from_vertices(vertices, intrinsics, distortion, camera.model)
+
+
+def segments_from_lines(
+    frames: Sequence[Sequence[LaneLine]], camera: Camera, num_boundaries: int = NUM_BOUNDARIES
+) -> LaneSegments:
+    """Convert the lines of B frames to segments, each frame a row of the batch."""
+    parts = zip(*(vertices_from_lines(lines, camera, num_boundaries) for lines in frames), strict=True)
+    return camera_segments(BoundaryVertices._make(map(torch.cat, parts)), camera)
+
+
+def segments_from_polylines(
+    polylines: Sequence[ArrayLike | Tensor] | Mapping[int, ArrayLike | Tensor],
+    camera: Camera,
+    sigma: float = LINE_SIGMA,
+    num_boundaries: int = NUM_BOUNDARIES,
+) -> LaneSegments:
+    """Convert one frame's polylines, see :meth:`lanebev.LaneSegments.from_polylines`."""
+    named = isinstance(polylines, Mapping)
+    lines = []
+    for key, given in polylines.items() if isinstance(polylines, Mapping) else enumerate(polylines):
+        points = np.array(given.tolist() if isinstance(given, Tensor) else given, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points[:, 1]).all():
+            raise ValueError(f"polylines[{key}]: expected (P, 2) px with finite y, got shape {points.shape}")
+        if named and not 0 <= key < num_boundaries:
+            raise ValueError(f"polylines: expected boundaries 0 to {num_boundaries - 1}, got {key}")
+        lines.append(LaneLine(points, key if named else None, np.full(len(points), float(sigma))))
+    return segments_from_lines([lines], camera, num_boundaries)
+
+
+def rows_from_vertices(vertices: BoundaryVertices, image_size: tuple[int, int]) -> BoundaryRows:
+    """Interpolate the boundaries of one frame on rows of the image; a gap stays a gap.
+
+    Args:
+        vertices: of batch size 1, boundary 0..L-1.
+        image_size: (height, width) px.
+    """
+    rows = image_rows(image_size[0])
+    x = np.full((vertices.weight.shape[1], len(rows)), np.nan)
+    for own, points, weight in zip(x, vertices.points[0], vertices.weight[0], strict=True):
+        seen = points[weight > 0].double().numpy()
+        on_rows = _on_rows(_with_gaps(seen[np.argsort(seen[:, 1])]), rows)
+        inside = _inside(on_rows, image_size[1])
+        if inside.sum() >= 2:
+            own[inside] = on_rows[inside]
+    return BoundaryRows(rows, x)
+
+
+def _indices(lines: Sequence[LaneLine], camera: Camera, num_boundaries: int) -> list[int | None]:
+    """Semantic boundary of each line: as they say, or counted if one of them does not."""
+    if all(line.boundary is not None for line in lines):
+        return [line.boundary for line in lines]
+    return boundary_indices([_undistorted(line.points, camera) for line in lines], num_boundaries)
+
+
+def _line_vertices(line: LaneLine, image_size: tuple[int, int]) -> NDArray[np.float64]:
+    """(K, 4) x, y, sigma and weight of a line's vertices, or of a polyline on rows."""
+    said = np.full(len(line.points), LINE_SIGMA) if line.sigma is None else line.sigma
+    if line.weight is not None:
+        return np.column_stack([line.points, said, line.weight])
+    rows = image_rows(image_size[0])
+    x = _on_rows(line.points, rows)
+    sigma = _on_rows(np.column_stack([said, line.points[:, 1]]), rows)
+    return np.column_stack([x, rows, sigma, np.ones(len(rows))])[_inside(x, image_size[1])]
+
+
+def _inside(x: NDArray[np.float64], width: int) -> NDArray[np.bool_]:
+    inside: NDArray[np.bool_] = (x >= 0) & (x <= width - 1)
+    return inside
+
+
+def _spread(count: int, most: int) -> NDArray[np.int64]:
+    """At most ``most`` indices of 0..count-1, evenly spread."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
 
 
 def _on_rows(points: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -188,22 +189,6 @@ def _with_gaps(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
     gaps = np.flatnonzero(steps > max(_GAP * float(np.median(steps)), _GAP_ROWS))
     middle = 0.5 * (vertices[gaps, 1] + vertices[gaps + 1, 1])
     return np.insert(vertices, gaps + 1, np.stack([np.full(len(gaps), np.nan), middle], axis=-1), axis=0)
-
-
-def _vertices(frame: BoundaryRows, sigma: NDArray[np.float64], camera: Camera) -> list[NDArray[np.float64]]:
-    """Vertices (K, 3) of each boundary: undistorted x, y and sigma, px; those the lens can have imaged."""
-    on_rows = np.stack([frame.x, np.broadcast_to(frame.rows, frame.x.shape)], axis=-1)
-    as_taken = torch.from_numpy(on_rows).flatten(0, 1).to(camera.intrinsics)
-    undistorted, valid = camera.undistort_points(as_taken)
-    undistorted = undistorted.double().reshape(*frame.x.shape, 2)
-    kept, noise = valid.reshape(frame.x.shape), torch.from_numpy(sigma)
-    lens = (camera.intrinsics[None].double(), camera.distortion[None].double(), camera.model)
-    lines = [points[seen] for points, seen in zip(undistorted, kept, strict=True)]
-    along = [torch.gradient(line, dim=0)[0] if len(line) > 1 else torch.zeros_like(line) for line in lines]
-    points = torch.cat(lines)
-    across = undistorted_sigma(noise[kept][None], points[None], torch.cat(along)[None], *lens)[0]
-    vertices = torch.cat([points, across.unsqueeze(-1)], dim=-1).numpy()
-    return np.split(vertices, np.cumsum([len(line) for line in lines])[:-1])
 
 
 def _undistorted(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:

@@ -42,6 +42,8 @@ class LineConfig:
         min_vertices: a boundary with fewer is not seen.
         sigma_floor: least standard deviation of a vertex, label px: what correlates along the line.
         sigma_scale: of all standard deviations; 1 where the maps are true.
+        least_weight: of a vertex; a fainter one is left out: as often it lies on the foot of a barrier as on
+            paint.
         correlation: px of the image, vertically, over which a line's errors are one error: vertices nearer
             together than this say no more than so many farther apart; 0 where the maps are true.
     """
@@ -56,6 +58,7 @@ class LineConfig:
     min_vertices: int = 8
     sigma_floor: float = 0.004
     sigma_scale: float = 1.0
+    least_weight: float = 0.15
     correlation: float = 0.0
 
     def __post_init__(self) -> None:
@@ -67,6 +70,8 @@ class LineConfig:
                 raise ValueError(f"{name}: expected more than 0 and finite, got {getattr(self, name)}")
         if not 0 <= self.correlation < math.inf:
             raise ValueError(f"correlation: expected 0 px or more, got {self.correlation}")
+        if not 0 <= self.least_weight <= 1:
+            raise ValueError(f"least_weight: expected 0 to 1, got {self.least_weight}")
         if not 0 <= self.absent < self.present:
             raise ValueError(f"present: expected more than absent ({self.absent}), got {self.present}")
         if not self.present < self.twice:

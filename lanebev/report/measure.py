@@ -13,8 +13,10 @@ from lanebev.geometry.road import road_from_image_points
 from lanebev.types import NUM_BOUNDARIES, Extrinsics, LaneSegments
 
 _MIN_VERTICES = 4
+_MIN_ROWS = 50.0  # px of the image that a boundary must cross: on fewer, its vertices err alike
 _MIN_STRETCH = 5.0  # m of road that a boundary must cover
-_LEAST_SIGMA = 1e-9  # like rad
+_LEAST_SCALE = 1e-6  # of the residuals in sigmas
+_WIDTH_STD = 0.03  # m, from which on a width is not told
 
 
 class RoadBoundaries(NamedTuple):
@@ -45,8 +47,9 @@ def measure_boundaries(
     """Measure a frame's boundaries in the bird's-eye view that these extrinsics give.
 
     Only the observed vertices and the pose enter, no model of the lanes: with a wrong pose the lanes fan out
-    and the widths are wrong, which is what this is for. Vertices count by what a pixel is worth on the road
-    (1 / Z²); a boundary's vertices off its line by 3 robust sigmas are left out.
+    and the widths are wrong, which is what this is for. Vertices count by what their sigma is worth on the
+    road (1 / (σ Z)²); a boundary's vertices off its line by 3 robust sigmas are left out, and so are widths
+    that the vertices' sigmas leave open by more than 3 cm.
 
     Args:
         segments: of batch size 1, end points in undistorted pixels.
@@ -61,15 +64,18 @@ def measure_boundaries(
     seen = (valid[0] & (segments.weight[0] > 0).repeat_interleave(2)).numpy()
     x, z = points[0].double().numpy().T
     seen &= np.isfinite(x) & np.isfinite(z) & (z >= near) & (z <= far)
-    seen &= _long_enough(boundary, z, seen, num_boundaries)
+    rows = segments.endpoints[0, ..., 1].flatten().double().numpy()
+    seen &= _long_enough(boundary, z, rows, seen, num_boundaries)
+    sigma = segments.sigma[0].repeat_interleave(2).double().numpy() / float(intrinsics[0, 0, 0]) * z  # m
     nothing = RoadBoundaries(np.full(num_boundaries, np.nan), np.full(num_boundaries - 1, np.nan))
     if not seen.any():
         return nothing
     for _ in range(3):
-        offset, slope, bend = _fit(x[seen], z[seen], boundary[seen], num_boundaries)
-        residual = (x - offset[boundary] - slope[boundary] * z - bend * z**2) / z  # like rad
-        sigma = 1.4826 * np.median(np.abs(residual[seen])) + _LEAST_SIGMA
-        seen &= np.abs(residual) < 3 * sigma
+        line, cov = _fit(x[seen], z[seen], sigma[seen], boundary[seen], num_boundaries)
+        offset, slope, bend = line[:num_boundaries], line[num_boundaries:-1], float(line[-1])
+        residual = (x - offset[boundary] - slope[boundary] * z - bend * z**2) / sigma
+        scale = 1.4826 * np.median(np.abs(residual[seen])) + _LEAST_SCALE
+        seen &= np.abs(residual) < 3 * scale
     present = np.array([(seen & (boundary == k)).sum() >= _MIN_VERTICES for k in range(num_boundaries)])
     direction = np.where(present, np.arctan(slope + 2 * bend * near), np.nan)
     widths = np.full(num_boundaries - 1, np.nan)
@@ -79,8 +85,10 @@ def measure_boundaries(
         if end > start:
             middle = 0.5 * (start + end)
             heading = 0.5 * (slope[k] + slope[k + 1]) + 2 * bend * middle
-            across = offset[k + 1] - offset[k] + (slope[k + 1] - slope[k]) * middle
-            widths[k] = across / np.hypot(1.0, heading)  # square to the lane
+            at = np.zeros(len(line))  # of the width, in the parameters
+            at[[k, k + 1, num_boundaries + k, num_boundaries + k + 1]] = -1.0, 1.0, -middle, middle
+            if at @ cov @ at < _WIDTH_STD**2:
+                widths[k] = at @ line / np.hypot(1.0, heading)  # square to the lane
     return RoadBoundaries(direction, widths)
 
 
@@ -96,22 +104,30 @@ def pose(pitch: float, yaw: float, roll: float, height: float, like: Tensor) -> 
 
 
 def _long_enough(
-    boundary: NDArray[np.int64], z: NDArray[np.float64], seen: NDArray[np.bool_], num_boundaries: int
+    boundary: NDArray[np.int64],
+    z: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    seen: NDArray[np.bool_],
+    num_boundaries: int,
 ) -> NDArray[np.bool_]:
     enough = np.zeros(num_boundaries, dtype=bool)
     for k in range(num_boundaries):
-        of = z[seen & (boundary == k)]
-        enough[k] = len(of) >= _MIN_VERTICES and np.ptp(of) >= _MIN_STRETCH
+        of = seen & (boundary == k)
+        long = of.sum() >= _MIN_VERTICES and np.ptp(z[of]) >= _MIN_STRETCH
+        enough[k] = long and np.ptp(rows[of]) >= _MIN_ROWS
     long_enough: NDArray[np.bool_] = enough[boundary]
     return long_enough
 
 
 def _fit(
-    x: NDArray[np.float64], z: NDArray[np.float64], boundary: NDArray[np.int64], num_boundaries: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Offsets (L,), slopes (L,) and the common bend, by least squares weighted with 1 / Z²."""
+    x: NDArray[np.float64],
+    z: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    boundary: NDArray[np.int64],
+    num_boundaries: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Offsets (L,), slopes (L,) and the common bend by weighted least squares, and their covariance."""
     member = np.eye(num_boundaries)[boundary]
-    columns = np.concatenate([member, member * z[:, None], z[:, None] ** 2], axis=1) / z[:, None]
-    solution = np.linalg.lstsq(columns, x / z, rcond=None)[0]
-    offset, slope = np.asarray(solution[:-1], dtype=np.float64).reshape(2, num_boundaries)
-    return offset, slope, float(solution[-1])
+    columns = np.concatenate([member, member * z[:, None], z[:, None] ** 2], axis=1) / sigma[:, None]
+    inverse = np.linalg.pinv(columns)
+    return inverse @ (x / sigma), inverse @ inverse.T

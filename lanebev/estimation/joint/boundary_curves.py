@@ -14,6 +14,8 @@ from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import NUM_BOUNDARIES, Extrinsics, LaneSegments
 
 _HEADING_STD = 0.02  # rad; real boundaries differ by about a degree in direction
+_CURVE_HEADING_STD = 0.005  # rad, likewise, while a curvature is fitted that would pass for it
+_CURVATURE_STD = (2e-3, 2e-5)  # 1/m, 1/m²; of c0 and c1 where they are not given
 _TOLERANCE = 0.008  # of the focal length: distance at which a segment's say has fallen to a quarter
 _REWEIGHTINGS = 5
 
@@ -53,7 +55,7 @@ def fit_boundaries(
         segments: (B, N) line segments.
         intrinsics: (B, 3, 3).
         extrinsics: each (B,), of this frame.
-        curvature: (B, 2), c0 and c1, or None for a straight road.
+        curvature: (B, 2), c0 and c1, or None to fit them to all boundaries together.
         num_boundaries: L.
         least_support: sum of the believed segments' weights from which a boundary is present.
 
@@ -64,14 +66,15 @@ def fit_boundaries(
         ValueError: shapes that do not fit.
     """
     seen = observe(segments, intrinsics, num_boundaries)
-    curvature = intrinsics.new_zeros(intrinsics.shape[0], 2) if curvature is None else curvature
+    given = intrinsics.new_zeros(intrinsics.shape[0], 2) if curvature is None else curvature
     rotation = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)
     x, down, ahead = (rotation @ seen.rays).unbind(1)  # each (B, 2N)
     height = extrinsics.height.unsqueeze(-1)
     on_road = (down * FARTHEST > height * ahead) & (ahead > 1e-3)
     down = torch.where(on_road, down, 1.0)
     z = height * ahead / down
-    lateral = height * x / down - _bend(z, curvature)  # (B, 2N) m
+    across = height * x / down  # (B, 2N) m
+    lateral = across - _bend(z, given)
     focal = seen.intrinsics[:, :1, 0]
     boundary = seen.boundary.repeat_interleave(2, dim=1)
     member = torch.nn.functional.one_hot(boundary, num_boundaries).mT.to(z.dtype)  # (B, L, 2N)
@@ -87,6 +90,9 @@ def fit_boundaries(
         far_off = residual * per_metre / (_TOLERANCE * focal.unsqueeze(-1))
         trust = (1 + far_off.square()).square().reciprocal()
         precision = member * trust * (per_metre / sigma.unsqueeze(1)).square()  # 1/m²
+        if curvature is None:
+            given = _fit_curvature(z, across, precision)
+            lateral = across - _bend(z, given)
         offset, heading = _fit_line(z, lateral, precision)
     present = 0.5 * (member * trust).sum(-1) >= least_support
     reached = (member > 0) & (trust > 0.25)
@@ -98,7 +104,7 @@ def fit_boundaries(
         heading=heading,
         extent=extent,
         present=present,
-        curvature=curvature,
+        curvature=given,
     )
 
 
@@ -144,7 +150,9 @@ def _pixels_per_metre(offset: Tensor, down: Tensor, height: Tensor, focal: Tenso
     return (down * focal / height).unsqueeze(1) * steepness.unsqueeze(-1)
 
 
-def _fit_line(z: Tensor, lateral: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
+def _fit_line(
+    z: Tensor, lateral: Tensor, precision: Tensor, heading_std: float = _HEADING_STD
+) -> tuple[Tensor, Tensor]:
     """Weighted line through (z, lateral), (B, M) each, for weights (B, L, M); heading held near zero."""
     total = precision.sum(-1)
     some = total > 0
@@ -152,6 +160,27 @@ def _fit_line(z: Tensor, lateral: Tensor, precision: Tensor) -> tuple[Tensor, Te
     mean_z = (precision * z.unsqueeze(1)).sum(-1) / safe
     mean_x = (precision * lateral.unsqueeze(1)).sum(-1) / safe
     centred = z.unsqueeze(1) - mean_z.unsqueeze(-1)
-    spread = (precision * centred * centred).sum(-1) + _HEADING_STD**-2
+    spread = (precision * centred * centred).sum(-1) + heading_std**-2
     heading = (precision * centred * (lateral.unsqueeze(1) - mean_x.unsqueeze(-1))).sum(-1) / spread
     return mean_x - heading * mean_z, heading
+
+
+def _fit_curvature(z: Tensor, across: Tensor, precision: Tensor) -> Tensor:
+    """Weighted c0 and c1 (B, 2) common to all boundaries, each with its own offset and heading.
+
+    Source: least squares with the offsets and headings eliminated (Frisch and Waugh 1933): the lines through
+    each boundary are taken off the shapes Z²/2 and Z³/6 and off the points (B, M), then these are fitted.
+    """
+    std = z.new_tensor(_CURVATURE_STD)
+    shapes = torch.stack([z.square() / 2, z**3 / 6], dim=1) * std.unsqueeze(-1)  # (B, 2, M)
+    left = [_off_line(z, part, precision) for part in (*shapes.unbind(1), across)]  # each (B, L, M)
+    weighted = torch.einsum("blm,bim->bilm", precision, shapes)
+    sums = torch.stack([(weighted * part.unsqueeze(1)).sum((2, 3)) for part in left], dim=-1)  # (B, 2, 3)
+    root = torch.linalg.cholesky_ex(sums[..., :2] + torch.eye(2, dtype=z.dtype, device=z.device)).L
+    return torch.cholesky_solve(sums[..., 2:], root).squeeze(-1) * std
+
+
+def _off_line(z: Tensor, values: Tensor, precision: Tensor) -> Tensor:
+    """Subtract each boundary's weighted line through (z, values), (B, M) each, from the values: (B, L, M)."""
+    offset, heading = _fit_line(z, values, precision, _CURVE_HEADING_STD)
+    return values.unsqueeze(1) - offset.unsqueeze(-1) - heading.unsqueeze(-1) * z.unsqueeze(1)

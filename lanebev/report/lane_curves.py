@@ -1,0 +1,46 @@
+"""The lane boundaries of one frame as curves on the calibrated road, on rows of the image."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from lanebev.camera.model import Camera
+from lanebev.estimation.joint.boundary_curves import boundary_polylines, fit_boundaries
+from lanebev.observation.polylines import BoundaryRows, image_rows
+from lanebev.types import NUM_BOUNDARIES, Calibration, LaneSegments, Status
+
+_LEAST_SUPPORT = 1.0  # sum of segments' weights that a boundary needs to be drawn
+_LEAST_REACH = 60.0  # m ahead that a boundary is drawn at least: all lead to one horizon
+_POINTS = 96  # of a curve
+
+
+def lane_curves(segments: LaneSegments, calibration: Calibration, camera: Camera) -> BoundaryRows:
+    """Fit a curve to every boundary, with the calibrated pose and one curvature for all.
+
+    A boundary that is seen in pieces is drawn as one, and what fits no road is left out.
+
+    Args:
+        segments: of batch size 1, in undistorted pixels.
+        calibration: of batch size 1.
+        camera: the lens.
+
+    Returns:
+        (L, R) px of the image as it came; none of them where the pose is not known.
+    """
+    rows = image_rows(camera.image_size[0])
+    x = np.full((NUM_BOUNDARIES, len(rows)), np.nan)
+    if int(calibration.status[0]) not in (Status.TRACKING, Status.COASTING):
+        return BoundaryRows(rows, x)
+    intrinsics = camera.intrinsics[None].to(segments.endpoints)
+    curves = fit_boundaries(segments, intrinsics, calibration.extrinsics, least_support=_LEAST_SUPPORT)
+    far = curves.extent[..., 1].clamp(min=_LEAST_REACH)
+    curves = curves._replace(extent=torch.stack([torch.ones_like(far), far], dim=-1))
+    lines, shown = boundary_polylines(curves, intrinsics, calibration.extrinsics, num_points=_POINTS)
+    for own, line, there in zip(x, lines[0], shown[0], strict=True):
+        points = camera.distort_points(line[there]).double().numpy()
+        if len(points) > 1:
+            order = np.argsort(points[:, 1])
+            across = np.interp(rows, points[order, 1], points[order, 0], np.nan, np.nan)
+            own[:] = np.where((across >= 0) & (across <= camera.image_size[1] - 1), across, np.nan)
+    return BoundaryRows(rows, x)

@@ -1,0 +1,64 @@
+"""LaneBEV frame by frame, ``lanebev run``, and a run on its ``lanes.json`` are the same calibration."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from lanebev import Camera, LaneBEV
+from lanebev.app.run import RunConfig, make_calibrator, run
+from lanebev.io.results import extrinsics_row
+from lanebev.io.video import VideoWriter, open_source
+from lanebev.render import Drive
+
+FRAMES, LANE_WIDTH = 5, 3.6
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """Folder of a rendered drive behind a lens: camera.yaml and drive.mp4."""
+    folder = tmp_path_factory.mktemp("drive")
+    made = Drive(10, (180, 320), FRAMES, 20.0)
+    camera = replace(
+        made.camera, distortion=torch.tensor([-0.2, 0.05, 1e-3, -1e-3, 0.0], dtype=torch.float64)
+    )
+    camera.to_file(folder / "camera.yaml")
+    pixels = torch.cartesian_prod(torch.arange(180.0), torch.arange(320.0)).flip(-1).double()
+    ideal = camera.undistort_points(pixels)[0].view(180, 320, 2).float().numpy()
+    with VideoWriter(folder / "drive.mp4", Fraction(20), crf=16) as writer:
+        for i in range(FRAMES):
+            image = (255 * made.frame(i).image[0].permute(1, 2, 0)).round().byte().numpy()
+            writer.write(cv2.remap(image, ideal, None, cv2.INTER_LINEAR))
+    return folder
+
+
+def _numbers(rows):
+    assert all(row.segments > 10 for row in rows)
+    return np.array([row[2:10] for row in rows])
+
+
+@pytest.mark.parametrize("calibrator", ["joint", "two-stage"])
+def test_one_road(drive, tmp_path, calibrator):
+    config = {"camera": str(drive / "camera.yaml"), "lane_width": LANE_WIDTH, "calibrator": calibrator}
+    by_run = run(RunConfig(str(drive / "drive.mp4"), out=str(tmp_path / "run"), **config))
+    lanes = str(tmp_path / "run" / "lanes.json")
+    by_lanes = run(RunConfig(str(drive / "drive.mp4"), out=str(tmp_path / "again"), lanes=lanes, **config))
+
+    camera = Camera.from_file(drive / "camera.yaml")
+    model = LaneBEV.from_pretrained(calibrator=make_calibrator(calibrator)).eval()
+    lens = (camera.distortion[None], camera.model)
+    state, rows = None, []
+    for frame in open_source(str(drive / "drive.mp4")):
+        image = torch.from_numpy(frame.image.copy()).permute(2, 0, 1)[None] / 255
+        with torch.inference_mode():
+            out, state = model(image, camera.intrinsics[None], state, frame.dt, LANE_WIDTH, *lens)
+        rows.append(extrinsics_row(frame.number, frame.time, out.calibration, out.segments.weight, ""))
+
+    assert [row.status for row in by_run.rows] == [row.status for row in rows]
+    assert [row.segments for row in by_lanes.rows] == [row.segments for row in rows]
+    np.testing.assert_allclose(_numbers(by_run.rows), _numbers(rows), atol=1e-6, rtol=0)
+    np.testing.assert_allclose(_numbers(by_lanes.rows), _numbers(rows), atol=1e-6, rtol=0)
