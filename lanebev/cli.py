@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn
 
 DESCRIPTION = "Online camera-to-road calibration from lane boundaries, and a stable bird's-eye view."
-CAMERA_HELP = "OpenCV or ROS camera_info YAML, KITTI calib.txt, or YAML of fx fy cx cy width height"
+CAMERA_HELP = "of OpenCV, ROS, Kalibr, EuRoC, KITTI, nuScenes; or YAML of fx fy cx cy width height"
 SOURCE_HELP = "a video, a folder of images, a quoted glob ('DIR/**/*.jpg'), or one image"
 
 
@@ -52,6 +52,8 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument("source", type=_path, metavar="SOURCE", help=SOURCE_HELP)
     run.add_argument("--camera", type=_path, required=True, metavar="FILE",
                      help=CAMERA_HELP)  # fmt: skip
+    run.add_argument("--rectified", action="store_true",
+                     help="the images were rectified: take the projection matrix P")  # fmt: skip
     run.add_argument("--lane-width", type=float, default=3.7, metavar="M", help="metres (%(default)s)")
     run.add_argument("--lanes", type=_path, metavar="FILE",
                      help="lanes of another detector: TuSimple JSON lines, CULane .lines.txt, OpenLane JSON, "

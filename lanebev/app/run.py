@@ -69,6 +69,7 @@ class RunConfig:
         calibrator: one of CALIBRATORS.
         fps: of a folder or glob; a video knows its own.
         lanes_size: (height, width) px of the images that ``lanes`` was drawn on; None is the source's own.
+        rectified: the images were rectified: the camera is the camera file's projection matrix P.
     """
 
     source: str
@@ -81,6 +82,7 @@ class RunConfig:
     calibrator: str = "joint"
     fps: float = float(DEFAULT_FPS)
     lanes_size: tuple[int, int] | None = None
+    rectified: bool = False
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.lane_width) and 1.0 < self.lane_width < 10.0):
@@ -111,7 +113,7 @@ def run(
     """
     source = open_source(config.source, Fraction(config.fps).limit_denominator(1000))
     check_inputs_stay(config.out, inputs(config, source))
-    camera = Camera.from_file(config.camera, source.image_size)
+    camera = Camera.from_file(config.camera, source.image_size, config.rectified)
     source = of_camera(camera, source)
     observer = make_observer(config, source, camera)
     calibrator, mount = make_calibrator(config.calibrator), MountEstimator()

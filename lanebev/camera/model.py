@@ -13,7 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lanebev.camera.files import CameraParameters, read_camera, write_camera
+from lanebev.camera.files import read_camera, write_camera
+from lanebev.camera.parameters import CameraParameters
 from lanebev.geometry.lens import (
     check_lens,
     check_points,
@@ -107,17 +108,22 @@ class Camera:
         )
 
     @classmethod
-    def from_file(cls, path: str | Path, image_size: tuple[int, int] | None = None) -> Camera:
-        """Read OpenCV FileStorage or ROS ``camera_info`` YAML, KITTI ``calib.txt`` or our short YAML.
+    def from_file(
+        cls, path: str | Path, image_size: tuple[int, int] | None = None, rectified: bool = False
+    ) -> Camera:
+        """Read a camera file: OpenCV, ROS, Kalibr, EuRoC, CamOdoCal, KITTI, nuScenes, OpenLane, short YAML.
+
+        :func:`lanebev.camera.files.read_camera` says what each of them is.
 
         Args:
             path: the file.
-            image_size: (height, width) px of the images, for a KITTI file without a size. Not used otherwise.
+            image_size: (height, width) px of the images, for a file without a size. Not used otherwise.
+            rectified: the images were rectified: take the projection matrix P, and no lens.
 
         Raises:
             ValueError: the file is missing, cut, or holds an absurd value; one line says which.
         """
-        read = read_camera(path, image_size)
+        read = read_camera(path, image_size, rectified)
         return cls(
             torch.tensor(read.matrix, dtype=torch.float64).reshape(3, 3),
             torch.tensor(read.distortion, dtype=torch.float64),

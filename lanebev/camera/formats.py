@@ -1,0 +1,231 @@
+"""Camera files' dialects: OpenCV, ROS and our short YAML; Kalibr, EuRoC and CamOdoCal."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from lanebev.camera.parameters import CameraParameters
+from lanebev.camera.parsing import mapping, number, numbers, required, whole_number
+from lanebev.numbers import shown
+
+_SHORT_KEYS = {"fx", "fy", "cx", "cy", "width", "height", "distortion", "model"}
+_MATRIX_KEYS = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "k")
+_DISTORTION_KEYS = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "D", "d")
+_PROJECTION_KEYS = ("projection_matrix", "P", "p")
+_ROTATION_KEYS = ("rectification_matrix", "R", "r")
+_WIDTH_KEYS = ("image_width", "image_Width", "width")
+_HEIGHT_KEYS = ("image_height", "image_Height", "height")
+_MODEL_KEYS = ("distortion_model", "model")
+_IGNORED_KEYS = {
+    # ROS camera_info beside the lens
+    "camera_name", "header",
+    # what OpenCV's calibration programs note down
+    "calibration_time", "nframes", "nFrames", "nr_of_frames", "nrOfFrames", "board_width", "board_height",
+    "board_size", "square_size", "marker_size", "aspectRatio", "fix_aspect_ratio", "flags", "flagValue",
+    "fisheye_model", "avg_reprojection_error", "per_view_reprojection_errors", "extrinsic_parameters",
+    "image_points", "grid_points",
+    # our own calibration.yaml
+    "mount", "vehicle_from_camera", "quaternion_xyzw",
+}  # fmt: skip
+_KNOWN_KEYS = {
+    *_MATRIX_KEYS, *_DISTORTION_KEYS, *_PROJECTION_KEYS, *_ROTATION_KEYS, *_WIDTH_KEYS, *_HEIGHT_KEYS,
+    *_MODEL_KEYS, *_IGNORED_KEYS, "binning_x", "binning_y", "roi", "xi",
+}  # fmt: skip
+_MODELS = {
+    "": "",  # what a driver of an ideal camera leaves empty
+    "pinhole": "pinhole",
+    "plumb_bob": "pinhole",
+    "rational_polynomial": "pinhole",
+    "fisheye": "fisheye",
+    "equidistant": "fisheye",
+    "kannala_brandt": "fisheye",
+    "omni": "omni",
+    "mei": "omni",
+}
+_KALIBR_MODELS = {  # camera_model, distortion_model of Kalibr, EuRoC and TUM-VI
+    ("pinhole", "none"): "pinhole",
+    ("pinhole", "radtan"): "pinhole",
+    ("pinhole", "radial-tangential"): "pinhole",
+    ("pinhole", "equi"): "fisheye",
+    ("pinhole", "equidistant"): "fisheye",
+    ("omni", "none"): "omni",
+    ("omni", "radtan"): "omni",
+}
+_IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+
+
+def opencv_or_ros(fields: Mapping[str, Any], rectified: bool) -> tuple[CameraParameters, bool]:
+    """Read the keys of OpenCV's calibration programs, of ROS's ``camera_info``, or our short ones.
+
+    ROS's ``roi`` (in pixels of the full resolution) and ``binning_x``, ``binning_y`` are applied, in this
+    order: what is returned is the camera of the images, as ``image_geometry`` has it. Deviation: a binned
+    pixel's centre is the centre of those it binds together, not their corner: (x + 0.5) / b − 0.5.
+
+    Args:
+        fields: of the file.
+        rectified: of the rectified images: the projection matrix P without a lens.
+
+    Returns:
+        the camera, and whether the file states its matrix twice, in K and P, as our own writer does.
+    """
+    short = "fx" in fields or "fy" in fields
+    unknown = sorted(set(fields) - (_SHORT_KEYS if short else _KNOWN_KEYS))
+    if unknown:
+        known = "fx, fy, cx, cy, width, height, distortion, model"
+        raise ValueError(f"unknown key {shown(unknown[0])}; expected {known}, or those of OpenCV or ROS")
+    if short:
+        return _short(fields, rectified), False
+    size = (whole_number(fields, *_HEIGHT_KEYS), whole_number(fields, *_WIDTH_KEYS))
+    if rectified:
+        camera = CameraParameters(_projection(fields), [], "pinhole", size)
+        return _as_taken(camera, fields), _restates(fields)
+    matrix = numbers(fields, *_MATRIX_KEYS, count=9)
+    distortion = numbers(fields, *_DISTORTION_KEYS)
+    model = _model(fields)
+    if "xi" in fields and fields["xi"] is not None:
+        xi = numbers(fields, "xi", count=1) if not isinstance(fields["xi"], str) else [number(fields, "xi")]
+        model, distortion = "omni", [*xi, *(distortion or [0.0] * 4)]
+    camera = CameraParameters(matrix, distortion, model, size)
+    return _as_taken(camera, fields), _restates(fields)
+
+
+def _short(fields: Mapping[str, Any], rectified: bool) -> CameraParameters:
+    height, width = whole_number(fields, "height"), whole_number(fields, "width")
+    fx, fy, cx, cy = (number(fields, key) for key in ("fx", "fy", "cx", "cy"))
+    distortion = [] if fields.get("distortion") is None else numbers(fields, "distortion")
+    camera = CameraParameters(
+        [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, _model(fields), (height, width)
+    )
+    return without_lens(camera) if rectified else camera
+
+
+def without_lens(camera: CameraParameters) -> CameraParameters:
+    """Return the camera of rectified images, for a file that has no projection matrix of them.
+
+    Raises:
+        ValueError: the lens distorts, so that nobody knows what rectified images are like.
+    """
+    if camera.model != "pinhole" or any(camera.distortion):
+        raise ValueError("projection_matrix: expected P for rectified images, got none; add the entry")
+    return camera._replace(distortion=[])
+
+
+def _projection(fields: Mapping[str, Any]) -> list[float]:
+    """The left 3 x 3 of P, row by row."""
+    if all(fields.get(key) is None for key in _PROJECTION_KEYS):
+        raise ValueError("projection_matrix: expected P for rectified images, got none; add the entry")
+    entries = numbers(fields, *_PROJECTION_KEYS, count=12)
+    return entries[0:3] + entries[4:7] + entries[8:11]
+
+
+def _restates(fields: Mapping[str, Any]) -> bool:
+    """Whether P = [K | 0] and R = I, as of a camera that is its own rectified one."""
+    try:
+        rotation = numbers(fields, *_ROTATION_KEYS, count=9)
+        return rotation == _IDENTITY and _projection(fields) == numbers(fields, *_MATRIX_KEYS, count=9)
+    except ValueError:
+        return False
+
+
+def _model(fields: Mapping[str, Any]) -> str:
+    default = "fisheye" if str(fields.get("fisheye_model", "0")).strip() == "1" else "pinhole"
+    name = next((str(fields[key]).strip() for key in _MODEL_KEYS if fields.get(key) is not None), "")
+    if name not in _MODELS:
+        known = ", ".join(each for each in _MODELS if each)
+        raise ValueError(f"model: expected one of {known}, got {shown(name)}")
+    return _MODELS[name] or default
+
+
+def _as_taken(camera: CameraParameters, fields: Mapping[str, Any]) -> CameraParameters:
+    """The camera of the images, cut to the region of interest and binned."""
+    roi = mapping("roi", fields.get("roi") or {})
+    left, top, width, height = (
+        whole_number(roi, key) if roi.get(key) is not None else 0
+        for key in ("x_offset", "y_offset", "width", "height")
+    )
+    rows, columns = camera.image_size
+    height, width = height or rows - top, width or columns - left
+    if min(left, top, height, width) < 0 or left + width > columns or top + height > rows:
+        raise ValueError(
+            f"roi: expected a part of the {columns} x {rows} px, got {width} x {height} at {left}, {top}"
+        )
+    across, down = (_binning(fields, key) for key in ("binning_x", "binning_y"))
+    fx, skew, cx, zero, fy, cy, *last = camera.matrix
+    matrix = [
+        fx / across, skew / across, _binned(cx - left, across),
+        zero, fy / down, _binned(cy - top, down),
+        *last,
+    ]  # fmt: skip
+    return camera._replace(matrix=matrix, image_size=(height // down, width // across))
+
+
+def _binning(fields: Mapping[str, Any], key: str) -> int:
+    """How many pixels are bound together; 0 is 1."""
+    factor = whole_number(fields, key) if fields.get(key) is not None else 1
+    if not 0 <= factor <= 64:
+        raise ValueError(f"{key}: expected 0 to 64, got {factor}")
+    return factor or 1
+
+
+def _binned(x: float, factor: int) -> float:
+    return x if factor == 1 else (x + 0.5) / factor - 0.5
+
+
+def is_kalibr(fields: Mapping[str, Any]) -> bool:
+    """Whether these are the keys of Kalibr's camera chain, or of one camera as EuRoC has it."""
+    return "intrinsics" in fields or any(re.fullmatch(r"cam\d+", key, re.ASCII) for key in fields)
+
+
+def kalibr(fields: Mapping[str, Any]) -> CameraParameters:
+    """Read Kalibr's camchain, its first camera, or EuRoC's ``sensor.yaml``.
+
+    Source: Kalibr, wiki, "Supported models" and "Yaml formats".
+    """
+    chain = [key for key in fields if re.fullmatch(r"cam\d+", key, re.ASCII)]
+    if chain:
+        first = min(chain, key=lambda key: int(key[3:10]))
+        fields = mapping(first, fields[first])
+    names = (
+        str(required(fields, ["camera_model"])).strip(),
+        str(fields.get("distortion_model") or "none").strip(),
+    )
+    if names not in _KALIBR_MODELS:
+        known = ", ".join("-".join(each) for each in _KALIBR_MODELS)
+        raise ValueError(f"camera_model: expected one of {known}, got {shown('-'.join(names))}")
+    model = _KALIBR_MODELS[names]
+    intrinsics = numbers(fields, "intrinsics", count=5 if model == "omni" else 4)
+    distortion = [0.0] * 4
+    if names[1] != "none":
+        distortion = numbers(fields, "distortion_coeffs", "distortion_coefficients", count=4)
+    *xi, fx, fy, cx, cy = intrinsics
+    width, height = numbers(fields, "resolution", count=2)
+    return CameraParameters(
+        [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        [*xi, *distortion],
+        model,
+        (round(height), round(width)),
+    )
+
+
+def camodocal(fields: Mapping[str, Any]) -> CameraParameters:
+    """Read CamOdoCal's YAML, which VINS and KITTI-360's fisheyes use: PINHOLE, KANNALA_BRANDT or MEI."""
+    name = str(required(fields, ["model_type"])).strip().upper()
+    projection = mapping("projection_parameters", required(fields, ["projection_parameters"]))
+    size = (whole_number(fields, "image_height"), whole_number(fields, "image_width"))
+    if name == "KANNALA_BRANDT":
+        fx, fy, cx, cy = (number(projection, key) for key in ("mu", "mv", "u0", "v0"))
+        model, distortion = "fisheye", [number(projection, key) for key in ("k2", "k3", "k4", "k5")]
+    elif name in ("PINHOLE", "MEI"):
+        distorted = mapping("distortion_parameters", required(fields, ["distortion_parameters"]))
+        model, distortion = "pinhole", [number(distorted, key) for key in ("k1", "k2", "p1", "p2")]
+        keys = ("fx", "fy", "cx", "cy")
+        if name == "MEI":
+            mirror = mapping("mirror_parameters", required(fields, ["mirror_parameters"]))
+            model, distortion = "omni", [number(mirror, "xi"), *distortion]
+            keys = ("gamma1", "gamma2", "u0", "v0")
+        fx, fy, cx, cy = (number(projection, key) for key in keys)
+    else:
+        raise ValueError(f"model_type: expected PINHOLE, KANNALA_BRANDT or MEI, got {shown(name)}")
+    return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, model, size)

@@ -1,0 +1,104 @@
+"""A camera as plain numbers, and what a real one can be like."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+from lanebev.geometry.lens import DISTORTION_LENGTHS, invert_distortion
+
+_FOCAL_RANGE = (0.1, 20.0)  # times the longer image side: 160 deg fisheye to 3 deg telephoto
+_LONGEST_SIDE = 99_999  # px
+_LARGEST_XI = 100.0  # of the unified model; 1 is a parabolic mirror, fisheyes have 1 to 4
+
+
+class CameraParameters(NamedTuple):
+    """A camera as plain numbers.
+
+    Attributes:
+        matrix: nine entries of the camera matrix, row by row, px.
+        distortion: coefficients in OpenCV's order, see :mod:`lanebev.geometry.distortion`.
+        model: "pinhole", "fisheye" or "omni".
+        image_size: (height, width) px.
+    """
+
+    matrix: list[float]
+    distortion: list[float]
+    model: str
+    image_size: tuple[int, int]
+
+
+def checked(camera: CameraParameters, restated: bool = False) -> CameraParameters:
+    """Return the camera without needless coefficients, if a real one could be like it.
+
+    Args:
+        camera: as read.
+        restated: the file states the camera matrix twice, as a program does. Then it may be of a cropped
+            image, with its principal point outside of it and a focal length of any number of image sides.
+
+    Raises:
+        ValueError: a value that no real camera has, and which.
+    """
+    height, width = camera.image_size
+    if not (0 < height <= _LONGEST_SIDE and 0 < width <= _LONGEST_SIDE):
+        raise ValueError(f"image size: expected 1..{_LONGEST_SIDE} px a side, got {width} x {height}")
+    _check_matrix(camera.matrix, camera.image_size, restated)
+    camera = camera._replace(distortion=_needed(camera.distortion, camera.model))
+    lengths = DISTORTION_LENGTHS[camera.model]
+    if len(camera.distortion) not in lengths:
+        expected = " or ".join(map(str, lengths))
+        got = len(camera.distortion)
+        raise ValueError(f"distortion: expected {expected} coefficients ({camera.model}), got {got}")
+    if camera.model == "omni" and not 0 <= camera.distortion[0] <= _LARGEST_XI:
+        raise ValueError(f"xi: expected 0 to {_LARGEST_XI:g}, got {camera.distortion[0]:g}")
+    if not (restated or _invertible(camera)):
+        raise ValueError(f"distortion: expected a lens that can be inverted, got {camera.distortion}")
+    return camera
+
+
+def _check_matrix(matrix: list[float], size: tuple[int, int], restated: bool) -> None:
+    height, width = size
+    fx, skew, cx, zero, fy, cy, *last = matrix
+    low, high = (0.0, float("inf")) if restated else (limit * max(size) for limit in _FOCAL_RANGE)
+    for name, focal in (("fx", fx), ("fy", fy)):
+        if not low <= focal <= high or focal == 0:
+            raise ValueError(
+                f"{name}: expected {low:g} to {high:g} px for an image of {width} x {height}, got {focal:g}; "
+                "focal lengths are in pixels"
+            )
+    if abs(skew) > 0.1 * fx or zero != 0 or last != [0.0, 0.0, 1.0]:
+        raise ValueError("camera matrix: expected [fx s cx; 0 fy cy; 0 0 1], got other off-diagonal entries")
+    if restated:
+        return
+    if not 0.4 < fx / fy < 2.5:
+        raise ValueError(f"fx / fy: expected nearly square pixels, got {fx:g} / {fy:g}")
+    for name, centre, side in (("cx", cx, width), ("cy", cy, height)):
+        if not 0 < centre < side:
+            raise ValueError(
+                f"{name}: expected a principal point inside the image, 0 to {side}, got {centre:g}; the "
+                "camera of a cropped image is written by Camera.cropped(...).to_file(...)"
+            )
+
+
+def _needed(distortion: list[float], model: str) -> list[float]:
+    """The coefficients without a tilt of nothing, and none of a pinhole that distorts nothing."""
+    if model == "fisheye":
+        return distortion or [0.0] * 4
+    if model == "omni":
+        return distortion
+    if len(distortion) == 14 and not any(distortion[12:]):
+        distortion = distortion[:12]
+    if not any(distortion) and len(distortion) in DISTORTION_LENGTHS[model]:
+        return []  # no lens to undo, which is much faster to do
+    return distortion
+
+
+def _invertible(camera: CameraParameters) -> bool:
+    """Whether the lens can be undone at four points half-way to the corners."""
+    height, width = camera.image_size
+    inner = torch.tensor([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]], dtype=torch.float64)
+    points = (inner * inner.new_tensor([width, height]))[None]
+    intrinsics = points.new_tensor(camera.matrix).reshape(1, 3, 3)
+    _, valid = invert_distortion(points, intrinsics, points.new_tensor(camera.distortion)[None], camera.model)
+    return bool(valid.all())

@@ -1,0 +1,185 @@
+"""Camera files' syntax: YAML, JSON and XML to keys and values; scalars stay texts, as they were written.
+
+YAML 1.1 would make 416 of a width of 0640, and 750 of 12:30.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import yaml
+
+from lanebev.numbers import finite_numbers, shown
+
+_LARGEST_YAML = 1_000_000  # characters; PyYAML reads some 100,000 a second
+_MOST_NUMBERS = 1_000  # of one matrix
+
+
+def parse(text: str) -> Any:
+    """Return what a camera file says: dicts by key, lists, texts, and None for nothing.
+
+    Raises:
+        ValueError: the syntax is none of YAML, JSON and XML, or a key is given twice.
+    """
+    start = text.lstrip()[:1]
+    if start == "<":
+        return _parse_xml(text)
+    if start in ("{", "["):
+        try:
+            return json.loads(
+                text,
+                object_pairs_hook=_once,
+                parse_int=str,
+                parse_float=str,
+                parse_constant=str,
+            )
+        except (json.JSONDecodeError, RecursionError):
+            pass  # YAML has braces too, and says where it breaks off
+    return _parse_yaml(text)
+
+
+def _once(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """The pairs as a dict, each key once."""
+    fields: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in fields:
+            raise ValueError(f"expected each key once, got {shown(key)} twice")
+        fields[key] = value
+    return fields
+
+
+class _TextLoader(yaml.SafeLoader):
+    """SafeLoader that leaves scalars as texts, knows OpenCV's matrices and refuses a key given twice."""
+
+    yaml_implicit_resolvers = {}  # noqa: RUF012 - so it is in the base class
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        if not all(isinstance(key, yaml.ScalarNode) for key, _ in node.value):
+            raise ValueError("expected plain keys, got a list or a mapping for one")
+        _once((key.value, None) for key, _ in node.value)
+        return {key.value: self.construct_object(value, deep=deep) for key, value in node.value}
+
+
+def _construct_mapping(loader: _TextLoader, node: yaml.MappingNode) -> dict[Any, Any]:
+    return loader.construct_mapping(node, deep=True)
+
+
+def _construct_text(loader: _TextLoader, node: yaml.ScalarNode) -> str:
+    return str(loader.construct_scalar(node))
+
+
+_TextLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:null", re.compile(r"^(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""]
+)
+for _tag in ("opencv-matrix", "opencv-nd-matrix"):
+    _TextLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _construct_mapping)
+for _tag in ("int", "float", "bool", "timestamp"):
+    _TextLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _construct_text)
+
+
+def _parse_yaml(text: str) -> Any:
+    if len(text) > _LARGEST_YAML:
+        raise ValueError(f"expected a camera file, got {len(text)} characters of YAML")
+    lines = text.splitlines()
+    if lines and lines[0].startswith("%YAML"):  # OpenCV writes %YAML:1.0, which YAML does not allow
+        lines[0] = ""
+    try:
+        documents = yaml.load_all("\n".join(lines), Loader=_TextLoader)
+        return next((each for each in documents if each is not None), None)  # ros2 topic echo ends with ---
+    except (yaml.YAMLError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" at line {mark.line + 1}" if mark else ""
+        raise ValueError(f"expected YAML, got a syntax error{where}; is the file cut?") from error
+
+
+def _parse_xml(text: str) -> dict[str, Any]:
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        line = error.position[0]
+        raise ValueError(f"expected XML, got a syntax error at line {line}; is the file cut?") from error
+    return _once((child.tag, _xml_value(child)) for child in root)
+
+
+def _xml_value(element: ET.Element) -> Any:
+    """A matrix's fields, or a text."""
+    if not len(element):
+        return element.text
+    return _once((field.tag, (field.text or "").strip()) for field in element)
+
+
+def required(fields: Mapping[str, Any], keys: Sequence[str]) -> Any:
+    """Return the value of the first of these spellings of a key that is there.
+
+    Raises:
+        ValueError: none of them is.
+    """
+    for key in keys:
+        if fields.get(key) is not None:
+            return fields[key]
+    raise ValueError(f"{keys[0]}: expected a value, got none; add the entry")
+
+
+def number(fields: Mapping[str, Any], *keys: str) -> float:
+    """Return the finite number of a key."""
+    return finite_numbers(keys[0], [required(fields, keys)], 1)[0]
+
+
+def whole_number(fields: Mapping[str, Any], *keys: str) -> int:
+    """Return the whole number of a key, of pixels."""
+    value = number(fields, *keys)
+    if value != round(value):
+        raise ValueError(f"{keys[0]}: expected whole pixels, got {value:g}")
+    return round(value)
+
+
+def numbers(fields: Mapping[str, Any], *keys: str, count: int | None = None) -> list[float]:
+    """Return the entries of ``{rows, cols, data}`` or of a (nested) list, row by row."""
+    name, value = keys[0], required(fields, keys)
+    if isinstance(value, Mapping):
+        return finite_numbers(name, *_opencv_data(name, value, count))
+    entries = list(itertools.islice(_entries(_sequence(name, value)), _MOST_NUMBERS + 1))
+    if len(entries) > _MOST_NUMBERS:
+        raise ValueError(f"{name}: expected a few numbers, got more than {_MOST_NUMBERS}")
+    return finite_numbers(name, entries, count)
+
+
+def mapping(name: str, value: Any) -> Mapping[str, Any]:
+    """Return the value, if it has keys of its own."""
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{name}: expected keys and values, got {shown(value)}")
+    return value
+
+
+def _opencv_data(name: str, value: Mapping[str, Any], count: int | None) -> tuple[list[Any], int]:
+    """Data of ``{rows, cols, data}``, or ``{sizes, data}`` of OpenCV 5, and how many there should be."""
+    unknown = sorted(set(value) - {"rows", "cols", "sizes", "data", "dt", "type_id"})  # type_id: JSON's
+    if unknown:
+        raise ValueError(f"{name}: expected rows, cols, dt, data, got the key {shown(unknown[0])}")
+    as_list = {key: field.split() if isinstance(field, str) else field for key, field in value.items()}
+    shape = as_list.get("sizes") or [entry for key in ("rows", "cols") for entry in _flat(as_list.get(key))]
+    sizes = finite_numbers(f"{name}.rows and .cols", _sequence(name, shape))
+    if not sizes:
+        raise ValueError(f"{name}: expected rows and cols, got neither")
+    return _sequence(name, as_list.get("data") or []), count or round(min(math.prod(sizes), 1e6))
+
+
+def _entries(rows: list[Any]) -> Iterator[Any]:
+    for row in rows:
+        yield from _flat(row)
+
+
+def _flat(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [] if value is None else [value]
+
+
+def _sequence(name: str, value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise ValueError(f"{name}: expected a list of numbers, got {shown(value)}")
+    return value
