@@ -78,9 +78,13 @@ def test_emulated_bfloat16_is_pointed_out(native, tmp_path, monkeypatch):
 
 
 def test_every_config_is_tested():
-    """Here, and tusimple.yaml and gpu.yaml beside their data modules."""
+    """Here, and the others beside what makes their data."""
     here = {"default.yaml", "paper.yaml", "end_to_end.yaml", "fast.yaml", "refine.yaml"}
-    assert {path.name for path in CONFIGS.glob("*.yaml")} == here | {"tusimple.yaml", "gpu.yaml"}
+    assert {path.name for path in CONFIGS.glob("*.yaml")} == here | {
+        "tusimple.yaml",
+        "gpu.yaml",
+        "adapt.yaml",
+    }
 
 
 @pytest.mark.slow

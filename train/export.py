@@ -137,8 +137,9 @@ def trained_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
         return load_segmenter(path), read_metadata(path).get("training", {})
     segmenter, settings = checkpoint_segmenter(path)
     training = {name: value for name, value in settings.items() if name != "network"}
-    if training["init_from"] is not None:
-        training["init_from"] = Path(training["init_from"]).name  # its folder is nobody else's business
+    for name in ("init_from", "backbone"):
+        if training.get(name) is not None:
+            training[name] = Path(training[name]).name  # its folder is nobody else's business
     return segmenter.eval(), training
 
 

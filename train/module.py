@@ -18,6 +18,7 @@ from torchmetrics.classification import MulticlassJaccardIndex
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from train.augment import Photometric
+from train.backbone import load_backbone
 from train.budget import rate_factor, used_share
 from train.data import Batch
 from train.datasets import ScoredBatch
@@ -44,6 +45,7 @@ class Segmentation(L.LightningModule):
         row_weight: of :func:`row_cross_entropy` beside the cross-entropy; the paper's is 0.
         augment: strength of the photometric augmentation, 0 for none.
         init_from: checkpoint or weights file to begin with; a network of half the width is widened.
+        backbone: ``state_dict`` of torchvision's ResNet-18 to begin the trunk with, such as ImageNet's.
         compiled: compile the network; worth it in runs of hours.
     """
 
@@ -60,6 +62,7 @@ class Segmentation(L.LightningModule):
         row_weight: float = 0.03,
         augment: float = 1.0,
         init_from: str | None = None,
+        backbone: str | None = None,
         compiled: bool = False,
     ) -> None:
         super().__init__()
@@ -79,6 +82,10 @@ class Segmentation(L.LightningModule):
         self.register_buffer("class_weight", weights, persistent=False)
         self.photometric = Photometric(augment) if augment > 0 else None
         self.compiled = compiled
+        if init_from is not None and backbone is not None:
+            raise ValueError("backbone: expected none beside init_from, whose weights have their own trunk")
+        if backbone is not None:
+            load_backbone(self.segmenter.trunk, Path(backbone))
         if init_from is not None:
             from train.export import load_weights
 
@@ -211,7 +218,7 @@ class Segmentation(L.LightningModule):
 
 _SETTINGS = (
     "optimizer", "learning_rate", "weight_decay", "warmup_steps", "decay_steps", "decay_share",
-    "class_weight", "row_weight", "augment", "init_from",
+    "class_weight", "row_weight", "augment", "init_from", "backbone",
 )  # fmt: skip
 
 

@@ -1,0 +1,177 @@
+"""A user's own unlabelled video as training data: ``python -m train.pseudo_labels RESULT SOURCE OUT``.
+
+RESULT is the folder that ``lanebev run`` made of SOURCE. What the network saw there, frame by frame, becomes
+labels that are better than what it saw: all boundaries of a frame are fitted together on the run's pose, a
+boundary's place on the road is the median over neighbouring frames, one that is in less than half of them is
+none, and a dashed or worn one is drawn through (behind vehicles too: who hides what is not known). Frames of
+which the run is not sure, and those of a lane change, are left out. OUT has images and ``labels.json`` in
+TuSimple's layout, for ``configs/adapt.yaml``.
+
+Source: self-training with pseudo-labels (Lee 2013) made consistent over time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from jsonargparse.typing import PositiveFloat, PositiveInt
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from lanebev.app.observers import FITTED_REACH, FITTED_SUPPORT
+from lanebev.batch import masked_median
+from lanebev.camera.model import Camera
+from lanebev.estimation.joint.boundary_curves import Boundaries, boundary_polylines, fit_boundaries
+from lanebev.estimation.joint.single_frame import fit_single_frame
+from lanebev.io.lanes import read_lanes
+from lanebev.io.results import ExtrinsicsRow, read_extrinsics
+from lanebev.io.video import open_source
+from lanebev.observation.polylines import image_rows, rows_from_lines, segments_from_rows
+from lanebev.types import Extrinsics
+from train.commands import one_line_errors
+
+LANE_CHANGE = 0.6  # m, sideways within the neighbouring frames
+
+
+def neighbours(values: Tensor, reach: int) -> Tensor:
+    """Gather the values of neighbouring frames: (F, ...) to (F, ..., 2 reach + 1), NaN beyond both ends."""
+    padding = values.new_full((reach, *values.shape[1:]), math.nan)
+    return torch.cat([padding, values, padding]).unfold(0, 2 * reach + 1, 1)
+
+
+def smoothed(curves: Boundaries, reach: int, least: float = 0.5) -> tuple[Boundaries, Tensor]:
+    """Place the boundaries of each frame by the median over its neighbours.
+
+    Args:
+        curves: of F frames in order.
+        reach: frames before and after.
+        least: share of the neighbours in which a boundary must be.
+
+    Returns:
+        The curves, and (F,) bool, false where the camera moves from lane to lane.
+    """
+    there = neighbours(curves.present.to(curves.offset), reach)  # (F, L, N), NaN beyond the ends
+    seen = there > 0.5
+    share = torch.where(there.isfinite(), there, 0.0).sum(-1) / there.isfinite().sum(-1)
+    offsets = neighbours(curves.offset, reach)
+    offset = masked_median(offsets, seen)
+    far = torch.where(seen, neighbours(curves.extent[..., 1], reach), 0.0).amax(-1)
+    bends = neighbours(curves.curvature, reach)
+    middle = slice(offset.shape[1] // 2 - 1, offset.shape[1] // 2 + 1)  # of the ego lane
+    away = torch.where(seen, (offsets - offset.unsqueeze(-1)).abs(), 0.0)[:, middle].amax((1, 2))
+    result = Boundaries(
+        offset=offset,
+        heading=masked_median(neighbours(curves.heading, reach), seen),
+        extent=torch.stack([torch.ones_like(far), far.clamp(min=FITTED_REACH)], dim=-1),
+        present=share >= least,
+        curvature=masked_median(bends, bends.isfinite()),
+    )
+    return result, away < LANE_CHANGE
+
+
+def label_rows(curves: Boundaries, camera: Camera, extrinsics: Extrinsics) -> NDArray[np.float64]:
+    """Draw curves on the rows of ``lanes.json``: (F, L, R) px of the image as it came, NaN for none."""
+    rows = image_rows(camera.image_size[0])
+    intrinsics = camera.intrinsics.to(curves.offset).expand(len(curves.offset), 3, 3)
+    lines, shown = boundary_polylines(curves, intrinsics, extrinsics, num_points=96)
+    x = np.full((*lines.shape[:2], len(rows)), np.nan)
+    for frame, index in np.ndindex(x.shape[:2]):
+        points = camera.distort_points(lines[frame, index][shown[frame, index]]).double().numpy()
+        if len(points) > 1:
+            order = np.argsort(points[:, 1])
+            across = np.interp(rows, points[order, 1], points[order, 0], np.nan, np.nan)
+            x[frame, index] = np.where((across >= 0) & (across < camera.image_size[1]), across, np.nan)
+    return x
+
+
+def fitted_curves(result: Path, camera: Camera, lane_width: float) -> tuple[Boundaries, list[ExtrinsicsRow]]:
+    """Fit the boundaries of every frame of a run together, on the run's pose.
+
+    Raises:
+        ValueError: the folder has no run's result, or one whose files are of different frames.
+    """
+    rows, entries = read_extrinsics(result / "extrinsics.csv"), read_lanes(result / "lanes.json")
+    if len(rows) != len(entries):
+        raise ValueError(
+            f"{result}: expected as many frames in lanes.json as in extrinsics.csv, "
+            f"got {len(entries)} and {len(rows)}"
+        )
+    segments = segments_from_rows([rows_from_lines(entry.lines, camera) for entry in entries], camera)
+    intrinsics = camera.intrinsics.to(segments.endpoints).expand(len(rows), 3, 3)
+    bend = fit_single_frame(segments, intrinsics, lane_width).curvature
+    pose = poses(rows, segments.endpoints)
+    return fit_boundaries(segments, intrinsics, pose, bend, least_support=FITTED_SUPPORT), rows
+
+
+def poses(rows: list[ExtrinsicsRow], like: Tensor) -> Extrinsics:
+    """Return the poses of ``extrinsics.csv`` in rad and m, each (F,)."""
+    degrees = [[row.pitch_deg, row.yaw_deg, row.roll_deg] for row in rows]
+    pitch, yaw, roll = like.new_tensor(degrees).deg2rad().unbind(-1)
+    return Extrinsics(pitch, yaw, roll, like.new_tensor([row.height_m for row in rows]))
+
+
+def write_labels(
+    result: Path, source: str, out: Path, camera: Camera, lane_width: float, reach: int, every: int
+) -> int:
+    """Write images and ``labels.json``, and return how many.
+
+    Args:
+        result: folder of a run.
+        source: of its frames.
+        out: new folder.
+        camera: that took them.
+        lane_width: m.
+        reach: frames before and after that place a boundary.
+        every: of so many sure frames one is written.
+    """
+    curves, rows = fitted_curves(result, camera, lane_width)
+    curves, steady = smoothed(curves, reach)
+    x = label_rows(curves, camera, poses(rows, curves.offset))
+    sure = [row.status == "TRACKING" and bool(fine) for row, fine in zip(rows, steady, strict=True)]
+    chosen = set([number for number, is_sure in enumerate(sure) if is_sure][::every])
+    if not chosen:
+        raise ValueError(f"{result}: expected frames that are TRACKING, got none; is it the right camera?")
+    (out / "images").mkdir(parents=True)
+    h_samples = image_rows(camera.image_size[0]).tolist()
+    written = 0
+    with (out / "labels.json").open("w") as file:
+        for frame in open_source(source):
+            if frame.number not in chosen or frame.image is None:
+                continue
+            name = f"images/{frame.number:06d}.jpg"
+            Image.fromarray(frame.image).save(out / name, quality=95)
+            there = [k for k in range(x.shape[1]) if np.isfinite(x[frame.number, k]).sum() > 1]
+            lanes = [np.nan_to_num(x[frame.number, k], nan=-2.0).round(2).tolist() for k in there]
+            entry = {"raw_file": name, "h_samples": h_samples, "lanes": lanes, "boundary": there}
+            file.write(json.dumps(entry) + "\n")
+            written += 1
+    return written
+
+
+@one_line_errors()
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("result", type=Path, help="folder that lanebev run made")
+    parser.add_argument("source", help="video or images that it ran on")
+    parser.add_argument("out", type=Path, help="new folder")
+    parser.add_argument("--camera", type=Path, required=True, help="file, as given to the run")
+    parser.add_argument("--lane-width", type=PositiveFloat, default=3.7, help="m, as given to the run")
+    parser.add_argument("--reach", type=PositiveInt, default=12, help="frames before and after")
+    parser.add_argument("--every", type=PositiveInt, default=3, help="sure frames of which one is written")
+    args = parser.parse_args()
+    if args.out.exists():
+        parser.error(f"out: expected a new folder, got {args.out}, which is there")
+    camera = Camera.from_file(args.camera)
+    count = write_labels(args.result, args.source, args.out, camera, args.lane_width, args.reach, args.every)
+    print(f"{args.out}: {count} labelled images")
+
+
+if __name__ == "__main__":
+    main()
