@@ -69,7 +69,7 @@ def run(tmp_path):
 def test_what_was_missed_once_is_labelled_and_what_strayed_in_once_is_not(run, tmp_path):
     result, source = run
     out = tmp_path / "out"
-    assert write_labels(result, str(source), out, CAMERA, 3.7, reach=3, every=1) == FRAMES - 1
+    assert write_labels(result, str(source), out, CAMERA, reach=3, every=1) == FRAMES - 1
     entries = read_entries("tusimple", out, ["labels.json"])
     assert len(entries) == FRAMES - 1  # the run was not sure of the last
     for entry in entries:
@@ -110,7 +110,7 @@ def test_frames_beyond_both_ends_do_not_count():
 @pytest.mark.filterwarnings("ignore")
 def test_adapt_config_trains_on_them(run, tmp_path):
     result, source = run
-    write_labels(result, str(source), tmp_path / "out", CAMERA, 3.7, reach=3, every=2)
+    write_labels(result, str(source), tmp_path / "out", CAMERA, reach=3, every=2)
     config = Path(__file__).parents[1] / "configs" / "adapt.yaml"
     small = ["network.base_width=4", "network.decoder_width=4", "init_from=null"]
     data = [f"root={tmp_path}/out", "batch_size=2", "sizes=[[48,80]]", "val_size=[48,80]", "workers=0"]

@@ -19,23 +19,23 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jsonargparse.typing import PositiveFloat, PositiveInt
+from jsonargparse.typing import PositiveInt
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from lanebev.app.observers import FITTED_REACH, FITTED_SUPPORT
 from lanebev.batch import masked_median
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.boundary_curves import Boundaries, boundary_polylines, fit_boundaries
-from lanebev.estimation.joint.single_frame import fit_single_frame
 from lanebev.io.lanes import read_lanes
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
 from lanebev.io.video import open_source
-from lanebev.observation.polylines import image_rows, rows_from_lines, segments_from_rows
+from lanebev.observation.polylines import image_rows, segments_from_lines
 from lanebev.types import Extrinsics
 from train.commands import one_line_errors
 
+SUPPORT = 1.0  # sum of segments' weights that a boundary needs in a frame
+REACH = 60.0  # m ahead that a boundary is drawn at least
 LANE_CHANGE = 0.6  # m, sideways within the neighbouring frames
 
 
@@ -68,7 +68,7 @@ def smoothed(curves: Boundaries, reach: int, least: float = 0.5) -> tuple[Bounda
     result = Boundaries(
         offset=offset,
         heading=masked_median(neighbours(curves.heading, reach), seen),
-        extent=torch.stack([torch.ones_like(far), far.clamp(min=FITTED_REACH)], dim=-1),
+        extent=torch.stack([torch.ones_like(far), far.clamp(min=REACH)], dim=-1),
         present=share >= least,
         curvature=masked_median(bends, bends.isfinite()),
     )
@@ -90,7 +90,7 @@ def label_rows(curves: Boundaries, camera: Camera, extrinsics: Extrinsics) -> ND
     return x
 
 
-def fitted_curves(result: Path, camera: Camera, lane_width: float) -> tuple[Boundaries, list[ExtrinsicsRow]]:
+def fitted_curves(result: Path, camera: Camera) -> tuple[Boundaries, list[ExtrinsicsRow]]:
     """Fit the boundaries of every frame of a run together, on the run's pose.
 
     Raises:
@@ -102,11 +102,10 @@ def fitted_curves(result: Path, camera: Camera, lane_width: float) -> tuple[Boun
             f"{result}: expected as many frames in lanes.json as in extrinsics.csv, "
             f"got {len(entries)} and {len(rows)}"
         )
-    segments = segments_from_rows([rows_from_lines(entry.lines, camera) for entry in entries], camera)
+    segments = segments_from_lines([entry.lines for entry in entries], camera)
     intrinsics = camera.intrinsics.to(segments.endpoints).expand(len(rows), 3, 3)
-    bend = fit_single_frame(segments, intrinsics, lane_width).curvature
     pose = poses(rows, segments.endpoints)
-    return fit_boundaries(segments, intrinsics, pose, bend, least_support=FITTED_SUPPORT), rows
+    return fit_boundaries(segments, intrinsics, pose, least_support=SUPPORT), rows
 
 
 def poses(rows: list[ExtrinsicsRow], like: Tensor) -> Extrinsics:
@@ -116,9 +115,7 @@ def poses(rows: list[ExtrinsicsRow], like: Tensor) -> Extrinsics:
     return Extrinsics(pitch, yaw, roll, like.new_tensor([row.height_m for row in rows]))
 
 
-def write_labels(
-    result: Path, source: str, out: Path, camera: Camera, lane_width: float, reach: int, every: int
-) -> int:
+def write_labels(result: Path, source: str, out: Path, camera: Camera, reach: int, every: int) -> int:
     """Write images and ``labels.json``, and return how many.
 
     Args:
@@ -126,11 +123,10 @@ def write_labels(
         source: of its frames.
         out: new folder.
         camera: that took them.
-        lane_width: m.
         reach: frames before and after that place a boundary.
         every: of so many sure frames one is written.
     """
-    curves, rows = fitted_curves(result, camera, lane_width)
+    curves, rows = fitted_curves(result, camera)
     curves, steady = smoothed(curves, reach)
     x = label_rows(curves, camera, poses(rows, curves.offset))
     sure = [row.status == "TRACKING" and bool(fine) for row, fine in zip(rows, steady, strict=True)]
@@ -162,14 +158,13 @@ def main() -> None:
     parser.add_argument("source", help="video or images that it ran on")
     parser.add_argument("out", type=Path, help="new folder")
     parser.add_argument("--camera", type=Path, required=True, help="file, as given to the run")
-    parser.add_argument("--lane-width", type=PositiveFloat, default=3.7, help="m, as given to the run")
     parser.add_argument("--reach", type=PositiveInt, default=12, help="frames before and after")
     parser.add_argument("--every", type=PositiveInt, default=3, help="sure frames of which one is written")
     args = parser.parse_args()
     if args.out.exists():
         parser.error(f"out: expected a new folder, got {args.out}, which is there")
     camera = Camera.from_file(args.camera)
-    count = write_labels(args.result, args.source, args.out, camera, args.lane_width, args.reach, args.every)
+    count = write_labels(args.result, args.source, args.out, camera, args.reach, args.every)
     print(f"{args.out}: {count} labelled images")
 
 
