@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from lanebev import Calibration, Extrinsics, Status
+from lanebev import Calibration, Extrinsics, Reason, Status
 from lanebev.io.results import (
     CSV_COLUMNS,
     OutputFolder,
@@ -18,12 +18,13 @@ from lanebev.io.results import (
 )
 
 
-def _row(frame=0, image=""):
+def _row(frame=0, image="", reasons=Reason.NONE):
     pose = Extrinsics(*(torch.tensor([math.radians(v)]) for v in (1.0, -2.0, 3.0)), torch.tensor([1.5]))
     cov = torch.diag(torch.tensor([math.radians(0.1), math.radians(0.2), math.radians(0.3), 0.04]) ** 2)[None]
     status = torch.tensor([int(Status.TRACKING)])
     calibration = Calibration(pose, cov, status, torch.ones(1, 4))
-    return extrinsics_row(frame, 0.04 * frame, calibration, torch.tensor([[1.0, 0.5, 0.0, 0.0]]), image)
+    weight = torch.tensor([[1.0, 0.5, 0.0, 0.0]])
+    return extrinsics_row(frame, 0.04 * frame, calibration, weight, image, reasons)
 
 
 def test_csv_is_as_promised(tmp_path):
@@ -31,14 +32,28 @@ def test_csv_is_as_promised(tmp_path):
     lines = (tmp_path / "e.csv").read_text().splitlines()
     assert lines[0] == (
         "frame,time_s,pitch_deg,yaw_deg,roll_deg,height_m,pitch_std_deg,yaw_std_deg,roll_std_deg,"
-        "height_std_m,status,segments,image"
+        "height_std_m,status,segments,image,reasons"
     )
     expected = (
-        "0,0.000000,1.000000,-2.000000,3.000000,1.500000,0.100000,0.200000,0.300000,0.040000,TRACKING,2,"
+        "0,0.000000,1.000000,-2.000000,3.000000,1.500000,0.100000,0.200000,0.300000,0.040000,TRACKING,2,,"
     )
     assert lines[1] == expected
-    assert lines[2].endswith('TRACKING,2,"a,b.jpg"')
-    assert len(CSV_COLUMNS) == 13
+    assert lines[2].endswith('TRACKING,2,"a,b.jpg",')
+    assert CSV_COLUMNS[-1] == "reasons"  # the 13 columns before it are promised
+
+
+def test_csv_tells_the_reasons_of_a_frame(tmp_path):
+    row = _row(reasons=Reason.ROLL_UNSEEN | Reason.LANE_CHANGE)
+    write_extrinsics(tmp_path / "e.csv", [row, _row(1)])
+    assert (tmp_path / "e.csv").read_text().splitlines()[1].endswith(",ROLL_UNSEEN|LANE_CHANGE")
+    assert [row.reasons for row in read_extrinsics(tmp_path / "e.csv")] == ["ROLL_UNSEEN|LANE_CHANGE", ""]
+
+
+def test_csv_without_reasons_is_read(tmp_path):
+    write_extrinsics(tmp_path / "e.csv", [_row(0)])
+    lines = (tmp_path / "e.csv").read_text().splitlines()
+    (tmp_path / "old.csv").write_text("\n".join(line.rsplit(",", 1)[0] for line in lines))
+    assert read_extrinsics(tmp_path / "old.csv") == read_extrinsics(tmp_path / "e.csv")
 
 
 def test_csv_keeps_a_file_name_that_is_no_text(tmp_path):
@@ -61,7 +76,7 @@ def test_csv_round_trip(tmp_path):
     [
         ("", "expected the columns"),
         ("a,b\n1,2\n", "expected the columns"),
-        ("0,1\n", "line 2: expected 13 values"),
+        ("0,1\n", "line 2: expected 14 values"),
     ],
 )
 def test_foreign_csv(tmp_path, text, message):

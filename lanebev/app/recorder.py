@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lanebev.app.concurrency import Background
 from lanebev.camera.model import Camera
+from lanebev.estimation.joint.state import Reason
 from lanebev.io.lanes import tusimple_line
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video import Frame, VideoWriter, write_png
@@ -39,6 +40,7 @@ class Recorded(NamedTuple):
         pose_sigma_scale: of the pose's sigmas.
         segments: of batch size 1, what the calibrator was given.
         calibration: of batch size 1.
+        reasons: why the frame is not (fully) tracked.
         before: pose of the view before, each (1,); None before anything is known.
         bev_before, bev_after: (U, V, 3) RGB.
     """
@@ -49,6 +51,7 @@ class Recorded(NamedTuple):
     pose_sigma_scale: float
     segments: LaneSegments
     calibration: Calibration
+    reasons: Reason
     before: Extrinsics | None
     bev_before: Picture
     bev_after: Picture
@@ -108,7 +111,9 @@ class Recorder:
         if frame.problem:
             self.problems.append(f"frame {frame.number}: {frame.problem}")
         weight = done.segments.weight
-        self.rows.append(extrinsics_row(frame.number, frame.time, done.calibration, weight, frame.name))
+        self.rows.append(
+            extrinsics_row(frame.number, frame.time, done.calibration, weight, frame.name, done.reasons)
+        )
         self._background.submit(lambda: self._write(done))
 
     def finish(

@@ -18,6 +18,7 @@ from lanebev.app.observers import LaneFileObserver, NetworkObserver, Observer
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.state import Reason
 from lanebev.estimation.mount import (
     MountCalibration,
     MountEstimator,
@@ -155,6 +156,7 @@ def run(
                         pose_sigma_scale,
                         segments,
                         calibration,
+                        reasons_of(states["calibrator"]),
                         before,
                         bird_view(coarse, frame, camera, before),
                         bird_view(warp, frame, camera, calibration.extrinsics),
@@ -276,9 +278,14 @@ def calibrate(
     intrinsics = camera.intrinsics[None]
     calibration: Calibration
     if config.stills:
-        return calibrate_still(calibrator, segments, intrinsics, config.lane_width), state
+        return _still(calibrator, segments, intrinsics, config.lane_width)
     calibration, state = calibrator(segments, intrinsics, state, frame.dt, config.lane_width)
     return calibration, state
+
+
+def reasons_of(state: Any) -> Reason:
+    """Return why the frame is not (fully) tracked; nothing where the calibrator gives no reasons."""
+    return Reason(int(state.reasons[0])) if hasattr(state, "reasons") else Reason.NONE
 
 
 def curvature(calibrator: Any, state: Any) -> Tensor | None:
@@ -303,6 +310,12 @@ def calibrate_still(
         intrinsics: (B, 3, 3).
         lane_width: m.
     """
+    return _still(calibrator, segments, intrinsics, lane_width)[0]
+
+
+def _still(
+    calibrator: nn.Module, segments: LaneSegments, intrinsics: Tensor, lane_width: float
+) -> tuple[Calibration, Any]:
     passes = 1 if isinstance(calibrator, JointCalibrator) else STILL_PASSES
     initial_state: Any = calibrator.initial_state
     state = initial_state(segments.sigma.shape[0], dtype=segments.sigma.dtype, device=segments.sigma.device)
@@ -310,7 +323,7 @@ def calibrate_still(
     for _ in range(passes):
         calibration: Calibration
         calibration, state = calibrator(shared, intrinsics, state, 1e-3, lane_width)
-    return calibration
+    return calibration, state
 
 
 def pose_before(

@@ -8,6 +8,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterable
+from enum import Flag
 from itertools import count
 from pathlib import Path
 from types import TracebackType
@@ -19,10 +20,10 @@ from lanebev.types import Calibration, Status
 
 CSV_COLUMNS = (
     "frame", "time_s", "pitch_deg", "yaw_deg", "roll_deg", "height_m", "pitch_std_deg", "yaw_std_deg",
-    "roll_std_deg", "height_std_m", "status", "segments", "image",
+    "roll_std_deg", "height_std_m", "status", "segments", "image", "reasons",
 )  # fmt: skip
 
-_COLUMN_TYPES = (int, *[float] * 9, str, int, str)
+_COLUMN_TYPES = (int, *[float] * 9, str, int, str, str)
 
 OUTPUT_NAMES = (
     "extrinsics.csv", "lanes.json", "bev.mp4", "bev.png", "overlay.mp4", "overlay.png", "report.html",
@@ -31,7 +32,7 @@ OUTPUT_NAMES = (
 
 
 class ExtrinsicsRow(NamedTuple):
-    """One row of ``extrinsics.csv``, in its units and order."""
+    """One row of ``extrinsics.csv``, in its units and order; ``reasons`` are names joined by ``|``."""
 
     frame: int
     time_s: float
@@ -46,12 +47,18 @@ class ExtrinsicsRow(NamedTuple):
     status: str
     segments: int
     image: str
+    reasons: str = ""
 
 
 def extrinsics_row(
-    frame: int, time: float, calibration: Calibration, weight: Tensor, image: str
+    frame: int,
+    time: float,
+    calibration: Calibration,
+    weight: Tensor,
+    image: str,
+    reasons: Iterable[Flag] = (),
 ) -> ExtrinsicsRow:
-    """Row of a frame.
+    """Return the row of a frame.
 
     Args:
         frame: its number.
@@ -59,6 +66,7 @@ def extrinsics_row(
         calibration: of batch size 1.
         weight: (1, N) of the frame's segments; those above zero are counted.
         image: the file's path as found, empty for a video.
+        reasons: flags such as those of :class:`lanebev.Reason` that hold in this frame.
     """
     pitch, yaw, roll, height = calibration.extrinsics.stack()[0].tolist()
     variances = calibration.covariance[0].diagonal().clamp_min(0)
@@ -77,6 +85,7 @@ def extrinsics_row(
         status=Status(int(calibration.status[0])).name,
         segments=int((weight[0] > 0).sum()),
         image=image,
+        reasons="|".join(str(reason.name) for reason in reasons),
     )
 
 
@@ -90,7 +99,7 @@ def write_extrinsics(path: str | Path, rows: list[ExtrinsicsRow]) -> None:
 
 
 def read_extrinsics(path: str | Path) -> list[ExtrinsicsRow]:
-    """Read what :func:`write_extrinsics` wrote.
+    """Read what :func:`write_extrinsics` wrote; in a file without the last column no reasons are known.
 
     Raises:
         ValueError: the file is missing, or its header or a row is not ours.
@@ -100,15 +109,17 @@ def read_extrinsics(path: str | Path) -> list[ExtrinsicsRow]:
             header, *rows = list(csv.reader(file)) or [[]]
     except OSError as error:
         raise ValueError(f"{path}: expected a readable extrinsics.csv, got: {error.strerror}") from error
-    if tuple(header) != CSV_COLUMNS:
+    if tuple(header) not in (CSV_COLUMNS, CSV_COLUMNS[:-1]):
         raise ValueError(f"{path}: expected the columns {','.join(CSV_COLUMNS)}, got {','.join(header)}")
     result = []
     for number, row in enumerate(rows, start=2):
         try:
-            typed = [kind(value) for kind, value in zip(_COLUMN_TYPES, row, strict=True)]
-            result.append(ExtrinsicsRow._make(typed))
+            typed = [kind(value) for kind, value in zip(_COLUMN_TYPES[: len(header)], row, strict=True)]
+            result.append(ExtrinsicsRow(*typed))
         except ValueError as error:
-            raise ValueError(f"{path}, line {number}: expected 13 values, got {','.join(row)}") from error
+            raise ValueError(
+                f"{path}, line {number}: expected {len(header)} values, got {','.join(row)}"
+            ) from error
     return result
 
 
