@@ -152,6 +152,7 @@ def fit(folder, *extra):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 @pytest.mark.usefixtures("instant")
 def test_gpu_config_trains_by_steps_and_an_interrupted_run_ends_as_one_in_a_piece(tmp_path, monkeypatch):
     each = "--trainer.callbacks+={class_path: lightning.pytorch.callbacks.ModelCheckpoint, " + (
@@ -184,6 +185,7 @@ def test_gpu_config_trains_by_steps_and_an_interrupted_run_ends_as_one_in_a_piec
     assert len(table) > 3
 
 
+@pytest.mark.slow
 @pytest.mark.slow
 @pytest.mark.usefixtures("instant")
 def test_gpu_config_ends_after_its_minutes_with_a_checkpoint(tmp_path):
