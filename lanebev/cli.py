@@ -68,8 +68,9 @@ def parser() -> argparse.ArgumentParser:
                      help="begin with the state that a run left in this folder")  # fmt: skip
     run.add_argument("--calibrator", default="joint", choices=("joint", "two-stage"),
                      help="two-stage is the paper's (%(default)s)")  # fmt: skip
-    run.add_argument("--fps", type=float, default=30.0, metavar="HZ",
-                     help="frame rate of a folder or glob; a video knows its own (%(default)g)")  # fmt: skip
+    run.add_argument("--fps", type=float, metavar="HZ",
+                     help="frame rate of a folder or glob (what names of seconds say, else 30) or of a raw "
+                     "stream; a video knows its own")  # fmt: skip
     return top
 
 

@@ -33,7 +33,7 @@ from lanebev.io.lane_size import resized_lanes
 from lanebev.io.lanes import lane_files, read_lanes
 from lanebev.io.results import ExtrinsicsRow, OutputFolder, check_inputs_stay
 from lanebev.io.state import load_state, save_state
-from lanebev.io.video import DEFAULT_FPS, Frame, FrameSource, image_size, open_source
+from lanebev.io.video import Frame, FrameSource, image_size, open_source
 from lanebev.observation.polylines import camera_segments
 from lanebev.pipeline import LaneBEV
 from lanebev.report.measure import pose
@@ -68,7 +68,8 @@ class RunConfig:
         stills: every image on its own.
         resume: output folder of an earlier run, with the same calibrator, whose state to begin with.
         calibrator: one of CALIBRATORS.
-        fps: of a folder or glob; a video knows its own.
+        fps: of a folder, a glob or a raw stream; None is what names or the stream say, else 30. A video knows
+            its own.
         lanes_size: (height, width) px of the images that ``lanes`` was drawn on; None is the source's own.
         rectified: the images were rectified: the camera is the camera file's projection matrix P.
     """
@@ -81,14 +82,19 @@ class RunConfig:
     stills: bool = False
     resume: str | None = None
     calibrator: str = "joint"
-    fps: float = float(DEFAULT_FPS)
+    fps: float | None = None
     lanes_size: tuple[int, int] | None = None
     rectified: bool = False
+
+    @property
+    def frame_rate(self) -> Fraction | None:
+        """``fps`` as a fraction."""
+        return None if self.fps is None else Fraction(self.fps).limit_denominator(1000)
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.lane_width) and 1.0 < self.lane_width < 10.0):
             raise ValueError(f"lane width: expected 1 to 10 m, got {self.lane_width:g}")
-        if not (math.isfinite(self.fps) and 0.01 <= self.fps <= 10_000):
+        if self.fps is not None and not (math.isfinite(self.fps) and 0.01 <= self.fps <= 10_000):
             raise ValueError(f"fps: expected 0.01 to 10000 frames per second, got {self.fps:g}")
         if self.calibrator not in CALIBRATORS:
             raise ValueError(f"calibrator: expected {' or '.join(CALIBRATORS)}, got {self.calibrator!r}")
@@ -112,7 +118,7 @@ def run(
     Raises:
         ValueError: bad input; one line says which and what would be right.
     """
-    source = open_source(config.source, Fraction(config.fps).limit_denominator(1000))
+    source = open_source(config.source, config.frame_rate)
     check_inputs_stay(config.out, inputs(config, source))
     camera = Camera.from_file(config.camera, source.image_size, config.rectified)
     source = of_camera(camera, source)

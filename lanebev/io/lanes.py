@@ -18,12 +18,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lanebev.io.image_names import in_natural_order
+from lanebev.io.images import IMAGE_SUFFIXES
 from lanebev.io.openlane import (
     camera_from_ground_points,
     camera_from_label_points,
     image_from_camera_points,
 )
-from lanebev.io.video import IMAGE_SUFFIXES, natural_order
 from lanebev.numbers import finite_numbers, numbers_or_gaps, read_text, shown
 from lanebev.observation.pairing import BoundaryVertices
 from lanebev.observation.polylines import LaneLine
@@ -77,9 +78,8 @@ def lane_files(path: str | Path) -> list[Path]:
     path = Path(path)
     if not path.is_dir():
         return [path]
-    return sorted(
-        [*path.rglob("*.lines.txt"), *path.rglob("*.json")], key=lambda file: natural_order(str(file))
-    )
+    found = [*path.rglob("*.lines.txt"), *path.rglob("*.json")]
+    return [Path(file) for file in in_natural_order(map(str, found))]
 
 
 def read_tusimple(path: str | Path) -> list[FrameLines]:

@@ -2,26 +2,41 @@
 
 from __future__ import annotations
 
-import bisect
 import glob
 import os
 import re
-import struct
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from statistics import median
 from types import TracebackType
 from typing import NamedTuple
 
 import av
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm")
+from lanebev.io.decoding import decoded, has_times, open_video, packets, rgb
+from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
+from lanebev.io.images import IMAGE_SUFFIXES, image_size, is_image, read_image, write_png
+
+__all__ = [
+    "DEFAULT_FPS",
+    "IMAGE_SUFFIXES",
+    "Frame",
+    "FrameSource",
+    "VideoWriter",
+    "image_size",
+    "in_natural_order",
+    "natural_order",
+    "open_source",
+    "read_image",
+    "write_png",
+]
+
 DEFAULT_FPS = Fraction(30)
+_SAME_RATE = 0.05  # relative, by which two frame rates may differ and be the same
 
 
 class Frame(NamedTuple):
@@ -33,7 +48,7 @@ class Frame(NamedTuple):
         dt: s since the frame before; of the first, the source's nominal interval.
         name: the image's path as found, empty for a video.
         image: (H, W, 3) uint8 RGB, or None if it did not decode.
-        problem: why not, else empty.
+        problem: why not, or what else is to be said of it; else empty.
     """
 
     number: int
@@ -55,6 +70,8 @@ class FrameSource:
         count: number of frames; of a damaged video an estimate.
         image_size: (height, width) of the first frame that decodes.
         problem: what is wrong with the whole of it, else empty.
+        times: s since the first, of images whose names state them; else empty.
+        has_times: whether a video says when its frames are shown; else they are evenly spaced.
     """
 
     source: str
@@ -63,6 +80,8 @@ class FrameSource:
     count: int
     image_size: tuple[int, int]
     problem: str = ""
+    times: tuple[float, ...] = ()
+    has_times: bool = True
 
     @property
     def is_video(self) -> bool:
@@ -84,21 +103,30 @@ class FrameSource:
                 image = self._right_size(read_image(path))
             except ValueError as error:
                 problem = str(error)
-            yield Frame(index, float(index / self.fps), float(1 / self.fps), path, image, problem)
+            time, dt = float(index / self.fps), float(1 / self.fps)
+            if self.times:
+                time, dt = self.times[index], self.times[index] - self.times[index - 1] if index else dt
+            yield Frame(index, time, dt, path, image, problem)
 
     def _video_frames(self) -> Iterator[Frame]:
         first, before = None, None
-        with _open_video(self.source) as container:
+        damaged, told = False, False  # since the last key frame
+        with open_video(self.source) as container:
             stream = container.streams.video[0]
-            for index, (pts, decoded) in enumerate(_decoded(container, stream)):
-                time = (first or 0) + index / self.fps if pts is None else pts * stream.time_base
+            for index, (pts, frame) in enumerate(decoded(container, stream)):
+                timed = pts is not None and self.has_times
+                time = pts * stream.time_base if timed else (first or 0) + index / self.fps
                 if before is not None and time <= before:  # AVI has no times of display
                     time = before + 1 / self.fps
                 first = time if first is None else first
                 dt = float(1 / self.fps) if before is None else float(time - before)
                 image, problem = None, ""
+                if isinstance(frame, str) or frame.key_frame:
+                    damaged, told = isinstance(frame, str), False
+                elif damaged and not told:
+                    problem, told = "up to the next key frame, images may show a lost frame's damage", True
                 try:
-                    image = self._right_size(_rgb(decoded))
+                    image = self._right_size(rgb(frame))
                 except ValueError as error:
                     problem = str(error)
                 yield Frame(index, float(time - first), dt, "", image, problem)
@@ -112,20 +140,21 @@ class FrameSource:
         return image
 
 
-def open_source(source: str, fps: Fraction = DEFAULT_FPS) -> FrameSource:
+def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
     """Look at what the user gave and check that a frame of it decodes.
 
     Args:
         source: a video, a folder of images, a glob (recursive with ``**``) or one image.
-        fps: frame rate of a folder or glob; a video knows its own.
+        fps: frame rate of a folder, a glob or a raw stream. None is that of images whose names state their
+            times, of a raw stream what it says or ffmpeg guesses, else 30. A video knows its own.
 
     Raises:
         ValueError: nothing there, no images in it, or the only (or every) image does not decode.
     """
     path = Path(source)
     if path.is_dir():
-        there = (p for p in path.iterdir() if _is_image(p) and p.name[0] != ".")  # macOS leaves ._ files
-        paths = sorted(map(str, there), key=natural_order)
+        there = (p for p in path.iterdir() if is_image(p) and p.name[0] != ".")  # macOS leaves ._ files
+        paths = in_natural_order(map(str, there))
         if not paths:
             raise ValueError(
                 f"{source}: expected images in the folder, got none; for those in folders below it give "
@@ -133,52 +162,13 @@ def open_source(source: str, fps: Fraction = DEFAULT_FPS) -> FrameSource:
             )
         return _image_source(source, paths, fps)
     if path.is_file():
-        return _image_source(source, [source], fps) if _is_image(path) else _video_source(source)
+        return _image_source(source, [source], fps) if is_image(path) else _video_source(source, fps)
     if glob.has_magic(source):
-        paths = sorted(filter(_is_image, glob.glob(source, recursive=True)), key=natural_order)
+        paths = in_natural_order(filter(is_image, glob.glob(source, recursive=True)))
         if not paths:
             raise ValueError(f"{source}: expected images that match, got none; quote the pattern")
         return _image_source(source, paths, fps)
     raise ValueError(f"{source}: expected a video, an image, a folder or a glob of images, got nothing there")
-
-
-def read_image(path: str | Path) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB, upright by its EXIF orientation, as viewers and OpenCV show it.
-
-    A file that is cut is an error, not an image with a grey half.
-
-    Raises:
-        ValueError: the file is missing, cut or no image.
-    """
-    try:
-        with warnings.catch_warnings(), Image.open(path) as image:
-            warnings.simplefilter("ignore")  # of odd EXIF; errors are errors
-            return np.asarray(_eight_bit(_upright(image)).convert("RGB"))
-    except (OSError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        if isinstance(error, UnidentifiedImageError):
-            reason = "no image or one whose header is cut"
-        else:
-            reason = (getattr(error, "strerror", None) or str(error)).splitlines()[0].lower()
-        raise ValueError(f"image {path}: expected a whole image, got: {reason}") from error
-
-
-def image_size(path: str | Path) -> tuple[int, int] | None:
-    """(height, width) of an image, None if it does not decode."""
-    try:
-        height, width = read_image(path).shape[:2]
-    except ValueError:
-        return None
-    return height, width
-
-
-def write_png(path: str | Path, image: NDArray[np.uint8]) -> None:
-    """(H, W, 3) uint8 RGB to a PNG."""
-    Image.fromarray(image).save(path)
-
-
-def natural_order(path: str) -> list[tuple[int, int, str]]:
-    """Sort key with numbers by value: 2.jpg before 10.jpg."""
-    return [(0, int(part), part) if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", path)]
 
 
 _HIDING = ("vp8", "libvpx")  # codecs with frames that are decoded and not shown, in packets of their own
@@ -232,68 +222,62 @@ class VideoWriter:
             self._container.mux(packet)
 
 
-def _is_image(path: str | Path) -> bool:
-    return Path(path).suffix.lower() in IMAGE_SUFFIXES and Path(path).is_file()
-
-
-def _upright(image: Image.Image) -> Image.Image:
-    try:
-        turned = image.getexif().get(ExifTags.Base.Orientation, 1) != 1
-    except (SyntaxError, struct.error, ValueError, KeyError, TypeError):  # of odd EXIF
-        turned = False
-    return ImageOps.exif_transpose(image) if turned else image
-
-
-def _eight_bit(image: Image.Image) -> Image.Image:
-    """16-bit grey at its own scale; ``convert`` would cut it off at 255.
-
-    Raises:
-        OSError: of floating point, whose scale nobody says.
-    """
-    if image.mode == "F":
-        raise OSError("floating point, expected 8 or 16 bits")
-    if not image.mode.startswith("I"):
-        return image
-    return Image.fromarray((np.asarray(image).clip(0, 65535) / 257).round().astype(np.uint8))
-
-
-def _image_source(source: str, paths: Sequence[str], fps: Fraction) -> FrameSource:
+def _image_source(source: str, paths: Sequence[str], fps: Fraction | None) -> FrameSource:
     problem = ""
     for path in paths:
         try:
-            return FrameSource(source, tuple(paths), fps, len(paths), read_image(path).shape[:2])
+            size = read_image(path).shape[:2]
+            break
         except ValueError as error:
             problem = problem or str(error)
-    raise ValueError(problem)
+    else:
+        raise ValueError(problem)
+    times = times_from_names(paths)
+    if not times:
+        return FrameSource(source, tuple(paths), fps or DEFAULT_FPS, len(paths), size)
+    own = 1 / Fraction(median(np.diff(times).tolist())).limit_denominator(1_000_000)
+    if fps is None:
+        return FrameSource(source, tuple(paths), own, len(paths), size, times=times)
+    differs = abs(own / fps - 1) > _SAME_RATE
+    problem = f"{source}: its names state {float(own):.4g} frames per second, --fps {float(fps):g} was given"
+    return FrameSource(source, tuple(paths), fps, len(paths), size, problem if differs else "")
 
 
-def _video_source(source: str) -> FrameSource:
-    with _open_video(source) as container:
+def _video_source(source: str, stated: Fraction | None) -> FrameSource:
+    with open_video(source) as container:
         stream = container.streams.video[0]
-        fps = Fraction(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
-        frames = (frame for _, frame in _decoded(container, stream) if not isinstance(frame, str))
+        timed = has_times(container)
+        own = Fraction((timed and stream.average_rate) or stream.guessed_rate or DEFAULT_FPS)
+        fps = own if timed else stated or own
+        frames = (frame for _, frame in decoded(container, stream) if not isinstance(frame, str))
         try:
             frame = next(frames)
         except (av.error.FFmpegError, StopIteration) as error:
             raise ValueError(f"video {source}: expected at least one whole frame, got none") from error
-        size = _rgb(frame).shape[:2]
-    with _open_video(source) as container:  # the header's count includes frames that an edit list cuts
+        size = rgb(frame).shape[:2]
+    with open_video(source) as container:  # the header's count includes frames that an edit list cuts
         stream = container.streams.video[0]
         begin, tick = stream.start_time or 0, stream.time_base or 1 / fps
         count, end = 0, Fraction(0)
         telling = stream.codec_context.name not in _HIDING
-        for packet in container.demux(stream):
+        for packet in packets(container, stream):
             telling = telling and (packet.pts is not None or not packet.size)
             if packet.pts is not None:
                 count += not packet.is_discard
                 end = max(end, packet.pts - begin + max(packet.duration or 0, 1 / fps / tick))
         declared, got = _declared_duration(stream, begin * tick), float(end * tick)
     if not telling:
-        with _open_video(source) as container:
-            count = sum(1 for _ in _decoded(container, container.streams.video[0]))
-    cut = declared - got > 0.5 / fps
-    problem = f"video {source}: expected {declared:.2f} s as it declares, got {got:.2f} s; is it cut?"
-    return FrameSource(source, (), fps, count, size, problem if cut else "")
+        with open_video(source) as container:
+            count = sum(1 for _ in decoded(container, container.streams.video[0]))
+    problems = []
+    if timed and declared - got > 0.5 / fps:
+        problems.append(f"expected {declared:.2f} s as it declares, got {got:.2f} s; is it cut?")
+    if not timed and stated is None:
+        problems.append(f"it has no times, and is taken for {float(fps):g} frames per second; state --fps")
+    if timed and stated is not None and abs(own / stated - 1) > _SAME_RATE:
+        problems.append(f"its own {float(own):.4g} frames per second are used, not --fps {float(stated):g}")
+    problem = f"video {source}: {'; '.join(problems)}" if problems else ""
+    return FrameSource(source, (), fps, count, size, problem, has_times=timed)
 
 
 def _declared_duration(stream: av.VideoStream, begin: Fraction) -> float:
@@ -305,54 +289,3 @@ def _declared_duration(stream: av.VideoStream, begin: Fraction) -> float:
         return 0.0
     hours, minutes, seconds = map(float, match.groups())
     return 3600 * hours + 60 * minutes + seconds - float(begin)
-
-
-def _decoded(
-    container: av.container.InputContainer, stream: av.VideoStream
-) -> Iterator[tuple[int | None, av.VideoFrame | str]]:
-    """Frames as they are shown, with the times that the file gives; of a lost one, what was got instead.
-
-    A packet whose frame does not come is lost if the file is damaged up to there; in a sound one it shows
-    nothing. No frame threads: they drop what follows the last error.
-    """
-    due: list[int] = []  # times of packets whose frames have not come
-    damage = ""
-    for packet in container.demux(stream):
-        if packet.pts is not None and not packet.is_discard:
-            bisect.insort(due, packet.pts)
-        if packet.is_corrupt:
-            damage = damage or "a damaged one"
-        frames: Sequence[av.VideoFrame] = ()
-        try:
-            frames = packet.decode()
-        except av.error.FFmpegError as error:  # one frame lost, the next may be whole
-            damage = error.strerror
-            if packet.pts is None and packet.size:
-                yield None, damage
-        for frame in frames:
-            while due and frame.pts is not None and due[0] <= frame.pts:
-                if (pts := due.pop(0)) < frame.pts and damage:
-                    yield pts, damage
-            yield frame.pts, frame
-    if damage:
-        yield from ((pts, damage) for pts in due)
-
-
-def _rgb(decoded: av.VideoFrame | str) -> NDArray[np.uint8]:
-    """Upright, by the container's display matrix, as players and OpenCV show it."""
-    if isinstance(decoded, str):
-        raise ValueError(f"expected a whole frame, got: {decoded}")
-    image: NDArray[np.uint8] = decoded.to_ndarray(format="rgb24")
-    return np.ascontiguousarray(np.rot90(image, round(decoded.rotation / 90)))
-
-
-def _open_video(source: str) -> av.container.InputContainer:
-    try:
-        container = av.open(os.path.abspath(source))  # else what precedes a colon is taken for a protocol
-    except (av.error.FFmpegError, OSError) as error:
-        reason = error.strerror or "unknown format"
-        raise ValueError(f"video {source}: expected a video that opens, got: {reason}; is it cut?") from error
-    if not container.streams.video:
-        container.close()
-        raise ValueError(f"video {source}: expected a video stream, got none")
-    return container

@@ -1,0 +1,131 @@
+"""Frames of a video container in the order in which they are shown, and what is wrong with them."""
+
+from __future__ import annotations
+
+import bisect
+import os
+import struct
+from collections.abc import Iterator, Sequence
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+_NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS: raw streams, whose times ffmpeg makes up
+_MARKED = "one that the decoder marks as damaged"
+
+
+def open_video(source: str) -> av.container.InputContainer:
+    """Open a container that has a video stream.
+
+    Raises:
+        ValueError: it does not open, or there is none.
+    """
+    try:
+        container = av.open(os.path.abspath(source))  # else what precedes a colon is taken for a protocol
+    except (av.error.FFmpegError, OSError) as error:
+        reason = error.strerror or "unknown format"
+        raise ValueError(f"video {source}: expected a video that opens, got: {reason}; is it cut?") from error
+    if not container.streams.video:
+        container.close()
+        raise ValueError(f"video {source}: expected a video stream, got none")
+    return container
+
+
+def has_times(container: av.container.InputContainer) -> bool:
+    """Return whether the container says when its frames are shown; raw streams do not."""
+    return not int(container.format.flags) & _NO_TIMES
+
+
+def packets(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[av.Packet]:
+    """Return the stream's packets, an empty one at the end; a container that breaks off just ends."""
+    demuxed = container.demux(stream)
+    while True:
+        try:
+            packet = next(demuxed)
+        except StopIteration:
+            return
+        except av.error.FFmpegError:
+            end = av.Packet()
+            end.stream = stream
+            yield end
+            return
+        yield packet
+
+
+def decoded(
+    container: av.container.InputContainer, stream: av.VideoStream
+) -> Iterator[tuple[int | None, av.VideoFrame | str]]:
+    """Return frames as they are shown, with the times that the file gives; of a lost one, what was got.
+
+    A packet whose frame does not come is lost if the file is damaged up to there; in a sound one it shows
+    nothing. A frame that the decoder marks as corrupt is lost too. AVI has no times of display, so that the
+    frames of a stream with B-frames come with another's: they take the packets' times in order. No frame
+    threads: they drop what follows the last error.
+    """
+    in_order = container.format.name == "avi" and stream.codec_context.has_b_frames
+    due: list[int] = []  # times of packets whose frames have not come
+    lost: set[int] = set()
+    damage = ""
+    for packet in packets(container, stream):
+        if packet.pts is not None and not packet.is_discard:
+            bisect.insort(due, packet.pts)
+        if packet.is_corrupt:
+            damage = damage or "a damaged one"
+        frames: Sequence[av.VideoFrame] = ()
+        try:
+            frames = packet.decode()
+        except av.error.FFmpegError as error:  # one frame lost, the next may be whole
+            damage = error.strerror
+            if packet.pts is None and packet.size:
+                yield None, damage
+            elif packet.pts is not None:
+                lost.add(packet.pts)
+        for frame in frames:
+            pts = frame.pts
+            if in_order:
+                while due and due[0] in lost:
+                    yield due.pop(0), damage
+                pts = due.pop(0) if due else None
+            while due and pts is not None and due[0] <= pts:
+                if (earlier := due.pop(0)) < pts and damage:
+                    yield earlier, damage
+            yield pts, _MARKED if frame.is_corrupt else frame
+    if damage:
+        yield from ((pts, damage) for pts in due)
+
+
+def rgb(frame: av.VideoFrame | str) -> NDArray[np.uint8]:
+    """Return a frame as (H, W, 3) uint8 RGB, upright as ffmpeg and players show it.
+
+    Raises:
+        ValueError: it is a lost one.
+    """
+    if isinstance(frame, str):
+        raise ValueError(f"expected a whole frame, got: {frame}")
+    image: NDArray[np.uint8] = frame.to_ndarray(format="rgb24")
+    for data in frame.side_data:
+        if data.type.name == "DISPLAYMATRIX":
+            image = displayed(image, struct.unpack("9i", bytes(data)[:36]))
+    return np.ascontiguousarray(image)
+
+
+def displayed(image: NDArray[np.uint8], matrix: Sequence[int]) -> NDArray[np.uint8]:
+    """Return an image as a display matrix shows it, turned by right angles and mirrored.
+
+    Source: ISO/IEC 14496-12, 8.3.2 (tkhd): with the matrix [a b u; c d v; x y w], a pixel at (p, q) is shown
+    at (a p + c q + x, b p + d q + y).
+
+    Args:
+        image: (H, W, 3).
+        matrix: nine numbers, row by row; other angles than right ones are brought to the nearest.
+
+    Returns:
+        (H, W, 3) or (W, H, 3).
+    """
+    a, b, _, c, d, *_ = matrix
+    down, right = d < 0, a < 0  # what is mirrored
+    if abs(a) + abs(d) < abs(b) + abs(c):
+        image = image.transpose(1, 0, 2)
+        down, right = b < 0, c < 0
+    return image[:: -1 if down else 1, :: -1 if right else 1]
