@@ -19,7 +19,9 @@ from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.observation.vertices import LineConfig
 from lanebev.pipeline import LaneBEV, LaneBEVOutput
 from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
+from lanebev.view.canonical import CanonicalView
 from lanebev.view.grid import BEVGrid, bev_from_image
+from lanebev.view.paint import ImageFromBEV
 from lanebev.view.warp import BEVWarp
 
 __version__ = "0.1.0"
@@ -29,7 +31,9 @@ __all__ = [
     "BEVWarp",
     "Calibration",
     "Camera",
+    "CanonicalView",
     "Extrinsics",
+    "ImageFromBEV",
     "JointCalibrator",
     "JointConfig",
     "LaneBEV",

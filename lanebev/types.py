@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from enum import IntEnum
-from typing import NamedTuple, Protocol, TypeVar, cast
+from typing import NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 from torch.utils import _pytree
 
-T = TypeVar("T")
+from lanebev.geometry.rotation import (
+    camera_from_road_matrix,
+    road_from_camera_matrix,
+    rotation_vector,
+)
+from lanebev.tensors import map_tensors as map_tensors  # noqa: PLC0414 - part of this module too
+
 TupleClass = TypeVar("TupleClass", bound=type)
 
 NUM_BOUNDARIES = 6
@@ -28,15 +34,6 @@ class TensorTuple(Protocol):
     """Any NamedTuple of tensors."""
 
     def _asdict(self) -> Mapping[str, Tensor]: ...
-
-
-def map_tensors(function: Callable[[Tensor], Tensor], value: T) -> T:
-    """Apply a function to a tensor, or to every tensor of a NamedTuple; return anything else as it is."""
-    if isinstance(value, Tensor):
-        return cast(T, function(value))
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return cast(T, type(value)(*(map_tensors(function, part) for part in value)))
-    return value
 
 
 def check_tensor(name: str, value: object) -> None:
@@ -141,6 +138,46 @@ class Extrinsics(NamedTuple):
         if values.shape[-1] != 4:
             raise ValueError(f"values: expected (..., 4), got {tuple(values.shape)}")
         return cls(*values.unbind(-1))
+
+    def camera_from_road(self) -> Tensor:
+        """Return the rigid transform from the road's frame to the camera's, (B, 4, 4).
+
+        For column vectors (X, Y, Z, 1) in m. The road's frame (X right, Y down, Z along the lanes) has its
+        origin on the road below the camera. The rotation is R(θ, φ, ψ)ᵀ of Eq. (24): a road vector is turned
+        first by roll about Z, then by yaw about Y, then by pitch about X,
+
+            camera_from_road[:3, :3] = R_x(θ) R_y(φ) R_z(ψ),
+
+        with the pitch θ, the yaw φ and the roll ψ, each R the right-handed rotation of a vector about an axis
+        that stays. Differentiable.
+        """
+        return camera_from_road_matrix(*self)
+
+    def road_from_camera(self) -> Tensor:
+        """Return the camera's pose in the road's frame, (B, 4, 4), inverse of :meth:`camera_from_road`."""
+        return road_from_camera_matrix(*self)
+
+    def projection(self, intrinsics: Tensor) -> Tensor:
+        """Return the projection of the road's frame to undistorted pixels, (B, 3, 4).
+
+        It is K [R | t] of :meth:`camera_from_road`: the third entry of its product is the depth in m, by
+        which the first two are divided.
+
+        Args:
+            intrinsics: (B, 3, 3) px.
+        """
+        camera_from_road = self.camera_from_road()
+        return intrinsics.to(camera_from_road.dtype) @ camera_from_road[..., :3, :]
+
+    def rvec_tvec(self) -> tuple[Tensor, Tensor]:
+        """Return the pose as OpenCV wants it, for points of the road's frame.
+
+        Returns:
+            rotation vector (B, 3) rad and translation (B, 3) m of :meth:`camera_from_road`, as
+            ``cv2.projectPoints``, ``cv2.solvePnP`` and ``cv2.drawFrameAxes`` take them.
+        """
+        camera_from_road = self.camera_from_road()
+        return rotation_vector(camera_from_road[..., :3, :3]), camera_from_road[..., :3, 3]
 
 
 def check_extrinsics(extrinsics: object, *rows: int) -> None:

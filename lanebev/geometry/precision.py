@@ -9,7 +9,7 @@ from typing import ParamSpec, TypeVar, cast
 import torch
 from torch import Tensor
 
-from lanebev.types import map_tensors
+from lanebev.tensors import map_tensors
 
 P = ParamSpec("P")
 R = TypeVar("R")

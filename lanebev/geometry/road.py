@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from lanebev.geometry.lens import check_points, normalise_points
+from lanebev.geometry.lens import cam_from_image, check_points, normalise_points
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import Extrinsics, check_extrinsics
@@ -179,3 +179,20 @@ def _propagated(
 def _road_from_cam(extrinsics: Extrinsics) -> Tensor:
     check_extrinsics(extrinsics)
     return road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)
+
+
+@full_precision
+def horizon_line(extrinsics: Extrinsics, intrinsics: Tensor) -> Tensor:
+    """Compute the image line of the road's horizon.
+
+    Args:
+        extrinsics: each (B,).
+        intrinsics: (B, 3, 3).
+
+    Returns:
+        (B, 3) homogeneous line: a x + b y + c = 0, with (a, b) of unit length and positive on the road.
+    """
+    down = _road_from_cam(extrinsics)[..., 1, :]
+    line = (down.unsqueeze(-2) @ cam_from_image(intrinsics)).squeeze(-2)
+    unit: Tensor = line / line[..., :2].norm(dim=-1, keepdim=True)
+    return unit

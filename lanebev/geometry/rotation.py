@@ -7,11 +7,10 @@ Matrices are named ``dst_from_src`` and act on column vectors.
 from __future__ import annotations
 
 import torch
+from kornia.geometry import rotation_matrix_to_axis_angle
 from torch import Tensor
 
-from lanebev.geometry.lens import cam_from_image
 from lanebev.geometry.precision import full_precision
-from lanebev.types import Extrinsics
 
 
 def _rotation(rows: list[list[Tensor]]) -> Tensor:
@@ -125,17 +124,50 @@ def pitch_yaw_from_vanishing_dir(vanishing_dir: Tensor) -> tuple[Tensor, Tensor]
 
 
 @full_precision
-def horizon_line(extrinsics: Extrinsics, intrinsics: Tensor) -> Tensor:
-    """Compute the image line of the road's horizon.
+def camera_from_road_matrix(pitch: Tensor, yaw: Tensor, roll: Tensor, height: Tensor) -> Tensor:
+    """Compute the rigid transform from the road's frame to the camera's.
+
+    The origin of the road's frame is the point of the road below the camera, so that
+    p_camera = R(θ, φ, ψ)ᵀ (p_road + (0, h, 0)), with R of Eq. (24).
 
     Args:
-        extrinsics: each (B,).
-        intrinsics: (B, 3, 3).
+        pitch: (...,) rad.
+        yaw: (...,) rad.
+        roll: (...,) rad.
+        height: (...,) m.
 
     Returns:
-        (B, 3) homogeneous line: a x + b y + c = 0, with (a, b) of unit length and positive on the road.
+        (..., 4, 4), for column vectors (X, Y, Z, 1) in m.
     """
-    down = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)[..., 1, :]
-    line = (down.unsqueeze(-2) @ cam_from_image(intrinsics)).squeeze(-2)
-    unit: Tensor = line / line[..., :2].norm(dim=-1, keepdim=True)
-    return unit
+    rotation = road_from_cam(pitch, yaw, roll).mT
+    return _rigid(rotation, rotation[..., 1] * height.unsqueeze(-1))
+
+
+@full_precision
+def road_from_camera_matrix(pitch: Tensor, yaw: Tensor, roll: Tensor, height: Tensor) -> Tensor:
+    """Compute the inverse of :func:`camera_from_road_matrix`: p_road = R p_camera - (0, h, 0)."""
+    zero = torch.zeros_like(height)
+    return _rigid(road_from_cam(pitch, yaw, roll), torch.stack([zero, -height, zero], dim=-1))
+
+
+@full_precision
+def rotation_vector(rotation: Tensor) -> Tensor:
+    """Compute the rotation vector, axis times angle, of rotations of less than half a turn.
+
+    Source: Rodrigues' formula; by the unit quaternion, which is well conditioned at small angles.
+
+    Args:
+        rotation: (..., 3, 3).
+
+    Returns:
+        (..., 3) rad, as ``cv2.Rodrigues``.
+    """
+    vector: Tensor = rotation_matrix_to_axis_angle(rotation)
+    return vector
+
+
+def _rigid(rotation: Tensor, translation: Tensor) -> Tensor:
+    """(..., 4, 4) of a rotation (..., 3, 3) and a translation (..., 3)."""
+    upper = torch.cat([rotation, translation.unsqueeze(-1)], dim=-1)
+    last = torch.zeros_like(upper[..., :1, :])
+    return torch.cat([upper, last + last.new_tensor([0.0, 0.0, 0.0, 1.0])], dim=-2)

@@ -17,8 +17,8 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from lanebev.camera.model import Camera
-from lanebev.geometry.road import road_from_image_points
-from lanebev.geometry.rotation import horizon_line, vanishing_dir_from_pitch_yaw
+from lanebev.geometry.road import horizon_line, road_from_image_points
+from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
 from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
 from lanebev.view.grid import BEVGrid
 

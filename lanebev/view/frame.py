@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from lanebev.camera.model import Camera
 from lanebev.types import Extrinsics
+from lanebev.view.cells import cells_and_lens
 from lanebev.view.grid import BEVGrid
-from lanebev.view.sampling import cells_and_lens, normalised_intrinsics, sampling_maps
+from lanebev.view.sampling import MapSize, normalised_intrinsics, sampling_maps
 
 
 def remap_frame(
@@ -42,10 +43,10 @@ def remap_frame(
         )
     with torch.inference_mode():
         image_from_cam = normalised_intrinsics(camera.intrinsics[None], (height, width))
-        sums, lens = cells_and_lens(
+        cells, lens = cells_and_lens(
             grid, image_from_cam, extrinsics, camera.distortion[None], camera.model, torch.float32
         )
-        (coordinates,), valid = sampling_maps(sums, lens, [(height, width)])
+        (coordinates,), valid = sampling_maps(cells, lens, [MapSize(height, width)], (height, width))
         half = coordinates.new_tensor([0.5 * width, 0.5 * height]).view(2, 1, 1)
         pixels: Any = (coordinates[0] * half + (half - 0.5)).cpu().numpy()
     bev: Any = cv2.remap(frame, pixels[0], pixels[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)

@@ -3,11 +3,66 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from lanebev.geometry.distortion import lens_model, max_undistorted_radius, tilt_homography
+
 _CENTRE = 1e-16  # squared radius below which a fisheye's factor is 1: sqrt has no gradient at 0
+
+
+class Lens(NamedTuple):
+    """What leads from the plane z = 1 to the image.
+
+    Attributes:
+        coefficients: (B, D) of the distortion.
+        model: "pinhole", "fisheye" or "omni".
+        focal, skew, centre: (B, 2, 1, 1) each; the skew of y is zero.
+        squared_limit: (B, 1, 1), x² + y² up to which the lens does not fold over.
+        tilt: (B, 3, 3, 1, 1), homography of a tilted sensor, or None.
+    """
+
+    coefficients: Tensor
+    model: str
+    focal: Tensor
+    skew: Tensor
+    centre: Tensor
+    squared_limit: Tensor
+    tilt: Tensor | None
+
+
+def make_lens(image_from_cam: Tensor, distortion: Tensor, model: str) -> Lens:
+    """Take apart intrinsics (B, 3, 3) and distortion (B, D)."""
+    upper = image_from_cam[:, :2, :, None, None]  # (B, 2, 3, 1, 1)
+    focal = torch.stack([upper[:, 0, 0], upper[:, 1, 1]], dim=1)
+    skew = torch.stack([upper[:, 0, 1], torch.zeros_like(upper[:, 0, 1])], dim=1)
+    limit = max_undistorted_radius(distortion.detach(), model).square()[:, None, None]
+    tilt = tilt_homography(distortion[:, 12:])[..., None, None] if distortion.shape[-1] == 14 else None
+    return Lens(distortion, lens_model(model), focal, skew, upper[:, :, 2], limit, tilt)
+
+
+def image_planes(points: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
+    """Project points of the ideal z = 1 plane to the image.
+
+    Args:
+        points: (B, 2, R, V).
+        lens: of each row of the batch.
+
+    Returns:
+        (B, 2, R, V) image coordinates, finite, and (B, R, V): zero where the lens does not fold over, else
+        positive, without gradient.
+    """
+    x, y = points.unbind(1)
+    squared_radius = torch.addcmul(x * x, y, y)
+    clamped = torch.minimum(squared_radius, lens.squared_limit)  # beyond it no gradient, and no overflow
+    beyond = (squared_radius - clamped).detach()
+    points = distort_planes(points, clamped, lens.coefficients, lens.model)
+    if lens.tilt is not None:
+        points, behind = tilt_planes(points, lens.tilt)
+        beyond = beyond + behind
+    return torch.addcmul(points * lens.focal, points[:, 1:], lens.skew) + lens.centre, beyond
 
 
 def distort_planes(points: Tensor, squared_radius: Tensor, distortion: Tensor, model: str) -> Tensor:
@@ -66,3 +121,16 @@ def _one_plus_polynomial(variable: Tensor, coefficients: Sequence[Tensor]) -> Te
     for coefficient in reversed(coefficients[:-1]):
         value = (value + coefficient) * variable
     return value + 1
+
+
+def tilt_planes(points: Tensor, homography: Tensor) -> tuple[Tensor, Tensor]:
+    """Transform (B, 2, R, V) points by a homography (B, 3, 3, 1, 1).
+
+    Returns:
+        (B, 2, R, V), finite, and (B, R, V): zero where the point stays in front, else positive.
+    """
+    x, y = points.unsqueeze(2).unbind(1)  # (B, 1, R, V)
+    mapped = homography[:, :, 0] * x + homography[:, :, 1] * y + homography[:, :, 2]
+    depth = mapped[:, 2:]
+    ahead = depth.clamp(min=1e-6)
+    return mapped[:, :2] / ahead, (ahead - depth).detach().squeeze(1)

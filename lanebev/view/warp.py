@@ -1,18 +1,19 @@
-"""The one resampling: from an image, or any feature map of it, to the bird's-eye grid."""
+"""The one resampling: from an image, or any feature maps of it, to the bird's-eye grid."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import overload
 
 from torch import Tensor, nn
 
-from lanebev.geometry.distortion import check_lens
-from lanebev.geometry.lens import check_intrinsics
 from lanebev.geometry.precision import common_dtype
-from lanebev.types import Extrinsics, check_extrinsics, check_tensor
+from lanebev.types import Extrinsics
+from lanebev.view.cells import cells_and_lens
+from lanebev.view.checks import check_cameras, check_image, check_size
 from lanebev.view.grid import BEVGrid
 from lanebev.view.sampling import (
-    cells_and_lens,
+    MapSize,
     image_coordinates,
     normalised_intrinsics,
     resample,
@@ -29,12 +30,18 @@ class BEVWarp(nn.Module):
 
     Args:
         grid: the road's rectangle; default :class:`BEVGrid`.
+        plane_heights: m above the road, of P planes parallel to it that are sampled instead of the road, as
+            heads that look at volumes want them.
     """
 
-    def __init__(self, grid: BEVGrid | None = None) -> None:
+    def __init__(self, grid: BEVGrid | None = None, plane_heights: Sequence[float] | None = None) -> None:
         super().__init__()
         self.grid = grid or BEVGrid()
+        self.plane_heights = None if plane_heights is None else tuple(map(float, plane_heights))
+        if self.plane_heights == ():
+            raise ValueError("plane_heights: expected one plane at least, or None for the road, got none")
 
+    @overload
     def forward(
         self,
         image: Tensor,
@@ -43,35 +50,65 @@ class BEVWarp(nn.Module):
         distortion: Tensor | None = None,
         model: str = "pinhole",
         image_size: tuple[int, int] | None = None,
-    ) -> tuple[Tensor, Tensor]:
+        strides: float | None = None,
+    ) -> tuple[Tensor, Tensor]: ...
+
+    @overload
+    def forward(
+        self,
+        image: Sequence[Tensor],
+        intrinsics: Tensor,
+        extrinsics: Extrinsics,
+        distortion: Tensor | None = None,
+        model: str = "pinhole",
+        image_size: tuple[int, int] | None = None,
+        strides: Sequence[float] | None = None,
+    ) -> tuple[list[Tensor], Tensor]: ...
+
+    def forward(
+        self,
+        image: Tensor | Sequence[Tensor],
+        intrinsics: Tensor,
+        extrinsics: Extrinsics,
+        distortion: Tensor | None = None,
+        model: str = "pinhole",
+        image_size: tuple[int, int] | None = None,
+        strides: float | Sequence[float] | None = None,
+    ) -> tuple[Tensor | list[Tensor], Tensor]:
         """Resample.
 
         Args:
-            image: (B, C, h, w), an image as it was taken or a feature map that covers it.
+            image: (B, C, h, w), an image as it was taken or a feature map that covers it, or a sequence of
+                maps of any sizes and channels.
             intrinsics: (B, 3, 3) px of the image.
             extrinsics: each (B,).
             distortion: (B, D) of the lens, or None for an undistorted image.
             model: "pinhole", "fisheye" or "omni", the lens of ``distortion``.
             image_size: (H, W) px of the image that the intrinsics belong to; None where that is ``image``
-                itself. A feature map of stride s is (H / s, W / s) and its cells' centres are evenly spread.
+                itself.
+            strides: of the map, or of each map, px: cell j is centred on pixel stride · j, as those of a
+                convolutional trunk with symmetric padding. None: cells are evenly spread over the image, as
+                those of pooling or patches.
 
         Returns:
-            bev (B, C, U, V), zero where not valid, and valid (B, 1, U, V) bool: in front of the camera and
-            inside the image.
+            bev (B, C, U, V), zero where not valid, or a list of one for each map; and valid (B, 1, U, V)
+            bool: in front of the camera and inside the image. With P plane heights, bev (B, C, P, U, V) and
+            valid (B, 1, P, U, V).
 
         Raises:
+            TypeError: an argument of another kind.
             ValueError: shapes that don't fit, or an image or intrinsics of whole numbers.
         """
-        check_image(image)
-        size = image_size or (image.shape[-2], image.shape[-1])
-        check_size(size)
-        check_cameras(image.shape[0], intrinsics, extrinsics, distortion, model)
-        image_from_cam = normalised_intrinsics(intrinsics, size)
-        sums, lens = cells_and_lens(
-            self.grid, image_from_cam, extrinsics, distortion, model, common_dtype(image)
-        )
-        (sampling_map,), valid = sampling_maps(sums, lens, [(image.shape[-2], image.shape[-1])])
-        return resample(image, sampling_map), valid
+        maps = [image] if isinstance(image, Tensor) or not isinstance(image, Sequence) else list(image)
+        sizes, size = _map_sizes(maps, strides, image_size)
+        check_cameras(maps[0].shape[0], intrinsics, extrinsics, distortion, model)
+        cells, lens = cells_and_lens(
+            self.grid, normalised_intrinsics(intrinsics, size), extrinsics, distortion, model,
+            common_dtype(*maps), self.plane_heights or (0.0,),
+        )  # fmt: skip
+        sampling, valid = sampling_maps(cells, lens, sizes, size)
+        bevs = [self._planes(resample(each, at)) for each, at in zip(maps, sampling, strict=True)]
+        return bevs[0] if maps[0] is image else bevs, self._planes(valid)
 
     def image_points(
         self,
@@ -80,38 +117,43 @@ class BEVWarp(nn.Module):
         distortion: Tensor | None = None,
         model: str = "pinhole",
     ) -> tuple[Tensor, Tensor]:
-        """Where every cell is seen: (B, U·V, 2) px of the image as taken, and (B, U·V) bool in front."""
-        sums, lens = cells_and_lens(
-            self.grid, intrinsics, extrinsics, distortion, model, common_dtype(intrinsics)
-        )
-        points, hidden = image_coordinates(sums, lens)
+        """Compute where every cell is seen.
+
+        Returns:
+            (B, U·V, 2) px of the image as taken, and (B, U·V) bool, in front; with P plane heights P·U·V.
+        """
+        cells, lens = cells_and_lens(
+            self.grid, intrinsics, extrinsics, distortion, model, common_dtype(intrinsics),
+            self.plane_heights or (0.0,),
+        )  # fmt: skip
+        points, hidden = image_coordinates(cells.rows(0, cells.shape[1]), lens)
         return points.flatten(2).mT, hidden.flatten(1) == 0
 
-
-def check_image(image: Tensor) -> None:
-    """Raise TypeError or ValueError unless this is a (B, C, h, w) map of floating point."""
-    check_tensor("image", image)
-    if image.ndim != 4:
-        raise ValueError(f"image: expected (B, C, h, w), got {tuple(image.shape)}")
-    if not image.is_floating_point():
-        raise ValueError(f"image: expected floating point, got {image.dtype}")
+    def _planes(self, sampled: Tensor) -> Tensor:
+        """(B, C, P·U, V) to (B, C, P, U, V) where there are planes."""
+        if self.plane_heights is None:
+            return sampled
+        planes: Tensor = sampled.unflatten(2, (len(self.plane_heights), -1))
+        return planes
 
 
-def check_size(size: object) -> None:
-    """Raise TypeError unless this is a pair, (height, width)."""
-    if not (isinstance(size, Sequence) and len(size) == 2):
-        raise TypeError(f"image_size: expected (height, width) in px, got {size!r}")
-
-
-def check_cameras(
-    batch: int, intrinsics: Tensor, extrinsics: Extrinsics, distortion: Tensor | None, model: str
-) -> None:
-    """Raise TypeError or ValueError unless there are ``batch`` cameras with poses, and lenses that exist."""
-    check_intrinsics(intrinsics, batch)
-    check_extrinsics(extrinsics, batch)
-    if distortion is None:
-        return
-    check_tensor("distortion", distortion)
-    if distortion.shape[:-1] != (batch,):
-        raise ValueError(f"distortion: expected ({batch}, D) like the points, got {tuple(distortion.shape)}")
-    check_lens(distortion, model)
+def _map_sizes(
+    maps: Sequence[Tensor], strides: float | Sequence[float] | None, image_size: tuple[int, int] | None
+) -> tuple[list[MapSize], tuple[int, int]]:
+    """Check maps, and return how each lies in the image, and the image's size."""
+    if not maps:
+        raise ValueError("image: expected one map at least, got none")
+    for each in maps:
+        check_image(each)
+        if each.shape[0] != maps[0].shape[0]:
+            raise ValueError(f"image: expected maps of {maps[0].shape[0]} images, got {each.shape[0]}")
+    steps = list(strides) if isinstance(strides, Sequence) else [strides] * len(maps)
+    if len(steps) != len(maps):
+        raise ValueError(f"strides: expected {len(maps)}, one for each map, got {len(steps)}")
+    if image_size is None:
+        if len(maps) > 1 or steps[0] is not None:
+            raise ValueError("image_size: expected (H, W) px of the image that maps belong to, got None")
+        image_size = (maps[0].shape[-2], maps[0].shape[-1])
+    check_size(image_size)
+    sizes = [MapSize(each.shape[-2], each.shape[-1], step) for each, step in zip(maps, steps, strict=True)]
+    return sizes, image_size

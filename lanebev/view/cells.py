@@ -1,0 +1,73 @@
+"""The cells of a bird's-eye grid as a camera sees them: a row's part plus a column's part."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lanebev.geometry.precision import full_precision
+from lanebev.geometry.rotation import road_from_cam
+from lanebev.types import Extrinsics
+from lanebev.view.grid import BEVGrid
+from lanebev.view.lens import Lens, make_lens
+from lanebev.view.sampling import CellSums
+
+_BEHIND = -1e6  # m, depth given to planes that are not below the camera
+
+
+def cells_and_lens(
+    grid: BEVGrid,
+    image_from_cam: Tensor,
+    extrinsics: Extrinsics,
+    distortion: Tensor | None,
+    model: str,
+    dtype: torch.dtype,
+    plane_heights: Sequence[float] = (0.0,),
+) -> tuple[CellSums, Lens | None]:
+    """Prepare the projection of cells.
+
+    Matrices are computed in the dtype of the geometry, and rounded to the dtype in which cells are projected.
+
+    Args:
+        grid: U × V cells.
+        image_from_cam: (B, 3, 3), the intrinsics, or ``normalised_intrinsics`` of them.
+        extrinsics: each (B,).
+        distortion: (B, D), or None.
+        model: "pinhole", "fisheye" or "omni".
+        dtype: of the results.
+        plane_heights: of P planes above the road, m.
+
+    Returns:
+        cells of P·U rows, those of the first plane first, and the lens, None for an undistorted image.
+    """
+    if distortion is None or distortion.shape[-1] == 0:
+        sums, lens = cell_sums(grid, plane_heights, image_from_cam, extrinsics), None
+    else:
+        sums = cell_sums(grid, plane_heights, None, extrinsics)
+        lens = make_lens(image_from_cam.to(dtype), distortion.to(dtype), model)
+    return CellSums(*(part.to(dtype) for part in sums)), lens
+
+
+@full_precision
+def cell_sums(
+    grid: BEVGrid, plane_heights: Sequence[float], image_from_cam: Tensor | None, extrinsics: Extrinsics
+) -> CellSums:
+    """Compute the homogeneous image coordinates of all cells of all planes.
+
+    Args:
+        grid: U × V cells.
+        plane_heights: P heights of planes above the road, m.
+        image_from_cam: (B, 3, 3), the intrinsics; None leaves camera coordinates, m.
+        extrinsics: each (B,).
+    """
+    matrix = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll).mT
+    if image_from_cam is not None:
+        matrix = image_from_cam @ matrix
+    x, z = grid.axes(matrix.dtype, matrix.device)
+    right, down, forward = matrix[..., None].unbind(-2)  # (B, 3, 1)
+    below = extrinsics.height.unsqueeze(-1) - matrix.new_tensor(plane_heights)  # (B, P)
+    by_row = (down * below.unsqueeze(1)).unsqueeze(-1) + (forward * z).unsqueeze(-2)  # (B, 3, P, U)
+    by_row = torch.where((below > 0)[:, None, :, None], by_row, _BEHIND)
+    return CellSums(by_row.flatten(2), right * x)

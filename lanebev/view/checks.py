@@ -1,0 +1,40 @@
+"""What all views require of their arguments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from lanebev.geometry.distortion import check_lens
+from lanebev.geometry.lens import check_intrinsics
+from lanebev.types import Extrinsics, check_extrinsics, check_tensor
+
+
+def check_image(image: Tensor, name: str = "image") -> None:
+    """Raise TypeError or ValueError unless this is a (B, C, h, w) map of floating point."""
+    check_tensor(name, image)
+    if image.ndim != 4:
+        raise ValueError(f"{name}: expected (B, C, h, w), got {tuple(image.shape)}")
+    if not image.is_floating_point():
+        raise ValueError(f"{name}: expected floating point, got {image.dtype}")
+
+
+def check_size(size: object) -> None:
+    """Raise TypeError unless this is a pair, (height, width)."""
+    if not (isinstance(size, Sequence) and len(size) == 2):
+        raise TypeError(f"image_size: expected (height, width) in px, got {size!r}")
+
+
+def check_cameras(
+    batch: int, intrinsics: Tensor, extrinsics: Extrinsics, distortion: Tensor | None, model: str
+) -> None:
+    """Raise TypeError or ValueError unless there are ``batch`` cameras with poses, and lenses that exist."""
+    check_intrinsics(intrinsics, batch)
+    check_extrinsics(extrinsics, batch)
+    if distortion is None:
+        return
+    check_tensor("distortion", distortion)
+    if distortion.shape[:-1] != (batch,):
+        raise ValueError(f"distortion: expected ({batch}, D) like the points, got {tuple(distortion.shape)}")
+    check_lens(distortion, model)

@@ -1,0 +1,126 @@
+"""Matrices of the current pose in the forms that detection heads take: BEVFormer, Lift-Splat-Shoot, BEVDet.
+
+Those heads know a vehicle ("ego", "LiDAR") frame: x forward, y left, z up. Here its origin is the point
+of the road below the camera, and x is the direction of the lanes; a matrix for another origin or
+direction, such as that of a LiDAR, takes the place of :func:`ego_from_road`.
+
+- BEVFormer, DETR3D, PETR, Sparse4D take ``img_metas["lidar2img"]``, 4 × 4, which makes (u d, v d, d, 1)
+  of an ego point: :func:`image_from_ego`.
+- Lift-Splat-Shoot takes ``rots`` and ``trans`` (ego from camera), ``intrins``, and ``post_rots`` and
+  ``post_trans`` of the resized and cropped image: :func:`lift_splat_inputs`.
+- BEVDet and BEVDepth take ``sensor2ego``, 4 × 4: :func:`ego_from_camera`; and the last three as above.
+
+With a fixed mount these are constants of the data set; here they change from frame to frame with the
+pose. All are differentiable in it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.geometry.lens import check_intrinsics
+from lanebev.types import Extrinsics, register_pytree
+
+
+def ego_from_road(dtype: torch.dtype = torch.float32, device: torch.device | str | None = None) -> Tensor:
+    """Return the rotation, (4, 4), from road (right, down, forward) to ego (forward, left, up)."""
+    rows = [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    return torch.tensor(rows, dtype=dtype, device=device)
+
+
+def ego_from_camera(extrinsics: Extrinsics, ego_from_road_matrix: Tensor | None = None) -> Tensor:
+    """Compute the camera's pose in the ego frame, ``sensor2ego`` of BEVDet.
+
+    Args:
+        extrinsics: each (B,).
+        ego_from_road_matrix: (4, 4) or (B, 4, 4), rigid; None is :func:`ego_from_road`.
+
+    Returns:
+        (B, 4, 4).
+    """
+    return _ego_from_road(extrinsics, ego_from_road_matrix) @ extrinsics.road_from_camera()
+
+
+def image_from_ego(
+    extrinsics: Extrinsics,
+    intrinsics: Tensor,
+    ego_from_road_matrix: Tensor | None = None,
+    image_transform: Tensor | None = None,
+) -> Tensor:
+    """Compute the projection of ego points to pixels, ``lidar2img`` of mmdetection3d's heads.
+
+    Args:
+        extrinsics: each (B,).
+        intrinsics: (B, 3, 3) px of the undistorted image.
+        ego_from_road_matrix: (4, 4) or (B, 4, 4), rigid; None is :func:`ego_from_road`.
+        image_transform: (3, 3) or (B, 3, 3), pixels of that image to pixels of the resized, cropped or
+            flipped one that the network is given.
+
+    Returns:
+        (B, 4, 4); its first three rows are the 3 × 4 projection, the last is (0, 0, 0, 1).
+
+    Raises:
+        ValueError: intrinsics of another batch.
+    """
+    check_intrinsics(intrinsics, *extrinsics.pitch.shape)
+    camera_from_road = extrinsics.camera_from_road()
+    road_from_ego = _inverse_rigid(_ego_from_road(extrinsics, ego_from_road_matrix))
+    image = intrinsics if image_transform is None else image_transform.to(intrinsics) @ intrinsics
+    upper = image.to(camera_from_road) @ (camera_from_road @ road_from_ego)[..., :3, :]
+    last = torch.zeros_like(upper[..., :1, :])
+    return torch.cat([upper, last + last.new_tensor([0.0, 0.0, 0.0, 1.0])], dim=-2)
+
+
+@register_pytree
+class LiftSplatInputs(NamedTuple):
+    """What Lift-Splat-Shoot's ``get_geometry`` takes of a camera.
+
+    Attributes:
+        rots: (B, 3, 3), ego from camera.
+        trans: (B, 3) m, the camera in the ego frame.
+        intrins: (B, 3, 3) px.
+        post_rots: (B, 3, 3), the image's resizing, flipping and turning.
+        post_trans: (B, 3) px, its shift.
+    """
+
+    rots: Tensor
+    trans: Tensor
+    intrins: Tensor
+    post_rots: Tensor
+    post_trans: Tensor
+
+
+def lift_splat_inputs(
+    extrinsics: Extrinsics,
+    intrinsics: Tensor,
+    ego_from_road_matrix: Tensor | None = None,
+    image_transform: Tensor | None = None,
+) -> LiftSplatInputs:
+    """Compute what Lift-Splat-Shoot takes; arguments as of :func:`image_from_ego`.
+
+    Its points are rots · intrins⁻¹ · (u d, v d, d) + trans with (u, v, 1) = post_rots⁻¹ ((u', v', 1) -
+    post_trans), (u', v') pixels of the image that the network is given.
+    """
+    check_intrinsics(intrinsics, *extrinsics.pitch.shape)
+    pose = ego_from_camera(extrinsics, ego_from_road_matrix)
+    eye = torch.eye(3, dtype=intrinsics.dtype, device=intrinsics.device).expand_as(intrinsics)
+    transform = eye if image_transform is None else image_transform.to(intrinsics).expand_as(intrinsics)
+    affine = torch.cat([transform[..., :2], eye[..., 2:]], dim=-1)
+    return LiftSplatInputs(
+        pose[..., :3, :3], pose[..., :3, 3], intrinsics, affine, transform[..., 2] - eye[..., 2]
+    )
+
+
+def _ego_from_road(extrinsics: Extrinsics, matrix: Tensor | None) -> Tensor:
+    pitch = extrinsics.pitch
+    return ego_from_road(pitch.dtype, pitch.device) if matrix is None else matrix.to(pitch)
+
+
+def _inverse_rigid(matrix: Tensor) -> Tensor:
+    """Inverse of (..., 4, 4) rigid transforms."""
+    rotation = matrix[..., :3, :3].mT
+    shift = -(rotation @ matrix[..., :3, 3:])
+    return torch.cat([torch.cat([rotation, shift], dim=-1), matrix[..., 3:, :]], dim=-2)

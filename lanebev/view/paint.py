@@ -1,0 +1,123 @@
+"""The way back: what lies on the road, painted into the image."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lanebev.geometry.lens import invert_distortion
+from lanebev.geometry.precision import common_dtype, full_precision
+from lanebev.types import Extrinsics
+from lanebev.view.checks import check_cameras, check_image, check_size
+from lanebev.view.grid import BEVGrid, bev_from_image
+from lanebev.view.sampling import CellSums, MapSize, normalised_intrinsics, resample, sampling_maps
+
+_ABOVE = -1e6  # depth of what is not on the road
+
+
+class PixelCells(NamedTuple):
+    """Homogeneous coordinates in the bird's-eye view of every pixel.
+
+    Attributes:
+        points: (B, 3, H, W).
+    """
+
+    points: Tensor
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(B, H, W)."""
+        return self.points.shape[0], self.points.shape[2], self.points.shape[3]
+
+    def rows(self, first: int, last: int) -> Tensor:
+        """Return those of rows first to last - 1, (B, 3, last - first, W)."""
+        return self.points[:, :, first:last]
+
+
+class ImageFromBEV(nn.Module):
+    """Bird's-eye map to the image that would show it on the road, differentiable like the way there.
+
+    For labels, masks or heat maps of the road that are wanted in the image, as a camera takes it.
+
+    Args:
+        grid: of the map; default :class:`BEVGrid`.
+        plane_height: m above the road of the plane that the map lies in.
+    """
+
+    def __init__(self, grid: BEVGrid | None = None, plane_height: float = 0.0) -> None:
+        super().__init__()
+        self.grid = grid or BEVGrid()
+        self.plane_height = plane_height
+
+    def forward(
+        self,
+        bev: Tensor,
+        intrinsics: Tensor,
+        extrinsics: Extrinsics,
+        image_size: tuple[int, int],
+        distortion: Tensor | None = None,
+        model: str = "pinhole",
+    ) -> tuple[Tensor, Tensor]:
+        """Resample.
+
+        Args:
+            bev: (B, C, u, v), of the grid's shape, or of another resolution of the same rectangle.
+            intrinsics: (B, 3, 3) px.
+            extrinsics: each (B,).
+            image_size: (H, W) px of the image.
+            distortion: (B, D) of the lens, or None for an undistorted image.
+            model: "pinhole", "fisheye" or "omni", the lens of ``distortion``.
+
+        Returns:
+            (B, C, H, W), zero where not valid, and valid (B, 1, H, W) bool: pixels that show the rectangle.
+
+        Raises:
+            TypeError: an argument of another kind.
+            ValueError: shapes that don't fit, or a map or intrinsics of whole numbers.
+        """
+        check_image(bev, "bev")
+        check_size(image_size)
+        check_cameras(bev.shape[0], intrinsics, extrinsics, distortion, model)
+        size, dtype = self.grid.shape, common_dtype(bev)
+        cells: CellSums | PixelCells
+        if distortion is None or distortion.shape[-1] == 0:
+            cells = CellSums(*(part.to(dtype) for part in self._sums(intrinsics, extrinsics, image_size)))
+        else:
+            points = self._points(intrinsics, extrinsics, image_size, distortion, model)
+            cells = PixelCells(points.to(dtype))
+        (sampling,), valid = sampling_maps(cells, None, [MapSize(bev.shape[-2], bev.shape[-1])], size)
+        return resample(bev, sampling), valid
+
+    @full_precision
+    def _sums(self, intrinsics: Tensor, extrinsics: Extrinsics, image_size: tuple[int, int]) -> CellSums:
+        by_x, by_y, constant = self._homography(intrinsics, extrinsics).unsqueeze(-1).unbind(-2)  # (B, 3, 1)
+        y, x = (torch.arange(side, dtype=by_x.dtype, device=by_x.device) for side in image_size)
+        return CellSums(by_y * y + constant, by_x * x)
+
+    @full_precision
+    def _points(
+        self,
+        intrinsics: Tensor,
+        extrinsics: Extrinsics,
+        image_size: tuple[int, int],
+        distortion: Tensor,
+        model: str,
+    ) -> Tensor:
+        homography = self._homography(intrinsics, extrinsics)
+        y, x = (torch.arange(side, dtype=homography.dtype, device=homography.device) for side in image_size)
+        taken = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(1, -1, 2)
+        pixels, valid = invert_distortion(taken.expand(len(homography), -1, 2), intrinsics, distortion, model)
+        points = homography[..., :2] @ pixels.mT + homography[..., 2:]  # (B, 3, H·W)
+        points = torch.where(valid.unsqueeze(1), points, _ABOVE)
+        cells: Tensor = points.unflatten(-1, image_size)
+        return cells
+
+    def _homography(self, intrinsics: Tensor, extrinsics: Extrinsics) -> Tensor:
+        """(B, 3, 3), undistorted pixels to the map as [-1, 1]; of a plane that is not below, to none."""
+        below = extrinsics.height - self.plane_height
+        height = torch.where(below > 0, below, 1.0)
+        matrix = bev_from_image(extrinsics._replace(height=height), intrinsics, self.grid)
+        slope = normalised_intrinsics(matrix, self.grid.shape) * height[:, None, None]  # last row: of a ray
+        return torch.where((below > 0)[:, None, None], slope, _ABOVE)
