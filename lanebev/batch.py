@@ -46,3 +46,13 @@ def masked_median(values: Tensor, mask: Tensor) -> Tensor:
     middle = ((mask.sum(-1, keepdim=True) - 1) // 2).clamp(min=0)
     median = ordered.gather(-1, middle).squeeze(-1)
     return torch.where(median.isfinite(), median, 0.0)
+
+
+def order_true_first(mask: Tensor) -> Tensor:
+    """Indices (..., N) that put the entries of a mask first and keep the order otherwise.
+
+    By keys that all differ, since ONNX has no stable sort.
+    """
+    count = mask.shape[-1]
+    place = torch.arange(count, device=mask.device)
+    return torch.where(mask, place, place + count).argsort(dim=-1)

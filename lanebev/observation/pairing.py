@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lanebev.batch import order_true_first
 from lanebev.geometry.lens import (
     invert_distortion,
     placeholder_intrinsics,
@@ -68,7 +69,7 @@ def segments_from_vertices(
 
 def move_to_front(vertices: BoundaryVertices) -> BoundaryVertices:
     """Move the vertices with a weight to the front of their boundary, in order; the rest become zeros."""
-    order = (vertices.weight <= 0).to(torch.int8).argsort(dim=-1, stable=True)  # (B, P, V)
+    order = order_true_first(vertices.weight > 0)  # (B, P, V)
     weight = vertices.weight.gather(-1, order)
     there = weight > 0
     return BoundaryVertices(
