@@ -1,6 +1,6 @@
-"""The rendered road: textures, scene, camera, drive.
+"""The rendered road: scenes, their images and what is true of them.
 
-Rendering is on the CPU, in the workers of a data loader; frames go to a device as batches do.
+Scenes are sampled on the CPU, the same on every machine; whole batches of them are rendered on any device.
 """
 
 from lanebev.render.drive import Drive

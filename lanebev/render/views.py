@@ -15,7 +15,7 @@ from lanebev.render.raster.rays import pixel_rays
 from lanebev.render.raster.sensor import take_image
 from lanebev.render.scene.alignment import build_alignment
 from lanebev.render.scene.camera import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
-from lanebev.render.scene.sampler import BatchSampler, concatenate_rows, map_tensors, select_rows
+from lanebev.render.scene.sampler import BatchSampler, concatenate_rows, select_rows, send
 from lanebev.render.scene.varied import varied_extrinsics, varied_intrinsics
 from lanebev.render.scene.window import (
     WindowConfig,
@@ -63,7 +63,7 @@ def render_scenes(
     with autocast_off(where):
         for start in range(0, len(host.place.along), rows):
             part = select_rows(host, slice(start, start + rows))
-            scene = map_tensors(lambda tensor: tensor.to(where, non_blocking=True), part)
+            scene = send(part, where)
             features = features_of(part)
             generators = [torch.Generator(where).manual_seed(seed) for seed in seeds[start : start + rows]]
             painted = paint_view(scene, pixel_rays(scene.lens, size, features.distorted), features)
@@ -126,7 +126,23 @@ def render_views(
         raise ValueError(
             f"expected batch_size >= 1 and image_size >= (16, 16), got {batch_size} and {tuple(image_size)}"
         )
-    sampler = BatchSampler(batch_size, _on_cpu(generator))
+    generator = _on_cpu(generator)
+    scene = sample_scene(batch_size, image_size, generator, window=window, model=model, kind=kind)
+    seeds: list[int] = torch.randint(2**62, (batch_size,), generator=generator).tolist()
+    return render_scenes(scene, image_size, seeds, device=device, rows=rows, ideal_sensor=ideal_sensor)
+
+
+def sample_scene(
+    batch_size: int,
+    image_size: tuple[int, int],
+    generator: torch.Generator,
+    *,
+    window: WindowConfig | None = None,
+    model: str = "pinhole",
+    kind: str = "any",
+) -> Scene:
+    """Sample B scenes on the CPU; for the arguments see :func:`render_views`."""
+    sampler = BatchSampler(batch_size, generator)
     world, ego_lane = sample_world(sampler, kind)
     world, place = sample_place(sampler, world, ego_lane)
     alignment = build_alignment(*sample_course(sampler))
@@ -138,9 +154,7 @@ def render_views(
     lens = Lens(intrinsics, distortion, model, pose)
     if window is not None:
         world, lens = _through_window(sampler, window, image_size, world, lens)
-    scene = scene_at(world, place, alignment, lens)
-    seeds: list[int] = torch.randint(2**62, (batch_size,), generator=sampler.generator).tolist()
-    return render_scenes(scene, image_size, seeds, device=device, rows=rows, ideal_sensor=ideal_sensor)
+    return scene_at(world, place, alignment, lens)
 
 
 def _through_window(

@@ -12,26 +12,30 @@ class Canvas(NamedTuple):
     """The pixels of B images of H x W, P = B·H·W of them, row-major; painted into in place.
 
     Attributes:
-        radiance: (3, P) linear.
-        distance: (2, P) m, Z of what is there, infinite in the sky; and Z of the nearest thing that is not
-            the road, infinite where there is none.
+        planes: (5, P) the linear radiance; Z of what is there, m, infinite in the sky; and Z of the nearest
+            thing that is not the road, infinite where there is none.
     """
 
-    radiance: Tensor
-    distance: Tensor
+    planes: Tensor
+
+    @property
+    def radiance(self) -> Tensor:
+        """(3, P) linear."""
+        return self.planes[:3]
 
     @property
     def depth(self) -> Tensor:
         """(P,) m, Z of what is there."""
-        return self.distance[0]
+        return self.planes[3]
 
     @property
     def blocked(self) -> Tensor:
         """(P,) m, Z of the nearest thing that is not the road."""
-        return self.distance[1]
+        return self.planes[4]
 
 
 def empty_canvas(pixels: int, device: torch.device) -> Canvas:
     """Make a canvas of nothing."""
-    distance = torch.full((2, pixels), torch.inf, device=device)
-    return Canvas(torch.zeros(3, pixels, device=device), distance)
+    planes = torch.full((5, pixels), torch.inf, device=device)
+    planes[:3] = 0
+    return Canvas(planes)

@@ -6,16 +6,16 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from lanebev.render.raster.filters import gaussian_blur
 from lanebev.render.raster.noise import CLOUD, sample_noise
 from lanebev.render.raster.randomness import uniform_rows
-from lanebev.render.raster.select import choose
+from lanebev.render.raster.select import as_float
 from lanebev.render.scene.sensor import Sensor
 from lanebev.render.scene.weather import Light
 
 _MOST_DROPS = 18
+_FLATTENED = 3  # rows of the image that a row of a bonnet mirrors
 
 
 def add_bonnet(
@@ -48,8 +48,10 @@ def add_bonnet(
     mirror = sensor.bonnet_mirror[:, None, None] * (1 - 0.75 * below)
     paint = colour * ((1.1 - 0.3 * below) * ridges)[:, None]
     paint = paint + (gloss * (1 - mirror).clamp(min=0))[:, None] * sky[..., None, None]
-    above = radiance[:, :, : max(1, top // 2)].index_select(0, rows).flip(2)  # it faces the sky
-    above = functional.interpolate(above, (height - top, width), mode="bilinear", align_corners=False)
+    mirrored = (_FLATTENED * torch.arange(height - top - 1, -1, -1, device=radiance.device)).clamp(
+        max=height // 2
+    )
+    above = radiance.index_select(0, rows).index_select(2, mirrored)  # it faces the sky
     paint = paint + (mirror * ridges)[:, None] * above.clamp(max=4.0)
     under = radiance[:, :, top:].index_select(0, rows)
     radiance[:, :, top:].index_copy_(0, rows, under + (paint - under) * alpha[:, None])
@@ -66,14 +68,14 @@ def rain(image: Tensor, wet: Tensor, generators: Sequence[torch.Generator]) -> T
         generators: R of them, on the images' device.
     """
     batch, _, height, width = image.shape
-    grain = uniform_rows((1, height, width), generators) > 0.997
-    lean = uniform_rows((), generators) * 0.4 - 0.2
+    grain = uniform_rows((1, height, width), generators, image.device) > 0.997
+    lean = uniform_rows((), generators, image.device) * 0.4 - 0.2
     falling = _streaks(grain.float(), lean) * (0.9 * wet)[:, None, None, None]
     image = image + falling * (0.9 - image)
 
     wide = 0.012 * width
     blurred = gaussian_blur(image, image.new_full((batch,), wide), wide)
-    mask = _drops(wet, uniform_rows((_MOST_DROPS, 3), generators), (height, width))
+    mask = _drops(wet, uniform_rows((_MOST_DROPS, 3), generators, image.device), (height, width))
     narrow = 0.0025 * width
     mask = gaussian_blur(mask[:, None], image.new_full((batch,), narrow), narrow)
     shifted = blurred.roll(-(height // 12), dims=2) * 1.05
@@ -96,14 +98,20 @@ def _streaks(grain: Tensor, lean: Tensor) -> Tensor:
 def _drops(wet: Tensor, draw: Tensor, size: tuple[int, int]) -> Tensor:
     """(R, H, W) 1 on drops, 4 to 18 of them, of random places and sizes (R, 18, 3)."""
     height, width = size
-    y = torch.arange(height, device=wet.device)[:, None]
-    x = torch.arange(width, device=wet.device)
-    nearest = torch.full((len(wet), height, width), 2.0, device=wet.device)
-    for number in range(_MOST_DROPS):
-        place_x, place_y, large = (v[:, None, None] for v in draw[:, number].unbind(1))
-        radius = (0.004 + 0.014 * large * large) * width
-        across = (x - place_x * width) / radius.clamp(min=1.0)
-        down = (y - place_y * height) / (radius * (0.9 + 0.5 * large)).clamp(min=1.0)
-        there = (number < 4 + 14 * wet)[:, None, None]
-        nearest = torch.minimum(nearest, choose(there, across * across + down * down, 2.0))
-    return (nearest < 1).float()
+    place_x, place_y, large = draw.unbind(2)
+    radius = (0.004 + 0.014 * large * large) * width
+    down_radius = (radius * (0.9 + 0.5 * large)).clamp(min=1.0)
+    reach = int(0.018 * 1.4 * width) + 2
+    span = torch.arange(-reach, reach + 1, device=wet.device)
+    centre_x, centre_y = place_x * width, place_y * height  # (R, 18)
+    x, y = centre_x.round()[..., None] + span, centre_y.round()[..., None] + span  # (R, 18, K)
+    across = (x - centre_x[..., None]) / radius.clamp(min=1.0)[..., None]
+    down = (y - centre_y[..., None]) / down_radius[..., None]
+    on = across.square()[..., None, :] + down.square()[..., None] < 1  # (R, 18, K, K)
+    on &= ((x >= 0) & (x < width))[..., None, :] & ((y >= 0) & (y < height))[..., None]
+    on &= (torch.arange(_MOST_DROPS, device=wet.device) < 4 + 14 * wet[:, None])[..., None, None]
+    place = y.clamp(0, height - 1)[..., None] * width + x.clamp(0, width - 1)[..., None, :]
+    mask = torch.zeros(len(wet), height * width, device=wet.device)
+    mask.scatter_reduce_(1, place.long().flatten(1), as_float(on).flatten(1), "amax")
+    drops: Tensor = mask.unflatten(1, size)
+    return drops

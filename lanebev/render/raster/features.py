@@ -9,8 +9,22 @@ from torch import Tensor
 
 from lanebev.render.scene.layout import Layout
 from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.surroundings import NOTHING, STYLES, TREES
+from lanebev.render.scene.surroundings import NOTHING, SLOPE, STYLES, TREES, Surroundings
+from lanebev.render.scene.weather import Light
 from lanebev.render.scene.world import Scene
+
+SHORTEST_SHADOW = 0.05  # m, of a wall on the ground
+STEEPEST = 0.12  # sine of the lowest sun that casts shadows
+
+
+def shadow_lengths(around: Surroundings, light: Light) -> Tensor:
+    """(B, W) m, how far walls' shadows reach towards the road; 0 or less: away from it, or none."""
+    slant = light.sun[:, 0] / light.sun[:, 1].clamp(min=STEEPEST)  # sideways per metre of height
+    wall = torch.arange(around.wall_kind.shape[1], device=slant.device)
+    side = (wall % 2) * 2 - 1
+    kind = around.wall_kind
+    casts = (kind != NOTHING) & (kind != SLOPE) & (light.direct > 0.02).any(1, keepdim=True)
+    return around.wall_height * slant[:, None] * side * casts
 
 
 class KindRows(NamedTuple):
@@ -57,6 +71,7 @@ class Features(NamedTuple):
         symbols: arrows, words, diamonds.
         night: a night of the kinds of road.
         rows: on which rows there are which kinds.
+        shading: which walls throw a shadow on the road.
         walls: (row, wall) of each wall that is there.
         looks: (kind, style) of each of these; trees come in several styles.
     """
@@ -81,6 +96,7 @@ class Features(NamedTuple):
     symbols: bool
     night: bool
     rows: KindRows
+    shading: list[int]
     walls: list[list[int]]
     looks: list[list[int]]
 
@@ -125,6 +141,7 @@ def features_of(scene: Scene) -> Features:
             night=_rows(world.lights.on > 0),
             glass=_rows(kinds.camera | kinds.night),
         ),
+        shading=_rows((shadow_lengths(around, scene.light) > SHORTEST_SHADOW).any(0)),
         walls=there.nonzero().tolist(),
         looks=torch.stack([around.wall_kind, style], dim=-1)[there].tolist(),
     )

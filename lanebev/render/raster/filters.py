@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -19,7 +17,7 @@ def gaussian_blur(image: Tensor, std: Tensor, largest: float) -> Tensor:
         std: (B,) px; 0 leaves a row as it is.
         largest: of ``std``, px, on the host.
     """
-    reach = max(1, math.ceil(3.5 * largest))
+    reach = max(1, round(2.6 * largest))
     place = torch.arange(reach + 1, device=image.device, dtype=image.dtype)
     weight = torch.exp(-0.5 * (place / std.clamp(min=1e-3)[:, None]).square())
     weight = weight / (2 * weight.sum(1, keepdim=True) - weight[:, :1])

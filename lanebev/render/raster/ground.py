@@ -122,15 +122,17 @@ def _add_kinds(
         own, painted = (t.view(len(t), *paved.shape) for t in (albedo, coverage))
         base, paint_on = own.index_select(1, index).transpose(0, 1), painted[0].index_select(0, index)
         road, blotch = paved.index_select(0, index), stain.index_select(0, index)
+        layout, pavement = select_rows(scene.world.layout, row), select_rows(scene.world.pavement, row)
         if name == "city":
             eye, height = scene.place.across[row], scene.lens.extrinsics.height[row]
-            world = select_rows(scene.world, row)
-            base, paint_on = city_ground(world, eye, height, part, base, road, paint_on, blotch)
+            street = select_rows(scene.world.street, row)
+            over = (part, base, road, paint_on, blotch)
+            base, paint_on = city_ground(street, layout, pavement, eye, height, *over)
         elif name == "works":
             base, paint_on = works_ground(select_rows(scene.world.works, row), part, base, road, paint_on)
         else:
-            world = select_rows(scene.world, row)
-            base, paint_on = snow_ground(world, part, base, road, paint_on, blotch)
+            winter = select_rows(scene.world.winter, row)
+            base, paint_on = snow_ground(winter, layout, pavement, part, base, road, paint_on, blotch)
         own.index_copy_(1, index, base.transpose(0, 1))
         painted[0].index_copy_(0, index, paint_on)
 

@@ -35,8 +35,8 @@ def _cosines(device: torch.device) -> Tensor:
 def compress(image: Tensor, quality: Tensor) -> Tensor:
     """Quantise images as baseline JPEG does, with chrominance at half the resolution.
 
-    Source: ITU-T T.81; tables scaled by quality as libjpeg does (jcparam.c). Deviation: rows of the image
-    are repeated, and not the last one alone, up to a multiple of 16; entropy coding loses nothing.
+    Source: ITU-T T.81; tables scaled by quality as libjpeg does (jcparam.c). Deviation: what comes out is not
+    rounded to 8 bits. Entropy coding loses nothing and is left out.
 
     Args:
         image: (B, 3, H, W) in [0, 1].
@@ -46,27 +46,26 @@ def compress(image: Tensor, quality: Tensor) -> Tensor:
         (B, 3, H, W) in [0, 1].
     """
     height, width = image.shape[2:]
-    padded = functional.pad(image, (0, -width % 16, 0, -height % 16), mode="replicate")
-    red, green, blue = (padded * 255).unbind(1)
-    luma = 0.299 * red + 0.587 * green + 0.114 * blue
-    chroma = torch.stack([0.5643 * (blue - luma), 0.7133 * (red - luma)], dim=1)
-    small = functional.avg_pool2d(chroma, 2)
+    red, green, blue = functional.pad(image, (0, -width % 16, 0, -height % 16), mode="replicate").unbind(1)
+    luma = torch.add(0.299 * red, green, alpha=0.587).add_(blue, alpha=0.114)
+    small = functional.avg_pool2d(torch.stack([blue - luma, red - luma], dim=1), 2)
+    chroma = constant(image.device, 0.5643, 0.7133)[:, None, None]
 
     quality = quality.clamp(1, 100).floor()
     scale = torch.where(quality < 50, 5000 / quality, 200 - 2 * quality)
-    luma = _quantised(luma[:, None] - 128, scale, constant(image.device, *_LUMINANCE)) + 128
-    small = _quantised(small, scale, constant(image.device, *_CHROMINANCE))
-    blue_part, red_part = functional.interpolate(small, scale_factor=2, mode="nearest").unbind(1)
-    luma = luma[:, 0]
-    red, blue = luma + red_part / 0.7133, luma + blue_part / 0.5643
-    green = (luma - 0.299 * red - 0.114 * blue) / 0.587
-    decoded = torch.stack([red, green, blue], dim=1)[..., :height, :width]
-    return decoded.round_().clamp_(0, 255).div_(255)
+    luma = _quantised(luma[:, None] - 0.5, scale, constant(image.device, *_LUMINANCE)) + 0.5
+    small = _quantised(small * chroma, scale, constant(image.device, *_CHROMINANCE)) / chroma
+    blue_part, red_part = small.unbind(1)
+    green_part = (-0.299 / 0.587) * red_part - (0.114 / 0.587) * blue_part
+    parts = torch.stack([red_part, green_part, blue_part], dim=1)[:, :, :, None, :, None]
+    decoded = luma.unflatten(3, (-1, 2)).unflatten(2, (-1, 2)) + parts  # (B, 3, H/2, 2, W/2, 2)
+    image = decoded.flatten(4, 5).flatten(2, 3)[..., :height, :width]
+    return image.clamp(0, 1)
 
 
 def _quantised(planes: Tensor, scale: Tensor, table: Tensor) -> Tensor:
     """(B, C, h, w) planes, their blocks' cosine transform rounded to multiples of the scaled table."""
-    step = ((table * scale[:, None] + 50) / 100).floor().clamp(1, 255)[:, None]  # (B, 1, 64)
+    step = ((table * scale[:, None] + 50) / 100).floor().clamp(1, 255)[:, None] / 255  # (B, 1, 64)
     batch, channels, height, width = planes.shape
     blocks = planes.unflatten(3, (-1, 8)).unflatten(2, (-1, 8)).transpose(3, 4)  # (B, C, h/8, w/8, 8, 8)
     blocks = blocks.reshape(batch, -1, 64)

@@ -25,11 +25,11 @@ from lanebev.render.raster.hexahedra import (
 from lanebev.render.raster.object_shading import object_radiance
 from lanebev.render.raster.rays import View
 from lanebev.render.raster.select import as_float, choose, indices_where, put, take, take_channels
+from lanebev.render.raster.tiles import TILE, TILE_PIXELS
 from lanebev.render.scene.objects import SceneObjects
 from lanebev.render.scene.sampler import map_tensors, select_rows
 from lanebev.render.scene.world import Scene
 
-_TILE = 8  # px
 _SUBPIXELS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))  # rotated grid
 _OVERLAP = 0.6  # m that something may be nearer than an object and still be hidden by it
 _EDGE = 0.6  # px by which an object is taken to be larger, and smaller, to find its outline
@@ -103,15 +103,15 @@ def _tiles(scene: Scene, size: tuple[int, int]) -> Tiles:
     order = objects.z.argsort(dim=1, descending=True, stable=True)
     index = (order + torch.arange(batch, device=device)[:, None] * slots).T.flatten()  # rank by rank
     left, top, right, bottom = box[index].unbind(1)
-    columns, rows = (right - left + (_TILE - 1)) // _TILE, (bottom - top + (_TILE - 1)) // _TILE
+    columns, rows = (right - left + (TILE - 1)) // TILE, (bottom - top + (TILE - 1)) // TILE
     count = columns * rows
     total = int(count.sum())
     source = torch.arange(len(index), device=device).repeat_interleave(count, output_size=total)
     number = torch.arange(total, device=device) - (count.cumsum(0) - count)[source]
-    within = torch.arange(_TILE * _TILE, device=device)
+    within = torch.arange(TILE_PIXELS, device=device)
     across = columns[source]
-    x = (left[source] + number % across * _TILE)[:, None] + within % _TILE
-    y = (top[source] + number // across * _TILE)[:, None] + within // _TILE
+    x = (left[source] + number % across * TILE)[:, None] + within % TILE
+    y = (top[source] + number // across * TILE)[:, None] + within // TILE
     inside = (x < right[source, None]) & (y < bottom[source, None])
     owner = index[source]
     pixel = (owner // slots * (height * width))[:, None] + y.clamp(max=height - 1) * width
@@ -140,7 +140,7 @@ def _hits(scene: Scene, view: View, canvas: Canvas, tiles: Tiles) -> Hits:
     inner = entry_depth(time - moved * margin, enters).amin(0)
 
     found = indices_where((outer < limit) & tiles.inside)
-    tile = found // (_TILE * _TILE)
+    tile = found // (TILE_PIXELS)
     owner, share, first = tiles.owner[tile], torch.ones_like(found, dtype=outer.dtype), take(outer, found)
     crossed, entered = (take_channels(t.flatten(1), found) for t in (outer_time, enters))
     face = entered_face(crossed, entered, first)
@@ -185,8 +185,7 @@ def _composite(canvas: Canvas, hits: Hits, colour: Tensor, slots: int) -> None:
             continue
         part = slice(end - count, end)
         pixel, share, z = hits.pixel[part], hits.share[part], hits.depth[part]
-        under = take_channels(canvas.radiance, pixel)
-        put(canvas.radiance, pixel, under + (colour[part].T - under) * share)
-        old = take_channels(canvas.distance, pixel)
-        new = torch.stack([z, torch.minimum(z, old[1])])
-        put(canvas.distance, pixel, torch.where(share > 0.4, new, old))
+        under = take_channels(canvas.planes, pixel)
+        mixed = torch.lerp(under[:3], colour[part].T, share)
+        distance = torch.stack([z, torch.minimum(z, under[4])])
+        put(canvas.planes, pixel, torch.cat([mixed, torch.where(share > 0.4, distance, under[3:])]))

@@ -89,8 +89,8 @@ def _add_ground(
     lit = ground_radiance(scene, below, ground, features)
     clear = torch.exp(-z / scene.world.weather.visibility[below.row, None])[:, None]
     haze = scene.world.surroundings.skyline[below.row, :, None]
-    put(canvas.radiance, below.place, (haze + (lit - haze) * clear).transpose(0, 1))
-    put(canvas.distance[:1], below.place, z[None])
+    put(canvas.radiance, below.place, torch.lerp(haze, lit, clear).transpose(0, 1))
+    put(canvas.planes[3:4], below.place, z[None])
     return ground, lit
 
 

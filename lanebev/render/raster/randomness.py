@@ -8,17 +8,21 @@ import torch
 from torch import Tensor
 
 
-def normal_rows(shape: tuple[int, ...], generators: Sequence[torch.Generator]) -> Tensor:
-    """Draw (R, *shape) standard normal values on the generators' device."""
-    values = torch.empty(len(generators), *shape, device=generators[0].device)
+def normal_rows(
+    shape: tuple[int, ...], generators: Sequence[torch.Generator], device: torch.device
+) -> Tensor:
+    """Draw (R, *shape) standard normal values on the device, which is the generators'."""
+    values = torch.empty(len(generators), *shape, device=device)
     for row, generator in zip(values, generators, strict=True):
         row.normal_(generator=generator)
     return values
 
 
-def uniform_rows(shape: tuple[int, ...], generators: Sequence[torch.Generator]) -> Tensor:
-    """Draw (R, *shape) uniform values in [0, 1) on the generators' device."""
-    values = torch.empty(len(generators), *shape, device=generators[0].device)
+def uniform_rows(
+    shape: tuple[int, ...], generators: Sequence[torch.Generator], device: torch.device
+) -> Tensor:
+    """Draw (R, *shape) uniform values in [0, 1) on the device, which is the generators'."""
+    values = torch.empty(len(generators), *shape, device=device)
     for row, generator in zip(values, generators, strict=True):
         row.uniform_(generator=generator)
     return values

@@ -90,7 +90,7 @@ def take_image(
 
 def add_noise(image: Tensor, sensor: Sensor, generators: Sequence[torch.Generator]) -> Tensor:
     """Add shot and read noise to display values, (B, 3, H, W)."""
-    noise = normal_rows(tuple(image.shape[1:]), generators)
+    noise = normal_rows(tuple(image.shape[1:]), generators, image.device)
     read, shot = (v.square()[:, None, None, None] for v in (sensor.read_noise, sensor.shot_noise))
-    level = (read + image * shot).sqrt_()
-    return noise.mul_(level).add_(image).clamp_(0, 1)
+    level = torch.addcmul(read, image, shot).sqrt_()
+    return torch.addcmul(image, noise, level).clamp_(0, 1)

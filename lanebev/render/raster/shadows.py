@@ -7,19 +7,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.features import Features
+from lanebev.render.raster.features import SHORTEST_SHADOW, STEEPEST, Features, shadow_lengths
 from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.noise import CLOUD, sample_line, sample_noise, smoothstep
 from lanebev.render.raster.select import as_float, choose, indices_where, take
 from lanebev.render.scene.objects import TRUCK, SceneObjects
 from lanebev.render.scene.sampler import select_rows
-from lanebev.render.scene.surroundings import FENCE, HEDGE, NOTHING, RAIL, SLOPE, TREES, Surroundings
+from lanebev.render.scene.surroundings import FENCE, HEDGE, RAIL, TREES, Surroundings
 from lanebev.render.scene.weather import Light
 from lanebev.render.scene.world import Scene, World
 
 BRIDGE_UNDERSIDE = 6.2  # m, of all bridges as far as their shadows go
 _PIECE = 64  # pixels that are looked at together for a vehicle's shadow
-_STEEPEST = 0.12  # sine of the lowest sun that casts shadows
 
 
 def shadows(scene: Scene, row: Tensor, ground: Ground, features: Features) -> tuple[Tensor, Tensor]:
@@ -40,14 +39,15 @@ def shadows(scene: Scene, row: Tensor, ground: Ground, features: Features) -> tu
         if features.crowns:
             sunlit = sunlit * (1 - world.shade[row, None] * _crown_shadow(world, row, ground))
         around = select_rows(world.surroundings, row)
-        for wall in sorted({wall for _, wall in features.walls}):
-            sunlit = sunlit * _wall_shadow(around, wall, light, ground)
+        lengths = shadow_lengths(around, light)
+        for wall in features.shading:
+            sunlit = sunlit * _wall_shadow(around, wall, lengths[:, wall, None], ground)
     return sunlit, open_sky
 
 
 def _bridge_shadow(bridge: Tensor, light: Light, ground: Ground) -> tuple[Tensor, Tensor]:
     """Shade of bridges (B, 2) m along, infinite where there is none, and how far points are below them."""
-    climb = light.sun[:, 1, None].clamp(min=_STEEPEST)
+    climb = light.sun[:, 1, None].clamp(min=STEEPEST)
     soft = 0.15 + ground.reach_along
     begin, end = bridge.clamp(max=1e6).unsqueeze(-1).unbind(1)
     shift = ground.along + BRIDGE_UNDERSIDE * light.sun[:, 2, None] / climb
@@ -65,12 +65,9 @@ def _crown_shadow(world: World, row: Tensor, ground: Ground) -> Tensor:
     return smoothstep(0.2, 0.75, crown + 0.35 * gaps - 0.09 * edge.clamp(min=0) + 0.25)
 
 
-def _wall_shadow(around: Surroundings, wall: int, light: Light, ground: Ground) -> Tensor:
-    """A band along the road beside a wall that stands between it and the sun; 1 where none does."""
-    slant = light.sun[:, 0] / light.sun[:, 1].clamp(min=_STEEPEST)  # sideways per metre of height
+def _wall_shadow(around: Surroundings, wall: int, length: Tensor, ground: Ground) -> Tensor:
+    """A band along the road beside a wall whose shadow is (B, 1) m long; 1 where it has none."""
     kind, side = around.wall_kind[:, wall, None], 1.0 if wall % 2 else -1.0
-    length = (around.wall_height[:, wall] * slant * side)[:, None]
-    casts = (kind != NOTHING) & (kind != SLOPE) & (length > 0.05) & (light.direct > 0.02).any(1, keepdim=True)
     leafy = (kind == TREES) | (kind == HEDGE)
     crowns = 0.55 + 0.2 * sample_line(ground.along / 60.0 + around.wall_seed[:, wall, None])
     reach = choose(leafy, length * crowns, length)
@@ -78,7 +75,7 @@ def _wall_shadow(around: Surroundings, wall: int, light: Light, ground: Ground) 
     soft = (0.05 + 0.04 * reach + ground.reach_across).clamp(min=0.01)
     shade = ((reach - inward) / soft + 0.5).clamp(0, 1) * (inward / ground.reach_across + 0.5).clamp(0, 1)
     shade = shade * as_float((kind != RAIL) | (inward > 0.45 * reach))
-    strength = torch.where(leafy | (kind == FENCE), 0.85, 0.95) * casts
+    strength = torch.where(leafy | (kind == FENCE), 0.85, 0.95) * (length > SHORTEST_SHADOW)
     return 1 - strength * shade
 
 
@@ -102,7 +99,7 @@ def _outlines(light: Light, objects: SceneObjects) -> tuple[_Outline, Tensor]:
     shape, x, z = objects.shape, objects.x, objects.z
     sin, cos = objects.heading.sin(), objects.heading.cos()
     tall = shape[..., 7].amax(2) * 0.9
-    sun = light.sun / light.sun[:, 1:2].clamp(min=_STEEPEST)
+    sun = light.sun / light.sun[:, 1:2].clamp(min=STEEPEST)
     sun_right, sun_ahead = sun[:, 0, None], sun[:, 2, None]
     sun_x, sun_z = (sun_right * cos - sun_ahead * sin) * tall, (sun_right * sin + sun_ahead * cos) * tall
     rear, front = shape[..., 2].amin(2), shape[..., 3].amax(2)

@@ -11,6 +11,7 @@ from lanebev.render.raster.glyphs import GLYPH_LENGTH, GLYPH_WIDTH, glyph_covera
 from lanebev.render.raster.noise import GRAIN, hash01, sample_grain, smoothstep
 from lanebev.render.raster.roadside import junction_coverage
 from lanebev.render.raster.street_surface import strips_between
+from lanebev.render.raster.surface import count_below
 from lanebev.render.scene.glyphs import BICYCLE, NUM_GLYPHS
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
 from lanebev.render.scene.pavement import Pavement
@@ -54,7 +55,7 @@ def street_paint(
 
 def lane_coordinates(layout: Layout, across: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Lane (int64), m right of its middle, its width in m, and whether there is a lane, (B, N) each."""
-    lane = torch.searchsorted(layout.across, across.contiguous()) - 1
+    lane = count_below(layout.across, across) - 1
     lanes = layout.exists.sum(1, keepdim=True) - 1
     on_lane = (lane >= 0) & (lane < lanes)
     lane = lane.clamp(0, MAX_BOUNDARIES - 2)

@@ -44,10 +44,10 @@ class LanePlace(NamedTuple):
 def nearest_slot(layout: Layout, across: Tensor) -> Tensor:
     """(B, N) int64: the boundary nearest to ``across`` (B, N) m."""
     middles = 0.5 * (layout.across[:, 1:] + layout.across[:, :-1])
-    return _count_below(middles, across)
+    return count_below(middles, across)
 
 
-def _count_below(edges: Tensor, value: Tensor) -> Tensor:
+def count_below(edges: Tensor, value: Tensor) -> Tensor:
     """(B, N) int64: how many of (B, K) edges lie below (B, N) values; for few edges faster than a search."""
     count = torch.zeros(value.shape, dtype=torch.uint8, device=value.device)
     for edge in edges.unsqueeze(-1).unbind(1):
@@ -62,7 +62,7 @@ def place_in_lanes(layout: Layout, across: Tensor) -> LanePlace:
         layout: the boundaries.
         across: (B, N) m in the layout's frame.
     """
-    lane = _count_below(layout.across, across)
+    lane = count_below(layout.across, across)
     count = layout.exists.sum(1, keepdim=True)
     edges = layout.across
     last = edges.gather(1, (count - 1).clamp(min=0))

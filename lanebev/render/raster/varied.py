@@ -11,12 +11,17 @@ from lanebev.render.raster.roadside import roadside
 from lanebev.render.raster.street import lane_coordinates, street_paint
 from lanebev.render.raster.street_surface import ironwork, strips, tracks
 from lanebev.render.raster.winter import snow_cover
+from lanebev.render.scene.layout import Layout
+from lanebev.render.scene.pavement import Pavement
+from lanebev.render.scene.street import Street
+from lanebev.render.scene.winter import Winter
 from lanebev.render.scene.works import NUM_OLD, Works
-from lanebev.render.scene.world import World
 
 
 def city_ground(
-    world: World,
+    street: Street,
+    layout: Layout,
+    pavement: Pavement,
     eye_across: Tensor,
     eye_height: Tensor,
     ground: Ground,
@@ -28,7 +33,9 @@ def city_ground(
     """Put a street's ground over that of a plain road.
 
     Args:
-        world: what there is.
+        street: what it has.
+        layout: its boundaries.
+        pavement: its edges.
         eye_across: (B,) m, the camera's place.
         eye_height: (B,) m.
         ground: (B, N) points.
@@ -40,7 +47,6 @@ def city_ground(
     Returns:
         albedo and painted of the street.
     """
-    street, layout, pavement = world.street, world.layout, world.pavement
     here = (ground.along, ground.across, ground.reach_along, ground.reach_across)
     beside, share = roadside(street, pavement, *here, eye_across, eye_height)
     albedo = albedo + (beside - albedo) * (share * (1 - paved))[:, None]
@@ -67,11 +73,18 @@ def works_ground(
 
 
 def snow_ground(
-    world: World, ground: Ground, albedo: Tensor, paved: Tensor, painted: Tensor, blotch: Tensor
+    winter: Winter,
+    layout: Layout,
+    pavement: Pavement,
+    ground: Ground,
+    albedo: Tensor,
+    paved: Tensor,
+    painted: Tensor,
+    blotch: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Put snow on the ground; for the arguments see :func:`city_ground`."""
-    winter, here = world.winter, (ground.along, ground.across, ground.reach_along, ground.reach_across)
-    cover = snow_cover(winter, world.layout, world.pavement, *here, blotch)
+    here = (ground.along, ground.across, ground.reach_along, ground.reach_across)
+    cover = snow_cover(winter, layout, pavement, *here, blotch)
     field = winter.on[:, None] * winter.verge[:, None] * (1 - paved)
     cover = torch.maximum(cover * paved, field * (0.85 + 0.15 * blotch).clamp(0, 1))
     return albedo + (winter.colour[..., None] - albedo) * cover[:, None], painted * (1 - cover)

@@ -14,14 +14,16 @@ from lanebev.render.raster.features import Features
 from lanebev.render.raster.ground import headlight_irradiance
 from lanebev.render.raster.houses import lit_windows
 from lanebev.render.raster.rays import View
-from lanebev.render.raster.select import as_float, put, take, take_channels
+from lanebev.render.raster.select import as_float, choose, put, take, take_channels
+from lanebev.render.raster.tiles import tile_corners, tile_pixels
 from lanebev.render.raster.wall_texture import wall_texture
 from lanebev.render.scene.alignment import elevation_at, wall_hit, wall_table
-from lanebev.render.scene.sampler import select_rows
-from lanebev.render.scene.surroundings import HOUSES, NUM_WALLS, SLOPE, TREES, Wall, walls_of
+from lanebev.render.scene.sampler import concatenate_rows, select_rows
+from lanebev.render.scene.surroundings import FENCE, HEDGE, HOUSES, NUM_WALLS, TREES, Wall, walls_of
 from lanebev.render.scene.world import Scene
 
-_BLOCK = 256  # pixels: a distant rail has few
+_TILES = 8  # tiles in a block of what may be wall
+_BLOCK = 256  # pixels in a block of what is: a distant rail has few
 _FARTHEST = 900.0  # m
 _OVERLAP = 0.5  # m that something may be nearer than a wall and still be hidden by it
 
@@ -44,6 +46,20 @@ class WallHits(NamedTuple):
     ray_x: Tensor
 
 
+class WallColours(NamedTuple):
+    """How points on walls look.
+
+    Attributes:
+        albedo: (T, 3, N) linear reflectance.
+        alpha: (T, N) coverage.
+        glow: (T, 3, N) radiance of lit windows.
+    """
+
+    albedo: Tensor
+    alpha: Tensor
+    glow: Tensor
+
+
 def add_walls(scene: Scene, view: View, canvas: Canvas, across: Tensor, features: Features) -> None:
     """Paint the walls beside the road, outside in, into the canvas.
 
@@ -57,30 +73,20 @@ def add_walls(scene: Scene, view: View, canvas: Canvas, across: Tensor, features
     if not features.walls:
         return
     looks = sorted((*features.looks[i], *entry) for i, entry in enumerate(features.walls))
-    entries = torch.tensor(looks).to(canvas.depth.device, non_blocking=True)
-    row, wall = entries[:, 2], entries[:, 3]
+    kind, _, row, wall = torch.tensor(looks).to(canvas.depth.device, non_blocking=True).unbind(1)
     walls = walls_of(scene.world.surroundings, row, wall)
     blocks, hits = _hits(scene, view, canvas, across, row, walls)
     if not len(blocks):
         return
-    starts = [0, *accumulate(blocks.counts)]
-    colours, alphas = [], []
-    for (kind, style), group in groupby(range(len(looks)), lambda e: tuple(looks[e][:2])):
-        members = list(group)
-        part = slice(starts[members[0]], starts[members[-1] + 1])
-        own = select_rows(walls, blocks.row[part])
-        seen = WallHits(*(t[part] for t in hits))
-        lit, alpha = _radiance(scene, view, row[blocks.row[part]], own, seen, (kind, style), features)
-        colours.append(lit)
-        alphas.append(alpha)
-    colour, alpha = torch.cat(colours), torch.cat(alphas)
+    colours = _textures(scene, view, row, walls, blocks, hits, [look[:2] for look in looks], features)
+    lit = _radiance(
+        scene, row[blocks.row], kind[blocks.row], walls.across[blocks.row], hits, colours, features
+    )
     for number in range(NUM_WALLS):
-        chosen = [
-            t for e, look in enumerate(looks) if look[3] == number for t in range(starts[e], starts[e + 1])
-        ]
-        if chosen:
-            index = torch.tensor(chosen).to(colour.device, non_blocking=True)
-            _composite(canvas, *(t.index_select(0, index) for t in (hits.pixel, hits.z, colour, alpha)))
+        members = [entry for entry, look in enumerate(looks) if look[3] == number]
+        index = blocks.of_rows(members)
+        if len(index):
+            _composite(canvas, *(t.index_select(0, index) for t in (hits.pixel, hits.z, lit, colours.alpha)))
 
 
 def _hits(
@@ -91,23 +97,19 @@ def _hits(
     place_across = walls.across - scene.place.across[row]
     tall = walls.height * 1.5
     mask = _candidates(scene, view, canvas, across, row, walls.across, place_across, tall - height)
-    blocks = make_blocks(mask, _BLOCK)
+    tiles = make_blocks(mask, _TILES)
     alignment = select_rows(scene.alignment, row)
     table = wall_table(alignment, place_across)
 
-    pixel = (
-        blocks.place + ((row - torch.arange(len(row), device=row.device)) * mask.shape[1])[blocks.row, None]
-    )
+    own = tiles.row
+    pixel = tile_pixels(tiles.place - own[:, None] * mask.shape[1], view.size).flatten(1)
+    pixel = pixel + (row * across.shape[1])[own, None]
     ray_x, ray_y = take(view.ray_x, pixel), take(view.ray_y, pixel)
-    z, arc = wall_hit(select_rows(table, blocks.row), ray_x)
-    up = height[blocks.row, None] - ray_y * z - elevation_at(select_rows(alignment, blocks.row), z)
-    keep = (
-        (z < _FARTHEST)
-        & (up > -0.3)
-        & (up < tall[blocks.row, None])
-        & (z < take(canvas.depth, pixel) + _OVERLAP)
-    )
-    kept = make_blocks(keep, _BLOCK, row=blocks.row, num_rows=len(row))
+    z, arc = wall_hit(select_rows(table, own), ray_x)
+    up = height[own, None] - ray_y * z - elevation_at(select_rows(alignment, own), z)
+    keep = (z < _FARTHEST) & (up > -0.3) & (up < tall[own, None])
+    keep &= z < take(canvas.depth, pixel) + _OVERLAP
+    kept = make_blocks(keep, _BLOCK, row=own, num_rows=len(row))
     return kept, WallHits(*(take(t, kept.place) for t in (pixel, z, arc, up, ray_x)))
 
 
@@ -121,58 +123,83 @@ def _candidates(
     place_across: Tensor,
     above: Tensor,
 ) -> Tensor:
-    """(E, H·W) bool: pixels that may show a wall: of the ground beyond it, or low enough in the sky."""
+    """(E, tiles) bool: tiles that may show a wall: of the ground beyond it, or low enough in the sky.
+
+    The line that bounds them is as good as straight within a tile, so one of its corners tells.
+    """
+    sky = tile_corners(canvas.depth.isinf().view_as(across), view.size).index_select(1, row)
+    ray_x, ray_y, across = (
+        tile_corners(t, view.size).index_select(1, row) for t in (view.ray_x, view.ray_y, across)
+    )
     side = place_across.sign()[:, None]
     aside = place_across.abs().clamp(min=0.5)[:, None]
     sharpest = scene.alignment.curvature.abs().amax(1)[row, None]
     bent = (sharpest / aside).sqrt()  # on a bend the road turns towards its wall
-    outward = (view.ray_x.index_select(0, row) * side).clamp(min=0)
-    steepest = above.clamp(min=0)[:, None] * (1.3 / aside * outward + (bent + 0.004))
-    low = -view.ray_y.index_select(0, row) < steepest
-    beyond = (across.index_select(0, row) - wall_across[:, None]) * side > 0
-    sky = canvas.depth.isinf().view_as(across).index_select(0, row)
-    return (sky & low) | (~sky & beyond)
+    steepest = above.clamp(min=0)[:, None] * (1.3 / aside * (ray_x * side).clamp(min=0) + (bent + 0.004))
+    low = -ray_y < steepest
+    beyond = (across - wall_across[:, None]) * side > 0
+    return ((sky & low) | (~sky & beyond)).any(0)
+
+
+def _textures(
+    scene: Scene,
+    view: View,
+    row: Tensor,
+    walls: Wall,
+    blocks: Blocks,
+    hits: WallHits,
+    looks: list[tuple[int, ...]],
+    features: Features,
+) -> WallColours:
+    """Colours of points on E walls, sorted by their (kind, style): those of one look at a time."""
+    along = hits.arc + scene.place.along[row][blocks.row, None]
+    footprint = (take(view.steps[3], hits.pixel).abs() * hits.z).clamp(min=1e-3)
+    starts = [0, *accumulate(blocks.counts)]
+    parts = []
+    for (kind, style), group in groupby(range(len(looks)), lambda entry: looks[entry]):
+        members = list(group)
+        part = slice(starts[members[0]], starts[members[-1] + 1])
+        own = select_rows(walls, blocks.row[part])
+        here = (along[part], hits.up[part], footprint[part])
+        albedo, alpha = wall_texture(own, kind, style, *here)
+        glow = torch.zeros_like(albedo)
+        if kind == HOUSES and features.night:
+            on = scene.world.lights.on[row][blocks.row[part]] > 0
+            glow = lit_windows(own, *here) * on[:, None, None]
+        parts.append(WallColours(albedo, alpha, glow))
+    return concatenate_rows(parts)
 
 
 def _radiance(
     scene: Scene,
-    view: View,
     row: Tensor,
-    wall: Wall,
+    kind: Tensor,
+    wall_across: Tensor,
     hits: WallHits,
-    look: tuple[int, int],
+    colours: WallColours,
     features: Features,
-) -> tuple[Tensor, Tensor]:
-    """Linear radiance (T, 3, N) as seen through the air, and coverage (T, N), of walls of one look."""
-    kind, style = look
+) -> Tensor:
+    """Linear radiance (T, 3, N) of points on walls of kinds (T,) in scenes (T,), as seen through the air."""
     light = select_rows(scene.light, row)
-    along = hits.arc + scene.place.along[row, None]
-    footprint = (take(view.steps[3], hits.pixel).abs() * hits.z).clamp(min=1e-3)
-    albedo, alpha = wall_texture(wall, kind, style, along, hits.up, footprint)
-    side = (wall.across - scene.place.across[row]).sign()
-    faces, open_sky = (-side * light.sun[:, 0]).clamp(min=0), 0.62
-    if kind >= TREES and kind not in (SLOPE, HOUSES):
-        away = (-light.sun[:, 2]).clamp(min=0)  # sun from behind lights what the camera sees
-        faces = 0.10 + 0.3 * light.sun[:, 1] * away + 0.35 * away + 0.35 * faces
-        open_sky = 0.35
-    lit = (light.direct * faces[:, None] + light.ambient * open_sky)[..., None]
+    right, up, ahead = light.sun.unbind(1)
+    facing = (-(wall_across - scene.place.across[row]).sign() * right).clamp(min=0)
+    away = (-ahead).clamp(min=0)  # sun from behind lights what the camera sees
+    soft = (kind == TREES) | (kind == HEDGE) | (kind == FENCE)
+    leaves = 0.10 + 0.3 * up * away + 0.35 * away + 0.35 * facing
+    facing, open_sky = choose(soft, leaves, facing), choose(soft, 0.35, 0.62)
+    lit = (light.direct * facing[:, None] + light.ambient * open_sky[:, None])[..., None]
     if features.headlight:
         beam = headlight_irradiance(hits.ray_x * hits.z, hits.z) * light.headlight[:, None]
         lit = lit + 0.6 * beam[:, None]
-    lit = albedo * lit
-    if kind == HOUSES and features.night:
-        glow = lit_windows(wall, along, hits.up, footprint)
-        lit = lit + glow * (scene.world.lights.on[row] > 0)[:, None, None]
+    lit = colours.albedo * lit + colours.glow
     clear = torch.exp(-hits.z / scene.world.weather.visibility[row, None])[:, None]
-    haze = scene.world.surroundings.skyline[row, :, None]
-    return haze + (lit - haze) * clear, alpha
+    return torch.lerp(scene.world.surroundings.skyline[row, :, None], lit, clear)
 
 
 def _composite(canvas: Canvas, pixel: Tensor, z: Tensor, colour: Tensor, alpha: Tensor) -> None:
     """Paint points of walls of which no two meet in a pixel."""
-    depth, blocked = take_channels(canvas.distance, pixel)
-    alpha = alpha * as_float(z < depth + _OVERLAP)
-    under = take_channels(canvas.radiance, pixel)
-    put(canvas.radiance, pixel, under + (colour.transpose(0, 1) - under) * alpha)
+    under = take_channels(canvas.planes, pixel)
+    alpha = alpha * as_float(z < under[3] + _OVERLAP)
+    mixed = torch.lerp(under[:3], colour.transpose(0, 1), alpha)
     solid = torch.where(alpha > 0.5, z, torch.inf)
-    put(canvas.distance, pixel, torch.stack([torch.minimum(depth, solid), torch.minimum(blocked, solid)]))
+    put(canvas.planes, pixel, torch.cat([mixed, torch.minimum(under[3:], solid)]))

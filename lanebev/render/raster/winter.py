@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from lanebev.render.raster.noise import CLOUD, GRAIN, SECOND, sample_grain, sample_noise, smoothstep
-from lanebev.render.raster.surface import nearest_slot
+from lanebev.render.raster.surface import count_below, nearest_slot
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout, presence
 from lanebev.render.scene.pavement import Pavement
 from lanebev.render.scene.winter import Winter
@@ -49,7 +49,7 @@ def snow_cover(
     distance = (across - layout.across.gather(1, slot)).abs()
     ridge = smoothstep(soft, -soft, distance - winter.line[:, None] - 0.6 * wave) * (1 - here) * there
 
-    lane = (torch.searchsorted(layout.across, across.contiguous()) - 1).clamp(0, MAX_BOUNDARIES - 2)
+    lane = (count_below(layout.across, across) - 1).clamp(0, MAX_BOUNDARIES - 2)
     middle = 0.5 * (layout.across.gather(1, lane) + layout.across.gather(1, lane + 1))
     wheel = ((across - middle).abs() - 0.8).abs() - winter.track[:, None]
     patchy = smoothstep(-0.6, 0.8, blotch + 0.6 * sample_noise(SECOND, along / 19.0, across / 7.0))

@@ -169,7 +169,7 @@ def local_from_road(alignment: Alignment, z_centre: Tensor, across: Tensor) -> t
 
 def z_from_arc(alignment: Alignment, arc: Tensor) -> Tensor:
     """(B, N) arc length to Z of the centreline; behind the camera the road is straight."""
-    index = torch.searchsorted(alignment.arc, arc.contiguous()).clamp(1, NUM_KNOTS - 1)
+    index = torch.searchsorted(alignment.arc.contiguous(), arc.contiguous()).clamp(1, NUM_KNOTS - 1)
     low, high = alignment.arc.gather(1, index - 1), alignment.arc.gather(1, index)
     z = _knots_on(arc.device)
     part = (arc - low) / (high - low)
@@ -210,7 +210,8 @@ def ground_hit(alignment: Alignment, height: Tensor, ray_y: Tensor) -> tuple[Ten
         (B, N) Z, m; and (B, N) the road's own slope dE/dZ there.
     """
     z = _knots_on(height.device)
-    index = torch.searchsorted(-lowest_slopes(alignment, height), -ray_y).clamp(max=NUM_KNOTS - 2)
+    lowest = lowest_slopes(alignment, height)
+    index = torch.searchsorted(-lowest, -ray_y).clamp(max=NUM_KNOTS - 2)
     rise = alignment.elevation.diff(dim=1) / z.diff()
     slope, start = rise.gather(1, index), alignment.elevation.gather(1, index)
     z_start = z.index_select(0, index.flatten()).view(index.shape)

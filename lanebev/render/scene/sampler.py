@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -60,11 +60,53 @@ def map_tensors(function: Callable[[Tensor], Tensor], values: T) -> T:
     return type(values)(*parts)
 
 
+def tensors_of(values: tuple[Any, ...]) -> list[Tensor]:
+    """Return all tensors of a nested NamedTuple, in order."""
+    found: list[Tensor] = []
+    for value in values:
+        if isinstance(value, tuple):
+            found += tensors_of(value)
+        elif isinstance(value, Tensor):
+            found.append(value)
+    return found
+
+
+def through_tables(function: Callable[[Tensor], Tensor], values: T) -> T:
+    """Apply a function of rows to a (nested) NamedTuple of (B, ...) tensors, all of one dtype at once.
+
+    Hundreds of small tensors so take a handful of operations: they become one table (B, F) for each dtype,
+    and the results are views of what the function makes of these.
+    """
+    leaves = tensors_of(values)
+    tables: dict[torch.dtype, Iterator[Tensor]] = {}
+    for dtype in {leaf.dtype for leaf in leaves}:
+        own = [leaf.flatten(1) if leaf.ndim > 1 else leaf[:, None] for leaf in leaves if leaf.dtype == dtype]
+        table = function(torch.cat(own, dim=1))
+        tables[dtype] = iter(table.split([part.shape[1] for part in own], dim=1))
+    return map_tensors(
+        lambda leaf: (
+            next(tables[leaf.dtype]).unflatten(1, leaf.shape[1:])
+            if leaf.ndim > 1
+            else next(tables[leaf.dtype])[:, 0]
+        ),
+        values,
+    )
+
+
 def select_rows(values: T, rows: Tensor | slice) -> T:
     """Rows of a (nested) NamedTuple of (B, ...) tensors: an index tensor (R,) or a slice."""
-    return map_tensors(
-        lambda tensor: tensor.index_select(0, rows) if isinstance(rows, Tensor) else tensor[rows], values
-    )
+    if isinstance(rows, slice):
+        return map_tensors(lambda tensor: tensor[rows], values)
+    if len(tensors_of(values)[0]) == 1:  # a batch of one row has no other: views
+        return map_tensors(lambda tensor: tensor.expand(len(rows), *tensor.shape[1:]), values)
+    return through_tables(lambda table: table.index_select(0, rows), values)
+
+
+def send(values: T, device: torch.device) -> T:
+    """Send a (nested) NamedTuple of (B, ...) tensors to a device, without waiting for it."""
+    if device.type == "cpu":
+        return values
+    return through_tables(lambda table: table.to(device, non_blocking=True), values)
 
 
 def row_of(values: T, index: int) -> T:

@@ -1,0 +1,92 @@
+"""A device that is none: tensors that say they are elsewhere, on a machine that has only a CPU.
+
+Every operation is carried out on the CPU, but tensors of "elsewhere" and those of the CPU must not meet, as
+on a real accelerator; what waits for the device, and what is launched on it, is counted.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_flatten, tree_map
+
+ELSEWHERE = torch.device("meta")
+_COPIES = ("aten::_to_copy", "aten::copy_")
+_WAITS = ("aten::_local_scalar_dense", "aten::nonzero", "aten::equal")
+
+
+class Elsewhere(torch.Tensor):
+    """A tensor that says it is on :data:`ELSEWHERE`; its values are in ``here``."""
+
+    here: Tensor
+
+    @staticmethod
+    def __new__(cls, here: Tensor) -> Elsewhere:
+        made = torch.Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
+            cls,
+            here.size(),
+            strides=here.stride(),
+            storage_offset=here.storage_offset(),
+            dtype=here.dtype,
+            device=ELSEWHERE,
+        )
+        made.here = here
+        return made
+
+    def tolist(self) -> Any:
+        """Return the values, after waiting for the device."""
+        return self.cpu().tolist()
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        raise AssertionError(f"{func}: used outside of OtherDevice")
+
+
+class OtherDevice(TorchDispatchMode):
+    """Context in which ``device=ELSEWHERE`` works.
+
+    Attributes:
+        launches: operations carried out elsewhere that compute, by name; views do not.
+        waits: those of them that wait for the device.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.launches: Counter[str] = Counter()
+        self.waits: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = dict(kwargs or {})
+        name = func._schema.name
+        values, _ = tree_flatten((args, kwargs))
+        tensors = [v for v in values if isinstance(v, Tensor)]
+        away = [t for t in tensors if isinstance(t, Elsewhere)]
+        target = kwargs.get("device")
+        if away and name not in _COPIES:
+            strangers = [t for t in tensors if not isinstance(t, Elsewhere) and t.ndim > 0]
+            if strangers:
+                shapes = [(tuple(t.shape), t.device.type) for t in tensors]
+                raise AssertionError(f"{name}: tensors of two devices meet: {shapes}")
+        to_elsewhere = ELSEWHERE in (target, str(target)) if target is not None else bool(away)
+        if name == "aten::copy_":
+            to_elsewhere = isinstance(args[0], Elsewhere)
+        if target is not None:
+            kwargs["device"] = torch.device("cpu")
+        views = any(r.alias_info is not None and not r.alias_info.is_write for r in func._schema.returns)
+        if (away or to_elsewhere) and not views:
+            self.launches[name] += 1
+        if (away and name in _WAITS) or (away and name == "aten::_to_copy" and not to_elsewhere):
+            self.waits[name] += 1
+        plain_args, plain = tree_map(lambda v: v.here if isinstance(v, Elsewhere) else v, (args, kwargs))
+        result = func(*plain_args, **plain)
+        if not to_elsewhere or name == "aten::_local_scalar_dense":
+            return result
+        if func._schema.is_mutable and away and args and isinstance(args[0], Elsewhere):
+            first = tree_flatten(result)[0]
+            if first and first[0] is args[0].here:
+                return args[0]
+        return tree_map(lambda v: Elsewhere(v) if isinstance(v, Tensor) else v, result)

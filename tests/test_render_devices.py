@@ -1,0 +1,137 @@
+"""Rendering on any device: the same scenes everywhere, nothing that meets across devices, few waits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from typing import Any
+from unittest import mock
+
+import pytest
+import torch
+from torch import Tensor
+
+from lanebev.render import Drive, RenderedFrame, WindowConfig, render_views
+from lanebev.render.scene.kinds import KINDS
+from lanebev.render.scene.sampler import row_of, select_rows, send, tensors_of
+from lanebev.render.scene.world import Scene
+from lanebev.render.views import render_scenes, sample_scene
+from tests.other_device import ELSEWHERE, Elsewhere, OtherDevice
+
+SIZE = (64, 112)
+cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def scene_of(batch: int, seed: int, kind: str = "any") -> Scene:
+    return sample_scene(batch, SIZE, generator(seed), kind=kind)
+
+
+def assert_same(first: RenderedFrame, second: RenderedFrame, share: float = 0.0) -> None:
+    """Equal truth; images equal, or unequal by more than a grey level in at most a share of the pixels."""
+    for name, one, other in zip(first._fields, first, second, strict=True):
+        if name == "image":
+            assert ((one.cpu() - other.cpu()).abs() > 1 / 255).float().mean() <= share
+        elif isinstance(one, Tensor):
+            torch.testing.assert_close(one.cpu(), other.cpu(), atol=2e-3, rtol=1e-4, msg=name)
+
+
+@contextmanager
+def other_device() -> Iterator[OtherDevice]:
+    """Generators and autocast know nothing of a device that is none."""
+
+    def of_cpu(device: Any = None) -> torch.Generator:
+        return torch._C.Generator()
+
+    with (
+        OtherDevice() as device,
+        mock.patch.object(torch, "Generator", of_cpu),
+        mock.patch.object(torch, "autocast", lambda *_, **__: nullcontext()),
+    ):
+        yield device
+
+
+def test_the_same_seed_gives_the_same_frames_bit_for_bit() -> None:
+    first, second = (render_views(3, SIZE, generator(1)) for _ in range(2))
+    for one, other in zip(tensors_of(first), tensors_of(second), strict=True):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_row_is_the_same_in_a_batch_of_any_size(kind: str) -> None:
+    """Blocks have one row each, so others change nothing but the rounding of vector instructions' ends."""
+    scene, seeds = scene_of(3, 2, kind), [1, 2, 3]
+    together = render_scenes(scene, SIZE, seeds, rows=3)
+    alone = [render_scenes(row_of(scene, b), SIZE, seeds[b : b + 1]) for b in range(3)]
+    for b in range(3):
+        assert_same(row_of(together, b), alone[b], share=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_tensor_of_the_host_meets_one_of_the_device(kind: str) -> None:
+    expected = render_views(4, SIZE, generator(3), kind=kind, rows=4)
+    with other_device() as device:
+        frame = render_views(4, SIZE, generator(3), kind=kind, device=ELSEWHERE)
+    assert all(isinstance(t, Elsewhere) for t in tensors_of(frame))
+    assert torch.equal(frame.image.here, expected.image)  # type: ignore[attr-defined]
+    assert sum(device.waits.values()) < 30
+
+
+def test_waits_and_launches_do_not_grow_with_the_batch() -> None:
+    counts = []
+    for batch in (8, 24):
+        scene = scene_of(batch, 4)
+        with other_device() as device:
+            render_scenes(scene, SIZE, list(range(batch)), device=ELSEWHERE)
+        counts.append((sum(device.waits.values()), sum(device.launches.values())))
+    (waits, launches), (more_waits, more_launches) = counts
+    assert more_waits == waits
+    assert more_launches < 1.4 * launches  # kinds of road and of wall that the smaller batch has not
+
+
+def test_frames_of_a_drive_are_those_asked_for_one_by_one() -> None:
+    drive = Drive(5, SIZE, num_frames=8, kind="any")
+    frames = drive.frames([6, 1, 3])
+    for row, index in enumerate((6, 1, 3)):
+        for one, other in zip(tensors_of(row_of(frames, row)), tensors_of(drive.frame(index)), strict=True):
+            assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("rows", [torch.tensor([2, 0, 0]), torch.tensor([1])])
+def test_selected_rows_are_those_of_every_tensor(rows: Tensor) -> None:
+    scene = scene_of(3, 6)
+    for one, other in zip(tensors_of(select_rows(scene, rows)), tensors_of(scene), strict=True):
+        assert torch.equal(one, other[rows])
+        assert one.dtype == other.dtype
+
+
+def test_what_is_sent_elsewhere_arrives() -> None:
+    scene = scene_of(2, 7)
+    with other_device():
+        sent = tensors_of(send(scene, ELSEWHERE))
+    for one, other in zip(sent, tensors_of(scene), strict=True):
+        assert torch.equal(one.here, other)  # type: ignore[attr-defined]
+
+
+@cuda
+@pytest.mark.parametrize("kind", KINDS)
+def test_cuda_shows_the_scenes_of_the_cpu(kind: str) -> None:
+    scene, seeds = scene_of(8, 8, kind), list(range(8))
+    here = render_scenes(scene, SIZE, seeds, ideal_sensor=True)
+    there = render_scenes(scene, SIZE, seeds, device="cuda", ideal_sensor=True)
+    assert there.image.is_cuda
+    assert_same(here, there, share=0.01)
+
+
+@cuda
+def test_cuda_repeats_bit_for_bit() -> None:
+    first, second = (
+        render_views(16, SIZE, generator(9), device="cuda", window=WindowConfig()) for _ in range(2)
+    )
+    for one, other in zip(tensors_of(first), tensors_of(second), strict=True):
+        assert torch.equal(one, other)
+    from_cuda = torch.Generator("cuda").manual_seed(9)
+    assert render_views(2, SIZE, from_cuda, device="cuda").image.isfinite().all()
