@@ -15,7 +15,6 @@ from lanebev.render.scene.sensor import Sensor
 from lanebev.render.scene.weather import Light
 
 _MOST_DROPS = 18
-_FLATTENED = 3  # rows of the image that a row of a bonnet mirrors
 
 
 def add_bonnet(
@@ -48,9 +47,8 @@ def add_bonnet(
     mirror = sensor.bonnet_mirror[:, None, None] * (1 - 0.75 * below)
     paint = colour * ((1.1 - 0.3 * below) * ridges)[:, None]
     paint = paint + (gloss * (1 - mirror).clamp(min=0))[:, None] * sky[..., None, None]
-    mirrored = (_FLATTENED * torch.arange(height - top - 1, -1, -1, device=radiance.device)).clamp(
-        max=height // 2
-    )
+    upwards = torch.arange(height - top - 1, -1, -1, device=radiance.device)
+    mirrored = (upwards * 3 // 2).clamp(max=height // 2)  # rows of the image
     above = radiance.index_select(0, rows).index_select(2, mirrored)  # it faces the sky
     paint = paint + (mirror * ridges)[:, None] * above.clamp(max=4.0)
     under = radiance[:, :, top:].index_select(0, rows)
