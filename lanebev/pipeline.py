@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
 
+from lanebev.batch import select_rows
 from lanebev.geometry.lens import check_intrinsics
 from lanebev.geometry.precision import autocast_off, common_dtype
 from lanebev.observation.lines import LineExtractor
@@ -16,22 +19,24 @@ from lanebev.types import Calibration, LaneSegments, check_tensor, register_pytr
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
 
+STAGES = ("segmenter", "extractor", "calibrator", "warp")
+
 
 @register_pytree
 class LaneBEVOutput(NamedTuple):
     """What one frame, or with (B, T) input every frame, gives.
 
     Attributes:
-        bev: (B, 3, U, V), zero where not valid.
-        valid: (B, 1, U, V) bool.
+        bev: (B, 3, U, V), zero where not valid; None where it was not asked for.
+        valid: (B, 1, U, V) bool; None likewise.
         calibration: extrinsics, covariance, status, inliers.
         bev_from_image: (B, 3, 3) homography from undistorted pixels to BEV pixels.
         segments: what the calibrator was given, in undistorted pixels of the image.
         logits: (B, 1 + L, h, w) of the network.
     """
 
-    bev: Tensor
-    valid: Tensor
+    bev: Tensor | None
+    valid: Tensor | None
     calibration: Calibration
     bev_from_image: Tensor
     segments: LaneSegments
@@ -52,9 +57,12 @@ class LaneBEV(nn.Module):
             before the segmenter; None leaves it as it is.
         pose_sigma_scale: factor on the standard deviations of the pose; None takes the segmenter's
             (:class:`SegmenterConfig`), or 1 where it has none.
+        frozen: those of STAGES that do not learn and let no gradient through: they stay in evaluation mode,
+            and no graph is kept of what they compute. With all but the warp frozen, the view is still
+            differentiable in the image.
 
     Raises:
-        ValueError: segmenter and calibrator that number other boundaries.
+        ValueError: segmenter and calibrator that number other boundaries, or a stage that does not exist.
     """
 
     def __init__(
@@ -65,8 +73,13 @@ class LaneBEV(nn.Module):
         warp: BEVWarp | None = None,
         network_width: int | None = None,
         pose_sigma_scale: float | None = None,
+        frozen: Collection[str] = (),
     ) -> None:
         super().__init__()
+        if unknown := set(frozen) - set(STAGES):
+            raise ValueError(
+                f"frozen: expected some of {', '.join(STAGES)}, got {', '.join(sorted(unknown))}"
+            )
         seen, known = (_configured(part, "num_boundaries") for part in (segmenter, calibrator))
         if seen != known and None not in (seen, known):
             raise ValueError(
@@ -81,6 +94,16 @@ class LaneBEV(nn.Module):
         self.warp = warp or BEVWarp()
         self.network_width = network_width
         self.pose_sigma_scale = pose_sigma_scale
+        self.frozen = frozenset(frozen)
+        for stage in self.frozen:
+            self.get_submodule(stage).requires_grad_(False).eval()
+
+    def train(self, mode: bool = True) -> Self:
+        """Set the mode of all stages but the frozen ones."""
+        super().train(mode)
+        for stage in self.frozen:
+            self.get_submodule(stage).eval()
+        return self
 
     @classmethod
     def from_pretrained(
@@ -89,6 +112,7 @@ class LaneBEV(nn.Module):
         grid: BEVGrid | None = None,
         calibrator: nn.Module | None = None,
         network_width: int | None = None,
+        frozen: Collection[str] = (),
     ) -> LaneBEV:
         """With the shipped weights; needs no network.
 
@@ -97,6 +121,7 @@ class LaneBEV(nn.Module):
             grid: of the view.
             calibrator: None is a default :class:`lanebev.JointCalibrator` of the network's boundaries.
             network_width: px; None is what the weights were trained for.
+            frozen: see the class.
 
         Raises:
             ValueError: a weights file that doesn't fit the network.
@@ -108,14 +133,16 @@ class LaneBEV(nn.Module):
         width = network_width or int(segmenter.image_size[1])
         extractor = LineExtractor.for_network(segmenter.config)
         calibrator = calibrator or JointCalibrator(num_boundaries=segmenter.config.num_boundaries)
-        return cls(segmenter, extractor, calibrator, BEVWarp(grid), width)
+        return cls(segmenter, extractor, calibrator, BEVWarp(grid), width, frozen=frozen)
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
     ) -> Any:
         """The calibrator's state before the first frame."""
         initial_state: Any = self.calibrator.initial_state
-        with autocast_off(torch.device(device or "cpu")):
+        device = torch.device(device or "cpu")
+        off = torch.is_autocast_enabled(device.type)  # asked, since torch.export cannot keep an empty context
+        with autocast_off(device) if off else nullcontext():
             return initial_state(batch_size, dtype=dtype, device=device)
 
     def forward(
@@ -127,6 +154,9 @@ class LaneBEV(nn.Module):
         lane_width: float | Tensor = 3.7,
         distortion: Tensor | None = None,
         model: str = "pinhole",
+        reset: Tensor | None = None,
+        truncation: int | None = None,
+        bev: bool = True,
     ) -> tuple[LaneBEVOutput, Any]:
         """One frame of every row, or T frames of every row in order.
 
@@ -139,6 +169,11 @@ class LaneBEV(nn.Module):
             lane_width: m: float, (B,) or (B, L-1).
             distortion: (B, D) of the lens, or None.
             model: "pinhole", "fisheye" or "omni".
+            reset: (B,) or, with T frames, (B, T) bool: rows whose frame is the first of another drive, which
+                are begun anew; (B,) speaks of the first frame.
+            truncation: frames over which gradients go back through the state: it is detached before every
+                such frame, the first included. None keeps the graph of all frames, also of earlier calls.
+            bev: whether to resample the image; a detector that warps its own features only needs no RGB view.
 
         Returns:
             the output, every tensor with (B, T, ...) where the image has T, and the state after it.
@@ -154,10 +189,15 @@ class LaneBEV(nn.Module):
         if 0 in image.shape[1:]:  # B may be 0
             raise ValueError(f"image: expected frames with pixels, got {tuple(image.shape)}")
         check_intrinsics(intrinsics, image.shape[0])
-        if state is None:
-            state = self.initial_state(image.shape[0], common_dtype(intrinsics), image.device)
+        if truncation is not None and truncation < 1:
+            raise ValueError(f"truncation: expected 1 frame or more, or None, got {truncation}")
         frames = image if image.ndim == 5 else image.unsqueeze(1)
         batch, steps = frames.shape[:2]
+        begins = None if reset is None else _begins(reset, batch, steps)
+        if state is None or begins is not None:
+            dtype = common_dtype(intrinsics) if state is None else state[0].dtype
+            fresh = self.initial_state(batch, dtype, image.device)
+            state = fresh if state is None else state
         logits, segments = self.observe(
             frames.flatten(0, 1),
             intrinsics.repeat_interleave(steps, 0),
@@ -168,12 +208,22 @@ class LaneBEV(nn.Module):
         outputs = []
         for step in range(steps):
             now = LaneSegments(*(part.reshape(batch, steps, *part.shape[1:])[:, step] for part in segments))
-            calibration, state = self.calibrator(now, intrinsics, state, intervals[:, step], lane_width)
-            calibration = calibration.with_std_scaled(self.pose_sigma_scale)
-            bev, valid = self.warp(frames[:, step], intrinsics, calibration.extrinsics, distortion, model)
+            if begins is not None:
+                state = select_rows(begins[:, step], fresh, state)
+            if truncation is not None and step % truncation == 0:
+                state = state.detach()
+            with self._gradients("calibrator"):
+                calibration, state = self.calibrator(now, intrinsics, state, intervals[:, step], lane_width)
+                calibration = calibration.with_std_scaled(self.pose_sigma_scale)
+            view, valid = None, None
+            if bev:
+                with self._gradients("warp"):
+                    view, valid = self.warp(
+                        frames[:, step], intrinsics, calibration.extrinsics, distortion, model
+                    )
             homography = bev_from_image(calibration.extrinsics, intrinsics, self.warp.grid)
             logits_now = logits.reshape(batch, steps, *logits.shape[1:])[:, step]
-            outputs.append(LaneBEVOutput(bev, valid, calibration, homography, now, logits_now))
+            outputs.append(LaneBEVOutput(view, valid, calibration, homography, now, logits_now))
         return (outputs[0] if image.ndim == 4 else _stack(outputs)), state
 
     def observe(
@@ -191,7 +241,8 @@ class LaneBEV(nn.Module):
             logits (B, 1 + L, h, w) and segments in undistorted pixels of the image.
         """
         logits, vertices = self.boundary_vertices(image)
-        return logits, segments_from_vertices(vertices, intrinsics, distortion, model)
+        with self._gradients("extractor"):
+            return logits, segments_from_vertices(vertices, intrinsics, distortion, model)
 
     def boundary_vertices(self, image: Tensor) -> tuple[Tensor, BoundaryVertices]:
         """Run network and line extraction only.
@@ -205,11 +256,17 @@ class LaneBEV(nn.Module):
         """
         resized = self._resize(image)
         finite = resized.isfinite().flatten(1).all(1)  # (B,)
-        logits = self.segmenter(torch.where(finite[:, None, None, None], resized, 0.0))
+        with self._gradients("segmenter"):
+            logits = self.segmenter(torch.where(finite[:, None, None, None], resized, 0.0))
         (height, width), (rows, columns) = image.shape[-2:], resized.shape[-2:]
-        vertices = self.extractor.vertices(logits, (height, width), (rows, columns))
+        with self._gradients("extractor"):
+            vertices = self.extractor.vertices(logits, (height, width), (rows, columns))
         weight = torch.where(finite[:, None, None], vertices.weight, 0.0)
         return logits, vertices._replace(weight=weight)
+
+    def _gradients(self, stage: str) -> AbstractContextManager[object]:
+        """Context of a stage: without a graph where it is frozen."""
+        return torch.no_grad() if stage in self.frozen else nullcontext()
 
     def _resize(self, image: Tensor) -> Tensor:
         if self.network_width is None:
@@ -244,8 +301,20 @@ def _intervals(dt: float | Tensor, batch: int, steps: int, like: Tensor) -> Tens
     return intervals.expand(batch, steps)
 
 
+def _begins(reset: Tensor, batch: int, steps: int) -> Tensor:
+    """Which frames begin a drive, (B, T) bool."""
+    check_tensor("reset", reset)
+    if reset.dtype != torch.bool or reset.shape not in ((batch,), (batch, steps)):
+        raise ValueError(
+            f"reset: expected bool ({batch},) or ({batch}, {steps}), got {reset.dtype} {tuple(reset.shape)}"
+        )
+    return reset if reset.ndim == 2 else nn.functional.pad(reset.unsqueeze(-1), (0, steps - 1))
+
+
 def _stack(outputs: list[Any]) -> Any:
-    """Per-frame (nested) tuples of tensors to one with (B, T, ...) tensors."""
+    """Per-frame (nested) tuples of tensors to one with (B, T, ...) tensors; None stays."""
+    if outputs[0] is None:
+        return None
     if isinstance(outputs[0], Tensor):
         return torch.stack(outputs, dim=1)
     return type(outputs[0])(*(_stack(list(parts)) for parts in zip(*outputs, strict=True)))

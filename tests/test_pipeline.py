@@ -21,6 +21,7 @@ from lanebev import (
 from lanebev.geometry.lens import distort_points
 from lanebev.observation.pairing import BoundaryVertices
 from lanebev.observation.segmenter import SegmenterConfig
+from lanebev.pipeline import STAGES
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes
 from lanebev.types import Extrinsics
@@ -322,3 +323,76 @@ def test_arguments_are_checked():
         model()(images(1), INTRINSICS[None], distortion=torch.zeros(5, dtype=torch.float64))
     with pytest.raises(ValueError, match=r"state.direction_mean: expected \(2, ...\)"):
         model()(images(2), INTRINSICS.expand(2, 3, 3), model().initial_state(1))
+
+
+def test_rows_of_another_drive_begin_anew():
+    """Within T frames and between calls; other rows go on as they were."""
+    net, frames, cameras = model(), images(2, 4), INTRINSICS.expand(2, 3, 3)
+    reset = torch.tensor([[False, False, True, False], [False] * 4])
+    mixed, last = net(frames, cameras, reset=reset)
+    through, end = net(frames, cameras)
+    first, _ = net(frames[:1, 2:], cameras[:1])
+    torch.testing.assert_close(mixed.calibration.covariance[:1, 2:], first.calibration.covariance)
+    torch.testing.assert_close(mixed.calibration.covariance[1], through.calibration.covariance[1])
+    assert (mixed.calibration.covariance[0, 2] - through.calibration.covariance[0, 2]).abs().max() > 0
+    _, state = net(frames[:, :2], cameras)
+    later, again = net(frames[:, 2:], cameras, state, reset=torch.tensor([True, False]))
+    torch.testing.assert_close(later.calibration.covariance, mixed.calibration.covariance[:, 2:])
+    torch.testing.assert_close(again.direction_mean, last.direction_mean)
+    torch.testing.assert_close(last.direction_mean[1], end.direction_mean[1])
+
+
+def test_gradients_go_back_over_as_many_frames_as_asked():
+    net, cameras = model(), INTRINSICS[None]
+    for truncation, reaches in ((None, 5), (1, 1), (2, 1), (3, 2), (10, 5)):
+        frames = images(1, 5).requires_grad_()
+        out, _ = net(frames, cameras, truncation=truncation)
+        out.calibration.extrinsics.pitch[:, -1].sum().backward()
+        moved = frames.grad.flatten(2).abs().sum(-1)[0] > 0
+        assert moved.tolist() == [False] * (5 - reaches) + [True] * reaches
+    _, state = net(images(1).requires_grad_(), cameras)
+    out, _ = net(images(1), cameras, state, truncation=1)
+    assert state[0].requires_grad
+    plain = out.calibration.extrinsics.pitch
+    assert torch.autograd.grad(plain.sum(), net.segmenter.gain)[0] != 0  # of this frame
+
+
+@pytest.mark.parametrize("stages", [["segmenter"], ["extractor"], ["calibrator"], list(STAGES)])
+def test_frozen_stages_do_not_learn(stages):
+    net, frames = model(frozen=stages), images(1, 2).requires_grad_()
+    assert net.train().warp.training != ("warp" in stages)
+    assert all(part.training != (name in stages) for name, part in net.named_children())
+    out, _ = net(frames, INTRINSICS[None])
+    free, _ = model()(frames, INTRINSICS[None])
+    assert torch.equal(out.bev, free.bev)
+    assert not out.calibration.extrinsics.pitch.requires_grad
+    assert out.bev.requires_grad == ("warp" not in stages)
+    if "warp" not in stages:
+        out.bev.sum().backward()
+        assert frames.grad.abs().sum() > 0  # through the resampling
+        assert net.segmenter.gain.grad is None
+    if "segmenter" not in stages:
+        out.logits.sum().backward()
+        assert net.segmenter.gain.grad != 0
+
+
+def test_the_view_can_be_left_out():
+    net, frames = model(), images(2, 2)
+    without, _ = net(frames, INTRINSICS.expand(2, 3, 3), bev=False)
+    whole, _ = net(frames, INTRINSICS.expand(2, 3, 3))
+    assert without.bev is None
+    assert without.valid is None
+    assert torch.equal(without.bev_from_image, whole.bev_from_image)
+    assert torch.equal(without.calibration.extrinsics.pitch, whole.calibration.extrinsics.pitch)
+
+
+def test_arguments_of_training_are_checked():
+    with pytest.raises(ValueError, match=r"frozen: expected some of segmenter, .* got head, neck"):
+        model(frozen=["head", "neck", "warp"])
+    with pytest.raises(ValueError, match="truncation: expected 1 frame or more, or None, got 0"):
+        model()(images(1), INTRINSICS[None], truncation=0)
+    for bad in (torch.zeros(2), torch.zeros(3, dtype=torch.bool), torch.zeros(2, 2, dtype=torch.bool)):
+        with pytest.raises(ValueError, match=r"reset: expected bool \(2,\) or \(2, 3\), got"):
+            model()(images(2, 3), INTRINSICS.expand(2, 3, 3), reset=bad)
+    with pytest.raises(TypeError, match=r"reset: expected a torch\.Tensor, got bool"):
+        model()(images(1), INTRINSICS[None], reset=True)
