@@ -58,7 +58,7 @@ class LineConfig:
     min_vertices: int = 8
     sigma_floor: float = 0.004
     sigma_scale: float = 1.0
-    least_weight: float = 0.15
+    least_weight: float = 0.2
     correlation: float = 0.0
 
     def __post_init__(self) -> None:
