@@ -16,9 +16,10 @@ from lanebev.geometry.road import (
 from lanebev.io.state import load_state, save_state
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
+from lanebev.observation.segments import LaneSegments
 from lanebev.observation.vertices import LineConfig
 from lanebev.pipeline import LaneBEV, LaneBEVOutput
-from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
+from lanebev.types import Calibration, Extrinsics, Status
 from lanebev.view.canonical import CanonicalView
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.paint import ImageFromBEV

@@ -13,9 +13,10 @@ from torch import Tensor, nn
 from lanebev.batch import select_rows
 from lanebev.geometry.lens import check_intrinsics
 from lanebev.geometry.precision import autocast_off, common_dtype
+from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.lines import LineExtractor
-from lanebev.observation.pairing import BoundaryVertices, segments_from_vertices
-from lanebev.types import Calibration, LaneSegments, check_tensor, register_pytree
+from lanebev.observation.segments import LaneSegments, segments_from_vertices
+from lanebev.types import Calibration, check_tensor, register_pytree
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
 
@@ -48,9 +49,8 @@ class LaneBEV(nn.Module):
 
     Args:
         segmenter: image (B, 3, h, w) in [0, 1] to logits (B, 1 + L, h', w').
-        extractor: its ``vertices`` takes logits, the image's (H, W) and the network input's (h, w) to
-            :class:`~lanebev.observation.pairing.BoundaryVertices` in the image's pixels, as those of a
-            :class:`LineExtractor` do.
+        extractor: a :class:`LineExtractor`, or another module whose ``vertices`` takes the same logits, (H, W)
+            of the image and (h, w) of the network's input to vertices in the image's pixels.
         calibrator: e.g. :class:`lanebev.JointCalibrator`.
         warp: default :class:`BEVWarp` on the default grid.
         network_width: px, the image is resized to this width, its aspect kept to the nearest multiple of 32,

@@ -58,63 +58,6 @@ class Status(IntEnum):
 
 
 @register_pytree
-class LaneSegments(NamedTuple):
-    """Line segments on lane boundaries, padded to N per image.
-
-    Attributes:
-        endpoints: (B, N, 2, 2) px, undistorted image coordinates, ``[segment, end, (x, y)]``.
-        boundary: (B, N) int64, index of the semantic lane boundary, left to right, 0..L-1.
-        weight: (B, N) in [0, 1]; 0 is padding or "not seen".
-        sigma: (B, N) px, standard deviation of an end point's position across the line.
-    """
-
-    endpoints: Tensor
-    boundary: Tensor
-    weight: Tensor
-    sigma: Tensor
-
-    def check(self, num_boundaries: int = NUM_BOUNDARIES) -> LaneSegments:
-        """Check what calibrators leave unchecked, since it would wait for the device: the numbers.
-
-        To a calibrator a segment that cannot be used is one that is not there. That is right for a detector's
-        bad frame and hides a mistake of the code that makes segments: check its first ones.
-
-        Args:
-            num_boundaries: L.
-
-        Returns:
-            the segments themselves.
-
-        Raises:
-            TypeError: a part is no tensor.
-            ValueError: a part has another shape or dtype, or a segment that is there has a boundary index
-                outside 0..L-1, a weight outside 0..1, an end point that is not finite or a sigma that is
-                not positive.
-        """
-        for name, part in self._asdict().items():
-            check_tensor(f"segments.{name}", part)
-        rows = self.weight.shape
-        shapes = {"endpoints": (*rows, 2, 2), "boundary": rows, "sigma": rows}
-        for name, shape in shapes.items():
-            if getattr(self, name).shape != shape:
-                got = tuple(getattr(self, name).shape)
-                raise ValueError(f"segments.{name}: expected {tuple(shape)}, got {got}")
-        if self.boundary.dtype != torch.int64:
-            raise ValueError(f"segments.boundary: expected int64 indices, got {self.boundary.dtype}")
-        seen, last = self.weight != 0, num_boundaries - 1
-        for name, expected, good in (
-            ("weight", "0 to 1", (self.weight >= 0) & (self.weight <= 1)),
-            ("boundary", f"0 to {last}", (self.boundary >= 0) & (self.boundary <= last)),
-            ("endpoints", "finite px", self.endpoints.isfinite().flatten(2).all(-1)),
-            ("sigma", "positive finite px", (self.sigma > 0) & self.sigma.isfinite()),
-        ):
-            if bool((seen & ~good).any()):
-                got = getattr(self, name)[seen & ~good][0].tolist()
-                raise ValueError(f"segments.{name}: expected {expected}, got {got}")
-        return self
-
-
-@register_pytree
 class Extrinsics(NamedTuple):
     """Camera pose over the road, each (B,): rad, rad, rad, m; always in this order.
 
@@ -126,6 +69,13 @@ class Extrinsics(NamedTuple):
     yaw: Tensor
     roll: Tensor
     height: Tensor
+
+    @classmethod
+    def from_values(
+        cls, pitch: float, yaw: float, roll: float, height: float, dtype: torch.dtype = torch.float64
+    ) -> Extrinsics:
+        """Return extrinsics of batch size 1 from plain numbers in rad and m."""
+        return cls(*(torch.full((1,), value, dtype=dtype) for value in (pitch, yaw, roll, height)))
 
     def stack(self) -> Tensor:
         """(B, 4) tensor of (pitch, yaw, roll, height)."""

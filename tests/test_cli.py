@@ -20,14 +20,13 @@ import torch
 import yaml
 from PIL import Image
 
-from lanebev import Camera, JointCalibrator, image_from_road_points
+from lanebev import Camera, Extrinsics, JointCalibrator, image_from_road_points
 from lanebev.app.run import RunConfig
 from lanebev.cli import main
 from lanebev.estimation.mount import MountReason
 from lanebev.io.results import CSV_COLUMNS, ExtrinsicsRow, write_extrinsics
 from lanebev.io.state import load_state
 from lanebev.io.video import VideoWriter, open_source
-from lanebev.report.measure import pose
 from tools import pseudo_ground_truth
 
 HEIGHT, WIDTH, FRAMES = 240, 416, 6
@@ -43,7 +42,7 @@ def _lane_lines(names):
     lanes = []
     for offset in OFFSETS:
         road = torch.stack([torch.full_like(z, offset), z], dim=-1)[None]
-        pixels = image_from_road_points(road, CAMERA.intrinsics[None], pose(*POSE, CAMERA.intrinsics))[0][0]
+        pixels = image_from_road_points(road, CAMERA.intrinsics[None], Extrinsics.from_values(*POSE))[0][0]
         x, y = pixels.flip(0).numpy().T
         on_rows = np.interp(ROWS, y, x, left=-2, right=-2)
         lanes.append([round(v, 2) if 0 <= v < WIDTH else -2 for v in on_rows])
@@ -151,7 +150,7 @@ def test_pseudo_ground_truth_compares_the_same_frames(data, tmp_path, capsys, mo
     (tmp_path / "cul").mkdir()
     z = torch.logspace(0.8, 2, 40, dtype=torch.float64)
     for name, height in zip(names, (1.2, 1.4, 1.6), strict=True):
-        at = pose(POSE[0], POSE[1], POSE[2], height, CAMERA.intrinsics)
+        at = Extrinsics.from_values(POSE[0], POSE[1], POSE[2], height)
         lanes = []
         for offset in (-5.55, -1.85, 1.85, 5.55):
             road = torch.stack([torch.full_like(z, offset), z], dim=-1)[None]

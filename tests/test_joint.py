@@ -36,9 +36,10 @@ from lanebev.estimation.joint.road import come_nearer, straight_or_bend, turn_al
 from lanebev.estimation.joint.single_frame import FramePrior
 from lanebev.estimation.joint.state import JointConfig, Reason, begin
 from lanebev.estimation.joint.update import iterate
+from lanebev.observation.segments import LaneSegments
 from lanebev.testing.scenarios import CAMERA, FPS, PLACES, WIDTH, moments
 from lanebev.testing.scenarios import observe as see
-from lanebev.types import LaneSegments, Status
+from lanebev.types import Status
 
 torch.set_num_threads(1)
 DOUBLE = torch.float64

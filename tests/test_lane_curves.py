@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from lanebev import Calibration, Camera, LaneSegments, Status, image_from_road_points
+from lanebev import Calibration, Camera, Extrinsics, LaneSegments, Status, image_from_road_points
 from lanebev.observation.polylines import image_rows
 from lanebev.report.lane_curves import lane_curves
-from lanebev.report.measure import pose
 
 DISTORTION = (-0.2, 0.05, 0.0, 0.0, 0.0)
 CAMERA = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720, distortion=DISTORTION)
-POSE = pose(0.05, -0.02, 0.03, 1.6, CAMERA.intrinsics)
+POSE = Extrinsics.from_values(0.05, -0.02, 0.03, 1.6)
 PLACES = (-9.35, -5.65, -1.95, 1.75, 5.45, 9.15)
 CURVATURE = 1 / 800
 

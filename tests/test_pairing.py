@@ -4,13 +4,8 @@ import pytest
 import torch
 
 from lanebev.geometry.lens import distort_points
-from lanebev.observation.pairing import (
-    BoundaryVertices,
-    line_directions,
-    move_to_front,
-    pair_vertices,
-    segments_from_vertices,
-)
+from lanebev.observation.boundary_vertices import BoundaryVertices, line_directions, move_to_front
+from lanebev.observation.segments import pair_vertices, segments_from_vertices
 
 K = torch.tensor([[1000.0, 0, 639.5], [0, 1000.0, 359.5], [0, 0, 1]], dtype=torch.float64)
 LENS = torch.tensor([[-0.25, 0.04, 1e-4, -1e-4, 0.0]], dtype=torch.float64)

@@ -19,7 +19,7 @@ from lanebev import (
     TwoStageCalibrator,
 )
 from lanebev.geometry.lens import distort_points
-from lanebev.observation.pairing import BoundaryVertices
+from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.pipeline import STAGES
 from lanebev.testing.segments import INTRINSICS as K

@@ -6,21 +6,19 @@ import numpy as np
 import pytest
 import torch
 
-from lanebev import Camera
+from lanebev import Camera, LaneSegments
 from lanebev.io.lanes import read_lanes, tusimple_line
 from lanebev.observation.boundary_order import boundary_indices
-from lanebev.observation.pairing import BoundaryVertices
+from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.polylines import (
     LINE_SIGMA,
     VERTICES_PER_LINE,
     LaneLine,
-    camera_segments,
     image_rows,
     rows_from_vertices,
-    segments_from_lines,
-    segments_from_polylines,
     vertices_from_lines,
 )
+from lanebev.observation.segments import camera_segments, segments_from_lines
 
 CAMERA = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720)
 DISTORTED = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720, [-0.25, 0.04, 1e-4, -1e-4, 0])
@@ -67,7 +65,7 @@ def test_boundary_index_skips_a_missed_line_and_merges_a_double():
 def test_segments_lie_on_the_lines_of_an_ideal_pinhole():
     offsets = [-5.4, -1.8, 1.8, 5.4]
     lines = [DISTORTED.distort_points(torch.from_numpy(line)).numpy() for line in _fan(offsets)]
-    segments = segments_from_polylines(lines, DISTORTED)
+    segments = LaneSegments.from_polylines(lines, DISTORTED)
     assert segments.endpoints.shape == (1, 180, 2, 2)
     seen = segments.weight[0] > 0
     for boundary, offset in zip((1, 2, 3, 4), offsets, strict=True):
@@ -80,19 +78,19 @@ def test_segments_lie_on_the_lines_of_an_ideal_pinhole():
 
 def test_polylines_by_boundary_are_taken_at_their_word():
     left, right = _fan([-1.8, 1.8])
-    named = segments_from_polylines({1: left, 4: right}, CAMERA, sigma=0.7)
+    named = LaneSegments.from_polylines({1: left, 4: right}, CAMERA, sigma=0.7)
     assert set(named.boundary[named.weight > 0].tolist()) == {1, 4}
     assert named.sigma[named.weight > 0].unique().tolist() == pytest.approx([0.7])
-    tensors = segments_from_polylines([torch.from_numpy(left).float(), torch.from_numpy(right)], CAMERA)
+    tensors = LaneSegments.from_polylines([torch.from_numpy(left).float(), torch.from_numpy(right)], CAMERA)
     assert set(tensors.boundary[tensors.weight > 0].tolist()) == {2, 3}
-    assert segments_from_polylines([], CAMERA).weight.sum() == 0
+    assert LaneSegments.from_polylines([], CAMERA).weight.sum() == 0
 
 
 def test_a_dense_polyline_says_no_more_than_one_on_rows():
     """Points a pixel apart err alike; the pose would be ten times too sure of itself."""
     dense = np.stack([np.linspace(640, 300, 1000), np.linspace(330, 710, 1000)], axis=-1)
     sparse = dense[[0, 400, -1]]
-    one, other = (segments_from_polylines({2: line}, CAMERA) for line in (dense, sparse))
+    one, other = (LaneSegments.from_polylines({2: line}, CAMERA) for line in (dense, sparse))
     torch.testing.assert_close(one.endpoints, other.endpoints)
     assert (one.weight > 0).sum() == 19  # of 39 rows from 330 to 710 the middle one is left out
 
@@ -107,7 +105,7 @@ def test_a_dense_polyline_says_no_more_than_one_on_rows():
 )
 def test_polylines_are_checked(polylines, message):
     with pytest.raises(ValueError, match=message):
-        segments_from_polylines(polylines, CAMERA)
+        LaneSegments.from_polylines(polylines, CAMERA)
 
 
 def test_gaps_stay_gaps():

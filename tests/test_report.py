@@ -9,14 +9,14 @@ import torch
 
 from lanebev import BEVGrid, Calibration, Camera, Extrinsics, LaneSegments, Status, image_from_road_points
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.measure import measure_boundaries, pose, spread
+from lanebev.report.measure import measure_boundaries, spread
 from lanebev.report.overlay import BOUNDARY_COLOURS, PANEL_HEIGHT, Panel, draw_frame
 from lanebev.report.page import Report, write_report
 from lanebev.report.plots import plot_estimates, plot_widths, width_deviation
 
 CAMERA = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720)
 INTRINSICS = CAMERA.intrinsics[None]
-POSE = pose(0.03, -0.02, 0.01, 1.4, INTRINSICS)
+POSE = Extrinsics.from_values(0.03, -0.02, 0.01, 1.4)
 OFFSETS = {1: -5.3, 2: -1.7, 3: 2.0, 4: 5.7}  # lanes of 3.6, 3.7 and 3.7 m
 
 
@@ -168,7 +168,3 @@ def test_page_of_nothing(tmp_path):
     nothing = np.full((1, 5), np.nan)
     write_report(tmp_path / "r.html", Report("x", _rows(1, "UNINITIALISED"), nothing, nothing, 3.7, {}))
     assert "No frame was calibrated" in (tmp_path / "r.html").read_text()
-
-
-def test_rows_of_extrinsics_type():
-    assert isinstance(pose(0.1, 0.2, 0.3, 1.5, INTRINSICS), Extrinsics)

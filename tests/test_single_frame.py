@@ -19,8 +19,9 @@ from lanebev.estimation.joint.measurement import (
 )
 from lanebev.estimation.joint.single_frame import FramePrior, fit_single_frame
 from lanebev.geometry.road import image_from_road_points
+from lanebev.observation.segments import LaneSegments
 from lanebev.testing.segments import noisy_segments, project_boundaries
-from lanebev.types import Extrinsics, LaneSegments
+from lanebev.types import Extrinsics
 
 torch.set_num_threads(1)
 DOUBLE = torch.float64

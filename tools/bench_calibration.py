@@ -29,9 +29,10 @@ from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
+from lanebev.observation.segments import LaneSegments
 from lanebev.testing.evaluation import NAMES, UNITS, WARM_UP, rms, summarise, track
 from lanebev.testing.scenarios import CAMERA, FPS, SCENARIOS, WIDTH, moments, observe
-from lanebev.types import LaneSegments, Status
+from lanebev.types import Status
 from tools.textbook_ekf import TextbookEKF
 from train.commands import one_line_errors
 

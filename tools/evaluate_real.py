@@ -23,10 +23,9 @@ from rich.console import Console
 from rich.table import Table
 
 import lanebev
-from lanebev import BEVGrid, BEVWarp, LaneSegments
+from lanebev import BEVGrid, BEVWarp, Extrinsics, LaneSegments
 from lanebev.app.run import bird_view, calibrate_still, make_calibrator
 from lanebev.io.video import open_source
-from lanebev.report.measure import pose
 from lanebev.report.overlay import Panel, draw_frame
 from tools.real_figures import (
     Figure,
@@ -106,7 +105,7 @@ def write_sheet(path: Path, data: Path, calibrator: Any) -> None:
     """Input, view before and view after of a dozen labelled images, two a row."""
     images, segments = tusimple_segments(data)
     camera, warp = tusimple_camera(), BEVWarp(BEVGrid())
-    level = pose(0.0, 0.0, 0.0, 1.5, camera.intrinsics)
+    level = Extrinsics.from_values(0.0, 0.0, 0.0, 1.5)
     pictures = []
     for i in (*SHEET, 87):
         one = LaneSegments(*(part[i : i + 1] for part in segments))

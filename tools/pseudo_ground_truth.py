@@ -29,7 +29,7 @@ from lanebev.geometry.road import great_circle_normals, segment_rays
 from lanebev.geometry.rotation import pitch_yaw_from_vanishing_dir
 from lanebev.io.lanes import FrameLines, match_frames, read_lanes
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
-from lanebev.observation.polylines import segments_from_lines
+from lanebev.observation.segments import segments_from_lines
 from lanebev.types import NUM_BOUNDARIES
 from train.commands import one_line_errors
 

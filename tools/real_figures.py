@@ -16,7 +16,7 @@ from lanebev.app.observers import NetworkObserver
 from lanebev.app.run import calibrate_still
 from lanebev.io.lanes import match_frames, read_lanes
 from lanebev.io.video import open_source
-from lanebev.observation.polylines import camera_segments, segments_from_lines
+from lanebev.observation.segments import camera_segments, segments_from_lines
 from lanebev.report.lane_curves import lane_curves
 from lanebev.report.measure import believed, measure_boundaries, spread
 from lanebev.report.plots import width_deviation

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from lanebev.estimation.joint.measurement import NUM_PARAMS, boundary_places, boundary_residuals, observe
 from lanebev.estimation.kalman import constant_velocity
-from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments, Status
+from lanebev.observation.segments import LaneSegments
+from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, Status
 
 _SIZE = 5  # pitch, yaw, roll, height, offset
 _DENSITY = (0.08, 0.08, 0.08, 0.15, 0.2)  # of the accelerations, unit²/s³: those of JointCalibrator

@@ -11,9 +11,10 @@ from torch import Tensor
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter
+from lanebev.observation.segments import LaneSegments
 from lanebev.pipeline import LaneBEV
 from lanebev.render import Drive
-from lanebev.types import NUM_BOUNDARIES, LaneSegments, Status
+from lanebev.types import NUM_BOUNDARIES, Status
 
 WARM_UP = 10  # frames
 

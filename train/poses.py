@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from lanebev.estimation.joint.single_frame import SingleFrameFit, fit_single_frame
 from lanebev.geometry.precision import cast_floating, widest_dtype
 from lanebev.observation.lines import LineExtractor
-from lanebev.observation.pairing import segments_from_vertices
+from lanebev.observation.segments import segments_from_vertices
 from train.data import Batch, LiveFrames, PoolFrames, RenderedRoads, Seed, run_position
 from train.labels import LabelledImage, ViewConfig, full_view
 from train.pool import Pose

@@ -30,7 +30,8 @@ from lanebev.estimation.joint.boundary_curves import Boundaries, boundary_polyli
 from lanebev.io.lanes import read_lanes
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
 from lanebev.io.video import open_source
-from lanebev.observation.polylines import image_rows, segments_from_lines
+from lanebev.observation.polylines import image_rows
+from lanebev.observation.segments import segments_from_lines
 from lanebev.types import Extrinsics
 from train.commands import one_line_errors
 

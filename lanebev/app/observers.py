@@ -11,7 +11,7 @@ from lanebev.camera.model import Camera
 from lanebev.io.lane_size import size_remark
 from lanebev.io.lanes import FrameLines, match_frames
 from lanebev.io.video import Frame, FrameSource
-from lanebev.observation.pairing import BoundaryVertices
+from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.polylines import vertices_from_lines
 from lanebev.pipeline import LaneBEV
 

@@ -19,12 +19,13 @@ from lanebev.estimation.joint.state import Reason
 from lanebev.io.lanes import tusimple_line
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video import Frame, VideoWriter, write_png
-from lanebev.observation.pairing import BoundaryVertices
+from lanebev.observation.boundary_vertices import BoundaryVertices
+from lanebev.observation.segments import LaneSegments
 from lanebev.report.lane_curves import lane_curves
 from lanebev.report.measure import believed, measure_boundaries
 from lanebev.report.overlay import Panel, Picture, draw_frame
 from lanebev.report.page import Report, summary_facts, write_report
-from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, LaneSegments
+from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics
 from lanebev.view.grid import BEVGrid
 
 REPORT_STILLS = 6

@@ -34,12 +34,11 @@ from lanebev.io.lanes import lane_files, read_lanes
 from lanebev.io.results import ExtrinsicsRow, OutputFolder, check_inputs_stay
 from lanebev.io.state import load_state, save_state
 from lanebev.io.video import Frame, FrameSource, image_size, open_source
-from lanebev.observation.polylines import camera_segments
+from lanebev.observation.segments import LaneSegments, camera_segments
 from lanebev.pipeline import LaneBEV
-from lanebev.report.measure import pose
 from lanebev.report.overlay import Picture
 from lanebev.report.page import Report
-from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
+from lanebev.types import Calibration, Extrinsics, Status
 from lanebev.view.grid import BEVGrid
 from lanebev.view.warp import BEVWarp
 
@@ -337,7 +336,7 @@ def pose_before(
 ) -> Extrinsics | None:
     """Pose of the view before: level for images on their own, in a drive the first that was tracked."""
     if alone:
-        return pose(0.0, 0.0, 0.0, _NOMINAL_HEIGHT, camera.intrinsics)
+        return Extrinsics.from_values(0.0, 0.0, 0.0, _NOMINAL_HEIGHT)
     if before is None and int(now.status[0]) == Status.TRACKING:
         return now.extrinsics
     return before

@@ -16,7 +16,8 @@ from lanebev.estimation.checks import (
     padded,
 )
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
-from lanebev.types import Calibration, LaneSegments, TensorTuple, map_tensors
+from lanebev.observation.segments import LaneSegments
+from lanebev.types import Calibration, TensorTuple, map_tensors
 
 
 class CalibratorState(TensorTuple, Protocol):

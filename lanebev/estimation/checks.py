@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from lanebev.geometry.lens import check_intrinsics, placeholder_intrinsics, usable_cameras
-from lanebev.types import LaneSegments, Status, TensorTuple, check_tensor
+from lanebev.observation.segments import LaneSegments
+from lanebev.types import Status, TensorTuple, check_tensor
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
 _MIN_SIGMA = 1e-3  # px; nothing is known better

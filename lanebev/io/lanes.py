@@ -26,7 +26,7 @@ from lanebev.io.openlane import (
     image_from_camera_points,
 )
 from lanebev.numbers import finite_numbers, numbers_or_gaps, read_text, shown
-from lanebev.observation.pairing import BoundaryVertices
+from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.polylines import LaneLine
 from lanebev.types import NUM_BOUNDARIES
 

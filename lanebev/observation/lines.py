@@ -6,10 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.geometry.precision import full_precision
-from lanebev.observation.pairing import BoundaryVertices, line_directions, move_to_front, pair_vertices
+from lanebev.observation.boundary_vertices import BoundaryVertices, line_directions, move_to_front
 from lanebev.observation.segmenter import SegmenterConfig
+from lanebev.observation.segments import LaneSegments, pair_vertices
 from lanebev.observation.vertices import LineConfig, representative_vertices, scan_vertices
-from lanebev.types import LaneSegments, check_tensor
+from lanebev.types import check_tensor
 
 NETWORK_CORRELATION = 10.0
 """``LineConfig.correlation`` of a network, px: how far along a line its errors are one error."""
@@ -59,7 +60,7 @@ class LineExtractor(nn.Module):
     def vertices(
         self, logits: Tensor, image_size: tuple[int, int], network_size: tuple[int, int] | None = None
     ) -> BoundaryVertices:
-        """Extract vertices, which :func:`~lanebev.observation.pairing.segments_from_vertices` pairs.
+        """Extract vertices, which :func:`~lanebev.observation.segments.segments_from_vertices` pairs.
 
         Args:
             logits: (B, 1+L, h, w), background first; of half precision they are raised to float32.

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from lanebev.camera.model import Camera
 from lanebev.observation.boundary_order import boundary_indices
-from lanebev.observation.pairing import BoundaryVertices, segments_from_vertices
-from lanebev.types import NUM_BOUNDARIES, LaneSegments
+from lanebev.observation.boundary_vertices import BoundaryVertices
+from lanebev.types import NUM_BOUNDARIES
 
 ROW_STEP = 10
 """px between the rows on which a polyline is sampled: neighbours on one row err alike, and say so once."""
@@ -90,28 +90,12 @@ def vertices_from_lines(
     return BoundaryVertices._make([*parts, torch.arange(num_boundaries)[None]])
 
 
-def camera_segments(vertices: BoundaryVertices, camera: Camera) -> LaneSegments:
-    """Pair the vertices of B images that one camera took, see :func:`segments_from_vertices`."""
-    rows = vertices.weight.shape[0]
-    intrinsics, distortion = camera.intrinsics.expand(rows, 3, 3), camera.distortion.expand(rows, -1)
-    return segments_from_vertices(vertices, intrinsics, distortion, camera.model)
-
-
-def segments_from_lines(
-    frames: Sequence[Sequence[LaneLine]], camera: Camera, num_boundaries: int = NUM_BOUNDARIES
-) -> LaneSegments:
-    """Convert the lines of B frames to segments, each frame a row of the batch."""
-    parts = zip(*(vertices_from_lines(lines, camera, num_boundaries) for lines in frames), strict=True)
-    return camera_segments(BoundaryVertices._make(map(torch.cat, parts)), camera)
-
-
-def segments_from_polylines(
+def lines_from_polylines(
     polylines: Sequence[ArrayLike | Tensor] | Mapping[int, ArrayLike | Tensor],
-    camera: Camera,
     sigma: float = LINE_SIGMA,
     num_boundaries: int = NUM_BOUNDARIES,
-) -> LaneSegments:
-    """Convert one frame's polylines, see :meth:`lanebev.LaneSegments.from_polylines`."""
+) -> list[LaneLine]:
+    """Check one frame's polylines, see :meth:`lanebev.LaneSegments.from_polylines`."""
     named = isinstance(polylines, Mapping)
     lines = []
     for key, given in polylines.items() if isinstance(polylines, Mapping) else enumerate(polylines):
@@ -121,7 +105,7 @@ def segments_from_polylines(
         if named and not 0 <= key < num_boundaries:
             raise ValueError(f"polylines: expected boundaries 0 to {num_boundaries - 1}, got {key}")
         lines.append(LaneLine(points, key if named else None, np.full(len(points), float(sigma))))
-    return segments_from_lines([lines], camera, num_boundaries)
+    return lines
 
 
 def rows_from_vertices(vertices: BoundaryVertices, image_size: tuple[int, int]) -> BoundaryRows:

@@ -8,7 +8,8 @@ import torch
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.boundary_curves import boundary_polylines, fit_boundaries
 from lanebev.observation.polylines import BoundaryRows, image_rows
-from lanebev.types import NUM_BOUNDARIES, Calibration, LaneSegments, Status
+from lanebev.observation.segments import LaneSegments
+from lanebev.types import NUM_BOUNDARIES, Calibration, Status
 
 _LEAST_SUPPORT = 1.0  # sum of segments' weights that a boundary needs to be drawn
 _LEAST_REACH = 60.0  # m ahead that a boundary is drawn at least: all lead to one horizon

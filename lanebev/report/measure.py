@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lanebev.geometry.road import road_from_image_points
-from lanebev.types import NUM_BOUNDARIES, Extrinsics, LaneSegments
+from lanebev.observation.segments import LaneSegments
+from lanebev.types import NUM_BOUNDARIES, Extrinsics
 
 _MIN_VERTICES = 4
 _MIN_ROWS = 50.0  # px of the image that a boundary must cross: on fewer, its vertices err alike
@@ -96,11 +97,6 @@ def spread(values: NDArray[np.float64]) -> float:
     """Largest difference between a frame's directions, or widths, in their unit; NaN with fewer than two."""
     seen = values[np.isfinite(values)]
     return float(np.ptp(seen)) if len(seen) > 1 else float("nan")
-
-
-def pose(pitch: float, yaw: float, roll: float, height: float, like: Tensor) -> Extrinsics:
-    """Extrinsics of batch size 1 from plain numbers in rad and m."""
-    return Extrinsics(*(torch.full((1,), value, dtype=like.dtype) for value in (pitch, yaw, roll, height)))
 
 
 def _long_enough(

@@ -19,7 +19,8 @@ from torch import Tensor
 from lanebev.camera.model import Camera
 from lanebev.geometry.road import horizon_line, road_from_image_points
 from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
-from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
+from lanebev.observation.segments import LaneSegments
+from lanebev.types import Calibration, Extrinsics, Status
 from lanebev.view.grid import BEVGrid
 
 Picture = NDArray[np.uint8]

@@ -11,8 +11,9 @@ from torch import Tensor
 from lanebev.estimation.joint.measurement import NUM_PARAMS, boundary_residuals
 from lanebev.estimation.joint.measurement import observe as make_ready
 from lanebev.estimation.joint.single_frame import normal_equations
+from lanebev.observation.segments import LaneSegments
 from lanebev.testing.scenarios import CAMERA, FPS, PLACES, WIDTH, Moment, observe
-from lanebev.types import LaneSegments, Status
+from lanebev.types import Status
 
 NAMES = ("pitch_deg", "yaw_deg", "roll_deg", "height_cm")
 UNITS = torch.tensor([180 / math.pi] * 3 + [100.0], dtype=torch.float64)

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from lanebev.geometry.rotation import road_from_cam
-from lanebev.types import Extrinsics, LaneSegments
+from lanebev.observation.segments import LaneSegments
+from lanebev.types import Extrinsics
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from lanebev.geometry.road import image_from_road_points
-from lanebev.types import Extrinsics, LaneSegments
+from lanebev.observation.segments import LaneSegments
+from lanebev.types import Extrinsics
 
 FPS = 30.0
 WIDTH = 3.7

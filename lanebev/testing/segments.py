@@ -9,7 +9,8 @@ from torch import Tensor
 
 from lanebev.estimation.joint.measurement import boundary_places
 from lanebev.geometry.road import image_from_road_points
-from lanebev.types import Extrinsics, LaneSegments
+from lanebev.observation.segments import LaneSegments
+from lanebev.types import Extrinsics
 
 INTRINSICS = torch.tensor([[1000.0, 0.0, 640.0], [0.0, 1000.0, 360.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 """(3, 3) px, for an image of 1280 × 720."""

@@ -11,7 +11,8 @@ from lanebev.batch import masked_median
 from lanebev.estimation.joint.measurement import FARTHEST, observe
 from lanebev.geometry.road import image_from_road_points
 from lanebev.geometry.rotation import road_from_cam
-from lanebev.types import NUM_BOUNDARIES, Extrinsics, LaneSegments
+from lanebev.observation.segments import LaneSegments
+from lanebev.types import NUM_BOUNDARIES, Extrinsics
 
 _HEADING_STD = 0.02  # rad; real boundaries differ by about a degree in direction
 _CURVE_HEADING_STD = 0.005  # rad, likewise, while a curvature is fitted that would pass for it

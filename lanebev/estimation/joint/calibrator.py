@@ -38,7 +38,8 @@ from lanebev.estimation.joint.update import (
     iterate,
     surprise,
 )
-from lanebev.types import Calibration, LaneSegments, Status
+from lanebev.observation.segments import LaneSegments
+from lanebev.types import Calibration, Status
 
 _NO_BOUNDARY = 0.36  # m out of place, three sigmas of what lanes differ, from which a line bounds no lane
 

@@ -23,7 +23,7 @@ from lanebev.estimation.checks import as_lane_width, check_segments, mask_invali
 from lanebev.geometry.lens import cam_from_image
 from lanebev.geometry.road import rays_from_pixels
 from lanebev.geometry.rotation import road_from_cam
-from lanebev.types import LaneSegments
+from lanebev.observation.segments import LaneSegments
 
 PITCH, YAW, ROLL, HEIGHT, OFFSET, CURVATURE, CURVATURE_RATE = range(7)
 NUM_PARAMS = 7

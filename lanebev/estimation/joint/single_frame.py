@@ -28,7 +28,8 @@ from lanebev.estimation.joint.robust import inlier_weights, log_likelihood, lowe
 from lanebev.geometry.linalg import inverse_spd, solve_spd
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import angles_from_matrix, road_from_cam
-from lanebev.types import NUM_BOUNDARIES, Extrinsics, LaneSegments
+from lanebev.observation.segments import LaneSegments
+from lanebev.types import NUM_BOUNDARIES, Extrinsics
 
 _ANNEALING = (0.1, 0.06, 0.035, 0.02, 0.02)  # scales of the linear fits, of the focal length
 _OBSERVED = 0.2  # a parameter is observed if its sigma fell below this part of the prior's

@@ -13,7 +13,8 @@ from lanebev.estimation.two_stage.lane_width import boundary_angles
 from lanebev.estimation.two_stage.roll_height import track_roll_height
 from lanebev.estimation.two_stage.state import TwoStageConfig, TwoStageState
 from lanebev.geometry.road import segment_rays
-from lanebev.types import Calibration, Extrinsics, LaneSegments, Status
+from lanebev.observation.segments import LaneSegments
+from lanebev.types import Calibration, Extrinsics, Status
 
 
 class TwoStageCalibrator(Calibrator[TwoStageState]):

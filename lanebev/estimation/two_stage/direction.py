@@ -21,7 +21,7 @@ from lanebev.estimation.two_stage.vanishing import (
 )
 from lanebev.geometry.road import great_circle_normals
 from lanebev.geometry.rotation import pitch_yaw_from_vanishing_dir, vanishing_dir_from_pitch_yaw
-from lanebev.types import LaneSegments
+from lanebev.observation.segments import LaneSegments
 
 
 class DirectionStep(NamedTuple):

@@ -1,4 +1,4 @@
-"""Vertices on lane boundaries to line segments: one road from any detector to a calibrator."""
+"""Vertices on lane boundaries, before they are paired: what every detector gives."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from lanebev.geometry.lens import (
     undistorted_sigma,
     usable_cameras,
 )
-from lanebev.geometry.precision import full_precision
 from lanebev.observation.vertices import take
-from lanebev.types import LaneSegments, register_pytree
+from lanebev.types import register_pytree
 
 
 @register_pytree
@@ -35,36 +34,6 @@ class BoundaryVertices(NamedTuple):
     weight: Tensor
     sigma: Tensor
     boundary: Tensor
-
-
-@full_precision
-def segments_from_vertices(
-    vertices: BoundaryVertices,
-    intrinsics: Tensor,
-    distortion: Tensor | None = None,
-    model: str = "pinhole",
-) -> LaneSegments:
-    """Pair the vertices of each boundary to line segments in undistorted pixels.
-
-    Source: Sects. VI-A and VI-B, representative vertices sampled and paired. Deviation: not at random, which
-    uses some vertices often and many never. Of K vertices of a boundary, vertex i is paired with vertex
-    i + ceil(K/2): each is used once, so that the errors of all end points are independent, and every segment
-    is half as long as the boundary. Its weight is the smaller one, its variance the mean of its ends'.
-
-    Args:
-        vertices: (B, P, V).
-        intrinsics: (B, 3, 3) px.
-        distortion: (B, D) of the lens, or None for images without distortion.
-        model: "pinhole", "fisheye" or "omni".
-
-    Returns:
-        segments with N = P·(V // 2), in the widest dtype of the arguments. A vertex that the lens cannot
-        have imaged, and every vertex of a row whose lens is not usable, is left out.
-    """
-    vertices = move_to_front(vertices)
-    if distortion is not None and distortion.shape[-1] > 0:
-        vertices = move_to_front(undistort_vertices(vertices, intrinsics, distortion, model))
-    return pair_vertices(vertices)
 
 
 def move_to_front(vertices: BoundaryVertices) -> BoundaryVertices:
@@ -121,30 +90,3 @@ def undistort_vertices(
     sigma = undistorted_sigma(vertices.sigma.flatten(1), flat, along.flatten(1, 2), *lens)
     weight = torch.where(kept, vertices.weight, 0.0)
     return vertices._replace(points=points, weight=weight, sigma=sigma.unflatten(1, shape))
-
-
-def pair_vertices(vertices: BoundaryVertices) -> LaneSegments:
-    """Pair vertex i of K with vertex i + ceil(K/2), see :func:`segments_from_vertices`.
-
-    Args:
-        vertices: (B, P, V), those with a weight in front.
-
-    Returns:
-        segments with N = P·(V // 2), in the pixels of the vertices.
-    """
-    points, weight, sigma, boundary = vertices
-    batch, lines, most = weight.shape
-    count = (weight > 0).sum(-1, keepdim=True)  # (B, P, 1)
-    half = count // 2
-    first = torch.arange(most // 2, device=points.device).expand(batch, lines, -1)  # (B, P, V // 2)
-    second = (first + count - half).clamp(max=most - 1)
-    seen = first < half
-    ends = torch.stack([take(points, first), take(points, second)], dim=-2)  # (B, P, V // 2, 2, 2)
-    smaller = torch.minimum(weight.gather(-1, first), weight.gather(-1, second))
-    variance = 0.5 * (sigma.gather(-1, first).square() + sigma.gather(-1, second).square())
-    return LaneSegments(
-        endpoints=torch.where(seen[..., None, None], ends, 0.0).flatten(1, 2),
-        boundary=boundary.unsqueeze(-1).expand_as(first).flatten(1),
-        weight=torch.where(seen, smaller, 0.0).flatten(1),
-        sigma=torch.where(seen, variance, 1.0).sqrt().flatten(1),
-    )
