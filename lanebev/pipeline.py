@@ -49,8 +49,8 @@ class LaneBEV(nn.Module):
 
     Args:
         segmenter: image (B, 3, h, w) in [0, 1] to logits (B, 1 + L, h', w').
-        extractor: a :class:`LineExtractor`, or another module whose ``vertices`` takes the same logits, (H, W)
-            of the image and (h, w) of the network's input to vertices in the image's pixels.
+        extractor: a :class:`LineExtractor`, or another module with a method ``vertices`` that takes logits,
+            (H, W) of the image and (h, w) of the network's input, and returns vertices in the image's pixels.
         calibrator: e.g. :class:`lanebev.JointCalibrator`.
         warp: default :class:`BEVWarp` on the default grid.
         network_width: px, the image is resized to this width, its aspect kept to the nearest multiple of 32,
