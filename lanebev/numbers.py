@@ -16,7 +16,7 @@ _BYTE_ORDER_MARKS = {
 }
 _REPR = reprlib.Repr()
 _REPR.maxlist = _REPR.maxdict = _REPR.maxtuple = 4
-_REPR.maxlevel = 3
+_REPR.maxlevel, _REPR.maxstring = 3, 200
 
 
 def read_text(path: Path) -> str:

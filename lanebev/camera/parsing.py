@@ -59,14 +59,16 @@ class _TextLoader(yaml.SafeLoader):
 
     yaml_implicit_resolvers = {}  # noqa: RUF012 - so it is in the base class
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+    def construct_mapping(self, node: yaml.Node, deep: bool = False) -> dict[Any, Any]:
+        if not isinstance(node, yaml.MappingNode):
+            raise ValueError(f"expected keys and values at line {node.start_mark.line + 1}, got others")
         if not all(isinstance(key, yaml.ScalarNode) for key, _ in node.value):
             raise ValueError("expected plain keys, got a list or a mapping for one")
         _once((key.value, None) for key, _ in node.value)
         return {key.value: self.construct_object(value, deep=deep) for key, value in node.value}
 
 
-def _construct_mapping(loader: _TextLoader, node: yaml.MappingNode) -> dict[Any, Any]:
+def _construct_mapping(loader: _TextLoader, node: yaml.Node) -> dict[Any, Any]:
     return loader.construct_mapping(node, deep=True)
 
 

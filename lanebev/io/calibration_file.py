@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-import yaml
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from torch import Tensor
 
 from lanebev.camera.files import camera_info, dump_yaml
 from lanebev.camera.model import Camera
+from lanebev.camera.parsing import parse
 from lanebev.estimation.mount import MountCalibration, MountReason, MountStatus, describe_mount
 from lanebev.estimation.mount.results import AXES
 from lanebev.geometry.rotation import road_from_cam
-from lanebev.numbers import finite_numbers
+from lanebev.numbers import finite_numbers, read_text
 from lanebev.types import Extrinsics
 
 _USED_BY_AXIS = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
@@ -112,9 +112,9 @@ def read_mount(path: str | Path) -> MountPrior:
         ValueError: the file cannot be read, has no mount, or no calibrated axis.
     """
     try:
-        fields = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ValueError(f"mount file {path}: expected a readable calibration.yaml") from error
+        fields = parse(read_text(Path(path)))
+    except ValueError as error:
+        raise ValueError(f"mount file {path}: expected a readable calibration.yaml, got: {error}") from error
     mount = fields.get("mount") if isinstance(fields, dict) else None
     if not isinstance(mount, dict):
         raise ValueError(
@@ -132,8 +132,10 @@ def read_mount(path: str | Path) -> MountPrior:
                 raise ValueError(f"mount file {path}: {error}") from error
             pose[axis], std[axis] = scale * value, scale * abs(sigma)
     if not std.isfinite().any():
-        needs = mount.get("needs") or ["no axis is calibrated"]
-        raise ValueError(f"mount file {path}: expected a calibrated axis, got none: {needs[0]}")
+        needs = mount.get("needs")
+        why = needs[0] if isinstance(needs, list) and needs else None
+        why = " ".join(why.split())[:200] if isinstance(why, str) else "no axis is calibrated"
+        raise ValueError(f"mount file {path}: expected a calibrated axis, got none: {why}")
     return MountPrior(pose, std)
 
 

@@ -22,7 +22,8 @@ def open_video(source: str) -> av.container.InputContainer:
         ValueError: it does not open, or there is none.
     """
     try:
-        container = av.open(os.path.abspath(source))  # else what precedes a colon is taken for a protocol
+        # abspath: else what precedes a colon is taken for a protocol; titles may be in any encoding
+        container = av.open(os.path.abspath(source), metadata_errors="replace")
     except (av.error.FFmpegError, OSError) as error:
         reason = error.strerror or "unknown format"
         raise ValueError(f"video {source}: expected a video that opens, got: {reason}; is it cut?") from error

@@ -34,14 +34,16 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
         ValueError: the file is missing, cut or no image.
     """
     try:
-        with warnings.catch_warnings(), Image.open(path) as image:
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of odd EXIF; errors are errors
-            return np.asarray(_eight_bit(_upright(image)).convert("RGB"))
+            with Image.open(path) as image:
+                return np.asarray(_eight_bit(_upright(image)).convert("RGB"))
     except _UNREADABLE as error:
         if isinstance(error, UnidentifiedImageError):
             reason = "no image or one whose header is cut"
         else:
-            reason = (getattr(error, "strerror", None) or str(error)).splitlines()[0].lower()
+            reason = " ".join((getattr(error, "strerror", None) or str(error)).split()).lower()[:100]
+            reason = reason or type(error).__name__
         raise ValueError(f"image {path}: expected a whole image, got: {reason}") from error
 
 

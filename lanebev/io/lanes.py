@@ -32,7 +32,7 @@ from lanebev.types import NUM_BOUNDARIES
 
 _OPENLANE_CURBS = (20, 21)  # left and right kerb: no lane ends there, so no lane width holds
 _GAP = 2.5  # times the usual distance of rows: from there on a line is not seen in between
-_FARTHEST = 1e6  # px, of any coordinate
+_FARTHEST = 1e6  # px or m, of any coordinate
 _TUSIMPLE_ROWS = {56: range(160, 720, 10), 48: range(240, 720, 10)}  # of the benchmark's labels, by number
 
 
@@ -319,7 +319,8 @@ def _seen_lines(fields: dict[str, Any]) -> list[LaneLine]:
             raise ValueError(f"seen.sigma[{i}]: expected px above 0, got {shown(sigmas[i])}")
         if not ((weight > 0) & (weight <= 1)).all():
             raise ValueError(f"seen.weight[{i}]: expected 0 to 1, got {shown(weights[i])}")
-        lines.append(LaneLine(np.reshape(pairs, (-1, 2)), index, sigma, weight))
+        vertices = _pixels(f"seen.points[{i}]", np.reshape(pairs, (-1, 2)))
+        lines.append(LaneLine(vertices, index, _pixels(f"seen.sigma[{i}]", sigma), weight))
     return lines
 
 
@@ -380,8 +381,13 @@ def _with_gaps(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _pixels(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
     """The values, if they can be pixels."""
+    return _within(name, "pixels", values)
+
+
+def _within(name: str, unit: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The values, if none is larger than any of this unit."""
     if (np.abs(values) > _FARTHEST).any():  # NaN is not
-        raise ValueError(f"{name}: expected pixels, got {np.nanmax(np.abs(values)):g}")
+        raise ValueError(f"{name}: expected {unit}, got {np.nanmax(np.abs(values)):g}")
     return values
 
 
@@ -396,7 +402,7 @@ def _openlane_points(
     xyz = _field(lane, "xyz", list)
     rows_of_three = len(xyz) != 3 and all(isinstance(point, list) and len(point) == 3 for point in xyz)
     columns = [list(axis) for axis in zip(*xyz, strict=True)] if rows_of_three and xyz else xyz
-    points = _columns(f"{name}.xyz", columns or [[], [], []], 3).T
+    points = _within(f"{name}.xyz", "m", _columns(f"{name}.xyz", columns or [[], [], []], 3).T)
     if (visibility := lane.get("visibility")) is not None:
         seen = _columns(f"{name}.visibility", [visibility], 1)[0]
         if len(seen) != len(points):
@@ -429,7 +435,7 @@ def _square(fields: dict[str, Any], name: str, size: int) -> NDArray[np.float64]
     rows = _field(fields, name, list)
     if len(rows) != size or not all(isinstance(row, list) for row in rows):
         raise ValueError(f"{name}: expected {size} x {size} numbers, got {shown(rows)}")
-    return np.array([finite_numbers(name, row, size) for row in rows])
+    return _within(name, "numbers of a camera", np.array([finite_numbers(name, row, size) for row in rows]))
 
 
 def _is_openlane(first_line: str, text: str) -> bool:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from lanebev.numbers import shown
 from lanebev.types import Calibration, Status
 
 CSV_COLUMNS = (
@@ -107,10 +108,12 @@ def read_extrinsics(path: str | Path) -> list[ExtrinsicsRow]:
     try:
         with open(path, newline="", encoding="utf-8", errors="surrogateescape") as file:
             header, *rows = list(csv.reader(file)) or [[]]
-    except OSError as error:
-        raise ValueError(f"{path}: expected a readable extrinsics.csv, got: {error.strerror}") from error
+    except (OSError, csv.Error) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ValueError(f"{path}: expected a readable extrinsics.csv, got: {reason}") from error
     if tuple(header) not in (CSV_COLUMNS, CSV_COLUMNS[:-1]):
-        raise ValueError(f"{path}: expected the columns {','.join(CSV_COLUMNS)}, got {','.join(header)}")
+        expected, got = ",".join(CSV_COLUMNS), shown(",".join(header))
+        raise ValueError(f"{path}: expected the columns {expected}, got {got}")
     result = []
     for number, row in enumerate(rows, start=2):
         try:
@@ -118,7 +121,7 @@ def read_extrinsics(path: str | Path) -> list[ExtrinsicsRow]:
             result.append(ExtrinsicsRow(*typed))
         except ValueError as error:
             raise ValueError(
-                f"{path}, line {number}: expected {len(header)} values, got {','.join(row)}"
+                f"{path}, line {number}: expected {len(header)} values, got {shown(','.join(row))}"
             ) from error
     return result
 

@@ -24,6 +24,7 @@ _FORMAT = "lanebev.LaneSegmenter/1"
 _COMPACT_FORMAT = "lanebev.LaneSegmenter/2"  # some tensors are int8 and have a scale beside them
 _SCALE = ".scale"
 _LARGE = 2**20  # weights; larger ones are 8-bit numbers in a compact file
+_MOST = {"num_boundaries": 64, "base_width": 512, "decoder_width": 512, "context": 16}
 _FORMER_NAMES = {"noise_factor": "sigma_scale", "pose_factor": "pose_sigma_scale"}
 
 
@@ -39,9 +40,10 @@ def load_segmenter(path: str | Path | None = None) -> LaneSegmenter:
     path = SHIPPED if path is None else Path(path)
     metadata, tensors = _read(path)
     try:
-        segmenter = LaneSegmenter(segmenter_config(json.loads(metadata["config"])))
+        config = segmenter_config(json.loads(metadata["config"]))
+        segmenter = LaneSegmenter(config)
         segmenter.load_state_dict(tensors, strict=True)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (LookupError, TypeError, ValueError, RuntimeError, ArithmeticError, AttributeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"{path}: weights do not fit the network they describe: {reason}") from error
     return segmenter.eval()
@@ -136,4 +138,9 @@ def segmenter_config(values: Mapping[str, Any]) -> SegmenterConfig:
         _FORMER_NAMES.get(name, name): tuple(value) if isinstance(value, list) else value
         for name, value in values.items()
     }
-    return SegmenterConfig(**arguments)
+    config = SegmenterConfig(**arguments)
+    for name, most in _MOST.items():  # no memory for a network that no file holds
+        value = getattr(config, name)
+        if len(value) > most if isinstance(value, tuple) else value > most:
+            raise ValueError(f"{name}: expected {most} at most, got {value}")
+    return config

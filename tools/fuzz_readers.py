@@ -1,0 +1,400 @@
+"""Give every reader of files mutated inputs: each is a value or one ValueError of one line, and soon.
+
+    python -m tools.fuzz_readers [--count 20000] [--seed 0] [--readers camera.yaml …] [--keep DIR]
+
+Inputs are valid files of each kind with bytes, numbers, lines and pieces changed, moved, left out or taken
+from another kind. A traceback, a message of several lines and an input that takes longer than ``--limit``
+seconds are faults: each kind is printed once, and kept with ``--keep``. Exit status 1 if there is any.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import random
+import re
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+import yaml
+from PIL import Image
+from safetensors.torch import save
+
+from lanebev import Camera, Extrinsics
+from lanebev.io.calibration_file import read_mount
+from lanebev.io.images import read_image
+from lanebev.io.lanes import read_lanes
+from lanebev.io.results import read_extrinsics
+from lanebev.io.state import load_state, save_state
+from lanebev.io.video import open_source
+from lanebev.weights import load_segmenter, read_metadata
+
+NUMBERS = [b"0", b"-1", b"1e308", b"1e-308", b"nan", b".inf", b"0640", b"9" * 40, b"1e999", b"-0.0", b"null"]
+PIECES = [
+    b"",
+    b"\xef\xbb\xbf",
+    b"\x00",
+    b"\xff\xfe",
+    b"---\n",
+    b"{",
+    b"[",
+    b"]",
+    b'"',
+    b"&a [*a]",
+    b"!!int x",
+    b"\n",
+]
+LONGEST_MESSAGE = 500
+
+
+class Reader(NamedTuple):
+    """A kind of file.
+
+    Attributes:
+        read: a path, to a value or a ValueError.
+        suffix: of its files' names.
+        seeds: valid files.
+        share: of the inputs, relative to the others.
+    """
+
+    read: Callable[[Path], Any]
+    suffix: str
+    seeds: list[bytes]
+    share: int = 10
+
+
+def readers() -> dict[str, Reader]:
+    """Every kind of file that the package reads, with valid ones."""
+    return {
+        "camera.yaml": Reader(_read_cameras, ".yaml", _camera_yaml(), 30),
+        "camera.json": Reader(_read_cameras, ".json", _camera_json()),
+        "camera.xml": Reader(_read_cameras, ".xml", [_opencv(".xml")]),
+        "calib.txt": Reader(
+            _read_cameras, "calib.txt", [b"P2: 721.5377 0 609.5 44.8 0 721.5377 172.8 0.2 0 0 1 0\n"]
+        ),
+        "lanes.json": Reader(read_lanes, ".json", _tusimple(), 30),
+        "openlane.json": Reader(read_lanes, ".json", _openlane(), 20),
+        "culane": Reader(
+            read_lanes, ".lines.txt", [b"10 590 12.5 580 15 570 17 560\n500.25 590 510 580 520 570\n"], 20
+        ),
+        "calibration.yaml": Reader(read_mount, ".yaml", [_calibration()], 20),
+        "state": Reader(_read_state, ".safetensors", [_state()], 20),
+        "weights": Reader(_read_weights, ".safetensors", [_weights()]),
+        "extrinsics.csv": Reader(read_extrinsics, ".csv", [_extrinsics()]),
+        "image": Reader(read_image, ".png", _images()),
+        "video": Reader(_read_video, ".mp4", _videos(), 2),
+    }
+
+
+def _read_cameras(path: Path) -> None:
+    for rectified in (False, True):
+        try:
+            Camera.from_file(path, rectified=rectified)
+        except ValueError as error:
+            failed = error
+        else:
+            return
+    raise failed
+
+
+def _read_state(path: Path) -> None:
+    like = {"pose": Extrinsics(*torch.zeros(4, 1))}
+    for expected in (None, like):
+        if (loaded := load_state(path, expected)).problem is not None:
+            raise ValueError(loaded.problem)
+
+
+def _read_weights(path: Path) -> None:
+    read_metadata(path)
+    load_segmenter(path)
+
+
+def _read_video(path: Path) -> None:
+    for _ in open_source(str(path)):
+        pass
+
+
+def _camera_yaml() -> list[bytes]:
+    lens = Camera.from_parameters(812.5, 810, 641, 355, 1280, 720, [-0.31, 0.11, 0.0004, -0.0007, -0.017])
+    omni = Camera.from_parameters(812.5, 810, 641, 355, 1280, 720, [1.2, 0.1, 0.0, 0.0, 0.0], "omni")
+    message = {
+        "header": {"frame_id": "a"}, "height": 720, "width": 1280, "distortion_model": "plumb_bob",
+        "D": [0.0] * 5, "K": [500.0, 0, 640, 0, 500, 360, 0, 0, 1], "R": [1, 0, 0, 0, 1, 0, 0, 0, 1],
+        "P": [500.0, 0, 640, 0, 0, 500, 360, 0, 0, 0, 1, 0], "binning_x": 2, "binning_y": 1,
+        "roi": {"x_offset": 4, "y_offset": 2, "height": 700, "width": 1200, "do_rectify": False},
+    }  # fmt: skip
+    kalibr = {
+        "camera_model": "pinhole", "intrinsics": [500, 500, 320, 240], "distortion_model": "radtan",
+        "distortion_coeffs": [0.1, 0.0, 0.0, 0.0], "resolution": [640, 480],
+    }  # fmt: skip
+    short = b"fx: 500\nfy: 500\ncx: 320\ncy: 240\nwidth: 640\nheight: 480\ndistortion: [-0.1, 0, 0, 0]\n"
+    mei = (
+        b"%YAML:1.0\n---\nmodel_type: MEI\nimage_width: 640\nimage_height: 480\n"
+        b"mirror_parameters: {xi: 1.1}\n"
+        b"distortion_parameters: {k1: 0, k2: 0, p1: 0, p2: 0}\n"
+        b"projection_parameters: {gamma1: 700, gamma2: 700, u0: 320, v0: 240}\n"
+    )
+    dumped = [yaml.safe_dump(each).encode() for each in (message, {"cam0": kalibr}, kalibr)]
+    return [_written(lens), _written(omni), _opencv(".yml"), short, mei, *dumped]
+
+
+def _written(camera: Camera) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        camera.to_file(Path(folder) / "camera.yaml")
+        return (Path(folder) / "camera.yaml").read_bytes()
+
+
+def _opencv(suffix: str) -> bytes:
+    """A calibration as OpenCV writes it."""
+    storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    storage.write("camera_matrix", np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]))
+    storage.write("distortion_coefficients", np.array([-0.1, 0.02, 0.0, 0.0, 0.0]))
+    return str(storage.releaseAndGetString()).encode()
+
+
+def _camera_json() -> list[bytes]:
+    matrix = [[1266.4, 0, 816.3], [0, 1266.4, 491.5], [0, 0, 1]]
+    records: list[Any] = [{"camera_intrinsic": matrix}, [{"camera_intrinsic": matrix}], {"intrinsic": matrix}]
+    return [_opencv(".json"), *(json.dumps(each).encode() for each in records)]
+
+
+def _tusimple() -> list[bytes]:
+    frame = {"raw_file": "a/1.jpg", "h_samples": [500, 510, 520], "lanes": [[-2, 5, 6.5], [7, 8, None]]}
+    sure = {**frame, "raw_file": "a/2.jpg", "boundary": [2, 3], "sigma": [[-2, 1, 1], [1, 1, -2]]}
+    vertices = {"points": [[[5, 500], [6, 510.5]]], "sigma": [[1, 2]], "weight": [[1, 0.5]], "boundary": [2]}
+    seen = {**frame, "raw_file": "a/3.jpg", "seen": vertices, "pose_sigma_scale": 1.5}
+    return ["\n".join(json.dumps(each) for each in (frame, sure, seen)).encode()]
+
+
+def _openlane() -> list[bytes]:
+    flat = {"uv": [[1, 2, 3], [590, 580, 570]], "category": 1}
+    label = {"xyz": [[10, 20, 30], [1, 1, 1], [-1.5, -1.5, -1.5]], "visibility": [1, 0, 1]}
+    predicted = {"xyz": [[1.8, 10, 0], [1.8, 20, 0.1], [1.7, 30, 0], [1.7, 40, 0]], "category": 2}
+    fields = {
+        "file_path": "a/1.jpg",
+        "intrinsic": [[1000, 0, 640], [0, 1000, 360], [0, 0, 1]],
+        "extrinsic": [[1, 0, 0, 1.5], [0, 1, 0, 0], [0, 0, 1, 2.1], [0, 0, 0, 1]],
+        "lane_lines": [flat, label, predicted],
+    }
+    return [json.dumps(fields).encode(), json.dumps(fields, indent=1).encode()]
+
+
+def _calibration() -> bytes:
+    mount = {"valid": False, "pitch_deg": 1.0, "pitch_std_deg": 0.1, "height_m": 1.5, "height_std_m": 0.05}
+    return yaml.safe_dump({"image_width": 640, "mount": {**mount, "needs": ["yaw: needs 20 s"]}}).encode()
+
+
+def _state() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "state.safetensors"
+        save_state(path, {"pose": Extrinsics(*torch.rand(4, 1)), "camera": "pinhole 640x480", "time": 1.5})
+        return path.read_bytes()
+
+
+def _weights() -> bytes:
+    config = json.dumps({"base_width": 8, "decoder_width": 8, "image_size": [64, 64], "context": [1, 2]})
+    metadata = {"format": "lanebev.LaneSegmenter/1", "config": config, "seed": "1"}
+    return bytes(save({"a.weight": torch.rand(2, 2), "b": torch.zeros(1, dtype=torch.int64)}, metadata))
+
+
+def _extrinsics() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "extrinsics.csv"
+        from lanebev.io.results import ExtrinsicsRow, write_extrinsics
+
+        values: dict[str, Any] = dict.fromkeys(ExtrinsicsRow._fields, 0.5)
+        values |= {"frame": 0, "status": "TRACKING", "segments": 5, "image": "a,b.jpg"}
+        if "reasons" in values:
+            values["reasons"] = ""
+        write_extrinsics(path, [ExtrinsicsRow(**values)])
+        return path.read_bytes()
+
+
+def _images() -> list[bytes]:
+    pictures = []
+    for kind, mode in (
+        ("png", "RGB"),
+        ("jpeg", "RGB"),
+        ("png", "I;16"),
+        ("tiff", "RGB"),
+        ("bmp", "L"),
+        ("webp", "RGB"),
+    ):
+        with io.BytesIO() as file:
+            Image.new(mode, (16, 12), 40 if len(mode) != 3 else (40, 50, 60)).save(file, kind)
+            pictures.append(file.getvalue())
+    return pictures
+
+
+def _videos() -> list[bytes]:
+    from fractions import Fraction
+
+    from lanebev.io.video import VideoWriter
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "v.mp4"
+        with VideoWriter(path, Fraction(10)) as writer:
+            for i in range(6):
+                writer.write(np.full((16, 16, 3), 40 * i, np.uint8))
+        return [path.read_bytes()]
+
+
+def mutated(data: bytes, others: list[bytes], draw: random.Random) -> bytes:
+    """Return a file with one to four changes, by chance."""
+    for _ in range(draw.choice((1, 1, 2, 4))):
+        data = draw.choice(_MUTATIONS)(data, others, draw)[:200_000]
+    return data
+
+
+def _flip(data: bytes, _: list[bytes], draw: random.Random) -> bytes:
+    changed = bytearray(data or b" ")
+    for _i in range(draw.choice((1, 1, 8))):
+        changed[draw.randrange(len(changed))] = draw.randrange(256)
+    return bytes(changed)
+
+
+def _cut(data: bytes, _: list[bytes], draw: random.Random) -> bytes:
+    return data[: draw.randrange(len(data) + 1)]
+
+
+def _leave_out(data: bytes, _: list[bytes], draw: random.Random) -> bytes:
+    start, end = sorted(draw.randrange(len(data) + 1) for _i in range(2))
+    return data[:start] + data[end:]
+
+
+def _repeat(data: bytes, _: list[bytes], draw: random.Random) -> bytes:
+    start, end = sorted(draw.randrange(len(data) + 1) for _i in range(2))
+    return data[:end] + data[start:end] * draw.choice((1, 2, 30)) + data[end:]
+
+
+def _insert(data: bytes, _: list[bytes], draw: random.Random) -> bytes:
+    place = draw.randrange(len(data) + 1)
+    return data[:place] + draw.choice(PIECES) * draw.choice((1, 1, 1, 500)) + data[place:]
+
+
+def _change_number(data: bytes, _: list[bytes], draw: random.Random) -> bytes:
+    found = list(re.finditer(rb"-?\d[\d.e+-]*", data))
+    if not found:
+        return data
+    number = draw.choice(found)
+    return data[: number.start()] + draw.choice(NUMBERS) + data[number.end() :]
+
+
+def _change_text(data: bytes, _: list[bytes], draw: random.Random) -> bytes:
+    found = list(re.finditer(rb"[A-Za-z_]\w+", data))
+    if not found:
+        return data
+    word, other = draw.choice(found), draw.choice(found)
+    return data[: word.start()] + other[0] + data[word.end() :]
+
+
+def _mix(data: bytes, others: list[bytes], draw: random.Random) -> bytes:
+    other = draw.choice(others)
+    return data[: draw.randrange(len(data) + 1)] + other[draw.randrange(len(other) + 1) :]
+
+
+def _mix_lines(data: bytes, others: list[bytes], draw: random.Random) -> bytes:
+    lines = data.split(b"\n")
+    lines.insert(draw.randrange(len(lines) + 1), draw.choice(draw.choice(others).split(b"\n")))
+    if draw.random() < 0.5:
+        del lines[draw.randrange(len(lines))]
+    return b"\n".join(lines)
+
+
+_MUTATIONS: list[Callable[[bytes, list[bytes], random.Random], bytes]] = [
+    _flip, _cut, _leave_out, _repeat, _insert, _change_number, _change_number, _change_text, _mix, _mix_lines,
+]  # fmt: skip
+
+
+@contextmanager
+def _time_limit(seconds: float) -> Iterator[None]:
+    def stop(*_: object) -> None:
+        raise TimeoutError(f"more than {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def fault(reader: Reader, data: bytes, folder: Path, limit: float = 10.0) -> str:
+    """Read an input; return what is wrong with how that ended, empty if nothing is."""
+    path = folder / f"input{reader.suffix}"
+    path.write_bytes(data)
+    try:
+        with warnings.catch_warnings(), _time_limit(limit):
+            warnings.simplefilter("error", RuntimeWarning)  # of numbers that overflow
+            reader.read(path)
+    except ValueError as error:
+        text = str(error)
+        if isinstance(error, UnicodeError):
+            return "a UnicodeError, no ValueError of our own"
+        if not text or len(text.splitlines()) > 1 or "\n" in text:
+            return f"a message of {len(text.splitlines())} lines: {text[:200]!r}"
+        if len(text) > LONGEST_MESSAGE + len(str(path)):
+            return f"a message of {len(text)} characters: {text[:200]}…"
+        return ""
+    except Exception as error:
+        where = [line for line in traceback.extract_tb(error.__traceback__) if "lanebev" in line.filename]
+        place = f"{Path(where[-1].filename).name}:{where[-1].lineno}" if where else "?"
+        return f"{type(error).__name__} at {place}: {' '.join(str(error).split())[:200]}"
+    return ""
+
+
+def main() -> int:
+    """Run."""
+    known = readers()
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
+    parser.add_argument("--count", type=int, default=20_000, help="inputs in all (%(default)s)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--limit", type=float, default=10.0, help="s for one input (%(default)s)")
+    parser.add_argument(
+        "--readers", nargs="+", choices=known, default=list(known), metavar="NAME", help=", ".join(known)
+    )
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="where inputs with faults are kept")
+    args = parser.parse_args()
+    everything = [seed for reader in known.values() for seed in reader.seeds]
+    total = sum(known[name].share for name in args.readers)
+    faults: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as folder:
+        for name in args.readers:
+            reader, draw, slowest = known[name], random.Random(f"{args.seed} {name}"), 0.0
+            count = round(args.count * reader.share / total)
+            for _ in range(count):
+                data = mutated(draw.choice(reader.seeds), everything, draw)
+                begin = time.perf_counter()
+                found = fault(reader, data, Path(folder), args.limit)
+                slowest = max(slowest, time.perf_counter() - begin)
+                if found:
+                    kind = f"{name}: {found}"
+                    if not faults[kind]:
+                        print(kind, flush=True)
+                        if args.keep:
+                            args.keep.mkdir(parents=True, exist_ok=True)
+                            (args.keep / f"{len(faults)}-{name}{reader.suffix}").write_bytes(data)
+                    faults[kind] += 1
+            print(f"{name}: {count} inputs, the slowest took {slowest:.2f} s", flush=True)
+    print(f"{args.count} inputs, {sum(faults.values())} faults of {len(faults)} kinds")
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
