@@ -19,6 +19,7 @@ from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.observation.segments import LaneSegments
 from lanebev.observation.vertices import LineConfig
 from lanebev.pipeline import LaneBEV, LaneBEVOutput
+from lanebev.session import Session, SessionResult
 from lanebev.types import Calibration, Extrinsics, Status
 from lanebev.view.canonical import CanonicalView
 from lanebev.view.grid import BEVGrid, bev_from_image
@@ -50,6 +51,8 @@ __all__ = [
     "MountStatus",
     "Reason",
     "SegmenterConfig",
+    "Session",
+    "SessionResult",
     "Status",
     "TwoStageCalibrator",
     "TwoStageConfig",

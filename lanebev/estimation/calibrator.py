@@ -114,3 +114,12 @@ class Calibrator(nn.Module, Generic[StateT]):
     def curvature(self, state: StateT) -> Tensor | None:
         """Return the road's curvature at the camera, (B,) 1/m, positive to the right, or None."""
         return None
+
+    def reasons(self, state: StateT) -> Tensor:
+        """Return why rows are not (fully) tracked, (B,) int64 flags of :class:`lanebev.Reason`.
+
+        They are the state's ``reasons``; zeros of a calibrator that gives none.
+        """
+        parts = state._asdict()
+        none = torch.zeros_like(next(iter(parts.values()))[:, 0], dtype=torch.int64)
+        return parts.get("reasons", none)

@@ -1,0 +1,55 @@
+"""Every example runs, and is short."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def run_example(name, monkeypatch, tmp_path, *arguments):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+    runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
+def test_an_example_is_short(path):
+    if path.name == "onnx_only.py":
+        pytest.skip("it has no library behind it")
+    code = [
+        line
+        for line in path.read_text().splitlines()
+        if line and not line.startswith(('"""', "import", "from"))
+    ]
+    assert len(code) <= 20
+
+
+def test_another_detectors_boundaries(monkeypatch, tmp_path, capsys):
+    run_example("other_detector.py", monkeypatch, tmp_path)
+    values = [float(word) for word in capsys.readouterr().out.replace(",", "").split() if word[-1].isdigit()]
+    assert values == pytest.approx([0.0, 0.0, 0.0, 3.7 / 2.6], abs=5e-3)
+
+
+@pytest.mark.slow
+def test_features_of_another_network(monkeypatch, tmp_path, capsys):
+    run_example("embed.py", monkeypatch, tmp_path)
+    assert "torch.Size([1, 8, 80, 40])" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_live_loop_ends_with_a_state(monkeypatch, tmp_path, capsys):
+    import cv2
+    import numpy as np
+
+    writer = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (320, 192))
+    for value in (0, 90, 180):
+        writer.write(np.full((192, 320, 3), value, np.uint8))
+    writer.release()
+    run_example("live_loop.py", monkeypatch, tmp_path, tmp_path / "v.avi", 60)
+    said = capsys.readouterr().out
+    assert said.count("+-") == 3
+    assert "does not advance" not in said
+    assert (tmp_path / "state.safetensors").is_file()

@@ -1,0 +1,146 @@
+"""Live use: time, states, what another detector saw, resuming, and what is said in words."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from lanebev import BEVGrid, Camera, Extrinsics, JointCalibrator, Session, Status, image_from_road_points
+from lanebev.estimation.joint.state import Reason
+from lanebev.session import REASONS, describe_reasons
+
+CAMERA = Camera.from_parameters(600, 600, 319.5, 179.5, 640, 360, distortion=(-0.2, 0.05, 0.0, 0.0, 0.0))
+POSE = (0.03, -0.01, 0.02, 1.4)
+
+
+def lines(pose=POSE, places=(-5.55, -1.85, 1.85, 5.55)):
+    """Polylines of lane boundaries in pixels as taken."""
+    extrinsics = Extrinsics(*(torch.tensor([value], dtype=torch.float64) for value in pose))
+    z = torch.linspace(1 / 5, 1 / 40, 40, dtype=torch.float64) ** -1
+    found = []
+    for place in places:
+        road = torch.stack([torch.full_like(z, place), z], dim=-1)[None]
+        pixels = image_from_road_points(road, CAMERA.intrinsics[None], extrinsics)[0][0]
+        points = CAMERA.distort_points(pixels)
+        inside = (points[:, 0] > 0) & (points[:, 0] < 639) & (points[:, 1] < 359)
+        found.append(points[inside].numpy())
+    return found
+
+
+def numbers(result):
+    return [float(value) for value in result.extrinsics]
+
+
+def test_polylines_give_the_pose_the_sigmas_and_the_mount():
+    session = Session(CAMERA)
+    for k in range(20):
+        result = session(polylines=lines(), stamp=100.0 + k / 20)
+    assert result.status == Status.TRACKING
+    assert result.reasons == []
+    assert result.dt == pytest.approx(0.05)
+    assert numbers(result) == pytest.approx(POSE, abs=2e-3)
+    assert all(0 < float(value) < 0.02 for value in result.std)
+    assert result.mount.progress.item() == pytest.approx(100 * (19 / 20 + 1 / 30) / 20, rel=0.3)
+    assert result.mount_needs[0].startswith("pitch: needs 20 s of straight driving; 1 s so far")
+
+
+def test_a_frame_without_lanes_says_so():
+    session = Session(CAMERA)
+    assert "no lane boundary was seen" in session(polylines=[], stamp=0.0).reasons
+    session(polylines=lines(), stamp=0.1)
+    result = session(stamp=0.2)
+    assert result.status == Status.COASTING
+    assert "no lane boundary was seen" in result.reasons
+
+
+def test_a_stamp_that_does_not_advance_changes_nothing_and_says_so():
+    session = Session(CAMERA)
+    for k in range(5):
+        before = session(polylines=lines(), stamp=0.1 * k)
+    moved = (0.06, *POSE[1:])
+    for stamp in (0.4, 0.2):
+        result = session(polylines=lines(moved), stamp=stamp)
+        assert result.status == Status.COASTING
+        assert result.reasons[0].startswith("the time stamp does not advance")
+        assert numbers(result) == pytest.approx(numbers(before), abs=1e-3)
+    after = session(polylines=lines(), stamp=0.5)
+    assert after.status == Status.TRACKING
+    assert after.dt == pytest.approx(0.1)
+
+
+def test_milliseconds_are_noticed():
+    session = Session(CAMERA)
+    said = [session(polylines=lines(), stamp=33.0 * k).reasons for k in range(8)]
+    assert not any("expected seconds" in text for texts in said[:5] for text in texts)
+    assert any("expected seconds, got milli- or nanoseconds?" in text for text in said[6])
+
+
+def test_a_saved_session_goes_on_exactly(tmp_path):
+    one, other = Session(CAMERA), Session(CAMERA)
+    for k in range(6):
+        one(polylines=lines(), stamp=k / 10)
+    one.save(tmp_path / "state.safetensors")
+    other.load(tmp_path / "state.safetensors")
+    for k in range(6, 9):
+        pair = [each(polylines=lines(), stamp=k / 10) for each in (one, other)]
+        assert pair[0].dt == pair[1].dt
+        assert torch.equal(pair[0].calibration.covariance, pair[1].calibration.covariance)
+        assert torch.equal(pair[0].mount.extrinsics.stack(), pair[1].mount.extrinsics.stack())
+    foreign = Session(Camera.from_parameters(500, 500, 319.5, 179.5, 640, 360))
+    with pytest.raises(ValueError, match="expected the state of this camera"):
+        foreign.load(tmp_path / "state.safetensors")
+    with pytest.raises(ValueError, match=r"none\.safetensors"):
+        other.load(tmp_path / "none.safetensors")
+
+
+def test_pixels_are_seen_in_either_order_of_colours_and_warped():
+    pixels = np.random.default_rng(0).integers(0, 255, (360, 640, 3), dtype=np.uint8)
+    grid = BEVGrid(x=(-5, 5), z=(5, 25), resolution=0.25)
+    bgr = Session(CAMERA, grid=grid)(pixels, 0.0)
+    rgb = Session(CAMERA, grid=grid, colours="rgb")(pixels[..., ::-1], 0.0)
+    assert bgr.bev.shape == (80, 40, 3)
+    np.testing.assert_array_equal(bgr.bev, rgb.bev[..., ::-1])
+    assert torch.equal(bgr.extrinsics.stack(), rgb.extrinsics.stack())
+    tensor = Session(CAMERA, grid=grid)(torch.from_numpy(pixels), 0.0)
+    np.testing.assert_array_equal(tensor.bev, bgr.bev)
+
+
+def test_an_unsure_focal_length_widens_the_pose():
+    sure, unsure = Session(CAMERA), Session(CAMERA, focal_std=0.1)
+    for k in range(5):
+        results = [each(polylines=lines(), stamp=k / 10) for each in (sure, unsure)]
+    grown = (results[1].std.pitch ** 2 - results[0].std.pitch ** 2).sqrt().item()
+    assert grown == pytest.approx(0.1 * math.sin(POSE[0]), rel=0.05)
+
+
+def test_careless_arguments_are_named():
+    session = Session(CAMERA)
+    with pytest.raises(TypeError, match=r"frame: expected \(H, W, 3\) of uint8, got float64"):
+        session(np.zeros((360, 640, 3)))
+    with pytest.raises(ValueError, match=r"frame: expected \(360, 640, 3\) as the camera's"):
+        session(np.zeros((720, 1280, 3), np.uint8))
+    with pytest.raises(ValueError, match="stamp: expected finite seconds"):
+        session(stamp=math.nan)
+    with pytest.raises(ValueError, match="lane_width: expected 1 to 10 m"):
+        Session(CAMERA, lane_width=370)
+    with pytest.raises(ValueError, match="colours: expected 'bgr' or 'rgb'"):
+        Session(CAMERA, colours="gray")
+
+
+def test_every_reason_has_words():
+    assert set(REASONS) == {reason for reason in Reason if reason}
+    assert describe_reasons(Reason.NONE) == []
+    assert describe_reasons(Reason.TIME, known=["said"]) == []
+    assert len(describe_reasons(Reason.TIME | Reason.ROLL_UNSEEN)) == 2
+
+
+def test_reasons_of_a_calibrator_without_any_are_zero():
+    state = JointCalibrator().initial_state(2)
+    assert JointCalibrator().reasons(state).shape == (2,)
+    from lanebev import TwoStageCalibrator
+
+    calibrator = TwoStageCalibrator()
+    assert calibrator.reasons(calibrator.initial_state(3)).tolist() == [0, 0, 0]
