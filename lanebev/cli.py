@@ -145,7 +145,10 @@ def _progress(label: str) -> Any:
     def follow(items: Iterator[Any], total: int) -> Iterator[Any]:
         columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         console = Console(stderr=True)
-        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        if not console.is_terminal:
+            yield from items
+            return
+        with Progress(*columns, console=console, transient=True) as bar:
             yield from bar.track(items, total=total)
 
     return follow
