@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics, LaneSegments
+from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics
 from lanebev.app.run import lens_remark
 from lanebev.geometry import undistortion
 from lanebev.geometry.distortion import (
@@ -24,7 +24,8 @@ from lanebev.geometry.distortion import (
 )
 from lanebev.geometry.lens import invert_distortion, undistort_points
 from lanebev.geometry.undistortion import bracket_increasing, undistort_plane
-from lanebev.observation.lines import undistort_segments
+from lanebev.observation.boundary_vertices import BoundaryVertices
+from lanebev.observation.segments import segments_from_vertices
 
 WIDTH, HEIGHT = 1024, 768
 PINCUSHION = [0.35, 0.3, 0, 0, 0.0]
@@ -221,9 +222,10 @@ def test_a_run_says_what_its_lens_cannot_have_imaged():
 def test_segments_that_the_lens_cannot_have_imaged_weigh_nothing():
     cam = _camera([-0.3, 0.0, 0.0, 0.0], focal=600.0)
     ends = torch.tensor([[[[500.0, 600], [520, 500]], [[0, 0], [300, 300]], [[400, 600], [1023, 767]]]])
-    segments = LaneSegments(ends, torch.tensor([[2, 1, 3]]), torch.ones(1, 3), torch.ones(1, 3))
     ends.requires_grad_()
-    got = undistort_segments(segments, cam.intrinsics[None].float(), cam.distortion[None].float())
+    ones = torch.ones(1, 3, 2)
+    vertices = BoundaryVertices(ends, ones, ones, torch.tensor([[2, 1, 3]]))
+    got = segments_from_vertices(vertices, cam.intrinsics[None].float(), cam.distortion[None].float())
     assert got.weight.tolist() == [[1, 0, 0]]
     assert got.endpoints.isfinite().all()
     assert got.sigma.isfinite().all()

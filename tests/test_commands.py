@@ -57,7 +57,8 @@ def test_the_commands_are_all_of_them():
 def test_bad_input_is_one_line(line, message, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("nothing")
     for name, network in (("odd", {"odd": 1}), ("misfit", {"base_width": 16})):
-        checkpoint = {"state_dict": {"segmenter.x": torch.zeros(1)}, "settings": {"network": network}}
+        weights = {"segmenter.x": torch.zeros(1)}
+        checkpoint = {"state_dict": weights, "settings": {"network": network}, "global_step": 1}
         torch.save(checkpoint, tmp_path / f"{name}.ckpt")
     command, *arguments = line.replace("TMP", str(tmp_path)).split()
     assert run(command, arguments, monkeypatch) == 2
