@@ -1,18 +1,14 @@
-"""What a person looks at: measured boundaries, the overlay, plots and the page."""
+"""What a person looks at: measured boundaries and the overlay."""
 
 import math
-import re
 
 import numpy as np
 import pytest
 import torch
 
 from lanebev import BEVGrid, Calibration, Camera, Extrinsics, LaneSegments, Status, image_from_road_points
-from lanebev.io.results import ExtrinsicsRow
 from lanebev.report.measure import measure_boundaries, spread
-from lanebev.report.overlay import BOUNDARY_COLOURS, PANEL_HEIGHT, Panel, draw_frame
-from lanebev.report.page import Report, write_report
-from lanebev.report.plots import plot_estimates, plot_widths, width_deviation
+from lanebev.report.overlay import BOUNDARY_COLOURS, PANEL_HEIGHT, Panel, draw_frame, draw_panels
 
 CAMERA = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720)
 INTRINSICS = CAMERA.intrinsics[None]
@@ -42,11 +38,6 @@ def _segments(bend=0.0, noise=0.0):
 def _calibration(segments, status=Status.TRACKING):
     cov = torch.diag(torch.tensor([1e-3, 1e-3, 2e-3, 0.01], dtype=torch.float64) ** 2)[None]
     return Calibration(POSE, cov, torch.tensor([int(status)]), torch.ones_like(segments.weight))
-
-
-def _rows(count, status="TRACKING"):
-    row = ExtrinsicsRow(0, 0.0, 1.0, 2.0, 0.1, 1.5, 0.01, 0.02, 0.03, 0.004, status, 12, "")
-    return [row._replace(frame=i, time_s=i / 25, pitch_deg=math.sin(i)) for i in range(count)]
 
 
 @pytest.mark.parametrize("bend", [0.0, 5e-4])
@@ -102,6 +93,18 @@ def test_overlay_draws_what_is_believed(status, height, width):
     assert (image == 90).all()  # the input is not drawn on
 
 
+def test_overlay_tells_the_reasons():
+    segments, grid = _segments(), BEVGrid(resolution=0.2)
+    view = Panel("after", np.zeros((*grid.shape, 3), np.uint8), POSE)
+    image = np.full((720, 1280, 3), 90, np.uint8)
+    arguments = (image, CAMERA, segments, _calibration(segments), "frame 1", (view,), grid)
+    (without, bev), (told, same) = draw_panels(*arguments), draw_panels(*arguments, reasons="one lane only")
+    assert (told[:-34] == without[:-34]).all()
+    assert (told[-34:].max(-1) > 200).sum() > (without[-34:].max(-1) > 200).sum() + 100  # letters
+    assert (bev == same).all()
+    assert draw_frame(*arguments).shape == (720, told.shape[1] + 8 + bev.shape[1], 3)
+
+
 def test_overlay_of_an_empty_frame_and_of_a_wide_lens():
     fisheye = Camera.from_parameters(300, 300, 639.5, 359.5, 1280, 720, [0.01, -0.002, 0.0, 0.0], "fisheye")
     segments = _segments()._replace(weight=torch.zeros(1, 32).double())
@@ -126,45 +129,3 @@ def test_overlay_of_a_strip_is_no_wider_than_video_codecs_take(shape):
     picture = draw_frame(image, camera, _segments(), _calibration(_segments()), "f", (view,), BEVGrid())
     assert picture.shape[0] == PANEL_HEIGHT
     assert picture.shape[1] < 4096
-
-
-@pytest.mark.parametrize("stills", [False, True])
-def test_plots_are_png(stills):
-    rows = _rows(30) if stills else _rows(5, "UNINITIALISED")
-    assert plot_estimates(rows, stills).startswith(b"\x89PNG")
-    widths = np.full((30, 5), 3.7)
-    widths[:, 0] = np.nan
-    assert plot_widths(np.arange(30.0), widths, widths * np.nan, 3.7).startswith(b"\x89PNG")
-    assert width_deviation(widths) == pytest.approx(0, abs=1e-9)
-    assert math.isnan(width_deviation(widths * np.nan))
-
-
-def test_page_is_self_contained_and_escapes(tmp_path):
-    widths = np.full((8, 5), 3.7)
-    widths[:, 4] = np.nan
-    picture = np.zeros((40, 60, 3), np.uint8)
-    report = Report(
-        "<b>.mp4",
-        _rows(8),
-        widths,
-        widths,
-        3.7,
-        {"camera": "a&b.yaml"},
-        [("still", picture)],
-        ["frame 3: no"],
-    )
-    write_report(tmp_path / "report.html", report)
-    page = (tmp_path / "report.html").read_text()
-    assert "&lt;b&gt;.mp4" in page
-    assert "a&amp;b.yaml" in page
-    assert "8 of 8 frames TRACKING" in page
-    assert "frame 3: no" in page
-    sources = re.findall(r'(?:src|href)="([^"]{0,30})', page)
-    assert len(sources) == 3
-    assert all(source.startswith("data:image/") for source in sources)
-
-
-def test_page_of_nothing(tmp_path):
-    nothing = np.full((1, 5), np.nan)
-    write_report(tmp_path / "r.html", Report("x", _rows(1, "UNINITIALISED"), nothing, nothing, 3.7, {}))
-    assert "No frame was calibrated" in (tmp_path / "r.html").read_text()

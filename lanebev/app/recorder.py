@@ -16,6 +16,7 @@ from torch import Tensor
 from lanebev.app.concurrency import Background
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.state import Reason
+from lanebev.estimation.mount import MountCalibration
 from lanebev.io.lanes import tusimple_line
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video import Frame, VideoWriter, write_png
@@ -23,12 +24,13 @@ from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.segments import LaneSegments
 from lanebev.report.lane_curves import lane_curves
 from lanebev.report.measure import believed, measure_boundaries
-from lanebev.report.overlay import Panel, Picture, draw_frame
+from lanebev.report.moments import MomentSampler
+from lanebev.report.overlay import Panel, Picture, draw_panels, joined
 from lanebev.report.page import Report, summary_facts, write_report
+from lanebev.report.verdict import reason_words
+from lanebev.report.worst import EventScores
 from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics
 from lanebev.view.grid import BEVGrid
-
-REPORT_STILLS = 6
 
 
 class Recorded(NamedTuple):
@@ -65,7 +67,6 @@ class Recorder:
         path: gives the path to write an output's name to.
         camera: the lens.
         grid: of the bird's-eye views.
-        count: frames to come, as far as known.
         fps: of the videos.
         lane_width: m, for the report.
         single: PNGs instead of videos.
@@ -77,7 +78,6 @@ class Recorder:
         path: Callable[[str], Path],
         camera: Camera,
         grid: BEVGrid,
-        count: int,
         fps: Fraction,
         lane_width: float,
         single: bool,
@@ -89,8 +89,7 @@ class Recorder:
         self.problems: list[str] = []
         self.before_title = "uncalibrated" if single or stills else "first frame's pose held"
         self._widths: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
-        self._pictures: list[tuple[str, Picture]] = []
-        self._shown = set(np.linspace(0, max(count - 1, 0), REPORT_STILLS).round().astype(int).tolist())
+        self._moments, self._scores = MomentSampler(), EventScores()
 
     def __enter__(self) -> Recorder:
         self._stack = ExitStack()
@@ -118,9 +117,20 @@ class Recorder:
         self._background.submit(lambda: self._write(done))
 
     def finish(
-        self, facts: Mapping[str, str], title: str, truth: Sequence[ExtrinsicsRow] | None = None
+        self,
+        facts: Mapping[str, str],
+        title: str,
+        truth: Sequence[ExtrinsicsRow] | None = None,
+        mount: MountCalibration | None = None,
     ) -> Report:
-        """Write extrinsics.csv and the report, after the last frame and outside of ``with``."""
+        """Write extrinsics.csv and the report, after the last frame and outside of ``with``.
+
+        Args:
+            facts: what ran, for the report.
+            title: of the report.
+            truth: a row per frame, of a rendered drive.
+            mount: as it is known at the end.
+        """
         write_extrinsics(self.path("extrinsics.csv"), self.rows)
         before, after = (np.array([pair[i] for pair in self._widths]) for i in (0, 1))
         report = Report(
@@ -130,11 +140,13 @@ class Recorder:
             after=after,
             lane_width=self.lane_width,
             facts=facts,
-            stills=self._pictures,
+            moments=self._moments.moments,
             problems=self.problems,
             is_stills=self.stills,
             before_title=self.before_title,
             truth=truth,
+            camera=self.camera,
+            mount=mount,
         )
         report.facts = {**facts, **summary_facts(report)}
         write_report(self.path("report.html"), report)
@@ -155,11 +167,21 @@ class Recorder:
         views = [Panel("after", done.bev_after, done.calibration.extrinsics)]
         if done.before is not None:
             views.insert(0, Panel("before", done.bev_before, done.before))
-        picture = draw_frame(
-            image, self.camera, done.segments, done.calibration, _shortened(place), tuple(views), self.grid
+        words = ", ".join(reason_words([str(reason.name) for reason in done.reasons]))
+        panels = draw_panels(
+            image,
+            self.camera,
+            done.segments,
+            done.calibration,
+            _shortened(place),
+            tuple(views),
+            self.grid,
+            words,
         )
-        if frame.number in self._shown:
-            self._pictures.append((_caption(self.rows[frame.number], self.before_title), picture))
+        names = ["image", *(view.title for view in views)]
+        scores = self._scores(self.rows[frame.number])
+        self._moments.add(frame.number, dict(zip(names, panels, strict=True)), scores)
+        picture = joined(panels)
         if self.single:
             write_png(self.path("bev.png"), done.bev_after)
             write_png(self.path("overlay.png"), picture)
@@ -178,8 +200,3 @@ class Recorder:
 
 def _shortened(name: str, most: int = 38) -> str:
     return name if len(name) <= most else "…" + name[-most + 1 :]
-
-
-def _caption(row: ExtrinsicsRow, before: str) -> str:
-    where = row.image or f"frame {row.frame}, {row.time_s:.2f} s"
-    return f"{where}: {row.status}, {row.segments} segments; bird's-eye views: {before} | after"

@@ -134,7 +134,6 @@ def run(
             out.__truediv__,
             camera,
             warp.grid,
-            source.count,
             STILLS_FPS if config.stills else source.fps,
             config.lane_width,
             source.is_single,
@@ -172,7 +171,7 @@ def run(
             save_state(out / STATE_FILE, {**states, "camera": lens(camera)})
             facts |= mount_facts(mounted)
             write_calibration(out / CALIBRATION_FILE, camera, mounted)
-        return recorder.finish(facts, Path(source.source).name, truth)
+        return recorder.finish(facts, Path(source.source).name, truth, None if config.stills else mounted)
 
 
 def begin(

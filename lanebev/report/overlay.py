@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -56,8 +56,23 @@ def draw_frame(
     headline: str,
     views: tuple[Panel, ...],
     grid: BEVGrid,
+    reasons: str = "",
 ) -> Picture:
-    """One picture: input with segments, boundaries, horizon and vanishing point; bird's-eye views beside it.
+    """Return the pictures of :func:`draw_panels` as one, (720, W', 3)."""
+    return joined(draw_panels(image, camera, segments, calibration, headline, views, grid, reasons))
+
+
+def draw_panels(
+    image: Picture,
+    camera: Camera,
+    segments: LaneSegments,
+    calibration: Calibration,
+    headline: str,
+    views: tuple[Panel, ...],
+    grid: BEVGrid,
+    reasons: str = "",
+) -> list[Picture]:
+    """Return the input with segments, boundaries, horizon and vanishing point, and its bird's-eye views.
 
     Args:
         image: (H, W, 3) as taken.
@@ -67,9 +82,10 @@ def draw_frame(
         headline: what frame this is.
         views: e.g. before and after.
         grid: of the views.
+        reasons: why the frame is not (fully) tracked, in words.
 
     Returns:
-        (720, W', 3).
+        (720, W, 3) each, the input first.
     """
     scale = PANEL_HEIGHT / max(image.shape[0], image.shape[1] / _WIDEST)
     size = (round(image.shape[1] * scale), max(1, round(image.shape[0] * scale)))
@@ -81,10 +97,15 @@ def draw_frame(
     shown = cv2.copyMakeBorder(shown, 0, below, 0, 0, cv2.BORDER_CONSTANT, value=_BACKGROUND)
     status = Status(int(calibration.status[0]))
     shown = _banner(shown, headline, status.name, _STATUS_COLOURS.get(status, _QUIET), _numbers(calibration))
-    panels = [shown, *(_bev_panel(view, grid, camera, segments) for view in views)]
-    gap = np.full((PANEL_HEIGHT, 8, 3), _BACKGROUND, np.uint8)
-    row = [part for panel in panels for part in (panel, gap)][:-1]
-    return np.concatenate(row, axis=1)
+    if reasons:
+        shown = _note(shown, reasons)
+    return [shown, *(_bev_panel(view, grid, camera, segments) for view in views)]
+
+
+def joined(panels: Sequence[Picture]) -> Picture:
+    """Return pictures of equal height side by side, with a gap between them."""
+    gap = np.full((panels[0].shape[0], 8, 3), _BACKGROUND, np.uint8)
+    return np.concatenate([part for panel in panels for part in (panel, gap)][:-1], axis=1)
 
 
 def _numbers(calibration: Calibration) -> str:
@@ -162,6 +183,15 @@ def _banner(shown: Picture, headline: str, status: str, colour: tuple[int, ...],
         shown[44:76] = (0.3 * shown[44:76] + 0.7 * np.array(_BACKGROUND)).astype(np.uint8)
         drawing = ImageDraw.Draw(picture := Image.fromarray(shown))
         drawing.text((12, 50), numbers, fill=_INK, font=_font(15))
+    return np.asarray(picture)
+
+
+def _note(shown: Picture, text: str) -> Picture:
+    """Return the picture with a line of text at the bottom, on a dark strip."""
+    shown = shown.copy()
+    shown[-34:] = (0.3 * shown[-34:] + 0.7 * np.array(_BACKGROUND)).astype(np.uint8)
+    picture = Image.fromarray(shown)
+    ImageDraw.Draw(picture).text((12, PANEL_HEIGHT - 27), text, fill=_INK, font=_font(16))
     return np.asarray(picture)
 
 

@@ -3,34 +3,31 @@
 from __future__ import annotations
 
 import base64
-import html
-import io
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 from numpy.typing import NDArray
-from PIL import Image
 
+from lanebev.camera.model import Camera
+from lanebev.estimation.mount import MountCalibration, MountStatus, describe_mount
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.overlay import Picture
-from lanebev.report.plots import plot_estimates, plot_widths, width_deviation
+from lanebev.report.axis_states import AXES, AxisState, axis_states, deviations, estimates
+from lanebev.report.lens_table import lens_table
+from lanebev.report.moments import Jpegs
+from lanebev.report.plots import bokeh_script, plot_estimates, plot_widths, width_deviation, width_limits
+from lanebev.report.timeline import STATE_WORDS, places_on_axis, shown_frames, strips
+from lanebev.report.verdict import describe, reason_words, verdict
+from lanebev.report.worst import worst_moments
 
-_STYLE = """
-:root { color-scheme: light; --ink: #1c2128; --quiet: #57606a; --line: #d9dee5; }
-body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); background: #fff;
-       max-width: 1180px; margin: 2rem auto; padding: 0 1.2rem; }
-h1 { font-size: 1.5rem; margin: 0; } h2 { font-size: 1.1rem; margin: 2.2rem 0 .6rem; }
-p.sub { color: var(--quiet); margin: .2rem 0 1.4rem; }
-table { border-collapse: collapse; } th, td { text-align: left; padding: .25rem 1.4rem .25rem 0;
-       border-bottom: 1px solid var(--line); vertical-align: top; }
-th { font-weight: 600; color: var(--quiet); }
-td.n { text-align: right; font-variant-numeric: tabular-nums; }
-img { max-width: 100%; height: auto; display: block; } figure { margin: 0 0 1.2rem; }
-figcaption { color: var(--quiet); font-size: .85rem; margin-top: .25rem; }
-ul.problems { color: #b42318; }
-"""
+_UNITS = ("°", "°", "°", " m")
+_DIGITS = (2, 2, 2, 3)
 
 
 @dataclass
@@ -44,11 +41,13 @@ class Report:
         after: (F, L-1) m, with the online pose.
         lane_width: m, assumed.
         facts: what ran, label to value.
-        stills: caption and picture.
+        moments: pictures of some frames by place of their row: "image", "before" and "after" as JPEG.
         problems: frames that did not decode and the like, one line each.
         is_stills: each image on its own.
         before_title: what "before" is.
         truth: a row per frame, of a rendered drive.
+        camera: the lens.
+        mount: as it is known at the end, of batch size 1.
     """
 
     title: str
@@ -57,54 +56,128 @@ class Report:
     after: NDArray[np.float64]
     lane_width: float
     facts: Mapping[str, str]
-    stills: Sequence[tuple[str, Picture]] = ()
+    moments: Mapping[int, Jpegs] = field(default_factory=dict)
     problems: Sequence[str] = field(default_factory=list)
     is_stills: bool = False
     before_title: str = "first frame's pose held"
     truth: Sequence[ExtrinsicsRow] | None = None
+    camera: Camera | None = None
+    mount: MountCalibration | None = None
+
+    @property
+    def after_title(self) -> str:
+        """What "after" is."""
+        return "calibrated" if self.is_stills else "online"
 
 
 def write_report(path: str | Path, report: Report) -> None:
-    """Write the page; nothing in it is loaded from elsewhere."""
-    rows = report.rows
-    tracking = sum(row.status == "TRACKING" for row in rows)
-    share = f"{tracking} of {len(rows)} {'images' if report.is_stills else 'frames'} TRACKING"
-    after_title = "calibrated" if report.is_stills else "online"
-    parts = [f"<h1>{html.escape(report.title)}</h1>", f'<p class="sub">{share}</p>']
-    parts += [_pose_table(rows), "<h2>Run</h2>", _facts(report.facts)]
-    if report.problems:
-        items = "".join(f"<li>{html.escape(problem)}</li>" for problem in report.problems)
-        parts.append(f'<h2>Problems</h2><ul class="problems">{items}</ul>')
-    if len(rows) > 1:
-        x = np.array([row.frame if report.is_stills else row.time_s for row in rows], dtype=np.float64)
-        parts += [
-            "<h2>Estimates</h2>",
-            _figure(plot_estimates(rows, report.is_stills, report.truth), "png", "±2σ"),
-        ]
-        widths = plot_widths(
-            x,
-            report.before,
-            report.after,
-            report.lane_width,
-            (report.before_title, after_title),
-            "image" if report.is_stills else "time (s)",
-        )
-        note = f"Widths of all lanes seen in the bird's-eye view; dashed: {report.lane_width:.4g} m assumed."
-        parts += ["<h2>Lane widths in the bird's-eye view</h2>", _figure(widths, "png", note)]
-    if report.stills:
-        parts.append("<h2>Stills</h2>")
-        parts += [_figure(_jpeg(picture), "jpeg", caption) for caption, picture in report.stills]
-    page = (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        f"<title>{html.escape(report.title)}</title>"
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{_STYLE}</style></head>'
-        f"<body>{''.join(parts)}</body></html>"
-    )
+    """Write the page; nothing in it is loaded from elsewhere, and every name in it is escaped."""
+    page = template("report.html.j2").render(page_context(report))
     Path(path).write_text(page, encoding="utf-8", errors="replace")
 
 
+def page_context(report: Report) -> dict[str, Any]:
+    """Return what the template shows."""
+    rows, stills = report.rows, report.is_stills
+    found = verdict(rows, stills)
+    worst = [] if stills else worst_moments(rows)
+    edges = places_on_axis(rows, stills)
+    places = shown_frames(rows, [*report.moments, *(moment.place for moment in worst)])
+    several = len(rows) > 1
+    return {
+        "title": report.title,
+        "stills": stills,
+        "verdict": found,
+        "tracking": sum(row.status == "TRACKING" for row in rows),
+        "findings": [(finding.first, describe(finding)) for finding in found.findings],
+        "width_sentence": _width_sentence(report),
+        "table": pose_table(rows),
+        "strips": strips(rows, stills) if several else [],
+        "ticks": _ticks(edges) if several else [],
+        "worst": worst,
+        "rows": rows,
+        "mount": mount_table(report.mount) if several else [],
+        "facts": {name: text for name, text in report.facts.items() if not name.startswith("mount")},
+        "problems": report.problems,
+        "lens": lens_table(report.camera) if report.camera else {},
+        "before_title": report.before_title,
+        "after_title": report.after_title,
+        "plots": _plots(report, edges[:-1]) if several else {},
+        "bokeh": Markup(bokeh_script()) if several else "",
+        "data": page_data(report, places, edges),
+        "axes": AXES,
+    }
+
+
+def page_data(report: Report, places: Sequence[int], edges: NDArray[np.float64]) -> dict[str, Any]:
+    """Return what the page's script shows of each frame, as plain values."""
+    rows = [report.rows[place] for place in places]
+    reasons = list(dict.fromkeys(row.reasons for row in rows))
+    return {
+        "place": list(places),
+        "x": _plain(edges[places], 3),
+        "range": _plain(edges[[0, -1]], 3),
+        "frame": [row.frame for row in rows],
+        "status": [row.status for row in rows],
+        "reason": [reasons.index(row.reasons) for row in rows],
+        "reasons": [", ".join(reason_words([name for name in each.split("|") if name])) for each in reasons],
+        "value": _plain(estimates(rows), 4),
+        "std": _plain(deviations(rows), 4),
+        "state": [[int(state) for state in axis_states(row)] for row in rows],
+        "states": [STATE_WORDS[state] for state in AxisState],
+        "kinds": [state.name.lower() for state in AxisState],
+        "segments": [row.segments for row in rows],
+        "image": [row.image for row in rows] if any(row.image for row in rows) else None,
+        "before": _plain(report.before[places], 3),
+        "after": _plain(report.after[places], 3),
+        "stills": report.is_stills,
+        "pictures": {
+            str(place): {name: data_uri(data) for name, data in pictures.items()}
+            for place, pictures in report.moments.items()
+        },
+    }
+
+
+def pose_table(rows: Sequence[ExtrinsicsRow]) -> list[tuple[str, list[str]]]:
+    """Return median, least, most and median sigma of each axis over the frames that measure it."""
+    states = np.array([axis_states(row) for row in rows]).reshape(-1, 4)
+    value, std = estimates(rows), deviations(rows)
+    table = []
+    for axis, name in enumerate(AXES):
+        seen = (states[:, axis] <= AxisState.UNCERTAIN) & np.isfinite(value[:, axis])
+        if seen.any():
+            at = value[seen, axis]
+            numbers = [np.median(at), at.min(), at.max(), np.median(std[seen, axis])]
+            table.append((name, [f"{float(each):.{_DIGITS[axis]}f}{_UNITS[axis]}" for each in numbers]))
+    return table
+
+
+def mount_table(mount: MountCalibration | None) -> list[dict[str, Any]]:
+    """Return name, status, progress, value and needs of each axis of the mount."""
+    if mount is None:
+        return []
+    values = mount.extrinsics.stack()[0].tolist()
+    stds = mount.covariance[0].diagonal().clamp_min(0).sqrt().tolist()
+    table = []
+    for axis, sentence in enumerate(describe_mount(mount)):
+        value, two_sigma = values[axis], 2 * stds[axis]
+        if axis < 3:
+            value, two_sigma = math.degrees(value), math.degrees(two_sigma)
+        name, _, words = sentence.partition(": ")
+        table.append(
+            {
+                "name": name,
+                "status": MountStatus(int(mount.axis_status[0, axis])).name.lower(),
+                "progress": round(float(mount.axis_progress[0, axis])),
+                "value": f"{value:.{_DIGITS[axis]}f} ± {two_sigma:.{_DIGITS[axis]}f}{_UNITS[axis]}",
+                "words": words,
+            }
+        )
+    return table
+
+
 def summary_facts(report: Report) -> dict[str, str]:
-    """Lane widths before and after in a line each, where lanes were seen."""
+    """Return the scatter of lane widths before and after, where lanes were seen."""
     names = {report.before_title: report.before, "calibrated": report.after}
     return {
         f"lane width σ, {name}": f"{100 * width_deviation(widths):.1f} cm"
@@ -113,39 +186,58 @@ def summary_facts(report: Report) -> dict[str, str]:
     }
 
 
-def _pose_table(rows: Sequence[ExtrinsicsRow]) -> str:
-    good = [row for row in rows if row.status == "TRACKING"]
-    if not good:
-        return "<p>No frame was calibrated.</p>"
-    body = ""
-    for name, unit, digits in (
-        ("pitch", "deg", 2),
-        ("yaw", "deg", 2),
-        ("roll", "deg", 2),
-        ("height", "m", 3),
-    ):
-        value = np.array([getattr(row, f"{name}_{unit}") for row in good])
-        std = np.median([getattr(row, f"{name}_std_{unit}") for row in good])
-        sign = "°" if unit == "deg" else " m"
-        cells = [np.median(value), value.min(), value.max(), std]
-        body += f"<tr><th>{name}</th>" + "".join(f'<td class="n">{c:.{digits}f}{sign}</td>' for c in cells)
-        body += "</tr>"
-    head = "<tr><th></th><th>median</th><th>least</th><th>most</th><th>median σ</th></tr>"
-    return f"<table>{head}{body}</table>"
+@cache
+def template(name: str) -> Any:
+    """Return a template of the package; it escapes what it is given."""
+    environment = Environment(
+        loader=PackageLoader("lanebev.report"), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.policies["json.dumps_kwargs"] = {
+        "sort_keys": False,
+        "allow_nan": False,
+    }  # Bokeh's have an order
+    return environment.get_template(name)
 
 
-def _facts(facts: Mapping[str, str]) -> str:
-    cells = (f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in facts.items())
-    return f"<table>{''.join(cells)}</table>"
+def data_uri(jpeg: bytes) -> str:
+    """Return a picture as an address that holds it."""
+    return f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}"
 
 
-def _figure(data: bytes, kind: str, caption: str) -> str:
-    source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
-    text = html.escape(caption)
-    return f'<figure><img src="{source}" alt="{text}"><figcaption>{text}</figcaption></figure>'
+def _plots(report: Report, x: NDArray[np.float64]) -> dict[str, Any]:
+    label = "image" if report.is_stills else "time (s)"
+    rows, places = report.rows, shown_frames(report.rows, [])
+    truth = None if report.truth is None else [report.truth[place] for place in places]
+    plots = {"estimates": plot_estimates(x[places], [rows[i] for i in places], report.is_stills, truth)}
+    if np.isfinite(report.before).any() or np.isfinite(report.after).any():
+        limits = width_limits(report.before, report.after, report.lane_width)
+        for name, widths in (("before", report.before), ("after", report.after)):
+            plots[name] = plot_widths(x[places], widths[places], report.lane_width, limits, label)
+    return plots
 
 
-def _jpeg(picture: Picture) -> bytes:
-    data = io.BytesIO()
-    Image.fromarray(picture).save(data, format="JPEG", quality=88)
-    return data.getvalue()
+def _width_sentence(report: Report) -> str:
+    before, after = width_deviation(report.before), width_deviation(report.after)
+    if not math.isfinite(after):
+        return ""
+    compared = f", {100 * before:.1f} cm with the {report.before_title}" if math.isfinite(before) else ""
+    return f"Lane widths in the bird's-eye view scatter by {100 * after:.1f} cm (σ){compared}."
+
+
+def _ticks(edges: NDArray[np.float64]) -> list[tuple[float, str]]:
+    """Return places in per cent and words of some round numbers on the time line."""
+    span = float(edges[-1] - edges[0])
+    rough = span / 6
+    scale = 10.0 ** math.floor(math.log10(rough))
+    step = next(scale * nice for nice in (1, 2, 5, 10) if scale * nice >= rough)
+    first = math.ceil(float(edges[0]) / step - 1e-9) * step
+    numbers = np.arange(first, float(edges[-1]) + 1e-9, step)
+    return [(100 * (float(number) - float(edges[0])) / span, f"{number:g}") for number in numbers]
+
+
+def _plain(values: NDArray[np.float64], digits: int) -> Any:
+    """Return nested lists of rounded numbers, None where one is not finite: JSON has no NaN."""
+    rounded = np.round(values, digits).astype(object)
+    rounded[~np.isfinite(values)] = None
+    return rounded.tolist()

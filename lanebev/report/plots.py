@@ -1,158 +1,233 @@
-"""Plots of a run: the four estimates with ±2 sigma, and lane widths before and after."""
+"""Interactive plots of a run: the four estimates with ±2 sigma, and lane widths before and after."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from bokeh.embed import json_item
+from bokeh.layouts import gridplot
+from bokeh.models import ColumnDataSource, HoverTool, Range1d, Span
+from bokeh.plotting import figure
+from bokeh.resources import Resources
 from numpy.typing import NDArray
 
 from lanebev.io.results import ExtrinsicsRow
+from lanebev.report.axis_states import AxisState, axis_states, deviations, estimates
 from lanebev.report.overlay import BOUNDARY_COLOURS
 
-_ESTIMATES = (
-    ("pitch_deg", "pitch (°)"), ("yaw_deg", "yaw (°)"), ("roll_deg", "roll (°)"), ("height_m", "height (m)"),
-)  # fmt: skip
-_LINE, _BAND, _GRID = "#1f6feb", "#1f6feb", "#d9dee5"
-_STATUS_COLOURS = {
-    "TRACKING": "#12a37a",
-    "COASTING": "#f0a30a",
-    "LOST": "#e5484d",
-    "UNINITIALISED": "#9aa4b2",
-}
-_LEAST_RANGE = {"pitch_deg": 0.5, "yaw_deg": 0.5, "roll_deg": 0.5, "height_m": 0.1}  # no zoom into nothing
+_LABELS = ("pitch (°)", "yaw (°)", "roll (°)", "height (m)")
+_LEAST_RANGE = (0.5, 0.5, 0.5, 0.1)  # deg, deg, deg, m: no zoom into nothing
+_LINE, _HELD, _TRUTH, _GRID, _INK = "#1f6feb", "#7d8794", "#24292f", "#e5e9ef", "#57606a"
+_NOW = "now"  # name of the lines that mark the frame shown
+_TOOLS = "xpan,xbox_zoom,xwheel_zoom,reset,save"
+_FONT = "system-ui, sans-serif"
+
+
+def bokeh_script() -> str:
+    """Return BokehJS, to be put into the page: it loads nothing from elsewhere."""
+    return "\n".join(Resources(mode="inline", components=["bokeh"], log_level="error").js_raw)
 
 
 def plot_estimates(
-    rows: Sequence[ExtrinsicsRow], stills: bool = False, truth: Sequence[ExtrinsicsRow] | None = None
-) -> bytes:
-    """PNG of pitch, yaw, roll and height over time (or image number) with ±2 sigma, status below.
+    x: NDArray[np.float64],
+    rows: Sequence[ExtrinsicsRow],
+    stills: bool = False,
+    truth: Sequence[ExtrinsicsRow] | None = None,
+) -> dict[str, Any]:
+    """Return a plot of pitch, yaw, roll and height with ±2 sigma, grey where they are not determined.
 
     Args:
+        x: (F,) time in s, or the image's number.
         rows: what was found.
-        stills: each image on its own.
+        stills: each image is on its own.
         truth: a row per frame where it is known.
     """
-    figure = Figure(figsize=(11, 8), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(5, 1, sharex=True, height_ratios=[4, 4, 4, 4, 0.6])
-    x = np.array([row.frame if stills else row.time_s for row in rows], dtype=np.float64)
-    known = np.array([row.status != "UNINITIALISED" for row in rows])
-    for axis, (name, label) in zip(axes[:4], _ESTIMATES, strict=True):
-        value = np.array([getattr(row, name) for row in rows])
-        base, unit = name.rsplit("_", 1)
-        std = np.array([getattr(row, f"{base}_std_{unit}") for row in rows])
-        if stills:
-            axis.errorbar(x[known], value[known], 2 * std[known], fmt="o", ms=3, lw=1, color=_LINE)
-        else:
-            shown = np.where(known, value, np.nan)
-            axis.fill_between(x, shown - 2 * std, shown + 2 * std, color=_BAND, alpha=0.18, lw=0, label="±2σ")
-            if truth is not None:
-                true = [getattr(row, name) for row in truth]
-                axis.plot(x, true, color="#24292f", lw=1.0, ls=(0, (4, 2)), label="truth")
-            axis.plot(x, shown, color=_LINE, lw=1.4, label="estimate")
-        _limit(axis, value[known], std[known], _LEAST_RANGE[name])
-        axis.set_ylabel(label)
-        _tidy(axis)
-    if not stills:
-        axes[0].legend(loc="upper right", ncols=3, frameon=False, fontsize=9)
-    _status_strip(axes[4], x, [row.status for row in rows])
-    axes[4].set_xlabel("image" if stills else "time (s)")
-    figure.align_ylabels(axes)
-    return _png(figure)
+    value, std = estimates(rows), deviations(rows)
+    states = np.array([axis_states(row) for row in rows]).reshape(-1, 4)
+    known = states != AxisState.UNKNOWN
+    measured = states <= AxisState.UNCERTAIN
+    true = None if truth is None else estimates(truth)
+    figures: list[Any] = []
+    for axis, label in enumerate(_LABELS):
+        shown = figures[0].x_range if figures else _x_range(x)
+        plot = _figure(label, shown, _limits(value[:, axis], std[:, axis], known[:, axis], axis))
+        bands = _bands(
+            x, value[:, axis], std[:, axis], measured[:, axis], known[:, axis] & ~measured[:, axis]
+        )
+        _draw_estimate(plot, bands, stills)
+        if true is not None:
+            plot.line(x, true[:, axis], color=_TRUTH, line_dash=[5, 3], line_width=1.2, legend_label="truth")
+        _finish(plot, axis == len(_LABELS) - 1, "image" if stills else "time (s)", legend=axis == 0)
+        figures.append(plot)
+    grid = gridplot([[plot] for plot in figures], sizing_mode="stretch_width", toolbar_location="right")
+    item: dict[str, Any] = json_item(grid)
+    return item
 
 
 def plot_widths(
     x: NDArray[np.float64],
-    before: NDArray[np.float64],
-    after: NDArray[np.float64],
+    widths: NDArray[np.float64],
     lane_width: float,
-    titles: tuple[str, str] = ("first frame's pose held", "online"),
-    xlabel: str = "time (s)",
-) -> bytes:
-    """PNG of the lanes' widths in the bird's-eye view, before beside after.
+    limits: tuple[float, float],
+    xlabel: str,
+) -> dict[str, Any]:
+    """Return a plot of the lanes' widths in the bird's-eye view.
 
     Args:
         x: (F,) times or numbers of the frames.
-        before: (F, L-1) m, NaN where a lane was not seen.
-        after: (F, L-1) m.
+        widths: (F, L-1) m, NaN where a lane was not seen.
         lane_width: m, what was assumed.
-        titles: of the two halves.
-        xlabel: of both.
+        limits: m, of the axis, see :func:`width_limits`.
+        xlabel: of the axis.
     """
-    figure = Figure(figsize=(11, 3.6), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(1, 2, sharex=True, sharey=True)
-    both = np.concatenate([before.ravel(), after.ravel()])
-    both = both[np.isfinite(both)]
-    for axis, widths, title in zip(axes, (before, after), titles, strict=True):
-        for lane in range(widths.shape[1]):
-            if np.isfinite(widths[:, lane]).any():
-                colour = tuple(c / 255 for c in BOUNDARY_COLOURS[lane % len(BOUNDARY_COLOURS)])
-                axis.plot(
-                    x, widths[:, lane], "o", ms=2.6, color=colour, alpha=0.8, label=f"{lane}-{lane + 1}"
-                )
-        axis.axhline(lane_width, color="#57606a", lw=1, ls=(0, (5, 4)))
-        axis.set_title(f"{title}: σ = {_centimetres(widths)}", fontsize=11, loc="left")
-        axis.set_xlabel(xlabel)
-        _tidy(axis)
-    if len(both):
-        low, high = np.percentile(both, [1, 99])
-        margin = max(0.15 * (high - low), 0.2)
-        axes[0].set_ylim(min(low, lane_width) - margin, max(high, lane_width) + margin)
-        seen = axes[1] if np.isfinite(after).any() else axes[0]
-        seen.legend(title="lane", loc="upper right", ncols=3, fontsize=8, title_fontsize=8, frameon=False)
-    axes[0].set_ylabel("lane width (m)")
-    return _png(figure)
+    plot = _figure("lane width (m)", _x_range(x), limits, height=240)
+    for lane in np.flatnonzero(np.isfinite(widths).any(0)).tolist():
+        seen = np.isfinite(widths[:, lane])
+        source = ColumnDataSource({"x": x[seen], "width": widths[seen, lane]})
+        colour = "#{:02x}{:02x}{:02x}".format(*_dark(BOUNDARY_COLOURS[lane % len(BOUNDARY_COLOURS)]))
+        plot.scatter(
+            "x",
+            "width",
+            source=source,
+            size=4,
+            color=colour,
+            alpha=0.8,
+            legend_label=f"lane {lane}–{lane + 1}",
+        )
+    plot.add_layout(Span(location=lane_width, dimension="width", line_color=_INK, line_dash=[6, 4]))
+    plot.add_tools(HoverTool(tooltips=[(xlabel, "@x{0.00}"), ("width", "@width{0.000} m")]))
+    _finish(plot, True, xlabel, legend=True)
+    item: dict[str, Any] = json_item(plot)
+    return item
+
+
+def width_limits(
+    before: NDArray[np.float64], after: NDArray[np.float64], lane_width: float
+) -> tuple[float, float]:
+    """Return limits in m that show both, outliers left out."""
+    both = np.concatenate([before.ravel(), after.ravel(), [lane_width]])
+    low, high = np.percentile(both[np.isfinite(both)], [1, 99]).tolist()
+    margin = max(0.15 * (high - low), 0.2)
+    return min(low, lane_width) - margin, max(high, lane_width) + margin
 
 
 def width_deviation(widths: NDArray[np.float64]) -> float:
-    """Standard deviation of all observed lane widths, m; NaN with fewer than two."""
+    """Return the standard deviation of all observed lane widths, m; NaN with fewer than two."""
     seen = widths[np.isfinite(widths)]
     return float(seen.std()) if len(seen) > 1 else float("nan")
 
 
-def _centimetres(widths: NDArray[np.float64]) -> str:
-    deviation = width_deviation(widths)
-    return "not seen" if np.isnan(deviation) else f"{100 * deviation:.1f} cm"
+def _bands(
+    x: NDArray[np.float64],
+    value: NDArray[np.float64],
+    std: NDArray[np.float64],
+    measured: NDArray[np.bool_],
+    held: NDArray[np.bool_],
+) -> dict[str, ColumnDataSource]:
+    """Return what is drawn blue and what is drawn grey, each with its colour."""
+    return {
+        colour: ColumnDataSource(
+            {
+                "x": x.astype(np.float32) if np.abs(x).max(initial=0) < 1e4 else x,
+                "value": np.where(at, value, np.nan).astype(np.float32),
+                "low": np.where(at, value - 2 * std, np.nan).astype(np.float32),
+                "high": np.where(at, value + 2 * std, np.nan).astype(np.float32),
+                "two_sigma": (2 * std).astype(np.float32),
+            }
+        )
+        for colour, at in ((_LINE, _extended(measured, held)), (_HELD, held))
+    }
 
 
-def _limit(axis: Axes, value: NDArray[np.float64], std: NDArray[np.float64], least: float) -> None:
-    if len(value):
-        band = np.minimum(2 * std, 1.5 * max(np.ptp(value), least))  # a wide start must not flatten the rest
-        low, high = float((value - band).min()), float((value + band).max())
-        margin = 0.05 * (high - low) + max(0.0, 0.5 * (least - (high - low)))
-        axis.set_ylim(low - margin, high + margin)
+def _extended(at: NDArray[np.bool_], other: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return ``at`` with the first frame of the other kind after each stretch, so that lines meet."""
+    after = np.zeros_like(at)
+    after[1:] = at[:-1] & other[1:]
+    extended: NDArray[np.bool_] = at | after
+    return extended
 
 
-def _status_strip(axis: Axes, x: NDArray[np.float64], statuses: Sequence[str]) -> None:
-    step = float(np.median(np.diff(x))) if len(x) > 1 else 1.0
-    colours = [_STATUS_COLOURS.get(status, "#000000") for status in statuses]
-    axis.bar(x, np.ones(len(x)), width=step * 1.05, color=colours, align="center", linewidth=0)
-    axis.set_ylim(0, 1)
-    axis.set_yticks([])
-    axis.set_ylabel("status", rotation=0, ha="right", va="center")
-    present = [status for status in _STATUS_COLOURS if status in set(statuses)]
-    for i, status in enumerate(present):
-        place = (1.0 - 0.13 * (len(present) - 1 - i), 1.1)
-        axis.annotate(status, place, xycoords="axes fraction", ha="right", va="bottom", fontsize=8,
-                      color=_STATUS_COLOURS[status], weight="bold")  # fmt: skip
-    for side in axis.spines.values():
-        side.set_visible(False)
+def _draw_estimate(plot: Any, bands: dict[str, ColumnDataSource], stills: bool) -> None:
+    names = {_LINE: "estimate ±2σ", _HELD: "not determined"}
+    for colour, source in bands.items():
+        if not np.isfinite(source.data["value"]).any():
+            continue
+        if stills:
+            plot.segment("x", "low", "x", "high", source=source, color=colour, alpha=0.5)
+            line = plot.scatter("x", "value", source=source, size=5, color=colour, legend_label=names[colour])
+        else:
+            plot.varea("x", "low", "high", source=source, fill_color=colour, fill_alpha=0.22)
+            line = plot.line(
+                "x", "value", source=source, color=colour, line_width=1.8, legend_label=names[colour]
+            )
+        tooltips = [("at", "@x{0.00}"), ("value", "@value{0.000} ± @two_sigma{0.000}")]
+        plot.add_tools(
+            HoverTool(renderers=[line], tooltips=tooltips, mode="vline", point_policy="snap_to_data")
+        )
 
 
-def _tidy(axis: Axes) -> None:
-    axis.grid(color=_GRID, lw=0.7)
-    axis.set_axisbelow(True)
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.margins(x=0.01)
+def _figure(label: str, x_range: Any, limits: tuple[float, float], height: int = 150) -> Any:
+    return figure(
+        height=height,
+        sizing_mode="stretch_width",
+        x_range=x_range,
+        y_range=Range1d(*limits),
+        y_axis_label=label,
+        tools=_TOOLS,
+        active_drag="xbox_zoom",
+        active_scroll=None,
+        output_backend="canvas",
+        min_border_left=62,
+    )
 
 
-def _png(figure: Figure) -> bytes:
-    data = io.BytesIO()
-    figure.savefig(data, format="png")
-    return data.getvalue()
+def _finish(plot: Any, is_last: bool, xlabel: str, legend: bool) -> None:
+    plot.add_layout(Span(location=0, dimension="height", line_color="#d1242f", name=_NOW, visible=False))
+    plot.toolbar.logo = None
+    plot.outline_line_color = None
+    plot.grid.grid_line_color = _GRID
+    plot.axis.axis_line_color = plot.axis.major_tick_line_color = _GRID
+    plot.axis.minor_tick_line_color = None
+    plot.axis.major_label_text_font = plot.axis.axis_label_text_font = _FONT
+    plot.axis.axis_label_text_font_style = "normal"
+    plot.axis.axis_label_text_color = plot.axis.major_label_text_color = _INK
+    plot.xaxis.major_label_text_font_size = "12px" if is_last else "0px"
+    if is_last:
+        plot.xaxis.axis_label = xlabel
+    if plot.legend:
+        plot.legend.visible = legend
+        plot.legend.orientation = "horizontal"
+        plot.legend.location = "top_right"
+        plot.legend.border_line_color = None
+        plot.legend.background_fill_alpha = 0.7
+        plot.legend.label_text_font = _FONT
+        plot.legend.label_text_font_size = "12px"
+        plot.legend.padding = plot.legend.margin = 2
+
+
+def _x_range(x: NDArray[np.float64]) -> Range1d:
+    low, high = (float(x.min()), float(x.max())) if len(x) else (0.0, 1.0)
+    margin = 0.01 * max(high - low, 1e-3)
+    return Range1d(low - margin, high + margin, bounds=(low - margin, high + margin))
+
+
+def _limits(
+    value: NDArray[np.float64], std: NDArray[np.float64], known: NDArray[np.bool_], axis: int
+) -> tuple[float, float]:
+    """Return limits that show the estimate; a wide start must not flatten the rest."""
+    shown = known & np.isfinite(value) & np.isfinite(std)
+    if not shown.any():
+        return -1.0, 1.0
+    value, std, least = value[shown], std[shown], _LEAST_RANGE[axis]
+    band = np.minimum(2 * std, 1.5 * max(float(np.ptp(value)), least))
+    low, high = float((value - band).min()), float((value + band).max())
+    margin = 0.05 * (high - low) + max(0.0, 0.5 * (least - (high - low)))
+    return low - margin, high + margin
+
+
+def _dark(colour: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Return the colour for white paper."""
+    red, green, blue = (round(0.72 * part) for part in colour)
+    return red, green, blue

@@ -1,0 +1,75 @@
+"""What each frame tells about pitch, yaw, roll and height: measured, uncertain, held, lost or unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanebev.estimation.mount import MountConfig
+from lanebev.io.results import ExtrinsicsRow
+
+AXES = ("pitch", "yaw", "roll", "height")
+_UNSEEN = {
+    "pitch": "DIRECTION_UNSEEN", "yaw": "DIRECTION_UNSEEN", "roll": "ROLL_UNSEEN", "height": "HEIGHT_UNSEEN",
+}  # fmt: skip
+_RADIANS = MountConfig().largest_std
+LARGEST_STD = (*np.degrees(_RADIANS[:3]).tolist(), _RADIANS[3])
+"""deg, deg, deg, m: above this standard deviation a value counts as uncertain, as in the mount estimator."""
+
+
+class AxisState(IntEnum):
+    """What a frame tells about one axis, the better first."""
+
+    MEASURED = 0  # from this frame's lane boundaries
+    UNCERTAIN = 1  # measured, but with a standard deviation above LARGEST_STD
+    HELD = 2  # not determined by this frame: predicted from earlier ones
+    LOST = 3  # too long without support
+    UNKNOWN = 4  # nothing known yet
+
+
+def pose(row: ExtrinsicsRow) -> tuple[float, float, float, float]:
+    """Return pitch, yaw, roll (deg) and height (m) of a row."""
+    return row.pitch_deg, row.yaw_deg, row.roll_deg, row.height_m
+
+
+def sigmas(row: ExtrinsicsRow) -> tuple[float, float, float, float]:
+    """Return the standard deviations of pitch, yaw, roll (deg) and height (m) of a row."""
+    return row.pitch_std_deg, row.yaw_std_deg, row.roll_std_deg, row.height_std_m
+
+
+def estimates(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.float64]:
+    """Return (F, 4) pitch, yaw, roll (deg) and height (m)."""
+    return np.array([pose(row) for row in rows], dtype=np.float64).reshape(-1, 4)
+
+
+def deviations(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.float64]:
+    """Return (F, 4) standard deviations of pitch, yaw, roll (deg) and height (m)."""
+    return np.array([sigmas(row) for row in rows], dtype=np.float64).reshape(-1, 4)
+
+
+def reasons_of(row: ExtrinsicsRow) -> list[str]:
+    """Return the names of the reasons that hold in a frame."""
+    return [name for name in row.reasons.split("|") if name]
+
+
+def axis_states(row: ExtrinsicsRow) -> tuple[AxisState, AxisState, AxisState, AxisState]:
+    """Return the state of pitch, yaw, roll and height in a frame, from its status, reasons and sigmas."""
+    whole = {"LOST": AxisState.LOST, "COASTING": AxisState.HELD, "TRACKING": AxisState.MEASURED}
+    state = whole.get(row.status, AxisState.UNKNOWN)
+    if state != AxisState.MEASURED:
+        return state, state, state, state
+    reasons = reasons_of(row)
+    pitch, yaw, roll, height = (
+        _tracked_state(_UNSEEN[axis] in reasons, std, most)
+        for axis, std, most in zip(AXES, sigmas(row), LARGEST_STD, strict=True)
+    )
+    return pitch, yaw, roll, height
+
+
+def _tracked_state(unseen: bool, std: float, most: float) -> AxisState:
+    if unseen:
+        return AxisState.HELD
+    return AxisState.MEASURED if std <= most else AxisState.UNCERTAIN

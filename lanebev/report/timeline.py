@@ -1,0 +1,97 @@
+"""The timeline: strips of status and of every axis over the drive, as stretches of equal state."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanebev.io.results import ExtrinsicsRow
+from lanebev.report.axis_states import AXES, AxisState, axis_states, reasons_of
+from lanebev.report.verdict import reason_words
+
+STATUSES = ("TRACKING", "COASTING", "LOST", "UNINITIALISED")  # the better first
+STATE_WORDS = {
+    AxisState.MEASURED: "measured",
+    AxisState.UNCERTAIN: "uncertain",
+    AxisState.HELD: "not determined",
+    AxisState.LOST: "lost",
+    AxisState.UNKNOWN: "not known yet",
+}
+_MOST = 1500  # stretches of a strip
+
+
+class Stretch(NamedTuple):
+    """A stretch of equal state: where it begins and how long it is, in per cent, its kind and words."""
+
+    start: float
+    width: float
+    kind: str
+    words: str
+
+
+class Strip(NamedTuple):
+    """What is shown of one axis, or of the status."""
+
+    name: str
+    stretches: tuple[Stretch, ...]
+
+
+def places_on_axis(rows: Sequence[ExtrinsicsRow], stills: bool) -> NDArray[np.float64]:
+    """Return (F+1,) where each frame begins and the last one ends: s, or the number of the image."""
+    if stills or len(rows) < 2:
+        return np.arange(len(rows) + 1, dtype=np.float64)
+    times = np.maximum.accumulate(np.array([row.time_s for row in rows]))
+    step = float(np.median(np.diff(times)))
+    return np.append(times, times[-1] + max(step, 1e-6))
+
+
+def strips(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> list[Strip]:
+    """Return the strips of status, pitch, yaw, roll and height."""
+    if not rows:
+        return []
+    edges = places_on_axis(rows, stills)
+    status = np.array([STATUSES.index(row.status) if row.status in STATUSES else 3 for row in rows])
+    states = np.array([axis_states(row) for row in rows])
+    found = [_strip("status", status, [name.lower() for name in STATUSES], edges, rows)]
+    kinds = [state.name.lower() for state in AxisState]
+    return found + [_strip(name, states[:, i], kinds, edges, rows) for i, name in enumerate(AXES)]
+
+
+def shown_frames(rows: Sequence[ExtrinsicsRow], always: Sequence[int], most: int = 3000) -> list[int]:
+    """Return places of frames: ``most`` evenly spaced ones, changes of status, and ``always``."""
+    every = max(1, -(-len(rows) // most))
+    changes = [i for i in range(1, len(rows)) if rows[i].status != rows[i - 1].status][:most]
+    return sorted({*range(0, len(rows), every), *changes, *always})
+
+
+def _strip(
+    name: str,
+    states: NDArray[np.int64],
+    kinds: Sequence[str],
+    edges: NDArray[np.float64],
+    rows: Sequence[ExtrinsicsRow],
+) -> Strip:
+    """Join equal neighbours; of a long drive, each of 1500 parts has the worst state in it."""
+    begins = np.unique(np.linspace(0, len(states), _MOST + 1).astype(int)[:-1])
+    worst = np.maximum.reduceat(states, begins)
+    first = np.flatnonzero(np.append(True, np.diff(worst) != 0))
+    bounds = [*begins[first].tolist(), len(states)]
+    per_cent = 100 * (edges - edges[0]) / (edges[-1] - edges[0])
+    stretches = []
+    for state, start, end in zip(worst[first].tolist(), bounds[:-1], bounds[1:], strict=True):
+        kind = kinds[state]
+        words = STATE_WORDS[AxisState[kind.upper()]] if kind.upper() in AxisState.__members__ else kind
+        why = ", ".join(_usual_reasons(rows[start:end])) if state else ""
+        place = f"{edges[start]:.1f} to {edges[end]:.1f}"
+        text = f"{name} {words}, {place}" + (f": {why}" if why else "")
+        stretches.append(Stretch(per_cent[start], per_cent[end] - per_cent[start], kind, text))
+    return Strip(name, tuple(stretches))
+
+
+def _usual_reasons(rows: Sequence[ExtrinsicsRow]) -> list[str]:
+    (most, _), *_ = Counter(row.reasons for row in rows).most_common(1)
+    return reason_words(reasons_of(rows[0]._replace(reasons=most)))

@@ -1,0 +1,285 @@
+"""The verdict on a run in words: how much of it is calibrated, and what is not determined, when and why."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanebev.io.results import ExtrinsicsRow
+from lanebev.report.axis_states import AXES, LARGEST_STD, AxisState, axis_states, deviations, reasons_of
+
+REASON_WORDS = {
+    "NO_SEGMENTS": "no lane boundaries seen",
+    "FEW_INLIERS": "what was seen does not fit the road",
+    "TIME": "the frames' times do not advance",
+    "NO_START": "no frame yet to start from",
+    "ROLL_UNSEEN": "one lane only",
+    "HEIGHT_UNSEEN": "no lane with both its boundaries",
+    "DIRECTION_UNSEEN": "one boundary only",
+    "LANE_CHANGE": "lane change",
+    "RESTARTED": "started anew",
+}
+_WHOLE_FRAME = ("NO_SEGMENTS", "FEW_INLIERS", "TIME", "NO_START")
+_UNSEEN = ("DIRECTION_UNSEEN", "HEIGHT_UNSEEN", "ROLL_UNSEEN")  # each implies those after it
+_STATUS_WORDS = {
+    "LOST": "lost",
+    "COASTING": "predicted from earlier frames",
+    "UNINITIALISED": "not yet calibrated",
+}
+_SEVERITY = ("no frames", *_STATUS_WORDS.values(), "not determined", "uncertain")
+_JOINED = 0.5  # s between two intervals of the same kind that are told as one
+_SHORTEST = 0.2  # s of an interval that is told
+_GAP = 1.0  # s between two frames, and
+_GAP_STEPS = 5.0  # times the usual step, from which on frames are missing
+_TOLD = 8  # findings
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that holds from one frame to another.
+
+    Attributes:
+        subject: an axis, several, or empty for the whole pose.
+        what: e.g. "not determined".
+        first, last: its frames' places in the rows.
+        start, end: s; numbers of images where each is on its own.
+        why: reasons in words, may be empty.
+        frames: how many of the frames from first to last it holds in.
+    """
+
+    subject: str
+    what: str
+    first: int
+    last: int
+    start: float
+    end: float
+    why: str
+    frames: int = 0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a run is worth, in words.
+
+    Attributes:
+        grade: "good", "fair" or "poor".
+        headline: one sentence.
+        precision: one sentence, empty if nothing was calibrated.
+        findings: what is amiss, the most severe first.
+        untold: further findings.
+    """
+
+    grade: str
+    headline: str
+    precision: str
+    findings: tuple[Finding, ...]
+    untold: int = 0
+
+    @property
+    def text(self) -> str:
+        """All of it in one line."""
+        told = [describe(finding) for finding in self.findings]
+        more = [f"and {self.untold} more"] if self.untold else []
+        return "; ".join([self.headline.removesuffix("."), *told, *more])
+
+
+def verdict(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> Verdict:
+    """Return the verdict on a run from the status, reasons and sigmas of its frames.
+
+    Args:
+        rows: one per frame.
+        stills: each image is on its own, so there are no intervals of time.
+    """
+    if not rows:
+        return Verdict("poor", "Not calibrated: there was no frame.", "", ())
+    tracked = np.array([row.status == "TRACKING" for row in rows])
+    states = np.array([axis_states(row) for row in rows])
+    whole = (states == AxisState.MEASURED).all(-1)
+    share, complete = float(tracked.mean()), float(whole.mean())
+    if not tracked.any():
+        why = _frequent([row for row in rows], _WHOLE_FRAME)
+        return Verdict("poor", f"Not calibrated: {why or 'no usable frame'}.", "", ())
+    if stills:
+        headline = f"{tracked.sum()} of {len(rows)} {_images(len(rows))} calibrated"
+        part = f"all four axes determined in {whole.sum()}"
+    else:
+        headline = f"Calibrated for {percent(share)} of the drive"
+        part = f"all four axes determined for {percent(complete)}"
+    headline += "." if complete == share else f", {part}."
+    grade = "good" if complete >= 0.9 else "fair" if share >= 0.5 else "poor"
+    found = image_findings(rows) if stills else drive_findings(rows)
+    return Verdict(grade, headline, _precision(rows, states), tuple(found[:_TOLD]), len(found[_TOLD:]))
+
+
+def describe(finding: Finding) -> str:
+    """Return a finding in words, such as "roll not determined from 7.2 to 9.8 s: one lane only"."""
+    subject = f"{finding.subject} " if finding.subject else ""
+    why = f": {finding.why}" if finding.why else ""
+    if finding.frames:
+        return f"{subject}{finding.what} in {finding.frames} {_images(finding.frames)}{why}"
+    return f"{subject}{finding.what} from {finding.start:.1f} to {finding.end:.1f} s{why}"
+
+
+def drive_findings(rows: Sequence[ExtrinsicsRow]) -> list[Finding]:
+    """Return what is amiss in a drive: intervals without frames, support or one of the axes."""
+    times = np.array([row.time_s for row in rows])
+    found = [*_missing_frames(times)]
+    for status, words in _STATUS_WORDS.items():
+        at = np.array([row.status == status for row in rows])
+        for first, last in intervals(at, times):
+            why = _frequent([row for row in rows[first : last + 1] if row.status == status], _WHOLE_FRAME)
+            found.append(_finding("", words, first, last, times, why))
+    states = np.array([axis_states(row) for row in rows])
+    held = states == AxisState.HELD
+    tracked = np.array([row.status == "TRACKING" for row in rows])
+    parts: list[Finding] = []
+    for axis, name in enumerate(AXES):
+        most = f"σ above {_value(axis, LARGEST_STD[axis])}"
+        for first, last in intervals(held[:, axis] & tracked, times):
+            why = _unseen_why([row for row, is_held in _cut(rows, held[:, axis], first, last) if is_held])
+            parts.append(_finding(name, "not determined", first, last, times, why))
+        for first, last in intervals(states[:, axis] == AxisState.UNCERTAIN, times):
+            parts.append(_finding(name, "uncertain", first, last, times, most))
+    found += _joined_axes(parts)
+    return sorted(found, key=lambda one: (_SEVERITY.index(one.what), one.start - one.end))
+
+
+def image_findings(rows: Sequence[ExtrinsicsRow]) -> list[Finding]:
+    """Return what is amiss in images, each on its own: in how many of them, and the first."""
+    states = np.array([axis_states(row) for row in rows])
+    tracked = np.array([row.status == "TRACKING" for row in rows])
+    lost = [row for row in rows if row.status != "TRACKING"]
+    found = [*_in_images("", "no calibration", ~tracked, _frequent(lost, _WHOLE_FRAME))]
+    for axis, name in enumerate(AXES):
+        held, uncertain = (
+            tracked & (states[:, axis] == AxisState.HELD),
+            states[:, axis] == AxisState.UNCERTAIN,
+        )
+        why = _unseen_why([row for row, is_held in zip(rows, held.tolist(), strict=True) if is_held])
+        found += _in_images(name, "not determined", held, why)
+        found += _in_images(name, "uncertain", uncertain, f"σ above {_value(axis, LARGEST_STD[axis])}")
+    return found
+
+
+def intervals(
+    at: NDArray[np.bool_], times: NDArray[np.float64], joined: float = _JOINED, shortest: float = _SHORTEST
+) -> Iterator[tuple[int, int]]:
+    """Yield first and last frame of each interval in which ``at`` holds.
+
+    Args:
+        at: (F,).
+        times: (F,) s.
+        joined: s, intervals that are not further apart are one.
+        shortest: s, shorter ones are left out.
+    """
+    places = np.flatnonzero(at)
+    if not len(places):
+        return
+    breaks = np.flatnonzero((np.diff(times[places]) > joined) & (np.diff(places) > 1)) + 1
+    for part in np.split(places, breaks):
+        first, last = int(part[0]), int(part[-1])
+        if _end(times, last) - times[first] >= shortest - 1e-9:
+            yield first, last
+
+
+def percent(share: float) -> str:
+    """Return a share in per cent, 0 % and 100 % only where they are exact."""
+    if 0.0 < share < 1.0:
+        return f"{min(max(round(100 * share), 1), 99)} %"
+    return f"{100 * share:.0f} %"
+
+
+def reason_words(names: Sequence[str]) -> list[str]:
+    """Return reasons in words; of the unseen axes the one that implies the others."""
+    unseen = next((name for name in _UNSEEN if name in names), None)
+    kept = [name for name in names if name not in _UNSEEN or name == unseen]
+    if any(name in names for name in _WHOLE_FRAME):  # nothing was used, so no axis was seen
+        kept = [name for name in kept if name not in _UNSEEN]
+    return [REASON_WORDS.get(name, name.lower().replace("_", " ")) for name in kept]
+
+
+def _in_images(subject: str, what: str, at: NDArray[np.bool_], why: str) -> Iterator[Finding]:
+    places: list[int] = np.flatnonzero(at).tolist()
+    if places:
+        yield Finding(subject, what, places[0], places[-1], places[0], places[-1], why, len(places))
+
+
+def _missing_frames(times: NDArray[np.float64]) -> Iterator[Finding]:
+    steps = np.diff(times)
+    if len(steps) < 2:
+        return
+    for place in np.flatnonzero(steps > max(_GAP, _GAP_STEPS * float(np.median(steps)))).tolist():
+        yield Finding("", "no frames", place, place + 1, float(times[place]), float(times[place + 1]), "")
+
+
+def _finding(subject: str, what: str, first: int, last: int, times: NDArray[np.float64], why: str) -> Finding:
+    return Finding(subject, what, first, last, float(times[first]), _end(times, last), why)
+
+
+def _end(times: NDArray[np.float64], last: int) -> float:
+    """Time until which a frame stands: that of the next, or a usual step later."""
+    usual = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    following = float(times[last + 1]) if last + 1 < len(times) else np.inf
+    return min(following, float(times[last]) + max(usual, 0.0))
+
+
+def _cut(
+    rows: Sequence[ExtrinsicsRow], at: NDArray[np.bool_], first: int, last: int
+) -> Iterator[tuple[ExtrinsicsRow, bool]]:
+    return zip(rows[first : last + 1], at[first : last + 1].tolist(), strict=True)
+
+
+def _joined_axes(parts: Sequence[Finding]) -> list[Finding]:
+    """Join axes to which the same happens in the same frames."""
+
+    def same(one: Finding) -> tuple[str, int, int, str]:
+        return one.what, one.first, one.last, one.why if one.what == "not determined" else ""
+
+    found = []
+    for _, group in groupby(sorted(parts, key=lambda one: (same(one), AXES.index(one.subject))), same):
+        members = list(group)
+        why = ", ".join(dict.fromkeys(one.why for one in members))
+        found.append(replace(members[0], subject=_listed([one.subject for one in members]), why=why))
+    return found
+
+
+def _frequent(rows: Sequence[ExtrinsicsRow], among: Sequence[str], least: float = 0.2) -> str:
+    """Return the reasons that hold in a fifth of the frames or more, in words."""
+    counts = Counter(name for row in rows for name in reasons_of(row) if name in among)
+    usual = [name for name, count in counts.most_common() if count >= least * len(rows)]
+    return ", ".join(REASON_WORDS[name] for name in usual)
+
+
+def _unseen_why(rows: Sequence[ExtrinsicsRow]) -> str:
+    """Return why an axis was not seen in most of the frames, in words."""
+    named = [next((name for name in _UNSEEN if name in reasons_of(row)), None) for row in rows]
+    counts = Counter(name for name in named if name)
+    return REASON_WORDS[counts.most_common(1)[0][0]] if counts else ""
+
+
+def _precision(rows: Sequence[ExtrinsicsRow], states: NDArray[np.int64]) -> str:
+    """Return the median of ±2σ over the frames that measure an axis."""
+    std = deviations(rows)
+    told = [
+        f"{name} ±{_value(axis, 2 * float(np.median(std[states[:, axis] <= AxisState.UNCERTAIN, axis])))}"
+        for axis, name in enumerate(AXES)
+        if (states[:, axis] <= AxisState.UNCERTAIN).any()
+    ]
+    return f"Typical accuracy (2σ): {', '.join(told)}." if told else ""
+
+
+def _value(axis: int, value: float) -> str:
+    return f"{100 * value:.1f} cm" if AXES[axis] == "height" else f"{value:.2f}°"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _images(count: int) -> str:
+    return "image" if count == 1 else "images"
