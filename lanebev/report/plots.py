@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,8 +27,9 @@ _FONT = "system-ui, sans-serif"
 
 
 def bokeh_script() -> str:
-    """Return BokehJS, to be put into the page: it loads nothing from elsewhere."""
-    return "\n".join(Resources(mode="inline", components=["bokeh"], log_level="error").js_raw)
+    """Return BokehJS to embed, with all addresses in it cut, so that it can load nothing."""
+    script = "\n".join(Resources(mode="inline", components=["bokeh"], log_level="error").js_raw)
+    return re.sub(r"([\"'`])https?://(?!www\.w3\.org/)", r"\1#", script)
 
 
 def plot_estimates(
