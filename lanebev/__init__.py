@@ -1,66 +1,28 @@
 """lanebev: the pose of a camera over the road, frame by frame, from lane boundaries alone."""
 
-from lanebev import weights as weights
-from lanebev.camera.model import Camera
-from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.state import JointConfig, Reason
-from lanebev.estimation.mount import MountCalibration, MountConfig, MountEstimator, MountReason, MountStatus
-from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
-from lanebev.estimation.two_stage.state import TwoStageConfig
-from lanebev.geometry.road import (
-    image_covariance,
-    image_from_road_points,
-    road_covariance,
-    road_from_image_points,
-)
-from lanebev.io.state import load_state, save_state
-from lanebev.observation.lines import LineExtractor
-from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
-from lanebev.observation.segments import LaneSegments
-from lanebev.observation.vertices import LineConfig
-from lanebev.pipeline import LaneBEV, LaneBEVOutput
-from lanebev.session import Session, SessionResult
-from lanebev.types import Calibration, Extrinsics, Status
-from lanebev.view.canonical import CanonicalView
-from lanebev.view.grid import BEVGrid, bev_from_image
-from lanebev.view.paint import ImageFromBEV
-from lanebev.view.warp import BEVWarp
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "BEVGrid",
-    "BEVWarp",
-    "Calibration",
-    "Camera",
-    "CanonicalView",
-    "Extrinsics",
-    "ImageFromBEV",
-    "JointCalibrator",
-    "JointConfig",
-    "LaneBEV",
-    "LaneBEVOutput",
-    "LaneSegmenter",
-    "LaneSegments",
-    "LineConfig",
-    "LineExtractor",
-    "MountCalibration",
-    "MountConfig",
-    "MountEstimator",
-    "MountReason",
-    "MountStatus",
-    "Reason",
-    "SegmenterConfig",
-    "Session",
-    "SessionResult",
-    "Status",
-    "TwoStageCalibrator",
-    "TwoStageConfig",
-    "bev_from_image",
-    "image_covariance",
-    "image_from_road_points",
-    "load_state",
-    "road_covariance",
-    "road_from_image_points",
-    "save_state",
-]
+
+def _is_command() -> bool:
+    """Whether this process is the command line, which answers ``--help`` before torch is imported."""
+    program = next(iter(getattr(sys, "argv", [])), "")  # an embedding program may have none
+    return program == "-m" or Path(program).stem == "lanebev"
+
+
+if TYPE_CHECKING or not _is_command():
+    from lanebev.api import *  # noqa: F403 - its __all__ are the public names
+    from lanebev.api import __all__ as __all__
+else:
+
+    def __getattr__(name: str) -> Any:
+        """Import the public names when the first of them is needed."""
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(importlib.import_module("lanebev.api"), name)

@@ -6,12 +6,15 @@ import argparse
 import contextlib
 import io
 import itertools
+import logging
 import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn
+
+from lanebev import __version__
 
 DESCRIPTION = "Online camera-to-road calibration from lane boundaries, and a stable bird's-eye view."
 CAMERA_HELP = "of OpenCV, ROS, Kalibr, EuRoC, KITTI, nuScenes; or YAML of fx fy cx cy width height"
@@ -43,6 +46,8 @@ def _size(text: str) -> tuple[int, int]:
 def parser() -> argparse.ArgumentParser:
     """The parser of ``lanebev``."""
     top = _Parser(prog="lanebev", description=DESCRIPTION, allow_abbrev=False)
+    top.add_argument("--version", action="version", version=f"lanebev {__version__}")
+    top.add_argument("--verbose", action="store_true", help="say on stderr what is done")
     commands = top.add_subparsers(dest="command", required=True, metavar="{demo,run}")
     demo = commands.add_parser("demo", help="a rendered drive end to end", allow_abbrev=False)
     demo.add_argument(
@@ -82,6 +87,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 when it is done, 2 with one line on bad input, 128 + the signal that stopped it."""
     options = vars(parser().parse_args(arguments))
     command = options.pop("command")
+    if options.pop("verbose"):
+        logging.basicConfig(format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
+        logging.getLogger("lanebev").setLevel(logging.DEBUG)
     try:
         with _signals_unwind():
             report = _run(options) if command == "run" else _demo(options)

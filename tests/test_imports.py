@@ -23,6 +23,7 @@ LAYERS = (  # from the bottom: a package imports packages of lower layers only, 
     {"session"},
     {"report"},
     {"app"},
+    {"api"},
     {"cli"},
     {"lanebev", "__main__"},  # lanebev: the names that the package exports
 )

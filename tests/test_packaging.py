@@ -88,3 +88,28 @@ def test_wheel_runs_without_the_checkout(tmp_path):
     done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "extrinsics.csv").exists()
+
+
+@pytest.mark.parametrize(
+    "start", [["-m", "lanebev"], ["-c", "import sys; sys.argv[0] = 'lanebev'; import lanebev.cli"]]
+)
+def test_help_is_there_before_torch(start):
+    """Torch takes seconds to import; ``--help`` needs none of it."""
+    code = [sys.executable, "-X", "importtime", *start, "--help"]
+    done = subprocess.run(code, capture_output=True, text=True, check=True)
+    imported = {line.rsplit("|", 1)[-1].strip() for line in done.stderr.splitlines()}
+    assert "lanebev.cli" in imported
+    assert not imported & {"torch", "numpy", "cv2", "av"}
+
+
+def test_the_command_has_the_public_names_too():
+    code = "import sys; sys.argv[0] = 'lanebev'; import lanebev; print(lanebev.Status.TRACKING.name)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "TRACKING\n"
+
+
+def test_version_is_said():
+    done = subprocess.run(
+        [sys.executable, "-m", "lanebev", "--version"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == f"lanebev {lanebev.__version__}\n"
