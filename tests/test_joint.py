@@ -8,34 +8,38 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lanebev.estimation.joint.calibrator import JointCalibrator, follow_lane_change
+from lanebev.estimation.joint.calibrator import JointCalibrator, predict_state
 from lanebev.estimation.joint.dynamics import (
-    MEANS,
-    NUM_COMMON,
-    NUM_SEEN,
-    RATES,
-    SHAPE,
-    SPEED,
-    STEPS,
     MotionConfig,
+    RoadMotion,
     motion,
-    spring,
+    pose_covariance,
+    pose_transition,
 )
+from lanebev.estimation.joint.evidence import adapt_motion_scale
+from lanebev.estimation.joint.lane_change import renumber
+from lanebev.estimation.joint.layout import NUM_COMMON, NUM_SHAPE, SHAPE, STEPS, layout
 from lanebev.estimation.joint.measurement import (
     CURVATURE,
     HEIGHT,
-    KNOT_SPACING,
-    NUM_STEPS,
     OFFSET,
     ROLL,
+    boundary_distances,
     boundary_places,
     boundary_residuals,
+    foot_rays,
+    look,
     observe,
 )
-from lanebev.estimation.joint.road import come_nearer, straight_or_bend, turn_along
+from lanebev.estimation.joint.road import propagate_road_shape, straight_or_bend, turn_along
+from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS, road_basis, road_curve
 from lanebev.estimation.joint.single_frame import FramePrior
-from lanebev.estimation.joint.state import JointConfig, Reason, begin
-from lanebev.estimation.joint.update import iterate
+from lanebev.estimation.joint.state import JointConfig, Reason, state_from_fit
+from lanebev.estimation.joint.update import (
+    frame_information,
+    posterior_covariance,
+    update,
+)
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.scenarios import CAMERA, FPS, PLACES, WIDTH, moments
 from lanebev.testing.scenarios import observe as see
@@ -43,6 +47,7 @@ from lanebev.types import Status
 
 torch.set_num_threads(1)
 DOUBLE = torch.float64
+PLACE = layout(6)
 OBLIQUE = CAMERA * torch.tensor([[1.1], [0.9], [1.0]]).double()  # pixels that are neither square nor upright
 OBLIQUE[0, 1] = 30.0
 
@@ -247,9 +252,9 @@ def test_spline_jacobian_equals_jacfwd():
     ends = segments.endpoints @ other[:2, :2].mT + other[:2, 2]
     seen = observe(segments._replace(endpoints=ends), OBLIQUE.expand(2, 3, 3), 6)
     places = boundary_places(WIDTH, 6, seen.sigma).gather(1, seen.boundary)
-    params = torch.zeros(2, NUM_SEEN, dtype=DOUBLE)
+    params = torch.zeros(2, NUM_COMMON, dtype=DOUBLE)
     params[:, :5] = torch.tensor([*moment.pose, moment.offset], dtype=DOUBLE)
-    params[:, SHAPE] = 1e-5 * torch.randn(2, 1 + NUM_STEPS, generator=generator, dtype=DOUBLE)
+    params[:, SHAPE] = 1e-5 * torch.randn(2, NUM_SHAPE, generator=generator, dtype=DOUBLE)
     phase = torch.tensor([0.0, 7.3], dtype=DOUBLE)
     found = boundary_residuals(params, places, seen, phase)
     full = torch.func.jacfwd(lambda p: boundary_residuals(p, places, seen, phase).distance)(params)
@@ -263,24 +268,40 @@ def test_spline_jacobian_equals_jacfwd():
 
 def test_road_comes_nearer_by_the_way_that_was_driven():
     """A clothoid seen ahead is the same clothoid after 23 m, of which the knots passed two."""
-    rate, size = 4e-5, NUM_COMMON + 6
-    mean = torch.zeros(1, size, dtype=DOUBLE)
+    rate = 4e-5
+    mean = torch.zeros(1, PLACE.size, dtype=DOUBLE)
     mean[:, SHAPE.start] = 1e-3
     mean[:, STEPS] = rate * KNOT_SPACING
-    cov = torch.eye(size, dtype=DOUBLE)[None] * 1e-10
-    cov[:, SPEED, SPEED] = 64.0
+    cov = torch.eye(NUM_SHAPE, dtype=DOUBLE)[None] * 1e-10
     cfg = MotionConfig(speed=20.0)
     none = torch.zeros(1, dtype=DOUBLE)
-    after, spread, phase = come_nearer(mean, cov, none, torch.tensor([1.15], dtype=DOUBLE), cfg)
-    assert phase.item() == pytest.approx(3.0)
+    after = propagate_road_shape(mean, cov, none, torch.tensor([1.15], dtype=DOUBLE), PLACE, cfg)
+    assert after.phase.item() == pytest.approx(3.0)
     turned = turn_along(mean[:, SHAPE], none, torch.tensor([23.0], dtype=DOUBLE))[0]
     torch.testing.assert_close(turned, mean[0, SHAPE], rtol=0.02, atol=0.0)  # R > 300 m: a slight turn
-    assert after[0, SHAPE.start].item() == pytest.approx(turned[:3].sum().item())
+    assert after.shape[0, 0].item() == pytest.approx(turned[:3].sum().item())
     steps = torch.cat([turned[3:], turned.new_zeros(2)])
-    torch.testing.assert_close(after[0, STEPS], steps)
-    # an unknown speed is an unknown curvature on a clothoid, here 8 m/s · 1.15 s · rate
-    assert spread[0, SHAPE.start, SHAPE.start].sqrt().item() == pytest.approx(8 * 1.15 * rate, rel=0.01)
-    torch.testing.assert_close(spread, spread.mT)
+    torch.testing.assert_close(after.shape[0, 1:], steps)
+    # an unknown speed is an unknown curvature on a clothoid: by 1 m/s · 1.15 s · rate
+    assert after.by_speed[0, 0].item() == pytest.approx(1.15 * rate, rel=0.01)
+    torch.testing.assert_close(after.transition[0] @ mean[0, SHAPE], after.shape[0], rtol=0.02, atol=1e-6)
+
+
+@pytest.mark.parametrize("phase", [0.0, 6.0])
+def test_the_curve_is_the_sum_of_its_basis_and_the_integral_of_its_curvature(phase):
+    generator = torch.Generator().manual_seed(0)
+    shape = 1e-3 * torch.randn(2, NUM_SHAPE, generator=generator, dtype=DOUBLE)
+    z = torch.linspace(0.0, 90.0, 9001, dtype=DOUBLE).expand(2, -1)
+    behind = torch.full((2,), phase, dtype=DOUBLE)
+    curve = road_curve(z, shape, behind)
+    for part, basis in zip(curve, road_basis(z, behind), strict=True):
+        torch.testing.assert_close((shape.unsqueeze(1) @ basis).squeeze(1), part)
+    heading = torch.cumulative_trapezoid(curve.curvature, dx=0.01)
+    torch.testing.assert_close(curve.heading[:, 1:], heading, rtol=1e-5, atol=1e-9)
+    torch.testing.assert_close(
+        curve.bend[:, 1:], torch.cumulative_trapezoid(curve.heading, dx=0.01), rtol=1e-4, atol=1e-6
+    )
+    assert (curve.heading[:, 0].abs() < 1e-15).all()
 
 
 @pytest.mark.parametrize("phase", [0.0, 6.0])
@@ -315,79 +336,151 @@ def test_turning_along_at_once_is_turning_along_in_steps():
     assert (turn_along(torch.zeros_like(shape), none, none + 8.0) == 0).all()
 
 
-def test_spring_is_constant_velocity_when_soft_and_halves_join():
-    dt = torch.tensor([0.02, 0.5], dtype=DOUBLE)
-    move, noise = (part.view(2, 2, 2) for part in spring(dt, 2.2))
-    half, half_noise = (part.view(2, 2, 2) for part in spring(dt / 2, 2.2))
+def no_road(rows: int = 1) -> RoadMotion:
+    """A shape that stays."""
+    eye = torch.eye(NUM_SHAPE, dtype=DOUBLE).expand(rows, -1, -1)
+    none = torch.zeros(rows, NUM_SHAPE, dtype=DOUBLE)
+    return RoadMotion(none, none[:, 0], eye, none, none)
+
+
+def test_pose_process_is_a_butterworth_low_pass():
+    """Its spectrum is 1 / (1 + (f / f_c)⁸), and its variance one."""
+    covariance = pose_covariance(1.5, torch.zeros((), dtype=DOUBLE))
+    frequency = torch.linspace(0.01, 20.0, 20_000, dtype=DOUBLE)
+    power = 1 / (1 + (frequency / 1.5) ** 8)
+    turn = (2 * math.pi * frequency) ** 2
+    for derivative, expected in ((1, turn), (2, turn**2)):
+        ratio = float((power * expected).sum() / power.sum())
+        assert float(covariance[derivative, derivative]) == pytest.approx(ratio, rel=0.01)
+    assert covariance[0, 0] == 1.0
+
+
+def test_pose_transition_halves_join_and_keeps_the_stationary_covariance():
+    dt = torch.tensor([0.02, 0.5, 5.0], dtype=DOUBLE)
+    move, noise = pose_transition(dt, 1.0)
+    half, half_noise = pose_transition(dt / 2, 1.0)
     torch.testing.assert_close(half @ half, move)
-    torch.testing.assert_close(half @ half_noise @ half.mT + half_noise, noise, rtol=1e-3, atol=1e-9)
-    soft, soft_noise = (part.view(2, 2, 2) for part in spring(dt, 1e-6))
-    torch.testing.assert_close(soft[:, 0, 1], dt, rtol=1e-5, atol=0)
-    torch.testing.assert_close(soft_noise[:, 0, 0], dt**3 / 3, rtol=1e-5, atol=0)
+    torch.testing.assert_close(half @ half_noise @ half.mT + half_noise, noise)
+    torch.testing.assert_close(move[0, 0, 1], dt[0], rtol=1e-3, atol=0.0)  # constant velocity over a frame
+    assert move[2].abs().max() < 1e-3  # and forgotten after seconds
+    torch.testing.assert_close(noise[2], pose_covariance(1.0, dt), rtol=1e-3, atol=1e-3)
+    none, nothing_new = pose_transition(torch.zeros(1, dtype=DOUBLE), 1.0)
+    torch.testing.assert_close(none[0], torch.eye(4, dtype=DOUBLE))
+    assert nothing_new.abs().max() < 1e-9
 
 
-def test_what_is_held_returns_by_a_stiffer_spring_and_unequal_lanes_forget():
+def test_motion_of_each_axis_scales_and_unequal_lanes_forget():
     cfg, dt = MotionConfig(), torch.full((2,), 0.1, dtype=DOUBLE)
-    held = torch.tensor([[False] * 4, [False, False, True, False]])
+    scale = torch.tensor([[1.0] * 4, [1.0, 1.0, 2.0, 1.0]], dtype=DOUBLE)
     unequal = torch.tensor([0.0, 0.12], dtype=DOUBLE)
-    transition, noise = motion(dt, held, unequal, 6, cfg)
-    for row, rate, factor in ((0, cfg.spring, 1.0), (1, cfg.held_spring, cfg.held_factor)):
-        x = [2, RATES.start + 2]  # roll and its rate
-        move, density = spring(dt[:1], rate)
-        torch.testing.assert_close(transition[row][x][:, x].flatten(), move[0])
-        torch.testing.assert_close(noise[row][x][:, x].flatten(), factor * cfg.angular_density * density[0])
-        assert transition[row, 2, MEANS.start + 2] == pytest.approx(1 - float(move[0, 0]))
-    torch.testing.assert_close(transition[0, 0], transition[1, 0])  # pitch is seen in both
+    transition, noise = motion(dt, scale, unequal, no_road(2), PLACE, cfg)
+    move, density = pose_transition(dt[:1], cfg.bandwidth)
+    for row in range(2):
+        *chain, mean = PLACE.chain(ROLL)
+        torch.testing.assert_close(transition[row][chain][:, chain], move[0])
+        variance = (float(scale[row, ROLL]) * cfg.angle_std) ** 2
+        torch.testing.assert_close(noise[row][chain][:, chain], variance * density[0])
+        # the pose returns to its mean, which moves nothing else
+        torch.testing.assert_close(transition[row][chain][:, mean], torch.eye(4).double()[0] - move[0, :, 0])
+        assert transition[row, mean, mean] == 1
     settled = math.exp(-0.1 / cfg.unequal_memory)
-    assert transition[1, NUM_COMMON, NUM_COMMON] == pytest.approx(settled)
-    assert noise[1, NUM_COMMON, NUM_COMMON] == pytest.approx(
-        0.12**2 * (1 - settled**2) + 0.1 * cfg.deviation_walk**2
-    )
+    own = PLACE.deviations.start
+    assert transition[1, own, own] == pytest.approx(settled)
+    assert noise[1, own, own] == pytest.approx(0.12**2 * (1 - settled**2) + 0.1 * cfg.deviation_walk**2)
+    assert noise[0, own, own] == pytest.approx(0.1 * cfg.deviation_walk**2)
+
+
+def test_motion_scale_follows_the_scores_and_decays():
+    cfg, one = JointConfig(), torch.ones(1, 4, dtype=DOUBLE)
+    dt, score = torch.full((1,), 1 / 30, dtype=DOUBLE), torch.tensor([[0.0, 1.0, 2.0, -2.0]], dtype=DOUBLE)
+    scale = one
+    for _ in range(10):
+        scale = adapt_motion_scale(scale, score, dt, cfg)
+    assert scale[0, :2].tolist() == [1.0, 1.0]  # never below one, and unchanged at a mean square of one
+    assert scale[0, 2] == scale[0, 3] > 2
+    for _ in range(90):
+        scale = adapt_motion_scale(scale, torch.ones_like(score), dt, cfg)
+    assert scale[0, 2] < 2.5
 
 
 def test_minutes_of_nothing_keep_the_covariance_positive_and_bounded():
-    cfg = MotionConfig()
     calibrator = JointCalibrator()
     state = calibrator.initial_state(1, dtype=DOUBLE)
-    mean, cov, phase = state.mean, state.cov, state.phase
-    dt, unequal = torch.ones(1, dtype=DOUBLE), torch.zeros(1, dtype=DOUBLE)
-    held = torch.ones(1, 4, dtype=torch.bool)
+    unseen = Reason.ROLL_UNSEEN | Reason.HEIGHT_UNSEEN | Reason.DIRECTION_UNSEEN
+    state = state._replace(reasons=torch.full_like(state.reasons, int(unseen)))
     for _ in range(300):
-        mean, cov, phase = come_nearer(mean, cov, phase, dt, cfg)
-        transition, noise = motion(dt, held, unequal, 6, cfg)
-        mean, cov = (transition @ mean.unsqueeze(-1)).squeeze(-1), transition @ cov @ transition.mT + noise
+        state = predict_state(state, torch.ones(1, dtype=DOUBLE), calibrator.config)
+    cov = state.cov
     size = cov.diagonal(dim1=1, dim2=2).rsqrt()
     assert torch.linalg.eigvalsh(size.unsqueeze(-1) * cov * size.unsqueeze(-2)).min() > 0
     assert cov[0, :3].diagonal().sqrt().max() < 0.3  # the pose stays about its mean
 
 
 def test_update_equals_a_plain_gauss_newton_on_all_data():
-    """One linear step against stacked least squares with the prior as rows."""
+    """One linear step and its covariance against stacked least squares with the prior as rows."""
     frames = drive(6)
     calibrator = JointCalibrator()
     _, state = run(calibrator, frames[:5])
     seen = observe(frames[5][1], cameras(2), 6)
     places = boundary_places(WIDTH, 6, seen.sigma).gather(1, seen.boundary)
-    scale = torch.ones(2, dtype=DOUBLE)
-    update = iterate(state.mean, state.cov, state.mean, scale, places, seen, state.phase, 1, state.cov)
-    at = boundary_residuals(
-        state.mean[:, :NUM_SEEN],
-        places + state.mean[:, NUM_COMMON:].gather(1, seen.boundary),
-        seen,
-        state.phase,
-    )
+    places = places + state.mean[:, PLACE.deviations].gather(1, seen.boundary)
+    member = torch.nn.functional.one_hot(seen.boundary, 6).double().repeat_interleave(2, dim=1)
+    at = boundary_residuals(state.mean[:, :NUM_COMMON], places, seen, state.phase)
+    scale, doubt = torch.ones(2, dtype=DOUBLE), state.cov[:, PLACE.observed, PLACE.observed]
+    frame = frame_information(at, scale, doubt, member, seen)
+    estimated = torch.ones_like(state.mean)
+    result = update(state.mean, state.cov, state.mean, frame, estimated)
+    cov = posterior_covariance(state.cov, frame.matrix, result.gain)
     for row in range(2):
-        jacobian = torch.zeros(at.jacobian.shape[-1], state.mean.shape[1], dtype=DOUBLE)
-        jacobian[:, :NUM_SEEN] = at.jacobian[row].mT
+        jacobian = torch.zeros(at.jacobian.shape[-1], PLACE.size, dtype=DOUBLE)
+        jacobian[:, :NUM_COMMON] = at.jacobian[row].mT
         boundary = seen.boundary[row].repeat_interleave(2)
-        jacobian[torch.arange(len(boundary)), NUM_COMMON + boundary] = at.jacobian[row, 4]
-        weight = (update.trust[row] * seen.weight[row] / seen.sigma[row] ** 2).repeat_interleave(2).sqrt()
+        jacobian[torch.arange(len(boundary)), NUM_COMMON + boundary] = at.jacobian[row, OFFSET]
+        weight = frame.trust[row] * seen.weight[row] / (frame.scale[row] * seen.sigma[row]) ** 2
+        weight = weight.repeat_interleave(2).sqrt()
         root = torch.linalg.inv(torch.linalg.cholesky(state.cov[row]))
         rows = torch.cat([jacobian * weight.unsqueeze(-1), root])
         right = torch.cat([-at.distance[row].flatten() * weight, torch.zeros(len(root), dtype=DOUBLE)])
         step = torch.linalg.lstsq(rows, right.unsqueeze(-1)).solution.squeeze(-1)
-        scaled = (update.mean[row] - state.mean[row] - step) / state.cov[row].diagonal().sqrt()
-        assert scaled.abs().max() < 1e-6
+        std = state.cov[row].diagonal().sqrt()
+        assert ((result.mean[row] - state.mean[row] - step) / std).abs().max() < 1e-6
+        expected = torch.linalg.inv(rows.mT @ rows)
+        assert ((cov[row] - expected) / std / std.unsqueeze(-1)).abs().max() < 1e-6
+
+
+def test_considered_entries_keep_their_mean_and_variance():
+    """Schmidt: on one lane roll stays, and its doubt stays in what is estimated."""
+    frames = drive(8, per_boundary=30)
+    calibrator = JointCalibrator()
+    _, state = run(calibrator, frames[:6])
+    segments = frames[6][1]
+    ego = (segments.boundary == 2) | (segments.boundary == 3)
+    predicted = predict_state(state, torch.full((2,), 1 / FPS, dtype=DOUBLE), calibrator.config)
+    _, after = calibrator(segments._replace(weight=segments.weight * ego), cameras(2), state, 1 / FPS, WIDTH)
+    for entry in PLACE.chain(ROLL):
+        torch.testing.assert_close(after.mean[:, entry], predicted.mean[:, entry])
+        torch.testing.assert_close(after.cov[:, entry, entry], predicted.cov[:, entry, entry])
+    assert (after.cov[:, 0, 0] < predicted.cov[:, 0, 0]).all()
+
+
+def test_distances_at_the_feet_are_those_of_the_residuals_and_close_to_them_nearby():
+    moment, segments = drive(1, sigma=1.0)[0]
+    seen = observe(segments, cameras(2), 6)
+    places = boundary_places(WIDTH, 6, seen.sigma).gather(1, seen.boundary)
+    params = torch.zeros(2, NUM_COMMON, dtype=DOUBLE)
+    params[:, :5] = torch.tensor([*moment.pose, moment.offset], dtype=DOUBLE)
+    params[:, SHAPE.start] = 1e-5
+    phase = torch.tensor([0.0, 7.3], dtype=DOUBLE)
+    feet = foot_rays(params, places, seen, look(params, seen, phase))
+    residuals = boundary_residuals(params, places, seen, phase, feet)
+    distance, valid = boundary_distances(params, places, seen, feet, phase)
+    torch.testing.assert_close(distance, residuals.distance)
+    assert torch.equal(valid, residuals.valid)
+    moved = params + torch.tensor([2e-4, 2e-4, 2e-4, 2e-3, 2e-3] + [0.0] * NUM_SHAPE, dtype=DOUBLE)
+    old_feet, _ = boundary_distances(moved, places, seen, feet, phase)
+    torch.testing.assert_close(
+        old_feet, boundary_residuals(moved, places, seen, phase).distance, rtol=0, atol=2e-3
+    )
 
 
 def test_gradient_flows_from_the_pose_to_the_end_points():
@@ -499,7 +592,7 @@ def test_single_images_of_bends_with_vague_lines_are_honest(radius):
 def test_straight_road_does_not_tell_the_speed():
     """Noise of the road's curvature stands still in the image; taken for a bend it would stop the car."""
     _, state = run(JointCalibrator(), drive(300, rows=4))
-    assert state.mean[:, SPEED].abs().max() < 4.0
+    assert state.mean[:, PLACE.speed].abs().max() < 4.0
 
 
 @pytest.mark.slow
@@ -592,27 +685,24 @@ def test_nothing_in_sight_is_no_misfit():
 
 
 @pytest.mark.parametrize("shift", [-1.0, 0.0, 1.0])
-def test_deviations_change_their_numbers_with_the_boundaries(shift, monkeypatch):
+def test_deviations_change_their_numbers_with_the_boundaries(shift):
     """Who moves a lane to the right has what was boundary k + 1 for boundary k."""
-    calibrator = JointCalibrator()
-    seen = observe(drive(1)[0][1], cameras(2), 6)
-    state = calibrator.initial_state(2, dtype=DOUBLE)
-    mean = state.mean.clone()
-    mean[:, NUM_COMMON:] = torch.arange(1.0, 7.0)
-    answer = (torch.full((2,), shift, dtype=DOUBLE), torch.ones(2, dtype=DOUBLE))
-    monkeypatch.setattr("lanebev.estimation.joint.calibrator.best_shift", lambda *_: answer)
-    positions = boundary_places(WIDTH, 6, mean)
-    moved, _, _ = follow_lane_change(state._replace(mean=mean), positions, seen, calibrator.config)
+    mean = JointCalibrator().initial_state(2, dtype=DOUBLE).mean.clone()
+    mean[:, PLACE.deviations] = torch.arange(1.0, 7.0)
+    lanes, width = torch.full((2,), shift, dtype=DOUBLE), torch.full((2,), WIDTH, dtype=DOUBLE)
+    moved = renumber(mean, lanes, width, 6)
     k = torch.arange(6) + int(shift)
     expected = torch.where((k >= 0) & (k < 6), k + 1.0, 0.0).double()
-    torch.testing.assert_close(moved[:, NUM_COMMON:], expected.expand(2, -1))
-    torch.testing.assert_close(moved[:, OFFSET] - mean[:, OFFSET], answer[0] * WIDTH)
+    torch.testing.assert_close(moved[:, PLACE.deviations], expected.expand(2, -1))
+    torch.testing.assert_close(moved[:, OFFSET] - mean[:, OFFSET], lanes * WIDTH)
+    rest = [i for i in range(PLACE.size) if i != OFFSET and not 11 <= i < 17]
+    assert torch.equal(moved[:, rest], mean[:, rest])
 
 
 def test_a_clothoids_steps_are_its_rate_by_the_knots_spacing():
     calibrator = JointCalibrator()
     params = torch.tensor([[0.0, 0, 0, 1.5, 0, 2e-3, 1e-4]], dtype=DOUBLE)
-    mean, _ = begin(params, 1e-12 * torch.eye(7, dtype=DOUBLE)[None], calibrator.config)
+    mean, _ = state_from_fit(params, 1e-12 * torch.eye(7, dtype=DOUBLE)[None], calibrator.config)
     torch.testing.assert_close(mean[:, CURVATURE], params[:, 5])
     torch.testing.assert_close(mean[0, STEPS], torch.full((NUM_STEPS,), 1e-4 * KNOT_SPACING, dtype=DOUBLE))
 
@@ -641,6 +731,7 @@ def test_height_doubts_roll_that_is_held_as_the_lane_seen_bends_it():
 def test_speed_wanders_about_its_mean_as_far_as_it_says():
     cfg = MotionConfig()
     time, equal = torch.tensor([1 / 30], dtype=DOUBLE), torch.zeros(1, dtype=DOUBLE)
-    transition, noise = motion(time, torch.zeros(1, 4, dtype=torch.bool), equal, 6, cfg)
-    fade, more = transition[0, SPEED, SPEED], noise[0, SPEED, SPEED]
+    one = torch.ones(1, 4, dtype=DOUBLE)
+    transition, noise = motion(time, one, equal, no_road(), PLACE, cfg)
+    fade, more = transition[0, PLACE.speed, PLACE.speed], noise[0, PLACE.speed, PLACE.speed]
     assert float(more / (1 - fade**2)) == pytest.approx(cfg.speed_std**2, rel=0.01)

@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 FORMAT = "lanebev-state"
-VERSION = 2
+VERSION = 3
 _SEPARATOR = "."
 
 

@@ -76,7 +76,7 @@ def fit_boundaries(
     z = height * ahead / down
     across = height * x / down  # (B, 2N) m
     lateral = across - _bend(z, given)
-    focal = seen.intrinsics[:, :1, 0]
+    focal = seen.focal.unsqueeze(-1)
     boundary = seen.boundary.repeat_interleave(2, dim=1)
     member = torch.nn.functional.one_hot(boundary, num_boundaries).mT.to(z.dtype)  # (B, L, 2N)
     weight = seen.weight.repeat_interleave(2, dim=1) * on_road

@@ -6,38 +6,51 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import flag, may_skip, select_rows
-from lanebev.estimation import kalman
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.checks import check_new_state, is_running
-from lanebev.estimation.joint.dynamics import (
-    NUM_COMMON,
-    NUM_POSE,
-    STEPS,
-    motion,
+from lanebev.estimation.joint.dynamics import motion
+from lanebev.estimation.joint.evidence import (
+    accumulate_evidence,
+    adapt_motion_scale,
+    adaptive_process_noise,
+    deviation_prior_std,
+    normalized_score,
 )
+from lanebev.estimation.joint.lane_change import best_shift, renumber
+from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, NUM_SHAPE, POSE, SHAPE, STEPS, layout
 from lanebev.estimation.joint.measurement import (
     CURVATURE,
     HEIGHT,
-    KNOT_SPACING,
-    NUM_STEPS,
-    OFFSET,
     ROLL,
     Observations,
+    boundary_distances,
     boundary_places,
+    boundary_residuals,
+    foot_rays,
+    look,
     observations,
 )
-from lanebev.estimation.joint.road import come_nearer
+from lanebev.estimation.joint.road import propagate_road_shape
+from lanebev.estimation.joint.road_curve import KNOT_SPACING
 from lanebev.estimation.joint.single_frame import fit_observations
-from lanebev.estimation.joint.state import JointConfig, JointState, Reason, begin, held
-from lanebev.estimation.joint.support import as_calibration, inequality, judge, opened
-from lanebev.estimation.joint.update import (
-    Update,
-    agreement,
-    best_shift,
-    evidence_index,
-    iterate,
-    surprise,
+from lanebev.estimation.joint.state import (
+    JointConfig,
+    JointState,
+    Reason,
+    state_from_fit,
+    unobserved_mask,
 )
+from lanebev.estimation.joint.status import as_calibration, update_track_status
+from lanebev.estimation.joint.update import (
+    agreement,
+    boundary_deviation,
+    estimated_entries,
+    frame_information,
+    posterior_covariance,
+    single_frame,
+    update,
+)
+from lanebev.estimation.kalman import predict
 from lanebev.observation.segments import LaneSegments
 from lanebev.types import Calibration, Status
 
@@ -71,7 +84,7 @@ class JointCalibrator(Calibrator[JointState]):
         check_new_state(batch_size, dtype)
         cfg = self.config
         like = torch.zeros((), dtype=dtype, device=device)
-        mean, cov = begin(
+        mean, cov = state_from_fit(
             cfg.prior.mean(like).repeat(batch_size, 1),
             cfg.prior.std(like).square().diag().repeat(batch_size, 1, 1),
             cfg,
@@ -82,8 +95,9 @@ class JointCalibrator(Calibrator[JointState]):
             mean=mean,
             cov=cov,
             phase=zero.clone(),
-            evidence=mean.new_zeros(batch_size, NUM_POSE + 1 + NUM_STEPS + cfg.num_boundaries),
-            mimicry=mean.new_zeros(batch_size, NUM_POSE, cfg.num_boundaries),
+            evidence=mean.new_zeros(batch_size, NUM_POSE + NUM_SHAPE + cfg.num_boundaries),
+            pose_sensitivity=mean.new_zeros(batch_size, NUM_POSE, cfg.num_boundaries),
+            motion_scale=mean.new_ones(batch_size, NUM_POSE),
             early=zero.clone(),
             unseen=zero,
             misfit=zero.clone(),
@@ -104,34 +118,23 @@ class JointCalibrator(Calibrator[JointState]):
         After a frame that comes late the next dt counts from it. Inliers fit the road; 0 for a boundary too
         far out of place to bound a lane, as the foot of a barrier, be it for long or in this frame.
         """
-        cfg = self.config
-        if state.mean.shape[-1] != NUM_COMMON + cfg.num_boundaries:
-            got = state.mean.shape[-1] - NUM_COMMON
+        cfg, place = self.config, layout(self.config.num_boundaries)
+        if state.mean.shape[-1] != place.size:
+            got = state.mean.shape[-1] - layout(0).size
             raise ValueError(f"state: expected one of {cfg.num_boundaries} boundaries, got one of {got}")
         seen = observations(segments, intrinsics)
         positions = boundary_places(lane_width, cfg.num_boundaries, dt)  # (B, L)
-        places = positions.gather(1, seen.boundary)  # (B, N)
         step, skip, early, guessed = _elapsed(dt, state, cfg)
 
-        mean, cov, phase = come_nearer(state.mean, state.cov, state.phase, step, cfg.motion)
-        moves = motion(step, held(state.reasons), inequality(mean, cfg), cfg.num_boundaries, cfg.motion)
-        mean, cov = kalman.predict(mean, cov, *moves)
-        predicted = state._replace(mean=mean, cov=cov, phase=phase)
-        mean, shift, scale = follow_lane_change(predicted, positions, seen, cfg)
-        update, evidence = _update(predicted, mean, scale, places, seen, step, cfg)
-        judged, supported = judge(predicted, update, evidence, shift, step, seen, cfg)
-        agreed = agreement(judged.mean, update.scale, places, seen, judged.phase)
-        after, agreed = _restart(judged, agreed, supported, seen, places, cfg)
+        predicted = predict_state(state, step, cfg)
+        updated, trust, agreed, alone = update_state(predicted, positions, seen, step, cfg)
+        after, supported = update_track_status(predicted, updated, trust, alone, step, seen, cfg)
+        after, agreed = _restart(after, agreed, supported, seen, positions, cfg)
         after = after._replace(reasons=after.reasons | flag(guessed, Reason.TIME))
 
         skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=early)
         after = select_rows(skip, skipped, after)
-        begun = (after.reasons & int(Reason.RESTARTED)) != 0
-        now = torch.where(begun.unsqueeze(-1), 0.0, update.apart)
-        apart = torch.maximum(after.mean[:, NUM_COMMON:].abs(), now.abs())
-        lane = apart < _NO_BOUNDARY  # (B, L)
-        inliers = torch.where((seen.weight > 0) & lane.gather(1, seen.boundary), agreed, 0.0)
-        return as_calibration(after, inliers, positions, cfg), after
+        return as_calibration(after, agreed, positions, cfg), after
 
     def curvature(self, state: JointState) -> Tensor:
         """Return the road's curvature at the camera, (B,) 1/m, positive to the right."""
@@ -149,45 +152,79 @@ def _elapsed(dt: Tensor, state: JointState, cfg: JointConfig) -> tuple[Tensor, T
     return due.clamp(0.0, 60.0), skip, torch.where(skip, -due, 0.0), guessed
 
 
-def follow_lane_change(
-    predicted: JointState, positions: Tensor, seen: Observations, cfg: JointConfig
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Predicted mean, offset and deviations moved by a lane if the indices were; shift; noise scale."""
-    ego = cfg.num_boundaries // 2 - 1
+def predict_state(state: JointState, dt: Tensor, cfg: JointConfig) -> JointState:
+    """Predict mean, covariance and phase over dt (B,) s."""
+    place = layout(cfg.num_boundaries)
+    road = propagate_road_shape(state.mean, state.cov[:, SHAPE, SHAPE], state.phase, dt, place, cfg.motion)
+    scale = torch.where(unobserved_mask(state.reasons), cfg.motion.unobserved_scale, 1.0).to(dt)
+    scale = scale * state.motion_scale.sqrt()
+    unequal = deviation_prior_std(state.mean[:, place.deviations], cfg)
+    mean, cov = predict(state.mean, state.cov, *motion(dt, scale, unequal, road, place, cfg.motion))
+    mean = torch.cat([mean[:, :CURVATURE], road.shape, mean[:, SHAPE.stop :]], dim=-1)
+    return state._replace(mean=mean, cov=cov, phase=road.phase)
+
+
+def update_state(
+    predicted: JointState, positions: Tensor, seen: Observations, step: Tensor, cfg: JointConfig
+) -> tuple[JointState, Tensor, Tensor, Tensor]:
+    """Update a prediction by a frame: lane change, iterated robust update, adaptive process noise.
+
+    After the first of the iterations, what contradicts the motion raises the process noise for the others.
+
+    Args:
+        predicted: state.
+        positions: (B, L) m, of the boundaries from the ego lane's middle.
+        seen: what was observed.
+        step: (B,) s since the last frame.
+        cfg: the numbers.
+
+    Returns:
+        the state with the frame; weights of the segments (B, N); inliers (B, N); standard deviations (B, 5)
+        of pose and offset by this frame alone.
+    """
+    place, num = layout(cfg.num_boundaries), cfg.num_boundaries
+    ego = num // 2 - 1
     width = positions[:, ego + 1] - positions[:, ego]
-    mean = predicted.mean
-    shift, scale = best_shift(mean, positions, seen, predicted.phase, width)
-    moved = mean.clone()
-    moved[:, OFFSET] = mean[:, OFFSET] + shift * width
-    own = mean[:, NUM_COMMON:]
-    none = torch.zeros_like(own[:, :1])
-    right, left = torch.cat([own[:, 1:], none], -1), torch.cat([none, own[:, :-1]], -1)
-    shifted = torch.where(shift.unsqueeze(-1) > 0, right, torch.where(shift.unsqueeze(-1) < 0, left, own))
-    moved[:, NUM_COMMON:] = shifted
-    return moved, shift, scale
-
-
-def _update(
-    predicted: JointState,
-    mean: Tensor,
-    scale: Tensor,
-    places: Tensor,
-    seen: Observations,
-    step: Tensor,
-    cfg: JointConfig,
-) -> tuple[Update, Tensor]:
-    """Robust update; what contradicts the motion opens its process noise, and the frame is used again."""
-    cov, phase = predicted.cov, predicted.phase
-    first = iterate(mean, cov, mean, scale, places, seen, phase, cfg.iterations, cov)
-    index = evidence_index(cfg.num_boundaries, mean.device)
-    fade = (-step / cfg.evidence_time).exp().unsqueeze(-1)
-    believed = 2 * (seen.weight * first.trust)
-    count = cov.new_zeros(cov.shape[0], cfg.num_boundaries).scatter_add(1, seen.boundary, believed)
-    news = surprise(first, index, count)
-    slow = predicted.evidence * fade + (1 - fade * fade).clamp(min=1e-12).sqrt() * news
-    evidence = torch.cat([news[:, :NUM_POSE], slow[:, NUM_POSE:]], dim=-1)
-    cov = cov + opened(evidence, cov, cfg)
-    return iterate(mean, cov, first.mean, first.scale, places, seen, phase, 1, first.cov), evidence
+    sight = look(predicted.mean[:, :NUM_COMMON], seen, predicted.phase)
+    shift, scale = best_shift(predicted.mean, positions, seen, sight, width)
+    prior, cov = renumber(predicted.mean, shift, width, num), predicted.cov
+    places = positions.gather(1, seen.boundary)  # (B, N)
+    member = torch.nn.functional.one_hot(seen.boundary, num).to(places).repeat_interleave(2, dim=1)
+    at, doubt, evidence = prior, cov[:, place.observed, place.observed], predicted.evidence
+    for iteration in range(cfg.iterations):
+        params, own = at[:, :NUM_COMMON], at[:, place.deviations].gather(1, seen.boundary)
+        if iteration == 0:
+            feet = foot_rays(params, places + own, seen, sight)
+            residuals = boundary_residuals(params, places + own, seen, predicted.phase, feet, sight)
+        else:  # the Jacobian stays
+            distance, valid = boundary_distances(params, places + own, seen, feet, predicted.phase)
+            residuals = residuals._replace(distance=distance, valid=valid)
+        frame = frame_information(residuals, scale, doubt, member, seen)
+        alone, sensitivity = single_frame(frame.matrix)
+        estimated = estimated_entries(alone, place)
+        result = update(prior, cov, at, frame, estimated)
+        if iteration == 0:
+            believed = (frame.trust * seen.weight).repeat_interleave(2, dim=1).unsqueeze(1)
+            score = normalized_score(doubt, frame, (believed @ member).squeeze(1))
+            evidence = accumulate_evidence(evidence, score, step, cfg.evidence_time)
+            motion_scale = adapt_motion_scale(predicted.motion_scale, score[:, POSE], step, cfg)
+            noise = adaptive_process_noise(evidence, doubt, cfg)
+            cov = cov + torch.nn.functional.pad(noise, (0, place.size - noise.shape[-1])).diag_embed()
+        moved = (result.mean - at)[:, place.observed]
+        apart = boundary_deviation(at, frame)
+        at, doubt, scale = result.mean, result.observed_cov, frame.scale
+    updated = predicted._replace(
+        mean=result.mean,
+        cov=posterior_covariance(cov, frame.matrix, result.gain),
+        evidence=evidence,
+        pose_sensitivity=sensitivity,
+        motion_scale=motion_scale,
+        reasons=flag(shift != 0, Reason.LANE_CHANGE),
+    )
+    agreed = agreement(frame, moved, seen)
+    apart = torch.maximum(result.mean[:, place.deviations].abs(), apart.abs())
+    lane = (apart < _NO_BOUNDARY).gather(1, seen.boundary)
+    return updated, frame.trust, torch.where((seen.weight > 0) & lane, agreed, 0.0), alone
 
 
 def _restart(
@@ -195,25 +232,28 @@ def _restart(
     agreed: Tensor,
     supported: Tensor,
     seen: Observations,
-    places: Tensor,
+    positions: Tensor,
     cfg: JointConfig,
 ) -> tuple[JointState, Tensor]:
-    """Rows that have nothing, or nothing that fits, start from this frame alone if it allows that."""
+    """Start rows that have no state, or none that fits, from this frame alone if it determines the pose."""
     wanted = ~is_running(state.status) | (~supported & (state.misfit > cfg.restart_after))
     wanted = wanted & (seen.weight > 0).any(-1)
     if may_skip(wanted):
         return state, agreed
-    fit = fit_observations(seen, places, cfg.prior, iterations=cfg.start_iterations)
+    fit = fit_observations(
+        seen, positions.gather(1, seen.boundary), cfg.prior, iterations=cfg.start_iterations
+    )
     share = (fit.inliers * seen.weight).sum(-1) / seen.weight.sum(-1).clamp(min=1e-6)
     fresh = wanted & fit.valid & (share >= cfg.enter_share)
-    mean, cov = begin(fit.params(), fit.covariance, cfg)
+    mean, cov = state_from_fit(fit.params(), fit.covariance, cfg)
     zero = torch.zeros_like(state.unseen)
     begun = JointState(
         mean=mean,
         cov=cov,
         phase=zero,
         evidence=torch.zeros_like(state.evidence),
-        mimicry=torch.zeros_like(state.mimicry),
+        pose_sensitivity=torch.zeros_like(state.pose_sensitivity),
+        motion_scale=torch.ones_like(state.motion_scale),
         early=zero,
         unseen=zero,
         misfit=zero,

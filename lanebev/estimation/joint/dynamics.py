@@ -1,38 +1,27 @@
-"""How the joint filter's state moves between frames, and what it is made of.
+"""How the state of the joint filter moves between frames, the road apart (``road``).
 
-The mean is [pitch, yaw, roll, height, offset | curvature at the first knot and its steps | rates of the
-first five | slow mean of the pose | speed | deviation of each boundary from its place].
-
-The pose swings about its slow mean as a critically damped spring driven by white noise: within a frame a
-constant-velocity model, over seconds of nothing a return to the mount's pose with a bounded sigma. What the
-last frame did not determine swings on a stiffer spring with more noise: between seen frames any density
-follows the swing, unseen its sigma must cover it, and a suspension does swing back.
-
-Boundaries keep their places: deviations decay slowly, and on a road of unequal lanes fast, with noise that
-keeps up how much they may be, since offset, height and roll mimic half of them.
-
-How the road comes nearer is in ``joint_road``.
+The pose moves about its slow mean as band-limited noise: white noise through a fourth-order Butterworth
+low-pass. A vehicle's body moves like this, smoothly from frame to frame and back to the mount's pose within a
+second.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from lanebev.estimation.joint.measurement import CURVATURE, NUM_STEPS, NUM_STRAIGHT, OFFSET
+from lanebev.estimation.joint.layout import NUM_POSE, SHAPE, Layout, layout
+from lanebev.estimation.joint.measurement import OFFSET
 
-NUM_POSE = 4
-NUM_SEEN = NUM_STRAIGHT + 1 + NUM_STEPS  # what a frame observes, the deviations apart
-STEPS = slice(CURVATURE + 1, NUM_SEEN)
-SHAPE = slice(CURVATURE, NUM_SEEN)
-RATES = slice(NUM_SEEN, NUM_SEEN + 5)
-MEANS = slice(NUM_SEEN + 5, NUM_SEEN + 9)
-SPEED = NUM_SEEN + 9
-NUM_COMMON = NUM_SEEN + 10  # then follow the L deviations
+_ORDER = 4  # of the low-pass: the pose and three derivatives
 
 
 @dataclass(frozen=True)
@@ -40,11 +29,10 @@ class MotionConfig:
     """Numbers of the motion; angles in rad, lengths in m, times in s.
 
     Attributes:
-        angular_density: of the angular acceleration, rad²/s³.
-        height_density: of the vertical acceleration, m²/s³.
-        spring: rad/s, rate of return to the slow mean.
-        held_spring: rad/s, likewise of what the last frame did not determine.
-        held_factor: by which its density is larger.
+        bandwidth: Hz, cut-off frequency of the pose's motion.
+        angle_std: rad, standard deviation of pitch, yaw and roll about their slow means.
+        height_std: m, likewise.
+        unobserved_scale: factor on these where the last frame did not determine an angle or the height.
         mean_angle_walk: rad/√s, of the slow mean.
         mean_height_walk: m/√s.
         offset_density: of the lateral acceleration, m²/s³.
@@ -58,11 +46,10 @@ class MotionConfig:
         unequal_memory: s, decay of the deviations on a road of unequal lanes.
     """
 
-    angular_density: float = 0.04
-    height_density: float = 0.08
-    spring: float = 2.5
-    held_spring: float = 5.0
-    held_factor: float = 6.0
+    bandwidth: float = 1.0
+    angle_std: float = 0.011
+    height_std: float = 0.02
+    unobserved_scale: float = 2.0
     mean_angle_walk: float = 5e-4
     mean_height_walk: float = 1e-3
     offset_density: float = 0.2
@@ -77,104 +64,186 @@ class MotionConfig:
     unequal_memory: float = 1.0
 
 
-def motion(
-    dt: Tensor, held: Tensor, unequal: Tensor, num_boundaries: int, cfg: MotionConfig
-) -> tuple[Tensor, Tensor]:
-    """Transition and process noise over dt, the road's coming nearer apart (``joint_road``).
+class LowPass(NamedTuple):
+    """A low-pass with cut-off 1 rad/s, driven by white noise, at unit variance of its output.
 
-    What is held is decided once for all of dt: half a second at once is not fifteen frames without segments.
+    Attributes:
+        modes: (4, 16), the transition matrix of (x, ẋ, ẍ, x⃛) as a sum of 4 × 4 matrices, row by row, one for
+            each of exp(a₁t) cos(b₁t), exp(a₁t) sin(b₁t), exp(a₂t) cos(b₂t), exp(a₂t) sin(b₂t).
+        decays: (2,) a, 1/s.
+        turns: (2,) b, rad/s.
+        covariance: (4, 4), stationary.
+    """
+
+    modes: NDArray[np.float64]
+    decays: NDArray[np.float64]
+    turns: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+
+def butterworth() -> LowPass:
+    """Return the fourth-order Butterworth low-pass.
+
+    Source: Butterworth 1930, poles exp(iπ (2k + 3) / 8); modal decomposition of the companion matrix; the
+    stationary covariance S solves A S + S Aᵀ + g gᵀ = 0 (Särkkä and Solin 2019, Sec. 6.5).
+    """
+    poles = np.exp(1j * np.pi * (2 * np.arange(1, _ORDER + 1) + _ORDER - 1) / (2 * _ORDER))
+    companion = np.eye(_ORDER, k=1)
+    companion[-1] = -np.poly(poles).real[:0:-1]
+    values, vectors = np.linalg.eig(companion)
+    inverse = np.linalg.inv(vectors)
+    upper = [k for k in range(_ORDER) if values[k].imag > 0]
+    each = [2 * np.outer(vectors[:, k], inverse[k]) for k in upper]
+    modes = np.stack([part.ravel() for matrix in each for part in (matrix.real, -matrix.imag)])
+    eye, drive = np.eye(_ORDER), np.zeros((_ORDER, _ORDER))
+    drive[-1, -1] = 1.0
+    lyapunov = np.kron(eye, companion) + np.kron(companion, eye)
+    covariance = np.linalg.solve(lyapunov, -drive.ravel()).reshape(_ORDER, _ORDER)
+    return LowPass(modes, values[upper].real, values[upper].imag, covariance / covariance[0, 0])
+
+
+_LOW_PASS = butterworth()
+
+
+def pose_covariance(bandwidth: float, like: Tensor) -> Tensor:
+    """Return the stationary covariance (4, 4) of value and three derivatives, at unit variance of value."""
+    powers = like.new_tensor([(2 * math.pi * bandwidth) ** k for k in range(_ORDER)])
+    return powers.unsqueeze(-1) * torch.as_tensor(_LOW_PASS.covariance).to(like) * powers
+
+
+def pose_transition(dt: Tensor, bandwidth: float) -> tuple[Tensor, Tensor]:
+    """Compute transition and process noise of one axis of the pose about its mean, at unit variance.
 
     Args:
         dt: (B,) s, >= 0.
-        held: (B, 4) bool, what of pitch, yaw, roll, height the last frame did not determine.
-        unequal: (B,) m, sigma of the deviations on a road of unequal lanes; 0 on one of equal lanes.
-        num_boundaries: L.
+        bandwidth: Hz, cut-off frequency.
+
+    Returns:
+        (B, 4, 4) F of value and three derivatives, and (B, 4, 4) W = S - F S Fᵀ.
+    """
+    cutoff = 2 * math.pi * bandwidth
+    modes, decays, turns = (torch.as_tensor(part).to(dt) for part in _LOW_PASS[:3])
+    time = cutoff * dt.unsqueeze(-1)
+    fade, angle = (time * decays).exp(), time * turns
+    mixed = torch.stack([fade * angle.cos(), fade * angle.sin()], dim=-1).flatten(1)  # (B, 4)
+    powers = dt.new_tensor([[cutoff ** (i - k) for k in range(_ORDER)] for i in range(_ORDER)])
+    transition = powers * (mixed @ modes).unflatten(-1, (_ORDER, _ORDER))
+    covariance = pose_covariance(bandwidth, dt)
+    return transition, covariance - transition @ covariance @ transition.mT
+
+
+class RoadMotion(NamedTuple):
+    """How the road's shape moves over a step, see :func:`lanebev.estimation.joint.road.propagate_road_shape`.
+
+    Attributes:
+        shape: (B, NUM_SHAPE) after it.
+        phase: (B,) m, after it.
+        transition: (B, NUM_SHAPE, NUM_SHAPE).
+        by_speed: (B, NUM_SHAPE), derivative of the shape by the speed.
+        noise: (B, NUM_SHAPE) variances.
+    """
+
+    shape: Tensor
+    phase: Tensor
+    transition: Tensor
+    by_speed: Tensor
+    noise: Tensor
+
+
+def motion(
+    dt: Tensor, pose_scale: Tensor, unequal: Tensor, road: RoadMotion, place: Layout, cfg: MotionConfig
+) -> tuple[Tensor, Tensor]:
+    """Compute transition and process noise of the whole state.
+
+    Args:
+        dt: (B,) s, >= 0.
+        pose_scale: (B, 4), factor on the pose's standard deviations about its slow mean.
+        unequal: (B,) m, standard deviation of the deviations on a road of unequal lanes; 0 on equal lanes.
+        road: how the shape moves.
+        place: indices.
         cfg: the numbers.
 
     Returns:
-        (B, D, D) F and (B, D, D) W, D = NUM_COMMON + L.
+        (B, D, D) F and (B, D, D) W.
     """
-    density = dt.new_tensor([cfg.angular_density] * 3 + [cfg.height_density])
-    density = torch.where(held, cfg.held_factor * density, density)  # (B, 4)
-    swing, drive = spring(dt.unsqueeze(-1), torch.where(held, cfg.held_spring, dt.new_tensor(cfg.spring)))
-    swing = torch.cat([swing, 1 - swing[..., :1], -swing[..., 2:3]], dim=-1)  # (B, 4, 6)
-    slide, push = _damped(dt, cfg.offset_memory)
+    num = place.deviations.stop - place.deviations.start
+    swing, drive = pose_transition(dt, cfg.bandwidth)
+    to_mean = torch.eye(_ORDER, dtype=dt.dtype, device=dt.device)[:, :1] - swing[:, :, :1]
+    chain = torch.cat([swing, to_mean], dim=-1).flatten(1)  # (B, 20)
+    slide, push = damped_velocity(dt, cfg.offset_memory)
     fade = (-dt / cfg.speed_memory).exp()
     memory = torch.where(unequal > 0, cfg.unequal_memory, dt.new_tensor(cfg.deviation_memory))
     settle = (-dt / memory).exp()
-    still = torch.stack([torch.ones_like(dt), fade, settle], dim=-1)
-    moves = torch.cat([swing.flatten(1), slide, still], dim=-1)  # (B, 31)
-    drive = (density.unsqueeze(-1) * drive).flatten(1)
+    still = torch.ones_like(pose_scale)
+    moves = [
+        chain.repeat(1, NUM_POSE),
+        still,
+        slide,
+        road.transition.flatten(1),
+        road.by_speed,
+        fade.unsqueeze(-1),
+        settle.unsqueeze(-1).expand(-1, num),
+    ]
+    std = dt.new_tensor([cfg.angle_std] * 3 + [cfg.height_std])
+    walk = dt.new_tensor([cfg.mean_angle_walk] * 3 + [cfg.mean_height_walk])
+    variance = (pose_scale * std).square()
     wander = cfg.deviation_walk**2 * dt + unequal.square() * (1 - settle * settle)
-    walks = torch.stack([dt, wander], dim=-1)
-    shakes = torch.cat([drive, cfg.offset_density * push, walks], dim=-1)  # (B, 22)
-    on_moves, on_shakes = _patterns(num_boundaries, cfg)
-    transition = torch.einsum("bk,kij->bij", moves, torch.as_tensor(on_moves).to(dt))
-    return transition, torch.einsum("bk,kij->bij", shakes, torch.as_tensor(on_shakes).to(dt))
+    noises = [
+        (variance.unsqueeze(-1) * drive.flatten(1).unsqueeze(1)).flatten(1),
+        walk.square() * dt.unsqueeze(-1),
+        cfg.offset_density * push,
+        road.noise + cfg.curvature_walk**2 * dt.unsqueeze(-1),
+        (2 * cfg.speed_std**2 / cfg.speed_memory) * dt.unsqueeze(-1),
+        wander.unsqueeze(-1).expand(-1, num),
+    ]
+    of_moves, of_noises = _places(num)
+    return _scatter(moves, of_moves, place.size), _scatter(noises, of_noises, place.size)
+
+
+def _scatter(parts: list[Tensor], places: NDArray[np.int64], size: int) -> Tensor:
+    """(B, D, D) of zeros with the values (B, K) at flat places (K,)."""
+    values = torch.cat(parts, dim=-1)
+    index = torch.as_tensor(places, device=values.device).expand(values.shape[0], -1)
+    flat = values.new_zeros(values.shape[0], size * size).scatter(1, index, values)
+    matrix: Tensor = flat.unflatten(1, (size, size))
+    return matrix
 
 
 @lru_cache(maxsize=16)
-def _patterns(num_boundaries: int, cfg: MotionConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Where each of the 31 numbers of F and the 22 of W go, (31, D, D) and (22, D, D)."""
-    size = NUM_COMMON + num_boundaries
-    moves, shakes = np.zeros((31, size, size)), np.zeros((22, size, size))
-    one, fade, settle, time, wander = 28, 29, 30, 20, 21
-    walk = [cfg.mean_angle_walk] * 3 + [cfg.mean_height_walk]
-    for x in range(NUM_POSE):
-        rate, mean = RATES.start + x, MEANS.start + x
-        places = ((x, x), (x, rate), (rate, x), (rate, rate), (x, mean), (rate, mean))
-        for k, place in enumerate(places):
-            moves[6 * x + k][place] = 1
-        for k, place in enumerate(places[:4]):
-            shakes[4 * x + k][place] = 1
-        moves[one, mean, mean] = 1
-        shakes[time, mean, mean] = walk[x] ** 2
-    rate = RATES.start + OFFSET
-    for k, place in enumerate(((OFFSET, OFFSET), (OFFSET, rate), (rate, OFFSET), (rate, rate))):
-        moves[24 + k][place] = 1
-        shakes[16 + k][place] = 1
-    for knot in range(CURVATURE, NUM_SEEN):
-        moves[one, knot, knot] = 1
-        shakes[time, knot, knot] = cfg.curvature_walk**2
-    moves[fade, SPEED, SPEED] = 1
-    shakes[time, SPEED, SPEED] = 2 * cfg.speed_std**2 / cfg.speed_memory
-    for own in range(NUM_COMMON, size):
-        moves[settle, own, own] = 1
-        shakes[wander, own, own] = 1
-    return moves, shakes
+def _places(num_boundaries: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Flat indices, in the order of :func:`motion`, of the entries of F and of W."""
+    place = layout(num_boundaries)
+
+    def block(rows: Sequence[int], columns: Sequence[int]) -> NDArray[np.int64]:
+        entries: NDArray[np.int64] = place.size * np.array(rows)[:, None] + np.array(columns)
+        return entries.ravel()
+
+    def diagonal(entries: slice) -> NDArray[np.int64]:
+        return (place.size + 1) * np.arange(entries.start, entries.stop)
+
+    chains = [place.chain(axis) for axis in range(NUM_POSE)]
+    slide = (OFFSET, place.rates.start + OFFSET)
+    shape = range(SHAPE.start, SHAPE.stop)
+    speed = slice(place.speed, place.speed + 1)
+    moves = [block(chain[:_ORDER], chain) for chain in chains]
+    moves += [diagonal(place.means), block(slide, slide), block(shape, shape), block(shape, [place.speed])]
+    moves += [diagonal(speed), diagonal(place.deviations)]
+    noises = [block(chain[:_ORDER], chain[:_ORDER]) for chain in chains]
+    noises += [diagonal(place.means), block(slide, slide), diagonal(SHAPE), diagonal(speed)]
+    noises += [diagonal(place.deviations)]
+    return np.concatenate(moves), np.concatenate(noises)
 
 
-def spring(dt: Tensor, rate: float | Tensor) -> tuple[Tensor, Tensor]:
-    """Critically damped spring driven by white noise, ẍ = -2 ω ẋ - ω² x + w.
-
-    Source: the exact discretisation; the impulse response is h(t) = t e^(-ω t), and the noise integrals are
-    those of h², h ḣ and ḣ². For ω → 0 it is :func:`lanebev.estimation.kalman.constant_velocity`.
+def damped_velocity(dt: Tensor, memory: float) -> tuple[Tensor, Tensor]:
+    """Compute transition and noise of a position whose velocity decays, driven by white acceleration.
 
     Args:
-        dt: (...) s.
-        rate: ω, rad/s, float or broadcast against dt. The stationary variance of x is density / (4 ω³).
+        dt: (B,) s.
+        memory: s, of the velocity.
 
     Returns:
-        (..., 4) transition of (x, ẋ), its 2 × 2 entries row by row, and (..., 4) noise at unit density.
+        (B, 4) transition of (x, ẋ), row by row, and (B, 4) noise at unit density.
     """
-    turn = rate * dt
-    decay = (-turn).exp()
-    transition = torch.stack(
-        [decay * (1 + turn), decay * dt, -decay * rate * turn, decay * (1 - turn)], dim=-1
-    )
-    faded = decay * decay
-    # (1 - e^(-2a) (1 + 2a + 2a²)) / (4 ω³) and its like cancel at small a: as series, in float32 too
-    small = turn < 0.1
-    safe = torch.where(small, 1.0, turn)
-    position = (1 - (-2 * safe).exp() * (1 + 2 * safe + 2 * safe**2)) / (4 * rate**3)
-    position = torch.where(small, dt**3 * (1 / 3 - turn / 2 + 2 * turn**2 / 5 - 2 * turn**3 / 9), position)
-    velocity = (1 - faded * (1 - 2 * turn + 2 * turn**2)) / (4 * rate)
-    both = 0.5 * dt * dt * faded
-    return transition, torch.stack([position, both, both, velocity], dim=-1)
-
-
-def _damped(dt: Tensor, memory: float) -> tuple[Tensor, Tensor]:
-    """Position and decaying velocity: (B, 4) transition and (B, 4) noise, as :func:`spring`."""
     fade = (-dt / memory).exp()
     one, zero = torch.ones_like(dt), torch.zeros_like(dt)
     transition = torch.stack([one, memory * (1 - fade), zero, fade], dim=-1)

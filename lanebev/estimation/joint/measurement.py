@@ -8,8 +8,9 @@ boundary is the zero of
 
     G(d) = h d_x - X_k(h d_z / d_y) d_y,
 
-and G / |∂G/∂p| is the perpendicular distance in pixels: exact for straight boundaries, where G is linear
-in p and regular on the horizon; Sampson's first order for curved ones.
+whose gradient by d at the foot point is the normal of the plane through the camera and the boundary's
+tangent there, n = (h, Z X' - X, -h X'). The perpendicular distance in pixels is that of the end point to this
+tangent, n·d / |∂(n·d)/∂p|: exact for straight boundaries, of second order in the distance for curved ones.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.checks import as_lane_width, check_segments, mask_invalid_rows
+from lanebev.estimation.joint.road_curve import RoadCurve, road_basis, road_curve
 from lanebev.geometry.lens import cam_from_image
 from lanebev.geometry.road import rays_from_pixels
 from lanebev.geometry.rotation import road_from_cam
@@ -31,10 +33,6 @@ NUM_PARAMS = 7
 
 NUM_STRAIGHT = 5
 """Those of a straight road."""
-
-KNOT_SPACING = 10.0  # m
-NUM_STEPS = 5
-"""Steps of curvature between knots, where the shape is a spline: c at the first knot and these, 1/m."""
 
 FARTHEST = 200.0  # m; beyond it a pixel is tens of metres and the flat road is fiction
 
@@ -49,14 +47,36 @@ class Observations(NamedTuple):
         boundary: (B, N) int64, 0..L-1.
         weight: (B, N) in [0, 1].
         sigma: (B, N) px.
-        intrinsics: (B, 3, 3), finite.
+        focal: (B,) px, of x.
+        cam_from_image: (B, 3, 2), derivative of a ray by its pixel.
     """
 
     rays: Tensor
     boundary: Tensor
     weight: Tensor
     sigma: Tensor
-    intrinsics: Tensor
+    focal: Tensor
+    cam_from_image: Tensor
+
+
+class Sight(NamedTuple):
+    """End points seen from a pose, in the road's axes.
+
+    Attributes:
+        rotation: (B, 3, 3), road_from_cam.
+        directions: (B, 3, M), right, down, ahead.
+        by_pixel: (B, 3, 2), derivative of a direction by its pixel.
+        z: (B, M) m, distance at which the end point meets the road, at most ``FARTHEST``.
+        valid: (B, N) bool, both end points meet the road nearer than that.
+        curve: (B, M) each, the road's middle line at z.
+    """
+
+    rotation: Tensor
+    directions: Tensor
+    by_pixel: Tensor
+    z: Tensor
+    valid: Tensor
+    curve: RoadCurve
 
 
 class Residuals(NamedTuple):
@@ -74,18 +94,15 @@ class Residuals(NamedTuple):
 
 
 def observe(segments: LaneSegments, intrinsics: Tensor, num_boundaries: int) -> Observations:
-    """Segments and intrinsics as the joint estimators use them.
+    """Prepare segments and intrinsics for the joint estimators.
 
-    What cannot be used, and every segment of a row without usable intrinsics, gets weight 0 and harmless
+    What cannot be used, and every segment of a row without usable intrinsics, gets weight 0 and placeholder
     numbers, so that no row or gradient turns NaN.
 
     Args:
         segments: (B, N) line segments.
         intrinsics: (B, 3, 3).
         num_boundaries: L.
-
-    Returns:
-        Rays, indices, weights, sigmas.
 
     Raises:
         ValueError: shapes that do not fit.
@@ -96,14 +113,15 @@ def observe(segments: LaneSegments, intrinsics: Tensor, num_boundaries: int) -> 
 
 
 def observations(segments: LaneSegments, intrinsics: Tensor) -> Observations:
-    """Of segments and intrinsics that are :func:`~lanebev.estimation.checks.mask_invalid_rows`."""
+    """Prepare what went through :func:`~lanebev.estimation.checks.mask_invalid_rows`."""
     rays = rays_from_pixels(segments.endpoints.flatten(1, 2), intrinsics)
     return Observations(
         rays=rays.mT.contiguous(),
         boundary=segments.boundary,
         weight=segments.weight,
         sigma=segments.sigma,
-        intrinsics=intrinsics,
+        focal=intrinsics[:, 0, 0],
+        cam_from_image=cam_from_image(intrinsics)[..., :2],
     )
 
 
@@ -127,146 +145,174 @@ def boundary_places(lane_width: float | Tensor, num_boundaries: int, like: Tenso
     return edges - 0.5 * (edges[:, ego] + edges[:, ego + 1]).unsqueeze(-1)
 
 
-def boundary_residuals(
-    params: Tensor, places: Tensor, seen: Observations, phase: Tensor | None = None
-) -> Residuals:
-    """Perpendicular pixel distance of every end point to its boundary, with its Jacobian.
+def look(params: Tensor, seen: Observations, phase: Tensor | None = None) -> Sight:
+    """See the end points from a pose.
 
-    The Jacobian is taken at the foot point on the boundary, which is the total derivative of G / |∂G/∂p|:
-    taken at the noisy point instead, noise and Jacobian correlate and the fit is biased by their product.
+    Args:
+        params: as in :func:`boundary_residuals`.
+        seen: what was observed.
+        phase: likewise.
+    """
+    rotation = road_from_cam(*params[:, :HEIGHT].unbind(-1))
+    directions = rotation @ seen.rays
+    z, on_road = _meet_road(directions, params[:, HEIGHT, None])
+    valid = on_road.unflatten(-1, (-1, 2)).all(-1)
+    curve = road_curve(z, params[:, NUM_STRAIGHT:], phase)
+    return Sight(rotation, directions, rotation @ seen.cam_from_image, z, valid, curve)
+
+
+def every_segment(sight: Sight, stride: int) -> Sight:
+    """Keep every so manieth segment only."""
+    directions = sight.directions.unflatten(-1, (-1, 2))[:, :, ::stride].flatten(2)
+    z, *curve = (part.unflatten(-1, (-1, 2))[:, ::stride].flatten(1) for part in (sight.z, *sight.curve))
+    return sight._replace(directions=directions, z=z, valid=sight.valid[:, ::stride], curve=RoadCurve(*curve))
+
+
+def boundary_residuals(
+    params: Tensor,
+    places: Tensor,
+    seen: Observations,
+    phase: Tensor | None = None,
+    feet: Tensor | None = None,
+    sight: Sight | None = None,
+) -> Residuals:
+    """Compute the perpendicular pixel distance of every end point to its boundary, with its Jacobian.
+
+    Both are taken at the foot point on the boundary. Taken at the noisy point instead, the Jacobian would
+    correlate with the noise, and the fit would be biased by their product.
 
     Args:
         params: (B, 7), see ``NUM_PARAMS``; with a phase (B, 6 + NUM_STEPS), the shape being a spline.
         places: (B, N) m, X of each segment's boundary at Z = 0 less the offset.
         seen: what was observed.
         phase: (B,) m, how far the first knot lies behind the camera, 0 to KNOT_SPACING; or None.
+        feet: (B, 3, M) rays to the foot points, by :func:`foot_rays` at parameters nearby; None finds them.
+        sight: from this pose, if it is known already.
 
     Returns:
         Distances, zero where not valid, Jacobian, validity.
     """
-    rotation = road_from_cam(*params[:, :HEIGHT].unbind(-1))  # (B, 3, 3)
-    direction_by_pixel = rotation @ cam_from_image(seen.intrinsics)[..., :2]  # (B, 3, 2)
-    directions, valid = _on_road(rotation @ seen.rays, params)
+    sight = look(params, seen, phase) if sight is None else sight
+    feet = foot_rays(params, places, seen, sight) if feet is None else feet
+    height = params[:, HEIGHT, None]
+    foot = sight.rotation @ feet
+    z, _ = _meet_road(foot, height)
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (B, M)
-    value, by_direction, _ = _implicit(directions, x_k, params, phase)
-    by_pixel = direction_by_pixel.mT @ by_direction  # (B, 2, M)
-    slope = torch.hypot(*by_pixel.unbind(1))
-    distance = value / slope
+    basis = road_basis(z, phase)
+    curve = RoadCurve(*((params[:, None, NUM_STRAIGHT:] @ part).squeeze(1) for part in basis))
+    normal, slope = _tangent_plane(z, x_k, height, curve)
+    size = _pixel_gradient(normal, sight.by_pixel).norm(dim=1)  # (B, M)
+    distance = (normal * sight.directions).sum(1) / size
 
-    reach = FOOT_RANGE * seen.intrinsics[:, 0, 0, None]
-    near = torch.maximum(torch.minimum(distance, reach), -reach) / slope
-    foot, foot_valid = _on_road(directions - direction_by_pixel @ (near.unsqueeze(1) * by_pixel), params)
-    foot = torch.where(foot_valid.unsqueeze(1), foot, directions)
-    _, by_foot, bend = _implicit(foot, x_k, params, phase)
-    turning = torch.linalg.cross(by_foot, foot, dim=1)  # ∂G/∂angle = by · (-axis × d) = axis · (by × d)
-    by_angles = _axes(rotation, params[:, ROLL]) @ turning
-    jacobian = torch.cat([by_angles, _by_shape(foot, bend)], dim=1)
-    both = valid.unflatten(-1, (-1, 2)).all(-1)
-    return Residuals(
-        distance=torch.where(both.unsqueeze(-1), distance.unflatten(-1, (-1, 2)), 0.0),
-        jacobian=jacobian / slope.unsqueeze(1),
-        valid=both,
-    )
+    turning = torch.linalg.cross(normal, foot, dim=1)  # ∂(n·d)/∂angle = n · (-axis × d) = axis · (n × d)
+    by_angles = _axes(sight.rotation, params[:, ROLL]) @ turning
+    x, down, ahead = foot.unbind(1)
+    by_height, by_offset = x - slope * ahead, -down * (1 + 0.5 * curve.heading.square())
+    by_shape = -down.unsqueeze(1) * (basis[0] + (x_k * curve.heading).unsqueeze(1) * basis[1])
+    jacobian = torch.cat([by_angles, by_height.unsqueeze(1), by_offset.unsqueeze(1), by_shape], dim=1)
+    return Residuals(_of_valid(distance, sight.valid), jacobian / size.unsqueeze(1), sight.valid)
 
 
 def boundary_distances(
-    params: Tensor, places: Tensor, seen: Observations, phase: Tensor | None = None
+    params: Tensor,
+    places: Tensor,
+    seen: Observations,
+    feet: Tensor,
+    phase: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """The distances alone, for several hypotheses of the places at once.
+    """Compute the distances of :func:`boundary_residuals` alone, (B, N, 2) px, and their validity (B, N)."""
+    rotation = road_from_cam(*params[:, :HEIGHT].unbind(-1))
+    directions, height = rotation @ seen.rays, params[:, HEIGHT, None]
+    _, on_road = _meet_road(directions, height)
+    valid = on_road.unflatten(-1, (-1, 2)).all(-1)
+    z, _ = _meet_road(rotation @ feet, height)
+    x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)
+    normal, _ = _tangent_plane(z, x_k, height, road_curve(z, params[:, NUM_STRAIGHT:], phase))
+    size = _pixel_gradient(normal, rotation @ seen.cam_from_image).norm(dim=1)
+    return _of_valid((normal * directions).sum(1) / size, valid), valid
+
+
+def foot_rays(params: Tensor, places: Tensor, seen: Observations, sight: Sight) -> Tensor:
+    """Find the foot point of every end point on its boundary, by one Newton step in the image.
+
+    A foot point is moved by ``FOOT_RANGE`` at most: an end point farther off is an outlier.
+
+    Args:
+        params: as in :func:`boundary_residuals`.
+        places: likewise.
+        seen: likewise.
+        sight: with the same parameters.
+
+    Returns:
+        (B, 3, M) camera rays, z = 1.
+    """
+    height = params[:, HEIGHT, None]
+    x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)
+    normal, _ = _tangent_plane(sight.z, x_k, height, sight.curve)
+    gradient = _pixel_gradient(normal, sight.by_pixel)  # (B, 2, M) 1/px
+    size = gradient.norm(dim=1)
+    reach = (FOOT_RANGE * seen.focal).unsqueeze(-1)
+    distance = (normal * sight.directions).sum(1) / size
+    step = torch.maximum(torch.minimum(distance, reach), -reach) / size
+    feet: Tensor = seen.rays - seen.cam_from_image @ (step.unsqueeze(1) * gradient)
+    return feet
+
+
+def sampson_distances(params: Tensor, places: Tensor, sight: Sight) -> Tensor:
+    """Compute the distances to first order, for several hypotheses of the places at once.
+
+    Source: Sampson 1982, the gradient taken at the end point itself.
 
     Args:
         params: (B, P), as :func:`boundary_residuals`.
         places: (H, B, N) m.
-        seen: what was observed.
-        phase: (B,) or None, likewise.
+        sight: with the same parameters.
 
     Returns:
-        (H, B, N, 2) px, zero where not valid, and (B, N) bool.
+        (H, B, N, 2) px, zero where not valid.
     """
-    rotation = road_from_cam(*params[:, :HEIGHT].unbind(-1))
-    direction_by_pixel = rotation @ cam_from_image(seen.intrinsics)[..., :2]
-    directions, valid = _on_road(rotation @ seen.rays, params)
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (H, B, M)
-    value, by_direction, _ = _implicit(directions, x_k, params, phase)
-    distance = value / torch.hypot(*(direction_by_pixel.mT @ by_direction).unbind(-2))
-    both = valid.unflatten(-1, (-1, 2)).all(-1)
-    return torch.where(both.unsqueeze(-1), distance.unflatten(-1, (-1, 2)), 0.0), both
+    normal, _ = _tangent_plane(sight.z, x_k, params[:, HEIGHT, None], sight.curve)
+    distance = (normal * sight.directions).sum(-2) / _pixel_gradient(normal, sight.by_pixel).norm(dim=-2)
+    return _of_valid(distance, sight.valid)
+
+
+def _of_valid(distance: Tensor, valid: Tensor) -> Tensor:
+    """(…, B, M) distances to (…, B, N, 2), zero where not valid."""
+    return torch.where(valid.unsqueeze(-1), distance.unflatten(-1, (-1, 2)), 0.0)
 
 
 def _axes(rotation: Tensor, roll: Tensor) -> Tensor:
     """Axes, in the road frame, about which pitch, yaw and roll turn a direction backwards; (B, 3, 3) rows."""
     zero, one = torch.zeros_like(roll), torch.ones_like(roll)
-    yaw = torch.stack([roll.sin(), roll.cos(), zero], dim=-1)
-    return torch.stack([rotation[:, :, 0], yaw, torch.stack([zero, zero, one], dim=-1)], dim=1)
+    turned = torch.stack([roll.sin(), roll.cos(), zero, zero, zero, one], dim=-1).unflatten(-1, (2, 3))
+    return torch.cat([rotation[:, :, 0].unsqueeze(1), turned], dim=1)
 
 
-def _on_road(directions: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
-    """(B, 3, M) directions with d_y kept off zero, and (B, M) bool: they meet the road before FARTHEST."""
-    x, down, ahead = directions.unbind(1)
-    lowest = ahead * (params[:, HEIGHT, None].clamp(min=0.1) / FARTHEST)
-    on_road = (ahead > 1e-3) & (down > lowest)
-    down = torch.where(on_road, down, lowest.abs() + 1e-3)
-    return torch.stack([x, down, ahead], dim=1), on_road
+def _pixel_gradient(normal: Tensor, by_pixel: Tensor) -> Tensor:
+    """Gradient of n·d by the pixel, (…, B, 2, M), for normals (…, B, 3, M)."""
+    gradient: Tensor = by_pixel.mT @ normal
+    return gradient
 
 
-class _Bend(NamedTuple):
-    """Where directions meet the road, and what the bend does there."""
-
-    heading: Tensor  # (B, M)
-    tilt: Tensor  # (…, B, M) m, x_k times the heading
-    slope: Tensor  # (…, B, M) dX_k / dZ
-    basis: tuple[Tensor, Tensor, Tensor]  # (B, K, M) bend, heading, curvature by shape parameter
-
-
-def _implicit(
-    directions: Tensor, x_k: Tensor, params: Tensor, phase: Tensor | None
-) -> tuple[Tensor, Tensor, _Bend]:
-    """G (…, B, M), its gradient by the direction (…, B, 3, M), and the bend for :func:`_by_shape`."""
-    x, down, ahead = directions.unbind(1)
-    height, shape = params[:, HEIGHT, None], params[:, None, NUM_STRAIGHT:]  # (B, 1), (B, 1, K)
-    z = height * ahead / down
-    basis = _polynomial(z) if phase is None else _spline(z, phase)
-    bend, heading, curvature = ((shape @ part).squeeze(1) for part in basis)
-    tilt = x_k * heading
-    out = x_k + bend + 0.5 * tilt * heading
-    slope = heading + tilt * curvature
-    across = torch.broadcast_tensors(height, z * slope - out, -height * slope)
-    return height * x - out * down, torch.stack(across, dim=-2), _Bend(heading, tilt, slope, basis)
+def _meet_road(directions: Tensor, height: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance Z (B, M) at which directions (B, 3, M) meet the road, and whether that is before FARTHEST."""
+    down, ahead = directions[:, 1], directions[:, 2]
+    nearest = ahead * (height.clamp(min=0.1) / FARTHEST)  # of d_y, for a point at FARTHEST
+    on_road = (ahead > 1e-3) & (down > nearest)
+    return torch.where(on_road, height * ahead / torch.where(on_road, down, 1.0), FARTHEST), on_road
 
 
-def _by_shape(directions: Tensor, bend: _Bend) -> Tensor:
-    """Gradient of G by height, offset and shape, (B, 2 + K, M)."""
-    x, down, ahead = directions.unbind(1)
-    straight = torch.stack([x - bend.slope * ahead, -down * (1 + 0.5 * bend.heading * bend.heading)], dim=1)
-    shape = bend.basis[0] + bend.tilt.unsqueeze(1) * bend.basis[1]
-    return torch.cat([straight, -down.unsqueeze(1) * shape], dim=1)
+def _tangent_plane(z: Tensor, x_k: Tensor, height: Tensor, curve: RoadCurve) -> tuple[Tensor, Tensor]:
+    """Normal n (…, B, 3, M) of the plane through the camera and a boundary's tangent, and its slope X'(Z).
 
-
-def _polynomial(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Bend, heading and curvature at (B, M) for unit c0 and unit c1, each (B, 2, M)."""
-    half = 0.5 * z * z
-    bend, heading = torch.stack([half, half * z / 3], 1), torch.stack([z, half], 1)
-    return bend, heading, torch.stack([torch.ones_like(z), z], 1)
-
-
-def _spline(z: Tensor, phase: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Bend, heading and curvature at (B, M) for a unit curvature and unit steps, each (B, 1 + NUM_STEPS, M).
-
-    A step rises from 0 at its knot to 1 at the next. Bend and heading are zero at Z = 0.
+    Args:
+        z: (B, M) m.
+        x_k: (…, B, M) m.
+        height: (B, 1) m.
+        curve: at z.
     """
-    knots = KNOT_SPACING * torch.arange(NUM_STEPS, dtype=z.dtype, device=z.device) - phase.unsqueeze(-1)
-    past = z.unsqueeze(1) - knots.unsqueeze(-1)  # (B, NUM_STEPS, M)
-    rise = (past / KNOT_SPACING).clamp(0.0, 1.0)
-    beyond = (past - KNOT_SPACING).clamp(min=0.0)
-    heading = KNOT_SPACING * 0.5 * rise * rise + beyond
-    bend = KNOT_SPACING**2 / 6 * rise**3 + 0.5 * beyond * (beyond + KNOT_SPACING)
-    first = (phase / KNOT_SPACING)[:, None, None]  # what lies behind the camera, of the first step only
-    turned = 0.5 * KNOT_SPACING * first * first
-    behind = KNOT_SPACING**2 / 6 * first**3 + turned * z.unsqueeze(1)
-    head_bend, head_heading = bend[:, :1] - behind, heading[:, :1] - turned
-    one = z.unsqueeze(1)
-    return (
-        torch.cat([0.5 * one * one, head_bend, bend[:, 1:]], 1),
-        torch.cat([one, head_heading, heading[:, 1:]], 1),
-        torch.cat([torch.ones_like(one), rise], 1),
-    )
+    tilt = x_k * curve.heading
+    slope = curve.heading + tilt * curve.curvature
+    out = x_k + curve.bend + 0.5 * tilt * curve.heading
+    return torch.stack([height.expand_as(out), z * slope - out, -height * slope], dim=-2), slope

@@ -1,8 +1,8 @@
-"""How the road ahead moves in the state of the joint filter, between frames.
+"""How the shape of the road moves in the state of the joint filter between frames.
 
-The road does not change, it comes nearer: knots of its curvature stand in the world, and the camera passes
-them at a speed that is estimated too. What was seen far ahead so holds when it is near, and new is only
-the step that comes into view. The frame turns along with the road.
+The knots of the road's curvature are fixed to the road, and the camera passes them at a speed that is
+estimated too: the curvature that was seen far ahead is the curvature when it is near. Process noise enters at
+the farthest step only, which comes into view. The road frame turns along with the road.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation import kalman
-from lanebev.estimation.joint.dynamics import SHAPE, SPEED, STEPS, MotionConfig
-from lanebev.estimation.joint.measurement import CURVATURE, KNOT_SPACING, NUM_STEPS
+from lanebev.estimation.joint.dynamics import MotionConfig, RoadMotion
+from lanebev.estimation.joint.layout import SHAPE, Layout
+from lanebev.estimation.joint.measurement import CURVATURE
+from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS
 from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
 
 CLEAR_BEND = (20.0, 40.0)  # chi-square of the five steps of curvature between which they come to tell speed
@@ -25,22 +27,23 @@ _SLOPE[0] = np.eye(1 + NUM_STEPS)[1]
 _CHANGE = np.diff(_SLOPE, axis=0, prepend=0.0) / KNOT_SPACING  # of the shape parameters by a metre, 1/m
 
 
-def come_nearer(
-    mean: Tensor, cov: Tensor, phase: Tensor, dt: Tensor, cfg: MotionConfig
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The camera passes knots: shape parameters move up, and new steps come into view.
+def propagate_road_shape(
+    mean: Tensor, shape_cov: Tensor, phase: Tensor, dt: Tensor, place: Layout, cfg: MotionConfig
+) -> RoadMotion:
+    """Predict the shape of the road as the camera passes knots and new steps come into view.
 
     Args:
-        mean: (B, D) with the speed about its prior.
-        cov: (B, D, D).
+        mean: (B, D) of the state.
+        shape_cov: (B, NUM_SHAPE, NUM_SHAPE) of its shape.
         phase: (B,) m, how far the first knot lies behind the camera.
         dt: (B,) s.
+        place: indices.
         cfg: the numbers.
 
     Returns:
-        mean, covariance and phase after it.
+        shape and phase after it, with derivatives and noise.
     """
-    way = dt * (cfg.speed + mean[:, SPEED]).clamp(min=0.0)
+    way = dt * (cfg.speed + mean[:, place.speed]).clamp(min=0.0)
     gone = phase + way
     passed = (gone / KNOT_SPACING).floor()  # (B,) knots
     shape = turn_along(mean[:, SHAPE], phase, way)
@@ -49,29 +52,25 @@ def come_nearer(
     left = (order < passed.unsqueeze(-1)).to(mean).unsqueeze(1)  # (B, 1, NUM_STEPS)
     first = torch.cat([torch.ones_like(left[..., :1]), left], dim=-1)
     moved = torch.cat([first, torch.cat([torch.zeros_like(shift[..., :1]), shift], dim=-1)], dim=1)
-
-    change = _change_per_metre(shape, cov[:, SHAPE, SHAPE])
-    by_speed = dt.unsqueeze(-1) * (moved @ change.unsqueeze(-1)).squeeze(-1)  # (B, 1 + NUM_STEPS)
-
-    transition = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device).repeat(dt.shape[0], 1, 1)
-    transition[:, SHAPE, SHAPE] = moved
-    transition[:, SHAPE, SPEED] = by_speed
-    noise = torch.zeros_like(mean)
-    noise[:, STEPS] = cfg.curvature_step**2 * _come_into_view(phase, gone, passed)
-    moved_mean = mean.clone()
-    moved_mean[:, SHAPE] = (moved @ shape.unsqueeze(-1)).squeeze(-1)
-    cov = kalman.symmetrise(transition @ cov @ transition.mT) + noise.diag_embed()
-    return moved_mean, cov, gone - passed * KNOT_SPACING
+    change = _change_per_metre(shape, shape_cov)
+    by_speed = dt.unsqueeze(-1) * (moved @ change.unsqueeze(-1)).squeeze(-1)  # (B, NUM_SHAPE)
+    seen = cfg.curvature_step**2 * _share_in_view(phase, gone, passed)
+    return RoadMotion(
+        shape=(moved @ shape.unsqueeze(-1)).squeeze(-1),
+        phase=gone - passed * KNOT_SPACING,
+        transition=moved,
+        by_speed=by_speed,
+        noise=torch.cat([torch.zeros_like(seen[:, :1]), seen], dim=-1),
+    )
 
 
 def turn_along(shape: Tensor, phase: Tensor, way: Tensor) -> Tensor:
-    """Shape parameters after the road frame turned with the road over a way, as it comes nearer.
+    """Compute the shape parameters after the road frame turned with the road over a way.
 
-    What the shape has at a knot is b'' = d²X/dZ², which is the road's curvature κ only where the road leads
-    straight ahead: b'' = κ / cos³ of its heading, which falls by κ₀ a metre until the knot is reached. On an
-    arc this takes back, to leading order, what coming nearer adds. Left out, as they gained nothing: a turn
-    also brings knots nearer, by κ₀ b; and an arc tells less of the speed than a clothoid does, so that in
-    sharp bends the speed is not to be trusted.
+    The shape at a knot is b'' = d²X/dZ² = κ / cos³ of the road's heading there, κ its curvature. The heading
+    falls by κ₀ per metre driven until the knot is reached. On an arc this cancels, to leading order, the
+    change by the knots' coming nearer. Two effects are left out because they improved nothing: a turn also
+    brings knots nearer, by κ₀ b; and an arc determines the speed less well than a clothoid does.
 
     Args:
         shape: (B, 1 + NUM_STEPS).
@@ -93,15 +92,15 @@ def turn_along(shape: Tensor, phase: Tensor, way: Tensor) -> Tensor:
 def straight_or_bend(
     params: Tensor, cov: Tensor, straight: Tensor, bend: Tensor, share: float
 ) -> tuple[Tensor, Tensor]:
-    """One frame's fit, averaged over the road being straight and its being a bend.
+    """Average one frame's fit over two models of the road, straight and bent, weighted by their evidence.
 
-    A bend far off and a yaw look alike. To take the likelier for certain is wrong by many sigmas as often as
-    it is the other; so each counts by its evidence, and what parts them goes to the covariance. Source:
-    Bayesian model averaging (Hoeting et al. 1999) of two Gaussians, moments matched. That the road is
-    straight is a measurement of c0 = c1 = 0 of the noise that turns the one prior into the other.
+    A distant bend and a yaw look alike. To choose the likelier model would be wrong by many standard
+    deviations whenever the other holds, so the difference of the two fits enters the covariance. Source:
+    Bayesian model averaging (Hoeting et al. 1999) of two Gaussians, moments matched. The straight road is a
+    measurement of c0 = c1 = 0 whose noise turns the one prior into the other.
 
     Args:
-        params: (B, 7) fitted to a frame as a bend, in the order of ``joint_model``.
+        params: (B, 7) fitted to a frame as a bend, in the order of ``NUM_PARAMS``.
         cov: (B, 7, 7).
         straight: (2,) 1/m and 1/m², sigmas of c0 and c1 of a straight road.
         bend: (2,), those of a bend, larger, which the fit had for a prior.
@@ -127,10 +126,11 @@ def straight_or_bend(
 
 
 def _change_per_metre(shape: Tensor, cov: Tensor) -> Tensor:
-    """Change of the shape parameters by a metre driven, (B, 1 + NUM_STEPS), as far as there is a bend.
+    """Compute the change (B, NUM_SHAPE) of the shape per metre driven, where a bend is significant.
 
-    On a straight road the steps are noise, and noise does not come nearer. Taken for a bend it would tell
-    that the car stands, and where knots are passed would be left to chance: precisions would drift apart.
+    On a straight road the steps are estimation noise, which does not move with the road. Were it moved, the
+    filter would estimate from it that the vehicle stands still. So the change is faded in between the two
+    values of χ² in ``CLEAR_BEND``.
     """
     change: Tensor = (torch.as_tensor(_CHANGE).to(shape) @ shape.unsqueeze(-1)).squeeze(-1)
     steps, spread = shape[:, 1:], cov[:, 1:, 1:]
@@ -142,11 +142,11 @@ def _change_per_metre(shape: Tensor, cov: Tensor) -> Tensor:
     return change * known.unsqueeze(-1)
 
 
-def _come_into_view(phase: Tensor, gone: Tensor, passed: Tensor) -> Tensor:
-    """Share (B, NUM_STEPS) of each step, numbered anew, that came into view on the way from phase to gone.
+def _share_in_view(phase: Tensor, gone: Tensor, passed: Tensor) -> Tensor:
+    """Compute the share (B, NUM_STEPS) of each step, after renumbering, that came into view on the way.
 
-    The last step comes in over ``ENTRY`` metres, not at once when a knot is passed: so it matters little in
-    which of two frames that is.
+    The farthest step comes in over ``ENTRY`` metres and not when a knot is passed, so that rounding does not
+    decide in which of two frames its noise is added.
     """
     behind = torch.arange(NUM_STEPS - 1, -1, -1, dtype=gone.dtype, device=gone.device) * KNOT_SPACING
     since = behind - KNOT_SPACING * passed.unsqueeze(-1)  # m, less the way, since a step came into view

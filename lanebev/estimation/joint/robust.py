@@ -1,7 +1,7 @@
-"""Which segments to believe: a mixture of inliers with known noise and a flat density of outliers.
+"""Robust weights of segments: a mixture of Gaussian inliers and uniformly distributed outliers.
 
-Maximising the mixture's likelihood by iterated reweighting loses almost nothing on clean data, since a
-segment within three sigmas keeps weight one, and cuts gross outliers off altogether.
+Iterated reweighting maximises the mixture's likelihood. A segment within three standard deviations keeps a
+weight near one, so clean data loses almost nothing; the weight of a gross outlier goes to zero.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ SCALE_PRIOR = 20.0  # segments' worth of belief in the sigmas as they were given
 
 
 def inlier_log_odds(distance: Tensor, sigma: Tensor, scale: Tensor, focal: Tensor) -> Tensor:
-    """Log odds that a segment is an inlier.
+    """Compute the log odds that a segment is an inlier.
 
     Args:
         distance: (B, N, 2) px, of both end points.
@@ -35,20 +35,20 @@ def inlier_log_odds(distance: Tensor, sigma: Tensor, scale: Tensor, focal: Tenso
 
 
 def inlier_weights(distance: Tensor, valid: Tensor, sigma: Tensor, scale: Tensor, focal: Tensor) -> Tensor:
-    """(B, N) in [0, 1]: probability that a segment is an inlier, 0 where not valid."""
+    """Compute the probability (B, N) that a segment is an inlier, 0 where not valid."""
     return torch.where(valid, inlier_log_odds(distance, sigma, scale, focal).sigmoid(), 0.0)
 
 
 def log_likelihood(
     distance: Tensor, valid: Tensor, weight: Tensor, sigma: Tensor, scale: Tensor, focal: Tensor
 ) -> Tensor:
-    """(B,) log likelihood of a frame under the mixture, less that of nothing but outliers."""
+    """Compute the log likelihood ratio (B,) of a frame: the mixture against outliers alone."""
     log_odds = inlier_log_odds(distance, sigma, scale, focal)
     return (weight * torch.where(valid, torch.nn.functional.softplus(log_odds), 0.0)).sum(-1)
 
 
 def noise_scale(distance: Tensor, sigma: Tensor, weight: Tensor) -> Tensor:
-    """Factor by which the residuals of the believed segments exceed their sigmas, at least 1.
+    """Compute the factor by which the residuals of inliers exceed their sigmas, at least 1.
 
     Args:
         distance: (B, N, 2) px.
@@ -63,26 +63,28 @@ def noise_scale(distance: Tensor, sigma: Tensor, weight: Tensor) -> Tensor:
     return (total / (SCALE_PRIOR + weight.sum(-1))).sqrt().clamp(min=1.0)
 
 
-def lowered(scale: Tensor, fitted: Tensor) -> Tensor:
-    """(B,) noise scale after a reweighting: as fitted, but no higher than it was, nor lower than half."""
+def anneal_scale(scale: Tensor, fitted: Tensor) -> Tensor:
+    """Lower the noise scale (B,) to the fitted one, by a factor of 2 at most; never raise it."""
     return torch.minimum(torch.maximum(fitted, 0.5 * scale), scale)
 
 
 def start_scale(distance: Tensor, sigma: Tensor, weight: Tensor) -> Tensor:
-    """Scale to begin reweighting with, from the 30 % quantile: right with up to two outliers in three.
+    """Compute the noise scale to begin reweighting with, from the 30 % quantile of the residuals.
+
+    It is right with up to two outliers in three.
 
     Args:
-        distance: (B, N, 2) px, at the predicted parameters.
+        distance: (..., B, N, 2) px, at the predicted parameters.
         sigma: (B, N) px.
         weight: (B, N), 0 where there is nothing.
 
     Returns:
-        (B,) at least 1.
+        (..., B) at least 1.
     """
     there = weight > 0
     worst = (distance.abs().amax(-1) / sigma).masked_fill(~there, torch.inf)  # (B, N)
     count = there.sum(-1, keepdim=True)
-    rank = (0.3 * count.to(distance.dtype)).long().clamp(max=worst.shape[-1] - 1)
+    rank = (0.3 * count.to(distance.dtype)).long().clamp(max=worst.shape[-1] - 1).expand(*worst.shape[:-1], 1)
     value = worst.sort(dim=-1).values.gather(-1, rank).squeeze(-1)
     # 30 % of max(|a|, |b|) lies at the root-30 % quantile of |N|, 0.75
     return torch.where(value.isfinite(), value / 0.75, 1.0).clamp(min=1.0)

@@ -24,7 +24,7 @@ from lanebev.estimation.joint.measurement import (
     boundary_residuals,
     observations,
 )
-from lanebev.estimation.joint.robust import inlier_weights, log_likelihood, lowered, noise_scale
+from lanebev.estimation.joint.robust import anneal_scale, inlier_weights, log_likelihood, noise_scale
 from lanebev.geometry.linalg import inverse_spd, solve_spd
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import angles_from_matrix, road_from_cam
@@ -165,14 +165,14 @@ def fit_observations(
 ) -> SingleFrameFit:
     """As :func:`fit_single_frame`, of segments made ready and places (B, N) of their boundaries, m."""
     with torch.no_grad():
-        fewer, fewer_places = _subset(seen, places, start_segments)
+        fewer, fewer_places = spread_subset(seen, places, start_segments)
         starts = _linear_starts(fewer, fewer_places, prior)  # (B, S, 7)
         params, scale = _best_start(starts, fewer, fewer_places, prior, iterations)
         params, scale, _ = refine(params, scale, places, seen, prior, iterations=3)
     params, scale, information = refine(params, scale, places, seen, prior, iterations=2)
 
     residuals = boundary_residuals(params, places, seen)
-    trust = inlier_weights(residuals.distance, residuals.valid, seen.sigma, scale, seen.intrinsics[:, 0, 0])
+    trust = inlier_weights(residuals.distance, residuals.valid, seen.sigma, scale, seen.focal)
     covariance = inverse_spd(information)
     std = covariance.diagonal(dim1=-2, dim2=-1)[:, :OFFSET].sqrt()
     observed = std < _OBSERVED * prior.std(params)[:OFFSET]
@@ -216,7 +216,7 @@ def refine(
     """
     mean, precision = prior.mean(params), prior.std(params).square().reciprocal()
     largest_step = prior.std(params)
-    focal = seen.intrinsics[:, 0, 0]
+    focal = seen.focal
     blur = torch.zeros_like(focal) if blur is None else blur
     information = precision.diag().expand(*params.shape, NUM_PARAMS)  # overwritten unless iterations == 0
     for _ in range(iterations):
@@ -224,7 +224,7 @@ def refine(
         sigma = (seen.sigma.square() + (blur / scale).square().unsqueeze(-1)).sqrt()
         trust = inlier_weights(residuals.distance, residuals.valid, sigma, scale, focal) * seen.weight
         fitted = noise_scale(residuals.distance, seen.sigma, trust)
-        scale = lowered(scale, fitted)
+        scale = anneal_scale(scale, fitted)
         by_noise = trust / ((seen.sigma * scale.unsqueeze(-1)).square() + blur.square().unsqueeze(-1))
         blur = 0.5 * blur
         information, gradient = normal_equations(
@@ -259,8 +259,8 @@ def _student_log(squared: Tensor) -> Tensor:
     return -2.5 * (squared / 4).log1p().sum(-1)
 
 
-def _subset(seen: Observations, places: Tensor, count: int) -> tuple[Observations, Tensor]:
-    """At most ``count`` segments, those with weight first, spread evenly over the list."""
+def spread_subset(seen: Observations, places: Tensor, count: int) -> tuple[Observations, Tensor]:
+    """Choose at most ``count`` segments, those with weight first, spread evenly over the list."""
     total = seen.boundary.shape[1]
     if total <= count:
         return seen, places
@@ -351,7 +351,7 @@ def _best_start(
     batch, count, _ = starts.shape
     many = Observations(*(tensor.repeat_interleave(count, dim=0) for tensor in seen))
     many_places = places.repeat_interleave(count, dim=0)
-    focal = many.intrinsics[:, 0, 0]
+    focal = many.focal
     sigma = (many.sigma * many.weight).sum(-1) / many.weight.sum(-1).clamp(min=1e-3)
     scale = (_ANNEALING[-1] * focal / sigma.clamp(min=1e-3)).clamp(min=1.0)
     blur = _ANNEALING[-1] * focal

@@ -1,4 +1,4 @@
-"""What the joint filter remembers, its numbers, and how a state begins."""
+"""State, configuration and reasons of the joint filter, and how a state starts."""
 
 from __future__ import annotations
 
@@ -9,21 +9,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint.dynamics import (
-    MEANS,
-    NUM_COMMON,
-    NUM_POSE,
-    NUM_SEEN,
-    RATES,
-    SHAPE,
-    SPEED,
-    STEPS,
-    MotionConfig,
-)
-from lanebev.estimation.joint.measurement import CURVATURE, KNOT_SPACING, NUM_PARAMS, NUM_STRAIGHT
+from lanebev.estimation.joint.dynamics import MotionConfig, pose_covariance
+from lanebev.estimation.joint.layout import NUM_POSE, POSE, SHAPE, STEPS, layout
+from lanebev.estimation.joint.measurement import CURVATURE, NUM_PARAMS, NUM_STRAIGHT
 from lanebev.estimation.joint.road import straight_or_bend
+from lanebev.estimation.joint.road_curve import KNOT_SPACING
 from lanebev.estimation.joint.single_frame import FramePrior
 from lanebev.types import NUM_BOUNDARIES, map_tensors, register_pytree
+
+_OFFSET_RATE_STD = 0.5  # m/s, of a start
 
 
 class Reason(IntFlag):
@@ -59,6 +53,10 @@ class JointConfig:
         bends: how probable it is that a start is on a bend, one of the curvatures of ``prior``.
         open_deviation: m, sigma of a boundary's deviation on a road of unequal lanes; 0: there are none.
         evidence_time: s over which a bend's or unequal lanes' evidence is summed.
+        motion_scale_rise: s in which the variance of the pose's motion rises by e where it is half of what
+            it should be.
+        motion_scale_memory: s, decay back to that of ``motion``.
+        motion_scale_most: largest factor on it.
         min_support: inlier segments (weights summed) of a usable frame.
         min_share, enter_share: share of inliers to go on tracking, and to begin again.
         assumed_dt: s between frames where it is not finite, or the clock jumped back by more than a second.
@@ -79,6 +77,9 @@ class JointConfig:
     bends: float = 0.2
     open_deviation: float = 0.12
     evidence_time: float = 0.15
+    motion_scale_rise: float = 0.3
+    motion_scale_memory: float = 1.0
+    motion_scale_most: float = 1e4
     min_support: float = 3.0
     min_share: float = 0.15
     enter_share: float = 0.25
@@ -106,13 +107,14 @@ class JointState(NamedTuple):
     """Everything the calibrator remembers, tensors only.
 
     Attributes:
-        mean: (B, D), see ``joint_motion``.
+        mean: (B, D), see :class:`~lanebev.estimation.joint.layout.Layout`.
         cov: (B, D, D).
         phase: (B,) m, how far the first knot of the road's curvature lies behind the camera.
         evidence: (B, 10 + L) evidence against the motion, unit variance: the last frame's of the pose, summed
             of shape and deviations.
-        mimicry: (B, 4, L) change of the pose by a metre that a boundary is out of place, by the last frame
-            that determined the pose.
+        pose_sensitivity: (B, 4, L) change of the pose by a metre that a boundary is out of place, by the last
+            frame that determined the pose.
+        motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, as the drive asks for.
         early: (B,) s by which the state is ahead of the last frame, which came out of order.
         unseen: (B,) s since the last usable frame.
         misfit: (B,) s for which there were segments that did not fit.
@@ -125,7 +127,8 @@ class JointState(NamedTuple):
     cov: Tensor
     phase: Tensor
     evidence: Tensor
-    mimicry: Tensor
+    pose_sensitivity: Tensor
+    motion_scale: Tensor
     early: Tensor
     unseen: Tensor
     misfit: Tensor
@@ -137,39 +140,40 @@ class JointState(NamedTuple):
         return map_tensors(Tensor.detach, self)
 
 
-def begin(params: Tensor, param_cov: Tensor, cfg: JointConfig) -> tuple[Tensor, Tensor]:
-    """State (B, D) and covariance (B, D, D) around one frame's parameters and their covariance."""
-    batch, num = params.shape[0], cfg.num_boundaries
-    angle, height = (
-        density / (4 * cfg.motion.spring**3)
-        for density in (cfg.motion.angular_density, cfg.motion.height_density)
-    )
-    swing = params.new_tensor([angle, angle, angle, height])  # stationary variances
-    rates = torch.cat([swing * cfg.motion.spring**2, params.new_tensor([0.5**2])])
+def state_from_fit(params: Tensor, param_cov: Tensor, cfg: JointConfig) -> tuple[Tensor, Tensor]:
+    """Start a state from one frame's fit.
+
+    Args:
+        params: (B, 7), see ``NUM_PARAMS``.
+        param_cov: (B, 7, 7).
+        cfg: the numbers.
+
+    Returns:
+        mean (B, D) and covariance (B, D, D).
+    """
+    place, motion = layout(cfg.num_boundaries), cfg.motion
     straight, bend = params.new_tensor(cfg.straight), cfg.prior.std(params)[CURVATURE:]
     params, param_cov = straight_or_bend(params, param_cov, straight, bend, cfg.bends)
-    spread = params.new_zeros(NUM_SEEN, NUM_PARAMS)  # c0 and c1 to the knots
-    spread[:NUM_STRAIGHT, :NUM_STRAIGHT] = torch.eye(NUM_STRAIGHT)
-    spread[CURVATURE, CURVATURE] = 1.0
-    spread[STEPS, CURVATURE + 1] = KNOT_SPACING
-    seen, seen_cov = params @ spread.mT, spread @ param_cov @ spread.mT
-    zero, own = params.new_zeros(batch, 5), params.new_zeros(batch, num)
-    mean = torch.cat([seen, zero, params[:, :NUM_POSE], own[:, :1], own], dim=-1)
-    cov = params.new_zeros(batch, NUM_COMMON + num, NUM_COMMON + num)
-    cov[:, :NUM_SEEN, :NUM_SEEN] = seen_cov
-    cov[:, :NUM_SEEN, MEANS] = seen_cov[:, :, :NUM_POSE]
-    cov[:, MEANS, :NUM_SEEN] = seen_cov[:, :NUM_POSE]
-    cov[:, MEANS, MEANS] = param_cov[:, :NUM_POSE, :NUM_POSE] + swing.diag()
-    cov[:, RATES, RATES] = rates.diag()
-    own_variance = params.new_zeros(NUM_COMMON + num)
-    own_variance[SHAPE] = cfg.motion.curvature_step**2
-    own_variance[SPEED] = cfg.motion.speed_std**2
-    own_variance[NUM_COMMON:] = cfg.motion.deviation_walk**2
-    return mean, cov + own_variance.diag()
+    copies = params.new_zeros(place.size, NUM_PARAMS)  # state entries as functions of the parameters
+    copies[:NUM_STRAIGHT, :NUM_STRAIGHT] = torch.eye(NUM_STRAIGHT)
+    copies[CURVATURE, CURVATURE] = 1.0
+    copies[STEPS, CURVATURE + 1] = KNOT_SPACING
+    copies[place.means, POSE] = torch.eye(NUM_POSE)
+    swing = params.new_tensor([motion.angle_std] * 3 + [motion.height_std]).square()
+    derivatives = pose_covariance(motion.bandwidth, params).diagonal()
+    own = params.new_zeros(place.size)
+    own[SHAPE] = motion.curvature_step**2
+    own[place.deviations] = motion.deviation_walk**2
+    own[place.rates] = torch.cat([swing * derivatives[1], params.new_tensor([_OFFSET_RATE_STD**2])])
+    own[place.accelerations] = swing * derivatives[2]
+    own[place.jerks] = swing * derivatives[3]
+    own[place.means] = swing
+    own[place.speed] = motion.speed_std**2
+    return params @ copies.mT, copies @ param_cov @ copies.mT + own.diag()
 
 
-def held(reasons: Tensor) -> Tensor:
-    """(B, 4) bool, what of pitch, yaw, roll and height the frame with these reasons did not determine."""
+def unobserved_mask(reasons: Tensor) -> Tensor:
+    """Tell what of pitch, yaw, roll and height the last frame did not determine, (B, 4) bool."""
     direction, roll, height = (
         (reasons & int(reason)) != 0
         for reason in (Reason.DIRECTION_UNSEEN, Reason.ROLL_UNSEEN, Reason.HEIGHT_UNSEEN)

@@ -1,0 +1,112 @@
+"""Evidence against the motion model: normalised scores, and the process noise that they call for."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lanebev.estimation.joint.layout import DEVIATIONS, NUM_POSE, NUM_SHAPE, POSE, SHAPE
+from lanebev.estimation.joint.state import JointConfig
+from lanebev.estimation.joint.update import FrameInformation, information_kept
+
+_SHARED = 0.2  # sigmas by which all end points of a boundary may be off alike
+_KNOWN = 1e-3  # share of a prediction-free score's variance below which the prediction determines the entry
+_FREE_POSE = (0.05, 0.05, 0.05, 0.3)  # rad, m: sigmas added where the pose is free
+_LARGEST_EXCESS = 4.0  # of a squared score; a larger one is a jump
+_CALL = 5.0  # sigmas of evidence at which half of the noise is admitted
+
+
+def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor) -> Tensor:
+    """Compute the normalised score of every entry that moves: N(0, 1) each if the motion is as assumed.
+
+    Source: the score test (Rao 1948) for more process noise in one entry. Whether the road bends, and whether
+    its lanes are equal, is asked with the pose free: near and far vertices of one frame tell, and a motion of
+    the pose that its process noise does not expect is no evidence. A detector's errors are correlated along a
+    boundary, so n end points determine its place no better than 1 / (1 / n + ``_SHARED``²) would.
+
+    Args:
+        cov: (B, O, O) of the prediction.
+        frame: linearised at the prediction.
+        count: (B, L) end points that each boundary was seen with.
+
+    Returns:
+        (B, 4 + NUM_SHAPE + L) of pose, shape, deviations; 0 where the frame says nothing of an entry.
+    """
+    free = cov.new_zeros(cov.shape[-1])
+    free[POSE] = cov.new_tensor(_FREE_POSE).square()
+    priors = torch.stack([cov, cov + free.diag()])  # (2, B, O, O)
+    matrix, vector = frame.matrix, frame.vector.unsqueeze(-1)
+    kept = information_kept(priors, matrix)
+    score = (kept @ vector).squeeze(-1)  # (2, B, O)
+    variance = (kept @ matrix).diagonal(dim1=-2, dim2=-1)
+    known = variance > _KNOWN * matrix.diagonal(dim1=-2, dim2=-1)
+    inflation = torch.cat([torch.ones_like(vector[:, : -count.shape[-1], 0]), 1 + _SHARED**2 * count], dim=-1)
+    known = known & (variance > 0)
+    normal = torch.where(known, score * torch.where(known, variance * inflation, 1.0).rsqrt(), 0.0)
+    return torch.cat([normal[0, :, POSE], normal[1, :, SHAPE], normal[1, :, DEVIATIONS]], dim=-1)
+
+
+def accumulate_evidence(before: Tensor, score: Tensor, dt: Tensor, memory: float) -> Tensor:
+    """Sum the scores of shape and deviations over time, at unit variance; those of the pose count at once.
+
+    Args:
+        before: (B, M), evidence so far.
+        score: (B, M), of this frame.
+        dt: (B,) s.
+        memory: s.
+    """
+    fade = (-dt / memory).exp().unsqueeze(-1)
+    slow = before * fade + (1 - fade * fade).clamp(min=1e-12).sqrt() * score
+    return torch.cat([score[:, :NUM_POSE], slow[:, NUM_POSE:]], dim=-1)
+
+
+def adapt_motion_scale(before: Tensor, score: Tensor, dt: Tensor, cfg: JointConfig) -> Tensor:
+    """Raise the variance of the pose's motion while its scores exceed what they should be, and let it decay.
+
+    Source: covariance matching (Mehra 1972), axis by axis, as a multiplicative step: a right variance has a
+    squared score of mean 1.
+
+    Args:
+        before: (B, 4) >= 1, factor on the variance so far.
+        score: (B, 4), normalised, of pitch, yaw, roll and height.
+        dt: (B,) s.
+        cfg: the numbers.
+    """
+    gain = 1 - (-dt / cfg.motion_scale_rise).exp().unsqueeze(-1)
+    excess = (score.square() - 1).clamp(max=_LARGEST_EXCESS)
+    fade = (-dt / cfg.motion_scale_memory).exp().unsqueeze(-1)
+    raised = before * (gain * excess).exp()
+    return (1 + (raised - 1) * fade).clamp(1.0, cfg.motion_scale_most)
+
+
+def adaptive_process_noise(evidence: Tensor, cov: Tensor, cfg: JointConfig) -> Tensor:
+    """Compute the process noise variances (B, O) that the evidence calls for; next to none below 3 sigmas.
+
+    Of the deviations only that of the most contradictory boundary is freed, and to ``open_deviation`` at
+    most: a detector errs on one boundary for seconds, and if all deviations were free, such an error would
+    be taken for a road of unequal lanes, and would turn the roll.
+
+    Args:
+        evidence: (B, 4 + NUM_SHAPE + L).
+        cov: (B, O, O), predicted.
+        cfg: the numbers.
+    """
+    parts = evidence.square().split([NUM_POSE, NUM_SHAPE, cfg.num_boundaries], dim=-1)
+    worst = [part.amax(-1, keepdim=True) for part in parts]
+    pose, bend, own = (0.01 * torch.sigmoid(0.5 * (most - _CALL**2)) * most for most in worst)
+    jump = evidence.new_tensor([cfg.open_pose] * 3 + [10 * cfg.open_pose, 0.0]).square()
+    change = evidence.new_tensor([cfg.open_curvature] + [cfg.open_step] * (NUM_SHAPE - 1)).square()
+    room = cfg.open_deviation**2 - cov.diagonal(dim1=1, dim2=2)[:, DEVIATIONS]
+    freed = (parts[2] == worst[2]) * own.clamp(max=1.0) * room.clamp(min=0.0)
+    return torch.cat([pose * jump, bend * change, freed], dim=-1)
+
+
+def deviation_prior_std(deviations: Tensor, cfg: JointConfig) -> Tensor:
+    """Compute the prior standard deviation (B,) m of deviations from the second largest; 0 for equal lanes.
+
+    A single boundary out of place is a detector's error. Of six deviations three combinations cannot be
+    observed, since changes of offset, height and roll have the same effect: they may be three times as large.
+    """
+    size = cfg.open_deviation
+    second = deviations.abs().topk(2, dim=-1).values[:, 1]
+    return torch.where(second > 0.1 * size, (3 * second).clamp(max=size), 0.0)

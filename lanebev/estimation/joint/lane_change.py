@@ -1,0 +1,72 @@
+"""Lane changes: the boundary indices move by one when the camera crosses a line."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lanebev.estimation.joint.layout import NUM_COMMON
+from lanebev.estimation.joint.measurement import OFFSET, Observations, Sight, every_segment, sampson_distances
+from lanebev.estimation.joint.robust import log_likelihood, start_scale
+
+_SEGMENTS = 96  # that decide, at least
+
+
+def best_shift(
+    mean: Tensor,
+    positions: Tensor,
+    seen: Observations,
+    sight: Sight,
+    lane_width: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Choose by how many lanes the boundary indices moved since the prediction: -1, 0 or 1.
+
+    A shift is chosen if it explains the frame far better than none: the camera crossed a line, or the
+    detector numbers the boundaries anew.
+
+    Args:
+        mean: (B, D) predicted.
+        positions: (B, L) m, of the boundaries from the ego lane's middle.
+        seen: what was observed.
+        sight: with the predicted state.
+        lane_width: (B,) m, of the ego lane.
+
+    Returns:
+        shift (B,) in the dtype of ``mean``, and (B,) noise scale of the frame's residuals after it.
+    """
+    own = mean[:, NUM_COMMON : NUM_COMMON + positions.shape[-1]]
+    places = (positions + own).gather(1, seen.boundary)
+    stride = max(1, places.shape[-1] // _SEGMENTS)
+    sight = every_segment(sight, stride)
+    places, weight, sigma = (part[:, ::stride] for part in (places, seen.weight, seen.sigma))
+    shifts = mean.new_tensor([0.0, -1.0, 1.0])
+    moved = places + (shifts[:, None] * lane_width)[:, :, None]  # (3, B, N)
+    distance = sampson_distances(mean[:, :NUM_COMMON], moved, sight)
+    scales = start_scale(distance, sigma, weight * sight.valid)  # (3, B)
+    scores = log_likelihood(distance, sight.valid, weight, sigma, scales.amin(0), seen.focal)  # (3, B)
+    clear = scores[1:].amax(0) > 2.0 * scores[0] + 10.0
+    best = torch.where(clear, 1 + scores[1:].argmax(0), 0)  # (B,)
+    return shifts[best], scales.gather(0, best.unsqueeze(0)).squeeze(0)
+
+
+def renumber(mean: Tensor, shift: Tensor, lane_width: Tensor, num_boundaries: int) -> Tensor:
+    """Move offset and deviations of a state by a lane: who changes to the right has boundary k + 1 for k.
+
+    Args:
+        mean: (B, D).
+        shift: (B,) lanes, -1, 0 or 1.
+        lane_width: (B,) m, of the ego lane.
+        num_boundaries: L.
+
+    Returns:
+        (B, D).
+    """
+    last = NUM_COMMON + num_boundaries
+    own = mean[:, NUM_COMMON:last]
+    none, direction = torch.zeros_like(own[:, :1]), shift.unsqueeze(-1)
+    right, left = torch.cat([own[:, 1:], none], -1), torch.cat([none, own[:, :-1]], -1)
+    own = torch.where(direction > 0, right, torch.where(direction < 0, left, own))
+    offset = mean[:, OFFSET : OFFSET + 1] + direction * lane_width.unsqueeze(-1)
+    return torch.cat(
+        [mean[:, :OFFSET], offset, mean[:, OFFSET + 1 : NUM_COMMON], own, mean[:, last:]], dim=-1
+    )

@@ -1,0 +1,68 @@
+"""The state vector of the joint filter: which entry is what."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+from lanebev.estimation.joint.measurement import CURVATURE, NUM_STRAIGHT
+from lanebev.estimation.joint.road_curve import NUM_STEPS
+
+NUM_POSE = 4
+NUM_SHAPE = 1 + NUM_STEPS
+NUM_COMMON = NUM_STRAIGHT + NUM_SHAPE  # entries that all boundaries depend on
+POSE = slice(0, NUM_POSE)
+SHAPE = slice(CURVATURE, NUM_COMMON)  # 1/m: curvature at the first knot, then its steps
+STEPS = slice(CURVATURE + 1, NUM_COMMON)
+DEVIATIONS = slice(NUM_COMMON, None)  # m, of what a frame observes: each boundary from its place
+
+
+class Layout(NamedTuple):
+    """Indices of the state vector for L boundaries.
+
+    A frame observes the first entries: pose, offset, shape of the road and the deviation of each boundary
+    from its place. The rest is known through motion only.
+
+    Attributes:
+        observed: pose, offset, shape, deviations.
+        deviations: m.
+        rates: of pitch, yaw, roll, height and offset, per s.
+        accelerations: of the pose, per s².
+        jerks: of the pose, per s³.
+        means: slow mean of the pose.
+        speed: m/s, above ``MotionConfig.speed``.
+        size: D.
+    """
+
+    observed: slice
+    deviations: slice
+    rates: slice
+    accelerations: slice
+    jerks: slice
+    means: slice
+    speed: int
+    size: int
+
+    def chain(self, axis: int) -> tuple[int, int, int, int, int]:
+        """Indices of an axis of the pose: its value, three derivatives and slow mean."""
+        starts = (0, self.rates.start, self.accelerations.start, self.jerks.start, self.means.start)
+        first, second, third, fourth, fifth = (int(start) + axis for start in starts)
+        return first, second, third, fourth, fifth
+
+
+@lru_cache(maxsize=16)
+def layout(num_boundaries: int) -> Layout:
+    """Return the indices for so many boundaries."""
+    seen = NUM_COMMON + num_boundaries
+    rates = seen + NUM_STRAIGHT
+    accelerations, jerks, means = (rates + NUM_POSE * k for k in (1, 2, 3))
+    return Layout(
+        observed=slice(0, seen),
+        deviations=slice(NUM_COMMON, seen),
+        rates=slice(seen, rates),
+        accelerations=slice(rates, accelerations),
+        jerks=slice(accelerations, jerks),
+        means=slice(jerks, means),
+        speed=means,
+        size=means + 1,
+    )

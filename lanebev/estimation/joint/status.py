@@ -1,0 +1,109 @@
+"""Status and reasons of a frame, and the calibration that goes out."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lanebev.batch import flag, select_rows
+from lanebev.estimation.checks import is_running
+from lanebev.estimation.joint.evidence import deviation_prior_std
+from lanebev.estimation.joint.layout import NUM_POSE, POSE, layout
+from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL, Observations
+from lanebev.estimation.joint.state import JointConfig, JointState, Reason, unobserved_mask
+from lanebev.estimation.joint.update import UNSEEN
+from lanebev.types import Calibration, Extrinsics, Status
+
+_DOUBTFUL = 0.6  # m out of place, below which a single boundary may stand for several
+
+
+def update_track_status(
+    predicted: JointState,
+    updated: JointState,
+    trust: Tensor,
+    single_frame_std: Tensor,
+    step: Tensor,
+    seen: Observations,
+    cfg: JointConfig,
+) -> tuple[JointState, Tensor]:
+    """Decide whether the frame supports the track, and set status and reasons.
+
+    Args:
+        predicted: state without the frame, which stands where the frame does not support it.
+        updated: state with the frame.
+        trust: (B, N), weights of the segments.
+        single_frame_std: (B, 5) of pose and offset by the frame alone.
+        step: (B,) s since the last frame.
+        seen: what was observed.
+        cfg: the numbers.
+
+    Returns:
+        the state after the frame, before any restart, and (B,) bool: it was supported.
+    """
+    running = is_running(predicted.status)
+    support, total = (seen.weight * trust).sum(-1), seen.weight.sum(-1)
+    share = support / total.clamp(min=1e-6)
+    least = torch.where(predicted.status == int(Status.TRACKING), cfg.min_share, cfg.enter_share)
+    finite = updated.mean.isfinite().all(-1) & updated.cov.isfinite().flatten(1).all(-1)
+    supported = running & finite & (support >= cfg.min_support) & (share >= least)
+    empty = total < 1e-3
+    unseen = torch.where(supported, 0.0, predicted.unseen + step)
+    misfit = torch.where(supported, 0.0, predicted.misfit + torch.where(empty, 0.0, step))
+    coasting = torch.where(unseen > cfg.lost_after, int(Status.LOST), int(Status.COASTING))
+    idle = torch.where(running, coasting, predicted.status)
+    blind = ~supported.unsqueeze(-1) | (single_frame_std[:, POSE] > single_frame_std.new_tensor(UNSEEN))
+    reasons = (
+        flag(empty, Reason.NO_SEGMENTS)
+        | flag(~empty & ~supported, Reason.FEW_INLIERS)
+        | flag(~running, Reason.NO_START)
+        | flag(blind[:, :ROLL].any(-1), Reason.DIRECTION_UNSEEN)
+        | flag(blind[:, ROLL], Reason.ROLL_UNSEEN)
+        | flag(blind[:, HEIGHT], Reason.HEIGHT_UNSEEN)
+        | torch.where(supported, updated.reasons, 0)
+    )
+    known = supported & ~blind.any(-1)
+    after = select_rows(supported, updated, predicted)._replace(
+        pose_sensitivity=select_rows(known, updated.pose_sensitivity, predicted.pose_sensitivity),
+        evidence=select_rows(supported, updated.evidence, torch.zeros_like(updated.evidence)),
+        early=torch.zeros_like(unseen),
+        unseen=unseen,
+        misfit=misfit,
+        status=torch.where(supported, int(Status.TRACKING), idle),
+        reasons=reasons,
+    )
+    return after, supported
+
+
+def single_deviation(deviations: Tensor, cfg: JointConfig) -> Tensor:
+    """Compute by how much (B,) m any boundary may be out of place if exactly one is."""
+    size = cfg.open_deviation
+    worst = deviations.abs().amax(-1)
+    alone = (worst > 0.1 * size) & (worst < _DOUBTFUL) & (deviation_prior_std(deviations, cfg) == 0)
+    return torch.where(alone, worst.clamp(max=size), 0.0)
+
+
+def as_calibration(state: JointState, inliers: Tensor, positions: Tensor, cfg: JointConfig) -> Calibration:
+    """Make the calibration of a state.
+
+    Its covariance adds what the filter does not estimate: the common scale of the lane widths; the deviation
+    that any boundary may have if one has; and the effect on height of an error of roll to second order, where
+    roll is not observed. With boundaries at x₁ and x₂ seen as they are, h'' = -2 (h - x₁ x₂ / h).
+
+    Args:
+        state: (B, ...).
+        inliers: (B, N).
+        positions: (B, L) m, of the boundaries from the ego lane's middle.
+        cfg: the numbers.
+    """
+    cov = state.cov[:, POSE, POSE]
+    height, ego = state.mean[:, HEIGHT], cfg.num_boundaries // 2 - 1
+    left, right = (positions[:, ego : ego + 2] + state.mean[:, OFFSET, None]).unbind(-1)
+    bend = height - left * right / height.clamp(min=0.1)
+    more = 3.0 * (bend * cov[:, ROLL, ROLL]).square() * unobserved_mask(state.reasons)[:, ROLL]
+    width = positions.diff(dim=-1).mean(-1)
+    more = more + (cfg.lane_width_std / width * height).square()
+    deviations = state.mean[:, layout(cfg.num_boundaries).deviations]
+    by_lanes = single_deviation(deviations, cfg)[:, None, None] * state.pose_sensitivity
+    only_height = torch.arange(NUM_POSE, device=cov.device) == HEIGHT
+    cov = cov + by_lanes @ by_lanes.mT + (only_height * more.unsqueeze(-1)).diag_embed()
+    return Calibration(Extrinsics.unstack(state.mean[:, POSE]), cov, state.status, inliers)
