@@ -156,8 +156,9 @@ def predict_state(state: JointState, dt: Tensor, cfg: JointConfig) -> JointState
     """Predict mean, covariance and phase over dt (B,) s."""
     place = layout(cfg.num_boundaries)
     road = propagate_road_shape(state.mean, state.cov[:, SHAPE, SHAPE], state.phase, dt, place, cfg.motion)
-    scale = torch.where(unobserved_mask(state.reasons), cfg.motion.unobserved_scale, 1.0).to(dt)
-    scale = scale * state.motion_scale.sqrt()
+    scale = state.motion_scale.sqrt()
+    unobserved = unobserved_mask(state.reasons)
+    scale = torch.where(unobserved, scale.clamp(min=cfg.motion.unobserved_scale), scale)
     unequal = deviation_prior_std(state.mean[:, place.deviations], cfg)
     mean, cov = predict(state.mean, state.cov, *motion(dt, scale, unequal, road, place, cfg.motion))
     mean = torch.cat([mean[:, :CURVATURE], road.shape, mean[:, SHAPE.stop :]], dim=-1)

@@ -32,7 +32,7 @@ class MotionConfig:
         bandwidth: Hz, cut-off frequency of the pose's motion.
         angle_std: rad, standard deviation of pitch, yaw and roll about their slow means.
         height_std: m, likewise.
-        unobserved_scale: factor on these where the last frame did not determine an angle or the height.
+        unobserved_scale: least factor on these where the last frame did not determine an angle or the height.
         mean_angle_walk: rad/√s, of the slow mean.
         mean_height_walk: m/√s.
         offset_density: of the lateral acceleration, m²/s³.
