@@ -2,8 +2,12 @@
 
 import pytest
 import torch
+from hypothesis import settings
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+settings.register_profile("lanebev", deadline=None, derandomize=True)  # a gate is the same twice
+settings.load_profile("lanebev")
 
 
 def pytest_addoption(parser):

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -88,6 +89,18 @@ def test_numbers_that_are_no_pixels_are_refused(tmp_path, text):
     path.write_text(text)
     with pytest.raises(ValueError, match=r"expected (pixels|finite numbers, or null)"):
         read_lanes(path)
+
+
+def test_rows_may_fall(tmp_path):
+    """As from the bottom of the image upwards."""
+    fields = {"raw_file": "1.jpg", "h_samples": [520, 510, 500], "lanes": [[6, 5, -2]]}
+    (tmp_path / "lanes.json").write_text(json.dumps(fields))
+    (line,) = read_lanes(tmp_path / "lanes.json")[0].lines
+    np.testing.assert_array_equal(line.points, [[6, 520], [5, 510], [np.nan, 500]])
+    lines = [LaneLine(line, i + 1) for i, line in enumerate(_lines())]
+    falling = [line._replace(points=line.points[::-1]) for line in lines]
+    for a, b in zip(vertices_from_lines(lines, CAMERA), vertices_from_lines(falling, CAMERA), strict=True):
+        assert torch.equal(a, b)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])

@@ -1,4 +1,4 @@
-"""OpenLane's 3D lane points to pixels.
+"""OpenLane's 2D and 3D lanes in JSON.
 
 Source: OpenLane, eval/LANE_evaluation/lane3d/eval_3D_lane.py. Labels are in the camera's frame turned to the
 vehicle's axes (x forward, y left, z up). Predictions for the benchmark are in the ground frame below the
@@ -7,14 +7,55 @@ camera (x right, y forward, z up), whose pose is the label's ``extrinsic``.
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
+
+from lanebev.io.lane_parsing import (
+    FrameLines,
+    Where,
+    checked_pixels,
+    columns,
+    field,
+    json_object,
+    lane_text,
+    within,
+)
+from lanebev.numbers import finite_numbers, shown
+from lanebev.observation.polylines import LaneLine
 
 Array = NDArray[np.float64]
 
 _CAMERA_FROM_LABEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 _VEHICLE_FROM_GROUND = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+_CURBS = (20, 21)  # left and right kerb: no lane ends there, so no lane width holds
+_FARTHEST = 1e6  # px of the image
 _NEAREST = 0.1  # m in front of the camera; what is nearer or behind has no image
+
+
+def read_openlane(path: str | Path, intrinsics: NDArray[np.float64] | None = None) -> FrameLines:
+    """Read an OpenLane 2D or 3D JSON, kerbs left out: the ``uv`` of its lane lines, else their ``xyz``.
+
+    Points ``xyz`` alone, as predictions have them, are projected by the file's ``intrinsic``. Three lists of
+    P numbers are in the camera's frame, as labels are; P lists of three are in the ground frame of the
+    benchmark's predictions if the file has the camera's ``extrinsic``, else in the camera's.
+
+    Args:
+        path: of the file.
+        intrinsics: (3, 3) px, for a file that has 3D points and no ``intrinsic``.
+    """
+    path = Path(path)
+    with Where(path, None):
+        fields = json_object(lane_text(path))
+        name = field(fields, "file_path", str)
+        lines = []
+        for i, lane in enumerate(field(fields, "lane_lines", list)):
+            points = _openlane_points(f"lane_lines[{i}]", lane, fields, intrinsics)
+            if lane.get("category") not in _CURBS and np.isfinite(points).any():
+                lines.append(LaneLine(points))
+    return FrameLines(name, lines)
 
 
 def camera_from_label_points(points: Array) -> Array:
@@ -47,3 +88,41 @@ def image_from_camera_points(points: Array, intrinsics: Array) -> Array:
     homogeneous = points @ intrinsics.T
     pixels: Array = homogeneous[:, :2] / depth[:, None]
     return pixels
+
+
+def _openlane_points(
+    name: str, lane: Any, fields: dict[str, Any], intrinsics: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """(P, 2) px of a lane line, by its ``uv`` if it has any, else by its ``xyz``."""
+    if not isinstance(lane, dict):
+        raise ValueError(f"{name}: expected an object, got {shown(lane)}")
+    if lane.get("uv") is not None or lane.get("xyz") is None:
+        return checked_pixels(f"{name}.uv", columns(f"{name}.uv", field(lane, "uv", list), 2).T)
+    xyz = field(lane, "xyz", list)
+    rows_of_three = len(xyz) != 3 and all(isinstance(point, list) and len(point) == 3 for point in xyz)
+    by_axis = [list(axis) for axis in zip(*xyz, strict=True)] if rows_of_three and xyz else xyz
+    points = within(f"{name}.xyz", "m", columns(f"{name}.xyz", by_axis or [[], [], []], 3).T)
+    if (visibility := lane.get("visibility")) is not None:
+        seen = columns(f"{name}.visibility", [visibility], 1)[0]
+        if len(seen) != len(points):
+            raise ValueError(f"{name}.visibility: expected {len(points)} numbers, got {len(seen)}")
+        points = points[seen > 0.5]
+    if rows_of_three and fields.get("extrinsic") is not None:
+        camera = camera_from_ground_points(points, _square(fields, "extrinsic", 4))
+    else:
+        camera = camera_from_label_points(points)
+        if len(camera) and not (camera[:, 2] > 0).any():
+            raise ValueError(f"{name}.xyz: expected points before the camera (x forward, y left, z up)")
+    matrix = intrinsics if fields.get("intrinsic") is None else _square(fields, "intrinsic", 3)
+    if matrix is None:
+        raise ValueError(f"intrinsic: expected the camera matrix of {name}.xyz, got none")
+    image = image_from_camera_points(camera, matrix)
+    return image[(np.abs(image) < _FARTHEST).all(-1)]
+
+
+def _square(fields: dict[str, Any], name: str, size: int) -> NDArray[np.float64]:
+    """(size, size) matrix of finite numbers."""
+    rows = field(fields, name, list)
+    if len(rows) != size or not all(isinstance(row, list) for row in rows):
+        raise ValueError(f"{name}: expected {size} x {size} numbers, got {shown(rows)}")
+    return within(name, "numbers of a camera", np.array([finite_numbers(name, row, size) for row in rows]))

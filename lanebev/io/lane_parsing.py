@@ -1,0 +1,103 @@
+"""What lane files' readers have in common: their result, text and JSON, and messages that say where."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanebev.numbers import finite_numbers, numbers_or_gaps, read_text, shown
+from lanebev.observation.polylines import LaneLine
+
+_FARTHEST = 1e6  # px or m, of any coordinate
+
+
+class FrameLines(NamedTuple):
+    """The lines of one frame.
+
+    Attributes:
+        name: of the frame in the file.
+        lines: as they were drawn.
+        pose_sigma_scale: factor on the standard deviations of the pose estimated from them; 1 unless stated.
+    """
+
+    name: str
+    lines: list[LaneLine]
+    pose_sigma_scale: float = 1.0
+
+
+class Where:
+    """Puts file and line before the message of a ValueError."""
+
+    def __init__(self, path: str | Path, line: int | None) -> None:
+        self.place = f"lane file {path}" + (f", line {line}" if line else "")
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        if isinstance(error, ValueError) and not str(error).startswith("lane file"):
+            raise ValueError(f"{self.place}: {error}") from error
+
+
+def lane_text(path: Path) -> str:
+    """Return a lane file's text; a ValueError names the file."""
+    try:
+        return read_text(path)
+    except ValueError as error:
+        raise ValueError(f"lane file {path}: expected a readable file, got: {error}") from error
+
+
+def json_object(text: str) -> dict[str, Any]:
+    """Return the object that a JSON text holds; else it is a ValueError."""
+    try:
+        fields = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError("expected JSON, got a line that breaks off or is none; is the file cut?") from error
+    if not isinstance(fields, dict):
+        raise ValueError(f"expected a JSON object, got {type(fields).__name__}")
+    return fields
+
+
+def field(fields: Any, key: str, kind: type) -> Any:
+    """Return the value of a key, if it is of this kind; else it is a ValueError."""
+    if not isinstance(fields, dict) or not isinstance(fields.get(key), kind):
+        got = type(fields.get(key)).__name__ if isinstance(fields, dict) and key in fields else "none"
+        raise ValueError(f"{key}: expected a {kind.__name__}, got {got}; formats: TuSimple, CULane, OpenLane")
+    return fields[key]
+
+
+def as_list(name: str, values: Any) -> list[Any]:
+    """Return the values, if they are a list; else it is a ValueError."""
+    if not isinstance(values, list):
+        raise ValueError(f"{name}: expected a list, got {shown(values)}")
+    return values
+
+
+def number_array(name: str, values: Any, count: int) -> NDArray[np.float64]:
+    """Return a list of ``count`` finite numbers as an array; else it is a ValueError."""
+    return np.array(finite_numbers(name, as_list(name, values), count), dtype=np.float64)
+
+
+def columns(name: str, values: list[Any], count: int) -> NDArray[np.float64]:
+    """(count, P) of ``count`` lists of one length; NaN where there is no number."""
+    lists = len(values) == count and all(isinstance(axis, list) for axis in values)
+    if not lists or len({len(axis) for axis in values}) != 1:
+        many = {1: "one list", 2: "two lists", 3: "three lists"}[count]
+        raise ValueError(f"{name}: expected {many} of one length, got {shown(values)}")
+    return np.array([numbers_or_gaps(name, axis) for axis in values])
+
+
+def checked_pixels(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The values, if they can be pixels."""
+    return within(name, "pixels", values)
+
+
+def within(name: str, unit: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The values, if none is larger than any of this unit."""
+    if (np.abs(values) > _FARTHEST).any():  # NaN is not
+        raise ValueError(f"{name}: expected {unit}, got {np.nanmax(np.abs(values)):g}")
+    return values
