@@ -1,18 +1,26 @@
-"""Warp the features of a network to the road by the pose that the same images give, and train through it."""
+"""Embed lanebev in a network: its features become a bird's-eye view by the pose that the same image shows."""
 
 import torch
+from torch import nn
 
 import lanebev
 
-model = lanebev.LaneBEV.from_pretrained()
-trunk = torch.nn.Conv2d(3, 8, 3, stride=8, padding=1)
-warp = lanebev.BEVWarp(lanebev.BEVGrid(x=(-10, 10), z=(5, 45), resolution=0.5))
-images = torch.rand(1, 2, 3, 192, 320)  # (B, T, 3, H, W)
-intrinsics = torch.tensor([[[260.0, 0, 159.5], [0, 260.0, 95.5], [0, 0, 1]]])
-state = None
-for image in images.unbind(1):
-    out, state = model(image, intrinsics, state, dt=0.1)
-    bev, valid = warp(trunk(image), intrinsics, out.calibration.extrinsics, image_size=(192, 320))
-    bev[valid.expand_as(bev)].square().mean().backward()
-    state = state.detach()
-print(bev.shape, float(trunk.weight.grad.norm()))
+
+class Detector(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.trunk = nn.Conv2d(3, 16, kernel_size=7, stride=8, padding=3)
+        self.lanes = lanebev.LaneBEV.from_pretrained(grid=lanebev.BEVGrid(resolution=0.5))
+        self.head = nn.Conv2d(16, 1, kernel_size=3, padding=1)
+
+    def forward(self, image, intrinsics, state=None):
+        out, state = self.lanes(image, intrinsics, state, dt=1 / 30)
+        pose, size = out.calibration.extrinsics, image.shape[-2:]
+        bev, _ = self.lanes.warp(self.trunk(image), intrinsics, pose, image_size=size, strides=8)
+        return self.head(bev), state.detach()
+
+
+intrinsics = torch.tensor([[[250.0, 0, 159.5], [0, 250.0, 95.5], [0, 0, 1]]])
+scores, state = Detector()(torch.rand(1, 3, 192, 320), intrinsics)
+scores.sum().backward()
+print(scores.shape, state.status)

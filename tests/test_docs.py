@@ -95,10 +95,3 @@ def test_the_version_is_one():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == lanebev.__version__
     assert f"## [{lanebev.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.py")), ids=_name)
-def test_examples_are_short(example):
-    lines = example.read_text(encoding="utf-8").splitlines()
-    if example.name != "onnx_only.py":
-        assert sum(bool(line.strip()) and not line.startswith("#") for line in lines) <= 20

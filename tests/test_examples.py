@@ -2,11 +2,18 @@
 
 import runpy
 import sys
+from fractions import Fraction
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
+from PIL import Image
+
+from lanebev.io.video import VideoWriter
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+GOLDEN = Path(__file__).parent / "golden"
 
 
 def run_example(name, monkeypatch, tmp_path, *arguments):
@@ -36,14 +43,11 @@ def test_another_detectors_boundaries(monkeypatch, tmp_path, capsys):
 @pytest.mark.slow
 def test_features_of_another_network(monkeypatch, tmp_path, capsys):
     run_example("embed.py", monkeypatch, tmp_path)
-    assert "torch.Size([1, 8, 80, 40])" in capsys.readouterr().out
+    assert "torch.Size([1, 1, 114, 40])" in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_a_live_loop_ends_with_a_state(monkeypatch, tmp_path, capsys):
-    import cv2
-    import numpy as np
-
     writer = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (320, 192))
     for value in (0, 90, 180):
         writer.write(np.full((192, 320, 3), value, np.uint8))
@@ -53,3 +57,20 @@ def test_a_live_loop_ends_with_a_state(monkeypatch, tmp_path, capsys):
     assert said.count("+-") == 3
     assert "does not advance" not in said
     assert (tmp_path / "state.safetensors").is_file()
+
+
+@pytest.mark.slow
+def test_ones_own_video(monkeypatch, tmp_path, capsys):
+    with VideoWriter(tmp_path / "drive.mp4", Fraction(20)) as video:
+        for _ in range(2):
+            video.write(np.asarray(Image.open(GOLDEN / "frame.png")))
+    (tmp_path / "camera.yaml").write_text("{fx: 300, fy: 300, cx: 159.5, cy: 89.5, width: 320, height: 180}")
+    run_example("own_video.py", monkeypatch, tmp_path, "drive.mp4", "camera.yaml", "out")
+    assert "2 frames" in capsys.readouterr().out
+    assert (tmp_path / "out" / "report.html").is_file()
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
+def test_an_example_stands_in_the_docs(path):
+    pages = (page.read_text(encoding="utf-8") for page in (EXAMPLES.parent / "docs").rglob("*.md"))
+    assert any(f'--8<-- "examples/{path.name}"' in page for page in pages)
