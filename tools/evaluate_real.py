@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 import lanebev
-from lanebev import BEVGrid, BEVWarp, Extrinsics, LaneSegments
+from lanebev import BEVGrid, Extrinsics, LaneSegments
 from lanebev.app.run import bird_view, calibrate_still, make_calibrator
 from lanebev.io.video import open_source
 from lanebev.report.overlay import Panel, draw_frame
@@ -104,7 +104,7 @@ def print_table(figures: list[Figure]) -> None:
 def write_sheet(path: Path, data: Path, calibrator: Any) -> None:
     """Input, view before and view after of a dozen labelled images, two a row."""
     images, segments = tusimple_segments(data)
-    camera, warp = tusimple_camera(), BEVWarp(BEVGrid())
+    camera, grid = tusimple_camera(), BEVGrid()
     level = Extrinsics.from_values(0.0, 0.0, 0.0, 1.5)
     pictures = []
     for i in (*SHEET, 87):
@@ -113,11 +113,11 @@ def write_sheet(path: Path, data: Path, calibrator: Any) -> None:
         frame = next(iter(open_source(images[i])))
         assert frame.image is not None
         views = tuple(
-            Panel(title, bird_view(warp, frame, camera, extrinsics), extrinsics)
+            Panel(title, bird_view(grid, frame, camera, extrinsics), extrinsics)
             for title, extrinsics in (("before", level), ("after", calibration.extrinsics))
         )
         name = "/".join(Path(images[i]).parts[-3:])
-        picture = draw_frame(frame.image, camera, one, calibration, name, views, warp.grid)
+        picture = draw_frame(frame.image, camera, one, calibration, name, views, grid)
         pictures.append(np.asarray(Image.fromarray(picture).resize((919, 360), Image.Resampling.LANCZOS)))
     rows = [np.concatenate(pictures[k : k + 2], axis=1) for k in range(0, len(pictures), 2)]
     Image.fromarray(np.concatenate(rows, axis=0)).save(path)

@@ -39,8 +39,8 @@ from lanebev.pipeline import LaneBEV
 from lanebev.report.overlay import Picture
 from lanebev.report.page import Report
 from lanebev.types import Calibration, Extrinsics, Status
+from lanebev.view.frame import remap_frame
 from lanebev.view.grid import BEVGrid
-from lanebev.view.warp import BEVWarp
 
 CALIBRATORS = ("joint", "two-stage")
 STATE_FILE, CALIBRATION_FILE = "state.safetensors", "calibration.yaml"
@@ -126,14 +126,14 @@ def run(
     states, problem = begin(config, calibrator, mount, camera)
     frames: Iterator[Frame] = prefetch(source)
     frames = progress(frames, source.count) if progress else frames
-    warp, coarse = BEVWarp(BEVGrid()), BEVWarp(BEVGrid(resolution=_BEFORE_RESOLUTION))
+    grid, coarse = BEVGrid(), BEVGrid(resolution=_BEFORE_RESOLUTION)
     with OutputFolder(config.out) as out, torch.inference_mode():
         if config.resume and problem:
             problem += keep_refused(config.resume, out)
         recorder = Recorder(
             out.__truediv__,
             camera,
-            warp.grid,
+            grid,
             STILLS_FPS if config.stills else source.fps,
             config.lane_width,
             source.is_single,
@@ -163,7 +163,7 @@ def run(
                         reasons_of(states["calibrator"]),
                         before,
                         bird_view(coarse, frame, camera, before),
-                        bird_view(warp, frame, camera, calibration.extrinsics),
+                        bird_view(grid, frame, camera, calibration.extrinsics),
                     )
                 )
         facts = run_facts(config, source, camera)
@@ -341,16 +341,11 @@ def pose_before(
     return before
 
 
-def bird_view(warp: BEVWarp, frame: Frame, camera: Camera, extrinsics: Extrinsics | None) -> Picture:
-    """(U, V, 3) uint8 RGB, black where the camera does not see, or nothing is known."""
+def bird_view(grid: BEVGrid, frame: Frame, camera: Camera, extrinsics: Extrinsics | None) -> Picture:
+    """Resample a frame to (U, V, 3) uint8 RGB, black where the camera does not see, or nothing is known."""
     if frame.image is None or extrinsics is None:
-        return np.zeros((*warp.grid.shape, 3), np.uint8)
-    image = torch.from_numpy(frame.image.copy()).permute(2, 0, 1)[None].float()
-    single = Extrinsics(*(value.float() for value in extrinsics))
-    intrinsics, distortion = camera.intrinsics[None].float(), camera.distortion[None].float()
-    bev: Tensor = warp(image, intrinsics, single, distortion, camera.model)[0][0]
-    picture: Picture = bev.permute(1, 2, 0).round().clamp(0, 255).byte().contiguous().numpy()
-    return picture
+        return np.zeros((*grid.shape, 3), np.uint8)
+    return remap_frame(frame.image, camera, extrinsics, grid)[0]
 
 
 def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[str, str]:

@@ -1,0 +1,98 @@
+"""How long ``lanebev run`` takes for a frame, beside the network's forward pass alone, in one process.
+
+    python -m tools.bench_run [--frames 60] [--json FILE] [--profile]
+
+A rendered drive of 1280 x 720 is written to a video, run with all outputs, and the network's forward pass is
+timed on its input before and after. The ratio is what counts: machines differ, and drift.
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import json
+import pstats
+import tempfile
+import time
+from fractions import Fraction
+from pathlib import Path
+
+import torch
+from jsonargparse.typing import PositiveInt
+
+import lanebev
+from lanebev.app.run import RunConfig, run
+from lanebev.io.video import VideoWriter
+from lanebev.render import Drive
+from lanebev.weights import load_segmenter
+from train.commands import one_line_errors
+
+SIZE, FPS, RENDERED = (720, 1280), 20, 8
+
+
+def write_video(folder: Path, frames: int) -> tuple[str, str]:
+    """Write a drive of so many frames (a few rendered ones, forth and back) and its camera."""
+    drive = Drive(3, SIZE, RENDERED, float(FPS))
+    images = [drive.frame(k).image[0] for k in range(min(RENDERED, frames))]
+    pictures = [(255 * image).round().byte().permute(1, 2, 0).contiguous().numpy() for image in images]
+    order = [k if k < len(pictures) else 2 * len(pictures) - 1 - k for k in range(2 * len(pictures))]
+    video, camera = folder / "drive.mp4", folder / "camera.yaml"
+    with VideoWriter(video, Fraction(FPS)) as writer:
+        for number in range(frames):
+            writer.write(pictures[order[number % len(order)]])
+    drive.camera.to_file(camera)
+    return str(video), str(camera)
+
+
+def forward_seconds(repeats: int = 9) -> float:
+    """Time the network's forward pass on one image of its size, the median."""
+    segmenter = load_segmenter().eval()
+    height, width = (int(side) for side in segmenter.image_size)
+    image = torch.rand(1, 3, height, width)
+    taken = []
+    with torch.inference_mode():
+        for _ in range(repeats + 2):
+            begin = time.perf_counter()
+            segmenter(image)
+            taken.append(time.perf_counter() - begin)
+    return sorted(taken[2:])[repeats // 2]
+
+
+@one_line_errors()
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--frames", type=PositiveInt, default=60)
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--profile", action="store_true", help="print where the main thread spends its time")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        video, camera = write_video(Path(name), args.frames)
+        before = forward_seconds()
+        profile = cProfile.Profile()
+        begin = time.perf_counter()
+        if args.profile:
+            profile.enable()
+        run(RunConfig(video, camera, str(Path(name) / "out")))
+        profile.disable()
+        whole = time.perf_counter() - begin
+        after = forward_seconds()
+    forward = 0.5 * (before + after)
+    figures = {
+        "frames": args.frames,
+        "run_ms": round(1e3 * whole / args.frames, 1),
+        "forward_ms": round(1e3 * forward, 1),
+        "ratio": round(whole / args.frames / forward, 2),
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+        "lanebev": lanebev.__version__,
+    }
+    print(json.dumps(figures))
+    if args.profile:
+        pstats.Stats(profile).sort_stats("cumtime").print_stats(45)
+    if args.json is not None:
+        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
