@@ -18,6 +18,7 @@ from lanebev.types import Status
 NAMES = ("pitch_deg", "yaw_deg", "roll_deg", "height_cm")
 UNITS = torch.tensor([180 / math.pi] * 3 + [100.0], dtype=torch.float64)
 WARM_UP = 15  # frames left out
+_DETERMINED = (0.1, 0.1, 0.1, 0.5)  # rad and m, standard deviation below which one frame determines it
 
 
 class Track(NamedTuple):
@@ -28,7 +29,7 @@ class Track(NamedTuple):
         variances: (T, R, 4).
         nees: (T, R).
         status: (T, R) int64.
-        bounds: (T, R, 4) variances of the per-frame Cramér-Rao bound, inf where there is none.
+        bounds: (T, R, 4) variances of the per-frame Cramér-Rao bound, inf of what a frame does not determine.
         hard: (T,) bool, frames that the scenario names.
     """
 
@@ -76,13 +77,14 @@ def track(
     return Track(errors, variances, nees, status, bounds, hard)
 
 
-def frame_bound(moment: Moment, segments: LaneSegments) -> Tensor:
-    """Variances (R, 4) of the per-frame bound with the offset unknown, or inf where roll is not determined.
+def frame_bound(moment: Moment, segments: LaneSegments, intrinsics: Tensor = CAMERA) -> Tensor:
+    """Variances (R, 4) of the per-frame bound with the offset unknown, inf of what is not determined.
 
     Source: Kay 1993, Sec. 3.9. Wrong segments count as if they were right ones, which only lowers it.
     """
     rows = segments.boundary.shape[0]
-    seen = make_ready(LaneSegments(*(_double(part) for part in segments)), CAMERA.expand(rows, 3, 3), 6)
+    cameras = intrinsics.double().expand(rows, 3, 3)
+    seen = make_ready(LaneSegments(*(_double(part) for part in segments)), cameras, 6)
     params = torch.zeros(rows, NUM_PARAMS, dtype=torch.float64)
     params[:, :5] = torch.tensor([*moment.pose, moment.offset], dtype=torch.float64)
     at = boundary_residuals(params, PLACES[segments.boundary], seen)
@@ -90,7 +92,7 @@ def frame_bound(moment: Moment, segments: LaneSegments) -> Tensor:
     info, _ = normal_equations(at.jacobian[:, :5], at.distance, weight)
     cov = torch.linalg.inv(info + 1e-6 * torch.eye(5, dtype=torch.float64))
     variances = cov.diagonal(dim1=1, dim2=2)[:, :4]
-    return torch.where((variances[:, 2:3] < 0.01), variances, torch.inf)
+    return torch.where(variances < variances.new_tensor(_DETERMINED).square(), variances, torch.inf)
 
 
 def _double(part: Tensor) -> Tensor:
@@ -101,12 +103,12 @@ def summarise(run: Track, usual: Tensor | None = None) -> dict[str, Any]:
     """Figures of one track; ``usual`` (4,) is the RMSE on the straight road, for the time to recover."""
     later = torch.arange(len(run.hard)) >= WARM_UP
     easy, hard = later & ~run.hard, later & run.hard
-    known = run.bounds.isfinite().all(-1) & easy.unsqueeze(-1)
-    bound = run.bounds[known].mean(0).sqrt()
+    known = run.bounds.isfinite() & easy[:, None, None]
     figures: dict[str, Any] = {
         "rmse": (rms(run.errors[easy]) * UNITS).tolist(),
-        "ratio_to_bound": (rms(run.errors[known]) / bound).tolist(),
+        "ratio_to_bound": (mean_of(run.errors.square(), known) / mean_of(run.bounds, known)).sqrt().tolist(),
         "nees_per_dof": float(run.nees[easy].mean() / 4),
+        "within_3_sigma": within_sigmas(run)[later].mean().item(),
         "time_in_status": {s.name: float((run.status[later] == s).double().mean()) for s in Status},
     }
     if hard.any():
@@ -121,10 +123,20 @@ def summarise(run: Track, usual: Tensor | None = None) -> dict[str, Any]:
     return figures
 
 
-def recovery(run: Track, usual: Tensor) -> float | None:
+def within_sigmas(run: Track, sigmas: float = 3.0) -> Tensor:
+    """Compute the share (T,) of all rows' parameters whose error is at most so many of their sigmas."""
+    return (run.errors.square() <= sigmas**2 * run.variances).double().mean((1, 2))
+
+
+def recovery(run: Track, usual: Tensor, fps: float = FPS) -> float | None:
     """Longest time, s, from the end of hard frames until the error of all rows is back at twice the usual.
 
     None if it never comes back before the next hard frames or the end.
+
+    Args:
+        run: of a drive with hard frames.
+        usual: (4,) or (T, 4) rad and m.
+        fps: of the drive.
     """
     fine = (run.errors.square().mean(1).sqrt() <= 2 * usual).all(-1)  # (T,)
     ends = [k + 1 for k in range(len(fine) - 1) if run.hard[k] and not run.hard[k + 1]]
@@ -135,10 +147,15 @@ def recovery(run: Track, usual: Tensor) -> float | None:
             until += 1
         if until == len(fine) or run.hard[until]:
             return None
-        longest = max(longest, (until - end) / FPS)
+        longest = max(longest, (until - end) / fps)
     return longest
 
 
 def rms(values: Tensor) -> Tensor:
     """Over all dimensions but the last."""
     return values.flatten(0, -2).square().mean(0).sqrt()
+
+
+def mean_of(values: Tensor, where: Tensor) -> Tensor:
+    """Mean over all dimensions but the last of the entries in the mask; NaN where there are none."""
+    return torch.where(where, values, 0.0).flatten(0, -2).sum(0) / where.flatten(0, -2).sum(0)

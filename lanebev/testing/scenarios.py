@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lanebev.geometry.road import image_from_road_points
 from lanebev.observation.segments import LaneSegments
+from lanebev.testing.motions import Motion
 from lanebev.types import Extrinsics
 
 FPS = 30.0
@@ -62,12 +63,18 @@ def drift(t: float) -> float:
     return -0.4 * math.sin(0.3 * math.pi * t + 0.5)
 
 
-def moments(seconds: float, change: Callable[[float, Moment], Moment] | None = None) -> list[Moment]:
-    """A drive of the usual motion, each frame changed by ``change(t, moment)``."""
+def moments(
+    seconds: float,
+    change: Callable[[float, Moment], Moment] | None = None,
+    motion: Motion = swing,
+    fps: float = FPS,
+    start: float = 0.0,
+) -> list[Moment]:
+    """A drive, from ``start`` s on, of a motion, each frame changed by ``change(t, moment)``."""
     drive = []
-    for k in range(round(seconds * FPS)):
-        t = k / FPS
-        moment = Moment(swing(t), drift(t))
+    for k in range(round(seconds * fps)):
+        t = start + k / fps
+        moment = Moment(motion(t), drift(t), dt=1 / fps)
         drive.append(change(t, moment) if change else moment)
     return drive
 
@@ -93,8 +100,8 @@ def observe(
         yield moment, segments
 
 
-def curves(moment: Moment, num: int = 400) -> tuple[Tensor, Tensor]:
-    """(6, G, 2) px of the boundaries from near to far, and (6, G) bool: in the image."""
+def road_curves(moment: Moment, num: int = 400) -> Tensor:
+    """(6, G, 2) m, X and Z of the boundaries from near to far."""
     inverse = torch.linspace(1 / moment.near, 1 / moment.far, num, dtype=torch.float64)
     z = 1 / inverse
     if moment.curvature is not None:
@@ -113,11 +120,16 @@ def curves(moment: Moment, num: int = 400) -> tuple[Tensor, Tensor]:
         for place, own in zip(moment.places + moment.offset, moment.headings, strict=True):
             x = side + place * turned.cos() + own * ahead
             zz = ahead - place * turned.sin()
-            points.append(_resample(zz, x, z))
+            points.append(resample(zz, x, z))
         x = torch.stack(points)
     else:
         x = (moment.places + moment.offset).unsqueeze(-1) + moment.headings.unsqueeze(-1) * z
-    road = torch.stack([x, z.expand_as(x)], dim=-1)
+    return torch.stack([x, z.expand_as(x)], dim=-1)
+
+
+def curves(moment: Moment, num: int = 400) -> tuple[Tensor, Tensor]:
+    """(6, G, 2) px of the boundaries from near to far, and (6, G) bool: in the image."""
+    road = road_curves(moment, num)
     pose = Extrinsics.unstack(torch.tensor([moment.pose], dtype=torch.float64))
     pixels, ahead_ok = image_from_road_points(road.flatten(0, 1)[None], CAMERA[None], pose)
     pixels = pixels[0].view(6, num, 2)
@@ -125,10 +137,11 @@ def curves(moment: Moment, num: int = 400) -> tuple[Tensor, Tensor]:
     return pixels, inside & ahead_ok[0].view(6, num)
 
 
-def _resample(z: Tensor, x: Tensor, at: Tensor) -> Tensor:
-    """x at the given z, linearly; z increasing."""
+def resample(z: Tensor, x: Tensor, at: Tensor) -> Tensor:
+    """x (G,) or (G, 2) at the given z, linearly; z (G,) increasing."""
     right = torch.searchsorted(z.contiguous(), at.contiguous()).clamp(1, len(z) - 1)
     share = (at - z[right - 1]) / (z[right] - z[right - 1])
+    share = share if x.ndim == 1 else share.unsqueeze(-1)
     return x[right - 1] + share * (x[right] - x[right - 1])
 
 
@@ -147,7 +160,7 @@ def _exact(
             weights.append(torch.zeros(rows, per_boundary, dtype=torch.float64))
             continue
         at = torch.arange(count, dtype=torch.float64) * STEP
-        points = torch.stack([_resample(arc, line[:, 0], at), _resample(arc, line[:, 1], at)], dim=-1)
+        points = resample(arc, line, at)
         first = torch.randint(count, (rows, per_boundary), generator=generator)
         reach = min(count - 1, moment.longest)
         second = first + torch.randint(1, reach + 1, first.shape, generator=generator)

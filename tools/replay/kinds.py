@@ -1,0 +1,214 @@
+"""The kinds of drive that a replay must hold, and the generated drives among them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+
+from lanebev.camera.model import Camera
+from lanebev.testing.motions import Motion, Pose, fall, landing_time, moved, sinusoids, suspension
+from lanebev.testing.scenarios import PLACES, SCENARIOS, Moment, moments, swing
+
+FRAMES = 120
+"""Of every drive, so that all of them are rows of one batch."""
+
+KINDS = (
+    "straight",
+    "strong motion",
+    "strong motion in a curve",
+    "suspension",
+    "sharp bends",
+    "drop",
+    "knock",
+    "cut",
+    "resumed",
+    "ego lane",
+    "lane change",
+    "outliers",
+    "unequal lanes",
+    "gap",
+    "clock",
+    "remount",
+    "lens: pinhole, radial",
+    "lens: pinhole, rational",
+    "lens: pinhole, thin prism",
+    "lens: pinhole, tilted",
+    "lens: fisheye",
+    "lens: omni",
+)
+"""Each needs one drive at least; what each is, is said beside the drives below."""
+
+
+@dataclass(frozen=True)
+class Generated:
+    """A drive of known truth, drawn by a seed.
+
+    Attributes:
+        kind: one of :data:`KINDS`.
+        moments: the truth of every frame; called once.
+        camera: the lens; None is the ideal camera of :mod:`lanebev.testing.scenarios`.
+        resumed: the drive whose last state is the first one here; None begins anew.
+        mount: also run the mount estimator.
+    """
+
+    kind: str
+    moments: Callable[[], list[Moment]]
+    camera: Camera | None = None
+    resumed: Callable[[], list[Moment]] | None = None
+    mount: bool = False
+
+
+def _degrees(pitch: float, yaw: float, roll: float, height: float) -> Pose:
+    """Differences in degrees and m as a pose."""
+    return math.radians(pitch), math.radians(yaw), math.radians(roll), height
+
+
+EGO_LANE = (2, 3)
+KNOCK = _degrees(3.0, -2.0, 3.0, -0.25)  # a knocked camera: 3° and 25 cm in 0.1 s, for good
+REMOUNT = _degrees(3.0, -4.0, 3.0, 0.2)
+TRUCK = _degrees(-3.0, 3.0, -2.0, 0.9)  # the camera of another vehicle
+_KNOCKED_AT, _CUT_AT, _MOVED_AT = 1.5, 2.0, 20.0  # s
+
+
+def _drive(
+    change: Callable[[float, Moment], Moment] | None = None,
+    motion: Motion = swing,
+    fps: float = 30.0,
+    start: float = 0.0,
+) -> Callable[[], list[Moment]]:
+    return lambda: moments(FRAMES / fps, change, motion, fps, start)
+
+
+def _scenario(name: str, fps: float = 30.0, start: float = 0.0) -> Callable[[], list[Moment]]:
+    """Part of a drive of :data:`lanebev.testing.scenarios.SCENARIOS`."""
+    return _drive(SCENARIOS[name][1], fps=fps, start=start)
+
+
+def _in_curve(seed: int) -> Callable[[], list[Moment]]:
+    """From the straight through a clothoid into R = 300 m and half out of it, 75 to 195 m at 30 m/s."""
+    return _drive(SCENARIOS["curves R 300 m, 5-40 m"][1], sinusoids(seed), start=2.0)
+
+
+def _only(visible: tuple[int, ...], moment: Moment) -> Moment:
+    return replace(moment, visible=visible)
+
+
+def _drop(t: float, moment: Moment) -> Moment:
+    tag = "falling" if t < landing_time() else ""
+    return replace(moment, pose=moved(moment.pose, fall(t)), tag=tag)
+
+
+def _knock(t: float, moment: Moment) -> Moment:
+    share = min(max((t - _KNOCKED_AT) / 0.1, 0.0), 1.0)
+    return replace(moment, pose=moved(moment.pose, KNOCK, share), tag="knock" if 0 < share < 1 else "")
+
+
+def _cut(t: float, moment: Moment) -> Moment:
+    """Another vehicle's camera on another road, nearer to the left boundary, from one frame to the next."""
+    if t < _CUT_AT:
+        return moment
+    tag = "cut" if t < _CUT_AT + 0.02 else ""
+    return replace(moment, pose=moved(moment.pose, TRUCK), offset=moment.offset + 0.8, tag=tag)
+
+
+def _truck(t: float, moment: Moment) -> Moment:
+    bend = lambda z: torch.full_like(z, 1 / 400)  # noqa: E731
+    return replace(moment, pose=moved(moment.pose, TRUCK), offset=-0.6, curvature=bend, far=40.0)
+
+
+def _unequal(t: float, moment: Moment) -> Moment:
+    """A lane half a metre narrower than its neighbours, as in towns."""
+    return replace(moment, places=PLACES + torch.tensor([0.1, 0.0, 0.25, -0.25, 0.0, -0.1]).double())
+
+
+def _nothing(first: float, last: float) -> Callable[[float, Moment], Moment]:
+    def change(t: float, moment: Moment) -> Moment:
+        gone = first <= t < last
+        return replace(moment, visible=() if gone else moment.visible, tag="gap" if gone else "")
+
+    return change
+
+
+def _stuck(t: float, moment: Moment) -> Moment:
+    """From 1 s to 2 s the clock stands, then it is right again."""
+    if not 1.0 <= t < 2.0:
+        return replace(moment, dt=1.0 + 1 / 30 if round(30 * t) == 60 else moment.dt)
+    return replace(moment, dt=0.0, tag="stuck")
+
+
+def _not_positive(t: float, moment: Moment) -> Moment:
+    """From 1 s on no frame is later than the one before: 0 and -1/30 s by turns."""
+    if t < 1.0:
+        return moment
+    return replace(moment, dt=-1 / 30 if round(30 * t) % 2 else 0.0)
+
+
+def _remount(t: float, moment: Moment) -> Moment:
+    tag = "moved" if _MOVED_AT <= t < _MOVED_AT + 0.3 else ""
+    return replace(moment, pose=moved(moment.pose, REMOUNT, float(t >= _MOVED_AT)), tag=tag)
+
+
+def _in_ego_lane(change: Callable[[float, Moment], Moment]) -> Callable[[float, Moment], Moment]:
+    return lambda t, moment: _only(EGO_LANE, change(t, moment))
+
+
+def _lens(distortion: tuple[float, ...], model: str = "pinhole", focal: float = 1050.0) -> Camera:
+    return Camera.from_parameters(focal, focal, 959.5, 509.5, 1920, 1020, distortion, model)
+
+
+_RADIAL = (-0.30, 0.12, 0.0006, -0.0004, -0.02)
+_RATIONAL = (0.42, 0.11, 0.0003, -0.0002, 0.004, 0.80, 0.24, 0.021)
+_PRISM = (*_RADIAL, 0.0, 0.0, 0.0, 0.001, -0.0004, -0.0008, 0.0003)
+
+GENERATED: dict[str, Generated] = {
+    "straight": Generated("straight", _drive()),
+    # Pitch, yaw and roll are sums of three sinusoids up to 1.2 Hz and 1.5° in all.
+    "strong-motion-1": Generated("strong motion", _drive(motion=sinusoids(1))),
+    "strong-motion-2": Generated("strong motion", _drive(motion=sinusoids(2))),
+    "strong-motion-3": Generated("strong motion", _drive(motion=sinusoids(3))),
+    "curve-1": Generated("strong motion in a curve", _in_curve(4)),
+    "curve-2": Generated("strong motion in a curve", _in_curve(5)),
+    "suspension": Generated("suspension", _drive(motion=suspension(6, 4.0))),
+    # R = 60 m at 15 m/s, boundaries 1, 2, 3 in sight, 45 to 105 m.
+    "sharp-bends": Generated("sharp bends", _scenario("sharp bends R 60 m, three boundaries", start=3.0)),
+    "drop": Generated("drop", _drive(_drop)),
+    "drop-ego-lane": Generated("drop", _drive(_in_ego_lane(_drop))),
+    "knock": Generated("knock", _drive(_knock)),
+    "knock-ego-lane": Generated("knock", _drive(_in_ego_lane(_knock))),
+    "cut": Generated("cut", _drive(_cut)),
+    "cut-ego-lane": Generated("cut", _drive(_in_ego_lane(_cut))),
+    # With the state of another vehicle's camera in a bend.
+    "resumed": Generated("resumed", _drive(), resumed=lambda: moments(2.0, _truck)),
+    "resumed-ego-lane": Generated(
+        "resumed", _drive(lambda t, m: _only(EGO_LANE, m)), resumed=lambda: moments(2.0, _truck)
+    ),
+    "ego-lane": Generated("ego lane", _drive(lambda t, m: _only(EGO_LANE, m))),
+    "lane-change": Generated("lane change", _scenario("lane change", fps=20.0, start=1.0)),
+    "outliers": Generated("outliers", _scenario("50 % outliers, 5 % wrong index")),
+    "wrong-boundaries": Generated("outliers", _scenario("wrong boundaries")),
+    "misnumbered": Generated("outliers", _scenario("whole frames misnumbered")),
+    "unequal-lanes": Generated("unequal lanes", _scenario("unequal lanes")),
+    "narrow-lane": Generated("unequal lanes", _drive(_unequal)),
+    "gap-2-s": Generated("gap", _drive(_nothing(1.0, 3.0))),
+    "gap-6-s": Generated("gap", _drive(_nothing(1.5, 7.5), fps=12.0)),
+    "clock-irregular": Generated("clock", _scenario("bad clock")),
+    "clock-stuck": Generated("clock", _drive(_stuck)),
+    "clock-not-positive": Generated("clock", _drive(_not_positive)),
+    # The camera is mounted anew after 20 s; three frames a second, for the mount needs 20 s of blocks.
+    "remount": Generated("remount", _drive(_remount, fps=3.0), mount=True),
+    "remount-ego-lane": Generated("remount", _drive(_in_ego_lane(_remount), fps=3.0), mount=True),
+    "lens-radial": Generated("lens: pinhole, radial", _drive(), _lens(_RADIAL)),
+    "lens-rational": Generated("lens: pinhole, rational", _drive(), _lens(_RATIONAL)),
+    "lens-thin-prism": Generated("lens: pinhole, thin prism", _drive(), _lens(_PRISM)),
+    "lens-tilted": Generated("lens: pinhole, tilted", _drive(), _lens((*_PRISM, 0.03, -0.02))),
+    "lens-fisheye": Generated(
+        "lens: fisheye", _drive(), _lens((-0.012, 0.004, -0.003, 0.0005), "fisheye", 620.0)
+    ),
+    "lens-omni": Generated(
+        "lens: omni", _drive(), _lens((1.2, -0.08, 0.02, 0.0003, -0.0002), "omni", 1500.0)
+    ),
+}
+"""By name, which is also that of the reference files."""
