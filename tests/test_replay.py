@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.state import JointConfig, MotionConfig
+from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.state import JointConfig
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.estimation.two_stage.state import TwoStageConfig
 from lanebev.testing.evaluation import Track, within_sigmas
@@ -65,7 +66,7 @@ def _of_motion(**factors):
 
 
 PLANTED = {
-    "process noise": ("joint", JointCalibrator(_of_motion(angular_density=1.01))),
+    "process noise": ("joint", JointCalibrator(_of_motion(angle_std=1.01))),
     "iterations": ("joint", JointCalibrator(iterations=3)),
     "process noise of two stages": (
         "two-stage",
