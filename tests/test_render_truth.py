@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from lanebev.render.raster.features import features_of
-from lanebev.render.raster.paint import paint_view
-from lanebev.render.raster.rays import pixel_rays
+from lanebev.render.raster.paint import paint_view, prepare
 from lanebev.render.scene.alignment import build_alignment
 from lanebev.render.scene.camera import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
 from lanebev.render.scene.sampler import BatchSampler
@@ -101,7 +100,7 @@ def test_points_lie_on_the_centre_of_the_painted_stripe(model: str, seed: int, k
     taken, usable = taken.unflatten(1, shape[1:]), inside.reshape(shape) & (marked > 0) & ~hidden
     usable &= points[..., 2] < 80.0  # beyond, a pixel is longer than what the chord of three points follows
 
-    painted = paint_view(scene, pixel_rays(lens, SIZE), features_of(scene))
+    painted = paint_view(scene, prepare(scene, SIZE), SIZE, features_of(scene))
     errors = []
     for b in range(batch):
         errors += _centroid_errors(painted.radiance[b, 1], taken[b], usable[b])

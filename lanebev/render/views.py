@@ -10,12 +10,11 @@ from torch import Tensor
 from lanebev.geometry.precision import autocast_off
 from lanebev.render.frame import RenderedFrame
 from lanebev.render.raster.features import features_of
-from lanebev.render.raster.paint import paint_view
-from lanebev.render.raster.rays import pixel_rays
+from lanebev.render.raster.paint import paint_view, prepare
 from lanebev.render.raster.sensor import take_image
 from lanebev.render.scene.alignment import build_alignment
 from lanebev.render.scene.camera import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
-from lanebev.render.scene.sampler import BatchSampler, concatenate_rows, select_rows, send
+from lanebev.render.scene.sampler import BatchSampler, select_rows, send
 from lanebev.render.scene.varied import varied_extrinsics, varied_intrinsics
 from lanebev.render.scene.window import (
     WindowConfig,
@@ -59,17 +58,21 @@ def render_scenes(
     """
     where = torch.device(device or "cpu")
     rows = rows or (_ROWS_ON_CPU if where.type == "cpu" else _ROWS_ELSEWHERE)
-    frames = []
     with autocast_off(where):
+        scene = send(host, where)
+        prepared = prepare(scene, size)
+        parts = []
         for start in range(0, len(host.place.along), rows):
-            part = select_rows(host, slice(start, start + rows))
-            scene = send(part, where)
-            features = features_of(part)
-            generators = [torch.Generator(where).manual_seed(seed) for seed in seeds[start : start + rows]]
-            painted = paint_view(scene, pixel_rays(scene.lens, size, features.distorted), features)
-            image = take_image(painted, scene, part, features.rows.glass, generators, ideal_sensor)
-            frames.append(frame_truth(image, painted.blocked, scene, painted.nearest))
-    return frames[0] if len(frames) == 1 else concatenate_rows(frames)
+            cut = slice(start, start + rows)
+            own = select_rows(host, cut)
+            part = own if scene is host else select_rows(scene, cut)
+            features = features_of(own)
+            generators = [torch.Generator(where).manual_seed(seed) for seed in seeds[cut]]
+            painted = paint_view(part, select_rows(prepared, cut), size, features)
+            image = take_image(painted, part, own, features, generators, ideal_sensor)
+            parts.append((image, painted.blocked, painted.nearest))
+        image, blocked, nearest = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
+        return frame_truth(image, blocked, scene, nearest)
 
 
 def sample_place(sampler: BatchSampler, world: World, ego_lane: Tensor) -> tuple[World, Place]:

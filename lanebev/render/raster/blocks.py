@@ -42,6 +42,21 @@ class Blocks(NamedTuple):
         chosen = [t for r in rows for t in range(ends[r] - self.counts[r], ends[r])]
         return torch.tensor(chosen, dtype=torch.long).to(self.row.device, non_blocking=True)
 
+    def sum_rows(self, values: Tensor) -> Tensor:
+        """Sum (C, T) values of blocks over those of each row, (C, R), always in the same order."""
+        most = max(*self.counts, 1)
+        within = torch.arange(len(self.row), device=self.row.device) - self._first().index_select(0, self.row)
+        table = values.new_zeros(len(values), len(self.counts) * most)
+        table.scatter_(1, (self.row * most + within).expand(len(values), -1), values)
+        total: Tensor = table.unflatten(1, (-1, most)).sum(2)
+        return total
+
+    def _first(self) -> Tensor:
+        """(R,) the first block of each row."""
+        ends = list(accumulate(self.counts))
+        first = [end - count for end, count in zip(ends, self.counts, strict=True)]
+        return torch.tensor(first).to(self.row.device, non_blocking=True)
+
 
 def make_blocks(mask: Tensor, size: int = BLOCK, row: Tensor | None = None, num_rows: int = 0) -> Blocks:
     """Select the elements where a mask holds. Waits for the device twice.

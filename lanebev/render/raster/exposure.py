@@ -16,13 +16,14 @@ _PER_ROOT, _LEVELS = 4096, 8192  # entries of the table of tones: up to a linear
 _MIDDLE = 0.45  # display level that the contrast leaves as it is
 
 
-def expose(radiance: Tensor, sensor: Sensor, road_level: Tensor) -> Tensor:
+def expose(radiance: Tensor, sensor: Sensor, road_level: Tensor, bloom: bool = True) -> Tensor:
     """Expose images, before noise.
 
     Args:
         radiance: (B, 3, H, W) linear.
         sensor: the cameras.
         road_level: (B,) radiance of the road; the exposure is set for it, and less for all the rest.
+        bloom: False if no camera has any.
 
     Returns:
         (B, 3, H, W) display values in [0, 1].
@@ -32,7 +33,8 @@ def expose(radiance: Tensor, sensor: Sensor, road_level: Tensor) -> Tensor:
     metered = road_level.clamp(min=1e-4) ** 0.7 * mean.clamp(min=1e-4) ** 0.3
     gain = (sensor.exposure / metered)[:, None] * sensor.tint
     value = radiance * gain[..., None, None]
-    _add_bloom(value, gain, sensor.bloom)
+    if bloom:
+        _add_bloom(value, gain, sensor.bloom)
     y = torch.arange(height, device=value.device)[:, None] / height - 0.5
     x = torch.arange(width, device=value.device) / width - 0.5
     value *= 1 - (2 * sensor.vignette)[:, None, None, None] * (x * x + y * y)

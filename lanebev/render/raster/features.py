@@ -51,12 +51,12 @@ class Features(NamedTuple):
     """True where at least one scene of the batch has it.
 
     Attributes:
-        distorted: a lens with distortion.
         sun: direct light that casts shadows.
         headlight: the camera's own headlights.
         wet: wet ground.
         cloud: clouds.
         bridge: a bridge.
+        bloom: bright light that spills.
         crowns: trees that shade the road.
         deck: stretches of another material.
         middle_seam: seams inside lanes.
@@ -76,12 +76,12 @@ class Features(NamedTuple):
         looks: (kind, style) of each of these; trees come in several styles.
     """
 
-    distorted: bool
     sun: bool
     headlight: bool
     wet: bool
     cloud: bool
     bridge: bool
+    bloom: bool
     crowns: bool
     deck: bool
     middle_seam: bool
@@ -114,12 +114,12 @@ def features_of(scene: Scene) -> Features:
     there = around.wall_kind != NOTHING
     style = torch.where(around.wall_kind == TREES, (around.wall_seed * 97).long() % STYLES, 0)
     return Features(
-        distorted=bool(scene.lens.distortion.any()),
         sun=bool((scene.light.direct > 0.02).any()),
         headlight=some(scene.light.headlight),
         wet=some(pavement.wet),
         cloud=some(world.surroundings.cloud),
         bridge=bool(world.bridge.isfinite().any()),
+        bloom=some(world.sensor.bloom),
         crowns=some(world.shade),
         deck=some(pavement.deck_length),
         middle_seam=some(pavement.middle_seam),

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+_REACH = 2.6  # standard deviations at which a Gaussian is cut off
+
 
 def gaussian_blur(image: Tensor, std: Tensor, largest: float) -> Tensor:
     """Blur images by Gaussians, the border repeated outside.
@@ -17,9 +19,10 @@ def gaussian_blur(image: Tensor, std: Tensor, largest: float) -> Tensor:
         std: (B,) px; 0 leaves a row as it is.
         largest: of ``std``, px, on the host.
     """
-    reach = max(1, round(2.6 * largest))
+    reach = max(1, round(_REACH * largest))
     place = torch.arange(reach + 1, device=image.device, dtype=image.dtype)
     weight = torch.exp(-0.5 * (place / std.clamp(min=1e-3)[:, None]).square())
+    weight = weight * (place <= (_REACH * std).round().clamp(min=1)[:, None])  # a row's own, whatever others'
     weight = weight / (2 * weight.sum(1, keepdim=True) - weight[:, :1])
     weight = weight.T[..., None, None, None]  # (reach + 1, B, 1, 1, 1)
     return _weighted(_weighted(image, weight, 3), weight, 2)

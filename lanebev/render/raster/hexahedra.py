@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -13,6 +15,35 @@ from lanebev.render.scene.objects import SceneObjects
 RIGHT, LEFT, FRONT, REAR, TOP, BOTTOM = range(6)  # faces in the object's own frame
 NEVER = 1e9  # m
 _TINY = 1e-20  # keeps a ray along a plane from dividing by zero
+
+
+class Hexahedra(NamedTuple):
+    """Where the objects of B scenes are, as seen from the camera.
+
+    Attributes:
+        box: (B, M, 4) int64, pixel bounds, see :func:`bounding_boxes`.
+        normal: (B, M, 2, 6, 3) outward normals, see :func:`face_planes`.
+        distance: (B, M, 2, 6) how far the camera lies inside of each plane, in lengths of its normal.
+    """
+
+    box: Tensor
+    normal: Tensor
+    distance: Tensor
+
+
+def hexahedra(objects: SceneObjects, lens: Lens, size: tuple[int, int]) -> Hexahedra:
+    """Compute planes and bounds of all objects.
+
+    Args:
+        objects: in the local road frame.
+        lens: from road directions to pixels.
+        size: image (height, width).
+    """
+    height = lens.extrinsics.height
+    normal, distance = face_planes(objects, height)
+    real = (objects.shape[..., 7] > objects.shape[..., 6])[..., None]
+    distance = distance.where(real, -1.0)  # nobody is inside nothing
+    return Hexahedra(bounding_boxes(objects, lens, height, size), normal, distance)
 
 
 def face_planes(objects: SceneObjects, height: Tensor) -> tuple[Tensor, Tensor]:

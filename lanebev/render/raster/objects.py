@@ -16,10 +16,9 @@ from lanebev.render.raster.canvas import Canvas
 from lanebev.render.raster.constants import constant
 from lanebev.render.raster.hexahedra import (
     NEVER,
-    bounding_boxes,
+    Hexahedra,
     entered_face,
     entry_depth,
-    face_planes,
     plane_times,
 )
 from lanebev.render.raster.object_shading import object_radiance
@@ -71,12 +70,12 @@ class Hits(NamedTuple):
     face: Tensor
 
 
-def add_objects(scene: Scene, view: View, canvas: Canvas) -> None:
+def add_objects(scene: Scene, view: View, solids: Hexahedra, canvas: Canvas) -> None:
     """Paint all objects into the canvas, far to near."""
-    tiles = _tiles(scene, view.size)
+    tiles = _tiles(scene, solids.box, view.size)
     if not len(tiles.owner):
         return
-    hits = _unhidden(canvas, _hits(scene, view, canvas, tiles))
+    hits = _unhidden(canvas, _hits(scene, view, solids, canvas, tiles))
     row = hits.owner // scene.objects.x.shape[1]
     objects = select_rows(_flat(scene.objects), hits.owner)
     ray_x, ray_y = take(view.ray_x, hits.pixel), take(view.ray_y, hits.pixel)
@@ -94,15 +93,14 @@ def _flat(objects: SceneObjects) -> SceneObjects:
     return map_tensors(lambda tensor: tensor.flatten(0, 1), objects)
 
 
-def _tiles(scene: Scene, size: tuple[int, int]) -> Tiles:
+def _tiles(scene: Scene, box: Tensor, size: tuple[int, int]) -> Tiles:
     """Cut the objects' bounding boxes into tiles. Asks the device for their number once."""
     height, width = size
     objects, device = scene.objects, scene.objects.x.device
     batch, slots = objects.x.shape
-    box = bounding_boxes(objects, scene.lens, scene.lens.extrinsics.height, size).flatten(0, 1)
     order = objects.z.argsort(dim=1, descending=True, stable=True)
     index = (order + torch.arange(batch, device=device)[:, None] * slots).T.flatten()  # rank by rank
-    left, top, right, bottom = box[index].unbind(1)
+    left, top, right, bottom = box.flatten(0, 1)[index].unbind(1)
     columns, rows = (right - left + (TILE - 1)) // TILE, (bottom - top + (TILE - 1)) // TILE
     count = columns * rows
     total = int(count.sum())
@@ -118,14 +116,10 @@ def _tiles(scene: Scene, size: tuple[int, int]) -> Tiles:
     return Tiles(owner, source // batch, pixel + x.clamp(max=width - 1), inside)
 
 
-def _hits(scene: Scene, view: View, canvas: Canvas, tiles: Tiles) -> Hits:
+def _hits(scene: Scene, view: View, solids: Hexahedra, canvas: Canvas, tiles: Tiles) -> Hits:
     """Intersect the rays of tiles with their objects: one to a pixel inside, four along the outlines."""
-    normal, distance = face_planes(scene.objects, scene.lens.extrinsics.height)
-    body = scene.objects.shape
-    real = (body[..., 7] > body[..., 6])[..., None]
-    distance = distance.where(real, -1.0)  # nobody is inside nothing
-    normal = normal.flatten(0, 1).flatten(1, 2).permute(2, 1, 0).contiguous()  # (3, 12, B M)
-    distance = distance.flatten(0, 1).flatten(1, 2).T.contiguous()  # (12, B M)
+    normal = solids.normal.flatten(0, 1).flatten(1, 2).permute(2, 1, 0).contiguous()  # (3, 12, B M)
+    distance = solids.distance.flatten(0, 1).flatten(1, 2).T.contiguous()  # (12, B M)
     depth = scene.objects.z.flatten()
 
     planes, apart = (t.index_select(-1, tiles.owner)[..., None] for t in (normal, distance))
@@ -179,7 +173,8 @@ def _unhidden(canvas: Canvas, hits: Hits) -> Hits:
 
 def _composite(canvas: Canvas, hits: Hits, colour: Tensor, slots: int) -> None:
     """Paint hits far to near: those of one rank meet in no pixel. Asks the device for their numbers once."""
-    counts = torch.bincount(hits.rank, minlength=slots).tolist()
+    ones = torch.ones_like(hits.rank)
+    counts = hits.rank.new_zeros(slots).index_add_(0, hits.rank, ones).tolist()
     for end, count in zip(accumulate(counts), counts, strict=True):
         if not count:
             continue

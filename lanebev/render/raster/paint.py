@@ -12,9 +12,10 @@ from lanebev.render.raster.canvas import Canvas, empty_canvas
 from lanebev.render.raster.features import Features
 from lanebev.render.raster.footprint import Ground, ground_under
 from lanebev.render.raster.ground import ground_radiance
+from lanebev.render.raster.hexahedra import Hexahedra, hexahedra
 from lanebev.render.raster.night import add_lights, sprites
 from lanebev.render.raster.objects import add_objects
-from lanebev.render.raster.rays import View
+from lanebev.render.raster.rays import View, coarse_plane, pixel_rays
 from lanebev.render.raster.select import as_float, put, take, take_channels
 from lanebev.render.raster.sky import sky_along
 from lanebev.render.raster.tunnel import add_ceiling
@@ -24,6 +25,18 @@ from lanebev.render.scene.sampler import select_rows
 from lanebev.render.scene.world import Scene
 
 _METERED = 40.0  # m of road by which the exposure is set
+
+
+class Prepared(NamedTuple):
+    """What of B scenes does not go by pixels.
+
+    Attributes:
+        plane: (B, 2, rows, columns), see :func:`~lanebev.render.raster.rays.coarse_plane`.
+        solids: the objects.
+    """
+
+    plane: Tensor
+    solids: Hexahedra
 
 
 class Painted(NamedTuple):
@@ -42,14 +55,26 @@ class Painted(NamedTuple):
     nearest: Tensor
 
 
-def paint_view(scene: Scene, view: View, features: Features) -> Painted:
+def prepare(scene: Scene, size: tuple[int, int]) -> Prepared:
+    """Compute what does not go by pixels, for scenes of which parts are painted together.
+
+    Args:
+        scene: B of them.
+        size: image (height, width).
+    """
+    return Prepared(coarse_plane(scene.lens, size), hexahedra(scene.objects, scene.lens, size))
+
+
+def paint_view(scene: Scene, prepared: Prepared, size: tuple[int, int], features: Features) -> Painted:
     """Paint scenes.
 
     Args:
         scene: B of them.
-        view: the pixels' rays.
+        prepared: see :func:`prepare`.
+        size: image (height, width).
         features: what the scenes have.
     """
+    view = pixel_rays(scene.lens, prepared.plane, size)
     canvas = empty_canvas(view.ray_y.numel(), view.ray_y.device)
     lowest = lowest_slopes(scene.alignment, scene.lens.extrinsics.height)[:, -1:]
     on_ground = view.ray_y > lowest
@@ -59,7 +84,7 @@ def paint_view(scene: Scene, view: View, features: Features) -> Painted:
     across = torch.zeros_like(canvas.depth)
     put(across[None], below.place, ground.across[None])
     add_walls(scene, view, canvas, across.view_as(view.ray_x), features)
-    add_objects(scene, view, canvas)
+    add_objects(scene, view, prepared.solids, canvas)
     shape = (len(lowest), *view.size)
     radiance, blocked = canvas.radiance.view(3, *shape).transpose(0, 1), canvas.blocked.view(shape)
     _add_tunnels(scene, view, radiance, blocked, features.rows.tunnel)
@@ -67,7 +92,7 @@ def paint_view(scene: Scene, view: View, features: Features) -> Painted:
     return Painted(
         radiance=radiance,
         blocked=blocked,
-        road_level=_road_level(scene, below, ground, lit, view),
+        road_level=_road_level(scene, below, ground, lit),
         nearest=_nearest(below, ground, len(lowest)),
     )
 
@@ -119,16 +144,15 @@ def _add_lights(scene: Scene, view: View, radiance: Tensor, blocked: Tensor, row
     radiance.index_copy_(0, index, add_lights(under, hidden, lights, shining, lens, own))
 
 
-def _road_level(scene: Scene, below: Blocks, ground: Ground, lit: Tensor, view: View) -> Tensor:
+def _road_level(scene: Scene, below: Blocks, ground: Ground, lit: Tensor) -> Tensor:
     """(B,) root mean square radiance of the road before the camera: bright parts count for more."""
     pavement = scene.world.pavement
     left, right = pavement.left[below.row, None], pavement.right[below.row, None]
     near = (ground.z < _METERED) & (ground.across > left) & (ground.across < right)
+    every, on_road = as_float(below.real), as_float(below.real & near)
     grey = lit.mean(1).square()
-    planes = torch.zeros(4, view.ray_x.numel(), device=grey.device)
-    on_road = as_float(near)
-    put(planes, below.place, torch.stack([grey * on_road, on_road, grey, torch.ones_like(grey)]))
-    road, road_count, all_of_it, count = planes.view(4, *view.ray_x.shape).sum(2)
+    sums = torch.stack([(grey * on_road).sum(1), on_road.sum(1), (grey * every).sum(1), every.sum(1)])
+    road, road_count, all_of_it, count = below.sum_rows(sums)
     mean = torch.where(road_count > 0, road / road_count.clamp(min=1), all_of_it / count.clamp(min=1))
     return mean.sqrt()
 

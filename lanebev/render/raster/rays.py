@@ -29,18 +29,32 @@ class View(NamedTuple):
     steps: Tensor
 
 
-def pixel_rays(lens: Lens, size: tuple[int, int], distorted: bool = True) -> View:
-    """Compute the rays of all pixels as taken.
+def coarse_plane(lens: Lens, size: tuple[int, int]) -> Tensor:
+    """Compute x and y on the z = 1 plane of every fourth pixel as taken, (B, 2, rows, columns).
 
     Args:
         lens: B cameras.
         size: image (height, width).
-        distorted: False if no lens has any distortion.
     """
-    if distorted and lens.distortion.shape[-1]:
-        x, y = _undistorted_plane(lens, size)
-    else:
-        x, y = _plane(lens, *size, 1)
+    rows, columns = -(-(size[0] - 1) // _COARSE) + 1, -(-(size[1] - 1) // _COARSE) + 1
+    k = lens.intrinsics
+    y = torch.arange(rows, dtype=k.dtype, device=k.device) * _COARSE
+    x = torch.arange(columns, dtype=k.dtype, device=k.device) * _COARSE
+    grid = torch.stack(torch.broadcast_tensors(x, y[:, None]), dim=-1).reshape(1, -1, 2)
+    ideal = undistort_points(grid.expand(len(k), -1, -1).contiguous(), k, lens.distortion, lens.model)
+    plane: Tensor = normalise_points(ideal, k).mT.unflatten(2, (rows, columns))
+    return plane
+
+
+def pixel_rays(lens: Lens, plane: Tensor, size: tuple[int, int]) -> View:
+    """Compute the rays of all pixels as taken.
+
+    Args:
+        lens: B cameras.
+        plane: see :func:`coarse_plane`; bilinear in between.
+        size: image (height, width).
+    """
+    x, y = _upsampled(_upsampled(plane, 3), 2)[:, :, : size[0], : size[1]].unbind(1)
     m = lens.road_from_cam()[..., None, None]
     right, down, ahead = (m[:, i, 0] * x + (m[:, i, 1] * y + m[:, i, 2]) for i in range(3))
     ahead = ahead.clamp(min=1e-2)
@@ -49,36 +63,12 @@ def pixel_rays(lens: Lens, size: tuple[int, int], distorted: bool = True) -> Vie
     return View(size, ray_x.flatten(1), ray_y.flatten(1), steps.flatten(2))
 
 
-def _plane(lens: Lens, rows: int, columns: int, spacing: int) -> tuple[Tensor, Tensor]:
-    """(B, rows, columns) x and y on the z = 1 plane, of pixels as if they were undistorted."""
-    k = lens.intrinsics
-    y = torch.arange(rows, dtype=k.dtype, device=k.device) * spacing
-    x = torch.arange(columns, dtype=k.dtype, device=k.device) * spacing
-    grid = torch.stack(torch.broadcast_tensors(x, y[:, None]), dim=-1).reshape(1, -1, 2)
-    plane = normalise_points(grid.expand(len(k), -1, -1), k).unflatten(1, (rows, columns))
-    return plane[..., 0], plane[..., 1]
-
-
-def _undistorted_plane(lens: Lens, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """(B, H, W) x and y on the z = 1 plane, exact at every fourth pixel, bilinear in between."""
-    height, width = size
-    rows, columns = -(-(height - 1) // _COARSE) + 1, -(-(width - 1) // _COARSE) + 1
-    k = lens.intrinsics
-    y = torch.arange(rows, dtype=k.dtype, device=k.device) * _COARSE
-    x = torch.arange(columns, dtype=k.dtype, device=k.device) * _COARSE
-    grid = torch.stack(torch.broadcast_tensors(x, y[:, None]), dim=-1).reshape(1, -1, 2)
-    ideal = undistort_points(grid.expand(len(k), -1, -1).contiguous(), k, lens.distortion, lens.model)
-    plane = normalise_points(ideal, k).unflatten(1, (rows, columns))
-    x, y = (_upsampled(_upsampled(plane[..., i], 2), 1)[:, :height, :width] for i in (0, 1))
-    return x, y
-
-
 def _upsampled(values: Tensor, dim: int) -> Tensor:
-    """(B, n, m) to (4 (n - 1) + 1) values along a dimension, linear in between."""
+    """(B, 2, n, m) to 4 (n - 1) + 1 values along one of the last two dimensions, linear in between."""
     share = torch.arange(_COARSE, dtype=values.dtype, device=values.device) / _COARSE
     count = values.shape[dim] - 1
     first, last = values.narrow(dim, 0, count), values.narrow(dim, count, 1)
-    share = share if dim == 2 else share[:, None]
+    share = share if dim == 3 else share[:, None]
     between = first.unsqueeze(dim + 1) + values.diff(dim=dim).unsqueeze(dim + 1) * share
     return torch.cat([between.flatten(dim, dim + 1), last], dim=dim)
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lanebev.render.raster.effects import add_bonnet, rain
 from lanebev.render.raster.exposure import expose
+from lanebev.render.raster.features import Features
 from lanebev.render.raster.filters import gaussian_blur
 from lanebev.render.raster.glass import behind_glass, frame_cover, recorded
 from lanebev.render.raster.jpeg import compress
@@ -26,7 +27,7 @@ def take_image(
     painted: Painted,
     scene: Scene,
     host: Scene,
-    faulty: list[int],
+    features: Features,
     generators: Sequence[torch.Generator],
     ideal: bool,
 ) -> Tensor:
@@ -36,14 +37,14 @@ def take_image(
         painted: B views.
         scene: of the views.
         host: the same on the host, where it is read which rows have what.
-        faulty: rows with faults of windscreen, lens and recorder.
+        features: what the scenes have.
         generators: B of them, of rain and noise, on the views' device.
         ideal: leave out rain, blur, noise and compression.
 
     Returns:
         (B, 3, H, W) in [0, 1].
     """
-    sensor, device = scene.world.sensor, painted.radiance.device
+    sensor, device, faulty = scene.world.sensor, painted.radiance.device, features.rows.glass
 
     def rows_with(mask: Tensor) -> Tensor:
         return mask.nonzero()[:, 0].to(device, non_blocking=True)
@@ -56,7 +57,7 @@ def take_image(
         sky = (scene.world.surroundings.skyline * open_air).index_select(0, rows)
         tallest = float((bonnet + 0.5 * host.world.sensor.bonnet_tilt.abs()).amax())
         add_bonnet(painted.radiance, painted.blocked, rows, tallest, own, light, sky)
-    image = expose(painted.radiance, sensor, painted.road_level)
+    image = expose(painted.radiance, sensor, painted.road_level, features.bloom)
     if ideal:
         return image
     raining = host.world.weather.wet > 0

@@ -71,6 +71,12 @@ def tensors_of(values: tuple[Any, ...]) -> list[Tensor]:
     return found
 
 
+def _first_of(values: tuple[Any, ...]) -> Tensor:
+    """Return the first tensor of a nested NamedTuple that begins with one."""
+    first = values[0]
+    return first if isinstance(first, Tensor) else _first_of(first)
+
+
 def through_tables(function: Callable[[Tensor], Tensor], values: T) -> T:
     """Apply a function of rows to a (nested) NamedTuple of (B, ...) tensors, all of one dtype at once.
 
@@ -97,8 +103,9 @@ def select_rows(values: T, rows: Tensor | slice) -> T:
     """Rows of a (nested) NamedTuple of (B, ...) tensors: an index tensor (R,) or a slice."""
     if isinstance(rows, slice):
         return map_tensors(lambda tensor: tensor[rows], values)
-    if len(tensors_of(values)[0]) == 1:  # a batch of one row has no other: views
-        return map_tensors(lambda tensor: tensor.expand(len(rows), *tensor.shape[1:]), values)
+    if _first_of(values).shape[0] == 1:  # a batch of one row has no other: views
+        count = rows.shape[0]
+        return map_tensors(lambda tensor: tensor.expand(count, *[-1] * (tensor.ndim - 1)), values)
     return through_tables(lambda table: table.index_select(0, rows), values)
 
 
