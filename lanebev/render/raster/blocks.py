@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.select import indices_where
+from lanebev.render.raster.select import count_where, indices_where
 
 BLOCK = 1024  # pixels
 
@@ -24,13 +24,13 @@ class Blocks(NamedTuple):
     Attributes:
         row: (T,) int64, of each block.
         place: (T, S) int64, row-major place of each element in the mask that selected it.
-        real: (T, S) bool, false for repeated ones.
+        selected: (R,) int64, how many elements of each row.
         counts: number of blocks of each of the R rows, on the host.
     """
 
     row: Tensor
     place: Tensor
-    real: Tensor
+    selected: Tensor
     counts: list[int]
 
     def __len__(self) -> int:
@@ -51,6 +51,13 @@ class Blocks(NamedTuple):
         total: Tensor = table.unflatten(1, (-1, most)).sum(2)
         return total
 
+    def real(self) -> Tensor:
+        """(T, S) bool, false for repeated elements."""
+        size = self.place.shape[1]
+        block = torch.arange(len(self.row), device=self.row.device) - self._first().index_select(0, self.row)
+        left = self.selected.index_select(0, self.row) - block * size
+        return torch.arange(size, device=self.row.device) < left[:, None]
+
     def _first(self) -> Tensor:
         """(R,) the first block of each row."""
         ends = list(accumulate(self.counts))
@@ -68,18 +75,18 @@ def make_blocks(mask: Tensor, size: int = BLOCK, row: Tensor | None = None, num_
         num_rows: R; given with ``row``.
     """
     device = mask.device
-    place = indices_where(mask)
-    count = mask.sum(1)
+    place, count = indices_where(mask), count_where(mask)
     if row is not None:
         count = count.new_zeros(num_rows).index_add_(0, row, count)
     blocks = (count + (size - 1)) // size
     counts: list[int] = blocks.tolist()
     total = sum(counts)
     rows = torch.arange(len(counts), device=device).repeat_interleave(blocks, output_size=total)
+    if len(counts) == 1:
+        rest = place[-1:].expand(total * size - len(place))
+        return Blocks(rows, torch.cat([place, rest]).view(total, size), count, counts)
     first, start = blocks.cumsum(0) - blocks, count.cumsum(0) - count
     within = (torch.arange(total, device=device) - first[rows])[:, None] * size
     within = within + torch.arange(size, device=device)
-    last = (count[rows] - 1)[:, None]
-    source = start[rows][:, None] + torch.minimum(within, last)
-    chosen = place.index_select(0, source.flatten()).view(source.shape)
-    return Blocks(rows, chosen, within <= last, counts)
+    source = start[rows][:, None] + torch.minimum(within, (count[rows] - 1)[:, None])
+    return Blocks(rows, place.index_select(0, source.flatten()).view(source.shape), count, counts)

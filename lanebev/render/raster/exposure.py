@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from lanebev.render.raster.select import indices_where, take
 from lanebev.render.scene.sensor import Sensor
@@ -74,34 +75,33 @@ def _toned(value: Tensor, contrast: Tensor, black: Tensor) -> Tensor:
 def _add_bloom(value: Tensor, gain: Tensor, strength: Tensor) -> None:
     """Spread light from what is brighter than white over its neighbourhood; changes ``value``."""
     height, width = value.shape[2:]
-    small = (max(1, height // _BLOOM_SCALE), max(1, width // _BLOOM_SCALE))
     white = gain / gain.amax(1, keepdim=True)  # of each channel, where the first saturates
-    bright = (value - white[..., None, None]).clamp_(min=0)
-    bright = torch.minimum(bright, 6 * white[..., None, None])
-    excess = torch.nn.functional.adaptive_avg_pool2d(bright, small)
-    rows = indices_where((strength > 0) & (excess.amax((1, 2, 3)) > 0))
+    rows = indices_where((strength > 0) & (value.amax((2, 3)) > white).any(1))
     if not len(rows):
         return
-    excess = excess.index_select(0, rows) * strength.index_select(0, rows)[:, None, None, None]
+    white, strength = (
+        t.index_select(0, rows) for t in (white[..., None, None], strength[:, None, None, None])
+    )
+    bright = torch.minimum((value.index_select(0, rows) - white).clamp_(min=0), 6 * white)
+    excess = functional.avg_pool2d(bright, _BLOOM_SCALE, ceil_mode=True, count_include_pad=False) * strength
     veil = torch.zeros_like(value[:1])
-    for std, share in ((2.0, 1.0), (0.06 * small[1], 0.6)):
-        down = _spread(small[0], height, std, value.device)
-        across = _spread(small[1], width, std, value.device)
+    for std, share in ((2.0, 1.0), (0.06 * excess.shape[3], 0.6)):
+        down, across = (_spread(n, std, value.device) for n in (height, width))
         veil = veil + share * (down @ (excess @ across.T))
     value.index_add_(0, rows, veil)
 
 
 @lru_cache(maxsize=64)
-def _spread(small: int, large: int, std: float, device: torch.device) -> Tensor:
-    """(large, small): a Gaussian blur of samples, the border repeated, then linear interpolation."""
-    index = torch.arange(small, dtype=torch.float64)
+def _spread(length: int, std: float, device: torch.device) -> Tensor:
+    """(length, cells): a Gaussian blur of cells, the border repeated, then linear interpolation."""
+    cells = -(-length // _BLOOM_SCALE)
     reach = int(4 * std + 0.5)
     shifts = torch.arange(-reach, reach + 1, dtype=torch.float64)
     weight = torch.exp(-0.5 * (shifts / std) ** 2)
-    source = (index[:, None] + shifts).clamp(0, small - 1).long()
-    blur = torch.zeros(small, small, dtype=torch.float64)
+    source = (torch.arange(cells)[:, None] + shifts).clamp(0, cells - 1).long()
+    blur = torch.zeros(cells, cells, dtype=torch.float64)
     blur.scatter_add_(1, source, (weight / weight.sum()).expand_as(source))
-    place = ((torch.arange(large, dtype=torch.float64) + 0.5) * small / large - 0.5).clamp(0, small - 1)
-    low = place.long().clamp(max=max(small - 2, 0))
+    place = ((torch.arange(length, dtype=torch.float64) + 0.5) / _BLOOM_SCALE - 0.5).clamp(0, cells - 1)
+    low = place.long().clamp(max=max(cells - 2, 0))
     share = (place - low)[:, None]
-    return (blur[low] * (1 - share) + blur[(low + 1).clamp(max=small - 1)] * share).float().to(device)
+    return (blur[low] * (1 - share) + blur[(low + 1).clamp(max=cells - 1)] * share).float().to(device)

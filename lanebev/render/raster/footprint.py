@@ -15,24 +15,18 @@ class Ground(NamedTuple):
     """Ground under pixels, each (B, N).
 
     Attributes:
-        x: m, right of the camera's foot.
-        z: m, ahead of it.
+        z: m, ahead of the camera's foot.
         along: m in the world.
         across: m in the layout's frame.
         reach_along: m per pixel.
         reach_across: m per pixel.
-        ray_x: right per metre forward.
-        ray_y: down per metre forward.
     """
 
-    x: Tensor
     z: Tensor
     along: Tensor
     across: Tensor
     reach_along: Tensor
     reach_across: Tensor
-    ray_x: Tensor
-    ray_y: Tensor
 
 
 def ground_under(
@@ -49,8 +43,7 @@ def ground_under(
         slope: (B, N) dE/dZ of the ground there.
         steps: (4, B, N) change of the rays per pixel, see :class:`~lanebev.render.raster.rays.View`.
     """
-    x = ray_x * z
-    point = road_from_local(alignment, x, z)
+    point = road_from_local(alignment, ray_x * z, z)
     reach = z / (ray_y + slope)  # m that the hit moves nearer per unit of ray_y
 
     def footprint(step_x: Tensor, step_y: Tensor) -> tuple[Tensor, Tensor]:
@@ -61,14 +54,11 @@ def ground_under(
     along_column, across_column = footprint(steps[0], steps[1])
     along_row, across_row = footprint(steps[2], steps[3])
     return Ground(
-        x=x,
         z=z,
         along=point.along + place.along[:, None],
         across=point.across + place.across[:, None],
         reach_along=_length(along_column, along_row).clamp(min=1e-3),
         reach_across=_length(across_column, across_row).clamp(min=1e-4),
-        ray_x=ray_x,
-        ray_y=ray_y,
     )
 
 

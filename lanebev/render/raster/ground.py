@@ -33,13 +33,17 @@ def headlight_irradiance(x: Tensor, z: Tensor) -> Tensor:
     return 1.2 * spread * pools * reach
 
 
-def ground_radiance(scene: Scene, below: Blocks, ground: Ground, features: Features) -> Tensor:
+def ground_radiance(
+    scene: Scene, below: Blocks, ground: Ground, ray_x: Tensor, ray_y: Tensor, features: Features
+) -> Tensor:
     """Compute the linear radiance of the ground, (T, 3, N).
 
     Args:
         scene: B of them.
         below: the pixels on the ground, in blocks.
         ground: (T, N) points in them.
+        ray_x: (T, N) right per metre forward.
+        ray_y: (T, N) down per metre forward.
         features: what any of the scenes has.
     """
     row, world = below.row, scene.world
@@ -57,19 +61,20 @@ def ground_radiance(scene: Scene, below: Blocks, ground: Ground, features: Featu
     shape = (3, *paved.shape)
     albedo, (coverage, studs) = albedo.view(shape).transpose(0, 1), coverage.view(2, *paved.shape)
 
-    sunlit, open_sky = shadows(scene, row, ground, features)
+    x = ray_x * ground.z
+    sunlit, open_sky = shadows(scene, row, x, ground, features)
     lit = light.direct[..., None] * (light.sun[:, 1, None] * sunlit)[:, None]
     lit = lit + light.ambient[..., None] * open_sky[:, None]
     if features.headlight:
         retro = 1 + 2.5 * coverage + 8.0 * studs
-        beam = headlight_irradiance(ground.x, ground.z) * retro
+        beam = headlight_irradiance(x, ground.z) * retro
         beam = beam * (light.headlight * (1 - world.lights.on[row]))[:, None]
         lit = lit + beam[:, None] * colour(beam.device, 1.0, 0.95, 0.85)
         if features.night:
             lights = select_rows(world.lights, row)
-            lamps, own = night_irradiance(lights, ground.x, ground.z, ground.along, ground.across)
+            lamps, own = night_irradiance(lights, x, ground.z, ground.along, ground.across)
             lit = lit + lamps + own * retro[:, None]
-    gloss = _gloss(scene, row, ground, sunlit, open_sky, blotch[2], features)
+    gloss = _gloss(scene, row, ray_x, ray_y, sunlit, open_sky, blotch[2], features)
     return albedo * lit + gloss * paved[:, None]
 
 
@@ -82,7 +87,10 @@ def _albedo(
     coverage = paved.new_zeros(2, planes)  # by paint, by studs
 
     road = make_blocks(paved > 0, row=row, num_rows=batch)
-    part, stain = Ground(*(take(t, road.place) for t in ground)), take_channels(blotch.flatten(1), road.place)
+    part, stain = (
+        Ground(*(take(t, road.place) for t in ground)),
+        take_channels(blotch[:3].flatten(1), road.place),
+    )
     layout = select_rows(scene.world.layout, road.row)
     pavement = select_rows(scene.world.pavement, road.row)
     lanes = place_in_lanes(layout, part.across)
@@ -171,7 +179,8 @@ def _add_paint(
 def _gloss(
     scene: Scene,
     row: Tensor,
-    ground: Ground,
+    ray_x: Tensor,
+    ray_y: Tensor,
     sunlit: Tensor,
     open_sky: Tensor,
     puddle: Tensor,
@@ -179,15 +188,15 @@ def _gloss(
 ) -> Tensor:
     """Mirrored sun and, on wet roads, sky; (T, 3, N)."""
     light, wet = select_rows(scene.light, row), scene.world.pavement.wet[row, None]
-    norm = (1 + ground.ray_x.square() + ground.ray_y.square()).rsqrt()
+    norm = (1 + ray_x.square() + ray_y.square()).rsqrt()
     sun_right, sun_up, sun_ahead = light.sun.unsqueeze(-1).unbind(1)
-    sun = (ground.ray_x * sun_right + ground.ray_y * sun_up + sun_ahead) * norm
+    sun = (ray_x * sun_right + ray_y * sun_up + sun_ahead) * norm
     eighth = sun.clamp(min=0).square().square().square()
     sparkle = 0.35 * eighth.square() * eighth * sunlit
     gloss = light.direct[..., None] * (sparkle * (0.4 + wet))[:, None]
     if features.wet:
         puddles = 0.35 + 0.65 * smoothstep(-0.5, 1.2, puddle)
-        mirror = wet * (0.05 + 0.3 * (1 - ground.ray_y * norm).square().square().square()) * puddles
+        mirror = wet * (0.05 + 0.3 * (1 - ray_y * norm).square().square().square()) * puddles
         sky = scene.world.surroundings.skyline[row, :, None]
         gloss = gloss + sky * (mirror * (0.3 + 0.7 * open_sky))[:, None]
     return gloss

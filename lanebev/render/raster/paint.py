@@ -111,7 +111,7 @@ def _add_ground(
     z, slope = ground_hit(alignment, scene.lens.extrinsics.height[below.row], ray_y)
     steps = take_channels(view.steps.flatten(1), below.place)
     ground = ground_under(place, alignment, ray_x, ray_y, z, slope, steps)
-    lit = ground_radiance(scene, below, ground, features)
+    lit = ground_radiance(scene, below, ground, ray_x, ray_y, features)
     clear = torch.exp(-z / scene.world.weather.visibility[below.row, None])[:, None]
     haze = scene.world.surroundings.skyline[below.row, :, None]
     put(canvas.radiance, below.place, torch.lerp(haze, lit, clear).transpose(0, 1))
@@ -149,7 +149,7 @@ def _road_level(scene: Scene, below: Blocks, ground: Ground, lit: Tensor) -> Ten
     pavement = scene.world.pavement
     left, right = pavement.left[below.row, None], pavement.right[below.row, None]
     near = (ground.z < _METERED) & (ground.across > left) & (ground.across < right)
-    every, on_road = as_float(below.real), as_float(below.real & near)
+    every, on_road = as_float(below.real()), as_float(below.real() & near)
     grey = lit.mean(1).square()
     sums = torch.stack([(grey * on_road).sum(1), on_road.sum(1), (grey * every).sum(1), every.sum(1)])
     road, road_count, all_of_it, count = below.sum_rows(sums)

@@ -10,7 +10,7 @@ from torch import Tensor
 from lanebev.geometry.lens import normalise_points, undistort_points
 from lanebev.render.scene.camera import Lens
 
-_COARSE = 4  # px between exactly undistorted pixels; bilinear in between errs by less than 0.005 px
+_COARSE = 8  # px between exactly undistorted pixels; cubic in between errs by less than 0.002 px
 
 
 class View(NamedTuple):
@@ -30,16 +30,18 @@ class View(NamedTuple):
 
 
 def coarse_plane(lens: Lens, size: tuple[int, int]) -> Tensor:
-    """Compute x and y on the z = 1 plane of every fourth pixel as taken, (B, 2, rows, columns).
+    """Compute x and y on the z = 1 plane of every eighth pixel as taken, (B, 2, rows, columns).
+
+    The first lies eight pixels before the image's first, the last beyond its last.
 
     Args:
         lens: B cameras.
         size: image (height, width).
     """
-    rows, columns = -(-(size[0] - 1) // _COARSE) + 1, -(-(size[1] - 1) // _COARSE) + 1
+    rows, columns = (-(-(side - 1) // _COARSE) + 3 for side in size)
     k = lens.intrinsics
-    y = torch.arange(rows, dtype=k.dtype, device=k.device) * _COARSE
-    x = torch.arange(columns, dtype=k.dtype, device=k.device) * _COARSE
+    y = (torch.arange(rows, dtype=k.dtype, device=k.device) - 1) * _COARSE
+    x = (torch.arange(columns, dtype=k.dtype, device=k.device) - 1) * _COARSE
     grid = torch.stack(torch.broadcast_tensors(x, y[:, None]), dim=-1).reshape(1, -1, 2)
     ideal = undistort_points(grid.expand(len(k), -1, -1).contiguous(), k, lens.distortion, lens.model)
     plane: Tensor = normalise_points(ideal, k).mT.unflatten(2, (rows, columns))
@@ -51,7 +53,7 @@ def pixel_rays(lens: Lens, plane: Tensor, size: tuple[int, int]) -> View:
 
     Args:
         lens: B cameras.
-        plane: see :func:`coarse_plane`; bilinear in between.
+        plane: see :func:`coarse_plane`; cubic in between.
         size: image (height, width).
     """
     x, y = _upsampled(_upsampled(plane, 3), 2)[:, :, : size[0], : size[1]].unbind(1)
@@ -64,13 +66,23 @@ def pixel_rays(lens: Lens, plane: Tensor, size: tuple[int, int]) -> View:
 
 
 def _upsampled(values: Tensor, dim: int) -> Tensor:
-    """(B, 2, n, m) to 4 (n - 1) + 1 values along one of the last two dimensions, linear in between."""
-    share = torch.arange(_COARSE, dtype=values.dtype, device=values.device) / _COARSE
-    count = values.shape[dim] - 1
-    first, last = values.narrow(dim, 0, count), values.narrow(dim, count, 1)
-    share = share if dim == 3 else share[:, None]
-    between = first.unsqueeze(dim + 1) + values.diff(dim=dim).unsqueeze(dim + 1) * share
-    return torch.cat([between.flatten(dim, dim + 1), last], dim=dim)
+    """(B, 2, n, m) to 8 (n - 3) + 1 values along one of the last two dimensions.
+
+    Source: cubic Lagrange interpolation through the four nearest; linear values stay as they are.
+    """
+    t = torch.arange(_COARSE, dtype=values.dtype, device=values.device) / _COARSE
+    weights = (
+        -t * (t - 1) * (t - 2) / 6,
+        (t + 1) * (t - 1) * (t - 2) / 2,
+        -(t + 1) * t * (t - 2) / 2,
+        (t + 1) * t * (t - 1) / 6,
+    )
+    count = values.shape[dim] - 3
+    shape = (-1, 1) if dim == 2 else (-1,)
+    between = values.new_zeros(())
+    for k, weight in enumerate(weights):
+        between = between + values.narrow(dim, k, count).unsqueeze(dim + 1) * weight.view(shape)
+    return torch.cat([between.flatten(dim, dim + 1), values.narrow(dim, count + 1, 1)], dim=dim)
 
 
 def _gradient(values: Tensor, dim: int) -> Tensor:

@@ -20,6 +20,13 @@ def indices_where(mask: Tensor) -> Tensor:
     return mask.flatten().nonzero()[:, 0]
 
 
+def count_where(mask: Tensor) -> Tensor:
+    """(M,) int64: how often a mask (M, N) holds in each line."""
+    if mask.device.type == "cpu":
+        return torch.from_numpy(np.count_nonzero(mask.numpy(), axis=1))
+    return mask.sum(1)
+
+
 def take(values: Tensor, place: Tensor) -> Tensor:
     """Elements of a tensor at row-major places, in the shape of ``place``."""
     return values.flatten().index_select(0, place.flatten()).view(place.shape)

@@ -21,17 +21,20 @@ BRIDGE_UNDERSIDE = 6.2  # m, of all bridges as far as their shadows go
 _PIECE = 64  # pixels that are looked at together for a vehicle's shadow
 
 
-def shadows(scene: Scene, row: Tensor, ground: Ground, features: Features) -> tuple[Tensor, Tensor]:
+def shadows(
+    scene: Scene, row: Tensor, x: Tensor, ground: Ground, features: Features
+) -> tuple[Tensor, Tensor]:
     """Share of the sun, and of the sky, that reaches the ground, (T, N) both.
 
     Args:
         scene: B of them.
         row: (T,) which scene each row of the points belongs to.
+        x: (T, N) m, right of the camera's foot.
         ground: (T, N) points.
         features: what any of the scenes has.
     """
     light, world = select_rows(scene.light, row), scene.world
-    sunlit, open_sky = _vehicle_shadows(scene.light, row, ground, scene.objects)
+    sunlit, open_sky = _vehicle_shadows(scene.light, row, x, ground, scene.objects)
     if features.bridge:
         shade, under = _bridge_shadow(world.bridge[row], light, ground)
         sunlit, open_sky = sunlit * (1 - shade), open_sky * (1 - 0.8 * under)
@@ -110,11 +113,11 @@ def _outlines(light: Light, objects: SceneObjects) -> tuple[_Outline, Tensor]:
 
 
 def _vehicle_shadows(
-    light: Light, row: Tensor, ground: Ground, objects: SceneObjects
+    light: Light, row: Tensor, x: Tensor, ground: Ground, objects: SceneObjects
 ) -> tuple[Tensor, Tensor]:
     """What vehicles leave of the sun (a swept rectangle) and of the sky (dark below them), (T, N) both."""
     shape = ground.z.shape
-    x, z, reach_along = (t.reshape(-1, _PIECE) for t in (ground.x, ground.z, ground.reach_along))
+    x, z, reach_along = (t.reshape(-1, _PIECE) for t in (x, ground.z, ground.reach_along))
     lit, contact = torch.ones_like(x), torch.ones_like(x)
     outline, reach = _outlines(light, objects)
     row = row.repeat_interleave(shape[1] // _PIECE)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import accumulate, groupby
+from collections.abc import Iterator
+from itertools import groupby
 from typing import NamedTuple
 
 import torch
@@ -34,16 +35,32 @@ class WallHits(NamedTuple):
     Attributes:
         pixel: int64, row-major in the batch.
         z: m.
-        arc: m from the camera's foot.
+        along: m in the world.
         up: m above the road.
         ray_x: right per metre forward.
+        footprint: m per pixel.
     """
 
     pixel: Tensor
     z: Tensor
-    arc: Tensor
+    along: Tensor
     up: Tensor
     ray_x: Tensor
+    footprint: Tensor
+
+
+class WallRows(NamedTuple):
+    """Of which wall T rows of points are.
+
+    Attributes:
+        row: (T,) int64, the scene.
+        kind: (T,) int64.
+        wall: (T,) of them.
+    """
+
+    row: Tensor
+    kind: Tensor
+    wall: Wall
 
 
 class WallColours(NamedTuple):
@@ -52,12 +69,10 @@ class WallColours(NamedTuple):
     Attributes:
         albedo: (T, 3, N) linear reflectance.
         alpha: (T, N) coverage.
-        glow: (T, 3, N) radiance of lit windows.
     """
 
     albedo: Tensor
     alpha: Tensor
-    glow: Tensor
 
 
 def add_walls(scene: Scene, view: View, canvas: Canvas, across: Tensor, features: Features) -> None:
@@ -72,19 +87,20 @@ def add_walls(scene: Scene, view: View, canvas: Canvas, across: Tensor, features
     """
     if not features.walls:
         return
-    looks = sorted((*features.looks[i], *entry) for i, entry in enumerate(features.walls))
-    kind, _, row, wall = torch.tensor(looks).to(canvas.depth.device, non_blocking=True).unbind(1)
+    entries = sorted((*features.looks[i], *entry) for i, entry in enumerate(features.walls))
+    kind, _, row, wall = torch.tensor(entries).to(canvas.depth.device, non_blocking=True).unbind(1)
+    looks = [(entry[0], entry[1]) for entry in entries]
     walls = walls_of(scene.world.surroundings, row, wall)
     blocks, hits = _hits(scene, view, canvas, across, row, walls)
     if not len(blocks):
         return
-    colours = _textures(scene, view, row, walls, blocks, hits, [look[:2] for look in looks], features)
-    lit = _radiance(
-        scene, row[blocks.row], kind[blocks.row], walls.across[blocks.row], hits, colours, features
-    )
+    own = WallRows(row[blocks.row], kind[blocks.row], select_rows(walls, blocks.row))
+    colours = _textures(own.wall, blocks, hits, looks)
+    lit = _radiance(scene, own, hits, colours.albedo, features)
+    if features.night:
+        _add_windows(scene, own, blocks, hits, looks, lit)
     for number in range(NUM_WALLS):
-        members = [entry for entry, look in enumerate(looks) if look[3] == number]
-        index = blocks.of_rows(members)
+        index = blocks.of_rows([i for i, entry in enumerate(entries) if entry[3] == number])
         if len(index):
             _composite(canvas, *(t.index_select(0, index) for t in (hits.pixel, hits.z, lit, colours.alpha)))
 
@@ -110,7 +126,10 @@ def _hits(
     keep = (z < _FARTHEST) & (up > -0.3) & (up < tall[own, None])
     keep &= z < take(canvas.depth, pixel) + _OVERLAP
     kept = make_blocks(keep, _BLOCK, row=own, num_rows=len(row))
-    return kept, WallHits(*(take(t, kept.place) for t in (pixel, z, arc, up, ray_x)))
+    along = arc + scene.place.along[row][own, None]
+    pixel, z, along, up, ray_x = (take(t, kept.place) for t in (pixel, z, along, up, ray_x))
+    footprint = (take(view.steps[3], pixel).abs() * z).clamp(min=1e-3)
+    return kept, WallHits(pixel, z, along, up, ray_x, footprint)
 
 
 def _candidates(
@@ -141,48 +160,31 @@ def _candidates(
     return ((sky & low) | (~sky & beyond)).any(0)
 
 
-def _textures(
-    scene: Scene,
-    view: View,
-    row: Tensor,
-    walls: Wall,
-    blocks: Blocks,
-    hits: WallHits,
-    looks: list[tuple[int, ...]],
-    features: Features,
-) -> WallColours:
-    """Colours of points on E walls, sorted by their (kind, style): those of one look at a time."""
-    along = hits.arc + scene.place.along[row][blocks.row, None]
-    footprint = (take(view.steps[3], hits.pixel).abs() * hits.z).clamp(min=1e-3)
-    starts = [0, *accumulate(blocks.counts)]
+def _textures(walls: Wall, blocks: Blocks, hits: WallHits, looks: list[tuple[int, int]]) -> WallColours:
+    """Colours of points on walls, sorted by their looks (kind, style): those of one look at a time."""
     parts = []
-    for (kind, style), group in groupby(range(len(looks)), lambda entry: looks[entry]):
-        members = list(group)
-        part = slice(starts[members[0]], starts[members[-1] + 1])
-        own = select_rows(walls, blocks.row[part])
-        here = (along[part], hits.up[part], footprint[part])
-        albedo, alpha = wall_texture(own, kind, style, *here)
-        glow = torch.zeros_like(albedo)
-        if kind == HOUSES and features.night:
-            on = scene.world.lights.on[row][blocks.row[part]] > 0
-            glow = lit_windows(own, *here) * on[:, None, None]
-        parts.append(WallColours(albedo, alpha, glow))
+    for look, part in _parts(blocks, looks):
+        own = select_rows(walls, part)
+        parts.append(
+            WallColours(*wall_texture(own, *look, hits.along[part], hits.up[part], hits.footprint[part]))
+        )
     return concatenate_rows(parts)
 
 
-def _radiance(
-    scene: Scene,
-    row: Tensor,
-    kind: Tensor,
-    wall_across: Tensor,
-    hits: WallHits,
-    colours: WallColours,
-    features: Features,
-) -> Tensor:
-    """Linear radiance (T, 3, N) of points on walls of kinds (T,) in scenes (T,), as seen through the air."""
-    light = select_rows(scene.light, row)
+def _parts(blocks: Blocks, looks: list[tuple[int, int]]) -> Iterator[tuple[tuple[int, int], slice]]:
+    """Yield the looks of walls, sorted by them, each with the blocks that have it."""
+    start = 0
+    for look, group in groupby(zip(looks, blocks.counts, strict=True), lambda entry: entry[0]):
+        count = sum(number for _, number in group)
+        yield look, slice(start, start + count)
+        start += count
+
+
+def _radiance(scene: Scene, own: WallRows, hits: WallHits, albedo: Tensor, features: Features) -> Tensor:
+    """Linear radiance (T, 3, N) of points on walls as seen through the air."""
+    light, row, kind = select_rows(scene.light, own.row), own.row, own.kind
     right, up, ahead = light.sun.unbind(1)
-    facing = (-(wall_across - scene.place.across[row]).sign() * right).clamp(min=0)
+    facing = (-(own.wall.across - scene.place.across[row]).sign() * right).clamp(min=0)
     away = (-ahead).clamp(min=0)  # sun from behind lights what the camera sees
     soft = (kind == TREES) | (kind == HEDGE) | (kind == FENCE)
     leaves = 0.10 + 0.3 * up * away + 0.35 * away + 0.35 * facing
@@ -191,9 +193,22 @@ def _radiance(
     if features.headlight:
         beam = headlight_irradiance(hits.ray_x * hits.z, hits.z) * light.headlight[:, None]
         lit = lit + 0.6 * beam[:, None]
-    lit = colours.albedo * lit + colours.glow
     clear = torch.exp(-hits.z / scene.world.weather.visibility[row, None])[:, None]
-    return torch.lerp(scene.world.surroundings.skyline[row, :, None], lit, clear)
+    return torch.lerp(scene.world.surroundings.skyline[row, :, None], albedo * lit, clear)
+
+
+def _add_windows(
+    scene: Scene, own: WallRows, blocks: Blocks, hits: WallHits, looks: list[tuple[int, int]], lit: Tensor
+) -> None:
+    """Light windows of houses at night; changes the radiance (T, 3, N)."""
+    for (kind, _), part in _parts(blocks, looks):
+        if kind == HOUSES and part.stop > part.start:
+            row = own.row[part]
+            on = as_float(scene.world.lights.on[row] > 0)[:, None]
+            clear = on * torch.exp(-hits.z[part] / scene.world.weather.visibility[row, None])
+            wall = select_rows(own.wall, part)
+            windows = lit_windows(wall, hits.along[part], hits.up[part], hits.footprint[part])
+            lit[part] += windows * clear[:, None]
 
 
 def _composite(canvas: Canvas, pixel: Tensor, z: Tensor, colour: Tensor, alpha: Tensor) -> None:

@@ -29,6 +29,11 @@ def _knots_on(device: torch.device) -> Tensor:
     return knots().float().to(device)
 
 
+def _at(table: Tensor, index: Tensor) -> Tensor:
+    """Entries of a table (K,) at indices of any shape."""
+    return table.index_select(0, index.flatten()).view(index.shape)
+
+
 class Alignment(NamedTuple):
     """Tables over the knots in Z, each (B, K).
 
@@ -121,7 +126,8 @@ class RoadPoint(NamedTuple):
 def _nearest_knot(z: Tensor) -> tuple[Tensor, Tensor]:
     """Index of the nearest knot and the distance from it, (B, N) both."""
     index = (z.clamp(min=0) * (1 / KNOT_SCALE)).log1p().mul(1 / KNOT_GROWTH).round().clamp(0, NUM_KNOTS - 1)
-    return index.long(), z - KNOT_SCALE * torch.expm1(index * KNOT_GROWTH)
+    index = index.long()
+    return index, z - _at(_knots_on(z.device), index)
 
 
 def _centreline(alignment: Alignment, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -180,9 +186,9 @@ def elevation_at(alignment: Alignment, z: Tensor) -> Tensor:
     """(B, N) m above the tangent plane, linear between knots."""
     position = (z.clamp(min=0) * (1 / KNOT_SCALE)).log1p() * (1 / KNOT_GROWTH)
     index = position.long().clamp(0, NUM_KNOTS - 2)
-    z0, z1 = (KNOT_SCALE * torch.expm1(i * KNOT_GROWTH) for i in (index, index + 1))
-    low, high = alignment.elevation.gather(1, index), alignment.elevation.gather(1, index + 1)
-    return low + (high - low) * ((z - z0) / (z1 - z0)).clamp(0, 1)
+    knot = _knots_on(z.device)
+    part = ((z - _at(knot, index)) * _at(1 / knot.diff(), index)).clamp(0, 1)
+    return alignment.elevation.gather(1, index) + alignment.elevation.diff(dim=1).gather(1, index) * part
 
 
 def lowest_slopes(alignment: Alignment, height: Tensor) -> Tensor:
@@ -214,8 +220,7 @@ def ground_hit(alignment: Alignment, height: Tensor, ray_y: Tensor) -> tuple[Ten
     index = torch.searchsorted(-lowest, -ray_y).clamp(max=NUM_KNOTS - 2)
     rise = alignment.elevation.diff(dim=1) / z.diff()
     slope, start = rise.gather(1, index), alignment.elevation.gather(1, index)
-    z_start = z.index_select(0, index.flatten()).view(index.shape)
-    return (height[:, None] - start + z_start * slope) / (ray_y + slope), slope
+    return (height[:, None] - start + _at(z, index) * slope) / (ray_y + slope), slope
 
 
 def hidden_by_crest(alignment: Alignment, height: Tensor, z: Tensor) -> Tensor:
