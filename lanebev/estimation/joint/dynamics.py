@@ -114,6 +114,8 @@ def pose_covariance(bandwidth: float, like: Tensor) -> Tensor:
 def pose_transition(dt: Tensor, bandwidth: float) -> tuple[Tensor, Tensor]:
     """Compute transition and process noise of one axis of the pose about its mean, at unit variance.
 
+    Source: (J11).
+
     Args:
         dt: (B,) s, >= 0.
         bandwidth: Hz, cut-off frequency.

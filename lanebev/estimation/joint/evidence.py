@@ -19,6 +19,8 @@ _CALL = 5.0  # sigmas of evidence at which half of the noise is admitted
 def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor) -> Tensor:
     """Compute the normalised score of every entry that moves: N(0, 1) each if the motion is as assumed.
 
+    Source: (J14).
+
     Source: the score test (Rao 1948) for more process noise in one entry. Whether the road bends, and whether
     its lanes are equal, is asked with the pose free: near and far vertices of one frame tell, and a motion of
     the pose that its process noise does not expect is no evidence. A detector's errors are correlated along a
@@ -49,6 +51,8 @@ def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor) -> Ten
 def accumulate_evidence(before: Tensor, score: Tensor, dt: Tensor, memory: float) -> Tensor:
     """Sum the scores of shape and deviations over time, at unit variance; those of the pose count at once.
 
+    Source: (J15).
+
     Args:
         before: (B, M), evidence so far.
         score: (B, M), of this frame.
@@ -62,6 +66,8 @@ def accumulate_evidence(before: Tensor, score: Tensor, dt: Tensor, memory: float
 
 def adapt_motion_scale(before: Tensor, score: Tensor, dt: Tensor, cfg: JointConfig) -> Tensor:
     """Raise the variance of the pose's motion while its scores exceed what they should be, and let it decay.
+
+    Source: (J17).
 
     Source: covariance matching (Mehra 1972), axis by axis, as a multiplicative step: a right variance has a
     squared score of mean 1.
@@ -81,6 +87,8 @@ def adapt_motion_scale(before: Tensor, score: Tensor, dt: Tensor, cfg: JointConf
 
 def adaptive_process_noise(evidence: Tensor, cov: Tensor, cfg: JointConfig) -> Tensor:
     """Compute the process noise variances (B, O) that the evidence calls for; next to none below 3 sigmas.
+
+    Source: (J16).
 
     Of the deviations only that of the most contradictory boundary is freed, and to ``open_deviation`` at
     most: a detector errs on one boundary for seconds, and if all deviations were free, such an error would
@@ -103,6 +111,8 @@ def adaptive_process_noise(evidence: Tensor, cov: Tensor, cfg: JointConfig) -> T
 
 def deviation_prior_std(deviations: Tensor, cfg: JointConfig) -> Tensor:
     """Compute the prior standard deviation (B,) m of deviations from the second largest; 0 for equal lanes.
+
+    Source: (J19).
 
     A single boundary out of place is a detector's error. Of six deviations three combinations cannot be
     observed, since changes of offset, height and roll have the same effect: they may be three times as large.

@@ -21,6 +21,8 @@ def best_shift(
 ) -> tuple[Tensor, Tensor]:
     """Choose by how many lanes the boundary indices moved since the prediction: -1, 0 or 1.
 
+    Source: (J13).
+
     A shift is chosen if it explains the frame far better than none: the camera crossed a line, or the
     detector numbers the boundaries anew.
 

@@ -1,5 +1,7 @@
 """The measurement of the joint estimators: end points against projected lane boundaries, in pixels.
 
+The equations (J1) to (J22) that this package cites are in docs/method/joint.md.
+
 Boundary k lies on the flat road at X_k(Z) = b(Z) + x_k (1 + b'(Z)² / 2), with x_k = offset + (its place in
 the ego lane's frame): parallel curves, to second order in their heading b'. The bend b is linear in the
 shape parameters: c0 Z²/2 + c1 Z³/6 (third-order clothoid), or the double integral of a curvature that is
@@ -178,6 +180,8 @@ def boundary_residuals(
 ) -> Residuals:
     """Compute the perpendicular pixel distance of every end point to its boundary, with its Jacobian.
 
+    Source: (J4) and (J5).
+
     Both are taken at the foot point on the boundary. Taken at the noisy point instead, the Jacobian would
     correlate with the noise, and the fit would be biased by their product.
 
@@ -296,7 +300,10 @@ def _pixel_gradient(normal: Tensor, by_pixel: Tensor) -> Tensor:
 
 
 def _meet_road(directions: Tensor, height: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance Z (B, M) at which directions (B, 3, M) meet the road, and whether that is before FARTHEST."""
+    """Distance Z (B, M) at which directions (B, 3, M) meet the road, and whether that is before FARTHEST.
+
+    Source: (J1).
+    """
     down, ahead = directions[:, 1], directions[:, 2]
     nearest = ahead * (height.clamp(min=0.1) / FARTHEST)  # of d_y, for a point at FARTHEST
     on_road = (ahead > 1e-3) & (down > nearest)
@@ -305,6 +312,8 @@ def _meet_road(directions: Tensor, height: Tensor) -> tuple[Tensor, Tensor]:
 
 def _tangent_plane(z: Tensor, x_k: Tensor, height: Tensor, curve: RoadCurve) -> tuple[Tensor, Tensor]:
     """Normal n (…, B, 3, M) of the plane through the camera and a boundary's tangent, and its slope X'(Z).
+
+    Source: (J2) and (J4).
 
     Args:
         z: (B, M) m.

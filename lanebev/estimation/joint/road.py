@@ -32,6 +32,8 @@ def propagate_road_shape(
 ) -> RoadMotion:
     """Predict the shape of the road as the camera passes knots and new steps come into view.
 
+    Source: (J12).
+
     Args:
         mean: (B, D) of the state.
         shape_cov: (B, NUM_SHAPE, NUM_SHAPE) of its shape.
@@ -93,6 +95,8 @@ def straight_or_bend(
     params: Tensor, cov: Tensor, straight: Tensor, bend: Tensor, share: float
 ) -> tuple[Tensor, Tensor]:
     """Average one frame's fit over two models of the road, straight and bent, weighted by their evidence.
+
+    Source: (J18).
 
     A distant bend and a yaw look alike. To choose the likelier model would be wrong by many standard
     deviations whenever the other holds, so the difference of the two fits enters the covariance. Source:

@@ -31,6 +31,8 @@ class RoadCurve(NamedTuple):
 def road_curve(z: Tensor, shape: Tensor, phase: Tensor | None) -> RoadCurve:
     """Compute the middle line of the road, with zero bend and heading at Z = 0.
 
+    Source: (J3).
+
     Args:
         z: (B, M) m.
         shape: (B, 2), c0 and c1 of a clothoid; with a phase (B, 1 + NUM_STEPS), curvature at the first knot

@@ -19,6 +19,8 @@ SCALE_PRIOR = 20.0  # segments' worth of belief in the sigmas as they were given
 def inlier_log_odds(distance: Tensor, sigma: Tensor, scale: Tensor, focal: Tensor) -> Tensor:
     """Compute the log odds that a segment is an inlier.
 
+    Source: (J6).
+
     Args:
         distance: (B, N, 2) px, of both end points.
         sigma: (B, N) px.
@@ -49,6 +51,8 @@ def log_likelihood(
 
 def noise_scale(distance: Tensor, sigma: Tensor, weight: Tensor) -> Tensor:
     """Compute the factor by which the residuals of inliers exceed their sigmas, at least 1.
+
+    Source: (J7).
 
     Args:
         distance: (B, N, 2) px.

@@ -111,6 +111,8 @@ def update(
 def updated_covariance(cov: Tensor, matrix: Tensor) -> Tensor:
     """Compute (P⁻¹ + Λ)⁻¹ without inverting P: L (I + Lᵀ Λ L)⁻¹ Lᵀ for P = L Lᵀ.
 
+    Source: (J9).
+
     Args:
         cov: (..., O, O), P, positive definite.
         matrix: (..., O, O), Λ.
@@ -129,6 +131,8 @@ def information_kept(cov: Tensor, matrix: Tensor) -> Tensor:
 
 def posterior_covariance(cov: Tensor, matrix: Tensor, gain: Tensor) -> Tensor:
     """Compute the covariance after an update whose gain may have rows of zero.
+
+    Source: (J10).
 
     Source: the Joseph form, (I - K H) P (I - K H)ᵀ + K Q Kᵀ, with K H = G Λ and K Q Kᵀ = G Λ Gᵀ.
 
@@ -192,7 +196,10 @@ def agreement(frame: FrameInformation, moved: Tensor, seen: Observations) -> Ten
 
 
 def _normal_equations(at: Residuals, weight: Tensor, member: Tensor) -> tuple[Tensor, Tensor]:
-    """Λ (B, O, O) and Hᵀ Q⁻¹ y (B, O); a boundary's deviation moves its end points as the offset does."""
+    """Λ (B, O, O) and Hᵀ Q⁻¹ y (B, O); a boundary's deviation moves its end points as the offset does.
+
+    Source: (J8).
+    """
     jacobian = at.jacobian
     weight = weight.repeat_interleave(2, dim=1).unsqueeze(1)
     left = torch.cat([jacobian, at.distance.flatten(1).unsqueeze(1)], dim=1) * weight  # (B, 12, M)
