@@ -2,7 +2,9 @@
 
 import sys
 
-from lanebev.app.run import RunConfig, run, summary
+from lanebev.app.config import RunConfig
+from lanebev.app.run import run
+from lanebev.app.summary import summary
 
 video, camera, out = sys.argv[1:]
 config = RunConfig(source=video, camera=camera, out=out, lane_width=3.7)

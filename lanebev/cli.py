@@ -11,14 +11,14 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import Field, fields
 from typing import Any, NoReturn
 
 from lanebev import __version__
+from lanebev.app.config import RunConfig, parse_path, read_settings
 
 DESCRIPTION = "Online camera-to-road calibration from lane boundaries, and a stable bird's-eye view."
-CAMERA_HELP = "of OpenCV, ROS, Kalibr, EuRoC, KITTI, nuScenes; or YAML of fx fy cx cy width height"
-SOURCE_HELP = "a video, a folder of images, a quoted glob ('DIR/**/*.jpg'), or one image"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -28,55 +28,62 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: error: {message}; see {self.prog} --help\n")
 
 
-def _path(text: str) -> str:
-    if not text:
-        raise argparse.ArgumentTypeError("expected a path, got an empty string")
-    return text
-
-
-def _size(text: str) -> tuple[int, int]:
-    from lanebev.io.lane_size import parse_size
-
-    try:
-        return parse_size(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
 def parser() -> argparse.ArgumentParser:
-    """The parser of ``lanebev``."""
+    """The parser of ``lanebev``; the options of ``run`` are the fields of its settings."""
     top = _Parser(prog="lanebev", description=DESCRIPTION, allow_abbrev=False)
     top.add_argument("--version", action="version", version=f"lanebev {__version__}")
-    top.add_argument("--verbose", action="store_true", help="say on stderr what is done")
+    _add_verbose(top, False)
     commands = top.add_subparsers(dest="command", required=True, metavar="{demo,run}")
     demo = commands.add_parser("demo", help="a rendered drive end to end", allow_abbrev=False)
-    demo.add_argument(
-        "--out", type=_path, default="lanebev-demo", metavar="DIR", help="output folder (%(default)s)"
-    )
+    path = _named(parse_path)
+    default = "lanebev-demo"
+    demo.add_argument("--out", type=path, default=default, metavar="DIR", help="output folder (%(default)s)")
     run = commands.add_parser("run", help="calibrate on images or a video", allow_abbrev=False)
-    run.add_argument("source", type=_path, metavar="SOURCE", help=SOURCE_HELP)
-    run.add_argument("--camera", type=_path, required=True, metavar="FILE",
-                     help=CAMERA_HELP)  # fmt: skip
-    run.add_argument("--rectified", action="store_true",
-                     help="the images were rectified: take the projection matrix P")  # fmt: skip
-    run.add_argument("--lane-width", type=float, default=3.7, metavar="M", help="metres (%(default)s)")
-    run.add_argument("--lanes", type=_path, metavar="FILE",
-                     help="lanes of another detector: TuSimple JSON lines, CULane .lines.txt, OpenLane JSON, "
-                     "or a folder of them")  # fmt: skip
-    run.add_argument("--lanes-size", type=_size, metavar="WxH",
-                     help="size of the images that --lanes was drawn on, if not the source's")  # fmt: skip
-    run.add_argument("--stills", action="store_true", help="every image on its own, not frames of a drive")
-    run.add_argument(
-        "--out", type=_path, default="lanebev-out", metavar="DIR", help="output folder (%(default)s)"
-    )
-    run.add_argument("--resume", type=_path, metavar="DIR",
-                     help="begin with the state that a run left in this folder")  # fmt: skip
-    run.add_argument("--calibrator", default="joint", choices=("joint", "two-stage"),
-                     help="two-stage is the paper's (%(default)s)")  # fmt: skip
-    run.add_argument("--fps", type=float, metavar="HZ",
-                     help="frame rate of a folder or glob (what names of seconds say, else 30) or of a raw "
-                     "stream; a video knows its own")  # fmt: skip
+    for setting in fields(RunConfig):
+        _add_setting(run, setting)
+    run.add_argument("--config", type=path, metavar="FILE", help="settings as YAML; options here override it")
+    for command in (demo, run):
+        _add_verbose(command, argparse.SUPPRESS)
     return top
+
+
+def _add_verbose(parser: argparse.ArgumentParser, default: bool | str) -> None:
+    parser.add_argument("--verbose", action="store_true", default=default, help="say on stderr what is done")
+
+
+def _add_setting(parser: argparse.ArgumentParser, setting: Field[object]) -> None:
+    """Add the option of a setting; one that is not given is not among the parsed ones."""
+    about = setting.metadata
+    words = about["help"].replace("%", "%%")
+    if setting.name == "source":
+        parser.add_argument(
+            setting.name, nargs="?", type=_named(about["parse"]), default=argparse.SUPPRESS,
+            metavar=about["metavar"], help=words,
+        )  # fmt: skip
+        return
+    flag = f"--{setting.name.replace('_', '-')}"
+    if isinstance(setting.default, bool):
+        parser.add_argument(flag, action="store_true", default=argparse.SUPPRESS, help=words)
+    elif about["choices"]:
+        parser.add_argument(flag, choices=about["choices"], default=argparse.SUPPRESS, help=words)
+    else:
+        parser.add_argument(
+            flag, type=_named(about["parse"]), default=argparse.SUPPRESS, metavar=about["metavar"], help=words
+        )
+
+
+def _named(parse: Callable[[str], object]) -> Callable[[str], object]:
+    """The same, saying what it says of bad texts as argparse wants it."""
+    if parse is float:
+        return parse
+
+    def parsed(text: str) -> object:
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return parsed
 
 
 class _Stopped(KeyboardInterrupt):
@@ -133,16 +140,19 @@ def _signals_unwind() -> Iterator[None]:
 
 
 def _run(options: dict[str, Any]) -> str:
-    from lanebev.app.run import RunConfig, run, summary
+    given = options.pop("config")
+    settings = {} if given is None else read_settings(given)
+    config = RunConfig(**(settings | options))  # type: ignore[arg-type]  # each parsed as its field
+    from lanebev.app.run import run
+    from lanebev.app.summary import summary
 
-    config = RunConfig(**options)
     return summary(run(config, _progress("calibrating")), config)
 
 
 def _demo(options: dict[str, Any]) -> str:
     from lanebev.app.demo import demo
 
-    return str(demo(options["out"], _progress))
+    return demo(options["out"], _progress)
 
 
 def _progress(label: str) -> Any:

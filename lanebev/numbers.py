@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import math
+import re
 import reprlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -81,3 +82,15 @@ def _floats(values: Sequence[Any]) -> list[float] | None:
 
 def _listed(values: Sequence[Any]) -> str:
     return ", ".join(shown(value).strip("'\"") for value in values[:60])[:60]
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Return (height, width) of a text such as ``1280x720``, width first.
+
+    Raises:
+        ValueError: another text, or sides that are no image's.
+    """
+    match = re.fullmatch(r"\s*(\d{1,6})\s*[x×X]\s*(\d{1,6})\s*", text, re.ASCII)
+    if match is None or 0 in (size := (int(match[2]), int(match[1]))):
+        raise ValueError(f"lanes size: expected WIDTHxHEIGHT in px, such as 1280x720, got {text!r}")
+    return size

@@ -415,7 +415,8 @@ def test_every_camera_that_we_write_we_read(
 def test_a_run_on_rectified_images(tmp_path):
     from PIL import Image
 
-    from lanebev.app.run import RunConfig, run
+    from lanebev.app.config import RunConfig
+    from lanebev.app.run import run
 
     Image.fromarray(np.zeros((72, 128, 3), np.uint8)).save(tmp_path / "0.png")
     camera = _message(width=128, height=72, K=(np.array(K) / 10).tolist(), P=(np.array(P) / 10).tolist())

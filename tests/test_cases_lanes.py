@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from lanebev import Camera
-from lanebev.app.run import RunConfig, run
-from lanebev.io.lane_size import parse_size, resized_lanes, size_remark
+from lanebev.app.config import RunConfig
+from lanebev.app.run import run
+from lanebev.io.lane_size import resized_lanes, size_remark
 from lanebev.io.lanes import FrameLines, read_culane, read_lanes, tusimple_line
 from lanebev.io.openlane import camera_from_ground_points
+from lanebev.numbers import parse_size
 from lanebev.observation.polylines import LaneLine, vertices_from_lines
 
 CAMERA = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics
-from lanebev.app.run import lens_remark
+from lanebev.app.build import lens_remark
 from lanebev.geometry import undistortion
 from lanebev.geometry.distortion import (
     brown_conrady,

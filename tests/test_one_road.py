@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from lanebev import Camera, LaneBEV
-from lanebev.app.run import RunConfig, make_calibrator, run
+from lanebev.app.build import make_calibrator
+from lanebev.app.config import RunConfig
+from lanebev.app.run import run
 from lanebev.io.results import extrinsics_row
 from lanebev.io.video import VideoWriter, open_source
 from lanebev.render import Drive

@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from lanebev.app.run import calibrate_still
 from lanebev.estimation.joint.boundary_curves import boundary_polylines, fit_boundaries
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.measurement import (
@@ -18,6 +17,7 @@ from lanebev.estimation.joint.measurement import (
     observe,
 )
 from lanebev.estimation.joint.single_frame import FramePrior, fit_single_frame
+from lanebev.estimation.still import calibrate_still
 from lanebev.geometry.road import image_from_road_points
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.segments import noisy_segments, project_boundaries

@@ -24,7 +24,9 @@ from rich.table import Table
 
 import lanebev
 from lanebev import BEVGrid, Extrinsics, LaneSegments
-from lanebev.app.run import bird_view, calibrate_still, make_calibrator
+from lanebev.app.build import make_calibrator
+from lanebev.app.views import bird_view
+from lanebev.estimation.still import calibrate_still
 from lanebev.io.video import open_source
 from lanebev.report.overlay import Panel, draw_frame
 from tools.real_figures import (
@@ -113,7 +115,7 @@ def write_sheet(path: Path, data: Path, calibrator: Any) -> None:
         frame = next(iter(open_source(images[i])))
         assert frame.image is not None
         views = tuple(
-            Panel(title, bird_view(grid, frame, camera, extrinsics), extrinsics)
+            Panel(title, bird_view(grid, frame.image, camera, extrinsics), extrinsics)
             for title, extrinsics in (("before", level), ("after", calibration.extrinsics))
         )
         name = "/".join(Path(images[i]).parts[-3:])

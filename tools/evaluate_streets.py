@@ -23,7 +23,7 @@ from torch import Tensor
 
 import lanebev
 from lanebev import Camera, JointCalibrator, LaneBEV, LaneSegments, Status
-from lanebev.app.run import calibrate_still
+from lanebev.estimation.still import calibrate_still
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.io.video import read_image
 from train.commands import one_line_errors

@@ -13,7 +13,7 @@ import torch
 
 from lanebev import Camera, Extrinsics, LaneSegments, Status
 from lanebev.app.observers import NetworkObserver
-from lanebev.app.run import calibrate_still
+from lanebev.estimation.still import calibrate_still
 from lanebev.io.lanes import match_frames, read_lanes
 from lanebev.io.video import open_source
 from lanebev.observation.segments import camera_segments, segments_from_lines

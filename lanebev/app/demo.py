@@ -13,7 +13,9 @@ import torch
 from numpy.typing import NDArray
 
 from lanebev.app.concurrency import Background
-from lanebev.app.run import RunConfig, run, summary
+from lanebev.app.config import RunConfig
+from lanebev.app.run import run
+from lanebev.app.summary import summary
 from lanebev.io.lanes import tusimple_line
 from lanebev.io.results import ExtrinsicsRow, OutputFolder, extrinsics_row, write_extrinsics
 from lanebev.io.video import VideoWriter

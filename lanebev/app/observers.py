@@ -6,14 +6,17 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import torch
+from torch import Tensor
 
 from lanebev.camera.model import Camera
 from lanebev.io.lane_size import size_remark
 from lanebev.io.lanes import FrameLines, match_frames
 from lanebev.io.video import Frame, FrameSource
 from lanebev.observation.boundary_vertices import BoundaryVertices
+from lanebev.observation.frames import check_frame, network_image
 from lanebev.observation.polylines import vertices_from_lines
 from lanebev.pipeline import LaneBEV
+from lanebev.tensors import map_tensors
 
 
 class Observation(NamedTuple):
@@ -92,7 +95,8 @@ class NetworkObserver:
         """See :class:`Observer`."""
         if frame.image is None:
             return Observation(vertices_from_lines([], self.camera), self.model.pose_sigma_scale)
-        image = torch.from_numpy(frame.image.copy()).permute(2, 0, 1)[None].float() / 255
+        device = next(self.model.parameters()).device
+        image = network_image(check_frame(frame.image, self.camera.image_size), device)
         with torch.inference_mode():
             _, vertices = self.model.boundary_vertices(image)
-        return Observation(vertices, self.model.pose_sigma_scale)
+        return Observation(map_tensors(Tensor.cpu, vertices), self.model.pose_sigma_scale)

@@ -4,90 +4,86 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from lanebev.app.concurrency import Background
+from lanebev.app.observers import Observation
+from lanebev.app.tracker import Estimate
+from lanebev.app.views import ViewBefore, bird_view
 from lanebev.camera.model import Camera
-from lanebev.estimation.joint.state import Reason
 from lanebev.estimation.mount import MountCalibration
 from lanebev.io.lanes import tusimple_line
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video import Frame, VideoWriter, write_png
-from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.segments import LaneSegments
 from lanebev.report.lane_curves import lane_curves
 from lanebev.report.measure import believed, measure_boundaries
 from lanebev.report.moments import MomentSampler
-from lanebev.report.overlay import Panel, Picture, draw_panels, joined
+from lanebev.report.overlay import Panel, draw_panels, joined
 from lanebev.report.page import Report, summary_facts, write_report
 from lanebev.report.verdict import reason_words
 from lanebev.report.worst import EventScores
-from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics
+from lanebev.types import NUM_BOUNDARIES, Extrinsics
 from lanebev.view.grid import BEVGrid
 
+_BEFORE_RESOLUTION = 0.1  # m, of the view before: it is only shown small
 
-class Recorded(NamedTuple):
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
     """One frame, done.
 
     Attributes:
         frame: as it came.
         name: for ``raw_file`` of lanes.json.
-        vertices: of batch size 1, as seen.
-        pose_sigma_scale: of the pose's sigmas.
-        segments: of batch size 1, what the calibrator was given.
-        calibration: of batch size 1.
-        reasons: why the frame is not (fully) tracked.
-        before: pose of the view before, each (1,); None before anything is known.
-        bev_before, bev_after: (U, V, 3) RGB.
+        seen: vertices of batch size 1.
+        estimate: what they led to.
     """
 
     frame: Frame
     name: str
-    vertices: BoundaryVertices
-    pose_sigma_scale: float
-    segments: LaneSegments
-    calibration: Calibration
-    reasons: Reason
-    before: Extrinsics | None
-    bev_before: Picture
-    bev_after: Picture
+    seen: Observation
+    estimate: Estimate
 
 
+@dataclass(kw_only=True)
 class Recorder:
     """Writes lanes.json and the pictures in a thread, and at the end extrinsics.csv and the report.
 
-    Args:
+    Attributes:
         path: gives the path to write an output's name to.
         camera: the lens.
-        grid: of the bird's-eye views.
         fps: of the videos.
         lane_width: m, for the report.
         single: PNGs instead of videos.
         stills: each image on its own.
+        grid: of the bird's-eye view.
+        rows: of extrinsics.csv, a frame each.
+        problems: what went wrong, for the report.
     """
 
-    def __init__(
-        self,
-        path: Callable[[str], Path],
-        camera: Camera,
-        grid: BEVGrid,
-        fps: Fraction,
-        lane_width: float,
-        single: bool,
-        stills: bool,
-    ) -> None:
-        self.path, self.camera, self.grid = path, camera, grid
-        self.fps, self.lane_width, self.single, self.stills = fps, lane_width, single, stills
-        self.rows: list[ExtrinsicsRow] = []
-        self.problems: list[str] = []
-        self.before_title = "uncalibrated" if single or stills else "first frame's pose held"
+    path: Callable[[str], Path]
+    camera: Camera
+    fps: Fraction
+    lane_width: float
+    single: bool
+    stills: bool
+    grid: BEVGrid = field(default_factory=BEVGrid)
+    rows: list[ExtrinsicsRow] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        alone = self.single or self.stills
+        self.before_title = "uncalibrated" if alone else "first frame's pose held"
+        self._before, self._coarse = ViewBefore(alone), BEVGrid(resolution=_BEFORE_RESOLUTION)
         self._widths: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
         self._moments, self._scores = MomentSampler(), EventScores()
 
@@ -110,11 +106,18 @@ class Recorder:
         frame = done.frame
         if frame.problem:
             self.problems.append(f"frame {frame.number}: {frame.problem}")
-        weight = done.segments.weight
+        estimate = done.estimate
         self.rows.append(
-            extrinsics_row(frame.number, frame.time, done.calibration, weight, frame.name, done.reasons)
+            extrinsics_row(
+                frame.number,
+                frame.time,
+                estimate.calibration,
+                estimate.segments.weight,
+                frame.name,
+                estimate.reasons,
+            )
         )
-        self._background.submit(lambda: self._write(done))
+        self._background.submit(lambda: self._draw(done))
 
     def finish(
         self,
@@ -152,27 +155,31 @@ class Recorder:
         write_report(self.path("report.html"), report)
         return report
 
-    def _write(self, done: Recorded) -> None:
-        curves = lane_curves(done.segments, done.calibration, self.camera)
-        line = tusimple_line(done.name, *curves, seen=done.vertices, pose_sigma_scale=done.pose_sigma_scale)
+    @torch.inference_mode()
+    def _draw(self, done: Recorded) -> None:
+        frame, (segments, calibration, reasons) = done.frame, done.estimate
+        curves = lane_curves(segments, calibration, self.camera)
+        line = tusimple_line(done.name, *curves, *done.seen)
         self._lanes.write(line + "\n")
-        intrinsics = self.camera.intrinsics[None].to(done.segments.endpoints)
-        lanes = believed(done.segments, done.calibration.inliers)
-        poses = (done.before, done.calibration.extrinsics)
-        before, after = (self._measure(lanes, intrinsics, pose) for pose in poses)
-        self._widths.append((before, after))
-        frame = done.frame
+        before, after = self._before(calibration), calibration.extrinsics
+        intrinsics = self.camera.intrinsics[None].to(segments.endpoints)
+        lanes = believed(segments, calibration.inliers)
+        self._widths.append(
+            (self._measure(lanes, intrinsics, before), self._measure(lanes, intrinsics, after))
+        )
         image = frame.image if frame.image is not None else np.zeros((*self.camera.image_size, 3), np.uint8)
         place = frame.name if self.single or self.stills else f"frame {frame.number}   {frame.time:.2f} s"
-        views = [Panel("after", done.bev_after, done.calibration.extrinsics)]
-        if done.before is not None:
-            views.insert(0, Panel("before", done.bev_before, done.before))
-        words = ", ".join(reason_words([str(reason.name) for reason in done.reasons]))
+        bev = bird_view(self.grid, frame.image, self.camera, after)
+        views = [Panel("after", bev, after)]
+        if before is not None:
+            coarse = bird_view(self._coarse, frame.image, self.camera, before)
+            views.insert(0, Panel("before", coarse, before))
+        words = ", ".join(reason_words([str(reason.name) for reason in reasons]))
         panels = draw_panels(
             image,
             self.camera,
-            done.segments,
-            done.calibration,
+            segments,
+            calibration,
             _shortened(place),
             tuple(views),
             self.grid,
@@ -183,11 +190,11 @@ class Recorder:
         self._moments.add(frame.number, dict(zip(names, panels, strict=True)), scores)
         picture = joined(panels)
         if self.single:
-            write_png(self.path("bev.png"), done.bev_after)
+            write_png(self.path("bev.png"), bev)
             write_png(self.path("overlay.png"), picture)
         else:
-            shown = None if self.stills else done.frame.time
-            self._bev.write(done.bev_after, shown)
+            shown = None if self.stills else frame.time
+            self._bev.write(bev, shown)
             self._overlay.write(picture, shown)
 
     def _measure(

@@ -41,7 +41,7 @@ class Calibrator(nn.Module, Generic[StateT]):
         state_type: the class of the state.
         num_boundaries: L.
         still_passes: updates that a single image needs, see
-            :func:`~lanebev.app.run.calibrate_still`: 1 for a calibrator that starts by a search.
+            :func:`~lanebev.estimation.still.calibrate_still`: 1 for a calibrator that starts by a search.
     """
 
     state_type: type[StateT]

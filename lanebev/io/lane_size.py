@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,18 +13,6 @@ _OUTSIDE = 0.1  # share of points below or far beside the images, of which more 
 _BESIDE = 0.5  # image widths beside an image that lines are drawn on to
 _REACHED = 0.7  # of both sides, one of which a drive's lanes reach: they leave images at the bottom
 _REACHED_DOWN = 0.55  # of the height, likewise; what is higher is the horizon
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """Return (height, width) of a text such as ``1280x720``, width first.
-
-    Raises:
-        ValueError: another text, or sides that are no image's.
-    """
-    match = re.fullmatch(r"\s*(\d{1,6})\s*[x×X]\s*(\d{1,6})\s*", text, re.ASCII)
-    if match is None or 0 in (size := (int(match[2]), int(match[1]))):
-        raise ValueError(f"lanes size: expected WIDTHxHEIGHT in px, such as 1280x720, got {text!r}")
-    return size
 
 
 def resized_lanes(

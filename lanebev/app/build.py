@@ -1,0 +1,92 @@
+"""The parts of a run, made of its settings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from lanebev.app.config import RunConfig
+from lanebev.app.observers import LaneFileObserver, NetworkObserver, Observer
+from lanebev.app.tracker import Tracker
+from lanebev.camera.model import Camera
+from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.state import JointState
+from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
+from lanebev.estimation.two_stage.state import TwoStageState
+from lanebev.io.lane_size import resized_lanes
+from lanebev.io.lanes import lane_files, read_lanes
+from lanebev.io.video import FrameSource, image_size
+from lanebev.pipeline import LaneBEV
+
+RunTracker = Tracker[JointState] | Tracker[TwoStageState]
+
+_LOOKED_AT = 20  # images of a folder, for one of the camera's size
+
+
+def make_calibrator(name: str) -> JointCalibrator | TwoStageCalibrator:
+    """Make the calibrator of this name, one of CALIBRATORS, with default settings."""
+    return TwoStageCalibrator() if name == "two-stage" else JointCalibrator()
+
+
+def make_tracker(name: str, camera: Camera, lane_width: float) -> RunTracker:
+    """Make the tracker by the calibrator of this name."""
+    if name == "two-stage":
+        return Tracker(TwoStageCalibrator(), camera, lane_width)
+    return Tracker(JointCalibrator(), camera, lane_width)
+
+
+def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Observer:
+    """Make what finds boundaries: by a lane file if one is given, else by the network.
+
+    Raises:
+        ValueError: lanes that do not fit the source, weights that do not fit the network, or a device that
+            is not there.
+    """
+    if config.lanes is not None:
+        entries = read_lanes(config.lanes, camera.intrinsics.double().numpy())
+        if config.lanes_size is not None:
+            entries = resized_lanes(entries, config.lanes_size, camera.image_size)
+        return LaneFileObserver(entries, source, camera)
+    model = LaneBEV.from_pretrained(config.weights)
+    try:
+        model = model.to(torch.device(config.device))
+    except (RuntimeError, AssertionError) as error:  # what torch raises of devices that it cannot use
+        reason = str(error).splitlines()[0]
+        raise ValueError(
+            f"device: expected one that torch can use here, got {config.device}: {reason}"
+        ) from error
+    return NetworkObserver(model, camera)
+
+
+def input_files(config: RunConfig, source: FrameSource) -> list[str | Path]:
+    """Return the files that a run reads and does not mean to replace."""
+    lanes = [] if config.lanes is None else lane_files(config.lanes)
+    weights = [] if config.weights is None else [config.weights]
+    return [*(source.paths or [source.source]), config.camera, *lanes, *weights]
+
+
+def match_image_size(camera: Camera, source: FrameSource) -> FrameSource:
+    """Return the source with the camera's image size: its first frame's or, if that is a stray, another's.
+
+    Raises:
+        ValueError: the camera file is for images of another size.
+    """
+    if camera.image_size == source.image_size:
+        return source
+    if any(image_size(path) == camera.image_size for path in source.paths[1:_LOOKED_AT]):
+        return replace(source, image_size=camera.image_size)
+    (height, width), (rows, columns) = camera.image_size, source.image_size
+    raise ValueError(
+        f"camera: expected one for the source's {columns} x {rows} px, got one for {width} x {height}; "
+        "give the calibration of these images or resize them"
+    )
+
+
+def lens_remark(camera: Camera) -> str:
+    """Say at how many of its pixels the camera's lens images nothing; empty if there are none."""
+    share = camera.share_without_rays()
+    if share == 0:
+        return ""
+    return f"camera: {share:.2%} of the pixels cannot be undistorted by the lens; lanes there are left out"

@@ -1,0 +1,169 @@
+"""What to run: settings with their defaults, from the command line or a YAML file. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from fractions import Fraction
+from pathlib import Path
+from typing import TypeVar
+
+import yaml
+
+from lanebev.numbers import parse_size, read_text
+
+T = TypeVar("T")
+
+CALIBRATORS = ("joint", "two-stage")
+
+
+def parse_path(text: str) -> str:
+    """Return a path as it is.
+
+    Raises:
+        ValueError: an empty one.
+    """
+    if not text:
+        raise ValueError("expected a path, got an empty string")
+    return text
+
+
+def option(
+    default: T,
+    words: str,
+    metavar: str = "",
+    parse: Callable[[str], object] = parse_path,
+    choices: tuple[str, ...] = (),
+) -> T:
+    """Return a field of the settings, with what the command line says of it and how it is read.
+
+    Args:
+        default: its value where it is not given.
+        words: for ``--help``; {} in them is the default.
+        metavar: for ``--help``.
+        parse: makes the value of a text; a truth value is a flag instead.
+        choices: all that it can be, if these are few.
+    """
+    metadata = {
+        "help": words.replace("{}", str(default)),
+        "metavar": metavar,
+        "parse": parse,
+        "choices": choices,
+    }
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What to run.
+
+    Attributes:
+        source: video, folder, glob or image.
+        camera: camera file.
+        out: output folder.
+        lane_width: m.
+        lanes: lane file or folder of another detector, None for the network.
+        stills: every image on its own.
+        resume: output folder of an earlier run, with the same calibrator, whose state to begin with.
+        calibrator: one of CALIBRATORS.
+        fps: of a folder, a glob or a raw stream; None is what names or the stream say, else 30. A video knows
+            its own.
+        lanes_size: (height, width) px of the images that ``lanes`` was drawn on; None is the source's own.
+        rectified: the images were rectified: the camera is the camera file's projection matrix P.
+        weights: of the network, None for the shipped ones.
+        device: that the network runs on, such as "cpu" or "cuda".
+    """
+
+    source: str = option(
+        "", "a video, a folder of images, a quoted glob ('DIR/**/*.jpg'), or one image", "SOURCE"
+    )
+    camera: str = option(
+        "", "of OpenCV, ROS, Kalibr, EuRoC, KITTI, nuScenes; or YAML of fx fy cx cy width height", "FILE"
+    )
+    out: str = option("lanebev-out", "output folder ({})", "DIR")
+    lane_width: float = option(3.7, "metres ({})", "M", float)
+    lanes: str | None = option(
+        None,
+        "lanes of another detector: TuSimple JSON lines, CULane .lines.txt, OpenLane JSON, or a folder of "
+        "them",
+        "FILE",
+    )
+    stills: bool = option(False, "every image on its own, not frames of a drive")
+    resume: str | None = option(None, "begin with the state that a run left in this folder", "DIR")
+    calibrator: str = option("joint", "two-stage is the paper's ({})", choices=CALIBRATORS)
+    fps: float | None = option(
+        None,
+        "frame rate of a folder or glob (what names of seconds say, else 30) or of a raw stream; a video "
+        "knows its own",
+        "HZ",
+        float,
+    )
+    lanes_size: tuple[int, int] | None = option(
+        None, "size of the images that --lanes was drawn on, if not the source's", "WxH", parse_size
+    )
+    rectified: bool = option(False, "the images were rectified: take the projection matrix P")
+    weights: str | None = option(None, "weights of the network instead of the shipped ones", "FILE")
+    device: str = option("cpu", "that the network runs on: cpu, cuda, cuda:1, mps ({})", "NAME")
+
+    @property
+    def frame_rate(self) -> Fraction | None:
+        """``fps`` as a fraction."""
+        return None if self.fps is None else Fraction(self.fps).limit_denominator(1000)
+
+    def __post_init__(self) -> None:
+        for name in ("source", "camera"):
+            if not getattr(self, name):
+                raise ValueError(
+                    f"{name}: expected {'a path' if name == 'source' else '--camera FILE'}, got none"
+                )
+        if not (math.isfinite(self.lane_width) and 1.0 < self.lane_width < 10.0):
+            raise ValueError(f"lane width: expected 1 to 10 m, got {self.lane_width:g}")
+        if self.fps is not None and not (math.isfinite(self.fps) and 0.01 <= self.fps <= 10_000):
+            raise ValueError(f"fps: expected 0.01 to 10000 frames per second, got {self.fps:g}")
+        if self.calibrator not in CALIBRATORS:
+            raise ValueError(f"calibrator: expected {' or '.join(CALIBRATORS)}, got {self.calibrator!r}")
+        if self.stills and self.resume:
+            raise ValueError("resume: expected a drive, got --stills; images on their own have no state")
+        if self.lanes and self.weights:
+            raise ValueError(
+                "weights: expected the network's lanes, got --lanes as well; leave one of them out"
+            )
+
+
+def read_settings(path: str | Path) -> dict[str, object]:
+    """Read the settings of a YAML file, names and values as on the command line.
+
+    Raises:
+        ValueError: the file is missing or no YAML mapping, or has a name or value that is no setting's.
+    """
+    try:
+        given = yaml.safe_load(read_text(Path(path)))
+    except (ValueError, yaml.YAMLError) as error:
+        reason = "not YAML" if isinstance(error, yaml.YAMLError) else error
+        raise ValueError(f"config {path}: expected a YAML file of settings, got: {reason}") from error
+    if not isinstance(given, dict):
+        raise ValueError(f"config {path}: expected a YAML file of settings, got {type(given).__name__}")
+    known = {setting.name: setting for setting in fields(RunConfig)}
+    values: dict[str, object] = {}
+    for key, value in given.items():
+        name = str(key).replace("-", "_")
+        if name not in known:
+            raise ValueError(f"config {path}: expected one of {', '.join(known)}, got {key!r}")
+        try:
+            values[name] = _parsed(value, known[name].default, known[name].metadata["parse"])
+        except ValueError as error:
+            raise ValueError(f"config {path}: {key}: {error}") from error
+    return values
+
+
+def _parsed(value: object, default: object, parse: Callable[[str], object]) -> object:
+    """A value of YAML as the command line would have it."""
+    if isinstance(default, bool) or isinstance(value, bool):
+        if not isinstance(value, bool) or not isinstance(default, bool):
+            expected = "true or false" if isinstance(default, bool) else "a text or number"
+            raise ValueError(f"expected {expected}, got {value!r}")
+        return value
+    if not isinstance(value, (str, int, float)):
+        raise ValueError(f"expected a text or number, got {value!r}")
+    return parse(str(value))

@@ -1,0 +1,61 @@
+"""What a run says of itself: for the report, and at its end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from lanebev import __version__
+from lanebev.app.config import RunConfig
+from lanebev.camera.model import Camera
+from lanebev.estimation.mount import MountCalibration, MountReason, MountStatus, describe_mount
+from lanebev.io.video import FrameSource
+from lanebev.report.page import Report
+
+_SHOWN = {"pitch_deg": "deg", "yaw_deg": "deg", "roll_deg": "deg", "height_m": "m"}
+_PROBLEMS = 5  # that are printed
+
+
+def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[str, str]:
+    """Say what ran, for the report."""
+    height, width = camera.image_size
+    fx, fy = float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1])
+    kind = "images, each on its own" if config.stills else "frames"
+    rate = "" if config.stills or source.is_single else f" at {float(source.fps):g} fps"
+    network = "the network" if config.weights is None else f"the network, {config.weights}"
+    return {
+        "source": f"{source.source} ({width} x {height})",
+        kind: f"{source.count}{rate}",
+        "camera": f"{config.camera}: {camera.model}, f = {fx:.1f} / {fy:.1f} px",
+        "lanes from": config.lanes or network,
+        "lane width": f"{config.lane_width:.4g} m",
+        "calibrator": config.calibrator,
+        "lanebev": __version__,
+    }
+
+
+def mount_facts(mounted: MountCalibration) -> dict[str, str]:
+    """Say how far the mount is known, for the report."""
+    status = MountStatus(int(mounted.status[0])).name
+    reasons = MountReason(int(mounted.reasons[0]))
+    why = f" ({reasons.name})" if reasons else ""
+    words = "; ".join(describe_mount(mounted))
+    return {"mount": f"{status}, {float(mounted.progress[0]):.0f} %{why}", "mount, axis by axis": words}
+
+
+def summary(report: Report, config: RunConfig) -> str:
+    """Return what to print when a run is done."""
+    tracking = [row for row in report.rows if row.status == "TRACKING"]
+    lines = [f"{len(report.rows)} frames, {len(tracking)} TRACKING"]
+    if tracking:
+        middle = {name: float(np.median([getattr(row, name) for row in tracking])) for name in _SHOWN}
+        values = "  ".join(f"{name.rsplit('_', 1)[0]} {middle[name]:+.3f} {_SHOWN[name]}" for name in _SHOWN)
+        lines.append(f"median  {values}")
+    shown = ("lane width σ", "mount")
+    lines += [f"{label}: {text}" for label, text in report.facts.items() if label.startswith(shown)]
+    lines += [f"problem: {problem}" for problem in report.problems[:_PROBLEMS]]
+    if len(report.problems) > _PROBLEMS:
+        lines.append(f"and {len(report.problems) - _PROBLEMS} more, see the report")
+    written = sorted(path.name for path in Path(config.out).iterdir())
+    return "\n".join([*lines, f"{config.out}: {', '.join(written)}"])

@@ -1,0 +1,77 @@
+"""A calibrator and a mount over the frames of a run, with the states that they hand on."""
+
+from __future__ import annotations
+
+from typing import Generic, NamedTuple
+
+import torch
+
+from lanebev.camera.model import Camera
+from lanebev.estimation.calibrator import Calibrator, StateT
+from lanebev.estimation.joint.state import Reason
+from lanebev.estimation.mount import MountCalibration, MountEstimator, MountState
+from lanebev.estimation.still import calibrate_still_with_state
+from lanebev.observation.boundary_vertices import BoundaryVertices
+from lanebev.observation.segments import LaneSegments, camera_segments
+from lanebev.types import Calibration
+
+
+class Estimate(NamedTuple):
+    """What the vertices of a frame lead to; tensors are of batch size 1.
+
+    Attributes:
+        segments: what the calibrator was given.
+        calibration: of this frame.
+        reasons: why the frame is not (fully) tracked.
+    """
+
+    segments: LaneSegments
+    calibration: Calibration
+    reasons: Reason
+
+
+class Tracker(Generic[StateT]):
+    """Estimate pose and mount frame by frame.
+
+    Args:
+        calibrator: of the pose.
+        camera: the lens.
+        lane_width: m.
+    """
+
+    def __init__(self, calibrator: Calibrator[StateT], camera: Camera, lane_width: float) -> None:
+        self.calibrator, self.camera, self.lane_width = calibrator, camera, lane_width
+        self.mount_estimator = MountEstimator()
+        self.state: StateT = calibrator.initial_state(1, dtype=torch.float64)
+        self.mount_state: MountState = self.mount_estimator.initial_state(1, dtype=torch.float64)
+        self.mount: MountCalibration | None = None  # after a first frame
+
+    def states(self) -> dict[str, StateT | MountState]:
+        """Return what is remembered, by name."""
+        return {"calibrator": self.state, "mount": self.mount_state}
+
+    def drive_frame(self, vertices: BoundaryVertices, dt: float, pose_sigma_scale: float) -> Estimate:
+        """Estimate on the next frame of the drive.
+
+        Args:
+            vertices: of batch size 1, in pixels of the image as taken.
+            dt: s since the frame before.
+            pose_sigma_scale: factor on the standard deviations of the pose.
+        """
+        segments = camera_segments(vertices, self.camera)
+        intrinsics = self.camera.intrinsics[None]
+        calibration, self.state = self.calibrator(segments, intrinsics, self.state, dt, self.lane_width)
+        calibration = calibration.with_std_scaled(pose_sigma_scale)
+        bend = self.calibrator.curvature(self.state)
+        self.mount, self.mount_state = self.mount_estimator(calibration, self.mount_state, dt, curvature=bend)
+        return Estimate(segments, calibration, Reason(int(self.calibrator.reasons(self.state)[0])))
+
+    def still(self, vertices: BoundaryVertices, pose_sigma_scale: float) -> Estimate:
+        """Estimate on an image of its own; nothing is remembered of it."""
+        segments = camera_segments(vertices, self.camera)
+        intrinsics = self.camera.intrinsics[None]
+        calibration, state = calibrate_still_with_state(
+            self.calibrator, segments, intrinsics, self.lane_width
+        )
+        calibration = calibration.with_std_scaled(pose_sigma_scale)
+        return Estimate(segments, calibration, Reason(int(self.calibrator.reasons(state)[0])))

@@ -1,0 +1,105 @@
+"""Settings of a run: from options, from a YAML file, and both; what the command line says of them."""
+
+import subprocess
+import sys
+from dataclasses import fields
+
+import pytest
+
+from lanebev.app.config import RunConfig, read_settings
+from lanebev.cli import main, parser
+
+
+def _file(folder, text):
+    (folder / "run.yaml").write_text(text)
+    return str(folder / "run.yaml")
+
+
+def test_settings_of_a_file_are_those_of_the_command_line(tmp_path):
+    text = "source: a.mp4\ncamera: c.yaml\nlane-width: 3.5\nstills: true\nlanes_size: 640x360\nfps: 12\n"
+    config = RunConfig(**read_settings(_file(tmp_path, text)))
+    assert config == RunConfig(
+        "a.mp4", "c.yaml", lane_width=3.5, stills=True, lanes_size=(360, 640), fps=12.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("lane_widht: 3", "expected one of source, camera, .*, got 'lane_widht'"),
+        ("lane_width: wide", "lane_width: could not convert"),
+        ("stills: 1", "stills: expected true or false, got 1"),
+        ("lane_width: true", "lane_width: expected a text or number, got True"),
+        ("source: [1]", r"source: expected a text or number, got \[1\]"),
+        ("lanes_size: 3", "lanes_size: .*expected WIDTHxHEIGHT"),
+        ("- 1", "expected a YAML file of settings, got list"),
+        ("{", "expected a YAML file of settings, got: not YAML"),
+    ],
+)
+def test_a_bad_file_is_one_line_that_names_it(tmp_path, text, message):
+    with pytest.raises(ValueError, match=rf"config .*run.yaml: {message}"):
+        read_settings(_file(tmp_path, text))
+    with pytest.raises(ValueError, match=r"config .*none.yaml: expected a YAML file"):
+        read_settings(tmp_path / "none.yaml")
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"lane_width": 37.0}, "lane width: expected 1 to 10 m, got 37"),
+        ({"fps": 0.0}, "fps: expected"),
+        ({"calibrator": "x"}, "calibrator: expected joint or two-stage, got 'x'"),
+        ({"camera": ""}, "camera: expected --camera FILE, got none"),
+        ({"source": ""}, "source: expected a path, got none"),
+        ({"lanes": "l.json", "weights": "w"}, "weights: expected the network's lanes, got --lanes as well"),
+    ],
+)
+def test_settings_check_themselves(values, message):
+    with pytest.raises(ValueError, match=message):
+        RunConfig(**{"source": "a", "camera": "b", **values})
+
+
+def test_options_override_a_file(tmp_path, capsys):
+    path = _file(tmp_path, "source: here.mp4\ncamera: c.yaml\nlane-width: 37\n")
+    assert main(["run", "--config", path]) == 2
+    assert "lane width: expected 1 to 10 m, got 37" in capsys.readouterr().err
+    assert main(["run", str(tmp_path / "none.mp4"), "--config", path, "--lane-width", "3.5"]) == 2
+    assert "none.mp4: expected a video" in capsys.readouterr().err
+
+
+def test_every_setting_is_an_option_that_says_its_default():
+    known = parser()
+    given = vars(known.parse_args(["run", "a"]))
+    assert set(given) == {"source", "config", "command", "verbose"}  # defaults are those of RunConfig alone
+    (commands,) = (action for action in known._actions if action.dest == "command")
+    words = commands.choices["run"].format_help()
+    for setting in fields(RunConfig):
+        assert setting.name == "source" or f"--{setting.name.replace('_', '-')}" in words
+        if setting.metadata["help"].endswith(")") and setting.default:
+            assert str(setting.default) in setting.metadata["help"]
+
+
+def test_device_that_is_not_there_is_one_line(tmp_path, capsys):
+    from PIL import Image
+
+    Image.new("RGB", (64, 32)).save(tmp_path / "a.png")
+    camera = tmp_path / "camera.yaml"
+    camera.write_text("{fx: 60, fy: 60, cx: 31.5, cy: 15.5, width: 64, height: 32}")
+    out = tmp_path / "out"
+    for device in ("magic", "cuda:99"):
+        arguments = [str(tmp_path / "a.png"), "--camera", str(camera), "--out", str(out), "--device", device]
+        assert main(["run", *arguments]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert f"device: expected one that torch can use here, got {device}" in error
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["--version"]])
+def test_help_imports_nothing_heavy(arguments):
+    script = f"import sys, runpy; sys.argv = ['lanebev', *{arguments!r}]\n"
+    script += "try: runpy.run_module('lanebev', run_name='__main__')\n"
+    script += "except SystemExit as done: assert not done.code\n"
+    script += "assert not {'torch', 'cv2', 'matplotlib', 'av', 'numpy'} & set(sys.modules)\n"
+    done = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
