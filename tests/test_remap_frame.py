@@ -50,6 +50,31 @@ def test_equals_the_module(distortion, model):
     assert off.max() < 1.0  # of 255: half a step of rounding, and 1/64 px on slopes of 10 a pixel
 
 
+@pytest.mark.parametrize("values", [(-0.4, 0.3, 0.2, 1.4), (0.2, -1.2, 0.1, 0.02), (0.1, 0.0, 0.0, 0.0)])
+def test_what_is_behind_or_beyond_a_fold_is_not_seen(values):
+    """Nor anything by a camera that is not above the road."""
+    grid = BEVGrid(x=(-6.0, 6.0), z=(-8.0, 20.0), resolution=0.1)
+    extrinsics = Extrinsics.unstack(torch.tensor([values], dtype=torch.float64))
+    for distortion in ((), (-0.3, 0.05, 0.001, -0.001), (-0.3, 0.05, 0.001, -0.001, 0.01)):
+        cam = Camera.from_parameters(150.0, 155.0, 160.0, 90.0, 320, 180, distortion)
+        bev, valid = remap_frame(frame(), cam, extrinsics, grid)
+        image = torch.from_numpy(frame()).permute(2, 0, 1)[None].double()
+        _, expected = BEVWarp(grid)(image, cam.intrinsics[None], extrinsics, cam.distortion[None])
+        assert (valid != expected[0, 0].numpy()).mean() < 1e-4  # on the edge itself
+        assert (bev[~valid] == 0).all()
+
+
+def test_a_skewed_camera_is_seen_as_by_the_module():
+    """OpenCV's own maps know no skew."""
+    cam = camera()
+    skewed = torch.tensor([[0.0, 20.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]) + cam.intrinsics
+    cam = Camera(skewed, cam.distortion, "pinhole", cam.image_size)
+    bev, _ = remap_frame(frame(), cam, POSE, GRID)
+    image = torch.from_numpy(frame()).permute(2, 0, 1)[None].double()
+    expected, _ = BEVWarp(GRID)(image, skewed[None], POSE)
+    assert np.abs(bev - expected[0].permute(1, 2, 0).numpy()).max() < 1.0
+
+
 def test_frames_of_another_kind_are_refused():
     with pytest.raises(ValueError, match=r"frame: expected \(H, W, 3\) of uint8, got .* of float64"):
         remap_frame(frame().astype(float), camera(), POSE, GRID)

@@ -120,7 +120,7 @@ def pitch_yaw_from_vanishing_dir(vanishing_dir: Tensor) -> tuple[Tensor, Tensor]
     if vanishing_dir.shape[-1] != 3:
         raise ValueError(f"vanishing_dir: expected (..., 3), got {tuple(vanishing_dir.shape)}")
     x, y, z = vanishing_dir.unbind(-1)
-    return torch.atan2(-y, z), torch.atan2(x, torch.hypot(y, z))
+    return torch.atan2(-y, z), torch.atan2(x, (y * y + z * z).sqrt())
 
 
 @full_precision

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lanebev.view.lens import Lens, image_planes
 
-_LEAST_DEPTH = 1e-3  # in front of the camera; m for cells of the road
+LEAST_DEPTH = 1e-3  # in front of the camera; m for cells of the road
 _PUSH = 1e4  # factor that moves what lies outside away from the map, even a millimetre above the road
 _BLOCK = 1 << 17  # cells: a dozen float32 planes of so many fit a cache of a few MB
 
@@ -95,7 +95,7 @@ def image_coordinates(cells: Tensor, lens: Lens | None) -> tuple[Tensor, Tensor]
         lens does not fold over, else positive.
     """
     depth = cells[:, 2]
-    ahead = depth.clamp(min=_LEAST_DEPTH)
+    ahead = depth.clamp(min=LEAST_DEPTH)
     points = cells[:, :2] / ahead.unsqueeze(1)
     hidden = (ahead - depth).detach()
     if lens is None:

@@ -1,0 +1,347 @@
+"""What views, extractor and calibrators cost, beside what others take for the same, and how it grows.
+
+    python -m tools.bench_speed --out out/bench_speed
+    python -m tools.bench_speed --parts warp frame --threads 1 --cpu-time
+
+Prints and writes (bench_speed.json, bench_speed.md, and a plot of every growing cost) medians and
+interquartile ranges in ms; ratios come first, each to the first line of its table. Alternatives take turns
+within one run, so that all of them see the same machine. ``--cpu-time`` takes the processor's time instead of
+the clock's: of one thread, and for a machine that others use too.
+
+- ``warp``: 1920 × 1020 px, three channels, or 64 channels at stride 8, to 1024 × 512 cells, against a bare
+  ``grid_sample`` with its grid at hand and kornia's ``warp_perspective``; ``gradients``: and back.
+- ``frame``: one frame of bytes through the lens, against ``cv2.remap`` with its maps at hand, and with its
+  maps computed, as they must be when the pose is another in every frame.
+- ``extractor``: seven maps of 160 × 288.
+- ``rows``, ``segments``, ``cells``: calibrators by rows of a batch and by segments, the warp by cells.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import kornia
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jsonargparse.typing import PositiveFloat, PositiveInt
+from kornia.geometry.transform import warp_perspective
+from torch import Tensor
+from torch.utils.benchmark import Measurement, Timer
+
+from lanebev import (
+    BEVGrid,
+    BEVWarp,
+    Camera,
+    Extrinsics,
+    JointCalibrator,
+    LaneSegments,
+    LineExtractor,
+    TwoStageCalibrator,
+    bev_from_image,
+)
+from lanebev.testing.segments import INTRINSICS, lanes
+from lanebev.view.frame import remap_frame
+from train.commands import one_line_errors
+
+Calls = Mapping[str, Callable[[], object]]
+Table = dict[str, dict[str, float]]
+
+SIZE = (1020, 1920)  # px, (H, W)
+GRID = BEVGrid(x=(-10.24, 10.24), z=(3.0, 43.96), resolution=0.04)  # 1024 × 512
+BROWN = [-0.2, 0.03, 0.001, -0.001, 0.005]
+RATIONAL = [-0.2, 0.03, 0.001, -0.001, 0.005, 0.1, 0.05, 0.01]
+FISHEYE = [-0.05, 0.01, -0.003, 0.001]
+POSE = [0.03, 0.02, 0.01, 1.5]
+
+
+def camera(distortion: list[float] | None = None, model: str = "pinhole") -> Camera:
+    return Camera.from_parameters(1050, 1050, 959.5, 509.5, SIZE[1], SIZE[0], distortion or [], model)
+
+
+def poses(batch: int) -> Extrinsics:
+    return Extrinsics.unstack(torch.tensor([POSE]).repeat(batch, 1))
+
+
+def measure(calls: Calls, seconds: float, clock: Callable[[], float]) -> Table:
+    """Time alternatives in turns for ``seconds`` each: median and quartiles, ms, and ratio to the first."""
+    timers = {
+        name: Timer("call()", globals={"call": call}, timer=clock, num_threads=torch.get_num_threads())
+        for name, call in calls.items()
+    }
+    first = {name: timer.timeit(1).median for name, timer in timers.items()}  # to warm up as well
+    number = {name: max(1, int(0.02 / duration)) for name, duration in first.items()}
+    turns = max(3, int(seconds / max(0.02, *first.values())))
+    runs: dict[str, list[Measurement]] = {name: [] for name in calls}
+    for _ in range(turns):
+        for name, timer in timers.items():
+            runs[name].append(timer.timeit(number[name]))
+    table: Table = {}
+    for name, parts in runs.items():
+        times = 1e3 * np.array([part.median for part in parts])
+        low, median, high = np.quantile(times, [0.25, 0.5, 0.75])
+        table[name] = {"ms": float(median), "low": float(low), "high": float(high)}
+    base = next(iter(table.values()))["ms"]
+    return {name: {"ratio": entry["ms"] / base, **entry} for name, entry in table.items()}
+
+
+def sampling_grid(batch: int) -> Tensor:
+    """What the warp samples at, as ``grid_sample`` takes it."""
+    intrinsics = camera().intrinsics.float().expand(batch, 3, 3)
+    points, _ = BEVWarp(GRID).image_points(intrinsics, poses(batch))
+    size = torch.tensor([SIZE[1], SIZE[0]])
+    return ((2 * points + 1) / size - 1).unflatten(1, GRID.shape)
+
+
+def warps(batch: int, channels: int, stride: int) -> Calls:
+    """The warp and its peers on one image or feature map."""
+    image = torch.rand(batch, channels, SIZE[0] // stride, SIZE[1] // stride)
+    grid, warp, extrinsics = sampling_grid(batch), BEVWarp(GRID), poses(batch)
+    ideal = camera().intrinsics.float().expand(batch, 3, 3)
+    coarse = torch.diag(torch.tensor([1 / stride, 1 / stride, 1.0]))
+    homography = bev_from_image(extrinsics, coarse @ ideal, GRID)
+
+    def with_lens(distortion: list[float], model: str = "pinhole") -> Callable[[], object]:
+        lens = torch.tensor([distortion]).expand(batch, -1)
+        return lambda: warp(image, ideal, extrinsics, lens, model, SIZE)
+
+    return {
+        "grid_sample": lambda: F.grid_sample(image, grid, align_corners=False),
+        "kornia warp_perspective": lambda: warp_perspective(image, homography, GRID.shape),
+        "BEVWarp": lambda: warp(image, ideal, extrinsics, image_size=SIZE),
+        "BEVWarp, 5 coefficients": with_lens(BROWN),
+        "BEVWarp, 8 coefficients": with_lens(RATIONAL),
+        "BEVWarp, fisheye": with_lens(FISHEYE, "fisheye"),
+    }
+
+
+def backwards(batch: int) -> Calls:
+    """The same with gradients of the image and of what it is sampled at."""
+    image = torch.rand(batch, 3, *SIZE, requires_grad=True)
+    grid = sampling_grid(batch).requires_grad_()
+    values = torch.tensor([POSE]).repeat(batch, 1).requires_grad_()
+    ideal, warp = camera().intrinsics.float().expand(batch, 3, 3), BEVWarp(GRID)
+    weight = torch.rand(batch, 3, *GRID.shape)
+
+    def both(forward: Callable[[], Tensor]) -> Callable[[], object]:
+        def run() -> None:
+            image.grad = grid.grad = values.grad = None
+            forward().backward(weight)
+
+        return run
+
+    def warped(lens: Tensor | None) -> Tensor:
+        bev: Tensor = warp(image, ideal, Extrinsics.unstack(values), lens)[0]
+        return bev
+
+    def by_kornia() -> Tensor:
+        return warp_perspective(image, bev_from_image(Extrinsics.unstack(values), ideal, GRID), GRID.shape)
+
+    lens = torch.tensor([BROWN]).expand(batch, -1)
+    return {
+        "grid_sample": both(lambda: F.grid_sample(image, grid, align_corners=False)),
+        "kornia warp_perspective": both(by_kornia),
+        "BEVWarp": both(lambda: warped(None)),
+        "BEVWarp, 5 coefficients": both(lambda: warped(lens)),
+    }
+
+
+def frames(model: str) -> Calls:
+    """One frame of bytes through a lens."""
+    taken = camera(FISHEYE if model == "fisheye" else BROWN, model)
+    frame = np.random.default_rng(0).integers(0, 255, (*SIZE, 3), np.uint8)
+    extrinsics = Extrinsics(*(value.double() for value in poses(1)))
+    matrix, distortion = taken.intrinsics.numpy(), taken.distortion.numpy()
+    turn = (bev_from_image(extrinsics, taken.intrinsics[None], GRID)[0] @ taken.intrinsics).numpy()
+    rectify: Any = cv2.fisheye.initUndistortRectifyMap if model == "fisheye" else cv2.initUndistortRectifyMap
+    shape = (GRID.shape[1], GRID.shape[0])
+
+    def maps() -> tuple[Any, Any]:
+        first, second = rectify(matrix, distortion, turn, np.eye(3), shape, cv2.CV_16SC2)
+        return first, second
+
+    ready = maps()
+    return {
+        "cv2.remap": lambda: cv2.remap(frame, *ready, cv2.INTER_LINEAR),
+        "cv2 maps and remap": lambda: cv2.remap(frame, *maps(), cv2.INTER_LINEAR),
+        "remap_frame": lambda: remap_frame(frame, taken, extrinsics, GRID),
+    }
+
+
+def extractors() -> Calls:
+    """Seven maps with six stripes, as the shipped network makes them of 576 × 320 px."""
+    rows, columns = torch.arange(160.0).unsqueeze(-1), torch.arange(288.0)
+    slopes = torch.tensor([-1.6, -1.0, -0.4, 0.3, 0.9, 1.5])
+    middle = 144 + slopes[:, None, None] * (rows - 30)
+    stripes = 8.0 * ((columns - middle).abs() < 1.2) * (rows > 40)
+    logits = torch.cat([torch.full((1, 160, 288), 4.0), stripes])[None]
+    logits = logits + 0.3 * torch.randn(logits.shape, generator=torch.Generator().manual_seed(0))
+    extractor = LineExtractor()
+    return {
+        "softmax": lambda: logits.softmax(1),
+        "LineExtractor": lambda: extractor(logits, SIZE, (320, 576)),
+    }
+
+
+def calibrators(rows: int, per_boundary: int) -> Calls:
+    """One frame of each calibrator that has started."""
+    seen = LaneSegments(
+        *(part.expand(rows, *part.shape[1:]) for part in lanes(per_boundary=per_boundary, noise=0.5))
+    )
+    intrinsics = INTRINSICS.expand(rows, 3, 3)
+    calls: dict[str, Callable[[], object]] = {}
+    for name, calibrator in (("joint", JointCalibrator()), ("two-stage", TwoStageCalibrator())):
+        state: Any = calibrator.initial_state(rows, dtype=torch.float64)
+        for _ in range(3):
+            _, state = calibrator(seen, intrinsics, state, 1 / 30)
+        calls[name] = lambda calibrator=calibrator, state=state: calibrator(seen, intrinsics, state, 1 / 30)
+    return calls
+
+
+def cells(resolution: float) -> Calls:
+    """The warp on grids of one rectangle."""
+    grid = BEVGrid(GRID.x, GRID.z, resolution)
+    image, ideal, warp = torch.rand(1, 3, *SIZE), camera().intrinsics[None].float(), BEVWarp(grid)
+    lens = torch.tensor([BROWN])
+    return {
+        "BEVWarp": lambda: warp(image, ideal, poses(1)),
+        "BEVWarp, 5 coefficients": lambda: warp(image, ideal, poses(1), lens),
+    }
+
+
+Growth = tuple[str, list[int], Callable[[int], Calls]]
+
+TABLES: dict[str, list[tuple[str, Callable[[], Calls]]]] = {
+    "warp": [
+        ("one image", lambda: warps(1, 3, 1)),
+        ("8 images", lambda: warps(8, 3, 1)),
+        ("64 channels at stride 8", lambda: warps(1, 64, 8)),
+    ],
+    "gradients": [
+        ("one image and back", lambda: backwards(1)),
+        ("8 images and back", lambda: backwards(8)),
+    ],
+    "frame": [
+        ("a frame of bytes", lambda: frames("pinhole")),
+        ("a fisheye's frame of bytes", lambda: frames("fisheye")),
+    ],
+    "extractor": [("maps to segments", extractors)],
+}
+GROWTHS: dict[str, Growth] = {
+    "rows": ("rows of a batch", [1, 4, 16, 64, 256, 1024, 4096], lambda rows: calibrators(rows, 5)),
+    "segments": ("segments", [12, 36, 120, 1200, 10_200], lambda count: calibrators(1, count // 6)),
+    "cells": (
+        "cells of the view",
+        [10_000, 100_000, 1_000_000, 10_000_000],
+        lambda count: cells((20.48 * 40.96 / count) ** 0.5),
+    ),
+}
+
+
+def shown(title: str, table: Table) -> str:
+    """A markdown table, ratios first."""
+    lines = [f"**{title}**", "", "| | ratio | ms | quartiles |", "|---|---|---|---|"]
+    for name, entry in table.items():
+        quartiles = f"{entry['low']:.2f} to {entry['high']:.2f}"
+        lines.append(f"| {name} | {entry['ratio']:.2f} | {entry['ms']:.2f} | {quartiles} |")
+    return "\n".join([*lines, ""])
+
+
+def grown(title: str, results: dict[int, Table]) -> str:
+    """A markdown table of ms by size."""
+    names = list(next(iter(results.values())))
+    lines = [f"**ms by {title}**", "", f"| {title} | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
+    for size, table in results.items():
+        lines.append(f"| {size} | " + " | ".join(f"{table[name]['ms']:.2f}" for name in names) + " |")
+    return "\n".join([*lines, ""])
+
+
+def plot(title: str, results: dict[int, Table], path: Path) -> None:
+    """Cost against size, both logarithmic."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    for name in next(iter(results.values())):
+        entries = [table[name] for table in results.values()]
+        axes.plot(list(results), [entry["ms"] for entry in entries], marker="o", label=name)
+        axes.fill_between(list(results), [e["low"] for e in entries], [e["high"] for e in entries], alpha=0.2)
+    axes.set(xscale="log", yscale="log", xlabel=title, ylabel="ms")
+    axes.grid(visible=True, which="both", alpha=0.3)
+    axes.legend()
+    figure.savefig(path, dpi=120)
+
+
+def facts(threads: int) -> dict[str, object]:
+    return {
+        "threads": threads,
+        "seed": 0,
+        "image": list(SIZE),
+        "grid": list(GRID.shape),
+        "torch": torch.__version__,
+        "kornia": kornia.__version__,
+        "cv2": cv2.__version__,
+        "machine": platform.machine(),
+        "processor": platform.processor(),
+    }
+
+
+def run(
+    parts: list[str], seconds: float, largest: int, out: Path, clock: Callable[[], float]
+) -> dict[str, Any]:
+    """Measure the parts, print each table as it is done, and write all."""
+    out.mkdir(parents=True, exist_ok=True)
+    results: dict[str, Any] = {}
+    texts = []
+    for part in parts:
+        for title, calls in TABLES.get(part, []):
+            with torch.set_grad_enabled(part == "gradients"):
+                table = measure(calls(), seconds, clock)
+            results[title] = table
+            texts.append(shown(title, table))
+            print(texts[-1], flush=True)
+        if part in GROWTHS:
+            title, sizes, make = GROWTHS[part]
+            with torch.no_grad():
+                by_size = {size: measure(make(size), seconds, clock) for size in sizes if size <= largest}
+            results[title] = {str(size): table for size, table in by_size.items()}
+            texts.append(grown(title, by_size))
+            print(texts[-1], flush=True)
+            plot(title, by_size, out / f"{part}.png")
+    report = {**facts(torch.get_num_threads()), "clock": clock.__name__, "results": results}
+    (out / "bench_speed.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    (out / "bench_speed.md").write_text("\n".join(texts), encoding="utf-8")
+    return report
+
+
+@one_line_errors()
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    every = [*TABLES, *GROWTHS]
+    parser.add_argument("--parts", nargs="+", choices=every, default=every)
+    parser.add_argument("--threads", type=PositiveInt, default=2)
+    parser.add_argument("--cpu-time", action="store_true", help="processor time, with --threads 1")
+    parser.add_argument("--seconds", type=PositiveFloat, default=5.0, help="per alternative (%(default)s)")
+    parser.add_argument("--largest", type=PositiveInt, default=10_000_000, help="size that costs grow to")
+    parser.add_argument("--out", type=Path, default=Path("out/bench_speed"))
+    args = parser.parse_args()
+    if args.cpu_time and args.threads != 1:
+        raise ValueError(f"cpu-time: expected --threads 1, got {args.threads}")
+    torch.set_num_threads(args.threads)
+    cv2.setNumThreads(args.threads)
+    torch.manual_seed(0)
+    clock = time.process_time if args.cpu_time else time.perf_counter
+    run(args.parts, args.seconds, args.largest, args.out, clock)
+
+
+if __name__ == "__main__":
+    main()
