@@ -3,8 +3,9 @@
 from lanebev import weights
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.state import JointConfig, Reason
+from lanebev.estimation.joint.state import JointConfig
 from lanebev.estimation.mount import MountCalibration, MountConfig, MountEstimator, MountReason, MountStatus
+from lanebev.estimation.reasons import Reason
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.estimation.two_stage.state import TwoStageConfig
 from lanebev.geometry.road import (

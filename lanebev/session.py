@@ -16,8 +16,8 @@ from torch import Tensor
 from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.state import Reason
 from lanebev.estimation.mount import MountCalibration, MountEstimator, describe_mount
+from lanebev.estimation.reasons import Reason
 from lanebev.geometry.focal import with_focal_std
 from lanebev.io.state import load_state, save_state
 from lanebev.observation.segments import LaneSegments

@@ -54,3 +54,25 @@ def test_mount():
         assert torch.equal(found.status, expected.status)
         assert torch.equal(found.reasons, expected.reasons)
         torch.testing.assert_close(found.extrinsics.stack(), expected.extrinsics.stack())
+
+
+@pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
+@pytest.mark.parametrize(
+    "calibrator",
+    [JointCalibrator(iterations=1, start_iterations=1), TwoStageCalibrator(num_hypotheses=20)],
+    ids=["joint", "two-stage"],
+)
+def test_an_interval_that_varies_makes_no_graph_per_frame(calibrator):
+    """Every video of variable frame rate: dt as a float, another one in each frame."""
+    torch.compiler.reset()
+    graphs = []
+
+    def backend(module, _):
+        graphs.append(module)
+        return module.forward
+
+    compiled = torch.compile(calibrator, backend=backend)
+    state = calibrator.initial_state(1, dtype=torch.float64)
+    for frame in range(6):
+        _, state = compiled(lanes(seed=frame), K[None], state, 0.033 + 1e-4 * frame)
+    assert len(graphs) <= 2

@@ -34,12 +34,13 @@ from lanebev.estimation.joint.measurement import (
 from lanebev.estimation.joint.road import propagate_road_shape, straight_or_bend, turn_along
 from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS, road_basis, road_curve
 from lanebev.estimation.joint.single_frame import FramePrior
-from lanebev.estimation.joint.state import JointConfig, Reason, state_from_fit
+from lanebev.estimation.joint.state import JointConfig, state_from_fit
 from lanebev.estimation.joint.update import (
     frame_information,
     posterior_covariance,
     update,
 )
+from lanebev.estimation.reasons import Reason
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.scenarios import CAMERA, FPS, PLACES, WIDTH, moments
 from lanebev.testing.scenarios import observe as see
@@ -196,6 +197,8 @@ def test_duplicate_and_late_frames_change_nothing_and_keep_their_time(dt):
     out, skipped = calibrator(frames[3][1], cameras(2), state, dt, WIDTH)
     assert torch.equal(out.extrinsics.stack(), before.extrinsics.stack())
     assert (skipped.reasons & Reason.TIME).all()
+    assert (out.status == Status.COASTING).all()  # nothing of the frame was used
+    assert out.inliers.sum() == 0
     torch.testing.assert_close(skipped.early, torch.full((2,), -dt, dtype=DOUBLE))
     direct, _ = calibrator(frames[10][1], cameras(2), state, 1 / FPS, WIDTH)
     after, state = calibrator(frames[10][1], cameras(2), skipped, 1 / FPS - dt, WIDTH)

@@ -171,7 +171,11 @@ def test_other_hard_roads_stay_near_the_straight_one(name):
     run = bench(name, 2.5 if name == "braking" else 0.0, 3.8 if name == "braking" else 1.5)
     assert (rmse(run) < 1.4 * rmse(bench("straight", last=2.2))).all()
     assert summarise(run)["nees_per_dof"] < 1.25
-    assert (run.status == Status.TRACKING).all()
+    skipped = torch.zeros(len(run.status), dtype=torch.bool)
+    if name == "bad clock":  # frames 3 and 5 of ten come twice and late: not used, and said to be so
+        skipped = torch.isin(torch.arange(len(run.status)) % 10, torch.tensor([3, 5]))
+    assert (run.status[~skipped] == Status.TRACKING).all()
+    assert (run.status[skipped] == Status.COASTING).all()
 
 
 @pytest.mark.slow

@@ -8,8 +8,17 @@ import numpy as np
 import pytest
 import torch
 
-from lanebev import BEVGrid, Camera, Extrinsics, JointCalibrator, Session, Status, image_from_road_points
-from lanebev.estimation.joint.state import Reason
+from lanebev import (
+    BEVGrid,
+    Camera,
+    Extrinsics,
+    JointCalibrator,
+    Session,
+    Status,
+    TwoStageCalibrator,
+    image_from_road_points,
+)
+from lanebev.estimation.reasons import Reason
 from lanebev.session import REASONS, describe_reasons
 
 CAMERA = Camera.from_parameters(600, 600, 319.5, 179.5, 640, 360, distortion=(-0.2, 0.05, 0.0, 0.0, 0.0))
@@ -137,10 +146,6 @@ def test_every_reason_has_words():
     assert len(describe_reasons(Reason.TIME | Reason.ROLL_UNSEEN)) == 2
 
 
-def test_reasons_of_a_calibrator_without_any_are_zero():
-    state = JointCalibrator().initial_state(2)
-    assert JointCalibrator().reasons(state).shape == (2,)
-    from lanebev import TwoStageCalibrator
-
-    calibrator = TwoStageCalibrator()
-    assert calibrator.reasons(calibrator.initial_state(3)).tolist() == [0, 0, 0]
+@pytest.mark.parametrize("calibrator", [JointCalibrator(), TwoStageCalibrator()], ids=["joint", "two-stage"])
+def test_reasons_before_the_first_frame(calibrator):
+    assert calibrator.reasons(calibrator.initial_state(2)).tolist() == [Reason.NO_START] * 2

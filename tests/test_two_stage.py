@@ -12,6 +12,7 @@ from lanebev import (
     Status,
     TwoStageCalibrator,
 )
+from lanebev.estimation.reasons import Reason
 from lanebev.estimation.two_stage.direction import incidence
 from lanebev.estimation.two_stage.state import TwoStageConfig
 from lanebev.geometry.road import great_circle_normals, segment_rays
@@ -146,6 +147,21 @@ def test_a_jump_is_reacquired():
     assert outputs[-1].extrinsics.stack()[0].tolist() == pytest.approx(after, abs=0.01)
 
 
+def test_reasons_say_what_is_not_determined():
+    calibrator = TwoStageCalibrator()
+    _, state = drive(calibrator, [lanes(seed=0)])
+    assert state.reasons.tolist() == [Reason.RESTARTED]
+    unseen = Reason.ROLL_UNSEEN
+    for frame, reasons in (
+        (lanes(seed=1), Reason.NONE),
+        (lanes(boundaries=(2, 3), per=24, seed=2), unseen),
+        (no_lanes(), unseen | Reason.NO_SEGMENTS | Reason.DIRECTION_UNSEEN | Reason.HEIGHT_UNSEEN),
+        (lanes(boundaries=(2,), seed=3), unseen | 2 | Reason.DIRECTION_UNSEEN | Reason.HEIGHT_UNSEEN),
+    ):
+        _, state = calibrator(frame, K[None], state, 1 / 30)
+        assert Reason(int(state.reasons)) == reasons
+
+
 def test_one_lane_never_moves_roll_and_says_so():
     calibrator = TwoStageCalibrator()
     frames = [lanes(seed=s) for s in range(10)]
@@ -227,9 +243,11 @@ def test_a_frame_given_again_says_nothing_new(dt):
     calibrator = TwoStageCalibrator()
     outputs, state = drive(calibrator, [lanes(seed=s) for s in range(3)])
     out, after = calibrator(lanes(seed=2), K[None], state, dt)
-    assert all(map(torch.equal, after, state))
+    assert after.reasons.tolist() == [Reason.TIME]
+    assert all(map(torch.equal, after[:-1], state[:-1]))
     assert torch.equal(out.covariance, outputs[-1].covariance)
-    assert out.inliers.sum() > 40
+    assert out.status.tolist() == [Status.COASTING]  # nothing of it was used
+    assert out.inliers.sum() == 0
 
 
 @pytest.mark.parametrize("dt", [float("nan"), float("inf"), -float("inf")])

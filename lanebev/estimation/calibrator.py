@@ -23,6 +23,11 @@ from lanebev.types import Calibration, TensorTuple, map_tensors
 class CalibratorState(TensorTuple, Protocol):
     """A NamedTuple of tensors, (B, ...) each; the first is floating point."""
 
+    @property
+    def reasons(self) -> Tensor:
+        """(B,) int64 flags of :class:`lanebev.Reason`, of the last frame."""
+        ...
+
     def detach(self) -> Self:
         """Return the state without the graph that computed it, as truncated backpropagation needs."""
         ...
@@ -116,10 +121,5 @@ class Calibrator(nn.Module, Generic[StateT]):
         return None
 
     def reasons(self, state: StateT) -> Tensor:
-        """Return why rows are not (fully) tracked, (B,) int64 flags of :class:`lanebev.Reason`.
-
-        They are the state's ``reasons``; zeros of a calibrator that gives none.
-        """
-        parts = state._asdict()
-        none = torch.zeros_like(next(iter(parts.values()))[:, 0], dtype=torch.int64)
-        return parts.get("reasons", none)
+        """Return why rows are not (fully) tracked, (B,) int64 flags of :class:`lanebev.Reason`."""
+        return state.reasons

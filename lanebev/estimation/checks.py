@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lanebev.geometry.lens import check_intrinsics, placeholder_intrinsics, usable_cameras
 from lanebev.observation.segments import LaneSegments
-from lanebev.types import Status, TensorTuple, check_tensor
+from lanebev.types import Calibration, Status, TensorTuple, check_tensor
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
 _MIN_SIGMA = 1e-3  # px; nothing is known better
@@ -150,6 +150,19 @@ def is_running(status: Tensor) -> Tensor:
     return (status == int(Status.TRACKING)) | (status == int(Status.COASTING))
 
 
+def unused_frame(calibration: Calibration, skipped: Tensor) -> Calibration:
+    """Say of rows whose frame was skipped that nothing of it was used: COASTING, no inliers.
+
+    Args:
+        calibration: (B, ...).
+        skipped: (B,) bool.
+    """
+    return calibration._replace(
+        status=torch.where(skipped, int(Status.COASTING), calibration.status),
+        inliers=torch.where(skipped.unsqueeze(-1), 0.0, calibration.inliers),
+    )
+
+
 def as_batch(value: float | Tensor, like: Tensor, name: str = "dt") -> Tensor:
     """A number or a (B,) tensor to (B,), with the dtype and device of ``like`` (B, ...).
 
@@ -158,6 +171,8 @@ def as_batch(value: float | Tensor, like: Tensor, name: str = "dt") -> Tensor:
         ValueError: another shape.
     """
     _check_number(name, value)
+    if isinstance(value, (int, float)):  # a tensor made of a number would be a constant to torch.compile
+        return torch.full(like.shape[:1], value, dtype=like.dtype, device=like.device)
     tensor = torch.as_tensor(value, dtype=like.dtype, device=like.device)
     if tensor.ndim > 1 or (tensor.ndim == 1 and tensor.shape[0] not in (1, like.shape[0])):
         raise ValueError(f"{name}: expected a float or ({like.shape[0]},), got {tuple(tensor.shape)}")

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from lanebev.batch import flag, may_skip, select_rows
 from lanebev.estimation.calibrator import Calibrator
-from lanebev.estimation.checks import check_new_state, is_running
+from lanebev.estimation.checks import check_new_state, is_running, unused_frame
 from lanebev.estimation.joint.dynamics import motion
 from lanebev.estimation.joint.evidence import (
     accumulate_evidence,
@@ -33,13 +33,7 @@ from lanebev.estimation.joint.measurement import (
 from lanebev.estimation.joint.road import propagate_road_shape
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
 from lanebev.estimation.joint.single_frame import fit_observations
-from lanebev.estimation.joint.state import (
-    JointConfig,
-    JointState,
-    Reason,
-    state_from_fit,
-    unobserved_mask,
-)
+from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit, unobserved_mask
 from lanebev.estimation.joint.status import as_calibration, update_track_status
 from lanebev.estimation.joint.update import (
     agreement,
@@ -51,6 +45,8 @@ from lanebev.estimation.joint.update import (
     update,
 )
 from lanebev.estimation.kalman import predict
+from lanebev.estimation.reasons import Reason
+from lanebev.geometry.precision import autocast_off
 from lanebev.observation.segments import LaneSegments
 from lanebev.types import Calibration, Status
 
@@ -84,11 +80,10 @@ class JointCalibrator(Calibrator[JointState]):
         check_new_state(batch_size, dtype)
         cfg = self.config
         like = torch.zeros((), dtype=dtype, device=device)
-        mean, cov = state_from_fit(
-            cfg.prior.mean(like).repeat(batch_size, 1),
-            cfg.prior.std(like).square().diag().repeat(batch_size, 1, 1),
-            cfg,
-        )
+        params = cfg.prior.mean(like).repeat(batch_size, 1)
+        with autocast_off(like.device):
+            spread = cfg.prior.std(like).square().diag().repeat(batch_size, 1, 1)
+            mean, cov = state_from_fit(params, spread, cfg)
         none = torch.zeros(batch_size, dtype=torch.int64, device=device)
         zero = torch.zeros(batch_size, dtype=dtype, device=device)
         return JointState(
@@ -134,7 +129,8 @@ class JointCalibrator(Calibrator[JointState]):
 
         skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=early)
         after = select_rows(skip, skipped, after)
-        return as_calibration(after, agreed, positions, cfg), after
+        calibration = as_calibration(after, agreed, positions, cfg)
+        return unused_frame(calibration, skip), after
 
     def curvature(self, state: JointState) -> Tensor:
         """Return the road's curvature at the camera, (B,) 1/m, positive to the right."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import IntFlag
 from typing import NamedTuple
 
 import torch
@@ -15,24 +14,10 @@ from lanebev.estimation.joint.measurement import CURVATURE, NUM_PARAMS, NUM_STRA
 from lanebev.estimation.joint.road import straight_or_bend
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
 from lanebev.estimation.joint.single_frame import FramePrior
+from lanebev.estimation.reasons import Reason
 from lanebev.types import NUM_BOUNDARIES, map_tensors, register_pytree
 
 _OFFSET_RATE_STD = 0.5  # m/s, of a start
-
-
-class Reason(IntFlag):
-    """Why a row is not (fully) tracking; several may hold at once."""
-
-    NONE = 0
-    NO_SEGMENTS = 1  # nothing was seen in this frame
-    FEW_INLIERS = 2  # what was seen does not fit the road that is believed
-    TIME = 4  # not later than the last frame, and not used; or the time unknown, and one guessed
-    NO_START = 8  # no start found yet: pitch and yaw not determined by this frame
-    ROLL_UNSEEN = 16  # one lane or less, or the frame was not used: roll holds with growing sigma
-    HEIGHT_UNSEEN = 32  # no lane, or not used: height holds with growing sigma
-    LANE_CHANGE = 64  # the boundary indices moved by one in this frame
-    RESTARTED = 128  # started, or started anew, in this frame
-    DIRECTION_UNSEEN = 256  # one boundary or less, or not used: pitch and yaw hold with growing sigma
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.evidence import deviation_prior_std
 from lanebev.estimation.joint.layout import NUM_POSE, POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL, Observations
-from lanebev.estimation.joint.state import JointConfig, JointState, Reason, unobserved_mask
+from lanebev.estimation.joint.state import JointConfig, JointState, unobserved_mask
 from lanebev.estimation.joint.update import UNSEEN
+from lanebev.estimation.reasons import Reason
 from lanebev.types import Calibration, Extrinsics, Status
 
 _DOUBTFUL = 0.6  # m out of place, below which a single boundary may stand for several

@@ -5,12 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.batch import select_rows
+from lanebev.batch import flag, select_rows
 from lanebev.estimation.calibrator import Calibrator
-from lanebev.estimation.checks import check_new_state, is_running
-from lanebev.estimation.two_stage.direction import track_direction
+from lanebev.estimation.checks import check_new_state, is_running, unused_frame
+from lanebev.estimation.reasons import Reason
+from lanebev.estimation.two_stage.direction import DirectionStep, track_direction
 from lanebev.estimation.two_stage.lane_width import boundary_angles
-from lanebev.estimation.two_stage.roll_height import track_roll_height
+from lanebev.estimation.two_stage.roll_height import RollHeightStep, track_roll_height
 from lanebev.estimation.two_stage.state import TwoStageConfig, TwoStageState
 from lanebev.geometry.road import segment_rays
 from lanebev.observation.segments import LaneSegments
@@ -61,8 +62,9 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
         no = torch.zeros(batch_size, dtype=torch.bool, device=device)
         unseen = torch.zeros(batch_size, dtype=dtype, device=device)
         status = torch.full((batch_size,), int(Status.UNINITIALISED), dtype=torch.int64, device=device)
+        reasons = torch.full_like(status, int(Reason.NO_START))
         return TwoStageState(
-            direction, direction_cov, roll_height, roll_height_cov, no, no.clone(), unseen, status
+            direction, direction_cov, roll_height, roll_height_cov, no, no.clone(), unseen, status, reasons
         )
 
     def step(
@@ -74,7 +76,8 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
         lane_width: Tensor,
     ) -> tuple[Calibration, TwoStageState]:
         """One frame, see :meth:`~lanebev.estimation.calibrator.Calibrator.forward`."""
-        dt = torch.where(dt.isfinite(), dt, self.config.assumed_dt)
+        guessed = ~dt.isfinite()
+        dt = torch.where(guessed, self.config.assumed_dt, dt)
         before, skip = state, (dt <= 0) & is_running(state.status)
         dt = dt.clamp(0.0, 60.0)
         rays = segment_rays(segments.endpoints, intrinsics)  # (B, N, 2, 3)
@@ -96,9 +99,11 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
         two = track_roll_height(boundaries, lane_width, one.cov[:, :2, :2], state, dt, one.fresh, self.config)
         unseen = torch.where(one.seen, 0.0, state.unseen + dt)
         status = _status(state.status, one.seen, unseen, self.config.lost_after)
-        after = TwoStageState(one.mean, one.cov, *two, unseen, status)
-        state = select_rows(skip, before, after)
-        return self._calibration(state, lane_width, one.inliers), state
+        reasons = _reasons(segments, one, two, status) | flag(guessed, Reason.TIME)
+        after = TwoStageState(one.mean, one.cov, *two[:4], unseen, status, reasons)
+        skipped = before._replace(reasons=before.reasons | int(Reason.TIME))
+        state = select_rows(skip, skipped, after)
+        return unused_frame(self._calibration(state, lane_width, one.inliers), skip), state
 
     def _calibration(self, state: TwoStageState, lane_width: Tensor, inliers: Tensor) -> Calibration:
         pose = torch.cat([state.direction_mean[:, :2], state.roll_height_mean[:, :2]], dim=-1)
@@ -117,3 +122,20 @@ def _status(before: Tensor, seen: Tensor, unseen: Tensor, lost_after: float) -> 
     idle = (before == int(Status.UNINITIALISED)) | (before == int(Status.LOST))
     unsupported = torch.where(idle, before, coasting)
     return torch.where(seen, int(Status.TRACKING), unsupported)
+
+
+def _reasons(
+    segments: LaneSegments, direction: DirectionStep, roll_height: RollHeightStep, status: Tensor
+) -> Tensor:
+    """(B,) int64 flags of :class:`Reason` for a frame that was not skipped."""
+    empty = ~(segments.weight > 0).any(-1)
+    idle = (status == int(Status.UNINITIALISED)) | (status == int(Status.LOST))
+    return (
+        flag(empty, Reason.NO_SEGMENTS)
+        | flag(~empty & ~direction.seen, Reason.FEW_INLIERS)
+        | flag(~direction.seen, Reason.DIRECTION_UNSEEN)
+        | flag(~(direction.seen & roll_height.roll_seen), Reason.ROLL_UNSEEN)
+        | flag(~(direction.seen & roll_height.height_seen), Reason.HEIGHT_UNSEEN)
+        | flag(direction.fresh, Reason.RESTARTED)
+        | flag(idle, Reason.NO_START)
+    )

@@ -30,12 +30,15 @@ class RollHeightStep(NamedTuple):
     Attributes:
         mean: (B, 4) roll, height and their rates; cov: (B, 4, 4).
         roll_known: (B,) bool; height_known: (B,) bool.
+        roll_seen: (B,) bool, two lanes or more in this frame; height_seen: (B,) bool, one lane or more.
     """
 
     mean: Tensor
     cov: Tensor
     roll_known: Tensor
     height_known: Tensor
+    roll_seen: Tensor
+    height_seen: Tensor
 
 
 def track_roll_height(
@@ -87,7 +90,8 @@ def track_roll_height(
     mean = torch.where(possible.unsqueeze(-1), mean, prior)
     cov = torch.where(possible[:, None, None], cov, wide)
     roll_known = (state.roll_known | roll_seen) & possible
-    return RollHeightStep(mean, cov, roll_known, (state.height_known | height_seen) & possible)
+    height_known = (state.height_known | height_seen) & possible
+    return RollHeightStep(mean, cov, roll_known, height_known, roll_seen, height_seen)
 
 
 def update_by_widths(

@@ -53,6 +53,7 @@ class TwoStageState(NamedTuple):
         roll_known, height_known: (B,) bool, initialised from lane widths.
         unseen: (B,) s since the vanishing point was last supported.
         status: (B,) int64.
+        reasons: (B,) int64, :class:`~lanebev.estimation.reasons.Reason` flags of the last frame.
     """
 
     direction_mean: Tensor
@@ -63,6 +64,7 @@ class TwoStageState(NamedTuple):
     height_known: Tensor
     unseen: Tensor
     status: Tensor
+    reasons: Tensor
 
     def detach(self) -> TwoStageState:
         """Return the state without the graph that computed it."""
