@@ -20,7 +20,6 @@ from lanebev.app.tracker import Estimate
 from lanebev.app.views import ViewBefore, bird_view
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration
-from lanebev.estimation.reasons import Reason
 from lanebev.io.lanes import tusimple_line
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video import Frame, VideoWriter, write_png

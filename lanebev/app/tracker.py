@@ -8,8 +8,8 @@ import torch
 
 from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator, StateT
-from lanebev.estimation.reasons import Reason
 from lanebev.estimation.mount import MountCalibration, MountEstimator, MountState
+from lanebev.estimation.reasons import Reason
 from lanebev.estimation.still import calibrate_still_with_state
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.segments import LaneSegments, camera_segments
