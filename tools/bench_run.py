@@ -21,7 +21,8 @@ import torch
 from jsonargparse.typing import PositiveInt
 
 import lanebev
-from lanebev.app.run import RunConfig, run
+from lanebev.app.config import RunConfig
+from lanebev.app.run import run
 from lanebev.io.video import VideoWriter
 from lanebev.render import Drive
 from lanebev.weights import load_segmenter
