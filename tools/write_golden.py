@@ -1,4 +1,4 @@
-"""Write the references of tests/test_golden.py anew, after a change that moves them on purpose.
+"""Write the references of tests/app/test_golden.py anew, after a change that moves them on purpose.
 
     python -m tools.write_golden [--inputs]
 

@@ -16,7 +16,7 @@ from train.module import Segmentation
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of Lightning about itself
 
-CONFIGS = Path(__file__).parents[1] / "configs"
+CONFIGS = Path(__file__).parents[2] / "configs"
 TINY = [
     "--trainer.max_steps=1",
     "--trainer.limit_val_batches=1",

@@ -18,7 +18,7 @@ from lanebev.io.lanes import (
 from lanebev.observation.polylines import vertices_from_lines
 
 CAMERA = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720)
-DATA = Path(__file__).parents[2] / "shared" / "data"
+DATA = Path(__file__).parents[3] / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is not on this machine")
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 LAYERS = (  # from the bottom: a package imports packages of lower layers only, and its own modules
     {"numbers", "tensors"},

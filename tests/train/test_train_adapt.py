@@ -111,7 +111,7 @@ def test_frames_beyond_both_ends_do_not_count():
 def test_adapt_config_trains_on_them(run, tmp_path):
     result, source = run
     write_labels(result, str(source), tmp_path / "out", CAMERA, reach=3, every=2)
-    config = Path(__file__).parents[1] / "configs" / "adapt.yaml"
+    config = Path(__file__).parents[2] / "configs" / "adapt.yaml"
     small = ["network.base_width=4", "network.decoder_width=4", "init_from=null"]
     data = [f"root={tmp_path}/out", "batch_size=2", "sizes=[[48,80]]", "val_size=[48,80]", "workers=0"]
     main(

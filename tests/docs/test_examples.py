@@ -12,8 +12,8 @@ from PIL import Image
 
 from lanebev.io.video import VideoWriter
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
-GOLDEN = Path(__file__).parent / "golden"
+EXAMPLES = Path(__file__).parents[2] / "examples"
+GOLDEN = Path(__file__).parents[1] / "golden"
 
 
 def run_example(name, monkeypatch, tmp_path, *arguments):

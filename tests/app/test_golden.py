@@ -7,7 +7,7 @@ import numpy as np
 
 from tools.write_golden import LEAST_WEIGHT, run_on_lanes, seen_segments
 
-GOLDEN = Path(__file__).parent / "golden"
+GOLDEN = Path(__file__).parents[1] / "golden"
 
 
 def _rows(path):

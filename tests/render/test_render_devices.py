@@ -16,7 +16,7 @@ from lanebev.render.scene.kinds import KINDS
 from lanebev.render.scene.sampler import row_of, select_rows, send, tensors_of
 from lanebev.render.scene.world import Scene
 from lanebev.render.views import render_scenes, sample_scene
-from tests.other_device import ELSEWHERE, Elsewhere, OtherDevice
+from tests.render.other_device import ELSEWHERE, Elsewhere, OtherDevice
 
 SIZE = (64, 112)
 cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")

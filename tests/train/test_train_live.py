@@ -147,7 +147,7 @@ SMALL = [
 
 def fit(folder, *extra):
     here = [f"--trainer.default_root_dir={folder}", f"--trainer.logger.init_args.save_dir={folder}"]
-    config = Path(__file__).parents[1] / "configs" / "gpu.yaml"
+    config = Path(__file__).parents[2] / "configs" / "gpu.yaml"
     main(["fit", "--config", str(config), *here, *SMALL, *extra])
 
 

@@ -15,7 +15,7 @@ import pytest
 
 import lanebev
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 MODULES = {"opencv-python-headless": "cv2", "pyyaml": "yaml", "pillow": "PIL", "rerun-sdk": "rerun"}
 

@@ -147,7 +147,7 @@ def test_config_trains_and_prints_the_benchmarks_figures(root):
     given = [f"--data.init_args.{name}={value}" for name, value in data.items()]
     brief = ["--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
     once = ["--trainer.max_steps=1", "--trainer.val_check_interval=1", "--trainer.num_sanity_val_steps=0"]
-    config = str(Path(__file__).parents[1] / "configs" / "tusimple.yaml")
+    config = str(Path(__file__).parents[2] / "configs" / "tusimple.yaml")
     main(["fit", "--config", config, *here, *small, *given, *brief, *once])
     last = next(root.rglob("last.ckpt"))
     main(["test", "--config", config, *here, *small, *given, *brief, f"--ckpt_path={last}"])

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from report_data import CAMERA, FRAMES, KNOCK, eventful_report, eventful_rows, picture
 
 from lanebev import Camera
 from lanebev.report.lens_table import lens_table
@@ -17,6 +16,7 @@ from lanebev.report.page import Report, write_report
 from lanebev.report.plots import plot_estimates, plot_widths, width_deviation, width_limits
 from lanebev.report.timeline import places_on_axis, shown_frames, strips
 from lanebev.report.worst import worst_moments
+from tests.report.report_data import CAMERA, FRAMES, KNOCK, eventful_report, eventful_rows, picture
 
 SECTIONS = ["verdict", "timeline", "worst", "pose", "widths", "mount", "problems", "settings", "conventions",
             "glossary"]  # fmt: skip
@@ -275,7 +275,7 @@ def test_lens_table_holds_every_coefficient():
 
 
 def test_the_sketch_is_that_of_the_docs():
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     drawn = [
         [
             line.strip()
