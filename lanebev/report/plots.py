@@ -55,10 +55,8 @@ def plot_estimates(
     for axis, label in enumerate(_LABELS):
         shown = figures[0].x_range if figures else _x_range(x)
         plot = _figure(label, shown, _limits(value[:, axis], std[:, axis], known[:, axis], axis))
-        bands = _bands(
-            x, value[:, axis], std[:, axis], measured[:, axis], known[:, axis] & ~measured[:, axis]
-        )
-        _draw_estimate(plot, bands, stills)
+        held = known[:, axis] & ~measured[:, axis]
+        _draw_estimate(plot, x, value[:, axis], std[:, axis], measured[:, axis], held, stills)
         if true is not None:
             plot.line(x, true[:, axis], color=_TRUTH, line_dash=[5, 3], line_width=1.2, legend_label="truth")
         _finish(plot, axis == len(_LABELS) - 1, "image" if stills else "time (s)", legend=axis == 0)
@@ -121,26 +119,10 @@ def width_deviation(widths: NDArray[np.float64]) -> float:
     return float(seen.std()) if len(seen) > 1 else float("nan")
 
 
-def _bands(
-    x: NDArray[np.float64],
-    value: NDArray[np.float64],
-    std: NDArray[np.float64],
-    measured: NDArray[np.bool_],
-    held: NDArray[np.bool_],
-) -> dict[str, ColumnDataSource]:
-    """Return what is drawn blue and what is drawn grey, each with its colour."""
-    return {
-        colour: ColumnDataSource(
-            {
-                "x": x.astype(np.float32) if np.abs(x).max(initial=0) < 1e4 else x,
-                "value": np.where(at, value, np.nan).astype(np.float32),
-                "low": np.where(at, value - 2 * std, np.nan).astype(np.float32),
-                "high": np.where(at, value + 2 * std, np.nan).astype(np.float32),
-                "two_sigma": (2 * std).astype(np.float32),
-            }
-        )
-        for colour, at in ((_LINE, _extended(measured, held)), (_HELD, held))
-    }
+def _stretches(at: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+    """Return the places of each stretch of neighbours in which ``at`` holds."""
+    places = np.flatnonzero(at)
+    return [part for part in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1) if len(part)]
 
 
 def _extended(at: NDArray[np.bool_], other: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -151,23 +133,51 @@ def _extended(at: NDArray[np.bool_], other: NDArray[np.bool_]) -> NDArray[np.boo
     return extended
 
 
-def _draw_estimate(plot: Any, bands: dict[str, ColumnDataSource], stills: bool) -> None:
-    names = {_LINE: "estimate ±2σ", _HELD: "not determined"}
-    for colour, source in bands.items():
-        if not np.isfinite(source.data["value"]).any():
+def _draw_estimate(
+    plot: Any,
+    x: NDArray[np.float64],
+    value: NDArray[np.float64],
+    std: NDArray[np.float64],
+    measured: NDArray[np.bool_],
+    held: NDArray[np.bool_],
+    stills: bool,
+) -> None:
+    """Draw an axis with ±2 sigma: blue where it was measured, grey where it was held."""
+    low, high = value - 2 * std, value + 2 * std
+    finite = np.isfinite(low) & np.isfinite(high)
+    kinds = (
+        (_HELD, finite & (held if stills else _extended(held, measured)), "not determined"),
+        (_LINE, finite & (measured if stills else _extended(measured, held)), "estimate ±2σ"),
+    )
+    for colour, mask, name in kinds:
+        if not mask.any():
             continue
+        columns = {"x": x, "value": value, "two_sigma": 2 * std}
+        columns |= {"low": low, "high": high} if stills else {}
+        source = ColumnDataSource({key: _single(column[mask]) for key, column in columns.items()})
         if stills:
             plot.segment("x", "low", "x", "high", source=source, color=colour, alpha=0.5)
-            line = plot.scatter("x", "value", source=source, size=5, color=colour, legend_label=names[colour])
         else:
-            plot.varea("x", "low", "high", source=source, fill_color=colour, fill_alpha=0.22)
-            line = plot.line(
-                "x", "value", source=source, color=colour, line_width=1.8, legend_label=names[colour]
-            )
+            stretches = _stretches(mask)
+            sides = _separated([np.concatenate([x[at], x[at][::-1]]) for at in stretches])
+            band = _separated([np.concatenate([low[at], high[at][::-1]]) for at in stretches])
+            plot.patch(sides, band, fill_color=colour, fill_alpha=0.22, line_color=None)
+            lines = (_separated([column[at] for at in stretches]) for column in (x, value))
+            plot.line(*lines, color=colour, line_width=1.8, legend_label=name)
+        dots = plot.scatter("x", "value", source=source, size=5, color=colour, alpha=1.0 if stills else 0.0,
+                            legend_label=name)  # fmt: skip
         tooltips = [("at", "@x{0.00}"), ("value", "@value{0.000} ± @two_sigma{0.000}")]
-        plot.add_tools(
-            HoverTool(renderers=[line], tooltips=tooltips, mode="vline", point_policy="snap_to_data")
-        )
+        plot.add_tools(HoverTool(renderers=[dots], tooltips=tooltips, mode="vline"))
+
+
+def _separated(parts: Sequence[NDArray[np.float64]]) -> NDArray[np.floating[Any]]:
+    """Return all parts in one, with a NaN after each: Bokeh draws them apart."""
+    return _single(np.concatenate([np.append(part, np.nan) for part in parts]))
+
+
+def _single(column: NDArray[np.float64]) -> NDArray[np.floating[Any]]:
+    """Return a column in single precision where that is exact to a thousandth."""
+    return column.astype(np.float32) if np.nanmax(np.abs(column), initial=0) < 1e4 else column
 
 
 def _figure(label: str, x_range: Any, limits: tuple[float, float], height: int = 150) -> Any:

@@ -21,7 +21,7 @@ STATE_WORDS = {
     AxisState.LOST: "lost",
     AxisState.UNKNOWN: "not known yet",
 }
-_MOST = 1500  # stretches of a strip
+_MOST = 600  # stretches of a strip
 
 
 class Stretch(NamedTuple):
@@ -61,7 +61,7 @@ def strips(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> list[Strip]:
     return found + [_strip(name, states[:, i], kinds, edges, rows) for i, name in enumerate(AXES)]
 
 
-def shown_frames(rows: Sequence[ExtrinsicsRow], always: Sequence[int], most: int = 3000) -> list[int]:
+def shown_frames(rows: Sequence[ExtrinsicsRow], always: Sequence[int], most: int = 2000) -> list[int]:
     """Return places of frames: ``most`` evenly spaced ones, changes of status, and ``always``."""
     every = max(1, -(-len(rows) // most))
     changes = [i for i in range(1, len(rows)) if rows[i].status != rows[i - 1].status][:most]
@@ -75,7 +75,7 @@ def _strip(
     edges: NDArray[np.float64],
     rows: Sequence[ExtrinsicsRow],
 ) -> Strip:
-    """Join equal neighbours; of a long drive, each of 1500 parts has the worst state in it."""
+    """Join equal neighbours; of a long drive, each of 600 parts has the worst state in it."""
     begins = np.unique(np.linspace(0, len(states), _MOST + 1).astype(int)[:-1])
     worst = np.maximum.reduceat(states, begins)
     first = np.flatnonzero(np.append(True, np.diff(worst) != 0))

@@ -27,8 +27,8 @@ REASON_WORDS = {
 _WHOLE_FRAME = ("NO_SEGMENTS", "FEW_INLIERS", "TIME", "NO_START")
 _UNSEEN = ("DIRECTION_UNSEEN", "HEIGHT_UNSEEN", "ROLL_UNSEEN")  # each implies those after it
 _STATUS_WORDS = {
-    "LOST": "lost",
-    "COASTING": "predicted from earlier frames",
+    "LOST": "pose lost",
+    "COASTING": "pose only predicted",
     "UNINITIALISED": "not yet calibrated",
 }
 _SEVERITY = ("no frames", *_STATUS_WORDS.values(), "not determined", "uncertain")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from lanebev.io.results import ExtrinsicsRow
@@ -28,12 +28,14 @@ class Moment(NamedTuple):
     what: str
 
 
-def scores(row: ExtrinsicsRow, before: ExtrinsicsRow | None, settled: bool = True) -> dict[str, float]:
+def scores(
+    row: ExtrinsicsRow, before: Sequence[ExtrinsicsRow] = (), settled: bool = True
+) -> dict[str, float]:
     """Return how remarkable a frame is, by kind of event; a kind that does not occur is left out.
 
     Args:
         row: of the frame.
-        before: of the frame before, None for the first.
+        before: of the two frames before it, fewer at the start.
         settled: tracking began at least SETTLING ago.
     """
     found: dict[str, float] = {}
@@ -41,23 +43,28 @@ def scores(row: ExtrinsicsRow, before: ExtrinsicsRow | None, settled: bool = Tru
         found |= {f"sigma {axis}": value for axis, value in zip(AXES, sigmas(row), strict=True)}
     if row.status in _STATUSES:
         found[row.status] = row.pitch_std_deg
-    if "RESTARTED" in row.reasons.split("|") and settled:
+    if settled and "RESTARTED" in row.reasons.split("|"):
         found["RESTARTED"] = 1.0
-    if settled and before is not None and before.status in ("TRACKING", *_STATUSES):
-        found |= {f"jump {axis}": value for axis, value in jumps(row, before).items()}
+    if settled and len(before) == 2 and all(one.status in ("TRACKING", *_STATUSES) for one in before):
+        large = zip(AXES, jumps(row, *before), sigmas(before[1]), _LEAST_JUMP, strict=True)
+        for axis, jump, std, least in large:
+            if abs(jump) > max(least, _LEAST_SIGMAS * std):
+                found[f"jump {axis}"] = abs(jump) / max(std, 1e-9)
     return {kind: value for kind, value in found.items() if math.isfinite(value)}
 
 
-def jumps(row: ExtrinsicsRow, before: ExtrinsicsRow) -> dict[str, float]:
-    """Return the axes that change between two frames by more than usual: axis to change in sigmas."""
-    found = {}
-    for axis, now, then, std, least in zip(
-        AXES, pose(row), pose(before), sigmas(before), _LEAST_JUMP, strict=True
-    ):
-        step = abs(now - then)
-        if step > least and step > _LEAST_SIGMAS * std:
-            found[axis] = step / max(std, 1e-9)
-    return found
+def jumps(row: ExtrinsicsRow, earlier: ExtrinsicsRow, before: ExtrinsicsRow) -> list[float]:
+    """Return by how much pitch, yaw, roll (deg) and height (m) depart from going on as they went.
+
+    Args:
+        row: of the frame.
+        earlier: two frames before.
+        before: one frame before.
+    """
+    step = before.time_s - earlier.time_s
+    share = (row.time_s - before.time_s) / step if step > 0 else 0.0
+    values = zip(pose(row), pose(earlier), pose(before), strict=True)
+    return [now - (then + share * (then - first)) for now, first, then in values]
 
 
 def worst_moments(rows: Sequence[ExtrinsicsRow]) -> list[Moment]:
@@ -68,18 +75,18 @@ def worst_moments(rows: Sequence[ExtrinsicsRow]) -> list[Moment]:
         for kind, score in score_of(row).items():
             if kind not in best or score > best[kind][0]:
                 best[kind] = (score, place)
-    words: dict[int, list[str]] = {}
+    moments: dict[int, dict[str, tuple[float, int]]] = {}
     for kind, (score, place) in best.items():
-        near = (at for at in words if abs(rows[at].time_s - rows[place].time_s) < _APART)
-        words.setdefault(next(near, place), []).append(_describe(kind, score, rows, place))
-    return [Moment(place, "; ".join(words[place])) for place in sorted(words)]
+        near = (at for at in moments if abs(rows[at].time_s - rows[place].time_s) < _APART)
+        moments.setdefault(next(near, place), {})[kind] = (score, place)
+    return [Moment(place, _describe(moments[place], rows)) for place in sorted(moments)]
 
 
 class EventScores:
     """Scores the frames of a drive one after another, see :func:`scores`."""
 
     def __init__(self) -> None:
-        self._before: ExtrinsicsRow | None = None
+        self._before: tuple[ExtrinsicsRow, ...] = ()
         self._start = math.inf
 
     def __call__(self, row: ExtrinsicsRow) -> dict[str, float]:
@@ -87,24 +94,29 @@ class EventScores:
         if row.status == "TRACKING":
             self._start = min(self._start, row.time_s)
         found = scores(row, self._before, row.time_s >= self._start + SETTLING)
-        self._before = row
+        self._before = (*self._before, row)[-2:]
         return found
 
 
-def _describe(kind: str, score: float, rows: Sequence[ExtrinsicsRow], place: int) -> str:
-    row = rows[place]
-    name, _, axis = kind.partition(" ")
-    if name in _STATUSES:
-        doing = "predicted" if name == "COASTING" else "lost"
-        return f"least certain while {doing}: σ of pitch {_value(0, score)}"
-    if name == "RESTARTED":
-        return "started anew"
-    number = AXES.index(axis)
-    if name == "sigma":
-        return f"largest σ of {axis}: {_value(number, score)}"
-    step = pose(row)[number] - pose(rows[place - 1])[number]
-    return f"{axis} jumps by {_value(number, step, '+')} ({score:.0f} σ)"
+def _describe(events: Mapping[str, tuple[float, int]], rows: Sequence[ExtrinsicsRow]) -> str:
+    """Return what happens in a moment in words; events: kind to score and place."""
+    words, stds, leaps = [], [], []
+    for kind, (score, place) in events.items():
+        name, _, axis = kind.partition(" ")
+        if name == "sigma":
+            stds.append(f"{axis} {_value(axis, score)}")
+        elif name == "jump":
+            jump = jumps(rows[place], *rows[place - 2 : place])[AXES.index(axis)]
+            leaps.append(f"{axis} {_value(axis, jump, '+')} ({score:.0f} σ)")
+        elif name == "RESTARTED":
+            words.append("started anew")
+        else:
+            doing = "predicted" if name == "COASTING" else "lost"
+            words.append(f"least certain while {doing}: σ of pitch {_value('pitch', score)}")
+    words += [f"largest jump: {', '.join(leaps)}"] if leaps else []
+    words += [f"largest σ: {', '.join(stds)}"] if stds else []
+    return "; ".join(words)
 
 
-def _value(axis: int, value: float, sign: str = "") -> str:
-    return f"{100 * value:{sign}.1f} cm" if AXES[axis] == "height" else f"{value:{sign}.2f}°"
+def _value(axis: str, value: float, sign: str = "") -> str:
+    return f"{100 * value:{sign}.1f} cm" if axis == "height" else f"{value:{sign}.2f}°"

@@ -35,7 +35,7 @@ def test_a_road_of_one_lane_is_told_in_seconds():
     found = verdict(drive(changes=[ONE_LANE, lost]))
     assert found.text == (
         "Calibrated for 96 % of the drive, all four axes determined for 70 %; "
-        "predicted from earlier frames from 3.0 to 3.4 s: no lane boundaries seen; "
+        "pose only predicted from 3.0 to 3.4 s: no lane boundaries seen; "
         "roll not determined from 7.2 to 9.8 s: one lane only"
     )
     assert found.grade == "fair"
@@ -66,8 +66,8 @@ def test_the_most_severe_comes_first():
     ]
     found = verdict(drive(changes=changes))
     assert [finding.what for finding in found.findings] == [
-        "lost",
-        "predicted from earlier frames",
+        "pose lost",
+        "pose only predicted",
         "not yet calibrated",
         "not determined",
     ]
