@@ -27,6 +27,7 @@ from tools.replay.check import (
 from tools.replay.figures import figures
 from tools.replay.kinds import FRAMES, KINDS
 from tools.replay.references import compare
+from tools.replay.rendered import DRIVES, RENDERED
 
 torch.set_num_threads(1)
 
@@ -38,6 +39,19 @@ def straight():
 
 def test_every_kind_has_a_drive_and_every_drive_a_kind():
     assert missing_kinds(KINDS, drive_kinds()) == []
+
+
+def test_every_rendered_drive_has_its_file_and_every_file_its_drive():
+    assert {path.name for path in DRIVES.iterdir()} == {f"{name}.npz" for name in RENDERED}
+
+
+def test_a_rendered_drive_holds_its_truth():
+    """On the highway the joint filter is within 3 sigma of it, and not by large sigmas alone."""
+    drives = recordings(["rendered-highway"])
+    _, replayed = replay_all(drives, {"joint": JointCalibrator()})
+    found = figures(drives["rendered-highway"], replayed["joint"], 0)
+    assert found.within > 0.95
+    assert all(error < most for error, most in zip(found.rmse, (0.3, 0.3, 0.3, 5.0), strict=True))
 
 
 def test_a_kind_without_a_drive_is_missed():

@@ -10,9 +10,10 @@ from zlib import crc32
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
-from tools.replay.kinds import GENERATED
+from tools.replay.kinds import GENERATED, Generated
 from tools.replay.recording import Recording, Replayed, record, replay
 from tools.replay.references import Difference, Row, compare, mount_rows, pose_rows, read_rows
+from tools.replay.rendered import RENDERED, Rendered, load
 
 REFERENCES = Path(__file__).resolve().parents[2] / "tests" / "replay" / "references"
 
@@ -20,6 +21,8 @@ TOLERANCE = 1e-3
 """Sigmas by which a number may differ. Rounding, as other processors and versions of torch do it, stays far
 below: it is some 1e-12 px of an end point, and end points moved by a million times that change no number by
 as much as 3e-4 sigmas. A change of an estimator that stays below it changes nobody's pose."""
+
+_DRIVES: dict[str, Generated | Rendered] = {**GENERATED, **RENDERED}
 
 Key = tuple[str, str]
 """Names of a drive and of an estimator."""
@@ -39,7 +42,7 @@ class Results(NamedTuple):
 
 def drive_kinds() -> dict[str, str]:
     """Return the kind of every drive by the drive's name."""
-    return {name: generated.kind for name, generated in GENERATED.items()}
+    return {name: drive.kind for name, drive in _DRIVES.items()}
 
 
 def missing_kinds(required: Collection[str], drives: Mapping[str, str]) -> list[str]:
@@ -48,8 +51,11 @@ def missing_kinds(required: Collection[str], drives: Mapping[str, str]) -> list[
 
 
 def recordings(names: Collection[str]) -> dict[str, Recording]:
-    """Record the drives of these names. Each has its own seed, whatever others there are."""
-    return {name: record(GENERATED[name], crc32(name.encode())) for name in names}
+    """Draw or read the drives of these names. Each has its own seed, whatever others there are."""
+    return {
+        name: record(GENERATED[name], crc32(name.encode())) if name in GENERATED else load(name)
+        for name in names
+    }
 
 
 def calibrators() -> dict[str, Calibrator[Any]]:
@@ -76,8 +82,8 @@ def reference_path(key: Key) -> Path:
 
 def reference_paths() -> set[Path]:
     """Return the paths of all references that there should be."""
-    keys = [(name, label) for name in GENERATED for label in calibrators()]
-    keys += [(name, "mount") for name, generated in GENERATED.items() if generated.mount]
+    keys = [(name, label) for name in _DRIVES for label in calibrators()]
+    keys += [(name, "mount") for name, drive in _DRIVES.items() if drive.mount]
     return {reference_path(key) for key in keys}
 
 

@@ -38,6 +38,9 @@ KINDS = (
     "lens: pinhole, tilted",
     "lens: fisheye",
     "lens: omni",
+    "rendered: highway",
+    "rendered: city",
+    "rendered: night",
 )
 """Each needs one drive at least; what each is, is said beside the drives below."""
 

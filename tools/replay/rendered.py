@@ -1,0 +1,139 @@
+"""Drives rendered as pixels and seen by the shipped network: kept as the boundary vertices that it saw.
+
+    python -m tools.replay.rendered [NAME…]
+
+writes ``tests/replay/drives/NAME.npz`` anew, which takes some minutes a drive. The replay reads these files
+only: another renderer or other weights change nothing until they are written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lanebev.camera.model import Camera
+from lanebev.observation.boundary_vertices import BoundaryVertices
+from lanebev.observation.segments import camera_segments
+from lanebev.pipeline import LaneBEV
+from lanebev.render import Drive
+from lanebev.testing.motions import fall, landing_time
+from lanebev.types import Extrinsics
+from tools.replay.kinds import FRAMES
+from tools.replay.recording import Recording
+from train.commands import one_line_errors
+
+DRIVES = Path(__file__).resolve().parents[2] / "tests" / "replay" / "drives"
+FPS = 20.0
+SIZE = (360, 640)
+_PIXEL = 64.0  # steps of a coordinate per px, so that 16 bits hold it
+_TOGETHER = 4  # frames rendered and seen at once
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What to render.
+
+    Attributes:
+        kind: one of the replay's kinds.
+        world: kind of the renderer's world.
+        seed: of the drive.
+        falls: begins in mid-air, see :func:`lanebev.testing.motions.fall`.
+        mount: also run the mount estimator.
+    """
+
+    kind: str
+    world: str
+    seed: int
+    falls: bool = False
+    mount: bool = False
+
+
+RENDERED = {
+    "rendered-highway": Rendered("rendered: highway", "highway", 11),
+    "rendered-city": Rendered("rendered: city", "city", 12),
+    "rendered-night": Rendered("rendered: night", "night", 13),
+}
+"""By name, which is also that of the files."""
+
+
+class FallingDrive(Drive):
+    """A drive that begins with a fall of 1.2 m onto the wheels."""
+
+    def extrinsics_at(self, time: float) -> Extrinsics:
+        """True pose over the road at a time, each (1,)."""
+        pose = super().extrinsics_at(time)
+        return Extrinsics(*(value + more for value, more in zip(pose, fall(time), strict=True)))
+
+
+def see(rendered: Rendered) -> dict[str, Any]:
+    """Render a drive and let the shipped network look at it: what the drive's file holds."""
+    make = FallingDrive if rendered.falls else Drive
+    drive = make(rendered.seed, SIZE, FRAMES, FPS, kind=rendered.world)
+    model = LaneBEV.from_pretrained()
+    seen, poses, width = [], [], 0.0
+    with torch.inference_mode():
+        for first in range(0, FRAMES, _TOGETHER):
+            frames = drive.frames(range(first, min(first + _TOGETHER, FRAMES)))
+            seen.append(model.boundary_vertices(frames.image)[1])
+            poses.append(frames.extrinsics.stack().double())
+            width = width or float(frames.lane_width[0, frames.lane_width.shape[1] // 2])
+    vertices = BoundaryVertices._make(torch.cat(parts) for parts in zip(*seen, strict=True))
+    return {
+        "points": (vertices.points.clamp(0, 1023) * _PIXEL).round().numpy().astype(np.uint16),
+        "weight": (vertices.weight * 255).round().numpy().astype(np.uint8),
+        "sigma": vertices.sigma.numpy().astype(np.float16),
+        "boundary": vertices.boundary.numpy().astype(np.uint8),
+        "intrinsics": drive.camera.intrinsics.double().numpy(),
+        "truth": torch.cat(poses).numpy(),
+        "lane_width": np.float64(width),
+        "sigma_scale": np.float64(model.pose_sigma_scale),
+    }
+
+
+def load(name: str) -> Recording:
+    """Read a rendered drive's file."""
+    rendered = RENDERED[name]
+    with np.load(DRIVES / f"{name}.npz") as file:
+        held = {key: torch.from_numpy(file[key].astype(np.float64)) for key in file.files}
+    camera = Camera(held["intrinsics"], torch.zeros(0, dtype=torch.float64), "pinhole", SIZE)
+    vertices = BoundaryVertices(
+        held["points"] / _PIXEL, held["weight"] / 255, held["sigma"], held["boundary"].long()
+    )
+    times = torch.arange(FRAMES) / FPS
+    return Recording(
+        segments=camera_segments(vertices, camera),
+        intrinsics=camera.intrinsics,
+        dt=torch.full((FRAMES,), 1 / FPS, dtype=torch.float64),
+        lane_width=float(held["lane_width"]),
+        sigma_scale=float(held["sigma_scale"]),
+        truth=held["truth"],
+        hard=times < landing_time() if rendered.falls else torch.zeros(FRAMES, dtype=torch.bool),
+        mount=rendered.mount,
+    )
+
+
+@one_line_errors()
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help="only these drives; all by default")
+    args = parser.parse_args(arguments)
+    unknown = sorted(set(args.names) - set(RENDERED))
+    if unknown:
+        raise ValueError(f"name: expected some of {', '.join(RENDERED)}, got {', '.join(unknown)}")
+    DRIVES.mkdir(parents=True, exist_ok=True)
+    for name in args.names or RENDERED:
+        np.savez_compressed(DRIVES / f"{name}.npz", **see(RENDERED[name]))
+        print(f"wrote {name}.npz, {(DRIVES / f'{name}.npz').stat().st_size / 1024:.0f} KiB", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
