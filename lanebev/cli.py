@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 
 from lanebev import __version__
 from lanebev.app.config import RunConfig, parse_path, read_settings
+from lanebev.app.progress import Item, Progress
 
 DESCRIPTION = "Online camera-to-road calibration from lane boundaries, and a stable bird's-eye view."
 
@@ -155,18 +156,23 @@ def _demo(options: dict[str, Any]) -> str:
     return demo(options["out"], _progress)
 
 
-def _progress(label: str) -> Any:
+def _progress(label: str) -> Progress:
     """A progress bar on stderr; on anything but a terminal it stays silent."""
+    from rich import progress
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    def follow(items: Iterator[Any], total: int) -> Iterator[Any]:
-        columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    def follow(items: Iterator[Item], total: int) -> Iterator[Item]:
+        columns = (
+            progress.TextColumn(label),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TimeRemainingColumn(),
+        )
         console = Console(stderr=True)
         if not console.is_terminal:
             yield from items
             return
-        with Progress(*columns, console=console, transient=True) as bar:
+        with progress.Progress(*columns, console=console, transient=True) as bar:
             yield from bar.track(items, total=total)
 
     return follow

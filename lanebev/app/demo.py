@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from lanebev.app.concurrency import Background
 from lanebev.app.config import RunConfig
+from lanebev.app.progress import Progress
 from lanebev.app.run import run
 from lanebev.app.summary import summary
 from lanebev.io.lanes import tusimple_line
@@ -26,7 +26,7 @@ from lanebev.types import Calibration, Extrinsics, Status
 SEED, FRAMES, FPS, IMAGE_SIZE = 10, 200, 20, (360, 640)
 _RENDERED_CRF = 16  # nearly as rendered
 
-ProgressOf = Callable[[str], Callable[[Any, int], Any]]
+ProgressOf = Callable[[str], Progress]
 
 
 def demo(out: str, progress: ProgressOf | None = None, frames: int = FRAMES) -> str:
@@ -53,7 +53,7 @@ def demo(out: str, progress: ProgressOf | None = None, frames: int = FRAMES) -> 
 
 
 def write_drive(
-    drive: Drive, path: Callable[[str], Path], progress: Callable[[Any, int], Any] | None = None
+    drive: Drive, path: Callable[[str], Path], progress: Progress | None = None
 ) -> tuple[list[ExtrinsicsRow], float]:
     """Render a drive to ``drive.mp4``, ``camera.yaml``, ``truth.csv`` and ``lanes.json``.
 
@@ -65,11 +65,11 @@ def write_drive(
     Returns:
         the truth, a row per frame, and the mean lane width (m).
     """
-    numbers: Any = range(len(drive))
+    numbers = iter(range(len(drive)))
     rows, widths, lines = [], [], []
     drive.camera.to_file(path("camera.yaml"))
     with VideoWriter(path("drive.mp4"), Fraction(FPS), _RENDERED_CRF) as video, Background() as background:
-        for number in progress(iter(numbers), len(drive)) if progress else numbers:
+        for number in progress(numbers, len(drive)) if progress else numbers:
             frame = drive.frame(number)
             picture = (255 * frame.image[0].permute(1, 2, 0)).round().byte().contiguous().numpy()
             background.submit(partial(video.write, picture))
@@ -93,7 +93,7 @@ def true_lanes(drive: Drive, frame: RenderedFrame) -> BoundaryRows:
     return rows_from_vertices(vertices_from_lines(lines, drive.camera), drive.camera.image_size)
 
 
-def against_truth(found: Any, truth: list[ExtrinsicsRow]) -> str:
+def against_truth(found: Sequence[ExtrinsicsRow], truth: Sequence[ExtrinsicsRow]) -> str:
     """Root mean square errors of the tracked frames, in a line."""
     tracked = [(row, true) for row, true in zip(found, truth, strict=True) if row.status == "TRACKING"]
     if not tracked:

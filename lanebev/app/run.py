@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import torch
 from lanebev.app.build import input_files, lens_remark, make_observer, make_tracker, match_image_size
 from lanebev.app.concurrency import prefetch
 from lanebev.app.config import RunConfig
+from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states
 from lanebev.app.summary import mount_facts, run_facts
@@ -24,7 +25,6 @@ from lanebev.report.page import Report
 
 STILLS_FPS = Fraction(2)  # of the videos that show images one after another
 
-Progress = Callable[[Iterator[Frame], int], Iterator[Frame]]
 
 logger = logging.getLogger(__name__)
 

@@ -1,0 +1,21 @@
+"""What shows how far a long job is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol, TypeVar
+
+Item = TypeVar("Item")
+
+
+class Progress(Protocol):
+    """Wraps the items of a job and shows how many of them are done."""
+
+    def __call__(self, items: Iterator[Item], total: int) -> Iterator[Item]:
+        """Pass the items on.
+
+        Args:
+            items: what the job works on.
+            total: how many there are.
+        """
+        ...
