@@ -23,6 +23,7 @@ import json
 import platform
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,8 @@ def sampling_grid(batch: int) -> Tensor:
     intrinsics = camera().intrinsics.float().expand(batch, 3, 3)
     points, _ = BEVWarp(GRID).image_points(intrinsics, poses(batch))
     size = torch.tensor([SIZE[1], SIZE[0]])
-    return ((2 * points + 1) / size - 1).unflatten(1, GRID.shape)
+    grid: Tensor = ((2 * points + 1) / size - 1).unflatten(1, GRID.shape)
+    return grid
 
 
 def warps(batch: int, channels: int, stride: int) -> Calls:
@@ -142,7 +144,9 @@ def backwards(batch: int) -> Calls:
         return bev
 
     def by_kornia() -> Tensor:
-        return warp_perspective(image, bev_from_image(Extrinsics.unstack(values), ideal, GRID), GRID.shape)
+        homography = bev_from_image(Extrinsics.unstack(values), ideal, GRID)
+        bev: Tensor = warp_perspective(image, homography, GRID.shape)
+        return bev
 
     lens = torch.tensor([BROWN]).expand(batch, -1)
     return {
@@ -192,16 +196,14 @@ def extractors() -> Calls:
 
 def calibrators(rows: int, per_boundary: int) -> Calls:
     """One frame of each calibrator that has started."""
-    seen = LaneSegments(
-        *(part.expand(rows, *part.shape[1:]) for part in lanes(per_boundary=per_boundary, noise=0.5))
-    )
+    seen = LaneSegments(*(part.expand(rows, *part.shape[1:]) for part in lanes(per=per_boundary, noise=0.5)))
     intrinsics = INTRINSICS.expand(rows, 3, 3)
     calls: dict[str, Callable[[], object]] = {}
     for name, calibrator in (("joint", JointCalibrator()), ("two-stage", TwoStageCalibrator())):
         state: Any = calibrator.initial_state(rows, dtype=torch.float64)
         for _ in range(3):
             _, state = calibrator(seen, intrinsics, state, 1 / 30)
-        calls[name] = lambda calibrator=calibrator, state=state: calibrator(seen, intrinsics, state, 1 / 30)
+        calls[name] = partial(calibrator, seen, intrinsics, state, 1 / 30)
     return calls
 
 

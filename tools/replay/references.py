@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from lanebev.estimation.joint.state import Reason
 from lanebev.estimation.mount import MountCalibration, MountReason, MountStatus
+from lanebev.estimation.reasons import Reason
 from lanebev.types import Extrinsics, Status
 from tools.replay.recording import Recording, Replayed
 
