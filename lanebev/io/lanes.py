@@ -64,7 +64,7 @@ def lane_files(path: str | Path) -> list[Path]:
     return [Path(file) for file in in_natural_order(map(str, found))]
 
 
-def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int | None]:
+def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int | None]:  # noqa: C901 - the rules of one decision
     """Which lane entry belongs to each image: the one that shares the longest tail of its path.
 
     An entry of the image's very name is its own. Else whole path components are compared from the end, the

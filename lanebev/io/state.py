@@ -96,49 +96,68 @@ def load_state(
     Returns:
         states, metadata and the problem, if there was one (a missing file is one too).
     """
-    like = like or {}
+    try:
+        kinds, metadata, tensors = _read(path)
+        states = _by_state(kinds, tensors, device)
+        return LoadedState(_rebuilt(kinds, states, like or {}), metadata, None)
+    except _RefusedError as error:
+        return LoadedState({}, {}, f"{path}: state ignored: {error}; calibration starts anew")
+
+
+class _RefusedError(Exception):
+    """Why a file is not used."""
+
+
+def _read(path: str | Path) -> tuple[dict[str, str], dict[str, Any], dict[str, Tensor]]:
+    """Read the kind of each state by name, the plain values, and all tensors."""
     if Path(path).exists() and not os.access(path, os.R_OK):  # safetensors says that there is none
-        return _refused(path, "no permission to read it")
+        raise _RefusedError("no permission to read it")
     try:
         with safe_open(str(path), framework="pt") as file:
             header = file.metadata() or {}
             if header.get("format") != FORMAT:
-                return _refused(path, "it was not written by lanebev")
+                raise _RefusedError("it was not written by lanebev")
             if header.get("version") != str(VERSION):
-                return _refused(path, f"expected version {VERSION}, got {header.get('version')}")
-            kinds = json.loads(header["kinds"])
-            metadata = json.loads(header["metadata"])
+                raise _RefusedError(f"expected version {VERSION}, got {header.get('version')}")
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
-    except FileNotFoundError:
-        return _refused(path, "there is no such file")
+            return json.loads(header["kinds"]), json.loads(header["metadata"]), tensors
+    except FileNotFoundError as error:
+        raise _RefusedError("there is no such file") from error
     except (OSError, SafetensorError, KeyError, ValueError, TypeError) as error:
-        return _refused(path, f"it is cut or not a state file ({str(error).splitlines()[0]})")
+        reason = str(error).splitlines()[0]
+        raise _RefusedError(f"it is cut or not a state file ({reason})") from error
 
+
+def _by_state(
+    kinds: Mapping[str, str], tensors: Mapping[str, Tensor], device: torch.device | str | None
+) -> dict[str, dict[str, Tensor]]:
+    """Sort the tensors by state and field."""
     states: dict[str, dict[str, Tensor]] = {name: {} for name in kinds}
     for key, tensor in tensors.items():
         name, _, field = key.partition(_SEPARATOR)
         if name not in states:
-            return _refused(path, f"{key} belongs to no state")
+            raise _RefusedError(f"{key} belongs to no state")
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
-            return _refused(path, f"{key} is not finite")
+            raise _RefusedError(f"{key} is not finite")
         states[name][field] = tensor.to(device) if device is not None else tensor
+    return states
+
+
+def _rebuilt(
+    kinds: Mapping[str, str], states: Mapping[str, dict[str, Tensor]], like: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Make states of the classes of ``like`` again; what is not in it stays as it was read."""
     built: dict[str, Any] = {}
     for name, fields in states.items():
         if name not in like:
             built[name] = fields[""] if set(fields) == {""} else fields
             continue
-        problem = _mismatch(name, kinds[name], fields, like[name])
-        if problem:
-            return _refused(path, problem)
+        if problem := _mismatch(name, kinds[name], fields, like[name]):
+            raise _RefusedError(problem)
         built[name] = type(like[name])(**fields)
-    missing = [name for name in like if name not in built]
-    if missing:
-        return _refused(path, f"expected {', '.join(missing)}, found {', '.join(built) or 'nothing'}")
-    return LoadedState(built, metadata, None)
-
-
-def _refused(path: str | Path, why: str) -> LoadedState:
-    return LoadedState({}, {}, f"{path}: state ignored: {why}; calibration starts anew")
+    if missing := [name for name in like if name not in built]:
+        raise _RefusedError(f"expected {', '.join(missing)}, found {', '.join(built) or 'nothing'}")
+    return built
 
 
 def _fields(value: Any) -> dict[str, Tensor] | None:
