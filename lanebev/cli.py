@@ -34,7 +34,7 @@ def parser() -> argparse.ArgumentParser:
     top = _Parser(prog="lanebev", description=DESCRIPTION, allow_abbrev=False)
     top.add_argument("--version", action="version", version=f"lanebev {__version__}")
     _add_verbose(top, False)
-    commands = top.add_subparsers(dest="command", required=True, metavar="{demo,run}")
+    commands = top.add_subparsers(dest="command", required=True, metavar="{demo,run,compare}")
     demo = commands.add_parser("demo", help="a rendered drive end to end", allow_abbrev=False)
     path = _named(parse_path)
     default = "lanebev-demo"
@@ -43,7 +43,12 @@ def parser() -> argparse.ArgumentParser:
     for setting in fields(RunConfig):
         _add_setting(run, setting)
     run.add_argument("--config", type=path, metavar="FILE", help="settings as YAML; options here override it")
-    for command in (demo, run):
+    compare = commands.add_parser("compare", help="two runs side by side on one page", allow_abbrev=False)
+    for name, words in (("first", "output folder of a run"), ("second", "of another run on the same frames")):
+        compare.add_argument(name, type=path, metavar="AB"[name == "second"], help=words)
+    default = "lanebev-compare.html"
+    compare.add_argument("--out", type=path, default=default, metavar="FILE", help="page (%(default)s)")
+    for command in (demo, run, compare):
         _add_verbose(command, argparse.SUPPRESS)
     return top
 
@@ -100,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logging.getLogger("lanebev").setLevel(logging.DEBUG)
     try:
         with _signals_unwind():
-            report = _run(options) if command == "run" else _demo(options)
+            report = {"run": _run, "demo": _demo, "compare": _compare}[command](options)
     except (ValueError, OSError) as error:
         print(f"lanebev {command}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -154,6 +159,12 @@ def _demo(options: dict[str, Any]) -> str:
     from lanebev.app.demo import demo
 
     return demo(options["out"], _progress)
+
+
+def _compare(options: dict[str, Any]) -> str:
+    from lanebev.app.compare import compare
+
+    return compare(**options)
 
 
 def _progress(label: str) -> Progress:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,16 @@ def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[st
         "lane width": f"{config.lane_width:.4g} m",
         "calibrator": config.calibrator,
         "lanebev": __version__,
+        **_other_settings(config),
     }
+
+
+def _other_settings(config: RunConfig) -> dict[str, str]:
+    """Return the settings that the facts do not name, by their names on the command line."""
+    named = {"source", "camera", "lanes", "lane_width", "calibrator", "weights", "out"}
+    settings = {item.name: getattr(config, item.name) for item in fields(config) if item.name not in named}
+    words = {None: "not given", True: "yes", False: "no"}
+    return {f"--{name.replace('_', '-')}": words.get(value, str(value)) for name, value in settings.items()}
 
 
 def mount_facts(mounted: MountCalibration) -> dict[str, str]:

@@ -6,12 +6,10 @@ import base64
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
 
@@ -19,10 +17,12 @@ from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration, MountStatus, describe_mount
 from lanebev.io.results import ExtrinsicsRow
 from lanebev.report.axis_states import AXES, AxisState, axis_states, deviations, estimates
+from lanebev.report.figures import bokeh_script
 from lanebev.report.lens_table import lens_table
 from lanebev.report.moments import Jpegs
-from lanebev.report.plots import bokeh_script, plot_estimates, plot_widths, width_deviation, width_limits
-from lanebev.report.timeline import STATE_WORDS, places_on_axis, shown_frames, strips
+from lanebev.report.plots import plot_estimates, plot_widths, width_deviation, width_limits
+from lanebev.report.templates import template
+from lanebev.report.timeline import STATE_WORDS, places_on_axis, shown_frames, strips, ticks
 from lanebev.report.verdict import describe, reason_words, verdict
 from lanebev.report.worst import worst_moments
 
@@ -93,7 +93,7 @@ def page_context(report: Report) -> dict[str, Any]:
         "width_sentence": _width_sentence(report),
         "table": pose_table(rows),
         "strips": strips(rows, stills) if several else [],
-        "ticks": _ticks(edges) if several else [],
+        "ticks": ticks(edges) if several else [],
         "worst": worst,
         "rows": rows,
         "mount": mount_table(report.mount) if several else [],
@@ -186,20 +186,6 @@ def summary_facts(report: Report) -> dict[str, str]:
     }
 
 
-@cache
-def template(name: str) -> Any:
-    """Return a template of the package; it escapes what it is given."""
-    environment = Environment(
-        loader=PackageLoader("lanebev.report"), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.policies["json.dumps_kwargs"] = {
-        "sort_keys": False,
-        "allow_nan": False,
-    }  # Bokeh's have an order
-    return environment.get_template(name)
-
-
 def data_uri(jpeg: bytes) -> str:
     """Return a picture as an address that holds it."""
     return f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}"
@@ -223,17 +209,6 @@ def _width_sentence(report: Report) -> str:
         return ""
     compared = f", {100 * before:.1f} cm with the {report.before_title}" if math.isfinite(before) else ""
     return f"Lane widths in the bird's-eye view scatter by {100 * after:.1f} cm (σ){compared}."
-
-
-def _ticks(edges: NDArray[np.float64]) -> list[tuple[float, str]]:
-    """Return places in per cent and words of some round numbers on the time line."""
-    span = float(edges[-1] - edges[0])
-    rough = span / 6
-    scale = 10.0 ** math.floor(math.log10(rough))
-    step = next(scale * nice for nice in (1, 2, 5, 10) if scale * nice >= rough)
-    first = math.ceil(float(edges[0]) / step - 1e-9) * step
-    numbers = np.arange(first, float(edges[-1]) + 1e-9, step)
-    return [(100 * (float(number) - float(edges[0])) / span, f"{number:g}") for number in numbers]
 
 
 def _plain(values: NDArray[np.float64], digits: int) -> Any:

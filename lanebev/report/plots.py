@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from bokeh.embed import json_item
-from bokeh.layouts import gridplot
-from bokeh.models import ColumnDataSource, HoverTool, Range1d, Span
-from bokeh.plotting import figure
-from bokeh.resources import Resources
+from bokeh.models import ColumnDataSource, HoverTool, Span
 from numpy.typing import NDArray
 
 from lanebev.io.results import ExtrinsicsRow
 from lanebev.report.axis_states import AxisState, axis_states, deviations, estimates
+from lanebev.report.figures import (
+    INK,
+    LEAST_RANGE,
+    finish,
+    new_figure,
+    separated,
+    single,
+    stacked,
+    value_limits,
+    x_range,
+)
 from lanebev.report.overlay import BOUNDARY_COLOURS
 
 _LABELS = ("pitch (°)", "yaw (°)", "roll (°)", "height (m)")
-_LEAST_RANGE = (0.5, 0.5, 0.5, 0.1)  # deg, deg, deg, m: no zoom into nothing
-_LINE, _HELD, _TRUTH, _GRID, _INK = "#1f6feb", "#7d8794", "#24292f", "#e5e9ef", "#57606a"
-_NOW = "now"  # name of the lines that mark the frame shown
-_TOOLS = "xpan,xbox_zoom,xwheel_zoom,reset,save"
-_FONT = "system-ui, sans-serif"
-
-
-def bokeh_script() -> str:
-    """Return BokehJS to embed, with all addresses in it cut, so that it can load nothing."""
-    script = "\n".join(Resources(mode="inline", components=["bokeh"], log_level="error").js_raw)
-    return re.sub(r"([\"'`])https?://(?!www\.w3\.org/)", r"\1#", script)
+_LINE, _HELD, _TRUTH, _SECOND = "#1f6feb", "#7d8794", "#24292f", "#c2410c"
 
 
 def plot_estimates(
@@ -47,23 +44,84 @@ def plot_estimates(
         truth: a row per frame where it is known.
     """
     value, std = estimates(rows), deviations(rows)
-    states = np.array([axis_states(row) for row in rows]).reshape(-1, 4)
+    states = _states(rows)
     known = states != AxisState.UNKNOWN
     measured = states <= AxisState.UNCERTAIN
     true = None if truth is None else estimates(truth)
     figures: list[Any] = []
     for axis, label in enumerate(_LABELS):
-        shown = figures[0].x_range if figures else _x_range(x)
-        plot = _figure(label, shown, _limits(value[:, axis], std[:, axis], known[:, axis], axis))
+        shown = figures[0].x_range if figures else x_range(x)
+        plot = new_figure(label, shown, value_limits(value[:, axis], std[:, axis], known[:, axis], axis))
         held = known[:, axis] & ~measured[:, axis]
-        _draw_estimate(plot, x, value[:, axis], std[:, axis], measured[:, axis], held, stills)
+        kinds = {_LINE: (measured[:, axis], "estimate ±2σ"), _HELD: (held, "not determined")}
+        _draw_estimate(plot, x, value[:, axis], std[:, axis], kinds, stills)
         if true is not None:
             plot.line(x, true[:, axis], color=_TRUTH, line_dash=[5, 3], line_width=1.2, legend_label="truth")
-        _finish(plot, axis == len(_LABELS) - 1, "image" if stills else "time (s)", legend=axis == 0)
+        finish(plot, axis == len(_LABELS) - 1, "image" if stills else "time (s)", legend=axis == 0)
         figures.append(plot)
-    grid = gridplot([[plot] for plot in figures], sizing_mode="stretch_width", toolbar_location="right")
-    item: dict[str, Any] = json_item(grid)
-    return item
+    return stacked(figures)
+
+
+def plot_two(
+    x: NDArray[np.float64],
+    first: Sequence[ExtrinsicsRow],
+    second: Sequence[ExtrinsicsRow],
+    stills: bool = False,
+) -> dict[str, Any]:
+    """Return a plot of the estimates of two runs with ±2 sigma, fainter where they are not determined.
+
+    Args:
+        x: (F,) time in s, or the image's number.
+        first: rows of the frames.
+        second: rows of the same frames.
+        stills: each image is on its own.
+    """
+    names, colours = ("A", "B"), (_LINE, _SECOND)
+    values = np.stack([estimates(first), estimates(second)])
+    stds = np.stack([deviations(first), deviations(second)])
+    states = np.stack([_states(first), _states(second)])
+    figures: list[Any] = []
+    for axis, label in enumerate(_LABELS):
+        shown = figures[0].x_range if figures else x_range(x)
+        value, std, state = values[..., axis], stds[..., axis], states[..., axis]
+        known, measured = state != AxisState.UNKNOWN, state <= AxisState.UNCERTAIN
+        plot = new_figure(label, shown, value_limits(value.ravel(), std.ravel(), known.ravel(), axis))
+        for i, (name, colour) in enumerate(zip(names, colours, strict=True)):
+            kinds = {colour: (measured[i], name), f"{colour}80": (known[i] & ~measured[i], "")}
+            _draw_estimate(plot, x, value[i], std[i], kinds, stills)
+        finish(plot, axis == len(_LABELS) - 1, "image" if stills else "time (s)", legend=axis == 0)
+        figures.append(plot)
+    return stacked(figures)
+
+
+def plot_differences(
+    x: NDArray[np.float64], change: NDArray[np.float64], sigma: NDArray[np.float64], stills: bool = False
+) -> dict[str, Any]:
+    """Return a plot of the change from one run to another with ±2 sigma about zero.
+
+    Args:
+        x: (F,) time in s, or the image's number.
+        change: (F, 4) deg and m.
+        sigma: (F, 4) of the change.
+        stills: each image is on its own.
+    """
+    figures: list[Any] = []
+    for axis, label in enumerate(_LABELS):
+        shown = figures[0].x_range if figures else x_range(x)
+        finite = np.isfinite(change[:, axis]) & np.isfinite(sigma[:, axis])
+        most = float(np.abs(change[finite, axis]).max(initial=0.1 * LEAST_RANGE[axis]))
+        plot = new_figure(f"Δ {label}", shown, (-1.2 * most, 1.2 * most), height=120)
+        where = {"x": x[finite], "change": change[finite, axis], "two_sigma": 2 * sigma[finite, axis]}
+        source = ColumnDataSource({key: single(column) for key, column in where.items()})
+        plot.varea(x[finite], -2 * sigma[finite, axis], 2 * sigma[finite, axis], color=_HELD, fill_alpha=0.2)
+        if not stills:
+            plot.line("x", "change", source=source, color=INK, line_width=1.5)
+        dots = plot.scatter("x", "change", source=source, color=INK, size=4, alpha=1.0 if stills else 0.0)
+        tooltips = [("at", "@x{0.00}"), ("B − A", "@change{0.000} (2σ @two_sigma{0.000})")]
+        plot.add_tools(HoverTool(renderers=[dots], tooltips=tooltips, mode="vline"))
+        finish(plot, axis == len(_LABELS) - 1, "image" if stills else "time (s)", legend=False)
+        figures.append(plot)
+    return stacked(figures)
 
 
 def plot_widths(
@@ -82,7 +140,7 @@ def plot_widths(
         limits: m, of the axis, see :func:`width_limits`.
         xlabel: of the axis.
     """
-    plot = _figure("lane width (m)", _x_range(x), limits, height=240)
+    plot = new_figure("lane width (m)", x_range(x), limits, height=240)
     for lane in np.flatnonzero(np.isfinite(widths).any(0)).tolist():
         seen = np.isfinite(widths[:, lane])
         source = ColumnDataSource({"x": x[seen], "width": widths[seen, lane]})
@@ -96,9 +154,9 @@ def plot_widths(
             alpha=0.8,
             legend_label=f"lane {lane}–{lane + 1}",
         )
-    plot.add_layout(Span(location=lane_width, dimension="width", line_color=_INK, line_dash=[6, 4]))
+    plot.add_layout(Span(location=lane_width, dimension="width", line_color=INK, line_dash=[6, 4]))
     plot.add_tools(HoverTool(tooltips=[(xlabel, "@x{0.00}"), ("width", "@width{0.000} m")]))
-    _finish(plot, True, xlabel, legend=True)
+    finish(plot, True, xlabel, legend=True)
     item: dict[str, Any] = json_item(plot)
     return item
 
@@ -138,105 +196,39 @@ def _draw_estimate(
     x: NDArray[np.float64],
     value: NDArray[np.float64],
     std: NDArray[np.float64],
-    measured: NDArray[np.bool_],
-    held: NDArray[np.bool_],
+    kinds: Mapping[str, tuple[NDArray[np.bool_], str]],
     stills: bool,
 ) -> None:
-    """Draw an axis with ±2 sigma: blue where it was measured, grey where it was held."""
+    """Draw an axis with ±2 sigma, in two colours; kinds: colour to where it holds and its name."""
     low, high = value - 2 * std, value + 2 * std
     finite = np.isfinite(low) & np.isfinite(high)
-    kinds = (
-        (_HELD, finite & (held if stills else _extended(held, measured)), "not determined"),
-        (_LINE, finite & (measured if stills else _extended(measured, held)), "estimate ±2σ"),
-    )
-    for colour, mask, name in kinds:
+    masks = [mask for mask, _ in kinds.values()]
+    for (colour, (own, name)), other in zip(kinds.items(), reversed(masks), strict=True):
+        mask = finite & (own if stills else _extended(own, other))
         if not mask.any():
             continue
+        label = {"legend_label": name} if name else {}
         columns = {"x": x, "value": value, "two_sigma": 2 * std}
         columns |= {"low": low, "high": high} if stills else {}
-        source = ColumnDataSource({key: _single(column[mask]) for key, column in columns.items()})
+        source = ColumnDataSource({key: single(column[mask]) for key, column in columns.items()})
         if stills:
             plot.segment("x", "low", "x", "high", source=source, color=colour, alpha=0.5)
         else:
             stretches = _stretches(mask)
-            sides = _separated([np.concatenate([x[at], x[at][::-1]]) for at in stretches])
-            band = _separated([np.concatenate([low[at], high[at][::-1]]) for at in stretches])
+            sides = separated([np.concatenate([x[at], x[at][::-1]]) for at in stretches])
+            band = separated([np.concatenate([low[at], high[at][::-1]]) for at in stretches])
             plot.patch(sides, band, fill_color=colour, fill_alpha=0.22, line_color=None)
-            lines = (_separated([column[at] for at in stretches]) for column in (x, value))
-            plot.line(*lines, color=colour, line_width=1.8, legend_label=name)
+            lines = (separated([column[at] for at in stretches]) for column in (x, value))
+            plot.line(*lines, color=colour, line_width=1.8, **label)
         dots = plot.scatter("x", "value", source=source, size=5, color=colour, alpha=1.0 if stills else 0.0,
-                            legend_label=name)  # fmt: skip
+                            **label)  # fmt: skip
         tooltips = [("at", "@x{0.00}"), ("value", "@value{0.000} ± @two_sigma{0.000}")]
         plot.add_tools(HoverTool(renderers=[dots], tooltips=tooltips, mode="vline"))
 
 
-def _separated(parts: Sequence[NDArray[np.float64]]) -> NDArray[np.floating[Any]]:
-    """Return all parts in one, with a NaN after each: Bokeh draws them apart."""
-    return _single(np.concatenate([np.append(part, np.nan) for part in parts]))
-
-
-def _single(column: NDArray[np.float64]) -> NDArray[np.floating[Any]]:
-    """Return a column in single precision where that is exact to a thousandth."""
-    return column.astype(np.float32) if np.nanmax(np.abs(column), initial=0) < 1e4 else column
-
-
-def _figure(label: str, x_range: Any, limits: tuple[float, float], height: int = 150) -> Any:
-    return figure(
-        height=height,
-        sizing_mode="stretch_width",
-        x_range=x_range,
-        y_range=Range1d(*limits),
-        y_axis_label=label,
-        tools=_TOOLS,
-        active_drag="xbox_zoom",
-        active_scroll=None,
-        output_backend="canvas",
-        min_border_left=62,
-    )
-
-
-def _finish(plot: Any, is_last: bool, xlabel: str, legend: bool) -> None:
-    plot.add_layout(Span(location=0, dimension="height", line_color="#d1242f", name=_NOW, visible=False))
-    plot.toolbar.logo = None
-    plot.outline_line_color = None
-    plot.grid.grid_line_color = _GRID
-    plot.axis.axis_line_color = plot.axis.major_tick_line_color = _GRID
-    plot.axis.minor_tick_line_color = None
-    plot.axis.major_label_text_font = plot.axis.axis_label_text_font = _FONT
-    plot.axis.axis_label_text_font_style = "normal"
-    plot.axis.axis_label_text_color = plot.axis.major_label_text_color = _INK
-    plot.xaxis.major_label_text_font_size = "12px" if is_last else "0px"
-    if is_last:
-        plot.xaxis.axis_label = xlabel
-    if plot.legend:
-        plot.legend.visible = legend
-        plot.legend.orientation = "horizontal"
-        plot.legend.location = "top_right"
-        plot.legend.border_line_color = None
-        plot.legend.background_fill_alpha = 0.7
-        plot.legend.label_text_font = _FONT
-        plot.legend.label_text_font_size = "12px"
-        plot.legend.padding = plot.legend.margin = 2
-
-
-def _x_range(x: NDArray[np.float64]) -> Range1d:
-    low, high = (float(x.min()), float(x.max())) if len(x) else (0.0, 1.0)
-    margin = 0.01 * max(high - low, 1e-3)
-    return Range1d(low - margin, high + margin, bounds=(low - margin, high + margin))
-
-
-def _limits(
-    value: NDArray[np.float64], std: NDArray[np.float64], known: NDArray[np.bool_], axis: int
-) -> tuple[float, float]:
-    """Return limits that show the estimate; a wide start must not flatten the rest."""
-    shown = known & np.isfinite(value) & np.isfinite(std)
-    if not shown.any():
-        return -1.0, 1.0
-    value, std, least = value[shown], std[shown], _LEAST_RANGE[axis]
-    band = np.minimum(2 * std, 1.5 * max(float(np.ptp(value)), least))
-    low, high = float((value - band).min()), float((value + band).max())
-    margin = 0.05 * (high - low) + max(0.0, 0.5 * (least - (high - low)))
-    return low - margin, high + margin
+def _states(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.int64]:
+    """Return (F, 4) states of pitch, yaw, roll and height."""
+    return np.array([axis_states(row) for row in rows], dtype=np.int64).reshape(-1, 4)
 
 
 def _dark(colour: tuple[int, int, int]) -> tuple[int, int, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -66,6 +67,17 @@ def shown_frames(rows: Sequence[ExtrinsicsRow], always: Sequence[int], most: int
     every = max(1, -(-len(rows) // most))
     changes = [i for i in range(1, len(rows)) if rows[i].status != rows[i - 1].status][:most]
     return sorted({*range(0, len(rows), every), *changes, *always})
+
+
+def ticks(edges: NDArray[np.float64]) -> list[tuple[float, str]]:
+    """Return places in per cent and words of some round numbers on the time line."""
+    span = float(edges[-1] - edges[0])
+    rough = span / 6
+    scale = 10.0 ** math.floor(math.log10(rough))
+    step = next(scale * nice for nice in (1, 2, 5, 10) if scale * nice >= rough)
+    first = math.ceil(float(edges[0]) / step - 1e-9) * step
+    numbers = np.arange(first, float(edges[-1]) + 1e-9, step)
+    return [(100 * (float(number) - float(edges[0])) / span, f"{number:g}") for number in numbers]
 
 
 def _strip(

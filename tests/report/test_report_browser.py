@@ -4,7 +4,9 @@ import shutil
 
 import pytest
 
+from lanebev.report.comparison import render_comparison
 from lanebev.report.page import write_report
+from lanebev.report.run_folder import RunFolder
 from tests.report.report_data import FRAMES, eventful_report
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -38,7 +40,7 @@ def _wait(page, condition, seconds=20):
     raise AssertionError(f"not within {seconds} s: {condition}")
 
 
-def _open(browser, path, screen="desktop", address=""):
+def _open(browser, path, screen="desktop", address="", plots=3):
     """A page that is drawn, and the list that its errors, requests and dialogs go to."""
     page, seen = browser.new_context(**SCREENS[screen]).new_page(), []
     page.on("console", lambda message: message.type in ("error", "warning") and seen.append(message.text))
@@ -46,7 +48,7 @@ def _open(browser, path, screen="desktop", address=""):
     page.on("request", lambda request: request.url.startswith(("file:", "data:")) or seen.append(request.url))
     page.on("dialog", lambda dialog: (seen.append(f"dialog {dialog.message}"), dialog.dismiss()))
     page.goto(f"file://{path}{address}")
-    _wait(page, "Bokeh.documents.length === 3 && Bokeh.documents.every(each => each.is_idle)")
+    _wait(page, f"Bokeh.documents.length === {plots} && Bokeh.documents.every(each => each.is_idle)")
     return page, seen
 
 
@@ -141,4 +143,16 @@ def test_hostile_names_run_nothing(browser, tmp_path):
     page, seen = _open(browser, tmp_path / "report.html")
     page.locator("#on").click()
     assert page.locator("#moment-title").inner_text() == HOSTILE
+    assert seen == []
+
+
+@pytest.mark.parametrize("screen", list(SCREENS))
+def test_two_runs_side_by_side_are_drawn(browser, tmp_path, screen):
+    report = eventful_report()
+    first = RunFolder("a", report.rows)
+    second = RunFolder("b", [row._replace(yaw_deg=row.yaw_deg + 0.1) for row in report.rows])
+    (tmp_path / "compare.html").write_text(render_comparison(first, second), encoding="utf-8")
+    page, seen = _open(browser, tmp_path / "compare.html", screen, plots=2)
+    assert page.locator(".plot canvas").count() >= 2
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert seen == []

@@ -1,0 +1,200 @@
+"""Two runs side by side: how their estimates differ over common frames, and which settings do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from lanebev.io.results import ExtrinsicsRow
+from lanebev.report.axis_states import AXES, AxisState, axis_states, deviations, estimates
+from lanebev.report.figures import bokeh_script
+from lanebev.report.plots import plot_differences, plot_two
+from lanebev.report.run_folder import RunFolder
+from lanebev.report.templates import template
+from lanebev.report.timeline import places_on_axis, shown_frames, strips, ticks
+from lanebev.report.verdict import describe, percent, verdict
+
+Pair = tuple[ExtrinsicsRow, ExtrinsicsRow]
+_ANGLE, _LENGTH = "{:+.3f}°", "{:+.1f} cm"
+
+
+@dataclass(frozen=True)
+class AxisDifference:
+    """How an axis differs, second run minus first, over the frames in which both measured it.
+
+    Attributes:
+        axis: its name.
+        count: frames.
+        mean, rms, largest: deg, or m; ``largest`` with its sign.
+        at: number of the frame, in the pairs, of the largest.
+        beyond: share of the frames that differ by more than two joint standard deviations.
+    """
+
+    axis: str
+    count: int
+    mean: float
+    rms: float
+    largest: float
+    at: int
+    beyond: float
+
+    @property
+    def words(self) -> list[str]:
+        """Mean, rms and largest difference with their units."""
+        values = (self.mean, self.rms, self.largest)
+        if self.axis == "height":
+            return [_LENGTH.format(100 * value) for value in values]
+        return [_ANGLE.format(value) for value in values]
+
+
+def common_frames(first: Sequence[ExtrinsicsRow], second: Sequence[ExtrinsicsRow]) -> list[Pair]:
+    """Return the rows of the same frames: of images by the name of their file, else by number.
+
+    Raises:
+        ValueError: there are none.
+    """
+    keys = _names(first), _names(second)
+    if not (keys[0] and keys[1]):
+        keys = [str(row.frame) for row in first], [str(row.frame) for row in second]
+    of_second = dict(zip(keys[1], second, strict=True))
+    pairs = [(row, of_second[key]) for row, key in zip(first, keys[0], strict=True) if key in of_second]
+    if not pairs:
+        raise ValueError("compare: expected two runs with frames in common, got none")
+    return pairs
+
+
+def differences(pairs: Sequence[Pair]) -> list[AxisDifference]:
+    """Return how each axis differs, where both runs measured it."""
+    first, second = ([pair[i] for pair in pairs] for i in (0, 1))
+    change, sigma = difference_and_sigma(pairs)
+    both = _measured(first) & _measured(second) & np.isfinite(change)
+    found = []
+    for axis, name in enumerate(AXES):
+        at = np.flatnonzero(both[:, axis])
+        if len(at):
+            value, std = change[at, axis], sigma[at, axis]
+            worst = int(np.abs(value).argmax())
+            beyond = float((np.abs(value) > 2 * std).mean())
+            rms = float(np.sqrt(np.mean(value**2)))
+            found.append(
+                AxisDifference(
+                    name, len(at), float(value.mean()), rms, float(value[worst]), int(at[worst]), beyond
+                )
+            )
+    return found
+
+
+def difference_and_sigma(pairs: Sequence[Pair]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the change from first to second (F, 4) in deg and m, and its sigma if both err independently."""
+    first, second = ([pair[i] for pair in pairs] for i in (0, 1))
+    return estimates(second) - estimates(first), np.hypot(deviations(first), deviations(second))
+
+
+def differing(first: Mapping[str, str], second: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+    """Return the settings that are not the same, with both values; a dash where one is missing."""
+    names = dict.fromkeys([*first, *second])
+    both = {name: (first.get(name, "–"), second.get(name, "–")) for name in names}
+    return {name: values for name, values in both.items() if values[0] != values[1]}
+
+
+def render_comparison(first: RunFolder, second: RunFolder) -> str:
+    """Return the page that shows two runs side by side.
+
+    Raises:
+        ValueError: they have no frame in common.
+    """
+    pairs = common_frames(first.rows, second.rows)
+    stills = bool(pairs[0][0].image) and len({row.time_s for row, _ in pairs}) == 1
+    found = differences(pairs)
+    shown = shown_frames([row for row, _ in pairs], [each.at for each in found])
+    shown_pairs = [pairs[place] for place in shown]
+    x = places_on_axis([row for row, _ in pairs], stills)[:-1]
+    runs = []
+    for letter, run, i in (("A", first, 0), ("B", second, 1)):
+        rows = [pair[i] for pair in pairs]
+        edges = places_on_axis(rows, stills)
+        result = verdict(rows, stills)
+        runs.append(
+            {
+                "letter": letter,
+                "name": run.name,
+                "verdict": result,
+                "findings": [describe(finding) for finding in result.findings],
+                "strips": strips(rows, stills) if len(rows) > 1 else [],
+                "ticks": ticks(edges) if len(rows) > 1 else [],
+                "frames": len(run.rows),
+            }
+        )
+    several = len(pairs) > 1
+    plots = {
+        "two": plot_two(x[shown], [a for a, _ in shown_pairs], [b for _, b in shown_pairs], stills),
+        "differences": plot_differences(x[shown], *difference_and_sigma(shown_pairs), stills),
+    } if several else {}  # fmt: skip
+    page: str = template("compare.html.j2").render(
+        title=f"{first.name} and {second.name}",
+        runs=runs,
+        common=len(pairs),
+        differences=found,
+        percent=percent,
+        frames={each.axis: pairs[each.at][0] for each in found},
+        settings=differing(first.settings, second.settings),
+        lens=differing(first.lens, second.lens),
+        known=bool(first.settings and second.settings),
+        moments=_moments(found, pairs, first, second),
+        stills=stills,
+        plots=plots,
+        bokeh=Markup(bokeh_script()) if several else "",
+    )
+    return page
+
+
+def comparison_summary(first: RunFolder, second: RunFolder) -> str:
+    """Return what to print: the frames in common, how each axis differs, the settings that do."""
+    pairs = common_frames(first.rows, second.rows)
+    lines = [f"{len(pairs)} frames in common; {second.name} minus {first.name}:"]
+    for each in differences(pairs):
+        mean, rms, largest = each.words
+        frame = pairs[each.at][0].frame
+        lines.append(f"{each.axis}: mean {mean}, rms {rms.lstrip('+')}, largest {largest} (frame {frame})")
+    changed = differing(first.settings, second.settings)
+    lines += [f"{name}: {a} | {b}" for name, (a, b) in changed.items()]
+    return "\n".join(lines)
+
+
+def _names(rows: Sequence[ExtrinsicsRow]) -> list[str]:
+    """Return the names of the images, none where they do not tell the frames apart."""
+    names = [PurePath(row.image).name for row in rows]
+    return names if all(names) and len(set(names)) == len(names) else []
+
+
+def _measured(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.bool_]:
+    measured: NDArray[np.bool_] = np.array([axis_states(row) for row in rows]) <= AxisState.UNCERTAIN
+    return measured
+
+
+def _moments(
+    found: Sequence[AxisDifference], pairs: Sequence[Pair], first: RunFolder, second: RunFolder
+) -> list[dict[str, Any]]:
+    """Return the pictures of both runs nearest to the largest difference of each axis."""
+    moments: dict[int, dict[str, Any]] = {}
+    for each in found:
+        rows = pairs[each.at]
+        numbers = [_nearest(run.pictures, row.frame) for run, row in zip((first, second), rows, strict=True)]
+        if None in numbers:
+            continue
+        pictures = [run.pictures[n] for run, n in zip((first, second), numbers, strict=True) if n is not None]
+        moment = moments.setdefault(
+            each.at, {"row": rows[0], "axes": [], "pictures": pictures, "frames": numbers}
+        )
+        moment["axes"].append(f"{each.axis} {each.words[2]}")
+    return [moments[at] for at in sorted(moments)]
+
+
+def _nearest(pictures: Mapping[int, object], frame: int) -> int | None:
+    return min(pictures, key=lambda number: abs(number - frame), default=None)

@@ -1,0 +1,81 @@
+"""What a run left in its folder, read back: rows, settings, lens and pictures."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lanebev.io.results import ExtrinsicsRow, read_extrinsics
+
+_PICTURE = re.compile(r"data:image/jpeg;base64,[A-Za-z0-9+/=]*")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A finished run.
+
+    Attributes:
+        name: of its folder.
+        rows: of ``extrinsics.csv``.
+        settings: label to value, empty if there is no report.
+        lens: likewise.
+        pictures: of some frames, by number of the frame: name of the view to an address that holds it.
+    """
+
+    name: str
+    rows: Sequence[ExtrinsicsRow]
+    settings: Mapping[str, str] = field(default_factory=dict)
+    lens: Mapping[str, str] = field(default_factory=dict)
+    pictures: Mapping[int, Mapping[str, str]] = field(default_factory=dict)
+
+
+def read_run(folder: str | Path) -> RunFolder:
+    """Read a run's folder; ``report.html`` in it may be missing or another program's.
+
+    Raises:
+        ValueError: the folder has no ``extrinsics.csv``, or it is not ours or has no frame.
+    """
+    folder = Path(folder)
+    rows = read_extrinsics(folder / "extrinsics.csv")
+    if not rows:
+        raise ValueError(f"{folder / 'extrinsics.csv'}: expected a row per frame, got none")
+    try:
+        page = (folder / "report.html").read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return RunFolder(folder.resolve().name, rows)
+    run, data = _json(page, "run"), _json(page, "data")
+    return RunFolder(
+        folder.resolve().name, rows, _texts(run.get("settings")), _texts(run.get("lens")), _pictures(data)
+    )
+
+
+def _json(page: str, name: str) -> dict[str, Any]:
+    """Return the data that a page gives its script by this name; nothing where there are none."""
+    found = re.search(rf'<script type="application/json" id="{name}">([^<]*)</script>', page)
+    try:
+        value = json.loads(found[1]) if found else {}
+    except ValueError:
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _texts(value: object) -> dict[str, str]:
+    return {str(key): str(text) for key, text in value.items()} if isinstance(value, dict) else {}
+
+
+def _pictures(data: Mapping[str, Any]) -> dict[int, dict[str, str]]:
+    """Return the pictures by number of the frame, those only that are JPEG."""
+    try:
+        frames = dict(zip(data["place"], data["frame"], strict=True))
+        return {
+            int(frames[int(place)]): {
+                str(name): uri for name, uri in views.items() if _PICTURE.fullmatch(uri)
+            }
+            for place, views in data["pictures"].items()
+        }
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return {}
