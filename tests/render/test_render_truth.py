@@ -9,6 +9,7 @@ import torch
 
 from lanebev.render.raster.features import features_of
 from lanebev.render.raster.paint import paint_view, prepare
+from lanebev.render.raster.select import take_channels
 from lanebev.render.scene.alignment import build_alignment
 from lanebev.render.scene.camera import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
 from lanebev.render.scene.sampler import BatchSampler
@@ -161,3 +162,8 @@ def _centroid(strip: torch.Tensor, expected: float) -> float | None:
     share = (position - first) / (last - first)
     excess = strip[first : last + 1] - (1 - share) * strip[first] - share * strip[last]
     return float((excess * position).sum() / excess.sum())
+
+
+def test_nothing_is_taken_where_no_object_is_in_view():
+    """As in a drive that begins in mid-air, looking at the empty road below."""
+    assert take_channels(torch.zeros(2, 3), torch.zeros(0, dtype=torch.int64)).shape == (2, 0)

@@ -34,7 +34,7 @@ def take(values: Tensor, place: Tensor) -> Tensor:
 
 def take_channels(values: Tensor, place: Tensor) -> Tensor:
     """(C, P) values at places in P, (C, *place.shape)."""
-    return values.index_select(1, place.flatten()).view(-1, *place.shape)
+    return values.index_select(1, place.flatten()).view(len(values), *place.shape)
 
 
 def put(values: Tensor, place: Tensor, new: Tensor) -> None:
