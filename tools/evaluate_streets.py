@@ -22,15 +22,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import lanebev
-from lanebev import Camera, JointCalibrator, LaneBEV, LaneSegments, Status
-from lanebev.estimation.still import calibrate_still
+from lanebev import BEVGrid, Camera, JointCalibrator, LaneBEV, Status
+from lanebev.estimation.tracker import Tracker
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.io.video import read_image
+from lanebev.observation.frames import check_frame, network_image
+from lanebev.report.overlay import draw_panels
 from train.commands import one_line_errors
 
 KITTI_LANE_WIDTH = 3.5  # m
+ASSUMED_FOV = 60.0  # deg, of a camera that is not published
 SIGMAS = 3.0
-COLOURS = ((255, 80, 80), (255, 170, 0), (60, 230, 60), (0, 220, 255), (90, 110, 255), (230, 80, 255))
 
 
 class Answer(NamedTuple):
@@ -64,17 +66,14 @@ def kitti_truth(path: Path) -> Tensor:
 def calibrate(
     model: LaneBEV, path: Path, camera: Camera, lane_width: float
 ) -> tuple[Answer, NDArray[np.uint8]]:
-    """Calibrate one image; also return it with its segments drawn."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
-    if image is None:
-        raise ValueError(f"{path}: expected an image")
-    tensor = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
-    lens = (camera.intrinsics[None].float(), camera.distortion[None].float(), camera.model)
+    """Calibrate one image, as ``lanebev run --stills`` does; also return it with what was seen drawn."""
+    image = read_image(path)
     with torch.inference_mode():
-        _, segments = model.observe(tensor, *lens)
-        segments = LaneSegments(*(t.double() if t.is_floating_point() else t for t in segments))
-        calibration = calibrate_still(JointCalibrator(), segments, lens[0].double(), lane_width)
-        calibration = calibration.with_std_scaled(model.pose_sigma_scale)
+        frame = network_image(check_frame(image, camera.image_size), torch.device("cpu"))
+        _, vertices = model.boundary_vertices(frame)
+        tracker = Tracker(JointCalibrator(), camera, lane_width)
+        segments, calibration, _ = tracker.still(vertices, model.pose_sigma_scale)
+        picture = draw_panels(image, camera, segments, calibration, path.name, (), BEVGrid())[0]
     pitch, yaw, roll, height = calibration.extrinsics
     down = road_from_cam(pitch, yaw, roll)[0, 1]
     sigma = calibration.covariance[0].diagonal().sqrt()
@@ -86,32 +85,7 @@ def calibrate(
         float(sigma[3]),
         int(calibration.status[0]) == Status.TRACKING,
     )
-    return answer, draw(image, segments, camera, answer)
-
-
-def draw(
-    image: NDArray[np.uint8], segments: LaneSegments, camera: Camera, answer: Answer
-) -> NDArray[np.uint8]:
-    """Draw segments by boundary, brighter where they weigh more, and the estimate."""
-    picture = image.copy()
-    ends = camera.distort_points(segments.endpoints[0].double().flatten(0, 1)).reshape(-1, 2, 2)
-    for (start, end), index, weight in zip(
-        ends.tolist(), segments.boundary[0].tolist(), segments.weight[0].tolist(), strict=True
-    ):
-        if weight > 0.05:
-            colour = tuple(int((0.4 + 0.6 * weight) * c) for c in COLOURS[index % len(COLOURS)])
-            for x, y in (start, end):
-                cv2.circle(picture, (round(x), round(y)), max(2, image.shape[1] // 500), colour, -1)
-    text = (
-        f"{answer.name}  pitch {answer.plane[0]:.2f} +- {answer.sigma[0]:.2f}  roll {answer.plane[1]:.2f} +- "
-        f"{answer.sigma[1]:.2f} deg  height {answer.height:.2f} +- {answer.height_sigma:.2f} m"
-        f"{'' if answer.tracking else '  NOT TRACKING'}"
-    )
-    scale = image.shape[1] / 1600
-    for colour, thick in (((0, 0, 0), 4), ((255, 255, 255), 1)):
-        place = (8, round(36 * scale) + 4)
-        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thick, cv2.LINE_AA)
-    return picture
+    return answer, picture
 
 
 def summarise(answers: list[Answer], truth: Tensor) -> dict[str, float]:
@@ -153,8 +127,7 @@ def culane(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
     """Night frames: how many are calibrated."""
     paths = sorted((data / "culane").rglob("*.jpg"))
     height, width = read_image(paths[0]).shape[:2]
-    focal = 0.5 * width / np.tan(np.radians(30.0))
-    camera = Camera.from_parameters(focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
+    camera = Camera.from_fov(ASSUMED_FOV, width, height)
     seen = [calibrate(model, path, camera, 3.7) for path in paths]
     save_sheet(sheets, "culane", [picture for _, picture in seen], 2, 900)
     return {"images": len(seen), "tracking": sum(answer.tracking for answer, _ in seen)}
@@ -169,9 +142,7 @@ def streets(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]
     for path in sorted(p for p in (data / "streets").iterdir() if p.suffix in (".jpg", ".png")):
         file = path.with_suffix(".yaml")
         height, width = read_image(path).shape[:2]
-        focal = 0.5 * width / np.tan(np.radians(30.0))
-        centred = (focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
-        camera = Camera.from_file(file) if file.exists() else Camera.from_parameters(*centred)
+        camera = Camera.from_file(file) if file.exists() else Camera.from_fov(ASSUMED_FOV, width, height)
         answer, picture = calibrate(model, path, camera, KITTI_LANE_WIDTH)
         pictures.append(picture)
         if path.name in rows:

@@ -9,10 +9,10 @@ import torch
 
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import LaneFileObserver, NetworkObserver, Observer
-from lanebev.app.tracker import Tracker
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.state import JointState
+from lanebev.estimation.tracker import Tracker
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.estimation.two_stage.state import TwoStageState
 from lanebev.io.lane_size import resized_lanes

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from lanebev.app.concurrency import Background
 from lanebev.app.observers import Observation
-from lanebev.app.tracker import Estimate
 from lanebev.app.views import ViewBefore, bird_view
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration
+from lanebev.estimation.tracker import Estimate
 from lanebev.io.lanes import tusimple_line
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video import Frame, VideoWriter, write_png

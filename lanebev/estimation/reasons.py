@@ -18,3 +18,40 @@ class Reason(IntFlag):
     LANE_CHANGE = 64  # the boundary indices moved by one in this frame
     RESTARTED = 128  # started, or started anew, in this frame
     DIRECTION_UNSEEN = 256  # one boundary or less, or not used: pitch and yaw are not updated
+
+
+REASON_WORDS = {
+    Reason.NO_SEGMENTS: "no lane boundaries seen",
+    Reason.FEW_INLIERS: "what was seen does not fit the road",
+    Reason.TIME: "the frames' times do not advance",
+    Reason.NO_START: "no frame yet to start from",
+    Reason.DIRECTION_UNSEEN: "one boundary only",
+    Reason.HEIGHT_UNSEEN: "no lane with both its boundaries",
+    Reason.ROLL_UNSEEN: "one lane only",
+    Reason.LANE_CHANGE: "lane change",
+    Reason.RESTARTED: "started anew",
+}
+WHOLE_FRAME = (Reason.NO_SEGMENTS, Reason.FEW_INLIERS, Reason.TIME, Reason.NO_START)
+UNSEEN = {  # axes that are not determined; the first that holds implies those after it
+    Reason.DIRECTION_UNSEEN: ("pitch", "yaw"),
+    Reason.HEIGHT_UNSEEN: ("height",),
+    Reason.ROLL_UNSEEN: ("roll",),
+}
+
+
+def telling_reasons(reasons: Reason) -> list[Reason]:
+    """Select the reasons that no other one implies, in the order of :data:`REASON_WORDS`.
+
+    Where nothing of the frame was used, no axis is determined; and one boundary alone leaves open what one
+    lane alone does.
+    """
+    unseen = [reason for reason in UNSEEN if reason & reasons]
+    implied = unseen if any(reason & reasons for reason in WHOLE_FRAME) else unseen[1:]
+    return [reason for reason in REASON_WORDS if reason & reasons and reason not in implied]
+
+
+def describe_reasons(reasons: Reason) -> list[str]:
+    """Describe why a frame is not (fully) tracked, a phrase for each reason that no other one implies."""
+    axes = [axis for reason, names in UNSEEN.items() if reason & reasons for axis in names]
+    what = f"{', '.join(axes)} not determined: "
+    return [(what if reason in UNSEEN else "") + REASON_WORDS[reason] for reason in telling_reasons(reasons)]

@@ -10,22 +10,12 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
+from lanebev.estimation.reasons import REASON_WORDS, UNSEEN, WHOLE_FRAME, Reason, telling_reasons
 from lanebev.io.results import ExtrinsicsRow
 from lanebev.report.axis_states import AXES, LARGEST_STD, AxisState, axis_states, deviations, reasons_of
 
-REASON_WORDS = {
-    "NO_SEGMENTS": "no lane boundaries seen",
-    "FEW_INLIERS": "what was seen does not fit the road",
-    "TIME": "the frames' times do not advance",
-    "NO_START": "no frame yet to start from",
-    "ROLL_UNSEEN": "one lane only",
-    "HEIGHT_UNSEEN": "no lane with both its boundaries",
-    "DIRECTION_UNSEEN": "one boundary only",
-    "LANE_CHANGE": "lane change",
-    "RESTARTED": "started anew",
-}
-_WHOLE_FRAME = ("NO_SEGMENTS", "FEW_INLIERS", "TIME", "NO_START")
-_UNSEEN = ("DIRECTION_UNSEEN", "HEIGHT_UNSEEN", "ROLL_UNSEEN")  # each implies those after it
+_WORDS = {str(reason.name): words for reason, words in REASON_WORDS.items()}
+_WHOLE_FRAME, _UNSEEN = ([str(reason.name) for reason in some] for some in (WHOLE_FRAME, UNSEEN))
 _STATUS_WORDS = {
     "LOST": "pose lost",
     "COASTING": "pose only predicted",
@@ -196,11 +186,11 @@ def percent(share: float) -> str:
 
 def reason_words(names: Sequence[str]) -> list[str]:
     """Return reasons in words; of the unseen axes the one that implies the others."""
-    unseen = next((name for name in _UNSEEN if name in names), None)
-    kept = [name for name in names if name not in _UNSEEN or name == unseen]
-    if any(name in names for name in _WHOLE_FRAME):  # nothing was used, so no axis was seen
-        kept = [name for name in kept if name not in _UNSEEN]
-    return [REASON_WORDS.get(name, name.lower().replace("_", " ")) for name in kept]
+    known = Reason.NONE
+    for name in names:
+        known |= Reason.__members__.get(name, Reason.NONE)
+    new = [name.lower().replace("_", " ") for name in names if name not in _WORDS]
+    return [REASON_WORDS[reason] for reason in telling_reasons(known)] + new
 
 
 def _in_images(subject: str, what: str, at: NDArray[np.bool_], why: str) -> Iterator[Finding]:
@@ -252,14 +242,14 @@ def _frequent(rows: Sequence[ExtrinsicsRow], among: Sequence[str], least: float 
     """Return the reasons that hold in a fifth of the frames or more, in words."""
     counts = Counter(name for row in rows for name in reasons_of(row) if name in among)
     usual = [name for name, count in counts.most_common() if count >= least * len(rows)]
-    return ", ".join(REASON_WORDS[name] for name in usual)
+    return ", ".join(_WORDS[name] for name in usual)
 
 
 def _unseen_why(rows: Sequence[ExtrinsicsRow]) -> str:
     """Return why an axis was not seen in most of the frames, in words."""
     named = [next((name for name in _UNSEEN if name in reasons_of(row)), None) for row in rows]
     counts = Counter(name for name in named if name)
-    return REASON_WORDS[counts.most_common(1)[0][0]] if counts else ""
+    return _WORDS[counts.most_common(1)[0][0]] if counts else ""
 
 
 def _precision(rows: Sequence[ExtrinsicsRow], states: NDArray[np.int64]) -> str:

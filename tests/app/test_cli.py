@@ -340,7 +340,7 @@ def test_a_second_ctrl_c_waits_until_the_first_has_cleaned_up(data, tmp_path, ca
         finally:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("lanebev.app.tracker.Tracker.drive_frame", stop)
+    monkeypatch.setattr("lanebev.estimation.tracker.Tracker.drive_frame", stop)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         assert _run(data, out=tmp_path / "out") == 130
@@ -527,7 +527,7 @@ def test_an_interrupted_run_leaves_nothing(data, tmp_path, capsys, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lanebev.app.tracker.Tracker.drive_frame", interrupt)
+    monkeypatch.setattr("lanebev.estimation.tracker.Tracker.drive_frame", interrupt)
     assert _run(data, out=tmp_path / "out") == 130
     assert capsys.readouterr().err == "lanebev run: interrupted, nothing written\n"
     assert list(tmp_path.iterdir()) == []
@@ -540,7 +540,7 @@ def test_a_run_stopped_by_the_system_leaves_nothing(data, tmp_path, capsys, monk
         time.sleep(10)
 
     before = signal.signal(number, signal.SIG_DFL)  # the tests may run under nohup
-    monkeypatch.setattr("lanebev.app.tracker.Tracker.drive_frame", stop)
+    monkeypatch.setattr("lanebev.estimation.tracker.Tracker.drive_frame", stop)
     try:
         assert _run(data, out=tmp_path / "out") == 128 + number
         assert capsys.readouterr().err == "lanebev run: interrupted, nothing written\n"

@@ -1,4 +1,4 @@
-"""LaneBEV frame by frame, ``lanebev run``, and a run on its ``lanes.json`` are the same calibration."""
+"""LaneBEV and Session frame by frame, a run, and a run on its ``lanes.json`` are the same calibration."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lanebev import Camera, LaneBEV
+from lanebev import Camera, LaneBEV, Session
 from lanebev.app.build import make_calibrator
 from lanebev.app.config import RunConfig
 from lanebev.app.run import run
@@ -53,13 +53,19 @@ def test_one_road(drive, tmp_path, calibrator):
     camera = Camera.from_file(drive / "camera.yaml")
     model = LaneBEV.from_pretrained(calibrator=make_calibrator(calibrator)).eval()
     lens = (camera.distortion[None], camera.model)
-    state, rows = None, []
+    session = Session(camera, calibrator=make_calibrator(calibrator), lane_width=LANE_WIDTH, colours="rgb")
+    state, rows, live = None, [], []
     for frame in open_source(str(drive / "drive.mp4")):
+        result = session(frame.image, stamp=frame.time)
+        weight = torch.ones(1, 11)  # Session does not tell them
+        live.append(extrinsics_row(frame.number, frame.time, result.calibration, weight, ""))
         image = torch.from_numpy(frame.image.copy()).permute(2, 0, 1)[None] / 255
         with torch.inference_mode():
             out, state = model(image, camera.intrinsics[None], state, frame.dt, LANE_WIDTH, *lens)
         rows.append(extrinsics_row(frame.number, frame.time, out.calibration, out.segments.weight, ""))
 
+    assert [row.status for row in live] == [row.status for row in rows]
+    np.testing.assert_allclose(_numbers(live), _numbers(rows), atol=1e-6, rtol=0)
     assert [row.status for row in by_run.rows] == [row.status for row in rows]
     assert [row.segments for row in by_lanes.rows] == [row.segments for row in rows]
     np.testing.assert_allclose(_numbers(by_run.rows), _numbers(rows), atol=1e-6, rtol=0)

@@ -1,4 +1,4 @@
-"""A calibrator and a mount over the frames of a run, with the states that they hand on."""
+"""A calibrator and a mount over the frames of a drive, with the states that they hand on."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from lanebev.estimation.calibrator import Calibrator, StateT
 from lanebev.estimation.mount import MountCalibration, MountEstimator, MountState
 from lanebev.estimation.reasons import Reason
 from lanebev.estimation.still import calibrate_still_with_state
+from lanebev.geometry.focal import with_focal_std
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.segments import LaneSegments, camera_segments
 from lanebev.types import Calibration
@@ -37,10 +38,14 @@ class Tracker(Generic[StateT]):
         calibrator: of the pose.
         camera: the lens.
         lane_width: m.
+        focal_std: standard deviation of the focal length as a share of it, which widens the pose's.
     """
 
-    def __init__(self, calibrator: Calibrator[StateT], camera: Camera, lane_width: float) -> None:
+    def __init__(
+        self, calibrator: Calibrator[StateT], camera: Camera, lane_width: float, focal_std: float = 0.0
+    ) -> None:
         self.calibrator, self.camera, self.lane_width = calibrator, camera, lane_width
+        self.focal_std = focal_std
         self.mount_estimator = MountEstimator()
         self.state: StateT = calibrator.initial_state(1, dtype=torch.float64)
         self.mount_state: MountState = self.mount_estimator.initial_state(1, dtype=torch.float64)
@@ -50,20 +55,30 @@ class Tracker(Generic[StateT]):
         """Return what is remembered, by name."""
         return {"calibrator": self.state, "mount": self.mount_state}
 
-    def drive_frame(self, vertices: BoundaryVertices, dt: float, pose_sigma_scale: float) -> Estimate:
+    def drive_frame(
+        self, vertices: BoundaryVertices, dt: float, pose_sigma_scale: float, speed: float | None = None
+    ) -> Estimate:
         """Estimate on the next frame of the drive.
 
         Args:
             vertices: of batch size 1, in pixels of the image as taken.
             dt: s since the frame before.
             pose_sigma_scale: factor on the standard deviations of the pose.
+            speed: m/s of the vehicle, if it is known; the mount learns nothing from a slow one.
         """
         segments = camera_segments(vertices, self.camera)
         intrinsics = self.camera.intrinsics[None]
         calibration, self.state = self.calibrator(segments, intrinsics, self.state, dt, self.lane_width)
         calibration = calibration.with_std_scaled(pose_sigma_scale)
-        bend = self.calibrator.curvature(self.state)
-        self.mount, self.mount_state = self.mount_estimator(calibration, self.mount_state, dt, curvature=bend)
+        if self.focal_std:
+            calibration = with_focal_std(calibration, intrinsics, self.focal_std)
+        self.mount, self.mount_state = self.mount_estimator(
+            calibration,
+            self.mount_state,
+            dt,
+            speed=None if speed is None else torch.tensor([speed], dtype=torch.float64),
+            curvature=self.calibrator.curvature(self.state),
+        )
         return Estimate(segments, calibration, Reason(int(self.calibrator.reasons(self.state)[0])))
 
     def still(self, vertices: BoundaryVertices, pose_sigma_scale: float) -> Estimate:
