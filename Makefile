@@ -48,7 +48,7 @@ format: $(VENV)/ready  ## mend what ruff can mend
 $(VENV)/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[train,export,docs,dev]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[train,export,formats,fleet,completion,rerun,docs,dev]'
 	touch $@
 
 clean:  ## remove the environment and everything that was made
