@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -11,10 +12,12 @@ from lanebev.app.config import RunConfig
 from lanebev.app.observers import LaneFileObserver, NetworkObserver, Observer
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.single_frame import FramePrior, prior_of_mount
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.tracker import Tracker
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.estimation.two_stage.state import TwoStageState
+from lanebev.io.calibration_file import read_mount
 from lanebev.io.lane_size import resized_lanes
 from lanebev.io.lanes import lane_files, read_lanes
 from lanebev.io.video import FrameSource, image_size
@@ -25,16 +28,37 @@ RunTracker = Tracker[JointState] | Tracker[TwoStageState]
 _LOOKED_AT = 20  # images of a folder, for one of the camera's size
 
 
-def make_calibrator(name: str) -> JointCalibrator | TwoStageCalibrator:
-    """Make the calibrator of this name, one of CALIBRATORS, with default settings."""
-    return TwoStageCalibrator() if name == "two-stage" else JointCalibrator()
+def make_camera(config: RunConfig, image_size: tuple[int, int]) -> Camera:
+    """Read the camera file, or make an ideal camera of the field of view and the source's image size.
+
+    Raises:
+        ValueError: the file is none of a camera.
+    """
+    if config.fov is not None:
+        height, width = image_size
+        return Camera.from_fov(config.fov, width, height)
+    return Camera.from_file(config.camera, image_size, config.rectified)
 
 
-def make_tracker(name: str, camera: Camera, lane_width: float) -> RunTracker:
-    """Make the tracker by the calibrator of this name."""
+def make_calibrator(name: str, prior: FramePrior | None = None) -> JointCalibrator | TwoStageCalibrator:
+    """Make the calibrator of this name, one of CALIBRATORS, with default settings but for the prior."""
     if name == "two-stage":
-        return Tracker(TwoStageCalibrator(), camera, lane_width)
-    return Tracker(JointCalibrator(), camera, lane_width)
+        return TwoStageCalibrator()
+    return JointCalibrator() if prior is None else JointCalibrator(prior=prior)
+
+
+def make_tracker(config: RunConfig, camera: Camera) -> RunTracker:
+    """Make the tracker with the calibrator, the prior and the standard deviations of the settings.
+
+    Raises:
+        ValueError: ``mount`` is no calibration of a mount.
+    """
+    prior = None
+    if config.mount is not None:
+        mount = read_mount(config.mount)
+        prior = prior_of_mount(mount.pose.tolist(), mount.std.tolist())
+    calibrator: Any = make_calibrator(config.calibrator, prior)
+    return Tracker(calibrator, camera, config.lane_width, config.relative_focal_std, config.lane_width_std)
 
 
 def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Observer:
@@ -64,7 +88,8 @@ def input_files(config: RunConfig, source: FrameSource) -> list[str | Path]:
     """Return the files that a run reads and does not mean to replace."""
     lanes = [] if config.lanes is None else lane_files(config.lanes)
     weights = [] if config.weights is None else [config.weights]
-    return [*(source.paths or [source.source]), config.camera, *lanes, *weights]
+    files = [path for path in (config.camera, config.mount) if path]
+    return [*(source.paths or [source.source]), *files, *lanes, *weights]
 
 
 def match_image_size(camera: Camera, source: FrameSource) -> FrameSource:

@@ -16,6 +16,8 @@ from lanebev.numbers import parse_size, read_text
 T = TypeVar("T")
 
 CALIBRATORS = ("joint", "two-stage")
+FOV_FOCAL_STD = 0.2
+"""Standard deviation of a guessed focal length as a share of it: 60 degrees of view may be 40 or 90."""
 
 
 def parse_path(text: str) -> str:
@@ -60,7 +62,7 @@ class RunConfig:
 
     Attributes:
         source: video, folder, glob or image.
-        camera: camera file.
+        camera: camera file, or empty with ``fov``.
         out: output folder.
         lane_width: m.
         lanes: lane file or folder of another detector, None for the network.
@@ -70,6 +72,11 @@ class RunConfig:
         fps: of a folder, a glob or a raw stream; None is what names or the stream say, else 30. A video knows
             its own.
         lanes_size: (height, width) px of the images that ``lanes`` was drawn on; None is the source's own.
+        fov: degrees, horizontal field of view of an ideal camera, in place of a camera file.
+        focal_std: standard deviation of the focal length as a share of it; None is 0 with a camera file and
+            FOV_FOCAL_STD with ``fov``.
+        lane_width_std: m, standard deviation of ``lane_width``; its part in the height's is proportional.
+        mount: ``calibration.yaml`` of an earlier run of this camera, whose pose is this one's prior.
         rectified: the images were rectified: the camera is the camera file's projection matrix P.
         weights: of the network, None for the shipped ones.
         device: that the network runs on, such as "cpu" or "cuda".
@@ -102,9 +109,33 @@ class RunConfig:
     lanes_size: tuple[int, int] | None = option(
         None, "size of the images that --lanes was drawn on, if not the source's", "WxH", parse_size
     )
+    fov: float | None = option(
+        None,
+        "horizontal field of view, instead of --camera, for those who know no more of the lens",
+        "DEG",
+        float,
+    )
+    focal_std: float | None = option(
+        None,
+        "standard deviation of the focal length, as a share of it (0 with --camera, "
+        f"{FOV_FOCAL_STD} with --fov)",
+        "REL",
+        float,
+    )
+    lane_width_std: float = option(0.0, "standard deviation of the lane width, metres ({})", "M", float)
+    mount: str | None = option(
+        None, "calibration.yaml of an earlier run, whose pose is a prior for this one", "FILE"
+    )
     rectified: bool = option(False, "the images were rectified: take the projection matrix P")
     weights: str | None = option(None, "weights of the network instead of the shipped ones", "FILE")
     device: str = option("cpu", "that the network runs on: cpu, cuda, cuda:1, mps ({})", "NAME")
+
+    @property
+    def relative_focal_std(self) -> float:
+        """``focal_std`` with its default."""
+        if self.focal_std is not None:
+            return self.focal_std
+        return 0.0 if self.fov is None else FOV_FOCAL_STD
 
     @property
     def frame_rate(self) -> Fraction | None:
@@ -112,23 +143,42 @@ class RunConfig:
         return None if self.fps is None else Fraction(self.fps).limit_denominator(1000)
 
     def __post_init__(self) -> None:
-        for name in ("source", "camera"):
-            if not getattr(self, name):
-                raise ValueError(
-                    f"{name}: expected {'a path' if name == 'source' else '--camera FILE'}, got none"
-                )
+        if not self.source:
+            raise ValueError("source: expected a path, got none")
+        self._check_lens()
+        if not 0.0 <= self.lane_width_std <= 2.0:
+            raise ValueError(f"lane width std: expected 0 to 2 m, got {self.lane_width_std:g}")
         if not (math.isfinite(self.lane_width) and 1.0 < self.lane_width < 10.0):
             raise ValueError(f"lane width: expected 1 to 10 m, got {self.lane_width:g}")
         if self.fps is not None and not (math.isfinite(self.fps) and 0.01 <= self.fps <= 10_000):
             raise ValueError(f"fps: expected 0.01 to 10000 frames per second, got {self.fps:g}")
         if self.calibrator not in CALIBRATORS:
             raise ValueError(f"calibrator: expected {' or '.join(CALIBRATORS)}, got {self.calibrator!r}")
+        if self.mount and self.calibrator != "joint":
+            raise ValueError(f"mount: expected --calibrator joint with it, got {self.calibrator}")
         if self.stills and self.resume:
             raise ValueError("resume: expected a drive, got --stills; images on their own have no state")
         if self.lanes and self.weights:
             raise ValueError(
                 "weights: expected the network's lanes, got --lanes as well; leave one of them out"
             )
+
+    def _check_lens(self) -> None:
+        if not self.camera and self.fov is None:
+            raise ValueError("camera: expected --camera FILE, or --fov DEG if no file is at hand, got none")
+        if self.camera and self.fov is not None:
+            raise ValueError("fov: expected no --camera beside it, got both; leave one of them out")
+        if self.fov is not None and not 0.0 < self.fov < 180.0:
+            raise ValueError(
+                f"fov: expected a horizontal field of view of 0 to 180 degrees, got {self.fov:g}"
+            )
+        if not 0.0 <= self.relative_focal_std < 1.0:
+            raise ValueError(
+                f"focal std: expected a share of the focal length from 0 to 1, as 0.05, "
+                f"got {self.focal_std:g}"
+            )
+        if self.rectified and self.fov is not None:
+            raise ValueError("rectified: expected a camera file with a projection matrix, got --fov")
 
 
 def read_settings(path: str | Path) -> dict[str, object]:

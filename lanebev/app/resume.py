@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from lanebev.app.build import RunTracker, make_tracker
@@ -31,7 +32,7 @@ def load_states(config: RunConfig, tracker: RunTracker, camera: Camera) -> str |
         )
     loaded = load_state(path, tracker.states())
     for name in CALIBRATORS if loaded.problem else ():
-        other = make_tracker(name, camera, config.lane_width)
+        other = make_tracker(replace(config, calibrator=name, mount=None), camera)
         if load_state(path, other.states()).problem is None:
             raise ValueError(
                 f"resume: expected a state of the {config.calibrator} calibrator, got one of the {name} "
@@ -41,7 +42,7 @@ def load_states(config: RunConfig, tracker: RunTracker, camera: Camera) -> str |
         return loaded.problem
     if loaded.metadata.get("camera") != camera.fingerprint():
         raise ValueError(
-            f"resume: expected a state of the camera in {config.camera}, got another camera's in "
+            f"resume: expected a state of the camera in {config.camera or '--fov'}, got another camera's in "
             f"{config.resume}; give its camera file or leave out --resume"
         )
     tracker.state, tracker.mount_state = loaded.states["calibrator"], loaded.states["mount"]

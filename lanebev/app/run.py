@@ -9,14 +9,20 @@ from pathlib import Path
 
 import torch
 
-from lanebev.app.build import input_files, lens_remark, make_observer, make_tracker, match_image_size
+from lanebev.app.build import (
+    input_files,
+    lens_remark,
+    make_camera,
+    make_observer,
+    make_tracker,
+    match_image_size,
+)
 from lanebev.app.concurrency import prefetch
 from lanebev.app.config import RunConfig
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states
 from lanebev.app.summary import mount_facts, run_facts
-from lanebev.camera.model import Camera
 from lanebev.io.calibration_file import write_calibration
 from lanebev.io.results import ExtrinsicsRow, OutputFolder, check_inputs_stay
 from lanebev.io.state import save_state
@@ -49,11 +55,11 @@ def run(
     """
     source = open_source(config.source, config.frame_rate)
     check_inputs_stay(config.out, input_files(config, source))
-    camera = Camera.from_file(config.camera, source.image_size, config.rectified)
+    camera = make_camera(config, source.image_size)
     source = match_image_size(camera, source)
     logger.info("%s: %d frames of %d x %d", source.source, source.count, *reversed(camera.image_size))
     observer = make_observer(config, source, camera)
-    tracker = make_tracker(config.calibrator, camera, config.lane_width)
+    tracker = make_tracker(config, camera)
     problem = load_states(config, tracker, camera)
     frames: Iterator[Frame] = prefetch(source)
     frames = progress(frames, source.count) if progress else frames

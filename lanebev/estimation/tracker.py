@@ -5,16 +5,18 @@ from __future__ import annotations
 from typing import Generic, NamedTuple
 
 import torch
+from torch import Tensor
 
 from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator, StateT
 from lanebev.estimation.mount import MountCalibration, MountEstimator, MountState
 from lanebev.estimation.reasons import Reason
 from lanebev.estimation.still import calibrate_still_with_state
-from lanebev.geometry.focal import with_focal_std
+from lanebev.geometry.focal import focal_covariance
+from lanebev.geometry.road import lane_width_covariance
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.segments import LaneSegments, camera_segments
-from lanebev.types import Calibration
+from lanebev.types import Calibration, Extrinsics
 
 
 class Estimate(NamedTuple):
@@ -39,13 +41,19 @@ class Tracker(Generic[StateT]):
         camera: the lens.
         lane_width: m.
         focal_std: standard deviation of the focal length as a share of it, which widens the pose's.
+        lane_width_std: m, standard deviation of the lane width, which widens the height's.
     """
 
     def __init__(
-        self, calibrator: Calibrator[StateT], camera: Camera, lane_width: float, focal_std: float = 0.0
+        self,
+        calibrator: Calibrator[StateT],
+        camera: Camera,
+        lane_width: float,
+        focal_std: float = 0.0,
+        lane_width_std: float = 0.0,
     ) -> None:
         self.calibrator, self.camera, self.lane_width = calibrator, camera, lane_width
-        self.focal_std = focal_std
+        self.focal_std, self.lane_width_std = focal_std, lane_width_std
         self.mount_estimator = MountEstimator()
         self.state: StateT = calibrator.initial_state(1, dtype=torch.float64)
         self.mount_state: MountState = self.mount_estimator.initial_state(1, dtype=torch.float64)
@@ -70,16 +78,16 @@ class Tracker(Generic[StateT]):
         intrinsics = self.camera.intrinsics[None]
         calibration, self.state = self.calibrator(segments, intrinsics, self.state, dt, self.lane_width)
         calibration = calibration.with_std_scaled(pose_sigma_scale)
-        if self.focal_std:
-            calibration = with_focal_std(calibration, intrinsics, self.focal_std)
-        self.mount, self.mount_state = self.mount_estimator(
+        mount, self.mount_state = self.mount_estimator(
             calibration,
             self.mount_state,
             dt,
             speed=None if speed is None else torch.tensor([speed], dtype=torch.float64),
             curvature=self.calibrator.curvature(self.state),
         )
-        return Estimate(segments, calibration, Reason(int(self.calibrator.reasons(self.state)[0])))
+        self.mount = mount._replace(covariance=mount.covariance + self._common_error(mount.extrinsics))
+        reasons = Reason(int(self.calibrator.reasons(self.state)[0]))
+        return Estimate(segments, self._with_common_error(calibration), reasons)
 
     def still(self, vertices: BoundaryVertices, pose_sigma_scale: float) -> Estimate:
         """Estimate on an image of its own; nothing is remembered of it."""
@@ -89,4 +97,19 @@ class Tracker(Generic[StateT]):
             self.calibrator, segments, intrinsics, self.lane_width
         )
         calibration = calibration.with_std_scaled(pose_sigma_scale)
-        return Estimate(segments, calibration, Reason(int(self.calibrator.reasons(state)[0])))
+        reasons = Reason(int(self.calibrator.reasons(state)[0]))
+        return Estimate(segments, self._with_common_error(calibration), reasons)
+
+    def _common_error(self, extrinsics: Extrinsics) -> Tensor:
+        """Return the covariance (1, 4, 4) of what focal length and lane width make wrong in all frames alike.
+
+        A filter does not average it out, nor does the mount.
+        """
+        common = lane_width_covariance(extrinsics.height, self.lane_width_std / self.lane_width)
+        if self.focal_std:
+            common = common + focal_covariance(extrinsics, self.camera.intrinsics[None], self.focal_std)
+        return common
+
+    def _with_common_error(self, calibration: Calibration) -> Calibration:
+        more = self._common_error(calibration.extrinsics)
+        return calibration._replace(covariance=calibration.covariance + more)

@@ -38,11 +38,34 @@ def pose_by_log_focal(extrinsics: Extrinsics, intrinsics: Tensor) -> Tensor:
     return slope
 
 
+def focal_covariance(extrinsics: Extrinsics, intrinsics: Tensor, focal_std: float | Tensor) -> Tensor:
+    """Compute what an uncertain focal length contributes to the covariance of a pose, (B, 4, 4).
+
+    It is d dᵀ σ² with d from :func:`pose_by_log_focal`.
+
+    Args:
+        extrinsics: each (B,).
+        intrinsics: (B, 3, 3) px.
+        focal_std: standard deviation of the focal length as a share of it, a float or (B,).
+
+    Raises:
+        ValueError: a negative or not finite standard deviation, given as a float.
+    """
+    if isinstance(focal_std, (int, float)) and not 0 <= focal_std < float("inf"):
+        raise ValueError(f"focal_std: expected a share of the focal length such as 0.05, got {focal_std}")
+    pose = extrinsics.pitch
+    slope = pose_by_log_focal(extrinsics, intrinsics.to(pose)).to(pose)
+    share = torch.as_tensor(focal_std, dtype=pose.dtype, device=pose.device)
+    change = slope * share.reshape(-1, 1)  # (B, 4)
+    covariance: Tensor = change.unsqueeze(-1) * change.unsqueeze(-2)
+    return covariance
+
+
 def with_focal_std(calibration: Calibration, intrinsics: Tensor, focal_std: float | Tensor) -> Calibration:
     """Add to a calibration's covariance what an uncertain focal length contributes.
 
     The error is the same in all frames, so that a filter does not average it out: the covariance grows by
-    d dᵀ σ² with d from :func:`pose_by_log_focal`.
+    :func:`focal_covariance`.
 
     Args:
         calibration: of B rows.
@@ -52,13 +75,8 @@ def with_focal_std(calibration: Calibration, intrinsics: Tensor, focal_std: floa
     Raises:
         ValueError: a negative or not finite standard deviation, given as a float.
     """
-    if isinstance(focal_std, (int, float)) and not 0 <= focal_std < float("inf"):
-        raise ValueError(f"focal_std: expected a share of the focal length such as 0.05, got {focal_std}")
-    covariance = calibration.covariance
-    slope = pose_by_log_focal(calibration.extrinsics, intrinsics.to(covariance)).to(covariance)
-    share = torch.as_tensor(focal_std, dtype=covariance.dtype, device=covariance.device)
-    change = slope * share.reshape(-1, 1)  # (B, 4)
-    return calibration._replace(covariance=covariance + change.unsqueeze(-1) * change.unsqueeze(-2))
+    more = focal_covariance(calibration.extrinsics, intrinsics, focal_std)
+    return calibration._replace(covariance=calibration.covariance + more)
 
 
 def _image_of_lanes(pose: Tensor, intrinsics: Tensor, log_focal: Tensor) -> Tensor:

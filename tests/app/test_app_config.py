@@ -49,7 +49,7 @@ def test_a_bad_file_is_one_line_that_names_it(tmp_path, text, message):
         ({"lane_width": 37.0}, "lane width: expected 1 to 10 m, got 37"),
         ({"fps": 0.0}, "fps: expected"),
         ({"calibrator": "x"}, "calibrator: expected joint or two-stage, got 'x'"),
-        ({"camera": ""}, "camera: expected --camera FILE, got none"),
+        ({"camera": ""}, "camera: expected --camera FILE, or --fov DEG .*, got none"),
         ({"source": ""}, "source: expected a path, got none"),
         ({"lanes": "l.json", "weights": "w"}, "weights: expected the network's lanes, got --lanes as well"),
     ],

@@ -8,8 +8,9 @@ every roll starts a robust Gauss-Newton on perpendicular pixel distances whose n
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,6 +33,7 @@ from lanebev.observation.segments import LaneSegments
 from lanebev.types import NUM_BOUNDARIES, Extrinsics
 
 _ANNEALING = (0.1, 0.06, 0.035, 0.02, 0.02)  # scales of the linear fits, of the focal length
+_BODY_STD = (0.005, 0.015, 0.01, 0.03)  # rad, rad, rad, m of a frame's pose about the mount
 _OBSERVED = 0.2  # a parameter is observed if its sigma fell below this part of the prior's
 
 
@@ -91,6 +93,32 @@ class FramePrior:
         angles = (self.pitch_std, self.yaw_std, self.roll_std)
         shape = (self.curvature_std, self.curvature_rate_std)
         return like.new_tensor([*angles, self.height_std, self.offset_std, *shape])
+
+
+def prior_of_mount(pose: Sequence[float], std: Sequence[float]) -> FramePrior:
+    """Make the prior of a frame from how the camera is mounted.
+
+    The vehicle's body moves on its suspension, drives askew in its lane and stands on a road with a
+    crossfall: ``_BODY_STD`` is added to the mount's own standard deviations. The search is as wide as the
+    prior is.
+
+    Args:
+        pose: pitch, yaw, roll (rad) and height (m) of the mount.
+        std: their standard deviations; infinite for what is not known, which stays as without a mount.
+    """
+    usual = FramePrior()
+    names = ("pitch", "yaw", "roll", "height")
+    known = [name for name, sigma in zip(names, std, strict=True) if math.isfinite(sigma)]
+    means = {name: value for name, value in zip(names, pose, strict=True) if name in known}
+    wide = zip(names, std, _BODY_STD, strict=True)
+    spread = {f"{name}_std": math.hypot(sigma, body) for name, sigma, body in wide if name in known}
+    search = {
+        f"{name}_range": min(3.0 * spread[f"{name}_std"], getattr(usual, f"{name}_range"))
+        for name in ("pitch", "roll")
+        if name in known
+    }
+    changes: dict[str, Any] = {**means, **spread, **search}
+    return replace(usual, **changes)
 
 
 class SingleFrameFit(NamedTuple):
