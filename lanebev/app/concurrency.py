@@ -1,14 +1,18 @@
-"""Decoding, network and writing side by side: a reader thread in front, a writer thread behind."""
+"""Decoding, network and writing side by side: threads in front that read and look, one behind that writes."""
 
 from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import TypeVar
 
+import torch
+
 T = TypeVar("T")
+Result = TypeVar("Result")
 _END = object()
 
 
@@ -48,6 +52,30 @@ def prefetch(items: Iterable[T], depth: int = 4) -> Iterator[T]:
     finally:
         stop.set()
         thread.join()
+
+
+def map_ahead(call: Callable[[T], Result], items: Iterable[T], workers: int) -> Generator[tuple[T, Result]]:
+    """Yield each item with what ``call`` makes of it, in order, several calls at a time in threads.
+
+    Until the end, torch's threads are shared out among the calls, and its operations in other threads use no
+    more. Several calls of one thread each are faster than one call after another of several threads, which
+    wait for each other at the end of every operation.
+
+    Args:
+        call: may run in several threads at once.
+        items: made ahead in a thread.
+        workers: calls at a time.
+    """
+    threads = torch.get_num_threads()
+    pool = ThreadPoolExecutor(workers, "map_ahead")
+    try:
+        torch.set_num_threads(max(1, threads // workers))  # also of threads that begin later
+        submitted = ((item, pool.submit(call, item)) for item in items)
+        for item, future in prefetch(submitted, depth=workers + 1):
+            yield item, future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+        torch.set_num_threads(threads)
 
 
 class Background:

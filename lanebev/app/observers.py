@@ -18,6 +18,8 @@ from lanebev.observation.polylines import vertices_from_lines
 from lanebev.pipeline import LaneBEV
 from lanebev.tensors import map_tensors
 
+_MOST_WORKERS = 4  # each holds a frame's feature maps in memory
+
 
 class Observation(NamedTuple):
     """What was seen in one frame.
@@ -36,9 +38,11 @@ class Observer(Protocol):
 
     Attributes:
         remark: what should be said of all frames together, else empty.
+        workers: calls at a time that make the best use of the machine.
     """
 
     remark: str
+    workers: int
 
     def __call__(self, frame: Frame) -> Observation:
         """Return the vertices in pixels of the image as taken."""
@@ -56,6 +60,8 @@ class LaneFileObserver:
     Raises:
         ValueError: the entries do not fit the source.
     """
+
+    workers = 1
 
     def __init__(self, entries: Sequence[FrameLines], source: FrameSource, camera: Camera) -> None:
         self.entries, self.camera = entries, camera
@@ -90,13 +96,14 @@ class NetworkObserver:
 
     def __init__(self, model: LaneBEV, camera: Camera) -> None:
         self.model, self.camera = model.eval(), camera
+        self.device = next(model.parameters()).device
+        self.workers = min(torch.get_num_threads(), _MOST_WORKERS) if self.device.type == "cpu" else 1
 
     def __call__(self, frame: Frame) -> Observation:
         """See :class:`Observer`."""
         if frame.image is None:
             return Observation(vertices_from_lines([], self.camera), self.model.pose_sigma_scale)
-        device = next(self.model.parameters()).device
-        image = network_image(check_frame(frame.image, self.camera.image_size), device)
+        image = network_image(check_frame(frame.image, self.camera.image_size), self.device)
         with torch.inference_mode():
             _, vertices = self.model.boundary_vertices(image)
         return Observation(map_tensors(Tensor.cpu, vertices), self.model.pose_sigma_scale)

@@ -35,6 +35,7 @@ from lanebev.types import NUM_BOUNDARIES, Extrinsics
 from lanebev.view.grid import BEVGrid
 
 _BEFORE_RESOLUTION = 0.1  # m, of the view before: it is only shown small
+_CRF = 23  # of the videos
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,8 +92,8 @@ class Recorder:
         self._stack = ExitStack()
         self._lanes = self._stack.enter_context(open(self.path("lanes.json"), "w", encoding="utf-8"))
         if not self.single:
-            self._bev = self._stack.enter_context(VideoWriter(self.path("bev.mp4"), self.fps))
-            self._overlay = self._stack.enter_context(VideoWriter(self.path("overlay.mp4"), self.fps))
+            self._bev = self._stack.enter_context(VideoWriter(self.path("bev.mp4"), self.fps, _CRF))
+            self._overlay = self._stack.enter_context(VideoWriter(self.path("overlay.mp4"), self.fps, _CRF))
         self._background = self._stack.enter_context(Background())
         return self
 

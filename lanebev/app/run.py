@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from lanebev.app.build import (
     make_tracker,
     match_image_size,
 )
-from lanebev.app.concurrency import prefetch
+from lanebev.app.concurrency import map_ahead
 from lanebev.app.config import RunConfig
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
@@ -26,7 +27,7 @@ from lanebev.app.summary import mount_facts, run_facts
 from lanebev.io.calibration_file import write_calibration
 from lanebev.io.results import ExtrinsicsRow, OutputFolder, check_inputs_stay
 from lanebev.io.state import save_state
-from lanebev.io.video import Frame, open_source
+from lanebev.io.video import open_source
 from lanebev.report.page import Report
 
 STILLS_FPS = Fraction(2)  # of the videos that show images one after another
@@ -40,7 +41,7 @@ def run(
 ) -> Report:
     """Run on all frames and write the output folder, all of it or nothing.
 
-    Frames are decoded in one thread and drawn and encoded in another, beside the network.
+    Frames are decoded in one thread, looked at in others, and drawn and encoded in one more.
 
     Args:
         config: what to run.
@@ -61,9 +62,8 @@ def run(
     observer = make_observer(config, source, camera)
     tracker = make_tracker(config, camera)
     problem = load_states(config, tracker, camera)
-    frames: Iterator[Frame] = prefetch(source)
-    frames = progress(frames, source.count) if progress else frames
-    with OutputFolder(config.out) as out, torch.inference_mode():
+    frames = map_ahead(observer, source, observer.workers)
+    with OutputFolder(config.out) as out, closing(frames), torch.inference_mode():
         if config.resume and problem:
             problem += backup_state(config.resume, out)
         recorder = Recorder(
@@ -76,8 +76,7 @@ def run(
         )
         recorder.problems += filter(None, (source.problem, problem, observer.remark, lens_remark(camera)))
         with recorder:
-            for frame in frames:
-                seen = observer(frame)
+            for frame, seen in progress(frames, source.count) if progress else frames:
                 if config.stills:
                     estimate = tracker.still(seen.vertices, seen.pose_sigma_scale)
                 else:

@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import NamedTuple
 
 import av
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -194,7 +195,7 @@ class VideoWriter:
         self._stream.pix_fmt = "yuv420p"
         self._stream.codec_context.time_base = _TICK
         self._interval, self._next = 1 / fps, Fraction(0)
-        self._stream.options = {"crf": str(crf), "preset": "veryfast", "bf": "0"}  # else a late gap is cut
+        self._stream.options = {"crf": str(crf), "preset": "ultrafast", "bf": "0"}  # else a late gap is cut
 
     def __enter__(self) -> VideoWriter:
         return self
@@ -214,7 +215,7 @@ class VideoWriter:
             image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         if not self._stream.codec_context.is_open:
             self._stream.height, self._stream.width = image.shape[:2]
-        frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+        frame = av.VideoFrame.from_ndarray(cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420), format="yuv420p")
         shown = self._next if time is None else max(Fraction(time), self._next - self._interval + _TICK)
         frame.pts, frame.time_base = round(shown / _TICK), _TICK
         self._next = shown + self._interval

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import cv2
-from PIL import Image
 
-from lanebev.report.overlay import Picture
+from lanebev.report.lettering import Picture
 
 MOST_BYTES = 4_300_000  # of all pictures; base64 makes 5.7 MB of it
 _EVERY = 1  # frames between two pictures at first
@@ -71,7 +69,8 @@ def jpeg(picture: Picture, longest: int = _LONGEST) -> bytes:
     scale = min(1.0, longest / max(picture.shape[:2]))
     if scale < 1.0:
         size = [max(1, round(side * scale)) for side in picture.shape[1::-1]]
-        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    data = io.BytesIO()
-    Image.fromarray(picture).save(data, format="JPEG", quality=_QUALITY, optimize=True)
-    return data.getvalue()
+        method = cv2.INTER_AREA if scale < 0.5 else cv2.INTER_LINEAR  # which is several times as fast
+        picture = cv2.resize(picture, size, interpolation=method)
+    bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return data.tobytes()

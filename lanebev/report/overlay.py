@@ -6,24 +6,20 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import cv2
-import matplotlib
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from lanebev.camera.model import Camera
 from lanebev.geometry.road import horizon_line, road_from_image_points
 from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
 from lanebev.observation.segments import LaneSegments
+from lanebev.report.lettering import Colour, Picture, text_width, write_text
 from lanebev.types import Calibration, Extrinsics, Status
 from lanebev.view.grid import BEVGrid
-
-Picture = NDArray[np.uint8]
 
 BOUNDARY_COLOURS = (
     (186, 140, 255), (80, 170, 255), (0, 214, 160), (255, 190, 0), (255, 112, 96), (255, 150, 214),
@@ -37,6 +33,7 @@ _STATUS_COLOURS = {
     Status.TRACKING: (0, 214, 160), Status.COASTING: (255, 190, 0), Status.LOST: (255, 92, 80),
 }  # fmt: skip
 _SUBPIXEL = 4  # bits of cv2's fixed-point coordinates
+_HEAD, _LEFT = 44, 34  # px of a panel above its view, and left of it
 
 
 @dataclass(frozen=True)
@@ -96,9 +93,10 @@ def draw_panels(
     below = PANEL_HEIGHT - size[1]
     shown = cv2.copyMakeBorder(shown, 0, below, 0, 0, cv2.BORDER_CONSTANT, value=_BACKGROUND)
     status = Status(int(calibration.status[0]))
-    shown = _banner(shown, headline, status.name, _STATUS_COLOURS.get(status, _QUIET), _numbers(calibration))
+    colour = _STATUS_COLOURS.get(status, _QUIET)
+    _draw_banner(shown, headline, status.name, colour, _numbers(calibration))
     if reasons:
-        shown = _note(shown, reasons)
+        _draw_note(shown, reasons)
     return [shown, *(_bev_panel(view, grid, camera, segments) for view in views)]
 
 
@@ -125,93 +123,101 @@ def _draw_boundaries(
     ends = _to_image(camera, segments.endpoints[0].flatten(0, 1)).reshape(-1, 2, 2) * scale
     there = segments.weight[0] > 0
     believed = there & (inliers[0] > 0.5)
-    for point in ends[there & ~believed].flatten(0, 1):
-        _dot(shown, point, 2, _QUIET)
+    _dots(shown, _fixed(ends[there & ~believed].flatten(0, 1)), 2, _QUIET)
     lines = list(_polylines(ends, segments.boundary[0], believed))
     soft = shown.copy()
     for colour, points in lines:
-        cv2.polylines(soft, [_fixed(points)], False, colour, 7, cv2.LINE_AA, _SUBPIXEL)
+        cv2.polylines(soft, [points], False, colour, 7, cv2.LINE_AA, _SUBPIXEL)
     cv2.addWeighted(soft, 0.45, shown, 0.55, 0, dst=shown)
     for colour, points in lines:
-        cv2.polylines(shown, [_fixed(points)], False, colour, 1, cv2.LINE_AA, _SUBPIXEL)
-        for point in points:
-            _dot(shown, point, 3, colour)
+        cv2.polylines(shown, [points], False, colour, 1, cv2.LINE_AA, _SUBPIXEL)
+        _dots(shown, points, 3, colour)
 
 
-def _polylines(ends: Tensor, boundary: Tensor, kept: Tensor) -> Iterator[tuple[tuple[int, int, int], Tensor]]:
+def _polylines(
+    ends: Tensor, boundary: Tensor, kept: Tensor
+) -> Iterator[tuple[tuple[int, int, int], NDArray[np.int32]]]:
     """Colour and (P, 2) vertices from top to bottom of each boundary; ends (N, 2, 2), kept (N,)."""
-    for index in sorted(set(boundary[kept].tolist())):
-        points = ends[kept & (boundary == index)].flatten(0, 1)
-        yield BOUNDARY_COLOURS[index % len(BOUNDARY_COLOURS)], points[points[:, 1].argsort()]
+    of = boundary[kept].numpy()
+    points = _fixed(ends[kept].flatten(0, 1)).reshape(-1, 2, 2)
+    for index in np.unique(of).tolist():
+        own = points[of == index].reshape(-1, 2)
+        yield BOUNDARY_COLOURS[index % len(BOUNDARY_COLOURS)], own[own[:, 1].argsort(kind="stable")]
 
 
 def _draw_horizon(shown: Picture, camera: Camera, extrinsics: Extrinsics, scale: float) -> None:
     a, b, c = horizon_line(extrinsics, camera.intrinsics[None].to(extrinsics.pitch))[0].tolist()
     if abs(b) < 1e-6:
         return
-    x = torch.linspace(0, camera.image_size[1], 65, dtype=torch.float64)
+    x = torch.linspace(0, camera.image_size[1], 65, dtype=torch.float64)[:-1]
     points = _to_image(camera, torch.stack([x, -(a * x + c) / b], dim=-1)) * scale
-    for start, end in zip(points[:-1:2], points[1::2], strict=False):  # dashes
-        if torch.isfinite(start + end).all():
-            ends = _fixed(torch.stack([start, end]))
-            cv2.polylines(shown, [ends], False, _HORIZON, 1, cv2.LINE_AA, _SUBPIXEL)
+    dashes = points.reshape(-1, 2, 2)
+    dashes = dashes[dashes.isfinite().all(-1).all(-1)]
+    ends = _fixed(dashes.flatten(0, 1)).reshape(-1, 2, 2)
+    cv2.polylines(shown, list(ends), False, _HORIZON, 1, cv2.LINE_AA, _SUBPIXEL)
 
 
 def _draw_vanishing_point(shown: Picture, camera: Camera, extrinsics: Extrinsics, scale: float) -> None:
     ray = vanishing_dir_from_pitch_yaw(extrinsics.pitch, extrinsics.yaw)[0].to(camera.intrinsics)
     pixel = camera.intrinsics @ ray
-    point = _to_image(camera, (pixel[:2] / pixel[2])[None])[0] * scale
+    point = _to_image(camera, (pixel[:2] / pixel[2])[None]) * scale
     if torch.isfinite(point).all():
-        centre = tuple(_fixed(point[None])[0].tolist())
+        place = _fixed(point)
+        centre = tuple(place[0].tolist())
         cv2.circle(shown, centre, 9 << _SUBPIXEL, (0, 0, 0), 4, cv2.LINE_AA, _SUBPIXEL)
         cv2.circle(shown, centre, 9 << _SUBPIXEL, _HORIZON, 2, cv2.LINE_AA, _SUBPIXEL)
-        _dot(shown, point, 2, _HORIZON)
+        _dots(shown, place, 2, _HORIZON)
 
 
-def _banner(shown: Picture, headline: str, status: str, colour: tuple[int, ...], numbers: str) -> Picture:
-    shown[:44] = (0.3 * shown[:44] + 0.7 * np.array(_BACKGROUND)).astype(np.uint8)
-    drawing = ImageDraw.Draw(picture := Image.fromarray(shown))
-    drawing.text((12, 12), headline, fill=_INK, font=_font(18))
-    x = 12 + drawing.textlength(headline, font=_font(18)) + 24
-    drawing.text((x, 12), status, fill=colour, font=_font(18, bold=True))
+def _draw_banner(shown: Picture, headline: str, status: str, colour: Colour, numbers: str) -> None:
+    """Frame, status and numbers on a dark strip at the top."""
+    _darken(shown[:44])
+    write_text(shown, (12, 12), headline, _INK, 18)
+    x = 12 + text_width(headline, 18) + 24
+    write_text(shown, (x, 12), status, colour, 18, bold=True)
     room = shown.shape[1] - 12
-    size = next((s for s in (17, 15, 13) if x + 150 + drawing.textlength(numbers, font=_font(s)) < room), 0)
+    size = next((s for s in (17, 15, 13) if x + 150 + text_width(numbers, s) < room), 0)
     if size:
-        drawing.text((room, 13), numbers, fill=_INK, font=_font(size), anchor="ra")
+        write_text(shown, (room, 13), numbers, _INK, size, anchor="ra")
     else:  # a narrow picture: a second strip below
-        shown = np.asarray(picture).copy()
-        shown[44:76] = (0.3 * shown[44:76] + 0.7 * np.array(_BACKGROUND)).astype(np.uint8)
-        drawing = ImageDraw.Draw(picture := Image.fromarray(shown))
-        drawing.text((12, 50), numbers, fill=_INK, font=_font(15))
-    return np.asarray(picture)
+        _darken(shown[44:76])
+        write_text(shown, (12, 50), numbers, _INK, 15)
 
 
-def _note(shown: Picture, text: str) -> Picture:
-    """Return the picture with a line of text at the bottom, on a dark strip."""
-    shown = shown.copy()
-    shown[-34:] = (0.3 * shown[-34:] + 0.7 * np.array(_BACKGROUND)).astype(np.uint8)
-    picture = Image.fromarray(shown)
-    ImageDraw.Draw(picture).text((12, PANEL_HEIGHT - 27), text, fill=_INK, font=_font(16))
-    return np.asarray(picture)
+def _draw_note(shown: Picture, text: str) -> None:
+    """A line of text on a dark strip at the bottom."""
+    _darken(shown[-34:])
+    write_text(shown, (12, PANEL_HEIGHT - 27), text, _INK, 16)
+
+
+def _darken(strip: Picture) -> None:
+    strip[:] = cv2.addWeighted(strip, 0.3, np.full_like(strip, _BACKGROUND), 0.7, 0)
 
 
 def _bev_panel(view: Panel, grid: BEVGrid, camera: Camera, segments: LaneSegments) -> Picture:
     """The view below its title, the boundaries thin in it, and a scale of metres ahead on its left."""
-    head, left = 44, 34
-    height = PANEL_HEIGHT - head
+    height = PANEL_HEIGHT - _HEAD
     width = round(view.bev.shape[1] * height / view.bev.shape[0])
-    panel = np.full((PANEL_HEIGHT, left + width, 3), _BACKGROUND, np.uint8)
-    bev = cv2.resize(view.bev, (width, height), interpolation=cv2.INTER_AREA)
+    panel = _empty_panel(view.title, width, grid.z).copy()
+    method = cv2.INTER_AREA if height < 0.5 * view.bev.shape[0] else cv2.INTER_LINEAR
+    bev = cv2.resize(view.bev, (width, height), interpolation=method)
     _draw_bev_boundaries(bev, view, grid, camera, segments)
-    panel[head:, left:] = bev
-    drawing = ImageDraw.Draw(picture := Image.fromarray(panel))
-    drawing.text((left, 12), view.title, fill=_INK, font=_font(18))
-    for metres in range(10 * math.ceil(grid.z[0] / 10), math.floor(grid.z[1]) + 1, 10):
-        y = head + (grid.z[1] - metres) / (grid.z[1] - grid.z[0]) * height
-        drawing.line([(left - 6, y), (left, y)], fill=_QUIET, width=1)
-        drawing.text((left - 8, max(y, head + 8)), str(metres), fill=_QUIET, font=_font(13), anchor="rm")
-    drawing.text((left - 8, PANEL_HEIGHT - 10), "m", fill=_QUIET, font=_font(13), anchor="rm")
-    return np.asarray(picture)
+    panel[_HEAD:, _LEFT:] = bev
+    return panel
+
+
+@lru_cache(maxsize=8)
+def _empty_panel(title: str, width: int, z: tuple[float, float]) -> Picture:
+    """A panel without its view, which is so wide; z: near and far, m."""
+    height = PANEL_HEIGHT - _HEAD
+    panel = np.full((PANEL_HEIGHT, _LEFT + width, 3), _BACKGROUND, np.uint8)
+    write_text(panel, (_LEFT, 12), title, _INK, 18)
+    for metres in range(10 * math.ceil(z[0] / 10), math.floor(z[1]) + 1, 10):
+        y = _HEAD + (z[1] - metres) / (z[1] - z[0]) * height
+        panel[min(round(y), PANEL_HEIGHT - 1), _LEFT - 6 : _LEFT] = _QUIET
+        write_text(panel, (_LEFT - 8, max(y, _HEAD + 8)), str(metres), _QUIET, 13, anchor="rm")
+    write_text(panel, (_LEFT - 8, PANEL_HEIGHT - 10), "m", _QUIET, 13, anchor="rm")
+    return panel
 
 
 def _draw_bev_boundaries(
@@ -223,7 +229,7 @@ def _draw_bev_boundaries(
     kept = (segments.weight[0] > 0) & valid[0].reshape(-1, 2).all(-1)
     soft = bev.copy()
     for colour, line in _polylines(ends, segments.boundary[0], kept):
-        cv2.polylines(soft, [_fixed(line)], False, colour, 1, cv2.LINE_AA, _SUBPIXEL)
+        cv2.polylines(soft, [line], False, colour, 1, cv2.LINE_AA, _SUBPIXEL)
     cv2.addWeighted(soft, 0.7, bev, 0.3, 0, dst=bev)
 
 
@@ -238,12 +244,7 @@ def _fixed(points: Tensor) -> NDArray[np.int32]:
     return np.asarray((bounded * (1 << _SUBPIXEL)).round().to(torch.int32).numpy())
 
 
-def _dot(shown: Picture, point: Tensor, radius: int, colour: tuple[int, ...]) -> None:
-    centre = tuple(_fixed(point[None])[0].tolist())
-    cv2.circle(shown, centre, radius << _SUBPIXEL, colour, -1, cv2.LINE_AA, _SUBPIXEL)
-
-
-@lru_cache
-def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
-    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"  # matplotlib brings them
-    return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name, size)
+def _dots(shown: Picture, points: NDArray[np.int32], radius: int, colour: Colour) -> None:
+    """Filled circles at (P, 2) points of :func:`_fixed`."""
+    for x, y in points.tolist():
+        cv2.circle(shown, (x, y), radius << _SUBPIXEL, colour, -1, cv2.LINE_AA, _SUBPIXEL)
