@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 from lanebev import __version__
 from lanebev.app.config import RunConfig, parse_path, read_settings
 from lanebev.app.progress import Item, Progress
+from lanebev.io.formats.names import FORMATS
 
 DESCRIPTION = "Online camera-to-road calibration from lane boundaries, and a stable bird's-eye view."
 
@@ -34,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
     top = _Parser(prog="lanebev", description=DESCRIPTION, allow_abbrev=False)
     top.add_argument("--version", action="version", version=f"lanebev {__version__}")
     _add_verbose(top, False)
-    commands = top.add_subparsers(dest="command", required=True, metavar="{demo,run,compare}")
+    commands = top.add_subparsers(dest="command", required=True, metavar="{demo,run,compare,convert}")
     demo = commands.add_parser("demo", help="a rendered drive end to end", allow_abbrev=False)
     path = _named(parse_path)
     default = "lanebev-demo"
@@ -48,7 +49,15 @@ def parser() -> argparse.ArgumentParser:
         compare.add_argument(name, type=path, metavar="AB"[name == "second"], help=words)
     default = "lanebev-compare.html"
     compare.add_argument("--out", type=path, default=default, metavar="FILE", help="page (%(default)s)")
-    for command in (demo, run, compare):
+    convert = commands.add_parser("convert", help="a run in another program's format", allow_abbrev=False)
+    convert.add_argument("run", type=path, metavar="DIR", help="output folder of a run")
+    convert.add_argument("--to", choices=FORMATS, required=True, help="the format")
+    convert.add_argument("--out", type=path, metavar="FILE", help="the file (one in DIR)")
+    words = "camera file, if DIR has no calibration.yaml"
+    convert.add_argument("--camera", type=path, metavar="FILE", help=words)
+    words = "the run's source, to show its images in mcap or rerun"
+    convert.add_argument("--images", type=path, metavar="SOURCE", help=words)
+    for command in (demo, run, compare, convert):
         _add_verbose(command, argparse.SUPPRESS)
     return top
 
@@ -105,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logging.getLogger("lanebev").setLevel(logging.DEBUG)
     try:
         with _signals_unwind():
-            report = {"run": _run, "demo": _demo, "compare": _compare}[command](options)
+            report = {"run": _run, "demo": _demo, "compare": _compare, "convert": _convert}[command](options)
     except (ValueError, OSError) as error:
         print(f"lanebev {command}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -165,6 +174,12 @@ def _compare(options: dict[str, Any]) -> str:
     from lanebev.app.compare import compare
 
     return compare(**options)
+
+
+def _convert(options: dict[str, Any]) -> str:
+    from lanebev.app.convert import convert
+
+    return convert(**options)
 
 
 def _progress(label: str) -> Progress:

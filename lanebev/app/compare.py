@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
-from pathlib import Path
-
+from lanebev.io.whole_file import whole_file
 from lanebev.report.comparison import comparison_summary, render_comparison
 from lanebev.report.run_folder import read_run
 
@@ -26,17 +23,7 @@ def compare(first: str, second: str, out: str) -> str:
             written.
     """
     runs = read_run(first), read_run(second)
-    page, path = render_comparison(*runs), Path(os.path.realpath(out))
-    try:
-        if path.is_dir():
-            raise IsADirectoryError(0, "a folder")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.partial-", dir=path.parent) as partial:
-            whole = Path(partial) / path.name
-            whole.write_text(page, encoding="utf-8", errors="replace")
-            whole.replace(path)
-    except OSError as error:
-        raise ValueError(
-            f"out {out}: expected a file that can be written, got: {error.strerror}; give another with --out"
-        ) from error
+    page = render_comparison(*runs)
+    with whole_file(out) as whole:
+        whole.write_text(page, encoding="utf-8", errors="replace")
     return f"{comparison_summary(*runs)}\n{out}"

@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import yaml
 
+from lanebev.io.formats.names import FORMATS, parse_formats
 from lanebev.numbers import parse_size, read_text
 
 T = TypeVar("T")
@@ -80,6 +81,7 @@ class RunConfig:
         rectified: the images were rectified: the camera is the camera file's projection matrix P.
         weights: of the network, None for the shipped ones.
         device: that the network runs on, such as "cpu" or "cuda".
+        formats: of other programs to write the results in as well, names of FORMATS.
     """
 
     source: str = option(
@@ -129,6 +131,9 @@ class RunConfig:
     rectified: bool = option(False, "the images were rectified: take the projection matrix P")
     weights: str | None = option(None, "weights of the network instead of the shipped ones", "FILE")
     device: str = option("cpu", "that the network runs on: cpu, cuda, cuda:1, mps ({})", "NAME")
+    formats: tuple[str, ...] = option(
+        (), f"write the results as these as well: {', '.join(FORMATS)}", "NAME,NAME", parse_formats
+    )
 
     @property
     def relative_focal_std(self) -> float:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from lanebev.app.build import (
     input_files,
@@ -20,11 +23,15 @@ from lanebev.app.build import (
 )
 from lanebev.app.concurrency import map_ahead
 from lanebev.app.config import RunConfig
+from lanebev.app.convert import writer
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states
 from lanebev.app.summary import mount_facts, run_facts
 from lanebev.io.calibration_file import write_calibration
+from lanebev.io.covariances import write_covariances
+from lanebev.io.formats.folder import read_record
+from lanebev.io.formats.names import FORMATS, check_installed
 from lanebev.io.results import ExtrinsicsRow, OutputFolder, check_inputs_stay
 from lanebev.io.state import save_state
 from lanebev.io.video import open_source
@@ -54,6 +61,7 @@ def run(
     Raises:
         ValueError: bad input; one line says which and what would be right.
     """
+    check_installed(config.formats)
     source = open_source(config.source, config.frame_rate)
     check_inputs_stay(config.out, input_files(config, source))
     camera = make_camera(config, source.image_size)
@@ -75,12 +83,14 @@ def run(
             stills=config.stills,
         )
         recorder.problems += filter(None, (source.problem, problem, observer.remark, lens_remark(camera)))
+        covariances: list[NDArray[np.float64]] = []
         with recorder:
             for frame, seen in progress(frames, source.count) if progress else frames:
                 if config.stills:
                     estimate = tracker.still(seen.vertices, seen.pose_sigma_scale)
                 else:
                     estimate = tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale)
+                covariances.append(estimate.calibration.covariance[0].double().cpu().numpy())
                 name = frame.name or f"{Path(source.source).name}/{frame.number:06d}"
                 recorder.add(Recorded(frame=frame, name=name, seen=seen, estimate=estimate))
         facts = run_facts(config, source, camera)
@@ -89,4 +99,10 @@ def run(
             facts |= mount_facts(tracker.mount)
             write_calibration(out / CALIBRATION_FILE, camera, tracker.mount)
         logger.info("writing the report")
-        return recorder.finish(facts, Path(source.source).name, truth, tracker.mount)
+        report = recorder.finish(facts, Path(source.source).name, truth, tracker.mount)
+        write_covariances(out / "covariance.csv", covariances)
+        if config.formats:
+            record = replace(read_record(out / "."), name=report.title, rows=recorder.rows, camera=camera)
+            for name in config.formats:
+                writer(name)(out / FORMATS[name].file, record, source)
+        return report

@@ -42,7 +42,7 @@ def _other_settings(config: RunConfig) -> dict[str, str]:
     """Return the settings that the facts do not name, by their names on the command line."""
     named = {"source", "camera", "lanes", "lane_width", "calibrator", "weights", "out"}
     settings = {item.name: getattr(config, item.name) for item in fields(config) if item.name not in named}
-    words = {None: "not given", True: "yes", False: "no"}
+    words = {None: "not given", (): "none", True: "yes", False: "no"}
     return {f"--{name.replace('_', '-')}": words.get(value, str(value)) for name, value in settings.items()}
 
 

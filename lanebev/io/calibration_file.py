@@ -19,6 +19,9 @@ from lanebev.geometry.rotation import road_from_cam
 from lanebev.numbers import finite_numbers, read_text
 from lanebev.types import Extrinsics
 
+ROAD_FROM_VEHICLE = ((0.0, -1.0, 0.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0))
+"""Axes of the road (X right, Y down, Z along the lanes) from the vehicle's (x forward, y left, z up)."""
+
 _USED_BY_AXIS = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
 
 
@@ -32,11 +35,17 @@ def vehicle_from_camera(mount: Extrinsics) -> torch.Tensor:
         (B, 4, 4), camera frame (x right, y down, z forward) to vehicle.
     """
     rotation = road_from_cam(mount.pitch, mount.yaw, mount.roll)
-    vehicle_from_road = rotation.new_tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    vehicle_from_road = rotation.new_tensor(ROAD_FROM_VEHICLE).T
     matrix = torch.eye(4, dtype=rotation.dtype, device=rotation.device).repeat(rotation.shape[0], 1, 1)
     matrix[:, :3, :3] = vehicle_from_road @ rotation
     matrix[:, 2, 3] = mount.height
     return matrix
+
+
+def quaternion_xyzw(matrix: Tensor) -> list[float]:
+    """Return the unit quaternion x, y, z, w of a rigid transform (4, 4)."""
+    w, x, y, z = rotation_matrix_to_quaternion(matrix[:3, :3].contiguous()).tolist()
+    return [x, y, z, w]
 
 
 class MountPrior(NamedTuple):
@@ -99,9 +108,8 @@ def write_calibration(path: str | Path, camera: Camera, mounted: MountCalibratio
     fields["mount"] = mount
     if all(calibrated):
         matrix = vehicle_from_camera(mounted.extrinsics)[0].double()
-        w, x, y, z = rotation_matrix_to_quaternion(matrix[:3, :3].contiguous()).tolist()
         fields["vehicle_from_camera"] = {"rows": 4, "cols": 4, "dt": "d", "data": matrix.flatten().tolist()}
-        fields["quaternion_xyzw"] = [x, y, z, w]
+        fields["quaternion_xyzw"] = quaternion_xyzw(matrix)
     Path(path).write_text(dump_yaml(fields), encoding="utf-8")
 
 

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from lanebev.io.formats.names import FORMATS
 from lanebev.numbers import shown
 from lanebev.types import Calibration, Status
 
@@ -28,7 +29,7 @@ _COLUMN_TYPES = (int, *[float] * 9, str, int, str, str)
 
 OUTPUT_NAMES = (
     "extrinsics.csv", "lanes.json", "bev.mp4", "bev.png", "overlay.mp4", "overlay.png", "report.html",
-    "state.safetensors", "calibration.yaml",
+    "state.safetensors", "calibration.yaml", "covariance.csv", *(known.file for known in FORMATS.values()),
 )  # fmt: skip
 
 

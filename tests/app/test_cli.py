@@ -124,7 +124,7 @@ def test_a_run_on_a_video_finds_the_pose(drive):
 def test_every_output_is_there_and_whole(drive):
     names = {path.name for path in drive.iterdir()}
     promised = {"extrinsics.csv", "lanes.json", "bev.mp4", "overlay.mp4", "report.html"}
-    assert names == promised | {"state.safetensors", "calibration.yaml"}
+    assert names == promised | {"state.safetensors", "calibration.yaml", "covariance.csv"}
     mount = yaml.safe_load((drive / "calibration.yaml").read_text())["mount"]
     assert mount["preliminary"]["height_m"] == pytest.approx(POSE[3], abs=0.02)
     assert (mount["valid"], mount["status"]) == (False, "UNCALIBRATED")  # 0.24 s

@@ -1,0 +1,60 @@
+"""``lanebev convert``: a finished run in a format of other programs."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Protocol, cast
+
+from lanebev.io.formats.folder import read_record
+from lanebev.io.formats.names import FORMATS, check_installed
+from lanebev.io.formats.record import RunRecord
+from lanebev.io.video import Frame, open_source
+from lanebev.io.whole_file import whole_file
+
+
+class Writer(Protocol):
+    """Writes a run to a file, with images of its frames if they are given and the format shows them."""
+
+    def __call__(self, path: Path, record: RunRecord, images: Iterable[Frame] | None = None) -> None:
+        """Write the file."""
+        ...
+
+
+def writer(name: str) -> Writer:
+    """Return what writes a format, one of FORMATS.
+
+    Raises:
+        ValueError: a library that it needs is not installed.
+    """
+    check_installed([name])
+    module = importlib.import_module(f"lanebev.io.formats.{FORMATS[name].module}")
+    return cast(Writer, module.write)
+
+
+def convert(
+    run: str, to: str, out: str | None = None, camera: str | None = None, images: str | None = None
+) -> str:
+    """Write a run's results in another format; the file is there whole or not at all.
+
+    Args:
+        run: output folder of ``lanebev run``.
+        to: name of the format.
+        out: the file; None is the format's own name in the run's folder.
+        camera: camera file, where the folder has no ``calibration.yaml``.
+        images: the run's source, for a format that shows images.
+
+    Returns:
+        what to print.
+
+    Raises:
+        ValueError: the folder is no run's, something that the format needs is not in it, or a library is not
+            installed.
+    """
+    write, record = writer(to), read_record(run, camera)
+    source = None if images is None else open_source(images)
+    path = Path(run) / FORMATS[to].file if out is None else Path(out)
+    with whole_file(path) as whole:
+        write(whole, record, source)
+    return f"{path}: {len(record.rows)} frames"

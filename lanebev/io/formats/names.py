@@ -1,0 +1,67 @@
+"""Formats by name: the file, the module that writes it, and what must be installed. Imports nothing heavy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from importlib.util import find_spec
+from typing import NamedTuple
+
+
+class FormatName(NamedTuple):
+    """What is known of a format before it is written.
+
+    Attributes:
+        file: its name in a run's folder.
+        module: of this package, with a function ``write``.
+        needs: modules that must be installed.
+        extra: of lanebev's, which brings them.
+    """
+
+    file: str
+    module: str
+    needs: tuple[str, ...] = ()
+    extra: str = ""
+
+
+FORMATS = {
+    "parquet": FormatName("frames.parquet", "parquet", ("pyarrow",), "formats"),
+    "jsonl": FormatName("frames.jsonl", "jsonl"),
+    "kitti": FormatName("kitti_calib.txt", "kitti"),
+    "nuscenes": FormatName("nuscenes_calibrated_sensor.json", "nuscenes"),
+    "ros-tf": FormatName("ros_static_transform.launch.yaml", "ros_tf"),
+    "ros-camera-info": FormatName("ros_camera_info.yaml", "ros_camera_info"),
+    "openpilot": FormatName("openpilot_calibration.json", "openpilot"),
+    "opencv": FormatName("opencv_poses.yaml", "opencv"),
+    "mcap": FormatName("run.mcap", "mcap", ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf"), "formats"),
+    "rerun": FormatName("run.rrd", "rerun", ("rerun",), "rerun"),
+}
+
+
+def parse_formats(text: str) -> tuple[str, ...]:
+    """Return the names of formats in a text such as ``parquet,mcap``, each once.
+
+    Raises:
+        ValueError: another name, or none.
+    """
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    unknown = [name for name in names if name not in FORMATS]
+    if unknown or not names:
+        got = unknown[0] if unknown else text
+        raise ValueError(f"formats: expected some of {', '.join(FORMATS)}, separated by commas, got {got!r}")
+    return names
+
+
+def check_installed(names: Iterable[str]) -> None:
+    """Raise unless all that these formats need is installed.
+
+    Raises:
+        ValueError: a library is missing; the message says what installs it.
+    """
+    for name in names:
+        known = FORMATS[name]
+        for module in known.needs:
+            if find_spec(module) is None:
+                raise ValueError(
+                    f"format {name}: expected the library {module}, got none; install it with "
+                    f"pip install 'lanebev[{known.extra}]'"
+                )

@@ -1,0 +1,134 @@
+"""What a run found, as every format takes it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import repeat
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lanebev.camera.model import Camera
+from lanebev.io.results import ExtrinsicsRow
+from lanebev.io.video import Frame
+from lanebev.types import Extrinsics
+
+Lines = Mapping[int, NDArray[np.float64]]
+"""Boundaries of a frame by index: (P, 2) px of the image as taken."""
+
+
+@dataclass(frozen=True)
+class StandingPose:
+    """How the camera stands over the road, as one pose for a whole run.
+
+    Attributes:
+        extrinsics: each (1,), float64.
+        source: where it is from, in words.
+    """
+
+    extrinsics: Extrinsics
+    source: str
+
+
+class RecordedFrame(NamedTuple):
+    """A frame's results.
+
+    Attributes:
+        row: of ``extrinsics.csv``.
+        pose: each (1,), float64.
+        lines: boundaries as fitted; empty if they are not known.
+    """
+
+    row: ExtrinsicsRow
+    pose: Extrinsics
+    lines: Lines
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """A run's results.
+
+    Attributes:
+        name: of the run, for titles.
+        rows: of ``extrinsics.csv``, a frame each.
+        covariances: (N, 4, 4) of pitch, yaw, roll (rad) and height (m), a frame each; NaN where not known.
+        lanes: boundaries as fitted, a frame each; None if they are not known.
+        camera: the lens, None if it is not known.
+        mounted: the pose of the mount if all its axes are calibrated, each (1,); else None.
+        start: time of the first frame, s since 1970; 0 if it is not known.
+    """
+
+    name: str
+    rows: Sequence[ExtrinsicsRow]
+    covariances: NDArray[np.float64]
+    lanes: Iterable[Lines] | None = None
+    camera: Camera | None = None
+    mounted: Extrinsics | None = None
+    start: float = 0.0
+
+    def lens(self) -> Camera:
+        """Return the camera.
+
+        Raises:
+            ValueError: it is not known.
+        """
+        if self.camera is None:
+            raise ValueError(f"run {self.name}: expected a camera, got none; give --camera FILE")
+        return self.camera
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        """Return a frame's results after another's."""
+        poses = self.poses().stack()
+        lanes = repeat({}) if self.lanes is None else self.lanes
+        for number, (row, lines) in enumerate(zip(self.rows, lanes, strict=False)):
+            yield RecordedFrame(row, Extrinsics.unstack(poses[number : number + 1]), lines)
+
+    def poses(self) -> Extrinsics:
+        """Return the pose of every frame, each (N,), float64."""
+        values = [(row.pitch_deg, row.yaw_deg, row.roll_deg, row.height_m) for row in self.rows]
+        return pose_from_degrees(values)
+
+    def standing_pose(self) -> StandingPose:
+        """Return the mount's pose if it is calibrated, else the median of the frames that were tracked.
+
+        Raises:
+            ValueError: there is neither.
+        """
+        if self.mounted is not None:
+            return StandingPose(self.mounted, "the calibrated mount")
+        tracked = [number for number, row in enumerate(self.rows) if row.status == "TRACKING"]
+        if not tracked:
+            raise ValueError(
+                f"run {self.name}: expected a calibrated mount or a frame that is TRACKING, got neither"
+            )
+        values = self.poses().stack()[tracked].quantile(0.5, dim=0)[None]
+        words = f"the median of {len(tracked)} TRACKING frames; the mount is not calibrated"
+        return StandingPose(Extrinsics.unstack(values), words)
+
+
+def pose_from_degrees(values: Sequence[Sequence[float]]) -> Extrinsics:
+    """Return poses, each (N,) rad and m, from N of pitch, yaw, roll (deg) and height (m)."""
+    scale = torch.tensor([math.pi / 180] * 3 + [1.0], dtype=torch.float64)
+    return Extrinsics.unstack(torch.tensor(values, dtype=torch.float64).reshape(-1, 4) * scale)
+
+
+def with_images(
+    record: RunRecord, images: Iterable[Frame] | None
+) -> Iterator[tuple[RecordedFrame, NDArray[np.uint8] | None]]:
+    """Return every frame's results with its image (H, W, 3) RGB; None where there is none.
+
+    Args:
+        record: of the run.
+        images: frames of the run's source, by rising number; some may be missing.
+    """
+    pictures = iter(images or ())
+    picture = next(pictures, None)
+    for frame in record.frames():
+        while picture is not None and picture.number < frame.row.frame:
+            picture = next(pictures, None)
+        found = picture is not None and picture.number == frame.row.frame
+        yield frame, picture.image if picture is not None and found else None

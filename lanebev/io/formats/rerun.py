@@ -1,0 +1,79 @@
+"""Rerun: a recording, or what is sent to a viewer while a run goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lanebev.camera.model import Camera
+from lanebev.io.calibration_file import vehicle_from_camera
+from lanebev.io.formats.record import RecordedFrame, RunRecord, with_images
+from lanebev.io.results import ExtrinsicsRow
+from lanebev.io.video import Frame
+
+APPLICATION = "lanebev"
+_QUALITY = 80  # of JPEG
+_NUMBERS = ExtrinsicsRow._fields[2:10]
+
+
+class RerunLog:
+    """Frames into a ``rerun.RecordingStream``.
+
+    Entities: ``road`` (x along the lanes, y left, z up, its origin below the camera), ``road/camera`` with
+    the camera's pose as child-to-parent transform and its pinhole, ``road/camera/image`` and
+    ``road/camera/boundaries``; ``pose/NAME`` for the numbers of ``extrinsics.csv``, and ``status``.
+    Timelines: ``frame``, and ``time`` since the first frame.
+
+    Source: Rerun's ``Transform3D``, ``Pinhole``, ``LineStrips2D``. Rerun's pixels have their origin at the
+    outer corner of the first pixel: half a pixel is added.
+    """
+
+    def __init__(self, stream: Any, camera: Camera | None) -> None:
+        import rerun
+
+        self._rerun, self._stream = rerun, stream
+        stream.log("road", rerun.ViewCoordinates.FLU, static=True)
+        if camera is not None:
+            matrix = camera.intrinsics.double().numpy().copy()
+            matrix[:2, 2] += 0.5
+            height, width = camera.image_size
+            pinhole = rerun.Pinhole(
+                image_from_camera=matrix, width=width, height=height, camera_xyz=rerun.ViewCoordinates.RDF
+            )
+            stream.log("road/camera", pinhole, static=True)
+
+    def add(self, frame: RecordedFrame, image: NDArray[np.uint8] | None = None) -> None:
+        """Take in a frame; ``image`` is (H, W, 3) RGB or None."""
+        rerun, stream, (row, pose, lines) = self._rerun, self._stream, frame
+        stream.set_time("frame", sequence=row.frame)
+        stream.set_time("time", duration=row.time_s)
+        matrix = vehicle_from_camera(pose)[0].double().numpy()
+        stream.log("road/camera", rerun.Transform3D(translation=matrix[:3, 3], mat3x3=matrix[:3, :3]))
+        strips = [points + 0.5 for points in lines.values()]
+        labels = [f"boundary {number}" for number in lines]
+        stream.log("road/camera/boundaries", rerun.LineStrips2D(strips, labels=labels, show_labels=False))
+        for name in _NUMBERS:
+            stream.log(f"pose/{name}", rerun.Scalars(getattr(row, name)))
+        stream.log("status", rerun.TextLog(" ".join([row.status, row.reasons]).strip()))
+        if image is not None:
+            _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            encoded = rerun.EncodedImage(contents=data.tobytes(), media_type="image/jpeg")
+            stream.log("road/camera/image", encoded)
+
+
+def write(path: Path, record: RunRecord, images: Iterable[Frame] | None = None) -> None:
+    """Write the run as a recording (``.rrd``), with its images if there are any."""
+    import rerun
+
+    with rerun.RecordingStream(APPLICATION) as stream:
+        stream.save(path)
+        log = RerunLog(stream, record.camera)
+        for frame, image in with_images(record, images):
+            log.add(frame, image)
+        stream.flush()
+        stream.disconnect()
