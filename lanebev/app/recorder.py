@@ -90,7 +90,8 @@ class Recorder:
 
     def __enter__(self) -> Recorder:
         self._stack = ExitStack()
-        self._lanes = self._stack.enter_context(open(self.path("lanes.json"), "w", encoding="utf-8"))
+        lanes = open(self.path("lanes.json"), "w", encoding="utf-8", buffering=1)  # whole lines, if killed
+        self._lanes = self._stack.enter_context(lanes)
         if not self.single:
             self._bev = self._stack.enter_context(VideoWriter(self.path("bev.mp4"), self.fps, _CRF))
             self._overlay = self._stack.enter_context(VideoWriter(self.path("overlay.mp4"), self.fps, _CRF))

@@ -28,6 +28,7 @@ from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states
 from lanebev.app.summary import mount_facts, run_facts
+from lanebev.app.take_up import frame_name, take_up
 from lanebev.io.calibration_file import write_calibration
 from lanebev.io.covariances import write_covariances
 from lanebev.io.formats.folder import read_record
@@ -48,7 +49,8 @@ def run(
 ) -> Report:
     """Run on all frames and write the output folder, all of it or nothing.
 
-    Frames are decoded in one thread, looked at in others, and drawn and encoded in one more.
+    Frames are decoded in one thread, looked at in others, and drawn and encoded in one more. What a run of
+    the same settings into the same folder had seen when it was killed is taken up.
 
     Args:
         config: what to run.
@@ -70,10 +72,10 @@ def run(
     observer = make_observer(config, source, camera)
     tracker = make_tracker(config, camera)
     problem = load_states(config, tracker, camera)
-    frames = map_ahead(observer, source, observer.workers)
-    with OutputFolder(config.out) as out, closing(frames), torch.inference_mode():
+    with OutputFolder(config.out) as out, torch.inference_mode():
         if config.resume and problem:
             problem += backup_state(config.resume, out)
+        taken = take_up(out, config, source, camera, observer)
         recorder = Recorder(
             path=out.__truediv__,
             camera=camera,
@@ -84,16 +86,16 @@ def run(
         )
         recorder.problems += filter(None, (source.problem, problem, observer.remark, lens_remark(camera)))
         covariances: list[NDArray[np.float64]] = []
-        with recorder:
+        with recorder, closing(map_ahead(taken, source, taken.workers)) as frames:
             for frame, seen in progress(frames, source.count) if progress else frames:
                 if config.stills:
                     estimate = tracker.still(seen.vertices, seen.pose_sigma_scale)
                 else:
                     estimate = tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale)
                 covariances.append(estimate.calibration.covariance[0].double().cpu().numpy())
-                name = frame.name or f"{Path(source.source).name}/{frame.number:06d}"
+                name = frame_name(frame, source)
                 recorder.add(Recorded(frame=frame, name=name, seen=seen, estimate=estimate))
-        facts = run_facts(config, source, camera)
+        facts = run_facts(config, source, camera) | taken.facts
         if tracker.mount is not None:
             save_state(out / STATE_FILE, {**tracker.states(), "camera": camera.fingerprint()})
             facts |= mount_facts(tracker.mount)

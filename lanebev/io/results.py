@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import csv
+import errno
 import math
 import os
 import shutil
-import tempfile
 from collections.abc import Iterable
 from enum import Flag
 from itertools import count
@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from lanebev.io.folder_lock import LOCK_NAME, FolderLock
 from lanebev.io.formats.names import FORMATS
 from lanebev.numbers import shown
 from lanebev.types import Calibration, Status
@@ -31,6 +32,8 @@ OUTPUT_NAMES = (
     "extrinsics.csv", "lanes.json", "bev.mp4", "bev.png", "overlay.mp4", "overlay.png", "report.html",
     "state.safetensors", "calibration.yaml", "covariance.csv", *(known.file for known in FORMATS.values()),
 )  # fmt: skip
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # what a disk says that has no room
 
 
 class ExtrinsicsRow(NamedTuple):
@@ -152,6 +155,8 @@ class OutputFolder:
     Files are written into a hidden temporary folder in it, or beside it if it is new, so on the same disk.
     On success they take their place, and outputs of an earlier run that this one did not write anew are
     removed; files of other names in an existing folder are left alone. On any error the folder is as it was.
+    One process at a time has the temporary folder. One that was killed leaves it behind, for the next to take
+    up or to replace. Hidden files in it are notes for that, and no outputs.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -162,7 +167,8 @@ class OutputFolder:
         """Make the temporary folder.
 
         Raises:
-            ValueError: the folder cannot be made or written, or a folder is where an output goes.
+            ValueError: the folder cannot be made or written, a folder is where an output goes, or another
+                process is writing into it.
         """
         target = self._target
         self._made = [parent for parent in target.parents if not parent.exists()]
@@ -176,7 +182,13 @@ class OutputFolder:
             if target.is_dir() and not os.access(target, os.W_OK | os.X_OK):
                 raise PermissionError(0, "no permission to write in it")
             beside = target if target.is_dir() else target.parent
-            self._partial = Path(tempfile.mkdtemp(prefix=f".{target.name}.partial-", dir=beside))
+            self._partial = beside / f".{target.name}.partial"
+            self._lock = FolderLock(self._partial)
+            if not self._lock.acquire():
+                raise BlockingIOError(0, "another run writes into it now")
+            for path in self._partial.iterdir():
+                if not path.name.startswith("."):
+                    path.replace(self.left(path.name))
         except OSError as error:
             self._remove_parents()
             raise ValueError(
@@ -193,12 +205,22 @@ class OutputFolder:
                 self._publish()
         finally:
             shutil.rmtree(self._partial, ignore_errors=True)
+            self._lock.release()
             if error is not None:
                 self._remove_parents()
+        if isinstance(error, OSError) and error.errno in _FULL:
+            raise ValueError(
+                f"output folder {self.folder}: expected room for the outputs, got: "
+                f"{os.strerror(error.errno)}; make room or give another with --out"
+            ) from error
 
     def __truediv__(self, name: str) -> Path:
         """Where to write the file of this name until the work is done."""
         return self._partial / name
+
+    def left(self, name: str) -> Path:
+        """Where the file of this name is that a process left behind when it was killed, if one was."""
+        return self._partial / f".{name}.left"
 
     def keep(self, name: str, why: str) -> str:
         """Have an earlier run's file stay as ``name.why``, numbered if there is one; the name it got."""
@@ -208,13 +230,17 @@ class OutputFolder:
         return kept
 
     def _publish(self) -> None:
-        if not self._target.exists():
-            self._partial.chmod(0o777 & ~_umask())  # mkdtemp's is for the owner alone
-            self._partial.rename(self._target)
-            return
-        written = {path.name for path in self._partial.iterdir()}
         for path in self._partial.iterdir():
-            path.replace(self._target / path.name)
+            if path.name.startswith(".") and path.name != LOCK_NAME:
+                path.unlink()
+        if not self._target.exists():
+            self._partial.chmod(0o777 & ~_umask())  # it is for the owner alone
+            self._partial.rename(self._target)
+            (self._target / LOCK_NAME).unlink()
+            return
+        written = {path.name for path in self._partial.iterdir()} - {LOCK_NAME}
+        for name in written:
+            (self._partial / name).replace(self._target / name)
         for name in set(OUTPUT_NAMES) - written:
             (self._target / name).unlink(missing_ok=True)
 

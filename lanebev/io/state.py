@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -70,13 +71,23 @@ def save_state(path: str | Path, contents: Mapping[str, Any]) -> None:
     descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
     os.close(descriptor)
     try:
-        save_file(tensors, temporary, metadata=header)
+        _save(tensors, temporary, header)
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
         Path(temporary).chmod(0o644)
         os.replace(temporary, path)
     finally:
         Path(temporary).unlink(missing_ok=True)
+
+
+def _save(tensors: Mapping[str, Tensor], path: str, header: dict[str, str]) -> None:
+    """Write the file; where the system refuses, that is an OSError as of any other file."""
+    try:
+        save_file(dict(tensors), path, metadata=header)
+    except SafetensorError as error:
+        if (number := re.search(r"os error (\d+)", str(error))) is None:
+            raise
+        raise OSError(int(number[1]), os.strerror(int(number[1])), path) from error
 
 
 def load_state(

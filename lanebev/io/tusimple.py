@@ -6,7 +6,7 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,16 @@ def read_tusimple(path: str | Path) -> list[FrameLines]:
         twice = next(name for name, count in Counter(names).items() if count > 1)
         raise ValueError(f"lane file {path}: expected each raw_file once, got {shown(twice)} again")
     return frames
+
+
+def whole_tusimple_lines(path: str | Path) -> Iterator[FrameLines]:
+    """Yield the entries of our own lanes.json one by one, up to a line that breaks off."""
+    with open(path, encoding="utf-8") as file:
+        for text in file:
+            try:
+                yield _tusimple_frame(json_object(text))
+            except ValueError:
+                return
 
 
 def tusimple_line(

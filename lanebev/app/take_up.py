@@ -1,0 +1,112 @@
+"""Take up what a run that was killed had seen: the network does not look at those frames again."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+from lanebev import __version__
+from lanebev.app.build import input_files
+from lanebev.app.config import RunConfig
+from lanebev.app.observers import Observation, Observer
+from lanebev.camera.model import Camera
+from lanebev.io.lane_parsing import FrameLines
+from lanebev.io.results import OutputFolder
+from lanebev.io.tusimple import whole_tusimple_lines
+from lanebev.io.video import Frame, FrameSource
+from lanebev.observation.polylines import vertices_from_lines
+
+_LANES = "lanes.json"
+_SETTINGS, _SEEN = ".settings.json", ".seen.json"  # in the temporary folder
+
+
+def frame_name(frame: Frame, source: FrameSource) -> str:
+    """Return the name of a frame in lanes.json."""
+    return frame.name or f"{Path(source.source).name}/{frame.number:06d}"
+
+
+class TakenUp:
+    """Gives what an earlier run saw in the first frames, and lets another observer look at the others.
+
+    Args:
+        entries: of the frames from the first one on.
+        observer: of the others.
+        camera: the lens.
+        source: the frames.
+
+    Attributes:
+        frames: how many were taken.
+        remark: of the other observer.
+        workers: likewise.
+    """
+
+    def __init__(
+        self, entries: Iterator[FrameLines], observer: Observer, camera: Camera, source: FrameSource
+    ) -> None:
+        self._entries, self._observer, self._camera, self._source = entries, observer, camera, source
+        self._ahead: dict[str, FrameLines] = {}  # read before their frames came: threads overtake each other
+        self._lock = threading.Lock()
+        self.remark, self.workers, self.frames = observer.remark, observer.workers, 0
+
+    def __call__(self, frame: Frame) -> Observation:
+        """See :class:`lanebev.app.observers.Observer`."""
+        entry = self._entry(frame_name(frame, self._source))
+        if entry is None:
+            return self._observer(frame)
+        return Observation(vertices_from_lines(entry.lines, self._camera), entry.pose_sigma_scale)
+
+    def _entry(self, name: str) -> FrameLines | None:
+        with self._lock:
+            while name not in self._ahead and (entry := next(self._entries, None)) is not None:
+                self._ahead[entry.name] = entry
+            self.frames += name in self._ahead
+            return self._ahead.pop(name, None)
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """What to say of it in the report."""
+        if not self.frames:
+            return {}
+        return {"taken up": f"what a run that was killed had seen in the first {self.frames} frames"}
+
+
+def take_up(
+    out: OutputFolder, config: RunConfig, source: FrameSource, camera: Camera, observer: Observer
+) -> TakenUp:
+    """Take up the run that was killed in this folder, if it was of the same settings and files.
+
+    Lanes of another detector are read as they are: nothing is saved by keeping them.
+    """
+    settings = fingerprint(config, source, camera)
+    known = out / _SETTINGS
+    same = known.is_file() and known.read_text(encoding="utf-8") == settings
+    left = [path for path in (out.left(_LANES), out / _SEEN) if path.is_file()]
+    if left and same:
+        max(left, key=lambda path: path.stat().st_size).replace(out / _SEEN)
+    else:
+        (out / _SEEN).unlink(missing_ok=True)
+    known.write_text(settings, encoding="utf-8")
+    is_there = (out / _SEEN).is_file() and config.lanes is None
+    entries = whole_tusimple_lines(out / _SEEN) if is_there else iter(())
+    return TakenUp(entries, observer, camera, source)
+
+
+def fingerprint(config: RunConfig, source: FrameSource, camera: Camera) -> str:
+    """Return all that decides what a run sees, as text: settings, sizes and times of files, the lens."""
+    settings = {name: value for name, value in asdict(config).items() if name != "out"}
+    files = [[os.fspath(path), *_size_and_time(Path(path))] for path in input_files(config, source)]
+    found = {"settings": settings, "files": files, "camera": camera.fingerprint(), "lanebev": __version__}
+    return json.dumps(found, default=str)
+
+
+def _size_and_time(path: Path) -> tuple[int, int]:
+    """Return a file's size and time of change; zeros where it is none, such as a stream."""
+    try:
+        about = path.stat()
+    except OSError:
+        return 0, 0
+    return about.st_size, about.st_mtime_ns
