@@ -39,7 +39,9 @@ def parser() -> argparse.ArgumentParser:
     demo = commands.add_parser("demo", help="a rendered drive end to end", allow_abbrev=False)
     path = _named(parse_path)
     default = "lanebev-demo"
-    demo.add_argument("--out", type=path, default=default, metavar="DIR", help="output folder (%(default)s)")
+    demo.add_argument(
+        "--out", type=path, default=default, metavar="DIR", help="output folder (default %(default)s)"
+    )
     run = commands.add_parser("run", help="calibrate on images or a video", allow_abbrev=False)
     for setting in fields(RunConfig):
         _add_setting(run, setting)
@@ -48,7 +50,9 @@ def parser() -> argparse.ArgumentParser:
     for name, words in (("first", "output folder of a run"), ("second", "of another run on the same frames")):
         compare.add_argument(name, type=path, metavar="AB"[name == "second"], help=words)
     default = "lanebev-compare.html"
-    compare.add_argument("--out", type=path, default=default, metavar="FILE", help="page (%(default)s)")
+    compare.add_argument(
+        "--out", type=path, default=default, metavar="FILE", help="page (default %(default)s)"
+    )
     convert = commands.add_parser("convert", help="a run in another program's format", allow_abbrev=False)
     convert.add_argument("run", type=path, metavar="DIR", help="output folder of a run")
     convert.add_argument("--to", choices=FORMATS, required=True, help="the format")

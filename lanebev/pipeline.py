@@ -185,7 +185,9 @@ class LaneBEV(nn.Module):
         if image.ndim not in (4, 5) or image.shape[-3] != 3:
             raise ValueError(f"image: expected (B, 3, H, W) or (B, T, 3, H, W), got {tuple(image.shape)}")
         if not image.is_floating_point():
-            raise ValueError(f"image: expected floating point in [0, 1], got {image.dtype}")
+            raise ValueError(
+                f"image: expected floating point in [0, 1], got {image.dtype}; divide bytes by 255"
+            )
         if 0 in image.shape[1:]:  # B may be 0
             raise ValueError(f"image: expected frames with pixels, got {tuple(image.shape)}")
         check_intrinsics(intrinsics, image.shape[0])

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from lanebev.camera.model import Camera
+from lanebev.camera.model import Camera, check_camera
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.mount import MountCalibration, describe_mount
@@ -22,7 +22,7 @@ from lanebev.estimation.tracker import Tracker
 from lanebev.io.state import load_state, save_state
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.frames import check_frame, network_image
-from lanebev.observation.polylines import lines_from_polylines, vertices_from_lines
+from lanebev.observation.polylines import LINE_SIGMA, lines_from_polylines, vertices_from_lines
 from lanebev.pipeline import LaneBEV
 from lanebev.tensors import map_tensors
 from lanebev.types import Calibration, Extrinsics, Status
@@ -81,7 +81,12 @@ class Session:
         grid: of the bird's-eye view; None for no view.
         colours: order of a frame's channels: "bgr" as OpenCV reads them, or "rgb".
         focal_std: standard deviation of the focal length as a share of it, which widens the pose's.
+        polyline_sigma: px, standard deviation across their lines of the polylines that are given.
         device: of the network; the filter runs on the CPU.
+
+    Raises:
+        TypeError: a camera or a grid of another type.
+        ValueError: an argument out of range.
     """
 
     def __init__(
@@ -94,13 +99,20 @@ class Session:
         grid: BEVGrid | None = None,
         colours: Literal["bgr", "rgb"] = "bgr",
         focal_std: float = 0.0,
+        polyline_sigma: float = LINE_SIGMA,
         device: torch.device | str = "cpu",
     ) -> None:
+        check_camera(camera)
+        if grid is not None and not isinstance(grid, BEVGrid):
+            raise TypeError(f"grid: expected a lanebev.BEVGrid or None, got {type(grid).__qualname__}")
         if colours not in ("bgr", "rgb"):
             raise ValueError(f"colours: expected 'bgr' or 'rgb', got {colours!r}")
         if not (math.isfinite(lane_width) and 1.0 < lane_width < 10.0):
             raise ValueError(f"lane_width: expected 1 to 10 m, got {lane_width}")
+        if not (math.isfinite(polyline_sigma) and polyline_sigma > 0):
+            raise ValueError(f"polyline_sigma: expected more than 0 px, got {polyline_sigma}")
         self.camera, self.grid, self.colours, self.device = camera, grid, colours, torch.device(device)
+        self.polyline_sigma = polyline_sigma
         self._model = model
         self._parts = (calibrator or JointCalibrator(), camera, float(lane_width), focal_std)
         self.reset()
@@ -130,12 +142,13 @@ class Session:
             speed: m/s of the vehicle, if it is known: below walking pace nothing is learnt of the mount.
 
         Raises:
-            TypeError: a frame that is neither an array nor a tensor.
+            TypeError: a frame that is neither an array nor a tensor, or a stamp that is no number.
             ValueError: a frame of another size than the camera's or of other numbers, or a stamp that is not
                 finite.
         """
         pixels = None if frame is None else self._rgb(frame)
         dt, remarks = self._step(stamp)
+        lost = ["no frame was given"] if frame is None and polylines is None else []
         with torch.inference_mode():
             vertices, scale = self._vertices(pixels, polylines)
             _, calibration, reasons = self.tracker.drive_frame(vertices, dt, scale, speed)
@@ -152,7 +165,7 @@ class Session:
             extrinsics=calibration.extrinsics,
             std=Extrinsics.unstack(std),
             status=Status(int(calibration.status[0])),
-            reasons=remarks + describe_reasons(reasons & ~Reason.TIME if remarks else reasons),
+            reasons=remarks + lost + describe_reasons(reasons & ~Reason.TIME if remarks else reasons),
             mount=mounted,
             mount_needs=describe_mount(mounted, self.tracker.mount_estimator.config),
             calibration=calibration,
@@ -178,7 +191,7 @@ class Session:
         fresh: Tracker[Any] = Tracker(*self._parts)
         loaded = load_state(path, fresh.states())
         if loaded.problem is not None:
-            raise ValueError(f"{path}: {loaded.problem}")
+            raise ValueError(loaded.problem)
         if loaded.metadata.get("camera") != self.camera.fingerprint():
             raise ValueError(f"{path}: expected the state of this camera, got another camera's")
         clock = loaded.metadata.get("clock") or {}
@@ -195,6 +208,8 @@ class Session:
         """Return the time since the frame before, and what is doubtful about it."""
         if stamp is None:
             return (self._steps[-1] if self._steps else FIRST_DT), []
+        if not isinstance(stamp, (int, float, np.number)):
+            raise TypeError(f"stamp: expected seconds as a number, got {type(stamp).__qualname__}")
         if not math.isfinite(stamp):
             raise ValueError(f"stamp: expected finite seconds, got {stamp}")
         if self._stamp is None:
@@ -218,7 +233,7 @@ class Session:
     ) -> tuple[BoundaryVertices, float]:
         """Return the frame's vertices and the scale of the pose's sigmas that their detector needs."""
         if polylines is not None or image is None:
-            lines = lines_from_polylines([] if polylines is None else polylines)
+            lines = lines_from_polylines([] if polylines is None else polylines, self.polyline_sigma)
             return vertices_from_lines(lines, self.camera), 1.0
         if self._model is None:
             self._model = LaneBEV.from_pretrained()

@@ -90,8 +90,8 @@ class RunConfig:
     camera: str = option(
         "", "of OpenCV, ROS, Kalibr, EuRoC, KITTI, nuScenes; or YAML of fx fy cx cy width height", "FILE"
     )
-    out: str = option("lanebev-out", "output folder ({})", "DIR")
-    lane_width: float = option(3.7, "metres ({})", "M", float)
+    out: str = option("lanebev-out", "output folder (default {})", "DIR")
+    lane_width: float = option(3.7, "metres (default {})", "M", float)
     lanes: str | None = option(
         None,
         "lanes of another detector: TuSimple JSON lines, CULane .lines.txt, OpenLane JSON, or a folder of "
@@ -100,7 +100,7 @@ class RunConfig:
     )
     stills: bool = option(False, "every image on its own, not frames of a drive")
     resume: str | None = option(None, "begin with the state that a run left in this folder", "DIR")
-    calibrator: str = option("joint", "two-stage is the paper's ({})", choices=CALIBRATORS)
+    calibrator: str = option("joint", "two-stage is the paper's (default {})", choices=CALIBRATORS)
     fps: float | None = option(
         None,
         "frame rate of a folder or glob (what names of seconds say, else 30) or of a raw stream; a video "
@@ -124,13 +124,15 @@ class RunConfig:
         "REL",
         float,
     )
-    lane_width_std: float = option(0.0, "standard deviation of the lane width, metres ({})", "M", float)
+    lane_width_std: float = option(
+        0.0, "standard deviation of the lane width, metres (default {})", "M", float
+    )
     mount: str | None = option(
         None, "calibration.yaml of an earlier run, whose pose is a prior for this one", "FILE"
     )
     rectified: bool = option(False, "the images were rectified: take the projection matrix P")
     weights: str | None = option(None, "weights of the network instead of the shipped ones", "FILE")
-    device: str = option("cpu", "that the network runs on: cpu, cuda, cuda:1, mps ({})", "NAME")
+    device: str = option("cpu", "that the network runs on: cpu, cuda, cuda:1, mps (default {})", "NAME")
     formats: tuple[str, ...] = option(
         (), f"write the results as these as well: {', '.join(FORMATS)}", "NAME,NAME", parse_formats
     )
@@ -173,9 +175,9 @@ class RunConfig:
             raise ValueError("camera: expected --camera FILE, or --fov DEG if no file is at hand, got none")
         if self.camera and self.fov is not None:
             raise ValueError("fov: expected no --camera beside it, got both; leave one of them out")
-        if self.fov is not None and not 0.0 < self.fov < 180.0:
+        if self.fov is not None and not 10.0 <= self.fov <= 179.0:
             raise ValueError(
-                f"fov: expected a horizontal field of view of 0 to 180 degrees, got {self.fov:g}"
+                f"fov: expected a horizontal field of view of 10 to 179 degrees, got {self.fov:g}"
             )
         if not 0.0 <= self.relative_focal_std < 1.0:
             raise ValueError(

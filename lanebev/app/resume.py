@@ -39,7 +39,7 @@ def load_states(config: RunConfig, tracker: RunTracker, camera: Camera) -> str |
                 f"calibrator in {config.resume}; give --calibrator {name} or leave out --resume"
             )
     if loaded.problem is not None:
-        return loaded.problem
+        return f"state ignored: {loaded.problem}; calibration starts anew"
     if loaded.metadata.get("camera") != camera.fingerprint():
         raise ValueError(
             f"resume: expected a state of the camera in {config.camera or '--fov'}, got another camera's in "

@@ -28,6 +28,17 @@ from lanebev.geometry.lens import (
 from lanebev.types import check_tensor
 
 
+def check_camera(value: object) -> None:
+    """Raise unless an argument is a camera.
+
+    Raises:
+        TypeError: saying what came and how to make one.
+    """
+    if not isinstance(value, Camera):
+        got = type(value).__qualname__
+        raise TypeError(f"camera: expected a lanebev.Camera, got {got}; see Camera.from_file and from_fov")
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """One camera's lens.
@@ -98,10 +109,12 @@ class Camera:
             dtype: of the tensors.
 
         Raises:
-            ValueError: an angle that is not between 0 and 180 degrees, or an impossible image size.
+            ValueError: an angle that is not between 10 and 179 degrees, or an impossible image size.
         """
-        if not 0.0 < degrees < 180.0:  # NaN is not
-            raise ValueError(f"fov: expected a horizontal field of view of 0 to 180 degrees, got {degrees!r}")
+        if not 10.0 <= degrees <= 179.0:  # NaN is not
+            raise ValueError(
+                f"fov: expected a horizontal field of view of 10 to 179 degrees, got {degrees!r}"
+            )
         focal = 0.5 * width / math.tan(math.radians(0.5 * degrees))
         return cls.from_parameters(
             focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), width, height, dtype=dtype

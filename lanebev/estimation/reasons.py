@@ -29,7 +29,7 @@ REASON_WORDS = {
     Reason.HEIGHT_UNSEEN: "no lane with both its boundaries",
     Reason.ROLL_UNSEEN: "one lane only",
     Reason.LANE_CHANGE: "lane change",
-    Reason.RESTARTED: "started anew",
+    Reason.RESTARTED: "started in this frame",
 }
 WHOLE_FRAME = (Reason.NO_SEGMENTS, Reason.FEW_INLIERS, Reason.TIME, Reason.NO_START)
 UNSEEN = {  # axes that are not determined; the first that holds implies those after it

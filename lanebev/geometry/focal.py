@@ -51,7 +51,7 @@ def focal_covariance(extrinsics: Extrinsics, intrinsics: Tensor, focal_std: floa
     Raises:
         ValueError: a negative or not finite standard deviation, given as a float.
     """
-    if isinstance(focal_std, (int, float)) and not 0 <= focal_std < float("inf"):
+    if isinstance(focal_std, (int, float)) and not 0 <= focal_std <= 1:
         raise ValueError(f"focal_std: expected a share of the focal length such as 0.05, got {focal_std}")
     pose = extrinsics.pitch
     slope = pose_by_log_focal(extrinsics, intrinsics.to(pose)).to(pose)

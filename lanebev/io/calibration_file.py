@@ -89,13 +89,13 @@ def write_calibration(path: str | Path, camera: Camera, mounted: MountCalibratio
         kind[f"{name}_{unit}"], kind[f"{name}_std_{unit}"] = values[axis], sigmas[axis]
         axes[name] = {
             "status": MountStatus(int(mounted.axis_status[0, axis])).name,
-            "progress_percent": float(mounted.axis_progress[0, axis]),
+            "progress_percent": round(float(mounted.axis_progress[0, axis]), 3),
             "reasons": _names(int(mounted.axis_reasons[0, axis])),
         }
     mount: dict[str, Any] = {
         "valid": all(calibrated),
         "status": MountStatus(int(mounted.status[0])).name,
-        "progress_percent": float(mounted.progress[0]),
+        "progress_percent": round(float(mounted.progress[0]), 3),
         "reasons": _names(int(mounted.reasons[0])),
         **known,
         "axes": axes,

@@ -27,7 +27,7 @@ class LoadedState(NamedTuple):
     Attributes:
         states: the named tuples of tensors, by name; empty if the file was refused.
         metadata: the plain values saved beside them.
-        problem: None, or one line saying why the file was ignored.
+        problem: None, or one line saying why the file cannot be used.
     """
 
     states: dict[str, Any]
@@ -112,7 +112,7 @@ def load_state(
         states = _by_state(kinds, tensors, device)
         return LoadedState(_rebuilt(kinds, states, like or {}), metadata, None)
     except _RefusedError as error:
-        return LoadedState({}, {}, f"{path}: state ignored: {error}; calibration starts anew")
+        return LoadedState({}, {}, f"{path}: {error}")
 
 
 class _RefusedError(Exception):

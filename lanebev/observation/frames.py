@@ -27,15 +27,14 @@ def check_frame(frame: NDArray[np.uint8] | Tensor, image_size: tuple[int, int]) 
     height, width = image_size
     if isinstance(frame, np.ndarray):
         if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
-            raise ValueError(
-                f"frame: expected ({height}, {width}, 3) uint8, the camera's size, got {frame.shape} "
-                f"{frame.dtype}; see Camera.scaled"
-            )
+            got = f"got {frame.shape} {frame.dtype}; {_remedy(frame, image_size)}"
+            raise ValueError(f"frame: expected ({height}, {width}, 3) uint8, the camera's size, {got}")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of arrays that must not be written: it is not
             return torch.from_numpy(np.ascontiguousarray(frame)).permute(2, 0, 1)
     if not isinstance(frame, Tensor):
-        raise TypeError(f"frame: expected a numpy array or a tensor, got {type(frame).__qualname__}")
+        got = type(frame).__qualname__
+        raise TypeError(f"frame: expected an array or a tensor, got {got}; lane boundaries go to polylines=")
     if frame.shape not in ((3, height, width), (1, 3, height, width)):
         raise ValueError(
             f"frame: expected a tensor (3, {height}, {width}), the camera's size, got {tuple(frame.shape)}; "
@@ -44,6 +43,15 @@ def check_frame(frame: NDArray[np.uint8] | Tensor, image_size: tuple[int, int]) 
     if frame.dtype != torch.uint8 and not frame.is_floating_point():
         raise ValueError(f"frame: expected uint8 or floating point in [0, 1], got {frame.dtype}")
     return frame.reshape(3, height, width)
+
+
+def _remedy(frame: NDArray[np.generic], image_size: tuple[int, int]) -> str:
+    """What to do about an array that is no frame of this size."""
+    if frame.shape[:2] != image_size:
+        return "for images of another size see Camera.scaled"
+    if frame.ndim != 3 or frame.shape[2] != 3:
+        return "for a grey image repeat its channel three times"
+    return "convert to bytes 0 to 255 with .astype('uint8')"
 
 
 def network_image(frame: Tensor, device: torch.device) -> Tensor:

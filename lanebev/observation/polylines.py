@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from lanebev.camera.model import Camera
+from lanebev.camera.model import Camera, check_camera
 from lanebev.observation.boundary_order import boundary_indices
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.types import NUM_BOUNDARIES
@@ -77,6 +78,7 @@ def vertices_from_lines(
     Returns:
         (1, L, VERTICES_PER_LINE) in double precision, boundary 0..L-1.
     """
+    check_camera(camera)
     shape = (1, num_boundaries, VERTICES_PER_LINE)
     points, weight, sigma = np.zeros((*shape, 2)), np.zeros(shape), np.ones(shape)
     for line, index in zip(lines, _indices(lines, camera, num_boundaries), strict=True):
@@ -102,8 +104,8 @@ def lines_from_polylines(
         points = np.array(given.tolist() if isinstance(given, Tensor) else given, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points[:, 1]).all():
             raise ValueError(f"polylines[{key}]: expected (P, 2) px with finite y, got shape {points.shape}")
-        if named and not 0 <= key < num_boundaries:
-            raise ValueError(f"polylines: expected boundaries 0 to {num_boundaries - 1}, got {key}")
+        if named and not (isinstance(key, Integral) and 0 <= key < num_boundaries):
+            raise ValueError(f"polylines: expected boundaries 0 to {num_boundaries - 1}, got {key!r}")
         lines.append(LaneLine(points, key if named else None, np.full(len(points), float(sigma))))
     return lines
 

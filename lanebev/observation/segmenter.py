@@ -115,7 +115,9 @@ class LaneSegmenter(nn.Module):
         if image.ndim != 4 or image.shape[1] != 3:
             raise ValueError(f"image: expected (B, 3, H, W), got {tuple(image.shape)}")
         if not image.is_floating_point():
-            raise ValueError(f"image: expected floating point in [0, 1], got {image.dtype}")
+            raise ValueError(
+                f"image: expected floating point in [0, 1], got {image.dtype}; divide bytes by 255"
+            )
         _check_scale(image)
         stem, c2, c3, c4, c5 = self.trunk((image - self.mean) / self.std)
         lateral2, lateral3, lateral4, lateral5 = self.lateral

@@ -109,7 +109,7 @@ def _describe(events: Mapping[str, tuple[float, int]], rows: Sequence[Extrinsics
             jump = jumps(rows[place], *rows[place - 2 : place])[AXES.index(axis)]
             leaps.append(f"{axis} {_value(axis, jump, '+')} ({score:.0f} σ)")
         elif name == "RESTARTED":
-            words.append("started anew")
+            words.append("started in this frame")
         else:
             doing = "predicted" if name == "COASTING" else "lost"
             words.append(f"least certain while {doing}: σ of pitch {_value('pitch', score)}")

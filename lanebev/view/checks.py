@@ -15,7 +15,9 @@ def check_image(image: Tensor, name: str = "image") -> None:
     """Raise TypeError or ValueError unless this is a (B, C, h, w) map of floating point."""
     check_tensor(name, image)
     if image.ndim != 4:
-        raise ValueError(f"{name}: expected (B, C, h, w), got {tuple(image.shape)}")
+        remedy = {3: "; add a batch axis, x[None]", 5: "; flatten clips (B, T) into one batch axis"}
+        got = f"{tuple(image.shape)}{remedy.get(image.ndim, '')}"
+        raise ValueError(f"{name}: expected (B, C, h, w), got {got}")
     if not image.is_floating_point():
         raise ValueError(f"{name}: expected floating point, got {image.dtype}")
 

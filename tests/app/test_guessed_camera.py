@@ -109,7 +109,7 @@ def test_a_mount_decides_what_one_lane_leaves_open(tmp_path):
     [
         ({}, "camera: expected --camera FILE, or --fov DEG if no file is at hand, got none"),
         ({"camera": "c", "fov": 60.0}, "fov: expected no --camera beside it, got both"),
-        ({"fov": 180.0}, "fov: expected a horizontal field of view of 0 to 180 degrees, got 180"),
+        ({"fov": 180.0}, "fov: expected a horizontal field of view of 10 to 179 degrees, got 180"),
         ({"fov": np.nan}, "fov: expected a horizontal field of view"),
         ({"fov": 60.0, "focal_std": -0.1}, "focal std: expected a share of the focal length .*, got -0.1"),
         ({"fov": 60.0, "lane_width_std": np.inf}, "lane width std: expected 0 to 2 m, got inf"),

@@ -200,7 +200,7 @@ def test_field_of_view_spans_the_outer_columns():
 
 @pytest.mark.parametrize("degrees", [0.0, 180.0, -60.0, float("nan"), float("inf")])
 def test_impossible_fields_of_view_are_refused(degrees):
-    with pytest.raises(ValueError, match="fov: expected a horizontal field of view of 0 to 180 degrees"):
+    with pytest.raises(ValueError, match="fov: expected a horizontal field of view of 10 to 179 degrees"):
         Camera.from_fov(degrees, 640, 480)
 
 

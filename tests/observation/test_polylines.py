@@ -101,11 +101,14 @@ def test_a_dense_polyline_says_no_more_than_one_on_rows():
         ([np.zeros((4, 3))], r"polylines\[0\]: expected \(P, 2\) px with finite y, got shape \(4, 3\)"),
         ([np.zeros((4, 2)), [[1.0, np.nan]]], r"polylines\[1\]: expected"),
         ({6: np.zeros((4, 2))}, "polylines: expected boundaries 0 to 5, got 6"),
+        ({"2": np.zeros((4, 2))}, "polylines: expected boundaries 0 to 5, got '2'"),
     ],
 )
 def test_polylines_are_checked(polylines, message):
     with pytest.raises(ValueError, match=message):
         LaneSegments.from_polylines(polylines, CAMERA)
+    with pytest.raises(TypeError, match=r"camera: expected a lanebev.Camera, got str"):
+        LaneSegments.from_polylines([], "camera.yaml")
 
 
 def test_gaps_stay_gaps():

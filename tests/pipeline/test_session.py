@@ -135,14 +135,39 @@ def test_an_unsure_focal_length_widens_the_pose():
     assert grown == pytest.approx(0.1 * math.sin(POSE[0]), rel=0.05)
 
 
+def test_polylines_are_as_sure_as_they_are_said_to_be():
+    """At the start, where nothing else is known, the pose is as unsure as the lines."""
+    stds = [Session(CAMERA, polyline_sigma=s)(polylines=lines(), stamp=0.0).std.pitch.item() for s in (1, 2)]
+    assert stds[1] == pytest.approx(2 * stds[0], rel=0.2)
+
+
+def test_a_lost_frame_is_said():
+    session = Session(CAMERA)
+    session(polylines=lines(), stamp=0.0)
+    assert session(stamp=0.1).reasons[0] == "no frame was given"
+    assert "no frame was given" not in session(polylines=[], stamp=0.2).reasons
+
+
 def test_careless_arguments_are_named():
     session = Session(CAMERA)
-    with pytest.raises(ValueError, match=r"frame: expected \(360, 640, 3\) uint8, .* float64"):
+    with pytest.raises(ValueError, match=r"frame: expected \(360, 640, 3\) uint8, .* float64; convert to"):
         session(np.zeros((360, 640, 3)))
+    with pytest.raises(ValueError, match="for a grey image repeat its channel"):
+        session(np.zeros((360, 640), np.uint8))
     with pytest.raises(ValueError, match=r"frame: expected \(360, 640, 3\) uint8, the camera's size"):
         session(np.zeros((720, 1280, 3), np.uint8))
-    with pytest.raises(TypeError, match="frame: expected a numpy array or a tensor, got list"):
+    with pytest.raises(TypeError, match=r"frame: expected an array or a tensor, got list; .* polylines="):
         session([0])
+    with pytest.raises(TypeError, match="stamp: expected seconds as a number, got str"):
+        session(stamp="12")
+    with pytest.raises(TypeError, match=r"camera: expected a lanebev.Camera, got str; see Camera.from_file"):
+        Session("camera.yaml")
+    with pytest.raises(TypeError, match=r"grid: expected a lanebev.BEVGrid or None, got float"):
+        Session(CAMERA, grid=0.1)
+    with pytest.raises(ValueError, match="polyline_sigma: expected more than 0 px, got 0"):
+        Session(CAMERA, polyline_sigma=0)
+    with pytest.raises(ValueError, match="there is no such file"):
+        session.load("nowhere.safetensors")
     with pytest.raises(ValueError, match="stamp: expected finite seconds"):
         session(stamp=math.nan)
     with pytest.raises(ValueError, match="lane_width: expected 1 to 10 m"):

@@ -157,7 +157,7 @@ def test_a_sigma_that_is_no_number_is_told(tmp_path):
 
 def test_worst_moments_are_found():
     found = {moment.place: moment.what for moment in worst_moments(eventful_rows())}
-    assert found[KNOCK].startswith("started anew; largest jump: pitch +3.")
+    assert found[KNOCK].startswith("started in this frame; largest jump: pitch +3.")
     assert found[139] == "least certain while predicted: σ of pitch 1.00°"
     assert found[159] == "least certain while lost: σ of pitch 2.00°"
     assert found[99].startswith("largest σ: roll 1.08")
