@@ -33,8 +33,9 @@ def check_frame(frame: NDArray[np.uint8] | Tensor, image_size: tuple[int, int]) 
             warnings.simplefilter("ignore", UserWarning)  # of arrays that must not be written: it is not
             return torch.from_numpy(np.ascontiguousarray(frame)).permute(2, 0, 1)
     if not isinstance(frame, Tensor):
-        got = type(frame).__qualname__
-        raise TypeError(f"frame: expected an array or a tensor, got {got}; lane boundaries go to polylines=")
+        raise TypeError(
+            f"frame: expected an array or a tensor, got {type(frame).__qualname__}; lanes go to polylines="
+        )
     if frame.shape not in ((3, height, width), (1, 3, height, width)):
         raise ValueError(
             f"frame: expected a tensor (3, {height}, {width}), the camera's size, got {tuple(frame.shape)}; "

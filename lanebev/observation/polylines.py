@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
@@ -104,7 +103,7 @@ def lines_from_polylines(
         points = np.array(given.tolist() if isinstance(given, Tensor) else given, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points[:, 1]).all():
             raise ValueError(f"polylines[{key}]: expected (P, 2) px with finite y, got shape {points.shape}")
-        if named and not (isinstance(key, Integral) and 0 <= key < num_boundaries):
+        if named and not (isinstance(key, (int, np.integer)) and 0 <= key < num_boundaries):
             raise ValueError(f"polylines: expected boundaries 0 to {num_boundaries - 1}, got {key!r}")
         lines.append(LaneLine(points, key if named else None, np.full(len(points), float(sigma))))
     return lines
