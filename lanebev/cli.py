@@ -93,7 +93,7 @@ def _add_setting(parser: argparse.ArgumentParser, setting: Field[object]) -> Non
 
 def _named(parse: Callable[[str], object]) -> Callable[[str], object]:
     """The same, saying what it says of bad texts as argparse wants it."""
-    if parse is float:
+    if parse in (float, int):
         return parse
 
     def parsed(text: str) -> object:

@@ -22,6 +22,7 @@ from lanebev.io.lane_size import resized_lanes
 from lanebev.io.lanes import lane_files, read_lanes
 from lanebev.io.video import FrameSource, image_size
 from lanebev.pipeline import LaneBEV
+from lanebev.view.grid import BEVGrid
 
 RunTracker = Tracker[JointState] | Tracker[TwoStageState]
 
@@ -38,6 +39,12 @@ def make_camera(config: RunConfig, image_size: tuple[int, int]) -> Camera:
         height, width = image_size
         return Camera.from_fov(config.fov, width, height)
     return Camera.from_file(config.camera, image_size, config.rectified)
+
+
+def make_grid(config: RunConfig) -> BEVGrid:
+    """Make the grid of the bird's-eye view."""
+    near, far, left, right, resolution = config.grid
+    return BEVGrid((left, right), (near, far), resolution)
 
 
 def make_calibrator(name: str, prior: FramePrior | None = None) -> JointCalibrator | TwoStageCalibrator:

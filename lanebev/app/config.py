@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from fractions import Fraction
@@ -15,6 +16,8 @@ from lanebev.io.formats.names import FORMATS, parse_formats
 from lanebev.numbers import parse_size, read_text
 
 T = TypeVar("T")
+
+_MOST_CELLS = 4096  # pixels a side of the bird's-eye view, which H.264 encodes
 
 CALIBRATORS = ("joint", "two-stage")
 FOV_FOCAL_STD = 0.2
@@ -30,6 +33,26 @@ def parse_path(text: str) -> str:
     if not text:
         raise ValueError("expected a path, got an empty string")
     return text
+
+
+def parse_grid(text: str) -> tuple[float, float, float, float, float]:
+    """Return (near, far, left, right, resolution) m of a text such as ``3:60,-10:10/0.05``.
+
+    Raises:
+        ValueError: another text, or one of no or too large a picture.
+    """
+    number = r"([-+]?\d+(?:\.\d*)?|[-+]?\.\d+)"
+    match = re.fullmatch(rf"{number}:{number},{number}:{number}/{number}", text.replace(" ", ""), re.ASCII)
+    if match is None:
+        raise ValueError(f"grid: expected NEAR:FAR,LEFT:RIGHT/STEP, such as 3:60,-10:10/0.05, got {text!r}")
+    near, far, left, right, step = map(float, match.groups())
+    if not (0 < near < far and left < right and step > 0):
+        raise ValueError(f"grid: expected 0 < NEAR < FAR, LEFT < RIGHT and a STEP above 0, got {text}")
+    rows, columns = (far - near) / step, (right - left) / step
+    if not (16 <= rows <= _MOST_CELLS and 16 <= columns <= _MOST_CELLS):
+        got = f"{columns:.0f} x {rows:.0f}"
+        raise ValueError(f"grid: expected 16 to {_MOST_CELLS} pixels a side, got {got} of {text}")
+    return near, far, left, right, step
 
 
 def option(
@@ -62,7 +85,7 @@ class RunConfig:
     """What to run.
 
     Attributes:
-        source: video, folder, glob or image.
+        source: video, folder, glob, image, camera, stream, or "-" for a pipe.
         camera: camera file, or empty with ``fov``.
         out: output folder.
         lane_width: m.
@@ -82,10 +105,19 @@ class RunConfig:
         weights: of the network, None for the shipped ones.
         device: that the network runs on, such as "cpu" or "cuda".
         formats: of other programs to write the results in as well, names of FORMATS.
+        start: s, of the first frame of the source that is taken.
+        end: s, before which the last one is; None is the source's end.
+        every: of the source's frames every so manieth is taken.
+        no_video: write no ``bev.mp4`` and ``overlay.mp4``.
+        grid: (near, far, left, right, resolution) m of the bird's-eye view.
+        keep_all: of a stream, drop no frame.
     """
 
     source: str = option(
-        "", "a video, a folder of images, a quoted glob ('DIR/**/*.jpg'), or one image", "SOURCE"
+        "",
+        "a video, a folder of images, a quoted glob ('DIR/**/*.jpg'), one image, a camera (/dev/video0), a "
+        "stream (rtsp://, http://), or - for a pipe",
+        "SOURCE",
     )
     camera: str = option(
         "", "of OpenCV, ROS, Kalibr, EuRoC, KITTI, nuScenes; or YAML of fx fy cx cy width height", "FILE"
@@ -136,6 +168,17 @@ class RunConfig:
     formats: tuple[str, ...] = option(
         (), f"write the results as these as well: {', '.join(FORMATS)}", "NAME,NAME", parse_formats
     )
+    start: float = option(0.0, "begin at this time of the source, seconds ({})", "S", float)
+    end: float | None = option(None, "end at this time of the source, seconds (its end)", "S", float)
+    every: int = option(1, "take every Nth frame of the source ({})", "N", int)
+    no_video: bool = option(False, "write no bev.mp4 and overlay.mp4")
+    grid: tuple[float, float, float, float, float] = option(
+        (3.0, 60.0, -10.0, 10.0, 0.05),
+        "of the bird's-eye view: metres ahead, metres to the right, metres a pixel; 3:60,-10:10/0.05 by default",
+        "NEAR:FAR,LEFT:RIGHT/STEP",
+        parse_grid,
+    )
+    keep_all: bool = option(False, "of a stream, drop no frame: it waits, and its own times are taken")
 
     @property
     def relative_focal_std(self) -> float:
@@ -153,6 +196,7 @@ class RunConfig:
         if not self.source:
             raise ValueError("source: expected a path, got none")
         self._check_lens()
+        self._check_selection()
         if not 0.0 <= self.lane_width_std <= 2.0:
             raise ValueError(f"lane width std: expected 0 to 2 m, got {self.lane_width_std:g}")
         if not (math.isfinite(self.lane_width) and 1.0 < self.lane_width < 10.0):
@@ -169,6 +213,14 @@ class RunConfig:
             raise ValueError(
                 "weights: expected the network's lanes, got --lanes as well; leave one of them out"
             )
+
+    def _check_selection(self) -> None:
+        if not (math.isfinite(self.start) and self.start >= 0):
+            raise ValueError(f"start: expected 0 s or later, got {self.start:g}")
+        if self.end is not None and not self.end > self.start:
+            raise ValueError(f"end: expected a time after --start {self.start:g}, got {self.end:g}")
+        if self.every < 1:
+            raise ValueError(f"every: expected 1 or more, got {self.every}")
 
     def _check_lens(self) -> None:
         if not self.camera and self.fov is None:

@@ -78,7 +78,8 @@ class LaneFileObserver:
 
     def __call__(self, frame: Frame) -> Observation:
         """See :class:`Observer`."""
-        entry = self.matches[frame.number] if frame.number < len(self.matches) else None
+        number = frame.number if frame.source_number is None else frame.source_number
+        entry = self.matches[number] if number < len(self.matches) else None
         found = FrameLines(frame.name, []) if entry is None else self.entries[entry]
         lines = [] if frame.image is None else found.lines
         return Observation(vertices_from_lines(lines, self.camera), found.pose_sigma_scale)

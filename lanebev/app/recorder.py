@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -67,6 +67,7 @@ class Recorder:
         single: PNGs instead of videos.
         stills: each image on its own.
         grid: of the bird's-eye view.
+        videos: whether there are any.
         rows: of extrinsics.csv, a frame each.
         problems: what went wrong, for the report.
     """
@@ -78,13 +79,15 @@ class Recorder:
     single: bool
     stills: bool
     grid: BEVGrid = field(default_factory=BEVGrid)
+    videos: bool = True
     rows: list[ExtrinsicsRow] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         alone = self.single or self.stills
         self.before_title = "uncalibrated" if alone else "first frame's pose held"
-        self._before, self._coarse = ViewBefore(alone), BEVGrid(resolution=_BEFORE_RESOLUTION)
+        self._before = ViewBefore(alone)
+        self._coarse = replace(self.grid, resolution=max(self.grid.resolution, _BEFORE_RESOLUTION))
         self._widths: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
         self._moments, self._scores = MomentSampler(), EventScores()
 
@@ -92,7 +95,7 @@ class Recorder:
         self._stack = ExitStack()
         lanes = open(self.path("lanes.json"), "w", encoding="utf-8", buffering=1)  # whole lines, if killed
         self._lanes = self._stack.enter_context(lanes)
-        if not self.single:
+        if self.videos and not self.single:
             self._bev = self._stack.enter_context(VideoWriter(self.path("bev.mp4"), self.fps, _CRF))
             self._overlay = self._stack.enter_context(VideoWriter(self.path("overlay.mp4"), self.fps, _CRF))
         self._background = self._stack.enter_context(Background())
@@ -194,7 +197,7 @@ class Recorder:
         if self.single:
             write_png(self.path("bev.png"), bev)
             write_png(self.path("overlay.png"), picture)
-        else:
+        elif self.videos:
             shown = None if self.stills else frame.time
             self._bev.write(bev, shown)
             self._overlay.write(picture, shown)

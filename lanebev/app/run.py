@@ -17,16 +17,17 @@ from lanebev.app.build import (
     input_files,
     lens_remark,
     make_camera,
+    make_grid,
     make_observer,
     make_tracker,
     match_image_size,
 )
-from lanebev.app.concurrency import map_ahead
 from lanebev.app.config import RunConfig
 from lanebev.app.convert import writer
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states
+from lanebev.app.sources import ended_by_signals, make_source, observed_frames
 from lanebev.app.summary import mount_facts, run_facts
 from lanebev.app.take_up import frame_name, take_up
 from lanebev.io.calibration_file import write_calibration
@@ -35,7 +36,6 @@ from lanebev.io.formats.folder import read_record
 from lanebev.io.formats.names import FORMATS, check_installed
 from lanebev.io.results import ExtrinsicsRow, OutputFolder, check_inputs_stay
 from lanebev.io.state import save_state
-from lanebev.io.video import open_source
 from lanebev.report.page import Report
 
 STILLS_FPS = Fraction(2)  # of the videos that show images one after another
@@ -64,7 +64,7 @@ def run(
         ValueError: bad input; one line says which and what would be right.
     """
     check_installed(config.formats)
-    source = open_source(config.source, config.frame_rate)
+    source = make_source(config)
     check_inputs_stay(config.out, input_files(config, source))
     camera = make_camera(config, source.image_size)
     source = match_image_size(camera, source)
@@ -79,15 +79,19 @@ def run(
         recorder = Recorder(
             path=out.__truediv__,
             camera=camera,
-            fps=STILLS_FPS if config.stills else source.fps,
+            fps=STILLS_FPS if config.stills else source.fps / config.every,
             lane_width=config.lane_width,
             single=source.is_single,
             stills=config.stills,
+            grid=make_grid(config),
+            videos=not config.no_video,
         )
         recorder.problems += filter(None, (source.problem, problem, observer.remark, lens_remark(camera)))
         covariances: list[NDArray[np.float64]] = []
-        with recorder, closing(map_ahead(taken, source, taken.workers)) as frames:
-            for frame, seen in progress(frames, source.count) if progress else frames:
+        frames = observed_frames(source, taken)
+        progress = None if source.is_live else progress
+        with recorder, closing(frames), ended_by_signals(source):
+            for frame, seen in progress(frames, source.taken_count) if progress else frames:
                 if config.stills:
                     estimate = tracker.still(seen.vertices, seen.pose_sigma_scale)
                 else:
@@ -106,5 +110,5 @@ def run(
         if config.formats:
             record = replace(read_record(out / "."), name=report.title, rows=recorder.rows, camera=camera)
             for name in config.formats:
-                writer(name)(out / FORMATS[name].file, record, source)
+                writer(name)(out / FORMATS[name].file, record, None if source.is_live else source)
         return report

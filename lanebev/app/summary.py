@@ -11,6 +11,7 @@ from lanebev import __version__
 from lanebev.app.config import RunConfig
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration, MountReason, MountStatus, describe_mount
+from lanebev.io.live import LiveSource
 from lanebev.io.video import FrameSource
 from lanebev.report.page import Report
 
@@ -28,12 +29,13 @@ def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[st
     network = "the network" if config.weights is None else f"the network, {config.weights}"
     return {
         "source": f"{source.source} ({width} x {height})",
-        kind: f"{source.count}{rate}",
+        kind: f"{source.taken_count}{rate}",
         "camera": f"{lens}: {camera.model}, f = {fx:.1f} / {fy:.1f} px",
         "lanes from": config.lanes or network,
         "lane width": f"{config.lane_width:.4g} m",
         "calibrator": config.calibrator,
         "lanebev": __version__,
+        **({"stream": source.figures.words()} if isinstance(source, LiveSource) else {}),
         **_other_settings(config),
     }
 
@@ -63,7 +65,7 @@ def summary(report: Report, config: RunConfig) -> str:
         middle = {name: float(np.median([getattr(row, name) for row in tracking])) for name in _SHOWN}
         values = "  ".join(f"{name.rsplit('_', 1)[0]} {middle[name]:+.3f} {_SHOWN[name]}" for name in _SHOWN)
         lines.append(f"median  {values}")
-    shown = ("lane width σ", "mount", "taken up")
+    shown = ("lane width σ", "mount", "taken up", "stream")
     lines += [f"{label}: {text}" for label, text in report.facts.items() if label.startswith(shown)]
     lines += [f"problem: {problem}" for problem in report.problems[:_PROBLEMS]]
     if len(report.problems) > _PROBLEMS:

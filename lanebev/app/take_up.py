@@ -79,7 +79,7 @@ def take_up(
 ) -> TakenUp:
     """Take up the run that was killed in this folder, if it was of the same settings and files.
 
-    Lanes of another detector are read as they are: nothing is saved by keeping them.
+    Lanes of another detector are read as they are: nothing is saved by keeping them. A stream begins anew.
     """
     settings = fingerprint(config, source, camera)
     known = out / _SETTINGS
@@ -90,7 +90,7 @@ def take_up(
     else:
         (out / _SEEN).unlink(missing_ok=True)
     known.write_text(settings, encoding="utf-8")
-    is_there = (out / _SEEN).is_file() and config.lanes is None
+    is_there = (out / _SEEN).is_file() and config.lanes is None and not source.is_live
     entries = whole_tusimple_lines(out / _SEEN) if is_there else iter(())
     return TakenUp(entries, observer, camera, source)
 

@@ -11,7 +11,6 @@ from fractions import Fraction
 from pathlib import Path
 from statistics import median
 from types import TracebackType
-from typing import NamedTuple
 
 import av
 import cv2
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.io.decoding import decoded, has_times, open_video, packets, rgb
+from lanebev.io.frames import ALL, Frame, Selection, taken_frames
 from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
 from lanebev.io.images import IMAGE_SUFFIXES, image_size, is_image, read_image, write_png
 
@@ -40,26 +40,6 @@ DEFAULT_FPS = Fraction(30)
 _SAME_RATE = 0.05  # relative, by which two frame rates may differ and be the same
 
 
-class Frame(NamedTuple):
-    """One frame of a source.
-
-    Attributes:
-        number: 0, 1, ...
-        time: s since the first frame.
-        dt: s since the frame before; of the first, the source's nominal interval.
-        name: the image's path as found, empty for a video.
-        image: (H, W, 3) uint8 RGB, or None if it did not decode.
-        problem: why not, or what else is to be said of it; else empty.
-    """
-
-    number: int
-    time: float
-    dt: float
-    name: str
-    image: NDArray[np.uint8] | None
-    problem: str = ""
-
-
 @dataclass(frozen=True)
 class FrameSource:
     """A video or a list of images, iterated frame by frame, as often as wanted.
@@ -73,6 +53,7 @@ class FrameSource:
         problem: what is wrong with the whole of it, else empty.
         times: s since the first, of images whose names state them; else empty.
         has_times: whether a video says when its frames are shown; else they are evenly spaced.
+        selection: which of the frames are taken. ``fps`` and ``count`` are those of the whole source.
     """
 
     source: str
@@ -83,6 +64,18 @@ class FrameSource:
     problem: str = ""
     times: tuple[float, ...] = ()
     has_times: bool = True
+    selection: Selection = ALL
+
+    @property
+    def is_live(self) -> bool:
+        """Whether the frames come when they come, once, until it is stopped."""
+        return False
+
+    @property
+    def taken_count(self) -> int:
+        """Number of frames that are taken; of a video an estimate."""
+        times = self.times or (float(index / self.fps) for index in range(self.count))
+        return sum(self.selection.takes(*each) for each in enumerate(times))
 
     @property
     def is_video(self) -> bool:
@@ -95,18 +88,20 @@ class FrameSource:
         return len(self.paths) == 1 and self.paths[0] == self.source
 
     def __iter__(self) -> Iterator[Frame]:
-        return self._video_frames() if self.is_video else self._image_frames()
+        frames = self._video_frames() if self.is_video else self._image_frames()
+        return frames if self.selection == ALL else taken_frames(frames, self.selection)
 
     def _image_frames(self) -> Iterator[Frame]:
         for index, path in enumerate(self.paths):
             image, problem = None, ""
-            try:
-                image = self._right_size(read_image(path))
-            except ValueError as error:
-                problem = str(error)
             time, dt = float(index / self.fps), float(1 / self.fps)
             if self.times:
                 time, dt = self.times[index], self.times[index] - self.times[index - 1] if index else dt
+            if self.selection.takes(index, time):
+                try:
+                    image = self._right_size(read_image(path))
+                except ValueError as error:
+                    problem = str(error)
             yield Frame(index, time, dt, path, image, problem)
 
     def _video_frames(self) -> Iterator[Frame]:
@@ -126,10 +121,11 @@ class FrameSource:
                     damaged, told = isinstance(frame, str), False
                 elif damaged and not told:
                     problem, told = "up to the next key frame, images may show a lost frame's damage", True
-                try:
-                    image = self._right_size(rgb(frame))
-                except ValueError as error:
-                    problem = str(error)
+                if self.selection.takes(index, float(time - first)):
+                    try:
+                        image = self._right_size(rgb(frame))
+                    except ValueError as error:
+                        problem = str(error)
                 yield Frame(index, float(time - first), dt, "", image, problem)
                 before = time
 

@@ -1,0 +1,74 @@
+"""The source of a run, made of its settings; and how a stream is ended."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import signal
+import threading
+from collections.abc import Generator, Iterator
+from dataclasses import replace
+from typing import Any
+
+from lanebev.app.concurrency import map_ahead
+from lanebev.app.config import RunConfig
+from lanebev.app.observers import Observation, Observer
+from lanebev.io.frames import ALL, Frame, Selection
+from lanebev.io.live import LiveSource, is_live, open_live
+from lanebev.io.video import FrameSource, open_source
+
+
+def make_source(config: RunConfig) -> FrameSource:
+    """Open the source, with the frames that the settings take.
+
+    Raises:
+        ValueError: nothing there, nothing that decodes, no frame that is taken, or a setting that a stream
+            cannot have.
+    """
+    selection = Selection(config.start, math.inf if config.end is None else config.end, config.every)
+    if is_live(config.source):
+        for name, given in (("--lanes", config.lanes), ("--stills", config.stills)):
+            if given:
+                raise ValueError(f"source {config.source}: expected no {name} with a stream, got it")
+        return open_live(config.source, config.frame_rate, config.keep_all, selection)
+    source = replace(open_source(config.source, config.frame_rate), selection=selection)
+    if selection != ALL and not source.taken_count:
+        last = source.times[-1] if source.times else float(source.count / source.fps)
+        raise ValueError(
+            f"start, end, every: expected some of the {source.count} frames to be taken, got none; "
+            f"{config.source} is {last:.2f} s long"
+        )
+    return source
+
+
+def observed_frames(source: FrameSource, observer: Observer) -> Generator[tuple[Frame, Observation]]:
+    """Yield each frame with what is seen in it; of a stream one after another, else several at a time."""
+    if not source.is_live:
+        return map_ahead(observer, source, observer.workers)
+    return ((frame, observer(frame)) for frame in source)
+
+
+@contextlib.contextmanager
+def ended_by_signals(source: FrameSource) -> Iterator[None]:
+    """Have Ctrl-C, SIGTERM and SIGHUP end a stream, and with it the run as usual; a second one interrupts.
+
+    Other sources, and threads other than the main one, are left as they are.
+    """
+    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    if not isinstance(source, LiveSource) or threading.current_thread() is not threading.main_thread():
+        numbers = []
+    before = {number: signal.getsignal(number) for number in numbers}
+
+    def stop(number: int, frame: Any) -> None:
+        source.stop()  # type: ignore[attr-defined]  # no signal is taken of another
+        for each, handler in before.items():
+            signal.signal(each, handler)
+
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:  # nohup's
+            signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,225 @@
+"""Cameras and streams: frames as they come, the newest first where not all can be looked at."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+
+import av
+
+from lanebev.io.decoding import rgb
+from lanebev.io.frames import ALL, Frame, Selection
+from lanebev.io.video import DEFAULT_FPS, FrameSource
+
+SCHEMES = ("rtsp", "rtsps", "rtmp", "http", "https", "udp", "rtp", "tcp", "srt")
+PIPE = "-"
+_TIMEOUT = 10.0  # s without a frame, after which a stream has ended
+_POLL = 0.05  # s between looks at whether it is to stop
+_LOW_DELAY = {"flags": "low_delay", "rtsp_transport": "tcp"}
+
+
+def is_live(source: str) -> bool:
+    """Return whether a source is a camera (``/dev/video0``), a stream's address or a pipe (``-``)."""
+    scheme, found, _ = source.partition("://")
+    device = source.startswith("/dev/video") or Path(source).is_fifo()
+    return source == PIPE or device or bool(found and scheme.lower() in SCHEMES)
+
+
+@dataclass
+class LiveFigures:
+    """What became of a stream's frames.
+
+    Attributes:
+        seen: frames that were handed on.
+        dropped: frames that came while an earlier one was looked at, and were replaced by a later one.
+        longest_delay: s from a frame's arrival to when the next one was asked for.
+        end: why the stream ended, empty if it was stopped or ran out.
+    """
+
+    seen: int = 0
+    dropped: int = 0
+    longest_delay: float = 0.0
+    end: str = ""
+
+    def words(self) -> str:
+        """Return the figures in a sentence."""
+        ended = f"; it ended: {self.end}" if self.end else ""
+        return (
+            f"{self.seen} frames used, {self.dropped} dropped, at most {self.longest_delay:.2f} s from a "
+            f"frame's arrival to its result{ended}"
+        )
+
+
+@dataclass(frozen=True)
+class LiveSource(FrameSource):
+    """A stream that is read in a thread of its own, which keeps the newest frame only.
+
+    Frames' times are those of their arrival. Who cannot look at every frame is given the newest, so that the
+    delay is that of one frame however slow the looking is. With ``keep_all`` nothing is dropped, the stream
+    waits instead, and times are those that the stream states.
+
+    Attributes:
+        container: of the stream, open; its first frame is not in it any more.
+        first: the first frame.
+        keep_all: wait for whoever looks.
+        figures: what became of the frames.
+    """
+
+    container: av.container.InputContainer | None = None
+    first: av.VideoFrame | None = None
+    keep_all: bool = False
+    figures: LiveFigures = field(default_factory=LiveFigures)
+    _stop: list[bool] = field(default_factory=list)
+
+    @property
+    def is_live(self) -> bool:
+        """Whether the frames come when they come: yes."""
+        return True
+
+    def stop(self) -> None:
+        """End the iteration after the frame in hand; signal handlers may call it."""
+        self._stop.append(True)
+
+    def __iter__(self) -> Iterator[Frame]:
+        slot = _Slot(self.keep_all, self._stop, self.figures)
+        thread = threading.Thread(target=self._read, args=(slot,), name="stream", daemon=True)
+        thread.start()
+        start = before = None
+        try:
+            while (item := slot.take()) is not None:
+                arrival, frame = item
+                now = self._stated(frame, self.figures.seen) if self.keep_all else arrival
+                start = now if start is None else start
+                dt = float(1 / self.fps) if before is None else now - before
+                image, problem = None, ""
+                try:
+                    image = self._right_size(rgb(frame))
+                except ValueError as error:
+                    problem = str(error)
+                yield Frame(self.figures.seen, now - start, dt, "", image, problem)
+                before = now
+                self.figures.seen += 1
+                delay = time.monotonic() - arrival
+                self.figures.longest_delay = max(self.figures.longest_delay, delay)
+        finally:
+            self.stop()
+
+    def _stated(self, frame: av.VideoFrame, number: int) -> float:
+        """Return the time (s) of a frame by the stream, or by its number if the stream states none."""
+        return float(number / self.fps) if frame.time is None else frame.time
+
+    def _read(self, slot: _Slot) -> None:
+        """Decode until the stream ends or is stopped; frames that do not decode are left out."""
+        if self.container is None or self.first is None:
+            raise RuntimeError("a live source is made by open_live")
+        slot.put(self.first)
+        try:
+            for packet in self.container.demux(self.container.streams.video[0]):
+                try:
+                    for frame in packet.decode():
+                        slot.put(frame)
+                except av.error.InvalidDataError:
+                    continue
+                if self._stop:
+                    break
+        except (av.error.FFmpegError, OSError) as error:
+            self.figures.end = error.strerror or str(error)
+        finally:
+            slot.close()
+            self.container.close()
+
+
+class _Slot:
+    """Where the reader leaves the newest frame: one place, no lock that a signal handler could wait for."""
+
+    def __init__(self, waits: bool, stop: list[bool], figures: LiveFigures) -> None:
+        self._waits, self._stop, self._figures = waits, stop, figures
+        self._frames: deque[tuple[float, av.VideoFrame]] = deque(maxlen=1)
+        self._came, self._closed = threading.Event(), False
+
+    def put(self, frame: av.VideoFrame) -> None:
+        while self._waits and self._frames and not self._stop:
+            time.sleep(0.001)
+        if self._frames:
+            self._figures.dropped += 1
+        self._frames.append((time.monotonic(), frame))
+        self._came.set()
+
+    def close(self) -> None:
+        self._closed = True
+        self._came.set()
+
+    def take(self) -> tuple[float, av.VideoFrame] | None:
+        """Wait for a frame; None at the end of the stream, or when it is to stop."""
+        waited = time.monotonic()
+        while not self._stop:
+            self._came.clear()
+            try:
+                return self._frames.popleft()
+            except IndexError:
+                if self._closed:
+                    return None
+            if not self._waits and time.monotonic() - waited > _TIMEOUT:
+                self._figures.end = f"no frame for {_TIMEOUT:g} s"
+                return None
+            self._came.wait(_POLL)
+        return None
+
+
+def open_live(
+    source: str, fps: Fraction | None = None, keep_all: bool = False, selection: Selection | None = None
+) -> LiveSource:
+    """Open a camera, a stream or a pipe, and wait for its first frame.
+
+    Args:
+        source: see :func:`is_live`.
+        fps: nominal frame rate, None for what the stream says, else 30.
+        keep_all: drop no frame.
+        selection: must be None: a stream is taken as it comes.
+
+    Raises:
+        ValueError: there is no such device, nothing answers, or no frame comes.
+    """
+    if selection not in (None, ALL):
+        raise ValueError(f"source {source}: expected no --start, --end or --every with a stream, got one")
+    name = "standard input" if source == PIPE else source
+    try:
+        container = _opened(source)
+    except (av.error.FFmpegError, OSError) as error:
+        reason = error.strerror or str(error)
+        raise ValueError(f"stream {name}: expected one that opens, got: {reason}") from error
+    try:
+        if not container.streams.video:
+            raise ValueError(f"stream {name}: expected a video stream, got none")
+        stream = container.streams.video[0]
+        first = next(container.decode(stream))
+        image = rgb(first)
+    except (av.error.FFmpegError, StopIteration, OSError) as error:
+        container.close()
+        raise ValueError(f"stream {name}: expected a frame, got none") from error
+    own = stream.average_rate or stream.guessed_rate or DEFAULT_FPS
+    return LiveSource(
+        source,
+        (),
+        Fraction(fps or own),
+        0,
+        image.shape[:2],
+        container=container,
+        first=first,
+        keep_all=keep_all,
+    )
+
+
+def _opened(source: str) -> av.container.InputContainer:
+    if source == PIPE:  # not by sys.stdin, whose lock a thread that still reads would hold at the end
+        return av.open("pipe:0", "r", metadata_errors="replace")
+    if source.startswith("/dev/video"):
+        return av.open(source, "r", format="v4l2")
+    return av.open(
+        source, "r", options=dict(_LOW_DELAY), timeout=(_TIMEOUT, _TIMEOUT), metadata_errors="replace"
+    )

@@ -1,0 +1,187 @@
+"""Streams and the frames that are taken of a source, as a person uses them; only this machine is asked."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from lanebev import Camera
+from lanebev.app.config import RunConfig, parse_grid
+from lanebev.app.sources import make_source
+from lanebev.cli import main
+from lanebev.io.live import is_live, open_live
+from lanebev.io.results import read_extrinsics
+from lanebev.io.video import VideoWriter, open_source
+from tools.stream_check import MjpegServer
+
+SIZE = (120, 160)
+CAMERA = Camera.from_fov(60.0, SIZE[1], SIZE[0])
+
+
+def _image(number):
+    return np.full((*SIZE, 3), 4 * (number % 60), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    root = tmp_path_factory.mktemp("data")
+    CAMERA.to_file(root / "camera.yaml")
+    with VideoWriter(root / "drive.mp4", Fraction(10)) as writer:
+        for number in range(20):
+            writer.write(_image(number))
+    return root
+
+
+def _fails(capsys, *arguments, word):
+    assert main([str(argument) for argument in arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert word in error, error
+
+
+def test_what_is_taken_for_a_stream(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    live = ("/dev/video0", "rtsp://a/b", "HTTP://a/b.mp4", "-", str(tmp_path / "pipe"))
+    assert all(map(is_live, live))
+    assert not any(map(is_live, ("drive.mp4", "a://b", str(tmp_path), "http:/a")))
+
+
+def test_some_frames_of_a_video(data):
+    source = make_source(RunConfig(str(data / "drive.mp4"), "c", start=0.45, end=1.55, every=3))
+    frames = list(source)
+    assert [frame.source_number for frame in frames] == [6, 9, 12, 15]
+    assert [frame.number for frame in frames] == [0, 1, 2, 3]
+    assert [frame.time for frame in frames] == pytest.approx([0, 0.3, 0.6, 0.9])
+    assert [frame.dt for frame in frames] == pytest.approx([0.3] * 4)
+    assert [frame.image.mean() for frame in frames] == pytest.approx([24, 36, 48, 60], abs=3)
+    assert source.taken_count == 4
+
+
+def test_all_frames_are_as_they_were(data):
+    frames = list(open_source(str(data / "drive.mp4")))
+    assert [frame.source_number for frame in frames] == [None] * 20
+
+
+def test_lanes_go_with_the_frames_that_are_taken(data, tmp_path):
+    lines = [
+        f'{{"raw_file": "{number}", "h_samples": [90, 100, 110], "lanes": [[{50 - number}, 45, 40]]}}'
+        for number in range(20)
+    ]
+    (tmp_path / "lanes.json").write_text("\n".join(lines))
+    fixed = ["run", f"{data}/drive.mp4", "--camera", f"{data}/camera.yaml", "--no-video", "--grid"]
+    fixed += ["3:20,-5:5/0.25", "--lanes", f"{tmp_path}/lanes.json"]
+    assert main([*fixed, "--start", "0.5", "--end", "1.1", "--every", "2", "--out", f"{tmp_path}/out"]) == 0
+    rows = read_extrinsics(tmp_path / "out" / "extrinsics.csv")
+    assert [row.time_s for row in rows] == pytest.approx([0, 0.2, 0.4])
+    assert not {"bev.mp4", "overlay.mp4"} & {path.name for path in (tmp_path / "out").iterdir()}
+    seen = (tmp_path / "out" / "lanes.json").read_text().splitlines()
+    for line, number in zip(seen, (6, 8, 10), strict=True):
+        assert f"[{50 - number}.0, 90.0]" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("--start", "2.5"), "got none; "),
+        (("--start", "-1"), "start: expected 0 s or later"),
+        (("--start", "2", "--end", "1"), "end: expected a time after --start 2"),
+        (("--every", "0"), "every: expected 1 or more"),
+    ],
+)
+def test_settings_that_take_nothing(data, tmp_path, capsys, arguments, word):
+    fixed = ("run", data / "drive.mp4", "--camera", data / "camera.yaml", "--out", tmp_path / "out")
+    _fails(capsys, *fixed, *arguments, word=word)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_grid_by_its_text():
+    assert parse_grid("3:60, -10:10/0.05") == RunConfig("a", "b").grid
+    for text, word in (("3:60", "NEAR:FAR"), ("60:3,-1:1/.1", "NEAR < FAR"), ("1:9,-5:5/1e-3", "NEAR:FAR")):
+        with pytest.raises(ValueError, match=word):
+            parse_grid(text)
+    with pytest.raises(ValueError, match="16 to 4096 pixels"):
+        parse_grid("3:60,-10:10/0.001")
+
+
+def test_a_stream_drops_what_it_cannot_look_at():
+    with MjpegServer([_image(number) for number in range(60)], 50.0) as server:
+        source = open_live(server.address)
+        delays = []
+        for frame in source:
+            time.sleep(0.1)  # five frames come meanwhile
+            delays.append(source.figures.longest_delay)
+            if frame.number == 7:
+                source.stop()
+    assert source.figures.seen == 8
+    assert 16 <= source.figures.dropped <= 60
+    assert max(delays) < 0.5
+    assert frame.time == pytest.approx(0.7, abs=0.4)  # by arrival
+    assert f"8 frames used, {source.figures.dropped} dropped" in source.figures.words()
+
+
+def test_a_stream_that_ends_ends_the_run(data, tmp_path, capsys):
+    with MjpegServer([_image(number) for number in range(12)], 60.0, limit=12) as server:
+        fixed = ["--camera", f"{data}/camera.yaml", "--out", f"{tmp_path}/out", "--keep-all"]
+        assert main(["run", server.address, *fixed]) == 0
+    out = capsys.readouterr().out
+    assert "0 dropped" in out
+    rows = read_extrinsics(tmp_path / "out" / "extrinsics.csv")
+    assert 10 <= len(rows) <= 12  # the demuxer learns of the last one's end at the next
+    assert (tmp_path / "out" / "overlay.mp4").exists()
+
+
+def test_ctrl_c_is_the_normal_end_of_a_stream(data, tmp_path, capsys):
+    with MjpegServer([_image(number) for number in range(60)], 30.0) as server:
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        timer = threading.Timer(2.0, os.kill, (os.getpid(), signal.SIGINT))
+        timer.start()
+        try:
+            status = main(
+                ["run", server.address, "--camera", f"{data}/camera.yaml", "--out", f"{tmp_path}/out"]
+            )
+        finally:
+            timer.cancel()
+            signal.signal(signal.SIGINT, before)
+    assert status == 0
+    assert "dropped" in capsys.readouterr().out
+    assert len(read_extrinsics(tmp_path / "out" / "extrinsics.csv")) > 1
+    assert (tmp_path / "out" / "state.safetensors").exists()
+
+
+@pytest.mark.slow
+def test_a_pipe(data, tmp_path):
+    command = [sys.executable, "-m", "lanebev", "run", "-", "--camera", f"{data}/camera.yaml", "--keep-all"]
+    with VideoWriter(tmp_path / "drive.ts", Fraction(10)) as writer:
+        for number in range(10):
+            writer.write(_image(number))
+    with open(tmp_path / "drive.ts", "rb") as file:
+        command += ["--out", f"{tmp_path}/out"]
+        done = subprocess.run(command, stdin=file, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    rows = read_extrinsics(tmp_path / "out" / "extrinsics.csv")
+    assert [row.time_s for row in rows] == pytest.approx(np.arange(10) / 10, abs=1e-3)  # the stream's own
+
+
+def test_a_stream_that_does_not_open(data, tmp_path, capsys):
+    fixed = ("--camera", data / "camera.yaml", "--out", tmp_path / "out")
+    _fails(
+        capsys,
+        "run",
+        "http://127.0.0.1:9/none",
+        *fixed,
+        word="that opens, got: Connection refused",
+    )
+    _fails(capsys, "run", "/dev/video99", *fixed, word="that opens, got: No such file")
+    _fails(capsys, "run", "-", *fixed, "--stills", word="expected no --stills with a stream")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_stream_is_not_cut(capsys, data):
+    arguments = ("run", "-", "--camera", data / "camera.yaml", "--start", "1")
+    _fails(capsys, *arguments, word="expected no --start, --end")
