@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 
 from lanebev import __version__
 from lanebev.app.config import RunConfig, parse_path, read_settings
+from lanebev.app.export_config import ExportConfig
 from lanebev.app.progress import Item, Progress
 from lanebev.io.formats.names import FORMATS
 
@@ -35,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
     top = _Parser(prog="lanebev", description=DESCRIPTION, allow_abbrev=False)
     top.add_argument("--version", action="version", version=f"lanebev {__version__}")
     _add_verbose(top, False)
-    commands = top.add_subparsers(dest="command", required=True, metavar="{demo,run,compare,convert}")
+    commands = top.add_subparsers(dest="command", required=True, metavar="{demo,run,compare,convert,export}")
     demo = commands.add_parser("demo", help="a rendered drive end to end", allow_abbrev=False)
     path = _named(parse_path)
     default = "lanebev-demo"
@@ -61,7 +62,10 @@ def parser() -> argparse.ArgumentParser:
     convert.add_argument("--camera", type=path, metavar="FILE", help=words)
     words = "the run's source, to show its images in mcap or rerun"
     convert.add_argument("--images", type=path, metavar="SOURCE", help=words)
-    for command in (demo, run, compare, convert):
+    files = commands.add_parser("export", help="parts as ONNX files or programs", allow_abbrev=False)
+    for setting in fields(ExportConfig):
+        _add_setting(files, setting)
+    for command in (demo, run, compare, convert, files):
         _add_verbose(command, argparse.SUPPRESS)
     return top
 
@@ -118,7 +122,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logging.getLogger("lanebev").setLevel(logging.DEBUG)
     try:
         with _signals_unwind():
-            report = {"run": _run, "demo": _demo, "compare": _compare, "convert": _convert}[command](options)
+            report = {
+                "run": _run,
+                "demo": _demo,
+                "compare": _compare,
+                "convert": _convert,
+                "export": _export,
+            }[command](options)
     except (ValueError, OSError) as error:
         print(f"lanebev {command}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -184,6 +194,13 @@ def _convert(options: dict[str, Any]) -> str:
     from lanebev.app.convert import convert
 
     return convert(**options)
+
+
+def _export(options: dict[str, Any]) -> str:
+    config = ExportConfig(**options)
+    from lanebev.app.export import export
+
+    return export(config)
 
 
 def _progress(label: str) -> Progress:

@@ -270,16 +270,20 @@ class LaneBEV(nn.Module):
         """Context of a stage: without a graph where it is frozen."""
         return torch.no_grad() if stage in self.frozen else nullcontext()
 
-    def _resize(self, image: Tensor) -> Tensor:
+    def network_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
+        """Return the (h, w) px to which images of (H, W) px are resized for the segmenter."""
         if self.network_width is None:
-            return image
-        height, width = image.shape[-2:]
-        rows = max(32, 32 * round(height * self.network_width / width / 32))
-        if (rows, self.network_width) == (height, width):
+            return image_size
+        height, width = image_size
+        return max(32, 32 * round(height * self.network_width / width / 32)), self.network_width
+
+    def _resize(self, image: Tensor) -> Tensor:
+        size = self.network_size((image.shape[-2], image.shape[-1]))
+        if size == image.shape[-2:]:
             return image
         resized = nn.functional.interpolate(
             image.to(common_dtype(image)),  # of half precision there is no kernel on the CPU
-            size=(rows, self.network_width),
+            size=size,
             mode="bilinear",
             antialias=True,
             align_corners=False,

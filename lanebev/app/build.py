@@ -17,6 +17,7 @@ from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.tracker import Tracker
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.estimation.two_stage.state import TwoStageState
+from lanebev.export.runtime import onnx_calibrator, onnx_model
 from lanebev.io.calibration_file import read_mount
 from lanebev.io.lane_size import resized_lanes
 from lanebev.io.lanes import lane_files, read_lanes
@@ -65,6 +66,8 @@ def make_tracker(config: RunConfig, camera: Camera) -> RunTracker:
         mount = read_mount(config.mount)
         prior = prior_of_mount(mount.pose.tolist(), mount.std.tolist())
     calibrator: Any = make_calibrator(config.calibrator, prior)
+    if config.backend == "onnxruntime":
+        calibrator = onnx_calibrator(Path(config.exported), config.calibrator, calibrator)
     return Tracker(calibrator, camera, config.lane_width, config.relative_focal_std, config.lane_width_std)
 
 
@@ -80,6 +83,8 @@ def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Obs
         if config.lanes_size is not None:
             entries = resized_lanes(entries, config.lanes_size, camera.image_size)
         return LaneFileObserver(entries, source, camera)
+    if config.backend == "onnxruntime":
+        return NetworkObserver(onnx_model(Path(config.exported), camera), camera)
     model = LaneBEV.from_pretrained(config.weights)
     try:
         model = model.to(torch.device(config.device))

@@ -20,6 +20,7 @@ T = TypeVar("T")
 _MOST_CELLS = 4096  # pixels a side of the bird's-eye view, which H.264 encodes
 
 CALIBRATORS = ("joint", "two-stage")
+BACKENDS = ("torch", "onnxruntime")
 FOV_FOCAL_STD = 0.2
 """Standard deviation of a guessed focal length as a share of it: 60 degrees of view may be 40 or 90."""
 
@@ -104,6 +105,8 @@ class RunConfig:
         rectified: the images were rectified: the camera is the camera file's projection matrix P.
         weights: of the network, None for the shipped ones.
         device: that the network runs on, such as "cpu" or "cuda".
+        backend: that computes network and calibrator, one of BACKENDS.
+        exported: folder of ``lanebev export``, for the backend "onnxruntime".
         formats: of other programs to write the results in as well, names of FORMATS.
         start: s, of the first frame of the source that is taken.
         end: s, before which the last one is; None is the source's end.
@@ -165,6 +168,8 @@ class RunConfig:
     rectified: bool = option(False, "the images were rectified: take the projection matrix P")
     weights: str | None = option(None, "weights of the network instead of the shipped ones", "FILE")
     device: str = option("cpu", "that the network runs on: cpu, cuda, cuda:1, mps (default {})", "NAME")
+    backend: str = option("torch", "that computes network and calibrator (default {})", choices=BACKENDS)
+    exported: str = option("lanebev-export", "folder of lanebev export, for onnxruntime (default {})", "DIR")
     formats: tuple[str, ...] = option(
         (), f"write the results as these as well: {', '.join(FORMATS)}", "NAME,NAME", parse_formats
     )
@@ -207,6 +212,7 @@ class RunConfig:
             raise ValueError(f"calibrator: expected {' or '.join(CALIBRATORS)}, got {self.calibrator!r}")
         if self.mount and self.calibrator != "joint":
             raise ValueError(f"mount: expected --calibrator joint with it, got {self.calibrator}")
+        self._check_backend()
         if self.stills and self.resume:
             raise ValueError("resume: expected a drive, got --stills; images on their own have no state")
         if self.lanes and self.weights:
@@ -221,6 +227,16 @@ class RunConfig:
             raise ValueError(f"end: expected a time after --start {self.start:g}, got {self.end:g}")
         if self.every < 1:
             raise ValueError(f"every: expected 1 or more, got {self.every}")
+
+    def _check_backend(self) -> None:
+        if self.backend not in BACKENDS:
+            raise ValueError(f"backend: expected {' or '.join(BACKENDS)}, got {self.backend!r}")
+        if self.backend != "torch" and (self.mount or self.weights):
+            given = "mount" if self.mount else "weights"
+            raise ValueError(
+                f"{given}: expected --backend torch with it, got {self.backend}; an exported calibrator and "
+                "network have their own"
+            )
 
     def _check_lens(self) -> None:
         if not self.camera and self.fov is None:

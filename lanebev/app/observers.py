@@ -97,7 +97,7 @@ class NetworkObserver:
 
     def __init__(self, model: LaneBEV, camera: Camera) -> None:
         self.model, self.camera = model.eval(), camera
-        self.device = next(model.parameters()).device
+        self.device = next(model.parameters(), torch.zeros(0)).device  # ONNX has no parameters
         self.workers = min(torch.get_num_threads(), _MOST_WORKERS) if self.device.type == "cpu" else 1
 
     def __call__(self, frame: Frame) -> Observation:

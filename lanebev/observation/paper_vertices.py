@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lanebev.batch import order_true_first
+
 
 def paper_vertices(probabilities: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Compute the mean position of each row's on-pixels, and sample vertices evenly from these rows.
@@ -27,7 +29,7 @@ def paper_vertices(probabilities: Tensor, count: int) -> tuple[Tensor, Tensor]:
     x = (on * columns).sum(-1) / mass.clamp(min=1)
     seen = mass > 0
     total = seen.sum(-1, keepdim=True)  # (B, L, 1) rows
-    order = torch.argsort((~seen).to(torch.int8), dim=-1, stable=True)  # rows with any first, from the top
+    order = order_true_first(seen)  # rows with any first, from the top
     index = torch.arange(count, device=on.device)
     chosen = torch.where(total > count, index * (total - 1) // max(count - 1, 1), index)
     rows = order.gather(-1, chosen.clamp(max=on.shape[-2] - 1))  # (B, L, V)

@@ -1,4 +1,4 @@
-"""Small positive definite solves: known answers, written out, rows on their own, gradients."""
+"""Small positive definite solves: known answers, rows on their own, gradients."""
 
 from __future__ import annotations
 
@@ -33,10 +33,8 @@ def test_known_answers():
     torch.testing.assert_close(linalg.inverse_spd(matrix), expected)
 
 
-@pytest.mark.parametrize("exporting", [False, True])
 @pytest.mark.parametrize("size", [1, 2, 7, 27])
-def test_solves_equal_the_general_ones(size, exporting, monkeypatch):
-    monkeypatch.setattr(torch.compiler, "is_exporting", lambda: exporting)
+def test_solves_equal_the_general_ones(size):
     matrix, right = spd(size), torch.randn(3, size, 2, dtype=DOUBLE)
     torch.testing.assert_close(matrix @ linalg.solve_spd(matrix, right), right, rtol=1e-7, atol=1e-9)
     torch.testing.assert_close(
@@ -47,18 +45,14 @@ def test_solves_equal_the_general_ones(size, exporting, monkeypatch):
     torch.testing.assert_close(factor @ linalg.solve_lower(factor, right), right, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("exporting", [False, True])
-def test_a_matrix_that_is_not_positive_leaves_other_rows_alone(exporting, monkeypatch):
-    monkeypatch.setattr(torch.compiler, "is_exporting", lambda: exporting)
+def test_a_matrix_that_is_not_positive_leaves_other_rows_alone():
     matrix = spd(3)
     matrix[1] = -matrix[1]
     alone = linalg.inverse_spd(matrix[[0, 2]])
     torch.testing.assert_close(linalg.inverse_spd(matrix)[[0, 2]], alone)
 
 
-@pytest.mark.parametrize("exporting", [False, True])
-def test_gradcheck(exporting, monkeypatch):
-    monkeypatch.setattr(torch.compiler, "is_exporting", lambda: exporting)
+def test_gradcheck():
     root = torch.randn(2, 3, 3, dtype=DOUBLE).requires_grad_()
     right = torch.randn(2, 3, 1, dtype=DOUBLE).requires_grad_()
     eye = torch.eye(3, dtype=DOUBLE)

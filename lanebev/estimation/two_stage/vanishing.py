@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from lanebev.batch import order_true_first
 from lanebev.geometry.linalg import inverse_spd
 
 SCORE_ANGLE_WEIGHT = 0.8  # λ₁
@@ -97,7 +98,7 @@ def segment_pairs(weight: Tensor, draws: Tensor) -> Tensor:
         pairs = torch.triu_indices(num_segments, num_segments, 1, device=weight.device).T
         return pairs.expand(weight.shape[0], -1, -1)
     present = weight > 0
-    order = torch.argsort((~present).to(torch.int8), dim=-1, stable=True)  # the present ones first
+    order = order_true_first(present)
     count = present.sum(-1).clamp_min(2)[:, None]  # (B, 1)
     first = (draws[:, 0] * count).long().clamp_max(num_segments - 1)  # (B, M)
     other = (draws[:, 1] * (count - 1)).long().clamp_max(num_segments - 2)

@@ -1,0 +1,49 @@
+"""Parts of the model as files for other runtimes."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+from pathlib import Path
+
+from lanebev.app.build import make_calibrator
+from lanebev.app.export_config import ExportConfig
+from lanebev.camera.model import Camera
+from lanebev.export.parts import make_part
+from lanebev.export.write import write_onnx, write_program
+from lanebev.pipeline import LaneBEV
+
+SUFFIXES = {"onnx": ".onnx", "torch-export": ".pt2"}
+
+logger = logging.getLogger(__name__)
+
+
+def export(config: ExportConfig) -> str:
+    """Write the parts to the output folder, all of them or nothing.
+
+    Returns:
+        a line for each file.
+
+    Raises:
+        ValueError: bad input, or the packages of ONNX are not there.
+    """
+    camera = Camera.from_file(config.camera)
+    model = LaneBEV.from_pretrained(config.weights, calibrator=make_calibrator(config.calibrator))
+    write, lines = {"onnx": write_onnx, "torch-export": write_program}[config.format], []
+    out = Path(config.out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=out, prefix=".export") as partial:
+            for name in config.parts:
+                logger.info("exporting %s", name)
+                path = Path(partial, f"{name}{SUFFIXES[config.format]}")
+                write(make_part(name, model, camera), path)
+                lines.append(f"{out / path.name}: {path.stat().st_size / 1e6:.1f} MB")
+            for path in Path(partial).iterdir():
+                os.replace(path, out / path.name)
+    except OSError as error:
+        raise ValueError(
+            f"output folder {out}: expected one that can be written, got: {error.strerror}"
+        ) from error
+    return "\n".join(lines)

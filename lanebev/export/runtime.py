@@ -1,0 +1,207 @@
+"""ONNX files at work: parts of :class:`lanebev.LaneBEV` that compute by ONNX Runtime."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lanebev.camera.model import Camera
+from lanebev.estimation.calibrator import Calibrator
+from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.export.write import METADATA, MISSING
+from lanebev.observation.boundary_vertices import BoundaryVertices
+from lanebev.observation.segments import LaneSegments
+from lanebev.pipeline import LaneBEV
+from lanebev.types import Calibration, Extrinsics
+
+_TYPES = {"tensor(float)": torch.float32, "tensor(double)": torch.float64}
+
+
+class OnnxPart:
+    """A part in an ONNX file.
+
+    Args:
+        path: of a file that ``lanebev export`` wrote.
+
+    Raises:
+        ValueError: ONNX Runtime is not there, or the file is missing or of something else.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise ValueError(f"onnxruntime: {MISSING} ({error})") from error
+        if not path.is_file():
+            raise ValueError(f"{path}: expected a file that lanebev export writes, there is none")
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 3  # errors
+        try:
+            self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # its classes have no common base
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"{path}: expected an ONNX file of lanebev export, got: {reason}") from error
+        metadata = self.session.get_modelmeta().custom_metadata_map
+        if METADATA not in metadata:
+            raise ValueError(f"{path}: expected an ONNX file of lanebev export, got another one")
+        self.facts: dict[str, Any] = json.loads(metadata[METADATA])
+        self.inputs = {each.name: _TYPES.get(each.type) for each in self.session.get_inputs()}
+        self.outputs = [each.name for each in self.session.get_outputs()]
+
+    def __call__(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Compute the outputs by name from the inputs by name; numbers are cast as the file wants them."""
+        feeds = {
+            name: values[name].detach().cpu().to(dtype or values[name].dtype).numpy()
+            for name, dtype in self.inputs.items()
+        }
+        found = self.session.run(self.outputs, feeds)
+        return {name: torch.from_numpy(value) for name, value in zip(self.outputs, found, strict=True)}
+
+
+class OnnxSegmenter(nn.Module):
+    """Stands in for :class:`lanebev.LaneSegmenter`."""
+
+    def __init__(self, part: OnnxPart) -> None:
+        super().__init__()
+        self.part = part
+        self.config = SimpleNamespace(
+            num_boundaries=part.facts["num_boundaries"], pose_sigma_scale=part.facts["pose_sigma_scale"]
+        )
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Image (B, 3, h, w) to logits."""
+        return self.part({"image": image})["logits"]
+
+
+class OnnxExtractor(nn.Module):
+    """Stands in for :class:`lanebev.LineExtractor`, for the images of one camera."""
+
+    def __init__(self, part: OnnxPart, camera: Camera) -> None:
+        super().__init__()
+        self.part, self.camera = part, camera
+
+    def vertices(
+        self, logits: Tensor, image_size: tuple[int, int], network_size: tuple[int, int]
+    ) -> BoundaryVertices:
+        """Logits (B, 1 + L, h, w) to vertices in pixels of the image as taken."""
+        rows = logits.shape[0]
+        found = self.part(
+            {
+                "logits": logits,
+                "intrinsics": self.camera.intrinsics.expand(rows, 3, 3),
+                "distortion": self.camera.distortion.expand(rows, -1),
+            }
+        )
+        return BoundaryVertices._make(found[f"vertex_{name}"] for name in BoundaryVertices._fields)
+
+
+class OnnxCalibrator(Calibrator[Any]):
+    """Stands in for a calibrator.
+
+    Args:
+        part: of the calibrator.
+        calibrator: of which it is the export; knows the state before the first frame and what is in it.
+    """
+
+    def __init__(self, part: OnnxPart, calibrator: Calibrator[Any]) -> None:
+        super().__init__()
+        self.part, self.calibrator = part, calibrator
+        self.state_type, self.num_boundaries = calibrator.state_type, calibrator.num_boundaries
+        self.still_passes = calibrator.still_passes
+
+    def initial_state(
+        self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
+    ) -> Any:
+        """See :meth:`~lanebev.estimation.calibrator.Calibrator.initial_state`."""
+        return self.calibrator.initial_state(batch_size, dtype, device)
+
+    def step(
+        self, segments: LaneSegments, intrinsics: Tensor, state: Any, dt: Tensor, lane_width: Tensor
+    ) -> tuple[Calibration, Any]:
+        """See :meth:`~lanebev.estimation.calibrator.Calibrator.step`."""
+        rows, count = segments.weight.shape
+        states = {f"state_{name}": value for name, value in state._asdict().items()}
+        found = self.part(
+            {
+                **_padded(segments, self.part.facts["segments"])._asdict(),
+                "intrinsics": intrinsics,
+                "dt": dt,
+                "lane_width": lane_width,
+                "reset": torch.zeros(rows, dtype=torch.bool),
+                **states,
+            }
+        )
+        calibration = Calibration(
+            Extrinsics.unstack(found["extrinsics"]),
+            found["covariance"],
+            found["status"],
+            found["inliers"][:, :count],
+        )
+        return calibration, type(state)(*(found[f"next_{name}"] for name in states))
+
+    def curvature(self, state: Any) -> Tensor | None:
+        """See :meth:`~lanebev.estimation.calibrator.Calibrator.curvature`."""
+        return self.calibrator.curvature(state)
+
+
+def onnx_model(folder: Path, camera: Camera) -> LaneBEV:
+    """Make a model of the segmenter and the extractor in a folder; its calibrator is PyTorch's.
+
+    Raises:
+        ValueError: files that are missing, or for images or a lens of another kind than the camera's.
+    """
+    segmenter, extractor = OnnxPart(folder / "segmenter.onnx"), OnnxPart(folder / "extractor.onnx")
+    expected = (list(camera.image_size), camera.model if camera.distortion.numel() else None)
+    found = (extractor.facts["image_size"], extractor.facts["lens"])
+    if found != expected:
+        raise ValueError(
+            f"{folder}: expected an extractor for this camera, {_words(*expected)}, got one for "
+            f"{_words(*found)}; export it again with this camera file"
+        )
+    return LaneBEV(
+        OnnxSegmenter(segmenter),
+        OnnxExtractor(extractor, camera),  # type: ignore[arg-type]  # LaneBEV asks it for vertices only
+        JointCalibrator(num_boundaries=segmenter.facts["num_boundaries"]),
+        network_width=extractor.facts["network_size"][1],
+    )
+
+
+def onnx_calibrator(folder: Path, name: str, calibrator: Calibrator[Any]) -> OnnxCalibrator:
+    """Make the calibrator of this name in a folder, the export of ``calibrator``.
+
+    Raises:
+        ValueError: a file that is missing, or of another calibrator.
+    """
+    path = folder / f"{name}.onnx"
+    part = OnnxPart(path)
+    state = calibrator.initial_state(1)._asdict()
+    if part.facts["part"] != name or not {f"state_{each}" for each in state} <= set(part.inputs):
+        raise ValueError(f"{path}: expected the calibrator {name}, got {part.facts['part']}")
+    return OnnxCalibrator(part, calibrator)
+
+
+def _words(size: list[int], lens: str | None) -> str:
+    return f"{size[1]} x {size[0]} px {lens or 'without lens'}"
+
+
+def _padded(segments: LaneSegments, count: int) -> LaneSegments:
+    """Return segments with others of weight zero behind them, ``count`` together.
+
+    Raises:
+        ValueError: there are more.
+    """
+    missing = count - segments.weight.shape[1]
+    if missing < 0:
+        raise ValueError(
+            f"segments: expected {count} at most, as the calibrator was exported for, got "
+            f"{segments.weight.shape[1]}"
+        )
+    return LaneSegments(
+        *(torch.cat([part, part.new_zeros(part.shape[0], missing, *part.shape[2:])], 1) for part in segments)
+    )

@@ -1,0 +1,132 @@
+"""A run by exported parts: the same rows, and one line about files that are missing or of another camera."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from lanebev import Camera, LaneBEV
+from lanebev.app.config import RunConfig
+from lanebev.app.export import export
+from lanebev.app.export_config import PARTS, ExportConfig
+from lanebev.app.run import run
+from lanebev.cli import main
+from lanebev.export import parts, runtime
+
+FRAME = Path(__file__).parents[1] / "golden" / "frame.png"
+CAMERA = "{fx: 300, fy: 300, cx: 159.5, cy: 89.5, width: 320, height: 180, distortion: [-0.1, 0.01, 0, 0]}"
+
+
+class EagerPart:
+    """Computes as the exported file of its name would, by PyTorch: export itself has its own tests."""
+
+    def __init__(self, path):
+        self.camera = Camera.from_file(path.parent / "camera.yaml")
+        self.part = parts.make_part(path.stem, LaneBEV.from_pretrained(), self.camera)
+        self.facts, self.inputs = self.part.facts, self.part.inputs
+
+    def __call__(self, values):
+        with torch.no_grad():
+            found = self.part.module(
+                *(values[name].to(example.dtype) for name, example in self.inputs.items())
+            )
+        return dict(zip(self.part.outputs, found, strict=True))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "camera.yaml").write_text(CAMERA)
+    (tmp_path / "images").mkdir()
+    for number in range(3):
+        Image.open(FRAME).save(tmp_path / "images" / f"{number}.png")
+    (tmp_path / "images" / "2.png").write_bytes(b"damaged")
+    return tmp_path
+
+
+def settings(folder, **changes):
+    paths = {"source": folder / "images", "camera": folder / "camera.yaml", "exported": folder}
+    return RunConfig(**{name: str(path) for name, path in paths.items()}, **changes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("calibrator", ["joint", "two-stage"])
+def test_the_rows_are_the_same(folder, calibrator, monkeypatch):
+    monkeypatch.setattr(runtime, "OnnxPart", EagerPart)
+    for backend in ("torch", "onnxruntime"):
+        run(settings(folder, calibrator=calibrator, backend=backend, out=str(folder / backend)))
+    rows = (folder / "torch" / "extrinsics.csv").read_text()
+    assert rows.count("TRACKING") == 2
+    assert (folder / "onnxruntime" / "extrinsics.csv").read_text() == rows
+
+
+def test_files_of_another_camera_or_calibrator_are_refused(folder, monkeypatch):
+    monkeypatch.setattr(runtime, "OnnxPart", EagerPart)
+    other = Camera.from_fov(60.0, 640, 360)
+    with pytest.raises(
+        ValueError, match="this camera, 640 x 360 px without lens, got one for 320 x 180 px pinhole"
+    ):
+        runtime.onnx_model(folder, other)
+    monkeypatch.setattr(runtime, "OnnxPart", lambda path: EagerPart(path.with_stem("joint")))
+    with pytest.raises(ValueError, match="expected the calibrator two-stage, got joint"):
+        runtime.onnx_calibrator(folder, "two-stage", LaneBEV.from_pretrained().calibrator)
+
+
+def test_a_run_without_the_files_is_one_line(folder, capsys):
+    words = ["run", "images", "--camera", "camera.yaml", "--backend", "onnxruntime", "--exported", "nowhere"]
+    assert main([str(folder / word) if word in ("images", "camera.yaml") else word for word in words]) == 2
+    assert (
+        "segmenter.onnx: expected a file that lanebev export writes, there is none" in capsys.readouterr().err
+    )
+
+
+def test_more_segments_than_exported_are_refused():
+    segments = parts.LaneSegments(*(torch.zeros(1, 5, *shape) for shape in ((2, 2), (), (), ())))
+    with pytest.raises(
+        ValueError, match="segments: expected 4 at most, as the calibrator was exported for, got 5"
+    ):
+        runtime._padded(segments, 4)
+    assert runtime._padded(segments, 7).endpoints.shape == (1, 7, 2, 2)
+
+
+def test_settings_are_checked():
+    assert PARTS == parts.PARTS
+    with pytest.raises(ValueError, match="camera: expected --camera FILE, got none"):
+        ExportConfig()
+    assert ExportConfig(camera="c", part="warp").parts == ("warp",)
+    assert ExportConfig(camera="c", calibrator="two-stage").parts[2] == "two-stage"
+    with pytest.raises(ValueError, match="backend: expected torch or onnxruntime, got 'tvm'"):
+        RunConfig(source="s", camera="c", backend="tvm")
+    with pytest.raises(ValueError, match="weights: expected --backend torch with it, got onnxruntime"):
+        RunConfig(source="s", camera="c", backend="onnxruntime", weights="w")
+
+
+@pytest.mark.slow
+def test_export_writes_a_program_that_computes_the_same(folder):
+    out = folder / "programs"
+    said = export(
+        ExportConfig(camera=str(folder / "camera.yaml"), part="warp", format="torch-export", out=str(out))
+    )
+    assert "warp.pt2" in said
+    assert [path.name for path in out.iterdir()] == ["warp.pt2"]
+    part = parts.make_part("warp", LaneBEV.from_pretrained(), Camera.from_file(folder / "camera.yaml"))
+    one = [value[:1] for value in part.inputs.values()]
+    for found, expected in zip(
+        torch.export.load(out / "warp.pt2").module()(*one), part.module(*one), strict=True
+    ):
+        torch.testing.assert_close(found, expected)
+
+
+def test_an_export_that_cannot_be_written_is_one_line(folder, capsys):
+    (folder / "file").write_text("")
+    words = [
+        "export",
+        "--camera",
+        str(folder / "camera.yaml"),
+        "--part",
+        "warp",
+        "--out",
+        str(folder / "file"),
+    ]
+    assert main(words) == 2
+    assert "expected one that can be written" in capsys.readouterr().err

@@ -1,0 +1,128 @@
+"""Each part as ONNX equals eager, for batches that the example was not of, row by row, frame after frame."""
+
+import pytest
+import torch
+
+from lanebev import (
+    BEVGrid,
+    BEVWarp,
+    Camera,
+    LaneBEV,
+    LaneSegmenter,
+    LineExtractor,
+    SegmenterConfig,
+    Status,
+    TwoStageCalibrator,
+)
+from lanebev.export.parts import calibrator_part, make_part
+from lanebev.export.runtime import OnnxCalibrator, OnnxPart
+from lanebev.export.write import export_program, write_onnx
+from lanebev.testing.segments import INTRINSICS as K
+from lanebev.testing.segments import lanes, no_lanes, stack_rows
+
+SIZE = (64, 128)
+GRID = BEVGrid(x=(-6.0, 6.0), z=(6.0, 30.0), resolution=0.5)
+INTRINSICS = torch.tensor([[80.0, 0.0, 63.5], [0.0, 80.0, 31.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def camera(*distortion):
+    return Camera(INTRINSICS, torch.tensor(distortion, dtype=torch.float64), "pinhole", SIZE)
+
+
+def model(network_width=None):
+    torch.manual_seed(0)
+    config = SegmenterConfig(base_width=4, decoder_width=8)
+    return LaneBEV(
+        LaneSegmenter(config), LineExtractor.for_network(config), TwoStageCalibrator(num_hypotheses=20),
+        BEVWarp(GRID), network_width,
+    )  # fmt: skip
+
+
+def onnx(part, folder):
+    write_onnx(part, folder / "part.onnx")
+    return OnnxPart(folder / "part.onnx")
+
+
+def equals(found, expected, tolerance):
+    for name, value in found.items():
+        assert value.dtype == expected[name].dtype
+        torch.testing.assert_close(value, expected[name], rtol=tolerance, atol=tolerance, msg=name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "distortion", "tolerance"),
+    [("segmenter", (), 1e-5), ("warp", (-0.1, 0.01, 0.0, 0.0, 0.0), 1e-4)],
+)
+def test_a_part_equals_eager_for_any_batch(name, distortion, tolerance, tmp_path):
+    part = make_part(name, model(), camera(*distortion))
+    other = onnx(part, tmp_path)
+    assert list(other.inputs) == list(part.inputs)
+    assert other.outputs == list(part.outputs)
+    for rows in (1, 3):
+        inputs = {key: value[:1].repeat(rows, *[1] * (value.ndim - 1)) for key, value in part.inputs.items()}
+        inputs["image"] = torch.rand(rows, *part.inputs["image"].shape[1:])
+        with torch.no_grad():
+            expected = dict(zip(part.outputs, part.module(*inputs.values()), strict=True))
+        equals(other(inputs), expected, tolerance)
+
+
+@pytest.mark.slow
+def test_a_calibrator_equals_eager_frame_after_frame(tmp_path):
+    calibrator = TwoStageCalibrator(num_hypotheses=20)
+    other = OnnxCalibrator(onnx(calibrator_part(calibrator, 48), tmp_path), calibrator)
+    state = again = calibrator.initial_state(3, dtype=torch.float64)
+    for frame in range(3):
+        segments = stack_rows(lanes(seed=frame), no_lanes(), lanes(boundaries=(2,), per=48, seed=frame))
+        arguments = (K.expand(3, 3, 3), 1 / 30, 3.6)
+        expected, state = calibrator(segments, arguments[0], state, *arguments[1:])
+        found, again = other(segments, arguments[0], again, *arguments[1:])
+        assert found.status.tolist() == expected.status.tolist()
+        equals(again._asdict(), state._asdict(), 1e-9)
+        torch.testing.assert_close(found.covariance, expected.covariance)
+    assert expected.status.tolist() == [Status.TRACKING, Status.UNINITIALISED, Status.UNINITIALISED]
+
+
+def test_a_row_that_is_reset_begins_anew():
+    calibrator = TwoStageCalibrator(num_hypotheses=20)
+    part = calibrator_part(calibrator, 48)
+    _, after = calibrator(lanes(), K[None], calibrator.initial_state(1, torch.float64), 1 / 30)
+    reset = torch.tensor([True, False])
+    begun = part.module.begin(reset, [value.repeat(2, *[1] * (value.ndim - 1)) for value in after])
+    for fresh, kept, value in zip(calibrator.initial_state(1, torch.float64), after, begun, strict=True):
+        assert torch.equal(value[:1], fresh)
+        assert torch.equal(value[1:], kept)
+
+
+def test_names_and_facts():
+    part = make_part("step", model(96), camera(0.1, 0.0, 0.0, 0.0))
+    assert list(part.inputs)[:6] == ["image", "dt", "lane_width", "reset", "intrinsics", "distortion"]
+    assert part.facts["network_size"] == [64, 96]
+    assert part.facts["lens"] == "pinhole"
+    results = part.module(*part.inputs.values())
+    named = dict(zip(part.outputs, results, strict=True))
+    assert named["bev"].shape == (2, 3, *GRID.shape)
+    for name, value in part.inputs.items():
+        if name.startswith("state_"):
+            assert named[f"next_{name}"].shape == value.shape
+            assert named[f"next_{name}"].dtype == value.dtype
+    with pytest.raises(ValueError, match=r"part: expected one of segmenter, .*, got 'all'"):
+        make_part("all", model(), camera())
+
+
+@pytest.mark.slow
+def test_the_step_as_a_program_equals_eager_for_any_batch():
+    part = make_part("step", model(96), camera())
+    program = export_program(part).module()
+    one = [value[:1] for value in part.inputs.values()]
+    with torch.no_grad():
+        for found, expected in zip(program(*one), part.module(*one), strict=True):
+            torch.testing.assert_close(found, expected)
+
+
+def test_files_of_others_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="expected a file that lanebev export writes, there is none"):
+        OnnxPart(tmp_path / "segmenter.onnx")
+    (tmp_path / "segmenter.onnx").write_bytes(b"no model")
+    with pytest.raises(ValueError, match="expected an ONNX file of lanebev export, got"):
+        OnnxPart(tmp_path / "segmenter.onnx")
