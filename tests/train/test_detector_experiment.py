@@ -3,6 +3,7 @@
 import json
 import math
 
+import av
 import pytest
 import torch
 
@@ -26,6 +27,7 @@ from train.detector.module import NOISE, arm_poses
 from train.detector.network import VehicleDetector
 from train.detector.predict import OFFSETS_DEG, offset_poses
 from train.detector.table import main as show
+from train.detector.video import main as film
 
 GRID = BEVGrid(x=(-8.0, 8.0), z=(4.0, 36.0), resolution=2.0)
 SIZE = (96, 160)
@@ -151,6 +153,9 @@ def test_the_experiment_runs_is_not_repeated_and_makes_its_table(folder, tmp_pat
     assert "true pose" in out
     assert "won back" in out
     assert (tmp_path / "ap.svg").stat().st_size > 1000
+    film([*arguments, f"--film={tmp_path}/film.mp4", "--film_frames=2"])
+    with av.open(str(tmp_path / "film.mp4")) as video:
+        assert sum(1 for _ in video.decode(video=0)) == 2
 
 
 @pytest.mark.slow
