@@ -3,6 +3,7 @@
     python -m tools.evaluate_streets [--data ../shared/data] [--weights FILE] [--json FILE] [--sheets FOLDER]
 
 ``kitti_road``: the road plane of the lidar is the truth of pitch and roll (0.1 to 0.2 degrees), yaw has none.
+``kitti_road_with_prior``: the same with the median of these as a mount that is known.
 ``culane``: frames at night whose camera is not published; a field of view of 60 degrees is assumed, and only
 the number of calibrated frames counts. ``streets``: two images with a known pose. Nothing here is trained on.
 """
@@ -23,6 +24,7 @@ from torch import Tensor
 
 import lanebev
 from lanebev import BEVGrid, Camera, JointCalibrator, LaneBEV, Status
+from lanebev.estimation.joint.single_frame import FramePrior, prior_of_mount
 from lanebev.estimation.tracker import Tracker
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.io.video import read_image
@@ -33,6 +35,7 @@ from train.commands import one_line_errors
 KITTI_LANE_WIDTH = 3.5  # m
 ASSUMED_FOV = 60.0  # deg, of a camera that is not published
 SIGMAS = 3.0
+MOUNT_STD = 0.001  # rad, of the median pose where it is given as a prior
 
 
 class Answer(NamedTuple):
@@ -64,14 +67,14 @@ def kitti_truth(path: Path) -> Tensor:
 
 
 def calibrate(
-    model: LaneBEV, path: Path, camera: Camera, lane_width: float
+    model: LaneBEV, path: Path, camera: Camera, lane_width: float, prior: FramePrior | None = None
 ) -> tuple[Answer, NDArray[np.uint8]]:
     """Calibrate one image, as ``lanebev run --stills`` does; also return it with what was seen drawn."""
     image = read_image(path)
     with torch.inference_mode():
         frame = network_image(check_frame(image, camera.image_size), torch.device("cpu"))
         _, vertices = model.boundary_vertices(frame)
-        tracker = Tracker(JointCalibrator(), camera, lane_width)
+        tracker = Tracker(JointCalibrator(prior=prior or FramePrior()), camera, lane_width)
         segments, calibration, _ = tracker.still(vertices, model.pose_sigma_scale)
         picture = draw_panels(image, camera, segments, calibration, path.name, (), BEVGrid())[0]
     pitch, yaw, roll, height = calibration.extrinsics
@@ -110,12 +113,26 @@ def summarise(answers: list[Answer], truth: Tensor) -> dict[str, float]:
 
 def kitti_road(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
     """German city streets against the lidar's road plane."""
+    return _kitti_road(model, data, sheets, None)
+
+
+def kitti_road_with_prior(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
+    """The same, with the median of the true pitch and roll as the pose that ``--mount`` gives."""
+    calibs = sorted((data / "kitti_road" / "calib").glob("*.txt"))
+    pitch, roll = torch.stack([kitti_truth(path) for path in calibs]).median(0).values.tolist()
+    pose, std = (pitch, 0.0, roll, 0.0), (MOUNT_STD, torch.inf, MOUNT_STD, torch.inf)
+    return _kitti_road(model, data, None, prior_of_mount(pose, std))
+
+
+def _kitti_road(
+    model: LaneBEV, data: Path, sheets: Path | None, prior: FramePrior | None
+) -> dict[str, float]:
     answers, truth, pictures = [], [], []
     for path in sorted((data / "kitti_road" / "image_2").glob("*.png")):
         calib = data / "kitti_road" / "calib" / f"{path.stem}.txt"
         height, width = read_image(path).shape[:2]
         camera = Camera.from_file(calib, image_size=(height, width))
-        answer, picture = calibrate(model, path, camera, KITTI_LANE_WIDTH)
+        answer, picture = calibrate(model, path, camera, KITTI_LANE_WIDTH, prior)
         answers.append(answer)
         truth.append(kitti_truth(calib))
         pictures.append(picture)
@@ -188,7 +205,8 @@ def main() -> None:
             raise ValueError(f"{options.data}: expected the folder {name}, got none; give --data")
     model = LaneBEV.from_pretrained(options.weights).eval()
     figures = {
-        part.__name__: part(model, options.data, options.sheets) for part in (kitti_road, culane, streets)
+        part.__name__: part(model, options.data, options.sheets)
+        for part in (kitti_road, kitti_road_with_prior, culane, streets)
     }
     print(json.dumps(figures, indent=1))
     if options.json is not None:

@@ -116,6 +116,25 @@ class Calibrator(nn.Module, Generic[StateT]):
         """Estimate as :meth:`forward`, from usable input of one dtype; dt is (B,), lane_width (B, L-1)."""
         raise NotImplementedError
 
+    def weigh_still(
+        self,
+        calibration: Calibration,
+        state: StateT,
+        segments: LaneSegments,
+        intrinsics: Tensor,
+        lane_width: float | Tensor,
+    ) -> Calibration:
+        """Return the calibration of images of their own, which no other frame will correct.
+
+        Args:
+            calibration: after the passes over them.
+            state: likewise.
+            segments: of B images.
+            intrinsics: (B, 3, 3) px.
+            lane_width: m, float, (B,) or (B, L-1).
+        """
+        return calibration
+
     def curvature(self, state: StateT) -> Tensor | None:
         """Return the road's curvature at the camera, (B,) 1/m, positive to the right, or None."""
         return None

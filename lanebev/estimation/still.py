@@ -44,4 +44,4 @@ def calibrate_still_with_state(
     state = calibrator.initial_state(segments.sigma.shape[0], segments.sigma.dtype, segments.sigma.device)
     for _ in range(passes):
         calibration, state = calibrator(shared, intrinsics, state, _INSTANT, lane_width)
-    return calibration, state
+    return calibrator.weigh_still(calibration, state, segments, intrinsics, lane_width), state

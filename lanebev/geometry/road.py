@@ -181,14 +181,14 @@ def _road_from_cam(extrinsics: Extrinsics) -> Tensor:
     return road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)
 
 
-def lane_width_covariance(height: Tensor, relative_std: float) -> Tensor:
+def lane_width_covariance(height: Tensor, relative_std: float | Tensor) -> Tensor:
     """Compute what an uncertain lane width contributes to the covariance of a pose, (B, 4, 4).
 
     From lane boundaries the height is known in lane widths only: a share of the width is that of the height.
 
     Args:
         height: (B,) m.
-        relative_std: standard deviation of the lane width as a share of it.
+        relative_std: standard deviation of the lane width as a share of it, a float or (B,).
     """
     change = torch.nn.functional.pad((height * relative_std).unsqueeze(-1), (3, 0))  # (B, 4)
     covariance: Tensor = change.unsqueeze(-1) * change.unsqueeze(-2)

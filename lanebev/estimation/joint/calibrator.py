@@ -7,7 +7,14 @@ from torch import Tensor
 
 from lanebev.batch import flag, may_skip, select_rows
 from lanebev.estimation.calibrator import Calibrator
-from lanebev.estimation.checks import check_new_state, is_running, unused_frame
+from lanebev.estimation.checks import (
+    as_lane_width,
+    check_new_state,
+    is_running,
+    mask_invalid_rows,
+    unused_frame,
+)
+from lanebev.estimation.joint.averaging import weigh_readings
 from lanebev.estimation.joint.dynamics import motion
 from lanebev.estimation.joint.evidence import (
     accumulate_evidence,
@@ -46,7 +53,7 @@ from lanebev.estimation.joint.update import (
 )
 from lanebev.estimation.kalman import predict
 from lanebev.estimation.reasons import Reason
-from lanebev.geometry.precision import autocast_off
+from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.observation.segments import LaneSegments
 from lanebev.types import Calibration, Status
 
@@ -131,6 +138,23 @@ class JointCalibrator(Calibrator[JointState]):
         after = select_rows(skip, skipped, after)
         calibration = as_calibration(after, agreed, positions, cfg)
         return unused_frame(calibration, skip), after
+
+    def weigh_still(
+        self,
+        calibration: Calibration,
+        state: JointState,
+        segments: LaneSegments,
+        intrinsics: Tensor,
+        lane_width: float | Tensor,
+    ) -> Calibration:
+        """Average a started row's pose over all ways to read its image, see :mod:`averaging`."""
+        like = state.mean.to(widest_dtype(state.mean.device))
+        segments, intrinsics = cast_floating(segments, like.dtype), cast_floating(intrinsics, like.dtype)
+        widths = as_lane_width(lane_width, like, self.num_boundaries)
+        segments, intrinsics, widths = mask_invalid_rows(segments, intrinsics, widths, self.num_boundaries)
+        with autocast_off(like.device):
+            weighed = weigh_readings(calibration, like, segments, intrinsics, widths, self.config)
+        return cast_floating(weighed, calibration.covariance.dtype)
 
     def curvature(self, state: JointState) -> Tensor:
         """Return the road's curvature at the camera, (B,) 1/m, positive to the right."""

@@ -115,18 +115,26 @@ def straight_or_bend(
     """
     noise = 1 / (straight.square().reciprocal() - bend.square().reciprocal())
     curvature, gain = params[:, CURVATURE:], cov[:, :, CURVATURE:]
-    predicted = cov[:, CURVATURE:, CURVATURE:] + noise.diag()
-    inverse = inverse_spd(predicted)
+    inverse = inverse_spd(cov[:, CURVATURE:, CURVATURE:] + noise.diag())
     solved = inverse @ curvature.unsqueeze(-1)  # (B, 2, 1)
-    chi2 = (curvature.unsqueeze(1) @ solved).flatten()
-    sharper = 0.5 * (bend.square() + noise).log().sum()
-    sharper = sharper - cholesky(predicted).diagonal(dim1=1, dim2=2).log().sum(-1)
-    odds = math.log((1 - share) / share) + sharper - 0.5 * chi2
+    odds = straight_log_odds(params, cov, straight, bend, share)
     is_straight = odds.sigmoid()[:, None, None]
     pull = gain @ solved  # (B, 7, 1), from the bend to the straight road
     known = gain @ inverse @ gain.mT
     spread = is_straight * (1 - is_straight) * (pull @ pull.mT)
     return params - (is_straight * pull).squeeze(-1), kalman.symmetrise(cov - is_straight * known + spread)
+
+
+def straight_log_odds(params: Tensor, cov: Tensor, straight: Tensor, bend: Tensor, share: float) -> Tensor:
+    """Compute the log odds (B,) of a straight road against a bend, see :func:`straight_or_bend`."""
+    noise = 1 / (straight.square().reciprocal() - bend.square().reciprocal())
+    curvature = params[:, CURVATURE:]
+    predicted = cov[:, CURVATURE:, CURVATURE:] + noise.diag()
+    chi2 = (curvature.unsqueeze(1) @ inverse_spd(predicted) @ curvature.unsqueeze(-1)).flatten()
+    sharper = 0.5 * (bend.square() + noise).log().sum()
+    sharper = sharper - cholesky(predicted).diagonal(dim1=1, dim2=2).log().sum(-1)
+    odds: Tensor = math.log((1 - share) / share) + sharper - 0.5 * chi2
+    return odds
 
 
 def _change_per_metre(shape: Tensor, cov: Tensor) -> Tensor:

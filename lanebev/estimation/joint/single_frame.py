@@ -33,7 +33,7 @@ from lanebev.observation.segments import LaneSegments
 from lanebev.types import NUM_BOUNDARIES, Extrinsics
 
 _ANNEALING = (0.1, 0.06, 0.035, 0.02, 0.02)  # scales of the linear fits, of the focal length
-_BODY_STD = (0.005, 0.015, 0.01, 0.03)  # rad, rad, rad, m of a frame's pose about the mount
+_BODY_STD = (0.003, 0.015, 0.008, 0.03)  # rad, rad, rad, m of a frame's pose about the mount
 _OBSERVED = 0.2  # a parameter is observed if its sigma fell below this part of the prior's
 
 
@@ -131,7 +131,8 @@ class SingleFrameFit(NamedTuple):
         covariance: (B, 7, 7) of all parameters, prior included, noise scaled to the residuals.
         inliers: (B, N) in [0, 1]; 0 for padding.
         scale: (B,) >= 1, factor by which residuals exceed the given sigmas.
-        observed: (B, 4) bool, of pitch, yaw, roll, height: said by the frame rather than by the prior.
+        observed: (B, 4) bool, of pitch, yaw, roll, height: said by the frame rather than by the prior, or
+            known as well as a frame could say by a prior that is sharper than the default.
         valid: (B,) bool: enough believed segments, pitch and yaw observed.
     """
 
@@ -194,7 +195,7 @@ def fit_observations(
     """As :func:`fit_single_frame`, of segments made ready and places (B, N) of their boundaries, m."""
     with torch.no_grad():
         fewer, fewer_places = spread_subset(seen, places, start_segments)
-        starts = _linear_starts(fewer, fewer_places, prior)  # (B, S, 7)
+        starts = linear_starts(fewer, fewer_places, prior)  # (B, S, 7)
         params, scale = _best_start(starts, fewer, fewer_places, prior, iterations)
         params, scale, _ = refine(params, scale, places, seen, prior, iterations=3)
     params, scale, information = refine(params, scale, places, seen, prior, iterations=2)
@@ -203,7 +204,8 @@ def fit_observations(
     trust = inlier_weights(residuals.distance, residuals.valid, seen.sigma, scale, seen.focal)
     covariance = inverse_spd(information)
     std = covariance.diagonal(dim1=-2, dim2=-1)[:, :OFFSET].sqrt()
-    observed = std < _OBSERVED * prior.std(params)[:OFFSET]
+    usual = FramePrior().std(params)[:OFFSET]
+    observed = std < _OBSERVED * torch.maximum(prior.std(params)[:OFFSET], usual)
     support = (trust * seen.weight).sum(-1)
     valid = (support >= 2.5) & observed[:, :2].all(-1) & params.isfinite().all(-1)
     return SingleFrameFit(
@@ -258,7 +260,7 @@ def refine(
         information, gradient = normal_equations(
             residuals.jacobian, residuals.distance, by_noise * residuals.valid
         )
-        held = precision * _student_weight((params - mean).square() * precision)
+        held = precision * student_weight((params - mean).square() * precision)
         information = information + held.diag_embed()
         gradient = gradient + held * (params - mean)
         step = solve_spd(information, gradient.unsqueeze(-1)).squeeze(-1)
@@ -274,7 +276,7 @@ def normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tupl
     return weighted @ jacobian.mT, (weighted @ distance.flatten(1).unsqueeze(-1)).squeeze(-1)
 
 
-def _student_weight(squared: Tensor) -> Tensor:
+def student_weight(squared: Tensor) -> Tensor:
     """Weight of a prior at a squared normalised distance, for Student's t with 4 degrees of freedom.
 
     One at its mean, not 5/4: near it the prior counts as the Gaussian that it is given as.
@@ -282,7 +284,7 @@ def _student_weight(squared: Tensor) -> Tensor:
     return (1 + squared / 4).reciprocal()
 
 
-def _student_log(squared: Tensor) -> Tensor:
+def student_log(squared: Tensor) -> Tensor:
     """Its log density, (…, P) to (…), the constant left out."""
     return -2.5 * (squared / 4).log1p().sum(-1)
 
@@ -310,7 +312,7 @@ def _spread(steps: int, like: Tensor) -> Tensor:
     return torch.linspace(-end, end, steps, dtype=like.dtype, device=like.device)
 
 
-def _linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Tensor:
+def linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Tensor:
     """Best pitch for every roll of the grid, by robust linear fits.
 
     With the road's axes right, down, forward for yaw 0, ray·right = a V + g x_k V + t F + b F² / (2 V),
@@ -350,7 +352,7 @@ def _linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Ten
     squared = (residual / _ANNEALING[-1]).square()
     cost = 1 - weight + weight * squared / (1 + squared)  # 1 for what is not explained at all
     away = torch.stack([(pitch - prior.pitch) / prior.pitch_std, (roll - prior.roll) / prior.roll_std], -1)
-    total = cost.sum(-1) - _student_log(((solution - mean) / std).square()) - _student_log(away.square())
+    total = cost.sum(-1) - student_log(((solution - mean) / std).square()) - student_log(away.square())
 
     best = total.view(-1, prior.pitch_steps, prior.roll_steps).argmin(1)  # (B, S)
     hypothesis = best * prior.roll_steps + torch.arange(prior.roll_steps, device=like.device)
@@ -387,6 +389,6 @@ def _best_start(
     residuals = boundary_residuals(params, many_places, many)
     score = log_likelihood(residuals.distance, residuals.valid, many.weight, many.sigma, scale, focal)
     away = (params - prior.mean(params)) / prior.std(params)
-    score = torch.where(params.isfinite().all(-1), score + _student_log(away.square()), -torch.inf)
+    score = torch.where(params.isfinite().all(-1), score + student_log(away.square()), -torch.inf)
     best = score.view(batch, count).argmax(-1) + count * torch.arange(batch, device=score.device)
     return params[best], scale[best]

@@ -11,6 +11,7 @@ from torch import Tensor
 from lanebev.estimation.joint.dynamics import MotionConfig, pose_covariance
 from lanebev.estimation.joint.layout import NUM_POSE, POSE, SHAPE, STEPS, layout
 from lanebev.estimation.joint.measurement import CURVATURE, NUM_PARAMS, NUM_STRAIGHT
+from lanebev.estimation.joint.readings import ReadingConfig
 from lanebev.estimation.joint.road import straight_or_bend
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
 from lanebev.estimation.joint.single_frame import FramePrior
@@ -47,6 +48,7 @@ class JointConfig:
         assumed_dt: s between frames where it is not finite, or the clock jumped back by more than a second.
         restart_after: s of segments that don't fit before the search starts over.
         lost_after: s without support.
+        readings: of images on their own, how roads and detectors differ from what is assumed.
     """
 
     num_boundaries: int = NUM_BOUNDARIES
@@ -71,6 +73,7 @@ class JointConfig:
     assumed_dt: float = 1 / 30
     restart_after: float = 0.3
     lost_after: float = 5.0
+    readings: ReadingConfig = field(default_factory=ReadingConfig)
 
     def __post_init__(self) -> None:
         if self.num_boundaries < 2 or self.num_boundaries % 2:
