@@ -1,9 +1,9 @@
 # mypy: ignore-errors
 """Operators of PyTorch in ONNX that its exporter or ONNX Runtime lacks.
 
-ONNX Runtime has Atan, Tan and Softplus in single precision only; ONNX has no Cholesky factor and no solve
-with triangular matrices. They are written here in operators that both have. ``torch.onnx.export`` takes
-:func:`translations` as its ``custom_translation_table``.
+ONNX Runtime has Atan, Tan and Softplus in single precision only and no Where of truth values; ONNX has no
+Cholesky factor and no solve with triangular matrices. They are written here in operators that both have.
+``torch.onnx.export`` takes :func:`translations` as its ``custom_translation_table``.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from onnx_ir import DataType
-from onnxscript import DOUBLE, script
+from onnxscript import DOUBLE, ir, script
 from onnxscript import opset18 as op
 from onnxscript.values import Opset
 
@@ -81,6 +80,7 @@ def translations() -> dict[Callable[..., Any], Callable[..., Any]]:
         aten.atan2.default: arctangent_of_quotient,
         aten.tan.default: tangent,
         aten.softplus.default: softplus,
+        aten.where.self: where,
         aten.linalg_cholesky_ex.default: cholesky_ex,
         aten.linalg_solve_triangular.default: solve_triangular,
         aten.cholesky_solve.default: cholesky_solve,
@@ -94,10 +94,10 @@ def arctangent(x: Any) -> Any:
     atan(x) - y = atan((x cos y - sin y) / (cos y + x sin y)), where the argument is below 1e-6 and its own
     arctangent.
     """
-    if x.dtype != DataType.DOUBLE:
+    if x.dtype != ir.DataType.DOUBLE:
         return op.Atan(x)
     finite = op.Where(op.IsInf(x), op.Sign(x) * _double(_HUGE), x)
-    y = op.Cast(op.Atan(op.Cast(finite, to=DataType.FLOAT)), to=DataType.DOUBLE)
+    y = op.Cast(op.Atan(op.Cast(finite, to=ir.DataType.FLOAT)), to=ir.DataType.DOUBLE)
     sine, cosine = op.Sin(y), op.Cos(y)
     return y + (finite * cosine - sine) / (cosine + finite * sine)
 
@@ -122,6 +122,13 @@ def softplus(x: Any, beta: float = 1.0, threshold: float = 20.0) -> Any:
     zero, one = op.CastLike(0.0, x), op.CastLike(1.0, x)
     soft = (op.Max(scaled, zero) + op.Log(one + op.Exp(-op.Abs(scaled)))) / op.CastLike(_double(beta), x)
     return op.Where(op.Greater(scaled, op.CastLike(threshold, x)), x, soft)
+
+
+def where(condition: Any, yes: Any, no: Any) -> Any:
+    """Choose element by element; ONNX Runtime chooses numbers only, no truth values."""
+    if yes.dtype == ir.DataType.BOOL:
+        return op.Or(op.And(condition, yes), op.And(op.Not(condition), no))
+    return op.Where(condition, yes, no)
 
 
 def cholesky_ex(matrix: Any, upper: bool = False, check_errors: bool = False) -> Any:
@@ -156,9 +163,7 @@ def cholesky_inverse(factor: Any, upper: bool = False) -> Any:
 
 def _double(value: float) -> Any:
     """Return a constant in double precision."""
-    import onnx_ir
-
-    return op.Constant(value=onnx_ir.tensor(value, dtype=DataType.DOUBLE))
+    return op.Constant(value=ir.tensor(value, dtype=ir.DataType.DOUBLE))
 
 
 def _typed(value: Any, like: Any) -> Any:

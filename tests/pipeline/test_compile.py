@@ -3,7 +3,17 @@
 import pytest
 import torch
 
-from lanebev import JointCalibrator, Status, TwoStageCalibrator
+from lanebev import (
+    BEVGrid,
+    BEVWarp,
+    JointCalibrator,
+    LaneBEV,
+    LaneSegmenter,
+    LineExtractor,
+    SegmenterConfig,
+    Status,
+    TwoStageCalibrator,
+)
 from lanebev.estimation.mount import MountEstimator
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes, no_lanes, stack_rows
@@ -35,6 +45,31 @@ def test_calibrators(calibrator):
         torch.testing.assert_close(found.extrinsics.stack(), expected.extrinsics.stack())
         torch.testing.assert_close(found.covariance, expected.covariance)
     assert expected.status.tolist() == [Status.COASTING, Status.TRACKING]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_the_whole_step():
+    """Network, lines, calibrator and view in one graph."""
+    torch.compiler.reset()
+    torch.manual_seed(0)
+    config = SegmenterConfig(base_width=4, decoder_width=8)
+    net = LaneBEV(
+        LaneSegmenter(config).eval(), LineExtractor.for_network(config),
+        TwoStageCalibrator(num_hypotheses=20),
+        BEVWarp(BEVGrid(x=(-6.0, 6.0), z=(6.0, 30.0), resolution=0.5)),
+    )  # fmt: skip
+    compiled = torch.compile(net, backend="eager", fullgraph=True)
+    camera = torch.tensor([[[80.0, 0.0, 63.5], [0.0, 80.0, 31.5], [0.0, 0.0, 1.0]]])
+    state = other = net.initial_state(1)
+    for _ in range(2):
+        arguments = (torch.rand(1, 3, 64, 128), camera)
+        with torch.no_grad():
+            expected, state = net(*arguments, state, torch.tensor([0.05]))
+            found, other = compiled(*arguments, other, torch.tensor([0.05]))
+        torch.testing.assert_close(found.bev, expected.bev)
+        torch.testing.assert_close(found.logits, expected.logits)
+        torch.testing.assert_close(found.calibration.covariance, expected.calibration.covariance)
 
 
 @pytest.mark.slow
