@@ -13,6 +13,7 @@ from typing import TypeVar
 import yaml
 
 from lanebev.io.formats.names import FORMATS, parse_formats
+from lanebev.io.source_names import is_bag
 from lanebev.numbers import parse_size, read_text
 
 T = TypeVar("T")
@@ -113,13 +114,14 @@ class RunConfig:
         every: of the source's frames every so manieth is taken.
         no_video: write no ``bev.mp4`` and ``overlay.mp4``.
         grid: (near, far, left, right, resolution) m of the bird's-eye view.
+        topic: of the images, in a bag that has several.
         keep_all: of a stream, drop no frame.
     """
 
     source: str = option(
         "",
-        "a video, a folder of images, a quoted glob ('DIR/**/*.jpg'), one image, a camera (/dev/video0), a "
-        "stream (rtsp://, http://), or - for a pipe",
+        "a video, a folder of images, a quoted glob ('DIR/**/*.jpg'), one image, an MCAP file or ROS bag, "
+        "a camera (/dev/video0), a stream (rtsp://, http://), or - for a pipe",
         "SOURCE",
     )
     camera: str = option(
@@ -179,10 +181,11 @@ class RunConfig:
     no_video: bool = option(False, "write no bev.mp4 and overlay.mp4")
     grid: tuple[float, float, float, float, float] = option(
         (3.0, 60.0, -10.0, 10.0, 0.05),
-        "of the bird's-eye view: metres ahead, metres to the right, metres a pixel; 3:60,-10:10/0.05 by default",
+        "of the bird's-eye view: metres ahead, to the right, and a pixel; 3:60,-10:10/0.05 by default",
         "NEAR:FAR,LEFT:RIGHT/STEP",
         parse_grid,
     )
+    topic: str | None = option(None, "of the images in a bag that has several", "NAME")
     keep_all: bool = option(False, "of a stream, drop no frame: it waits, and its own times are taken")
 
     @property
@@ -239,7 +242,7 @@ class RunConfig:
             )
 
     def _check_lens(self) -> None:
-        if not self.camera and self.fov is None:
+        if not self.camera and self.fov is None and not is_bag(self.source):
             raise ValueError("camera: expected --camera FILE, or --fov DEG if no file is at hand, got none")
         if self.camera and self.fov is not None:
             raise ValueError("fov: expected no --camera beside it, got both; leave one of them out")

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from lanebev.app.build import (
     input_files,
     lens_remark,
-    make_camera,
     make_grid,
     make_observer,
     make_tracker,
@@ -27,7 +26,7 @@ from lanebev.app.convert import writer
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states
-from lanebev.app.sources import ended_by_signals, make_source, observed_frames
+from lanebev.app.sources import camera_of, ended_by_signals, make_source, observed_frames
 from lanebev.app.summary import mount_facts, run_facts
 from lanebev.app.take_up import frame_name, take_up
 from lanebev.io.calibration_file import write_calibration
@@ -66,7 +65,7 @@ def run(
     check_installed(config.formats)
     source = make_source(config)
     check_inputs_stay(config.out, input_files(config, source))
-    camera = make_camera(config, source.image_size)
+    camera = camera_of(config, source)
     source = match_image_size(camera, source)
     logger.info("%s: %d frames of %d x %d", source.source, source.count, *reversed(camera.image_size))
     observer = make_observer(config, source, camera)

@@ -10,11 +10,15 @@ from collections.abc import Generator, Iterator
 from dataclasses import replace
 from typing import Any
 
+from lanebev.app.build import make_camera
 from lanebev.app.concurrency import map_ahead
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import Observation, Observer
+from lanebev.camera.model import Camera
+from lanebev.io.bags import BagSource, open_bag_source
 from lanebev.io.frames import ALL, Frame, Selection
-from lanebev.io.live import LiveSource, is_live, open_live
+from lanebev.io.live import LiveSource, open_live
+from lanebev.io.source_names import is_bag, is_live
 from lanebev.io.video import FrameSource, open_source
 
 
@@ -31,7 +35,11 @@ def make_source(config: RunConfig) -> FrameSource:
             if given:
                 raise ValueError(f"source {config.source}: expected no {name} with a stream, got it")
         return open_live(config.source, config.frame_rate, config.keep_all, selection)
-    source = replace(open_source(config.source, config.frame_rate), selection=selection)
+    if is_bag(config.source):
+        found: FrameSource = open_bag_source(config.source, config.topic, config.frame_rate)
+    else:
+        found = open_source(config.source, config.frame_rate)
+    source = replace(found, selection=selection)
     if selection != ALL and not source.taken_count:
         last = source.times[-1] if source.times else float(source.count / source.fps)
         raise ValueError(
@@ -39,6 +47,25 @@ def make_source(config: RunConfig) -> FrameSource:
             f"{config.source} is {last:.2f} s long"
         )
     return source
+
+
+def camera_of(config: RunConfig, source: FrameSource) -> Camera:
+    """Make the camera of the settings, or else of the bag that the frames are from.
+
+    Raises:
+        ValueError: the camera file is none, or the bag has no camera.
+    """
+    if config.camera or config.fov is not None or not isinstance(source, BagSource):
+        return make_camera(config, source.image_size)
+    if source.lens is None:
+        raise ValueError(
+            f"camera: expected --camera FILE, got none, and bag {source.source} has no calibrated CameraInfo "
+            f"beside {source.topic}"
+        )
+    try:
+        return Camera.from_fields(source.lens, config.rectified)
+    except ValueError as error:
+        raise ValueError(f"camera of bag {source.source}: {error}; give --camera FILE") from error
 
 
 def observed_frames(source: FrameSource, observer: Observer) -> Generator[tuple[Frame, Observation]]:

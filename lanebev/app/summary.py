@@ -23,7 +23,7 @@ def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[st
     """Say what ran, for the report."""
     height, width = camera.image_size
     fx, fy = float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1])
-    lens = config.camera or f"field of view of {config.fov:g} deg"
+    lens = config.camera or ("the bag" if config.fov is None else f"field of view of {config.fov:g} deg")
     kind = "images, each on its own" if config.stills else "frames"
     rate = "" if config.stills or source.is_single else f" at {float(source.fps):g} fps"
     network = "the network" if config.weights is None else f"the network, {config.weights}"

@@ -73,6 +73,15 @@ def _camera(content: Any, image_size: tuple[int, int] | None, rectified: bool) -
     return checked(camera, restated)
 
 
+def camera_from_fields(fields: Mapping[str, Any], rectified: bool = False) -> CameraParameters:
+    """Return the camera of the fields of a ROS ``camera_info``, as a message has them.
+
+    Raises:
+        ValueError: an unknown field, or a missing or absurd value.
+    """
+    return _camera(dict(fields), None, rectified)
+
+
 def camera_info(camera: CameraParameters, name: str = "camera") -> dict[str, Any]:
     """Return the camera as the fields of a ROS ``camera_info`` YAML.
 

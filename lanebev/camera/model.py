@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral
@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lanebev.camera.files import read_camera, write_camera
+from lanebev.camera.files import camera_from_fields, read_camera, write_camera
 from lanebev.camera.parameters import CameraParameters
 from lanebev.geometry.lens import (
     check_lens,
@@ -136,7 +136,23 @@ class Camera:
         Raises:
             ValueError: the file is missing, cut, or holds an absurd value; one line says which.
         """
-        read = read_camera(path, image_size, rectified)
+        return cls._of(read_camera(path, image_size, rectified))
+
+    @classmethod
+    def from_fields(cls, fields: Mapping[str, Any], rectified: bool = False) -> Camera:
+        """Take the fields of a ROS ``camera_info`` message: width, height, distortion_model, D, K, R, P, roi.
+
+        Args:
+            fields: by name.
+            rectified: the images were rectified: take the projection matrix P, and no lens.
+
+        Raises:
+            ValueError: an unknown field, or a missing or absurd value.
+        """
+        return cls._of(camera_from_fields(fields, rectified))
+
+    @classmethod
+    def _of(cls, read: CameraParameters) -> Camera:
         return cls(
             torch.tensor(read.matrix, dtype=torch.float64).reshape(3, 3),
             torch.tensor(read.distortion, dtype=torch.float64),

@@ -8,26 +8,17 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
-from pathlib import Path
 
 import av
 
 from lanebev.io.decoding import rgb
 from lanebev.io.frames import ALL, Frame, Selection
+from lanebev.io.source_names import PIPE
 from lanebev.io.video import DEFAULT_FPS, FrameSource
 
-SCHEMES = ("rtsp", "rtsps", "rtmp", "http", "https", "udp", "rtp", "tcp", "srt")
-PIPE = "-"
 _TIMEOUT = 10.0  # s without a frame, after which a stream has ended
 _POLL = 0.05  # s between looks at whether it is to stop
 _LOW_DELAY = {"flags": "low_delay", "rtsp_transport": "tcp"}
-
-
-def is_live(source: str) -> bool:
-    """Return whether a source is a camera (``/dev/video0``), a stream's address or a pipe (``-``)."""
-    scheme, found, _ = source.partition("://")
-    device = source.startswith("/dev/video") or Path(source).is_fifo()
-    return source == PIPE or device or bool(found and scheme.lower() in SCHEMES)
 
 
 @dataclass
@@ -177,7 +168,7 @@ def open_live(
     """Open a camera, a stream or a pipe, and wait for its first frame.
 
     Args:
-        source: see :func:`is_live`.
+        source: see :func:`lanebev.io.source_names.is_live`.
         fps: nominal frame rate, None for what the stream says, else 30.
         keep_all: drop no frame.
         selection: must be None: a stream is taken as it comes.

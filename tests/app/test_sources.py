@@ -15,8 +15,9 @@ from lanebev import Camera
 from lanebev.app.config import RunConfig, parse_grid
 from lanebev.app.sources import make_source
 from lanebev.cli import main
-from lanebev.io.live import is_live, open_live
+from lanebev.io.live import open_live
 from lanebev.io.results import read_extrinsics
+from lanebev.io.source_names import is_live
 from lanebev.io.video import VideoWriter, open_source
 from tools.stream_check import MjpegServer
 

@@ -1,0 +1,140 @@
+"""Messages of MCAP files and ROS bags, by topic: those of ROS and of Foxglove."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+IMAGE_TYPES = (
+    "sensor_msgs/msg/CompressedImage",
+    "sensor_msgs/msg/Image",
+    "foxglove.CompressedImage",
+    "foxglove.RawImage",
+)
+LENS_TYPES = ("sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration")
+
+
+class Topic(NamedTuple):
+    """A topic of a bag.
+
+    Attributes:
+        name: of the topic.
+        kind: of its messages.
+        size: number of its messages.
+    """
+
+    name: str
+    kind: str
+    size: int
+
+
+class Bag(Protocol):
+    """A bag that is open.
+
+    Attributes:
+        topics: those of images and lenses.
+        duration: s, of all of it.
+    """
+
+    topics: list[Topic]
+    duration: float
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Return a topic's messages in the order of their times (ns)."""
+        ...
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """Open a bag.
+
+    Raises:
+        ValueError: a library is missing, or the bag cannot be read, also within the ``with`` block.
+    """
+    for module in ("mcap", "rosbags"):
+        if find_spec(module) is None:
+            raise ValueError(
+                f"bag {path}: expected the library {module}, got none; install it with "
+                "pip install 'lanebev[formats]'"
+            )
+    try:
+        if path.suffix.lower() == ".mcap":
+            with open(path, "rb") as file:
+                yield _Mcap(file)
+        else:
+            from rosbags.highlevel import AnyReader
+            from rosbags.typesys import Stores, get_typestore
+
+            store = get_typestore(Stores.ROS2_HUMBLE)
+            with AnyReader([path], default_typestore=store) as reader:
+                yield _RosBag(reader)
+    except ValueError as error:
+        if str(error).startswith("bag "):
+            raise
+        raise _unreadable(path, error) from error
+    except Exception as error:  # two libraries' own, and what damaged bytes make of any decoder
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> ValueError:
+    reason = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
+    return ValueError(f"bag {path}: expected one that can be read, got: {reason[:160]}; is it cut?")
+
+
+class _RosBag:
+    """A ROS bag by rosbags."""
+
+    def __init__(self, reader: Any) -> None:
+        self._reader = reader
+        known = {*IMAGE_TYPES, *LENS_TYPES}
+        connections = [each for each in reader.connections if each.msgtype in known]
+        self.topics = [Topic(each.topic, each.msgtype, each.msgcount) for each in connections]
+        self.duration = 1e-9 * reader.duration
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        connections = [each for each in self._reader.connections if each.topic == topic]
+        for connection, time, data in self._reader.messages(connections):
+            yield time, self._reader.deserialize(data, connection.msgtype)
+
+
+class _Mcap:
+    """An MCAP file by mcap: messages of ROS 2 (CDR) by rosbags' types, of Foxglove by protobuf."""
+
+    def __init__(self, file: Any) -> None:
+        from mcap.reader import make_reader
+        from mcap_protobuf.decoder import DecoderFactory
+
+        factories = [DecoderFactory(), _CdrFactory()]
+        self._reader = make_reader(file, validate_crcs=True, decoder_factories=factories)
+        summary = self._reader.get_summary()
+        if summary is None or summary.statistics is None:
+            raise ValueError("no summary at its end")
+        figures = summary.statistics
+        self.duration = 1e-9 * (figures.message_end_time - figures.message_start_time)
+        self.topics = []
+        for number, channel in summary.channels.items():
+            schema = summary.schemas.get(channel.schema_id)
+            if schema is not None and schema.name in {*IMAGE_TYPES, *LENS_TYPES}:
+                count = figures.channel_message_counts.get(number, 0)
+                self.topics.append(Topic(channel.topic, schema.name, count))
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        for _, _, message, decoded in self._reader.iter_decoded_messages([topic]):
+            yield message.log_time, decoded
+
+
+class _CdrFactory:
+    """Gives mcap's reader what decodes messages of ROS 2, as its ``DecoderFactory`` does."""
+
+    def decoder_for(self, message_encoding: str, schema: Any) -> Any:
+        """Return what decodes the messages of a schema; None for those of others."""
+        if message_encoding != "cdr" or schema is None or schema.encoding != "ros2msg":
+            return None
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        store = get_typestore(Stores.EMPTY)
+        store.register(get_types_from_msg(schema.data.decode(), schema.name))
+        return lambda data: store.deserialize_cdr(data, schema.name)

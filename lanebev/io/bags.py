@@ -1,0 +1,186 @@
+"""Frames and lens of an MCAP file or a ROS bag."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lanebev.io.bag_messages import IMAGE_TYPES, LENS_TYPES, Bag, Topic, open_bag
+from lanebev.io.frames import Frame
+from lanebev.io.video import DEFAULT_FPS, FrameSource
+
+_PLAIN = {  # encoding of ROS to channels, and to OpenCV's conversion to RGB
+    "rgb8": (3, None),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "8UC3": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
+    "8UC1": (1, cv2.COLOR_GRAY2RGB),
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2RGB),  # OpenCV names the second row's pixels
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2RGB),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2RGB),
+    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
+    "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
+}
+_LENS_FIELDS = ("width", "height", "distortion_model", "D", "K", "R", "P", "binning_x", "binning_y")
+_REGION = ("x_offset", "y_offset", "height", "width")
+
+
+@dataclass(frozen=True)
+class BagSource(FrameSource):
+    """Images of one topic of a bag.
+
+    Attributes:
+        topic: of the images.
+        lens: fields of a ``camera_info`` beside them, None if there is none.
+    """
+
+    topic: str = ""
+    lens: Mapping[str, Any] | None = field(default=None, compare=False)
+
+    def _video_frames(self) -> Iterator[Frame]:
+        first = before = None
+        number, interval = 0, float(1 / self.fps)
+        try:
+            with open_bag(Path(self.source)) as bag:
+                for number, (logged, message) in enumerate(bag.messages(self.topic)):
+                    time = _stamp(message, logged)
+                    if before is not None and time <= before:
+                        time = before + interval
+                    first = time if first is None else first
+                    dt = interval if before is None else time - before
+                    image, problem = None, ""
+                    if self.selection.takes(number, time - first):
+                        try:
+                            image = self._right_size(message_image(message))
+                        except ValueError as error:
+                            problem = str(error)
+                    yield Frame(number, time - first, dt, "", image, problem)
+                    before = time
+        except ValueError as error:  # from here on the bag cannot be read
+            if first is None or before is None:
+                raise
+            yield Frame(number + 1, before - first + interval, interval, "", None, str(error))
+
+
+def open_bag_source(source: str, topic: str | None = None, fps: Fraction | None = None) -> BagSource:
+    """Open a bag and check that an image of it decodes.
+
+    Args:
+        source: an MCAP file, a ROS bag, or the folder of a ROS 2 bag.
+        topic: of the images, None for the only one that has any.
+        fps: nominal frame rate, None for the mean of the images' times.
+
+    Raises:
+        ValueError: the bag cannot be read, has no such topic or more than one, or its image does not decode.
+    """
+    with open_bag(Path(source)) as bag:
+        chosen = _image_topic(source, bag.topics, topic)
+        size = None
+        for _, message in bag.messages(chosen.name):
+            size = message_image(message).shape[:2]
+            break
+        if size is None:
+            raise ValueError(f"bag {source}: expected images on {chosen.name}, got none")
+        rate = (chosen.size - 1) / bag.duration if bag.duration > 0 and chosen.size > 1 else 0.0
+        own = Fraction(rate).limit_denominator(1000) or DEFAULT_FPS
+        lens = _lens(bag, chosen.name)
+    return BagSource(source, (), fps or own, chosen.size, size, topic=chosen.name, lens=lens)
+
+
+def message_image(message: Any) -> NDArray[np.uint8]:
+    """Return the image of a message as (H, W, 3) RGB.
+
+    Source: ROS's ``sensor_msgs/CompressedImage`` and ``Image`` (``image_encodings.hpp``), Foxglove's
+    ``CompressedImage`` and ``RawImage``.
+
+    Raises:
+        ValueError: it does not decode, or is of an encoding that is not known.
+    """
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    if not hasattr(message, "encoding"):
+        found = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+        if found is None:
+            raise ValueError(f"expected an image of format {message.format[:40]!r} that decodes, got another")
+        return np.ascontiguousarray(found[..., ::-1])
+    encoding, height, width, step = message.encoding, message.height, message.width, message.step
+    if encoding not in _PLAIN:
+        raise ValueError(f"expected an image of {', '.join(_PLAIN)}, got {encoding[:40]!r}")
+    channels, conversion = _PLAIN[encoding]
+    if not (height > 0 and width > 0 and step >= width * channels and len(data) >= height * step):
+        raise ValueError(f"expected {height} rows of {step} bytes, got {len(data)} bytes; is it cut?")
+    rows = data[: height * step].reshape(height, step)[:, : width * channels]
+    image = np.ascontiguousarray(rows.reshape(height, width, channels))
+    if conversion is None:
+        return image
+    try:
+        converted: NDArray[np.uint8] = cv2.cvtColor(image, conversion)
+        return converted
+    except cv2.error as error:
+        raise ValueError(f"expected an image of {encoding}, got {width} x {height} px of it") from error
+
+
+def lens_fields(message: Any) -> dict[str, Any]:
+    """Return a message of a lens as the fields of a ROS ``camera_info``.
+
+    Raises:
+        ValueError: K is zero, which says that the camera is not calibrated.
+    """
+    fields: dict[str, Any] = {}
+    for name in _LENS_FIELDS:
+        value = getattr(message, name, None)
+        value = getattr(message, name.lower(), None) if value is None else value
+        if value is not None:
+            fields[name] = value if isinstance(value, str) else np.asarray(value).tolist()
+    if not any(fields.get("K") or ()):
+        raise ValueError("K is zero: the camera was not calibrated")
+    region = getattr(message, "roi", None)
+    if region is not None:
+        fields["roi"] = {name: int(getattr(region, name)) for name in _REGION}
+    return fields
+
+
+def _lens(bag: Bag, images: str) -> dict[str, Any] | None:
+    """Return the first lens of the topic beside the images, or of the only one; None if there is none."""
+    topics = [each.name for each in bag.topics if each.kind in LENS_TYPES and each.size]
+    beside = [name for name in topics if images.startswith(name.rpartition("/")[0] + "/")]
+    for name in beside[:1] or (topics if len(topics) == 1 else []):
+        for _, message in bag.messages(name):
+            try:
+                return lens_fields(message)
+            except ValueError:
+                return None
+    return None
+
+
+def _image_topic(source: str, topics: Sequence[Topic], wanted: str | None) -> Topic:
+    found = {each.name: each for each in topics if each.kind in IMAGE_TYPES and each.size}
+    names = ", ".join(sorted(found)) or "none"
+    if wanted is not None and wanted not in found:
+        raise ValueError(f"bag {source}: expected images on {wanted}, got them on: {names}")
+    if wanted is None and len(found) != 1:
+        remedy = "; choose one with --topic" if found else ""
+        raise ValueError(f"bag {source}: expected one topic of images, got: {names}{remedy}")
+    return next(iter(found.values())) if wanted is None else found[wanted]
+
+
+def _stamp(message: Any, logged: int) -> float:
+    """Return a message's own time (s), or that of its recording where it has none."""
+    stamp = message.header.stamp if hasattr(message, "header") else message.timestamp
+    seconds = getattr(stamp, "sec", None)
+    if seconds is None:
+        seconds, fraction = stamp.seconds, stamp.nanos
+    else:
+        fraction = stamp.nanosec
+    return float(seconds + 1e-9 * fraction) if seconds or fraction else 1e-9 * logged

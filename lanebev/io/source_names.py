@@ -1,0 +1,21 @@
+"""What kind of source a text names, by the text and the file system alone. Imports nothing heavy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+SCHEMES = ("rtsp", "rtsps", "rtmp", "http", "https", "udp", "rtp", "tcp", "srt")
+PIPE = "-"
+
+
+def is_live(source: str) -> bool:
+    """Return whether a source is a camera (``/dev/video0``), a stream's address or a pipe (``-``)."""
+    scheme, found, _ = source.partition("://")
+    device = source.startswith("/dev/video") or Path(source).is_fifo()
+    return source == PIPE or device or bool(found and scheme.lower() in SCHEMES)
+
+
+def is_bag(source: str) -> bool:
+    """Return whether a source is an MCAP file, a ROS bag, or the folder of a ROS 2 bag."""
+    path = Path(source)
+    return path.suffix.lower() in (".mcap", ".bag") or (path / "metadata.yaml").is_file()

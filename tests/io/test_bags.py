@@ -1,0 +1,211 @@
+"""MCAP files and ROS bags as sources, written by the libraries of their own."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from lanebev import Camera
+from lanebev.app.config import RunConfig
+from lanebev.app.sources import camera_of, make_source
+from lanebev.cli import main
+from lanebev.io.bags import message_image, open_bag_source
+from lanebev.io.formats.mcap import write
+from lanebev.io.formats.record import RunRecord
+from lanebev.io.frames import Frame
+from lanebev.io.results import ExtrinsicsRow, read_extrinsics
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+TYPES = STORE.types
+SIZE = (48, 64)
+CAMERA = Camera.from_parameters(60, 61, 32, 24, 64, 48, (-0.1, 0.01, 0.0, 0.0, 0.0))
+COUNT, START = 6, 1_700_000_000.5
+
+
+def _picture(number):
+    image = np.full((*SIZE, 3), 20, np.uint8)
+    image[:, :, 0] = 20 * number
+    return image
+
+
+def _header(number, frame="camera"):
+    time = START + 0.1 * number
+    stamp = TYPES["builtin_interfaces/msg/Time"](int(time), round(1e9 * (time % 1)))
+    return TYPES["std_msgs/msg/Header"](stamp, frame)
+
+
+def _compressed(number):
+    data = cv2.imencode(".png", _picture(number)[..., ::-1])[1].reshape(-1)
+    return TYPES["sensor_msgs/msg/CompressedImage"](_header(number), "png", data)
+
+
+def _raw(image, encoding, padding=0):
+    rows = np.pad(image.reshape(image.shape[0], -1), ((0, 0), (0, padding)))
+    shape = (image.shape[0], image.shape[1], encoding, 0, rows.shape[1])
+    return TYPES["sensor_msgs/msg/Image"](_header(0), *shape, rows.reshape(-1))
+
+
+def _info():
+    lens = (CAMERA.distortion.numpy(), CAMERA.intrinsics.flatten().numpy(), np.eye(3).reshape(-1))
+    projection = torch.cat([CAMERA.intrinsics, torch.zeros(3, 1)], dim=1).flatten().numpy()
+    region = TYPES["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    return TYPES["sensor_msgs/msg/CameraInfo"](
+        _header(0), *SIZE, "plumb_bob", *lens, projection.astype(np.float64), 0, 0, region
+    )
+
+
+def _bag(folder, plugin=StoragePlugin.SQLITE3, topics=("/cam/image/compressed",), lens=True):
+    with Writer(folder, version=9, storage_plugin=plugin) as writer:
+        if lens:
+            name = "sensor_msgs/msg/CameraInfo"
+            connection = writer.add_connection("/cam/camera_info", name, typestore=STORE)
+            writer.write(connection, round(1e9 * START), STORE.serialize_cdr(_info(), name))
+        for topic in topics:
+            name = "sensor_msgs/msg/CompressedImage"
+            connection = writer.add_connection(topic, name, typestore=STORE)
+            for number in range(COUNT):
+                logged = round(1e9 * (START + 0.1 * number)) + 5_000_000
+                writer.write(connection, logged, STORE.serialize_cdr(_compressed(number), name))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory):
+    root = tmp_path_factory.mktemp("bags")
+    folder = _bag(root / "mcap", StoragePlugin.MCAP)
+    return {"folder": _bag(root / "sqlite"), "folder of mcap": folder, "mcap": next(folder.glob("*.mcap"))}
+
+
+@pytest.mark.parametrize("kind", ["folder", "folder of mcap", "mcap"])
+def test_frames_and_lens_of_a_ros_2_bag(bags, kind):
+    config = RunConfig(str(bags[kind]), "")
+    source = make_source(config)
+    frames = list(source)
+    assert [frame.image[0, 0, 0] for frame in frames] == [20 * number for number in range(COUNT)]
+    assert [frame.time for frame in frames] == pytest.approx(np.arange(COUNT) / 10, abs=1e-6)
+    assert [frame.dt for frame in frames] == pytest.approx([0.1] * COUNT, rel=0.05)
+    assert (source.count, source.image_size) == (COUNT, SIZE)
+    assert camera_of(config, source).fingerprint() == CAMERA.fingerprint()
+    some = list(make_source(replace(config, start=0.15, every=2)))
+    assert [frame.source_number for frame in some] == [2, 4]
+
+
+def test_an_mcap_of_ours_is_a_source(tmp_path):
+    rows = [ExtrinsicsRow(i, i / 10, *[1.0] * 8, "TRACKING", 9, "") for i in range(COUNT)]
+    record = RunRecord("drive", rows, np.zeros((COUNT, 4, 4)), camera=CAMERA)
+    images = [Frame(number, number / 10, 0.1, "", _picture(number)) for number in range(COUNT)]
+    write(tmp_path / "run.mcap", record, images)
+    config = RunConfig(str(tmp_path / "run.mcap"), "")
+    source = make_source(config)
+    shown = [frame.image[..., 0].mean() for frame in source]
+    assert shown == pytest.approx([20 * number for number in range(COUNT)], abs=4)
+    assert camera_of(config, source).fingerprint() == CAMERA.fingerprint()
+
+
+def test_a_run_on_a_bag(bags, tmp_path, capsys):
+    assert main(["run", str(bags["mcap"]), "--no-video", "--out", str(tmp_path / "out")]) == 0
+    assert len(read_extrinsics(tmp_path / "out" / "extrinsics.csv")) == COUNT
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("encoding", "convert"),
+    [
+        ("rgb8", lambda image: image),
+        ("bgr8", lambda image: image[..., ::-1]),
+        ("rgba8", lambda image: np.dstack([image, image[..., :1]])),
+        ("bgra8", lambda image: np.dstack([image[..., ::-1], image[..., :1]])),
+    ],
+)
+def test_raw_images(encoding, convert):
+    image = np.random.default_rng(0).integers(0, 255, (*SIZE, 3), dtype=np.uint8)
+    assert np.array_equal(message_image(_raw(np.ascontiguousarray(convert(image)), encoding, 5)), image)
+
+
+def test_grey_and_bayer_images():
+    grey = np.random.default_rng(0).integers(0, 255, SIZE, dtype=np.uint8)
+    assert np.array_equal(message_image(_raw(grey, "mono8")), np.dstack([grey] * 3))
+    red = np.zeros(SIZE, np.uint8)
+    red[::2, ::2] = 200  # in RGGB the first pixel is a red one
+    shown = message_image(_raw(red, "bayer_rggb8"))[4:-4, 4:-4].reshape(-1, 3).mean(0)
+    assert shown[0] > 190
+    assert max(shown[1:]) < 5
+    blue = message_image(_raw(red, "bayer_bggr8"))[4:-4, 4:-4].reshape(-1, 3).mean(0)
+    assert blue[2] > 190
+    assert max(blue[:2]) < 5
+
+
+def test_yuv_images():
+    uyvy = np.tile(np.array([128, 90], np.uint8), (*SIZE, 1))
+    yuyv = np.tile(np.array([90, 128], np.uint8), (*SIZE, 1))
+    for image, encoding in ((uyvy, "yuv422"), (yuyv, "yuv422_yuy2")):
+        shown = message_image(_raw(image, encoding)).reshape(-1, 3)
+        assert np.ptp(shown) <= 1  # grey
+
+
+@pytest.mark.parametrize(
+    ("message", "word"),
+    [
+        (_raw(_picture(0), "32FC1"), "got '32FC1'"),
+        (replace(_raw(_picture(0), "rgb8"), data=np.zeros(9, np.uint8)), "got 9 bytes; is it cut"),
+        (replace(_compressed(0), data=np.zeros(9, np.uint8)), "format 'png' that decodes"),
+        (replace(_compressed(0), data=np.zeros(0, np.uint8)), "format 'png' that decodes"),
+    ],
+)
+def test_images_that_do_not_decode(message, word):
+    with pytest.raises(ValueError, match=word):
+        message_image(message)
+
+
+def _fails(capsys, *arguments, word):
+    assert main([str(argument) for argument in arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert word in error, error
+
+
+def test_bags_that_cannot_be_a_source(tmp_path, capsys, monkeypatch):
+    two = _bag(tmp_path / "two", topics=("/a", "/b"), lens=False)
+    _fails(capsys, "run", two, word="expected one topic of images, got: /a, /b; choose one with --topic")
+    _fails(capsys, "run", two, "--topic", "/c", word="expected images on /c, got them on: /a, /b")
+    _fails(capsys, "run", two, "--topic", "/a", word="has no calibrated CameraInfo beside /a")
+    empty = _bag(tmp_path / "empty", topics=())
+    _fails(capsys, "run", empty, word="expected one topic of images, got: none")
+    (tmp_path / "no.mcap").write_bytes(b"")
+    _fails(capsys, "run", tmp_path / "no.mcap", word="expected one that can be read")
+    _fails(capsys, "run", tmp_path / "there.mcap", word="No such file")
+    monkeypatch.setattr("lanebev.io.bag_messages.find_spec", lambda name: None)
+    _fails(capsys, "run", two, word="pip install 'lanebev[formats]'")
+
+
+@settings(max_examples=60)
+@given(data=st.data())
+def test_any_bytes_are_one_line(bags, tmp_path_factory, data):
+    """A file of any bytes, or one damaged or cut anywhere, is read or is a ValueError."""
+    path = tmp_path_factory.mktemp("fuzz") / "a.mcap"
+    whole = bytearray(bags["mcap"].read_bytes())
+    place = data.draw(st.integers(0, len(whole) - 1))
+    kind = data.draw(st.sampled_from(["cut", "damaged", "any"]))
+    if kind == "cut":
+        whole = whole[:place]
+    elif kind == "damaged":
+        whole[place : place + 8] = data.draw(st.binary(min_size=8, max_size=8))
+    else:
+        whole = b"\x89MCAP0\r\n" + data.draw(st.binary(max_size=200))
+    path.write_bytes(whole)
+    try:
+        frames = list(open_bag_source(str(path)))
+    except ValueError as error:
+        problem = str(error)
+        frames = []
+    else:
+        problem = "bag "
+    assert problem.startswith("bag ")
+    assert "\n" not in problem
+    assert len(frames) <= COUNT + 1
