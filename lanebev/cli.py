@@ -24,6 +24,11 @@ from lanebev.io.formats.names import FORMATS
 DESCRIPTION = "Online camera-to-road calibration from lane boundaries, and a stable bird's-eye view."
 
 
+_DOCTOR_SETTINGS = (
+    "source", "camera", "fov", "rectified", "fps", "topic", "lane_width", "weights", "device",
+)  # fmt: skip
+
+
 class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line."""
 
@@ -35,8 +40,18 @@ def parser() -> argparse.ArgumentParser:
     """The parser of ``lanebev``; the options of ``run`` are the fields of its settings."""
     top = _Parser(prog="lanebev", description=DESCRIPTION, allow_abbrev=False)
     top.add_argument("--version", action="version", version=f"lanebev {__version__}")
+    words = "print a script that completes commands and options in this shell, and end"
+    top.add_argument(
+        "--print-completion",
+        choices=("bash", "zsh"),
+        action=_PrintCompletion,
+        default=argparse.SUPPRESS,
+        help=words,
+    )
     _add_verbose(top, False)
-    commands = top.add_subparsers(dest="command", required=True, metavar="{demo,run,compare,convert,export}")
+    commands = top.add_subparsers(
+        dest="command", required=True, metavar="{demo,run,compare,convert,export,doctor}"
+    )
     demo = commands.add_parser("demo", help="a rendered drive end to end", allow_abbrev=False)
     path = _named(parse_path)
     default = "lanebev-demo"
@@ -65,7 +80,12 @@ def parser() -> argparse.ArgumentParser:
     files = commands.add_parser("export", help="parts as ONNX files or programs", allow_abbrev=False)
     for setting in fields(ExportConfig):
         _add_setting(files, setting)
-    for command in (demo, run, compare, convert, files):
+    words = "whether a camera fits a source; status 1 if something is doubtful, 2 if it does not fit"
+    doctor = commands.add_parser("doctor", help=words, allow_abbrev=False)
+    for setting in fields(RunConfig):
+        if setting.name in _DOCTOR_SETTINGS:
+            _add_setting(doctor, setting)
+    for command in (demo, run, compare, convert, files, doctor):
         _add_verbose(command, argparse.SUPPRESS)
     return top
 
@@ -109,12 +129,42 @@ def _named(parse: Callable[[str], object]) -> Callable[[str], object]:
     return parsed
 
 
+class _PrintCompletion(argparse.Action):
+    """Prints what a shell completes with, by shtab."""
+
+    def __call__(self, parser: argparse.ArgumentParser, _: object, values: object, __: object = None) -> None:
+        """Print it and end."""
+        try:
+            import shtab
+        except ImportError:
+            parser.error(
+                "--print-completion: expected the library shtab, got none; install it with "
+                "pip install 'lanebev[completion]'"
+            )
+        _complete_files(parser, shtab.FILE)
+        print(shtab.complete(parser, shell=str(values)))
+        parser.exit(0)
+
+
+def _complete_files(parser: argparse.ArgumentParser, files: dict[str, str]) -> None:
+    """Have all that takes a path complete names of files, in commands too."""
+    for action in parser._actions:
+        if action.metavar in ("FILE", "DIR", "SOURCE", "A", "B"):
+            action.complete = files  # type: ignore[attr-defined]  # shtab looks for it
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                _complete_files(command, files)
+
+
 class _Stopped(KeyboardInterrupt):
     """By a signal, its number the argument."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; 0 when it is done, 2 with one line on bad input, 128 + the signal that stopped it."""
+    """Run a command; 0 when it is done, 2 with one line on bad input, 128 + the signal that stopped it.
+
+    ``doctor`` has 1 for what is doubtful, and 2 for what does not fit.
+    """
     options = vars(parser().parse_args(arguments))
     command = options.pop("command")
     if options.pop("verbose"):
@@ -122,13 +172,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logging.getLogger("lanebev").setLevel(logging.DEBUG)
     try:
         with _signals_unwind():
-            report = {
-                "run": _run,
-                "demo": _demo,
-                "compare": _compare,
-                "convert": _convert,
-                "export": _export,
-            }[command](options)
+            done = _COMMANDS[command](options)
+            report, status = (done, 0) if isinstance(done, str) else done
     except (ValueError, OSError) as error:
         print(f"lanebev {command}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -141,7 +186,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(report, flush=True)
     except OSError:  # nobody reads it; the outputs are there
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - else closing it at exit fails once more
-    return 0
+    return status
 
 
 @contextlib.contextmanager
@@ -201,6 +246,23 @@ def _export(options: dict[str, Any]) -> str:
     from lanebev.app.export import export
 
     return export(config)
+
+
+def _doctor(options: dict[str, Any]) -> tuple[str, int]:
+    config = RunConfig(**options)
+    from lanebev.app.doctor import doctor
+
+    return doctor(config, _progress("looking"))
+
+
+_COMMANDS: dict[str, Callable[[dict[str, Any]], str | tuple[str, int]]] = {
+    "run": _run,
+    "demo": _demo,
+    "compare": _compare,
+    "convert": _convert,
+    "export": _export,
+    "doctor": _doctor,
+}
 
 
 def _progress(label: str) -> Progress:

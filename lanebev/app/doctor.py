@@ -1,0 +1,207 @@
+"""``lanebev doctor``: whether a camera fits a source, and whether a run on it can be trusted."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from lanebev.app.build import make_observer, make_tracker
+from lanebev.app.config import RunConfig
+from lanebev.app.progress import Progress
+from lanebev.app.sources import camera_of, make_source
+from lanebev.camera.model import Camera
+from lanebev.io.frames import Selection
+from lanebev.io.video import FrameSource
+from lanebev.types import Status
+
+OK, DOUBT, WRONG = 0, 1, 2
+_WORDS = ("ok", "doubt", "wrong")
+_SAMPLED = 40  # frames
+_SECONDS = 120.0  # of a source, from which they are taken
+_FIELD_OF_VIEW = (25.0, 130.0)  # degrees across, of cameras that look at a road
+_OFF_CENTRE = 0.1  # of the image's sides, between its centre and the principal point
+_GAP = 3.0  # times the usual interval
+_LEAST_VERTICES = 4  # of a boundary that is seen
+_SHARE_SEEN = 0.5  # of frames with two boundaries
+_POSE = ((-15.0, 25.0), (-15.0, 15.0), (-8.0, 8.0), (0.8, 4.0))  # pitch, yaw, roll (degrees), height (m)
+
+
+class Finding(NamedTuple):
+    """One thing that was looked at.
+
+    Attributes:
+        level: OK, DOUBT or WRONG.
+        words: what was found, and what to do.
+    """
+
+    level: int
+    words: str
+
+
+@dataclass
+class Sample:
+    """What was seen in some frames of a source.
+
+    Attributes:
+        undecoded: number of frames that did not decode.
+        steps: s between frames, each by the nominal one.
+        boundaries: number of boundaries seen, a frame each.
+        poses: pitch, yaw, roll (degrees) and height (m) of the frames that were tracked.
+    """
+
+    undecoded: int = 0
+    steps: list[float] = field(default_factory=list)
+    boundaries: list[int] = field(default_factory=list)
+    poses: list[list[float]] = field(default_factory=list)
+
+
+def doctor(config: RunConfig, progress: Progress | None = None) -> tuple[str, int]:
+    """Look at a source and its camera.
+
+    Args:
+        config: source, camera, and what the network needs.
+        progress: wraps the frames that are looked at.
+
+    Returns:
+        what to print, and 0 if all is well, 1 if something is doubtful, 2 if the camera does not fit.
+
+    Raises:
+        ValueError: source or camera cannot be read.
+    """
+    source = make_source(config)
+    camera = camera_of(config, source)
+    findings = [check_size(camera, source.image_size)]
+    if findings[0].level != WRONG:
+        findings += [check_field_of_view(camera), check_centre(camera)]
+        sample = look(config, source, camera, progress)
+        findings += [check_times(sample), check_lanes(sample), check_pose(sample)]
+    level = max(finding.level for finding in findings)
+    lines = [f"{_WORDS[finding.level]:<6} {finding.words}" for finding in findings]
+    verdict = (
+        "all is well",
+        "a run will do, but look at what is doubtful",
+        "a run would refuse this camera, or be wrong by it",
+    )[level]
+    return "\n".join([*lines, f"{config.source}: {verdict}"]), level
+
+
+def look(config: RunConfig, source: FrameSource, camera: Camera, progress: Progress | None) -> Sample:
+    """Let the network look at some frames, each on its own: the first ones of a stream, else spread out."""
+    count = _SAMPLED if source.is_live else min(source.count, round(_SECONDS * float(source.fps)))
+    every = 1 if source.is_live else max(1, count // _SAMPLED)
+    if not source.is_live:
+        source = replace(source, selection=Selection(0.0, _SECONDS, every))
+    observer, tracker = make_observer(config, source, camera), make_tracker(config, camera)
+    sample, nominal = Sample(), every / float(source.fps)
+    frames = islice(source, _SAMPLED + 1)
+    with torch.inference_mode():
+        for frame in progress(frames, min(count, _SAMPLED)) if progress else frames:
+            sample.undecoded += frame.image is None
+            if frame.number:
+                sample.steps.append(frame.dt / nominal)
+            vertices = observer(frame).vertices
+            seen = (vertices.weight[0] > 0).sum(-1) >= _LEAST_VERTICES
+            sample.boundaries.append(len(set(vertices.boundary[0][seen].tolist())))
+            pose = tracker.still(vertices, 1.0).calibration
+            if int(pose.status[0]) == Status.TRACKING:
+                values = pose.extrinsics.stack()[0].tolist()
+                sample.poses.append([*map(math.degrees, values[:3]), values[3]])
+    return sample
+
+
+def check_size(camera: Camera, image_size: tuple[int, int]) -> Finding:
+    """Compare the camera's image size with the source's, (height, width) px."""
+    (height, width), (rows, columns) = camera.image_size, image_size
+    if camera.image_size == image_size:
+        return Finding(OK, f"size: {columns} x {rows} px, as the camera's")
+    got = f"size: the images are {columns} x {rows} px, the camera is for {width} x {height}"
+    if abs(columns * height - rows * width) <= max(width, height):
+        remedy = f"the same shape: give Camera.scaled(({rows}, {columns})) if the images were resized"
+    else:
+        remedy = "another shape: the images were cropped, or are another camera's"
+    return Finding(WRONG, f"{got}; {remedy}")
+
+
+def field_of_view(camera: Camera) -> float:
+    """Return the angle (degrees) between the left and the right edge; 180 if the lens has no rays there."""
+    height, width = camera.image_size
+    edges = camera.intrinsics.new_tensor([[0.0, 0.5 * (height - 1)], [width - 1.0, 0.5 * (height - 1)]])
+    points, valid = camera.undistort_points(edges)
+    if not bool(valid.all()):
+        return 180.0
+    rays = torch.cat([points, points.new_ones(2, 1)], dim=1) @ camera.intrinsics.inverse().mT
+    return math.degrees(sum(math.atan(abs(float(ray[0] / ray[2]))) for ray in rays))
+
+
+def check_field_of_view(camera: Camera) -> Finding:
+    """Judge the focal length by the field of view that it gives the images."""
+    angle, (low, high) = field_of_view(camera), _FIELD_OF_VIEW
+    focal = float(camera.intrinsics[0, 0])
+    words = f"focal length: {focal:.0f} px, {angle:.0f} degrees across"
+    if low <= angle <= high or camera.model != "pinhole":
+        return Finding(OK, words)
+    return Finding(
+        DOUBT, f"{words}, where cameras on cars have {low:g} to {high:g}: was it calibrated at another size?"
+    )
+
+
+def check_centre(camera: Camera) -> Finding:
+    """Judge the principal point by its distance from the image's centre."""
+    height, width = camera.image_size
+    right = float(camera.intrinsics[0, 2]) - 0.5 * (width - 1)
+    down = float(camera.intrinsics[1, 2]) - 0.5 * (height - 1)
+    words = f"principal point: {right:+.0f} px right of the centre, {down:+.0f} px below it"
+    if abs(right) <= _OFF_CENTRE * width and abs(down) <= _OFF_CENTRE * height:
+        return Finding(OK, words)
+    return Finding(DOUBT, f"{words}: right only if the images were cropped")
+
+
+def check_times(sample: Sample) -> Finding:
+    """Judge time stamps by how evenly they advance, and frames by whether they decode."""
+    if sample.undecoded:
+        words = f"frames: {sample.undecoded} of {len(sample.boundaries)} that were looked at do not decode"
+        return Finding(DOUBT, words)
+    longest = max(sample.steps, default=1.0)
+    usual = float(np.median(sample.steps)) if sample.steps else 1.0
+    if longest > _GAP * usual:
+        return Finding(DOUBT, f"times: a gap of {longest / usual:.0f} times the usual interval")
+    if not 0.8 < usual < 1.25:
+        return Finding(DOUBT, f"times: frames come every {usual:.2f} of the interval that the rate says")
+    return Finding(OK, "times: frames are evenly spaced and decode")
+
+
+def check_lanes(sample: Sample) -> Finding:
+    """Judge the lanes by the share of frames in which two boundaries or more are seen."""
+    share = float(np.mean([number >= 2 for number in sample.boundaries])) if sample.boundaries else 0.0
+    words = f"lanes: two boundaries or more in {share:.0%} of {len(sample.boundaries)} frames"
+    if share >= _SHARE_SEEN:
+        return Finding(OK, words)
+    return Finding(DOUBT, f"{words}: is there a marked road, and does the camera look at it?")
+
+
+def check_pose(sample: Sample) -> Finding:
+    """Judge the median pose of the frames by what a camera in a car can have.
+
+    A focal length that is wrong changes the pitch and yaw of a vanishing point, and hardly anything else:
+    lanes alone do not tell it, unless the pose gets impossible.
+    """
+    if not sample.poses:
+        return Finding(DOUBT, "pose: of no frame; lanes were not seen well enough")
+    pose = np.median(sample.poses, axis=0)
+    names = ("pitch", "yaw", "roll", "height")
+    units = (" degrees", " degrees", " degrees", " m")
+    values = [f"{n} {v:+.1f}{u}" for n, v, u in zip(names, pose, units, strict=True)]
+    odd = [
+        value
+        for value, number, (low, high) in zip(values, pose, _POSE, strict=True)
+        if not low <= number <= high
+    ]
+    if odd:
+        cause = "are camera and lane width right?"
+        return Finding(DOUBT, f"pose: {', '.join(odd)} is not that of a camera in a car: {cause}")
+    return Finding(OK, f"pose: {', '.join(values)}; lanes alone do not tell the focal length")

@@ -1,0 +1,112 @@
+"""``lanebev doctor`` says what is amiss, and how much; ``--print-completion`` completes."""
+
+import subprocess
+import sys
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from lanebev import Camera
+from lanebev.app.doctor import (
+    DOUBT,
+    OK,
+    WRONG,
+    Sample,
+    check_centre,
+    check_field_of_view,
+    check_lanes,
+    check_pose,
+    check_size,
+    check_times,
+    field_of_view,
+)
+from lanebev.cli import main
+from lanebev.io.video import VideoWriter
+
+CAMERA = Camera.from_fov(60.0, 640, 360)
+GOOD_POSE = [2.0, -1.0, 0.5, 1.4]
+
+
+def _sample(poses=(GOOD_POSE,), boundaries=(2, 2, 4), steps=(1.0, 1.0), undecoded=0):
+    return Sample(undecoded, list(steps), list(boundaries), [list(pose) for pose in poses])
+
+
+@pytest.mark.parametrize(
+    ("finding", "level", "word"),
+    [
+        (check_size(CAMERA, (360, 640)), OK, "as the camera's"),
+        (check_size(CAMERA, (720, 1280)), WRONG, "Camera.scaled((720, 1280))"),
+        (check_size(CAMERA, (480, 640)), WRONG, "another shape"),
+        (check_field_of_view(CAMERA), OK, "60 degrees across"),
+        (check_field_of_view(Camera.from_fov(10.0, 640, 360)), DOUBT, "10 degrees across"),
+        (check_field_of_view(Camera.from_fov(150.0, 640, 360)), DOUBT, "150 degrees across"),
+        (check_centre(CAMERA), OK, "+0 px right"),
+        (check_centre(CAMERA.cropped(100, 0, 260, 640)), DOUBT, "-50 px below"),
+        (check_times(_sample()), OK, "evenly spaced"),
+        (check_times(_sample(steps=(1.0, 1.0, 5.0))), DOUBT, "a gap of 5 times"),
+        (check_times(_sample(steps=(2.0, 2.0))), DOUBT, "every 2.00 of the interval"),
+        (check_times(_sample(undecoded=2)), DOUBT, "2 of 3 that were looked at do not decode"),
+        (check_lanes(_sample()), OK, "100% of 3 frames"),
+        (check_lanes(_sample(boundaries=(0, 1, 2))), DOUBT, "33% of 3 frames"),
+        (check_pose(_sample()), OK, "pitch +2.0 degrees"),
+        (check_pose(_sample(poses=())), DOUBT, "of no frame"),
+        (check_pose(_sample(poses=([2.0, 1.0, 0.5, 9.0],))), DOUBT, "height +9.0 m is not that"),
+        (check_pose(_sample(poses=([-40.0, 1.0, 20.0, 1.4],))), DOUBT, "pitch -40.0 degrees, roll +20.0"),
+    ],
+)
+def test_findings(finding, level, word):
+    assert finding.level == level
+    assert word in finding.words
+
+
+def test_field_of_view_of_a_lens():
+    assert field_of_view(CAMERA) == pytest.approx(60.0, abs=0.1)  # between middles of the outer pixels
+    fisheye = Camera.from_parameters(250, 250, 319.5, 179.5, 640, 360, (0.0,) * 4, "fisheye")
+    assert field_of_view(fisheye) == pytest.approx(np.degrees(639 / 250), abs=1e-3)  # r = f times the angle
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    root = tmp_path_factory.mktemp("data")
+    CAMERA.to_file(root / "camera.yaml")
+    Camera.from_fov(60.0, 320, 180).to_file(root / "half.yaml")
+    with VideoWriter(root / "drive.mp4", Fraction(10)) as writer:
+        for number in range(4):
+            writer.write(np.full((360, 640, 3), 10 * number, np.uint8))
+    return root
+
+
+def test_status_is_that_of_the_worst(data, capsys):
+    assert main(["doctor", f"{data}/drive.mp4", "--camera", f"{data}/camera.yaml"]) == 1  # no lanes
+    out = capsys.readouterr().out
+    assert "ok     size: 640 x 360 px" in out
+    assert "doubt  lanes: two boundaries or more in 0% of 4 frames" in out
+    assert main(["doctor", f"{data}/drive.mp4", "--camera", f"{data}/half.yaml"]) == 2
+    out = capsys.readouterr().out
+    assert out.startswith("wrong  size: the images are 640 x 360 px, the camera is for 320 x 180")
+    assert main(["doctor", f"{data}/none.mp4", "--camera", f"{data}/half.yaml"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_completion(shell, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--print-completion", shell])
+    assert stopped.value.code == 0
+    script = capsys.readouterr().out
+    for word in ("lanebev", "--lane-width", "doctor", "convert", "parquet", "--print-completion"):
+        assert word in script
+    if shell == "bash":
+        checked = subprocess.run(["bash", "-n"], input=script, text=True, capture_output=True, check=False)
+        assert checked.returncode == 0, checked.stderr
+
+
+def test_completion_without_its_library(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    with pytest.raises(SystemExit) as stopped:
+        main(["--print-completion", "bash"])
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "pip install 'lanebev[completion]'" in error
