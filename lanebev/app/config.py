@@ -114,6 +114,7 @@ class RunConfig:
         every: of the source's frames every so manieth is taken.
         no_video: write no ``bev.mp4`` and ``overlay.mp4``.
         grid: (near, far, left, right, resolution) m of the bird's-eye view.
+        rerun: "viewer", which opens one, or the address of one: Rerun shows the run while it goes on.
         topic: of the images, in a bag that has several.
         keep_all: of a stream, drop no frame.
     """
@@ -184,6 +185,11 @@ class RunConfig:
         "of the bird's-eye view: metres ahead, to the right, and a pixel; 3:60,-10:10/0.05 by default",
         "NEAR:FAR,LEFT:RIGHT/STEP",
         parse_grid,
+    )
+    rerun: str | None = option(
+        None,
+        "show the run in a Rerun viewer while it goes on: viewer opens one, else its address",
+        "viewer|URL",
     )
     topic: str | None = option(None, "of the images in a bag that has several", "NAME")
     keep_all: bool = option(False, "of a stream, drop no frame: it waits, and its own times are taken")

@@ -33,6 +33,8 @@ from lanebev.io.calibration_file import write_calibration
 from lanebev.io.covariances import write_covariances
 from lanebev.io.formats.folder import read_record
 from lanebev.io.formats.names import FORMATS, check_installed
+from lanebev.io.formats.record import RecordedFrame, vertex_lines
+from lanebev.io.formats.rerun import open_viewer
 from lanebev.io.results import ExtrinsicsRow, OutputFolder, check_inputs_stay
 from lanebev.io.state import save_state
 from lanebev.report.page import Report
@@ -71,6 +73,7 @@ def run(
     observer = make_observer(config, source, camera)
     tracker = make_tracker(config, camera)
     problem = load_states(config, tracker, camera)
+    viewer = None if config.rerun is None else open_viewer(config.rerun, camera)
     with OutputFolder(config.out) as out, torch.inference_mode():
         if config.resume and problem:
             problem += backup_state(config.resume, out)
@@ -98,6 +101,9 @@ def run(
                 covariances.append(estimate.calibration.covariance[0].double().cpu().numpy())
                 name = frame_name(frame, source)
                 recorder.add(Recorded(frame=frame, name=name, seen=seen, estimate=estimate))
+                if viewer is not None:
+                    pose, lines = estimate.calibration.extrinsics, vertex_lines(seen.vertices)
+                    viewer.add(RecordedFrame(recorder.rows[-1], pose, lines), frame.image)
         facts = run_facts(config, source, camera) | taken.facts
         if tracker.mount is not None:
             save_state(out / STATE_FILE, {**tracker.states(), "camera": camera.fingerprint()})

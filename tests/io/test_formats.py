@@ -284,6 +284,41 @@ def test_rerun_by_its_reader(tmp_path):
     assert len(columns["/road/camera/image", "EncodedImage:blob"]) == 4
 
 
+def test_a_viewer_is_shown_the_run_as_it_goes_on(tmp_path, monkeypatch, capsys):
+    import rerun
+
+    monkeypatch.setattr(
+        rerun.RecordingStream, "connect_grpc", lambda stream, _: stream.save(tmp_path / "a.rrd")
+    )
+    write_png(tmp_path / "0.png", np.zeros((240, 416, 3), np.uint8))
+    lane = {"raw_file": "0.png", "h_samples": [200, 210, 220], "lanes": [[100, 90, 80]]}
+    (tmp_path / "lanes.json").write_text(json.dumps(lane))
+    CAMERA.to_file(tmp_path / "camera.yaml")
+    fixed = [f"{tmp_path}/*.png", "--camera", f"{tmp_path}/camera.yaml", "--lanes", f"{tmp_path}/lanes.json"]
+    address = "rerun+http://127.0.0.1:9876/proxy"
+    assert main(["run", *fixed, "--out", f"{tmp_path}/out", "--rerun", address]) == 0
+    capsys.readouterr()
+    chunks = rerun.chunk.RrdReader(tmp_path / "a.rrd").stream().to_chunks()
+    entities = {str(chunk.entity_path) for chunk in chunks}
+    assert {"/road/camera/boundaries", "/road/camera/image", "/pose/height_m", "/status"} <= entities
+
+
+def test_a_viewer_that_is_not_there(monkeypatch):
+    import rerun
+
+    from lanebev.io.formats.rerun import open_viewer
+
+    with pytest.raises(ValueError, match="rerun no address: expected viewer"):
+        open_viewer("no address", CAMERA)
+
+    def fail(_):
+        raise RuntimeError("no display")
+
+    monkeypatch.setattr(rerun.RecordingStream, "spawn", fail)
+    with pytest.raises(ValueError, match="got: no display"):
+        open_viewer("viewer", CAMERA)
+
+
 def _folder(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()

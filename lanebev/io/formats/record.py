@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from lanebev.camera.model import Camera
 from lanebev.io.results import ExtrinsicsRow
 from lanebev.io.video import Frame
+from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.types import Extrinsics
 
 Lines = Mapping[int, NDArray[np.float64]]
@@ -132,3 +133,14 @@ def with_images(
             picture = next(pictures, None)
         found = picture is not None and picture.number == frame.row.frame
         yield frame, picture.image if picture is not None and found else None
+
+
+def vertex_lines(vertices: BoundaryVertices) -> Lines:
+    """Return a frame's vertices, of batch size 1, as the lines through them."""
+    found: dict[int, NDArray[np.float64]] = {}
+    for boundary, points, weight in zip(
+        vertices.boundary[0].tolist(), vertices.points[0], vertices.weight[0], strict=True
+    ):
+        if bool((weight > 0).any()):
+            found.setdefault(boundary, points[weight > 0].double().numpy())
+    return found

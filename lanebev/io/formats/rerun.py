@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from lanebev.camera.model import Camera
 from lanebev.io.calibration_file import vehicle_from_camera
+from lanebev.io.formats.names import check_installed
 from lanebev.io.formats.record import RecordedFrame, RunRecord, with_images
 from lanebev.io.results import ExtrinsicsRow
 from lanebev.io.video import Frame
 
-APPLICATION = "lanebev"
+APPLICATION, VIEWER = "lanebev", "viewer"
 _QUALITY = 80  # of JPEG
 _NUMBERS = ExtrinsicsRow._fields[2:10]
 
@@ -77,3 +78,29 @@ def write(path: Path, record: RunRecord, images: Iterable[Frame] | None = None) 
             log.add(frame, image)
         stream.flush()
         stream.disconnect()
+
+
+def open_viewer(where: str, camera: Camera) -> RerunLog:
+    """Return a log whose frames a viewer shows as they come.
+
+    Args:
+        where: "viewer" for one that is opened, else the address of one that is there, as
+            ``rerun+http://127.0.0.1:9876/proxy``.
+        camera: the lens.
+
+    Raises:
+        ValueError: the library is not installed, no viewer opens, or the address is none.
+    """
+    check_installed(["rerun"])
+    import rerun
+
+    stream = rerun.RecordingStream(APPLICATION)
+    try:
+        if where == VIEWER:
+            stream.spawn()
+        else:
+            stream.connect_grpc(where)
+    except (RuntimeError, ValueError, OSError) as error:
+        reason = " ".join(str(error).split())[:160]
+        raise ValueError(f"rerun {where}: expected {VIEWER}, or the address of one, got: {reason}") from error
+    return RerunLog(stream, camera)
