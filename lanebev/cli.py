@@ -16,6 +16,7 @@ from dataclasses import Field, fields
 from typing import Any, NoReturn
 
 from lanebev import __version__
+from lanebev.app.completion import PrintCompletion
 from lanebev.app.config import RunConfig, parse_path, read_settings
 from lanebev.app.export_config import ExportConfig
 from lanebev.app.progress import Item, Progress
@@ -44,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument(
         "--print-completion",
         choices=("bash", "zsh"),
-        action=_PrintCompletion,
+        action=PrintCompletion,
         default=argparse.SUPPRESS,
         help=words,
     )
@@ -127,33 +128,6 @@ def _named(parse: Callable[[str], object]) -> Callable[[str], object]:
             raise argparse.ArgumentTypeError(str(error)) from error
 
     return parsed
-
-
-class _PrintCompletion(argparse.Action):
-    """Prints what a shell completes with, by shtab."""
-
-    def __call__(self, parser: argparse.ArgumentParser, _: object, values: object, __: object = None) -> None:
-        """Print it and end."""
-        try:
-            import shtab
-        except ImportError:
-            parser.error(
-                "--print-completion: expected the library shtab, got none; install it with "
-                "pip install 'lanebev[completion]'"
-            )
-        _complete_files(parser, shtab.FILE)
-        print(shtab.complete(parser, shell=str(values)))
-        parser.exit(0)
-
-
-def _complete_files(parser: argparse.ArgumentParser, files: dict[str, str]) -> None:
-    """Have all that takes a path complete names of files, in commands too."""
-    for action in parser._actions:
-        if action.metavar in ("FILE", "DIR", "SOURCE", "A", "B"):
-            action.complete = files  # type: ignore[attr-defined]  # shtab looks for it
-        if isinstance(action, argparse._SubParsersAction):
-            for command in action.choices.values():
-                _complete_files(command, files)
 
 
 class _Stopped(KeyboardInterrupt):
