@@ -108,6 +108,7 @@ def test_an_mcap_of_ours_is_a_source(tmp_path):
     assert camera_of(config, source).fingerprint() == CAMERA.fingerprint()
 
 
+@pytest.mark.slow
 def test_a_run_on_a_bag(bags, tmp_path, capsys):
     assert main(["run", str(bags["mcap"]), "--no-video", "--out", str(tmp_path / "out")]) == 0
     assert len(read_extrinsics(tmp_path / "out" / "extrinsics.csv")) == COUNT
