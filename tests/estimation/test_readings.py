@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lanebev import JointCalibrator, LaneSegments, Status
-from lanebev.estimation.joint.averaging import mixture_moments, window
+from lanebev.estimation.joint.averaging import distance, mixture_moments, window
 from lanebev.estimation.joint.readings import ReadingConfig, log_prior, log_prior_of_half, readings
 from lanebev.estimation.still import calibrate_still
 from lanebev.testing.scenarios import CAMERA, Moment, observe
@@ -200,3 +200,14 @@ def test_gradients_flow():
     found = still(LaneSegments(ends, *segments[1:]))
     found.extrinsics.stack().sum().backward()
     assert ends.grad.isfinite().all()
+
+
+def test_distance_is_in_sigmas():
+    cov = torch.diag(torch.tensor([4.0, 9.0], dtype=DOUBLE))[None]
+    assert float(distance(torch.tensor([[2.0, 3.0]], dtype=DOUBLE), cov)) == pytest.approx(1.0)
+
+
+def test_where_readings_agree_the_likeliest_stands():
+    segments = lanes()
+    best = calibrate_still(Best(), segments, INTRINSICS[None], 3.7)
+    assert torch.allclose(still(segments).extrinsics.stack(), best.extrinsics.stack(), atol=1e-12)

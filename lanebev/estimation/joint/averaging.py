@@ -23,6 +23,8 @@ from lanebev.estimation.joint.measurement import (
     HEIGHT,
     NUM_PARAMS,
     OFFSET,
+    PITCH,
+    ROLL,
     Observations,
     boundary_places,
     boundary_residuals,
@@ -61,6 +63,9 @@ from lanebev.types import Calibration, Extrinsics
 
 _START_STEPS, _STEPS = 6, 5  # Gauss-Newton steps of the start and of every reading
 _SEGMENTS = 192  # that are fitted
+_ANGLES = [PITCH, ROLL]
+_KEEP = 2.0  # sigmas from the average within which the likeliest reading stands
+_NEAR_PRIOR = 1.5  # sigmas of the prior, likewise
 _POSE = slice(0, HEIGHT + 1)
 
 
@@ -160,8 +165,9 @@ def average_readings(
 ) -> AveragedPose:
     """Average a frame's pose over all ways to read it.
 
-    The mean is that by the evidence as it is. The covariance about it is that by the evidence to a power
-    below 1, which leaves more readings in.
+    The mean is that by the evidence as it is; but where the pose of ``start`` lies within ``_KEEP`` sigmas of
+    the average, and near the prior, it stands, since an average of readings that agree only adds noise. The
+    covariance about it is that by the evidence to a power below 1, which leaves more readings in.
 
     Args:
         start: (B, 7) parameters near the likeliest reading.
@@ -199,6 +205,9 @@ def average_readings(
     likely, doubted = (window(power * evidence + before, cfg.least) for power in (1.0, cfg.information))
     mean, _ = mixture_moments(*_with_half(pose, cov, likely, prior, half, cfg.least))
     centre, spread = mixture_moments(*_with_half(pose, cov, doubted, prior, half, cfg.least))
+    from_prior = ((start - prior.mean(like)) / prior.std(like))[:, _ANGLES].abs().amax(-1)
+    keep = (distance(start[:, _POSE] - centre, spread) < _KEEP) & (from_prior < _NEAR_PRIOR)
+    mean = select_rows(keep, start[:, _POSE], mean)
     apart = centre - mean
     wrong = likely @ ways.wrong.to(like)
     return AveragedPose(mean, spread + apart.unsqueeze(-1) * apart.unsqueeze(-2), 1 - wrong)
@@ -229,6 +238,12 @@ def mixture_moments(mean: Tensor, cov: Tensor, weight: Tensor) -> tuple[Tensor, 
     apart = mean - total.unsqueeze(1)
     spread = cov + apart.unsqueeze(-1) * apart.unsqueeze(-2)
     return total, (weight[..., None, None] * spread).sum(1)
+
+
+def distance(apart: Tensor, cov: Tensor) -> Tensor:
+    """Compute the Mahalanobis distance (B,) of deviations (B, P), per root of P."""
+    squared = (apart * solve_spd(cov, apart.unsqueeze(-1)).squeeze(-1)).mean(-1)
+    return squared.clamp(min=0.0).sqrt()
 
 
 def _with_half(
