@@ -11,18 +11,9 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch import nn
 
-from lanebev import (
-    BEVGrid,
-    BEVWarp,
-    Camera,
-    LaneBEV,
-    LaneSegmenter,
-    LineExtractor,
-    SegmenterConfig,
-    TwoStageCalibrator,
-)
-from lanebev.export.parts import make_part
+from lanebev.export.parts import Part
 from lanebev.export.write import write_onnx
 from lanebev.io.video import VideoWriter
 
@@ -36,16 +27,32 @@ def run_example(name, monkeypatch, tmp_path, *arguments):
     runpy.run_path(str(EXAMPLES / name), run_name="__main__")
 
 
-def small_step():
-    config = SegmenterConfig(base_width=4, decoder_width=8)
-    model = LaneBEV(
-        LaneSegmenter(config),
-        LineExtractor.for_network(config),
-        TwoStageCalibrator(num_hypotheses=20),
-        BEVWarp(BEVGrid(x=(-6.0, 6.0), z=(6.0, 30.0), resolution=0.5)),
-    )
-    intrinsics = [[80.0, 0.0, 63.5], [0.0, 80.0, 31.5], [0.0, 0.0, 1.0]]
-    return make_part("step", model, Camera(torch.tensor(intrinsics), torch.zeros(0), "pinhole", (64, 128)))
+class Counts(nn.Module):
+    """Has the names of an exported step; its pitch counts the frames since a reset."""
+
+    inputs = ("image", "dt", "lane_width", "reset", "intrinsics", "state_count")
+    outputs = ("bev", "extrinsics", "covariance", "status", "next_state_count")
+
+    def forward(self, image, dt, lane_width, reset, intrinsics, count):
+        count = torch.where(reset, 0, count) + 1
+        pose = torch.stack([count.deg2rad(), dt, lane_width[:, 0], intrinsics[:, 0, 0]], dim=-1)
+        return image[..., ::2, ::2], pose, torch.ones_like(pose).diag_embed(), 1 * reset, count
+
+
+def counting_step():
+    values = (torch.rand(1, 3, 64, 128), *(torch.rand(1, *shape).double() for shape in ((), (5,))))
+    state = torch.zeros(1, dtype=torch.float64)
+    example = (*values, torch.tensor([True]), torch.eye(3).double()[None], state)
+    inputs = {
+        name: value.repeat(2, *[1] * (value.ndim - 1))
+        for name, value in zip(Counts.inputs, example, strict=True)
+    }
+    facts = {
+        "image_size": [64, 128],
+        "intrinsics": [[80.0, 0, 63.5], [0, 80.0, 31.5], [0, 0, 1]],
+        "distortion": [],
+    }
+    return Part(Counts().eval(), inputs, Counts.outputs, facts)
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
@@ -112,8 +119,8 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 
 @pytest.mark.slow
 def test_a_step_runs_without_torch(tmp_path):
-    """A small step, exported here, in a process that refuses torch."""
-    part = small_step()
+    """In a process that refuses torch, by a file with the names of a step."""
+    part = counting_step()
     write_onnx(part, tmp_path / "step.onnx")
     writer = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (128, 64))
     for value in (0, 90, 180):
@@ -126,8 +133,12 @@ def test_a_step_runs_without_torch(tmp_path):
     rows = (tmp_path / "out.csv").read_text().splitlines()
     assert rows[0].startswith("frame,pitch_deg,yaw_deg,roll_deg,height_m,std_pitch_deg")
     assert len(rows) == 4
-    assert rows[1].endswith(",0")  # UNINITIALISED: no lanes
-    assert cv2.imread(str(tmp_path / "out.csv.png")).shape == (48, 24, 3)
+    assert rows[1] == "0,1.000000,2.864789,211.994384,80.000000,57.295780,57.295780,57.295780,1.000000,1"
+    assert [row.split(",")[1] for row in rows[1:]] == ["1.000000", "2.000000", "3.000000"]
+    assert [row[-1] for row in rows[1:]] == ["1", "0", "0"]  # reset with the first frame only
+    view = cv2.imread(str(tmp_path / "out.csv.png"))
+    assert view.shape == (32, 64, 3)
+    assert abs(int(view.mean()) - 180) <= 2
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
