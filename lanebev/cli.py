@@ -50,9 +50,8 @@ def parser() -> argparse.ArgumentParser:
         help=words,
     )
     _add_verbose(top, False)
-    commands = top.add_subparsers(
-        dest="command", required=True, metavar="{demo,run,compare,convert,export,doctor}"
-    )
+    names = "{demo,run,compare,convert,export,doctor,fleet}"
+    commands = top.add_subparsers(dest="command", required=True, metavar=names)
     demo = commands.add_parser("demo", help="a rendered drive end to end", allow_abbrev=False)
     path = _named(parse_path)
     default = "lanebev-demo"
@@ -86,9 +85,44 @@ def parser() -> argparse.ArgumentParser:
     for setting in fields(RunConfig):
         if setting.name in _DOCTOR_SETTINGS:
             _add_setting(doctor, setting)
-    for command in (demo, run, compare, convert, files, doctor):
+    fleet = commands.add_parser("fleet", help="many drives, on all cores or a cluster", allow_abbrev=False)
+    _add_fleet(fleet)
+    for command in (demo, run, compare, convert, files, doctor, fleet):
         _add_verbose(command, argparse.SUPPRESS)
     return top
+
+
+def _add_fleet(fleet: argparse.ArgumentParser) -> None:
+    path = _named(parse_path)
+    fleet.add_argument(
+        "manifest", type=path, metavar="MANIFEST", help="YAML or CSV: video, camera, ... a drive"
+    )
+    fleet.add_argument(
+        "--out", type=path, default="lanebev-fleet", metavar="DIR", help="folder (%(default)s)"
+    )
+    words = "of a running Ray cluster; without it one begins on this machine and ends with the command"
+    fleet.add_argument("--address", type=path, metavar="ADDRESS", help=words)
+    fleet.add_argument("--workers", type=_at_least(1), metavar="N", help="drives at a time here (one a core)")
+    fleet.add_argument(
+        "--retries", type=_at_least(0), default=2, metavar="N", help="of a drive (%(default)s)"
+    )
+    words = "share of a GPU that a drive takes, with device: cuda in the manifest (%(default)s)"
+    fleet.add_argument("--gpus", type=float, default=0.0, metavar="SHARE", help=words)
+    words = "folder that no path may leave (the manifest's)"
+    fleet.add_argument("--root", type=path, metavar="DIR", help=words)
+    words = "try drives again that failed in an earlier call"
+    fleet.add_argument("--again", action="store_true", help=words)
+
+
+def _at_least(least: int) -> Callable[[str], int]:
+    """Return what makes a whole number of a text."""
+
+    def parsed(text: str) -> int:
+        if not text.isdecimal() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"expected a whole number from {least}, got {text!r}")
+        return int(text)
+
+    return parsed
 
 
 def _add_verbose(parser: argparse.ArgumentParser, default: bool | str) -> None:
@@ -137,7 +171,7 @@ class _Stopped(KeyboardInterrupt):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 when it is done, 2 with one line on bad input, 128 + the signal that stopped it.
 
-    ``doctor`` has 1 for what is doubtful, and 2 for what does not fit.
+    ``doctor`` has 1 for what is doubtful, and 2 for what does not fit; ``fleet`` has 1 where drives failed.
     """
     options = vars(parser().parse_args(arguments))
     command = options.pop("command")
@@ -152,7 +186,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"lanebev {command}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as stopped:
-        print(f"lanebev {command}: interrupted, nothing written", file=sys.stderr)
+        kept = "finished drives stay" if command == "fleet" else "nothing written"
+        print(f"lanebev {command}: interrupted, {kept}", file=sys.stderr)
         return 128 + int(stopped.args[0] if isinstance(stopped, _Stopped) else signal.SIGINT)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # of signs that a terminal's encoding lacks
@@ -229,6 +264,15 @@ def _doctor(options: dict[str, Any]) -> tuple[str, int]:
     return doctor(config, _progress("looking"))
 
 
+def _fleet(options: dict[str, Any]) -> tuple[str, int]:
+    from lanebev.app.fleet.cluster import Cluster
+    from lanebev.app.fleet.fleet import fleet
+
+    cluster = Cluster(**{name: options.pop(name) for name in ("address", "workers", "retries", "gpus")})
+    result = fleet(**options, cluster=cluster, progress=_progress("drives"))
+    return result.text, int(any(outcome.failure for outcome in result.outcomes.values()))
+
+
 _COMMANDS: dict[str, Callable[[dict[str, Any]], str | tuple[str, int]]] = {
     "run": _run,
     "demo": _demo,
@@ -236,6 +280,7 @@ _COMMANDS: dict[str, Callable[[dict[str, Any]], str | tuple[str, int]]] = {
     "convert": _convert,
     "export": _export,
     "doctor": _doctor,
+    "fleet": _fleet,
 }
 
 

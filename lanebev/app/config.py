@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from fractions import Fraction
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import yaml
 
@@ -278,16 +278,28 @@ def read_settings(path: str | Path) -> dict[str, object]:
         raise ValueError(f"config {path}: expected a YAML file of settings, got: {reason}") from error
     if not isinstance(given, dict):
         raise ValueError(f"config {path}: expected a YAML file of settings, got {type(given).__name__}")
+    try:
+        return parsed_settings(given)
+    except ValueError as error:
+        raise ValueError(f"config {path}: {error}") from error
+
+
+def parsed_settings(given: Mapping[Any, Any]) -> dict[str, object]:
+    """Return settings as the command line would have them, of names and values as in a YAML file.
+
+    Raises:
+        ValueError: a name or value that is no setting's.
+    """
     known = {setting.name: setting for setting in fields(RunConfig)}
     values: dict[str, object] = {}
     for key, value in given.items():
         name = str(key).replace("-", "_")
         if name not in known:
-            raise ValueError(f"config {path}: expected one of {', '.join(known)}, got {key!r}")
+            raise ValueError(f"expected one of {', '.join(known)}, got {key!r}")
         try:
             values[name] = _parsed(value, known[name].default, known[name].metadata["parse"])
         except ValueError as error:
-            raise ValueError(f"config {path}: {key}: {error}") from error
+            raise ValueError(f"{key}: {error}") from error
     return values
 
 

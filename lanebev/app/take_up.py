@@ -98,12 +98,12 @@ def take_up(
 def fingerprint(config: RunConfig, source: FrameSource, camera: Camera) -> str:
     """Return all that decides what a run sees, as text: settings, sizes and times of files, the lens."""
     settings = {name: value for name, value in asdict(config).items() if name != "out"}
-    files = [[os.fspath(path), *_size_and_time(Path(path))] for path in input_files(config, source)]
+    files = [[os.fspath(path), *size_and_time(Path(path))] for path in input_files(config, source)]
     found = {"settings": settings, "files": files, "camera": camera.fingerprint(), "lanebev": __version__}
     return json.dumps(found, default=str)
 
 
-def _size_and_time(path: Path) -> tuple[int, int]:
+def size_and_time(path: Path) -> tuple[int, int]:
     """Return a file's size and time of change; zeros where it is none, such as a stream."""
     try:
         about = path.stat()

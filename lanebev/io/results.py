@@ -149,6 +149,10 @@ def check_inputs_stay(folder: str | Path, inputs: Iterable[str | Path]) -> None:
             )
 
 
+class OutputFolderError(ValueError):
+    """The outputs, not the inputs, are why a run ends: no room, no permission, another run at work."""
+
+
 class OutputFolder:
     """A folder whose files appear all together when the work is done, or not at all.
 
@@ -167,8 +171,8 @@ class OutputFolder:
         """Make the temporary folder.
 
         Raises:
-            ValueError: the folder cannot be made or written, a folder is where an output goes, or another
-                process is writing into it.
+            OutputFolderError: the folder cannot be made or written, a folder is where an output goes, or
+                another process is writing into it.
         """
         target = self._target
         self._made = [parent for parent in target.parents if not parent.exists()]
@@ -191,7 +195,7 @@ class OutputFolder:
                     path.replace(self.left(path.name))
         except OSError as error:
             self._remove_parents()
-            raise ValueError(
+            raise OutputFolderError(
                 f"output folder {self.folder}: expected one that can be written, got: {error.strerror}; "
                 "give another with --out"
             ) from error
@@ -209,7 +213,7 @@ class OutputFolder:
             if error is not None:
                 self._remove_parents()
         if isinstance(error, OSError) and error.errno in _FULL:
-            raise ValueError(
+            raise OutputFolderError(
                 f"output folder {self.folder}: expected room for the outputs, got: "
                 f"{os.strerror(error.errno)}; make room or give another with --out"
             ) from error

@@ -1,0 +1,189 @@
+"""``lanebev fleet``: run on all drives of a manifest, and bring their results together."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from lanebev.app.fleet.cluster import Cluster, check_ray, outcomes
+from lanebev.app.fleet.collect import FRAMES, collect_frames
+from lanebev.app.fleet.manifest import Drive, read_manifest
+from lanebev.app.fleet.mounts import Stretch, drive_mounts, stretches
+from lanebev.app.fleet.page import CameraMounts, DriveVerdict, fleet_page
+from lanebev.app.fleet.plan import Outcome, Task, drive_folder, earlier_outcome, tasks_of
+from lanebev.app.progress import Progress
+from lanebev.app.resume import STATE_FILE
+from lanebev.estimation.mount import MountEstimator, MountState
+from lanebev.estimation.mount.results import AXES
+from lanebev.io.folder_lock import FolderLock
+from lanebev.io.formats.names import check_installed
+from lanebev.io.results import read_extrinsics
+from lanebev.io.state import load_state
+from lanebev.io.whole_file import whole_file
+from lanebev.report.verdict import verdict
+
+logger = logging.getLogger(__name__)
+_TOLD = 10  # failures that are printed
+
+
+class FleetResult(NamedTuple):
+    """What became of a fleet.
+
+    Attributes:
+        outcomes: by name of the drive, in the manifest's order.
+        ran: how many drives were run in this call.
+        text: what to print.
+    """
+
+    outcomes: dict[str, Outcome]
+    ran: int
+    text: str
+
+
+def fleet(
+    manifest: str,
+    out: str,
+    cluster: Cluster | None = None,
+    root: str | None = None,
+    again: bool = False,
+    progress: Progress | None = None,
+) -> FleetResult:
+    """Run on the drives of a manifest that are not finished, and collect the results of all.
+
+    Args:
+        manifest: see :func:`lanebev.app.fleet.manifest.read_manifest`.
+        out: folder; each drive's outputs go to ``drives/NAME`` in it.
+        cluster: where to run.
+        root: folder that paths must not leave; None is the manifest's.
+        again: try once more what failed in an earlier call.
+        progress: wraps the drives that end, told how many are to be run.
+
+    Raises:
+        ValueError: bad manifest, a library that is not installed, or another call at work in this folder.
+    """
+    check_ray()
+    check_installed(["parquet"])
+    drives = read_manifest(manifest, root)
+    tasks = tasks_of(drives, out)
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FolderLock(folder / ".fleet")
+        is_free = lock.acquire()
+    except OSError as error:
+        raise ValueError(
+            f"output folder {out}: expected one that can be written, got: {error.strerror}; "
+            "give another with --out"
+        ) from error
+    if not is_free:
+        raise ValueError(
+            f"output folder {out}: expected one that is free, got: another fleet writes into it now"
+        )
+    try:
+        found, ran = _run(tasks, cluster or Cluster(), again, progress)
+        done = [drive for drive in drives if not found[drive.name].failure]
+        collect_frames(done, out)
+        cameras = camera_mounts(done, out)
+        write_mounts(folder / "mounts.json", cameras)
+        verdicts = {drive.name: _verdict(out, drive) for drive in done}
+        with whole_file(folder / "index.html") as path:
+            page = fleet_page(folder.resolve().name, drives, found, verdicts, cameras)
+            path.write_text(page, encoding="utf-8", errors="replace")
+    finally:
+        shutil.rmtree(lock.folder, ignore_errors=True)
+        lock.release()
+    return FleetResult(found, ran, _summary(found, ran, out))
+
+
+def camera_mounts(drives: Sequence[Drive], out: str | Path) -> list[CameraMounts]:
+    """Return the mount of each camera over its finished drives, in order of time."""
+    ordered = sorted(drives, key=lambda drive: (drive.camera_id, drive.time))
+    like = {"mount": MountEstimator().initial_state(1, dtype=torch.float64)}
+    found = []
+    for camera_id, own in groupby(ordered, key=lambda drive: drive.camera_id):
+        states: list[tuple[str, str, MountState]] = []
+        for drive in own:
+            loaded = load_state(drive_folder(out, drive.name) / STATE_FILE, like)
+            if loaded.problem is None:  # images on their own have none
+                states.append((drive.name, drive.time, loaded.states["mount"]))
+        mounts = drive_mounts(states)
+        found.append(CameraMounts(camera_id, mounts, stretches(mounts)))
+    return found
+
+
+def write_mounts(path: Path, cameras: Sequence[CameraMounts]) -> None:
+    """Write ``mounts.json``: of each camera its stretches, and what each drive says; degrees and metres."""
+    content = [
+        {
+            "camera": camera.camera_id,
+            "stretches": [_stretch_fields(each) for each in camera.stretches],
+            "drives": [
+                {"drive": each.name, "time": each.time or None,
+                 **_axes("", each.pose), **_axes("_std", each.std),
+                 "moved": [axis for axis, moved in zip(AXES, each.moved, strict=True) if moved]}
+                for each in camera.mounts
+            ],
+        }
+        for camera in cameras
+    ]  # fmt: skip
+    with whole_file(path) as whole:
+        whole.write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
+
+
+def _run(
+    tasks: Sequence[Task], cluster: Cluster, again: bool, progress: Progress | None
+) -> tuple[dict[str, Outcome], int]:
+    """Run what is not finished; outcomes by name in the order of the tasks, and how many were run."""
+    earlier = {task.name: earlier_outcome(task) for task in tasks}
+    to_do = [task for task in tasks if _is_to_do(earlier[task.name], again)]
+    found = {name: outcome for name, outcome in earlier.items() if outcome is not None}
+    logger.info("%d drives, %d of them to run", len(tasks), len(to_do))
+    if to_do:
+        ended: Iterator[Outcome] = outcomes(to_do, cluster)
+        for outcome in progress(ended, len(to_do)) if progress else ended:
+            logger.info("%s: %s", outcome.name, outcome.failure or f"{outcome.frames} frames")
+            found[outcome.name] = outcome
+    return {task.name: found[task.name] for task in tasks}, len(to_do)
+
+
+def _is_to_do(earlier: Outcome | None, again: bool) -> bool:
+    return earlier is None or (bool(earlier.failure) and again)
+
+
+def _verdict(out: str, drive: Drive) -> DriveVerdict:
+    found = verdict(read_extrinsics(drive_folder(out, drive.name) / "extrinsics.csv"), drive.config.stills)
+    return DriveVerdict(found.grade, found.headline)
+
+
+def _stretch_fields(stretch: Stretch) -> dict[str, Any]:
+    fields = asdict(stretch)
+    parts = {"": "pose", "_std": "std", "_drift_per_day": "drift", "_drift_std_per_day": "drift_std"}
+    axes = {key: value for end, name in parts.items() for key, value in _axes(end, fields.pop(name)).items()}
+    return {**fields, **axes}
+
+
+def _axes(end: str, values: Any) -> dict[str, float | None]:
+    """Return the axes of a pose by name, deg and m; None where one is not known."""
+    known: dict[str, float | None] = {}
+    for axis, value in zip(AXES, values.tolist(), strict=True):
+        shown = value if axis == "height" else math.degrees(value)
+        known[f"{axis}{end}_{'m' if axis == 'height' else 'deg'}"] = shown if math.isfinite(shown) else None
+    return known
+
+
+def _summary(found: dict[str, Outcome], ran: int, out: str) -> str:
+    failed = [outcome for outcome in found.values() if outcome.failure]
+    lines = [f"{len(found)} drives: {len(found) - len(failed)} finished, {len(failed)} failed; {ran} run now"]
+    lines += [f"failed: {outcome.name}: {outcome.failure}" for outcome in failed[:_TOLD]]
+    if len(failed) > _TOLD:
+        lines.append(f"and {len(failed) - _TOLD} more, see the page")
+    return "\n".join([*lines, f"{out}: index.html, mounts.json, {FRAMES}/, drives/"])

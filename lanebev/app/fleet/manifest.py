@@ -1,0 +1,211 @@
+"""The manifest: which drives there are, a row each, as YAML or CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lanebev.app.config import RunConfig, parsed_settings
+from lanebev.numbers import read_text, shown
+
+UNKNOWN_DAY = "unknown"
+PATHS = ("source", "camera", "lanes", "weights", "mount", "resume")  # settings that are paths
+_OWN = ("name", "camera_id", "day", "time")
+_REFUSED = ("out", "source")
+_MOST_NAME = 150  # characters, of which names of files and folders are made
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive to run on.
+
+    Attributes:
+        name: unlike that of all other drives; of its folder.
+        camera_id: of the camera, which may have taken many drives.
+        day: as 2026-03-01, or UNKNOWN_DAY.
+        time: when it began, as in ISO 8601; the day if no more is known; empty if nothing is.
+        config: what to run, without the output folder.
+    """
+
+    name: str
+    camera_id: str
+    day: str
+    time: str
+    config: RunConfig
+
+
+def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Drive]:
+    """Read a manifest.
+
+    Columns (or keys) are ``video``, ``camera``, and, where wanted, ``name``, ``camera_id``, ``day``, ``time``
+    and any setting of ``lanebev run``. YAML is a list of mappings, or a mapping with ``drives``, the list,
+    and ``defaults``, settings of all drives. Relative paths begin at the manifest's folder.
+
+    Args:
+        path: of the file; CSV if it ends so, else YAML.
+        root: folder that no path may leave, links resolved; None is the manifest's folder.
+
+    Raises:
+        ValueError: the file cannot be read, a row is wrong, a path leaves the folder, or two drives have the
+            same name.
+    """
+    path = Path(path)
+    rows = _rows(path)
+    if not rows:
+        raise ValueError(f"manifest {path}: expected at least one drive, got none")
+    base = Path(os.path.abspath(path)).parent
+    inside = Path(os.path.realpath(base if root is None else root))
+    drives = []
+    for number, row in enumerate(rows, start=1):
+        try:
+            drives.append(_drive(row, base, inside))
+        except ValueError as error:
+            raise ValueError(f"manifest {path}, drive {number}: {error}") from error
+    _check_names(path, drives)
+    return drives
+
+
+def path_inside(text: str, base: Path, inside: Path) -> str:
+    """Return a path as an absolute one.
+
+    Args:
+        text: relative to ``base``, or absolute.
+        base: folder of the manifest.
+        inside: folder that it must not leave, links resolved.
+
+    Raises:
+        ValueError: it leaves that folder, also by a link.
+    """
+    whole = os.path.normpath(base / text)
+    try:
+        real = Path(os.path.realpath(whole))
+    except (OSError, ValueError) as error:  # a NUL byte
+        raise ValueError(f"expected a path, got {shown(text)}") from error
+    if not real.is_relative_to(inside):
+        raise ValueError(
+            f"expected a path inside of {inside}, got {shown(text)}, which leaves it; move the file, or "
+            "allow a wider folder with --root"
+        )
+    return whole
+
+
+def _rows(path: Path) -> list[dict[str, Any]]:
+    try:
+        text = read_text(path)
+        if path.suffix.lower() == ".csv":
+            return _csv_rows(text)
+        given = yaml.safe_load(text)
+    except (ValueError, yaml.YAMLError, csv.Error) as error:
+        reason = "not YAML" if isinstance(error, yaml.YAMLError) else error
+        raise ValueError(f"manifest {path}: expected YAML or CSV, got: {reason}") from error
+    defaults: dict[Any, Any] = {}
+    if isinstance(given, dict):
+        if unknown := [key for key in given if key not in ("drives", "defaults")]:
+            raise ValueError(f"manifest {path}: expected drives and defaults, got {shown(unknown[0])}")
+        defaults, given = given.get("defaults") or {}, given.get("drives")
+    is_good = isinstance(given, list) and all(isinstance(row, dict) for row in (*given, defaults))
+    if not is_good:
+        raise ValueError(f"manifest {path}: expected a list of drives, each with video and camera")
+    return [{**defaults, **row} for row in given]
+
+
+def _csv_rows(text: str) -> list[dict[str, Any]]:
+    rows = []
+    for row in csv.DictReader(io.StringIO(text, newline=""), strict=True):
+        if None in row or None in row.values():
+            raise ValueError(f"a row with another number of columns: {shown(row)}")
+        filled = {str(key).strip(): value.strip() for key, value in row.items() if value.strip()}
+        flags = {each.name for each in fields(RunConfig) if isinstance(each.default, bool)}
+        truth = {"true": True, "false": False}
+        rows.append(
+            {key: truth.get(value.lower(), value) if key in flags else value for key, value in filled.items()}
+        )
+    return rows
+
+
+def _drive(row: Mapping[Any, Any], base: Path, inside: Path) -> Drive:
+    row = {str(key).replace("-", "_"): value for key, value in row.items() if value is not None}
+    for name in _REFUSED:
+        if name in row:
+            raise ValueError(f"expected video, camera, {', '.join(_OWN)} or settings of a run, got {name}")
+    if not isinstance(row.get("video"), str) or not row["video"]:
+        raise ValueError(f"video: expected a path, got {shown(row.get('video', 'none'))}")
+    settings = {("source" if key == "video" else key): value for key, value in row.items() if key not in _OWN}
+    values = parsed_settings(settings)
+    for key in PATHS:
+        if values.get(key) is not None:
+            try:
+                values[key] = path_inside(str(values[key]), base, inside)
+            except ValueError as error:
+                raise ValueError(f"{'video' if key == 'source' else key}: {error}") from error
+    config = RunConfig(**values)  # type: ignore[arg-type]  # each parsed as its field
+    time, day = _time_and_day(row)
+    name = str(row.get("name") or _default_name(row["video"]))
+    lens = str(row.get("camera_id") or _default_camera(config))
+    for key, text in (("name", name), ("camera_id", lens)):
+        if not _is_name(text):
+            raise ValueError(
+                f"{key}: expected a name of up to {_MOST_NAME} characters, without a slash and not beginning "
+                f"with a dot, got {shown(text)}"
+            )
+    return Drive(name, lens, day, time, config)
+
+
+def _is_name(text: str) -> bool:
+    good = 0 < len(text) <= _MOST_NAME and text.isprintable() and not text.startswith(".")
+    return good and not set("/\\") & set(text)
+
+
+def _default_name(video: str) -> str:
+    """Return a name of the path from the manifest, such as ``tuesday-front`` of tuesday/front.mp4."""
+    parts = [part for part in Path(video).with_suffix("").parts if part not in ("/", "..", ".")]
+    return re.sub(r"[*?\[\]]", "_", "-".join(parts))[-_MOST_NAME:]
+
+
+def _default_camera(config: RunConfig) -> str:
+    return Path(config.camera).stem if config.camera else f"fov-{config.fov:g}"
+
+
+def _time_and_day(row: Mapping[str, Any]) -> tuple[str, str]:
+    """Return time and day in ISO 8601; what is not known is empty, or UNKNOWN_DAY."""
+    texts = {}
+    for key in ("time", "day"):
+        try:
+            found = None if key not in row else datetime.fromisoformat(str(row[key]))
+        except ValueError as error:
+            raise ValueError(
+                f"{key}: expected ISO 8601 as 2026-03-01T08:30, got {shown(row[key])}"
+            ) from error
+        texts[key] = found
+    time, day = texts["time"], texts["day"]
+    if day is None and time is None:
+        return "", UNKNOWN_DAY
+    date = (day or time).date().isoformat()  # type: ignore[union-attr]  # one is there
+    return (date if time is None else time.isoformat()), date
+
+
+def _check_names(path: Path, drives: Iterable[Drive]) -> None:
+    names = Counter(drive.name.casefold() for drive in drives)
+    if twice := [drive.name for drive in drives if names[drive.name.casefold()] > 1]:
+        raise ValueError(
+            f"manifest {path}: expected names that tell the drives apart, got {shown(twice[0])} twice; "
+            "give name"
+        )
+    files: dict[str, str] = {}
+    for drive in drives:
+        lens = drive.config.camera
+        if files.setdefault(drive.camera_id, lens) != lens:
+            raise ValueError(
+                f"manifest {path}: expected one camera file a camera, got {files[drive.camera_id]} and "
+                f"{lens} for {drive.camera_id}; give camera_id"
+            )

@@ -1,0 +1,115 @@
+"""The manifest of a fleet: rows, defaults, names, and paths that leave its folder."""
+
+import pytest
+import yaml
+
+from lanebev.app.fleet.manifest import UNKNOWN_DAY, read_manifest
+from lanebev.cli import main
+
+
+@pytest.fixture
+def write(tmp_path):
+    def written(text, name="manifest.yaml"):
+        path = tmp_path / "fleet" / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text if isinstance(text, str) else yaml.safe_dump(text))
+        return path
+
+    return written
+
+
+def test_a_row_a_drive(write, tmp_path):
+    path = write(
+        "video,camera,camera_id,time,lane_width,rectified\n"
+        "a/x.mp4,cam.yaml,front,2026-03-01T08:30:00,3.5,true\n"
+        "b/x.mp4,cam.yaml,,,,\n",
+        "manifest.csv",
+    )
+    first, second = read_manifest(path)
+    assert (first.name, first.camera_id, first.day, first.time) == (
+        "a-x",
+        "front",
+        "2026-03-01",
+        "2026-03-01T08:30:00",
+    )
+    assert first.config.source == str(tmp_path / "fleet" / "a" / "x.mp4")
+    assert first.config.camera == str(tmp_path / "fleet" / "cam.yaml")
+    assert (first.config.lane_width, first.config.rectified) == (3.5, True)
+    assert (second.name, second.camera_id, second.day, second.time) == ("b-x", "cam", UNKNOWN_DAY, "")
+    assert (second.config.lane_width, second.config.rectified) == (3.7, False)
+
+
+def test_yaml_with_defaults_says_the_same(write):
+    rows = [{"video": "a.mp4", "day": "2026-03-01"}, {"video": "b.mp4", "lane-width": 3.4, "name": "second"}]
+    first, second = read_manifest(
+        write({"defaults": {"camera": "c.yaml", "lane-width": 3.5}, "drives": rows})
+    )
+    assert (first.name, first.day, first.time, first.config.lane_width) == (
+        "a",
+        "2026-03-01",
+        "2026-03-01",
+        3.5,
+    )
+    assert (second.name, second.config.lane_width) == ("second", 3.4)
+    listed = [{"camera": "c.yaml", "lane-width": 3.5, **row} for row in rows]
+    assert read_manifest(write(listed)) == [first, second]
+
+
+@pytest.mark.parametrize("key", ["video", "camera", "lanes", "weights", "mount", "resume"])
+@pytest.mark.parametrize("text", ["../x", "/etc/passwd", "a/../../x", "link/x"])
+def test_a_path_that_leaves_the_folder_is_refused(write, tmp_path, key, text):
+    row = {"video": "a.mp4", "camera": "c.yaml", key: text}
+    if key == "weights":
+        row.pop("lanes", None)
+    path = write([row])
+    (tmp_path / "outside").mkdir()
+    (path.parent / "link").symlink_to(tmp_path / "outside")
+    words = f"drive 1: {key}: expected a path inside of .*, which leaves it; move the file, or allow"
+    with pytest.raises(ValueError, match=words):
+        read_manifest(path)
+    if text != "/etc/passwd":
+        assert len(read_manifest(path, root=tmp_path)) == 1
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([], "at least one drive"),
+        ([{"camera": "c.yaml"}], "drive 1: video: expected a path, got 'none'"),
+        ([{"video": "a.mp4"}], "drive 1: camera: expected"),
+        ([{"video": "a.mp4", "camera": "c", "out": "x"}], "drive 1: expected video, .* got out"),
+        ([{"video": "a.mp4", "camera": "c", "widht": 3}], "drive 1: expected one of .* got 'widht'"),
+        ([{"video": "a.mp4", "camera": "c", "lane_width": 37}], "drive 1: lane width: expected 1 to 10"),
+        ([{"video": "a.mp4", "camera": "c", "day": "monday"}], "drive 1: day: expected ISO 8601"),
+        ([{"video": "a.mp4", "camera": "c", "name": "a/b"}], "drive 1: name: expected a name"),
+        ([{"video": "a.mp4", "camera": "c", "name": ".."}], "drive 1: name: expected a name"),
+        ([{"video": "a.mp4", "camera": "c", "camera_id": "x\ny"}], "drive 1: camera_id: expected a name"),
+        ([{"video": "a.mp4", "camera": "c"}, {"video": "A.mp4", "camera": "c"}], "got 'a' twice; give name"),
+        (
+            [{"video": "a.mp4", "camera": "x/c"}, {"video": "b.mp4", "camera": "y/c"}],
+            "expected one camera file a camera, .* give camera_id",
+        ),
+        ({"drive": []}, "expected drives and defaults, got 'drive'"),
+        ("video", "expected a list of drives"),
+        ("a: [", "not YAML"),
+    ],
+)
+def test_a_bad_manifest_is_one_line(write, rows, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        read_manifest(write(rows))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_csv_row_with_too_many_cells_is_refused(write):
+    for row in ("a.mp4,c.yaml,x", "a.mp4"):
+        with pytest.raises(ValueError, match="a row with another number of columns"):
+            read_manifest(write(f"video,camera\n{row}\n", "manifest.csv"))
+
+
+def test_the_command_says_it_in_a_line_and_status_2(write, tmp_path, capsys):
+    path = write([{"video": "../a.mp4", "camera": "c.yaml"}])
+    assert main(["fleet", str(path), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "which leaves it" in said
+    assert not (tmp_path / "out").exists()

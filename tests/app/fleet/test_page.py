@@ -1,0 +1,83 @@
+"""The index page and the plan of a fleet, without Ray."""
+
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lanebev.app.config import RunConfig
+from lanebev.app.fleet.fleet import write_mounts
+from lanebev.app.fleet.manifest import Drive
+from lanebev.app.fleet.mounts import DriveMount, stretches
+from lanebev.app.fleet.page import CameraMounts, DriveVerdict, fleet_page
+from lanebev.app.fleet.plan import Outcome, earlier_outcome, failure_path, tasks_of, write_mark
+
+HOSTILE = "<script>alert(1)<_script>\"'&é…"
+
+
+def _drive(tmp_path, name, camera="front"):
+    config = RunConfig(str(tmp_path / "a.mp4"), str(tmp_path / "c.yaml"))
+    return Drive(name, camera, "2026-03-01", "2026-03-01", config)
+
+
+@pytest.fixture
+def camera():
+    mounts = [
+        DriveMount(
+            HOSTILE, f"2026-03-0{i + 1}", np.full(4, 0.01 * i), np.full(4, 0.003), np.array([i == 2] * 4)
+        )
+        for i in range(4)
+    ]
+    mounts[1].pose[2] = mounts[1].std[2] = np.nan
+    return CameraMounts(HOSTILE, mounts, stretches(mounts))
+
+
+def test_every_name_is_escaped(tmp_path, camera):
+    drives = [_drive(tmp_path, HOSTILE, HOSTILE), _drive(tmp_path, f"{HOSTILE}2")]
+    outcomes = {
+        HOSTILE: Outcome(HOSTILE, frames=7, seconds=1.25),
+        drives[1].name: Outcome(drives[1].name, failure=f"video {HOSTILE}: no"),
+    }
+    page = fleet_page(HOSTILE, drives, outcomes, {HOSTILE: DriveVerdict("fair", HOSTILE)}, [camera])
+    assert "<script>alert" not in page
+    assert "1 drives finished, 1 failed, 7 frames" in page
+    assert "&lt;script&gt;alert(1)" in page
+    assert 'href="drives/%3Cscript%3Ealert%281%29%3C_script%3E%22%27%26%C3%A9%E2%80%A6/report.html"' in page
+    assert 'src="http' not in page
+
+
+def test_mounts_are_written_as_json(tmp_path, camera):
+    write_mounts(tmp_path / "mounts.json", [camera])
+    (found,) = json.loads((tmp_path / "mounts.json").read_text())
+    assert [stretch["drives"] for stretch in found["stretches"]] == [2, 2]
+    assert found["drives"][1]["roll_deg"] is None
+    assert found["drives"][3]["pitch_deg"] == pytest.approx(np.degrees(0.03))
+    assert found["drives"][2]["moved"] == ["pitch", "yaw", "roll", "height"]
+
+
+def test_what_is_finished_is_known_until_something_changes(tmp_path):
+    (tmp_path / "a.mp4").write_text("video")
+    drive = _drive(tmp_path, "one")
+    (task,) = tasks_of([drive], tmp_path / "out")
+    assert earlier_outcome(task) is None
+    folder = tmp_path / "out" / "drives" / "one"
+    folder.mkdir(parents=True)
+    (folder / "extrinsics.csv").write_text("")
+    done = Outcome("one", frames=3, seconds=1.5)
+    write_mark(task, done)
+    assert earlier_outcome(task) == done
+    (other,) = tasks_of([replace(drive, config=replace(drive.config, lane_width=3.5))], tmp_path / "out")
+    assert earlier_outcome(other) is None
+    os.utime(tmp_path / "a.mp4", (1, 1))
+    (changed,) = tasks_of([drive], tmp_path / "out")
+    assert earlier_outcome(changed) is None
+    failed = Outcome("one", failure="no video", is_final=True)
+    write_mark(changed, failed)
+    assert earlier_outcome(changed) == failed
+    write_mark(changed, done)
+    assert earlier_outcome(changed) == done
+    assert not failure_path(changed).exists()
+    (folder / "fleet.json").write_text("{")
+    assert earlier_outcome(changed) is None
