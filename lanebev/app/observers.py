@@ -108,3 +108,10 @@ class NetworkObserver:
         with torch.inference_mode():
             _, vertices = self.model.boundary_vertices(image)
         return Observation(map_tensors(Tensor.cpu, vertices), self.model.pose_sigma_scale)
+
+    def restored(self, found: FrameLines) -> Observation:
+        """Return what the network saw by lanes.json, in its own layout: sums are the same to the bit."""
+        vertices = vertices_from_lines(found.lines, self.camera)
+        most = 2 * self.model.extractor.config.segments
+        cut = [part[:, :, :most].float() for part in vertices[:3]]
+        return Observation(BoundaryVertices(*cut, vertices.boundary), found.pose_sigma_scale)

@@ -28,7 +28,7 @@ from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states
 from lanebev.app.sources import camera_of, ended_by_signals, make_source, observed_frames
 from lanebev.app.summary import mount_facts, run_facts
-from lanebev.app.take_up import frame_name, take_up
+from lanebev.app.take_up import facts_of, frame_name, take_up
 from lanebev.io.calibration_file import write_calibration
 from lanebev.io.covariances import write_covariances
 from lanebev.io.formats.folder import read_record
@@ -104,7 +104,7 @@ def run(
                 if viewer is not None:
                     pose, lines = estimate.calibration.extrinsics, vertex_lines(seen.vertices)
                     viewer.add(RecordedFrame(recorder.rows[-1], pose, lines), frame.image)
-        facts = run_facts(config, source, camera) | taken.facts
+        facts = run_facts(config, source, camera) | facts_of(taken)
         if tracker.mount is not None:
             save_state(out / STATE_FILE, {**tracker.states(), "camera": camera.fingerprint()})
             facts |= mount_facts(tracker.mount)

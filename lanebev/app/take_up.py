@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
+from typing import Protocol, cast
 
 from lanebev import __version__
 from lanebev.app.build import input_files
@@ -18,10 +19,17 @@ from lanebev.io.lane_parsing import FrameLines
 from lanebev.io.results import OutputFolder
 from lanebev.io.tusimple import whole_tusimple_lines
 from lanebev.io.video import Frame, FrameSource
-from lanebev.observation.polylines import vertices_from_lines
 
 _LANES = "lanes.json"
 _SETTINGS, _SEEN = ".settings.json", ".seen.json"  # in the temporary folder
+
+
+class RestoringObserver(Observer, Protocol):
+    """An observer that gives again what it saw."""
+
+    def restored(self, found: FrameLines) -> Observation:
+        """Return the observation of a frame from its entry in lanes.json."""
+        ...
 
 
 def frame_name(frame: Frame, source: FrameSource) -> str:
@@ -35,7 +43,6 @@ class TakenUp:
     Args:
         entries: of the frames from the first one on.
         observer: of the others.
-        camera: the lens.
         source: the frames.
 
     Attributes:
@@ -45,9 +52,9 @@ class TakenUp:
     """
 
     def __init__(
-        self, entries: Iterator[FrameLines], observer: Observer, camera: Camera, source: FrameSource
+        self, entries: Iterator[FrameLines], observer: RestoringObserver, source: FrameSource
     ) -> None:
-        self._entries, self._observer, self._camera, self._source = entries, observer, camera, source
+        self._entries, self._observer, self._source = entries, observer, source
         self._ahead: dict[str, FrameLines] = {}  # read before their frames came: threads overtake each other
         self._lock = threading.Lock()
         self.remark, self.workers, self.frames = observer.remark, observer.workers, 0
@@ -55,9 +62,9 @@ class TakenUp:
     def __call__(self, frame: Frame) -> Observation:
         """See :class:`lanebev.app.observers.Observer`."""
         entry = self._entry(frame_name(frame, self._source))
-        if entry is None:
+        if entry is None or frame.image is None:
             return self._observer(frame)
-        return Observation(vertices_from_lines(entry.lines, self._camera), entry.pose_sigma_scale)
+        return self._observer.restored(entry)
 
     def _entry(self, name: str) -> FrameLines | None:
         with self._lock:
@@ -66,17 +73,17 @@ class TakenUp:
             self.frames += name in self._ahead
             return self._ahead.pop(name, None)
 
-    @property
-    def facts(self) -> dict[str, str]:
-        """What to say of it in the report."""
-        if not self.frames:
-            return {}
-        return {"taken up": f"what a run that was killed had seen in the first {self.frames} frames"}
+
+def facts_of(observer: Observer) -> dict[str, str]:
+    """Return what to say in the report of what was taken up."""
+    if not isinstance(observer, TakenUp) or not observer.frames:
+        return {}
+    return {"taken up": f"what a run that was killed had seen in the first {observer.frames} frames"}
 
 
 def take_up(
     out: OutputFolder, config: RunConfig, source: FrameSource, camera: Camera, observer: Observer
-) -> TakenUp:
+) -> Observer:
     """Take up the run that was killed in this folder, if it was of the same settings and files.
 
     Lanes of another detector are read as they are: nothing is saved by keeping them. A stream begins anew.
@@ -90,9 +97,10 @@ def take_up(
     else:
         (out / _SEEN).unlink(missing_ok=True)
     known.write_text(settings, encoding="utf-8")
-    is_there = (out / _SEEN).is_file() and config.lanes is None and not source.is_live
-    entries = whole_tusimple_lines(out / _SEEN) if is_there else iter(())
-    return TakenUp(entries, observer, camera, source)
+    if config.lanes is not None or source.is_live:
+        return observer
+    entries = whole_tusimple_lines(out / _SEEN) if (out / _SEEN).is_file() else iter(())
+    return TakenUp(entries, cast(RestoringObserver, observer), source)
 
 
 def fingerprint(config: RunConfig, source: FrameSource, camera: Camera) -> str:

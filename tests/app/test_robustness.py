@@ -27,7 +27,7 @@ from lanebev.app.take_up import take_up
 from lanebev.cli import main
 from lanebev.io.folder_lock import FolderLock
 from lanebev.io.results import OutputFolder
-from lanebev.io.state import save_state
+from lanebev.io.state import load_state, save_state
 from lanebev.io.video import VideoWriter, open_source
 
 ROOT = Path(__file__).parents[2]
@@ -164,8 +164,10 @@ def test_a_killed_run_is_taken_up(data, looked, tmp_path, monkeypatch):
     report = run(RunConfig(str(data / "drive.mp4"), str(data / "camera.yaml"), str(out)))
     assert seen == [4, 5]
     assert report.facts["taken up"] == "what a run that was killed had seen in the first 4 frames"
-    for name in ("extrinsics.csv", "lanes.json"):
+    for name in ("extrinsics.csv", "covariance.csv", "lanes.json", "calibration.yaml"):
         assert (out / name).read_bytes() == (looked / name).read_bytes()
+    states = [load_state(folder / "state.safetensors").states for folder in (out, looked)]
+    torch.testing.assert_close(*states, rtol=0, atol=0)
     assert {path.name for path in out.iterdir()} == {path.name for path in looked.iterdir()}
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
@@ -181,6 +183,9 @@ def test_a_killed_run_of_other_settings_is_not_taken_up(data, tmp_path):
 
         def __call__(self, frame):
             return "looked"
+
+        def restored(self, found):
+            return found.name
 
     def taken(config):
         """How many of three frames a run takes that finds two whole lines and a half; it is killed too."""
