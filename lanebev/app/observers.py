@@ -114,4 +114,4 @@ class NetworkObserver:
         vertices = vertices_from_lines(found.lines, self.camera)
         most = 2 * self.model.extractor.config.segments
         cut = [part[:, :, :most].float() for part in vertices[:3]]
-        return Observation(BoundaryVertices(*cut, vertices.boundary), found.pose_sigma_scale)
+        return Observation(BoundaryVertices._make([*cut, vertices.boundary]), found.pose_sigma_scale)

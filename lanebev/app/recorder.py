@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lanebev.app.concurrency import Background
+from lanebev.app.kept import KeptNumbers, KeptRows
 from lanebev.app.observers import Observation
 from lanebev.app.views import ViewBefore, bird_view
 from lanebev.camera.model import Camera
@@ -36,6 +37,7 @@ from lanebev.view.grid import BEVGrid
 
 _BEFORE_RESOLUTION = 0.1  # m, of the view before: it is only shown small
 _CRF = 23  # of the videos
+_MOST_PROBLEMS = 1000  # of frames, that are listed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +82,7 @@ class Recorder:
     stills: bool
     grid: BEVGrid = field(default_factory=BEVGrid)
     videos: bool = True
-    rows: list[ExtrinsicsRow] = field(default_factory=list)
+    rows: KeptRows = field(default_factory=KeptRows)
     problems: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -88,7 +90,7 @@ class Recorder:
         self.before_title = "uncalibrated" if alone else "first frame's pose held"
         self._before = ViewBefore(alone)
         self._coarse = replace(self.grid, resolution=max(self.grid.resolution, _BEFORE_RESOLUTION))
-        self._widths: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+        self._widths = KeptNumbers(2, NUM_BOUNDARIES - 1)
         self._moments, self._scores = MomentSampler(), EventScores()
 
     def __enter__(self) -> Recorder:
@@ -110,7 +112,7 @@ class Recorder:
         """Take one frame; its pictures are drawn and encoded in the background."""
         frame = done.frame
         if frame.problem:
-            self.problems.append(f"frame {frame.number}: {frame.problem}")
+            self._note(f"frame {frame.number}: {frame.problem}")
         estimate = done.estimate
         self.rows.append(
             extrinsics_row(
@@ -123,6 +125,12 @@ class Recorder:
             )
         )
         self._background.submit(lambda: self._draw(done))
+
+    def _note(self, problem: str) -> None:
+        if len(self.problems) < _MOST_PROBLEMS:
+            self.problems.append(problem)
+        elif len(self.problems) == _MOST_PROBLEMS:
+            self.problems.append("further problems of frames are not listed: see the rows without segments")
 
     def finish(
         self,
@@ -140,7 +148,7 @@ class Recorder:
             mount: as it is known at the end.
         """
         write_extrinsics(self.path("extrinsics.csv"), self.rows)
-        before, after = (np.array([pair[i] for pair in self._widths]) for i in (0, 1))
+        before, after = self._widths.all().transpose(1, 0, 2)
         report = Report(
             title=title,
             rows=self.rows,
@@ -169,9 +177,8 @@ class Recorder:
         before, after = self._before(calibration), calibration.extrinsics
         intrinsics = self.camera.intrinsics[None].to(segments.endpoints)
         lanes = believed(segments, calibration.inliers)
-        self._widths.append(
-            (self._measure(lanes, intrinsics, before), self._measure(lanes, intrinsics, after))
-        )
+        widths = [self._measure(lanes, intrinsics, pose) for pose in (before, after)]
+        self._widths.append(np.stack(widths))
         image = frame.image if frame.image is not None else np.zeros((*self.camera.image_size, 3), np.uint8)
         place = frame.name if self.single or self.stills else f"frame {frame.number}   {frame.time:.2f} s"
         bev = bird_view(self.grid, frame.image, self.camera, after)

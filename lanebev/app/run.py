@@ -9,9 +9,7 @@ from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from lanebev.app.build import (
     input_files,
@@ -23,6 +21,7 @@ from lanebev.app.build import (
 )
 from lanebev.app.config import RunConfig
 from lanebev.app.convert import writer
+from lanebev.app.kept import KeptNumbers
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states
@@ -89,7 +88,7 @@ def run(
             videos=not config.no_video,
         )
         recorder.problems += filter(None, (source.problem, problem, observer.remark, lens_remark(camera)))
-        covariances: list[NDArray[np.float64]] = []
+        covariances = KeptNumbers(4, 4)
         frames = observed_frames(source, taken)
         progress = None if source.is_live else progress
         with recorder, closing(frames), ended_by_signals(source):
@@ -111,7 +110,7 @@ def run(
             write_calibration(out / CALIBRATION_FILE, camera, tracker.mount)
         logger.info("writing the report")
         report = recorder.finish(facts, Path(source.source).name, truth, tracker.mount)
-        write_covariances(out / "covariance.csv", covariances)
+        write_covariances(out / "covariance.csv", covariances.all())
         if config.formats:
             record = replace(read_record(out / "."), name=report.title, rows=recorder.rows, camera=camera)
             for name in config.formats:

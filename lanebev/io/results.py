@@ -94,7 +94,7 @@ def extrinsics_row(
     )
 
 
-def write_extrinsics(path: str | Path, rows: list[ExtrinsicsRow]) -> None:
+def write_extrinsics(path: str | Path, rows: Iterable[ExtrinsicsRow]) -> None:
     """Write ``extrinsics.csv``: a header and one row per frame."""
     with open(path, "w", newline="", encoding="utf-8", errors="surrogateescape") as file:  # names of files
         writer = csv.writer(file, lineterminator="\n")

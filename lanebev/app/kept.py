@@ -1,0 +1,82 @@
+"""What is kept of every frame until the end of a run, in a few bytes: ten hours have a million frames."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable, Sequence
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanebev.io.results import ExtrinsicsRow
+
+_NUMBERS = 9  # of a row, from time_s on
+
+
+class KeptRows(Sequence[ExtrinsicsRow]):
+    """Rows of ``extrinsics.csv`` as columns, in 0.1 kB each; a row is made when it is asked for."""
+
+    def __init__(self, rows: Iterable[ExtrinsicsRow] = ()) -> None:
+        self._numbers, self._counts, self._codes = array("d"), array("q"), array("l")
+        self._texts: dict[str, int] = {}
+        self._known: list[str] = []
+        self._images: list[str] = []  # each is there once, in the source
+        for row in rows:
+            self.append(row)
+
+    def append(self, row: ExtrinsicsRow) -> None:
+        """Add the row of the next frame."""
+        self._numbers.extend(row[1 : 1 + _NUMBERS])
+        self._counts.extend((row.frame, row.segments))
+        self._codes.extend((self._code(row.status), self._code(row.reasons)))
+        self._images.append(row.image)  # last: from now on it is there for other threads
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    @overload
+    def __getitem__(self, place: int) -> ExtrinsicsRow: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> KeptRows: ...
+
+    def __getitem__(self, place: int | slice) -> ExtrinsicsRow | KeptRows:
+        if isinstance(place, slice):
+            return KeptRows(self[each] for each in range(*place.indices(len(self))))
+        at = range(len(self))[place]
+        frame, segments = self._counts[2 * at : 2 * at + 2]
+        status, reasons = (self._known[code] for code in self._codes[2 * at : 2 * at + 2])
+        numbers = self._numbers[_NUMBERS * at : _NUMBERS * (at + 1)]
+        return ExtrinsicsRow._make([frame, *numbers, status, segments, self._images[at], reasons])
+
+    def _code(self, text: str) -> int:
+        if text not in self._texts:
+            self._known.append(text)
+            self._texts[text] = len(self._known) - 1
+        return self._texts[text]
+
+
+class KeptNumbers:
+    """Arrays of one shape, a frame each, as their numbers only.
+
+    Args:
+        shape: of each.
+    """
+
+    def __init__(self, *shape: int) -> None:
+        self._shape, self._numbers = shape, array("d")
+
+    def append(self, values: NDArray[np.float64]) -> None:
+        """Add the array of the next frame.
+
+        Raises:
+            ValueError: it has another shape.
+        """
+        if values.shape != self._shape:
+            raise ValueError(f"values: expected shape {self._shape}, got {values.shape}")
+        self._numbers.frombytes(np.ascontiguousarray(values, np.float64).tobytes())
+
+    def all(self) -> NDArray[np.float64]:
+        """Return all of them, (F, ...), without a copy; no more can be added while it is in use."""
+        return np.frombuffer(self._numbers, np.float64).reshape(-1, *self._shape)

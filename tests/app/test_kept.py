@@ -1,0 +1,48 @@
+"""What is kept of every frame: the same rows and numbers back, in little memory."""
+
+import numpy as np
+import pytest
+
+from lanebev.app.kept import KeptNumbers, KeptRows
+from lanebev.io.results import ExtrinsicsRow
+
+
+def _row(number):
+    numbers = np.random.default_rng(number).normal(size=9).tolist()
+    image = f"images/{number}.png" if number % 2 else ""
+    return ExtrinsicsRow(
+        number + 10, *numbers, "TRACKING" if number else "LOST", number, image, "A|B"[:number]
+    )
+
+
+def test_rows_come_back_as_they_were():
+    rows = [_row(number) for number in range(6)]
+    kept = KeptRows(rows)
+    assert list(kept) == rows
+    assert kept[-1] == rows[-1]
+    assert list(kept[1:4]) == rows[1:4]
+    assert list(kept[::-2]) == rows[::-2]
+    assert len(kept) == 6
+    with pytest.raises(IndexError):
+        kept[6]
+
+
+def test_a_row_takes_little():
+    kept = KeptRows()
+    for number in range(2000):
+        kept.append(_row(5)._replace(frame=number))
+    parts = (kept._numbers, kept._counts, kept._codes)
+    assert sum(part.itemsize * len(part) for part in parts) == 2000 * (9 * 8 + 2 * 8 + 2 * 8)
+    assert len(kept._texts) == 2
+
+
+def test_numbers_come_back_as_they_were():
+    values = np.random.default_rng(0).normal(size=(5, 2, 3))
+    values[1, 0, 2] = np.nan
+    kept = KeptNumbers(2, 3)
+    for value in values:
+        kept.append(value)
+    np.testing.assert_array_equal(kept.all(), values)
+    assert KeptNumbers(4, 4).all().shape == (0, 4, 4)
+    with pytest.raises(ValueError, match=r"expected shape \(4, 4\), got \(2, 3\)"):
+        KeptNumbers(4, 4).append(values[0])
