@@ -27,7 +27,7 @@ class KeptRows(Sequence[ExtrinsicsRow]):
 
     def append(self, row: ExtrinsicsRow) -> None:
         """Add the row of the next frame."""
-        self._numbers.extend(row[1 : 1 + _NUMBERS])
+        self._numbers.extend(float(number) for number in row[1 : 1 + _NUMBERS])
         self._counts.extend((row.frame, row.segments))
         self._codes.extend((self._code(row.status), self._code(row.reasons)))
         self._images.append(row.image)  # last: from now on it is there for other threads
