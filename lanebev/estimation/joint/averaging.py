@@ -65,7 +65,7 @@ _START_STEPS, _STEPS = 6, 5  # Gauss-Newton steps of the start and of every read
 _SEGMENTS = 192  # that are fitted
 _ANGLES = [PITCH, ROLL]
 _KEEP = 2.0  # sigmas from the average within which the likeliest reading stands
-_NEAR_PRIOR = 1.5  # sigmas of the prior, likewise
+_FARTHER = 0.5  # sigmas by which it may be farther from the prior than the average is
 _POSE = slice(0, HEIGHT + 1)
 
 
@@ -166,8 +166,8 @@ def average_readings(
     """Average a frame's pose over all ways to read it.
 
     The mean is that by the evidence as it is; but where the pose of ``start`` lies within ``_KEEP`` sigmas of
-    the average, and near the prior, it stands, since an average of readings that agree only adds noise. The
-    covariance about it is that by the evidence to a power below 1, which leaves more readings in.
+    the average, and no farther from the prior, it stands, since an average of readings that agree only adds
+    noise. The covariance about it is that by the evidence to a power below 1, which leaves more readings in.
 
     Args:
         start: (B, 7) parameters near the likeliest reading.
@@ -180,8 +180,8 @@ def average_readings(
     """
     (batch, num), like = positions.shape, positions
     seen, places = spread_subset(seen, positions.gather(1, seen.boundary), _SEGMENTS)
-    level = replace(prior, roll_steps=1)
-    starts = torch.cat([start.unsqueeze(1), linear_starts(seen, places, level)], dim=1)  # (B, S, 7)
+    at_level = replace(prior, roll_steps=1)
+    starts = torch.cat([start.unsqueeze(1), linear_starts(seen, places, at_level)], dim=1)  # (B, S, 7)
     ways = readings(num, cfg, like)
     kinds, count, tries = len(cfg.unequal), len(ways.kind), starts.shape[1]
     alike = Readings(*(part[:kinds] for part in ways))
@@ -205,8 +205,10 @@ def average_readings(
     likely, doubted = (window(power * evidence + before, cfg.least) for power in (1.0, cfg.information))
     mean, _ = mixture_moments(*_with_half(pose, cov, likely, prior, half, cfg.least))
     centre, spread = mixture_moments(*_with_half(pose, cov, doubted, prior, half, cfg.least))
-    from_prior = ((start - prior.mean(like)) / prior.std(like))[:, _ANGLES].abs().amax(-1)
-    keep = (distance(start[:, _POSE] - centre, spread) < _KEEP) & (from_prior < _NEAR_PRIOR)
+    level = prior.mean(like)[_ANGLES]
+    farther = (start[:, _ANGLES] - level).abs() - (mean[:, _ANGLES] - level).abs()
+    farther = (farther / prior.std(like)[_ANGLES]).amax(-1)
+    keep = (distance(start[:, _POSE] - centre, spread) < _KEEP) & (farther < _FARTHER)
     mean = select_rows(keep, start[:, _POSE], mean)
     apart = centre - mean
     wrong = likely @ ways.wrong.to(like)
