@@ -64,7 +64,7 @@ from lanebev.types import Calibration, Extrinsics
 _START_STEPS, _STEPS = 6, 5  # Gauss-Newton steps of the start and of every reading
 _SEGMENTS = 192  # that are fitted
 _ANGLES = [PITCH, ROLL]
-_KEEP = 2.0  # sigmas from the average within which the likeliest reading stands
+_KEEP = 3.0  # sigmas from the average within which the likeliest reading stands
 _FARTHER = 0.5  # sigmas by which it may be farther from the prior than the average is
 _POSE = slice(0, HEIGHT + 1)
 
