@@ -8,6 +8,7 @@ import io
 import itertools
 import logging
 import os
+import re
 import signal
 import sys
 import threading
@@ -110,8 +111,19 @@ def _add_fleet(fleet: argparse.ArgumentParser) -> None:
     fleet.add_argument("--gpus", type=float, default=0.0, metavar="SHARE", help=words)
     words = "folder that no path may leave (the manifest's)"
     fleet.add_argument("--root", type=path, metavar="DIR", help=words)
+    words = "cut longer videos into parts of so many minutes, which run side by side"
+    fleet.add_argument("--part-minutes", type=_above_zero, metavar="MIN", help=words)
+    words = "seconds that a part begins earlier, for its filter to converge (%(default)s)"
+    fleet.add_argument("--overlap", type=_above_zero, default=20.0, metavar="S", help=words)
     words = "try drives again that failed in an earlier call"
     fleet.add_argument("--again", action="store_true", help=words)
+
+
+def _above_zero(text: str) -> float:
+    number = float(text) if re.fullmatch(r"[0-9.]+", text) and text.count(".") < 2 and text != "." else 0.0
+    if number <= 0:
+        raise argparse.ArgumentTypeError(f"expected a number above zero, got {text!r}")
+    return number
 
 
 def _at_least(least: int) -> Callable[[str], int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 from lanebev import __version__
 from lanebev.app.config import RunConfig
+from lanebev.app.fleet.joining import Part, duration, parts_of
 from lanebev.app.fleet.manifest import PATHS, Drive
 from lanebev.app.take_up import size_and_time
 
@@ -21,14 +23,18 @@ class Task:
     """One run.
 
     Attributes:
-        name: of the drive.
+        name: of the drive; of a part of it, with its number.
         config: what to run, and the folder to write.
         fingerprint: of settings and files, to know whether it is done.
+        parts: of the drive, if it is cut.
+        number: of the part.
     """
 
     name: str
     config: RunConfig
     fingerprint: str
+    parts: tuple[Part, ...] = ()
+    number: int = 0
 
 
 @dataclass(frozen=True)
@@ -55,13 +61,50 @@ def drive_folder(out: str | Path, name: str) -> Path:
     return Path(out) / DRIVES / name
 
 
-def tasks_of(drives: Sequence[Drive], out: str | Path) -> list[Task]:
-    """Return a task for each drive."""
-    tasks = []
+def tasks_of(
+    drives: Sequence[Drive], out: str | Path, length: float | None = None, overlap: float = 0.0
+) -> dict[str, list[Task]]:
+    """Return the tasks of each drive by its name: one, or several where a video is cut.
+
+    Args:
+        drives: of the manifest.
+        out: folder of the fleet.
+        length: s of a part, None to cut nothing.
+        overlap: s that a part begins before the first frame that is kept of it.
+    """
+    tasks: dict[str, list[Task]] = {}
     for drive in drives:
-        config = replace(drive.config, out=str(drive_folder(out, drive.name)))
-        tasks.append(Task(drive.name, config, settings_fingerprint(config)))
+        config, folder = drive.config, drive_folder(out, drive.name)
+        end = config.end if config.end is not None else math.inf
+        if length is not None and not config.stills and Path(config.source).is_file():
+            parts = tuple(parts_of(config.start, min(end, duration(config.source)), length, overlap))
+        else:
+            parts = ()
+        if len(parts) < 2:
+            whole = replace(config, out=str(folder))
+            tasks[drive.name] = [Task(drive.name, whole, settings_fingerprint(whole))]
+            continue
+        tasks[drive.name] = []
+        for number, part in enumerate(parts):
+            last = config.end if part.end is None else part.end
+            own = replace(config, out=str(folder / f"part-{number:03d}"), start=part.start, end=last)
+            name = f"{drive.name}, part {number}"
+            tasks[drive.name].append(Task(name, own, settings_fingerprint(own), parts, number))
     return tasks
+
+
+def drive_outcome(name: str, tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> Outcome:
+    """Return what became of a drive from what became of its tasks."""
+    failed = [(task, outcome) for task, outcome in zip(tasks, outcomes, strict=True) if outcome.failure]
+    if len(tasks) == 1:
+        return outcomes[0]
+    seconds = sum(outcome.seconds for outcome in outcomes)
+    if failed:
+        task, outcome = failed[0]
+        return Outcome(
+            name, f"part {task.number}: {outcome.failure}", seconds=seconds, is_final=outcome.is_final
+        )
+    return Outcome(name, frames=sum(outcome.frames for outcome in outcomes), seconds=seconds)
 
 
 def settings_fingerprint(config: RunConfig) -> str:
