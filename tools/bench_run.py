@@ -3,7 +3,9 @@
     python -m tools.bench_run [--frames 60] [--json FILE] [--profile]
 
 A rendered drive of 1280 x 720 is written to a video, run with all outputs, and the network's forward pass is
-timed on its input before and after. The ratio is what counts: machines differ, and drift.
+timed on its input before and after. The ratio is what counts: machines differ, and drift. Beside it stands
+the ratio of processor times, which says more where other programs run: all cores together, so that at best
+the run's time is its processor time by the number of cores.
 """
 
 from __future__ import annotations
@@ -45,18 +47,28 @@ def write_video(folder: Path, frames: int) -> tuple[str, str]:
     return str(video), str(camera)
 
 
-def forward_seconds(repeats: int = 9) -> float:
-    """Time the network's forward pass on one image of its size, the median."""
+def forward_seconds(repeats: int = 9) -> tuple[float, float]:
+    """Time the network's forward pass on one image of its size: medians of wall and of processor time."""
     segmenter = load_segmenter().eval()
     height, width = (int(side) for side in segmenter.image_size)
     image = torch.rand(1, 3, height, width)
     taken = []
     with torch.inference_mode():
         for _ in range(repeats + 2):
-            begin = time.perf_counter()
+            begin = _clocks()
             segmenter(image)
-            taken.append(time.perf_counter() - begin)
-    return sorted(taken[2:])[repeats // 2]
+            taken.append(_since(begin))
+    wall, processor = (sorted(each)[repeats // 2] for each in zip(*taken[2:], strict=True))
+    return wall, processor
+
+
+def _clocks() -> tuple[float, float]:
+    return time.perf_counter(), time.process_time()
+
+
+def _since(begin: tuple[float, float]) -> tuple[float, float]:
+    wall, processor = _clocks()
+    return wall - begin[0], processor - begin[1]
 
 
 @one_line_errors()
@@ -71,19 +83,23 @@ def main() -> None:
         video, camera = write_video(Path(name), args.frames)
         before = forward_seconds()
         profile = cProfile.Profile()
-        begin = time.perf_counter()
+        begin = _clocks()
         if args.profile:
             profile.enable()
         run(RunConfig(video, camera, str(Path(name) / "out")))
         profile.disable()
-        whole = time.perf_counter() - begin
+        whole = _since(begin)
         after = forward_seconds()
-    forward = 0.5 * (before + after)
+    wall, processor = (1e3 * each / args.frames for each in whole)
+    forward, forward_processor = (500 * (one + other) for one, other in zip(before, after, strict=True))
     figures = {
         "frames": args.frames,
-        "run_ms": round(1e3 * whole / args.frames, 1),
-        "forward_ms": round(1e3 * forward, 1),
-        "ratio": round(whole / args.frames / forward, 2),
+        "run_ms": round(wall, 1),
+        "forward_ms": round(forward, 1),
+        "ratio": round(wall / forward, 2),
+        "run_cpu_ms": round(processor, 1),
+        "forward_cpu_ms": round(forward_processor, 1),
+        "cpu_ratio": round(processor / forward_processor, 2),
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
         "lanebev": lanebev.__version__,
