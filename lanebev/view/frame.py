@@ -15,9 +15,10 @@ from lanebev.geometry.distortion import max_undistorted_radius
 from lanebev.types import Extrinsics
 from lanebev.view.cells import cell_sums, cells_and_lens
 from lanebev.view.grid import BEVGrid, bev_from_image
-from lanebev.view.sampling import LEAST_DEPTH, image_coordinates
+from lanebev.view.kept import KeptArrays
+from lanebev.view.sampling import BLOCK, LEAST_DEPTH, image_coordinates
 
-Plane = NDArray[np.float32]
+_kept = KeptArrays()
 
 
 def remap_frame(
@@ -45,17 +46,22 @@ def remap_frame(
             f"frame: expected the camera's {height} x {width}, got {frame.shape[0]} x {frame.shape[1]}; "
             "see Camera.scaled"
         )
-    x, y, seen = pixels_of_cells(camera, extrinsics, grid)
-    valid = seen & (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
-    maps = cv2.convertMaps(x, y, cv2.CV_16SC2)  # which cv2.remap does in more time
-    taken: Any = cv2.remap(frame, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    bev: Any = cv2.bitwise_and(taken, taken, mask=valid.view(np.uint8))
-    return bev, valid
+    pixels, seen = _pixels_of_cells(camera, extrinsics, grid)
+    mask = _kept("mask", grid.shape, np.uint8)
+    cv2.inRange(pixels, (-0.5, -0.5), (width - 0.5, height - 0.5), dst=mask)
+    if seen is not None:
+        mask *= seen
+    maps: Any = _kept("whole", (*grid.shape, 2), np.int16), _kept("parts", grid.shape, np.uint16)
+    cv2.convertMaps(pixels, None, cv2.CV_16SC2, maps[0], maps[1])  # which cv2.remap does in more time
+    taken: Any = _kept("taken", (*grid.shape, *frame.shape[2:]), np.uint8)
+    cv2.remap(frame, maps[0], maps[1], cv2.INTER_LINEAR, taken, cv2.BORDER_REPLICATE)
+    bev: Any = cv2.bitwise_and(taken, taken, mask=mask)
+    return bev, mask > 0
 
 
-def pixels_of_cells(
+def _pixels_of_cells(
     camera: Camera, extrinsics: Extrinsics, grid: BEVGrid
-) -> tuple[Plane, Plane, NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
     """Compute where a camera sees the cells of a grid.
 
     Args:
@@ -64,8 +70,9 @@ def pixels_of_cells(
         grid: U × V cells.
 
     Returns:
-        x and y px of the image as taken, and whether the cell is in front of the camera and where the lens
-        does not fold over, each (U, V); x and y are anything where it is not.
+        (U, V, 2) x and y px of the image as taken, anything where not seen, in memory that is kept; and
+        (U, V), whether the cell is in front of the camera and where the lens does not fold over, None if all
+        are.
     """
     with torch.inference_mode():
         if camera.model == "pinhole" and float(camera.intrinsics[0, 1]) == 0.0:
@@ -73,27 +80,41 @@ def pixels_of_cells(
         cells, lens = cells_and_lens(
             grid, camera.intrinsics[None], extrinsics, camera.distortion[None], camera.model, torch.float32
         )
-        points, hidden = image_coordinates(cells.rows(0, cells.shape[1]), lens)
-        x, y, seen = (part.cpu().numpy() for part in (*points[0], hidden[0] == 0))
-    return x, y, seen
+        pixels = _kept("pixels", (*grid.shape, 2), np.float32)
+        seen = np.empty(grid.shape, np.bool_)
+        step = max(1, BLOCK // grid.shape[1])
+        for first in range(0, grid.shape[0], step):
+            rows = slice(first, min(first + step, grid.shape[0]))
+            points, hidden = image_coordinates(cells.rows(rows.start, rows.stop), lens)
+            pixels[rows] = points[0].movedim(0, -1).cpu().numpy()
+            seen[rows] = (hidden[0] == 0).cpu().numpy()
+    return pixels, seen
 
 
 def _by_opencv(
     camera: Camera, extrinsics: Extrinsics, grid: BEVGrid
-) -> tuple[Plane, Plane, NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
     """By OpenCV's single pass over the cells, which says nothing of cells behind or beyond a fold."""
-    sums = cell_sums(grid, (0.0,), None, extrinsics)
-    by_row, by_column = (part[0].float() for part in sums)  # (3, U), (3, V) m in the camera
-    seen = by_row[2].unsqueeze(-1) + by_column[2] > LEAST_DEPTH
+    bev_from_cam = bev_from_image(extrinsics, camera.intrinsics[None], grid)[0] @ camera.intrinsics
+    pixels = _kept("pixels", (*grid.shape, 2), np.float32)
+    cv2.initUndistortRectifyMap(
+        camera.intrinsics.numpy(), camera.distortion.numpy(), bev_from_cam.cpu().numpy(), np.eye(3),
+        grid.shape[::-1], cv2.CV_32FC2, pixels,
+    )  # fmt: skip
+    by_row, by_column = (part[0].float() for part in cell_sums(grid, (0.0,), None, extrinsics))
+    limit = None
     if len(camera.distortion):
         limit = max_undistorted_radius(camera.distortion[None], camera.model)[0].float()
-        seen &= _within(by_row, by_column, limit)
-    bev_from_cam = bev_from_image(extrinsics, camera.intrinsics[None], grid)[0] @ camera.intrinsics
-    x, y = cv2.initUndistortRectifyMap(
-        camera.intrinsics.numpy(), camera.distortion.numpy(), bev_from_cam.cpu().numpy(), np.eye(3),
-        grid.shape[::-1], cv2.CV_32FC1,
-    )  # fmt: skip
-    return x, y, seen.cpu().numpy()
+    corners = by_row[:, [0, -1]], by_column[:, [0, -1]]
+    if _seen(*corners, limit).all():  # then all are: the corners' rays span a cone, and what is seen is one
+        return pixels, None
+    return pixels, _seen(by_row, by_column, limit).cpu().numpy()
+
+
+def _seen(by_row: Tensor, by_column: Tensor, limit: Tensor | None) -> Tensor:
+    """Whether the sum of a row's and a column's vector, (3, U) and (3, V), is ahead and within the limit."""
+    ahead = by_row[2].unsqueeze(-1) + by_column[2] > LEAST_DEPTH
+    return ahead if limit is None else ahead & _within(by_row, by_column, limit)
 
 
 def _within(by_row: Tensor, by_column: Tensor, limit: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from lanebev.view.lens import Lens, image_planes
 
 LEAST_DEPTH = 1e-3  # in front of the camera; m for cells of the road
 _PUSH = 1e4  # factor that moves what lies outside away from the map, even a millimetre above the road
-_BLOCK = 1 << 17  # cells: a dozen float32 planes of so many fit a cache of a few MB
+BLOCK = 1 << 17  # cells: a dozen float32 planes of so many fit a cache of a few MB
 
 
 class Cells(Protocol):
@@ -134,7 +134,7 @@ def sampling_maps(
         (B, 2, R, V) for each size, and (B, 1, R, V) bool: valid.
     """
     batch, rows, columns = cells.shape
-    block = max(1, _BLOCK // max(1, batch * columns))
+    block = max(1, BLOCK // max(1, batch * columns))
     if torch.compiler.is_compiling():  # compiled code has no planes in between
         block = rows
     maps: list[tuple[list[Tensor], list[Tensor]]] = [([], []) for _ in sizes]
