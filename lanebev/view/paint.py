@@ -33,7 +33,7 @@ class PixelCells(NamedTuple):
 
     def rows(self, first: int, last: int) -> Tensor:
         """Return those of rows first to last - 1, (B, 3, last - first, W)."""
-        return self.points[:, :, first:last]
+        return self.points[:, :, first:last].clone()
 
 
 class ImageFromBEV(nn.Module):

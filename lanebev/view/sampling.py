@@ -14,7 +14,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lanebev.view.kept import KeptArrays
 from lanebev.view.lens import Lens, image_planes
+
+_kept = KeptArrays()
 
 LEAST_DEPTH = 1e-3  # in front of the camera; m for cells of the road
 _PUSH = 1e4  # factor that moves what lies outside away from the map, even a millimetre above the road
@@ -30,7 +33,7 @@ class Cells(Protocol):
         ...
 
     def rows(self, first: int, last: int) -> Tensor:
-        """Return those of rows first to last - 1, (B, 3, last - first, V)."""
+        """Return those of rows first to last - 1, (B, 3, last - first, V), a tensor of its own."""
         ...
 
 
@@ -124,6 +127,9 @@ def sampling_maps(
 ) -> tuple[list[Tensor], Tensor]:
     """Compute the maps for :func:`resample`.
 
+    Where nothing asks for a gradient, they are written to memory that the next call in this thread writes to
+    again: they are to be used up before.
+
     Args:
         cells: homogeneous coordinates, :func:`normalised_intrinsics` applied; with a lens in the camera.
         lens: into normalised coordinates, or None.
@@ -133,6 +139,8 @@ def sampling_maps(
     Returns:
         (B, 2, R, V) for each size, and (B, 1, R, V) bool: valid.
     """
+    if _may_overwrite():
+        return _filled_maps(cells, lens, sizes, image_size)
     batch, rows, columns = cells.shape
     block = max(1, BLOCK // max(1, batch * columns))
     if torch.compiler.is_compiling():  # compiled code has no planes in between
@@ -151,7 +159,52 @@ def sampling_maps(
     return stacked, torch.cat(invalid, dim=1).logical_not().unsqueeze(1)
 
 
-def map_coordinate(coordinate: Tensor, cells: int, stride: float | None, pixels: int) -> Tensor:
+def _may_overwrite() -> bool:
+    """Whether results need no graph, be it of gradients or of operations."""
+    traced = torch.compiler.is_compiling() or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
+    return not (torch.is_grad_enabled() or traced or torch._C._are_functorch_transforms_active())
+
+
+def _filled_maps(
+    cells: Cells, lens: Lens | None, sizes: Sequence[MapSize], image_size: tuple[int, int]
+) -> tuple[list[Tensor], Tensor]:
+    """Compute what :func:`sampling_maps` does, by the same arithmetic in place, in memory that is kept."""
+    batch, rows, columns = cells.shape
+    like = cells.rows(0, 0)
+    maps = [_kept_map(number, (batch, 2, rows, columns), like) for number in range(len(sizes))]
+    valid = torch.empty((batch, 1, rows, columns), dtype=torch.bool, device=like.device)
+    block = max(1, BLOCK // max(1, batch * columns))
+    for first in range(0, rows, block):
+        last = min(first + block, rows)
+        homogeneous = cells.rows(first, last)
+        depth = homogeneous[:, 2]
+        ahead = depth.clamp(min=LEAST_DEPTH)
+        points = homogeneous[:, :2].div_(ahead.unsqueeze(1))
+        outside = ahead.sub_(depth)
+        if lens is not None:
+            points, beyond = image_planes(points, lens)
+            outside += beyond
+        for beyond in F.hardshrink(points, 1.0).unbind(1):
+            outside.addcmul_(beyond, beyond)
+        for size, whole in zip(sizes, maps, strict=True):
+            x, y = whole[:, :, first:last].unbind(1)
+            map_coordinate(points[:, 0], size.width, size.stride, image_size[1], out=x)
+            map_coordinate(points[:, 1], size.height, size.stride, image_size[0], out=y)
+            x.add_(outside, alpha=_PUSH)
+        torch.logical_not(outside.bool(), out=valid[:, 0, first:last])
+    return maps, valid
+
+
+def _kept_map(number: int, shape: tuple[int, int, int, int], like: Tensor) -> Tensor:
+    """Memory for the map of this number; the device's own store of memory elsewhere than on a CPU."""
+    if like.device.type != "cpu":
+        return like.new_empty(shape)
+    return torch.from_numpy(_kept(f"map {number}", shape, like.numpy().dtype))
+
+
+def map_coordinate(
+    coordinate: Tensor, cells: int, stride: float | None, pixels: int, out: Tensor | None = None
+) -> Tensor:
     """Transform a normalised coordinate of the image to that of a map, clamped to its outermost centres.
 
     Args:
@@ -159,11 +212,14 @@ def map_coordinate(coordinate: Tensor, cells: int, stride: float | None, pixels:
         cells: of the map along it.
         stride: px, or None, see :class:`MapSize`.
         pixels: of the image along it.
+        out: (B, R, V) to write to.
     """
     if stride is not None:  # x of the image to x / stride of the map
         scale = pixels / (stride * cells)
         coordinate = coordinate * scale + ((pixels - 1) / (stride * cells) + 1 / cells - 1)
     centre = 1 - 1 / cells
+    if out is not None:
+        return torch.clamp(coordinate, -centre, centre, out=out)
     return F.hardtanh(coordinate, -centre, centre)
 
 
