@@ -13,6 +13,7 @@ _SHARED = 0.2  # sigmas by which all end points of a boundary may be off alike
 _KNOWN = 1e-3  # share of a prediction-free score's variance below which the prediction determines the entry
 _FREE_POSE = (0.05, 0.05, 0.05, 0.3)  # rad, m: sigmas added where the pose is free
 _LARGEST_EXCESS = 4.0  # of a squared score; a larger one is a jump
+EQUAL = 0.1  # of the deviations of unequal lanes, up to which lanes are equal
 _CALL = 5.0  # sigmas of evidence at which half of the noise is admitted
 
 
@@ -114,9 +115,13 @@ def deviation_prior_std(deviations: Tensor, cfg: JointConfig) -> Tensor:
 
     Source: (J19).
 
-    A single boundary out of place is a detector's error. Of six deviations three combinations cannot be
-    observed, since changes of offset, height and roll have the same effect: they may be three times as large.
+    A single boundary out of place is a detector's error, and errors that last let a second one deviate by
+    ``EQUAL`` of ``open_deviation``: that much is subtracted in variance, so that a deviation a little larger
+    than that admits little. Of six deviations three combinations cannot be observed, since changes of
+    offset, height and roll have the same effect: they may be three times as large.
     """
     size = cfg.open_deviation
     second = deviations.abs().topk(2, dim=-1).values[:, 1]
-    return torch.where(second > 0.1 * size, (3 * second).clamp(max=size), 0.0)
+    excess = second.square() - (EQUAL * size) ** 2
+    unequal = excess > 0
+    return torch.where(unequal, 3 * torch.where(unequal, excess, 1.0).sqrt(), 0.0).clamp(max=size)

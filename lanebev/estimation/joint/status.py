@@ -7,7 +7,7 @@ from torch import Tensor
 
 from lanebev.batch import flag, select_rows
 from lanebev.estimation.checks import is_running
-from lanebev.estimation.joint.evidence import deviation_prior_std
+from lanebev.estimation.joint.evidence import EQUAL, deviation_prior_std
 from lanebev.estimation.joint.layout import NUM_POSE, POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL, Observations
 from lanebev.estimation.joint.state import JointConfig, JointState, unobserved_mask
@@ -79,7 +79,7 @@ def single_deviation(deviations: Tensor, cfg: JointConfig) -> Tensor:
     """Compute by how much (B,) m any boundary may be out of place if exactly one is."""
     size = cfg.open_deviation
     worst = deviations.abs().amax(-1)
-    alone = (worst > 0.1 * size) & (worst < _DOUBTFUL) & (deviation_prior_std(deviations, cfg) == 0)
+    alone = (worst > EQUAL * size) & (worst < _DOUBTFUL) & (deviation_prior_std(deviations, cfg) == 0)
     return torch.where(alone, worst.clamp(max=size), 0.0)
 
 
