@@ -13,7 +13,9 @@ import pytest
 import torch
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.reasons import Reason
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
+from lanebev.observation.segments import LaneSegments
 from lanebev.testing.evaluation import UNITS, WARM_UP, Track, summarise, track
 from lanebev.testing.experiment import Experiment
 from lanebev.testing.scenarios import CAMERA, PLACES, SCENARIOS, WIDTH, Moment, moments, observe
@@ -254,3 +256,50 @@ def test_lost_after_long_nothing_and_recovers_without_help():
     assert (run.status[40:45] == LOST).all()
     assert (run.status[46:] == Status.TRACKING).all()
     assert (run.errors[50:].abs() * UNITS < torch.tensor([0.05, 0.15, 0.08, 0.8])).all()
+
+
+def _cut(t: float, moment: Moment) -> Moment:
+    """From 1 s on another vehicle's camera."""
+    if t < 1.0:
+        return moment
+    pose = (moment.pose[0] - 0.05, moment.pose[1] + 0.05, moment.pose[2] - 0.035, moment.pose[3] + 0.9)
+    return replace(moment, pose=pose, offset=moment.offset + 0.8)
+
+
+@pytest.mark.parametrize("visible", [(0, 1, 2, 3, 4, 5), (2, 3)])
+def test_comes_back_within_half_a_second_of_a_cut_and_is_honest_before(visible):
+    """All lanes or the ego lane in view; roll stays at its prior with the latter."""
+    drive = moments(1.5, lambda t, m: replace(_cut(t, m), visible=visible))
+    with torch.inference_mode():
+        run = track(JointCalibrator(), drive, 3, per_boundary=8)
+    assert (run.status[29] == Status.TRACKING).all()
+    assert (run.status[31:34] == Status.COASTING).all()
+    assert (run.errors.square() <= 9 * run.variances).double().mean() > 0.97
+    assert (run.status[-1] == Status.TRACKING).all()
+    late = run.errors[-2:].square().mean((0, 1)).sqrt() * UNITS
+    limits = [0.04, 0.12, 0.05, 1.0] if len(visible) == 6 else [0.15, 0.2, 4.0, 8.0]
+    assert (late < torch.tensor(limits)).all(), late
+
+
+@pytest.mark.parametrize("name", ["50 % outliers, 5 % wrong index", "unequal lanes", "bumps 1 deg in 0.2 s"])
+def test_does_not_start_anew_without_a_shock(name):
+    calibrator, change = JointCalibrator(), SCENARIOS[name][1]
+    state = calibrator.initial_state(3, dtype=torch.float64)
+    with torch.inference_mode():
+        for k, (moment, segments) in enumerate(observe(moments(1.3, change), 3, 1.0, 8, 1, torch.float64)):
+            _, state = calibrator(segments, CAMERA.expand(3, 3, 3), state, moment.dt, WIDTH)
+            started = (state.reasons & int(Reason.RESTARTED)) != 0
+            assert started.tolist() == [k == 0] * 3
+
+
+def test_a_cut_in_one_row_leaves_the_others_as_they_are():
+    calibrator = JointCalibrator()
+    usual, cut = (list(observe(moments(1.3, c), 1, 1.0, 8, 2, torch.float64)) for c in (None, _cut))
+    both, alone = (calibrator.initial_state(rows, dtype=torch.float64) for rows in (2, 1))
+    with torch.inference_mode():
+        for (moment, one), (_, other) in zip(usual, cut, strict=True):
+            pair = LaneSegments(*(torch.cat(parts) for parts in zip(one, other, strict=True)))
+            _, both = calibrator(pair, CAMERA.expand(2, 3, 3), both, moment.dt, WIDTH)
+            _, alone = calibrator(one, CAMERA[None], alone, moment.dt, WIDTH)
+    torch.testing.assert_close(both.mean[:1], alone.mean, rtol=1e-9, atol=1e-12)
+    assert both.mean[1, 3] > 2.0  # m: this one started anew

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.batch import flag, may_skip, select_rows
+from lanebev.batch import flag, select_rows
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.checks import (
     as_lane_width,
@@ -27,8 +27,6 @@ from lanebev.estimation.joint.lane_change import best_shift, renumber
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, NUM_SHAPE, POSE, SHAPE, STEPS, layout
 from lanebev.estimation.joint.measurement import (
     CURVATURE,
-    HEIGHT,
-    ROLL,
     Observations,
     boundary_distances,
     boundary_places,
@@ -37,9 +35,9 @@ from lanebev.estimation.joint.measurement import (
     look,
     observations,
 )
+from lanebev.estimation.joint.restart import restart
 from lanebev.estimation.joint.road import propagate_road_shape
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
-from lanebev.estimation.joint.single_frame import fit_observations
 from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit, unobserved_mask
 from lanebev.estimation.joint.status import as_calibration, update_track_status
 from lanebev.estimation.joint.update import (
@@ -103,6 +101,8 @@ class JointCalibrator(Calibrator[JointState]):
             early=zero.clone(),
             unseen=zero,
             misfit=zero.clone(),
+            doubt=zero.clone(),
+            contrary=zero.clone(),
             status=none + int(Status.UNINITIALISED),
             reasons=none + int(Reason.NO_START),
         )
@@ -131,12 +131,13 @@ class JointCalibrator(Calibrator[JointState]):
         predicted = predict_state(state, step, cfg)
         updated, trust, agreed, alone = update_state(predicted, positions, seen, step, cfg)
         after, supported = update_track_status(predicted, updated, trust, alone, step, seen, cfg)
-        after, agreed = _restart(after, agreed, supported, seen, positions, cfg)
+        after, agreed, apart = restart(after, agreed, supported, seen, positions, cfg)
         after = after._replace(reasons=after.reasons | flag(guessed, Reason.TIME))
 
         skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=early)
         after = select_rows(skip, skipped, after)
-        calibration = as_calibration(after, agreed, positions, cfg)
+        apart = torch.where(skip.unsqueeze(-1), 0.0, apart)
+        calibration = as_calibration(after, agreed, apart, positions, cfg)
         return unused_frame(calibration, skip), after
 
     def weigh_still(
@@ -246,42 +247,3 @@ def update_state(
     apart = torch.maximum(result.mean[:, place.deviations].abs(), apart.abs())
     lane = (apart < _NO_BOUNDARY).gather(1, seen.boundary)
     return updated, frame.trust, torch.where((seen.weight > 0) & lane, agreed, 0.0), alone
-
-
-def _restart(
-    state: JointState,
-    agreed: Tensor,
-    supported: Tensor,
-    seen: Observations,
-    positions: Tensor,
-    cfg: JointConfig,
-) -> tuple[JointState, Tensor]:
-    """Start rows that have no state, or none that fits, from this frame alone if it determines the pose."""
-    wanted = ~is_running(state.status) | (~supported & (state.misfit > cfg.restart_after))
-    wanted = wanted & (seen.weight > 0).any(-1)
-    if may_skip(wanted):
-        return state, agreed
-    fit = fit_observations(
-        seen, positions.gather(1, seen.boundary), cfg.prior, iterations=cfg.start_iterations
-    )
-    share = (fit.inliers * seen.weight).sum(-1) / seen.weight.sum(-1).clamp(min=1e-6)
-    fresh = wanted & fit.valid & (share >= cfg.enter_share)
-    mean, cov = state_from_fit(fit.params(), fit.covariance, cfg)
-    zero = torch.zeros_like(state.unseen)
-    begun = JointState(
-        mean=mean,
-        cov=cov,
-        phase=zero,
-        evidence=torch.zeros_like(state.evidence),
-        pose_sensitivity=torch.zeros_like(state.pose_sensitivity),
-        motion_scale=torch.ones_like(state.motion_scale),
-        early=zero,
-        unseen=zero,
-        misfit=zero,
-        status=torch.full_like(state.status, int(Status.TRACKING)),
-        reasons=int(Reason.RESTARTED)
-        | flag(~fit.observed[:, ROLL], Reason.ROLL_UNSEEN)
-        | flag(~fit.observed[:, HEIGHT], Reason.HEIGHT_UNSEEN),
-    )
-    after = select_rows(fresh, begun, state)
-    return after, torch.where(fresh.unsqueeze(-1), fit.inliers, agreed)

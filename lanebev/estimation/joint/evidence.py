@@ -14,7 +14,7 @@ _KNOWN = 1e-3  # share of a prediction-free score's variance below which the pre
 _FREE_POSE = (0.05, 0.05, 0.05, 0.3)  # rad, m: sigmas added where the pose is free
 _LARGEST_EXCESS = 4.0  # of a squared score; a larger one is a jump
 EQUAL = 0.1  # of the deviations of unequal lanes, up to which lanes are equal
-_CALL = 5.0  # sigmas of evidence at which half of the noise is admitted
+CALL = 5.0  # sigmas of evidence at which half of the noise is admitted
 
 
 def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor) -> Tensor:
@@ -102,7 +102,7 @@ def adaptive_process_noise(evidence: Tensor, cov: Tensor, cfg: JointConfig) -> T
     """
     parts = evidence.square().split([NUM_POSE, NUM_SHAPE, cfg.num_boundaries], dim=-1)
     worst = [part.amax(-1, keepdim=True) for part in parts]
-    pose, bend, own = (0.01 * torch.sigmoid(0.5 * (most - _CALL**2)) * most for most in worst)
+    pose, bend, own = (0.01 * torch.sigmoid(0.5 * (most - CALL**2)) * most for most in worst)
     jump = evidence.new_tensor([cfg.open_pose] * 3 + [10 * cfg.open_pose, 0.0]).square()
     change = evidence.new_tensor([cfg.open_curvature] + [cfg.open_step] * (NUM_SHAPE - 1)).square()
     room = cfg.open_deviation**2 - cov.diagonal(dim1=1, dim2=2)[:, DEVIATIONS]

@@ -49,6 +49,8 @@ class JointConfig:
         restart_after: s of segments that don't fit before the search starts over.
         lost_after: s without support.
         readings: of images on their own, how roads and detectors differ from what is assumed.
+        doubt_frames: after a jump or a misfit, that are compared, each by itself, with the state.
+        contrary_frames: usable frames in a row that have to contradict it.
     """
 
     num_boundaries: int = NUM_BOUNDARIES
@@ -74,6 +76,8 @@ class JointConfig:
     restart_after: float = 0.3
     lost_after: float = 5.0
     readings: ReadingConfig = field(default_factory=ReadingConfig)
+    doubt_frames: int = 15
+    contrary_frames: int = 5
 
     def __post_init__(self) -> None:
         if self.num_boundaries < 2 or self.num_boundaries % 2:
@@ -106,6 +110,8 @@ class JointState(NamedTuple):
         early: (B,) s by which the state is ahead of the last frame, which came out of order.
         unseen: (B,) s since the last usable frame.
         misfit: (B,) s for which there were segments that did not fit.
+        doubt: (B,) frames that are still to be compared, each by itself, with the state.
+        contrary: (B,) usable frames in a row that contradicted the state by themselves.
         status: (B,) int64, values of Status.
         reasons: (B,) int64, :class:`Reason` flags of the last frame; those of what is unseen decide how the
             next prediction moves.
@@ -120,6 +126,8 @@ class JointState(NamedTuple):
     early: Tensor
     unseen: Tensor
     misfit: Tensor
+    doubt: Tensor
+    contrary: Tensor
     status: Tensor
     reasons: Tensor
 

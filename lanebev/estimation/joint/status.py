@@ -83,16 +83,20 @@ def single_deviation(deviations: Tensor, cfg: JointConfig) -> Tensor:
     return torch.where(alone, worst.clamp(max=size), 0.0)
 
 
-def as_calibration(state: JointState, inliers: Tensor, positions: Tensor, cfg: JointConfig) -> Calibration:
+def as_calibration(
+    state: JointState, inliers: Tensor, apart: Tensor, positions: Tensor, cfg: JointConfig
+) -> Calibration:
     """Make the calibration of a state.
 
     Its covariance adds what the filter does not estimate: the common scale of the lane widths; the deviation
-    that any boundary may have if one has; and the effect on height of an error of roll to second order, where
-    roll is not observed. With boundaries at x₁ and x₂ seen as they are, h'' = -2 (h - x₁ x₂ / h).
+    that any boundary may have if one has; the difference from a frame that contradicts the state; and the
+    effect on height of an error of roll to second order, where roll is not observed. With boundaries at x₁
+    and x₂ seen as they are, h'' = -2 (h - x₁ x₂ / h).
 
     Args:
         state: (B, ...).
         inliers: (B, N).
+        apart: (B, 4) or (1, 4), pose of a frame that contradicts the state, less the state's; else 0.
         positions: (B, L) m, of the boundaries from the ego lane's middle.
         cfg: the numbers.
     """
@@ -106,5 +110,6 @@ def as_calibration(state: JointState, inliers: Tensor, positions: Tensor, cfg: J
     deviations = state.mean[:, layout(cfg.num_boundaries).deviations]
     by_lanes = single_deviation(deviations, cfg)[:, None, None] * state.pose_sensitivity
     only_height = torch.arange(NUM_POSE, device=cov.device) == HEIGHT
-    cov = cov + by_lanes @ by_lanes.mT + (only_height * more.unsqueeze(-1)).diag_embed()
+    cov = cov + by_lanes @ by_lanes.mT + apart.unsqueeze(-1) * apart.unsqueeze(-2)
+    cov = cov + (only_height * more.unsqueeze(-1)).diag_embed()
     return Calibration(Extrinsics.unstack(state.mean[:, POSE]), cov, state.status, inliers)

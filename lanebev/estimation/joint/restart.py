@@ -1,0 +1,157 @@
+"""Starts of the joint filter: without a state, with one that does not fit, or one that frames contradict.
+
+After a shock the filter may have taken a wrong pose for unequal lanes or a bend, and be content with it. So
+for a while after every jump each frame is fitted by itself, without what the filter has learned.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lanebev.batch import flag, may_skip, select_rows
+from lanebev.estimation.checks import is_running
+from lanebev.estimation.joint.evidence import CALL
+from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, layout
+from lanebev.estimation.joint.measurement import (
+    HEIGHT,
+    NUM_STRAIGHT,
+    ROLL,
+    Observations,
+    boundary_residuals,
+)
+from lanebev.estimation.joint.robust import log_likelihood
+from lanebev.estimation.joint.single_frame import SingleFrameFit, fit_observations
+from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit
+from lanebev.estimation.reasons import Reason
+from lanebev.geometry.linalg import inverse_spd
+from lanebev.types import Status
+
+_FAR = 25.7  # χ² of pose and offset, five degrees of freedom, exceeded by chance once in 10,000 frames
+_FEW = 0.5  # share of the segments that fit, below which the state is in doubt
+
+
+def restart(
+    state: JointState,
+    agreed: Tensor,
+    supported: Tensor,
+    seen: Observations,
+    positions: Tensor,
+    cfg: JointConfig,
+) -> tuple[JointState, Tensor, Tensor]:
+    """Start rows from this frame alone if it determines the pose, and if no state, or a worse one, is there.
+
+    A state that a second frame contradicts is COASTING until enough of them did.
+
+    Args:
+        state: after the frame.
+        agreed: (B, N), inliers.
+        supported: (B,) bool, the frame supports the state.
+        seen: what was observed.
+        positions: (B, L) m, of the boundaries from the ego lane's middle.
+        cfg: the numbers.
+
+    Returns:
+        the state; the inliers; and the difference (B, 4), or (1, 4), of the pose from that of a frame that
+        contradicts it, else 0.
+    """
+    total = seen.weight.sum(-1).clamp(min=1e-6)
+    state = state._replace(doubt=remaining_doubt(state, (agreed * seen.weight).sum(-1) / total, cfg))
+    there = (seen.weight > 0).any(-1)
+    wanted = (~is_running(state.status) | (~supported & (state.misfit > cfg.restart_after))) & there
+    asked = wanted | (is_running(state.status) & there & (state.doubt > 0))
+    if may_skip(asked):
+        kept = state._replace(contrary=torch.zeros_like(state.contrary))
+        return kept, agreed, state.mean.new_zeros(1, NUM_POSE)
+    places = positions.gather(1, seen.boundary)
+    fit = fit_observations(seen, places, cfg.prior, iterations=cfg.start_iterations)
+    share = (fit.inliers * seen.weight).sum(-1) / total
+    usable = fit.valid & (share >= cfg.enter_share)
+    begun = state_of_fit(fit, state, cfg)
+    contrary = asked & usable & is_contrary(state, begun, fit, places, seen, cfg)
+    count = torch.where(usable | ~asked, (state.contrary + 1) * contrary, state.contrary)
+    fresh = usable & (wanted | (count >= cfg.contrary_frames))
+    doubted = contrary & ~fresh
+    kept = state._replace(
+        contrary=count,
+        status=torch.where(doubted & (count > 1), int(Status.COASTING), state.status),
+        reasons=state.reasons | flag(doubted & (count > 1), Reason.FEW_INLIERS),
+    )
+    apart = torch.where(doubted.unsqueeze(-1), (begun.mean - state.mean)[:, POSE], 0.0)
+    return select_rows(fresh, begun, kept), torch.where(fresh.unsqueeze(-1), fit.inliers, agreed), apart
+
+
+def remaining_doubt(state: JointState, share: Tensor, cfg: JointConfig) -> Tensor:
+    """Compute in how many more frames (B,) the frame is compared: some after a jump or a misfit.
+
+    Args:
+        state: after the frame.
+        share: (B,), of the frame's segments that fit the state.
+        cfg: the numbers.
+    """
+    jumped = (state.evidence[:, :NUM_POSE].abs() > CALL).any(-1)
+    return torch.where(jumped | (share < _FEW), float(cfg.doubt_frames), (state.doubt - 1).clamp(min=0))
+
+
+def is_contrary(
+    state: JointState,
+    begun: JointState,
+    fit: SingleFrameFit,
+    places: Tensor,
+    seen: Observations,
+    cfg: JointConfig,
+) -> Tensor:
+    """Tell whether a frame by itself says something else than the state, and explains itself no worse.
+
+    Source: (J25).
+
+    If the state is right, its error is part of the frame's, so that their difference has no more than the
+    covariance of the frame's fit. The state has the deviations beside, which the fit has not: they must raise
+    the likelihood by more than parameters that mean nothing would (Schwarz 1978).
+
+    Args:
+        state: after the frame.
+        begun: the state that would start from the frame.
+        fit: of the frame.
+        places: (B, N) m, of the segments' boundaries on equal lanes.
+        seen: what was observed.
+        cfg: the numbers.
+
+    Returns:
+        (B,) bool.
+    """
+    straight = slice(0, NUM_STRAIGHT)
+    apart = (state.mean - begun.mean)[:, straight].unsqueeze(-1)
+    chi2 = (apart.mT @ inverse_spd(begun.cov[:, straight, straight]) @ apart).flatten()
+    own = state.mean[:, layout(cfg.num_boundaries).deviations].gather(1, seen.boundary)
+    with_state = boundary_residuals(state.mean[:, :NUM_COMMON], places + own, seen, state.phase)
+    alone = boundary_residuals(fit.params(), places, seen)
+    by_state, by_fit = (
+        log_likelihood(at.distance, at.valid, seen.weight, seen.sigma, fit.scale, seen.focal)
+        for at in (with_state, alone)
+    )
+    penalty = 0.5 * cfg.num_boundaries * seen.weight.sum(-1).clamp(min=1.0).log()
+    return (chi2 > _FAR) & (by_fit + penalty > by_state)
+
+
+def state_of_fit(fit: SingleFrameFit, before: JointState, cfg: JointConfig) -> JointState:
+    """Make a state of one frame's fit; nothing of the state before is kept."""
+    mean, cov = state_from_fit(fit.params(), fit.covariance, cfg)
+    zero = torch.zeros_like(before.unseen)
+    return JointState(
+        mean=mean,
+        cov=cov,
+        phase=zero,
+        evidence=torch.zeros_like(before.evidence),
+        pose_sensitivity=torch.zeros_like(before.pose_sensitivity),
+        motion_scale=torch.ones_like(before.motion_scale),
+        early=zero,
+        unseen=zero,
+        misfit=zero,
+        doubt=before.doubt,
+        contrary=zero,
+        status=torch.full_like(before.status, int(Status.TRACKING)),
+        reasons=int(Reason.RESTARTED)
+        | flag(~fit.observed[:, ROLL], Reason.ROLL_UNSEEN)
+        | flag(~fit.observed[:, HEIGHT], Reason.HEIGHT_UNSEEN),
+    )
