@@ -113,7 +113,7 @@ def adaptive_process_noise(evidence: Tensor, cov: Tensor, cfg: JointConfig) -> T
 def deviation_prior_std(deviations: Tensor, cfg: JointConfig) -> Tensor:
     """Compute the prior standard deviation (B,) m of deviations from the second largest; 0 for equal lanes.
 
-    Source: (J19).
+    Source: (J20).
 
     A single boundary out of place is a detector's error, and errors that last let a second one deviate by
     ``EQUAL`` of ``open_deviation``: that much is subtracted in variance, so that a deviation a little larger

@@ -103,7 +103,7 @@ def is_contrary(
 ) -> Tensor:
     """Tell whether a frame by itself says something else than the state, and explains itself no worse.
 
-    Source: (J25).
+    Source: (J19).
 
     If the state is right, its error is part of the frame's, so that their difference has no more than the
     covariance of the frame's fit. The state has the deviations beside, which the fit has not: they must raise
