@@ -4,7 +4,8 @@
 
 Prints and writes (bench.json, bench.md) the RMSE of every parameter, its ratio to the per-frame Cramér-Rao
 bound, NEES per degree of freedom, the time in each status and the time to recover. ``--stream N`` runs N
-frames of an endless drive and watches memory, covariance, drift, and float32 against float64.
+frames of an endless drive and watches memory, covariance, drift, and float32 against float64. ``--kinds N``
+draws N drives of each kind of ``tools/bench_kinds.py``, motions and shocks at random.
 
 "Hard" frames are those a scenario names (nothing to see, a bump, a line crossed); they are counted on their
 own. The first half second is left out of every figure.
@@ -33,6 +34,7 @@ from lanebev.observation.segments import LaneSegments
 from lanebev.testing.evaluation import NAMES, UNITS, WARM_UP, rms, summarise, track
 from lanebev.testing.scenarios import CAMERA, FPS, SCENARIOS, WIDTH, moments, observe
 from lanebev.types import Status
+from tools.bench_kinds import measure_all
 from tools.textbook_ekf import TextbookEKF
 from train.commands import one_line_errors
 
@@ -190,6 +192,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--sigma", type=PositiveFloat, default=1.0, help="noise of an end point, px")
     parser.add_argument("--quick", action="store_true", help="2 rows, 1.5 s of the first two scenarios")
     parser.add_argument("--stream", type=PositiveInt, metavar="N", help="stream N frames instead")
+    parser.add_argument("--kinds", type=PositiveInt, metavar="N", help="N random drives of each kind instead")
     parser.add_argument("--stream-rows", type=PositiveInt, default=2, help="vehicles streamed side by side")
     parser.add_argument("--out", type=Path, default=Path("out/bench"))
     args = parser.parse_args(arguments)
@@ -210,6 +213,10 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
         report["stream"] = stream(args.stream, args.stream_rows)
         print(json.dumps(report["stream"], indent=1))
         (args.out / "stream.json").write_text(json.dumps(report, indent=1))
+        return report
+    if args.kinds:
+        report["kinds"] = measure_all(args.kinds)
+        (args.out / "kinds.json").write_text(json.dumps(report, indent=1))
         return report
     scenarios = args.scenarios[:2] if args.quick else args.scenarios
     with torch.inference_mode():

@@ -1,0 +1,195 @@
+"""The joint filter on drives whose motions and shocks are drawn at random from stated families.
+
+Every seed is another drive, a row of one batch. The seeds are none that a test or a replay uses.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from random import Random
+from typing import Any, NamedTuple
+
+import torch
+
+from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.testing.evaluation import Track, recovery, summarise, within_sigmas
+from lanebev.testing.motions import Pose, fall, landing_time, moved, sinusoids
+from lanebev.testing.scenarios import FPS, SCENARIOS, Moment, moments
+from tools.replay.figures import as_track
+from tools.replay.kinds import EGO_LANE, FRAMES, Generated
+from tools.replay.recording import record, replay
+
+FIRST_SEED = 20_000
+SHOCK = 1.5
+"""s, when a knock or a cut comes."""
+
+ALLOWED = 15
+"""Frames after a shock that ratio and NEES leave out: so long it may take to come back."""
+
+Change = Callable[[float, Moment], Moment]
+
+
+class KindFigures(NamedTuple):
+    """Of all drives of a kind.
+
+    Attributes:
+        ratio: RMSE of pitch, yaw, roll and height by the per-frame bound; NaN where there is none.
+        nees: NEES per degree of freedom; both leave out the first half second, and ``ALLOWED`` frames after a shock.
+        within: share within 3 sigma in the second in which it is lowest, all drives together.
+        back: frames after the shock until all errors are below twice the bound, of every drive; inf if never.
+    """
+
+    ratio: tuple[float, ...]
+    nees: float
+    within: float
+    back: tuple[float, ...]
+
+
+def measure(kind: str, seeds: Sequence[int]) -> KindFigures:
+    """Draw the drives of a kind, follow them, and compute the figures."""
+    drives = [record(KINDS[kind](seed), seed) for seed in seeds]
+    made = replay(JointCalibrator(), drives)
+    each = [as_track(drive, made, row) for row, drive in enumerate(drives)]
+    shock = each[0].hard
+    after = torch.nn.functional.max_pool1d(
+        torch.nn.functional.pad(shock.double()[None, None], (ALLOWED, 0)), ALLOWED + 1, 1
+    )
+    error, variance, nees, status, bound = (
+        torch.cat(parts, dim=1) for parts in zip(*(track[:-1] for track in each), strict=True)
+    )
+    run = Track(error, variance, nees, status, bound, after.flatten() > 0)
+    found = summarise(run)
+    windows = within_sigmas(run).unfold(0, round(FPS), 1).mean(-1)
+    return KindFigures(
+        ratio=tuple(found["ratio_to_bound"]),
+        nees=found["nees_per_dof"],
+        within=float(windows.amin()),
+        back=tuple(_frames(recovery(track, track.bounds[:, 0].sqrt())) for track in each if track.hard.any()),
+    )
+
+
+def measure_all(count: int) -> dict[str, dict[str, Any]]:
+    """Measure every kind on so many drives, print a row of each, and return them for JSON."""
+    seeds = range(FIRST_SEED, FIRST_SEED + count)
+    print(
+        "| kind | × bound: pitch yaw roll height | NEES/dof | within 3 σ, worst second | frames until back |"
+    )
+    print("|---|---|---|---|---|")
+    results = {}
+    for kind in KINDS:
+        found = measure(kind, seeds)
+        ratio = " ".join("–" if math.isnan(value) else f"{value:.2f}" for value in found.ratio)
+        back = f"{min(found.back):.0f} to {max(found.back):.0f}" if found.back else ""
+        print(f"| {kind} | {ratio} | {found.nees:.2f} | {100 * found.within:.0f} % | {back} |", flush=True)
+        results[kind] = found._asdict()
+    return results
+
+
+def _frames(seconds: float | None) -> float:
+    return math.inf if seconds is None else round(seconds * FPS)
+
+
+def _drawn(
+    seed: int, change: Change | None = None, largest_deg: float = 1.5, highest_hz: float = 1.2
+) -> Generated:
+    """Draw a drive whose pitch, yaw and roll are sums of three sinusoids."""
+    motion = sinusoids(seed, largest_deg, highest_hz=highest_hz)
+    return Generated("", lambda: moments(FRAMES / FPS, change, motion))
+
+
+def _curve(seed: int) -> Generated:
+    """Draw the same motion from the straight through a clothoid into R = 300 m and half out of it."""
+    change = SCENARIOS["curves R 300 m, 5-40 m"][1]
+    return Generated("", lambda: moments(FRAMES / FPS, change, sinusoids(seed), start=2.0))
+
+
+def difference(seed: int, degrees: float, metres: float) -> Pose:
+    """Draw a change of the pose of that size in every axis, the signs at random."""
+    random = Random(seed)
+    size = (math.radians(degrees),) * 3 + (metres,)
+    pitch, yaw, roll, height = (random.choice((-1.0, 1.0)) * value for value in size)
+    return pitch, yaw, roll, height
+
+
+def _drop(seed: int) -> Generated:
+    """Fall 1.2 m onto the wheels from the first frame on."""
+
+    def change(t: float, moment: Moment) -> Moment:
+        tag = "falling" if t < landing_time() else ""
+        return replace(moment, pose=moved(moment.pose, fall(t)), tag=tag)
+
+    return _drawn(seed, change)
+
+
+def _knock(seed: int) -> Generated:
+    """Knock the camera by 3° and 25 cm in 0.1 s, for good."""
+    by = difference(seed, 3.0, 0.25)
+
+    def change(t: float, moment: Moment) -> Moment:
+        share = min(max((t - SHOCK) / 0.1, 0.0), 1.0)
+        return replace(moment, pose=moved(moment.pose, by, share), tag="knock" if 0 < share < 1 else "")
+
+    return _drawn(seed, change)
+
+
+def _other_vehicle(seed: int, moment: Moment) -> Moment:
+    random = Random(seed)
+    pitch, yaw, roll, _ = difference(seed, random.uniform(1.0, 4.0), 0.0)
+    by = (pitch, yaw, roll, random.uniform(-0.3, 1.2))
+    return replace(moment, pose=moved(moment.pose, by), offset=moment.offset + random.uniform(-1.0, 1.0))
+
+
+def _cut(seed: int) -> Generated:
+    """Cut to another vehicle's camera, 1 to 4° and -0.3 to 1.2 m away, up to a metre beside."""
+
+    def change(t: float, moment: Moment) -> Moment:
+        if t < SHOCK:
+            return moment
+        return replace(_other_vehicle(seed, moment), tag="cut" if t < SHOCK + 0.5 / FPS else "")
+
+    return _drawn(seed, change)
+
+
+def _resumed(seed: int) -> Generated:
+    """Resume with the state of another vehicle's camera in a bend of R = 400 m."""
+
+    def bend(z: torch.Tensor) -> torch.Tensor:
+        return torch.full_like(z, 1 / 400)
+
+    def before(t: float, moment: Moment) -> Moment:
+        return replace(_other_vehicle(seed, moment), curvature=bend, far=40.0)
+
+    def change(t: float, moment: Moment) -> Moment:
+        return replace(moment, tag="resumed" if t == 0 else "")
+
+    return replace(_drawn(seed, change), resumed=lambda: moments(1.0, before))
+
+
+def in_ego_lane(drive: Generated) -> Generated:
+    """Leave only the ego lane in view."""
+    return replace(drive, moments=lambda: [replace(m, visible=EGO_LANE) for m in drive.moments()])
+
+
+_ALL_LANES: dict[str, Callable[[int], Generated]] = {
+    "motion up to 1.5°, 1.2 Hz": _drawn,
+    "motion up to 2.5°, 1.5 Hz": partial(_drawn, largest_deg=2.5, highest_hz=1.5),
+    "motion up to 1.5°, 1.2 Hz, R 300 m": _curve,
+    "drop": _drop,
+    "knock": _knock,
+    "cut": _cut,
+    "resumed": _resumed,
+}
+
+
+def _ego_lane_of(kind: str, seed: int) -> Generated:
+    return in_ego_lane(_ALL_LANES[kind](seed))
+
+
+KINDS: dict[str, Callable[[int], Generated]] = {
+    **_ALL_LANES,
+    **{f"{kind}, ego lane": partial(_ego_lane_of, kind) for kind in _ALL_LANES},
+}
+"""A drive of each kind by its seed."""
