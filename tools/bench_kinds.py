@@ -37,7 +37,8 @@ class KindFigures(NamedTuple):
 
     Attributes:
         ratio: RMSE of pitch, yaw, roll and height by the per-frame bound; NaN where there is none.
-        nees: NEES per degree of freedom; both leave out the first half second, and ``ALLOWED`` frames after a shock.
+        nees: NEES per degree of freedom. Both leave out the first half second, and ``ALLOWED`` frames after
+            a shock.
         within: share within 3 sigma in the second in which it is lowest, all drives together.
         back: frames after the shock until all errors are below twice the bound, of every drive; inf if never.
     """

@@ -9,6 +9,7 @@ import torch
 
 from lanebev.testing.evaluation import Track, recovery, summarise
 from tools.bench_calibration import main, smallest_eigenvalue, stream
+from tools.bench_kinds import ALLOWED, FIRST_SEED, measure
 
 
 @pytest.mark.slow
@@ -64,3 +65,11 @@ def test_recovery_counts_from_the_end_of_the_hard_frames():
 def test_smallest_eigenvalue_is_of_the_correlations():
     cov = torch.tensor([[[1e-12, 5e-7], [5e-7, 1.0]]])
     assert smallest_eigenvalue(cov) == pytest.approx(0.5, rel=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["cut, ego lane", "knock"])
+def test_shocks_of_drives_on_which_nothing_was_chosen(kind):
+    found = measure(kind, [FIRST_SEED + 500, FIRST_SEED + 501])
+    assert max(found.back) <= ALLOWED
+    assert found.within >= 0.97
