@@ -92,6 +92,7 @@ def test_mount():
 
 
 @pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "calibrator",
     [JointCalibrator(iterations=1, start_iterations=1), TwoStageCalibrator(num_hypotheses=20)],
