@@ -153,4 +153,4 @@ def test_folders_and_what_is_not_there_are_one_line(tmp_path, read):
         with pytest.raises(ValueError, match="expected") as error:
             read(path)
         assert str(error.value)
-    assert load_state(tmp_path / "none").problem.endswith("there is no such file; calibration starts anew")
+    assert load_state(tmp_path / "none").problem.endswith("there is no such file")
