@@ -60,6 +60,7 @@ def test_the_rows_are_the_same(folder, calibrator, monkeypatch):
     assert (folder / "onnxruntime" / "extrinsics.csv").read_text() == rows
 
 
+@pytest.mark.slow
 def test_files_of_another_camera_or_calibrator_are_refused(folder, monkeypatch):
     monkeypatch.setattr(runtime, "OnnxPart", EagerPart)
     other = Camera.from_fov(60.0, 640, 360)

@@ -226,6 +226,7 @@ def _calls(tree):
     return [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
 
 
+@pytest.mark.slow
 def test_nothing_is_unpickled():
     for path in (ROOT / "lanebev").rglob("*.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))

@@ -150,6 +150,7 @@ def _interrupt_when(begun, seconds=60.0):
     os.kill(os.getpid(), signal.SIGINT)
 
 
+@pytest.mark.slow
 def test_ctrl_c_is_the_normal_end_of_a_stream(data, tmp_path, capsys):
     with MjpegServer([_image(number) for number in range(60)], 30.0) as server:
         before = signal.signal(signal.SIGINT, signal.default_int_handler)

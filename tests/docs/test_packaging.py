@@ -112,6 +112,7 @@ def test_help_is_there_before_torch(start):
     assert not imported & {"torch", "numpy", "cv2", "av"}
 
 
+@pytest.mark.slow
 def test_the_command_has_the_public_names_too():
     code = "import sys; sys.argv[0] = 'lanebev'; import lanebev; print(lanebev.Status.TRACKING.name)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

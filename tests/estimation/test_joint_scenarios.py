@@ -281,6 +281,7 @@ def test_comes_back_within_half_a_second_of_a_cut_and_is_honest_before(visible):
     assert (late < torch.tensor(limits)).all(), late
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["50 % outliers, 5 % wrong index", "unequal lanes", "bumps 1 deg in 0.2 s"])
 def test_does_not_start_anew_without_a_shock(name):
     calibrator, change = JointCalibrator(), SCENARIOS[name][1]

@@ -89,6 +89,7 @@ PLANTED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PLANTED)
 def test_a_planted_change_is_noticed(name, straight):
     label, calibrator = PLANTED[name]
@@ -98,6 +99,7 @@ def test_a_planted_change_is_noticed(name, straight):
     assert max(difference.sigmas.values()) < 0.5  # and it is a small change
 
 
+@pytest.mark.slow
 def test_rounding_is_not_noticed():
     """1e-7 px is a hundred thousand times a processor's rounding."""
     drives = recordings(["sharp-bends", "knock", "outliers"])
@@ -143,6 +145,7 @@ def test_compare_says_when_there_is_nothing_to_compare():
     assert compare(_rows(pitch_deg="nan"), _rows(pitch_deg="nan")).within(0.0)
 
 
+@pytest.mark.slow
 def test_figures_of_a_straight_drive(straight):
     _, replayed = replay_all(straight, {"joint": JointCalibrator()})
     found = figures(straight["straight"], replayed["joint"], 0)

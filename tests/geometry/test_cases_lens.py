@@ -141,6 +141,7 @@ def lenses(draw):
     return model, [a * b for a, b in zip(k, scale, strict=False)]
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(lenses(), st.floats(0.02, 0.9), st.integers(0, 11))
 def test_distorted_points_come_back(lens, share, turn):

@@ -135,6 +135,7 @@ def test_padding_carries_no_gradient_that_is_not_finite():
     assert points.grad.isfinite().all()
 
 
+@pytest.mark.slow
 def test_export_equals_eager():
     class Pair(torch.nn.Module):
         def forward(self, vertices, intrinsics, lens):

@@ -105,6 +105,7 @@ def test_overfits_one_image():
     assert loss < 0.05
 
 
+@pytest.mark.slow
 def test_export_equals_eager(small):
     image = torch.rand(2, 3, 64, 96)
     exported = torch.export.export(small, (image,)).module()

@@ -70,6 +70,7 @@ def test_a_row_is_the_same_in_a_batch_of_any_size(kind: str) -> None:
         assert_same(row_of(together, b), alone[b], share=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_tensor_of_the_host_meets_one_of_the_device(kind: str) -> None:
     expected = render_views(4, SIZE, generator(3), kind=kind, rows=4)
@@ -80,6 +81,7 @@ def test_no_tensor_of_the_host_meets_one_of_the_device(kind: str) -> None:
     assert sum(device.waits.values()) < 30
 
 
+@pytest.mark.slow
 def test_waits_and_launches_do_not_grow_with_the_batch() -> None:
     counts = []
     for batch in (8, 24):

@@ -113,6 +113,7 @@ def test_a_page_that_is_not_ours_gives_no_pictures_and_settings(tmp_path, data):
     assert read_run(tmp_path / "run").rows == run.rows
 
 
+@pytest.mark.slow
 def test_the_page_shows_both_and_escapes_them(tmp_path):
     rows = [row._replace(image=f"{row.frame} {HOSTILE}") for row in eventful_rows()]
     first = read_run(_write_run(tmp_path / "a", eventful_report(rows=rows, facts={HOSTILE: HOSTILE})))
@@ -140,6 +141,7 @@ def test_images_on_their_own_are_compared():
     assert "50 of 50 images calibrated" in page
 
 
+@pytest.mark.slow
 def test_command(tmp_path, capsys):
     _write_run(tmp_path / "a", eventful_report())
     _write_run(tmp_path / "b", eventful_report(rows=_changed(eventful_rows(), height_m=0.1)))

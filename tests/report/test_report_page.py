@@ -125,6 +125,7 @@ def test_the_page_loads_nothing(page):
     assert not re.findall(r"fetch\(|XMLHttpRequest|@import|WebSocket|sendBeacon|import\(", own)
 
 
+@pytest.mark.slow
 def test_the_page_stays_small(tmp_path):
     """Ten hours of video at 30 frames a second make a page that a mail takes."""
     first = eventful_rows()
@@ -214,6 +215,7 @@ def test_timeline_has_stretches_without_gaps():
     np.testing.assert_allclose([s.start for s in roll[1:]], np.cumsum([s.width for s in roll])[:-1])
 
 
+@pytest.mark.slow
 def test_timeline_of_a_long_drive_keeps_the_worst():
     rows = [QUIET._replace(frame=i, time_s=i / 20) for i in range(100_000)]
     rows[50_000] = rows[50_000]._replace(status="LOST")

@@ -3,9 +3,12 @@
 import json
 import time
 
+import pytest
+
 from tools import bench_speed
 
 
+@pytest.mark.slow
 def test_tables_and_growth_are_written(tmp_path, monkeypatch):
     monkeypatch.setattr(bench_speed, "SIZE", (60, 120))
     monkeypatch.setattr(bench_speed, "GRID", bench_speed.BEVGrid(resolution=2.0))

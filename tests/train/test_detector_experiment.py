@@ -42,6 +42,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_camera_shakes_about_a_mount_that_is_off():
     poses = torch.stack([
         ShakingDrive(seed, image_size=(16, 32), num_frames=100, fps=10.0).extrinsics_at(t).stack()[0]
@@ -62,6 +63,7 @@ def test_edges_of_the_image_are_bearings_on_the_road():
     assert (left, right) == pytest.approx((-math.pi / 4 - 0.1, math.pi / 4 - 0.1))  # looks left
 
 
+@pytest.mark.slow
 def test_a_drive_comes_back_from_its_file(folder, tmp_path):
     record = read_drive(folder / "3.npz")
     assert record.images().shape == (WARM_UP + 2, *SIZE, 3)
@@ -76,6 +78,7 @@ def test_a_drive_comes_back_from_its_file(folder, tmp_path):
         DriveFrames(tmp_path / "nothing", GRID)
 
 
+@pytest.mark.slow
 def test_each_arm_takes_its_own_pose(folder):
     frames = DriveFrames(folder, GRID).frames
     assert len(frames.image) == 4

@@ -52,6 +52,7 @@ def test_every_config_trains_a_step(config, tmp_path):
     assert any(row["val/recall"] for row in rows)
 
 
+@pytest.mark.slow
 def test_training_goes_on_from_a_weights_file_and_exports_it_unchanged(tmp_path):
     torch.manual_seed(0)
     before = LaneSegmenter(SegmenterConfig(base_width=4, decoder_width=4))

@@ -82,6 +82,7 @@ def test_drives_of_a_steady_camera_are_one_stretch():
     assert (np.abs(stretch.drift) < 4 * stretch.drift_std).all()
 
 
+@pytest.mark.slow
 def test_drift_is_found():
     rate = 0.001  # rad a day
     states = [
