@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import LaneFileObserver, NetworkObserver, Observer
 from lanebev.camera.model import Camera
+from lanebev.estimation.calibrator import Calibrator, StateT
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.single_frame import FramePrior, prior_of_mount
+from lanebev.estimation.joint.single_frame import prior_of_mount
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.tracker import Tracker
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
@@ -48,11 +48,9 @@ def make_grid(config: RunConfig) -> BEVGrid:
     return BEVGrid((left, right), (near, far), resolution)
 
 
-def make_calibrator(name: str, prior: FramePrior | None = None) -> JointCalibrator | TwoStageCalibrator:
-    """Make the calibrator of this name, one of CALIBRATORS, with default settings but for the prior."""
-    if name == "two-stage":
-        return TwoStageCalibrator()
-    return JointCalibrator() if prior is None else JointCalibrator(prior=prior)
+def make_calibrator(name: str) -> JointCalibrator | TwoStageCalibrator:
+    """Make the calibrator of this name, one of CALIBRATORS, with default settings."""
+    return TwoStageCalibrator() if name == "two-stage" else JointCalibrator()
 
 
 def make_tracker(config: RunConfig, camera: Camera) -> RunTracker:
@@ -61,11 +59,17 @@ def make_tracker(config: RunConfig, camera: Camera) -> RunTracker:
     Raises:
         ValueError: ``mount`` is no calibration of a mount.
     """
-    prior = None
-    if config.mount is not None:
-        mount = read_mount(config.mount)
-        prior = prior_of_mount(mount.pose.tolist(), mount.std.tolist())
-    calibrator: Any = make_calibrator(config.calibrator, prior)
+    if config.calibrator == "two-stage":
+        return _tracker(TwoStageCalibrator(), config, camera)
+    if config.mount is None:
+        return _tracker(JointCalibrator(), config, camera)
+    mount = read_mount(config.mount)
+    prior = prior_of_mount(mount.pose.tolist(), mount.std.tolist())
+    return _tracker(JointCalibrator(prior=prior), config, camera)
+
+
+def _tracker(calibrator: Calibrator[StateT], config: RunConfig, camera: Camera) -> Tracker[StateT]:
+    """Make the tracker of a calibrator, or of its export."""
     if config.backend == "onnxruntime":
         calibrator = onnx_calibrator(Path(config.exported), config.calibrator, calibrator)
     return Tracker(calibrator, camera, config.lane_width, config.relative_focal_std, config.lane_width_std)

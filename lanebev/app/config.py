@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import yaml
 
@@ -284,7 +284,7 @@ def read_settings(path: str | Path) -> dict[str, object]:
         raise ValueError(f"config {path}: {error}") from error
 
 
-def parsed_settings(given: Mapping[Any, Any]) -> dict[str, object]:
+def parsed_settings(given: Mapping[str, object]) -> dict[str, object]:
     """Return settings as the command line would have them, of names and values as in a YAML file.
 
     Raises:

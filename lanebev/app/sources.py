@@ -8,7 +8,7 @@ import signal
 import threading
 from collections.abc import Generator, Iterator
 from dataclasses import replace
-from typing import Any
+from types import FrameType
 
 from lanebev.app.build import make_camera
 from lanebev.app.concurrency import map_ahead
@@ -86,7 +86,7 @@ def ended_by_signals(source: FrameSource) -> Iterator[None]:
         numbers = []
     before = {number: signal.getsignal(number) for number in numbers}
 
-    def stop(number: int, frame: Any) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
         source.stop()  # type: ignore[attr-defined]  # no signal is taken of another
         for each, handler in before.items():
             signal.signal(each, handler)

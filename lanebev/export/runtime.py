@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.camera.model import Camera
-from lanebev.estimation.calibrator import Calibrator
+from lanebev.estimation.calibrator import Calibrator, StateT
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.export.write import METADATA, MISSING
 from lanebev.observation.boundary_vertices import BoundaryVertices
@@ -101,7 +101,7 @@ class OnnxExtractor(nn.Module):
         return BoundaryVertices._make(found[f"vertex_{name}"] for name in BoundaryVertices._fields)
 
 
-class OnnxCalibrator(Calibrator[Any]):
+class OnnxCalibrator(Calibrator[StateT]):
     """Stands in for a calibrator.
 
     Args:
@@ -109,7 +109,7 @@ class OnnxCalibrator(Calibrator[Any]):
         calibrator: of which it is the export; knows the state before the first frame and what is in it.
     """
 
-    def __init__(self, part: OnnxPart, calibrator: Calibrator[Any]) -> None:
+    def __init__(self, part: OnnxPart, calibrator: Calibrator[StateT]) -> None:
         super().__init__()
         self.part, self.calibrator = part, calibrator
         self.state_type, self.num_boundaries = calibrator.state_type, calibrator.num_boundaries
@@ -117,13 +117,13 @@ class OnnxCalibrator(Calibrator[Any]):
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
-    ) -> Any:
+    ) -> StateT:
         """See :meth:`~lanebev.estimation.calibrator.Calibrator.initial_state`."""
         return self.calibrator.initial_state(batch_size, dtype, device)
 
     def step(
-        self, segments: LaneSegments, intrinsics: Tensor, state: Any, dt: Tensor, lane_width: Tensor
-    ) -> tuple[Calibration, Any]:
+        self, segments: LaneSegments, intrinsics: Tensor, state: StateT, dt: Tensor, lane_width: Tensor
+    ) -> tuple[Calibration, StateT]:
         """See :meth:`~lanebev.estimation.calibrator.Calibrator.step`."""
         rows, count = segments.weight.shape
         states = {f"state_{name}": value for name, value in state._asdict().items()}
@@ -145,7 +145,7 @@ class OnnxCalibrator(Calibrator[Any]):
         )
         return calibration, type(state)(*(found[f"next_{name}"] for name in states))
 
-    def curvature(self, state: Any) -> Tensor | None:
+    def curvature(self, state: StateT) -> Tensor | None:
         """See :meth:`~lanebev.estimation.calibrator.Calibrator.curvature`."""
         return self.calibrator.curvature(state)
 
@@ -172,7 +172,7 @@ def onnx_model(folder: Path, camera: Camera) -> LaneBEV:
     )
 
 
-def onnx_calibrator(folder: Path, name: str, calibrator: Calibrator[Any]) -> OnnxCalibrator:
+def onnx_calibrator(folder: Path, name: str, calibrator: Calibrator[StateT]) -> Calibrator[StateT]:
     """Make the calibrator of this name in a folder, the export of ``calibrator``.
 
     Raises:

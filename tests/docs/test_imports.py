@@ -79,3 +79,15 @@ def test_no_import_runs_upwards(package):
 
 def test_no_modules_import_each_other():
     TopologicalSorter(GRAPH).prepare()  # raises CycleError, which names the circle
+
+
+def test_nothing_is_of_any_type_where_parts_are_put_together():
+    """Neither the interface of calibrators nor app/ gives up the check of types."""
+    paths = [*(ROOT / "lanebev" / "app").rglob("*.py"), ROOT / "lanebev" / "estimation" / "calibrator.py"]
+    found = {
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for path in paths
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Name) and node.id == "Any"
+    }
+    assert not found

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Any
+from types import ModuleType
 
 from lanebev.app.fleet.plan import Outcome, Task, write_mark
 from lanebev.app.fleet.worker import run_task
@@ -63,7 +63,7 @@ def outcomes(tasks: Sequence[Task], cluster: Cluster) -> Iterator[Outcome]:
             retry_exceptions=True,
         )
         most = max(16, round(_IN_FLIGHT * ray.cluster_resources().get("CPU", 1)))
-        waiting, pending = iter(tasks), dict[Any, Task]()
+        waiting, pending = iter(tasks), dict[object, Task]()
         while True:
             while len(pending) < most and (task := next(waiting, None)) is not None:
                 pending[remote.remote(task)] = task
@@ -76,7 +76,7 @@ def outcomes(tasks: Sequence[Task], cluster: Cluster) -> Iterator[Outcome]:
         ray.shutdown()
 
 
-def _outcome(ray: Any, reference: Any, task: Task) -> Outcome:
+def _outcome(ray: ModuleType, reference: object, task: Task) -> Outcome:
     try:
         outcome: Outcome = ray.get(reference)
     except ray.exceptions.RayTaskError as error:
@@ -93,13 +93,14 @@ def _outcome(ray: Any, reference: Any, task: Task) -> Outcome:
     return outcome
 
 
-def _started(cluster: Cluster) -> Any:
+def _started(cluster: Cluster) -> ModuleType:
+    """Start Ray, or join the cluster of an address, and return its module."""
     check_ray()
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     import ray
 
-    local: dict[str, Any] = {}
+    local: dict[str, object] = {}
     if cluster.address is None:
         local = {
             "num_cpus": None if cluster.workers is None else max(1, round(cluster.workers * cluster.cpus)),
@@ -119,4 +120,5 @@ def _started(cluster: Cluster) -> Any:
         raise ValueError(
             f"fleet: expected a Ray cluster at {where}, got: {str(error).splitlines()[0]}"
         ) from error
-    return ray
+    module: ModuleType = ray
+    return module

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from lanebev.app.fleet.manifest import Drive
@@ -13,6 +13,9 @@ from lanebev.io.formats.folder import read_record
 from lanebev.io.formats.names import check_installed
 from lanebev.io.formats.parquet import frame_table
 from lanebev.io.whole_file import whole_file
+
+if TYPE_CHECKING:
+    import pyarrow
 
 FRAMES = "frames"
 
@@ -51,7 +54,7 @@ def collect_frames(drives: Sequence[Drive], out: str | Path) -> None:
             pyarrow.parquet.write_table(_table(run, drive.name), whole)
 
 
-def _table(run: Path, name: str) -> Any:
+def _table(run: Path, name: str) -> pyarrow.Table:
     import pyarrow as pa
 
     table = frame_table(read_record(run))

@@ -10,9 +10,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from lanebev.app.fleet.cluster import Cluster, check_ray, outcomes
 from lanebev.app.fleet.collect import FRAMES, collect_frames
@@ -209,14 +211,14 @@ def _verdict(out: str, drive: Drive) -> DriveVerdict:
     return DriveVerdict(found.grade, found.headline)
 
 
-def _stretch_fields(stretch: Stretch) -> dict[str, Any]:
+def _stretch_fields(stretch: Stretch) -> dict[str, object]:
     fields = asdict(stretch)
     parts = {"": "pose", "_std": "std", "_drift_per_day": "drift", "_drift_std_per_day": "drift_std"}
     axes = {key: value for end, name in parts.items() for key, value in _axes(end, fields.pop(name)).items()}
     return {**fields, **axes}
 
 
-def _axes(end: str, values: Any) -> dict[str, float | None]:
+def _axes(end: str, values: NDArray[np.float64]) -> dict[str, float | None]:
     """Return the axes of a pose by name, deg and m; None where one is not known."""
     known: dict[str, float | None] = {}
     for axis, value in zip(AXES, values.tolist(), strict=True):

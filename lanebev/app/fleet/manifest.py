@@ -7,11 +7,10 @@ import io
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -23,6 +22,10 @@ PATHS = ("source", "camera", "lanes", "weights", "mount", "resume")  # settings 
 _OWN = ("name", "camera_id", "day", "time")
 _REFUSED = ("out", "source")
 _MOST_NAME = 150  # characters, of which names of files and folders are made
+
+
+Row = dict[str, object]
+"""Settings of a drive by name, as the manifest has them."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,7 @@ def path_inside(text: str, base: Path, inside: Path) -> str:
     return whole
 
 
-def _rows(path: Path) -> list[dict[str, Any]]:
+def _rows(path: Path) -> list[Row]:
     try:
         text = read_text(path)
         if path.suffix.lower() == ".csv":
@@ -108,7 +111,7 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     except (ValueError, yaml.YAMLError, csv.Error) as error:
         reason = "not YAML" if isinstance(error, yaml.YAMLError) else error
         raise ValueError(f"manifest {path}: expected YAML or CSV, got: {reason}") from error
-    defaults: dict[Any, Any] = {}
+    defaults: Row = {}
     if isinstance(given, dict):
         if unknown := [key for key in given if key not in ("drives", "defaults")]:
             raise ValueError(f"manifest {path}: expected drives and defaults, got {shown(unknown[0])}")
@@ -116,10 +119,10 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     is_good = isinstance(given, list) and all(isinstance(row, dict) for row in (*given, defaults))
     if not is_good:
         raise ValueError(f"manifest {path}: expected a list of drives, each with video and camera")
-    return [{**defaults, **row} for row in given]
+    return [{str(key): value for key, value in {**defaults, **row}.items()} for row in given]
 
 
-def _csv_rows(text: str) -> list[dict[str, Any]]:
+def _csv_rows(text: str) -> list[Row]:
     rows = []
     for row in csv.DictReader(io.StringIO(text, newline=""), strict=True):
         if None in row or None in row.values():
@@ -133,12 +136,13 @@ def _csv_rows(text: str) -> list[dict[str, Any]]:
     return rows
 
 
-def _drive(row: Mapping[Any, Any], base: Path, inside: Path) -> Drive:
-    row = {str(key).replace("-", "_"): value for key, value in row.items() if value is not None}
+def _drive(given: Row, base: Path, inside: Path) -> Drive:
+    row = {key.replace("-", "_"): value for key, value in given.items() if value is not None}
     for name in _REFUSED:
         if name in row:
             raise ValueError(f"expected video, camera, {', '.join(_OWN)} or settings of a run, got {name}")
-    if not isinstance(row.get("video"), str) or not row["video"]:
+    video = row.get("video")
+    if not (isinstance(video, str) and video):
         raise ValueError(f"video: expected a path, got {shown(row.get('video', 'none'))}")
     settings = {("source" if key == "video" else key): value for key, value in row.items() if key not in _OWN}
     values = parsed_settings(settings)
@@ -150,7 +154,7 @@ def _drive(row: Mapping[Any, Any], base: Path, inside: Path) -> Drive:
                 raise ValueError(f"{'video' if key == 'source' else key}: {error}") from error
     config = RunConfig(**values)  # type: ignore[arg-type]  # each parsed as its field
     time, day = _time_and_day(row)
-    name = str(row.get("name") or _default_name(row["video"]))
+    name = str(row.get("name") or _default_name(video))
     lens = str(row.get("camera_id") or _default_camera(config))
     for key, text in (("name", name), ("camera_id", lens)):
         if not _is_name(text):
@@ -176,7 +180,7 @@ def _default_camera(config: RunConfig) -> str:
     return Path(config.camera).stem if config.camera else f"fov-{config.fov:g}"
 
 
-def _time_and_day(row: Mapping[str, Any]) -> tuple[str, str]:
+def _time_and_day(row: Row) -> tuple[str, str]:
     """Return time and day in ISO 8601; what is not known is empty, or UNKNOWN_DAY."""
     texts = {}
     for key in ("time", "day"):

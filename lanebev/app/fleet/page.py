@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TypedDict
 from urllib.parse import quote
 
 import numpy as np
 from bokeh.models import ColumnDataSource, HoverTool, Whisker
+from bokeh.plotting import figure
 from markupsafe import Markup
 
 from lanebev.app.fleet.manifest import Drive
@@ -51,6 +52,15 @@ class CameraMounts:
     camera_id: str
     mounts: Sequence[DriveMount]
     stretches: Sequence[Stretch]
+
+
+class StretchWords(TypedDict):
+    """A stretch as the page shows it: how many drives and which, values and drifts by axis."""
+
+    drives: int
+    names: str
+    values: list[str]
+    drifts: list[str]
 
 
 def fleet_page(
@@ -96,7 +106,7 @@ def fleet_page(
     return page
 
 
-def stretch_words(stretch: Stretch) -> dict[str, Any]:
+def stretch_words(stretch: Stretch) -> StretchWords:
     """Return the drives of a stretch, and value and drift of each axis, in words."""
     value, std, drift, drift_std = (
         part * _SCALE for part in (stretch.pose, stretch.std, stretch.drift, stretch.drift_std)
@@ -118,7 +128,7 @@ def stretch_words(stretch: Stretch) -> dict[str, Any]:
     return {"drives": stretch.drives, "names": names, "values": values, "drifts": drifts}
 
 
-def plot_mounts(camera: CameraMounts) -> dict[str, Any]:
+def plot_mounts(camera: CameraMounts) -> dict[str, object]:
     """Return a plot of the mount of each drive with ±2 sigma, red where the camera was moved."""
     times = np.array([days(mount.time) for mount in camera.mounts])
     known = bool(np.isfinite(times).all()) and len(set(times.tolist())) > 1
@@ -126,7 +136,7 @@ def plot_mounts(camera: CameraMounts) -> dict[str, Any]:
     pose = np.stack([mount.pose for mount in camera.mounts]) * _SCALE
     std = np.stack([mount.std for mount in camera.mounts]) * _SCALE
     moved = np.stack([mount.moved for mount in camera.mounts])
-    figures: list[Any] = []
+    figures: list[figure] = []
     for axis, name in enumerate(AXES):
         seen = np.isfinite(pose[:, axis])
         shown = figures[0].x_range if figures else x_range(x)

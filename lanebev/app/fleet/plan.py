@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from lanebev import __version__
 from lanebev.app.config import RunConfig
@@ -143,7 +142,7 @@ def failure_path(task: Task) -> Path:
 
 def _read_mark(path: Path, task: Task) -> Outcome | None:
     try:
-        found: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(path.read_text(encoding="utf-8"))
         if found["fingerprint"] != task.fingerprint:
             return None
         return Outcome(**{name: found[name] for name in Outcome.__dataclass_fields__})
