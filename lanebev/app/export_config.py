@@ -27,7 +27,9 @@ class ExportConfig:
     part: str | None = option(None, "one part only, instead of what a run needs and the step", choices=PARTS)
     format: str = option("onnx", "of the files (default {})", choices=FORMATS)
     out: str = option("lanebev-export", "output folder (default {})", "DIR")
-    calibrator: str = option("joint", "two-stage is the paper's (default {})", choices=CALIBRATORS)
+    calibrator: str = option(
+        "joint", "two-stage is the paper's (default {}, which takes very long as ONNX)", choices=CALIBRATORS
+    )
     weights: str | None = option(None, "weights of the network instead of the shipped ones", "FILE")
 
     def __post_init__(self) -> None:
