@@ -3,13 +3,21 @@
     python -m tools.stream_check --minutes 10
 
 A server on a loopback address plays a rendered drive at a fixed rate as MJPEG over HTTP, and ``lanebev run``
-looks at it in a process of its own until it is interrupted. Printed are the delay from a frame's arrival to
-its result, the frames that came, were used and dropped, and the process's resident memory over time.
+looks at it in a process of its own until it is interrupted. Passed is what has
+
+- every frame handed on within 0.5 s of its arrival, and its result there within 2 s: how long one frame takes
+  to look at is the machine's;
+- at most 1 s of frames underway, which the server has sent and the run has not received;
+- as many frames used as rows written, and the others counted as dropped;
+- resident memory that grows by 10 % at most after the first half minute.
+
+Prints the figures, what is amiss, and at the end all of it as a line of JSON.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import re
 import signal
@@ -19,6 +27,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from types import TracebackType
@@ -27,11 +36,67 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lanebev.io.results import read_extrinsics
+from lanebev.numbers import parse_size
+
 _BOUNDARY = "frame"
 _WARM_UP = 30.0  # s, in which buffers fill; memory is compared from then on
-_MOST_DELAY = 2.0  # s
-_MOST_GROWTH = 1.2  # resident memory at the end over that after the warm-up
-_SMALL_IMAGE = (360, 640)
+_PATIENCE = 120.0  # s, until a run has looked at its first frames
+_MOST_DELAY, _MOST_WAIT, _MOST_UNDERWAY = 2.0, 0.5, 1.0  # s
+_MOST_GROWTH = 1.1  # resident memory at the end over that after the warm-up
+
+
+@dataclass(frozen=True)
+class StreamFigures:
+    """What a run on a stream did.
+
+    Attributes:
+        seconds: that it was watched.
+        fps: frames a second that the server sends.
+        sent: frames that the server had sent when the run was told to end.
+        used, dropped: frames of which the run says so.
+        rows: of extrinsics.csv.
+        wait: s at most from a frame's arrival to when it was handed on.
+        delay: s at most from a frame's arrival to its result.
+        memory: MiB, resident, every second after the warm-up.
+    """
+
+    seconds: float
+    fps: float
+    sent: int
+    used: int
+    dropped: int
+    rows: int
+    wait: float
+    delay: float
+    memory: tuple[float, ...]
+
+    @property
+    def underway(self) -> float:
+        """Frames that were sent and had not come, as s of the stream."""
+        return max(0, self.sent - self.used - self.dropped) / self.fps
+
+    @property
+    def growth(self) -> float:
+        """Resident memory at the end over that after the warm-up."""
+        return self.memory[-1] / self.memory[0]
+
+    def problems(self) -> list[str]:
+        """Return what is out of bounds, a line each."""
+        bounds = (
+            ("delay from arrival to result", self.delay, _MOST_DELAY, "s"),
+            ("wait from arrival to use", self.wait, _MOST_WAIT, "s"),
+            ("frames underway", self.underway, _MOST_UNDERWAY, "s"),
+            ("memory at the end over that after the warm-up", self.growth, _MOST_GROWTH, ""),
+        )
+        found = [
+            f"{name}: expected {most:g} {unit} at most, got {value:.2f}".replace("  ", " ")
+            for name, value, most, unit in bounds
+            if not value <= most
+        ]
+        if self.rows != self.used or not self.used:
+            found.append(f"rows: expected one a frame of the {self.used} used, got {self.rows}")
+        return found
 
 
 class MjpegServer:
@@ -93,39 +158,73 @@ def resident_mib(process: int) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Play, look, print; 1 if the delay is not bounded or memory is not flat."""
+    """Play, look, print; 1 if something is out of bounds."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--fps", type=float, default=30.0)
+    parser.add_argument("--size", type=parse_size, default=(360, 640), metavar="WxH", help="640x360")
     options = parser.parse_args(arguments)
+    found = watch(60 * options.minutes, options.fps, options.size)
+    print(f"{options.minutes:g} minutes at {options.fps:g} fps on {os.cpu_count()} cores")
+    rate = found.used / found.seconds
+    print(f"frames: {found.sent} sent, {found.used} used ({rate:.1f} a second), {found.dropped} dropped")
+    print(f"delay from arrival to result: at most {found.delay:.2f} s, {found.wait:.2f} s of them waiting")
+    print(f"underway at the end: {found.underway:.2f} s")
+    low, high = found.memory[0], found.memory[-1]
+    print(f"resident memory: {low:.0f} MiB after the warm-up, {high:.0f} MiB at the end")
+    problems = found.problems()
+    print("\n".join(problems) if problems else "passed")
+    figures = asdict(found) | {"memory": [low, high], "underway": found.underway, "problems": problems}
+    print(json.dumps(figures))
+    return int(bool(problems))
+
+
+def watch(seconds: float, fps: float, size: tuple[int, int]) -> StreamFigures:
+    """Run on a stream of rendered images of a size (height, width) px; what was seen of it.
+
+    Raises:
+        RuntimeError: the run did not begin, or ended before it was told to.
+    """
     from lanebev.render import Drive
 
-    drive = Drive(10, _SMALL_IMAGE, 60, options.fps)
+    drive = Drive(10, size, 60, fps)
     pictures = (drive.frame(number).image[0] for number in range(len(drive)))
     images = [(255 * each.permute(1, 2, 0)).round().byte().contiguous().numpy() for each in pictures]
-    with tempfile.TemporaryDirectory() as folder, MjpegServer(images, options.fps) as server:
-        drive.camera.to_file(f"{folder}/camera.yaml")
-        camera = f"{folder}/camera.yaml"
-        command = [sys.executable, "-m", "lanebev", "run", server.address, "--camera", camera]
-        with subprocess.Popen([*command, "--out", f"{folder}/out"], stdout=subprocess.PIPE, text=True) as run:
-            memory = _watch(run, 60 * options.minutes)
+    with tempfile.TemporaryDirectory() as temporary, MjpegServer(images, fps) as server:
+        folder = Path(temporary)
+        drive.camera.to_file(folder / "camera.yaml")
+        command = [sys.executable, "-m", "lanebev", "run", server.address]
+        command += ["--camera", str(folder / "camera.yaml"), "--out", str(folder / "out")]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as run:
+            _wait_for_lines(run, folder)
+            memory = _memory(run, seconds)
+            sent = server.sent
             run.send_signal(signal.SIGINT)
             said = run.communicate()[0]
-        sent = server.sent
-    found = re.search(r"(\d+) frames used, (\d+) dropped, at most ([\d.]+) s", said)
-    if run.returncode or found is None:
-        print(said)
-        return 1
-    used, dropped, delay = int(found[1]), int(found[2]), float(found[3])
-    rate, growth = used / (60 * options.minutes), memory[-1] / memory[0]
-    print(f"{options.minutes:g} minutes at {options.fps:g} fps on {os.cpu_count()} cores")
-    print(f"frames: {sent} sent, {used} used ({rate:.1f} a second), {dropped} dropped")
-    print(f"delay from arrival to result: at most {delay:.2f} s")
-    print(f"resident memory: {memory[0]:.0f} MiB after the warm-up, {memory[-1]:.0f} MiB at the end")
-    return int(delay > _MOST_DELAY or growth > _MOST_GROWTH)
+        words = r"(\d+) frames used, (\d+) dropped, at most ([\d.]+) s .*?, ([\d.]+) s of them waiting"
+        match = re.search(words, said)
+        if run.returncode or match is None:
+            raise RuntimeError(
+                f"run: expected it to end well when told to, got status {run.returncode}: {said}"
+            )
+        rows = len(read_extrinsics(folder / "out" / "extrinsics.csv"))
+    used, dropped = int(match[1]), int(match[2])
+    wait, delay = float(match[4]), float(match[3])
+    return StreamFigures(seconds, fps, sent, used, dropped, rows, wait, delay, tuple(memory))
 
 
-def _watch(run: subprocess.Popen[str], seconds: float) -> list[float]:
+def _wait_for_lines(run: subprocess.Popen[str], folder: Path) -> None:
+    """Wait until a run below this folder has looked at two frames."""
+    begin = time.monotonic()
+    while time.monotonic() - begin < _PATIENCE and run.poll() is None:
+        if any(path.read_text().count("\n") >= 2 for path in folder.rglob("lanes.json")):
+            return
+        time.sleep(0.1)
+    run.kill()
+    raise RuntimeError(f"run: expected two frames within {_PATIENCE:g} s, got fewer")
+
+
+def _memory(run: subprocess.Popen[str], seconds: float) -> list[float]:
     """Return the resident memory (MiB) after the warm-up and every second from then on."""
     begin, memory = time.monotonic(), []
     warm_up = min(_WARM_UP, seconds / 2)
@@ -133,7 +232,7 @@ def _watch(run: subprocess.Popen[str], seconds: float) -> list[float]:
         time.sleep(min(1.0, seconds - passed))
         if time.monotonic() - begin >= warm_up and run.poll() is None:
             memory.append(resident_mib(run.pid))
-    return memory or [0.0]
+    return memory or [resident_mib(run.pid)]
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -28,12 +29,14 @@ class LiveFigures:
     Attributes:
         seen: frames that were handed on.
         dropped: frames that came while an earlier one was looked at, and were replaced by a later one.
+        longest_wait: s from a frame's arrival to when it was handed on.
         longest_delay: s from a frame's arrival to when the next one was asked for.
         end: why the stream ended, empty if it was stopped or ran out.
     """
 
     seen: int = 0
     dropped: int = 0
+    longest_wait: float = 0.0
     longest_delay: float = 0.0
     end: str = ""
 
@@ -42,7 +45,7 @@ class LiveFigures:
         ended = f"; it ended: {self.end}" if self.end else ""
         return (
             f"{self.seen} frames used, {self.dropped} dropped, at most {self.longest_delay:.2f} s from a "
-            f"frame's arrival to its result{ended}"
+            f"frame's arrival to its result, {self.longest_wait:.2f} s of them waiting{ended}"
         )
 
 
@@ -51,21 +54,19 @@ class LiveSource(FrameSource):
     """A stream that is read in a thread of its own, which keeps the newest frame only.
 
     Frames' times are those of their arrival. Who cannot look at every frame is given the newest, so that the
-    delay is that of one frame however slow the looking is. With ``keep_all`` nothing is dropped, the stream
+    delay is that of one frame however slow the looking is. The thread reads from the opening on, also while
+    nobody looks yet, so that nothing queues in the network. With ``keep_all`` nothing is dropped, the stream
     waits instead, and times are those that the stream states.
 
     Attributes:
-        container: of the stream, open; its first frame is not in it any more.
-        first: the first frame.
+        slot: where the thread leaves the frames.
         keep_all: wait for whoever looks.
         figures: what became of the frames.
     """
 
-    container: av.container.InputContainer | None = None
-    first: av.VideoFrame | None = None
+    slot: _Slot | None = None
     keep_all: bool = False
     figures: LiveFigures = field(default_factory=LiveFigures)
-    _stop: list[bool] = field(default_factory=list)
 
     @property
     def is_live(self) -> bool:
@@ -74,16 +75,15 @@ class LiveSource(FrameSource):
 
     def stop(self) -> None:
         """End the iteration after the frame in hand; signal handlers may call it."""
-        self._stop.append(True)
+        self._own_slot().stop()
 
     def __iter__(self) -> Iterator[Frame]:
-        slot = _Slot(self.keep_all, self._stop, self.figures)
-        thread = threading.Thread(target=self._read, args=(slot,), name="stream", daemon=True)
-        thread.start()
+        slot = self._own_slot()
         start = before = None
         try:
             while (item := slot.take()) is not None:
                 arrival, frame = item
+                self.figures.longest_wait = max(self.figures.longest_wait, time.monotonic() - arrival)
                 now = self._stated(frame, self.figures.seen) if self.keep_all else arrival
                 start = now if start is None else start
                 dt = float(1 / self.fps) if before is None else now - before
@@ -100,41 +100,47 @@ class LiveSource(FrameSource):
         finally:
             self.stop()
 
+    def _own_slot(self) -> _Slot:
+        if self.slot is None:
+            raise RuntimeError("a live source is made by open_live")
+        return self.slot
+
     def _stated(self, frame: av.VideoFrame, number: int) -> float:
         """Return the time (s) of a frame by the stream, or by its number if the stream states none."""
         return float(number / self.fps) if frame.time is None else frame.time
 
-    def _read(self, slot: _Slot) -> None:
-        """Decode until the stream ends or is stopped; frames that do not decode are left out."""
-        if self.container is None or self.first is None:
-            raise RuntimeError("a live source is made by open_live")
-        slot.put(self.first)
-        try:
-            for packet in self.container.demux(self.container.streams.video[0]):
-                try:
-                    for frame in packet.decode():
-                        slot.put(frame)
-                except av.error.InvalidDataError:
-                    continue
-                if self._stop:
-                    break
-        except (av.error.FFmpegError, OSError) as error:
-            self.figures.end = error.strerror or str(error)
-        finally:
-            slot.close()
-            self.container.close()
+
+def _read(container: av.container.InputContainer, slot: _Slot, figures: LiveFigures) -> None:
+    """Decode until the stream ends or is stopped; frames that do not decode are left out."""
+    try:
+        for packet in container.demux(container.streams.video[0]):
+            try:
+                for frame in packet.decode():
+                    slot.put(frame)
+            except av.error.InvalidDataError:
+                continue
+            if slot.is_stopped:
+                break
+    except (av.error.FFmpegError, OSError) as error:
+        figures.end = error.strerror or str(error)
+    finally:
+        slot.close()
+        container.close()
 
 
 class _Slot:
     """Where the reader leaves the newest frame: one place, no lock that a signal handler could wait for."""
 
-    def __init__(self, waits: bool, stop: list[bool], figures: LiveFigures) -> None:
-        self._waits, self._stop, self._figures = waits, stop, figures
+    def __init__(self, waits: bool, figures: LiveFigures) -> None:
+        self._waits, self._figures = waits, figures
         self._frames: deque[tuple[float, av.VideoFrame]] = deque(maxlen=1)
-        self._came, self._closed = threading.Event(), False
+        self._came, self._closed, self.is_stopped = threading.Event(), False, False
+
+    def stop(self) -> None:
+        self.is_stopped = True
 
     def put(self, frame: av.VideoFrame) -> None:
-        while self._waits and self._frames and not self._stop:
+        while self._waits and self._frames and not self.is_stopped:
             time.sleep(0.001)
         if self._frames:
             self._figures.dropped += 1
@@ -148,7 +154,7 @@ class _Slot:
     def take(self) -> tuple[float, av.VideoFrame] | None:
         """Wait for a frame; None at the end of the stream, or when it is to stop."""
         waited = time.monotonic()
-        while not self._stop:
+        while not self.is_stopped:
             self._came.clear()
             try:
                 return self._frames.popleft()
@@ -193,17 +199,15 @@ def open_live(
     except (av.error.FFmpegError, StopIteration, OSError) as error:
         container.close()
         raise ValueError(f"stream {name}: expected a frame, got none") from error
-    own = stream.average_rate or stream.guessed_rate or DEFAULT_FPS
-    return LiveSource(
-        source,
-        (),
-        Fraction(fps or own),
-        0,
-        image.shape[:2],
-        container=container,
-        first=first,
-        keep_all=keep_all,
-    )
+    rate = Fraction(fps or stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
+    figures = LiveFigures()
+    slot = _Slot(keep_all, figures)
+    slot.put(first)
+    thread = threading.Thread(target=_read, args=(container, slot, figures), name="stream", daemon=True)
+    thread.start()
+    live = LiveSource(source, (), rate, 0, image.shape[:2], slot=slot, keep_all=keep_all, figures=figures)
+    weakref.finalize(live, slot.stop)  # of a run that ended before its first frame
+    return live
 
 
 def _opened(source: str) -> av.container.InputContainer:

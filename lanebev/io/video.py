@@ -21,6 +21,7 @@ from lanebev.io.decoding import decoded, has_times, open_video, packets, rgb
 from lanebev.io.frames import ALL, Frame, Selection, taken_frames
 from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
 from lanebev.io.images import IMAGE_SUFFIXES, image_size, is_image, read_image, write_png
+from lanebev.io.seeking import begun
 
 __all__ = [
     "DEFAULT_FPS",
@@ -105,13 +106,12 @@ class FrameSource:
             yield Frame(index, time, dt, path, image, problem)
 
     def _video_frames(self) -> Iterator[Frame]:
-        first, before = None, None
         damaged, told = False, False  # since the last key frame
-        with open_video(self.source) as container:
-            stream = container.streams.video[0]
-            for index, (pts, frame) in enumerate(decoded(container, stream)):
+        with begun(self.source, self.selection.start) as video:
+            first, before, tick = video.first, video.before, video.stream.time_base
+            for index, (pts, frame) in enumerate(video.frames, start=video.number):
                 timed = pts is not None and self.has_times
-                time = pts * stream.time_base if timed else (first or 0) + index / self.fps
+                time = pts * tick if timed else (first or 0) + index / self.fps
                 if before is not None and time <= before:  # AVI has no times of display
                     time = before + 1 / self.fps
                 first = time if first is None else first

@@ -1,5 +1,6 @@
 """Streams and the frames that are taken of a source, as a person uses them; only this machine is asked."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -19,6 +20,7 @@ from lanebev.io.live import open_live
 from lanebev.io.results import read_extrinsics
 from lanebev.io.source_names import is_live
 from lanebev.io.video import VideoWriter, open_source
+from tests.app.rtsp_server import RtspServer, transport_stream
 from tools.stream_check import MjpegServer
 
 SIZE = (120, 160)
@@ -124,6 +126,51 @@ def test_a_stream_drops_what_it_cannot_look_at():
     assert max(delays) < 0.5
     assert frame.time == pytest.approx(0.7, abs=0.4)  # by arrival
     assert f"8 frames used, {source.figures.dropped} dropped" in source.figures.words()
+
+
+def test_nothing_queues_before_a_stream_is_looked_at():
+    images = [_image(number) for number in range(60)]
+    with MjpegServer(images, 50.0) as server:
+        source = open_live(server.address)
+        time.sleep(0.6)  # as while a network is loaded: thirty frames come
+        first = next(iter(source))
+        newest = server.sent - 1
+        source.stop()
+    assert source.figures.dropped >= 15
+    assert first.image.mean() == pytest.approx(4 * (newest % 60), abs=4 * 8)
+    assert source.figures.longest_wait < 0.3
+
+
+def test_an_unused_stream_is_closed():
+    with MjpegServer([_image(0)], 50.0) as server:
+        source = open_live(server.address)
+        slot = source.slot
+        del source
+        gc.collect()
+        assert slot.is_stopped
+
+
+@pytest.mark.parametrize("breaks_at", [None, 20])
+def test_an_rtsp_stream(breaks_at):
+    content = transport_stream([_image(number) for number in range(40)], fps=20)
+    with RtspServer(content, 1.0, breaks_at) as server:
+        source = open_live(server.address)
+        means = [frame.image.mean() for frame in source]
+    figures = source.figures
+    assert len(means) == figures.seen >= 2
+    assert means == sorted(means)
+    if breaks_at is None:
+        assert 30 <= figures.seen + figures.dropped <= 40
+
+
+def test_an_rtsp_stream_is_all_there_if_it_may_wait():
+    content = transport_stream([_image(number) for number in range(40)], fps=20, bframes=2)
+    with RtspServer(content, 0.2) as server:
+        frames = list(open_live(server.address, keep_all=True))
+    assert 36 <= len(frames) <= 40  # the connection ends before the last packets are known to be whole
+    assert [frame.dt for frame in frames[:36]] == pytest.approx([0.05] * 36, abs=1e-4)
+    means = [frame.image.mean() for frame in frames[:36]]
+    assert means == pytest.approx([4 * number for number in range(36)], abs=4)
 
 
 @pytest.mark.slow
