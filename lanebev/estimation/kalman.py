@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.geometry.linalg import cholesky, solve_lower
+from lanebev.geometry.linalg import cholesky, solve_lower, solve_spd
 
 
 def predict(mean: Tensor, cov: Tensor, transition: Tensor, process_noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -119,6 +119,45 @@ def update(mean: Tensor, cov: Tensor, info_matrix: Tensor, info_vector: Tensor) 
     keep = eye - posterior @ info_matrix
     joseph = keep @ cov @ keep.mT + posterior @ info_matrix @ posterior
     return mean + (posterior @ info_vector.unsqueeze(-1)).squeeze(-1), symmetrise(joseph)
+
+
+def smoother_gain(cov: Tensor, transition: Tensor, process_noise: Tensor, linked: Tensor) -> Tensor:
+    """Compute the gain of a smoother, C = P Fᵀ (F P Fᵀ + W)⁻¹, from the entries of the later state in a mask.
+
+    Source: Särkkä 2013, Bayesian Filtering and Smoothing, Eq. (8.6).
+
+    Args:
+        cov: (..., D, D), P, filtered.
+        transition: (..., D, D), F, to the later state.
+        process_noise: (..., D, D), W.
+        linked: (..., D) bool, entries of the later state that tell of the earlier one; the others' columns are
+            zero.
+
+    Returns:
+        (..., D, D).
+    """
+    both = linked.unsqueeze(-1) & linked.unsqueeze(-2)
+    crossed = torch.where(linked.unsqueeze(-1), transition @ cov, 0.0)  # (..., D, D)
+    predicted = symmetrise(transition @ cov @ transition.mT + process_noise)
+    predicted = torch.where(both, predicted, 0.0) + (~linked).to(cov).diag_embed()
+    return solve_spd(predicted, crossed).mT
+
+
+def smoother_covariance(cov: Tensor, transition: Tensor, process_noise: Tensor, gain: Tensor) -> Tensor:
+    """Compute the covariance of a smoothed state if the later one were known exactly.
+
+    Source: Särkkä 2013, Eq. (8.6), P + C (P' - F P Fᵀ - W) Cᵀ. Deviation: as a sum of positive terms,
+    (I - C F) P (I - C F)ᵀ + C W Cᵀ + C P' Cᵀ, which holds for every C and keeps sign in floating point. The
+    last term, with the later state's covariance P', is left to the recursion.
+
+    Args:
+        cov: (..., D, D), P, filtered.
+        transition: (..., D, D), F, to the later state.
+        process_noise: (..., D, D), W.
+        gain: (..., D, D), C.
+    """
+    keep = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device) - gain @ transition
+    return symmetrise(keep @ cov @ keep.mT + gain @ process_noise @ gain.mT)
 
 
 def gate(

@@ -15,7 +15,7 @@ from lanebev.estimation.checks import (
     unused_frame,
 )
 from lanebev.estimation.joint.averaging import weigh_readings
-from lanebev.estimation.joint.dynamics import motion
+from lanebev.estimation.joint.dynamics import RoadMotion, motion
 from lanebev.estimation.joint.evidence import (
     accumulate_evidence,
     adapt_motion_scale,
@@ -126,7 +126,7 @@ class JointCalibrator(Calibrator[JointState]):
             raise ValueError(f"state: expected one of {cfg.num_boundaries} boundaries, got one of {got}")
         seen = observations(segments, intrinsics)
         positions = boundary_places(lane_width, cfg.num_boundaries, dt)  # (B, L)
-        step, skip, early, guessed = _elapsed(dt, state, cfg)
+        step, skip, early, guessed = elapsed(dt, state, cfg)
 
         predicted = predict_state(state, step, cfg)
         updated, trust, agreed, alone = update_state(predicted, positions, seen, step, cfg)
@@ -164,8 +164,8 @@ class JointCalibrator(Calibrator[JointState]):
         return first + (share * steps)[:, 0]
 
 
-def _elapsed(dt: Tensor, state: JointState, cfg: JointConfig) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Time to predict over; whether to skip the frame; how far ahead the state then is; if guessed."""
+def elapsed(dt: Tensor, state: JointState, cfg: JointConfig) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Compute the time to predict over; whether to skip the frame; how far ahead the state is; if guessed."""
     due = dt - state.early
     guessed = ~(due > -1.0) | ~dt.isfinite()
     due = torch.where(guessed, cfg.assumed_dt, due)
@@ -175,15 +175,21 @@ def _elapsed(dt: Tensor, state: JointState, cfg: JointConfig) -> tuple[Tensor, T
 
 def predict_state(state: JointState, dt: Tensor, cfg: JointConfig) -> JointState:
     """Predict mean, covariance and phase over dt (B,) s."""
+    road, transition, noise = state_motion(state, dt, cfg)
+    mean, cov = predict(state.mean, state.cov, transition, noise)
+    mean = torch.cat([mean[:, :CURVATURE], road.shape, mean[:, SHAPE.stop :]], dim=-1)
+    return state._replace(mean=mean, cov=cov, phase=road.phase)
+
+
+def state_motion(state: JointState, dt: Tensor, cfg: JointConfig) -> tuple[RoadMotion, Tensor, Tensor]:
+    """Compute how a state moves over dt (B,) s: its road; F (B, D, D); W (B, D, D)."""
     place = layout(cfg.num_boundaries)
     road = propagate_road_shape(state.mean, state.cov[:, SHAPE, SHAPE], state.phase, dt, place, cfg.motion)
     scale = state.motion_scale.sqrt()
     unobserved = unobserved_mask(state.reasons)
     scale = torch.where(unobserved, scale.clamp(min=cfg.motion.unobserved_scale), scale)
     unequal = deviation_prior_std(state.mean[:, place.deviations], cfg)
-    mean, cov = predict(state.mean, state.cov, *motion(dt, scale, unequal, road, place, cfg.motion))
-    mean = torch.cat([mean[:, :CURVATURE], road.shape, mean[:, SHAPE.stop :]], dim=-1)
-    return state._replace(mean=mean, cov=cov, phase=road.phase)
+    return road, *motion(dt, scale, unequal, road, place, cfg.motion)
 
 
 def update_state(

@@ -1,0 +1,158 @@
+"""Fixed-interval smoothing: every state of a drive estimated from all of its frames, later ones too.
+
+The predictions of the filter are repeated from its states, so the states of a drive are all that is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.estimation import kalman
+from lanebev.estimation.joint.calibrator import elapsed, predict_state, state_motion
+from lanebev.estimation.joint.evidence import adaptive_process_noise
+from lanebev.estimation.joint.layout import POSE, layout
+from lanebev.estimation.joint.measurement import OFFSET
+from lanebev.estimation.joint.state import JointConfig, JointState
+from lanebev.estimation.reasons import Reason
+from lanebev.geometry.precision import full_precision
+from lanebev.types import Calibration, Extrinsics, Status
+
+_CHUNK = 256  # rows, of one frame or several, whose gains are computed at once
+
+
+class Link(NamedTuple):
+    """How a state follows from the one before.
+
+    Attributes:
+        predicted: (B, D), mean of the prediction.
+        transition: (B, D, D), F.
+        noise: (B, D, D), W, with that which the frame's evidence added.
+        linked: (B, D) bool, entries that are the same quantity before and after.
+    """
+
+    predicted: Tensor
+    transition: Tensor
+    noise: Tensor
+    linked: Tensor
+
+
+def link_states(before: JointState, after: JointState, dt: Tensor, cfg: JointConfig) -> Link:
+    """Repeat the prediction that led from one frame's state to the next one's.
+
+    A start takes over nothing of the state before. Where the boundaries' numbers moved, offset and deviations
+    are other quantities. A frame that was skipped moved nothing.
+
+    Args:
+        before: state after a frame.
+        after: state after the next.
+        dt: (B,) s between them, as the calibrator was given it.
+        cfg: the calibrator's.
+    """
+    place = layout(cfg.num_boundaries)
+    step, skip, _, _ = elapsed(dt, before, cfg)
+    _, transition, noise = state_motion(before, step, cfg)
+    predicted = predict_state(before, step, cfg)
+    evidence = torch.where(skip.unsqueeze(-1), 0.0, after.evidence)
+    raised = adaptive_process_noise(evidence, predicted.cov[:, place.observed, place.observed], cfg)
+    noise = noise + torch.nn.functional.pad(raised, (0, place.size - raised.shape[-1])).diag_embed()
+    begun = ((after.reasons & int(Reason.RESTARTED)) != 0) | (after.status == int(Status.UNINITIALISED))
+    renumbered = (after.reasons & int(Reason.LANE_CHANGE)) != 0
+    of_numbers = torch.zeros(place.size, dtype=torch.bool, device=dt.device)
+    of_numbers[OFFSET] = True
+    of_numbers[place.deviations] = True
+    apart = begun.unsqueeze(-1) | (renumbered.unsqueeze(-1) & of_numbers)
+    return Link(predicted.mean, transition, noise, skip.unsqueeze(-1) | ~apart)
+
+
+def smooth_states(
+    states: Sequence[JointState], dt: Sequence[Tensor], cfg: JointConfig
+) -> Iterator[JointState]:
+    """Yield the smoothed states of a drive, the last one first, with ``mean`` and ``cov`` replaced.
+
+    Source: (J26), (J27); Rauch, Tung and Striebel 1965, Särkkä 2013, Sec. 9.1, on the filter's linearisation.
+
+    Args:
+        states: after every frame, (B, ...) each, in order; they are looked at from the last one to the first,
+            so that a sequence which reads them from a file does.
+        dt: (B,) s from the frame before to each frame, as the calibrator was given it; the first is not used.
+        cfg: the calibrator's.
+    """
+    if not states:
+        return
+    mean, cov = states[-1].mean, states[-1].cov
+    yield states[-1]
+    chunk = max(1, _CHUNK // max(1, mean.shape[0]))  # frames
+    for stop in range(len(states), 1, -chunk):
+        some = [states[k] for k in range(max(stop - 1 - chunk, 0), stop)]
+        intervals = torch.cat([dt[k] for k in range(stop - len(some) + 1, stop)])
+        links = _backward_links(_joined(some[:-1]), _joined(some[1:]), intervals, cfg)
+        parts = [part.chunk(len(some) - 1)[::-1] for part in links]
+        for state, predicted, gain, own in zip(some[-2::-1], *parts, strict=True):
+            mean = state.mean + (gain @ (mean - predicted).unsqueeze(-1)).squeeze(-1)
+            cov = kalman.symmetrise(own + gain @ cov @ gain.mT)
+            yield state._replace(mean=mean, cov=cov)
+
+
+def _backward_links(
+    before: JointState, after: JointState, dt: Tensor, cfg: JointConfig
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Prediction (B, D), gain (B, D, D) and covariance (B, D, D) that a step backward takes."""
+    link = link_states(before, after, dt, cfg)
+    gain = kalman.smoother_gain(before.cov, link.transition, link.noise, link.linked)
+    own = kalman.smoother_covariance(before.cov, link.transition, link.noise, gain)
+    return link.predicted, gain, own
+
+
+def smooth_drive(
+    calibrations: Sequence[Calibration],
+    states: Sequence[JointState],
+    dt: Sequence[Tensor],
+    cfg: JointConfig,
+) -> list[Calibration]:
+    """Compute the calibration of every frame of a drive from all of its frames.
+
+    Status and inliers are those of the filter. What cannot be smoothed is as the filter gave it: the frames up
+    to a start by itself, and the last one.
+
+    Args:
+        calibrations: of every frame, in order, as the calibrator gave them.
+        states: after every frame, best in float64.
+        dt: (T, B), or (B,) for each frame: s from the frame before, as the calibrator was given it.
+        cfg: the calibrator's.
+
+    Raises:
+        ValueError: they are not of as many frames.
+    """
+    if not len(calibrations) == len(states) == len(dt):
+        raise ValueError(
+            "calibrations, states, dt: expected one of each a frame, got "
+            f"{len(calibrations)}, {len(states)}, {len(dt)}"
+        )
+    backward = zip(calibrations[::-1], states[::-1], smooth_states(states, dt, cfg), strict=True)
+    return [smoothed_calibration(*frame) for frame in backward][::-1]
+
+
+def _joined(states: Sequence[JointState]) -> JointState:
+    """States of several frames as rows of one batch."""
+    return JointState(*(torch.cat(parts) for parts in zip(*states, strict=True)))
+
+
+def smoothed_calibration(calibration: Calibration, state: JointState, smoothed: JointState) -> Calibration:
+    """Replace the pose of a frame's calibration by the smoothed one, and what the filter knew of its covariance.
+
+    What was added to the filter's covariance, as for lanes that differ, stays.
+
+    Args:
+        calibration: of the frame, as the calibrator gave it.
+        state: after the frame.
+        smoothed: that state, smoothed.
+    """
+    added = calibration.covariance - state.cov[:, POSE, POSE].to(calibration.covariance)
+    covariance = smoothed.cov[:, POSE, POSE].to(added) + added
+    return calibration._replace(
+        extrinsics=Extrinsics.unstack(smoothed.mean[:, POSE].to(added)), covariance=covariance
+    )
