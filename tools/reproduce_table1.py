@@ -23,6 +23,7 @@ from jsonargparse.typing import PositiveInt
 import lanebev
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.joint.smoother import smooth_drive
+from lanebev.estimation.joint.state import JointConfig
 from lanebev.estimation.kalman import symmetrise
 from lanebev.testing.experiment import Experiment, frames
 from lanebev.types import Status
@@ -75,8 +76,8 @@ def run(
         truths.append(frame.truth)
         bounds.append(frame.bound)
     if smooth:
-        dt = torch.full((exp.num_frames, rows), 1 / exp.fps, dtype=dtype)
-        calibrations = smooth_drive(calibrations, states, dt, calibrator.config)
+        steps = [torch.full((rows,), 1 / exp.fps, dtype=dtype)] * exp.num_frames
+        calibrations = smooth_drive(calibrations, states, steps, JointConfig())
     estimates, nees, tracking = [], [], []
     for calibration, true in zip(calibrations, truths, strict=True):
         estimate = calibration.extrinsics.stack().double()

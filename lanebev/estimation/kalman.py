@@ -122,31 +122,32 @@ def update(mean: Tensor, cov: Tensor, info_matrix: Tensor, info_vector: Tensor) 
 
 
 def smoother_gain(cov: Tensor, transition: Tensor, process_noise: Tensor, linked: Tensor) -> Tensor:
-    """Compute the gain of a smoother, C = P Fᵀ (F P Fᵀ + W)⁻¹, from the entries of the later state in a mask.
+    """Compute the gain of a smoother, C = P Fᵀ (F P Fᵀ + W)⁻¹, its entries outside of a mask being zero.
 
-    Source: Särkkä 2013, Bayesian Filtering and Smoothing, Eq. (8.6).
+    Source: Särkkä 2013, Bayesian Filtering and Smoothing, Sec. 8.2.
 
     Args:
         cov: (..., D, D), P, filtered.
         transition: (..., D, D), F, to the later state.
         process_noise: (..., D, D), W.
-        linked: (..., D) bool, entries of the later state that tell of the earlier one; the others' columns are
-            zero.
+        linked: (..., D, D) bool, [i, j]: entry j of the later state tells of entry i. Of entries in blocks
+            each block is solved by itself; an entry that tells nothing has a column of zeros.
 
     Returns:
         (..., D, D).
     """
-    both = linked.unsqueeze(-1) & linked.unsqueeze(-2)
-    crossed = torch.where(linked.unsqueeze(-1), transition @ cov, 0.0)  # (..., D, D)
-    predicted = symmetrise(transition @ cov @ transition.mT + process_noise)
-    predicted = torch.where(both, predicted, 0.0) + (~linked).to(cov).diag_embed()
-    return solve_spd(predicted, crossed).mT
+    crossed = transition @ cov  # (..., D, D)
+    predicted = symmetrise(crossed @ transition.mT + process_noise)
+    known = linked.diagonal(dim1=-2, dim2=-1)  # (..., D) of the later state
+    among = linked & known.unsqueeze(-1)
+    predicted = torch.where(among, predicted, 0.0) + (~known).to(cov).diag_embed()
+    return solve_spd(predicted, torch.where(linked.mT, crossed, 0.0)).mT
 
 
 def smoother_covariance(cov: Tensor, transition: Tensor, process_noise: Tensor, gain: Tensor) -> Tensor:
     """Compute the covariance of a smoothed state if the later one were known exactly.
 
-    Source: Särkkä 2013, Eq. (8.6), P + C (P' - F P Fᵀ - W) Cᵀ. Deviation: as a sum of positive terms,
+    Source: Särkkä 2013, Sec. 8.2, P + C (P' - F P Fᵀ - W) Cᵀ. Deviation: as a sum of positive terms,
     (I - C F) P (I - C F)ᵀ + C W Cᵀ + C P' Cᵀ, which holds for every C and keeps sign in floating point. The
     last term, with the later state's covariance P', is left to the recursion.
 

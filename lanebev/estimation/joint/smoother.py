@@ -15,10 +15,10 @@ from lanebev.estimation import kalman
 from lanebev.estimation.joint.calibrator import elapsed, predict_state, state_motion
 from lanebev.estimation.joint.evidence import adaptive_process_noise
 from lanebev.estimation.joint.layout import POSE, layout
-from lanebev.estimation.joint.measurement import OFFSET
+from lanebev.estimation.joint.measurement import OFFSET, ROLL
 from lanebev.estimation.joint.state import JointConfig, JointState
 from lanebev.estimation.reasons import Reason
-from lanebev.geometry.precision import full_precision
+from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.types import Calibration, Extrinsics, Status
 
 _CHUNK = 256  # rows, of one frame or several, whose gains are computed at once
@@ -31,7 +31,7 @@ class Link(NamedTuple):
         predicted: (B, D), mean of the prediction.
         transition: (B, D, D), F.
         noise: (B, D, D), W, with that which the frame's evidence added.
-        linked: (B, D) bool, entries that are the same quantity before and after.
+        linked: (B, D, D) bool, [i, j]: entry j after tells of entry i before.
     """
 
     predicted: Tensor
@@ -44,7 +44,8 @@ def link_states(before: JointState, after: JointState, dt: Tensor, cfg: JointCon
     """Repeat the prediction that led from one frame's state to the next one's.
 
     A start takes over nothing of the state before. Where the boundaries' numbers moved, offset and deviations
-    are other quantities. A frame that was skipped moved nothing.
+    are other quantities. A frame that was skipped moved nothing. Where roll was considered and not estimated,
+    its error and those of the other entries do not tell of each other, as in the filter.
 
     Args:
         before: state after a frame.
@@ -59,13 +60,25 @@ def link_states(before: JointState, after: JointState, dt: Tensor, cfg: JointCon
     evidence = torch.where(skip.unsqueeze(-1), 0.0, after.evidence)
     raised = adaptive_process_noise(evidence, predicted.cov[:, place.observed, place.observed], cfg)
     noise = noise + torch.nn.functional.pad(raised, (0, place.size - raised.shape[-1])).diag_embed()
-    begun = ((after.reasons & int(Reason.RESTARTED)) != 0) | (after.status == int(Status.UNINITIALISED))
-    renumbered = (after.reasons & int(Reason.LANE_CHANGE)) != 0
-    of_numbers = torch.zeros(place.size, dtype=torch.bool, device=dt.device)
-    of_numbers[OFFSET] = True
-    of_numbers[place.deviations] = True
-    apart = begun.unsqueeze(-1) | (renumbered.unsqueeze(-1) & of_numbers)
-    return Link(predicted.mean, transition, noise, skip.unsqueeze(-1) | ~apart)
+    known = (skip.unsqueeze(-1) | ~other_quantities(after, cfg)).unsqueeze(-2)  # (B, 1, D)
+    roll_alone = has(after, Reason.ROLL_UNSEEN) & (after.unseen == 0)
+    is_roll = torch.tensor([k in place.chain(ROLL) for k in range(place.size)], device=dt.device)
+    same = is_roll.unsqueeze(-1) == is_roll  # (D, D)
+    return Link(predicted.mean, transition, noise, known & (same | ~roll_alone[:, None, None]))
+
+
+def other_quantities(after: JointState, cfg: JointConfig) -> Tensor:
+    """Tell which entries (B, D) of a state are not the same quantity as in the state of the frame before."""
+    place = layout(cfg.num_boundaries)
+    numbered = (OFFSET, *range(place.size)[place.deviations])
+    of_numbers = torch.tensor([k in numbered for k in range(place.size)], device=after.mean.device)
+    begun = has(after, Reason.RESTARTED) | (after.status == int(Status.UNINITIALISED))
+    return begun.unsqueeze(-1) | (has(after, Reason.LANE_CHANGE).unsqueeze(-1) & of_numbers)
+
+
+def has(state: JointState, reason: Reason) -> Tensor:
+    """Tell whether a reason holds, (B,) bool."""
+    return (state.reasons & int(reason)) != 0
 
 
 def smooth_states(
@@ -85,25 +98,31 @@ def smooth_states(
         return
     mean, cov = states[-1].mean, states[-1].cov
     yield states[-1]
-    chunk = max(1, _CHUNK // max(1, mean.shape[0]))  # frames
+    rows = mean.shape[0]
+    chunk = max(1, _CHUNK // max(1, rows))  # frames
     for stop in range(len(states), 1, -chunk):
         some = [states[k] for k in range(max(stop - 1 - chunk, 0), stop)]
         intervals = torch.cat([dt[k] for k in range(stop - len(some) + 1, stop)])
         links = _backward_links(_joined(some[:-1]), _joined(some[1:]), intervals, cfg)
-        parts = [part.chunk(len(some) - 1)[::-1] for part in links]
+        parts = [part.unflatten(0, (len(some) - 1, rows)).unbind()[::-1] for part in links]
         for state, predicted, gain, own in zip(some[-2::-1], *parts, strict=True):
-            mean = state.mean + (gain @ (mean - predicted).unsqueeze(-1)).squeeze(-1)
-            cov = kalman.symmetrise(own + gain @ cov @ gain.mT)
-            yield state._replace(mean=mean, cov=cov)
+            with autocast_off(mean.device):
+                mean = state.mean + (gain @ (mean - predicted).unsqueeze(-1)).squeeze(-1)
+                cov = kalman.symmetrise(own + gain @ cov.to(gain) @ gain.mT)
+            yield state._replace(mean=mean.to(state.mean), cov=cov.to(state.cov))
 
 
 def _backward_links(
     before: JointState, after: JointState, dt: Tensor, cfg: JointConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Prediction (B, D), gain (B, D, D) and covariance (B, D, D) that a step backward takes."""
-    link = link_states(before, after, dt, cfg)
-    gain = kalman.smoother_gain(before.cov, link.transition, link.noise, link.linked)
-    own = kalman.smoother_covariance(before.cov, link.transition, link.noise, gain)
+    dtype = widest_dtype(before.mean.device)
+    before, after = cast_floating(before, dtype), cast_floating(after, dtype)
+    dt = dt.to(dtype)
+    with autocast_off(dt.device):
+        link = link_states(before, after, dt, cfg)
+        gain = kalman.smoother_gain(before.cov, link.transition, link.noise, link.linked)
+        own = kalman.smoother_covariance(before.cov, link.transition, link.noise, gain)
     return link.predicted, gain, own
 
 
@@ -115,8 +134,8 @@ def smooth_drive(
 ) -> list[Calibration]:
     """Compute the calibration of every frame of a drive from all of its frames.
 
-    Status and inliers are those of the filter. What cannot be smoothed is as the filter gave it: the frames up
-    to a start by itself, and the last one.
+    Status and inliers are those of the filter. Frames before the first start, and the last frame, are as the
+    filter gave them; so is the last frame before a new start.
 
     Args:
         calibrations: of every frame, in order, as the calibrator gave them.
@@ -142,9 +161,9 @@ def _joined(states: Sequence[JointState]) -> JointState:
 
 
 def smoothed_calibration(calibration: Calibration, state: JointState, smoothed: JointState) -> Calibration:
-    """Replace the pose of a frame's calibration by the smoothed one, and what the filter knew of its covariance.
+    """Replace pose and covariance of a frame's calibration by the smoothed ones.
 
-    What was added to the filter's covariance, as for lanes that differ, stays.
+    What the calibration's covariance has beside the filter's, as for lanes that differ, stays.
 
     Args:
         calibration: of the frame, as the calibrator gave it.
