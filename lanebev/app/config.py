@@ -117,6 +117,7 @@ class RunConfig:
         rerun: "viewer", which opens one, or the address of one: Rerun shows the run while it goes on.
         topic: of the images, in a bag that has several.
         keep_all: of a stream, drop no frame.
+        smooth: estimate every pose from the whole drive, in two passes over the source.
     """
 
     source: str = option(
@@ -193,6 +194,7 @@ class RunConfig:
     )
     topic: str | None = option(None, "of the images in a bag that has several", "NAME")
     keep_all: bool = option(False, "of a stream, drop no frame: it waits, and its own times are taken")
+    smooth: bool = option(False, "estimate every pose from the whole drive, later frames too, in two passes")
 
     @property
     def relative_focal_std(self) -> float:
@@ -222,6 +224,11 @@ class RunConfig:
         if self.mount and self.calibrator != "joint":
             raise ValueError(f"mount: expected --calibrator joint with it, got {self.calibrator}")
         self._check_backend()
+        if self.smooth and (self.calibrator != "joint" or self.stills):
+            expected = "a drive" if self.stills else "--calibrator joint"
+            raise ValueError(
+                f"smooth: expected {expected} with it, got {'--stills' if self.stills else self.calibrator}"
+            )
         if self.stills and self.resume:
             raise ValueError("resume: expected a drive, got --stills; images on their own have no state")
         if self.lanes and self.weights:

@@ -32,7 +32,7 @@ from lanebev.report.overlay import Panel, draw_panels, joined
 from lanebev.report.page import Report, summary_facts, write_report
 from lanebev.report.verdict import reason_words
 from lanebev.report.worst import EventScores
-from lanebev.types import NUM_BOUNDARIES, Extrinsics
+from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics
 from lanebev.view.grid import BEVGrid
 
 _BEFORE_RESOLUTION = 0.1  # m, of the view before: it is only shown small
@@ -49,12 +49,14 @@ class Recorded:
         name: for ``raw_file`` of lanes.json.
         seen: vertices of batch size 1.
         estimate: what they led to.
+        filtered: calibration from frames up to this one, where the estimate is smoothed.
     """
 
     frame: Frame
     name: str
     seen: Observation
     estimate: Estimate
+    filtered: Calibration | None = None
 
 
 @dataclass(kw_only=True)
@@ -70,6 +72,7 @@ class Recorder:
         stills: each image on its own.
         grid: of the bird's-eye view.
         videos: whether there are any.
+        smoothed: whether every pose is from the whole drive.
         rows: of extrinsics.csv, a frame each.
         problems: what went wrong, for the report.
     """
@@ -82,6 +85,7 @@ class Recorder:
     stills: bool
     grid: BEVGrid = field(default_factory=BEVGrid)
     videos: bool = True
+    smoothed: bool = False
     rows: KeptRows = field(default_factory=KeptRows)
     problems: list[str] = field(default_factory=list)
 
@@ -90,6 +94,7 @@ class Recorder:
         self.before_title = "uncalibrated" if alone else "first frame's pose held"
         self._before = ViewBefore(alone)
         self._coarse = replace(self.grid, resolution=max(self.grid.resolution, _BEFORE_RESOLUTION))
+        self._filtered_rows = KeptRows()
         self._widths = KeptNumbers(2, NUM_BOUNDARIES - 1)
         self._moments, self._scores = MomentSampler(), EventScores()
 
@@ -113,17 +118,9 @@ class Recorder:
         frame = done.frame
         if frame.problem:
             self._note(f"frame {frame.number}: {frame.problem}")
-        estimate = done.estimate
-        self.rows.append(
-            extrinsics_row(
-                frame.number,
-                frame.time,
-                estimate.calibration,
-                estimate.segments.weight,
-                frame.name,
-                estimate.reasons,
-            )
-        )
+        self.rows.append(_row(done, done.estimate.calibration))
+        if self.smoothed and done.filtered is not None:
+            self._filtered_rows.append(_row(done, done.filtered))
         self._background.submit(lambda: self._draw(done))
 
     def _note(self, problem: str) -> None:
@@ -139,7 +136,7 @@ class Recorder:
         truth: Sequence[ExtrinsicsRow] | None = None,
         mount: MountCalibration | None = None,
     ) -> Report:
-        """Write extrinsics.csv and the report, after the last frame and outside of ``with``.
+        """Write extrinsics.csv, filtered.csv and the report, after the last frame and outside of ``with``.
 
         Args:
             facts: what ran, for the report.
@@ -148,6 +145,8 @@ class Recorder:
             mount: as it is known at the end.
         """
         write_extrinsics(self.path("extrinsics.csv"), self.rows)
+        if self.smoothed:
+            write_extrinsics(self.path("filtered.csv"), self._filtered_rows)
         before, after = self._widths.all().transpose(1, 0, 2)
         report = Report(
             title=title,
@@ -159,6 +158,7 @@ class Recorder:
             moments=self._moments.moments,
             problems=self.problems,
             is_stills=self.stills,
+            is_smoothed=self.smoothed,
             before_title=self.before_title,
             truth=truth,
             camera=self.camera,
@@ -215,6 +215,13 @@ class Recorder:
         if pose is None:
             return np.full(NUM_BOUNDARIES - 1, np.nan)
         return measure_boundaries(segments, intrinsics, pose).widths
+
+
+def _row(done: Recorded, calibration: Calibration) -> ExtrinsicsRow:
+    """Row of a frame with one of its calibrations."""
+    frame, estimate = done.frame, done.estimate
+    weight, reasons = estimate.segments.weight, estimate.reasons
+    return extrinsics_row(frame.number, frame.time, calibration, weight, frame.name, reasons)
 
 
 def _shortened(name: str, most: int = 38) -> str:

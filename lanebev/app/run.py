@@ -22,13 +22,15 @@ from lanebev.app.build import (
 from lanebev.app.config import RunConfig
 from lanebev.app.convert import writer
 from lanebev.app.kept import KeptNumbers
+from lanebev.app.observers import Observer
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states
-from lanebev.app.shared_network import SharedNetwork
+from lanebev.app.smoothing import SmoothedPoses, smooth_frames
 from lanebev.app.sources import camera_of, ended_by_signals, make_source, observed_frames
 from lanebev.app.summary import mount_facts, run_facts
-from lanebev.app.take_up import facts_of, frame_name, take_up
+from lanebev.app.take_up import facts_of, frame_name, seen_again, take_up
+from lanebev.camera.model import Camera
 from lanebev.io.calibration_file import write_calibration
 from lanebev.io.covariances import write_covariances
 from lanebev.io.formats.folder import read_record
@@ -37,6 +39,7 @@ from lanebev.io.formats.record import RecordedFrame, vertex_lines
 from lanebev.io.formats.rerun import open_viewer
 from lanebev.io.results import ExtrinsicsRow, OutputFolder, check_inputs_stay
 from lanebev.io.state import save_state
+from lanebev.io.video import FrameSource
 from lanebev.report.page import Report
 
 STILLS_FPS = Fraction(2)  # of the videos that show images one after another
@@ -46,10 +49,7 @@ logger = logging.getLogger(__name__)
 
 
 def run(
-    config: RunConfig,
-    progress: Progress | None = None,
-    truth: Sequence[ExtrinsicsRow] | None = None,
-    network: SharedNetwork | None = None,
+    config: RunConfig, progress: Progress | None = None, truth: Sequence[ExtrinsicsRow] | None = None
 ) -> Report:
     """Run on all frames and write the output folder, all of it or nothing.
 
@@ -60,7 +60,6 @@ def run(
         config: what to run.
         progress: wraps the frames, told how many there are.
         truth: of a rendered drive, a row per frame, for the report.
-        network: that is there already, with the settings' weights on their device.
 
     Returns:
         what the report page shows.
@@ -74,14 +73,19 @@ def run(
     camera = camera_of(config, source)
     source = match_image_size(camera, source)
     logger.info("%s: %d frames of %d x %d", source.source, source.count, *reversed(camera.image_size))
-    observer = make_observer(config, source, camera, network)
+    observer = make_observer(config, source, camera)
     tracker = make_tracker(config, camera)
     problem = load_states(config, tracker, camera)
     viewer = None if config.rerun is None else open_viewer(config.rerun, camera)
     with OutputFolder(config.out) as out, torch.inference_mode():
         if config.resume and problem:
             problem += backup_state(config.resume, out)
+        progress = None if source.is_live else progress
         taken = take_up(out, config, source, camera, observer)
+        smoothed, second = None, taken
+        if config.smooth:
+            smoothed = first_pass(config, source, camera, taken, out, progress)
+            second = seen_again(out, observer, taken, source)
         recorder = Recorder(
             path=out.__truediv__,
             camera=camera,
@@ -91,20 +95,25 @@ def run(
             stills=config.stills,
             grid=make_grid(config),
             videos=not config.no_video,
+            smoothed=config.smooth,
         )
         recorder.problems += filter(None, (source.problem, problem, observer.remark, lens_remark(camera)))
         covariances = KeptNumbers(4, 4)
-        frames = observed_frames(source, taken)
-        progress = None if source.is_live else progress
+        frames = observed_frames(source, second)
         with recorder, closing(frames), ended_by_signals(source):
             for frame, seen in progress(frames, source.taken_count) if progress else frames:
                 if config.stills:
                     estimate = tracker.still(seen.vertices, seen.pose_sigma_scale)
                 else:
                     estimate = tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale)
+                filtered = estimate.calibration
+                if smoothed is not None:
+                    estimate = smoothed.of(estimate, frame.number)
                 covariances.append(estimate.calibration.covariance[0].double().cpu().numpy())
                 name = frame_name(frame, source)
-                recorder.add(Recorded(frame=frame, name=name, seen=seen, estimate=estimate))
+                recorder.add(
+                    Recorded(frame=frame, name=name, seen=seen, estimate=estimate, filtered=filtered)
+                )
                 if viewer is not None:
                     pose, lines = estimate.calibration.extrinsics, vertex_lines(seen.vertices)
                     viewer.add(RecordedFrame(recorder.rows[-1], pose, lines), frame.image)
@@ -121,3 +130,20 @@ def run(
             for name in config.formats:
                 writer(name)(out / FORMATS[name].file, record, None if source.is_live else source)
         return report
+
+
+def first_pass(
+    config: RunConfig,
+    source: FrameSource,
+    camera: Camera,
+    observer: Observer,
+    out: OutputFolder,
+    progress: Progress | None,
+) -> SmoothedPoses:
+    """Go over the whole drive once, and estimate every pose from all of it."""
+    tracker = make_tracker(config, camera)
+    load_states(config, tracker, camera)
+    with closing(observed_frames(source, observer)) as frames:
+        logger.info("first of two passes")
+        shown = progress(frames, source.taken_count) if progress else frames
+        return smooth_frames(shown, tracker, out, source)

@@ -31,7 +31,8 @@ def make_source(config: RunConfig) -> FrameSource:
     """
     selection = Selection(config.start, math.inf if config.end is None else config.end, config.every)
     if is_live(config.source):
-        for name, given in (("--lanes", config.lanes), ("--stills", config.stills)):
+        unfit = {"--lanes": config.lanes, "--stills": config.stills, "--smooth": config.smooth}
+        for name, given in unfit.items():
             if given:
                 raise ValueError(f"source {config.source}: expected no {name} with a stream, got it")
         return open_live(config.source, config.frame_rate, config.keep_all, selection)

@@ -36,13 +36,20 @@ def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[st
         "calibrator": config.calibrator,
         "lanebev": __version__,
         **({"stream": source.figures.words()} if isinstance(source, LiveSource) else {}),
+        **smoothing_facts(config),
         **_other_settings(config),
     }
 
 
+def smoothing_facts(config: RunConfig) -> dict[str, str]:
+    """Say, for the report, that every pose is from the whole drive."""
+    words = "every pose is from the whole drive, later frames too; those of the filter are in filtered.csv"
+    return {"smoothed": words} if config.smooth else {}
+
+
 def _other_settings(config: RunConfig) -> dict[str, str]:
     """Return the settings that the facts do not name, by their names on the command line."""
-    named = {"source", "camera", "lanes", "lane_width", "calibrator", "weights", "out"}
+    named = {"source", "camera", "lanes", "lane_width", "calibrator", "weights", "out", "smooth"}
     settings = {item.name: getattr(config, item.name) for item in fields(config) if item.name not in named}
     words = {None: "not given", (): "none", True: "yes", False: "no"}
     return {f"--{name.replace('_', '-')}": words.get(value, str(value)) for name, value in settings.items()}
@@ -65,7 +72,7 @@ def summary(report: Report, config: RunConfig) -> str:
         middle = {name: float(np.median([getattr(row, name) for row in tracking])) for name in _SHOWN}
         values = "  ".join(f"{name.rsplit('_', 1)[0]} {middle[name]:+.3f} {_SHOWN[name]}" for name in _SHOWN)
         lines.append(f"median  {values}")
-    shown = ("lane width σ", "mount", "taken up", "stream")
+    shown = ("lane width σ", "mount", "smoothed", "taken up", "stream")
     lines += [f"{label}: {text}" for label, text in report.facts.items() if label.startswith(shown)]
     lines += [f"problem: {problem}" for problem in report.problems[:_PROBLEMS]]
     if len(report.problems) > _PROBLEMS:

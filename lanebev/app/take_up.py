@@ -20,7 +20,7 @@ from lanebev.io.results import OutputFolder
 from lanebev.io.tusimple import whole_tusimple_lines
 from lanebev.io.video import Frame, FrameSource
 
-_LANES = "lanes.json"
+LANES_FILE = "lanes.json"
 _SETTINGS, _SEEN = ".settings.json", ".seen.json"  # in the temporary folder
 
 
@@ -91,7 +91,7 @@ def take_up(
     settings = fingerprint(config, source, camera)
     known = out / _SETTINGS
     same = known.is_file() and known.read_text(encoding="utf-8") == settings
-    left = [path for path in (out.left(_LANES), out / _SEEN) if path.is_file()]
+    left = [path for path in (out.left(LANES_FILE), out / _SEEN) if path.is_file()]
     if left and same:
         max(left, key=lambda path: path.stat().st_size).replace(out / _SEEN)
     else:
@@ -101,6 +101,21 @@ def take_up(
         return observer
     entries = whole_tusimple_lines(out / _SEEN) if (out / _SEEN).is_file() else iter(())
     return TakenUp(entries, cast(RestoringObserver, observer), source)
+
+
+def seen_again(out: OutputFolder, observer: Observer, taken: Observer, source: FrameSource) -> Observer:
+    """Return an observer for a second pass, which takes what lanes.json of the first one says was seen.
+
+    Args:
+        out: with the first pass's lanes.json, which is moved.
+        observer: of the frames.
+        taken: what :func:`take_up` made of it.
+        source: the frames.
+    """
+    if not isinstance(taken, TakenUp):
+        return observer
+    (out / LANES_FILE).replace(out / _SEEN)
+    return TakenUp(whole_tusimple_lines(out / _SEEN), cast(RestoringObserver, observer), source)
 
 
 def fingerprint(config: RunConfig, source: FrameSource, camera: Camera) -> str:

@@ -58,6 +58,7 @@ class Tracker(Generic[StateT]):
         self.state: StateT = calibrator.initial_state(1, dtype=torch.float64)
         self.mount_state: MountState = self.mount_estimator.initial_state(1, dtype=torch.float64)
         self.mount: MountCalibration | None = None  # after a first frame
+        self.unscaled_covariance: Tensor = torch.zeros(1, 4, 4)  # as the calibrator gave it of the last frame
 
     def states(self) -> dict[str, StateT | MountState]:
         """Return what is remembered, by name."""
@@ -77,6 +78,8 @@ class Tracker(Generic[StateT]):
         segments = camera_segments(vertices, self.camera)
         intrinsics = self.camera.intrinsics[None]
         calibration, self.state = self.calibrator(segments, intrinsics, self.state, dt, self.lane_width)
+        self.unscaled_covariance = calibration.covariance
+        given_out = self.given_out(calibration, pose_sigma_scale)
         calibration = calibration.with_std_scaled(pose_sigma_scale)
         mount, self.mount_state = self.mount_estimator(
             calibration,
@@ -87,7 +90,7 @@ class Tracker(Generic[StateT]):
         )
         self.mount = mount._replace(covariance=mount.covariance + self._common_error(mount.extrinsics))
         reasons = Reason(int(self.calibrator.reasons(self.state)[0]))
-        return Estimate(segments, self._with_common_error(calibration), reasons)
+        return Estimate(segments, given_out, reasons)
 
     def still(self, vertices: BoundaryVertices, pose_sigma_scale: float) -> Estimate:
         """Estimate on an image of its own; nothing is remembered of it."""
@@ -96,9 +99,8 @@ class Tracker(Generic[StateT]):
         calibration, state = calibrate_still_with_state(
             self.calibrator, segments, intrinsics, self.lane_width
         )
-        calibration = calibration.with_std_scaled(pose_sigma_scale)
         reasons = Reason(int(self.calibrator.reasons(state)[0]))
-        return Estimate(segments, self._with_common_error(calibration), reasons)
+        return Estimate(segments, self.given_out(calibration, pose_sigma_scale), reasons)
 
     def _common_error(self, extrinsics: Extrinsics) -> Tensor:
         """Return the covariance (1, 4, 4) of what focal length and lane width make wrong in all frames alike.
@@ -110,6 +112,12 @@ class Tracker(Generic[StateT]):
             common = common + focal_covariance(extrinsics, self.camera.intrinsics[None], self.focal_std)
         return common
 
-    def _with_common_error(self, calibration: Calibration) -> Calibration:
-        more = self._common_error(calibration.extrinsics)
-        return calibration._replace(covariance=calibration.covariance + more)
+    def given_out(self, calibration: Calibration, pose_sigma_scale: float) -> Calibration:
+        """Return a calibration with the covariance that goes out.
+
+        Args:
+            calibration: as the calibrator gave it.
+            pose_sigma_scale: factor on the standard deviations of the pose.
+        """
+        scaled = calibration.with_std_scaled(pose_sigma_scale)
+        return scaled._replace(covariance=scaled.covariance + self._common_error(calibration.extrinsics))

@@ -29,8 +29,9 @@ CSV_COLUMNS = (
 _COLUMN_TYPES = (int, *[float] * 9, str, int, str, str)
 
 OUTPUT_NAMES = (
-    "extrinsics.csv", "lanes.json", "bev.mp4", "bev.png", "overlay.mp4", "overlay.png", "report.html",
-    "state.safetensors", "calibration.yaml", "covariance.csv", *(known.file for known in FORMATS.values()),
+    "extrinsics.csv", "filtered.csv", "lanes.json", "bev.mp4", "bev.png", "overlay.mp4", "overlay.png",
+    "report.html", "state.safetensors", "calibration.yaml", "covariance.csv",
+    *(known.file for known in FORMATS.values()),
 )  # fmt: skip
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # what a disk says that has no room

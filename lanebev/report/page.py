@@ -38,12 +38,13 @@ class Report:
         title: the source's name.
         rows: of ``extrinsics.csv``.
         before: (F, L-1) m, lane widths in the view with the pose before.
-        after: (F, L-1) m, with the online pose.
+        after: (F, L-1) m, with the online pose, or the smoothed one.
         lane_width: m, assumed.
         facts: what ran, label to value.
         moments: pictures of some frames by place of their row: "image", "before" and "after" as JPEG.
         problems: frames that did not decode and the like, one line each.
         is_stills: each image on its own.
+        is_smoothed: each pose from the whole drive.
         before_title: what "before" is.
         truth: a row per frame, of a rendered drive.
         camera: the lens.
@@ -59,6 +60,7 @@ class Report:
     moments: Mapping[int, Jpegs] = field(default_factory=dict)
     problems: Sequence[str] = field(default_factory=list)
     is_stills: bool = False
+    is_smoothed: bool = False
     before_title: str = "first frame's pose held"
     truth: Sequence[ExtrinsicsRow] | None = None
     camera: Camera | None = None
@@ -67,7 +69,7 @@ class Report:
     @property
     def after_title(self) -> str:
         """What "after" is."""
-        return "calibrated" if self.is_stills else "online"
+        return "calibrated" if self.is_stills else "smoothed" if self.is_smoothed else "online"
 
 
 def write_report(path: str | Path, report: Report) -> None:

@@ -82,7 +82,7 @@ def has(state: JointState, reason: Reason) -> Tensor:
 
 
 def smooth_states(
-    states: Sequence[JointState], dt: Sequence[Tensor], cfg: JointConfig
+    states: Sequence[JointState], dt: Sequence[Tensor] | Tensor, cfg: JointConfig
 ) -> Iterator[JointState]:
     """Yield the smoothed states of a drive, the last one first, with ``mean`` and ``cov`` replaced.
 
@@ -91,7 +91,8 @@ def smooth_states(
     Args:
         states: after every frame, (B, ...) each, in order; they are looked at from the last one to the first,
             so that a sequence which reads them from a file does.
-        dt: (B,) s from the frame before to each frame, as the calibrator was given it; the first is not used.
+        dt: (T, B), or (B,) for each frame: s from the frame before, as the calibrator was given it; the first
+            is not used.
         cfg: the calibrator's.
     """
     if not states:
@@ -129,7 +130,7 @@ def _backward_links(
 def smooth_drive(
     calibrations: Sequence[Calibration],
     states: Sequence[JointState],
-    dt: Sequence[Tensor],
+    dt: Sequence[Tensor] | Tensor,
     cfg: JointConfig,
 ) -> list[Calibration]:
     """Compute the calibration of every frame of a drive from all of its frames.

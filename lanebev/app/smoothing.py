@@ -1,0 +1,181 @@
+"""The first of the two passes of ``lanebev run --smooth``: every pose of a drive from all of its frames."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import NamedTuple, cast, overload
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lanebev.app.build import RunTracker
+from lanebev.app.kept import KeptNumbers
+from lanebev.app.observers import Observation
+from lanebev.app.take_up import LANES_FILE, frame_name
+from lanebev.estimation.joint.layout import POSE
+from lanebev.estimation.joint.smoother import smooth_states, smoothed_calibration
+from lanebev.estimation.joint.state import JointConfig, JointState
+from lanebev.estimation.tracker import Estimate
+from lanebev.io.lanes import tusimple_line
+from lanebev.io.results import OutputFolder
+from lanebev.io.video import Frame, FrameSource
+from lanebev.types import Calibration, Extrinsics
+
+_STATES = ".states"
+_NO_LANES = (np.empty(0), np.empty((0, 0)))  # rows, and columns of curves: what was seen is enough
+
+
+class SmoothedPoses(NamedTuple):
+    """Poses of a drive as they go out, by number of the frame.
+
+    Attributes:
+        poses: (F, 4) rad, rad, rad, m.
+        covariances: (F, 4, 4).
+    """
+
+    poses: NDArray[np.float64]
+    covariances: NDArray[np.float64]
+
+    def of(self, estimate: Estimate, number: int) -> Estimate:
+        """Return a frame's estimate with the smoothed pose and its covariance."""
+        pose, covariance = (torch.from_numpy(part[number : number + 1].copy()) for part in self)
+        calibration = estimate.calibration._replace(
+            extrinsics=Extrinsics.unstack(pose), covariance=covariance
+        )
+        return estimate._replace(calibration=calibration)
+
+
+class KeptStates(Sequence[JointState]):
+    """States of batch size 1 after every frame, in a file: memory stays flat.
+
+    A state of six boundaries takes 6 kB, so that an hour at 30 frames a second takes 0.6 GB.
+
+    Args:
+        path: of the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = open(path, "w+b")  # noqa: SIM115 - closed by close
+        self._count, self._size = 0, 0
+        self._like: JointState | None = None
+
+    def append(self, state: JointState) -> None:
+        """Add the state after the next frame."""
+        self._like = state
+        record = torch.cat([_packed(part).flatten().double() for part in state]).cpu().numpy().tobytes()
+        self._size = len(record)
+        self._file.write(record)
+        self._count += 1
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, place: int) -> JointState: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> list[JointState]: ...
+
+    def __getitem__(self, place: int | slice) -> JointState | list[JointState]:
+        if isinstance(place, slice):
+            return [self[each] for each in range(*place.indices(len(self)))]
+        at = range(len(self))[place]
+        like = cast(JointState, self._like)
+        self._file.flush()
+        record = os.pread(self._file.fileno(), self._size, at * self._size)
+        numbers = torch.frombuffer(bytearray(record), dtype=torch.float64)
+        parts = numbers.split([_packed(part).numel() for part in like])
+        return JointState._make(map(_unpacked, parts, like))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def _packed(part: Tensor) -> Tensor:
+    """Return a part of a state, of a symmetric matrix (1, D, D) the lower triangle only."""
+    if not _is_covariance(part):
+        return part
+    row, column = torch.tril_indices(*part.shape[1:])
+    return part[:, row, column]
+
+
+def _unpacked(numbers: Tensor, like: Tensor) -> Tensor:
+    if _is_covariance(like):
+        row, column = torch.tril_indices(*like.shape[1:])
+        matrix = numbers.new_zeros(like.shape)
+        matrix[:, row, column] = matrix[:, column, row] = numbers
+        numbers = matrix
+    return numbers.reshape(like.shape).to(like.dtype)
+
+
+def _is_covariance(part: Tensor) -> bool:
+    return part.ndim == 3 and part.shape[1] == part.shape[2]
+
+
+def smooth_frames(
+    frames: Iterable[tuple[Frame, Observation]],
+    tracker: RunTracker,
+    out: OutputFolder,
+    source: FrameSource,
+) -> SmoothedPoses:
+    """Track all frames, and then smooth from the last one to the first.
+
+    What was seen is written to lanes.json, for the second pass or, if this one is killed, for another run.
+
+    Args:
+        frames: of a drive, with what is seen in them.
+        tracker: with the joint calibrator.
+        out: for lanes.json and, meanwhile, the states.
+        source: of the frames.
+    """
+    path = out / _STATES
+    states, intervals = KeptStates(path), KeptNumbers(1)
+    covariances, scales = KeptNumbers(4, 4), KeptNumbers(1)
+    with closing(states), open(out / LANES_FILE, "w", encoding="utf-8", buffering=1) as lanes:  # whole lines
+        for frame, seen in frames:
+            lanes.write(tusimple_line(frame_name(frame, source), *_NO_LANES, *seen) + "\n")
+            tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale)
+            states.append(cast(JointState, tracker.state))
+            intervals.append(np.array([frame.dt]))
+            covariances.append(tracker.unscaled_covariance[0].double().cpu().numpy())
+            scales.append(np.array([seen.pose_sigma_scale]))
+        smoothed = _smoothed(states, intervals, covariances, scales, tracker)
+    path.unlink()
+    return smoothed
+
+
+def _smoothed(
+    states: KeptStates,
+    intervals: KeptNumbers,
+    covariances: KeptNumbers,
+    scales: KeptNumbers,
+    tracker: RunTracker,
+) -> SmoothedPoses:
+    """Smooth kept states.
+
+    Args:
+        states: after every frame.
+        intervals: s from the frame before.
+        covariances: of the pose as the calibrator gave it.
+        scales: factor on the standard deviations of the pose.
+        tracker: which they are from.
+    """
+    steps, count = torch.from_numpy(intervals.all().copy()), len(states)
+    result = SmoothedPoses(np.empty((count, 4)), np.empty((count, 4, 4)))
+    backward = zip(range(count - 1, -1, -1), smooth_states(states, steps, JointConfig()), strict=True)
+    for number, smoothed in backward:
+        state = states[number]
+        given = torch.from_numpy(covariances.all()[number : number + 1].copy())
+        pose, nobody = Extrinsics.unstack(state.mean[:, POSE]), given.new_zeros(1, 0)
+        filtered = Calibration(pose, given, state.status, nobody)
+        scale = float(scales.all()[number, 0])
+        calibration = tracker.given_out(smoothed_calibration(filtered, state, smoothed), scale)
+        result.poses[number] = calibration.extrinsics.stack()[0].numpy()
+        result.covariances[number] = calibration.covariance[0].numpy()
+    return result
