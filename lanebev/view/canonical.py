@@ -13,13 +13,8 @@ from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import Extrinsics
 from lanebev.view.checks import check_cameras, check_image, check_size
 from lanebev.view.lens import make_lens
-from lanebev.view.sampling import (
-    CellSums,
-    MapSize,
-    normalised_intrinsics,
-    resample,
-    sampling_maps,
-)
+from lanebev.view.projection import CellSums, normalised_intrinsics
+from lanebev.view.sampling import MapSize, resampled
 
 
 class CanonicalCells(NamedTuple):
@@ -123,8 +118,8 @@ class CanonicalView(nn.Module):
             CellSums(*(part.to(dtype) for part in cells.down)),
             cells.stretch.to(dtype),
         )
-        (sampling,), valid = sampling_maps(cells, lens, [MapSize(image.shape[-2], image.shape[-1])], size)
-        return resample(image, sampling), valid
+        (view,), valid = resampled([image], cells, lens, [MapSize(image.shape[-2], image.shape[-1])], size)
+        return view, valid
 
     @full_precision
     def _cells(self, image_from_cam: Tensor | None, extrinsics: Extrinsics) -> CanonicalCells:

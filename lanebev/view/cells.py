@@ -12,7 +12,7 @@ from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import Extrinsics
 from lanebev.view.grid import BEVGrid
 from lanebev.view.lens import Lens, make_lens
-from lanebev.view.sampling import CellSums
+from lanebev.view.projection import CellSums
 
 _BEHIND = -1e6  # m, depth given to planes that are not below the camera
 

@@ -13,10 +13,11 @@ from torch import Tensor
 from lanebev.camera.model import Camera
 from lanebev.geometry.distortion import max_undistorted_radius
 from lanebev.types import Extrinsics
+from lanebev.view.blocks import BLOCK
 from lanebev.view.cells import cell_sums, cells_and_lens
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.kept import KeptArrays
-from lanebev.view.sampling import BLOCK, LEAST_DEPTH, image_coordinates
+from lanebev.view.projection import LEAST_DEPTH, image_coordinates
 
 _kept = KeptArrays()
 

@@ -12,7 +12,8 @@ from lanebev.geometry.precision import common_dtype, full_precision
 from lanebev.types import Extrinsics
 from lanebev.view.checks import check_cameras, check_image, check_size
 from lanebev.view.grid import BEVGrid, bev_from_image
-from lanebev.view.sampling import CellSums, MapSize, normalised_intrinsics, resample, sampling_maps
+from lanebev.view.projection import CellSums, normalised_intrinsics
+from lanebev.view.sampling import MapSize, resampled
 
 _ABOVE = -1e6  # depth of what is not on the road
 
@@ -87,8 +88,8 @@ class ImageFromBEV(nn.Module):
         else:
             points = self._points(intrinsics, extrinsics, image_size, distortion, model)
             cells = PixelCells(points.to(dtype))
-        (sampling,), valid = sampling_maps(cells, None, [MapSize(bev.shape[-2], bev.shape[-1])], size)
-        return resample(bev, sampling), valid
+        (image,), valid = resampled([bev], cells, None, [MapSize(bev.shape[-2], bev.shape[-1])], size)
+        return image, valid
 
     @full_precision
     def _sums(self, intrinsics: Tensor, extrinsics: Extrinsics, image_size: tuple[int, int]) -> CellSums:

@@ -1,61 +1,27 @@
-"""The maps of a resampling: where an image is sampled for each cell, and which cells it does not show.
+"""The one resampling of maps at the cells that an image shows.
 
-Coordinates are planes (B, 2, R, V), never pairs, and rows of cells are processed in blocks that stay in the
-cache. Sums that are zero inside the image tell what lies outside: comparisons and ``where`` take several
-times as long as arithmetic on a CPU.
+Coordinates are computed in blocks of rows that stay in the cache; without gradients, in memory that is kept.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lanebev.view.blocks import Block, blocks, traced
 from lanebev.view.kept import KeptArrays
-from lanebev.view.lens import Lens, image_planes
+from lanebev.view.lens import Lens
+from lanebev.view.projection import Cells
 
 _kept = KeptArrays()
 
-LEAST_DEPTH = 1e-3  # in front of the camera; m for cells of the road
 _PUSH = 1e4  # factor that moves what lies outside away from the map, even a millimetre above the road
-BLOCK = 1 << 17  # cells: a dozen float32 planes of so many fit a cache of a few MB
-
-
-class Cells(Protocol):
-    """Homogeneous coordinates of R × V cells."""
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(B, R, V)."""
-        ...
-
-    def rows(self, first: int, last: int) -> Tensor:
-        """Return those of rows first to last - 1, (B, 3, last - first, V), a tensor of its own."""
-        ...
-
-
-class CellSums(NamedTuple):
-    """Homogeneous coordinates of cells, as sums of a row's and a column's part.
-
-    Attributes:
-        by_row: (B, 3, R).
-        by_column: (B, 3, V).
-    """
-
-    by_row: Tensor
-    by_column: Tensor
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(B, R, V)."""
-        return self.by_row.shape[0], self.by_row.shape[2], self.by_column.shape[2]
-
-    def rows(self, first: int, last: int) -> Tensor:
-        """Return those of rows first to last - 1, (B, 3, last - first, V)."""
-        return self.by_row[..., first:last].unsqueeze(-1) + self.by_column.unsqueeze(-2)
+_FEW = 8  # channels of which a copy costs less than to sample one image with one thread
 
 
 class MapSize(NamedTuple):
@@ -71,135 +37,76 @@ class MapSize(NamedTuple):
     stride: float | None = None
 
 
-def normalised_intrinsics(intrinsics: Tensor, image_size: tuple[int, int]) -> Tensor:
-    """Intrinsics to coordinates in which the image, its outer pixels' edges included, is [-1, 1].
-
-    This is the convention of ``grid_sample(align_corners=False)``: the same for maps of every size.
-
-    Args:
-        intrinsics: (B, 3, 3) px.
-        image_size: (H, W) px.
-    """
-    height, width = image_size
-    scale = intrinsics.new_tensor([2 / width, 2 / height, 1.0]).unsqueeze(-1)
-    shift = intrinsics.new_tensor([1 / width - 1, 1 / height - 1, 0.0]).unsqueeze(-1)
-    return intrinsics * scale + intrinsics[..., 2:, :] * shift
-
-
-def image_coordinates(cells: Tensor, lens: Lens | None) -> tuple[Tensor, Tensor]:
-    """Project cells.
-
-    Args:
-        cells: (B, 3, R, V) homogeneous coordinates in the image, or with a lens in the camera.
-        lens: None for an undistorted image.
-
-    Returns:
-        (B, 2, R, V) coordinates, finite everywhere, and (B, R, V): zero in front of the camera and where the
-        lens does not fold over, else positive.
-    """
-    depth = cells[:, 2]
-    ahead = depth.clamp(min=LEAST_DEPTH)
-    points = cells[:, :2] / ahead.unsqueeze(1)
-    hidden = (ahead - depth).detach()
-    if lens is None:
-        return points, hidden
-    points, beyond = image_planes(points, lens)
-    return points, hidden + beyond
-
-
-def outside_image(points: Tensor, hidden: Tensor) -> Tensor:
-    """Mark what an image does not show.
-
-    Args:
-        points: (B, 2, R, V) normalised coordinates.
-        hidden: (B, R, V), zero where seen.
-
-    Returns:
-        (B, R, V), zero where seen and inside the image, else positive; without gradient.
-    """
-    beyond = F.hardshrink(points.detach(), 1.0)  # zero in [-1, 1]
-    x, y = beyond.unbind(1)
-    return torch.addcmul(torch.addcmul(hidden, x, x), y, y)
-
-
-def sampling_maps(
-    cells: Cells, lens: Lens | None, sizes: Sequence[MapSize], image_size: tuple[int, int]
+def resampled(
+    maps: Sequence[Tensor],
+    cells: Cells,
+    lens: Lens | None,
+    sizes: Sequence[MapSize],
+    image_size: tuple[int, int],
 ) -> tuple[list[Tensor], Tensor]:
-    """Compute the maps for :func:`resample`.
-
-    Where nothing asks for a gradient, they are written to memory that the next call in this thread writes to
-    again: they are to be used up before.
+    """Sample maps of one image where it shows cells, bilinearly, zero where it does not.
 
     Args:
-        cells: homogeneous coordinates, :func:`normalised_intrinsics` applied; with a lens in the camera.
+        maps: (B, C, h, w) each.
+        cells: homogeneous coordinates, ``normalised_intrinsics`` applied; with a lens in the camera.
         lens: into normalised coordinates, or None.
-        sizes: of every map to be sampled.
+        sizes: of every map.
         image_size: (H, W) px of the image that the coordinates belong to.
 
     Returns:
-        (B, 2, R, V) for each size, and (B, 1, R, V) bool: valid.
+        (B, C, R, V) of each map in its dtype, and (B, 1, R, V) bool: valid.
     """
-    if _may_overwrite():
-        return _filled_maps(cells, lens, sizes, image_size)
-    batch, rows, columns = cells.shape
-    block = max(1, BLOCK // max(1, batch * columns))
-    if torch.compiler.is_compiling():  # compiled code has no planes in between
-        block = rows
-    maps: list[tuple[list[Tensor], list[Tensor]]] = [([], []) for _ in sizes]
+    limit = min(1 - 1 / side for size in sizes for side in (size.width, size.height))
+    kept = _kept_maps(len(maps), cells) if _may_overwrite() else None
+    parts: list[list[Tensor]] = [[] for _ in maps]
     invalid = []
-    for first in range(0, rows, block):
-        points, hidden = image_coordinates(cells.rows(first, min(first + block, rows)), lens)
-        outside = outside_image(points, hidden)
-        for size, (xs, ys) in zip(sizes, maps, strict=True):
-            x = map_coordinate(points[:, 0], size.width, size.stride, image_size[1])
-            xs.append(torch.add(x, outside, alpha=_PUSH))
-            ys.append(map_coordinate(points[:, 1], size.height, size.stride, image_size[0]))
-        invalid.append(outside.bool())
-    stacked = [torch.cat([*xs, *ys], dim=1).unflatten(1, (2, rows)) for xs, ys in maps]
-    return stacked, torch.cat(invalid, dim=1).logical_not().unsqueeze(1)
+    for block in blocks(cells, lens, limit, kept[0] if kept else None):
+        for number in reversed(range(len(maps))):  # the first map may take the place of the points
+            out = kept[number][:, :, block.first : block.last] if kept else None
+            parts[number].append(block_map(block, sizes[number], image_size, out))
+        invalid.append(block.invalid())
+    at = kept or [torch.cat(part, dim=2) for part in parts]
+    found = [_sample(each, where) for each, where in zip(maps, at, strict=True)]
+    return found, torch.cat(invalid, dim=1).logical_not().unsqueeze(1)
 
 
 def _may_overwrite() -> bool:
     """Whether results need no graph, be it of gradients or of operations."""
-    traced = torch.compiler.is_compiling() or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
-    return not (torch.is_grad_enabled() or traced or torch._C._are_functorch_transforms_active())
+    return not (torch.is_grad_enabled() or traced())
 
 
-def _filled_maps(
-    cells: Cells, lens: Lens | None, sizes: Sequence[MapSize], image_size: tuple[int, int]
-) -> tuple[list[Tensor], Tensor]:
-    """Compute what :func:`sampling_maps` does, by the same arithmetic in place, in memory that is kept."""
-    batch, rows, columns = cells.shape
+def _kept_maps(count: int, cells: Cells) -> list[Tensor]:
+    """Memory for maps; the device's own store of memory elsewhere than on a CPU."""
     like = cells.rows(0, 0)
-    maps = [_kept_map(number, (batch, 2, rows, columns), like) for number in range(len(sizes))]
-    valid = torch.empty((batch, 1, rows, columns), dtype=torch.bool, device=like.device)
-    block = max(1, BLOCK // max(1, batch * columns))
-    for first in range(0, rows, block):
-        last = min(first + block, rows)
-        homogeneous = cells.rows(first, last)
-        depth = homogeneous[:, 2]
-        ahead = depth.clamp(min=LEAST_DEPTH)
-        points = homogeneous[:, :2].div_(ahead.unsqueeze(1))
-        outside = ahead.sub_(depth)
-        if lens is not None:
-            points, beyond = image_planes(points, lens)
-            outside += beyond
-        for beyond in F.hardshrink(points, 1.0).unbind(1):
-            outside.addcmul_(beyond, beyond)
-        for size, whole in zip(sizes, maps, strict=True):
-            x, y = whole[:, :, first:last].unbind(1)
-            map_coordinate(points[:, 0], size.width, size.stride, image_size[1], out=x)
-            map_coordinate(points[:, 1], size.height, size.stride, image_size[0], out=y)
-            x.add_(outside, alpha=_PUSH)
-        torch.logical_not(outside.bool(), out=valid[:, 0, first:last])
-    return maps, valid
-
-
-def _kept_map(number: int, shape: tuple[int, int, int, int], like: Tensor) -> Tensor:
-    """Memory for the map of this number; the device's own store of memory elsewhere than on a CPU."""
+    shape = (cells.shape[0], 2, *cells.shape[1:])
     if like.device.type != "cpu":
-        return like.new_empty(shape)
-    return torch.from_numpy(_kept(f"map {number}", shape, like.numpy().dtype))
+        return [like.new_empty(shape) for _ in range(count)]
+    return [torch.from_numpy(_kept(f"map {number}", shape, like.numpy().dtype)) for number in range(count)]
+
+
+def block_map(block: Block, size: MapSize, image_size: tuple[int, int], out: Tensor | None = None) -> Tensor:
+    """Compute the coordinates of a map for ``grid_sample``; far away where not seen.
+
+    Args:
+        block: of the image.
+        size: of the map.
+        image_size: (H, W) px.
+        out: (B, 2, rows, V) to write to, which may be the block's points.
+
+    Returns:
+        (B, 2, rows, V).
+    """
+    if block.outside is None and size.stride is None:
+        if out is None or out.data_ptr() == block.points.data_ptr():
+            return block.points
+        return out.copy_(block.points)
+    x, y = block.points.unbind(1)
+    to_x, to_y = (None, None) if out is None else out.unbind(1)
+    x = map_coordinate(x, size.width, size.stride, image_size[1], to_x)
+    y = map_coordinate(y, size.height, size.stride, image_size[0], to_y)
+    if block.outside is not None:
+        x = torch.add(x, block.outside, alpha=_PUSH, out=to_x)
+    return torch.stack([x, y], dim=1) if out is None else out
 
 
 def map_coordinate(
@@ -223,9 +130,28 @@ def map_coordinate(
     return F.hardtanh(coordinate, -centre, centre)
 
 
-def resample(features: Tensor, sampling_map: Tensor) -> Tensor:
-    """Sample (B, C, h, w) bilinearly, zero where the map lies outside, in the features' dtype."""
+def _sample(features: Tensor, at: Tensor) -> Tensor:
+    """Sample (B, C, h, w) bilinearly at (B, 2, R, V), zero where that lies outside, in its dtype."""
+    strips = _strips(features, at)
+    if strips == 1:
+        return _grid_sample(features, at)
+    parts = at[0].unflatten(1, (strips, -1)).transpose(0, 1)
+    sampled = _grid_sample(features.expand(strips, -1, -1, -1), parts)
+    return sampled.transpose(0, 1).flatten(1, 2).unsqueeze(0)
+
+
+def _strips(features: Tensor, at: Tensor) -> int:
+    """Number of strips of rows to be sampled as if they were images of a batch.
+
+    ``grid_sample`` divides its work on a CPU by images: of one image, one thread does all. A copy puts the
+    strips together, and gradients of the image would be computed once for each.
+    """
+    one = len(features) == 1 and features.shape[1] <= _FEW and features.device.type == "cpu"
+    return math.gcd(at.shape[2], torch.get_num_threads()) if one and _may_overwrite() else 1
+
+
+def _grid_sample(features: Tensor, at: Tensor) -> Tensor:
     sampled = F.grid_sample(
-        features.to(sampling_map.dtype), sampling_map.movedim(1, -1), "bilinear", "zeros", align_corners=False
+        features.to(at.dtype), at.movedim(1, -1), "bilinear", "zeros", align_corners=False
     )
     return sampled.to(features.dtype)

@@ -12,13 +12,8 @@ from lanebev.types import Extrinsics
 from lanebev.view.cells import cells_and_lens
 from lanebev.view.checks import check_cameras, check_image, check_size
 from lanebev.view.grid import BEVGrid
-from lanebev.view.sampling import (
-    MapSize,
-    image_coordinates,
-    normalised_intrinsics,
-    resample,
-    sampling_maps,
-)
+from lanebev.view.projection import image_coordinates, normalised_intrinsics
+from lanebev.view.sampling import MapSize, resampled
 
 
 class BEVWarp(nn.Module):
@@ -106,8 +101,8 @@ class BEVWarp(nn.Module):
             self.grid, normalised_intrinsics(intrinsics, size), extrinsics, distortion, model,
             common_dtype(*maps), self.plane_heights or (0.0,),
         )  # fmt: skip
-        sampling, valid = sampling_maps(cells, lens, sizes, size)
-        bevs = [self._planes(resample(each, at)) for each, at in zip(maps, sampling, strict=True)]
+        sampled, valid = resampled(maps, cells, lens, sizes, size)
+        bevs = [self._planes(each) for each in sampled]
         return bevs[0] if maps[0] is image else bevs, self._planes(valid)
 
     def image_points(

@@ -257,7 +257,7 @@ def test_blocks_of_rows_change_nothing(monkeypatch):
     extrinsics, intrinsics = pose([0.03, 0.02, -0.05, 1.4]), LENS.intrinsics[None]
     args = (smooth_image(), intrinsics, extrinsics, LENS.distortion[None])
     whole, valid = BEVWarp(GRID)(*args)
-    monkeypatch.setattr("lanebev.view.sampling.BLOCK", 7 * GRID.shape[1])
+    monkeypatch.setattr("lanebev.view.blocks.BLOCK", 7 * GRID.shape[1])
     bev, there = BEVWarp(GRID)(*args)
     assert torch.equal(bev, whole)
     assert torch.equal(there, valid)

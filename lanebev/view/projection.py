@@ -1,0 +1,102 @@
+"""Where an image shows cells: homogeneous coordinates to those of the image, and what it does not show.
+
+Coordinates are planes (B, 2, R, V), never pairs. Sums that are zero inside the image tell what lies outside:
+comparisons and ``where`` take several times as long as arithmetic on a CPU.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from lanebev.view.lens import Lens, image_planes
+
+LEAST_DEPTH = 1e-3  # in front of the camera; m for cells of the road
+
+
+class Cells(Protocol):
+    """Homogeneous coordinates of R × V cells."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(B, R, V)."""
+        ...
+
+    def rows(self, first: int, last: int) -> Tensor:
+        """Return those of rows first to last - 1, (B, 3, last - first, V), a tensor of its own."""
+        ...
+
+
+class CellSums(NamedTuple):
+    """Homogeneous coordinates of cells, as sums of a row's and a column's part.
+
+    Attributes:
+        by_row: (B, 3, R).
+        by_column: (B, 3, V).
+    """
+
+    by_row: Tensor
+    by_column: Tensor
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(B, R, V)."""
+        return self.by_row.shape[0], self.by_row.shape[2], self.by_column.shape[2]
+
+    def rows(self, first: int, last: int) -> Tensor:
+        """Return those of rows first to last - 1, (B, 3, last - first, V)."""
+        return self.by_row[..., first:last].unsqueeze(-1) + self.by_column.unsqueeze(-2)
+
+
+def normalised_intrinsics(intrinsics: Tensor, image_size: tuple[int, int]) -> Tensor:
+    """Intrinsics to coordinates in which the image, its outer pixels' edges included, is [-1, 1].
+
+    This is the convention of ``grid_sample(align_corners=False)``: the same for maps of every size.
+
+    Args:
+        intrinsics: (B, 3, 3) px.
+        image_size: (H, W) px.
+    """
+    height, width = image_size
+    scale = intrinsics.new_tensor([2 / width, 2 / height, 1.0]).unsqueeze(-1)
+    shift = intrinsics.new_tensor([1 / width - 1, 1 / height - 1, 0.0]).unsqueeze(-1)
+    return intrinsics * scale + intrinsics[..., 2:, :] * shift
+
+
+def image_coordinates(cells: Tensor, lens: Lens | None) -> tuple[Tensor, Tensor]:
+    """Project cells.
+
+    Args:
+        cells: (B, 3, R, V) homogeneous coordinates in the image, or with a lens in the camera.
+        lens: None for an undistorted image.
+
+    Returns:
+        (B, 2, R, V) coordinates, finite everywhere, and (B, R, V): zero in front of the camera and where the
+        lens does not fold over, else positive.
+    """
+    depth = cells[:, 2]
+    ahead = depth.clamp(min=LEAST_DEPTH)
+    points = cells[:, :2] / ahead.unsqueeze(1)
+    hidden = (ahead - depth).detach()
+    if lens is None:
+        return points, hidden
+    points, beyond = image_planes(points, lens)
+    return points, hidden + beyond
+
+
+def outside_image(points: Tensor, hidden: Tensor) -> Tensor:
+    """Mark what an image does not show.
+
+    Args:
+        points: (B, 2, R, V) normalised coordinates.
+        hidden: (B, R, V), zero where seen.
+
+    Returns:
+        (B, R, V), zero where seen and inside the image, else positive; without gradient.
+    """
+    beyond = F.hardshrink(points.detach(), 1.0)  # zero in [-1, 1]
+    x, y = beyond.unbind(1)
+    return torch.addcmul(torch.addcmul(hidden, x, x), y, y)
