@@ -103,11 +103,13 @@ def _add_fleet(fleet: argparse.ArgumentParser) -> None:
     )
     words = "of a running Ray cluster; without it one begins on this machine and ends with the command"
     fleet.add_argument("--address", type=path, metavar="ADDRESS", help=words)
-    fleet.add_argument("--workers", type=_at_least(1), metavar="N", help="drives at a time here (one a core)")
+    fleet.add_argument("--workers", type=_at_least(1), metavar="N", help="processes here (one a core)")
     fleet.add_argument(
         "--retries", type=_at_least(0), default=2, metavar="N", help="of a drive (%(default)s)"
     )
-    words = "share of a GPU that a drive takes, with device: cuda in the manifest (%(default)s)"
+    words = "drives that a worker takes at a time, their frames as one batch for the network (%(default)s)"
+    fleet.add_argument("--batch", type=_at_least(1), default=1, metavar="N", help=words)
+    words = "share of a GPU that a worker takes, with device: cuda in the manifest (%(default)s)"
     fleet.add_argument("--gpus", type=float, default=0.0, metavar="SHARE", help=words)
     words = "folder that no path may leave (the manifest's)"
     fleet.add_argument("--root", type=path, metavar="DIR", help=words)
@@ -280,7 +282,8 @@ def _fleet(options: dict[str, Any]) -> tuple[str, int]:
     from lanebev.app.fleet.cluster import Cluster
     from lanebev.app.fleet.fleet import fleet
 
-    cluster = Cluster(**{name: options.pop(name) for name in ("address", "workers", "retries", "gpus")})
+    own = ("address", "workers", "retries", "gpus", "batch")
+    cluster = Cluster(**{name: options.pop(name) for name in own})
     result = fleet(**options, cluster=cluster, progress=_progress("drives"))
     return result.text, int(any(outcome.failure for outcome in result.outcomes.values()))
 

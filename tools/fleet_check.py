@@ -1,8 +1,9 @@
 """lanebev fleet over short rendered drives, workers killed and a file corrupt: python -m tools.fleet_check.
 
 Checks that every drive but the corrupt one has the outputs of a single run, to the last digit, that the
-corrupt one is reported, and that a second call does nothing. ``--timing`` then times one worker and several
-on the same drives. Prints a line of JSON.
+corrupt one is reported, and that a second call does nothing. Then times one worker and several on the same
+drives: the speed-up, and what a drive costs besides its run. Prints a line of JSON; its status is 0 if all
+is as it should be.
 """
 
 from __future__ import annotations
@@ -37,11 +38,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--drives", type=int, default=40)
     parser.add_argument("--frames", type=int, default=20, help="of each drive (%(default)s)")
     parser.add_argument(
-        "--network", type=int, default=1, help="drives that the network looks at (%(default)s)"
+        "--network", type=int, default=4, help="drives that the network looks at (%(default)s)"
     )
     parser.add_argument("--kills", type=int, default=2, help="workers to kill (%(default)s)")
     parser.add_argument("--workers", type=int, default=4)
-    parser.add_argument("--timing", action="store_true", help="time one worker and --workers, too")
+    parser.add_argument("--batch", type=int, default=1, help="drives a worker takes at a time (%(default)s)")
+    parser.add_argument("--no-timing", action="store_true", help="do not time one worker and --workers")
     parser.add_argument("--folder", type=Path, help="to leave all in")
     args = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as temporary:
@@ -58,10 +60,10 @@ def check(args: argparse.Namespace, folder: Path) -> dict[str, object]:
         "1"  # as Ray gives its workers: sums of several threads have another order
     )
     out = folder / "fleet"
-    said, seconds, killed = call(manifest, out, args.workers, args.kills, args.drives)
+    said, seconds, killed = call(manifest, out, args.workers, args.batch, args.kills, args.drives)
     counts = [int(number) for number in re.findall(r"(\d+) finished, (\d+) failed", said)[0]]
     before = times_of(out / "drives")
-    again, second, _ = call(manifest, out, args.workers)
+    again, second, _ = call(manifest, out, args.workers, args.batch)
     changed = sum(before.get(path) != time for path, time in times_of(out / "drives").items())
     equal, single = compare(manifest, out, folder / "single")
     found: dict[str, object] = {
@@ -76,7 +78,7 @@ def check(args: argparse.Namespace, folder: Path) -> dict[str, object]:
         "second_call_seconds": round(second, 1),
         "median_single_seconds": round(sorted(single)[len(single) // 2], 2),
     }
-    return found | (timing(manifest, folder, args) if args.timing else {})
+    return found | ({} if args.no_timing else timing(manifest, folder, args))
 
 
 def write_drives(folder: Path, drives: int, frames: int, network: int) -> Path:
@@ -97,11 +99,14 @@ def write_drives(folder: Path, drives: int, frames: int, network: int) -> Path:
     return folder / "manifest.csv"
 
 
-def call(manifest: Path, out: Path, workers: int, kills: int = 0, drives: int = 0) -> tuple[str, float, int]:
+def call(
+    manifest: Path, out: Path, workers: int, batch: int = 1, kills: int = 0, drives: int = 0
+) -> tuple[str, float, int]:
     """Run ``lanebev fleet`` and kill workers as drives end; what it says, seconds, how many were killed."""
     command = [sys.executable, "-m", "lanebev", "fleet", str(manifest), "--out", str(out)]
+    command += ["--workers", str(workers), "--batch", str(batch)]
     start, killed = time.perf_counter(), 0
-    process = subprocess.Popen([*command, "--workers", str(workers)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     while process.poll() is None and time.perf_counter() - start < PATIENCE:
         done = len(list((out / "drives").glob("*/fleet.json"))) if kills else 0
         if killed < kills and done >= (killed + 1) * drives // (kills + 2):
@@ -149,15 +154,30 @@ def compare(manifest: Path, out: Path, singles: Path) -> tuple[int, list[float]]
 
 
 def timing(manifest: Path, folder: Path, args: argparse.Namespace) -> dict[str, object]:
-    """Time one worker and several, without kills; overhead is what is no run, over the drives."""
-    found: dict[str, object] = {}
+    """Time one worker and several on the same drives, without kills.
+
+    ``seconds_N`` is a whole call, ``working_N`` of it from when the first run begins to when the last ends:
+    Ray and Python with torch start before, results are collected after. ``overhead_a_drive_N`` is what of
+    the workers' time in between is no run, over the drives.
+    """
+    found: dict[str, object] = {"cores": os.cpu_count()}
+    working = []
     for workers in (1, args.workers):
         out = folder / f"workers-{workers}"
-        _, seconds, _ = call(manifest, out, workers)
-        runs = [json.loads(path.read_text())["seconds"] for path in out.glob("drives/*/fleet.json")]
+        begin = time.time()
+        _, seconds, _ = call(manifest, out, workers, args.batch)
+        runs = [
+            (path.stat().st_mtime, json.loads(path.read_text())["seconds"])
+            for path in out.glob("drives/*/fleet.json")
+        ]
+        first = min(end - took for end, took in runs)
+        span, total = max(end for end, _ in runs) - first, sum(took for _, took in runs)
+        working.append(span)
         found[f"seconds_{workers}"] = round(seconds, 1)
-        found[f"runs_{workers}"] = round(sum(runs), 1)
-    return found
+        found[f"starting_{workers}"] = round(first - begin, 1)
+        found[f"working_{workers}"] = round(span, 1)
+        found[f"overhead_a_drive_{workers}"] = round((span * workers - total) / len(runs), 2)
+    return found | {"speed_up": round(working[0] / working[1], 2)}
 
 
 def times_of(folder: Path) -> dict[Path, int]:

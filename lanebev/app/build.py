@@ -9,6 +9,7 @@ import torch
 
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import LaneFileObserver, NetworkObserver, Observer
+from lanebev.app.shared_network import SharedNetwork
 from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator, StateT
 from lanebev.estimation.joint.calibrator import JointCalibrator
@@ -75,12 +76,38 @@ def _tracker(calibrator: Calibrator[StateT], config: RunConfig, camera: Camera) 
     return Tracker(calibrator, camera, config.lane_width, config.relative_focal_std, config.lane_width_std)
 
 
-def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Observer:
-    """Make what finds boundaries: by a lane file if one is given, else by the network.
+def needs_network(config: RunConfig) -> bool:
+    """Return whether a run looks at images by torch's network."""
+    return config.lanes is None and config.backend == "torch"
+
+
+def make_network(weights: str | None, device: str) -> LaneBEV:
+    """Load a network, the shipped one without ``weights``, on a device.
 
     Raises:
-        ValueError: lanes that do not fit the source, weights that do not fit the network, or a device that
-            is not there.
+        ValueError: weights that do not fit the network, or a device that is not there.
+    """
+    model = LaneBEV.from_pretrained(weights)
+    try:
+        return model.to(torch.device(device))
+    except (RuntimeError, AssertionError) as error:  # what torch raises of devices that it cannot use
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"device: expected one that torch can use here, got {device}: {reason}") from error
+
+
+def make_observer(
+    config: RunConfig, source: FrameSource, camera: Camera, network: SharedNetwork | None = None
+) -> Observer:
+    """Make what finds boundaries: by a lane file if one is given, else by the network.
+
+    Args:
+        config: the settings.
+        source: the frames.
+        camera: the lens.
+        network: that is there already, with the settings' weights on their device.
+
+    Raises:
+        ValueError: lanes that do not fit the source, or see :func:`make_network`.
     """
     if config.lanes is not None:
         entries = read_lanes(config.lanes, camera.intrinsics.double().numpy())
@@ -89,15 +116,7 @@ def make_observer(config: RunConfig, source: FrameSource, camera: Camera) -> Obs
         return LaneFileObserver(entries, source, camera)
     if config.backend == "onnxruntime":
         return NetworkObserver(onnx_model(Path(config.exported), camera), camera)
-    model = LaneBEV.from_pretrained(config.weights)
-    try:
-        model = model.to(torch.device(config.device))
-    except (RuntimeError, AssertionError) as error:  # what torch raises of devices that it cannot use
-        reason = str(error).splitlines()[0]
-        raise ValueError(
-            f"device: expected one that torch can use here, got {config.device}: {reason}"
-        ) from error
-    return NetworkObserver(model, camera)
+    return NetworkObserver(network or make_network(config.weights, config.device), camera)
 
 
 def input_files(config: RunConfig, source: FrameSource) -> list[str | Path]:

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from lanebev.app.shared_network import SharedNetwork
 from lanebev.camera.model import Camera
 from lanebev.io.lane_size import size_remark
 from lanebev.io.lanes import FrameLines, match_frames
@@ -19,6 +20,7 @@ from lanebev.pipeline import LaneBEV
 from lanebev.tensors import map_tensors
 
 _MOST_WORKERS = 4  # each holds a frame's feature maps in memory
+_WORKERS_SHARED = 2  # one frame of a drive is in the batch that is looked at, another waits for the next
 
 
 class Observation(NamedTuple):
@@ -89,16 +91,20 @@ class NetworkObserver:
     """Lanes from the images, by LaneBEV's network and line extraction.
 
     Args:
-        model: whose segmenter and extractor are used.
+        network: whose segmenter and extractor are used, by itself or in batches with other drives.
         camera: the lens.
     """
 
     remark = ""
 
-    def __init__(self, model: LaneBEV, camera: Camera) -> None:
-        self.model, self.camera = model.eval(), camera
-        self.device = next(model.parameters(), torch.zeros(0)).device  # ONNX has no parameters
+    def __init__(self, network: LaneBEV | SharedNetwork, camera: Camera) -> None:
+        self._shared = network if isinstance(network, SharedNetwork) else None
+        self.model = network.model if isinstance(network, SharedNetwork) else network.eval()
+        self.camera = camera
+        self.device = next(self.model.parameters(), torch.zeros(0)).device  # ONNX has no parameters
         self.workers = min(torch.get_num_threads(), _MOST_WORKERS) if self.device.type == "cpu" else 1
+        if self._shared is not None and self._shared.most > 1:
+            self.workers = _WORKERS_SHARED
 
     def __call__(self, frame: Frame) -> Observation:
         """See :class:`Observer`."""
@@ -106,7 +112,10 @@ class NetworkObserver:
             return Observation(vertices_from_lines([], self.camera), self.model.pose_sigma_scale)
         image = network_image(check_frame(frame.image, self.camera.image_size), self.device)
         with torch.inference_mode():
-            _, vertices = self.model.boundary_vertices(image)
+            if self._shared is not None:
+                vertices = self._shared.vertices(image)
+            else:
+                _, vertices = self.model.boundary_vertices(image)
         return Observation(map_tensors(Tensor.cpu, vertices), self.model.pose_sigma_scale)
 
     def restored(self, found: FrameLines) -> Observation:

@@ -26,6 +26,7 @@ from lanebev.app.observers import Observer
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states
+from lanebev.app.shared_network import SharedNetwork
 from lanebev.app.smoothing import SmoothedPoses, smooth_frames
 from lanebev.app.sources import camera_of, ended_by_signals, make_source, observed_frames
 from lanebev.app.summary import mount_facts, run_facts
@@ -49,7 +50,10 @@ logger = logging.getLogger(__name__)
 
 
 def run(
-    config: RunConfig, progress: Progress | None = None, truth: Sequence[ExtrinsicsRow] | None = None
+    config: RunConfig,
+    progress: Progress | None = None,
+    truth: Sequence[ExtrinsicsRow] | None = None,
+    network: SharedNetwork | None = None,
 ) -> Report:
     """Run on all frames and write the output folder, all of it or nothing.
 
@@ -60,6 +64,7 @@ def run(
         config: what to run.
         progress: wraps the frames, told how many there are.
         truth: of a rendered drive, a row per frame, for the report.
+        network: that is there already, with the settings' weights on their device.
 
     Returns:
         what the report page shows.
@@ -73,7 +78,7 @@ def run(
     camera = camera_of(config, source)
     source = match_image_size(camera, source)
     logger.info("%s: %d frames of %d x %d", source.source, source.count, *reversed(camera.image_size))
-    observer = make_observer(config, source, camera)
+    observer = make_observer(config, source, camera, network)
     tracker = make_tracker(config, camera)
     problem = load_states(config, tracker, camera)
     viewer = None if config.rerun is None else open_viewer(config.rerun, camera)

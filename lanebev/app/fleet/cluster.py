@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import logging
 import os
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from types import ModuleType
 
+from lanebev.app.build import needs_network
 from lanebev.app.fleet.plan import Outcome, Task, write_mark
-from lanebev.app.fleet.worker import run_task
-from lanebev.io.results import OutputFolderError
+from lanebev.app.fleet.worker import run_tasks
 
 _IN_FLIGHT = 4  # tasks a core that Ray knows of at a time
 _STORE = 80 * 2**20  # bytes of shared memory: results are a few numbers
@@ -27,6 +28,7 @@ class Cluster:
         retries: of a task that failed or whose worker died.
         cpus: cores of a task.
         gpus: share of a GPU of a task.
+        batch: drives of a task, whose frames the network looks at in one batch.
     """
 
     address: str | None = None
@@ -34,6 +36,7 @@ class Cluster:
     retries: int = 2
     cpus: float = 1.0
     gpus: float = 0.0
+    batch: int = 1
 
 
 def check_ray() -> None:
@@ -48,49 +51,64 @@ def check_ray() -> None:
         )
 
 
+def groups_of(tasks: Sequence[Task], batch: int) -> list[tuple[Task, ...]]:
+    """Return tasks in groups of up to ``batch`` for one network; those that need none, one by one."""
+    alike: dict[tuple[object, ...], list[Task]] = {}
+    for task in tasks:
+        config = task.config
+        shares = needs_network(config) and batch > 1
+        key = (config.weights, config.device) if shares else (task.name,)
+        alike.setdefault(key, []).append(task)
+    return [
+        tuple(own[first : first + batch]) for own in alike.values() for first in range(0, len(own), batch)
+    ]
+
+
 def outcomes(tasks: Sequence[Task], cluster: Cluster) -> Iterator[Outcome]:
     """Run tasks and yield what became of each, in the order in which they end.
 
-    Ray starts a task again whose worker died or which raised. After ``retries`` it counts as failed; where
-    it was the input's fault, that is noted, and it is not tried again until its files or settings change.
+    Ray begins a group of tasks again whose worker died; if it dies again and again, its tasks are begun one
+    by one. One that fails is begun again, alone. After ``retries`` it counts as failed; where it was the
+    input's fault, that is noted, and it is not tried again until its files or settings change.
     """
     ray = _started(cluster)
     try:
-        remote = ray.remote(run_task).options(
-            num_cpus=cluster.cpus,
-            num_gpus=cluster.gpus,
-            max_retries=cluster.retries,
-            retry_exceptions=True,
+        remote = ray.remote(run_tasks).options(
+            num_cpus=cluster.cpus, num_gpus=cluster.gpus, max_retries=cluster.retries
         )
         most = max(16, round(_IN_FLIGHT * ray.cluster_resources().get("CPU", 1)))
-        waiting, pending = iter(tasks), dict[object, Task]()
-        while True:
-            while len(pending) < most and (task := next(waiting, None)) is not None:
-                pending[remote.remote(task)] = task
-            if not pending:
-                return
+        waiting = deque(groups_of(tasks, cluster.batch))
+        pending = dict[object, tuple[Task, ...]]()
+        failures = Counter[str]()
+        while waiting or pending:
+            while waiting and len(pending) < most:
+                group = waiting.popleft()
+                pending[remote.remote(group)] = group
             ready, _ = ray.wait(list(pending), num_returns=1)
             for each in ready:
-                yield _outcome(ray, each, pending.pop(each))
+                group = pending.pop(each)
+                found, is_last = _found(ray, each, group)
+                for task, outcome in zip(group, found, strict=True):
+                    failures[task.name] += bool(outcome.failure)
+                    if outcome.failure and not is_last and failures[task.name] <= cluster.retries:
+                        waiting.append((task,))
+                        continue
+                    if outcome.is_final:
+                        write_mark(task, outcome)
+                    yield outcome
     finally:
         ray.shutdown()
 
 
-def _outcome(ray: ModuleType, reference: object, task: Task) -> Outcome:
+def _found(ray: ModuleType, reference: object, group: Sequence[Task]) -> tuple[Sequence[Outcome], bool]:
+    """Return what became of a group, and whether Ray has tried all it was told to."""
     try:
-        outcome: Outcome = ray.get(reference)
-    except ray.exceptions.RayTaskError as error:
-        is_input = isinstance(error.cause, (ValueError, OSError))
-        words = " ".join(str(error.cause).split()) or type(error.cause).__name__
-        words = words if is_input else f"{type(error.cause).__name__}: {words}"
-        is_final = isinstance(error.cause, ValueError) and not isinstance(error.cause, OutputFolderError)
-        outcome = Outcome(task.name, failure=words, is_final=is_final)
-        if outcome.is_final:
-            write_mark(task, outcome)
+        found: Sequence[Outcome] = ray.get(reference)
     except ray.exceptions.RayError as error:  # its worker died again and again
         first = str(error).strip().splitlines()[0]
-        outcome = Outcome(task.name, failure=f"its worker died: {type(error).__name__}: {first}")
-    return outcome
+        words = f"its worker died: {type(error).__name__}: {first}"
+        return [Outcome(task.name, failure=words) for task in group], len(group) == 1
+    return found, False
 
 
 def _started(cluster: Cluster) -> ModuleType:

@@ -1,21 +1,74 @@
-"""One drive: the run of the command line, in whatever process."""
+"""Some drives, in whatever process: the run of the command line, each in a thread of its own."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache, partial
+from pathlib import Path
 
-from lanebev.app.fleet.plan import Outcome, Task, write_mark
+from lanebev.app.build import make_network, needs_network
+from lanebev.app.config import RunConfig
+from lanebev.app.fleet.plan import Outcome, Task, earlier_outcome, write_mark
 from lanebev.app.run import run
+from lanebev.app.shared_network import SharedNetwork
+from lanebev.app.take_up import size_and_time
+from lanebev.io.results import OutputFolderError
+from lanebev.pipeline import LaneBEV
 
 
-def run_task(task: Task) -> Outcome:
-    """Run on a drive, and note that it is done.
+def run_tasks(tasks: Sequence[Task]) -> list[Outcome]:
+    """Run on drives at the same time, and note which are done.
 
-    Raises:
-        ValueError, OSError: as :func:`lanebev.app.run.run`.
+    Their frames are looked at in batches, by a network that stays loaded for later calls in this process.
+    A drive that fails has an outcome that says why, and disturbs no other.
+
+    Args:
+        tasks: all with the same weights and device. What is done already, by a worker that died later on, is
+            not done again.
     """
+    try:
+        network = _shared_network(tasks[0].config, len(tasks))
+    except Exception as error:  # as of a drive
+        return [_failed(task, error) for task in tasks]
+    if len(tasks) == 1:  # in the main thread, which signals reach
+        return [_run_task(tasks[0], network)]
+    with ThreadPoolExecutor(len(tasks), "drive") as pool:
+        return list(pool.map(partial(_run_task, network=network), tasks))
+
+
+def _run_task(task: Task, network: SharedNetwork | None) -> Outcome:
+    earlier = earlier_outcome(task)
+    if earlier is not None and not earlier.failure:
+        return earlier
     start = time.perf_counter()
-    report = run(task.config)
+    try:
+        report = run(task.config, network=network)
+    except Exception as error:  # whatever it is, it is this drive's only
+        return _failed(task, error)
     outcome = Outcome(task.name, frames=len(report.rows), seconds=time.perf_counter() - start)
     write_mark(task, outcome)
     return outcome
+
+
+def _failed(task: Task, error: Exception) -> Outcome:
+    """Return the outcome of a drive that raised; it is final where the same input would raise it again."""
+    words = " ".join(str(error).split()) or type(error).__name__
+    if not isinstance(error, (ValueError, OSError)):
+        words = f"{type(error).__name__}: {words}"
+    is_final = isinstance(error, ValueError) and not isinstance(error, OutputFolderError)
+    return Outcome(task.name, failure=words, is_final=is_final)
+
+
+def _shared_network(config: RunConfig, batch: int) -> SharedNetwork | None:
+    if not needs_network(config):
+        return None
+    changed = size_and_time(Path(config.weights)) if config.weights else (0, 0)
+    return SharedNetwork(_loaded(config.weights, changed, config.device), batch)
+
+
+@lru_cache(maxsize=1)
+def _loaded(weights: str | None, changed: tuple[int, int], device: str) -> LaneBEV:
+    """Return the network of some weights; ``changed`` is the file's size and time, to notice a new one."""
+    return make_network(weights, device)

@@ -12,8 +12,21 @@ parquet = pytest.importorskip("pyarrow.dataset", reason="pyarrow is not installe
 
 @pytest.mark.slow
 def test_a_fleet_equals_single_runs(tmp_path, capsys):
-    arguments = ["--drives", "3", "--frames", "4", "--workers", "2", "--kills", "1"]
-    assert fleet_check.main([*arguments, "--folder", str(tmp_path)]) == 0
+    arguments = [
+        "--drives",
+        "3",
+        "--network",
+        "3",
+        "--frames",
+        "4",
+        "--workers",
+        "2",
+        "--kills",
+        "1",
+        "--batch",
+        "2",
+    ]
+    assert fleet_check.main([*arguments, "--no-timing", "--folder", str(tmp_path)]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["finished"], found["failed"], found["equal"], found["killed"]) == (2, 1, 2, 1)
     assert found["second_call"] == "3 drives: 2 finished, 1 failed; 0 run now"

@@ -1,0 +1,82 @@
+"""One network for several drives: frames that wait at the same time are one batch."""
+
+from __future__ import annotations
+
+import threading
+from concurrent.futures import Future
+from operator import itemgetter
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.observation.boundary_vertices import BoundaryVertices
+from lanebev.pipeline import LaneBEV
+from lanebev.tensors import map_tensors
+
+
+class _Request(NamedTuple):
+    """An image (1, 3, H, W) that waits, and where its vertices go."""
+
+    image: Tensor
+    answer: Future[BoundaryVertices]
+
+
+class SharedNetwork:
+    """Looks at frames of several drives, each in a thread of its own.
+
+    Whoever finds the network free looks at all frames of one size that wait then, as one batch. Nobody waits
+    for frames that have not come: a drive that ends or fails holds up no other.
+
+    Args:
+        model: whose segmenter and extractor are used.
+        most: frames in a batch.
+
+    Attributes:
+        batches: how many there were.
+        frames: how many frames in all.
+    """
+
+    def __init__(self, model: LaneBEV, most: int = 1) -> None:
+        if most < 1:
+            raise ValueError(f"batch: expected 1 frame or more, got {most}")
+        self.model, self.most = model.eval(), most
+        self.batches = self.frames = 0
+        self._waiting: list[_Request] = []
+        self._changing, self._looking = threading.Lock(), threading.Lock()
+
+    def vertices(self, image: Tensor) -> BoundaryVertices:
+        """Return the vertices of an image (1, 3, H, W) in [0, 1], of batch size 1, on its device."""
+        own = _Request(image, Future())
+        with self._changing:
+            self._waiting.append(own)
+        with self._looking:
+            if not own.answer.done():
+                self._look(self._taken(own))
+        return own.answer.result()
+
+    def _taken(self, own: _Request) -> list[_Request]:
+        """Take this frame, and as many others of its size as a batch holds, off the list."""
+        with self._changing:
+            alike = [
+                each for each in self._waiting if each is not own and each.image.shape == own.image.shape
+            ]
+            taken = [own, *alike[: self.most - 1]]
+            self._waiting = [each for each in self._waiting if all(each is not one for one in taken)]
+        return taken
+
+    @torch.inference_mode()
+    def _look(self, requests: list[_Request]) -> None:
+        """Look at frames in one batch; where that fails, at each by itself, so that one fails alone."""
+        try:
+            _, found = self.model.boundary_vertices(torch.cat([each.image for each in requests]))
+        except Exception as error:
+            if len(requests) == 1:
+                requests[0].answer.set_exception(error)
+                return
+            for each in requests:
+                self._look([each])
+            return
+        self.batches, self.frames = self.batches + 1, self.frames + len(requests)
+        for row, each in enumerate(requests):
+            each.answer.set_result(map_tensors(itemgetter(slice(row, row + 1)), found))
