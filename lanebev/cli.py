@@ -113,10 +113,8 @@ def _add_fleet(fleet: argparse.ArgumentParser) -> None:
     fleet.add_argument("--gpus", type=float, default=0.0, metavar="SHARE", help=words)
     words = "folder that no path may leave (the manifest's)"
     fleet.add_argument("--root", type=path, metavar="DIR", help=words)
-    words = "cut longer videos into parts of so many minutes, which run side by side"
+    words = "cut longer videos into parts of so many minutes, which the network looks at side by side"
     fleet.add_argument("--part-minutes", type=_above_zero, metavar="MIN", help=words)
-    words = "seconds that a part begins earlier, for its filter to converge (%(default)s)"
-    fleet.add_argument("--overlap", type=_above_zero, default=20.0, metavar="S", help=words)
     words = "try drives again that failed in an earlier call"
     fleet.add_argument("--again", action="store_true", help=words)
 

@@ -43,6 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--kills", type=int, default=2, help="workers to kill (%(default)s)")
     parser.add_argument("--workers", type=int, default=4)
     parser.add_argument("--batch", type=int, default=1, help="drives a worker takes at a time (%(default)s)")
+    words = "cut drives that the network looks at into parts of so many seconds"
+    parser.add_argument("--part-seconds", type=float, help=words)
     parser.add_argument("--no-timing", action="store_true", help="do not time one worker and --workers")
     parser.add_argument("--folder", type=Path, help="to leave all in")
     args = parser.parse_args(arguments)
@@ -60,10 +62,12 @@ def check(args: argparse.Namespace, folder: Path) -> dict[str, object]:
         "1"  # as Ray gives its workers: sums of several threads have another order
     )
     out = folder / "fleet"
-    said, seconds, killed = call(manifest, out, args.workers, args.batch, args.kills, args.drives)
+    cut = [] if args.part_seconds is None else ["--part-minutes", f"{args.part_seconds / 60:.5f}"]
+    options = ["--batch", str(args.batch), *cut]
+    said, seconds, killed = call(manifest, out, args.workers, options, args.kills, args.drives)
     counts = [int(number) for number in re.findall(r"(\d+) finished, (\d+) failed", said)[0]]
     before = times_of(out / "drives")
-    again, second, _ = call(manifest, out, args.workers, args.batch)
+    again, second, _ = call(manifest, out, args.workers, options)
     changed = sum(before.get(path) != time for path, time in times_of(out / "drives").items())
     equal, single = compare(manifest, out, folder / "single")
     found: dict[str, object] = {
@@ -78,7 +82,7 @@ def check(args: argparse.Namespace, folder: Path) -> dict[str, object]:
         "second_call_seconds": round(second, 1),
         "median_single_seconds": round(sorted(single)[len(single) // 2], 2),
     }
-    return found | ({} if args.no_timing else timing(manifest, folder, args))
+    return found | ({} if args.no_timing else timing(manifest, folder, args.workers, options))
 
 
 def write_drives(folder: Path, drives: int, frames: int, network: int) -> Path:
@@ -100,11 +104,11 @@ def write_drives(folder: Path, drives: int, frames: int, network: int) -> Path:
 
 
 def call(
-    manifest: Path, out: Path, workers: int, batch: int = 1, kills: int = 0, drives: int = 0
+    manifest: Path, out: Path, workers: int, options: Sequence[str] = (), kills: int = 0, drives: int = 0
 ) -> tuple[str, float, int]:
     """Run ``lanebev fleet`` and kill workers as drives end; what it says, seconds, how many were killed."""
     command = [sys.executable, "-m", "lanebev", "fleet", str(manifest), "--out", str(out)]
-    command += ["--workers", str(workers), "--batch", str(batch)]
+    command += ["--workers", str(workers), *options]
     start, killed = time.perf_counter(), 0
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     while process.poll() is None and time.perf_counter() - start < PATIENCE:
@@ -153,7 +157,7 @@ def compare(manifest: Path, out: Path, singles: Path) -> tuple[int, list[float]]
     return equal, seconds
 
 
-def timing(manifest: Path, folder: Path, args: argparse.Namespace) -> dict[str, object]:
+def timing(manifest: Path, folder: Path, several: int, options: Sequence[str]) -> dict[str, object]:
     """Time one worker and several on the same drives, without kills.
 
     ``seconds_N`` is a whole call, ``working_N`` of it from when the first run begins to when the last ends:
@@ -162,10 +166,10 @@ def timing(manifest: Path, folder: Path, args: argparse.Namespace) -> dict[str, 
     """
     found: dict[str, object] = {"cores": os.cpu_count()}
     working = []
-    for workers in (1, args.workers):
+    for workers in (1, several):
         out = folder / f"workers-{workers}"
         begin = time.time()
-        _, seconds, _ = call(manifest, out, workers, args.batch)
+        _, seconds, _ = call(manifest, out, workers, options)
         runs = [
             (path.stat().st_mtime, json.loads(path.read_text())["seconds"])
             for path in out.glob("drives/*/fleet.json")

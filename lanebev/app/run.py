@@ -22,6 +22,7 @@ from lanebev.app.build import (
 from lanebev.app.config import RunConfig
 from lanebev.app.convert import writer
 from lanebev.app.kept import KeptNumbers
+from lanebev.app.look import take_parts
 from lanebev.app.observers import Observer
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
@@ -54,6 +55,7 @@ def run(
     progress: Progress | None = None,
     truth: Sequence[ExtrinsicsRow] | None = None,
     network: SharedNetwork | None = None,
+    parts: Sequence[Path] = (),
 ) -> Report:
     """Run on all frames and write the output folder, all of it or nothing.
 
@@ -65,6 +67,8 @@ def run(
         progress: wraps the frames, told how many there are.
         truth: of a rendered drive, a row per frame, for the report.
         network: that is there already, with the settings' weights on their device.
+        parts: what :func:`lanebev.app.look.look` wrote of parts of the source, in order; the network does not
+            look at these frames again.
 
     Returns:
         what the report page shows.
@@ -86,7 +90,7 @@ def run(
         if config.resume and problem:
             problem += backup_state(config.resume, out)
         progress = None if source.is_live else progress
-        taken = take_up(out, config, source, camera, observer)
+        taken = take_parts(parts, observer) if parts else take_up(out, config, source, camera, observer)
         smoothed, second = None, taken
         if config.smooth:
             smoothed = first_pass(config, source, camera, taken, out, progress)

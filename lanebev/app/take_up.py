@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Protocol, cast
@@ -43,25 +43,32 @@ class TakenUp:
     Args:
         entries: of the frames from the first one on.
         observer: of the others.
-        source: the frames.
+        name_of: gives the name of a frame's entry.
+        told: whether the report says so.
 
     Attributes:
         frames: how many were taken.
+        told: see above.
         remark: of the other observer.
         workers: likewise.
     """
 
     def __init__(
-        self, entries: Iterator[FrameLines], observer: RestoringObserver, source: FrameSource
+        self,
+        entries: Iterator[FrameLines],
+        observer: RestoringObserver,
+        name_of: Callable[[Frame], str],
+        told: bool = True,
     ) -> None:
-        self._entries, self._observer, self._source = entries, observer, source
+        self.told = told
+        self._entries, self._observer, self._name_of = entries, observer, name_of
         self._ahead: dict[str, FrameLines] = {}  # read before their frames came: threads overtake each other
         self._lock = threading.Lock()
         self.remark, self.workers, self.frames = observer.remark, observer.workers, 0
 
     def __call__(self, frame: Frame) -> Observation:
         """See :class:`lanebev.app.observers.Observer`."""
-        entry = self._entry(frame_name(frame, self._source))
+        entry = self._entry(self._name_of(frame))
         if entry is None or frame.image is None:
             return self._observer(frame)
         return self._observer.restored(entry)
@@ -76,7 +83,7 @@ class TakenUp:
 
 def facts_of(observer: Observer) -> dict[str, str]:
     """Return what to say in the report of what was taken up."""
-    if not isinstance(observer, TakenUp) or not observer.frames:
+    if not isinstance(observer, TakenUp) or not (observer.told and observer.frames):
         return {}
     return {"taken up": f"what a run that was killed had seen in the first {observer.frames} frames"}
 
@@ -100,7 +107,7 @@ def take_up(
     if config.lanes is not None or source.is_live:
         return observer
     entries = whole_tusimple_lines(out / _SEEN) if (out / _SEEN).is_file() else iter(())
-    return TakenUp(entries, cast(RestoringObserver, observer), source)
+    return _named(entries, observer, source)
 
 
 def seen_again(out: OutputFolder, observer: Observer, taken: Observer, source: FrameSource) -> Observer:
@@ -115,7 +122,12 @@ def seen_again(out: OutputFolder, observer: Observer, taken: Observer, source: F
     if not isinstance(taken, TakenUp):
         return observer
     (out / LANES_FILE).replace(out / _SEEN)
-    return TakenUp(whole_tusimple_lines(out / _SEEN), cast(RestoringObserver, observer), source)
+    return _named(whole_tusimple_lines(out / _SEEN), observer, source)
+
+
+def _named(entries: Iterator[FrameLines], observer: Observer, source: FrameSource) -> TakenUp:
+    """Return an observer that takes the entries of lanes.json by their names."""
+    return TakenUp(entries, cast(RestoringObserver, observer), lambda frame: frame_name(frame, source))
 
 
 def fingerprint(config: RunConfig, source: FrameSource, camera: Camera) -> str:

@@ -12,6 +12,7 @@ from types import ModuleType
 
 from lanebev.app.build import needs_network
 from lanebev.app.fleet.plan import Outcome, Task, write_mark
+from lanebev.app.fleet.schedule import Schedule
 from lanebev.app.fleet.worker import run_tasks
 
 _IN_FLIGHT = 4  # tasks a core that Ray knows of at a time
@@ -65,7 +66,7 @@ def groups_of(tasks: Sequence[Task], batch: int) -> list[tuple[Task, ...]]:
 
 
 def outcomes(tasks: Sequence[Task], cluster: Cluster) -> Iterator[Outcome]:
-    """Run tasks and yield what became of each, in the order in which they end.
+    """Run on drives and yield what became of each, in the order in which they end.
 
     Ray begins a group of tasks again whose worker died; if it dies again and again, its tasks are begun one
     by one. One that fails is begun again, alone. After ``retries`` it counts as failed; where it was the
@@ -77,9 +78,10 @@ def outcomes(tasks: Sequence[Task], cluster: Cluster) -> Iterator[Outcome]:
             num_cpus=cluster.cpus, num_gpus=cluster.gpus, max_retries=cluster.retries
         )
         most = max(16, round(_IN_FLIGHT * ray.cluster_resources().get("CPU", 1)))
-        waiting = deque(groups_of(tasks, cluster.batch))
+        schedule = Schedule(tasks)
+        waiting = deque(groups_of(schedule.first, cluster.batch))
         pending = dict[object, tuple[Task, ...]]()
-        failures = Counter[str]()
+        failures, drives = Counter[str](), {task.name: task for task in tasks}
         while waiting or pending:
             while waiting and len(pending) < most:
                 group = waiting.popleft()
@@ -93,9 +95,13 @@ def outcomes(tasks: Sequence[Task], cluster: Cluster) -> Iterator[Outcome]:
                     if outcome.failure and not is_last and failures[task.name] <= cluster.retries:
                         waiting.append((task,))
                         continue
-                    if outcome.is_final:
-                        write_mark(task, outcome)
-                    yield outcome
+                    follows, told = schedule.ended(task, outcome)
+                    if follows is not None:
+                        waiting.append((follows,))
+                    if told is not None:
+                        if told.is_final:
+                            write_mark(drives[told.name], told)
+                        yield told
     finally:
         ray.shutdown()
 

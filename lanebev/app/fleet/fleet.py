@@ -6,8 +6,8 @@ import json
 import logging
 import math
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from lanebev.app.fleet.cluster import Cluster, check_ray, outcomes
 from lanebev.app.fleet.collect import FRAMES, collect_frames
-from lanebev.app.fleet.joining import join_parts
 from lanebev.app.fleet.manifest import Drive, read_manifest
 from lanebev.app.fleet.mounts import Stretch, drive_mounts, stretches
 from lanebev.app.fleet.page import CameraMounts, DriveVerdict, fleet_page
-from lanebev.app.fleet.plan import MARK, Outcome, Task, drive_folder, drive_outcome, earlier_outcome, tasks_of
+from lanebev.app.fleet.plan import Outcome, Task, drive_folder, earlier_outcome, tasks_of
 from lanebev.app.progress import Progress
 from lanebev.app.resume import STATE_FILE
 from lanebev.estimation.mount import MountEstimator, MountState
@@ -35,7 +34,6 @@ from lanebev.io.whole_file import whole_file
 from lanebev.report.verdict import verdict
 
 logger = logging.getLogger(__name__)
-OVERLAP = 20.0  # s
 _TOLD = 10  # failures that are printed
 
 
@@ -60,7 +58,6 @@ def fleet(
     root: str | None = None,
     again: bool = False,
     part_minutes: float | None = None,
-    overlap: float = OVERLAP,
     progress: Progress | None = None,
 ) -> FleetResult:
     """Run on the drives of a manifest that are not finished, and collect the results of all.
@@ -71,8 +68,8 @@ def fleet(
         cluster: where to run.
         root: folder that paths must not leave; None is the manifest's.
         again: try once more what failed in an earlier call.
-        part_minutes: length of the parts into which longer videos are cut; None cuts nothing.
-        overlap: s that a part begins earlier, for its filter to converge.
+        part_minutes: length of the parts of longer videos that the network looks at side by side; None cuts
+            nothing.
         progress: wraps the drives that end, told how many are to be run.
 
     Raises:
@@ -81,7 +78,7 @@ def fleet(
     check_ray()
     check_installed(["parquet"])
     drives = read_manifest(manifest, root)
-    tasks = tasks_of(drives, out, None if part_minutes is None else 60 * part_minutes, overlap)
+    tasks = tasks_of(drives, out, None if part_minutes is None else 60 * part_minutes)
     folder = Path(out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -97,18 +94,14 @@ def fleet(
             f"output folder {out}: expected one that is free, got: another fleet writes into it now"
         )
     try:
-        every, ran = _run(
-            [each for own in tasks.values() for each in own], cluster or Cluster(), again, progress
-        )
-        found = _joined(out, tasks, every)
+        found, ran = _run(list(tasks.values()), cluster or Cluster(), again, progress)
         done = [drive for drive in drives if not found[drive.name].failure]
         collect_frames(done, out)
-        cameras = camera_mounts(done, out, tasks)
+        cameras = camera_mounts(done, out)
         write_mounts(folder / "mounts.json", cameras)
         verdicts = {drive.name: _verdict(out, drive) for drive in done}
         with whole_file(folder / "index.html") as path:
-            reports = {name: [_report(out, task) for task in own] for name, own in tasks.items()}
-            page = fleet_page(folder.resolve().name, drives, found, verdicts, cameras, reports)
+            page = fleet_page(folder.resolve().name, drives, found, verdicts, cameras)
             path.write_text(page, encoding="utf-8", errors="replace")
     finally:
         shutil.rmtree(lock.folder, ignore_errors=True)
@@ -116,20 +109,17 @@ def fleet(
     return FleetResult(found, ran, _summary(found, ran, out))
 
 
-def camera_mounts(
-    drives: Sequence[Drive], out: str | Path, tasks: Mapping[str, Sequence[Task]]
-) -> list[CameraMounts]:
-    """Return the mount of each camera over its finished drives, or parts of them, in order of time."""
+def camera_mounts(drives: Sequence[Drive], out: str | Path) -> list[CameraMounts]:
+    """Return the mount of each camera over its finished drives, in order of time."""
     ordered = sorted(drives, key=lambda drive: (drive.camera_id, drive.time))
     like = {"mount": MountEstimator().initial_state(1, dtype=torch.float64)}
     found = []
     for camera_id, own in groupby(ordered, key=lambda drive: drive.camera_id):
         states: list[tuple[str, str, MountState]] = []
         for drive in own:
-            for task in tasks[drive.name]:
-                loaded = load_state(Path(task.config.out) / STATE_FILE, like)
-                if loaded.problem is None:  # images on their own have none
-                    states.append((task.name, drive.time, loaded.states["mount"]))
+            loaded = load_state(drive_folder(out, drive.name) / STATE_FILE, like)
+            if loaded.problem is None:  # images on their own have none
+                states.append((drive.name, drive.time, loaded.states["mount"]))
         mounts = drive_mounts(states)
         found.append(CameraMounts(camera_id, mounts, stretches(mounts)))
     return found
@@ -168,38 +158,6 @@ def _run(
             logger.info("%s: %s", outcome.name, outcome.failure or f"{outcome.frames} frames")
             found[outcome.name] = outcome
     return {task.name: found[task.name] for task in tasks}, len(to_do)
-
-
-def _joined(
-    out: str, tasks: Mapping[str, Sequence[Task]], every: Mapping[str, Outcome]
-) -> dict[str, Outcome]:
-    """Join the parts of drives that are cut; outcomes of the drives by name."""
-    found = {}
-    for name, own in tasks.items():
-        outcome = drive_outcome(name, own, [every[task.name] for task in own])
-        if len(own) > 1 and not outcome.failure:
-            try:
-                outcome = replace(outcome, frames=_join(drive_folder(out, name), own))
-            except ValueError as error:
-                outcome = replace(outcome, frames=0, failure=" ".join(str(error).split()))
-        found[name] = outcome
-    return found
-
-
-def _join(folder: Path, tasks: Sequence[Task]) -> int:
-    """Join the parts of a drive unless they are joined already; how many frames it has."""
-    folders = [Path(task.config.out) for task in tasks]
-    joined = folder / "extrinsics.csv"
-    newest = max((part / MARK).stat().st_mtime_ns for part in folders)
-    if joined.is_file() and not (folder / MARK).exists() and joined.stat().st_mtime_ns >= newest:
-        return len(read_extrinsics(joined))
-    (folder / MARK).unlink(missing_ok=True)  # of a run on the whole drive
-    return join_parts(folder, tasks[0].parts, folders)
-
-
-def _report(out: str, task: Task) -> str:
-    """Return the place of a task's report from the fleet's folder."""
-    return (Path(task.config.out) / "report.html").relative_to(out).as_posix()
 
 
 def _is_to_do(earlier: Outcome | None, again: bool) -> bool:

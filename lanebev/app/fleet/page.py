@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from lanebev.app.fleet.manifest import Drive
 from lanebev.app.fleet.mounts import DriveMount, Stretch, days
-from lanebev.app.fleet.plan import Outcome
+from lanebev.app.fleet.plan import DRIVES, Outcome
 from lanebev.report.axis_states import AXES
 from lanebev.report.figures import bokeh_script, finish, new_figure, stacked, value_limits, x_range
 from lanebev.report.templates import template
@@ -69,7 +69,6 @@ def fleet_page(
     outcomes: Mapping[str, Outcome],
     verdicts: Mapping[str, DriveVerdict],
     cameras: Sequence[CameraMounts],
-    reports: Mapping[str, Sequence[str]],
 ) -> str:
     """Return the page; nothing in it is loaded from elsewhere, and every name in it is escaped.
 
@@ -79,7 +78,6 @@ def fleet_page(
         outcomes: by name of the drive.
         verdicts: likewise, of finished drives.
         cameras: the mounts.
-        reports: places of the reports of each drive, several where it was cut.
     """
     failed = [drive for drive in drives if outcomes[drive.name].failure]
     done = [drive for drive in drives if not outcomes[drive.name].failure]
@@ -89,7 +87,7 @@ def fleet_page(
         title=title,
         failed=[(drive, outcomes[drive.name].failure) for drive in failed],
         drives=[
-            (drive, [quote(each) for each in reports[drive.name]], verdicts[drive.name], outcomes[drive.name])
+            (drive, quote(f"{DRIVES}/{drive.name}/report.html"), verdicts[drive.name], outcomes[drive.name])
             for drive in poor[:_MOST_DRIVES]
         ],
         untold=max(0, len(poor) - _MOST_DRIVES),

@@ -10,30 +10,35 @@ from pathlib import Path
 
 from lanebev import __version__
 from lanebev.app.config import RunConfig
-from lanebev.app.fleet.joining import Part, duration, parts_of
+from lanebev.app.fleet.cutting import Part, duration, parts_of
 from lanebev.app.fleet.manifest import PATHS, Drive
 from lanebev.app.take_up import size_and_time
 
-DRIVES, MARK = "drives", "fleet.json"
+DRIVES, MARK, SEEN = "drives", "fleet.json", "seen.json"
 
 
 @dataclass(frozen=True)
 class Task:
-    """One run.
+    """A run on a drive, or a look at a part of it.
 
     Attributes:
         name: of the drive; of a part of it, with its number.
         config: what to run, and the folder to write.
         fingerprint: of settings and files, to know whether it is done.
-        parts: of the drive, if it is cut.
-        number: of the part.
+        parts: what the network is to look at before, if the drive is cut.
+        is_part: whether it is one of those.
     """
 
     name: str
     config: RunConfig
     fingerprint: str
-    parts: tuple[Part, ...] = ()
-    number: int = 0
+    parts: tuple[Task, ...] = ()
+    is_part: bool = False
+
+    @property
+    def result(self) -> Path:
+        """A file that is there when it is done."""
+        return Path(self.config.out) / (SEEN if self.is_part else "extrinsics.csv")
 
 
 @dataclass(frozen=True)
@@ -60,50 +65,40 @@ def drive_folder(out: str | Path, name: str) -> Path:
     return Path(out) / DRIVES / name
 
 
-def tasks_of(
-    drives: Sequence[Drive], out: str | Path, length: float | None = None, overlap: float = 0.0
-) -> dict[str, list[Task]]:
-    """Return the tasks of each drive by its name: one, or several where a video is cut.
+def tasks_of(drives: Sequence[Drive], out: str | Path, length: float | None = None) -> dict[str, Task]:
+    """Return the task of each drive by its name, with parts where a video is cut.
 
     Args:
         drives: of the manifest.
         out: folder of the fleet.
-        length: s of a part, None to cut nothing.
-        overlap: s that a part begins before the first frame that is kept of it.
+        length: s of a part, None to cut nothing. Drives with lanes of their own need no network, and are not
+            cut.
     """
-    tasks: dict[str, list[Task]] = {}
+    tasks: dict[str, Task] = {}
     for drive in drives:
-        config, folder = drive.config, drive_folder(out, drive.name)
-        end = config.end if config.end is not None else math.inf
-        if length is not None and not config.stills and Path(config.source).is_file():
-            parts = tuple(parts_of(config.start, min(end, duration(config.source)), length, overlap))
-        else:
-            parts = ()
-        if len(parts) < 2:
-            whole = replace(config, out=str(folder))
-            tasks[drive.name] = [Task(drive.name, whole, settings_fingerprint(whole))]
-            continue
-        tasks[drive.name] = []
-        for number, part in enumerate(parts):
-            last = config.end if part.end is None else part.end
-            own = replace(config, out=str(folder / f"part-{number:03d}"), start=part.start, end=last)
-            name = f"{drive.name}, part {number}"
-            tasks[drive.name].append(Task(name, own, settings_fingerprint(own), parts, number))
+        folder = drive_folder(out, drive.name)
+        config = replace(drive.config, out=str(folder))
+        parts: tuple[Task, ...] = ()
+        if length is not None and _is_to_be_cut(config):
+            end = min(math.inf if config.end is None else config.end, duration(config.source))
+            parts = tuple(
+                _part_task(drive.name, config, folder, number, part)
+                for number, part in enumerate(parts_of(config.start, end, length))
+            )
+        parts = parts if len(parts) > 1 else ()
+        tasks[drive.name] = Task(drive.name, config, settings_fingerprint(config), parts)
     return tasks
 
 
-def drive_outcome(name: str, tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> Outcome:
-    """Return what became of a drive from what became of its tasks."""
-    failed = [(task, outcome) for task, outcome in zip(tasks, outcomes, strict=True) if outcome.failure]
-    if len(tasks) == 1:
-        return outcomes[0]
-    seconds = sum(outcome.seconds for outcome in outcomes)
-    if failed:
-        task, outcome = failed[0]
-        return Outcome(
-            name, f"part {task.number}: {outcome.failure}", seconds=seconds, is_final=outcome.is_final
-        )
-    return Outcome(name, frames=sum(outcome.frames for outcome in outcomes), seconds=seconds)
+def _is_to_be_cut(config: RunConfig) -> bool:
+    return config.lanes is None and not config.stills and Path(config.source).is_file()
+
+
+def _part_task(name: str, config: RunConfig, folder: Path, number: int, part: Part) -> Task:
+    hidden = folder.parent / f".{name}.part-{number:03d}"
+    last = config.end if part.end is None else part.end
+    own = replace(config, out=str(hidden), start=part.start, end=last)
+    return Task(f"{name}, part {number}", own, settings_fingerprint(own), is_part=True)
 
 
 def settings_fingerprint(config: RunConfig) -> str:
@@ -119,7 +114,13 @@ def earlier_outcome(task: Task) -> Outcome | None:
     if failed is not None:
         return failed
     done = _read_mark(Path(task.config.out) / MARK, task)
-    return done if done is not None and (Path(task.config.out) / "extrinsics.csv").is_file() else None
+    return done if done is not None and task.result.is_file() else None
+
+
+def is_done(task: Task) -> bool:
+    """Return whether a task was finished, and well, in an earlier call or by a worker that died later on."""
+    earlier = earlier_outcome(task)
+    return earlier is not None and not earlier.failure
 
 
 def write_mark(task: Task, outcome: Outcome) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,6 +12,7 @@ from pathlib import Path
 from lanebev.app.build import make_network, needs_network
 from lanebev.app.config import RunConfig
 from lanebev.app.fleet.plan import Outcome, Task, earlier_outcome, write_mark
+from lanebev.app.look import look
 from lanebev.app.run import run
 from lanebev.app.shared_network import SharedNetwork
 from lanebev.app.take_up import size_and_time
@@ -44,11 +46,17 @@ def _run_task(task: Task, network: SharedNetwork | None) -> Outcome:
         return earlier
     start = time.perf_counter()
     try:
-        report = run(task.config, network=network)
+        if task.is_part:
+            frames = look(task.config, task.result, network)
+        else:
+            frames = len(run(task.config, network=network, parts=[part.result for part in task.parts]).rows)
     except Exception as error:  # whatever it is, it is this drive's only
         return _failed(task, error)
-    outcome = Outcome(task.name, frames=len(report.rows), seconds=time.perf_counter() - start)
+    before = sum(part.seconds for part in map(earlier_outcome, task.parts) if part is not None)
+    outcome = Outcome(task.name, frames=frames, seconds=before + time.perf_counter() - start)
     write_mark(task, outcome)
+    for part in task.parts:
+        shutil.rmtree(part.config.out, ignore_errors=True)
     return outcome
 
 

@@ -40,8 +40,7 @@ def test_every_name_is_escaped(tmp_path, camera):
         HOSTILE: Outcome(HOSTILE, frames=7, seconds=1.25),
         drives[1].name: Outcome(drives[1].name, failure=f"video {HOSTILE}: no"),
     }
-    reports = {drive.name: [f"drives/{drive.name}/report.html"] for drive in drives}
-    page = fleet_page(HOSTILE, drives, outcomes, {HOSTILE: DriveVerdict("fair", HOSTILE)}, [camera], reports)
+    page = fleet_page(HOSTILE, drives, outcomes, {HOSTILE: DriveVerdict("fair", HOSTILE)}, [camera])
     assert "<script>alert" not in page
     assert "1 drives finished, 1 failed, 7 frames" in page
     assert "&lt;script&gt;alert(1)" in page
@@ -61,7 +60,7 @@ def test_mounts_are_written_as_json(tmp_path, camera):
 def test_what_is_finished_is_known_until_something_changes(tmp_path):
     (tmp_path / "a.mp4").write_text("video")
     drive = _drive(tmp_path, "one")
-    (task,) = tasks_of([drive], tmp_path / "out")["one"]
+    task = tasks_of([drive], tmp_path / "out")["one"]
     assert earlier_outcome(task) is None
     folder = tmp_path / "out" / "drives" / "one"
     folder.mkdir(parents=True)
@@ -70,10 +69,10 @@ def test_what_is_finished_is_known_until_something_changes(tmp_path):
     write_mark(task, done)
     assert earlier_outcome(task) == done
     narrow = replace(drive, config=replace(drive.config, lane_width=3.5))
-    (other,) = tasks_of([narrow], tmp_path / "out")["one"]
+    other = tasks_of([narrow], tmp_path / "out")["one"]
     assert earlier_outcome(other) is None
     os.utime(tmp_path / "a.mp4", (1, 1))
-    (changed,) = tasks_of([drive], tmp_path / "out")["one"]
+    changed = tasks_of([drive], tmp_path / "out")["one"]
     assert earlier_outcome(changed) is None
     failed = Outcome("one", failure="no video", is_final=True)
     write_mark(changed, failed)

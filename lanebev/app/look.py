@@ -1,0 +1,65 @@
+"""What the network sees in a part of a drive, for the run on the whole of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from itertools import chain
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from lanebev.app.build import make_observer, match_image_size
+from lanebev.app.config import RunConfig
+from lanebev.app.observers import Observer
+from lanebev.app.shared_network import SharedNetwork
+from lanebev.app.sources import camera_of, make_source, observed_frames
+from lanebev.app.take_up import RestoringObserver, TakenUp
+from lanebev.io.tusimple import tusimple_line, whole_tusimple_lines
+from lanebev.io.video import Frame
+from lanebev.io.whole_file import whole_file
+
+_NO_ROWS, _NO_LANES = np.zeros(0), np.zeros((0, 0))
+
+
+def look(config: RunConfig, path: Path, network: SharedNetwork | None = None) -> int:
+    """Write what is seen in each frame that the settings take, with its number in the whole source.
+
+    Args:
+        config: the settings; those of the estimation have no effect.
+        path: of the file, in which the vertices are in full precision.
+        network: that is there already.
+
+    Returns:
+        how many frames there were.
+
+    Raises:
+        ValueError: see :func:`lanebev.app.run.run`.
+    """
+    source = make_source(config)
+    camera = camera_of(config, source)
+    source = match_image_size(camera, source)
+    frames = observed_frames(source, make_observer(config, source, camera, network))
+    count = 0
+    with whole_file(path) as whole, closing(frames), open(whole, "w", encoding="utf-8") as file:
+        for frame, seen in frames:
+            file.write(tusimple_line(number_in_source(frame), _NO_ROWS, _NO_LANES, *seen) + "\n")
+            count += 1
+    return count
+
+
+def number_in_source(frame: Frame) -> str:
+    """Return the number of a frame in the whole source, as a name."""
+    return f"{frame.number if frame.source_number is None else frame.source_number:06d}"
+
+
+def take_parts(paths: Sequence[Path], observer: Observer) -> Observer:
+    """Return an observer that takes what :func:`look` wrote of the parts of a source.
+
+    Args:
+        paths: of the files, in the order of the parts.
+        observer: of frames that are in none of them.
+    """
+    entries = chain.from_iterable(map(whole_tusimple_lines, paths))
+    return TakenUp(entries, cast(RestoringObserver, observer), number_in_source, told=False)
