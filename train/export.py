@@ -35,7 +35,7 @@ def checkpoint_weights(path: Path) -> dict[str, Tensor]:
 def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Weights and settings."""
     try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=False)
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         state, settings = checkpoint["state_dict"], dict(checkpoint["settings"])
         settings["steps"] = checkpoint["global_step"]
         if (seen := checkpoint.get("callbacks", {}).get("Throughput")) is not None:

@@ -115,7 +115,7 @@ class Training:
         newest = self.checkpoint()
         if newest is None:
             return 0.0
-        timer = torch.load(newest, map_location="cpu", weights_only=False)["callbacks"].get("Timer", {})
+        timer = torch.load(newest, map_location="cpu", weights_only=True)["callbacks"].get("Timer", {})
         return float(timer.get("time_elapsed", {}).get("train", 0.0))
 
 

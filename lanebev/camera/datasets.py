@@ -45,7 +45,12 @@ def kitti(text: str, image_size: tuple[int, int] | None) -> CameraParameters:
 
 
 def nuscenes(records: Sequence[Any], image_size: tuple[int, int] | None) -> CameraParameters:
-    """Read records of nuScenes' table ``calibrated_sensor``, of one camera; its images are undistorted."""
+    """Read records of nuScenes' table ``calibrated_sensor``, of one camera; its images are undistorted.
+
+    The table has no size of images: nuScenes' are all of one. Other programs write such tables for images of
+    other sizes. Images of another size are those of the record if its principal point is less than half as
+    far from their centre as from that of nuScenes' images, in shares of the sides; else they were resized.
+    """
     matrices = [
         numbers(record, "camera_intrinsic", count=9)
         for record in records
@@ -56,8 +61,17 @@ def nuscenes(records: Sequence[Any], image_size: tuple[int, int] | None) -> Came
             f"camera_intrinsic: expected one camera's, got {len(matrices)}; keep the record of your camera, "
             "by its token"
         )
+    known_offset = _centre_offset(matrices[0], _NUSCENES_SIZE)
+    if image_size is not None and 2 * _centre_offset(matrices[0], image_size) < known_offset:
+        return CameraParameters(matrices[0], [], "pinhole", image_size)
     size = _size("nuScenes'", image_size, _NUSCENES_SIZE)
     return CameraParameters(matrices[0], [], "pinhole", size or _NUSCENES_SIZE)
+
+
+def _centre_offset(matrix: Sequence[float], image_size: tuple[int, int]) -> float:
+    """Return how far the principal point is from the centre of an image, in shares of its sides."""
+    (height, width), x, y = image_size, matrix[2], matrix[5]
+    return max(abs(x / width - 0.5), abs(y / height - 0.5))
 
 
 def openlane(fields: Mapping[str, Any], image_size: tuple[int, int] | None) -> CameraParameters:

@@ -333,6 +333,15 @@ def test_nuscenes_and_openlane_json(tmp_path):
         _same(Camera.from_file(path, image_size=(900, 1600)), expected)
     with pytest.raises(ValueError, match="expected images of about 1600 x 900 px, nuScenes', got 800 x 450"):
         Camera.from_file(path, image_size=(450, 800))
+    with pytest.raises(ValueError, match="nuScenes', got 1920 x 1080"):
+        Camera.from_file(path, image_size=(1080, 1920))
+    for width, height in ((640, 360), (1920, 1080), (1280, 960)):  # another program's
+        own = [[500.0, 0.0, 0.51 * width], [0.0, 500.0, 0.49 * height], [0.0, 0.0, 1.0]]
+        path.write_text(json.dumps([{**record, "camera_intrinsic": own}]))
+        expected = Camera.from_parameters(500.0, 500.0, 0.51 * width, 0.49 * height, width, height)
+        _same(Camera.from_file(path, image_size=(height, width)), expected)
+        with pytest.raises(ValueError, match="expected images of about 1600 x 900"):
+            Camera.from_file(path, image_size=(height // 2, width // 2))
     other = [[1200.0, 0.0, 800.0], *matrix[1:]]
     path.write_text(json.dumps([{**record, "camera_intrinsic": each} for each in (matrix, other)]))
     with pytest.raises(ValueError, match="camera_intrinsic: expected one camera's, got 2; keep the record"):

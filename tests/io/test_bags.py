@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -94,6 +95,54 @@ def test_frames_and_lens_of_a_ros_2_bag(bags, kind):
     assert camera_of(config, source).fingerprint() == CAMERA.fingerprint()
     some = list(make_source(replace(config, start=0.15, every=2)))
     assert [frame.source_number for frame in some] == [2, 4]
+
+
+def _ros1_header(store, number):
+    time = START + 0.1 * number
+    stamp = store.types["builtin_interfaces/msg/Time"](int(time), round(1e9 * (time % 1)))
+    return store.types["std_msgs/msg/Header"](number, stamp, "camera")
+
+
+def _ros1_bag(path):
+    """A ROS 1 bag of compressed images and their camera_info, whose matrices have capital names there."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    size, types = tuple(SIZE), store.types
+    lens = (CAMERA.distortion.numpy(), CAMERA.intrinsics.flatten().numpy(), np.eye(3).reshape(-1))
+    projection = torch.cat([CAMERA.intrinsics, torch.zeros(3, 1)], dim=1).flatten().numpy()
+    region = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    info = types["sensor_msgs/msg/CameraInfo"](
+        _ros1_header(store, 0), *size, "plumb_bob", *lens, projection.astype(np.float64), 0, 0, region
+    )
+    with Writer1(path) as writer:
+        lenses = writer.add_connection("/cam/camera_info", info.__msgtype__, typestore=store)
+        writer.write(lenses, round(1e9 * START), store.serialize_ros1(info, info.__msgtype__))
+        name = "sensor_msgs/msg/CompressedImage"
+        images = writer.add_connection("/cam/image/compressed", name, typestore=store)
+        for number in range(COUNT):
+            data = cv2.imencode(".png", _picture(number)[..., ::-1])[1].reshape(-1)
+            message = types[name](_ros1_header(store, number), "png", data)
+            logged = round(1e9 * (START + 0.1 * number)) + 5_000_000
+            writer.write(images, logged, store.serialize_ros1(message, name))
+    return path
+
+
+def test_frames_and_lens_of_a_ros_1_bag(tmp_path):
+    config = RunConfig(str(_ros1_bag(tmp_path / "drive.bag")), "")
+    source = make_source(config)
+    frames = list(source)
+    assert [frame.image[0, 0, 0] for frame in frames] == [20 * number for number in range(COUNT)]
+    assert [frame.time for frame in frames] == pytest.approx(np.arange(COUNT) / 10, abs=1e-6)
+    assert (source.count, source.image_size) == (COUNT, SIZE)
+    assert camera_of(config, source).fingerprint() == CAMERA.fingerprint()
+
+
+def test_a_ros_1_bag_that_breaks_off_is_one_line(tmp_path, capsys):
+    path = _ros1_bag(tmp_path / "drive.bag")
+    path.write_bytes(path.read_bytes()[:-300])
+    assert main(["run", str(path), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "bag " in error
 
 
 def test_an_mcap_of_ours_is_a_source(tmp_path):

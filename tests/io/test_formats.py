@@ -139,6 +139,16 @@ def test_nuscenes_projects_as_we_do(tmp_path):
     image = camera @ np.array(record["camera_intrinsic"]).T
     assert np.allclose(image[:, :2] / image[:, 2:], _pixels(MOUNT), rtol=0, atol=1e-6)
     assert {len(record["token"]), len(record["sensor_token"])} == {32}
+    assert set(record) == {"token", "sensor_token", "translation", "rotation", "camera_intrinsic"}
+
+
+def test_nuscenes_is_read_back(tmp_path):
+    path = _written(tmp_path, "nuscenes")
+    size = CAMERA.image_size
+    assert size != (900, 1600)
+    read = Camera.from_file(path, image_size=size)
+    assert torch.allclose(read.intrinsics, CAMERA.intrinsics, rtol=0, atol=1e-6)
+    assert read.image_size == size
 
 
 def test_ros_messages_by_rosbags(tmp_path):

@@ -7,7 +7,7 @@ import torch
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.weights import load_segmenter, quantised, read_metadata, save_segmenter
-from train.export import checkout_commit, export
+from train.export import checkout_commit, checkpoint_weights, export
 
 
 def test_rounding_to_8_bits_is_within_half_a_scale_of_each_channel():
@@ -59,3 +59,20 @@ def test_a_checkpoint_in_place_of_weights_is_told_how_to_export(tmp_path):
 def test_commit_is_the_environments_where_one_is_given(monkeypatch):
     monkeypatch.setenv("LANEBEV_COMMIT", "abc1234")
     assert checkout_commit() == "abc1234"
+
+
+class _Touches:
+    """What a hostile file holds: it writes a file where it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_a_checkpoint_is_never_unpickled(tmp_path):
+    torch.save({"state_dict": {}, "settings": _Touches(tmp_path / "there")}, tmp_path / "bad.ckpt")
+    with pytest.raises(ValueError, match="expected a checkpoint of python -m train, got"):
+        checkpoint_weights(tmp_path / "bad.ckpt")
+    assert not (tmp_path / "there").exists()

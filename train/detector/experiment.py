@@ -90,7 +90,7 @@ def new_module(experiment: Experiment, arm: Arm) -> DetectorTraining:
 
 def checkpoint_weights(path: Path) -> dict[str, Any]:
     """Return the weights of a checkpoint."""
-    state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=False)["state_dict"]
+    state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
     return state
 
 
