@@ -23,7 +23,9 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=200_000)
     frames = parser.parse_args().frames
     before, random = resident(), np.random.default_rng(0)
-    rows, widths, covariances = KeptRows(), KeptNumbers(2, NUM_BOUNDARIES - 1), KeptNumbers(4, 4)
+    folder = tempfile.gettempdir()
+    rows, widths = KeptRows(), KeptNumbers(2, NUM_BOUNDARIES - 1, folder=folder)
+    covariances = KeptNumbers(4, 4, folder=folder)
     for frame in range(frames):
         pose, reason = random.normal(size=3).tolist(), "" if frame % 700 else "ROLL_UNSEEN"
         numbers = [frame / FPS, *pose, 1.4, 0.1, 0.1, 0.1, 0.01]
@@ -32,11 +34,11 @@ def main() -> None:
         covariances.append(np.eye(4))
     kept, start = resident(), time.perf_counter()
     print(f"{frames} frames: {(kept - before) / frames:.0f} bytes a frame")
-    with tempfile.TemporaryDirectory() as folder:
-        write_extrinsics(Path(folder) / "extrinsics.csv", rows)
+    with tempfile.TemporaryDirectory() as outputs:
+        write_extrinsics(Path(outputs) / "extrinsics.csv", rows)
         first, second = widths.all().transpose(1, 0, 2)
         report = Report(title="drive", rows=rows, before=first, after=second, lane_width=3.7, facts={})
-        write_report(Path(folder) / "report.html", report)
+        write_report(Path(outputs) / "report.html", report)
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     seconds = time.perf_counter() - start
     print(f"extrinsics.csv and report.html: {(most - kept) / MEGA:.0f} MB more, {seconds:.0f} s")

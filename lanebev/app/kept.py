@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import tempfile
 from array import array
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import overload
 
 import numpy as np
@@ -62,21 +65,29 @@ class KeptNumbers:
 
     Args:
         shape: of each.
+        folder: where they are kept on disk, in a file without a name; None keeps them in memory.
     """
 
-    def __init__(self, *shape: int) -> None:
-        self._shape, self._numbers = shape, array("d")
+    def __init__(self, *shape: int, folder: str | Path | None = None) -> None:
+        self._shape, self._count = shape, 0
+        self._file = io.BytesIO() if folder is None else tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
 
     def append(self, values: NDArray[np.float64]) -> None:
         """Add the array of the next frame.
 
         Raises:
             ValueError: it has another shape.
+            OSError: the disk is full.
         """
         if values.shape != self._shape:
             raise ValueError(f"values: expected shape {self._shape}, got {values.shape}")
-        self._numbers.frombytes(np.ascontiguousarray(values, np.float64).tobytes())
+        self._file.write(np.ascontiguousarray(values, np.float64).tobytes())
+        self._count += 1
 
     def all(self) -> NDArray[np.float64]:
         """Return all of them, (F, ...), without a copy; no more can be added while it is in use."""
-        return np.frombuffer(self._numbers, np.float64).reshape(-1, *self._shape)
+        whole = (self._count, *self._shape)
+        if isinstance(self._file, io.BytesIO):
+            return np.frombuffer(self._file.getbuffer(), np.float64).reshape(whole)
+        self._file.flush()
+        return np.memmap(self._file, np.float64, "r", shape=whole) if self._count else np.zeros(whole)

@@ -95,7 +95,7 @@ class Recorder:
         self._before = ViewBefore(alone)
         self._coarse = replace(self.grid, resolution=max(self.grid.resolution, _BEFORE_RESOLUTION))
         self._filtered_rows = KeptRows()
-        self._widths = KeptNumbers(2, NUM_BOUNDARIES - 1)
+        self._widths = KeptNumbers(2, NUM_BOUNDARIES - 1, folder=self.path("."))
         self._moments, self._scores = MomentSampler(), EventScores()
 
     def __enter__(self) -> Recorder:

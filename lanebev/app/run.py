@@ -107,7 +107,7 @@ def run(
             smoothed=config.smooth,
         )
         recorder.problems += filter(None, (source.problem, problem, observer.remark, lens_remark(camera)))
-        covariances = KeptNumbers(4, 4)
+        covariances = KeptNumbers(4, 4, folder=out / ".")
         frames = observed_frames(source, second)
         with recorder, closing(frames), ended_by_signals(source):
             for frame, seen in progress(frames, source.taken_count) if progress else frames:

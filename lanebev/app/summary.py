@@ -49,10 +49,23 @@ def smoothing_facts(config: RunConfig) -> dict[str, str]:
 
 def _other_settings(config: RunConfig) -> dict[str, str]:
     """Return the settings that the facts do not name, by their names on the command line."""
-    named = {"source", "camera", "lanes", "lane_width", "calibrator", "weights", "out", "smooth"}
+    named = {"source", "camera", "lanes", "lane_width", "calibrator", "weights", "out"}
     settings = {item.name: getattr(config, item.name) for item in fields(config) if item.name not in named}
-    words = {None: "not given", (): "none", True: "yes", False: "no"}
-    return {f"--{name.replace('_', '-')}": words.get(value, str(value)) for name, value in settings.items()}
+    settings["focal_std"] = config.relative_focal_std
+    near, far, left, right, step = config.grid
+    settings["grid"] = f"{near:g}:{far:g},{left:g}:{right:g}/{step:g}"
+    return {f"--{name.replace('_', '-')}": setting_words(value) for name, value in settings.items()}
+
+
+def setting_words(value: object) -> str:
+    """Return the value of a setting as one would give it; flags as yes or no."""
+    if value is None:
+        return "not given"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, tuple):
+        return ", ".join(map(str, value)) or "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def mount_facts(mounted: MountCalibration) -> dict[str, str]:

@@ -7,6 +7,7 @@ from dataclasses import fields
 import pytest
 
 from lanebev.app.config import RunConfig, read_settings
+from lanebev.app.summary import setting_words
 from lanebev.cli import main, parser
 
 
@@ -103,3 +104,17 @@ def test_help_imports_nothing_heavy(arguments):
     script += "assert not {'torch', 'cv2', 'matplotlib', 'av', 'numpy'} & set(sys.modules)\n"
     done = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_settings_in_the_report_are_as_given():
+    """0 and 1 are no flags, though they equal them."""
+    cases = {
+        0.0: "0",
+        1: "1",
+        3.5: "3.5",
+        None: "not given",
+        (): "none",
+        ("parquet", "mcap"): "parquet, mcap",
+    }
+    assert {value: setting_words(value) for value in cases} == cases
+    assert [setting_words(value) for value in (True, False, "cpu")] == ["yes", "no", "cpu"]

@@ -36,13 +36,16 @@ def test_a_row_takes_little():
     assert len(kept._texts) == 2
 
 
-def test_numbers_come_back_as_they_were():
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_numbers_come_back_as_they_were(tmp_path, on_disk):
+    folder = tmp_path if on_disk else None
     values = np.random.default_rng(0).normal(size=(5, 2, 3))
     values[1, 0, 2] = np.nan
-    kept = KeptNumbers(2, 3)
+    kept = KeptNumbers(2, 3, folder=folder)
     for value in values:
         kept.append(value)
     np.testing.assert_array_equal(kept.all(), values)
-    assert KeptNumbers(4, 4).all().shape == (0, 4, 4)
+    assert KeptNumbers(4, 4, folder=folder).all().shape == (0, 4, 4)
     with pytest.raises(ValueError, match=r"expected shape \(4, 4\), got \(2, 3\)"):
         KeptNumbers(4, 4).append(values[0])
+    assert list(tmp_path.iterdir()) == []  # the file has no name, and ends with its process

@@ -239,7 +239,9 @@ def test_nothing_is_unpickled():
             assert text != "torch.load" or keywords.get("weights_only") == "True", path
             assert text not in ("yaml.load", "yaml.unsafe_load", "eval", "exec"), path
             assert keywords.get("allow_pickle", "False") == "False", path
-    for path in itertools.chain.from_iterable((ROOT / name).rglob("*.py") for name in ("train", "tools", "examples")):
+    for path in itertools.chain.from_iterable(
+        (ROOT / name).rglob("*.py") for name in ("train", "tools", "examples")
+    ):
         for call in _calls(ast.parse(path.read_text(encoding="utf-8"))):
             keywords = {word.arg: ast.unparse(word.value) for word in call.keywords}
             is_load = ast.unparse(call.func) == "torch.load"
