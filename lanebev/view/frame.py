@@ -13,11 +13,11 @@ from torch import Tensor
 from lanebev.camera.model import Camera
 from lanebev.geometry.distortion import max_undistorted_radius
 from lanebev.types import Extrinsics
-from lanebev.view.blocks import BLOCK
+from lanebev.view.blocks import blocks
 from lanebev.view.cells import cell_sums, cells_and_lens
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.kept import KeptArrays
-from lanebev.view.projection import LEAST_DEPTH, image_coordinates
+from lanebev.view.projection import LEAST_DEPTH, normalised_intrinsics
 
 _kept = KeptArrays()
 
@@ -72,23 +72,26 @@ def _pixels_of_cells(
 
     Returns:
         (U, V, 2) x and y px of the image as taken, anything where not seen, in memory that is kept; and
-        (U, V), whether the cell is in front of the camera and where the lens does not fold over, None if all
-        are.
+        (U, V), whether the cell is in front of the camera and where the lens does not fold over (some of those
+        beside the image are not marked either), None if all are.
     """
     with torch.inference_mode():
         if camera.model == "pinhole" and float(camera.intrinsics[0, 1]) == 0.0:
             return _by_opencv(camera, extrinsics, grid)
+        height, width = camera.image_size
+        image_from_cam = normalised_intrinsics(camera.intrinsics[None], (height, width))
         cells, lens = cells_and_lens(
-            grid, camera.intrinsics[None], extrinsics, camera.distortion[None], camera.model, torch.float32
+            grid, image_from_cam, extrinsics, camera.distortion[None], camera.model, torch.float32
         )
+        half = torch.tensor([width / 2, height / 2])
         pixels = _kept("pixels", (*grid.shape, 2), np.float32)
-        seen = np.empty(grid.shape, np.bool_)
-        step = max(1, BLOCK // grid.shape[1])
-        for first in range(0, grid.shape[0], step):
-            rows = slice(first, min(first + step, grid.shape[0]))
-            points, hidden = image_coordinates(cells.rows(rows.start, rows.stop), lens)
-            pixels[rows] = points[0].movedim(0, -1).cpu().numpy()
-            seen[rows] = (hidden[0] == 0).cpu().numpy()
+        seen = np.ones(grid.shape, np.bool_)
+        for block in blocks(cells, lens, limit=1.0):
+            points = block.points[0].movedim(0, -1).cpu()
+            rows = slice(block.first, block.last)
+            torch.addcmul(half - 0.5, points, half, out=torch.from_numpy(pixels)[rows])
+            if block.outside is not None:
+                seen[rows] = block.invalid()[0].logical_not().cpu().numpy()
     return pixels, seen
 
 
