@@ -72,8 +72,8 @@ def _pixels_of_cells(
 
     Returns:
         (U, V, 2) x and y px of the image as taken, anything where not seen, in memory that is kept; and
-        (U, V), whether the cell is in front of the camera and where the lens does not fold over (some of those
-        beside the image are not marked either), None if all are.
+        (U, V), whether the cell is in front of the camera and where the lens does not fold over (some that
+        are not in the image are not marked either), None if all are.
     """
     with torch.inference_mode():
         if camera.model == "pinhole" and float(camera.intrinsics[0, 1]) == 0.0:
