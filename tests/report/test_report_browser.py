@@ -2,8 +2,14 @@
 
 import shutil
 
+import numpy as np
 import pytest
 
+from lanebev.app.config import RunConfig
+from lanebev.app.fleet.manifest import Drive
+from lanebev.app.fleet.mounts import DriveMount, stretches
+from lanebev.app.fleet.page import CameraMounts, DriveVerdict, fleet_page
+from lanebev.app.fleet.plan import Outcome
 from lanebev.report.comparison import render_comparison
 from lanebev.report.page import write_report
 from lanebev.report.run_folder import RunFolder
@@ -156,3 +162,34 @@ def test_two_runs_side_by_side_are_drawn(browser, tmp_path, screen):
     assert page.locator(".plot canvas").count() >= 2
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert seen == []
+
+
+@pytest.mark.parametrize("screen", list(SCREENS))
+def test_a_fleet_is_drawn(browser, tmp_path, screen):
+    times = [f"2026-03-{day:02d}" for day in range(1, 9)]
+    mounts = [
+        DriveMount(
+            f"{HOSTILE} {day}",
+            time,
+            np.array([0.02, -0.01, 0.001 * day + (0.05 if day > 4 else 0.0), 1.4]),
+            np.array([0.002, 0.002, 0.003, 0.02]),
+            np.array([False, False, day == 5, False]),
+        )
+        for day, time in enumerate(times)
+    ]
+    cameras = [CameraMounts(name, mounts, stretches(mounts)) for name in ("17", HOSTILE)]
+    drives = [
+        Drive(mount.name, "17", time, time, RunConfig("a.mp4", "c.yaml"))
+        for mount, time in zip(mounts, times, strict=True)
+    ]
+    outcomes = {drive.name: Outcome(drive.name, frames=300, seconds=12.3) for drive in drives}
+    outcomes[drives[3].name] = Outcome(drives[3].name, failure=f"video {HOSTILE}: expected a video")
+    verdicts = {drive.name: DriveVerdict("good", "Calibrated for 96 % of the drive.") for drive in drives}
+    path = tmp_path / "index.html"
+    path.write_text(fleet_page("fleet", drives, outcomes, verdicts, cameras), encoding="utf-8")
+    page, seen = _open(browser, path, screen, plots=2)
+    assert page.locator("#failed li").count() == 1
+    assert page.locator("#drives tbody tr").count() == 7
+    assert page.locator("#cameras tbody tr").count() == 2 * 2  # the camera was moved once
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    assert not seen, seen
