@@ -3,7 +3,7 @@
     python -m tools.bench_speed --out out/bench_speed
     python -m tools.bench_speed --parts warp frame --threads 1 --cpu-time
 
-Prints and writes (bench_speed.json, bench_speed.md, and a plot of every growing cost) medians and
+Prints and writes (bench_speed.json, bench_speed.md, and an SVG plot of every growing cost) medians and
 interquartile ranges in ms; ratios come first, each to the first line of its table. Alternatives take turns
 within one run, so that all of them see the same machine. ``--cpu-time`` takes the processor's time instead of
 the clock's: of one thread, and for a machine that others use too.
@@ -79,7 +79,8 @@ def measure(calls: Calls, seconds: float, clock: Callable[[], float]) -> Table:
     }
     first = {name: timer.timeit(1).median for name, timer in timers.items()}  # to warm up as well
     number = {name: max(1, int(0.02 / duration)) for name, duration in first.items()}
-    turns = max(3, int(seconds / max(0.02, *first.values())))
+    longest = max(0.02, *first.values())
+    turns = max(1 if longest > seconds else 3, int(seconds / longest))
     runs: dict[str, list[Measurement]] = {name: [] for name in calls}
     for _ in range(turns):
         for name, timer in timers.items():
@@ -269,7 +270,7 @@ def plot(title: str, results: dict[int, Table], path: Path) -> None:
     """Cost against size, both logarithmic."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(6, 4), layout="constrained")
+    figure = Figure(figsize=(5, 3.2), layout="constrained")
     axes = figure.subplots()
     for name in next(iter(results.values())):
         entries = [table[name] for table in results.values()]
@@ -278,7 +279,7 @@ def plot(title: str, results: dict[int, Table], path: Path) -> None:
     axes.set(xscale="log", yscale="log", xlabel=title, ylabel="ms")
     axes.grid(visible=True, which="both", alpha=0.3)
     axes.legend()
-    figure.savefig(path, dpi=120)
+    figure.savefig(path, metadata={"Date": None})
 
 
 def facts(threads: int) -> dict[str, object]:
@@ -296,7 +297,12 @@ def facts(threads: int) -> dict[str, object]:
 
 
 def run(
-    parts: list[str], seconds: float, largest: int, out: Path, clock: Callable[[], float]
+    parts: list[str],
+    seconds: float,
+    largest: int,
+    out: Path,
+    clock: Callable[[], float],
+    longest: float = 20.0,
 ) -> dict[str, Any]:
     """Measure the parts, print each table as it is done, and write all."""
     out.mkdir(parents=True, exist_ok=True)
@@ -311,12 +317,18 @@ def run(
             print(texts[-1], flush=True)
         if part in GROWTHS:
             title, sizes, make = GROWTHS[part]
-            with torch.no_grad():
-                by_size = {size: measure(make(size), seconds, clock) for size in sizes if size <= largest}
+            by_size: dict[int, Table] = {}
+            for size in sizes:
+                slowest = max(
+                    (entry["ms"] for table in by_size.values() for entry in table.values()), default=0
+                )
+                if size <= largest and slowest < 1e3 * longest:
+                    with torch.no_grad():
+                        by_size[size] = measure(make(size), seconds, clock)
             results[title] = {str(size): table for size, table in by_size.items()}
             texts.append(grown(title, by_size))
             print(texts[-1], flush=True)
-            plot(title, by_size, out / f"{part}.png")
+            plot(title, by_size, out / f"{part}.svg")
     report = {**facts(torch.get_num_threads()), "clock": clock.__name__, "results": results}
     (out / "bench_speed.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     (out / "bench_speed.md").write_text("\n".join(texts), encoding="utf-8")
@@ -334,6 +346,12 @@ def main() -> None:
     parser.add_argument("--cpu-time", action="store_true", help="processor time, with --threads 1")
     parser.add_argument("--seconds", type=PositiveFloat, default=5.0, help="per alternative (%(default)s)")
     parser.add_argument("--largest", type=PositiveInt, default=10_000_000, help="size that costs grow to")
+    parser.add_argument(
+        "--longest",
+        type=PositiveFloat,
+        default=20.0,
+        help="seconds of a call after which no larger size is tried",
+    )
     parser.add_argument("--out", type=Path, default=Path("out/bench_speed"))
     args = parser.parse_args()
     if args.cpu_time and args.threads != 1:
@@ -342,7 +360,7 @@ def main() -> None:
     cv2.setNumThreads(args.threads)
     torch.manual_seed(0)
     clock = time.process_time if args.cpu_time else time.perf_counter
-    run(args.parts, args.seconds, args.largest, args.out, clock)
+    run(args.parts, args.seconds, args.largest, args.out, clock, args.longest)
 
 
 if __name__ == "__main__":

@@ -208,9 +208,10 @@ def box_peak(padded: Tensor, padding: int, dim: int) -> Tensor:
         (..., h) of rows or (..., w) of columns, int64, counted without the padding.
     """
     size = padded.shape[dim] - 2 * padding
-    total = padded.narrow(dim, padding - _PEAK, size)
-    for start in range(padding - _PEAK + 1, padding + _PEAK + 1):
-        total = total + padded.narrow(dim, start, size)
+    first = padding - _PEAK
+    total = padded.narrow(dim, first, size) + padded.narrow(dim, first + 1, size)
+    for start in range(first + 2, padding + _PEAK + 1):
+        total += padded.narrow(dim, start, size)
     return total.max(dim).indices
 
 

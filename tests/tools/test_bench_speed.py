@@ -19,7 +19,7 @@ def test_tables_and_growth_are_written(tmp_path, monkeypatch):
     assert table["grid_sample"]["ratio"] == 1
     assert all(entry["low"] <= entry["ms"] <= entry["high"] for entry in table.values())
     assert list(report["results"]["cells of the view"]) == ["10000"]
-    assert (tmp_path / "cells.png").stat().st_size > 1000
+    assert (tmp_path / "cells.svg").stat().st_size > 1000
     assert "| BEVWarp |" in (tmp_path / "bench_speed.md").read_text()
 
 
@@ -31,3 +31,9 @@ def test_alternatives_give_the_same(monkeypatch):
     seen = warp[1].expand_as(warp[0])
     for other in (grid, kornia):
         assert (other - warp[0])[seen].abs().median() < 1e-4
+
+
+def test_sizes_grow_until_a_call_takes_too_long(tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_speed, "cells", lambda resolution: {"sleep": lambda: time.sleep(0.05)})
+    report = bench_speed.run(["cells"], 0.01, 10_000_000, tmp_path, time.perf_counter, longest=0.02)
+    assert list(report["results"]["cells of the view"]) == ["10000"]
