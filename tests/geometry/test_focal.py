@@ -6,7 +6,11 @@ import pytest
 import torch
 
 from lanebev import Calibration, Extrinsics, JointCalibrator, LaneSegments, Status, image_from_road_points
+from lanebev.estimation.joint.measurement import boundary_residuals, observe
 from lanebev.geometry.focal import pose_by_log_focal, with_focal_std
+from lanebev.testing.scenarios import CAMERA, moments, swing
+from lanebev.testing.scenarios import observe as see
+from tools.focal_information import frame_information
 
 INTRINSICS = torch.tensor([[[1000.0, 0, 640], [0, 1000.0, 360], [0, 0, 1]]], dtype=torch.float64)
 
@@ -73,3 +77,50 @@ def test_rows_are_independent():
     both = pose_by_log_focal(Extrinsics.unstack(poses), INTRINSICS.expand(2, 3, 3))
     alone = pose_by_log_focal(Extrinsics.unstack(poses[1:]), INTRINSICS)
     torch.testing.assert_close(both[1:], alone, rtol=1e-12, atol=1e-15)
+
+
+def test_straight_lanes_are_another_poses_at_any_focal_length_and_bends_are_not():
+    """So no drive along straight lanes tells it; ``tools.focal_information`` prints what bends do."""
+    straight, bend = (frame_information(radius) for radius in (math.inf, 300.0))
+    assert straight.share < 1e-20
+    assert bend.share > 1e-4
+    assert 0.03 < bend.std < 0.15  # from one frame, were the road as even as assumed
+    assert max(map(abs, bend.biases)) > 0.03  # which it is not
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.4])
+def test_another_pose_explains_straight_lanes_to_rounding(factor):
+    """Far beyond the linearisation: the residual vanishes at the pose found with a wrong focal length."""
+    segments, places = lanes(pose_of(0.05, 0.03, 0.02, 1.5)), (torch.arange(6).double() - 2.5) * 3.7
+    wrong = INTRINSICS * INTRINSICS.new_tensor([[factor], [factor], [1.0]])
+    wrong[:, :2, 2] = INTRINSICS[:, :2, 2]
+    seen = observe(segments, wrong, 6)
+    params = torch.tensor([[0.05 / factor, 0.03 / factor, 0.02, 1.5, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    for _ in range(8):
+        at = boundary_residuals(params, places[segments.boundary], seen)
+        step = torch.linalg.lstsq(at.jacobian[0, :5].mT, at.distance.flatten(1)[0]).solution
+        params[:, :5] -= step
+    assert (params[0, :2] - torch.tensor([0.05, 0.03])).abs().min() > 0.005
+    assert boundary_residuals(params, places[segments.boundary], seen).distance.abs().max() < 1e-9
+
+
+@pytest.mark.slow
+def test_focal_lengths_drawn_from_their_sigma_leave_errors_as_large_as_the_covariance_says():
+    rows, generator = 64, torch.Generator().manual_seed(1)
+    factor = (0.1 * torch.randn(rows, generator=generator, dtype=torch.float64)).exp()
+    assumed = CAMERA.repeat(rows, 1, 1)
+    assumed[:, 0, 0] *= factor
+    assumed[:, 1, 1] *= factor
+    calibrator = JointCalibrator()
+    state = calibrator.initial_state(rows, dtype=torch.float64)
+    mount = (math.radians(3), math.radians(-2), math.radians(1), 0.0)
+    drive = moments(0.3, motion=lambda t: tuple(map(sum, zip(swing(t), mount, strict=True))))
+    for moment, segments in see(drive, rows, 1.0, 8, 0, torch.float64):
+        calibration, state = calibrator(segments, assumed, state, moment.dt, 3.7)
+    error = calibration.extrinsics.stack() - torch.tensor(moment.pose, dtype=torch.float64)
+
+    def nees(covariance):
+        return float((error * torch.linalg.solve(covariance, error)).sum(-1).mean()) / 4
+
+    assert nees(calibration.covariance) > 20
+    assert 0.6 < nees(with_focal_std(calibration, assumed, 0.1).covariance) < 1.4
