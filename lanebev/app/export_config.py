@@ -28,7 +28,7 @@ class ExportConfig:
     format: str = option("onnx", "of the files (default {})", choices=FORMATS)
     out: str = option("lanebev-export", "output folder (default {})", "DIR")
     calibrator: str = option(
-        "joint", "two-stage is the paper's (default {}, which takes very long as ONNX)", choices=CALIBRATORS
+        "joint", "two-stage is the paper's (default {}, which takes minutes as ONNX)", choices=CALIBRATORS
     )
     weights: str | None = option(None, "weights of the network instead of the shipped ones", "FILE")
 
