@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from lanebev import Camera, Extrinsics, image_from_road_points
+from lanebev import Camera, Extrinsics, LaneBEV, Status, image_from_road_points
 from lanebev.app.build import make_camera, make_tracker
 from lanebev.app.config import FOV_FOCAL_STD, RunConfig
+from lanebev.app.observers import NetworkObserver
 from lanebev.estimation.joint.single_frame import FramePrior, prior_of_mount
 from lanebev.geometry.road import lane_width_covariance
+from lanebev.io.video import Frame
 from lanebev.observation.polylines import LaneLine, vertices_from_lines
+from lanebev.render import Drive
 
+CONFIG = RunConfig("a", fov=60.0)
 SIZE, POSE = (720, 1280), (0.05, 0.03, 0.01, 1.5)
 
 
@@ -120,3 +124,23 @@ def test_a_mount_decides_what_one_lane_leaves_open(tmp_path):
 def test_settings_check_themselves(values, message):
     with pytest.raises(ValueError, match=message):
         RunConfig("a", **values)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fov", [50.0, 70.0])
+def test_a_guess_of_60_degrees_is_within_three_sigma_from_pixels(fov):
+    mount = Extrinsics.from_values(*POSE)
+    drive = Drive(3, (360, 640), 12, 20.0, Camera.from_fov(fov, 640, 360), mount=mount, weather="clear")
+    camera = Camera.from_fov(60.0, 640, 360)
+    observer, tracker = NetworkObserver(LaneBEV.from_pretrained(), camera), make_tracker(CONFIG, camera)
+    for number in range(len(drive)):
+        rendered = drive.frame(number)
+        image = (255 * rendered.image[0].permute(1, 2, 0)).round().byte().numpy()
+        seen = observer(Frame(number, number / 20, 1 / 20, "", image))
+        estimate = tracker.drive_frame(seen.vertices, 1 / 20, seen.pose_sigma_scale)
+    calibration = estimate.calibration
+    error = calibration.extrinsics.stack()[0] - rendered.extrinsics.stack()[0].double()
+    sigma = calibration.covariance[0].diagonal().sqrt()
+    assert int(calibration.status[0]) == Status.TRACKING
+    assert (error.abs() <= 3 * sigma).all(), (error / sigma).tolist()
+    assert sigma[0] < 0.03
