@@ -135,6 +135,15 @@ class Calibrator(nn.Module, Generic[StateT]):
         """
         return calibration
 
+    def scale_still(self, calibration: Calibration, factor: float) -> Calibration:
+        """Return the calibration of images of their own whose detector's errors are larger than it says.
+
+        Args:
+            calibration: of :meth:`weigh_still`.
+            factor: on the standard deviations of what an image says of the pose.
+        """
+        return calibration.with_std_scaled(factor)
+
     def curvature(self, state: StateT) -> Tensor | None:
         """Return the road's curvature at the camera, (B,) 1/m, positive to the right, or None."""
         return None

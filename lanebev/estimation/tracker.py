@@ -93,14 +93,20 @@ class Tracker(Generic[StateT]):
         return Estimate(segments, given_out, reasons)
 
     def still(self, vertices: BoundaryVertices, pose_sigma_scale: float) -> Estimate:
-        """Estimate on an image of its own; nothing is remembered of it."""
+        """Estimate on an image of its own; nothing is remembered of it.
+
+        Args:
+            vertices: of batch size 1, in pixels of the image as taken.
+            pose_sigma_scale: factor on the standard deviations of what the image says of the pose.
+        """
         segments = camera_segments(vertices, self.camera)
         intrinsics = self.camera.intrinsics[None]
         calibration, state = calibrate_still_with_state(
             self.calibrator, segments, intrinsics, self.lane_width
         )
+        calibration = self.calibrator.scale_still(calibration, pose_sigma_scale)
         reasons = Reason(int(self.calibrator.reasons(state)[0]))
-        return Estimate(segments, self.given_out(calibration, pose_sigma_scale), reasons)
+        return Estimate(segments, self.given_out(calibration, 1.0), reasons)
 
     def _common_error(self, extrinsics: Extrinsics) -> Tensor:
         """Return the covariance (1, 4, 4) of what focal length and lane width make wrong in all frames alike.

@@ -208,6 +208,7 @@ def test_gradient_reaches_the_endpoints():
         ({"roll_steps": 0}, "roll_steps: expected at least 1, got 0"),
         ({"roll": math.nan}, "roll: expected a finite number, got nan"),
         ({"height": 0.0}, "height: expected more than 0 m, got 0.0"),
+        ({"freedom": 0.0}, "freedom: expected more than 0, got 0.0"),
     ],
 )
 def test_a_prior_that_is_none_is_refused(numbers, message):

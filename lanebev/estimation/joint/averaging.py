@@ -256,8 +256,8 @@ def _with_half(
     The image is the same: only the prior of the height tells, and how likely such lines are.
     """
     height = mean[..., HEIGHT]
-    away = torch.stack([0.5 * height, height], dim=-1) - prior.height
-    of_half, of_whole = student_log((away / prior.height_std).square().unsqueeze(-1)).unbind(-1)
+    away = (torch.stack([0.5 * height, height], dim=-1) - prior.height) / prior.height_std
+    of_half, of_whole = student_log(away.square().unsqueeze(-1), prior.freedom).unbind(-1)
     half = (odds.to(mean).unsqueeze(-1) + of_half - of_whole).sigmoid()
     half = torch.where(half < least, 0.0, half)
     halve = mean.new_tensor([1.0, 1.0, 1.0, 0.5])
@@ -334,7 +334,8 @@ def _fit(params: Tensor, model: _Model, steps: int) -> _Fits:
         scale = anneal_scale(scale, noise_scale(at.distance, seen.sigma, trust))
         weighted = at.jacobian * _per_end(at.valid * trust / (seen.sigma * scale.unsqueeze(-1)).square())
         away = ((params - mean) / std).square()
-        held = torch.cat([student_weight(away) / std.square(), model.std.square().reciprocal()], dim=-1)
+        of_prior = student_weight(away, prior.freedom) / std.square()
+        held = torch.cat([of_prior, model.std.square().reciprocal()], dim=-1)
         information = weighted @ at.jacobian.mT + held.diag_embed()
         if step == steps:
             break
@@ -350,7 +351,7 @@ def _fit(params: Tensor, model: _Model, steps: int) -> _Fits:
     odds = inlier_log_odds(at.distance, seen.sigma, scale, seen.focal)
     likelihood = (seen.weight * torch.where(at.valid, softplus(odds), 0.0)).sum(-1)
     of_lines = -0.5 * (own / model.std).square().sum(-1) - model.std.log().sum(-1)
-    evidence = likelihood + student_log(away) + of_lines - _half_log_det(information)
+    evidence = likelihood + student_log(away, prior.freedom) + of_lines - _half_log_det(information)
     good = evidence.isfinite() & params.isfinite().all(-1)
     return _Fits(
         params=torch.where(good.unsqueeze(-1), params, mean),

@@ -40,6 +40,7 @@ from lanebev.estimation.joint.road import propagate_road_shape
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
 from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit, unobserved_mask
 from lanebev.estimation.joint.status import as_calibration, update_track_status
+from lanebev.estimation.joint.tempering import temper_frame
 from lanebev.estimation.joint.update import (
     agreement,
     boundary_deviation,
@@ -53,7 +54,7 @@ from lanebev.estimation.kalman import predict
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.observation.segments import LaneSegments
-from lanebev.types import Calibration, Status
+from lanebev.types import Calibration, Extrinsics, Status
 
 _NO_BOUNDARY = 0.36  # m out of place, three sigmas of what lanes differ, from which a line bounds no lane
 
@@ -156,6 +157,18 @@ class JointCalibrator(Calibrator[JointState]):
         with autocast_off(like.device):
             weighed = weigh_readings(calibration, like, segments, intrinsics, widths, self.config)
         return cast_floating(weighed, calibration.covariance.dtype)
+
+    def scale_still(self, calibration: Calibration, factor: float) -> Calibration:
+        """Weaken what an image says by a factor on its standard deviations, but not what was known before."""
+        given = calibration.covariance
+        like = given.to(widest_dtype(given.device))
+        pose = calibration.extrinsics.stack().to(like)
+        with autocast_off(like.device):
+            tempered = temper_frame(pose, like, self.config.prior, factor)
+        begun = is_running(calibration.status)
+        pose, covariance = (select_rows(begun, *both) for both in zip(tempered, (pose, like), strict=True))
+        scaled = calibration._replace(extrinsics=Extrinsics.unstack(pose), covariance=covariance)
+        return cast_floating(scaled, given.dtype)
 
     def curvature(self, state: JointState) -> Tensor:
         """Return the road's curvature at the camera, (B,) 1/m, positive to the right."""

@@ -34,6 +34,7 @@ from lanebev.types import NUM_BOUNDARIES, Extrinsics
 
 _ANNEALING = (0.1, 0.06, 0.035, 0.02, 0.02)  # scales of the linear fits, of the focal length
 _BODY_STD = (0.003, 0.015, 0.008, 0.03)  # rad, rad, rad, m of a frame's pose about the mount
+_MOUNT_FREEDOM = 30.0  # degrees of freedom of a frame's pose about a mount that is known
 _OBSERVED = 0.2  # a parameter is observed if its sigma fell below this part of the prior's
 
 
@@ -42,7 +43,8 @@ class FramePrior:
     """What is known before looking, as Student's t distributions, and where the search starts.
 
     Heavy tails: a camera rolled by 20 deg is found, and not pulled back. They decide only what the
-    observations leave open (roll on one lane, all but two numbers on one boundary).
+    observations leave open (roll on one lane, all but two numbers on one boundary). The pose of a mount that
+    is known is nearly Gaussian: a vehicle's body does not lean by many of its standard deviations.
 
     Attributes:
         pitch, yaw, roll: means, rad.
@@ -52,6 +54,7 @@ class FramePrior:
         offset_std: m, of the ego lane's middle from the camera.
         curvature_std: 1/m.
         curvature_rate_std: 1/m².
+        freedom: degrees of freedom of all of them.
         pitch_range, roll_range: half widths of the search about the means, rad.
         pitch_steps, roll_steps: hypotheses across each; 1 is the mean alone.
     """
@@ -67,6 +70,7 @@ class FramePrior:
     offset_std: float = 1.5
     curvature_std: float = 2e-3
     curvature_rate_std: float = 2e-5
+    freedom: float = 4.0
     pitch_range: float = 0.24
     roll_range: float = 0.4
     pitch_steps: int = 13
@@ -77,7 +81,7 @@ class FramePrior:
             value = getattr(self, part.name)
             if not math.isfinite(value):
                 raise ValueError(f"{part.name}: expected a finite number, got {value}")
-            if part.name.endswith("_std") and value <= 0:
+            if part.name.endswith(("_std", "freedom")) and value <= 0:
                 raise ValueError(f"{part.name}: expected more than 0, got {value}")
             if part.name.endswith("_steps") and value < 1:
                 raise ValueError(f"{part.name}: expected at least 1, got {value}")
@@ -117,7 +121,8 @@ def prior_of_mount(pose: Sequence[float], std: Sequence[float]) -> FramePrior:
         for name in ("pitch", "roll")
         if name in known
     }
-    changes: dict[str, Any] = {**means, **spread, **search}
+    freedom = {"freedom": _MOUNT_FREEDOM} if known else {}
+    changes: dict[str, Any] = {**means, **spread, **search, **freedom}
     return replace(usual, **changes)
 
 
@@ -165,6 +170,18 @@ def fit_single_frame(
     Survives 50 % gross outliers with 5 % wrong boundary indices. What the boundaries in sight do not
     determine stays at the prior with the prior's covariance. Never raises on contents: a row without
     usable data has ``valid`` false and the prior's numbers.
+
+    The fit is of the likeliest reading alone, and ``covariance`` takes it for granted:
+
+    * lanes are as wide as ``lane_width`` says. Height is in proportion to it. Where two lanes differ by
+      half a metre, roll is wrong by up to some degrees, many times its sigma;
+    * every boundary bounds a lane and has the index given: what fits no lane is an outlier, but a kerb, or an
+      arrow, that replaces a boundary is believed;
+    * roll is observed with two lanes or more, height with one, pitch and yaw with two boundaries. The rest is
+      the prior's: ``observed`` tells.
+
+    ``calibrate_still`` with the joint calibrator averages over other readings, and its sigmas contain how
+    much an answer leans on these (:mod:`lanebev.estimation.joint.averaging`).
 
     Args:
         segments: (B, N) line segments.
@@ -260,7 +277,7 @@ def refine(
         information, gradient = normal_equations(
             residuals.jacobian, residuals.distance, by_noise * residuals.valid
         )
-        held = precision * student_weight((params - mean).square() * precision)
+        held = precision * student_weight((params - mean).square() * precision, prior.freedom)
         information = information + held.diag_embed()
         gradient = gradient + held * (params - mean)
         step = solve_spd(information, gradient.unsqueeze(-1)).squeeze(-1)
@@ -276,17 +293,17 @@ def normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tupl
     return weighted @ jacobian.mT, (weighted @ distance.flatten(1).unsqueeze(-1)).squeeze(-1)
 
 
-def student_weight(squared: Tensor) -> Tensor:
-    """Weight of a prior at a squared normalised distance, for Student's t with 4 degrees of freedom.
+def student_weight(squared: Tensor, freedom: float) -> Tensor:
+    """Compute the weight of a prior, Student's t, at a squared normalised distance.
 
-    One at its mean, not 5/4: near it the prior counts as the Gaussian that it is given as.
+    One at its mean, not 1 + 1 / ``freedom``: near it the prior counts as the Gaussian that it is given as.
     """
-    return (1 + squared / 4).reciprocal()
+    return (1 + squared / freedom).reciprocal()
 
 
-def student_log(squared: Tensor) -> Tensor:
-    """Its log density, (…, P) to (…), the constant left out."""
-    return -2.5 * (squared / 4).log1p().sum(-1)
+def student_log(squared: Tensor, freedom: float) -> Tensor:
+    """Compute its log density, (…, P) to (…), the constant left out."""
+    return -0.5 * (freedom + 1) * (squared / freedom).log1p().sum(-1)
 
 
 def spread_subset(seen: Observations, places: Tensor, count: int) -> tuple[Observations, Tensor]:
@@ -352,7 +369,8 @@ def linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Tens
     squared = (residual / _ANNEALING[-1]).square()
     cost = 1 - weight + weight * squared / (1 + squared)  # 1 for what is not explained at all
     away = torch.stack([(pitch - prior.pitch) / prior.pitch_std, (roll - prior.roll) / prior.roll_std], -1)
-    total = cost.sum(-1) - student_log(((solution - mean) / std).square()) - student_log(away.square())
+    of_prior = student_log(((solution - mean) / std).square(), prior.freedom)
+    total = cost.sum(-1) - of_prior - student_log(away.square(), prior.freedom)
 
     best = total.view(-1, prior.pitch_steps, prior.roll_steps).argmin(1)  # (B, S)
     hypothesis = best * prior.roll_steps + torch.arange(prior.roll_steps, device=like.device)
@@ -389,6 +407,7 @@ def _best_start(
     residuals = boundary_residuals(params, many_places, many)
     score = log_likelihood(residuals.distance, residuals.valid, many.weight, many.sigma, scale, focal)
     away = (params - prior.mean(params)) / prior.std(params)
-    score = torch.where(params.isfinite().all(-1), score + student_log(away.square()), -torch.inf)
+    score = score + student_log(away.square(), prior.freedom)
+    score = torch.where(params.isfinite().all(-1), score, -torch.inf)
     best = score.view(batch, count).argmax(-1) + count * torch.arange(batch, device=score.device)
     return params[best], scale[best]

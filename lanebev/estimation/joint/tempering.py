@@ -1,0 +1,34 @@
+"""What one image says, weakened by how much its detector's errors exceed their sigmas."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from lanebev.estimation.joint.single_frame import FramePrior, student_weight
+from lanebev.geometry.linalg import inverse_spd
+
+
+def temper_frame(pose: Tensor, covariance: Tensor, prior: FramePrior, factor: float) -> tuple[Tensor, Tensor]:
+    """Weaken what a frame said of the pose by a factor on its standard deviations, but not the prior.
+
+    Source: (J26), the power posterior p(x) p(frame | x)^(1/factor²) of Gaussians (Grünwald and van Ommen
+    2017).
+
+    Args:
+        pose: (B, 4) pitch, yaw, roll (rad), height (m), with the prior in it.
+        covariance: (B, 4, 4).
+        prior: of the frame.
+        factor: on the standard deviations, at least 1.
+
+    Returns:
+        pose and covariance; those given at a factor of 1, the prior's at a large one.
+    """
+    size = pose.shape[-1]
+    mean, std = prior.mean(pose)[:size], prior.std(pose)[:size]
+    apart = pose - mean
+    known = (student_weight((apart / std).square(), prior.freedom) / std.square()).diag_embed()
+    share = factor**-2
+    information = inverse_spd(covariance)
+    weakened = inverse_spd(share * information + (1 - share) * known)
+    moved: Tensor = share * (weakened @ information @ apart.unsqueeze(-1)).squeeze(-1)
+    return mean + moved, weakened
