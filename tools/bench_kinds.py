@@ -10,14 +10,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from random import Random
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.testing.evaluation import Track, recovery, summarise, within_sigmas
+from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.single_frame import FramePrior
+from lanebev.estimation.joint.update import UNSEEN
+from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, within_sigmas
 from lanebev.testing.motions import Pose, fall, landing_time, moved, sinusoids
-from lanebev.testing.scenarios import FPS, SCENARIOS, Moment, moments
+from lanebev.testing.scenarios import FPS, PLACES, SCENARIOS, Moment, moments
 from tools.replay.figures import as_track
 from tools.replay.kinds import EGO_LANE, FRAMES, Generated
 from tools.replay.recording import record, replay
@@ -29,6 +34,9 @@ SHOCK = 1.5
 ALLOWED = 15
 """Frames after a shock that ratio and NEES leave out: so long it may take to come back."""
 
+_IN_CURVE = "motion up to 1.5°, 1.2 Hz, R 300 m"
+_GIVEN = ", speed given"
+
 Change = Callable[[float, Moment], Moment]
 
 
@@ -37,22 +45,24 @@ class KindFigures(NamedTuple):
 
     Attributes:
         ratio: RMSE of pitch, yaw, roll and height by the per-frame bound; NaN where there is none.
-        nees: NEES per degree of freedom. Both leave out the first half second, and ``ALLOWED`` frames after
-            a shock.
+        nees: NEES per degree of freedom of the whole pose.
+        nees_seen: the same of what a single frame determines. These leave out the first half second, and
+            ``ALLOWED`` frames after a shock.
         within: share within 3 sigma in the second in which it is lowest, all drives together.
         back: frames after the shock until all errors are below twice the bound, of every drive; inf if never.
     """
 
     ratio: tuple[float, ...]
     nees: float
+    nees_seen: float
     within: float
     back: tuple[float, ...]
 
 
-def measure(kind: str, seeds: Sequence[int]) -> KindFigures:
+def measure(kind: str, seeds: Sequence[int], calibrator: JointCalibrator | None = None) -> KindFigures:
     """Draw the drives of a kind, follow them, and compute the figures."""
     drives = [record(KINDS[kind](seed), seed) for seed in seeds]
-    made = replay(JointCalibrator(), drives)
+    made = replay(calibrator or JointCalibrator(), drives)
     each = [as_track(drive, made, row) for row, drive in enumerate(drives)]
     shock = each[0].hard
     after = torch.nn.functional.max_pool1d(
@@ -64,27 +74,52 @@ def measure(kind: str, seeds: Sequence[int]) -> KindFigures:
     run = Track(error, variance, nees, status, bound, after.flatten() > 0)
     found = summarise(run)
     windows = within_sigmas(run).unfold(0, round(FPS), 1).mean(-1)
+    easy = (torch.arange(len(shock)) >= WARM_UP) & ~run.hard
     return KindFigures(
         ratio=tuple(found["ratio_to_bound"]),
         nees=found["nees_per_dof"],
+        nees_seen=nees_of_determined(error[easy], made.covariance[easy], bound[easy]),
         within=float(windows.amin()),
         back=tuple(_frames(recovery(track, track.bounds[:, 0].sqrt())) for track in each if track.hard.any()),
     )
+
+
+def nees_of_determined(error: Tensor, covariance: Tensor, bound: Tensor) -> float:
+    """Compute the NEES per degree of freedom of the parameters that their frame determines.
+
+    Args:
+        error: (T, R, 4) rad and m.
+        covariance: (T, R, 4, 4).
+        bound: (T, R, 4), variances of the per-frame bound.
+    """
+    known = bound < bound.new_tensor(UNSEEN).square()
+    both = known.unsqueeze(-1) & known.unsqueeze(-2)
+    own = torch.where(both, covariance, torch.eye(4, dtype=covariance.dtype))
+    left = torch.where(known, error, 0.0)
+    return float((left * torch.linalg.solve(own, left)).sum() / known.sum())
+
+
+def speed_given() -> JointCalibrator:
+    """Return the joint filter of somebody who knows the speed of the drives in bends, to 0.5 m/s."""
+    return JointCalibrator(motion=MotionConfig(speed=30.0, speed_std=0.5))
 
 
 def measure_all(count: int) -> dict[str, dict[str, Any]]:
     """Measure every kind on so many drives, print a row of each, and return them for JSON."""
     seeds = range(FIRST_SEED, FIRST_SEED + count)
     print(
-        "| kind | × bound: pitch yaw roll height | NEES/dof | within 3 σ, worst second | frames until back |"
+        "| kind | × bound: pitch yaw roll height | NEES/dof | of what is seen | within 3 σ, worst second "
+        "| frames until back |"
     )
-    print("|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|")
     results = {}
-    for kind in KINDS:
-        found = measure(kind, seeds)
+    for kind in (*KINDS, *(f"{kind}{_GIVEN}" for kind in KINDS if kind.startswith(_IN_CURVE))):
+        calibrator = speed_given() if kind.endswith(_GIVEN) else JointCalibrator()
+        found = measure(kind.removesuffix(_GIVEN), seeds, calibrator)
         ratio = " ".join("–" if math.isnan(value) else f"{value:.2f}" for value in found.ratio)
         back = f"{min(found.back):.0f} to {max(found.back):.0f}" if found.back else ""
-        print(f"| {kind} | {ratio} | {found.nees:.2f} | {100 * found.within:.0f} % | {back} |", flush=True)
+        nees = f"{found.nees:.2f} | {found.nees_seen:.2f}"
+        print(f"| {kind} | {ratio} | {nees} | {100 * found.within:.0f} % | {back} |", flush=True)
         results[kind] = found._asdict()
     return results
 
@@ -169,15 +204,35 @@ def _resumed(seed: int) -> Generated:
     return replace(_drawn(seed, change), resumed=lambda: moments(1.0, before))
 
 
-def in_ego_lane(drive: Generated) -> Generated:
-    """Leave only the ego lane in view."""
-    return replace(drive, moments=lambda: [replace(m, visible=EGO_LANE) for m in drive.moments()])
+def _unequal(seed: int, std: float) -> Generated:
+    """Put every boundary out of its place for good, independently, by a normal deviate."""
+    random = Random(seed)
+    out = torch.tensor([random.gauss(0.0, std) for _ in PLACES], dtype=PLACES.dtype)
+    return _drawn(seed, lambda t, moment: replace(moment, places=PLACES + out))
+
+
+def mounted_roll(seed: int) -> float:
+    """Draw the roll of a mount, rad, normal with the standard deviation of the estimator's prior.
+
+    Seeds in a row give quantiles spread evenly (Weyl's sequence), so that a few are like many.
+    """
+    share = (seed * 0.6180339887498949) % 1.0
+    return NormalDist(0.0, FramePrior().roll_std).inv_cdf(min(max(share, 0.01), 0.99))
+
+
+def in_ego_lane(drive: Generated, roll: float = 0.0) -> Generated:
+    """Leave only the ego lane in view, of a camera that is mounted with a roll (rad), which is not seen."""
+
+    def only(moment: Moment) -> Moment:
+        return replace(moment, visible=EGO_LANE, pose=moved(moment.pose, (0.0, 0.0, roll, 0.0)))
+
+    return replace(drive, moments=lambda: [only(moment) for moment in drive.moments()])
 
 
 _ALL_LANES: dict[str, Callable[[int], Generated]] = {
     "motion up to 1.5°, 1.2 Hz": _drawn,
     "motion up to 2.5°, 1.5 Hz": partial(_drawn, largest_deg=2.5, highest_hz=1.5),
-    "motion up to 1.5°, 1.2 Hz, R 300 m": _curve,
+    _IN_CURVE: _curve,
     "drop": _drop,
     "knock": _knock,
     "cut": _cut,
@@ -189,8 +244,18 @@ def _ego_lane_of(kind: str, seed: int) -> Generated:
     return in_ego_lane(_ALL_LANES[kind](seed))
 
 
+def _rolled_ego_lane_of(kind: str, seed: int) -> Generated:
+    return in_ego_lane(_ALL_LANES[kind](seed), mounted_roll(seed))
+
+
 KINDS: dict[str, Callable[[int], Generated]] = {
     **_ALL_LANES,
+    "lanes unequal by 2 cm": partial(_unequal, std=0.02),
+    "lanes unequal by 10 cm": partial(_unequal, std=0.1),
     **{f"{kind}, ego lane": partial(_ego_lane_of, kind) for kind in _ALL_LANES},
+    **{
+        f"{kind}, ego lane, roll drawn": partial(_rolled_ego_lane_of, kind)
+        for kind in ("motion up to 1.5°, 1.2 Hz", _IN_CURVE, "drop")
+    },
 }
 """A drive of each kind by its seed."""

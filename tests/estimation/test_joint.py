@@ -16,7 +16,7 @@ from lanebev.estimation.joint.dynamics import (
     pose_covariance,
     pose_transition,
 )
-from lanebev.estimation.joint.evidence import adapt_motion_scale
+from lanebev.estimation.joint.evidence import adapt_motion_scale, deviation_prior_std
 from lanebev.estimation.joint.lane_change import renumber
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_SHAPE, SHAPE, STEPS, layout
 from lanebev.estimation.joint.measurement import (
@@ -35,6 +35,7 @@ from lanebev.estimation.joint.road import propagate_road_shape, straight_or_bend
 from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS, road_basis, road_curve
 from lanebev.estimation.joint.single_frame import FramePrior
 from lanebev.estimation.joint.state import JointConfig, state_from_fit
+from lanebev.estimation.joint.status import single_deviation
 from lanebev.estimation.joint.update import (
     frame_information,
     posterior_covariance,
@@ -404,6 +405,46 @@ def test_motion_scale_follows_the_scores_and_decays():
     for _ in range(90):
         scale = adapt_motion_scale(scale, torch.ones_like(score), dt, cfg)
     assert scale[0, 2] < 2.5
+
+
+def test_motion_scale_of_roll_stands_still_on_one_lane():
+    """There the score of roll is that of the offset."""
+    calibrator, intrinsics = JointCalibrator(), CAMERA.expand(1, 3, 3)
+    for visible, still in (((2, 3), True), (tuple(range(6)), False)):
+        drive = moments(0.5, lambda t, m, only=visible: replace(m, visible=only))
+        state, most = calibrator.initial_state(1, dtype=DOUBLE), 1.0
+        for k, (moment, segments) in enumerate(see(drive, 1, 1.0, 8, 3, DOUBLE)):
+            turned = segments._replace(endpoints=segments.endpoints + 2.0 * (k % 2))
+            _, state = calibrator(turned, intrinsics, state, moment.dt, WIDTH)
+            most = max(most, float(state.motion_scale[0, ROLL]))
+        assert (most == 1.0) == still
+
+
+def test_prior_of_unequal_lanes_makes_roll_honest():
+    """Places fitted by offset, height and roll (1, x, x²): what is left gives the prior of the error."""
+    places = (torch.arange(6, dtype=DOUBLE) - 2.5) * 3.7
+    by_pose = torch.stack([torch.ones_like(places), places, places.square()], dim=-1)
+    out = 0.04 * torch.randn(20_000, 6, generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
+    error = out @ torch.linalg.pinv(by_pose).mT
+    left = out - error @ by_pose.mT
+    size = deviation_prior_std(left, JointConfig())
+    spread = torch.linalg.inv(by_pose.mT @ by_pose)[2, 2].sqrt() * size
+    opened = size > 0.02  # m; below, lanes count as nearly equal
+    chi2 = (error[opened, 2] / spread[opened]).square()
+    assert opened.double().mean() > 0.8
+    assert 0.6 < chi2.mean() < 1.3
+    assert (chi2 < 9).double().mean() > 0.97
+
+
+def test_one_boundary_out_of_place_counts_until_the_filter_holds_unequal_lanes():
+    """Half of six deviations are seen, so that those of unequal lanes keep half of their variance."""
+    cfg = JointConfig()
+    size = cfg.open_deviation
+    out = torch.tensor([[-0.4, 0.0, 0.0, 0.013, 0.0, 0.0]] * 3 + [[0.011] + [0.0] * 5], dtype=DOUBLE)
+    held = torch.tensor([0.0, 0.5 * size**2 / 6, 0.5 * size**2, 0.0], dtype=DOUBLE)
+    found = single_deviation(out, held.unsqueeze(-1).expand(-1, 6), cfg)
+    expected = torch.tensor([size, size * math.sqrt(0.75), 0.0, 0.0], dtype=DOUBLE)
+    torch.testing.assert_close(found, expected)
 
 
 def test_minutes_of_nothing_keep_the_covariance_positive_and_bounded():

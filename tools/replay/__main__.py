@@ -26,7 +26,7 @@ from tools.replay.check import (
     reference_paths,
     replay_all,
 )
-from tools.replay.figures import figures, markdown
+from tools.replay.figures import after_shock, as_track, figures, markdown
 from tools.replay.kinds import KINDS
 from tools.replay.references import Difference, Row, write_rows
 from train.commands import one_line_errors
@@ -57,6 +57,11 @@ def main(arguments: list[str] | None = None) -> int:
             ]
         )
     )
+    for row, (name, recording) in enumerate(drives.items()):
+        if not recording.moments and recording.hard.any():
+            run = as_track(recording, replayed["joint"], row)
+            errors = " ".join(f"{value:.2f}" for value in after_shock(run, 1 / float(recording.dt[0])))
+            print(f"\n{name}, joint, half a second after: {errors} (RMSE of half a second, °, cm)")
     found = differences(rows)
     moved = {key: difference for key, difference in found.items() if not difference.within(TOLERANCE)}
     print(f"\n{len(found) - len(moved)} of {len(found)} are as their references say, to {TOLERANCE:g} σ")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lanebev.observation.segments import LaneSegments
-from lanebev.testing.evaluation import Track, frame_bound, recovery, summarise, within_sigmas
+from lanebev.testing.evaluation import UNITS, Track, frame_bound, recovery, rms, summarise, within_sigmas
 from tools.replay.recording import Recording, Replayed
 
 
@@ -49,6 +49,19 @@ def figures(recording: Recording, replayed: Replayed, row: int) -> Figures:
         worst=float(share.unfold(0, window, 1).mean(-1).amin()),
         back=_back(run, fps),
     )
+
+
+def after_shock(run: Track, fps: float) -> list[float]:
+    """Compute the RMSE (4,) in degrees and cm of the half second that begins half a second after the event.
+
+    Args:
+        run: of a drive with hard frames.
+        fps: of the drive.
+    """
+    end = int(run.hard.nonzero().max()) + 1
+    half = round(0.5 * fps)
+    found: list[float] = (rms(run.errors[end + half : end + 2 * half]) * UNITS).tolist()
+    return found
 
 
 def as_track(recording: Recording, replayed: Replayed, row: int) -> Track:

@@ -41,6 +41,8 @@ KINDS = (
     "rendered: highway",
     "rendered: city",
     "rendered: night",
+    "rendered: drop",
+    "rendered: knock",
 )
 """Each needs one drive at least; what each is, is said beside the drives below."""
 

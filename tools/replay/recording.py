@@ -49,6 +49,17 @@ class Recording(NamedTuple):
     mount: bool = False
     moments: Sequence[Moment] = ()
 
+    def begin_at(self, frame: int) -> Recording:
+        """Return the drive without the frames before one, begun anew."""
+        return self._replace(
+            segments=LaneSegments._make(part[frame:] for part in self.segments),
+            dt=self.dt[frame:],
+            truth=self.truth[frame:],
+            hard=self.hard[frame:],
+            resumed=None,
+            moments=self.moments[frame:],
+        )
+
 
 class Replayed(NamedTuple):
     """What a calibrator made of R drives of T frames.

@@ -12,7 +12,7 @@ import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,9 +22,9 @@ from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.segments import camera_segments
 from lanebev.pipeline import LaneBEV
 from lanebev.render import Drive
-from lanebev.testing.motions import fall, landing_time
+from lanebev.testing.motions import Motion, Pose, fall, landing_time, moved
 from lanebev.types import Extrinsics
-from tools.replay.kinds import FRAMES
+from tools.replay.kinds import FRAMES, KNOCK
 from tools.replay.recording import Recording
 from train.commands import one_line_errors
 
@@ -33,6 +33,37 @@ FPS = 20.0
 SIZE = (360, 640)
 _PIXEL = 64.0  # steps of a coordinate per px, so that 16 bits hold it
 _TOGETHER = 4  # frames rendered and seen at once
+_KNOCKED_AT = 2.0  # s
+
+
+class Shock(NamedTuple):
+    """A fast motion of the camera.
+
+    Attributes:
+        pose: difference of pitch, yaw, roll (rad) and height (m) at a time in s.
+        first: s, when it begins.
+        last: s, when it is over.
+    """
+
+    pose: Motion
+    first: float
+    last: float
+
+    def during(self, times: torch.Tensor) -> torch.Tensor:
+        """Tell which times (T,) s are in it, (T,) bool."""
+        return (times >= self.first) & (times < self.last)
+
+
+def _knocked(t: float) -> Pose:
+    """3° and 25 cm in 0.1 s, for good."""
+    share = min(max((t - _KNOCKED_AT) / 0.1, 0.0), 1.0)
+    return moved((0.0, 0.0, 0.0, 0.0), KNOCK, share)
+
+
+FALL = Shock(fall, 0.0, landing_time())
+"""The drive begins in mid-air: a fall of 1.2 m onto the wheels, in half a second."""
+
+KNOCKED = Shock(_knocked, _KNOCKED_AT, _KNOCKED_AT + 0.1)
 
 
 @dataclass(frozen=True)
@@ -43,14 +74,14 @@ class Rendered:
         kind: one of the replay's kinds.
         world: kind of the renderer's world.
         seed: of the drive.
-        falls: begins in mid-air, see :func:`lanebev.testing.motions.fall`.
+        shock: what moves the camera beside the drive's own motion; None: nothing.
         mount: also run the mount estimator.
     """
 
     kind: str
     world: str
     seed: int
-    falls: bool = False
+    shock: Shock | None = None
     mount: bool = False
 
 
@@ -58,23 +89,29 @@ RENDERED = {
     "rendered-highway": Rendered("rendered: highway", "highway", 11),
     "rendered-city": Rendered("rendered: city", "city", 12),
     "rendered-night": Rendered("rendered: night", "night", 13),
+    "rendered-drop": Rendered("rendered: drop", "highway", 14, FALL),
+    "rendered-knock": Rendered("rendered: knock", "highway", 16, KNOCKED),
 }
 """By name, which is also that of the files."""
 
 
-class FallingDrive(Drive):
-    """A drive that begins with a fall of 1.2 m onto the wheels."""
+class ShockedDrive(Drive):
+    """A drive with a shock beside its own motion; None is no shock."""
+
+    shock: Shock | None = None
 
     def extrinsics_at(self, time: float) -> Extrinsics:
         """True pose over the road at a time, each (1,)."""
         pose = super().extrinsics_at(time)
-        return Extrinsics(*(value + more for value, more in zip(pose, fall(time), strict=True)))
+        if self.shock is None:
+            return pose
+        return Extrinsics(*(value + more for value, more in zip(pose, self.shock.pose(time), strict=True)))
 
 
 def see(rendered: Rendered) -> dict[str, Any]:
     """Render a drive and let the shipped network look at it: what the drive's file holds."""
-    make = FallingDrive if rendered.falls else Drive
-    drive = make(rendered.seed, SIZE, FRAMES, FPS, kind=rendered.world)
+    drive = ShockedDrive(rendered.seed, SIZE, FRAMES, FPS, kind=rendered.world)
+    drive.shock = rendered.shock
     model = LaneBEV.from_pretrained()
     seen, poses, width = [], [], 0.0
     with torch.inference_mode():
@@ -105,7 +142,7 @@ def load(name: str) -> Recording:
     vertices = BoundaryVertices(
         held["points"] / _PIXEL, held["weight"] / 255, held["sigma"], held["boundary"].long()
     )
-    times = torch.arange(FRAMES) / FPS
+    times, shock = torch.arange(FRAMES) / FPS, rendered.shock
     return Recording(
         segments=camera_segments(vertices, camera),
         intrinsics=camera.intrinsics,
@@ -113,7 +150,7 @@ def load(name: str) -> Recording:
         lane_width=float(held["lane_width"]),
         sigma_scale=float(held["sigma_scale"]),
         truth=held["truth"],
-        hard=times < landing_time() if rendered.falls else torch.zeros(FRAMES, dtype=torch.bool),
+        hard=torch.zeros(FRAMES, dtype=torch.bool) if shock is None else shock.during(times),
         mount=rendered.mount,
     )
 

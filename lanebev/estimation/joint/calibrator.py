@@ -248,7 +248,8 @@ def update_state(
             believed = (frame.trust * seen.weight).repeat_interleave(2, dim=1).unsqueeze(1)
             score = normalized_score(doubt, frame, (believed @ member).squeeze(1))
             evidence = accumulate_evidence(evidence, score, step, cfg.evidence_time)
-            motion_scale = adapt_motion_scale(predicted.motion_scale, score[:, POSE], step, cfg)
+            told = torch.where(estimated[:, POSE] > 0, score[:, POSE], 1.0)  # 1 changes nothing
+            motion_scale = adapt_motion_scale(predicted.motion_scale, told, step, cfg)
             noise = adaptive_process_noise(evidence, doubt, cfg)
             cov = cov + torch.nn.functional.pad(noise, (0, place.size - noise.shape[-1])).diag_embed()
         moved = (result.mean - at)[:, place.observed]

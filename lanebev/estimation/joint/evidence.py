@@ -71,7 +71,8 @@ def adapt_motion_scale(before: Tensor, score: Tensor, dt: Tensor, cfg: JointConf
     Source: (J17).
 
     Source: covariance matching (Mehra 1972), axis by axis, as a multiplicative step: a right variance has a
-    squared score of mean 1.
+    squared score of mean 1. Roll that a frame does not determine has the
+    score of the offset: it is given as 1, which changes nothing.
 
     Args:
         before: (B, 4) >= 1, factor on the variance so far.
@@ -118,10 +119,11 @@ def deviation_prior_std(deviations: Tensor, cfg: JointConfig) -> Tensor:
     A single boundary out of place is a detector's error, and errors that last let a second one deviate by
     ``EQUAL`` of ``open_deviation``: that much is subtracted in variance, so that a deviation a little larger
     than that admits little. Of six deviations three combinations cannot be observed, since changes of
-    offset, height and roll have the same effect: they may be three times as large.
+    offset, height and roll have the same effect, and what is left of independent deviations is smaller than
+    they are. Twice the second largest makes the squared error of roll 1.0 times its variance in the mean.
     """
     size = cfg.open_deviation
     second = deviations.abs().topk(2, dim=-1).values[:, 1]
     excess = second.square() - (EQUAL * size) ** 2
     unequal = excess > 0
-    return torch.where(unequal, 3 * torch.where(unequal, excess, 1.0).sqrt(), 0.0).clamp(max=size)
+    return torch.where(unequal, 2 * torch.where(unequal, excess, 1.0).sqrt(), 0.0).clamp(max=size)

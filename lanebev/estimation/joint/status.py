@@ -7,7 +7,7 @@ from torch import Tensor
 
 from lanebev.batch import flag, select_rows
 from lanebev.estimation.checks import is_running
-from lanebev.estimation.joint.evidence import EQUAL, deviation_prior_std
+from lanebev.estimation.joint.evidence import EQUAL
 from lanebev.estimation.joint.layout import NUM_POSE, POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL, Observations
 from lanebev.estimation.joint.state import JointConfig, JointState, unobserved_mask
@@ -75,12 +75,25 @@ def update_track_status(
     return after, supported
 
 
-def single_deviation(deviations: Tensor, cfg: JointConfig) -> Tensor:
-    """Compute by how much (B,) m any boundary may be out of place if exactly one is."""
+def single_deviation(deviations: Tensor, variances: Tensor, cfg: JointConfig) -> Tensor:
+    """Compute by how much (B,) m any boundary may be out of place if exactly one is.
+
+    Source: (J24).
+
+    What the filter's own covariance of the deviations holds is subtracted in variance, so that nothing is
+    missing while lanes turn out to be unequal. Half of six independent deviations can be observed, so their
+    variances sum to three times that of one.
+
+    Args:
+        deviations: (B, L) m.
+        variances: (B, L) m², of these by the filter.
+        cfg: the numbers.
+    """
     size = cfg.open_deviation
     worst = deviations.abs().amax(-1)
-    alone = (worst > EQUAL * size) & (worst < _DOUBTFUL) & (deviation_prior_std(deviations, cfg) == 0)
-    return torch.where(alone, worst.clamp(max=size), 0.0)
+    missing = worst.clamp(max=size).square() - 0.5 * variances.sum(-1)
+    alone = (worst > EQUAL * size) & (worst < _DOUBTFUL) & (missing > 0)
+    return torch.where(alone, torch.where(alone, missing, 1.0).sqrt(), 0.0)
 
 
 def as_calibration(
@@ -107,8 +120,9 @@ def as_calibration(
     more = 3.0 * (bend * cov[:, ROLL, ROLL]).square() * unobserved_mask(state.reasons)[:, ROLL]
     width = positions.diff(dim=-1).mean(-1)
     more = more + (cfg.lane_width_std / width * height).square()
-    deviations = state.mean[:, layout(cfg.num_boundaries).deviations]
-    by_lanes = single_deviation(deviations, cfg)[:, None, None] * state.pose_sensitivity
+    own = layout(cfg.num_boundaries).deviations
+    variances = state.cov.diagonal(dim1=1, dim2=2)[:, own]
+    by_lanes = single_deviation(state.mean[:, own], variances, cfg)[:, None, None] * state.pose_sensitivity
     only_height = torch.arange(NUM_POSE, device=cov.device) == HEIGHT
     cov = cov + by_lanes @ by_lanes.mT + apart.unsqueeze(-1) * apart.unsqueeze(-2)
     cov = cov + (only_height * more.unsqueeze(-1)).diag_embed()
