@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import IntFlag
 from typing import TypeVar, cast
 
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 
 T = TypeVar("T")
+FlagT = TypeVar("FlagT", bound=IntFlag)
 
 
 def select_rows(rows: Tensor, yes: T, no: T) -> T:
@@ -20,7 +22,7 @@ def select_rows(rows: Tensor, yes: T, no: T) -> T:
         no: of the same shapes.
     """
     if isinstance(yes, Tensor):
-        mask = rows.view(-1, *[1] * (yes.ndim - 1))
+        mask = rows.view(-1, *[1] * (yes.ndim - 1)) if yes.ndim > 1 else rows
         return cast(T, torch.where(mask, yes, cast(Tensor, no)))
     pairs = zip(cast("tuple[Tensor, ...]", yes), cast("tuple[Tensor, ...]", no), strict=True)
     return type(yes)(*(select_rows(rows, *pair) for pair in pairs))
@@ -32,6 +34,14 @@ def may_skip(wanted: Tensor) -> bool:
     The one place where the maths asks the device. A compiled or exported program cannot, and always searches.
     """
     return not torch.compiler.is_compiling() and not bool(wanted.any())
+
+
+def flags(conditions: Mapping[FlagT, Tensor]) -> Tensor:
+    """Return the bits of the reasons whose conditions (B,) hold, (B,) int64; no two share a bit."""
+    holds = torch.stack(list(conditions.values()), dim=-1)
+    bits = torch.tensor([int(reason) for reason in conditions], device=holds.device)
+    total: Tensor = (holds * bits).sum(-1)
+    return total
 
 
 def flag(condition: Tensor, reason: IntFlag) -> Tensor:

@@ -99,10 +99,10 @@ def clean_segments(segments: LaneSegments, num_boundaries: int) -> LaneSegments:
         segments of the same shapes, finite throughout.
     """
     ends, boundary, weight, sigma = segments
-    finite = ends.isfinite().all(-1).all(-1) & weight.isfinite() & sigma.isfinite()
+    finite = (torch.maximum(weight, sigma) < torch.inf) & (torch.minimum(weight, sigma) > 0)  # false on NaN
     known = (boundary >= 0) & (boundary < num_boundaries)
-    long = (ends[..., 1, :] - ends[..., 0, :]).abs().amax(-1) > _MIN_LENGTH  # false on NaN
-    good = finite & known & long & (weight > 0) & (sigma > 0) & (ends.abs().amax(-1).amax(-1) < 1e6)
+    long = (ends[..., 1, :] - ends[..., 0, :]).abs().amax(-1) > _MIN_LENGTH
+    good = finite & known & long & (ends.abs().amax((-2, -1)) < 1e6)
     harmless = ends.new_tensor([[0.0, 0.0], [1.0, 1.0]])
     return LaneSegments(
         torch.where(good[..., None, None], ends, harmless),

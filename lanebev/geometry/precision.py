@@ -26,6 +26,8 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
     @wraps(function)
     def precise(*args: P.args, **kwargs: P.kwargs) -> R:
         tensors = list(_floating((*args, *kwargs.values())))
+        if _is_precise(tensors):
+            return function(*args, **kwargs)
         dtype = common_dtype(*tensors)
         raised = [cast_floating(value, dtype) for value in args]
         named = {name: cast_floating(value, dtype) for name, value in kwargs.items()}
@@ -33,6 +35,17 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
             return cast("Callable[..., R]", function)(*raised, **named)
 
     return precise
+
+
+def _is_precise(tensors: list[Tensor]) -> bool:
+    """Tell whether there is nothing to raise: one dtype of full precision, and no autocast.
+
+    A compiled or exported program may be called under autocast later, and is never sure.
+    """
+    if torch.compiler.is_compiling() or len({tensor.dtype for tensor in tensors}) != 1:
+        return False
+    first = tensors[0]
+    return first.dtype in (torch.float32, torch.float64) and not torch.is_autocast_enabled(first.device.type)
 
 
 def autocast_off(device: torch.device) -> torch.autocast:
@@ -52,7 +65,11 @@ def widest_dtype(device: torch.device) -> torch.dtype:
 
 def cast_floating(value: T, dtype: torch.dtype) -> T:
     """Cast a floating tensor, or those of a NamedTuple, to a dtype; return anything else as it is."""
-    return map_tensors(lambda part: part.to(dtype) if part.is_floating_point() else part, value)
+
+    def cast_part(part: Tensor) -> Tensor:
+        return part.to(dtype) if part.dtype != dtype and part.is_floating_point() else part
+
+    return map_tensors(cast_part, value)
 
 
 def _floating(values: Iterable[object]) -> Iterator[Tensor]:

@@ -14,7 +14,9 @@ from lanebev.geometry.precision import full_precision
 
 
 def _rotation(rows: list[list[Tensor]]) -> Tensor:
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    entries = torch.stack([entry for row in rows for entry in row], dim=-1)
+    matrix: Tensor = entries.unflatten(-1, (3, 3))
+    return matrix
 
 
 def rotation_x(pitch: Tensor) -> Tensor:
@@ -68,7 +70,7 @@ def road_from_cam(pitch: Tensor, yaw: Tensor, roll: Tensor) -> Tensor:
     Returns:
         (..., 3, 3) rotation.
     """
-    return rotation_z(roll) @ cam_from_world(pitch, yaw).mT
+    return rotation_z(roll) @ (rotation_x(pitch) @ rotation_y(yaw)).mT
 
 
 @full_precision

@@ -252,18 +252,16 @@ def update_state(
             motion_scale = adapt_motion_scale(predicted.motion_scale, told, step, cfg)
             noise = adaptive_process_noise(evidence, doubt, cfg)
             cov = cov + torch.nn.functional.pad(noise, (0, place.size - noise.shape[-1])).diag_embed()
-        moved = (result.mean - at)[:, place.observed]
-        apart = boundary_deviation(at, frame)
-        at, doubt, scale = result.mean, result.observed_cov, frame.scale
+        last, at, doubt, scale = at, result.mean, result.observed_cov, frame.scale
     updated = predicted._replace(
-        mean=result.mean,
+        mean=at,
         cov=posterior_covariance(cov, frame.matrix, result.gain),
         evidence=evidence,
         pose_sensitivity=sensitivity,
         motion_scale=motion_scale,
         reasons=flag(shift != 0, Reason.LANE_CHANGE),
     )
-    agreed = agreement(frame, moved, seen)
-    apart = torch.maximum(result.mean[:, place.deviations].abs(), apart.abs())
+    agreed = agreement(frame, (at - last)[:, place.observed], seen)
+    apart = torch.maximum(at[:, place.deviations].abs(), boundary_deviation(last, frame).abs())
     lane = (apart < _NO_BOUNDARY).gather(1, seen.boundary)
     return updated, frame.trust, torch.where((seen.weight > 0) & lane, agreed, 0.0), alone

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lanebev.estimation.joint.layout import DEVIATIONS, NUM_POSE, NUM_SHAPE, POSE, SHAPE
 from lanebev.estimation.joint.state import JointConfig
@@ -37,14 +38,13 @@ def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor) -> Ten
     """
     free = cov.new_zeros(cov.shape[-1])
     free[POSE] = cov.new_tensor(_FREE_POSE).square()
-    priors = torch.stack([cov, cov + free.diag()])  # (2, B, O, O)
-    matrix, vector = frame.matrix, frame.vector.unsqueeze(-1)
+    priors = torch.cat([cov, cov + free.diag()])  # (2 B, O, O)
+    matrix = torch.cat([frame.matrix, frame.matrix])
     kept = information_kept(priors, matrix)
-    score = (kept @ vector).squeeze(-1)  # (2, B, O)
-    variance = (kept @ matrix).diagonal(dim1=-2, dim2=-1)
-    known = variance > _KNOWN * matrix.diagonal(dim1=-2, dim2=-1)
-    inflation = torch.cat([torch.ones_like(vector[:, : -count.shape[-1], 0]), 1 + _SHARED**2 * count], dim=-1)
-    known = known & (variance > 0)
+    score = torch.bmm(kept, torch.cat([frame.vector, frame.vector]).unsqueeze(-1)).view(2, -1, cov.shape[-1])
+    variance = torch.bmm(kept, matrix).diagonal(dim1=1, dim2=2).view_as(score)
+    known = variance > (_KNOWN * frame.matrix.diagonal(dim1=1, dim2=2)).clamp(min=0.0)
+    inflation = pad(_SHARED**2 * count, (cov.shape[-1] - count.shape[-1], 0)) + 1
     normal = torch.where(known, score * torch.where(known, variance * inflation, 1.0).rsqrt(), 0.0)
     return torch.cat([normal[0, :, POSE], normal[1, :, SHAPE], normal[1, :, DEVIATIONS]], dim=-1)
 

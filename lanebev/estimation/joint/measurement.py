@@ -21,11 +21,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lanebev.estimation.checks import as_lane_width, check_segments, mask_invalid_rows
 from lanebev.estimation.joint.road_curve import RoadCurve, road_basis, road_curve
 from lanebev.geometry.lens import cam_from_image
-from lanebev.geometry.road import rays_from_pixels
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.observation.segments import LaneSegments
 
@@ -37,6 +37,8 @@ NUM_STRAIGHT = 5
 """Those of a straight road."""
 
 FARTHEST = 200.0  # m; beyond it a pixel is tens of metres and the flat road is fiction
+
+_AHEAD = 1e-3  # of a direction's component ahead; below it a point is not in front of the camera
 
 FOOT_RANGE = 0.02  # of the focal length; a foot point farther off is an outlier's, perhaps above the horizon
 
@@ -116,14 +118,15 @@ def observe(segments: LaneSegments, intrinsics: Tensor, num_boundaries: int) -> 
 
 def observations(segments: LaneSegments, intrinsics: Tensor) -> Observations:
     """Prepare what went through :func:`~lanebev.estimation.checks.mask_invalid_rows`."""
-    rays = rays_from_pixels(segments.endpoints.flatten(1, 2), intrinsics)
+    inverse = cam_from_image(intrinsics)
+    pixels = pad(segments.endpoints.flatten(1, 2).mT, (0, 0, 0, 1), value=1.0)  # (B, 3, M)
     return Observations(
-        rays=rays.mT.contiguous(),
+        rays=torch.bmm(inverse, pixels),
         boundary=segments.boundary,
         weight=segments.weight,
         sigma=segments.sigma,
         focal=intrinsics[:, 0, 0],
-        cam_from_image=cam_from_image(intrinsics)[..., :2],
+        cam_from_image=inverse[..., :2],
     )
 
 
@@ -156,11 +159,11 @@ def look(params: Tensor, seen: Observations, phase: Tensor | None = None) -> Sig
         phase: likewise.
     """
     rotation = road_from_cam(*params[:, :HEIGHT].unbind(-1))
-    directions = rotation @ seen.rays
-    z, on_road = _meet_road(directions, params[:, HEIGHT, None])
-    valid = on_road.unflatten(-1, (-1, 2)).all(-1)
+    directions = torch.bmm(rotation, seen.rays)
+    height = params[:, HEIGHT, None]
+    z, valid = _meet_road(directions, height), _before_farthest(directions, height)
     curve = road_curve(z, params[:, NUM_STRAIGHT:], phase)
-    return Sight(rotation, directions, rotation @ seen.cam_from_image, z, valid, curve)
+    return Sight(rotation, directions, torch.bmm(rotation, seen.cam_from_image), z, valid, curve)
 
 
 def every_segment(sight: Sight, stride: int) -> Sight:
@@ -199,21 +202,22 @@ def boundary_residuals(
     sight = look(params, seen, phase) if sight is None else sight
     feet = foot_rays(params, places, seen, sight) if feet is None else feet
     height = params[:, HEIGHT, None]
-    foot = sight.rotation @ feet
-    z, _ = _meet_road(foot, height)
+    foot = torch.bmm(sight.rotation, feet)
+    z = _meet_road(foot, height)
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (B, M)
-    basis = road_basis(z, phase)
-    curve = RoadCurve(*((params[:, None, NUM_STRAIGHT:] @ part).squeeze(1) for part in basis))
+    basis, shape = road_basis(z, phase), params[:, None, NUM_STRAIGHT:]
+    curve = RoadCurve(*(torch.bmm(shape, part).squeeze(1) for part in basis))
     normal, slope = _tangent_plane(z, x_k, height, curve)
-    size = _pixel_gradient(normal, sight.by_pixel).norm(dim=1)  # (B, M)
+    _, size = _pixel_gradient(normal, sight.by_pixel)  # (B, M)
     distance = (normal * sight.directions).sum(1) / size
 
     turning = torch.linalg.cross(normal, foot, dim=1)  # ∂(n·d)/∂angle = n · (-axis × d) = axis · (n × d)
-    by_angles = _axes(sight.rotation, params[:, ROLL]) @ turning
+    by_angles = torch.bmm(_axes(sight.rotation, params[:, ROLL]), turning)
     x, down, ahead = foot.unbind(1)
-    by_height, by_offset = x - slope * ahead, -down * (1 + 0.5 * curve.heading.square())
-    by_shape = -down.unsqueeze(1) * (basis[0] + (x_k * curve.heading).unsqueeze(1) * basis[1])
-    jacobian = torch.cat([by_angles, by_height.unsqueeze(1), by_offset.unsqueeze(1), by_shape], dim=1)
+    up = -down
+    by_height, by_offset = x - slope * ahead, up + 0.5 * up * curve.heading.square()
+    by_shape = torch.addcmul(basis[0], (x_k * curve.heading).unsqueeze(1), basis[1]) * up.unsqueeze(1)
+    jacobian = torch.cat([by_angles, torch.stack([by_height, by_offset], dim=1), by_shape], dim=1)
     return Residuals(_of_valid(distance, sight.valid), jacobian / size.unsqueeze(1), sight.valid)
 
 
@@ -226,13 +230,12 @@ def boundary_distances(
 ) -> tuple[Tensor, Tensor]:
     """Compute the distances of :func:`boundary_residuals` alone, (B, N, 2) px, and their validity (B, N)."""
     rotation = road_from_cam(*params[:, :HEIGHT].unbind(-1))
-    directions, height = rotation @ seen.rays, params[:, HEIGHT, None]
-    _, on_road = _meet_road(directions, height)
-    valid = on_road.unflatten(-1, (-1, 2)).all(-1)
-    z, _ = _meet_road(rotation @ feet, height)
+    directions, height = torch.bmm(rotation, seen.rays), params[:, HEIGHT, None]
+    valid = _before_farthest(directions, height)
+    z = _meet_road(torch.bmm(rotation, feet), height)
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)
     normal, _ = _tangent_plane(z, x_k, height, road_curve(z, params[:, NUM_STRAIGHT:], phase))
-    size = _pixel_gradient(normal, rotation @ seen.cam_from_image).norm(dim=1)
+    _, size = _pixel_gradient(normal, torch.bmm(rotation, seen.cam_from_image))
     return _of_valid((normal * directions).sum(1) / size, valid), valid
 
 
@@ -253,13 +256,11 @@ def foot_rays(params: Tensor, places: Tensor, seen: Observations, sight: Sight) 
     height = params[:, HEIGHT, None]
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)
     normal, _ = _tangent_plane(sight.z, x_k, height, sight.curve)
-    gradient = _pixel_gradient(normal, sight.by_pixel)  # (B, 2, M) 1/px
-    size = gradient.norm(dim=1)
+    gradient, size = _pixel_gradient(normal, sight.by_pixel)  # (B, 2, M) 1/px
     reach = (FOOT_RANGE * seen.focal).unsqueeze(-1)
     distance = (normal * sight.directions).sum(1) / size
-    step = torch.maximum(torch.minimum(distance, reach), -reach) / size
-    feet: Tensor = seen.rays - seen.cam_from_image @ (step.unsqueeze(1) * gradient)
-    return feet
+    step = distance.clamp(-reach, reach) / size
+    return torch.baddbmm(seen.rays, seen.cam_from_image, step.unsqueeze(1) * gradient, alpha=-1)
 
 
 def sampson_distances(params: Tensor, places: Tensor, sight: Sight) -> Tensor:
@@ -277,7 +278,8 @@ def sampson_distances(params: Tensor, places: Tensor, sight: Sight) -> Tensor:
     """
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (H, B, M)
     normal, _ = _tangent_plane(sight.z, x_k, params[:, HEIGHT, None], sight.curve)
-    distance = (normal * sight.directions).sum(-2) / _pixel_gradient(normal, sight.by_pixel).norm(dim=-2)
+    _, size = _pixel_gradient(normal, sight.by_pixel)
+    distance = (normal * sight.directions).sum(-2) / size
     return _of_valid(distance, sight.valid)
 
 
@@ -289,25 +291,38 @@ def _of_valid(distance: Tensor, valid: Tensor) -> Tensor:
 def _axes(rotation: Tensor, roll: Tensor) -> Tensor:
     """Axes, in the road frame, about which pitch, yaw and roll turn a direction backwards; (B, 3, 3) rows."""
     zero, one = torch.zeros_like(roll), torch.ones_like(roll)
-    turned = torch.stack([roll.sin(), roll.cos(), zero, zero, zero, one], dim=-1).unflatten(-1, (2, 3))
-    return torch.cat([rotation[:, :, 0].unsqueeze(1), turned], dim=1)
+    entries = [*rotation[:, :, 0].unbind(-1), roll.sin(), roll.cos(), zero, zero, zero, one]
+    axes: Tensor = torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+    return axes
 
 
-def _pixel_gradient(normal: Tensor, by_pixel: Tensor) -> Tensor:
-    """Gradient of n·d by the pixel, (…, B, 2, M), for normals (…, B, 3, M)."""
-    gradient: Tensor = by_pixel.mT @ normal
-    return gradient
+def _pixel_gradient(normal: Tensor, by_pixel: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradient of n·d by the pixel (…, B, 2, M), and its length (…, B, M), for normals (…, B, 3, M)."""
+    gradient = by_pixel.mT @ normal
+    return gradient, gradient.square().sum(-2).sqrt()
 
 
-def _meet_road(directions: Tensor, height: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance Z (B, M) at which directions (B, 3, M) meet the road, and whether that is before FARTHEST.
+def _meet_road(directions: Tensor, height: Tensor) -> Tensor:
+    """Distance Z (B, M) at which directions (B, 3, M) meet the road, at most that of ``FARTHEST``.
 
     Source: (J1).
     """
+    ahead = directions[:, 2].clamp(min=_AHEAD)
+    down = torch.maximum(directions[:, 1], ahead * _least_slope(height))
+    return height * ahead / down
+
+
+def _before_farthest(directions: Tensor, height: Tensor) -> Tensor:
+    """(B, N) bool: both end points, of directions (B, 3, M), meet the road nearer than ``FARTHEST``."""
     down, ahead = directions[:, 1], directions[:, 2]
-    nearest = ahead * (height.clamp(min=0.1) / FARTHEST)  # of d_y, for a point at FARTHEST
-    on_road = (ahead > 1e-3) & (down > nearest)
-    return torch.where(on_road, height * ahead / torch.where(on_road, down, 1.0), FARTHEST), on_road
+    on_road = (ahead > _AHEAD) & (down > ahead * _least_slope(height))
+    valid: Tensor = on_road.unflatten(-1, (-1, 2)).all(-1)
+    return valid
+
+
+def _least_slope(height: Tensor) -> Tensor:
+    """Slope (B, 1) of the direction to the point of the road at ``FARTHEST``, down by ahead."""
+    return height.clamp(min=0.1) / FARTHEST
 
 
 def _tangent_plane(z: Tensor, x_k: Tensor, height: Tensor, curve: RoadCurve) -> tuple[Tensor, Tensor]:
@@ -322,6 +337,6 @@ def _tangent_plane(z: Tensor, x_k: Tensor, height: Tensor, curve: RoadCurve) -> 
         curve: at z.
     """
     tilt = x_k * curve.heading
-    slope = curve.heading + tilt * curve.curvature
-    out = x_k + curve.bend + 0.5 * tilt * curve.heading
+    slope = torch.addcmul(curve.heading, tilt, curve.curvature)
+    out = torch.addcmul(x_k + curve.bend, tilt, curve.heading, value=0.5)
     return torch.stack([height.expand_as(out), z * slope - out, -height * slope], dim=-2), slope

@@ -12,6 +12,7 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lanebev.estimation import kalman
 from lanebev.estimation.joint.dynamics import MotionConfig, RoadMotion
@@ -49,21 +50,29 @@ def propagate_road_shape(
     gone = phase + way
     passed = (gone / KNOT_SPACING).floor()  # (B,) knots
     shape = turn_along(mean[:, SHAPE], phase, way)
-    order = torch.arange(NUM_STEPS, dtype=mean.dtype, device=mean.device)
-    shift = (order[:, None] + passed[:, None, None] == order).to(mean)  # (B, NUM_STEPS, NUM_STEPS)
-    left = (order < passed.unsqueeze(-1)).to(mean).unsqueeze(1)  # (B, 1, NUM_STEPS)
-    first = torch.cat([torch.ones_like(left[..., :1]), left], dim=-1)
-    moved = torch.cat([first, torch.cat([torch.zeros_like(shift[..., :1]), shift], dim=-1)], dim=1)
+    moved = _renumbering(passed)
     change = _change_per_metre(shape, shape_cov)
-    by_speed = dt.unsqueeze(-1) * (moved @ change.unsqueeze(-1)).squeeze(-1)  # (B, NUM_SHAPE)
+    both = torch.bmm(moved, torch.stack([shape, dt.unsqueeze(-1) * change], dim=-1))  # (B, NUM_SHAPE, 2)
     seen = cfg.curvature_step**2 * _share_in_view(phase, gone, passed)
     return RoadMotion(
-        shape=(moved @ shape.unsqueeze(-1)).squeeze(-1),
+        shape=both[..., 0],
         phase=gone - passed * KNOT_SPACING,
         transition=moved,
-        by_speed=by_speed,
-        noise=torch.cat([torch.zeros_like(seen[:, :1]), seen], dim=-1),
+        by_speed=both[..., 1],
+        noise=pad(seen, (1, 0)),
     )
+
+
+def _renumbering(passed: Tensor) -> Tensor:
+    """Transition (B, NUM_SHAPE, NUM_SHAPE) by which what was step j is step j - passed, or in the curvature.
+
+    Row and column 0 are the curvature at the first knot: it takes up the steps up to the last knot passed.
+    """
+    order = torch.arange(1 + NUM_STEPS, dtype=passed.dtype, device=passed.device)
+    passed = passed[:, None, None]
+    steps = order[:, None] + passed == order  # (B, NUM_SHAPE, NUM_SHAPE), right below row 0
+    taken = (order <= passed) & (order[:, None] == 0)
+    return torch.where(order[:, None] == 0, taken, steps & (order > 0)).to(passed.dtype)
 
 
 def turn_along(shape: Tensor, phase: Tensor, way: Tensor) -> Tensor:
@@ -79,12 +88,12 @@ def turn_along(shape: Tensor, phase: Tensor, way: Tensor) -> Tensor:
         phase: (B,) m, how far the first knot lies behind the camera.
         way: (B,) m.
     """
-    bend = torch.cat([shape[:, :1], shape[:, :1] + shape[:, 1:].cumsum(-1)], dim=-1)  # b'' at the knots
+    bend = shape.cumsum(-1)  # b'' at the knots
     behind = phase.unsqueeze(-1)
     here = bend[:, :1] + behind / KNOT_SPACING * shape[:, 1:2]
     to_knots = (0.5 * KNOT_SPACING * (bend[:, 1:] + bend[:, :-1])).cumsum(-1)
     to_here = 0.5 * behind * (bend[:, :1] + here)
-    heading = (torch.cat([torch.zeros_like(here), to_knots], dim=-1) - to_here).atan()
+    heading = (pad(to_knots, (1, 0)) - to_here).atan()
     places = KNOT_SPACING * torch.arange(1 + NUM_STEPS, dtype=shape.dtype, device=shape.device)
     after = heading - here * torch.minimum(way.unsqueeze(-1), (places - behind).clamp(min=0.0))
     bend = bend * (heading.cos() / after.cos().clamp(min=0.6)) ** 3
@@ -144,7 +153,7 @@ def _change_per_metre(shape: Tensor, cov: Tensor) -> Tensor:
     filter would estimate from it that the vehicle stands still. So the change is faded in between the two
     values of χ² in ``CLEAR_BEND``.
     """
-    change: Tensor = (torch.as_tensor(_CHANGE).to(shape) @ shape.unsqueeze(-1)).squeeze(-1)
+    change = shape @ torch.as_tensor(_CHANGE).to(shape).mT
     steps, spread = shape[:, 1:], cov[:, 1:, 1:]
     size = spread.diagonal(dim1=1, dim2=2).rsqrt()  # (B, NUM_STEPS)
     factor = cholesky(size.unsqueeze(-1) * spread * size.unsqueeze(-2))

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import pad
 
 KNOT_SPACING = 10.0  # m
 NUM_STEPS = 5
 """Steps of curvature between knots, where the shape is a spline: c at the first knot and these, 1/m."""
+
+_SQUARE, _CUBE = KNOT_SPACING / 2, KNOT_SPACING**2 / 6  # heading and bend of a unit ramp, one spacing on
 
 
 class RoadCurve(NamedTuple):
@@ -49,38 +50,34 @@ def road_curve(z: Tensor, shape: Tensor, phase: Tensor | None) -> RoadCurve:
 
 
 def _spline_curve(z: Tensor, shape: Tensor, phase: Tensor) -> RoadCurve:
-    """The curve of a curvature that is linear between knots, from the first knot, then from Z = 0."""
-    table = (shape @ torch.as_tensor(_KNOT_VALUES).to(shape)).unflatten(-1, (4, 1 + NUM_STEPS))
-    start = phase.unsqueeze(-1)
-    beyond = torch.cat([z + start, start], dim=-1)  # (B, M + 1) m past the first knot; the last is the camera
-    interval = (beyond / KNOT_SPACING).floor().clamp(0, NUM_STEPS)
-    along = beyond - KNOT_SPACING * interval
-    index = interval.long().unsqueeze(1).expand(-1, 4, -1)
-    bend, heading, curvature, rate = table.gather(2, index).unbind(
-        1
-    )  # (B, M + 1) each, at the last knot passed
-    bend = bend + along * (heading + along * (curvature / 2 + along * (rate / 6)))
-    heading = heading + along * (curvature + along * (rate / 2))
-    curvature = curvature + along * rate
-    turned = heading[:, -1:]
-    return RoadCurve(bend[:, :-1] - bend[:, -1:] - turned * z, heading[:, :-1] - turned, curvature[:, :-1])
+    """The curve of a curvature that is linear between knots: its slope changes at each knot."""
+    past = _past_knots(z, phase)
+    square = past * past
+    steps = shape[:, 1:]
+    changes = (pad(steps, (0, 1)) - pad(steps, (1, 0))).unsqueeze(1)  # (B, 1, 1 + NUM_STEPS), of the slope
+    first, (turned, moved) = shape[:, :1], _behind(phase)
+    turned, moved = turned * steps[:, :1], moved * steps[:, :1]
+    turning = first * z
+    by_square, by_cube = changes.mul(_SQUARE), changes.mul(_CUBE)
+    return RoadCurve(
+        bend=(z * (0.5 * turning - turned) - moved) + torch.bmm(by_cube, square * past).squeeze(1),
+        heading=(turning - turned) + torch.bmm(by_square, square).squeeze(1),
+        curvature=first + torch.bmm(changes, past).squeeze(1),
+    )
 
 
-def _knot_values() -> NDArray[np.float64]:
-    """(K, 4 K): bend, heading, curvature and its rate at every knot, for unit shape parameters."""
-    last = 1 + NUM_STEPS
-    curvature = np.triu(np.ones((last, last)))  # [parameter, knot]
-    rate = np.eye(last, k=-1) / KNOT_SPACING
-    heading, bend = np.zeros((last, last)), np.zeros((last, last))
-    for k in range(1, last):
-        before, after = curvature[:, k - 1], curvature[:, k]
-        heading[:, k] = heading[:, k - 1] + KNOT_SPACING * (before + after) / 2
-        bend[:, k] = bend[:, k - 1] + KNOT_SPACING * heading[:, k - 1]
-        bend[:, k] += KNOT_SPACING**2 * (before / 3 + after / 6)
-    return np.concatenate([bend, heading, curvature, rate], axis=1)
+def _past_knots(z: Tensor, phase: Tensor) -> Tensor:
+    """Distances (B, 1 + NUM_STEPS, M) past the knots, in knot spacings, 0 before a knot."""
+    knots = torch.arange(1 + NUM_STEPS, dtype=z.dtype, device=z.device).unsqueeze(-1)
+    past = ((z + phase.unsqueeze(-1)) / KNOT_SPACING).unsqueeze(1) - knots
+    return past.clamp(min=0.0)
 
 
-_KNOT_VALUES = _knot_values()
+def _behind(phase: Tensor) -> tuple[Tensor, Tensor]:
+    """Heading and bend (B, 1) at the camera for a unit first step: what lies behind it, of that step only."""
+    first = (phase / KNOT_SPACING).unsqueeze(-1)
+    square = first * first
+    return _SQUARE * square, _CUBE * (square * first)
 
 
 def road_basis(z: Tensor, phase: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -103,22 +100,18 @@ def _polynomial(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _spline(z: Tensor, phase: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Bend, heading and curvature at (B, M) for a unit curvature and unit steps, each (B, 1 + NUM_STEPS, M).
 
-    A step rises from 0 at its knot to 1 at the next. Bend and heading are zero at Z = 0.
+    A step rises from 0 at its knot to 1 at the next, so it is the difference of the ramps from both. Bend and
+    heading are zero at Z = 0.
     """
-    knots = KNOT_SPACING * torch.arange(NUM_STEPS, dtype=z.dtype, device=z.device) - phase.unsqueeze(-1)
-    past = z.unsqueeze(1) - knots.unsqueeze(-1)  # (B, NUM_STEPS, M)
-    rise = (past / KNOT_SPACING).clamp(0.0, 1.0)
-    beyond = (past - KNOT_SPACING).clamp(min=0.0)
-    squared = rise * rise
-    heading = (0.5 * KNOT_SPACING) * squared + beyond
-    bend = (KNOT_SPACING**2 / 6) * (squared * rise) + (0.5 * KNOT_SPACING) * beyond + 0.5 * beyond * beyond
-    first = (phase / KNOT_SPACING)[:, None, None]  # what lies behind the camera, of the first step only
-    turned = 0.5 * KNOT_SPACING * first * first
-    behind = KNOT_SPACING**2 / 6 * first**3 + turned * z.unsqueeze(1)
-    head_bend, head_heading = bend[:, :1] - behind, heading[:, :1] - turned
-    one = z.unsqueeze(1)
+    past, one = _past_knots(z, phase), z.unsqueeze(1)
+    square = past * past
+    turned, moved = (part.unsqueeze(-1) for part in _behind(phase))
+    rise, heading, bend = (
+        part[:, :-1] - part[:, 1:] for part in (past, _SQUARE * square, _CUBE * (square * past))
+    )
+    head_bend = bend[:, :1] - (moved + turned * one)
     return (
         torch.cat([0.5 * one * one, head_bend, bend[:, 1:]], 1),
-        torch.cat([one, head_heading, heading[:, 1:]], 1),
+        torch.cat([one, heading[:, :1] - turned, heading[:, 1:]], 1),
         torch.cat([torch.ones_like(one), rise], 1),
     )

@@ -30,10 +30,10 @@ def inlier_log_odds(distance: Tensor, sigma: Tensor, scale: Tensor, focal: Tenso
     Returns:
         (B, N): log of inlier over outlier density.
     """
-    noise = sigma * scale.unsqueeze(-1)
-    chi2 = (distance / noise.unsqueeze(-1)).square().sum(-1)
-    spread = OUTLIER_RANGE * focal.unsqueeze(-1) / noise
-    return 2.0 * spread.log() - math.log(2.0 * math.pi * OUTLIER_ODDS) - 0.5 * chi2
+    variance = (sigma * scale.unsqueeze(-1)).square()
+    spread = (OUTLIER_RANGE * focal).square() / (2.0 * math.pi * OUTLIER_ODDS)
+    chi2 = distance.square().sum(-1) / variance
+    return torch.sub((spread.unsqueeze(-1) / variance).log(), chi2, alpha=0.5)
 
 
 def inlier_weights(distance: Tensor, valid: Tensor, sigma: Tensor, scale: Tensor, focal: Tensor) -> Tensor:
@@ -62,8 +62,8 @@ def noise_scale(distance: Tensor, sigma: Tensor, weight: Tensor) -> Tensor:
     Returns:
         (B,) root of the mean squared normalised distance, drawn to 1 by ``SCALE_PRIOR`` segments.
     """
-    chi2 = 0.5 * (distance / sigma.unsqueeze(-1)).square().sum(-1)
-    total = SCALE_PRIOR + (weight * chi2).sum(-1)
+    chi2 = distance.square().sum(-1) / sigma.square()
+    total = SCALE_PRIOR + 0.5 * (weight * chi2).sum(-1)
     return (total / (SCALE_PRIOR + weight.sum(-1))).sqrt().clamp(min=1.0)
 
 

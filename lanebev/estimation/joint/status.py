@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.batch import flag, select_rows
+from lanebev.batch import flags, select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.evidence import EQUAL
 from lanebev.estimation.joint.layout import NUM_POSE, POSE, layout
@@ -45,7 +45,7 @@ def update_track_status(
     support, total = (seen.weight * trust).sum(-1), seen.weight.sum(-1)
     share = support / total.clamp(min=1e-6)
     least = torch.where(predicted.status == int(Status.TRACKING), cfg.min_share, cfg.enter_share)
-    finite = updated.mean.isfinite().all(-1) & updated.cov.isfinite().flatten(1).all(-1)
+    finite = torch.cat([updated.mean, updated.cov.flatten(1)], dim=-1).isfinite().all(-1)
     supported = running & finite & (support >= cfg.min_support) & (share >= least)
     empty = total < 1e-3
     unseen = torch.where(supported, 0.0, predicted.unseen + step)
@@ -53,24 +53,26 @@ def update_track_status(
     coasting = torch.where(unseen > cfg.lost_after, int(Status.LOST), int(Status.COASTING))
     idle = torch.where(running, coasting, predicted.status)
     blind = ~supported.unsqueeze(-1) | (single_frame_std[:, POSE] > single_frame_std.new_tensor(UNSEEN))
-    reasons = (
-        flag(empty, Reason.NO_SEGMENTS)
-        | flag(~empty & ~supported, Reason.FEW_INLIERS)
-        | flag(~running, Reason.NO_START)
-        | flag(blind[:, :ROLL].any(-1), Reason.DIRECTION_UNSEEN)
-        | flag(blind[:, ROLL], Reason.ROLL_UNSEEN)
-        | flag(blind[:, HEIGHT], Reason.HEIGHT_UNSEEN)
-        | torch.where(supported, updated.reasons, 0)
-    )
+    conditions = {
+        Reason.NO_SEGMENTS: empty,
+        Reason.FEW_INLIERS: ~(empty | supported),
+        Reason.NO_START: ~running,
+        Reason.DIRECTION_UNSEEN: blind[:, :ROLL].any(-1),
+        Reason.ROLL_UNSEEN: blind[:, ROLL],
+        Reason.HEIGHT_UNSEEN: blind[:, HEIGHT],
+    }
     known = supported & ~blind.any(-1)
-    after = select_rows(supported, updated, predicted)._replace(
+    after = predicted._replace(
+        mean=select_rows(supported, updated.mean, predicted.mean),
+        cov=select_rows(supported, updated.cov, predicted.cov),
+        motion_scale=select_rows(supported, updated.motion_scale, predicted.motion_scale),
         pose_sensitivity=select_rows(known, updated.pose_sensitivity, predicted.pose_sensitivity),
         evidence=select_rows(supported, updated.evidence, torch.zeros_like(updated.evidence)),
         early=torch.zeros_like(unseen),
         unseen=unseen,
         misfit=misfit,
         status=torch.where(supported, int(Status.TRACKING), idle),
-        reasons=reasons,
+        reasons=flags(conditions) | torch.where(supported, updated.reasons, 0),
     )
     return after, supported
 

@@ -99,12 +99,13 @@ def update(
     """
     count = frame.vector.shape[-1]
     moved = at[:, :count] - predicted[:, :count]
-    pull = frame.vector + (frame.matrix @ moved.unsqueeze(-1)).squeeze(-1)
+    pull = torch.baddbmm(frame.vector.unsqueeze(-1), frame.matrix, moved.unsqueeze(-1))
     free = estimated.clamp(min=_FIXED)
     prior = free.unsqueeze(-1) * cov[:, :, :count] * free[:, None, :count]  # (B, D, O)
     observed_cov = updated_covariance(prior[:, :count], frame.matrix)
-    gain = estimated.unsqueeze(-1) * (prior - prior @ frame.matrix @ observed_cov)
-    mean = predicted + (gain @ pull.unsqueeze(-1)).squeeze(-1)
+    known = torch.bmm(prior, frame.matrix)
+    gain = estimated.unsqueeze(-1) * torch.baddbmm(prior, known, observed_cov, alpha=-1)
+    mean = torch.baddbmm(predicted.unsqueeze(-1), gain, pull).squeeze(-1)
     return Posterior(mean, observed_cov, gain)
 
 
@@ -114,19 +115,20 @@ def updated_covariance(cov: Tensor, matrix: Tensor) -> Tensor:
     Source: (J9).
 
     Args:
-        cov: (..., O, O), P, positive definite.
-        matrix: (..., O, O), Λ.
+        cov: (B, O, O), P, positive definite.
+        matrix: (B, O, O), Λ.
     """
     root = cholesky(cov)
     eye = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device)
-    half = solve_lower(cholesky(eye + root.mT @ matrix @ root), root.mT)
-    return half.mT @ half
+    factor = cholesky(torch.baddbmm(eye, torch.bmm(root.mT, matrix), root))
+    half = solve_lower(factor, root.mT)
+    return torch.bmm(half.mT, half)
 
 
 def information_kept(cov: Tensor, matrix: Tensor) -> Tensor:
     """Compute (I + Λ P)⁻¹, by which Hᵀ Q⁻¹ y becomes the score Hᵀ S⁻¹ y; arguments as before."""
     eye = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device)
-    return eye - matrix @ updated_covariance(cov, matrix)
+    return torch.baddbmm(eye, matrix, updated_covariance(cov, matrix), alpha=-1)
 
 
 def posterior_covariance(cov: Tensor, matrix: Tensor, gain: Tensor) -> Tensor:
@@ -142,9 +144,11 @@ def posterior_covariance(cov: Tensor, matrix: Tensor, gain: Tensor) -> Tensor:
         gain: (B, D, O), G.
     """
     count = matrix.shape[-1]
-    crossed = gain @ (matrix @ cov[:, :count])  # (B, D, D)
-    inner = matrix @ cov[:, :count, :count] @ matrix + matrix
-    return symmetrise(cov - crossed - crossed.mT + gain @ inner @ gain.mT)
+    seen = torch.bmm(matrix, cov[:, :count])  # (B, O, D)
+    crossed = torch.bmm(gain, seen)  # (B, D, D)
+    inner = torch.baddbmm(matrix, seen[:, :, :count], matrix)
+    added = torch.bmm(torch.bmm(gain, inner), gain.mT)
+    return symmetrise(cov - crossed - crossed.mT + added)
 
 
 def single_frame(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -159,7 +163,8 @@ def single_frame(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """
     prior = matrix.new_tensor(_WIDE_PRIOR).square().reciprocal().diag()
     cov = inverse_spd(matrix[:, :NUM_STRAIGHT, :NUM_STRAIGHT] + prior)
-    return cov.diagonal(dim1=1, dim2=2).sqrt(), cov[:, :NUM_POSE] @ matrix[:, :NUM_STRAIGHT, NUM_COMMON:]
+    sensitivity = torch.bmm(cov[:, :NUM_POSE], matrix[:, :NUM_STRAIGHT, NUM_COMMON:])
+    return cov.diagonal(dim1=1, dim2=2).sqrt(), sensitivity
 
 
 def estimated_entries(single_frame_std: Tensor, place: Layout) -> Tensor:
@@ -188,9 +193,9 @@ def agreement(frame: FrameInformation, moved: Tensor, seen: Observations) -> Ten
     """
     common, own = moved[:, :NUM_COMMON], moved[:, NUM_COMMON:]
     jacobian = frame.residuals.jacobian
-    change = (common.unsqueeze(1) @ jacobian).squeeze(1)
-    change = change + jacobian[:, OFFSET] * own.gather(1, seen.boundary).repeat_interleave(2, dim=1)
-    distance = frame.residuals.distance + change.unflatten(-1, (-1, 2))
+    change = torch.bmm(common.unsqueeze(1), jacobian).unflatten(-1, (-1, 2)).squeeze(1)
+    by_own = jacobian[:, OFFSET].unflatten(-1, (-1, 2)) * own.gather(1, seen.boundary).unsqueeze(-1)
+    distance = frame.residuals.distance + change + by_own
     focal = seen.focal
     return inlier_weights(distance, frame.residuals.valid, seen.sigma, frame.scale, focal)
 
@@ -200,14 +205,11 @@ def _normal_equations(at: Residuals, weight: Tensor, member: Tensor) -> tuple[Te
 
     Source: (J8).
     """
-    jacobian = at.jacobian
-    weight = weight.repeat_interleave(2, dim=1).unsqueeze(1)
-    left = torch.cat([jacobian, at.distance.flatten(1).unsqueeze(1)], dim=1) * weight  # (B, 12, M)
-    by_deviation = member * jacobian[:, OFFSET].unsqueeze(-1)  # (B, M, L)
-    products = left @ torch.cat([jacobian.mT, by_deviation], dim=-1)  # (B, 12, O)
-    common, cross = products[:, :NUM_COMMON, :NUM_COMMON], products[:, :NUM_COMMON, NUM_COMMON:]
-    lower = torch.cat([cross.mT, cross[:, OFFSET].diag_embed()], dim=-1)
-    return torch.cat([torch.cat([common, cross], dim=-1), lower], dim=1), -products[:, NUM_COMMON]
+    by_deviation = member.mT * at.jacobian[:, OFFSET : OFFSET + 1]  # (B, L, M)
+    jacobian = torch.cat([at.jacobian, by_deviation], dim=1)
+    weighted = jacobian * weight.repeat_interleave(2, dim=1).unsqueeze(1)
+    against = torch.bmm(weighted, at.distance.flatten(1).unsqueeze(-1)).squeeze(-1)
+    return torch.bmm(weighted, jacobian.mT), -against
 
 
 def _predicted_variance(jacobian: Tensor, cov: Tensor, boundary: Tensor) -> Tensor:
@@ -215,10 +217,8 @@ def _predicted_variance(jacobian: Tensor, cov: Tensor, boundary: Tensor) -> Tens
 
     Correlations between deviations and the common entries are left out: they lower it.
     """
-    common = ((cov[:, :NUM_COMMON, :NUM_COMMON] @ jacobian) * jacobian).sum(1)  # (B, M)
-    own = cov.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:].gather(1, boundary).unsqueeze(-1)  # (B, N, 1)
-    both = (
-        torch.stack([common, jacobian[:, OFFSET].square()], dim=-1).unflatten(1, (-1, 2)).mean(2)
-    )  # (B, N, 2)
-    total: Tensor = both[..., 0] + own.squeeze(-1) * both[..., 1]
-    return total
+    common = (torch.bmm(cov[:, :NUM_COMMON, :NUM_COMMON], jacobian) * jacobian).sum(1)  # (B, M)
+    own = cov.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:].gather(1, boundary)  # (B, N)
+    shift = jacobian[:, OFFSET].square().unflatten(-1, (-1, 2)).sum(-1)
+    total: Tensor = torch.addcmul(common.unflatten(-1, (-1, 2)).sum(-1), own, shift)
+    return 0.5 * total
