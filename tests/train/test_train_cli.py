@@ -84,6 +84,7 @@ def test_every_config_is_tested():
     assert {path.name for path in CONFIGS.glob("*.yaml")} == here | {
         "tusimple.yaml",
         "gpu.yaml",
+        "refine_live.yaml",
         "adapt.yaml",
         "detector.yaml",
     }

@@ -145,13 +145,20 @@ SMALL = [
 ]
 
 
-def fit(folder, *extra):
+def fit(folder, *extra, config="gpu.yaml"):
     here = [f"--trainer.default_root_dir={folder}", f"--trainer.logger.init_args.save_dir={folder}"]
-    config = Path(__file__).parents[2] / "configs" / "gpu.yaml"
-    main(["fit", "--config", str(config), *here, *SMALL, *extra])
+    path = Path(__file__).parents[2] / "configs" / config
+    main(["fit", "--config", str(path), *here, *SMALL, *extra])
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("instant")
+def test_refine_live_config_trains_by_steps(tmp_path):
+    fit(tmp_path, "--trainer.max_steps=2", config="refine_live.yaml")
+    last = next(tmp_path.rglob("last.ckpt"))
+    assert torch.load(last, weights_only=False)["global_step"] == 2
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("instant")
 def test_gpu_config_trains_by_steps_and_an_interrupted_run_ends_as_one_in_a_piece(tmp_path, monkeypatch):
@@ -185,7 +192,6 @@ def test_gpu_config_trains_by_steps_and_an_interrupted_run_ends_as_one_in_a_piec
     assert len(table) > 3
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 @pytest.mark.usefixtures("instant")
 def test_gpu_config_ends_after_its_minutes_with_a_checkpoint(tmp_path):
