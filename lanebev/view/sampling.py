@@ -146,7 +146,7 @@ def _strips(features: Tensor, at: Tensor) -> int:
     ``grid_sample`` divides its work on a CPU by images: of one image, one thread does all. A copy puts the
     strips together, and gradients of the image would be computed once for each.
     """
-    one = len(features) == 1 and features.shape[1] <= _FEW and features.device.type == "cpu"
+    one = features.shape[0] == 1 and features.shape[1] <= _FEW and features.device.type == "cpu"
     return math.gcd(at.shape[2], torch.get_num_threads()) if one and _may_overwrite() else 1
 
 
