@@ -10,6 +10,7 @@ how much the estimate would be off if the road's crossfall changed by 1 % over 1
 
 from __future__ import annotations
 
+import argparse
 import math
 from typing import NamedTuple
 
@@ -84,6 +85,8 @@ def frame_information(radius: float) -> Information:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.parse_args()
     print(f"{'radius':>8} | one frame | a minute | crossfall, crest, wide lane")
     for radius in RADII:
         found = frame_information(radius)

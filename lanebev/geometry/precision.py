@@ -44,8 +44,9 @@ def _is_precise(tensors: list[Tensor]) -> bool:
     """
     if torch.compiler.is_compiling() or len({tensor.dtype for tensor in tensors}) != 1:
         return False
-    first = tensors[0]
-    return first.dtype in (torch.float32, torch.float64) and not torch.is_autocast_enabled(first.device.type)
+    dtype, device = tensors[0].dtype, tensors[0].device.type
+    autocast = torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
+    return dtype in (torch.float32, torch.float64) and not autocast
 
 
 def autocast_off(device: torch.device) -> torch.autocast:

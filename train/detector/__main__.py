@@ -44,9 +44,9 @@ def trained(experiment: Experiment, arm: Arm, seed: int, frames: DriveFrames) ->
     """
     L.seed_everything(seed, verbose=False)
     module, folder = new_module(experiment, arm), experiment.out / f"{arm}-{seed}"
-    steps, batch = experiment.steps, experiment.batch_size
+    steps, batch = int(experiment.steps), experiment.batch_size
     if arm == "tuned":
-        steps, batch = experiment.tuned_steps, experiment.tuned_batch_size
+        steps, batch = int(experiment.tuned_steps), experiment.tuned_batch_size
         begin = experiment.out / f"online-{seed}" / f"step={experiment.steps - steps}.ckpt"
         if not begin.exists():
             raise ValueError(f"arms: expected 'online' before 'tuned', got no {begin}")

@@ -69,7 +69,9 @@ class DetectorTraining(L.LightningModule):
     ) -> None:
         super().__init__()
         self.arm, self.grid = arm, grid
-        self.learning_rate, self.lane_rate, self.fps = learning_rate, lane_rate, fps
+        self.fps = fps
+        self.learning_rate = float(learning_rate)  # a plain number, which a checkpoint may hold
+        self.lane_rate = float(lane_rate)
         self.detector = VehicleDetector(grid, width, bev_width, top)
         self.lanes: LaneBEV | None = None
         if arm == "tuned":
@@ -112,7 +114,7 @@ class DetectorTraining(L.LightningModule):
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimizer,
             [group["lr"] for group in optimizer.param_groups],
-            self.trainer.max_steps,
+            int(self.trainer.max_steps),  # plain, as the rates are
             pct_start=0.15,
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
