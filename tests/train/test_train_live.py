@@ -199,5 +199,5 @@ def test_gpu_config_ends_after_its_minutes_with_a_checkpoint(tmp_path):
     checkpoint = torch.load(next(tmp_path.rglob("last.ckpt")), weights_only=False)
     assert checkpoint["global_step"] > 0
     assert checkpoint["callbacks"]["Timer"]["time_elapsed"]["train"] >= 5
-    (rate,) = {group["lr"] for group in checkpoint["optimizer_states"][0]["param_groups"]}
-    assert rate < 1.5e-3  # it falls by the clock
+    rates = [group["lr"] for group in checkpoint["optimizer_states"][0]["param_groups"]]
+    assert max(rates) < 1.5e-3  # they fall by the clock, which each group reads for itself
