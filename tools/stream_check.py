@@ -199,7 +199,7 @@ def watch(seconds: float, fps: float, size: tuple[int, int]) -> StreamFigures:
             _wait_for_lines(run, folder)
             memory = _memory(run, seconds)
             sent = server.sent
-            run.send_signal(signal.SIGINT)
+            run.send_signal(signal.SIGTERM)  # SIGINT is ignored where nohup or & began this
             said = run.communicate()[0]
         words = r"(\d+) frames used, (\d+) dropped, at most ([\d.]+) s .*?, ([\d.]+) s of them waiting"
         match = re.search(words, said)

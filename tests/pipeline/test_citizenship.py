@@ -17,11 +17,11 @@ from lanebev import (
     LaneSegments,
     LineExtractor,
     SegmenterConfig,
-    Status,
     TwoStageCalibrator,
 )
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes, no_lanes, stack_rows
+from tests.pipeline.rows import started
 
 DOUBLE = torch.float64
 CALIBRATORS = pytest.mark.parametrize(
@@ -101,16 +101,6 @@ def test_64_rows_equal_each_alone(calibrator):
             covariance, other = together.covariance[row], found.covariance[0]
             torch.testing.assert_close(covariance, other, rtol=1e-6, atol=1e-12)
             assert together.status[row] == found.status[0]
-
-
-def started(calibrator):
-    """A state after two frames, of rows that track, see one boundary, see nothing, and are lost."""
-    state = calibrator.initial_state(4, dtype=DOUBLE)
-    for seed in range(2):
-        frame = stack_rows(*(lanes(seed=seed + 10 * row) for row in range(4)))
-        _, state = calibrator(frame, K.expand(4, 3, 3), state, 1 / 30)
-    lost = torch.tensor([Status.TRACKING, Status.TRACKING, Status.TRACKING, Status.LOST])
-    return state._replace(status=lost).detach()
 
 
 @CALIBRATORS

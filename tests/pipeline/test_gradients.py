@@ -3,9 +3,10 @@
 import pytest
 import torch
 
-from lanebev import BEVGrid, BEVWarp, JointCalibrator, LineExtractor, Status, TwoStageCalibrator
+from lanebev import BEVGrid, BEVWarp, JointCalibrator, LineExtractor, TwoStageCalibrator
 from lanebev.testing.segments import INTRINSICS as K
-from lanebev.testing.segments import lanes, stack_rows
+from lanebev.testing.segments import lanes
+from tests.pipeline.rows import started
 
 DOUBLE = torch.float64
 IMAGE, NETWORK, MAP = (720, 1280), (180, 320), (90, 160)  # (H, W) px, px, cells
@@ -36,16 +37,6 @@ def painted():
 def _outermost(ends):
     """Indices (6, 1, 1) of each boundary's highest and lowest points."""
     return ends[..., 1].argmin(1)[:, None, None], ends[..., 1].argmax(1)[:, None, None]
-
-
-def started(calibrator):
-    """A state after two frames, but that of the last row, which is lost."""
-    state = calibrator.initial_state(4, dtype=DOUBLE)
-    for seed in range(2):
-        frame = stack_rows(*(lanes(seed=seed + 10 * row) for row in range(4)))
-        _, state = calibrator(frame, K.expand(4, 3, 3), state, 1 / 30)
-    lost = torch.tensor([Status.TRACKING, Status.TRACKING, Status.TRACKING, Status.LOST])
-    return state._replace(status=lost).detach()
 
 
 @pytest.mark.parametrize("of", [pytest.param("logits", marks=pytest.mark.slow), "pixels"])
