@@ -22,6 +22,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from lanebev.app.demo import write_drive
 from lanebev.app.fleet.manifest import read_manifest
 from lanebev.app.run import run
@@ -58,9 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def check(args: argparse.Namespace, folder: Path) -> dict[str, object]:
     """Return the figures."""
     manifest = write_drives(folder, args.drives, args.frames, args.network)
-    os.environ["OMP_NUM_THREADS"] = (
-        "1"  # as Ray gives its workers: sums of several threads have another order
-    )
+    torch.set_num_threads(1)  # as Ray gives its workers: sums of several threads have another order
     out = folder / "fleet"
     cut = [] if args.part_seconds is None else ["--part-minutes", f"{args.part_seconds / 60:.5f}"]
     options = ["--batch", str(args.batch), *cut]
@@ -113,7 +113,7 @@ def call(
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     while process.poll() is None and time.perf_counter() - start < PATIENCE:
         done = len(list((out / "drives").glob("*/fleet.json"))) if kills else 0
-        if killed < kills and done >= (killed + 1) * drives // (kills + 2):
+        if killed < kills and done >= killed * drives // (kills + 1):  # the first is looked for at once
             for worker in list(busy_workers(process.pid))[:1]:
                 os.kill(worker, signal.SIGKILL)
                 killed += 1

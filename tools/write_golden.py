@@ -56,7 +56,7 @@ def run_on_lanes(lanes: Path, out: Path) -> Path:
         (Path(folder) / "camera.yaml").write_text(json.dumps(camera), encoding="utf-8")
         with contextlib.chdir(folder):  # extrinsics.csv keeps the images' paths as they are given
             inputs = ["frames", "--camera", "camera.yaml", "--lanes", str(lanes.resolve())]
-            status = command(["run", *inputs, "--fps", "20", "--out", "out"])
+            status = command(["run", *inputs, "--fps", "20", "--lane-width", "3.7", "--out", "out"])
         if status:
             raise ValueError(f"lanebev run: expected status 0, got {status}")
         shutil.copy(Path(folder) / "out" / "extrinsics.csv", out)

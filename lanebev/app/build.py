@@ -73,7 +73,8 @@ def _tracker(calibrator: Calibrator[StateT], config: RunConfig, camera: Camera) 
     """Make the tracker of a calibrator, or of its export."""
     if config.backend == "onnxruntime":
         calibrator = onnx_calibrator(Path(config.exported), config.calibrator, calibrator)
-    return Tracker(calibrator, camera, config.lane_width, config.relative_focal_std, config.lane_width_std)
+    lane_width, lane_width_std = config.taken_lane_width
+    return Tracker(calibrator, camera, lane_width, config.relative_focal_std, lane_width_std)
 
 
 def needs_network(config: RunConfig) -> bool:

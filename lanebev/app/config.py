@@ -24,6 +24,8 @@ CALIBRATORS = ("joint", "two-stage")
 BACKENDS = ("torch", "onnxruntime")
 FOV_FOCAL_STD = 0.2
 """Standard deviation of a guessed focal length as a share of it: 60 degrees of view may be 40 or 90."""
+LANE_WIDTH, LANE_WIDTH_STD = 3.7, 0.2
+"""m, of roads whose lane width nobody stated: most main roads of the world have lanes of 3.25 to 3.75 m."""
 
 
 def parse_path(text: str) -> str:
@@ -90,7 +92,7 @@ class RunConfig:
         source: video, folder, glob, image, camera, stream, or "-" for a pipe.
         camera: camera file, or empty with ``fov``.
         out: output folder.
-        lane_width: m.
+        lane_width: m, None where it is not known, which takes LANE_WIDTH.
         lanes: lane file or folder of another detector, None for the network.
         stills: every image on its own.
         resume: output folder of an earlier run, with the same calibrator, whose state to begin with.
@@ -102,6 +104,7 @@ class RunConfig:
         focal_std: standard deviation of the focal length as a share of it; None is 0 with a camera file and
             FOV_FOCAL_STD with ``fov``.
         lane_width_std: m, standard deviation of ``lane_width``; its part in the height's is proportional.
+            None is 0 where ``lane_width`` is given and LANE_WIDTH_STD where it is not.
         mount: ``calibration.yaml`` of an earlier run of this camera, whose pose is this one's prior.
         rectified: the images were rectified: the camera is the camera file's projection matrix P.
         weights: of the network, None for the shipped ones.
@@ -130,7 +133,12 @@ class RunConfig:
         "", "of OpenCV, ROS, Kalibr, EuRoC, KITTI, nuScenes; or YAML of fx fy cx cy width height", "FILE"
     )
     out: str = option("lanebev-out", "output folder (default {})", "DIR")
-    lane_width: float = option(3.7, "metres (default {})", "M", float)
+    lane_width: float | None = option(
+        None,
+        f"metres ({LANE_WIDTH:g}, with a standard deviation of {LANE_WIDTH_STD:g})",
+        "M",
+        float,
+    )
     lanes: str | None = option(
         None,
         "lanes of another detector: TuSimple JSON lines, CULane .lines.txt, OpenLane JSON, or a folder of "
@@ -163,8 +171,11 @@ class RunConfig:
         "REL",
         float,
     )
-    lane_width_std: float = option(
-        0.0, "standard deviation of the lane width, metres (default {})", "M", float
+    lane_width_std: float | None = option(
+        None,
+        f"standard deviation of the lane width, metres (0 with --lane-width, {LANE_WIDTH_STD:g} without)",
+        "M",
+        float,
     )
     mount: str | None = option(
         None, "calibration.yaml of an earlier run, whose pose is a prior for this one", "FILE"
@@ -204,6 +215,12 @@ class RunConfig:
         return 0.0 if self.fov is None else FOV_FOCAL_STD
 
     @property
+    def taken_lane_width(self) -> tuple[float, float]:
+        """``lane_width`` and ``lane_width_std`` with their defaults."""
+        mean, std = (LANE_WIDTH, LANE_WIDTH_STD) if self.lane_width is None else (self.lane_width, 0.0)
+        return mean, std if self.lane_width_std is None else self.lane_width_std
+
+    @property
     def frame_rate(self) -> Fraction | None:
         """``fps`` as a fraction."""
         return None if self.fps is None else Fraction(self.fps).limit_denominator(1000)
@@ -213,10 +230,11 @@ class RunConfig:
             raise ValueError("source: expected a path, got none")
         self._check_lens()
         self._check_selection()
-        if not 0.0 <= self.lane_width_std <= 2.0:
-            raise ValueError(f"lane width std: expected 0 to 2 m, got {self.lane_width_std:g}")
-        if not (math.isfinite(self.lane_width) and 1.0 < self.lane_width < 10.0):
-            raise ValueError(f"lane width: expected 1 to 10 m, got {self.lane_width:g}")
+        width, width_std = self.taken_lane_width
+        if not 0.0 <= width_std <= 2.0:
+            raise ValueError(f"lane width std: expected 0 to 2 m, got {width_std:g}")
+        if not (math.isfinite(width) and 1.0 < width < 10.0):
+            raise ValueError(f"lane width: expected 1 to 10 m, got {width:g}")
         if self.fps is not None and not (math.isfinite(self.fps) and 0.01 <= self.fps <= 10_000):
             raise ValueError(f"fps: expected 0.01 to 10000 frames per second, got {self.fps:g}")
         if self.calibrator not in CALIBRATORS:

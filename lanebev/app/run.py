@@ -99,7 +99,7 @@ def run(
             path=out.__truediv__,
             camera=camera,
             fps=STILLS_FPS if config.stills else source.fps / config.every,
-            lane_width=config.lane_width,
+            lane_width=config.taken_lane_width[0],
             single=source.is_single,
             stills=config.stills,
             grid=make_grid(config),

@@ -32,13 +32,22 @@ def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[st
         kind: f"{source.taken_count}{rate}",
         "camera": f"{lens}: {camera.model}, f = {fx:.1f} / {fy:.1f} px",
         "lanes from": config.lanes or network,
-        "lane width": f"{config.lane_width:.4g} m",
+        "lane width": lane_width_words(config),
         "calibrator": config.calibrator,
         "lanebev": __version__,
         **({"stream": source.figures.words()} if isinstance(source, LiveSource) else {}),
         **smoothing_facts(config),
         **_other_settings(config),
     }
+
+
+def lane_width_words(config: RunConfig) -> str:
+    """Say which lane width is taken, and what its standard deviation means for the height."""
+    width, std = config.taken_lane_width
+    words = f"{width:.4g} m"
+    if std:
+        words += f", standard deviation {std:.2g} m: {std / width:.1%} of the height"
+    return words if config.lane_width is not None else words + "; --lane-width states that of the road"
 
 
 def smoothing_facts(config: RunConfig) -> dict[str, str]:
@@ -52,6 +61,7 @@ def _other_settings(config: RunConfig) -> dict[str, str]:
     named = {"source", "camera", "lanes", "lane_width", "calibrator", "weights", "out"}
     settings = {item.name: getattr(config, item.name) for item in fields(config) if item.name not in named}
     settings["focal_std"] = config.relative_focal_std
+    settings["lane_width_std"] = config.taken_lane_width[1]
     near, far, left, right, step = config.grid
     settings["grid"] = f"{near:g}:{far:g},{left:g}:{right:g}/{step:g}"
     return {f"--{name.replace('_', '-')}": setting_words(value) for name, value in settings.items()}
@@ -85,7 +95,7 @@ def summary(report: Report, config: RunConfig) -> str:
         middle = {name: float(np.median([getattr(row, name) for row in tracking])) for name in _SHOWN}
         values = "  ".join(f"{name.rsplit('_', 1)[0]} {middle[name]:+.3f} {_SHOWN[name]}" for name in _SHOWN)
         lines.append(f"median  {values}")
-    shown = ("lane width σ", "mount", "smoothed", "taken up", "stream")
+    shown = ("lane width", "mount", "smoothed", "taken up", "stream")
     lines += [f"{label}: {text}" for label, text in report.facts.items() if label.startswith(shown)]
     lines += [f"problem: {problem}" for problem in report.problems[:_PROBLEMS]]
     if len(report.problems) > _PROBLEMS:

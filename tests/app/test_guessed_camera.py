@@ -65,13 +65,28 @@ def test_stills_have_the_sigmas_of_the_settings_too():
     camera = Camera.from_fov(60.0, 1280, 720)
     found = []
     for settings in ({}, {"focal_std": 0.1}, {"lane_width_std": 0.37}):
-        tracker = make_tracker(RunConfig("a", "b", **settings), camera)
+        tracker = make_tracker(RunConfig("a", "b", lane_width=3.7, **settings), camera)
         still = tracker.still(vertices_from_lines(lines(camera), camera), 1.0)
         found.append(still.calibration.covariance[0].diagonal())
     known, by_focal, by_width = found
     assert float(by_focal[0] - known[0]) == pytest.approx((0.1 * POSE[0]) ** 2, rel=0.05)
     assert float(by_width[3] - known[3]) == pytest.approx((0.1 * POSE[3]) ** 2, rel=0.05)
     assert torch.equal(by_width[:3], known[:3])
+
+
+def test_a_lane_width_that_nobody_stated_is_unsure():
+    """Lanes of 3.25 m, of which only the first user tells."""
+    camera = Camera.from_fov(60.0, 1280, 720)
+    drawn = lines(camera, places=(-4.875, -1.625, 1.625, 4.875))
+    errors = []
+    for settings in ({"lane_width": 3.25}, {"lane_width_std": 0.0}, {}):
+        calibration = tracked(RunConfig("a", "b", **settings), camera, drawn)[1]
+        error = abs(float(calibration.extrinsics.height) - POSE[3])
+        errors.append(error / float(calibration.covariance[0, 3, 3].sqrt()))
+    stated, wrongly_sure, unsure = errors
+    assert stated < 1
+    assert wrongly_sure > 3
+    assert 1 < unsure < 3
 
 
 def test_lane_width_is_a_share_of_height_alone():

@@ -36,7 +36,7 @@ def test_a_row_a_drive(write, tmp_path):
     assert first.config.camera == str(tmp_path / "fleet" / "cam.yaml")
     assert (first.config.lane_width, first.config.rectified) == (3.5, True)
     assert (second.name, second.camera_id, second.day, second.time) == ("b-x", "cam", UNKNOWN_DAY, "")
-    assert (second.config.lane_width, second.config.rectified) == (3.7, False)
+    assert (second.config.lane_width, second.config.rectified) == (None, False)
 
 
 def test_yaml_with_defaults_says_the_same(write):
