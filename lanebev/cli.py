@@ -39,10 +39,10 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parser() -> argparse.ArgumentParser:
-    """The parser of ``lanebev``; the options of ``run`` are the fields of its settings."""
+    """Return the parser of ``lanebev``; the options of ``run`` are the fields of :class:`RunConfig`."""
     top = _Parser(prog="lanebev", description=DESCRIPTION, allow_abbrev=False)
     top.add_argument("--version", action="version", version=f"lanebev {__version__}")
-    words = "print a script that completes commands and options in this shell, and end"
+    words = "print a script that completes commands and options in this shell, and exit"
     top.add_argument(
         "--print-completion",
         choices=("bash", "zsh"),
@@ -53,40 +53,44 @@ def parser() -> argparse.ArgumentParser:
     _add_verbose(top, False)
     names = "{demo,run,compare,convert,export,doctor,fleet}"
     commands = top.add_subparsers(dest="command", required=True, metavar=names)
-    demo = commands.add_parser("demo", help="a rendered drive end to end", allow_abbrev=False)
+    demo = commands.add_parser("demo", help="render a drive and calibrate it", allow_abbrev=False)
     path = _named(parse_path)
     default = "lanebev-demo"
     demo.add_argument(
         "--out", type=path, default=default, metavar="DIR", help="output folder (default %(default)s)"
     )
-    run = commands.add_parser("run", help="calibrate on images or a video", allow_abbrev=False)
+    run = commands.add_parser("run", help="calibrate on a video, images or a stream", allow_abbrev=False)
     for setting in fields(RunConfig):
         _add_setting(run, setting)
     run.add_argument("--config", type=path, metavar="FILE", help="settings as YAML; options here override it")
-    compare = commands.add_parser("compare", help="two runs side by side on one page", allow_abbrev=False)
-    for name, words in (("first", "output folder of a run"), ("second", "of another run on the same frames")):
+    compare = commands.add_parser("compare", help="compare two runs on one page", allow_abbrev=False)
+    folder = "output folder of a run"
+    for name, words in (("first", folder), ("second", f"{folder} on the same frames")):
         compare.add_argument(name, type=path, metavar="AB"[name == "second"], help=words)
     default = "lanebev-compare.html"
     compare.add_argument(
         "--out", type=path, default=default, metavar="FILE", help="page (default %(default)s)"
     )
-    convert = commands.add_parser("convert", help="a run in another program's format", allow_abbrev=False)
+    words = "write the results of a run in another program's format"
+    convert = commands.add_parser("convert", help=words, allow_abbrev=False)
     convert.add_argument("run", type=path, metavar="DIR", help="output folder of a run")
-    convert.add_argument("--to", choices=FORMATS, required=True, help="the format")
-    convert.add_argument("--out", type=path, metavar="FILE", help="the file (one in DIR)")
+    convert.add_argument("--to", choices=FORMATS, required=True, help="the format to write")
+    convert.add_argument("--out", type=path, metavar="FILE", help="the file to write (default: one in DIR)")
     words = "camera file, if DIR has no calibration.yaml"
     convert.add_argument("--camera", type=path, metavar="FILE", help=words)
-    words = "the run's source, to show its images in mcap or rerun"
+    words = "the run's source, whose images are added to mcap or rerun"
     convert.add_argument("--images", type=path, metavar="SOURCE", help=words)
-    files = commands.add_parser("export", help="parts as ONNX files or programs", allow_abbrev=False)
+    words = "write parts of the model as ONNX files or torch.export programs"
+    files = commands.add_parser("export", help=words, allow_abbrev=False)
     for setting in fields(ExportConfig):
         _add_setting(files, setting)
-    words = "whether a camera fits a source; status 1 if something is doubtful, 2 if it does not fit"
+    words = "check if a camera fits a source; status 1 if something is doubtful, 2 if it does not fit"
     doctor = commands.add_parser("doctor", help=words, allow_abbrev=False)
     for setting in fields(RunConfig):
         if setting.name in _DOCTOR_SETTINGS:
             _add_setting(doctor, setting)
-    fleet = commands.add_parser("fleet", help="many drives, on all cores or a cluster", allow_abbrev=False)
+    words = "calibrate on many drives, on all cores or a cluster"
+    fleet = commands.add_parser("fleet", help=words, allow_abbrev=False)
     _add_fleet(fleet)
     for command in (demo, run, compare, convert, files, doctor, fleet):
         _add_verbose(command, argparse.SUPPRESS)
@@ -95,27 +99,25 @@ def parser() -> argparse.ArgumentParser:
 
 def _add_fleet(fleet: argparse.ArgumentParser) -> None:
     path = _named(parse_path)
-    fleet.add_argument(
-        "manifest", type=path, metavar="MANIFEST", help="YAML or CSV: video, camera, ... a drive"
-    )
-    fleet.add_argument(
-        "--out", type=path, default="lanebev-fleet", metavar="DIR", help="folder (%(default)s)"
-    )
-    words = "of a running Ray cluster; without it one begins on this machine and ends with the command"
+    words = "YAML or CSV with the video, camera, ... of each drive"
+    fleet.add_argument("manifest", type=path, metavar="MANIFEST", help=words)
+    words = "output folder (default %(default)s)"
+    fleet.add_argument("--out", type=path, default="lanebev-fleet", metavar="DIR", help=words)
+    words = "address of a running Ray cluster (default: start one on this machine, for this command)"
     fleet.add_argument("--address", type=path, metavar="ADDRESS", help=words)
-    fleet.add_argument("--workers", type=_at_least(1), metavar="N", help="processes here (one a core)")
-    fleet.add_argument(
-        "--retries", type=_at_least(0), default=2, metavar="N", help="of a drive (%(default)s)"
-    )
-    words = "drives that a worker takes at a time, their frames as one batch for the network (%(default)s)"
+    words = "worker processes on this machine (default: one per core)"
+    fleet.add_argument("--workers", type=_at_least(1), metavar="N", help=words)
+    words = "retries of a drive that fails (default %(default)s)"
+    fleet.add_argument("--retries", type=_at_least(0), default=2, metavar="N", help=words)
+    words = "drives per worker at a time, whose frames the network takes as one batch (default %(default)s)"
     fleet.add_argument("--batch", type=_at_least(1), default=1, metavar="N", help=words)
-    words = "share of a GPU that a worker takes, with device: cuda in the manifest (%(default)s)"
-    fleet.add_argument("--gpus", type=float, default=0.0, metavar="SHARE", help=words)
-    words = "folder that no path may leave (the manifest's)"
+    words = "fraction of a GPU per worker, with device: cuda in the manifest (default %(default)s)"
+    fleet.add_argument("--gpus", type=float, default=0.0, metavar="FRACTION", help=words)
+    words = "folder outside which no path may be (default: that of the manifest)"
     fleet.add_argument("--root", type=path, metavar="DIR", help=words)
-    words = "cut longer videos into parts of so many minutes, which the network looks at side by side"
+    words = "length of the parts into which longer videos are cut, for several workers (default: not cut)"
     fleet.add_argument("--part-minutes", type=_above_zero, metavar="MIN", help=words)
-    words = "try drives again that failed in an earlier call"
+    words = "also run drives again that failed in an earlier call"
     fleet.add_argument("--again", action="store_true", help=words)
 
 
@@ -127,7 +129,7 @@ def _above_zero(text: str) -> float:
 
 
 def _at_least(least: int) -> Callable[[str], int]:
-    """Return what makes a whole number of a text."""
+    """Return a parser of whole numbers that are not below ``least``."""
 
     def parsed(text: str) -> int:
         if not text.isdecimal() or int(text) < least:
@@ -138,11 +140,11 @@ def _at_least(least: int) -> Callable[[str], int]:
 
 
 def _add_verbose(parser: argparse.ArgumentParser, default: bool | str) -> None:
-    parser.add_argument("--verbose", action="store_true", default=default, help="say on stderr what is done")
+    parser.add_argument("--verbose", action="store_true", default=default, help="log each step to stderr")
 
 
 def _add_setting(parser: argparse.ArgumentParser, setting: Field[object]) -> None:
-    """Add the option of a setting; one that is not given is not among the parsed ones."""
+    """Add the option of a setting; if it is not given, the parsed options do not contain it."""
     about = setting.metadata
     words = about["help"].replace("%", "%%")
     if setting.name == "source":
@@ -163,7 +165,7 @@ def _add_setting(parser: argparse.ArgumentParser, setting: Field[object]) -> Non
 
 
 def _named(parse: Callable[[str], object]) -> Callable[[str], object]:
-    """The same, saying what it says of bad texts as argparse wants it."""
+    """Return the same function with its ValueError turned into argparse's error."""
     if parse in (float, int):
         return parse
 
@@ -177,13 +179,15 @@ def _named(parse: Callable[[str], object]) -> Callable[[str], object]:
 
 
 class _Stopped(KeyboardInterrupt):
-    """By a signal, its number the argument."""
+    """Raised by a signal, whose number is the argument."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; 0 when it is done, 2 with one line on bad input, 128 + the signal that stopped it.
+    """Run a command and return its exit status.
 
-    ``doctor`` has 1 for what is doubtful, and 2 for what does not fit; ``fleet`` has 1 where drives failed.
+    The status is 0 on success, 2 (with one line on stderr) on bad input, and 128 + n if signal n stopped the
+    command. ``doctor`` returns 1 if something is doubtful and 2 if the camera does not fit; ``fleet`` returns
+    1 if drives failed.
     """
     options = vars(parser().parse_args(arguments))
     command = options.pop("command")
@@ -212,7 +216,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 @contextlib.contextmanager
 def _signals_unwind() -> Iterator[None]:
-    """Ctrl-C, a job scheduler, a closed terminal: outputs are undone, for which a second signal waits."""
+    """Raise :class:`_Stopped` on SIGINT, SIGTERM, SIGHUP; a second signal waits while outputs are undone."""
     known = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     before = {each: signal.getsignal(each) for each in known}
     usual = (signal.SIG_DFL, signal.default_int_handler)
@@ -298,7 +302,7 @@ _COMMANDS: dict[str, Callable[[dict[str, Any]], str | tuple[str, int]]] = {
 
 
 def _progress(label: str) -> Progress:
-    """A progress bar on stderr; on anything but a terminal it stays silent."""
+    """Return a progress bar on stderr, which draws only on a terminal."""
     from rich import progress
     from rich.console import Console
 

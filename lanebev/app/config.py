@@ -1,4 +1,4 @@
-"""What to run: settings with their defaults, from the command line or a YAML file. Imports nothing heavy."""
+"""Settings of a run and their defaults, from the command line or a YAML file. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _MOST_CELLS = 4096  # pixels a side of the bird's-eye view, which H.264 encodes
 CALIBRATORS = ("joint", "two-stage")
 BACKENDS = ("torch", "onnxruntime")
 FOV_FOCAL_STD = 0.2
-"""Standard deviation of a guessed focal length as a share of it: 60 degrees of view may be 40 or 90."""
+"""Standard deviation of a guessed focal length as a fraction of it: 60 degrees of view may be 40 or 90."""
 LANE_WIDTH, LANE_WIDTH_STD = 3.7, 0.2
-"""m, of roads whose lane width nobody stated: most main roads of the world have lanes of 3.25 to 3.75 m."""
+"""Mean and standard deviation (m) of an unknown lane width: most main roads have lanes of 3.25 to 3.75 m."""
 
 
 def parse_path(text: str) -> str:
-    """Return a path as it is.
+    """Return a path unchanged.
 
     Raises:
-        ValueError: an empty one.
+        ValueError: the path is empty.
     """
     if not text:
         raise ValueError("expected a path, got an empty string")
@@ -40,10 +40,10 @@ def parse_path(text: str) -> str:
 
 
 def parse_grid(text: str) -> tuple[float, float, float, float, float]:
-    """Return (near, far, left, right, resolution) m of a text such as ``3:60,-10:10/0.05``.
+    """Return (near, far, left, right, resolution) in m from a text such as ``3:60,-10:10/0.05``.
 
     Raises:
-        ValueError: another text, or one of no or too large a picture.
+        ValueError: the text has another form, or the picture would be empty or too large.
     """
     number = r"([-+]?\d+(?:\.\d*)?|[-+]?\.\d+)"
     match = re.fullmatch(rf"{number}:{number},{number}:{number}/{number}", text.replace(" ", ""), re.ASCII)
@@ -66,14 +66,14 @@ def option(
     parse: Callable[[str], object] = parse_path,
     choices: tuple[str, ...] = (),
 ) -> T:
-    """Return a field of the settings, with what the command line says of it and how it is read.
+    """Return a dataclass field with its ``--help`` text and its parser.
 
     Args:
-        default: its value where it is not given.
-        words: for ``--help``; {} in them is the default.
-        metavar: for ``--help``.
-        parse: makes the value of a text; a truth value is a flag instead.
-        choices: all that it can be, if these are few.
+        default: value if the option is not given.
+        words: help text; {} in it is replaced by the default.
+        metavar: name of the value in ``--help``.
+        parse: converts the text to the value; options with a boolean default are flags instead.
+        choices: all allowed values, if there are few.
     """
     metadata = {
         "help": words.replace("{}", str(default)),
@@ -86,41 +86,41 @@ def option(
 
 @dataclass(frozen=True)
 class RunConfig:
-    """What to run.
+    """Settings of a run.
 
     Attributes:
         source: video, folder, glob, image, camera, stream, or "-" for a pipe.
-        camera: camera file, or empty with ``fov``.
+        camera: camera file; empty with ``fov``.
         out: output folder.
-        lane_width: m, None where it is not known, which takes LANE_WIDTH.
-        lanes: lane file or folder of another detector, None for the network.
-        stills: every image on its own.
-        resume: output folder of an earlier run, with the same calibrator, whose state to begin with.
+        lane_width: m; None if unknown, then LANE_WIDTH.
+        lanes: lane file or folder of another detector; None runs the network.
+        stills: every image is independent, not a frame of a drive.
+        resume: output folder of an earlier run with the same calibrator, whose state is the first one.
         calibrator: one of CALIBRATORS.
-        fps: of a folder, a glob or a raw stream; None is what names or the stream say, else 30. A video knows
-            its own.
-        lanes_size: (height, width) px of the images that ``lanes`` was drawn on; None is the source's own.
-        fov: degrees, horizontal field of view of an ideal camera, in place of a camera file.
-        focal_std: standard deviation of the focal length as a share of it; None is 0 with a camera file and
-            FOV_FOCAL_STD with ``fov``.
-        lane_width_std: m, standard deviation of ``lane_width``; its part in the height's is proportional.
-            None is 0 where ``lane_width`` is given and LANE_WIDTH_STD where it is not.
-        mount: ``calibration.yaml`` of an earlier run of this camera, whose pose is this one's prior.
-        rectified: the images were rectified: the camera is the camera file's projection matrix P.
-        weights: of the network, None for the shipped ones.
-        device: that the network runs on, such as "cpu" or "cuda".
-        backend: that computes network and calibrator, one of BACKENDS.
-        exported: folder of ``lanebev export``, for the backend "onnxruntime".
-        formats: of other programs to write the results in as well, names of FORMATS.
-        start: s, of the first frame of the source that is taken.
-        end: s, before which the last one is; None is the source's end.
-        every: of the source's frames every so manieth is taken.
+        fps: frame rate of a folder, a glob or a raw stream, Hz; None takes it from names or stream, else 30.
+            A video states its own.
+        lanes_size: (height, width) px of the images that ``lanes`` was drawn on; None is the source's size.
+        fov: horizontal field of view (degrees) of an ideal camera, instead of a camera file.
+        focal_std: standard deviation of the focal length as a fraction of it; None is 0 with a camera file
+            and FOV_FOCAL_STD with ``fov``.
+        lane_width_std: standard deviation of ``lane_width``, m; the height's is proportional to it. None is 0
+            if ``lane_width`` is given and LANE_WIDTH_STD if not.
+        mount: ``calibration.yaml`` of an earlier run of this camera, whose pose is the prior.
+        rectified: the images were rectified; the camera is the projection matrix P of the camera file.
+        weights: weights file of the network; None is the shipped one.
+        device: device of the network, such as "cpu" or "cuda".
+        backend: library that computes network and calibrator, one of BACKENDS.
+        exported: output folder of ``lanebev export``, for the backend "onnxruntime".
+        formats: names of FORMATS in which to write the results as well.
+        start: time of the first frame taken, s in the source.
+        end: time before which the last frame taken is, s in the source; None is its end.
+        every: take every Nth frame of the source.
         no_video: write no ``bev.mp4`` and ``overlay.mp4``.
-        grid: (near, far, left, right, resolution) m of the bird's-eye view.
-        rerun: "viewer", which opens one, or the address of one: Rerun shows the run while it goes on.
-        topic: of the images, in a bag that has several.
-        keep_all: of a stream, drop no frame.
-        smooth: estimate every pose from the whole drive, in two passes over the source.
+        grid: (near, far, left, right, resolution) of the bird's-eye view, m.
+        rerun: "viewer" to open a Rerun viewer that shows the run, or the address of an open one.
+        topic: topic of the images in a bag with several.
+        keep_all: drop no frame of a stream.
+        smooth: estimate every pose from all frames of the drive, in two passes over the source.
     """
 
     source: str = option(
@@ -130,12 +130,14 @@ class RunConfig:
         "SOURCE",
     )
     camera: str = option(
-        "", "of OpenCV, ROS, Kalibr, EuRoC, KITTI, nuScenes; or YAML of fx fy cx cy width height", "FILE"
+        "",
+        "camera file of OpenCV, ROS, Kalibr, EuRoC, KITTI or nuScenes, or YAML with fx fy cx cy width height",
+        "FILE",
     )
     out: str = option("lanebev-out", "output folder (default {})", "DIR")
     lane_width: float | None = option(
         None,
-        f"metres ({LANE_WIDTH:g}, with a standard deviation of {LANE_WIDTH_STD:g})",
+        f"lane width, metres (default {LANE_WIDTH:g}, with a standard deviation of {LANE_WIDTH_STD:g})",
         "M",
         float,
     )
@@ -145,13 +147,14 @@ class RunConfig:
         "them",
         "FILE",
     )
-    stills: bool = option(False, "every image on its own, not frames of a drive")
-    resume: str | None = option(None, "begin with the state that a run left in this folder", "DIR")
-    calibrator: str = option("joint", "two-stage is the paper's (default {})", choices=CALIBRATORS)
+    stills: bool = option(False, "treat every image as independent, not as a frame of a drive")
+    resume: str | None = option(None, "continue from the state that a run saved in this folder", "DIR")
+    calibrator: str = option(
+        "joint", "calibrator; two-stage is the paper's method (default {})", choices=CALIBRATORS
+    )
     fps: float | None = option(
         None,
-        "frame rate of a folder or glob (what names of seconds say, else 30) or of a raw stream; a video "
-        "knows its own",
+        "frame rate of a folder, a glob or a raw stream (default: from image names that are times, else 30)",
         "HZ",
         float,
     )
@@ -160,63 +163,67 @@ class RunConfig:
     )
     fov: float | None = option(
         None,
-        "horizontal field of view, instead of --camera, for those who know no more of the lens",
+        "horizontal field of view, degrees, if there is no camera file for --camera",
         "DEG",
         float,
     )
     focal_std: float | None = option(
         None,
-        "standard deviation of the focal length, as a share of it (0 with --camera, "
+        "standard deviation of the focal length as a fraction of it (default 0 with --camera, "
         f"{FOV_FOCAL_STD} with --fov)",
         "REL",
         float,
     )
     lane_width_std: float | None = option(
         None,
-        f"standard deviation of the lane width, metres (0 with --lane-width, {LANE_WIDTH_STD:g} without)",
+        "standard deviation of the lane width, metres (default 0 with --lane-width, "
+        f"{LANE_WIDTH_STD:g} without)",
         "M",
         float,
     )
-    mount: str | None = option(
-        None, "calibration.yaml of an earlier run, whose pose is a prior for this one", "FILE"
-    )
-    rectified: bool = option(False, "the images were rectified: take the projection matrix P")
+    mount: str | None = option(None, "calibration.yaml of an earlier run, whose pose is the prior", "FILE")
+    rectified: bool = option(False, "the images were rectified: use the projection matrix P")
     weights: str | None = option(None, "weights of the network instead of the shipped ones", "FILE")
-    device: str = option("cpu", "that the network runs on: cpu, cuda, cuda:1, mps (default {})", "NAME")
-    backend: str = option("torch", "that computes network and calibrator (default {})", choices=BACKENDS)
-    exported: str = option("lanebev-export", "folder of lanebev export, for onnxruntime (default {})", "DIR")
-    formats: tuple[str, ...] = option(
-        (), f"write the results as these as well: {', '.join(FORMATS)}", "NAME,NAME", parse_formats
+    device: str = option("cpu", "device of the network: cpu, cuda, cuda:1, mps (default {})", "NAME")
+    backend: str = option(
+        "torch", "library that computes network and calibrator (default {})", choices=BACKENDS
     )
-    start: float = option(0.0, "begin at this time of the source, seconds ({})", "S", float)
-    end: float | None = option(None, "end at this time of the source, seconds (its end)", "S", float)
-    every: int = option(1, "take every Nth frame of the source ({})", "N", int)
+    exported: str = option(
+        "lanebev-export", "output folder of lanebev export, for onnxruntime (default {})", "DIR"
+    )
+    formats: tuple[str, ...] = option(
+        (), f"write the results in these formats too: {', '.join(FORMATS)}", "NAME,NAME", parse_formats
+    )
+    start: float = option(0.0, "begin at this time of the source, seconds (default {})", "S", float)
+    end: float | None = option(None, "end at this time of the source, seconds (default: its end)", "S", float)
+    every: int = option(1, "take every Nth frame of the source (default {})", "N", int)
     no_video: bool = option(False, "write no bev.mp4 and overlay.mp4")
     grid: tuple[float, float, float, float, float] = option(
         (3.0, 60.0, -10.0, 10.0, 0.05),
-        "of the bird's-eye view: metres ahead, to the right, and a pixel; 3:60,-10:10/0.05 by default",
+        "range of the bird's-eye view, default 3:60,-10:10/0.05: metres ahead, metres to the right, "
+        "metres per pixel",
         "NEAR:FAR,LEFT:RIGHT/STEP",
         parse_grid,
     )
     rerun: str | None = option(
         None,
-        "show the run in a Rerun viewer while it goes on: viewer opens one, else its address",
+        "show the run in Rerun as it proceeds: viewer opens a viewer, URL is the address of an open one",
         "viewer|URL",
     )
-    topic: str | None = option(None, "of the images in a bag that has several", "NAME")
-    keep_all: bool = option(False, "of a stream, drop no frame: it waits, and its own times are taken")
-    smooth: bool = option(False, "estimate every pose from the whole drive, later frames too, in two passes")
+    topic: str | None = option(None, "topic of the images in a bag with several", "NAME")
+    keep_all: bool = option(False, "drop no frame of a stream: it waits, and its own times are used")
+    smooth: bool = option(False, "estimate every pose from all frames of the drive, in two passes")
 
     @property
     def relative_focal_std(self) -> float:
-        """``focal_std`` with its default."""
+        """Standard deviation of the focal length as a fraction of it, with the default applied."""
         if self.focal_std is not None:
             return self.focal_std
         return 0.0 if self.fov is None else FOV_FOCAL_STD
 
     @property
     def taken_lane_width(self) -> tuple[float, float]:
-        """``lane_width`` and ``lane_width_std`` with their defaults."""
+        """Lane width and its standard deviation, m, with the defaults applied."""
         mean, std = (LANE_WIDTH, LANE_WIDTH_STD) if self.lane_width is None else (self.lane_width, 0.0)
         return mean, std if self.lane_width_std is None else self.lane_width_std
 
@@ -291,10 +298,10 @@ class RunConfig:
 
 
 def read_settings(path: str | Path) -> dict[str, object]:
-    """Read the settings of a YAML file, names and values as on the command line.
+    """Read the settings of a YAML file, with names and values as on the command line.
 
     Raises:
-        ValueError: the file is missing or no YAML mapping, or has a name or value that is no setting's.
+        ValueError: the file is missing or not a YAML mapping, or has an unknown name or a bad value.
     """
     try:
         given = yaml.safe_load(read_text(Path(path)))
@@ -310,10 +317,10 @@ def read_settings(path: str | Path) -> dict[str, object]:
 
 
 def parsed_settings(given: Mapping[str, object]) -> dict[str, object]:
-    """Return settings as the command line would have them, of names and values as in a YAML file.
+    """Parse the names and values of a YAML file to settings, as the command line does.
 
     Raises:
-        ValueError: a name or value that is no setting's.
+        ValueError: an unknown name, or a value that its setting does not allow.
     """
     known = {setting.name: setting for setting in fields(RunConfig)}
     values: dict[str, object] = {}
@@ -329,7 +336,7 @@ def parsed_settings(given: Mapping[str, object]) -> dict[str, object]:
 
 
 def _parsed(value: object, default: object, parse: Callable[[str], object]) -> object:
-    """A value of YAML as the command line would have it."""
+    """Parse a value of a YAML file as the command line does."""
     if isinstance(default, bool) or isinstance(value, bool):
         if not isinstance(value, bool) or not isinstance(default, bool):
             expected = "true or false" if isinstance(default, bool) else "a text or number"

@@ -1,4 +1,4 @@
-"""What to export: settings with their defaults. Imports nothing heavy."""
+"""Settings of an export and their defaults. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -12,23 +12,25 @@ PARTS = ("segmenter", "extractor", "warp", "joint", "two-stage", "step")
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """What to export.
+    """Settings of an export.
 
     Attributes:
-        camera: camera file; images of its size and behind its kind of lens can be given to what is exported.
-        part: one of PARTS, or None for all that a run by ONNX Runtime needs, and the step.
+        camera: camera file; the exported parts take images of its size and lens model.
+        part: one of PARTS; None exports all parts that a run by ONNX Runtime needs, and the step.
         format: one of FORMATS.
         out: output folder.
-        calibrator: of the step, one of CALIBRATORS.
-        weights: of the network, None for the shipped ones.
+        calibrator: calibrator of the step, one of CALIBRATORS.
+        weights: weights file of the network; None is the shipped one.
     """
 
-    camera: str = option("", "whose image size and kind of lens are fixed", "FILE")
-    part: str | None = option(None, "one part only, instead of what a run needs and the step", choices=PARTS)
-    format: str = option("onnx", "of the files (default {})", choices=FORMATS)
+    camera: str = option("", "camera file, whose image size and lens model the export keeps", "FILE")
+    part: str | None = option(None, "export this part only (default: all)", choices=PARTS)
+    format: str = option("onnx", "format of the files (default {})", choices=FORMATS)
     out: str = option("lanebev-export", "output folder (default {})", "DIR")
     calibrator: str = option(
-        "joint", "two-stage is the paper's (default {}, which takes minutes as ONNX)", choices=CALIBRATORS
+        "joint",
+        "calibrator; two-stage is the paper's method (default {}, which takes minutes to export as ONNX)",
+        choices=CALIBRATORS,
     )
     weights: str | None = option(None, "weights of the network instead of the shipped ones", "FILE")
 
