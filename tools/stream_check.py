@@ -9,7 +9,8 @@ looks at it in a process of its own until it is interrupted. Passed is what has
   to look at is the machine's;
 - at most 1 s of frames underway, which the server has sent and the run has not received;
 - as many frames used as rows written, and the others counted as dropped;
-- resident memory that grows by 10 % at most after the first half minute.
+- resident memory of its own, without that of mapped files, that grows by 10 % at most after the first half
+  minute.
 
 Prints the figures, what is amiss, and at the end all of it as a line of JSON.
 """
@@ -152,8 +153,8 @@ class MjpegServer:
 
 
 def resident_mib(process: int) -> float:
-    """Return the resident memory (MiB) of a process, by Linux's ``/proc``."""
-    match = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{process}/status").read_text())
+    """Return the resident memory (MiB) of a process that no file backs, by Linux's ``/proc``."""
+    match = re.search(r"RssAnon:\s+(\d+) kB", Path(f"/proc/{process}/status").read_text())
     return 0.0 if match is None else int(match[1]) / 1024
 
 

@@ -96,8 +96,24 @@ def decoded(  # noqa: C901 - every loop is a way in which files are damaged
         yield from ((pts, damage) for pts in due)
 
 
-def rgb(frame: av.VideoFrame | str) -> NDArray[np.uint8]:
+def display_matrix(frame: av.VideoFrame) -> tuple[int, ...] | None:
+    """Return the matrix by which players show a stream's frames, see :func:`displayed`; None if it has none.
+
+    All frames of a stream have the same. It is not asked of each, since a frame that was asked for its side
+    data is in a cycle of references, and stays in memory until Python's garbage collector looks for those.
+    """
+    for data in frame.side_data:
+        if data.type.name == "DISPLAYMATRIX":
+            return struct.unpack("9i", bytes(data)[:36])
+    return None
+
+
+def rgb(frame: av.VideoFrame | str, matrix: Sequence[int] | None) -> NDArray[np.uint8]:
     """Return a frame as (H, W, 3) uint8 RGB, upright as ffmpeg and players show it.
+
+    Args:
+        frame: decoded, or what is wrong with a lost one.
+        matrix: of the stream, see :func:`display_matrix`.
 
     Raises:
         ValueError: it is a lost one.
@@ -105,10 +121,7 @@ def rgb(frame: av.VideoFrame | str) -> NDArray[np.uint8]:
     if isinstance(frame, str):
         raise ValueError(f"expected a whole frame, got: {frame}")
     image: NDArray[np.uint8] = frame.to_ndarray(format="rgb24")
-    for data in frame.side_data:
-        if data.type.name == "DISPLAYMATRIX":
-            image = displayed(image, struct.unpack("9i", bytes(data)[:36]))
-    return np.ascontiguousarray(image)
+    return np.ascontiguousarray(image if matrix is None else displayed(image, matrix))
 
 
 def displayed(image: NDArray[np.uint8], matrix: Sequence[int]) -> NDArray[np.uint8]:

@@ -12,7 +12,7 @@ from fractions import Fraction
 
 import av
 
-from lanebev.io.decoding import rgb
+from lanebev.io.decoding import display_matrix, rgb
 from lanebev.io.frames import ALL, Frame, Selection
 from lanebev.io.source_names import PIPE
 from lanebev.io.video import DEFAULT_FPS, FrameSource
@@ -89,7 +89,7 @@ class LiveSource(FrameSource):
                 dt = float(1 / self.fps) if before is None else now - before
                 image, problem = None, ""
                 try:
-                    image = self._right_size(rgb(frame))
+                    image = self._right_size(rgb(frame, self.matrix))
                 except ValueError as error:
                     problem = str(error)
                 yield Frame(self.figures.seen, now - start, dt, "", image, problem)
@@ -195,7 +195,8 @@ def open_live(
             raise ValueError(f"stream {name}: expected a video stream, got none")
         stream = container.streams.video[0]
         first = next(container.decode(stream))
-        image = rgb(first)
+        matrix = display_matrix(first)
+        image = rgb(first, matrix)
     except (av.error.FFmpegError, StopIteration, OSError) as error:
         container.close()
         raise ValueError(f"stream {name}: expected a frame, got none") from error
@@ -205,7 +206,8 @@ def open_live(
     slot.put(first)
     thread = threading.Thread(target=_read, args=(container, slot, figures), name="stream", daemon=True)
     thread.start()
-    live = LiveSource(source, (), rate, 0, image.shape[:2], slot=slot, keep_all=keep_all, figures=figures)
+    size = image.shape[:2]
+    live = LiveSource(source, (), rate, 0, size, matrix=matrix, slot=slot, keep_all=keep_all, figures=figures)
     weakref.finalize(live, slot.stop)  # of a run that ended before its first frame
     return live
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.io.decoding import decoded, has_times, open_video, packets, rgb
+from lanebev.io.decoding import decoded, display_matrix, has_times, open_video, packets, rgb
 from lanebev.io.frames import ALL, Frame, Selection, taken_frames
 from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
 from lanebev.io.images import IMAGE_SUFFIXES, image_size, is_image, read_image, write_png
@@ -55,6 +55,7 @@ class FrameSource:
         times: s since the first, of images whose names state them; else empty.
         has_times: whether a video says when its frames are shown; else they are evenly spaced.
         selection: which of the frames are taken. ``fps`` and ``count`` are those of the whole source.
+        matrix: by which a video's frames are shown, see :func:`lanebev.io.decoding.display_matrix`.
     """
 
     source: str
@@ -66,6 +67,7 @@ class FrameSource:
     times: tuple[float, ...] = ()
     has_times: bool = True
     selection: Selection = ALL
+    matrix: tuple[int, ...] | None = None
 
     @property
     def is_live(self) -> bool:
@@ -123,7 +125,7 @@ class FrameSource:
                     problem, told = "up to the next key frame, images may show a lost frame's damage", True
                 if self.selection.takes(index, float(time - first)):
                     try:
-                        image = self._right_size(rgb(frame))
+                        image = self._right_size(rgb(frame, self.matrix))
                     except ValueError as error:
                         problem = str(error)
                 yield Frame(index, float(time - first), dt, "", image, problem)
@@ -251,7 +253,8 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
             frame = next(frames)
         except (av.error.FFmpegError, StopIteration) as error:
             raise ValueError(f"video {source}: expected at least one whole frame, got none") from error
-        size = rgb(frame).shape[:2]
+        matrix = display_matrix(frame)
+        size = rgb(frame, matrix).shape[:2]
     with open_video(source) as container:  # the header's count includes frames that an edit list cuts
         stream = container.streams.video[0]
         begin, tick = stream.start_time or 0, stream.time_base or 1 / fps
@@ -274,7 +277,7 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
     if timed and stated is not None and abs(own / stated - 1) > _SAME_RATE:
         problems.append(f"its own {float(own):.4g} frames per second are used, not --fps {float(stated):g}")
     problem = f"video {source}: {'; '.join(problems)}" if problems else ""
-    return FrameSource(source, (), fps, count, size, problem, has_times=timed)
+    return FrameSource(source, (), fps, count, size, problem, has_times=timed, matrix=matrix)
 
 
 def _declared_duration(stream: av.VideoStream, begin: Fraction) -> float:

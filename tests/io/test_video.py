@@ -1,5 +1,6 @@
 """Frames from videos, folders, globs and single images; H.264 out; work side by side."""
 
+import gc
 import struct
 import threading
 import time
@@ -63,6 +64,19 @@ def test_frames_are_shown_at_their_times(tmp_path):
     with av.open(str(tmp_path / "x.mp4")) as container:
         stream = container.streams.video[0]
         assert float(stream.duration * stream.time_base) == pytest.approx(9.0 + 2 / 30, abs=0.05)
+
+
+def test_decoded_frames_are_given_up_at_once(tmp_path):
+    """Not when the garbage collector comes, which may be a thousand frames later."""
+    source = open_source(str(_video(tmp_path / "video.mp4")))
+    gc.collect()
+    gc.disable()
+    try:
+        before = sum(type(each) is av.VideoFrame for each in gc.get_objects())
+        assert sum(frame.image is not None for frame in source) == 5
+        assert sum(type(each) is av.VideoFrame for each in gc.get_objects()) == before
+    finally:
+        gc.enable()
 
 
 def test_frames_of_an_avi_are_evenly_spaced(tmp_path):
