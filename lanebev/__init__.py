@@ -11,7 +11,7 @@ __version__ = "0.1.0"
 
 
 def _is_command() -> bool:
-    """Whether this process is the command line, which answers ``--help`` before torch is imported."""
+    """Tell whether this process is the command line, which answers ``--help`` before torch is imported."""
     program = next(iter(getattr(sys, "argv", [])), "")  # an embedding program may have none
     return program == "-m" or Path(program).stem == "lanebev"
 

@@ -59,7 +59,7 @@ def masked_median(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def order_true_first(mask: Tensor) -> Tensor:
-    """Indices (..., N) that put the entries of a mask first and keep the order otherwise.
+    """Return indices (..., N) that sort the true entries of a mask first, in their order.
 
     By keys that all differ, since ONNX has no stable sort.
     """

@@ -43,7 +43,7 @@ def shown(value: Any, most: int = 60) -> str:
 
 
 def finite_numbers(name: str, values: Sequence[Any], count: int | None = None) -> list[float]:
-    """Texts or numbers to floats, ``count`` of them if given.
+    """Convert texts or numbers to floats, ``count`` of them if given.
 
     Raises:
         ValueError: another count, or one that is not a finite number; a truth value is none.
@@ -57,7 +57,7 @@ def finite_numbers(name: str, values: Sequence[Any], count: int | None = None) -
 
 
 def numbers_or_gaps(name: str, values: Sequence[Any]) -> list[float]:
-    """Texts or numbers to floats, NaN where there is none: ``null``, ``nan`` or NaN.
+    """Convert texts or numbers to floats, NaN for missing ones: ``null``, ``nan`` or NaN.
 
     Raises:
         ValueError: one that is none of these, or infinite.
@@ -71,7 +71,7 @@ def numbers_or_gaps(name: str, values: Sequence[Any]) -> list[float]:
 
 
 def _floats(values: Sequence[Any]) -> list[float] | None:
-    """The values as floats, None if one is no number."""
+    """Return the values as floats, None if one is not a number."""
     if any(isinstance(value, bool) for value in values):
         return None
     try:

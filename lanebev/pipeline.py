@@ -114,7 +114,7 @@ class LaneBEV(nn.Module):
         network_width: int | None = None,
         frozen: Collection[str] = (),
     ) -> LaneBEV:
-        """With the shipped weights; needs no network.
+        """Make a model with the shipped weights, offline.
 
         Args:
             weights: another file in the same format; None is the shipped one.
@@ -138,7 +138,7 @@ class LaneBEV(nn.Module):
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
     ) -> Any:
-        """The calibrator's state before the first frame."""
+        """Return the calibrator's state before the first frame."""
         initial_state: Any = self.calibrator.initial_state
         device = torch.device(device or "cpu")
         off = torch.is_autocast_enabled(device.type)  # asked, since torch.export cannot keep an empty context
@@ -158,7 +158,7 @@ class LaneBEV(nn.Module):
         truncation: int | None = None,
         bev: bool = True,
     ) -> tuple[LaneBEVOutput, Any]:
-        """One frame of every row, or T frames of every row in order.
+        """Process one frame of every row, or T frames of every row in order.
 
         Args:
             image: (B, 3, H, W) or (B, T, 3, H, W), RGB in [0, 1], as taken.
@@ -267,7 +267,7 @@ class LaneBEV(nn.Module):
         return logits, vertices._replace(weight=weight)
 
     def _gradients(self, stage: str) -> AbstractContextManager[object]:
-        """Context of a stage: without a graph where it is frozen."""
+        """Return the context of a stage: without gradients if it is frozen."""
         return torch.no_grad() if stage in self.frozen else nullcontext()
 
     def network_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
@@ -292,12 +292,12 @@ class LaneBEV(nn.Module):
 
 
 def _configured(part: nn.Module, name: str, default: Any = None) -> Any:
-    """A setting of a module's ``config``, if it has one."""
+    """Return a setting of a module's ``config``, if it has one."""
     return getattr(getattr(part, "config", None), name, default)
 
 
 def _intervals(dt: float | Tensor, batch: int, steps: int, like: Tensor) -> Tensor:
-    """Time steps to (B, T) s, float32 at least, on the device of ``like``."""
+    """Convert time steps to (B, T) s, at least float32, on the device of ``like``."""
     intervals = torch.as_tensor(dt, dtype=common_dtype(like), device=like.device)
     got = tuple(intervals.shape)
     if intervals.ndim < 2:
@@ -308,7 +308,7 @@ def _intervals(dt: float | Tensor, batch: int, steps: int, like: Tensor) -> Tens
 
 
 def _begins(reset: Tensor, batch: int, steps: int) -> Tensor:
-    """Which frames begin a drive, (B, T) bool."""
+    """Return which frames begin a drive, (B, T) bool."""
     check_tensor("reset", reset)
     if reset.dtype != torch.bool or reset.shape not in ((batch,), (batch, steps)):
         raise ValueError(
@@ -318,7 +318,7 @@ def _begins(reset: Tensor, batch: int, steps: int) -> Tensor:
 
 
 def _stack(outputs: list[Any]) -> Any:
-    """Per-frame (nested) tuples of tensors to one with (B, T, ...) tensors; None stays."""
+    """Stack per-frame (nested) tuples of tensors to one of (B, T, ...) tensors; None stays."""
     if outputs[0] is None:
         return None
     if isinstance(outputs[0], Tensor):

@@ -183,7 +183,7 @@ class Session:
         save_state(path, {**self.tracker.states(), "camera": self.camera.fingerprint(), "clock": clock})
 
     def load(self, path: str | Path) -> None:
-        """Go on from a file that :meth:`save` wrote.
+        """Continue from a file that :meth:`save` wrote.
 
         Raises:
             ValueError: the file cannot be used, or is of another calibrator or camera; nothing is changed.

@@ -78,12 +78,12 @@ class Extrinsics(NamedTuple):
         return cls(*(torch.full((1,), value, dtype=dtype) for value in (pitch, yaw, roll, height)))
 
     def stack(self) -> Tensor:
-        """(B, 4) tensor of (pitch, yaw, roll, height)."""
+        """Return the (B, 4) tensor of (pitch, yaw, roll, height)."""
         return torch.stack(tuple(self), dim=-1)
 
     @classmethod
     def unstack(cls, values: Tensor) -> Extrinsics:
-        """From a (B, 4) tensor of (pitch, yaw, roll, height)."""
+        """Make extrinsics of a (B, 4) tensor of (pitch, yaw, roll, height)."""
         check_tensor("values", values)
         if values.shape[-1] != 4:
             raise ValueError(f"values: expected (..., 4), got {tuple(values.shape)}")

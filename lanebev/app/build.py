@@ -146,7 +146,7 @@ def match_image_size(camera: Camera, source: FrameSource) -> FrameSource:
 
 
 def lens_remark(camera: Camera) -> str:
-    """Say at how many of its pixels the camera's lens images nothing; empty if there are none."""
+    """Return a remark on the number of pixels that the lens cannot image; empty if there are none."""
     share = camera.share_without_rays()
     if share == 0:
         return ""

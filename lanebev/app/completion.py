@@ -23,7 +23,7 @@ class PrintCompletion(argparse.Action):
 
 
 def _complete_files(parser: argparse.ArgumentParser, files: dict[str, str]) -> None:
-    """Have all that takes a path complete names of files, in commands too."""
+    """Let every argument that is a path complete file names, also in subcommands."""
     for action in parser._actions:
         if action.metavar in ("FILE", "DIR", "SOURCE", "A", "B"):
             action.complete = files  # type: ignore[attr-defined]  # shtab looks for it

@@ -17,7 +17,7 @@ _END = object()
 
 
 def prefetch(items: Iterable[T], depth: int = 4) -> Iterator[T]:
-    """The same items in the same order, up to ``depth`` of them made ahead in a thread.
+    """Yield the same items in the same order, up to ``depth`` of them made ahead in a thread.
 
     An exception of the producer is raised here. Leaving the loop early stops the thread.
     """

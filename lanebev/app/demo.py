@@ -82,7 +82,7 @@ def write_drive(
 
 
 def true_lanes(drive: Drive, frame: RenderedFrame) -> BoundaryRows:
-    """What a perfect detector would see of a rendered frame, on image rows."""
+    """Return the lanes of a rendered frame on image rows, as a perfect detector would find them."""
     lines = []
     for index, (points, visible) in enumerate(zip(frame.boundaries[0], frame.visible[0], strict=True)):
         as_taken = drive.camera.distort_points(points).double()
@@ -94,7 +94,7 @@ def true_lanes(drive: Drive, frame: RenderedFrame) -> BoundaryRows:
 
 
 def against_truth(found: Sequence[ExtrinsicsRow], truth: Sequence[ExtrinsicsRow]) -> str:
-    """Root mean square errors of the tracked frames, in a line."""
+    """Return the root mean square errors of the tracked frames, in one line."""
     tracked = [(row, true) for row, true in zip(found, truth, strict=True) if row.status == "TRACKING"]
     if not tracked:
         return "RMSE against the truth: no frame was tracked"
@@ -107,7 +107,7 @@ def against_truth(found: Sequence[ExtrinsicsRow], truth: Sequence[ExtrinsicsRow]
 
 
 def pose_of(row: ExtrinsicsRow) -> NDArray[np.float64]:
-    """(4,) deg, deg, deg, m."""
+    """Return pitch, yaw, roll (deg) and height (m), (4,)."""
     return np.array([row.pitch_deg, row.yaw_deg, row.roll_deg, row.height_m])
 
 

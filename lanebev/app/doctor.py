@@ -139,7 +139,7 @@ def field_of_view(camera: Camera) -> float:
 
 
 def check_field_of_view(camera: Camera) -> Finding:
-    """Judge the focal length by the field of view that it gives the images."""
+    """Check the focal length by the field of view that it gives the images."""
     angle, (low, high) = field_of_view(camera), _FIELD_OF_VIEW
     focal = float(camera.intrinsics[0, 0])
     words = f"focal length: {focal:.0f} px, {angle:.0f} degrees across"
@@ -151,7 +151,7 @@ def check_field_of_view(camera: Camera) -> Finding:
 
 
 def check_centre(camera: Camera) -> Finding:
-    """Judge the principal point by its distance from the image's centre."""
+    """Check the principal point by its distance from the image's centre."""
     height, width = camera.image_size
     right = float(camera.intrinsics[0, 2]) - 0.5 * (width - 1)
     down = float(camera.intrinsics[1, 2]) - 0.5 * (height - 1)
@@ -162,7 +162,7 @@ def check_centre(camera: Camera) -> Finding:
 
 
 def check_times(sample: Sample) -> Finding:
-    """Judge time stamps by how evenly they advance, and frames by whether they decode."""
+    """Check if time stamps advance evenly and frames decode."""
     if sample.undecoded:
         words = f"frames: {sample.undecoded} of {len(sample.boundaries)} that were looked at do not decode"
         return Finding(DOUBT, words)
@@ -176,7 +176,7 @@ def check_times(sample: Sample) -> Finding:
 
 
 def check_lanes(sample: Sample) -> Finding:
-    """Judge the lanes by the share of frames in which two boundaries or more are seen."""
+    """Check in how many frames two boundaries or more are found."""
     share = float(np.mean([number >= 2 for number in sample.boundaries])) if sample.boundaries else 0.0
     words = f"lanes: two boundaries or more in {share:.0%} of {len(sample.boundaries)} frames"
     if share >= _SHARE_SEEN:
@@ -185,7 +185,7 @@ def check_lanes(sample: Sample) -> Finding:
 
 
 def check_pose(sample: Sample) -> Finding:
-    """Judge the median pose of the frames by what a camera in a car can have.
+    """Check if the median pose of the frames is possible for a camera in a car.
 
     A focal length that is wrong changes the pitch and yaw of a vanishing point, and hardly anything else:
     lanes alone do not tell it, unless the pose gets impossible.

@@ -218,7 +218,7 @@ class Recorder:
 
 
 def _row(done: Recorded, calibration: Calibration) -> ExtrinsicsRow:
-    """Row of a frame with one of its calibrations."""
+    """Return the row of a frame with one of its calibrations."""
     frame, estimate = done.frame, done.estimate
     weight, reasons = estimate.segments.weight, estimate.reasons
     return extrinsics_row(frame.number, frame.time, calibration, weight, frame.name, reasons)

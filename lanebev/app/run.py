@@ -149,7 +149,7 @@ def first_pass(
     out: OutputFolder,
     progress: Progress | None,
 ) -> SmoothedPoses:
-    """Go over the whole drive once, and estimate every pose from all of it."""
+    """Process the whole drive once, and estimate every pose from all frames."""
     tracker = make_tracker(config, camera)
     load_states(config, tracker, camera)
     with closing(observed_frames(source, observer)) as frames:

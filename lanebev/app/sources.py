@@ -78,7 +78,7 @@ def observed_frames(source: FrameSource, observer: Observer) -> Generator[tuple[
 
 @contextlib.contextmanager
 def ended_by_signals(source: FrameSource) -> Iterator[None]:
-    """Have Ctrl-C, SIGTERM and SIGHUP end a stream, and with it the run as usual; a second one interrupts.
+    """Let Ctrl-C, SIGTERM and SIGHUP end a stream, and so the run normally; a second one interrupts.
 
     Other sources, and threads other than the main one, are left as they are.
     """

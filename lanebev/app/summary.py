@@ -20,7 +20,7 @@ _PROBLEMS = 5  # that are printed
 
 
 def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[str, str]:
-    """Say what ran, for the report."""
+    """Return the settings of the run for the report."""
     height, width = camera.image_size
     fx, fy = float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1])
     lens = config.camera or ("the bag" if config.fov is None else f"field of view of {config.fov:g} deg")
@@ -42,7 +42,7 @@ def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[st
 
 
 def lane_width_words(config: RunConfig) -> str:
-    """Say which lane width is taken, and what its standard deviation means for the height."""
+    """Return the lane width used, and the effect of its standard deviation on the height, in words."""
     width, std = config.taken_lane_width
     words = f"{width:.4g} m"
     if std:
@@ -51,7 +51,7 @@ def lane_width_words(config: RunConfig) -> str:
 
 
 def smoothing_facts(config: RunConfig) -> dict[str, str]:
-    """Say, for the report, that every pose is from the whole drive."""
+    """Return the fact that every pose is estimated from the whole drive, for the report."""
     words = "every pose is from the whole drive, later frames too; those of the filter are in filtered.csv"
     return {"smoothed": words} if config.smooth else {}
 
@@ -79,7 +79,7 @@ def setting_words(value: object) -> str:
 
 
 def mount_facts(mounted: MountCalibration) -> dict[str, str]:
-    """Say how far the mount is known, for the report."""
+    """Return how far the mount is calibrated, for the report."""
     status = MountStatus(int(mounted.status[0])).name
     reasons = MountReason(int(mounted.reasons[0]))
     why = f" ({reasons.name})" if reasons else ""

@@ -83,7 +83,7 @@ def openlane(fields: Mapping[str, Any], image_size: tuple[int, int] | None) -> C
 def _size(
     whose: str, image_size: tuple[int, int] | None, known: tuple[int, int] | None, spread: int = 0
 ) -> tuple[int, int] | None:
-    """The images' size, else the known one.
+    """Return the images' size, else the data set's.
 
     Raises:
         ValueError: they differ: the images were resized.

@@ -57,7 +57,7 @@ def read_camera(
 
 
 def _camera(content: Any, image_size: tuple[int, int] | None, rectified: bool) -> CameraParameters:
-    """The camera of a file's content, by the keys that tell its kind."""
+    """Return the camera of a file's content, whose format its keys tell."""
     if isinstance(content, list):
         return checked(nuscenes(content, image_size))
     if not isinstance(content, dict) or not content:
@@ -121,7 +121,7 @@ def write_camera(path: str | Path, camera: CameraParameters, name: str = "camera
 
 
 def dump_yaml(fields: Mapping[str, Any]) -> str:
-    """Plain YAML that PyYAML, yaml-cpp (ROS) and ``cv2.FileStorage`` read."""
+    """Return plain YAML that PyYAML, yaml-cpp (ROS) and ``cv2.FileStorage`` read."""
     header = "%YAML 1.1\n---\n"  # cv2.FileStorage wants this line
     body: str = yaml.safe_dump(dict(fields), sort_keys=False, default_flow_style=None, width=1000)
     return header + body

@@ -113,7 +113,7 @@ def without_lens(camera: CameraParameters) -> CameraParameters:
 
 
 def _projection(fields: Mapping[str, Any]) -> list[float]:
-    """The left 3 x 3 of P, row by row."""
+    """Return the left 3 x 3 matrix of P, row by row."""
     if all(fields.get(key) is None for key in _PROJECTION_KEYS):
         raise ValueError("projection_matrix: expected P for rectified images, got none; add the entry")
     entries = numbers(fields, *_PROJECTION_KEYS, count=12)
@@ -121,7 +121,7 @@ def _projection(fields: Mapping[str, Any]) -> list[float]:
 
 
 def _restates(fields: Mapping[str, Any]) -> bool:
-    """Whether P = [K | 0] and R = I, as of a camera that is its own rectified one."""
+    """Tell whether P = [K | 0] and R = I, which state no rectification."""
     try:
         rotation = numbers(fields, *_ROTATION_KEYS, count=9)
         return rotation == _IDENTITY and _projection(fields) == numbers(fields, *_MATRIX_KEYS, count=9)
@@ -139,7 +139,7 @@ def _model(fields: Mapping[str, Any]) -> str:
 
 
 def _as_taken(camera: CameraParameters, fields: Mapping[str, Any]) -> CameraParameters:
-    """The camera of the images, cut to the region of interest and binned."""
+    """Return the camera of the images, cropped to the region of interest and binned."""
     roi = mapping("roi", fields.get("roi") or {})
     left, top, width, height = (
         whole_number(roi, key) if roi.get(key) is not None else 0
@@ -162,7 +162,7 @@ def _as_taken(camera: CameraParameters, fields: Mapping[str, Any]) -> CameraPara
 
 
 def _binning(fields: Mapping[str, Any], key: str) -> int:
-    """How many pixels are bound together; 0 is 1."""
+    """Return the binning factor; 0 means 1."""
     factor = whole_number(fields, key) if fields.get(key) is not None else 1
     if not 0 <= factor <= 64:
         raise ValueError(f"{key}: expected 0 to 64, got {factor}")
@@ -174,7 +174,7 @@ def _binned(x: float, factor: int) -> float:
 
 
 def is_kalibr(fields: Mapping[str, Any]) -> bool:
-    """Whether these are the keys of Kalibr's camera chain, or of one camera as EuRoC has it."""
+    """Tell whether the keys are those of Kalibr's camera chain, or of one camera as in EuRoC."""
     return "intrinsics" in fields or any(re.fullmatch(r"cam\d+", key, re.ASCII) for key in fields)
 
 

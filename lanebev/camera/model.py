@@ -91,7 +91,7 @@ class Camera:
         model: str = "pinhole",
         dtype: torch.dtype = torch.float64,
     ) -> Camera:
-        """From plain numbers, in pixels."""
+        """Make a camera from plain numbers, in pixels."""
         intrinsics = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=dtype)
         return cls(intrinsics, torch.tensor(list(distortion), dtype=dtype), model, (height, width))
 
@@ -185,7 +185,7 @@ class Camera:
         write_camera(path, self.parameters(), name)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
-        """The same camera on another device or in another precision."""
+        """Return the same camera on another device or in another precision."""
         return replace(
             self,
             intrinsics=self.intrinsics.to(device=device, dtype=dtype),
@@ -193,7 +193,7 @@ class Camera:
         )
 
     def scaled(self, image_size: tuple[int, int]) -> Camera:
-        """The camera of the image resized to (height, width); pixel centres at integers on both sides."""
+        """Return the camera of the image resized to (height, width), with pixel centres at integers."""
         if not (isinstance(image_size, Sequence) and len(image_size) == 2):
             raise TypeError(f"image_size: expected (height, width) in px, got {image_size!r}")
         sy, sx = image_size[0] / self.image_size[0], image_size[1] / self.image_size[1]
@@ -203,12 +203,12 @@ class Camera:
         return replace(self, intrinsics=resize @ self.intrinsics, image_size=(image_size[0], image_size[1]))
 
     def cropped(self, top: int, left: int, height: int, width: int) -> Camera:
-        """The camera of ``image[top:top+height, left:left+width]``; may reach beyond the image."""
+        """Return the camera of ``image[top:top+height, left:left+width]``; may reach beyond the image."""
         shift = self.intrinsics.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
         return replace(self, intrinsics=self.intrinsics - shift, image_size=(height, width))
 
     def distort_points(self, points: Tensor) -> Tensor:
-        """(N, 2) px undistorted to (N, 2) px as taken."""
+        """Convert undistorted pixels (N, 2) to pixels as taken (N, 2)."""
         return distort_points(points[None], self.intrinsics[None], self.distortion[None], self.model)[0]
 
     @cached_property
@@ -217,7 +217,7 @@ class Camera:
         return max_undistorted_radius(self.distortion[None], self.model)[0]
 
     def undistort_points(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, 2) px as taken to (N, 2) px undistorted and (N,) bool, false where no such point exists."""
+        """Convert pixels as taken (N, 2) to undistorted ones (N, 2), and (N,) bool: such a point exists."""
         lens = (self.intrinsics[None], self.distortion[None], self.model)
         undistorted, valid = invert_distortion(points[None], *lens, reach=self.max_radius[None])
         return undistorted[0], valid[0]
@@ -236,12 +236,12 @@ class Camera:
         return 1.0 - float(self.undistort_points(points)[1].double().mean())
 
     def rays(self, points: Tensor) -> Tensor:
-        """(N, 2) px as taken to (N, 3) camera rays with z = 1."""
+        """Convert pixels as taken (N, 2) to camera rays (N, 3) with z = 1."""
         plane = normalise_points(self.undistort_points(points)[0], self.intrinsics)
         return torch.cat([plane, torch.ones_like(plane[..., :1])], dim=-1)
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Camera-frame points to pixels as taken.
+        """Project points of the camera frame to pixels as taken.
 
         Args:
             points: (N, 3) m.

@@ -82,7 +82,7 @@ def _check_matrix(matrix: list[float], size: tuple[int, int], restated: bool) ->
 
 
 def _needed(distortion: list[float], model: str) -> list[float]:
-    """The coefficients without a tilt of nothing, and none of a pinhole that distorts nothing."""
+    """Return the coefficients without a zero tilt, and none for a pinhole camera without distortion."""
     if model == "fisheye":
         return distortion or [0.0] * 4
     if model == "omni":
@@ -95,7 +95,7 @@ def _needed(distortion: list[float], model: str) -> list[float]:
 
 
 def _invertible(camera: CameraParameters) -> bool:
-    """Whether the lens can be undone at four points half-way to the corners."""
+    """Tell whether the distortion can be inverted at four points half-way to the corners."""
     height, width = camera.image_size
     inner = torch.tensor([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]], dtype=torch.float64)
     points = (inner * inner.new_tensor([width, height]))[None]

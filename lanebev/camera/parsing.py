@@ -45,7 +45,7 @@ def parse(text: str) -> Any:
 
 
 def _once(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """The pairs as a dict, each key once."""
+    """Return the pairs as a dict; a repeated key is an error."""
     fields: dict[str, Any] = {}
     for key, value in pairs:
         if key in fields:
@@ -110,7 +110,7 @@ def _parse_xml(text: str) -> dict[str, Any]:
 
 
 def _xml_value(element: ET.Element) -> Any:
-    """A matrix's fields, or a text."""
+    """Return a matrix's fields, or a text."""
     if not len(element):
         return element.text
     return _once((field.tag, (field.text or "").strip()) for field in element)
@@ -160,7 +160,7 @@ def mapping(name: str, value: Any) -> Mapping[str, Any]:
 
 
 def _opencv_data(name: str, value: Mapping[str, Any], count: int | None) -> tuple[list[Any], int]:
-    """Data of ``{rows, cols, data}``, or ``{sizes, data}`` of OpenCV 5, and how many there should be."""
+    """Return the data of ``{rows, cols, data}``, or ``{sizes, data}`` of OpenCV 5, and their number."""
     unknown = sorted(set(value) - {"rows", "cols", "sizes", "data", "dt", "type_id"})  # type_id: JSON's
     if unknown:
         raise ValueError(f"{name}: expected rows, cols, dt, data, got the key {shown(unknown[0])}")

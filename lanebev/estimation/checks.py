@@ -86,7 +86,7 @@ def check_new_state(batch_size: object, dtype: torch.dtype) -> None:
 
 
 def clean_segments(segments: LaneSegments, num_boundaries: int) -> LaneSegments:
-    """Weight zero, and harmless numbers, wherever a segment can't be used.
+    """Set weight zero, and valid numbers, in segments that cannot be used.
 
     Non-finite entries, no length, no positive sigma, or a boundary index outside 0..L-1 make a segment
     unusable. The masked entries carry no gradient.
@@ -136,7 +136,7 @@ def mask_invalid_rows(
 
 
 def padded(segments: LaneSegments) -> LaneSegments:
-    """With segments of weight zero where there are fewer than the estimators ask for."""
+    """Pad with segments of weight zero to the number that the estimators need."""
     missing = _MIN_SEGMENTS - segments.weight.shape[1]
     if missing <= 0:
         return segments
@@ -146,12 +146,12 @@ def padded(segments: LaneSegments) -> LaneSegments:
 
 
 def is_running(status: Tensor) -> Tensor:
-    """(B,) bool: started and not lost."""
+    """Return (B,) bool: the row has started and is not lost."""
     return (status == int(Status.TRACKING)) | (status == int(Status.COASTING))
 
 
 def unused_frame(calibration: Calibration, skipped: Tensor) -> Calibration:
-    """Say of rows whose frame was skipped that nothing of it was used: COASTING, no inliers.
+    """Set COASTING and no inliers in rows whose frame was skipped.
 
     Args:
         calibration: (B, ...).
@@ -164,7 +164,7 @@ def unused_frame(calibration: Calibration, skipped: Tensor) -> Calibration:
 
 
 def as_batch(value: float | Tensor, like: Tensor, name: str = "dt") -> Tensor:
-    """A number or a (B,) tensor to (B,), with the dtype and device of ``like`` (B, ...).
+    """Convert a number or a (B,) tensor to (B,), with the dtype and device of ``like`` (B, ...).
 
     Raises:
         TypeError: neither number nor tensor.
@@ -186,7 +186,7 @@ def _check_number(name: str, value: object) -> None:
 
 
 def as_lane_width(value: float | Tensor, like: Tensor, num_boundaries: int) -> Tensor:
-    """Lane width prior to (B, L-1) m: from a float, (B,) or (B, L-1).
+    """Convert a lane width prior, float, (B,) or (B, L-1), to (B, L-1) m.
 
     Raises:
         TypeError: neither number nor tensor.

@@ -14,7 +14,7 @@ from lanebev.geometry.linalg import cholesky, solve_lower, solve_spd
 
 
 def predict(mean: Tensor, cov: Tensor, transition: Tensor, process_noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Prediction of a linear system model.
+    """Predict mean and covariance by a linear system model.
 
     Source: Eqs. (12)-(13).
 
@@ -49,7 +49,7 @@ def innovation(predicted: Tensor, measured: float | Tensor = 0.0) -> Tensor:
 def information(
     innovation: Tensor, jacobian: Tensor, measurement_noise: Tensor, weight: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """What N independent scalar measurements say, Hᵀ Q⁻¹ H and Hᵀ Q⁻¹ y.
+    """Compute the information of N independent scalar measurements, Hᵀ Q⁻¹ H and Hᵀ Q⁻¹ y.
 
     Args:
         innovation: (..., N), measured minus predicted.
@@ -164,7 +164,7 @@ def smoother_covariance(cov: Tensor, transition: Tensor, process_noise: Tensor, 
 def gate(
     innovation: Tensor, jacobian: Tensor, measurement_noise: Tensor, cov: Tensor, sigmas: float
 ) -> Tensor:
-    """Which measurements lie within so many standard deviations of their prediction.
+    """Return which measurements are within so many standard deviations of their prediction.
 
     Args:
         innovation: (..., N).
@@ -181,7 +181,7 @@ def gate(
 
 
 def constant_velocity(dt: Tensor, spectral_density: Tensor) -> tuple[Tensor, Tensor]:
-    """Transition and process noise of D/2 positions followed by their D/2 rates.
+    """Return transition and process noise of D/2 positions followed by their D/2 rates.
 
     Source: Eqs. (9), (10); Bar-Shalom, Li, Kirubarajan 2001, Sec. 6.2.2. Deviation: the noise is a white
     acceleration integrated over dt, which reaches the positions too, so that frames of any spacing agree.
@@ -217,12 +217,12 @@ def limit_variance(cov: Tensor, limit: Tensor) -> Tensor:
 
 
 def symmetrise(matrix: Tensor) -> Tensor:
-    """The symmetric part, (M + Mᵀ) / 2."""
+    """Return the symmetric part, (M + Mᵀ) / 2."""
     return 0.5 * (matrix + matrix.mT)
 
 
 def _kron(blocks: Tensor, inner: Tensor) -> Tensor:
-    """(B, a, a) ⊗ (b, b) -> (B, ab, ab); B may be 0."""
+    """Compute (B, a, a) ⊗ (b, b) -> (B, ab, ab); B may be 0."""
     product: Tensor = torch.einsum("nij,kl->nikjl", blocks, inner)
     return product.reshape(
         blocks.shape[0], blocks.shape[1] * inner.shape[0], blocks.shape[2] * inner.shape[1]

@@ -72,7 +72,7 @@ def make_part(name: str, model: LaneBEV, camera: Camera) -> Part:
 
 
 def _facts(model: LaneBEV, camera: Camera) -> dict[str, Any]:
-    """Sizes and conventions that no tensor's shape tells."""
+    """Return sizes and conventions that the shapes of tensors do not tell."""
     grid = model.warp.grid
     return {
         "image_size": list(camera.image_size),

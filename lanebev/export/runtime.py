@@ -75,7 +75,7 @@ class OnnxSegmenter(nn.Module):
         )
 
     def forward(self, image: Tensor) -> Tensor:
-        """Image (B, 3, h, w) to logits."""
+        """Convert an image (B, 3, h, w) to logits."""
         return self.part({"image": image})["logits"]
 
 
@@ -89,7 +89,7 @@ class OnnxExtractor(nn.Module):
     def vertices(
         self, logits: Tensor, image_size: tuple[int, int], network_size: tuple[int, int]
     ) -> BoundaryVertices:
-        """Logits (B, 1 + L, h, w) to vertices in pixels of the image as taken."""
+        """Convert logits (B, 1 + L, h, w) to vertices in pixels of the image as taken."""
         rows = logits.shape[0]
         found = self.part(
             {

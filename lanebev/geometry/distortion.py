@@ -61,7 +61,7 @@ def distort_plane(plane: Tensor, distortion: Tensor, model: str) -> Tensor:
 
 
 def _distorted(plane: Tensor, distortion: Tensor) -> Tensor:
-    """Brown-Conrady distortion, (B, N, 2)."""
+    """Apply Brown-Conrady distortion, (B, N, 2)."""
     return brown_conrady(coordinates_first(plane), distortion).value.movedim(0, -1)
 
 
@@ -122,7 +122,7 @@ def brown_conrady(plane: Tensor, distortion: Tensor) -> Linearised:
 
 
 def _pair(distortion: Tensor, first: int, second: int) -> Tensor:
-    """(2, B, 1) of two coefficients."""
+    """Return two coefficients as (2, B, 1)."""
     return torch.stack([distortion[..., first], distortion[..., second]]).unsqueeze(-1)
 
 
@@ -262,6 +262,6 @@ def max_undistorted_radius(distortion: Tensor, model: str = "pinhole", limit: fl
 
 
 def _matrix(entries: list[Tensor]) -> Tensor:
-    """(B, 3, 3) of nine entries (B,), row by row."""
+    """Return (B, 3, 3) of nine entries (B,), row by row."""
     matrix: Tensor = torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
     return matrix

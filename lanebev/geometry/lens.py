@@ -73,13 +73,13 @@ def check_intrinsics(intrinsics: Tensor, *rows: int) -> None:
 
 
 def usable_cameras(intrinsics: Tensor) -> Tensor:
-    """(...,) bool of (..., 3, 3): finite, and with positive focal lengths."""
+    """Return (...,) bool of intrinsics (..., 3, 3): finite, and with positive focal lengths."""
     finite = intrinsics.isfinite().all(-1).all(-1)
     return finite & (intrinsics[..., 0, 0] > 0) & (intrinsics[..., 1, 1] > 0)
 
 
 def placeholder_intrinsics(like: Tensor) -> Tensor:
-    """(3, 3) to put in place of one that can't be used, so that no number or gradient turns NaN."""
+    """Return (3, 3) intrinsics that replace unusable ones, so that no number or gradient becomes NaN."""
     return torch.diag(like.new_tensor([_HARMLESS_FOCAL, _HARMLESS_FOCAL, 1.0]))
 
 
@@ -91,7 +91,7 @@ def check_points(points: Tensor, size: int = 2) -> None:
 
 
 def normalise_points(points: Tensor, intrinsics: Tensor) -> Tensor:
-    """Undistorted pixels to the z = 1 plane.
+    """Convert undistorted pixels to the z = 1 plane.
 
     Args:
         points: (..., N, 2) px.
@@ -108,7 +108,7 @@ def normalise_points(points: Tensor, intrinsics: Tensor) -> Tensor:
 
 
 def denormalise_points(points: Tensor, intrinsics: Tensor) -> Tensor:
-    """Inverse of :func:`normalise_points`."""
+    """Convert points of the z = 1 plane to undistorted pixels, the inverse of :func:`normalise_points`."""
     check_points(points)
     fx, fy = intrinsics[..., None, 0, 0], intrinsics[..., None, 1, 1]
     skew, cx, cy = intrinsics[..., None, 0, 1], intrinsics[..., None, 0, 2], intrinsics[..., None, 1, 2]
@@ -117,7 +117,7 @@ def denormalise_points(points: Tensor, intrinsics: Tensor) -> Tensor:
 
 
 def cam_from_image(intrinsics: Tensor) -> Tensor:
-    """K⁻¹, undistorted pixels to the z = 1 plane as a matrix.
+    """Return K⁻¹, which converts undistorted pixels to the z = 1 plane.
 
     In closed form: a row whose camera can't be used is not finite, where a solver would raise for all.
 
@@ -229,7 +229,7 @@ def undistorted_sigma(
     distortion: Tensor,
     model: str = "pinhole",
 ) -> Tensor:
-    """Standard deviation across a line, from pixels of the image as taken to undistorted ones.
+    """Convert standard deviations across a line from pixels as taken to undistorted pixels.
 
     Source: first-order propagation. With F the Jacobian of :func:`distort_points`, a line along the unit
     vector τ appears along F τ, and a pixel across it there is |F τ| / |det F| here.

@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 def full_precision(function: Callable[P, R]) -> Callable[P, R]:
-    """A function of tensors, with autocast off and its floating arguments in one dtype.
+    """Decorate a function of tensors: autocast off, and its floating arguments in one dtype.
 
     That is the widest of theirs, and float32 at least; tensors in NamedTuples count. Integers and booleans
     stay. Gradients flow back in the dtypes that came.
@@ -50,12 +50,12 @@ def _is_precise(tensors: list[Tensor]) -> bool:
 
 
 def autocast_off(device: torch.device) -> torch.autocast:
-    """Context in which operations on ``device`` keep the dtype of their arguments."""
+    """Return a context in which operations on ``device`` keep the dtype of their arguments."""
     return torch.autocast(device.type, enabled=False)
 
 
 def common_dtype(*tensors: Tensor) -> torch.dtype:
-    """The widest floating dtype among the tensors, and float32 at least."""
+    """Return the widest floating dtype among the tensors, and at least float32."""
     return reduce(torch.promote_types, (tensor.dtype for tensor in tensors), torch.float32)
 
 

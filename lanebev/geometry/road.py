@@ -14,7 +14,7 @@ from lanebev.types import Extrinsics, check_extrinsics
 
 
 def rays_from_pixels(points: Tensor, intrinsics: Tensor) -> Tensor:
-    """Undistorted pixels to camera rays, K⁻¹ p.
+    """Convert undistorted pixels to camera rays, K⁻¹ p.
 
     Args:
         points: (..., N, 2) px.
@@ -28,7 +28,7 @@ def rays_from_pixels(points: Tensor, intrinsics: Tensor) -> Tensor:
 
 
 def segment_rays(endpoints: Tensor, intrinsics: Tensor) -> Tensor:
-    """Camera rays to both ends of segments, K⁻¹ p₁ and K⁻¹ p₂.
+    """Compute the camera rays to both ends of segments, K⁻¹ p₁ and K⁻¹ p₂.
 
     Args:
         endpoints: (..., N, 2, 2) px, undistorted.
@@ -42,7 +42,7 @@ def segment_rays(endpoints: Tensor, intrinsics: Tensor) -> Tensor:
 
 
 def great_circle_normals(rays: Tensor) -> Tensor:
-    """Normals of the planes through the camera and each segment, not normalised.
+    """Compute the normals of the planes through the camera and each segment, not normalised.
 
     Source: Eq. (3), n = (K⁻¹ p₁) × (K⁻¹ p₂). Left unnormalised because |n| grows with the segment's
     length, and with it the segment's say (paper.md D9).
@@ -61,7 +61,7 @@ def great_circle_normals(rays: Tensor) -> Tensor:
 def road_from_image_points(
     points: Tensor, intrinsics: Tensor, extrinsics: Extrinsics
 ) -> tuple[Tensor, Tensor]:
-    """Undistorted pixels to the road.
+    """Project undistorted pixels to the road.
 
     Args:
         points: (B, N, 2) px.
@@ -83,7 +83,7 @@ def road_from_image_points(
 def image_from_road_points(
     points: Tensor, intrinsics: Tensor, extrinsics: Extrinsics
 ) -> tuple[Tensor, Tensor]:
-    """Road points to undistorted pixels.
+    """Project road points to undistorted pixels.
 
     Args:
         points: (B, N, 2) m, (X right, Z along the lanes).
@@ -111,7 +111,7 @@ def road_covariance(
     pixel_cov: Tensor | None = None,
     extrinsics_cov: Tensor | None = None,
 ) -> Tensor:
-    """Covariance of road points, to first order, from that of the pixels and of the pose.
+    """Compute the first-order covariance of road points from that of their pixels and of the pose.
 
     Args:
         points: (B, N, 2) px.
@@ -135,7 +135,7 @@ def image_covariance(
     road_cov: Tensor | None = None,
     extrinsics_cov: Tensor | None = None,
 ) -> Tensor:
-    """Covariance of road points' pixels, to first order, from that of the points and of the pose.
+    """Compute the first-order covariance of pixels from that of their road points and of the pose.
 
     Args:
         points: (B, N, 2) m, (X right, Z along the lanes).
@@ -158,7 +158,7 @@ def _propagated(
     points_cov: Tensor | None,
     extrinsics_cov: Tensor | None,
 ) -> Tensor:
-    """Covariance (B, N, 2, 2) of what ``project`` makes of points; infinite where that is not valid."""
+    """Compute the covariance (B, N, 2, 2) of projected points; infinite where they are not valid."""
 
     def projected(point: Tensor, pose: Tensor, matrix: Tensor) -> Tensor:
         pose_1 = Extrinsics.unstack(pose.unsqueeze(0))

@@ -169,7 +169,7 @@ def rotation_vector(rotation: Tensor) -> Tensor:
 
 
 def _rigid(rotation: Tensor, translation: Tensor) -> Tensor:
-    """(..., 4, 4) of a rotation (..., 3, 3) and a translation (..., 3)."""
+    """Return the matrix (..., 4, 4) of a rotation (..., 3, 3) and a translation (..., 3)."""
     upper = torch.cat([rotation, translation.unsqueeze(-1)], dim=-1)
     last = torch.zeros_like(upper[..., :1, :])
     return torch.cat([upper, last + last.new_tensor([0.0, 0.0, 0.0, 1.0])], dim=-2)

@@ -93,7 +93,7 @@ def bracket_increasing(nodes: Tensor, values: Tensor, target: Tensor) -> Bracket
 
 
 def _nodes(upper: Tensor) -> Tensor:
-    """(B, 2^k + 1) evenly from 0 to (B,) ``upper``."""
+    """Return (B, 2^k + 1) evenly spaced values from 0 to ``upper`` (B,)."""
     count = 2**_TABLE_BITS + 1
     return upper.unsqueeze(-1) * torch.linspace(0.0, 1.0, count, dtype=upper.dtype, device=upper.device)
 

@@ -26,7 +26,7 @@ _USED_BY_AXIS = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
 
 
 def vehicle_from_camera(mount: Extrinsics) -> torch.Tensor:
-    """Camera pose in ROS's (and OpenLane's) vehicle frame: x forward, y left, z up, origin on the road.
+    """Return the camera's pose in ROS's vehicle frame: x forward, y left, z up, origin on the road.
 
     Args:
         mount: each (B,).

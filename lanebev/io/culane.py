@@ -55,7 +55,7 @@ def _check_culane_rows(y: NDArray[np.float64], last: str) -> None:
 
 
 def _with_gaps(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (P, 2) in order of rows, with a NaN put where rows were left out."""
+    """Return points (P, 2) in order of rows, with a NaN where rows were left out."""
     steps = np.abs(np.diff(points[:, 1]))
     if not len(steps):
         return points

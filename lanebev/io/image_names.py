@@ -82,7 +82,7 @@ def times_from_names(paths: Sequence[str]) -> tuple[float, ...]:
 
 
 def _are_decimal(fractions: Sequence[str]) -> bool:
-    """Whether digits after a dot are fractions: of one length, or as a float's shortest text has them."""
+    """Tell whether digits after a dot are fractions: of one length, or as in a float's shortest text."""
     lengths = {len(digits) for digits in fractions}
     if len(lengths) <= 1:
         return True

@@ -26,7 +26,7 @@ def is_image(path: str | Path) -> bool:
 
 
 def read_image(path: str | Path) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB, upright by its EXIF orientation, as viewers and OpenCV show it.
+    """Read an image as (H, W, 3) uint8 RGB, upright by its EXIF orientation, as viewers and OpenCV show it.
 
     A file that is cut is an error, not an image with a grey half.
 
@@ -48,7 +48,7 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
 
 
 def image_size(path: str | Path) -> tuple[int, int] | None:
-    """(height, width) of an image, None if it does not decode."""
+    """Return (height, width) of an image, None if it does not decode."""
     try:
         height, width = read_image(path).shape[:2]
     except ValueError:
@@ -57,7 +57,7 @@ def image_size(path: str | Path) -> tuple[int, int] | None:
 
 
 def write_png(path: str | Path, image: NDArray[np.uint8]) -> None:
-    """(H, W, 3) uint8 RGB to a PNG."""
+    """Write (H, W, 3) uint8 RGB to a PNG file."""
     Image.fromarray(image).save(path)
 
 
@@ -70,7 +70,7 @@ def _upright(image: Image.Image) -> Image.Image:
 
 
 def _eight_bit(image: Image.Image) -> Image.Image:
-    """16-bit grey at its own scale; ``convert`` would cut it off at 255.
+    """Convert 16-bit grey by its own scale; ``convert`` would clip it at 255.
 
     Raises:
         OSError: of floating point, whose scale nobody says.

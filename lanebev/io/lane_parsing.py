@@ -83,7 +83,7 @@ def number_array(name: str, values: Any, count: int) -> NDArray[np.float64]:
 
 
 def columns(name: str, values: list[Any], count: int) -> NDArray[np.float64]:
-    """(count, P) of ``count`` lists of one length; NaN where there is no number."""
+    """Return ``count`` lists of one length as (count, P); NaN for missing numbers."""
     lists = len(values) == count and all(isinstance(axis, list) for axis in values)
     if not lists or len({len(axis) for axis in values}) != 1:
         many = {1: "one list", 2: "two lists", 3: "three lists"}[count]
@@ -92,12 +92,12 @@ def columns(name: str, values: list[Any], count: int) -> NDArray[np.float64]:
 
 
 def checked_pixels(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The values, if they can be pixels."""
+    """Return the values if they can be pixels."""
     return within(name, "pixels", values)
 
 
 def within(name: str, unit: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The values, if none is larger than any of this unit."""
+    """Return the values if none is too large for this unit."""
     if (np.abs(values) > _FARTHEST).any():  # NaN is not
         raise ValueError(f"{name}: expected {unit}, got {np.nanmax(np.abs(values)):g}")
     return values

@@ -72,7 +72,7 @@ def size_remark(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> st
 
 
 def _all_points(frames: Sequence[FrameLines]) -> NDArray[np.float64]:
-    """(P, 2) px of all lines that are there."""
+    """Return the points (P, 2) px of all lines."""
     points = [line.points for frame in frames for line in frame.lines]
     together = np.concatenate(points) if points else np.empty((0, 2))
     there: NDArray[np.float64] = together[np.isfinite(together).all(-1)]

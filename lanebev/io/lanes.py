@@ -56,7 +56,7 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
 
 
 def lane_files(path: str | Path) -> list[Path]:
-    """The files that :func:`read_lanes` reads: the file itself, or a folder's in natural order."""
+    """Return the files that :func:`read_lanes` reads: the file itself, or a folder's in natural order."""
     path = Path(path)
     if not path.is_dir():
         return [path]
@@ -65,7 +65,7 @@ def lane_files(path: str | Path) -> list[Path]:
 
 
 def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int | None]:  # noqa: C901 - the rules of one decision
-    """Which lane entry belongs to each image: the one that shares the longest tail of its path.
+    """Find the lane entry of each image: the one whose path has the longest common end with its path.
 
     An entry of the image's very name is its own. Else whole path components are compared from the end, the
     last without an image's suffix. An entry goes to the image that shares most with it, so an image without

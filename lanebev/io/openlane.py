@@ -93,7 +93,7 @@ def image_from_camera_points(points: Array, intrinsics: Array) -> Array:
 def _openlane_points(
     name: str, lane: Any, fields: dict[str, Any], intrinsics: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """(P, 2) px of a lane line, by its ``uv`` if it has any, else by its ``xyz``."""
+    """Return the points (P, 2) px of a lane line, by its ``uv`` if it has any, else by its ``xyz``."""
     if not isinstance(lane, dict):
         raise ValueError(f"{name}: expected an object, got {shown(lane)}")
     if lane.get("uv") is not None or lane.get("xyz") is None:
@@ -121,7 +121,7 @@ def _openlane_points(
 
 
 def _square(fields: dict[str, Any], name: str, size: int) -> NDArray[np.float64]:
-    """(size, size) matrix of finite numbers."""
+    """Return a (size, size) matrix of finite numbers."""
     rows = field(fields, name, list)
     if len(rows) != size or not all(isinstance(row, list) for row in rows):
         raise ValueError(f"{name}: expected {size} x {size} numbers, got {shown(rows)}")

@@ -132,7 +132,7 @@ def read_extrinsics(path: str | Path) -> list[ExtrinsicsRow]:
 
 
 def check_inputs_stay(folder: str | Path, inputs: Iterable[str | Path]) -> None:
-    """No output of a run may take the place of a file that it reads.
+    """Raise if an output of the run would replace a file that it reads.
 
     Args:
         folder: where the outputs go.
@@ -220,15 +220,15 @@ class OutputFolder:
             ) from error
 
     def __truediv__(self, name: str) -> Path:
-        """Where to write the file of this name until the work is done."""
+        """Return where to write the file of this name until the work is done."""
         return self._partial / name
 
     def left(self, name: str) -> Path:
-        """Where the file of this name is that a process left behind when it was killed, if one was."""
+        """Return the path that a file of this name has after its process was killed."""
         return self._partial / f".{name}.left"
 
     def keep(self, name: str, why: str) -> str:
-        """Have an earlier run's file stay as ``name.why``, numbered if there is one; the name it got."""
+        """Copy an earlier run's file to ``name.why``, numbered if that exists, and return the new name."""
         names = (f"{name}.{why}{number or ''}" for number in count())
         kept = next(free for free in names if not os.path.lexists(self._target / free))
         shutil.copy2(self._target / name, self / kept)

@@ -172,7 +172,7 @@ def _rebuilt(
 
 
 def _fields(value: Any) -> dict[str, Tensor] | None:
-    """A NamedTuple's tensors by field, a tensor's under '', None for anything else."""
+    """Return a NamedTuple's tensors by field, a tensor's under '', None for anything else."""
     if isinstance(value, Tensor):
         return {"": value}
     names = getattr(value, "_fields", None)
@@ -198,7 +198,7 @@ def _check_finite(key: str, tensor: Tensor) -> None:
 
 
 def _mismatch(name: str, kind: str, fields: Mapping[str, Tensor], like: Any) -> str | None:
-    """Why the saved fields are not those of ``like``, or None."""
+    """Return why the saved fields are not those of ``like``, or None."""
     if kind != type(like).__name__:
         return f"{name} is a {kind}, expected {type(like).__name__}"
     expected = _fields(like) or {}

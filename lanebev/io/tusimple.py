@@ -68,7 +68,7 @@ def tusimple_line(
     seen: BoundaryVertices | None = None,
     pose_sigma_scale: float = 1.0,
 ) -> str:
-    """One frame's boundaries as a line of TuSimple JSON, with each lane's ``boundary``.
+    """Return one frame's boundaries as a line of TuSimple JSON, with each lane's ``boundary``.
 
     Args:
         name: ``raw_file``.
@@ -150,7 +150,7 @@ def _boundary_indices(fields: dict[str, Any], count: int) -> Sequence[int | None
 
 
 def _seen_lines(fields: dict[str, Any]) -> list[LaneLine]:
-    """The vertices that a run wrote, boundary by boundary."""
+    """Return the vertices that a run wrote, boundary by boundary."""
     points, sigmas, weights = (field(fields, name, list) for name in ("points", "sigma", "weight"))
     if not len(points) == len(sigmas) == len(weights):
         raise ValueError(
@@ -173,7 +173,7 @@ def _seen_lines(fields: dict[str, Any]) -> list[LaneLine]:
 
 
 def _benchmark_rows(lanes: list[Any]) -> list[float]:
-    """Of a prediction as TuSimple's benchmark takes it, without ``h_samples``: their number says which."""
+    """Return the rows of a prediction without ``h_samples``, by their number, as in TuSimple's benchmark."""
     count = len(lanes[0]) if lanes and isinstance(lanes[0], list) else 0
     if lanes and count not in _TUSIMPLE_ROWS:
         known = " or ".join(map(str, _TUSIMPLE_ROWS))

@@ -207,7 +207,7 @@ class VideoWriter:
         self._container.close()
 
     def write(self, image: NDArray[np.uint8], time: float | None = None) -> None:
-        """(H, W, 3) uint8 RGB, the same size every time; shown at ``time`` s, or a frame after the last."""
+        """Write (H, W, 3) uint8 RGB, always of one size, shown at ``time`` s or a frame after the last."""
         height, width = image.shape[:2]
         if height % 2 or width % 2:
             image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
@@ -281,7 +281,7 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
 
 
 def _declared_duration(stream: av.VideoStream, begin: Fraction) -> float:
-    """How long the header says that the stream is, s; 0 if it does not. Matroska has its end, in a tag."""
+    """Return the stream's duration in the header, s; 0 if there is none. Matroska has its end, in a tag."""
     if stream.duration is not None and stream.time_base is not None:
         return float(stream.duration * stream.time_base)
     match = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", stream.metadata.get("DURATION", ""))

@@ -16,7 +16,7 @@ _SAME_LINE, _NEXT_BUT_ONE = 0.4, 1.75  # gap between neighbours, in usual gaps
 def boundary_indices(
     lines: Sequence[NDArray[np.float64]], num_boundaries: int = NUM_BOUNDARIES
 ) -> list[int | None]:
-    """Semantic boundary of each line: the nearest on the left is L/2 - 1, the nearest on the right L/2.
+    """Number the lines by boundary: the nearest on the left is L/2 - 1, the nearest on the right L/2.
 
     The lower half of each line is extended to the bottom of the image; the lines are counted outwards in
     that order, also those that leave the image sideways. A line runs down to its own side of the camera, so
@@ -54,7 +54,7 @@ def boundary_indices(
 
 
 def _crossing(points: NDArray[np.float64], bottom: float) -> tuple[float, float]:
-    """Where the lower half of a line meets the row ``bottom``, and its slope dx/dy there."""
+    """Return where the lower half of a line meets the row ``bottom``, and its slope dx/dy there."""
     lower = points[np.argsort(points[:, 1])][-max(4, len(points) // 2) :]
     y = lower[:, 1] - lower[:, 1].mean()
     slope = float((y * lower[:, 0]).sum() / max((y * y).sum(), 1e-9))

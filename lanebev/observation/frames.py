@@ -47,7 +47,7 @@ def check_frame(frame: NDArray[np.uint8] | Tensor, image_size: tuple[int, int]) 
 
 
 def _remedy(frame: NDArray[np.generic], image_size: tuple[int, int]) -> str:
-    """What to do about an array that is no frame of this size."""
+    """Return what to do about an array that is no frame of this size."""
     if frame.shape[:2] != image_size:
         return "for images of another size see Camera.scaled"
     if frame.ndim != 3 or frame.shape[2] != 3:

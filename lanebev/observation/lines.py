@@ -142,7 +142,7 @@ def _across_scale(along: Tensor, scale: Tensor) -> Tensor:
 
 
 def _redundancy(y: Tensor, there: Tensor, correlation: float) -> Tensor:
-    """(B, L) at least 1, by which V vertices (B, L, V) of a line are less sure than independent ones."""
+    """Return (B, L): the factor, at least 1, by which the vertices (B, L, V) of a line are redundant."""
     low, high = (torch.where(there, y.detach(), end) for end in (torch.inf, -torch.inf))
     extent = (high.amax(-1) - low.amin(-1)).clamp(min=0.5 * correlation)  # also where there are none
     return (there.sum(-1) * correlation / extent).clamp(min=1.0).sqrt()

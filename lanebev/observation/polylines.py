@@ -128,14 +128,14 @@ def rows_from_vertices(vertices: BoundaryVertices, image_size: tuple[int, int]) 
 
 
 def _indices(lines: Sequence[LaneLine], camera: Camera, num_boundaries: int) -> list[int | None]:
-    """Semantic boundary of each line: as they say, or counted if one of them does not."""
+    """Return the boundary of each line: as stated, or counted if one line does not state it."""
     if all(line.boundary is not None for line in lines):
         return [line.boundary for line in lines]
     return boundary_indices([_undistorted(line.points, camera) for line in lines], num_boundaries)
 
 
 def _line_vertices(line: LaneLine, image_size: tuple[int, int]) -> NDArray[np.float64]:
-    """(K, 4) x, y, sigma and weight of a line's vertices, or of a polyline on rows."""
+    """Return (K, 4) x, y, sigma and weight of a line's vertices, or of a polyline on rows."""
     said = np.full(len(line.points), LINE_SIGMA) if line.sigma is None else line.sigma
     if line.weight is not None:
         return np.column_stack([line.points, said, line.weight])
@@ -151,12 +151,12 @@ def _inside(x: NDArray[np.float64], width: int) -> NDArray[np.bool_]:
 
 
 def _spread(count: int, most: int) -> NDArray[np.int64]:
-    """At most ``most`` indices of 0..count-1, evenly spread."""
+    """Return at most ``most`` indices of 0..count-1, evenly spread."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
 
 
 def _on_rows(points: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x of a polyline on rows, NaN outside its extent and in its gaps."""
+    """Return x of a polyline on rows, NaN outside its extent and in its gaps."""
     y, first = np.unique(points[:, 1], return_index=True)
     x = points[first, 0]
     there = np.isfinite(x)
@@ -167,7 +167,7 @@ def _on_rows(points: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[
 
 
 def _with_gaps(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vertices from top to bottom, with a NaN put where something hides the line between two of them."""
+    """Return vertices from top to bottom, with a NaN where something hides the line between two of them."""
     steps = np.diff(vertices[:, 1])
     if not len(steps):
         return vertices
@@ -177,7 +177,7 @@ def _with_gaps(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _undistorted(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """(P, 2) px as taken to those (Q, 2) px undistorted that the lens can have imaged."""
+    """Convert pixels as taken (P, 2) to undistorted ones (Q, 2), those that the lens can have imaged."""
     if not len(points):
         return points
     undistorted, valid = camera.undistort_points(torch.from_numpy(points).to(camera.intrinsics))

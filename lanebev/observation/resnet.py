@@ -30,7 +30,7 @@ class BasicBlock(nn.Module):
             )
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) to (B, channels, ceil(H / stride), ceil(W / stride))."""
+        """Map (B, C, H, W) to (B, channels, ceil(H / stride), ceil(W / stride))."""
         identity = x if self.downsample is None else self.downsample(x)
         x = F.relu(self.bn1(self.conv1(x)), inplace=True)
         return F.relu(self.bn2(self.conv2(x)) + identity, inplace=True)
@@ -74,7 +74,7 @@ class ResNet18(nn.Module):
                 nn.init.zeros_(module.bn2.weight)  # every block starts as the identity (Goyal et al. 2017)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """(B, 3, H, W), normalised, to five (B, widths[i], ceil(H/s), ceil(W/s)), s = STRIDES[i]."""
+        """Map (B, 3, H, W), normalised, to five (B, widths[i], ceil(H/s), ceil(W/s)), s = STRIDES[i]."""
         c1 = F.relu(self.bn1(self.conv1(image)), inplace=True)
         c2 = self.layer1(self.maxpool(c1))
         c3 = self.layer2(c2)

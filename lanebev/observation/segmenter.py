@@ -163,7 +163,7 @@ class StripMessage(nn.Module):
         self.norm = nn.BatchNorm2d(channels)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) to the same."""
+        """Map (B, C, H, W) to the same shape."""
         return x + F.relu(self.norm(self.across(F.relu(self.down(x)))))
 
 
@@ -187,7 +187,7 @@ def upsample_aligned(x: Tensor, size: torch.Size | tuple[int, int]) -> Tensor:
 
 
 def _fold(x: Tensor, size: torch.Size) -> Tensor:
-    """Stride-2 cells (2i, 2i+1) as channels of stride-4 cell i: (B, C, ·, ·) to (B, 4C, *size)."""
+    """Return stride-2 cells (2i, 2i+1) as channels of stride-4 cell i: (B, C, ·, ·) to (B, 4C, *size)."""
     padded = F.pad(x, (0, 2 * size[1] - x.shape[-1], 0, 2 * size[0] - x.shape[-2]))
     if x.shape[0] == 0:  # of which torch 2.13 makes no channels
         return padded.reshape(0, 4 * x.shape[1], *size)
@@ -195,7 +195,7 @@ def _fold(x: Tensor, size: torch.Size) -> Tensor:
 
 
 def _positions(features: Tensor) -> Tensor:
-    """(B, 2, h, w): x and y of each cell, -1 to 1 over the map."""
+    """Return x and y of each cell, -1 to 1 over the map, (B, 2, h, w)."""
     height, width = features.shape[-2:]
     y = torch.linspace(-1, 1, height, dtype=features.dtype, device=features.device)
     x = torch.linspace(-1, 1, width, dtype=features.dtype, device=features.device)

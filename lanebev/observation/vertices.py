@@ -99,7 +99,7 @@ class Vertices(NamedTuple):
 
 
 def scan_vertices(probabilities: Tensor, config: LineConfig) -> Vertices:
-    """Where each row and each column crosses each boundary, V = h + w.
+    """Find where each row and each column crosses each boundary, V = h + w.
 
     Rows count where a boundary is steep and columns where it is shallow, with a blend about 45 degrees.
     """
@@ -137,14 +137,14 @@ def _scan(counted: Tensor, config: LineConfig, dim: int) -> Vertices:
 
 
 def _eroded(weight: Tensor) -> Tensor:
-    """Least weight within _END scans, (..., h): nothing at the ends of a stripe and of the map."""
+    """Compute the least weight within _END scans, (..., h): zero at the ends of a stripe and of the map."""
     padded = F.pad(weight.flatten(0, -2), (_END, _END)).unsqueeze(1)  # (M, 1, h), where M may be 0
     least: Tensor = F.max_pool1d(-padded, 2 * _END + 1, 1).view_as(weight)
     return -least
 
 
 def _local_mean(values: Tensor, weight: Tensor) -> Tensor:
-    """Weighted mean over _NEIGHBOURS scans on either side, (..., h); 0 where nothing has weight."""
+    """Compute the weighted mean over _NEIGHBOURS scans on either side, (..., h); 0 without any weight."""
     both = torch.stack([values * weight, weight]).flatten(0, -2).unsqueeze(1)
     pooled: Tensor = F.avg_pool1d(both, 2 * _NEIGHBOURS + 1, 1, _NEIGHBOURS)
     total, mass = pooled.view(2, *values.shape).unbind()
@@ -152,7 +152,7 @@ def _local_mean(values: Tensor, weight: Tensor) -> Tensor:
 
 
 def row_moments(probabilities: Tensor, window: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean position, mass and variance of each row's probability about its peak, see :func:`scan_moments`.
+    """Compute mean position, mass and variance of each row about its peak, see :func:`scan_moments`.
 
     Args:
         probabilities: (..., h, w).
@@ -216,19 +216,19 @@ def box_peak(padded: Tensor, padding: int, dim: int) -> Tensor:
 
 
 def _about(padded: Tensor, centre: Tensor, window: int, dim: int) -> tuple[Tensor, Tensor]:
-    """Values of scans within ``window`` of their centres, 2·window + 1 along ``dim``, and offsets, px."""
+    """Return values within ``window`` of the scans' centres, 2·window + 1 along ``dim``, and offsets, px."""
     offset = torch.arange(-window, window + 1, device=padded.device).view((-1,) + (1,) * (-1 - dim))
     return padded.gather(dim, centre.unsqueeze(dim) + offset), offset.to(padded.dtype)
 
 
 def _mean(values: Tensor, step: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """Mean offset and mass of windows; an empty one has mean 0."""
+    """Compute the mean offset and mass of windows; an empty one has mean 0."""
     mass = values.sum(dim)
     return (values * step).sum(dim) / mass.clamp(min=_LEAST_MASS), mass
 
 
 def local_line(position: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Line through each row's neighbours: slope in px a row, and the variance of a row about it.
+    """Fit a line to each row's neighbours: slope in px per row, and the variance of a row about it.
 
     Args:
         position: (..., h).
@@ -257,7 +257,7 @@ def local_line(position: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
-    """At most 2S vertices a boundary, in order along it: means over stretches of equally many vertices.
+    """Average vertices over stretches of equally many: at most 2S on a boundary, in order along it.
 
     The mean of points on a parabola lies off it by half of what it lies off their tangents, on average: by
     that it is moved back. A boundary of n < 2S vertices keeps 2·floor(n/2) of them as they are.
@@ -305,7 +305,7 @@ def stretches(vertices: Vertices, config: LineConfig) -> tuple[Tensor, Tensor, T
 
 
 def _as_sure_as_most(variance: Tensor, there: Tensor) -> Tensor:
-    """Weight (B, L, 2S) of vertices by their variance and the median variance of their boundary.
+    """Weigh vertices (B, L, 2S) by their variance and the median variance of their boundary.
 
     On a clean map an unsure vertex is where there is no line: at its end, at a nick, on a bend of a few px.
     A map that hedges has unsure ones anyway: there the limit grows as the median variance does.
@@ -316,7 +316,7 @@ def _as_sure_as_most(variance: Tensor, there: Tensor) -> Tensor:
 
 
 def _with_the_middle(vertices: Vertices, middle: Tensor, size: Tensor) -> Tensor:
-    """Which vertices may be averaged with the middle one of their stretch, (B, L, V).
+    """Return which vertices may be averaged with the middle one of their stretch, (B, L, V).
 
     Not those across a gap, further away than so many scans reach (two for scans that were dropped), nor
     those of another arm of a boundary that turns back: a chord of a circle makes equal angles with the
@@ -337,7 +337,7 @@ def _half_of(count: Tensor, config: LineConfig) -> Tensor:
 
 
 def _order_along(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Vertices in order along their boundary's main direction, and each one's rank; those not seen come last.
+    """Sort vertices along their boundary's main direction, unseen ones last; return them and the ranks.
 
     Args:
         points: (B, L, V, 2).
@@ -357,5 +357,5 @@ def _order_along(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def take(points: Tensor, index: Tensor) -> Tensor:
-    """(B, L, V, 2) at (B, L, S) to (B, L, S, 2)."""
+    """Gather (B, L, V, 2) at indices (B, L, S), (B, L, S, 2)."""
     return points.gather(2, index.unsqueeze(-1).expand(*index.shape, 2))

@@ -49,7 +49,7 @@ def text_width(text: str, size: int, bold: bool = False) -> float:
 
 @lru_cache(maxsize=64)
 def _letters(text: str, size: int, bold: bool, anchor: str) -> tuple[NDArray[np.float32], tuple[int, int]]:
-    """Share of the ink in each pixel, and where its upper left corner is from the anchor, px."""
+    """Return the share of ink in each pixel, and the offset of its upper left corner from the anchor, px."""
     font = _font(size, bold)
     left, top, right, bottom = (round(side) for side in font.getbbox(text, anchor=anchor))
     mask = Image.new("L", (max(right - left, 1), max(bottom - top, 1)))

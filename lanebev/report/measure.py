@@ -33,7 +33,7 @@ class RoadBoundaries(NamedTuple):
 
 
 def believed(segments: LaneSegments, inliers: Tensor) -> LaneSegments:
-    """The segments that a calibrator believes: with :attr:`~lanebev.Calibration.inliers` above a half."""
+    """Select the inliers of a calibrator, with :attr:`~lanebev.Calibration.inliers` above a half."""
     return segments._replace(weight=torch.where(inliers > 0.5, segments.weight, 0.0))
 
 
@@ -94,7 +94,7 @@ def measure_boundaries(
 
 
 def spread(values: NDArray[np.float64]) -> float:
-    """Largest difference between a frame's directions, or widths, in their unit; NaN with fewer than two."""
+    """Compute the largest difference between a frame's directions, or widths; NaN with fewer than two."""
     seen = values[np.isfinite(values)]
     return float(np.ptp(seen)) if len(seen) > 1 else float("nan")
 
@@ -122,7 +122,7 @@ def _fit(
     boundary: NDArray[np.int64],
     num_boundaries: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Offsets (L,), slopes (L,) and the common bend by weighted least squares, and their covariance."""
+    """Fit offsets (L,), slopes (L,) and the common bend by weighted least squares, with their covariance."""
     member = np.eye(num_boundaries)[boundary]
     columns = np.concatenate([member, member * z[:, None], z[:, None] ** 2], axis=1) / sigma[:, None]
     inverse = np.linalg.pinv(columns)

@@ -119,7 +119,7 @@ def _numbers(calibration: Calibration) -> str:
 def _draw_boundaries(
     shown: Picture, camera: Camera, segments: LaneSegments, inliers: Tensor, scale: float
 ) -> None:
-    """Vertices as dots, each boundary's as one line through them; what was not believed is grey."""
+    """Draw vertices as dots, each boundary's as one line through them; outliers are grey."""
     ends = _to_image(camera, segments.endpoints[0].flatten(0, 1)).reshape(-1, 2, 2) * scale
     there = segments.weight[0] > 0
     believed = there & (inliers[0] > 0.5)
@@ -137,7 +137,7 @@ def _draw_boundaries(
 def _polylines(
     ends: Tensor, boundary: Tensor, kept: Tensor
 ) -> Iterator[tuple[tuple[int, int, int], NDArray[np.int32]]]:
-    """Colour and (P, 2) vertices from top to bottom of each boundary; ends (N, 2, 2), kept (N,)."""
+    """Return colour and vertices (P, 2), top to bottom, of each boundary; ends (N, 2, 2), kept (N,)."""
     of = boundary[kept].numpy()
     points = _fixed(ends[kept].flatten(0, 1)).reshape(-1, 2, 2)
     for index in np.unique(of).tolist():
@@ -170,7 +170,7 @@ def _draw_vanishing_point(shown: Picture, camera: Camera, extrinsics: Extrinsics
 
 
 def _draw_banner(shown: Picture, headline: str, status: str, colour: Colour, numbers: str) -> None:
-    """Frame, status and numbers on a dark strip at the top."""
+    """Draw frame, status and numbers on a dark strip at the top."""
     _darken(shown[:44])
     write_text(shown, (12, 12), headline, _INK, 18)
     x = 12 + text_width(headline, 18) + 24
@@ -185,7 +185,7 @@ def _draw_banner(shown: Picture, headline: str, status: str, colour: Colour, num
 
 
 def _draw_note(shown: Picture, text: str) -> None:
-    """A line of text on a dark strip at the bottom."""
+    """Draw a line of text on a dark strip at the bottom."""
     _darken(shown[-34:])
     write_text(shown, (12, PANEL_HEIGHT - 27), text, _INK, 16)
 
@@ -195,7 +195,7 @@ def _darken(strip: Picture) -> None:
 
 
 def _bev_panel(view: Panel, grid: BEVGrid, camera: Camera, segments: LaneSegments) -> Picture:
-    """The view below its title, the boundaries thin in it, and a scale of metres ahead on its left."""
+    """Draw the view below its title, with thin boundaries and a scale of metres ahead on its left."""
     height = PANEL_HEIGHT - _HEAD
     width = round(view.bev.shape[1] * height / view.bev.shape[0])
     panel = _empty_panel(view.title, width, grid.z).copy()
@@ -208,7 +208,7 @@ def _bev_panel(view: Panel, grid: BEVGrid, camera: Camera, segments: LaneSegment
 
 @lru_cache(maxsize=8)
 def _empty_panel(title: str, width: int, z: tuple[float, float]) -> Picture:
-    """A panel without its view, which is so wide; z: near and far, m."""
+    """Draw a panel without its view, of this width; z: near and far, m."""
     height = PANEL_HEIGHT - _HEAD
     panel = np.full((PANEL_HEIGHT, _LEFT + width, 3), _BACKGROUND, np.uint8)
     write_text(panel, (_LEFT, 12), title, _INK, 18)
@@ -234,17 +234,17 @@ def _draw_bev_boundaries(
 
 
 def _to_image(camera: Camera, points: Tensor) -> Tensor:
-    """(N, 2) undistorted px to (N, 2) px as taken."""
+    """Convert undistorted pixels (N, 2) to pixels as taken (N, 2)."""
     return camera.distort_points(points.to(camera.intrinsics))
 
 
 def _fixed(points: Tensor) -> NDArray[np.int32]:
-    """Pixels, centres at integers, to cv2's fixed point."""
+    """Convert pixels, centres at integers, to cv2's fixed point."""
     bounded = points.nan_to_num(-1e4).clamp(-3e4, 3e4)
     return np.asarray((bounded * (1 << _SUBPIXEL)).round().to(torch.int32).numpy())
 
 
 def _dots(shown: Picture, points: NDArray[np.int32], radius: int, colour: Colour) -> None:
-    """Filled circles at (P, 2) points of :func:`_fixed`."""
+    """Draw filled circles at (P, 2) points of :func:`_fixed`."""
     for x, y in points.tolist():
         cv2.circle(shown, (x, y), radius << _SUBPIXEL, colour, -1, cv2.LINE_AA, _SUBPIXEL)

@@ -78,7 +78,7 @@ def track(
 
 
 def frame_bound(moment: Moment, segments: LaneSegments, intrinsics: Tensor = CAMERA) -> Tensor:
-    """Variances (R, 4) of the per-frame bound with the offset unknown, inf of what is not determined.
+    """Compute the variances (R, 4) of the per-frame bound with unknown offset, inf if not determined.
 
     Source: Kay 1993, Sec. 3.9. Wrong segments count as if they were right ones, which only lowers it.
     """
@@ -100,7 +100,7 @@ def _double(part: Tensor) -> Tensor:
 
 
 def summarise(run: Track, usual: Tensor | None = None) -> dict[str, Any]:
-    """Figures of one track; ``usual`` (4,) is the RMSE on the straight road, for the time to recover."""
+    """Return the figures of one track; ``usual`` (4,) is the RMSE on the straight road, for the recovery."""
     later = torch.arange(len(run.hard)) >= WARM_UP
     easy, hard = later & ~run.hard, later & run.hard
     known = run.bounds.isfinite() & easy[:, None, None]
@@ -129,7 +129,7 @@ def within_sigmas(run: Track, sigmas: float = 3.0) -> Tensor:
 
 
 def recovery(run: Track, usual: Tensor, fps: float = FPS) -> float | None:
-    """Longest time, s, from the end of hard frames until the error of all rows is back at twice the usual.
+    """Compute the longest time, s, from the end of hard frames until all errors are below twice the usual.
 
     None if it never comes back before the next hard frames or the end.
 
@@ -152,10 +152,10 @@ def recovery(run: Track, usual: Tensor, fps: float = FPS) -> float | None:
 
 
 def rms(values: Tensor) -> Tensor:
-    """Over all dimensions but the last."""
+    """Compute the root mean square over all dimensions but the last."""
     return values.flatten(0, -2).square().mean(0).sqrt()
 
 
 def mean_of(values: Tensor, where: Tensor) -> Tensor:
-    """Mean over all dimensions but the last of the entries in the mask; NaN where there are none."""
+    """Compute the mean over all dimensions but the last of the entries in the mask; NaN if there are none."""
     return torch.where(where, values, 0.0).flatten(0, -2).sum(0) / where.flatten(0, -2).sum(0)

@@ -47,7 +47,7 @@ class Experiment:
         )
 
     def motion(self) -> tuple[Extrinsics, Tensor]:
-        """Extrinsics of every frame, each (T,), and the lateral offset (T,) m: sinusoids up to 1 Hz."""
+        """Return extrinsics of every frame and the lateral offset, m, each (T,): sinusoids up to 1 Hz."""
         t = torch.arange(self.num_frames, dtype=torch.float64) / self.fps
         turn = 2 * math.pi * self.max_frequency_hz * t
         pitch = math.radians(self.pitch_deg) * (turn + 0.3).sin()
@@ -59,7 +59,7 @@ class Experiment:
 
 
 def boundary_lines(pose: Tensor, positions: Tensor, intrinsics: Tensor) -> Tensor:
-    """Image lines of straight boundaries.
+    """Compute the image lines of straight boundaries.
 
     Args:
         pose: (5,) pitch, yaw, roll, height, offset of the camera to the right.
@@ -80,7 +80,7 @@ def boundary_lines(pose: Tensor, positions: Tensor, intrinsics: Tensor) -> Tenso
 
 
 def boundary_spans(pose: Tensor, positions: Tensor, intrinsics: Tensor, exp: Experiment) -> Tensor:
-    """(L, 2, 2) px: where each boundary enters the image and where it ends near the vanishing point."""
+    """Compute where each boundary enters the image and ends near the vanishing point, (L, 2, 2) px."""
     rotation = road_from_cam(pose[0], pose[1], pose[2])
     vanishing = intrinsics @ rotation[2]
     vp = vanishing[:2] / vanishing[2]
@@ -103,7 +103,7 @@ def boundary_spans(pose: Tensor, positions: Tensor, intrinsics: Tensor, exp: Exp
 def sample_segments(
     spans: Tensor, exp: Experiment, rows: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Random pairs of points every 30 px, without noise.
+    """Draw random pairs of points every 30 px, without noise.
 
     Args:
         spans: (L, 2, 2) px.
@@ -130,7 +130,7 @@ def sample_segments(
 def cramer_rao_cov(
     pose: Tensor, positions: Tensor, intrinsics: Tensor, endpoints: Tensor, boundary: Tensor, variance: float
 ) -> Tensor:
-    """Per-frame Cramér-Rao bound of (pitch, yaw, roll, height) with the offset unknown.
+    """Compute the per-frame Cramér-Rao bound of (pitch, yaw, roll, height) with unknown offset.
 
     Source: Kay 1993, Sec. 3.9, for independent perpendicular errors of all end points.
 
@@ -163,7 +163,7 @@ class Frame:
     bound: Tensor  # (4,) standard deviations at a variance of 1 px²
 
     def segments(self, std: Tensor, generator: torch.Generator, dtype: torch.dtype) -> LaneSegments:
-        """With Gaussian noise of (R,) px on every end point."""
+        """Return segments with Gaussian noise of (R,) px on every end point."""
         noise = torch.randn(self.endpoints.shape, generator=generator, dtype=self.endpoints.dtype)
         noisy = self.endpoints + noise * std[:, None, None, None]
         weight = torch.ones(self.boundary.shape, dtype=dtype)

@@ -35,7 +35,7 @@ def vertices_through_lens(
 
 
 def _exact(moment: Moment, camera: Camera, count: int) -> tuple[Tensor, Tensor]:
-    """(6, V, 2) px as taken, evenly spaced in pixels, and (6, V) weights."""
+    """Return points evenly spaced in pixels as taken, (6, V, 2), and weights (6, V)."""
     road = road_curves(moment)
     pitch, yaw, roll, height = torch.tensor(moment.pose, dtype=torch.float64)
     x, z = road.unbind(-1)

@@ -48,7 +48,7 @@ class Moment:
 
 
 def swing(t: float) -> tuple[float, float, float, float]:
-    """The motion of the Table I experiment: ±1.5° pitch and yaw, ±1° roll, ±5 cm, up to 1 Hz."""
+    """Return the motion of the Table I experiment: ±1.5° pitch and yaw, ±1° roll, ±5 cm, up to 1 Hz."""
     turn = 2 * math.pi * t
     return (
         math.radians(1.5) * math.sin(turn + 0.3),
@@ -59,7 +59,7 @@ def swing(t: float) -> tuple[float, float, float, float]:
 
 
 def drift(t: float) -> float:
-    """Lateral offset of the same experiment, m."""
+    """Return the lateral offset of the same experiment, m."""
     return -0.4 * math.sin(0.3 * math.pi * t + 0.5)
 
 
@@ -70,7 +70,7 @@ def moments(
     fps: float = FPS,
     start: float = 0.0,
 ) -> list[Moment]:
-    """A drive, from ``start`` s on, of a motion, each frame changed by ``change(t, moment)``."""
+    """Return a drive of a motion from ``start`` s on, each frame changed by ``change(t, moment)``."""
     drive = []
     for k in range(round(seconds * fps)):
         t = start + k / fps
@@ -101,7 +101,7 @@ def observe(
 
 
 def road_curves(moment: Moment, num: int = 400) -> Tensor:
-    """(6, G, 2) m, X and Z of the boundaries from near to far."""
+    """Return X and Z of the boundaries from near to far, (6, G, 2) m."""
     inverse = torch.linspace(1 / moment.near, 1 / moment.far, num, dtype=torch.float64)
     z = 1 / inverse
     if moment.curvature is not None:
@@ -128,7 +128,7 @@ def road_curves(moment: Moment, num: int = 400) -> Tensor:
 
 
 def curves(moment: Moment, num: int = 400) -> tuple[Tensor, Tensor]:
-    """(6, G, 2) px of the boundaries from near to far, and (6, G) bool: in the image."""
+    """Return the boundaries from near to far, (6, G, 2) px, and (6, G) bool: in the image."""
     road = road_curves(moment, num)
     pose = Extrinsics.unstack(torch.tensor([moment.pose], dtype=torch.float64))
     pixels, ahead_ok = image_from_road_points(road.flatten(0, 1)[None], CAMERA[None], pose)
@@ -138,7 +138,7 @@ def curves(moment: Moment, num: int = 400) -> tuple[Tensor, Tensor]:
 
 
 def resample(z: Tensor, x: Tensor, at: Tensor) -> Tensor:
-    """x (G,) or (G, 2) at the given z, linearly; z (G,) increasing."""
+    """Interpolate x (G,) or (G, 2) linearly at the given z; z (G,) increasing."""
     right = torch.searchsorted(z.contiguous(), at.contiguous()).clamp(1, len(z) - 1)
     share = (at - z[right - 1]) / (z[right] - z[right - 1])
     share = share if x.ndim == 1 else share.unsqueeze(-1)
@@ -174,7 +174,7 @@ def _exact(
 def _corrupt(
     moment: Moment, endpoints: Tensor, boundary: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Gross outliers anywhere in the lower half, wrong indices one by one or a boundary at a time."""
+    """Add gross outliers anywhere in the lower half, and wrong indices of segments or of whole boundaries."""
 
     def draw() -> Tensor:
         return torch.rand(boundary.shape, generator=generator)
@@ -192,7 +192,7 @@ def _corrupt(
 
 
 def _clothoid(s: Tensor, radius: float, transition: float) -> Tensor:
-    """Curvature along the road, 1/m: 60 m straight, a bend to the right, 30 m straight, one to the left.
+    """Return the road's curvature, 1/m: 60 m straight, a right bend, 30 m straight, a left bend.
 
     Each bend is a clothoid, 60 m of an arc and a clothoid back.
     """
@@ -210,7 +210,7 @@ def _curves(t: float, moment: Moment) -> Moment:
 
 
 def _sharp_bends(t: float, moment: Moment) -> Moment:
-    """An exit's loop, of whose boundaries a detector shows three."""
+    """Return the loop of an exit, of whose boundaries a detector shows three."""
     shown = replace(moment, near=5.0, far=30.0, visible=(1, 2, 3))
     return replace(shown, curvature=lambda z: _clothoid(z + 15.0 * t, 60.0, 20.0))
 
@@ -268,7 +268,7 @@ def _garbage(t: float, moment: Moment) -> Moment:
 
 
 def _clock(t: float, moment: Moment) -> Moment:
-    """Of ten frames one comes twice, one late, one without a time, and one is dropped."""
+    """Repeat one frame in ten, send one late, one without a time, and drop one."""
     k = round(t * FPS)
 
     def at(frame: int) -> Moment:

@@ -107,6 +107,6 @@ def _tile_block(
 
 
 def traced() -> bool:
-    """Whether operations are recorded, for all values that there may be."""
+    """Tell whether operations are recorded for all possible values."""
     compiled = torch.compiler.is_compiling() or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
     return compiled or torch._C._are_functorch_transforms_active()

@@ -147,6 +147,6 @@ class CanonicalView(nn.Module):
 
 
 def _pixel_sums(matrix: Tensor, rows: Tensor, columns: Tensor) -> CellSums:
-    """Products of (B, k, 3) matrices with pixels (x, y, 1)."""
+    """Compute the products of (B, k, 3) matrices with pixels (x, y, 1)."""
     by_x, by_y, constant = matrix.unsqueeze(-1).unbind(-2)  # (B, k, 1)
     return CellSums(by_y * rows + constant, by_x * columns)

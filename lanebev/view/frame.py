@@ -98,7 +98,7 @@ def _pixels_of_cells(
 def _by_opencv(
     camera: Camera, extrinsics: Extrinsics, grid: BEVGrid
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
-    """By OpenCV's single pass over the cells, which says nothing of cells behind or beyond a fold."""
+    """Compute the maps in OpenCV's one pass, which marks no cells behind the camera or beyond a fold."""
     bev_from_cam = bev_from_image(extrinsics, camera.intrinsics[None], grid)[0] @ camera.intrinsics
     pixels = _kept("pixels", (*grid.shape, 2), np.float32)
     cv2.initUndistortRectifyMap(
@@ -116,13 +116,13 @@ def _by_opencv(
 
 
 def _seen(by_row: Tensor, by_column: Tensor, limit: Tensor | None) -> Tensor:
-    """Whether the sum of a row's and a column's vector, (3, U) and (3, V), is ahead and within the limit."""
+    """Tell whether the sum of a row's (3, U) and a column's vector (3, V) is ahead and within the limit."""
     ahead = by_row[2].unsqueeze(-1) + by_column[2] > LEAST_DEPTH
     return ahead if limit is None else ahead & _within(by_row, by_column, limit)
 
 
 def _within(by_row: Tensor, by_column: Tensor, limit: Tensor) -> Tensor:
-    """Whether x² + y² < limit² z² for the sum of a row's and a column's vector, (3, U) and (3, V)."""
+    """Tell whether x² + y² < limit² z² for the sum of a row's and a column's vector, (3, U) and (3, V)."""
     sign = torch.stack([torch.ones_like(limit), torch.ones_like(limit), -limit.square()]).unsqueeze(-1)
     row, column = ((sign * part * part).sum(0) for part in (by_row, by_column))
     left = torch.stack([*(2 * sign * by_row), row, torch.ones_like(row)], dim=1)  # (U, 5)

@@ -54,34 +54,34 @@ class BEVGrid:
         )
 
     def road_from_bev_points(self, points: Tensor) -> Tensor:
-        """(..., 2) BEV px (column, row) to (..., 2) m (X, Z)."""
+        """Convert BEV pixels (column, row), (..., 2), to road points (X, Z), m."""
         column, row = points.unbind(-1)
         return torch.stack([self.x[0] + column * self.resolution, self.z[1] - row * self.resolution], dim=-1)
 
     def bev_from_road_points(self, points: Tensor) -> Tensor:
-        """(..., 2) m (X, Z) to (..., 2) BEV px (column, row)."""
+        """Convert road points (X, Z), (..., 2) m, to BEV pixels (column, row)."""
         x, z = points.unbind(-1)
         return torch.stack([(x - self.x[0]) / self.resolution, (self.z[1] - z) / self.resolution], dim=-1)
 
     def bev_from_road_covariance(self, cov: Tensor) -> Tensor:
-        """(..., 2, 2) m² of (X, Z) to (..., 2, 2) px² of (column, row)."""
+        """Convert covariances of (X, Z), (..., 2, 2) m², to those of (column, row), px²."""
         sign = cov.new_tensor([1.0, -1.0]) / self.resolution
         return cov * sign[:, None] * sign
 
     def road_from_bev_covariance(self, cov: Tensor) -> Tensor:
-        """(..., 2, 2) px² of (column, row) to (..., 2, 2) m² of (X, Z)."""
+        """Convert covariances of (column, row), (..., 2, 2) px², to those of (X, Z), m²."""
         sign = cov.new_tensor([1.0, -1.0]) * self.resolution
         return cov * sign[:, None] * sign
 
     def axes(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> tuple[Tensor, Tensor]:
-        """(V,) X of the columns' centres and (U,) Z of the rows' centres, m."""
+        """Return X of the columns' centres (V,) and Z of the rows' centres (U,), m."""
         row, column = (torch.arange(size, dtype=dtype, device=device) for size in self.shape)
         return self.x[0] + column * self.resolution, self.z[1] - row * self.resolution
 
     def cells(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
-        """(U, V, 2) road coordinates (X, Z) of every pixel centre, m."""
+        """Return road coordinates (X, Z) of every pixel centre, (U, V, 2) m."""
         x, z = self.axes(dtype, device)
         z, x = torch.meshgrid(z, x, indexing="ij")
         return torch.stack([x, z], dim=-1)
@@ -89,7 +89,7 @@ class BEVGrid:
 
 @full_precision
 def bev_from_image(extrinsics: Extrinsics, intrinsics: Tensor, grid: BEVGrid) -> Tensor:
-    """Homography from undistorted image pixels to BEV pixels.
+    """Compute the homography from undistorted image pixels to BEV pixels.
 
     Source: Eq. (23), H_WC = S [r₁; r₃; r₂/h] K⁻¹ with r_i the rows of R(θ, φ, ψ). S is the paper's for a
     grid x = (-b_X/2, b_X/2), z = (0, b_Z); other rectangles shift it.

@@ -116,7 +116,7 @@ def fisheye_factor(squared_radius: Tensor, k: Sequence[Tensor]) -> Tensor:
 
 
 def _one_plus_polynomial(variable: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
-    """1 + c₀ v + c₁ v² + …, by Horner's rule."""
+    """Compute 1 + c₀ v + c₁ v² + …, by Horner's rule."""
     value = coefficients[-1].expand_as(variable)
     for coefficient in reversed([torch.ones_like(coefficients[0]), *coefficients[:-1]]):
         value = torch.addcmul(coefficient, value, variable)

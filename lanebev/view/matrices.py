@@ -120,7 +120,7 @@ def _ego_from_road(extrinsics: Extrinsics, matrix: Tensor | None) -> Tensor:
 
 
 def _inverse_rigid(matrix: Tensor) -> Tensor:
-    """Inverse of (..., 4, 4) rigid transforms."""
+    """Invert rigid transforms (..., 4, 4)."""
     rotation = matrix[..., :3, :3].mT
     shift = -(rotation @ matrix[..., :3, 3:])
     return torch.cat([torch.cat([rotation, shift], dim=-1), matrix[..., 3:, :]], dim=-2)

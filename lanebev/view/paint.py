@@ -116,7 +116,7 @@ class ImageFromBEV(nn.Module):
         return cells
 
     def _homography(self, intrinsics: Tensor, extrinsics: Extrinsics) -> Tensor:
-        """(B, 3, 3), undistorted pixels to the map as [-1, 1]; of a plane that is not below, to none."""
+        """Compute undistorted pixels to the map as [-1, 1], (B, 3, 3), if the plane is below."""
         below = extrinsics.height - self.plane_height
         height = torch.where(below > 0, below, 1.0)
         matrix = bev_from_image(extrinsics._replace(height=height), intrinsics, self.grid)

@@ -52,7 +52,7 @@ class CellSums(NamedTuple):
 
 
 def normalised_intrinsics(intrinsics: Tensor, image_size: tuple[int, int]) -> Tensor:
-    """Intrinsics to coordinates in which the image, its outer pixels' edges included, is [-1, 1].
+    """Convert intrinsics to coordinates in which the image, with the edges of its outer pixels, is [-1, 1].
 
     This is the convention of ``grid_sample(align_corners=False)``: the same for maps of every size.
 

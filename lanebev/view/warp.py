@@ -125,7 +125,7 @@ class BEVWarp(nn.Module):
         return points.flatten(2).mT, hidden.flatten(1) == 0
 
     def _planes(self, sampled: Tensor) -> Tensor:
-        """(B, C, P·U, V) to (B, C, P, U, V) where there are planes."""
+        """Reshape (B, C, P·U, V) to (B, C, P, U, V) if there are several planes."""
         if self.plane_heights is None:
             return sampled
         planes: Tensor = sampled.unflatten(2, (len(self.plane_heights), -1))

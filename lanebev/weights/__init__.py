@@ -29,7 +29,7 @@ _FORMER_NAMES = {"noise_factor": "sigma_scale", "pose_factor": "pose_sigma_scale
 
 
 def load_segmenter(path: str | Path | None = None) -> LaneSegmenter:
-    """A segmenter with its weights, ready for inference.
+    """Load a segmenter with its weights, ready for inference.
 
     Args:
         path: a file written by :func:`save_segmenter`; None is the shipped one.
@@ -50,7 +50,7 @@ def load_segmenter(path: str | Path | None = None) -> LaneSegmenter:
 
 
 def read_metadata(path: str | Path | None = None) -> dict[str, Any]:
-    """What a weights file says about itself: config, training, seed, commit, metrics."""
+    """Read the metadata of a weights file: config, training, seed, commit, metrics."""
     metadata, _ = _read(SHIPPED if path is None else Path(path), tensors=False)
     return {name: json.loads(value) for name, value in metadata.items() if name != "format"}
 
@@ -106,7 +106,7 @@ def quantised(weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
-    """Metadata, and every tensor in single precision (counters as they are)."""
+    """Read metadata, and every tensor in single precision (counters unchanged)."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a weights file, there is none")
     if path.suffix == ".ckpt":

@@ -47,7 +47,7 @@ def fit_boundaries(
     num_boundaries: int = NUM_BOUNDARIES,
     least_support: float = 2.0,
 ) -> Boundaries:
-    """Every boundary's own offset and heading, by robust least squares on perpendicular pixel distances.
+    """Fit each boundary's offset and heading by robust least squares on perpendicular pixel distances.
 
     Real lanes are neither equally wide nor parallel: nothing ties the boundaries here but pose and
     curvature. The start is the median offset of a boundary's end points.
@@ -115,7 +115,7 @@ def boundary_polylines(
     extrinsics: Extrinsics,
     num_points: int = 64,
 ) -> tuple[Tensor, Tensor]:
-    """Where boundaries were seen, as polylines in the undistorted image, evenly spaced in rows, near to far.
+    """Return the seen part of each boundary as a polyline in the undistorted image, near to far.
 
     Args:
         boundaries: from :func:`fit_boundaries`.
@@ -140,13 +140,13 @@ def boundary_polylines(
 
 
 def _bend(z: Tensor, curvature: Tensor) -> Tensor:
-    """c0 Z²/2 + c1 Z³/6, (B, M) m."""
+    """Compute c0 Z²/2 + c1 Z³/6, (B, M) m."""
     c0, c1 = curvature.unsqueeze(-1).unbind(1)
     return z * z * (c0 / 2 + c1 * z / 6)
 
 
 def _pixels_per_metre(offset: Tensor, down: Tensor, height: Tensor, focal: Tensor) -> Tensor:
-    """(B, L, 2N): perpendicular pixels in the image per lateral metre on the road."""
+    """Compute the perpendicular pixels in the image per lateral metre on the road, (B, L, 2N)."""
     steepness = (1 + (offset / height).square()).rsqrt()
     return (down * focal / height).unsqueeze(1) * steepness.unsqueeze(-1)
 
@@ -154,7 +154,7 @@ def _pixels_per_metre(offset: Tensor, down: Tensor, height: Tensor, focal: Tenso
 def _fit_line(
     z: Tensor, lateral: Tensor, precision: Tensor, heading_std: float = _HEADING_STD
 ) -> tuple[Tensor, Tensor]:
-    """Weighted line through (z, lateral), (B, M) each, for weights (B, L, M); heading held near zero."""
+    """Fit a weighted line through (z, lateral), (B, M) each, with a prior on its heading."""
     total = precision.sum(-1)
     some = total > 0
     safe = torch.where(some, total, 1.0)
@@ -167,7 +167,7 @@ def _fit_line(
 
 
 def _fit_curvature(z: Tensor, across: Tensor, precision: Tensor) -> Tensor:
-    """Weighted c0 and c1 (B, 2) common to all boundaries, each with its own offset and heading.
+    """Fit weighted c0 and c1 (B, 2) common to all boundaries, each with its own offset and heading.
 
     Source: least squares with the offsets and headings eliminated (Frisch and Waugh 1933): the lines through
     each boundary are taken off the shapes Z²/2 and Z³/6 and off the points (B, M), then these are fitted.

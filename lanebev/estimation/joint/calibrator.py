@@ -82,7 +82,7 @@ class JointCalibrator(Calibrator[JointState]):
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
     ) -> JointState:
-        """State before the first frame: the prior, UNINITIALISED."""
+        """Return the state before the first frame: the prior, UNINITIALISED."""
         check_new_state(batch_size, dtype)
         cfg = self.config
         like = torch.zeros((), dtype=dtype, device=device)
@@ -116,7 +116,7 @@ class JointCalibrator(Calibrator[JointState]):
         dt: Tensor,
         lane_width: Tensor,
     ) -> tuple[Calibration, JointState]:
-        """One frame, see :meth:`~lanebev.estimation.calibrator.Calibrator.forward`.
+        """Process one frame, see :meth:`~lanebev.estimation.calibrator.Calibrator.forward`.
 
         After a frame that comes late the next dt counts from it. Inliers fit the road; 0 for a boundary too
         far out of place to bound a lane, as the foot of a barrier, be it for long or in this frame.

@@ -50,7 +50,7 @@ def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor) -> Ten
 
 
 def accumulate_evidence(before: Tensor, score: Tensor, dt: Tensor, memory: float) -> Tensor:
-    """Sum the scores of shape and deviations over time, at unit variance; those of the pose count at once.
+    """Accumulate the scores of shape and deviations at unit variance; use those of the pose directly.
 
     Source: (J15).
 

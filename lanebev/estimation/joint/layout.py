@@ -44,7 +44,7 @@ class Layout(NamedTuple):
     size: int
 
     def chain(self, axis: int) -> tuple[int, int, int, int, int]:
-        """Indices of an axis of the pose: its value, three derivatives and slow mean."""
+        """Return the indices of an axis of the pose: its value, three derivatives and slow mean."""
         starts = (0, self.rates.start, self.accelerations.start, self.jerks.start, self.means.start)
         first, second, third, fourth, fifth = (int(start) + axis for start in starts)
         return first, second, third, fourth, fifth

@@ -131,7 +131,7 @@ def observations(segments: LaneSegments, intrinsics: Tensor) -> Observations:
 
 
 def boundary_places(lane_width: float | Tensor, num_boundaries: int, like: Tensor) -> Tensor:
-    """X of each boundary from the middle of the ego lane, the lane between boundaries L/2 - 1 and L/2.
+    """Compute X of each boundary from the middle of the ego lane, that between boundaries L/2 - 1 and L/2.
 
     Args:
         lane_width: float, (B,) or (B, L-1) m.
@@ -151,7 +151,7 @@ def boundary_places(lane_width: float | Tensor, num_boundaries: int, like: Tenso
 
 
 def look(params: Tensor, seen: Observations, phase: Tensor | None = None) -> Sight:
-    """See the end points from a pose.
+    """Compute rays of the end points in road axes and where they meet the road.
 
     Args:
         params: as in :func:`boundary_residuals`.

@@ -89,7 +89,7 @@ class FramePrior:
             raise ValueError(f"height: expected more than 0 m, got {self.height}")
 
     def mean(self, like: Tensor) -> Tensor:
-        """(7,) in the order of ``joint_model``."""
+        """Return the means (7,), in the order of ``measurement``."""
         return like.new_tensor([self.pitch, self.yaw, self.roll, self.height, 0.0, 0.0, 0.0])
 
     def std(self, like: Tensor) -> Tensor:
@@ -165,7 +165,7 @@ def fit_single_frame(
     start_segments: int = 96,
     iterations: int = 8,
 ) -> SingleFrameFit:
-    """Robust maximum a posteriori fit of one frame, each row of the batch on its own.
+    """Compute the robust maximum a posteriori fit of one frame, for each row of the batch.
 
     Survives 50 % gross outliers with 5 % wrong boundary indices. What the boundaries in sight do not
     determine stays at the prior with the prior's covariance. Never raises on contents: a row without
@@ -288,7 +288,7 @@ def refine(
 
 
 def normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Jᵀ W J (B, P, P) and Jᵀ W r (B, P), from (B, P, 2N), (B, N, 2) and a weight (B, N) per segment."""
+    """Compute Jᵀ W J and Jᵀ W r, (B, P, P) and (B, P), from (B, P, 2N), (B, N, 2) and a weight (B, N)."""
     weighted = jacobian * weight.repeat_interleave(2, dim=1).unsqueeze(1)
     return weighted @ jacobian.mT, (weighted @ distance.flatten(1).unsqueeze(-1)).squeeze(-1)
 
@@ -330,7 +330,7 @@ def _spread(steps: int, like: Tensor) -> Tensor:
 
 
 def linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Tensor:
-    """Best pitch for every roll of the grid, by robust linear fits.
+    """Find the best pitch for every roll of the grid, by robust linear fits.
 
     With the road's axes right, down, forward for yaw 0, ray·right = a V + g x_k V + t F + b F² / (2 V),
     V = ray·down, F = ray·forward: linear in a = offset / h', g = 1 / h', t = tan(heading), b = c0 h.

@@ -41,7 +41,7 @@ class Link(NamedTuple):
 
 
 def link_states(before: JointState, after: JointState, dt: Tensor, cfg: JointConfig) -> Link:
-    """Repeat the prediction that led from one frame's state to the next one's.
+    """Repeat the prediction from one frame's state to the next one's.
 
     A start takes over nothing of the state before. Where the boundaries' numbers moved, offset and deviations
     are other quantities. A frame that was skipped moved nothing. Where roll was considered and not estimated,

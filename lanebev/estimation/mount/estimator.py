@@ -179,7 +179,7 @@ class MountEstimator(nn.Module):
         return state._replace(contradicted=torch.where(agrees, 0.0, seconds))
 
     def _close_blocks(self, state: MountState) -> tuple[MountState, Tensor]:
-        """Push each axis' full block and judge it by the others; (B, 4) bool where the camera was moved."""
+        """Append full blocks and compare them with the others; (B, 4) bool: the camera was moved."""
         cfg = self.config
         full = state.seconds >= cfg.block_time - 1e-4  # rounding of the summed steps
         time = torch.where(full, state.seconds, 1.0)
@@ -278,7 +278,7 @@ class MountEstimator(nn.Module):
 def _answer(
     pose: Tensor, variance: Tensor, status: Tensor, progress: Tensor, why: Tensor
 ) -> MountCalibration:
-    """Sum up the axes: calibrated if all are, otherwise the gravest status of any."""
+    """Summarise the axes: calibrated if all are, otherwise the gravest status of any."""
     calibrated = status == int(MountStatus.CALIBRATED)
     whole = torch.where(calibrated.any(-1), int(MountStatus.PARTIAL), int(MountStatus.UNCALIBRATED))
     for grave in (MountStatus.RECALIBRATING, MountStatus.INVALID):

@@ -45,7 +45,7 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
     ) -> TwoStageState:
-        """State before the first frame: the initial pose with its uncertainty, UNINITIALISED."""
+        """Return the state before the first frame: the initial pose with its uncertainty, UNINITIALISED."""
         check_new_state(batch_size, dtype)
         cfg = self.config
         pose, pose_std = cfg.initial_pose, cfg.initial_pose_std
@@ -75,7 +75,7 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
         dt: Tensor,
         lane_width: Tensor,
     ) -> tuple[Calibration, TwoStageState]:
-        """One frame, see :meth:`~lanebev.estimation.calibrator.Calibrator.forward`."""
+        """Process one frame, see :meth:`~lanebev.estimation.calibrator.Calibrator.forward`."""
         guessed = ~dt.isfinite()
         dt = torch.where(guessed, self.config.assumed_dt, dt)
         before, skip = state, (dt <= 0) & is_running(state.status)
@@ -117,7 +117,7 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
 
 
 def _status(before: Tensor, seen: Tensor, unseen: Tensor, lost_after: float) -> Tensor:
-    """initialise -> track -> coast -> lost -> re-initialise, per row."""
+    """Update the status of each row: initialise -> track -> coast -> lost -> re-initialise."""
     coasting = torch.where(unseen > lost_after, int(Status.LOST), int(Status.COASTING))
     idle = (before == int(Status.UNINITIALISED)) | (before == int(Status.LOST))
     unsupported = torch.where(idle, before, coasting)
@@ -127,7 +127,7 @@ def _status(before: Tensor, seen: Tensor, unseen: Tensor, lost_after: float) -> 
 def _reasons(
     segments: LaneSegments, direction: DirectionStep, roll_height: RollHeightStep, status: Tensor
 ) -> Tensor:
-    """(B,) int64 flags of :class:`Reason` for a frame that was not skipped."""
+    """Return flags (B,) int64 of :class:`Reason` for a frame that was not skipped."""
     empty = ~(segments.weight > 0).any(-1)
     idle = (status == int(Status.UNINITIALISED)) | (status == int(Status.LOST))
     return (
