@@ -1,4 +1,4 @@
-"""lanebev: the pose of a camera over the road, frame by frame, from lane boundaries alone."""
+"""lanebev: estimate the pose of a camera above the road, frame by frame, from lane boundaries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line: arguments, nothing else."""
+"""The command line: parse arguments and call the commands."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _DOCTOR_SETTINGS = (
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
+    """Reports an error in one line."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {message}; see {self.prog} --help\n")

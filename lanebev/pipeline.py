@@ -1,4 +1,4 @@
-"""LaneBEV: the modules wired together. Adds no maths."""
+"""LaneBEV: combines the modules; contains no maths."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STAGES = ("segmenter", "extractor", "calibrator", "warp")
 
 @register_pytree
 class LaneBEVOutput(NamedTuple):
-    """What one frame, or with (B, T) input every frame, gives.
+    """Output for one frame, or for every frame with (B, T) input.
 
     Attributes:
         bev: (B, 3, U, V), zero where not valid; None where it was not asked for.

@@ -1,4 +1,4 @@
-"""Live use: one object that keeps a drive's state from frame to frame."""
+"""Live use: one object that holds a drive's state from frame to frame."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _LOOKED_AT = 5  # steps that are looked at for that
 
 
 class SessionResult(NamedTuple):
-    """What a frame gave.
+    """Result of one frame.
 
     Attributes:
         stamp: s, as given; None where none was.

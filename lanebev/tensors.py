@@ -1,4 +1,4 @@
-"""Operations on tensors and NamedTuples of them that know nothing of what they mean."""
+"""Generic operations on tensors and NamedTuples of tensors."""
 
 from __future__ import annotations
 

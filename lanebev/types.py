@@ -1,4 +1,4 @@
-"""The tuples of tensors and the status that cross module borders."""
+"""Named tuples of tensors that modules pass to each other, and the status."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def check_tensor(name: str, value: object) -> None:
 
 
 class Status(IntEnum):
-    """What a row of a calibration is worth. A new meaning is a new value."""
+    """Status of a row of a calibration. A new meaning is a new value."""
 
     UNINITIALISED = 0  # nothing has been seen yet: the extrinsics are the initial guess
     TRACKING = 1  # this frame's observations were used

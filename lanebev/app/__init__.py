@@ -1,1 +1,1 @@
-"""The main job: settings, the run over a source, its records, the demo."""
+"""The commands: settings, the run over a source, its recorder, the demo."""

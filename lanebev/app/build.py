@@ -1,4 +1,4 @@
-"""The parts of a run, made of its settings."""
+"""Build the parts of a run from its settings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``lanebev compare``: two runs side by side on one page."""
+"""``lanebev compare``: compare two runs on one page."""
 
 from __future__ import annotations
 

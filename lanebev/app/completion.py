@@ -6,7 +6,7 @@ import argparse
 
 
 class PrintCompletion(argparse.Action):
-    """Prints what a shell completes with, by shtab."""
+    """Prints the completion script of a shell, by shtab."""
 
     def __call__(self, parser: argparse.ArgumentParser, _: object, values: object, __: object = None) -> None:
         """Print it and end."""

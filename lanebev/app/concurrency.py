@@ -1,4 +1,4 @@
-"""Decoding, network and writing side by side: threads in front that read and look, one behind that writes."""
+"""Decode, process and write in parallel: threads ahead that read and process, one behind that writes."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def map_ahead(call: Callable[[T], Result], items: Iterable[T], workers: int) -> 
 
 
 class Background:
-    """Runs calls one after another in a thread; ``with`` waits for them and raises what they raised."""
+    """Runs calls one after another in a thread; ``with`` waits for them and raises their exceptions."""
 
     def __init__(self, depth: int = 8) -> None:
         self._calls: queue.Queue[Callable[[], object] | None] = queue.Queue(depth)

@@ -1,4 +1,4 @@
-"""``lanebev convert``: a finished run in a format of other programs."""
+"""``lanebev convert``: write the results of a finished run in another program's format."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lanebev.io.whole_file import whole_file
 
 
 class Writer(Protocol):
-    """Writes a run to a file, with images of its frames if they are given and the format shows them."""
+    """Writes a run to a file, with the images of its frames if given and if the format contains images."""
 
     def __call__(self, path: Path, record: RunRecord, images: Iterable[Frame] | None = None) -> None:
         """Write the file."""

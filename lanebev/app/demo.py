@@ -1,4 +1,4 @@
-"""``lanebev demo``: a rendered drive through the main job, with the truth beside what was found."""
+"""``lanebev demo``: run on a rendered drive and compare the result with the truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``lanebev doctor``: whether a camera fits a source, and whether a run on it can be trusted."""
+"""``lanebev doctor``: check if a camera fits a source, and if a run on it can be trusted."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _POSE = ((-15.0, 25.0), (-15.0, 15.0), (-8.0, 8.0), (0.8, 4.0))  # pitch, yaw, r
 
 
 class Finding(NamedTuple):
-    """One thing that was looked at.
+    """The result of one check.
 
     Attributes:
         level: OK, DOUBT or WRONG.
@@ -45,7 +45,7 @@ class Finding(NamedTuple):
 
 @dataclass
 class Sample:
-    """What was seen in some frames of a source.
+    """Some frames of a source and the lanes found in them.
 
     Attributes:
         undecoded: number of frames that did not decode.

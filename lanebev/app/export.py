@@ -1,4 +1,4 @@
-"""Parts of the model as files for other runtimes."""
+"""``lanebev export``: write parts of the model as files for other runtimes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is kept of every frame until the end of a run, in a few bytes: ten hours have a million frames."""
+"""Compact storage of every frame until the end of a run: ten hours have a million frames."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NUMBERS = 9  # of a row, from time_s on
 
 
 class KeptRows(Sequence[ExtrinsicsRow]):
-    """Rows of ``extrinsics.csv`` as columns, in 0.1 kB each; a row is made when it is asked for."""
+    """Rows of ``extrinsics.csv`` stored as columns, 0.1 kB each; a row is made when it is requested."""
 
     def __init__(self, rows: Iterable[ExtrinsicsRow] = ()) -> None:
         self._numbers, self._counts, self._codes = array("d"), array("q"), array("l")
@@ -61,7 +61,7 @@ class KeptRows(Sequence[ExtrinsicsRow]):
 
 
 class KeptNumbers:
-    """Arrays of one shape, a frame each, as their numbers only.
+    """Arrays of one shape, one for each frame, stored as their numbers only.
 
     Args:
         shape: of each.

@@ -1,4 +1,4 @@
-"""What the network sees in a part of a drive, for the run on the whole of it."""
+"""Run the network on a part of a drive, for the later run on the whole drive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a run's boundary vertices come from: a lane file, or the network."""
+"""Sources of a run's boundary vertices: a lane file, or the network."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _WORKERS_SHARED = 2  # one frame of a drive is in the batch that is looked at, a
 
 
 class Observation(NamedTuple):
-    """What was seen in one frame.
+    """Lane boundaries found in one frame.
 
     Attributes:
         vertices: of batch size 1.
@@ -36,7 +36,7 @@ class Observation(NamedTuple):
 
 
 class Observer(Protocol):
-    """Finds the lane boundaries in a frame; in one that did not decode it finds none.
+    """Finds the lane boundaries in a frame; none in a frame that did not decode.
 
     Attributes:
         remark: what should be said of all frames together, else empty.
@@ -88,7 +88,7 @@ class LaneFileObserver:
 
 
 class NetworkObserver:
-    """Lanes from the images, by LaneBEV's network and line extraction.
+    """Finds lanes in the images by LaneBEV's network and line extraction.
 
     Args:
         network: whose segmenter and extractor are used, by itself or in batches with other drives.

@@ -1,4 +1,4 @@
-"""What shows how far a long job is."""
+"""Progress of a long job."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Item = TypeVar("Item")
 
 
 class Progress(Protocol):
-    """Wraps the items of a job and shows how many of them are done."""
+    """Wraps the items of a job and shows how many are done."""
 
     def __call__(self, items: Iterator[Item], total: int) -> Iterator[Item]:
         """Pass the items on.

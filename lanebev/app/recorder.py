@@ -1,4 +1,4 @@
-"""Everything a run writes, frame by frame, while it runs."""
+"""Write the outputs of a run frame by frame."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _MOST_PROBLEMS = 1000  # of frames, that are listed
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """One frame, done.
+    """Results of one frame.
 
     Attributes:
         frame: as it came.

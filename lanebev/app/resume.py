@@ -1,4 +1,4 @@
-"""Begin with the state of an earlier run."""
+"""Start from the state of an earlier run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The main job: frames in, extrinsics and a stable bird's-eye view out."""
+"""``lanebev run``: frames in, extrinsics and a stable bird's-eye view out."""
 
 from __future__ import annotations
 

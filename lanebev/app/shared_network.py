@@ -1,4 +1,4 @@
-"""One network for several drives: frames that wait at the same time are one batch."""
+"""One network for several drives: frames that wait at the same time form one batch."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from lanebev.tensors import map_tensors
 
 
 class _Request(NamedTuple):
-    """An image (1, 3, H, W) that waits, and where its vertices go."""
+    """A waiting image (1, 3, H, W), and where its vertices go."""
 
     image: Tensor
     answer: Future[BoundaryVertices]
 
 
 class SharedNetwork:
-    """Looks at frames of several drives, each in a thread of its own.
+    """Runs the network on frames of several drives, each in its own thread.
 
     Whoever finds the network free looks at all frames of one size that wait then, as one batch. Nobody waits
     for frames that have not come: a drive that ends or fails holds up no other.

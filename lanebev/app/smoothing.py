@@ -1,4 +1,4 @@
-"""The first of the two passes of ``lanebev run --smooth``: every pose of a drive from all of its frames."""
+"""First pass of ``lanebev run --smooth``: estimate every pose of a drive from all of its frames."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _NO_LANES = (np.empty(0), np.empty((0, 0)))  # rows, and columns of curves: what
 
 
 class SmoothedPoses(NamedTuple):
-    """Poses of a drive as they go out, by number of the frame.
+    """Smoothed poses of a drive by frame number.
 
     Attributes:
         poses: (F, 4) rad, rad, rad, m.
@@ -51,7 +51,7 @@ class SmoothedPoses(NamedTuple):
 
 
 class KeptStates(Sequence[JointState]):
-    """States of batch size 1 after every frame, in a file: memory stays flat.
+    """States of batch size 1 after every frame, stored in a file so that memory stays constant.
 
     A state of six boundaries takes 6 kB, so that an hour at 30 frames a second takes 0.6 GB.
 

@@ -1,4 +1,4 @@
-"""The source of a run, made of its settings; and how a stream is ended."""
+"""Open the source of a run from its settings, and end a stream."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run says of itself: for the report, and at its end."""
+"""Facts about a run: for the report, and printed at its end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Take up what a run that was killed had seen: the network does not look at those frames again."""
+"""Continue a run that was killed: the network is not run again on the frames that it had processed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SETTINGS, _SEEN = ".settings.json", ".seen.json"  # in the temporary folder
 
 
 class RestoringObserver(Observer, Protocol):
-    """An observer that gives again what it saw."""
+    """An observer that can return its earlier observations."""
 
     def restored(self, found: FrameLines) -> Observation:
         """Return the observation of a frame from its entry in lanes.json."""
@@ -38,7 +38,7 @@ def frame_name(frame: Frame, source: FrameSource) -> str:
 
 
 class TakenUp:
-    """Gives what an earlier run saw in the first frames, and lets another observer look at the others.
+    """Returns an earlier run's observations of the first frames, and another observer's of the others.
 
     Args:
         entries: of the frames from the first one on.

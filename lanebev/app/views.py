@@ -1,4 +1,4 @@
-"""Bird's-eye views of a run, before calibration and after."""
+"""Bird's-eye views of a run before and after calibration."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _NOMINAL_HEIGHT = 1.5  # m, of the view before anything is known
 
 
 class ViewBefore:
-    """Tell the pose of the view before: level for images on their own, in a drive the first that was tracked.
+    """Chooses the pose of the view before calibration: level for stills, in a drive the first tracked one.
 
     Args:
         alone: images on their own.

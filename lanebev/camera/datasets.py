@@ -1,4 +1,4 @@
-"""Cameras in data sets' own files, which leave the image's size to the images: KITTI, nuScenes, OpenLane."""
+"""Camera files of data sets that state no image size: KITTI, nuScenes, OpenLane."""
 
 from __future__ import annotations
 

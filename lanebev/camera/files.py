@@ -1,4 +1,4 @@
-"""Camera files: those of many programs and data sets in; a ``camera_info`` YAML out.
+"""Camera files: read those of many programs and data sets, write a ``camera_info`` YAML.
 
 Reading is strict: an unknown key, a missing, non-finite or absurd value is a ``ValueError`` of one line.
 """

@@ -1,4 +1,4 @@
-"""Camera files' dialects: OpenCV, ROS and our short YAML; Kalibr, EuRoC and CamOdoCal."""
+"""Formats of camera files: OpenCV, ROS and the short YAML; Kalibr, EuRoC and CamOdoCal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A camera as plain numbers, and what a real one can be like."""
+"""A camera as plain numbers, and checks of their range."""
 
 from __future__ import annotations
 

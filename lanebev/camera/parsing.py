@@ -1,4 +1,4 @@
-"""Camera files' syntax: YAML, JSON and XML to keys and values; scalars stay texts, as they were written.
+"""Syntax of camera files: YAML, JSON and XML to keys and values; scalars stay unparsed texts.
 
 YAML 1.1 would make 416 of a width of 0640, and 750 of 12:30.
 """

@@ -1,4 +1,4 @@
-"""The interface of all online calibrators, and the checks and casts that every one of them needs."""
+"""The interface of all online calibrators, and the checks and casts that they share."""
 
 from __future__ import annotations
 

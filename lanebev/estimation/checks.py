@@ -1,4 +1,4 @@
-"""What every calibrator asks of its input: shapes at the border, and unusable entries to weight zero."""
+"""Checks of a calibrator's input: shapes at the border, weight zero for unusable entries."""
 
 from __future__ import annotations
 

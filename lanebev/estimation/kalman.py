@@ -1,4 +1,4 @@
-"""Batched Kalman prediction and update. Knows nothing of lanes or cameras.
+"""Batched Kalman prediction and update, independent of lanes and cameras.
 
 The update is in information form: N scalar measurements enter as a D × D matrix and a D-vector, so it
 costs O(N D²) where the gain form inverts an N × N matrix (Eq. (15)), and a measurement of weight zero is

@@ -1,4 +1,4 @@
-"""Why a frame is not (fully) tracked."""
+"""Reasons why a frame is not, or not fully, tracked."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntFlag
 
 
 class Reason(IntFlag):
-    """Why a row is not (fully) tracked; several may hold at once. A new meaning is a new value."""
+    """Why a row is not, or not fully, tracked; several may hold at once. A new meaning is a new value."""
 
     NONE = 0
     NO_SEGMENTS = 1  # nothing was seen in this frame

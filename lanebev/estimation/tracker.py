@@ -1,4 +1,4 @@
-"""A calibrator and a mount over the frames of a drive, with the states that they hand on."""
+"""A calibrator and a mount estimator over the frames of a drive, with their states."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lanebev.types import Calibration, Extrinsics
 
 
 class Estimate(NamedTuple):
-    """What the vertices of a frame lead to; tensors are of batch size 1.
+    """Results for the vertices of one frame; tensors are of batch size 1.
 
     Attributes:
         segments: what the calibrator was given.

@@ -51,7 +51,7 @@ class LiveFigures:
 
 @dataclass(frozen=True)
 class LiveSource(FrameSource):
-    """A stream that is read in a thread of its own, which keeps the newest frame only.
+    """A stream that is read in its own thread, which keeps the newest frame only.
 
     Frames' times are those of their arrival. Who cannot look at every frame is given the newest, so that the
     delay is that of one frame however slow the looking is. The thread reads from the opening on, also while
@@ -129,7 +129,7 @@ def _read(container: av.container.InputContainer, slot: _Slot, figures: LiveFigu
 
 
 class _Slot:
-    """Where the reader leaves the newest frame: one place, no lock that a signal handler could wait for."""
+    """Place of the newest frame, without a lock that a signal handler could wait for."""
 
     def __init__(self, waits: bool, figures: LiveFigures) -> None:
         self._waits, self._figures = waits, figures

@@ -1,4 +1,4 @@
-"""The output folder: complete or not there at all, and ``extrinsics.csv`` in it."""
+"""The output folder, written completely or not at all, and ``extrinsics.csv`` in it."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def check_inputs_stay(folder: str | Path, inputs: Iterable[str | Path]) -> None:
 
 
 class OutputFolderError(ValueError):
-    """The outputs, not the inputs, are why a run ends: no room, no permission, another run at work."""
+    """The output folder cannot be used: no space, no permission, or another run writes into it."""
 
 
 class OutputFolder:

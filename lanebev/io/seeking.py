@@ -1,4 +1,4 @@
-"""Begin a video in its middle, with the very frames that decoding from its beginning would give."""
+"""Start a video in its middle with exactly the frames of a decoding from its beginning."""
 
 from __future__ import annotations
 

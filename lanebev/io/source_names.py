@@ -1,4 +1,4 @@
-"""What kind of source a text names, by the text and the file system alone. Imports nothing heavy."""
+"""The kind of a source by its name and the file system. Imports nothing heavy."""
 
 from __future__ import annotations
 

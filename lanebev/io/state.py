@@ -1,4 +1,4 @@
-"""States of calibrators and mount on disk: written atomically, read back bit for bit or not at all."""
+"""States of calibrators and mount on disk: written atomically, read back exactly or not at all."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SEPARATOR = "."
 
 
 class LoadedState(NamedTuple):
-    """What :func:`load_state` found.
+    """Result of :func:`load_state`.
 
     Attributes:
         states: the named tuples of tensors, by name; empty if the file was refused.
@@ -116,7 +116,7 @@ def load_state(
 
 
 class _RefusedError(Exception):
-    """Why a file is not used."""
+    """The reason why a file is not used."""
 
 
 def _read(path: str | Path) -> tuple[dict[str, str], dict[str, Any], dict[str, Tensor]]:

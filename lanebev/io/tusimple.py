@@ -1,4 +1,4 @@
-"""TuSimple's JSON lines, and what ours say besides."""
+"""TuSimple's JSON lines, and lanebev's additional keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames in from a video, a folder, a glob or one image; H.264 that browsers play out."""
+"""Frames of a video, a folder, a glob or one image; H.264 output for browsers."""
 
 from __future__ import annotations
 

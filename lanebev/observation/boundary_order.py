@@ -1,4 +1,4 @@
-"""Which semantic boundary each of a frame's lines is, by the side of the ego lane it lies on."""
+"""Number the lines of a frame as semantic boundaries, by their side of the ego lane."""
 
 from __future__ import annotations
 

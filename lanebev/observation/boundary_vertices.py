@@ -1,4 +1,4 @@
-"""Vertices on lane boundaries, before they are paired: what every detector gives."""
+"""Vertices on lane boundaries, the common output of all detectors, before pairing."""
 
 from __future__ import annotations
 

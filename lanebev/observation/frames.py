@@ -1,4 +1,4 @@
-"""Frames as cameras and decoders give them, and as the network wants them."""
+"""Convert frames of cameras and decoders to the network's input."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ NETWORK_CORRELATION = 10.0
 
 
 class LineExtractor(nn.Module):
-    """Logits to the vertices of lane boundaries, or to :class:`~lanebev.LaneSegments`.
+    """Converts logits to the vertices of lane boundaries, or to :class:`~lanebev.LaneSegments`.
 
     Source: Sect. "Experiments": where a boundary's probability is larger than 0.5, the mean position of its
     on-pixels, then representative vertices. Deviation: so it is on maps of zeros and ones; on others a pixel

@@ -1,4 +1,4 @@
-"""Polylines of any lane detector, in pixels of the image as it came, to boundary vertices and back."""
+"""Convert polylines of any lane detector, in pixels as taken, to boundary vertices and back."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class SegmenterConfig:
 
 
 class LaneSegmenter(nn.Module):
-    """One class per semantic lane boundary, and background.
+    """Segmentation network with one class per semantic lane boundary, and background.
 
     Source: Sect. "Experiments", FCN (Shelhamer et al. 2017) on ResNet-18. Deviation: the skips fuse features
     instead of scores, and strip convolutions pass messages along the lanes (after Pan et al. 2018 and Zheng

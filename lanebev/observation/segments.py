@@ -1,4 +1,4 @@
-"""Line segments on lane boundaries: vertices paired, one road from any detector to a calibrator."""
+"""Line segments on lane boundaries: vertices of any detector, paired for the calibrators."""
 
 from __future__ import annotations
 

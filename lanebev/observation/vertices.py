@@ -1,4 +1,4 @@
-"""Probability maps to vertices: where rows and columns cross each boundary.
+"""Extract vertices from probability maps: where rows and columns cross each boundary.
 
 Label pixels are cells of the map. Everything is differentiable in the probabilities.
 """
@@ -28,7 +28,7 @@ _NEIGHBOURS = 5  # scans on either side that decide a vertex' direction and scat
 
 @dataclass(frozen=True)
 class LineConfig:
-    """How lines are read off the maps.
+    """Numbers of the line extraction.
 
     Attributes:
         stride: px of the network's input per label px.

@@ -47,7 +47,7 @@ class SmoothNoise:
         self.weight = amplitude * weight / weight.norm() / math.sqrt(2)
 
     def __call__(self, time: float) -> float:
-        """Value at ``time`` s."""
+        """Return the value at ``time`` s."""
         return float((self.weight * (self.rate * time + self.phase).sin()).sum())
 
 
@@ -128,7 +128,7 @@ class Drive:
         self._wave_bend = hills * sampler.uniform(0, 1, 3)[0].double() / 9000.0
 
     def curvature_at(self, arc: Tensor) -> Tensor:
-        """Curvature of the road, 1/m, at arc lengths from the drive's start, m: linear between nodes."""
+        """Return the road's curvature, 1/m, at arc lengths from the drive's start; linear between nodes."""
         position = (arc / 90.0 + 1.0).clamp(0, len(self._curvature) - 1.001)
         index = position.long()
         low, high = self._curvature[index], self._curvature[index + 1]
@@ -139,7 +139,7 @@ class Drive:
         return float(torch.trapezoid(self.curvature_at(nodes), nodes))
 
     def _elevation_about(self, arc: float, ahead: Tensor) -> Tensor:
-        """Elevation above the tangent at ``arc``, m, for distances ``ahead`` m."""
+        """Return the elevation above the tangent at ``arc``, m, for distances ``ahead`` m."""
         amplitude = self._wave_bend / self._wave**2
         angle = self._wave * arc + self._wave_phase
         there = (self._wave * (ahead[..., None] + arc) + self._wave_phase).sin()
@@ -147,7 +147,7 @@ class Drive:
         return (amplitude * (there - tangent)).sum(-1)
 
     def _sample_lanes(self, sampler: BatchSampler, first: int, duration: float, lane_changes: bool) -> None:
-        """Lane changes as (start time, from lane, to lane)."""
+        """Return lane changes as (start time, from lane, to lane)."""
         street = self.world.street
         lowest, lanes = int(street.first), int(street.own) or int(self.world.layout.exists.sum()) - 1
         self._changes: list[tuple[float, int, int]] = []
@@ -163,7 +163,7 @@ class Drive:
         return float(self.world.layout.across[0, lane : lane + 2].mean())
 
     def _across(self, time: float) -> float:
-        """m across at a time: the lane's middle, lane changes with smooth lateral jerk, and wander."""
+        """Return the lateral position at a time, m: the lane's middle, smooth lane changes, and wander."""
         place = self._lane_middle(self._first_lane)
         for start, old, new in self._changes:
             u = min(max((time - start) / _LANE_CHANGE, 0.0), 1.0)
@@ -198,7 +198,7 @@ class Drive:
             self._mount = [float(value) for value in mount]
 
     def extrinsics_at(self, time: float) -> Extrinsics:
-        """True pose over the road at a time, each (1,)."""
+        """Return the true pose over the road at a time, each (1,)."""
         arc = self.speed * time
         h = 0.01
         slip = (self._across(time + h) - self._across(time - h)) / (2 * h * self.speed)
@@ -230,7 +230,7 @@ class Drive:
         return world._replace(traffic=traffic._replace(speed=speed, valid=valid))
 
     def _world_at(self, arc: float, time: float) -> World:
-        """The world, its traffic where it is by then and its scenery wrapped about the camera."""
+        """Return the world with its traffic at this time and its scenery wrapped about the camera."""
         traffic = self.world.traffic
         ahead = traffic.along + traffic.speed * time  # of the camera
         oncoming, still = traffic.speed < _COMING, traffic.speed == 0
@@ -244,7 +244,7 @@ class Drive:
         return self.world._replace(traffic=traffic, bridge=bridge)
 
     def alignment_at(self, arc: float) -> Alignment:
-        """The road's course from ``arc`` m after the start on."""
+        """Return the road's course from ``arc`` m after the start on."""
         ahead = arc_nodes()
         return build_alignment(self.curvature_at(ahead + arc)[None], self._elevation_about(arc, ahead)[None])
 
@@ -302,7 +302,7 @@ def _default_camera(image_size: tuple[int, int]) -> Camera:
 
 
 def _sample_drive_world(sampler: BatchSampler, weather: str, kind: str) -> tuple[World, Tensor]:
-    """Any world, or the first on a clear day."""
+    """Sample a world for a drive: any, or the first one on a clear day."""
     while True:
         world, lane = sample_world(sampler, kind)
         if weather == "any" or int(world.weather.kind) == CLEAR:

@@ -23,7 +23,7 @@ _SLACK = 0.3  # m; nearer to a boundary than this does not hide it
 def boundary_points(
     layout: Layout, place: Place, alignment: Alignment, lens: Lens, nearest: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Centres of the labelled boundaries in the local road frame.
+    """Compute the centres of the labelled boundaries in the local road frame.
 
     Args:
         layout: of the road.
@@ -52,7 +52,7 @@ def boundary_points(
 
 
 def project(points: Tensor, lens: Lens, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Points (B, N, 3) right, down, forward from the camera to pixels.
+    """Project points (B, N, 3) right, down, forward from the camera to pixels.
 
     Returns:
         (B, N, 2) px undistorted, (B, N, 2) px as taken, (B, N) bool: inside the image.
@@ -70,7 +70,7 @@ def project(points: Tensor, lens: Lens, size: tuple[int, int]) -> tuple[Tensor, 
 
 
 def frame_truth(image: Tensor, blocked: Tensor, scene: Scene, nearest: Tensor) -> RenderedFrame:
-    """Images with what is true of them.
+    """Return images with their true boundaries, lanes and boxes.
 
     Args:
         image: (B, 3, H, W).

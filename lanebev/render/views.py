@@ -76,7 +76,7 @@ def render_scenes(
 
 
 def sample_place(sampler: BatchSampler, world: World, ego_lane: Tensor) -> tuple[World, Place]:
-    """Random places in the ego lane, at times close to its border or over it, and the worlds about them."""
+    """Sample places in the ego lane, at times near its border or over it, and the worlds about them."""
     across = world.layout.across
     left, right = (across.gather(1, ego_lane[:, None] + i)[:, 0] for i in (0, 1))
     start = sampler.uniform(0, 3000)  # elsewhere in the endless textures
@@ -105,7 +105,7 @@ def render_views(
     ideal_sensor: bool = False,
     rows: int | None = None,
 ) -> RenderedFrame:
-    """Random scenes, poses, lenses and weather, one image each.
+    """Render random scenes, poses, lenses and weather, one image each.
 
     The same state of the generator gives the same scenes on every device, and on one device the same images
     bit for bit. What a row shows depends on the batch size, since all rows draw from one generator.
@@ -173,7 +173,7 @@ def _through_window(
 
 
 def _on_cpu(generator: torch.Generator) -> torch.Generator:
-    """The generator itself, or one of the CPU with a seed drawn from one of another device."""
+    """Return the generator itself, or one on the CPU with a seed drawn from one on another device."""
     if generator.device.type == "cpu":
         return generator
     seed = torch.randint(2**62, (), generator=generator, device=generator.device)

@@ -1,1 +1,1 @@
-"""What a person looks at: overlay, plots, page."""
+"""Outputs for people: overlay, plots, page."""

@@ -1,4 +1,4 @@
-"""What each frame tells about pitch, yaw, roll and height: measured, uncertain, held, lost or unknown."""
+"""State of pitch, yaw, roll and height in each frame: measured, uncertain, held, lost or unknown."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LARGEST_STD = (*np.degrees(_RADIANS[:3]).tolist(), _RADIANS[3])
 
 
 class AxisState(IntEnum):
-    """What a frame tells about one axis, the better first."""
+    """How well a frame determines one axis, best first."""
 
     MEASURED = 0  # from this frame's lane boundaries
     UNCERTAIN = 1  # measured, but with a standard deviation above LARGEST_STD

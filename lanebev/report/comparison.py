@@ -1,4 +1,4 @@
-"""Two runs side by side: how their estimates differ over common frames, and which settings do."""
+"""Compare two runs: differences of their estimates over common frames, and of their settings."""
 
 from __future__ import annotations
 

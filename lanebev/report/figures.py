@@ -1,4 +1,4 @@
-"""How figures look, and Bokeh for the page: what all plots share."""
+"""Common style of all plots, and Bokeh for the page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All numbers of a lens, for people."""
+"""A table of all numbers of a lens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Words on pictures, drawn in place."""
+"""Draw text on pictures, in place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person checks in a bird's-eye view: are the boundaries parallel, and the lanes equally wide."""
+"""Measure the bird's-eye view: are boundaries parallel and lanes equally wide?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small pictures of some frames of a drive, of bounded size whatever its length."""
+"""Small pictures of some frames of a drive, of limited total size."""
 
 from __future__ import annotations
 

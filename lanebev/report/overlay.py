@@ -1,4 +1,4 @@
-"""The overlay: a frame with what was seen and believed in it, and its bird's-eye view before and after."""
+"""The overlay: a frame with its detections and estimate, and its bird's-eye view before and after."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``report.html``: one page that holds everything it shows."""
+"""``report.html``: one self-contained page."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _DIGITS = (2, 2, 2, 3)
 
 @dataclass
 class Report:
-    """What goes on the page.
+    """Contents of the page.
 
     Attributes:
         title: the source's name.

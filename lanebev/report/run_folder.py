@@ -1,4 +1,4 @@
-"""What a run left in its folder, read back: rows, settings, lens and pictures."""
+"""Read the outputs of a run back: rows, settings, lens and pictures."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ class Stretch(NamedTuple):
 
 
 class Strip(NamedTuple):
-    """What is shown of one axis, or of the status."""
+    """A strip of the timeline, for one axis or the status."""
 
     name: str
     stretches: tuple[Stretch, ...]

@@ -31,7 +31,7 @@ _TOLD = 8  # findings
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that holds from one frame to another.
+    """A condition that holds from one frame to another.
 
     Attributes:
         subject: an axis, several, or empty for the whole pose.
@@ -54,7 +54,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a run is worth, in words.
+    """The verdict on a run, in words.
 
     Attributes:
         grade: "good", "fair" or "poor".

@@ -1,4 +1,4 @@
-"""The worst moments of a drive, which its own rows show: largest sigmas, largest jumps, loss of support."""
+"""The worst moments of a drive: largest sigmas, largest jumps, losses of tracking."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _APART = 0.3  # s, that two moments told are apart
 
 
 class Moment(NamedTuple):
-    """One frame that is worth a look.
+    """A frame worth looking at.
 
     Attributes:
         place: of its row.

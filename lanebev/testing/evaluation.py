@@ -1,4 +1,4 @@
-"""A calibrator on a drive of known truth: errors, covariance, status, and the figures made of them."""
+"""Run a calibrator on a drive with known truth: errors, covariance, status, and their statistics."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _DETERMINED = (0.1, 0.1, 0.1, 0.5)  # rad and m, standard deviation below which 
 
 
 class Track(NamedTuple):
-    """What a calibrator made of a drive of T frames in R rows.
+    """Results of a calibrator on a drive of T frames in R rows.
 
     Attributes:
         errors: (T, R, 4) rad and m.

@@ -20,7 +20,7 @@ from lanebev.types import Extrinsics
 
 @dataclass(frozen=True)
 class Experiment:
-    """What the paper leaves open is ours: focal length, rate, motion, range (paper.md D13)."""
+    """Settings that the paper does not give: focal length, frame rate, motion, range (paper.md D13)."""
 
     width: int = 1920
     height: int = 1020

@@ -1,4 +1,4 @@
-"""Drives of known truth seen through a real lens: vertices in pixels of the image as it was taken."""
+"""Drives with known truth seen through a real lens: vertices in pixels as taken."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ PLACES = (torch.arange(6, dtype=torch.float64) - 2.5) * WIDTH
 
 @dataclass(frozen=True)
 class Moment:
-    """One frame of a drive: the truth, and what is done to the observations."""
+    """One frame of a drive: the truth, and the changes made to its observations."""
 
     pose: tuple[float, float, float, float]  # rad, rad, rad, m
     offset: float = 0.0  # m, X of the ego lane's middle

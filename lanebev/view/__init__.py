@@ -1,1 +1,1 @@
-"""The bird's-eye grid, its homography and the one resampling."""
+"""The bird's-eye grid, its homography and the resampling."""

@@ -1,4 +1,4 @@
-"""Where an image shows the cells of a view, block of rows by block of rows."""
+"""Compute where an image shows the cells of a view, in blocks of rows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A camera that stays: the image as a fixed virtual camera over the same road would take it."""
+"""Resample an image as a fixed virtual camera over the same road would take it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class CanonicalCells(NamedTuple):
 
 
 class CanonicalView(nn.Module):
-    """Image or feature map as a fixed virtual camera would see it, whatever the real one does.
+    """Resamples an image or feature map as a fixed virtual camera would see it.
 
     A network that was trained for one mount then sees that mount. Rotation is exact. A difference in height
     is exact for the road; what stands on the road is moved as if it lay on it. What is above the horizon is

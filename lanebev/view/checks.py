@@ -1,4 +1,4 @@
-"""What all views require of their arguments."""
+"""Checks of the arguments of all views."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The resampling of camera frames as files hold them: one image of bytes."""
+"""Resample camera frames as files hold them: one image of bytes."""
 
 from __future__ import annotations
 

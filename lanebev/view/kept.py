@@ -1,4 +1,4 @@
-"""Memory that is kept from call to call: a fresh page takes longer to come by than to fill."""
+"""Memory that is reused from call to call: allocating a page takes longer than filling it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _MOST_BYTES = 1 << 28  # of all arrays of a thread
 
 
 class KeptArrays(threading.local):
-    """Arrays to be filled anew in every call, those of each thread its own.
+    """Arrays that every call fills again, separate for each thread.
 
     They are for what a function computes on its way, and are never part of what it returns.
     """

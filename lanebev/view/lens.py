@@ -14,7 +14,7 @@ _CENTRE = 1e-16  # squared radius below which a fisheye's factor is 1: sqrt has 
 
 
 class Lens(NamedTuple):
-    """What leads from the plane z = 1 to the image.
+    """The mapping from the plane z = 1 to the image.
 
     Attributes:
         coefficients: (B, D) of the distortion.

@@ -76,7 +76,7 @@ def image_from_ego(
 
 @register_pytree
 class LiftSplatInputs(NamedTuple):
-    """What Lift-Splat-Shoot's ``get_geometry`` takes of a camera.
+    """Arguments of Lift-Splat-Shoot's ``get_geometry`` for a camera.
 
     Attributes:
         rots: (B, 3, 3), ego from camera.

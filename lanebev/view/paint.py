@@ -1,4 +1,4 @@
-"""The way back: what lies on the road, painted into the image."""
+"""Resample a map of the road to the image, the inverse of the bird's-eye view."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class PixelCells(NamedTuple):
 
 
 class ImageFromBEV(nn.Module):
-    """Bird's-eye map to the image that would show it on the road, differentiable like the way there.
+    """Resamples a bird's-eye map to the image that would show it on the road; differentiable.
 
     For labels, masks or heat maps of the road that are wanted in the image, as a camera takes it.
 

@@ -1,4 +1,4 @@
-"""Where an image shows cells: homogeneous coordinates to those of the image, and what it does not show.
+"""Project homogeneous coordinates of cells to the image, and find the cells that it does not show.
 
 Coordinates are planes (B, 2, R, V), never pairs. Sums that are zero inside the image tell what lies outside:
 comparisons and ``where`` take several times as long as arithmetic on a CPU.

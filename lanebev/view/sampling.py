@@ -1,4 +1,4 @@
-"""The one resampling of maps at the cells that an image shows.
+"""Resample maps at the cells that an image shows.
 
 Coordinates are computed in blocks of rows that stay in the cache; without gradients, in memory that is kept.
 """
@@ -25,7 +25,7 @@ _FEW = 8  # channels of which a copy costs less than to sample one image with on
 
 
 class MapSize(NamedTuple):
-    """Shape of a map to be sampled and how its cells lie in the image.
+    """Shape of a map to be sampled and the position of its cells in the image.
 
     Attributes:
         height, width: cells.

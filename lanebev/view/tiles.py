@@ -1,4 +1,4 @@
-"""Where cells are seen, by interpolation: exact at a few cells of each tile, polynomials for the others.
+"""Interpolate where cells are seen: exact at a few cells of each tile, polynomials for the others.
 
 Perspective and lens are smooth functions of a cell's row and column: the polynomial through 10 × 10 cells of
 a tile of 64 × 128 is as exact as float32 itself. Whether it is, its Chebyshev coefficients tell; tiles in

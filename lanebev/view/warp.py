@@ -1,4 +1,4 @@
-"""The one resampling: from an image, or any feature maps of it, to the bird's-eye grid."""
+"""Resample an image, or its feature maps, to the bird's-eye grid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The shipped weights, and the one way to load weights: strictly.
+"""Load and save weights files, strictly, and the shipped weights.
 
 A weights file is safetensors with JSON metadata: ``config`` (:class:`SegmenterConfig`), and for the record
 ``training``, ``seed``, ``commit`` and ``metrics``. Tensors may be stored in half precision, or as 8-bit

@@ -1,1 +1,1 @@
-"""Many drives at once, on the cores of one machine or of a cluster."""
+"""Many drives in parallel, on the cores of one machine or of a cluster."""

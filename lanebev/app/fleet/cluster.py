@@ -1,4 +1,4 @@
-"""Tasks on Ray: the only module that imports it."""
+"""Run tasks on Ray; the only module that imports it."""
 
 from __future__ import annotations
 

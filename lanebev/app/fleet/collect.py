@@ -1,4 +1,4 @@
-"""All frames of all drives as one Parquet data set, by camera and day."""
+"""Collect all frames of all drives in one Parquet data set, by camera and day."""
 
 from __future__ import annotations
 

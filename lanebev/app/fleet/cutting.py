@@ -1,4 +1,4 @@
-"""Long drives, cut into parts that the network looks at side by side."""
+"""Cut long drives into parts that the network processes in parallel."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _TIME_BASE = 1_000_000  # ticks a second of a container's duration
 
 
 class Part(NamedTuple):
-    """A part of a drive, s in the source.
+    """A part of a drive; times in s of the source.
 
     Attributes:
         start: of its first frame.

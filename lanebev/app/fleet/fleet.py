@@ -1,4 +1,4 @@
-"""``lanebev fleet``: run on all drives of a manifest, and bring their results together."""
+"""``lanebev fleet``: run on all drives of a manifest and collect their results."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _TOLD = 10  # failures that are printed
 
 
 class FleetResult(NamedTuple):
-    """What became of a fleet.
+    """Result of a fleet.
 
     Attributes:
         outcomes: by name of the drive, in the manifest's order.

@@ -1,4 +1,4 @@
-"""The manifest: which drives there are, a row each, as YAML or CSV."""
+"""The manifest: a list of drives and their settings, as YAML or CSV."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ _DAY = 86_400.0  # s
 
 
 class DriveMount(NamedTuple):
-    """What one drive says of its camera's mount.
+    """The mount of a camera as estimated from one drive.
 
     Attributes:
         name: of the drive.

@@ -28,7 +28,7 @@ _MOST_DRIVES = 2000  # that are listed one by one, those that failed first
 
 @dataclass(frozen=True)
 class DriveVerdict:
-    """What a drive's run is worth.
+    """The verdict on one drive's run.
 
     Attributes:
         grade: "good", "fair" or "poor".
@@ -55,7 +55,7 @@ class CameraMounts:
 
 
 class StretchWords(TypedDict):
-    """A stretch as the page shows it: how many drives and which, values and drifts by axis."""
+    """A stretch as the page shows it: number and names of its drives, values and drifts by axis."""
 
     drives: int
     names: str

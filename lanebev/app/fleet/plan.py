@@ -1,4 +1,4 @@
-"""What is to be done: a task a drive, and which are finished."""
+"""Plan the tasks, one for each drive, and find which are finished."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DRIVES, MARK, SEEN = "drives", "fleet.json", "seen.json"
 
 @dataclass(frozen=True)
 class Task:
-    """A run on a drive, or a look at a part of it.
+    """A run on a drive, or the network alone on a part of it.
 
     Attributes:
         name: of the drive; of a part of it, with its number.
@@ -43,7 +43,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a task.
+    """Result of a task.
 
     Attributes:
         name: of the drive.

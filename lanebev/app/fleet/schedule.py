@@ -1,4 +1,4 @@
-"""Which tasks can begin: parts of a cut drive first, the run on the whole when all are there."""
+"""Decide which tasks can start: parts of a cut drive first, then the run on the whole drive."""
 
 from __future__ import annotations
 

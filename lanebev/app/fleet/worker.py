@@ -1,4 +1,4 @@
-"""Some drives, in whatever process: the run of the command line, each in a thread of its own."""
+"""Run several drives in one process, as the command line does, each in its own thread."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A single image's pose, averaged over the ways to read it.
+"""The pose of a single image, averaged over its readings.
 
 Every reading (:mod:`lanebev.estimation.joint.readings`) is fitted with a deviation and a heading of its own
 for each boundary, Gaussian about the road's, and weighted by its evidence (Laplace's approximation). Source:
@@ -84,7 +84,7 @@ class AveragedPose(NamedTuple):
 
 
 class _Model(NamedTuple):
-    """R fits to be made: rows of observations with what each takes for granted.
+    """R fits to compute: rows of observations and the assumptions of each.
 
     Attributes:
         seen: of R rows.

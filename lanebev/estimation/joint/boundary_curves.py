@@ -1,4 +1,4 @@
-"""The boundaries of a frame as curves: each with its own offset and heading, on a pose known from all."""
+"""The boundaries of a frame as curves, each with its own offset and heading, given the pose."""
 
 from __future__ import annotations
 

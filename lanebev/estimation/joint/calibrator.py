@@ -1,4 +1,4 @@
-"""One filter over the whole pose: every end point a measurement, every boundary told apart."""
+"""One filter over the whole pose, with every end point as a measurement."""
 
 from __future__ import annotations
 

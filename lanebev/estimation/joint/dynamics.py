@@ -1,4 +1,4 @@
-"""How the state of the joint filter moves between frames, the road apart (``road``).
+"""Dynamics of the joint filter's state, except the road (``road``).
 
 The pose moves about its slow mean as band-limited noise: white noise through a fourth-order Butterworth
 low-pass. A vehicle's body moves like this, smoothly from frame to frame and back to the mount's pose within a

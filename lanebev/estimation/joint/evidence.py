@@ -1,4 +1,4 @@
-"""Evidence against the motion model: normalised scores, and the process noise that they call for."""
+"""Evidence against the motion model: normalised scores, and the process noise that follows from them."""
 
 from __future__ import annotations
 

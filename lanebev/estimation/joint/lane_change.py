@@ -1,4 +1,4 @@
-"""Lane changes: the boundary indices move by one when the camera crosses a line."""
+"""Lane changes: all boundary indices change by one when the camera crosses a line."""
 
 from __future__ import annotations
 

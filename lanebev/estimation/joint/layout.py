@@ -1,4 +1,4 @@
-"""The state vector of the joint filter: which entry is what."""
+"""Indices of the state vector of the joint filter."""
 
 from __future__ import annotations
 

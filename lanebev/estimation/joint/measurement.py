@@ -44,7 +44,7 @@ FOOT_RANGE = 0.02  # of the focal length; a foot point farther off is an outlier
 
 
 class Observations(NamedTuple):
-    """Segments made ready: rays once per frame, bad entries at weight zero. M = 2 N end points.
+    """Prepared segments: rays computed once per frame, weight zero for bad entries. M = 2 N end points.
 
     Attributes:
         rays: (B, 3, M), z = 1; end point e of segment n is entry 2 n + e.

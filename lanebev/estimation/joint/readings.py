@@ -1,4 +1,4 @@
-"""The ways to read a single image: which lines bound lanes, and how equal the lanes are.
+"""The readings of a single image: which lines bound lanes, and how equal the lanes are.
 
 One image seldom tells. :mod:`lanebev.estimation.joint.averaging` fits every reading and averages the fits by
 their evidence, so that how much an answer leans on one of them is in its covariance.
@@ -61,7 +61,7 @@ class ReadingConfig:
 
 
 class Readings(NamedTuple):
-    """C ways to read a frame of L boundaries.
+    """C readings of a frame of L boundaries.
 
     Attributes:
         wrong: (C, L) bool, of a line that bounds no lane.

@@ -1,4 +1,4 @@
-"""Starts of the joint filter: without a state, with one that does not fit, or one that frames contradict.
+"""Starts of the joint filter: without a state, or with one that does not fit or is contradicted.
 
 After a shock the filter may have taken a wrong pose for unequal lanes or a bend, and be content with it. So
 for a while after every jump each frame is fitted by itself, without what the filter has learned.

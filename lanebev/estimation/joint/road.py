@@ -1,4 +1,4 @@
-"""How the shape of the road moves in the state of the joint filter between frames.
+"""Dynamics of the shape of the road in the joint filter.
 
 The knots of the road's curvature are fixed to the road, and the camera passes them at a speed that is
 estimated too: the curvature that was seen far ahead is the curvature when it is near. Process noise enters at

@@ -1,4 +1,4 @@
-"""Pose, lateral offset and curvature from one frame: all boundaries fitted jointly, from anywhere.
+"""Joint fit of pose, lateral offset and curvature to all boundaries of one frame, without a start value.
 
 A nonlinear fit from one start gets stuck. So a grid over the horizon (pitch and roll) is tried with a
 robust fit inside that is linear, u = a_k V + u0 + b / V with V below the horizon, and the best pitch for
@@ -40,7 +40,7 @@ _OBSERVED = 0.2  # a parameter is observed if its sigma fell below this part of 
 
 @dataclass(frozen=True)
 class FramePrior:
-    """What is known before looking, as Student's t distributions, and where the search starts.
+    """Prior of a single frame, as Student's t distributions, and the start of the search.
 
     Heavy tails: a camera rolled by 20 deg is found, and not pulled back. They decide only what the
     observations leave open (roll on one lane, all but two numbers on one boundary). The pose of a mount that

@@ -1,4 +1,4 @@
-"""Fixed-interval smoothing: every state of a drive estimated from all of its frames, later ones too.
+"""Fixed-interval smoothing: estimate every state of a drive from all of its frames.
 
 The predictions of the filter are repeated from its states, so the states of a drive are all that is needed.
 """
@@ -25,7 +25,7 @@ _CHUNK = 256  # rows, of one frame or several, whose gains are computed at once
 
 
 class Link(NamedTuple):
-    """How a state follows from the one before.
+    """The prediction from one state to the next.
 
     Attributes:
         predicted: (B, D), mean of the prediction.

@@ -96,7 +96,7 @@ class JointConfig:
 
 @register_pytree
 class JointState(NamedTuple):
-    """Everything the calibrator remembers, tensors only.
+    """The state of the calibrator between frames, tensors only.
 
     Attributes:
         mean: (B, D), see :class:`~lanebev.estimation.joint.layout.Layout`.

@@ -1,4 +1,4 @@
-"""Status and reasons of a frame, and the calibration that goes out."""
+"""Status and reasons of a frame, and the resulting calibration."""
 
 from __future__ import annotations
 

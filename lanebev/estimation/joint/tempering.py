@@ -1,4 +1,4 @@
-"""What one image says, weakened by how much its detector's errors exceed their sigmas."""
+"""Scaling of the standard deviations of a single image's information."""
 
 from __future__ import annotations
 

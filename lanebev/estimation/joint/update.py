@@ -28,7 +28,7 @@ _NO_INFORMATION = 1e-3  # 1/m², information about a boundary's place below whic
 
 
 class FrameInformation(NamedTuple):
-    """What one frame says about the O observed entries of the state, linearised.
+    """Information of one frame on the O observed entries of the state, linearised.
 
     Attributes:
         matrix: (B, O, O), Λ = Hᵀ Q⁻¹ H.

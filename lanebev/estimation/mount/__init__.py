@@ -1,4 +1,4 @@
-"""How the camera is mounted in the vehicle: a slow estimate behind the fast pose, axis by axis."""
+"""The camera's mount in the vehicle: a slow estimate from the poses of frames, axis by axis."""
 
 from lanebev.estimation.mount.config import MountConfig
 from lanebev.estimation.mount.estimator import MountEstimator

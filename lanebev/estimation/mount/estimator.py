@@ -1,4 +1,4 @@
-"""The slow calibration behind the fast pose: how the camera is mounted in the vehicle.
+"""Estimate the camera's mount in the vehicle from the poses of frames.
 
 The fast pose is the mount plus what the suspension and the driver's heading add. Accepted frames are
 averaged in blocks of some seconds, blocks in a running estimate whose uncertainty is their scatter. Each

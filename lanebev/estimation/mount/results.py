@@ -1,4 +1,4 @@
-"""What the mount estimator remembers and what it answers."""
+"""State and results of the mount estimator."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ AXES = ("pitch", "yaw", "roll", "height")
 
 
 class MountStatus(IntEnum):
-    """What a mount estimate, or one axis of it, is worth. A new meaning is a new value."""
+    """Status of a mount estimate or of one axis. A new meaning is a new value."""
 
     UNCALIBRATED = 0  # not enough blocks yet
     CALIBRATED = 1
@@ -44,7 +44,7 @@ class MountReason(IntFlag):
 
 @register_pytree
 class MountState(NamedTuple):
-    """Everything the estimator remembers, tensors only. K blocks of each axis, the newest first.
+    """The state of the estimator between frames, tensors only. K blocks of each axis, the newest first.
 
     Attributes:
         blocks: (B, K, 4) mean pose of each.
@@ -81,7 +81,7 @@ class MountState(NamedTuple):
 
 @register_pytree
 class MountCalibration(NamedTuple):
-    """The mount as it is known now.
+    """The current mount estimate.
 
     Attributes:
         extrinsics: pitch, yaw, roll, height of the camera in the vehicle, each (B,).

@@ -17,7 +17,7 @@ _MIN_COSINE = 0.02  # 1.1 deg: a boundary plane closer to the road's own has no 
 
 
 class BoundaryAngles(NamedTuple):
-    """Where each boundary's plane stands around the vanishing direction.
+    """Angle of each boundary's plane around the vanishing direction.
 
     Attributes:
         angles: (B, L) rad, α of Fig. 6(c), positive left of the camera; beyond ±pi/2 where roll lifts a

@@ -1,4 +1,4 @@
-"""What the paper's calibrator remembers, and its numbers."""
+"""State and configuration of the paper's calibrator."""
 
 from __future__ import annotations
 

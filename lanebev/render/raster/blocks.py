@@ -37,13 +37,13 @@ class Blocks(NamedTuple):
         return len(self.row)
 
     def of_rows(self, rows: list[int]) -> Tensor:
-        """(T',) int64: which blocks belong to some of the rows."""
+        """Return which blocks belong to some of the rows, (T',) int64."""
         ends = list(accumulate(self.counts))
         chosen = [t for r in rows for t in range(ends[r] - self.counts[r], ends[r])]
         return torch.tensor(chosen, dtype=torch.long).to(self.row.device, non_blocking=True)
 
     def sum_rows(self, values: Tensor) -> Tensor:
-        """Sum (C, T) values of blocks over those of each row, (C, R), always in the same order."""
+        """Sum the values (C, T) of blocks over those of each row, (C, R), always in the same order."""
         most = max(*self.counts, 1)
         within = torch.arange(len(self.row), device=self.row.device) - self._first().index_select(0, self.row)
         table = values.new_zeros(len(values), len(self.counts) * most)
@@ -52,14 +52,14 @@ class Blocks(NamedTuple):
         return total
 
     def real(self) -> Tensor:
-        """(T, S) bool, false for repeated elements."""
+        """Return which elements are not repeated ones, (T, S) bool."""
         size = self.place.shape[1]
         block = torch.arange(len(self.row), device=self.row.device) - self._first().index_select(0, self.row)
         left = self.selected.index_select(0, self.row) - block * size
         return torch.arange(size, device=self.row.device) < left[:, None]
 
     def _first(self) -> Tensor:
-        """(R,) the first block of each row."""
+        """Return the first block of each row, (R,)."""
         ends = list(accumulate(self.counts))
         first = [end - count for end, count in zip(ends, self.counts, strict=True)]
         return torch.tensor(first).to(self.row.device, non_blocking=True)

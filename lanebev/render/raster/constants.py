@@ -10,10 +10,10 @@ from torch import Tensor
 
 @lru_cache(maxsize=256)
 def constant(device: torch.device, *values: float) -> Tensor:
-    """(N,) float32 of the values; not to be written to."""
+    """Return the values as (N,) float32; not to be written to."""
     return torch.tensor(values).to(device)
 
 
 def colour(device: torch.device, *values: float) -> Tensor:
-    """(3, 1) float32: broadcasts over (B, 3, N)."""
+    """Return a colour as (3, 1) float32, which broadcasts over (B, 3, N)."""
     return constant(device, *values)[:, None]

@@ -9,7 +9,7 @@ PSF = 0.5  # px, standard deviation of the pixel's Gaussian: keeps thin stripes'
 
 
 def stripe_coverage(distance: Tensor, width: Tensor, footprint: Tensor) -> Tensor:
-    """Share of a pixel that a stripe covers: a box of the stripe's width under a Gaussian pixel.
+    """Compute the share of a Gaussian pixel that a stripe covers.
 
     Args:
         distance: m from the stripe's centre line.
@@ -22,7 +22,7 @@ def stripe_coverage(distance: Tensor, width: Tensor, footprint: Tensor) -> Tenso
 
 
 def dash_coverage(along: Tensor, length: Tensor, period: Tensor, footprint: Tensor) -> Tensor:
-    """Share of a pixel that a periodic dash covers, exactly integrated over the footprint along the road."""
+    """Compute the share of a pixel that a periodic dash covers, integrated exactly along the road."""
     reach = 0.5 * footprint.clamp(min=1e-3)
 
     def painted_up_to(s: Tensor) -> Tensor:

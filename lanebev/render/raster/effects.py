@@ -81,7 +81,7 @@ def rain(image: Tensor, wet: Tensor, generators: Sequence[torch.Generator]) -> T
 
 
 def _streaks(grain: Tensor, lean: Tensor) -> Tensor:
-    """(R, 1, H, W) grains drawn out along lines that lean by (R,) px to the right per px down."""
+    """Draw grains out along lines that lean by (R,) px to the right per px down, (R, 1, H, W)."""
     height, width = grain.shape[2:]
     length = max(3, height // 18)
     total = torch.zeros_like(grain)
@@ -94,7 +94,7 @@ def _streaks(grain: Tensor, lean: Tensor) -> Tensor:
 
 
 def _drops(wet: Tensor, draw: Tensor, size: tuple[int, int]) -> Tensor:
-    """(R, H, W) 1 on drops, 4 to 18 of them, of random places and sizes (R, 18, 3)."""
+    """Draw 4 to 18 drops of random places and sizes (R, 18, 3): 1 on drops, (R, H, W)."""
     height, width = size
     place_x, place_y, large = draw.unbind(2)
     radius = (0.004 + 0.014 * large * large) * width

@@ -64,7 +64,7 @@ def tone_curve(value: Tensor, contrast: Tensor) -> Tensor:
 
 
 def _toned(value: Tensor, contrast: Tensor, black: Tensor) -> Tensor:
-    """The tone curve over black by a table over square roots, to 2e-4: a tenth of the time of powers."""
+    """Apply the tone curve by a table over square roots, to 2e-4: a tenth of the time of powers."""
     level = torch.arange(_LEVELS, device=value.device) / _PER_ROOT
     table = tone_curve(level.square(), contrast[:, None]) + black[:, None]  # (B, LEVELS)
     index = value.sqrt().mul_(_PER_ROOT).add_(0.5).clamp_(max=_LEVELS - 1).int()
@@ -93,7 +93,7 @@ def _add_bloom(value: Tensor, gain: Tensor, strength: Tensor) -> None:
 
 @lru_cache(maxsize=64)
 def _spread(length: int, std: float, device: torch.device) -> Tensor:
-    """(length, cells): a Gaussian blur of cells, the border repeated, then linear interpolation."""
+    """Return the matrix (length, cells) of a Gaussian blur of cells and linear interpolation."""
     cells = -(-length // _BLOOM_SCALE)
     reach = int(4 * std + 0.5)
     shifts = torch.arange(-reach, reach + 1, dtype=torch.float64)

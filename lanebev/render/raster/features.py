@@ -18,7 +18,7 @@ STEEPEST = 0.12  # sine of the lowest sun that casts shadows
 
 
 def shadow_lengths(around: Surroundings, light: Light) -> Tensor:
-    """(B, W) m, how far walls' shadows reach towards the road; 0 or less: away from it, or none."""
+    """Compute how far walls' shadows reach towards the road, (B, W) m; 0 or less if they do not."""
     slant = light.sun[:, 0] / light.sun[:, 1].clamp(min=STEEPEST)  # sideways per metre of height
     wall = torch.arange(around.wall_kind.shape[1], device=slant.device)
     side = (wall % 2) * 2 - 1
@@ -148,6 +148,6 @@ def features_of(scene: Scene) -> Features:
 
 
 def _rows(mask: Tensor) -> list[int]:
-    """Rows where a mask (B,) holds."""
+    """Return the rows in which a mask (B,) holds."""
     rows: list[int] = mask.nonzero()[:, 0].tolist()
     return rows

@@ -10,7 +10,7 @@ _REACH = 2.6  # standard deviations at which a Gaussian is cut off
 
 
 def gaussian_blur(image: Tensor, std: Tensor, largest: float) -> Tensor:
-    """Blur images by Gaussians, the border repeated outside.
+    """Blur images by Gaussians; the border is repeated.
 
     A sum of shifted images, since depthwise convolutions are slow on processors.
 
@@ -29,7 +29,7 @@ def gaussian_blur(image: Tensor, std: Tensor, largest: float) -> Tensor:
 
 
 def _weighted(image: Tensor, weight: Tensor, dim: int) -> Tensor:
-    """Sum of an image shifted along a dimension both ways by k, times the k-th weight."""
+    """Sum an image shifted both ways by k along a dimension, times the k-th weight."""
     reach, size = len(weight) - 1, image.shape[dim]
     padding = (reach, reach, 0, 0) if dim == 3 else (0, 0, reach, reach)
     padded = functional.pad(image, padding, mode="replicate")

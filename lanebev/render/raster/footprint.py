@@ -63,5 +63,5 @@ def ground_under(
 
 
 def _length(a: Tensor, b: Tensor) -> Tensor:
-    """The hypotenuse; ``torch.hypot`` takes twice as long on processors."""
+    """Compute the hypotenuse; ``torch.hypot`` takes twice as long on processors."""
     return torch.addcmul(a * a, b, b).sqrt_()

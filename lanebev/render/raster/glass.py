@@ -14,7 +14,7 @@ _SHAKES = 9  # images that a shaken one is the mean of
 
 
 def behind_glass(image: Tensor, glass: Glass) -> Tensor:
-    """An image (B, 3, H, W), shaken, through a dirty windscreen that mirrors the dashboard."""
+    """Shake an image (B, 3, H, W) and put a dirty windscreen that mirrors the dashboard before it."""
     image = shaken(image, glass.shake)
     height, width = image.shape[2:]
     y = ((torch.arange(height, device=image.device) + 0.5) / height)[None, :, None]
@@ -29,7 +29,7 @@ def behind_glass(image: Tensor, glass: Glass) -> Tensor:
 
 
 def _dirty(image: Tensor, glass: Glass, x: Tensor, y: Tensor, seed: Tensor) -> Tensor:
-    """Spots that hide a part of the light and scatter some of it; drops that show the image upside down."""
+    """Add spots that block and scatter light, and drops that show the image upside down."""
     wide = image.shape[3]
     level = image.mean((2, 3), keepdim=True)
     spots = sample_noise(CLOUD, x * 0.9 + 3 * seed, y * 0.5 + 5 * seed)
@@ -52,7 +52,7 @@ def _dirty(image: Tensor, glass: Glass, x: Tensor, y: Tensor, seed: Tensor) -> T
 
 
 def shaken(image: Tensor, shake: Tensor) -> Tensor:
-    """The mean of an image over a small motion.
+    """Average an image over a small motion.
 
     Args:
         image: (B, 3, H, W).
@@ -78,7 +78,7 @@ def shaken(image: Tensor, shake: Tensor) -> Tensor:
 
 
 def frame_cover(glass: Glass, size: tuple[int, int]) -> Tensor:
-    """(B, H, W) share of each pixel under black rounded corners at the image's sides."""
+    """Compute the share of each pixel under black rounded corners at the image's sides, (B, H, W)."""
     height, width = size
     y = ((torch.arange(height, device=glass.frame.device) + 0.5) / height * 2 - 1)[None, :, None]
     x = ((torch.arange(width, device=glass.frame.device) + 0.5) / width * 2 - 1)[None, None, :]
@@ -87,7 +87,7 @@ def frame_cover(glass: Glass, size: tuple[int, int]) -> Tensor:
 
 
 def recorded(image: Tensor, glass: Glass) -> Tensor:
-    """An image with what the recorder puts over it, and what its codec loses."""
+    """Add what the recorder draws over an image, and the losses of its codec."""
     height, width = image.shape[2:]
     y = torch.arange(height, device=image.device)[None, :, None]
     x = torch.arange(width, device=image.device)[None, None, :]
@@ -113,7 +113,7 @@ def recorded(image: Tensor, glass: Glass) -> Tensor:
 
 
 def _coded(image: Tensor, glass: Glass) -> Tensor:
-    """Colour of little detail, and blocks of one brightness."""
+    """Reduce the detail of colours, and make blocks of one brightness."""
     grey = image.mean(1, keepdim=True)
     size = list(image.shape[2:])
     fine, coarse = (_blocks(image - grey, cell, size) for cell in (4, 16))
@@ -126,6 +126,6 @@ def _coded(image: Tensor, glass: Glass) -> Tensor:
 
 
 def _blocks(image: Tensor, cell: int, size: list[int]) -> Tensor:
-    """Means over squares of ``cell`` px, at the image's own size."""
+    """Average over squares of ``cell`` px, at the image's own size."""
     means = functional.avg_pool2d(image, cell, ceil_mode=True, count_include_pad=False)
     return means.repeat_interleave(cell, 2).repeat_interleave(cell, 3)[..., : size[0], : size[1]]

@@ -63,7 +63,7 @@ def _stroked(lines: list[Outline], wide: int, rings: list[tuple[float, float, fl
 
 
 def _written(text: str) -> Picture:
-    """A word, upright for the driver, 1.6 m wide and 2.4 to 4 m long."""
+    """Draw a word, upright for the driver, 1.6 m wide and 2.4 to 4 m long."""
     (wide, high), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 6.0, 36)
     canvas = np.zeros((high + 60, wide + 60), np.uint8)
     cv2.putText(canvas, text, (30, high + 25), cv2.FONT_HERSHEY_SIMPLEX, 6.0, 255, 36)
@@ -106,7 +106,7 @@ def _pictures() -> list[Picture]:
 
 @lru_cache(maxsize=8)
 def _integral_table(device: torch.device) -> Tensor:
-    """(G · (ROWS + 1) · (COLUMNS + 1),) summed pictures: at (g, r, c) the paint in rows < r, columns < c."""
+    """Sum pictures: at (g, r, c) the paint in rows < r, columns < c, (G · (ROWS + 1) · (COLUMNS + 1),)."""
     small = [cv2.resize(p, (_COLUMNS, _ROWS), interpolation=cv2.INTER_AREA) for p in _pictures()]
     paint = torch.from_numpy(np.stack(small).astype(np.float64)) / 255
     table = torch.nn.functional.pad(paint.cumsum(1).cumsum(2), (1, 0, 1, 0))
@@ -114,7 +114,7 @@ def _integral_table(device: torch.device) -> Tensor:
 
 
 def glyph_coverage(glyph: Tensor, x: Tensor, y: Tensor, reach_x: Tensor, reach_y: Tensor) -> Tensor:
-    """Share of a pixel that a glyph's paint covers: the exact mean over the pixel's footprint.
+    """Compute the share of a pixel that a glyph's paint covers: the exact mean over the pixel's footprint.
 
     Args:
         glyph: (...,) int64; negative is none.

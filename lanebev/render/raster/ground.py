@@ -25,7 +25,7 @@ STUD_ALBEDO = 0.62
 
 
 def headlight_irradiance(x: Tensor, z: Tensor) -> Tensor:
-    """(B, N) relative irradiance of dipped headlights on the road at (x, z) m."""
+    """Compute the relative irradiance of dipped headlights on the road at (x, z) m, (B, N)."""
     distance = z.clamp(min=0.5)
     spread = torch.exp(-(((x - 0.02 * distance) / (1.8 + 0.22 * distance)) ** 2))
     pools = 1 + 0.5 * torch.exp(-(((x.abs() - 0.9 - 0.05 * distance) / (0.7 + 0.05 * distance)) ** 2))
@@ -81,7 +81,7 @@ def ground_radiance(
 def _albedo(
     scene: Scene, row: Tensor, ground: Ground, paved: Tensor, blotch: Tensor, features: Features
 ) -> tuple[Tensor, Tensor]:
-    """(3, T·N) linear reflectance of a plain road; (2, T·N) coverage by paint, and by studs."""
+    """Compute a plain road's linear reflectance (3, T·N), and coverage by paint and by studs (2, T·N)."""
     batch, planes = len(scene.place.along), paved.numel()
     albedo = paved.new_zeros(3, planes)
     coverage = paved.new_zeros(2, planes)  # by paint, by studs
@@ -186,7 +186,7 @@ def _gloss(
     puddle: Tensor,
     features: Features,
 ) -> Tensor:
-    """Mirrored sun and, on wet roads, sky; (T, 3, N)."""
+    """Compute the mirrored sun and, on wet roads, the mirrored sky, (T, 3, N)."""
     light, wet = select_rows(scene.light, row), scene.world.pavement.wet[row, None]
     norm = (1 + ray_x.square() + ray_y.square()).rsqrt()
     sun_right, sun_up, sun_ahead = light.sun.unsqueeze(-1).unbind(1)

@@ -47,7 +47,7 @@ def hexahedra(objects: SceneObjects, lens: Lens, size: tuple[int, int]) -> Hexah
 
 
 def face_planes(objects: SceneObjects, height: Tensor) -> tuple[Tensor, Tensor]:
-    """Planes of all faces, seen from the camera.
+    """Compute the planes of all faces, seen from the camera.
 
     Args:
         objects: the objects.
@@ -85,7 +85,7 @@ def face_planes(objects: SceneObjects, height: Tensor) -> tuple[Tensor, Tensor]:
 def plane_times(
     normal: Tensor, plane_distance: Tensor, ray_x: Tensor, ray_y: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Where rays pass the planes of hexahedra.
+    """Compute where rays pass the planes of hexahedra.
 
     Args:
         normal: (3, 12, ...) outward normals, right, up, forward, see :func:`face_planes`.
@@ -103,7 +103,7 @@ def plane_times(
 
 
 def entry_depth(time: Tensor, enters: Tensor) -> Tensor:
-    """Z at which rays enter pairs of convex hexahedra, (2, ...) m; ``NEVER`` where they do not.
+    """Compute Z at which rays enter pairs of convex hexahedra, (2, ...) m; ``NEVER`` where they do not.
 
     Args:
         time: (12, ...) Z, m, see :func:`plane_times`.
@@ -115,7 +115,7 @@ def entry_depth(time: Tensor, enters: Tensor) -> Tensor:
 
 
 def entered_face(time: Tensor, enters: Tensor, depth: Tensor) -> Tensor:
-    """(...) int64: which of the 12 planes rays enter by at ``depth`` (...), -1 if by none.
+    """Return by which of the 12 planes rays enter at ``depth`` (...), (...) int64; -1 if by none.
 
     For ``time`` and ``enters`` see :func:`entry_depth`; of several planes it is the last.
     """
@@ -124,7 +124,7 @@ def entered_face(time: Tensor, enters: Tensor, depth: Tensor) -> Tensor:
 
 
 def bounding_boxes(objects: SceneObjects, lens: Lens, height: Tensor, size: tuple[int, int]) -> Tensor:
-    """Pixel bounds of every object.
+    """Compute the pixel bounds of every object.
 
     Args:
         objects: the objects.

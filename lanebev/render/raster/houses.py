@@ -13,7 +13,7 @@ _FLOOR = 3.1  # m
 
 
 def _share(position: Tensor, length: Tensor | float, period: Tensor | float, footprint: Tensor) -> Tensor:
-    """(B, N) share of a pixel inside pieces of a length in the middle of every period, all m."""
+    """Compute the share of a pixel inside pieces of a length in the middle of every period, (B, N); all m."""
     distance = ((position / period) % 1.0 - 0.5).abs() * period
     inside = ((0.5 * length - distance) / footprint + 0.5).clamp(0, 1)
     coarse = smoothstep(0.4, 1.0, footprint / period)
@@ -23,7 +23,7 @@ def _share(position: Tensor, length: Tensor | float, period: Tensor | float, foo
 def house_front(
     colour: Tensor, height: Tensor, seed: Tensor, along: Tensor, up: Tensor, footprint: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Reflectance, coverage and lit windows of a row of houses.
+    """Compute reflectance, coverage and lit windows of a row of houses.
 
     Args:
         colour: (B, 3, 1) linear reflectance.
@@ -68,7 +68,7 @@ def house_front(
 
 
 def lit_windows(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> Tensor:
-    """(B, 3, N) radiance of the windows of walls of houses at night."""
+    """Compute the radiance of the windows of walls of houses at night, (B, 3, N)."""
     height, seed = wall.height[:, None], wall.seed[:, None]
     _, _, lit = house_front(wall.colour[..., None], height, seed, along, up, footprint)
     return (0.5 * seed * lit)[:, None] * colour_of(lit.device, 1.0, 0.8, 0.5)

@@ -25,7 +25,7 @@ _CHROMINANCE = (
 
 @lru_cache(maxsize=8)
 def _cosines(device: torch.device) -> Tensor:
-    """(64, 64) orthonormal cosine transform of a flattened 8 x 8 block."""
+    """Return the orthonormal cosine transform of a flattened 8 x 8 block, (64, 64)."""
     k, n = torch.arange(8.0)[:, None], torch.arange(8.0)
     row = torch.cos((2 * n + 1) * k * (math.pi / 16)) * 0.5
     row[0] *= 0.5**0.5
@@ -64,7 +64,7 @@ def compress(image: Tensor, quality: Tensor) -> Tensor:
 
 
 def _quantised(planes: Tensor, scale: Tensor, table: Tensor) -> Tensor:
-    """(B, C, h, w) planes, their blocks' cosine transform rounded to multiples of the scaled table."""
+    """Round the blocks' cosine transform of planes (B, C, h, w) to multiples of the scaled table."""
     step = ((table * scale[:, None] + 50) / 100).floor().clamp(1, 255)[:, None] / 255  # (B, 1, 64)
     batch, channels, height, width = planes.shape
     blocks = planes.unflatten(3, (-1, 8)).unflatten(2, (-1, 8)).transpose(3, 4)  # (B, C, h/8, w/8, 8, 8)

@@ -17,7 +17,7 @@ _TAIL = 2.5  # px beside a stripe at which nothing is left of it: five standard 
 
 
 def near_marking(layout: Layout, ground: Ground, slot: Tensor) -> Tensor:
-    """(B, N) bool: points that any paint or stud of the nearest boundary can reach.
+    """Return which points any paint or stud of the nearest boundary can reach, (B, N) bool.
 
     Args:
         layout: the road's boundaries.
@@ -92,6 +92,6 @@ def _stud_pattern(along: Tensor, period: Tensor, group: Tensor, reach: Tensor, g
 
 
 def _wear(ground: Ground, wear: Tensor, patches: Tensor) -> Tensor:
-    """(B, N) in [0, 1] remaining paint: patches worn off by the tyres, grain showing through."""
+    """Compute the remaining paint, (B, N) in [0, 1]: patches are worn off by tyres, grain shows through."""
     grain = sample_grain(GRAIN, ground.along / 5.0, ground.across / 2.5) / (1 + ground.reach_along / 0.05)
     return smoothstep(-0.6, 0.5, patches * 0.5 + grain * 0.45 + 0.95 - 1.6 * wear)

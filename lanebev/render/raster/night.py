@@ -39,7 +39,7 @@ class Sprites(NamedTuple):
 
 
 def low_beam(lights: Lights, x: Tensor, z: Tensor) -> Tensor:
-    """(B, N) relative irradiance of the own dipped headlights on the road at (x, z) m."""
+    """Compute the relative irradiance of the own dipped headlights on the road at (x, z) m, (B, N)."""
     ahead = z.clamp(min=0.5)
     wide = lights.beam_width[:, :1] + lights.beam_width[:, 1:] * ahead
     aside = (x - 0.03 * ahead) / wide
@@ -53,7 +53,7 @@ def low_beam(lights: Lights, x: Tensor, z: Tensor) -> Tensor:
 
 
 def lamp_light(lights: Lights, along: Tensor, across: Tensor) -> Tensor:
-    """(B, N) relative irradiance of the street lamps on the road; 1 below a lamp of unit power."""
+    """Compute the street lamps' relative irradiance of the road, (B, N); 1 below unit power."""
     period, high = lights.lamp_period[:, None], lights.lamp_height[:, None]
     offset = (along - lights.lamp_phase[:, None]) / period
     offset = (offset - offset.round()) * period
@@ -70,14 +70,14 @@ def lamp_light(lights: Lights, along: Tensor, across: Tensor) -> Tensor:
 def night_irradiance(
     lights: Lights, x: Tensor, z: Tensor, along: Tensor, across: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Irradiance of the road by street lamps, and by the own beam, (B, 3, N) both."""
+    """Compute the irradiance of the road by street lamps, and by the own beam, (B, 3, N) both."""
     lamps = lights.lamp_colour[..., None] * lamp_light(lights, along, across)[:, None]
     beam = (lights.beam[:, None] * low_beam(lights, x, z))[:, None] * lights.beam_colour[..., None]
     return lamps, beam
 
 
 def sprites(lights: Lights, place: Place, alignment: Alignment, lens: Lens, objects: SceneObjects) -> Sprites:
-    """All lights that a camera may see."""
+    """Return all lights that a camera may see."""
     parts = [_street_lamps(lights, place, alignment, lens), _vehicle_lamps(lights, lens, objects)]
     parts.append(_town(lights, place))
     return Sprites(*(torch.cat(values, dim=1) for values in zip(*parts, strict=True)))
@@ -96,7 +96,7 @@ def _street_lamps(lights: Lights, place: Place, alignment: Alignment, lens: Lens
 
 
 def _vehicle_lamps(lights: Lights, lens: Lens, objects: SceneObjects) -> Sprites:
-    """Two lamps of every vehicle: red ones of those ahead, white ones of those that come."""
+    """Return two lamps of every vehicle: red ones of those ahead, white ones of oncoming ones."""
     body = objects.shape[..., 0, :]
     sin, cos = objects.heading.sin(), objects.heading.cos()
     coming = cos < 0
@@ -166,7 +166,7 @@ def add_lights(
 
 
 def _discs(colour: Tensor, pixel: Tensor, radius: Tensor, size: tuple[int, int]) -> Tensor:
-    """Soft discs, (B, 3, H, W): each over a window of fixed size about its middle."""
+    """Draw soft discs, (B, 3, H, W), each over a window of fixed size about its middle."""
     height, width = size
     reach = max(3, width // 36)
     span = torch.arange(-reach, reach + 1, device=colour.device)
@@ -191,7 +191,7 @@ def _grid(size: tuple[int, int], cell: tuple[int, int], like: Tensor) -> tuple[T
 
 
 def _glare(colour: Tensor, pixel: Tensor, radius: Tensor, lights: Lights, size: tuple[int, int]) -> Tensor:
-    """Wide halos and streaks about lights, (B, 3, H, W)."""
+    """Draw wide halos and streaks about lights, (B, 3, H, W)."""
     y, x = _grid(size, _GLARE_GRID, pixel)
     dx, dy = x - pixel[..., 0, None, None], y - pixel[..., 1, None, None]  # (B, S, h, w)
     wide = (lights.halo_size * size[1])[:, None, None, None] + radius[..., None, None]
@@ -205,7 +205,7 @@ def _glare(colour: Tensor, pixel: Tensor, radius: Tensor, lights: Lights, size: 
 
 
 def _mirror(colour: Tensor, pixel: Tensor, radius: Tensor, size: tuple[int, int]) -> Tensor:
-    """Upright streaks at mirrored lights, (B, 3, H, W)."""
+    """Draw upright streaks at mirrored lights, (B, 3, H, W)."""
     y, x = _grid(size, _MIRROR_GRID, pixel)
     dx, dy = x - pixel[..., 0, None, None], y - pixel[..., 1, None, None]
     wide = 1.5 * radius[..., None, None] + 0.004 * size[1]

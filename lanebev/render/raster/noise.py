@@ -17,7 +17,7 @@ _TILE_SEED = 20261122
 
 @lru_cache(maxsize=1)
 def _tile_on_host() -> Tensor:
-    """(4, TILE + 1, TILE + 1) periodic tile: grain and its like of unit variance, about four texels wide;
+    """Make a periodic tile (4, TILE + 1, TILE + 1): grain and its like of unit variance, four texels wide;
     cloud, 1/f noise of unit variance; crack, 1 on the edges of irregular cells and 0 elsewhere.
     """
     generator = torch.Generator().manual_seed(_TILE_SEED)
@@ -40,7 +40,7 @@ def _shaped(spectrum: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _cracks(warp: Tensor, generator: torch.Generator, cells: int = 9) -> Tensor:
-    """Edges of the cells of a jittered periodic grid, bent by a noise."""
+    """Draw the edges of the cells of a jittered periodic grid, bent by a noise."""
     axis = torch.arange(TILE) / TILE * cells
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     y, x = y + 0.12 * warp, x + 0.12 * warp.roll(200, 1)
@@ -57,13 +57,13 @@ def _cracks(warp: Tensor, generator: torch.Generator, cells: int = 9) -> Tensor:
 
 @lru_cache(maxsize=32)
 def noise_tile(device: torch.device, channel: int) -> Tensor:
-    """(TILE + 1, TILE + 1) one channel of the tile."""
+    """Return one channel of the tile, (TILE + 1, TILE + 1)."""
     return _tile_on_host()[channel].contiguous().to(device)
 
 
 @lru_cache(maxsize=8)
 def _blotch_tile(device: torch.device) -> Tensor:
-    """(1, 4, TILE + 1, TILE + 1) four independent clouds."""
+    """Make four independent clouds, (1, 4, TILE + 1, TILE + 1)."""
     cloud = _tile_on_host()[CLOUD, :-1, :-1]
     moved = [cloud.roll((151 * i, 97 * i), (0, 1)) for i in range(4)]
     return functional.pad(torch.stack(moved)[None], (0, 1, 0, 1), mode="circular").to(device)
@@ -71,14 +71,14 @@ def _blotch_tile(device: torch.device) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _line_table(device: torch.device) -> Tensor:
-    """(16 · TILE,) a periodic cloud over a line, finely sampled."""
+    """Make a periodic cloud over a line, finely sampled, (16 · TILE,)."""
     row = _tile_on_host()[CLOUD, 77]
     fine = functional.interpolate(row[None, None], 16 * TILE + 1, mode="linear", align_corners=True)
     return fine[0, 0, :-1].contiguous().to(device)
 
 
 def sample_noise(channel: int, u: Tensor, v: Tensor) -> Tensor:
-    """The tile at (u, v), bilinear and periodic.
+    """Sample the tile at (u, v), bilinear and periodic.
 
     Args:
         channel: GRAIN, CLOUD, CRACK or SECOND.
@@ -93,12 +93,12 @@ def sample_noise(channel: int, u: Tensor, v: Tensor) -> Tensor:
 
 
 def blotches(along: Tensor, across: Tensor) -> Tensor:
-    """Four slow noises over the road in one look-up, (4, B, N): 1/f, features up to 60 m by 20 m."""
+    """Sample four slow noises over the road at once, (4, B, N): 1/f, features up to 60 m by 20 m."""
     return _bilinear(_blotch_tile(along.device), along * (1 / 173.0), across * (1 / 61.0))
 
 
 def _bilinear(tile: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """(1, C, TILE + 1, TILE + 1) periodic tiles at (u, v) (...,) periods, (C, ...)."""
+    """Interpolate periodic tiles (1, C, TILE + 1, TILE + 1) at (u, v) (...,) periods, (C, ...)."""
     grid = torch.view_as_real(torch.complex(u, v))  # a fast stack
     grid = grid.sub_(grid.floor()).mul_(2).sub_(1)
     values = functional.grid_sample(
@@ -108,23 +108,23 @@ def _bilinear(tile: Tensor, u: Tensor, v: Tensor) -> Tensor:
 
 
 def sample_grain(channel: int, u: Tensor, v: Tensor) -> Tensor:
-    """As :func:`sample_noise`, the nearest texel: for grain that is finer than a pixel, four times faster."""
+    """Sample the nearest texel of the tile: for grain finer than a pixel, four times faster."""
     row, column = (v * TILE).int() & (TILE - 1), (u * TILE).int() & (TILE - 1)
     return take(noise_tile(u.device, channel), row * (TILE + 1) + column)
 
 
 def sample_line(u: Tensor) -> Tensor:
-    """A periodic noise over a line, u (...,) in periods."""
+    """Sample a periodic noise over a line at u (...,) periods."""
     return take(_line_table(u.device), (u * (16 * TILE)).int() & (16 * TILE - 1))
 
 
 def hash01(a: Tensor, b: Tensor, salt: float) -> Tensor:
-    """Repeatable pseudo-random numbers in [0, 1) of two integer-valued float tensors."""
+    """Compute repeatable pseudo-random numbers in [0, 1) from two integer-valued float tensors."""
     value = (a * 12.9898 + b * 78.233 + salt * 37.719).sin() * 43758.5453
     return value - value.floor()
 
 
 def smoothstep(low: float | Tensor, high: float | Tensor, value: Tensor) -> Tensor:
-    """0 below low, 1 above high, smooth between."""
+    """Return 0 below low and 1 above high, smooth between."""
     t = ((value - low) / (high - low)).clamp(0, 1)
     return t * t * (3 - 2 * t)

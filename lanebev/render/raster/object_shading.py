@@ -94,7 +94,7 @@ def _point(
 
 
 def _vehicle_surface(colour: Tensor, p: Point, vehicle: Tensor, truck: Tensor) -> tuple[Tensor, Tensor]:
-    """Reflectance (N, 3) with what cars and trucks have, and (N,) bool: on a lamp."""
+    """Add the features of cars and trucks to the reflectance (N, 3); also (N,) bool: on a lamp."""
     dark = constant(colour.device, 0.012, 0.012, 0.013)
     surface = _car_glass(colour, p, vehicle & ~truck)
     below = vehicle & (p.up < torch.where(truck, 1.0, 0.28))
@@ -114,7 +114,7 @@ def _vehicle_surface(colour: Tensor, p: Point, vehicle: Tensor, truck: Tensor) -
 
 
 def _car_glass(colour: Tensor, p: Point, car: Tensor) -> Tensor:
-    """Reflectance with windows, which are dark, between frames and pillars."""
+    """Add dark windows between frames and pillars to the reflectance."""
     pane = (p.up - p.top[:, 6]) / (p.top[:, 7] - p.top[:, 6]).clamp(min=1e-3)
     width_here = p.top[:, 0] + (p.top[:, 1] - p.top[:, 0]) * pane
     frame = (pane > 0.88) | (pane < 0.08) | (p.end & (p.x.abs() > width_here - 0.09))
@@ -124,7 +124,7 @@ def _car_glass(colour: Tensor, p: Point, car: Tensor) -> Tensor:
 
 
 def _car_end(surface: Tensor, p: Point, end: Tensor) -> tuple[Tensor, Tensor]:
-    """Reflectance with bumper, plate and gap at a car's ends, and (N,) bool: on a lamp."""
+    """Add bumper, plate and gap at a car's ends to the reflectance; also (N,) bool: on a lamp."""
     bumper = end & (p.level < 0.42) & (p.level > 0.28)
     surface = torch.where(bumper[:, None], surface * 0.6, surface)
     plate = end & (p.x.abs() < 0.26) & (p.level > 0.45) & (p.level < 0.62)
@@ -135,7 +135,7 @@ def _car_end(surface: Tensor, p: Point, end: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _truck_end(surface: Tensor, p: Point, end: Tensor, car_lamp: Tensor) -> tuple[Tensor, Tensor]:
-    """Reflectance with lamps and doors at a truck's ends, and (N,) bool: on a lamp of any vehicle."""
+    """Add lamps and doors at a truck's ends to the reflectance; also (N,) bool: on a lamp of any vehicle."""
     lamp = car_lamp | (end & (p.up > 1.0) & (p.up < 1.15) & (p.aside > 0.7))
     red, white = lamp & (p.face == REAR), lamp & (p.face == FRONT)
     surface = _put(surface, red, constant(surface.device, 0.28, 0.012, 0.01))
@@ -146,7 +146,7 @@ def _truck_end(surface: Tensor, p: Point, end: Tensor, car_lamp: Tensor) -> tupl
 
 
 def _sign_surface(surface: Tensor, colour: Tensor, p: Point, sign: Tensor) -> Tensor:
-    """Reflectance with a sign's face: a rim and two lines of something like letters."""
+    """Add a sign's face to the reflectance: a rim and two lines of something like letters."""
     wide, low, high = p.top[:, 0], p.top[:, 6], p.top[:, 7]
     level = (p.up - low) / (high - low).clamp(min=1e-3)
     across = p.x / wide.clamp(min=1e-3)
@@ -160,7 +160,7 @@ def _sign_surface(surface: Tensor, colour: Tensor, p: Point, sign: Tensor) -> Te
 
 
 def _bridge_surface(surface: Tensor, p: Point, bridge: Tensor) -> Tensor:
-    """Reflectance with a bridge's ribs and parapets."""
+    """Add a bridge's ribs and parapets to the reflectance."""
     ribs = bridge & p.side & ((p.z % 3.0) < 0.15)
     surface = torch.where(ribs[:, None], surface * 0.7, surface)
     parapet = bridge & p.end & (p.level > 0.72)
@@ -168,13 +168,13 @@ def _bridge_surface(surface: Tensor, p: Point, bridge: Tensor) -> Tensor:
 
 
 def _normal_up(p: Point) -> Tensor:
-    """Upward part of the normal; windows lean."""
+    """Return the upward part of the normal; windows are inclined."""
     leaning = 0.35 * (p.upper & (p.face < TOP)).float()
     return (p.face == TOP).float() - (p.face == BOTTOM).float() + leaning
 
 
 def _illumination(light: Light, heading: Tensor, p: Point, vehicle: Tensor) -> Tensor:
-    """Irradiance over pi by sun, sky and the camera's own headlights, (N, 3)."""
+    """Compute the irradiance over pi by sun, sky and the camera's own headlights, (N, 3)."""
     normal_x = (p.face == RIGHT).float() - (p.face == LEFT).float()
     normal_z = (p.face == FRONT).float() - (p.face == REAR).float()
     normal_up = _normal_up(p)
@@ -189,7 +189,7 @@ def _illumination(light: Light, heading: Tensor, p: Point, vehicle: Tensor) -> T
 
 
 def _lamp_radiance(light: Light, braking: Tensor, p: Point, lamp: Tensor) -> Tensor:
-    """What tail lamps and, at night, headlamps of others shine themselves, (N, 3)."""
+    """Compute the radiance of tail lamps and, at night, of other vehicles' headlamps, (N, 3)."""
     night = light.night > 0.4
     tail = lamp & (p.face == REAR) & (braking | night)
     red = (0.35 + 0.5 * braking.float()) * tail

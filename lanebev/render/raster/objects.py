@@ -89,7 +89,7 @@ def add_objects(scene: Scene, view: View, solids: Hexahedra, canvas: Canvas) -> 
 
 
 def _flat(objects: SceneObjects) -> SceneObjects:
-    """(B, M) objects in one row of B M."""
+    """Return the (B, M) objects as one row of B M."""
     return map_tensors(lambda tensor: tensor.flatten(0, 1), objects)
 
 
@@ -150,7 +150,7 @@ def _hits(scene: Scene, view: View, solids: Hexahedra, canvas: Canvas, tiles: Ti
 def _subpixels(
     normal: Tensor, distance: Tensor, ray_x: Tensor, ray_y: Tensor, limit: Tensor, step: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Share of N pixels that objects cover before a limit, their least Z there and its face, (N,) each."""
+    """Compute the share of pixels that objects cover before a limit, least Z and its face, (N,) each."""
     shift = constant(step.device, *(v for pair in _SUBPIXELS for v in pair)).view(-1, 2, 1)
     fine_x = ray_x + shift[:, 0] * step[0] + shift[:, 1] * step[2]  # (4, N)
     fine_y = ray_y + shift[:, 0] * step[1] + shift[:, 1] * step[3]
@@ -164,7 +164,7 @@ def _subpixels(
 
 
 def _unhidden(canvas: Canvas, hits: Hits) -> Hits:
-    """Leave out hits that cover nothing, and those behind another object that fills the pixel."""
+    """Remove hits that cover nothing, and those behind another object that fills the pixel."""
     opaque = choose(hits.share > 0.99, hits.depth, NEVER)
     front = take(canvas.depth.scatter_reduce(0, hits.pixel, opaque, "amin"), hits.pixel)
     seen = indices_where((hits.share > 0) & (hits.depth < front + _OVERLAP))

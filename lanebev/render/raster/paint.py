@@ -145,7 +145,7 @@ def _add_lights(scene: Scene, view: View, radiance: Tensor, blocked: Tensor, row
 
 
 def _road_level(scene: Scene, below: Blocks, ground: Ground, lit: Tensor) -> Tensor:
-    """(B,) root mean square radiance of the road before the camera: bright parts count for more."""
+    """Compute the root mean square radiance of the road before the camera, (B,): bright parts count more."""
     pavement = scene.world.pavement
     left, right = pavement.left[below.row, None], pavement.right[below.row, None]
     near = (ground.z < _METERED) & (ground.across > left) & (ground.across < right)
@@ -158,7 +158,7 @@ def _road_level(scene: Scene, below: Blocks, ground: Ground, lit: Tensor) -> Ten
 
 
 def _nearest(below: Blocks, ground: Ground, batch: int) -> Tensor:
-    """(B,) m, Z of the nearest road in the image; 3 where there is none."""
+    """Compute Z of the nearest road in the image, (B,) m; 3 where there is none."""
     nearest = ground.z.new_full((batch,), torch.inf)
     nearest = nearest.scatter_reduce(0, below.row, ground.z.amin(1).clamp(0.8, 8.0), "amin")
     return nearest.where(nearest.isfinite(), 3.0)

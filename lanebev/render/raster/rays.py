@@ -66,7 +66,7 @@ def pixel_rays(lens: Lens, plane: Tensor, size: tuple[int, int]) -> View:
 
 
 def _upsampled(values: Tensor, dim: int) -> Tensor:
-    """(B, 2, n, m) to 8 (n - 3) + 1 values along one of the last two dimensions.
+    """Interpolate (B, 2, n, m) to 8 (n - 3) + 1 values along one of the last two dimensions.
 
     Source: cubic Lagrange interpolation through the four nearest; linear values stay as they are.
     """
@@ -86,7 +86,7 @@ def _upsampled(values: Tensor, dim: int) -> Tensor:
 
 
 def _gradient(values: Tensor, dim: int) -> Tensor:
-    """Central differences, one-sided at the border."""
+    """Compute central differences, one-sided at the border."""
     size = values.shape[dim]
     inner = (values.narrow(dim, 2, size - 2) - values.narrow(dim, 0, size - 2)) * 0.5
     first = values.narrow(dim, 1, 1) - values.narrow(dim, 0, 1)

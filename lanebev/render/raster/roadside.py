@@ -22,7 +22,7 @@ def roadside(
     eye_across: Tensor,
     eye_height: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Kerbs, grass, cycle paths and pavements beside the carriageway.
+    """Add kerbs, grass, cycle paths and pavements beside the carriageway.
 
     A point at height k above the road is seen where the ray through it meets the road, farther from the
     camera by the factor H / (H - k): so the kerb's face and all beyond it are drawn on the road's plane.
@@ -84,7 +84,7 @@ def roadside(
 
 
 def _blocks(street: Street, along: Tensor, reach: Tensor, tone: Tensor) -> Tensor:
-    """Kerbs painted alternately white and dark."""
+    """Return the factor of kerbs painted alternately white and dark."""
     length = street.kerb_blocks[:, None].clamp(min=0.1)
     white = dash_coverage(along, length.expand_as(along), 2 * length.expand_as(along), reach)
     painted = 0.04 + 0.6 * white[:, None] * street.paint[..., None]
@@ -92,7 +92,7 @@ def _blocks(street: Street, along: Tensor, reach: Tensor, tone: Tensor) -> Tenso
 
 
 def _slabs(street: Street, along: Tensor, inner: Tensor, reach_along: Tensor, reach_across: Tensor) -> Tensor:
-    """(B, N) factor of slabs' joints and of their different tones."""
+    """Compute the factor of slabs' joints and of their different tones, (B, N)."""
     size = street.slab.clamp(min=0.2)[:, None].expand_as(along)
     gap = torch.full_like(along, 0.012)
     joint = torch.maximum(
@@ -104,6 +104,6 @@ def _slabs(street: Street, along: Tensor, inner: Tensor, reach_along: Tensor, re
 
 
 def junction_coverage(street: Street, along: Tensor, reach: Tensor) -> Tensor:
-    """(B, N) share of a pixel on a junction."""
+    """Compute the share of a pixel on a junction, (B, N)."""
     length, period = street.junction_length[:, None], street.junction_period[:, None]
     return dash_coverage(along + street.phase[:, None], length, period, reach)

@@ -14,26 +14,26 @@ from lanebev.render.raster.constants import constant
 
 
 def indices_where(mask: Tensor) -> Tensor:
-    """(N,) int64: row-major places where a mask holds, in order. Waits for the device."""
+    """Return the row-major places where a mask holds, in order, (N,) int64. Waits for the device."""
     if mask.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(mask.numpy()))
     return mask.flatten().nonzero()[:, 0]
 
 
 def count_where(mask: Tensor) -> Tensor:
-    """(M,) int64: how often a mask (M, N) holds in each line."""
+    """Count how often a mask (M, N) holds in each line, (M,) int64."""
     if mask.device.type == "cpu":
         return torch.from_numpy(np.count_nonzero(mask.numpy(), axis=1))
     return mask.sum(1)
 
 
 def take(values: Tensor, place: Tensor) -> Tensor:
-    """Elements of a tensor at row-major places, in the shape of ``place``."""
+    """Return elements of a tensor at row-major places, in the shape of ``place``."""
     return values.flatten().index_select(0, place.flatten()).view(place.shape)
 
 
 def take_channels(values: Tensor, place: Tensor) -> Tensor:
-    """(C, P) values at places in P, (C, *place.shape)."""
+    """Return the values (C, P) at places in P, (C, *place.shape)."""
     return values.index_select(1, place.flatten()).view(len(values), *place.shape)
 
 
@@ -44,16 +44,16 @@ def put(values: Tensor, place: Tensor, new: Tensor) -> None:
 
 
 def as_float(mask: Tensor) -> Tensor:
-    """1 where a mask holds, else 0, float32."""
+    """Return 1 where a mask holds, else 0, float32."""
     return mask.contiguous().view(torch.uint8).float()
 
 
 def choose(mask: Tensor, yes: Tensor | float, no: Tensor | float) -> Tensor:
-    """``yes`` where a mask holds, else ``no``, exactly, like ``torch.where``; both finite, float32."""
+    """Return ``yes`` where a mask holds, else ``no``, exactly as ``torch.where``; both finite, float32."""
     yes, no = (v if isinstance(v, Tensor) else constant(mask.device, v)[0] for v in (yes, no))
     return torch.lerp(no, yes, as_float(mask))
 
 
 def remainder(value: Tensor, period: Tensor | float) -> Tensor:
-    """``value % period`` but for rounding."""
+    """Compute ``value % period`` up to rounding."""
     return value - (value / period).floor() * period

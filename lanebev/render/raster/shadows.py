@@ -24,7 +24,7 @@ _PIECE = 64  # pixels that are looked at together for a vehicle's shadow
 def shadows(
     scene: Scene, row: Tensor, x: Tensor, ground: Ground, features: Features
 ) -> tuple[Tensor, Tensor]:
-    """Share of the sun, and of the sky, that reaches the ground, (T, N) both.
+    """Compute the share of the sun, and of the sky, that reaches the ground, (T, N) both.
 
     Args:
         scene: B of them.
@@ -49,7 +49,7 @@ def shadows(
 
 
 def _bridge_shadow(bridge: Tensor, light: Light, ground: Ground) -> tuple[Tensor, Tensor]:
-    """Shade of bridges (B, 2) m along, infinite where there is none, and how far points are below them."""
+    """Compute the shade of bridges (B, 2) m along, and how far points are below them."""
     climb = light.sun[:, 1, None].clamp(min=STEEPEST)
     soft = 0.15 + ground.reach_along
     begin, end = bridge.clamp(max=1e6).unsqueeze(-1).unbind(1)
@@ -60,7 +60,7 @@ def _bridge_shadow(bridge: Tensor, light: Light, ground: Ground) -> tuple[Tensor
 
 
 def _crown_shadow(world: World, row: Tensor, ground: Ground) -> Tensor:
-    """Dappled shade of trees that reach over the road, thicker towards its edges."""
+    """Compute the dappled shade of trees that reach over the road, thicker towards its edges."""
     crown = sample_noise(CLOUD, ground.along / 110.0, ground.across / 70.0)
     gaps = sample_noise(CLOUD, ground.along / 21.0, ground.across / 16.0)
     left, right = world.pavement.left[row, None], world.pavement.right[row, None]
@@ -69,7 +69,7 @@ def _crown_shadow(world: World, row: Tensor, ground: Ground) -> Tensor:
 
 
 def _wall_shadow(around: Surroundings, wall: int, length: Tensor, ground: Ground) -> Tensor:
-    """A band along the road beside a wall whose shadow is (B, 1) m long; 1 where it has none."""
+    """Compute the shadow, (B, 1) m long, along the road beside a wall; 1 where there is none."""
     kind, side = around.wall_kind[:, wall, None], 1.0 if wall % 2 else -1.0
     leafy = (kind == TREES) | (kind == HEDGE)
     crowns = 0.55 + 0.2 * sample_line(ground.along / 60.0 + around.wall_seed[:, wall, None])
@@ -98,7 +98,7 @@ class _Outline(NamedTuple):
 
 
 def _outlines(light: Light, objects: SceneObjects) -> tuple[_Outline, Tensor]:
-    """(B, M) outlines of vehicles, and (B, M) m, how far in X and in Z they cast any."""
+    """Return outlines of vehicles (B, M), and how far in X and in Z their shadows reach, (B, M) m."""
     shape, x, z = objects.shape, objects.x, objects.z
     sin, cos = objects.heading.sin(), objects.heading.cos()
     tall = shape[..., 7].amax(2) * 0.9
@@ -115,7 +115,7 @@ def _outlines(light: Light, objects: SceneObjects) -> tuple[_Outline, Tensor]:
 def _vehicle_shadows(
     light: Light, row: Tensor, x: Tensor, ground: Ground, objects: SceneObjects
 ) -> tuple[Tensor, Tensor]:
-    """What vehicles leave of the sun (a swept rectangle) and of the sky (dark below them), (T, N) both."""
+    """Compute the share of the sun (swept rectangles) and of the sky that vehicles leave, (T, N) both."""
     shape = ground.z.shape
     x, z, reach_along = (t.reshape(-1, _PIECE) for t in (x, ground.z, ground.reach_along))
     lit, contact = torch.ones_like(x), torch.ones_like(x)
@@ -145,7 +145,7 @@ def _vehicle_shadows(
 
 
 def _slab(position: Tensor, speed: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Times at which position + t · speed enters and leaves [low, high]."""
+    """Compute the times at which position + t · speed enters and leaves [low, high]."""
     speed = choose(speed.abs() < 1e-3, 1e-3, speed)
     first, second = (low - position) / speed, (high - position) / speed
     return torch.minimum(first, second), torch.maximum(first, second)

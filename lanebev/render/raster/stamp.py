@@ -16,7 +16,7 @@ _HIGH, _WIDE, _FONTS = 24, 16, (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLE
 
 @lru_cache(maxsize=8)
 def _letters(device: torch.device) -> Tensor:
-    """(2, G · HIGH · WIDE) the letters, and the letters with their rims."""
+    """Return the letters, and the letters with their rims, (2, G · HIGH · WIDE)."""
     cells, thick = [], []
     for letter in LETTERS:
         canvas = np.zeros((4 * _HIGH, 4 * _WIDE), np.uint8)

@@ -28,7 +28,7 @@ def street_paint(
     reach_across: Tensor,
     blotch: Tensor,
 ) -> Tensor:
-    """Coverage of a pixel by paint that bounds no lane, (B, N).
+    """Compute the coverage of a pixel by paint that bounds no lane, (B, N).
 
     Args:
         street: what is painted.
@@ -54,7 +54,7 @@ def street_paint(
 
 
 def lane_coordinates(layout: Layout, across: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Lane (int64), m right of its middle, its width in m, and whether there is a lane, (B, N) each."""
+    """Return the lane (int64), m right of its middle, its width (m) and whether there is one, (B, N) each."""
     lane = count_below(layout.across, across) - 1
     lanes = layout.exists.sum(1, keepdim=True) - 1
     on_lane = (lane >= 0) & (lane < lanes)
@@ -96,7 +96,7 @@ def _hatching(
     reach_along: Tensor,
     reach_across: Tensor,
 ) -> Tensor:
-    """Oblique stripes or chevrons that fill a lane, or grow into it from its left boundary."""
+    """Draw oblique stripes or chevrons that fill a lane, or grow into it from its left boundary."""
     chevron = street.hatch_chevron[:, None]
     slope = street.hatch_slope[:, None]
     oblique = along + slope * torch.where(chevron > 0, inside.abs(), inside)
@@ -168,7 +168,7 @@ def _bays(
     reach_along: Tensor,
     reach_across: Tensor,
 ) -> Tensor:
-    """Lines across parking strips, the outer line of cycle strips, and bicycles on them."""
+    """Draw lines across parking strips, the outer line of cycle strips, and bicycles on them."""
     marks = torch.zeros_like(along)
     for side, low, high in strips_between(layout, pavement):
         kind = street.strip[:, side, None]

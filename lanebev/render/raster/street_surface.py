@@ -18,7 +18,7 @@ RAIL_GAUGE = 1.435  # m
 def tracks(
     street: Street, along: Tensor, across: Tensor, reach_along: Tensor, reach_across: Tensor, albedo: Tensor
 ) -> Tensor:
-    """Tram rails in their bed over a reflectance (B, 3, N)."""
+    """Draw tram rails in their bed over a reflectance (B, 3, N)."""
     aside = across - street.tram_across[:, None]
     on = street.tram[:, None]
     bed = (
@@ -42,7 +42,7 @@ def tracks(
 def strips(
     street: Street, layout: Layout, pavement: Pavement, across: Tensor, reach: Tensor, albedo: Tensor
 ) -> Tensor:
-    """Coloured cycle lanes between the outer boundaries and the kerbs, over a reflectance (B, 3, N)."""
+    """Draw coloured cycle lanes between the outer boundaries and the kerbs over a reflectance (B, 3, N)."""
     for side, low, high in strips_between(layout, pavement):
         cover = band(across, low + 0.15, high, reach) * street.strip_opacity[:, side, None]
         albedo = albedo + (street.strip_colour[:, side, :, None] - albedo) * cover[:, None]
@@ -50,7 +50,7 @@ def strips(
 
 
 def strips_between(layout: Layout, pavement: Pavement) -> list[tuple[int, Tensor, Tensor]]:
-    """Side and limits (B, 1), m, of the strips beside the outer boundaries."""
+    """Return side and limits (B, 1), m, of the strips beside the outer boundaries."""
     last = layout.across.masked_fill(~layout.exists, 0.0).amax(1, keepdim=True)
     return [(0, pavement.left[:, None], -0.15 + 0 * last), (1, last, pavement.right[:, None])]
 
@@ -58,7 +58,7 @@ def strips_between(layout: Layout, pavement: Pavement) -> list[tuple[int, Tensor
 def ironwork(
     street: Street, lane: Tensor, along: Tensor, inside: Tensor, reach_along: Tensor, reach_across: Tensor
 ) -> Tensor:
-    """Darkening, (B, N) in [0, 1], by manhole covers and by the sealed cuts about old trenches.
+    """Compute the darkening by manhole covers and by sealed cuts about old trenches, (B, N) in [0, 1].
 
     Args:
         street: how many there are.

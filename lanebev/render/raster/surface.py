@@ -42,13 +42,13 @@ class LanePlace(NamedTuple):
 
 
 def nearest_slot(layout: Layout, across: Tensor) -> Tensor:
-    """(B, N) int64: the boundary nearest to ``across`` (B, N) m."""
+    """Return the boundary nearest to ``across`` (B, N) m, (B, N) int64."""
     middles = 0.5 * (layout.across[:, 1:] + layout.across[:, :-1])
     return count_below(middles, across)
 
 
 def count_below(edges: Tensor, value: Tensor) -> Tensor:
-    """(B, N) int64: how many of (B, K) edges lie below (B, N) values; for few edges faster than a search."""
+    """Count the (B, K) edges below values (B, N), (B, N) int64; for few edges faster than a search."""
     count = torch.zeros(value.shape, dtype=torch.uint8, device=value.device)
     for edge in edges.unsqueeze(-1).unbind(1):
         count += (value > edge).view(torch.uint8)
@@ -110,7 +110,7 @@ def pavement_albedo(
 
 
 def _weathering(pavement: Pavement, ground: Ground, inside: Tensor, mottle: Tensor) -> Tensor:
-    """(B, N) relative change by aggregate, blotches, streaks, tyre tracks and oil."""
+    """Compute the relative change by aggregate, blotches, streaks, tyre tracks and oil, (B, N)."""
     u, v, reach = ground.along, ground.across, ground.reach_along
     grain = sample_grain(GRAIN, u / 6.1, v / 6.1) / (1 + reach / 0.05)
     medium = sample_noise(SECOND, u / 61.0, v / 47.0) / (1 + reach / 0.5)
@@ -127,7 +127,7 @@ def _weathering(pavement: Pavement, ground: Ground, inside: Tensor, mottle: Tens
 def _lines(
     pavement: Pavement, layout: Layout, ground: Ground, lanes: LanePlace, blotch: Tensor, features: Features
 ) -> Tensor:
-    """(B, N) darkening by seams, joints, cracks and skids."""
+    """Compute the darkening by seams, joints, cracks and skids, (B, N)."""
     along, across, slot, inside = ground.along, ground.across, lanes.slot, lanes.inside
     wobble = sample_line(along / 90.0)
     beside = (layout.across + pavement.seam_shift).gather(1, slot)  # m, where the seam is
@@ -155,7 +155,7 @@ def _lines(
 
 
 def _patches(pavement: Pavement, ground: Ground, lanes: LanePlace) -> Tensor:
-    """(B, N) factor: rectangles of newer or older surface, one at most in 14 m of a lane."""
+    """Compute the factor (B, N) of rectangles of newer or older surface, at most one in 14 m of a lane."""
     cell = (ground.along / 14.0).floor()
     row = lanes.lane.to(cell.dtype)
     exists = hash01(cell, row, 1.0) < pavement.patch[:, None]
@@ -168,7 +168,7 @@ def _patches(pavement: Pavement, ground: Ground, lanes: LanePlace) -> Tensor:
 
 
 def _gutter(pavement: Pavement, ground: Ground, side: int, mottle: Tensor) -> Tensor:
-    """(B, N) factor of the strip along an edge: a line beside a barrier's foot that is no marking."""
+    """Compute the factor (B, N) of the strip along an edge, a line beside a barrier's foot, not a marking."""
     edge = (pavement.left, pavement.right)[side]
     width = pavement.gutter_width[:, side, None] * (1 + 0.15 * sample_line(ground.along / 70.0 + side))
     inwards = (ground.across - edge[:, None]) * (1 - 2 * side)

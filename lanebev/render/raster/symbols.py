@@ -17,7 +17,7 @@ _LETTER = (0.42, 2.4)  # m, a letter's pitch across and its height along the roa
 
 
 def symbols(layout: Layout, ground: Ground, lane: Tensor) -> Tensor:
-    """Coverage of a pixel by symbols, (B, N).
+    """Compute the coverage of a pixel by symbols, (B, N).
 
     Args:
         layout: of the road; the symbol of lane k stands between boundaries k and k + 1.
@@ -52,7 +52,7 @@ def symbols(layout: Layout, ground: Ground, lane: Tensor) -> Tensor:
 
 
 def _arrow(x: Tensor, y: Tensor, wide: Tensor, far: Tensor) -> Tensor:
-    """A stem of 3 m and a head of 1.6 m."""
+    """Draw a stem of 3 m and a head of 1.6 m."""
     stem = stripe_coverage(x, torch.full_like(x, 0.16), wide) * stripe_coverage(
         y - 1.5, torch.full_like(x, 3.0), far
     )
@@ -62,7 +62,7 @@ def _arrow(x: Tensor, y: Tensor, wide: Tensor, far: Tensor) -> Tensor:
 
 
 def _turn(x: Tensor, y: Tensor, wide: Tensor, far: Tensor) -> Tensor:
-    """A stem that leads to a head pointing right."""
+    """Draw a stem that leads to a head pointing right."""
     stem = stripe_coverage(x + 0.3, torch.full_like(x, 0.16), wide) * stripe_coverage(
         y - 1.6, torch.full_like(x, 3.2), far
     )
@@ -75,7 +75,7 @@ def _turn(x: Tensor, y: Tensor, wide: Tensor, far: Tensor) -> Tensor:
 
 
 def _word(x: Tensor, y: Tensor, wide: Tensor, far: Tensor, seed: Tensor) -> Tensor:
-    """Four letters of a stroke or three each, tall enough to be read from a car."""
+    """Draw four letters of one stroke or three each, tall enough to be read from a car."""
     letter = (x / _LETTER[0]).floor()
     u, v = x / _LETTER[0] - letter, y / _LETTER[1]
     inside = (letter >= -2) & (letter < 2) & (v > 0) & (v < 1)
@@ -94,7 +94,7 @@ def _word(x: Tensor, y: Tensor, wide: Tensor, far: Tensor, seed: Tensor) -> Tens
 
 
 def _diamond(x: Tensor, y: Tensor, wide: Tensor, far: Tensor) -> Tensor:
-    """The outline of a rhombus, 1 m by 4 m."""
+    """Draw the outline of a rhombus, 1 m by 4 m."""
     size = x.abs() / 0.5 + (y - 2.0).abs() / 2.0
     reach = torch.hypot(wide / 0.5, far / 2.0)
     return (((1.0 - size) / reach + 0.5).clamp(0, 1)) * (((size - 0.68) / reach + 0.5).clamp(0, 1))

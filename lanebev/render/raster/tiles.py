@@ -15,7 +15,7 @@ def tile_grid(size: tuple[int, int]) -> tuple[int, int]:
 
 
 def tile_corners(plane: Tensor, size: tuple[int, int]) -> Tensor:
-    """Values (B, H·W) at the four corners of every tile, (4, B, tiles)."""
+    """Return the values (B, H·W) at the four corners of every tile, (4, B, tiles)."""
     rows, columns = tile_grid(size)
     y = torch.arange(rows, device=plane.device) * TILE
     x = torch.arange(columns, device=plane.device) * TILE
@@ -30,7 +30,7 @@ def tile_corners(plane: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def tile_pixels(tile: Tensor, size: tuple[int, int]) -> Tensor:
-    """Row-major places (..., 64) of the pixels of tiles (...,); beyond the border, the last one's."""
+    """Return row-major places (..., 64) of the pixels of tiles (...,), kept inside the border."""
     columns = tile_grid(size)[1]
     within = torch.arange(TILE_PIXELS, device=tile.device)
     y = ((tile // columns * TILE)[..., None] + within // TILE).clamp(max=size[0] - 1)

@@ -62,6 +62,6 @@ def add_ceiling(
 
 
 def _inside(distance: Tensor, size: Tensor, footprint: Tensor) -> Tensor:
-    """(B, N) share of a pixel within half the size, m, of a middle."""
+    """Compute the share of a pixel within half the size, m, of a middle, (B, N)."""
     wide = torch.maximum(footprint, 0.05 * size)
     return ((0.5 * size - distance) / wide + 0.5).clamp(0, 1) * (size / footprint).clamp(max=1)

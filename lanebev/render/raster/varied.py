@@ -93,7 +93,7 @@ def snow_ground(
 def old_lines(
     works: Works, along: Tensor, across: Tensor, reach_along: Tensor, reach_across: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Coverage by lines that are not in force, and darkening where some were taken off, (B, N) both."""
+    """Compute the coverage by lines that are not valid, and the darkening by removed ones, (B, N) both."""
     paint, scars = torch.zeros_like(along), torch.zeros_like(along)
     ahead = along + works.phase[:, None]
     for line in range(NUM_OLD):

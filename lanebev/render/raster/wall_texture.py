@@ -43,12 +43,12 @@ def wall_texture(
 
 
 def _below(top: Tensor, up: Tensor, footprint: Tensor) -> Tensor:
-    """Share of a pixel below a height."""
+    """Compute the share of a pixel below a height."""
     return ((top - up) / footprint + 0.5).clamp(0, 1)
 
 
 def _concrete(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
-    """Panels with stains; some with a sloping, brighter foot."""
+    """Draw panels with stains; some with a sloping, brighter foot."""
     height, toe = wall.height[:, None], wall.toe[:, None]
     panel = periodic_coverage(along, 0.03, 6.0, footprint)
     stain = sample_noise(CLOUD, along / 30.0 + wall.seed[:, None], up / 9.0)
@@ -60,12 +60,12 @@ def _concrete(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple
 
 
 def _standing(height: Tensor, up: Tensor, footprint: Tensor) -> Tensor:
-    """Share of a pixel between the ground and a height."""
+    """Compute the share of a pixel between the ground and a height."""
     return (up / footprint + 0.5).clamp(0, 1) * _below(height, up, footprint)
 
 
 def _rail(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
-    """A beam on posts."""
+    """Draw a beam on posts."""
     height = wall.height[:, None]
     below = _below(height, up, footprint)
     beam = below * (1 - _below(height - 0.31, up, footprint))
@@ -77,7 +77,7 @@ def _rail(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Ten
 
 
 def _fence(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
-    """Panels between posts."""
+    """Draw panels between posts."""
     stain = sample_noise(CLOUD, along / 60.0 + wall.seed[:, None], up / 20.0)
     panel = periodic_coverage(along, 0.15, 5.0, footprint)
     shade = 0.9 + 0.12 * stain - 0.3 * panel
@@ -85,7 +85,7 @@ def _fence(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Te
 
 
 def _slope(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
-    """An embankment with tufts and bushes."""
+    """Draw an embankment with tufts and bushes."""
     seed = wall.seed[:, None]
     top = wall.height[:, None] * (0.75 + 0.3 * sample_line(along / 420.0 + seed).clamp(-1.5, 1.5))
     tufts = sample_noise(CLOUD, along / 60.0 + seed, up / 25.0)
@@ -95,7 +95,7 @@ def _slope(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Te
 
 
 def _houses(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
-    """House fronts."""
+    """Draw house fronts."""
     height, seed = wall.height[:, None], wall.seed[:, None]
     return house_front(wall.colour[..., None], height, seed, along, up, footprint)[:2]
 
@@ -103,7 +103,7 @@ def _houses(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[T
 def _foliage(
     wall: Wall, kind: int, style: int, along: Tensor, up: Tensor, footprint: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """A row of trees or bushes: crowns by noise on their outline, lit from above, holes of sky."""
+    """Draw a row of trees or bushes: crowns by noise on their outline, lit from above, with holes of sky."""
     height, seed = wall.height[:, None], wall.seed[:, None]
     leaves = sample_noise(CLOUD, along / 33.0 + seed, up / 33.0)
     fine = sample_grain(GRAIN, along / 22.0, up / 22.0 + seed) / (1 + footprint / 0.15)
@@ -122,7 +122,7 @@ def _foliage(
 
 
 def _crowns(along: Tensor, height: Tensor, seed: Tensor, conifer: bool) -> Tensor:
-    """(B, N) m, outline of single trees of random place, size and shape over some undergrowth."""
+    """Compute the outline of single trees of random place, size and shape over undergrowth, (B, N) m."""
     spacing = height * (0.45 if conifer else 0.8)
     u = along / spacing
     row = (seed * 97.0).floor()
@@ -141,7 +141,7 @@ def _crowns(along: Tensor, height: Tensor, seed: Tensor, conifer: bool) -> Tenso
 
 
 def periodic_coverage(along: Tensor, length: float, period: float, footprint: Tensor) -> Tensor:
-    """(B, N) coverage of things ``length`` long every ``period`` metres, softened by the footprint."""
+    """Compute the coverage of things ``length`` long every ``period`` m, softened, (B, N)."""
     distance = (along / period - (along / period).round()).abs() * period
     share = length / (length + footprint)
     return share * ((0.5 * length - distance) / footprint + 0.5).clamp(0, 1) + (1 - share) * length / period

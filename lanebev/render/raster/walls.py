@@ -108,7 +108,7 @@ def add_walls(scene: Scene, view: View, canvas: Canvas, across: Tensor, features
 def _hits(
     scene: Scene, view: View, canvas: Canvas, across: Tensor, row: Tensor, walls: Wall
 ) -> tuple[Blocks, WallHits]:
-    """Where rays meet E walls (in scenes ``row``) before the ground."""
+    """Compute where rays meet E walls (in scenes ``row``) before the ground."""
     height = scene.lens.extrinsics.height[row]
     place_across = walls.across - scene.place.across[row]
     tall = walls.height * 1.5
@@ -142,7 +142,7 @@ def _candidates(
     place_across: Tensor,
     above: Tensor,
 ) -> Tensor:
-    """(E, tiles) bool: tiles that may show a wall: of the ground beyond it, or low enough in the sky.
+    """Return which tiles may show a wall: of the ground beyond it, or low in the sky, (E, tiles) bool.
 
     The line that bounds them is as good as straight within a tile, so one of its corners tells.
     """
@@ -161,7 +161,7 @@ def _candidates(
 
 
 def _textures(walls: Wall, blocks: Blocks, hits: WallHits, looks: list[tuple[int, int]]) -> WallColours:
-    """Colours of points on walls, sorted by their looks (kind, style): those of one look at a time."""
+    """Compute colours of points on walls, sorted by their looks (kind, style), one look at a time."""
     parts = []
     for look, part in _parts(blocks, looks):
         own = select_rows(walls, part)
@@ -181,7 +181,7 @@ def _parts(blocks: Blocks, looks: list[tuple[int, int]]) -> Iterator[tuple[tuple
 
 
 def _radiance(scene: Scene, own: WallRows, hits: WallHits, albedo: Tensor, features: Features) -> Tensor:
-    """Linear radiance (T, 3, N) of points on walls as seen through the air."""
+    """Compute the linear radiance (T, 3, N) of points on walls as seen through the air."""
     light, row, kind = select_rows(scene.light, own.row), own.row, own.kind
     right, up, ahead = light.sun.unbind(1)
     facing = (-(own.wall.across - scene.place.across[row]).sign() * right).clamp(min=0)
@@ -200,7 +200,7 @@ def _radiance(scene: Scene, own: WallRows, hits: WallHits, albedo: Tensor, featu
 def _add_windows(
     scene: Scene, own: WallRows, blocks: Blocks, hits: WallHits, looks: list[tuple[int, int]], lit: Tensor
 ) -> None:
-    """Light windows of houses at night; changes the radiance (T, 3, N)."""
+    """Add light windows of houses at night; changes the radiance (T, 3, N)."""
     for (kind, _), part in _parts(blocks, looks):
         if kind == HOUSES and part.stop > part.start:
             row = own.row[part]

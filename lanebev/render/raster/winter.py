@@ -22,7 +22,7 @@ def snow_cover(
     reach_across: Tensor,
     blotch: Tensor,
 ) -> Tensor:
-    """Share of a pixel under snow, (B, N); none where a boundary's paint is to be seen.
+    """Compute the share of a pixel under snow, (B, N); none where a boundary's paint is visible.
 
     Args:
         winter: the snow.

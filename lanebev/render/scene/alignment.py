@@ -19,18 +19,18 @@ MAX_HEADING = 0.9  # rad; beyond it the centreline would not be a function of Z
 
 
 def knots(count: int = NUM_KNOTS, growth: float = KNOT_GROWTH) -> Tensor:
-    """(K,) m, float64."""
+    """Return the knots, (K,) m, float64."""
     return KNOT_SCALE * torch.expm1(torch.arange(count, dtype=torch.float64) * growth)
 
 
 @lru_cache(maxsize=8)
 def _knots_on(device: torch.device) -> Tensor:
-    """(K,) m, float32."""
+    """Return the knots on a device, (K,) m, float32."""
     return knots().float().to(device)
 
 
 def _at(table: Tensor, index: Tensor) -> Tensor:
-    """Entries of a table (K,) at indices of any shape."""
+    """Return the entries of a table (K,) at indices of any shape."""
     return table.index_select(0, index.flatten()).view(index.shape)
 
 
@@ -55,7 +55,7 @@ class Alignment(NamedTuple):
 
 
 def arc_nodes() -> Tensor:
-    """(A,) m, float64: arc lengths at which :func:`build_alignment` wants curvature and elevation."""
+    """Return the arc lengths of :func:`build_alignment`'s curvature and elevation, (A,) m, float64."""
     return knots(NUM_KNOTS * FINE, KNOT_GROWTH / FINE)
 
 
@@ -124,14 +124,14 @@ class RoadPoint(NamedTuple):
 
 
 def _nearest_knot(z: Tensor) -> tuple[Tensor, Tensor]:
-    """Index of the nearest knot and the distance from it, (B, N) both."""
+    """Return the index of the nearest knot and the distance from it, (B, N) both."""
     index = (z.clamp(min=0) * (1 / KNOT_SCALE)).log1p().mul(1 / KNOT_GROWTH).round().clamp(0, NUM_KNOTS - 1)
     index = index.long()
     return index, z - _at(_knots_on(z.device), index)
 
 
 def _centreline(alignment: Alignment, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """x, sin and cos of the heading, arc and curvature at z, by Taylor expansion from the nearest knot."""
+    """Compute x, sin and cos of the heading, arc and curvature at z, by Taylor expansion from a knot."""
     index, dz = _nearest_knot(z)
     slope, bend = alignment.slope.gather(1, index), alignment.bend.gather(1, index)
     x = alignment.x.gather(1, index) + dz * (slope + 0.5 * bend * dz)
@@ -143,7 +143,7 @@ def _centreline(alignment: Alignment, z: Tensor) -> tuple[Tensor, Tensor, Tensor
 
 
 def road_from_local(alignment: Alignment, x: Tensor, z: Tensor) -> RoadPoint:
-    """Local X, Z to arc length and offset; exact where the curvature is constant over the offset.
+    """Convert local X, Z to arc length and offset; exact where the curvature is constant over the offset.
 
     Args:
         alignment: (B, K) tables.
@@ -162,7 +162,7 @@ def road_from_local(alignment: Alignment, x: Tensor, z: Tensor) -> RoadPoint:
 
 
 def local_from_road(alignment: Alignment, z_centre: Tensor, across: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Points beside the centreline at z_centre to local X, Z, and their arc length.
+    """Convert points beside the centreline at z_centre to local X, Z, and return their arc length.
 
     Args:
         alignment: (B, K) tables.
@@ -174,7 +174,7 @@ def local_from_road(alignment: Alignment, z_centre: Tensor, across: Tensor) -> t
 
 
 def z_from_arc(alignment: Alignment, arc: Tensor) -> Tensor:
-    """(B, N) arc length to Z of the centreline; behind the camera the road is straight."""
+    """Convert arc length (B, N) to Z of the centreline; behind the camera the road is straight."""
     index = torch.searchsorted(alignment.arc.contiguous(), arc.contiguous()).clamp(1, NUM_KNOTS - 1)
     low, high = alignment.arc.gather(1, index - 1), alignment.arc.gather(1, index)
     z = _knots_on(arc.device)
@@ -183,7 +183,7 @@ def z_from_arc(alignment: Alignment, arc: Tensor) -> Tensor:
 
 
 def elevation_at(alignment: Alignment, z: Tensor) -> Tensor:
-    """(B, N) m above the tangent plane, linear between knots."""
+    """Compute the elevation above the tangent plane, (B, N) m, linear between knots."""
     position = (z.clamp(min=0) * (1 / KNOT_SCALE)).log1p() * (1 / KNOT_GROWTH)
     index = position.long().clamp(0, NUM_KNOTS - 2)
     knot = _knots_on(z.device)
@@ -192,7 +192,7 @@ def elevation_at(alignment: Alignment, z: Tensor) -> Tensor:
 
 
 def lowest_slopes(alignment: Alignment, height: Tensor) -> Tensor:
-    """Least fall per metre forward of any ray from the camera to the road up to each knot, (B, K - 1).
+    """Compute the least fall per metre ahead of rays from the camera to the road up to each knot, (B, K - 1).
 
     Not increasing; a ray meets the road if and only if it falls by more than the last.
 
@@ -205,7 +205,7 @@ def lowest_slopes(alignment: Alignment, height: Tensor) -> Tensor:
 
 
 def ground_hit(alignment: Alignment, height: Tensor, ray_y: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays meet the road surface.
+    """Compute where rays meet the road surface.
 
     Args:
         alignment: (B, K) tables.
@@ -224,7 +224,7 @@ def ground_hit(alignment: Alignment, height: Tensor, ray_y: Tensor) -> tuple[Ten
 
 
 def hidden_by_crest(alignment: Alignment, height: Tensor, z: Tensor) -> Tensor:
-    """(B, N) bool: the road at z lies behind a crest."""
+    """Return whether the road at z is behind a crest, (B, N) bool."""
     table, lowest = _knots_on(z.device), lowest_slopes(alignment, height)
     index = torch.searchsorted(table, z.contiguous()).clamp(1, NUM_KNOTS - 1) - 1
     before = lowest.gather(1, (index - 1).clamp(min=0))
@@ -265,7 +265,7 @@ def wall_table(alignment: Alignment, across: Tensor) -> WallTable:
 
 
 def wall_hit(table: WallTable, ray_x: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays meet a wall.
+    """Compute where rays meet a wall.
 
     Args:
         table: of the walls.

@@ -31,7 +31,7 @@ class Lens(NamedTuple):
     extrinsics: Extrinsics
 
     def road_from_cam(self) -> Tensor:
-        """(B, 3, 3), computed in double precision: the product of matrices may round to 10 bits in single."""
+        """Compute the rotation (B, 3, 3) in double precision: single may round products to 10 bits."""
         pitch, yaw, roll, _ = self.extrinsics
         wide = widest_dtype(pitch.device)
         return road_from_cam(pitch.to(wide), yaw.to(wide), roll.to(wide)).to(pitch.dtype)
@@ -43,7 +43,7 @@ class Lens(NamedTuple):
         return turned[0] + turned[1] + turned[2]
 
     def pixels_as_taken(self, points: Tensor, size: tuple[int, int]) -> Tensor:
-        """Points (right, down, forward) from the camera, in road directions, to pixels as taken.
+        """Project points (right, down, forward) from the camera, in road directions, to pixels as taken.
 
         Args:
             points: (B, N, 3) m.
@@ -63,7 +63,7 @@ class Lens(NamedTuple):
 
 
 def sample_intrinsics(sampler: BatchSampler, size: tuple[int, int]) -> Tensor:
-    """(B, 3, 3): horizontal field of view 40 to 90 degrees, principal point near the centre."""
+    """Sample intrinsics (B, 3, 3): field of view 40 to 90 degrees, principal point near the centre."""
     height, width = size
     view = torch.where(sampler.chance(0.6), sampler.uniform(44, 68), sampler.uniform(40, 90)).deg2rad()
     focal = 0.5 * width / (0.5 * view).tan()
@@ -79,7 +79,7 @@ def sample_intrinsics(sampler: BatchSampler, size: tuple[int, int]) -> Tensor:
 
 
 def sample_distortion(sampler: BatchSampler, intrinsics: Tensor, size: tuple[int, int], model: str) -> Tensor:
-    """(B, 5) Brown-Conrady or (B, 4) Kannala-Brandt, mild enough to be invertible over the image."""
+    """Sample (B, 5) Brown-Conrady or (B, 4) Kannala-Brandt coefficients that can be inverted in the image."""
     corner = 0.25 * (size[0] ** 2 + size[1] ** 2) / intrinsics[:, 0, 0] ** 2  # squared radius, z = 1 plane
     if model == "fisheye":
         return torch.stack(
@@ -93,7 +93,7 @@ def sample_distortion(sampler: BatchSampler, intrinsics: Tensor, size: tuple[int
 
 
 def sample_extrinsics(sampler: BatchSampler) -> Extrinsics:
-    """Random poses: mostly near level, at times far from it."""
+    """Sample random poses: mostly near level, at times far from it."""
 
     def mixed(narrow: float, wide: float, rare: float, share_rare: float) -> Tensor:
         spread = torch.where(

@@ -32,7 +32,7 @@ BLOCKS = [(0.5, 0.7), (0.5, 1.0), (1.0, 2.0), (1.5, 3.0)]  # broad dashes beside
 
 
 def sample_city_layout(sampler: BatchSampler, base: Layout) -> tuple[Layout, Tensor, Tensor, Tensor]:
-    """A street's boundaries, narrow or wide lanes of unequal width, mostly two-way.
+    """Sample a street's boundaries, with narrow or wide lanes of unequal width, mostly two-way.
 
     Args:
         sampler: the randomness.

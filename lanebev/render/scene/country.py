@@ -30,7 +30,7 @@ _BARE, _MIDDLE, _EDGES = range(3)  # what is painted
 def country_layout(
     sampler: BatchSampler, country: Tensor, layout: Layout, ego_lane: Tensor
 ) -> tuple[Layout, Tensor]:
-    """One or two narrow lanes, where country (B,) holds: three in four without paint."""
+    """Sample one or two narrow lanes where country (B,) holds; three in four have no paint."""
     lanes = 1 + sampler.chance(0.7).long()
     index = torch.arange(MAX_BOUNDARIES, device=lanes.device)
     exists = index <= lanes[:, None]
@@ -62,7 +62,7 @@ def country_layout(
 
 
 def country_pavement(sampler: BatchSampler, country: Tensor, layout: Layout, pavement: Pavement) -> Pavement:
-    """Old asphalt up to the grass, at times gravel or earth, where country (B,) holds."""
+    """Sample old asphalt up to the grass, at times gravel or earth, where country (B,) holds."""
     last = layout.across.masked_fill(~layout.exists, 0.0).amax(1)
     shoulder = sampler.uniform(0.0, 0.5, 2)
     gravel = sampler.chance(0.2)[:, None]
@@ -85,7 +85,7 @@ def country_pavement(sampler: BatchSampler, country: Tensor, layout: Layout, pav
 def country_surroundings(
     sampler: BatchSampler, country: Tensor, pavement: Pavement, around: Surroundings
 ) -> Surroundings:
-    """Fields, hedges and trees near a narrow road, where country (B,) holds."""
+    """Sample fields, hedges and trees near a narrow road, where country (B,) holds."""
     near = sampler.pick([0.55, 0.2, 0.15, 0.1], 2)
     near = near.new_tensor([NOTHING, HEDGE, RAIL, FENCE])[near]
     middle = near.new_tensor([NOTHING, TREES, HEDGE, SLOPE])[sampler.pick([0.35, 0.35, 0.15, 0.15], 2)]

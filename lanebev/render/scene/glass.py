@@ -60,7 +60,7 @@ class Glass(NamedTuple):
 
 
 def sample_glass(sampler: BatchSampler, camera: Tensor, night: Tensor) -> Glass:
-    """Random faults.
+    """Sample random faults.
 
     Args:
         sampler: the randomness.

@@ -68,7 +68,7 @@ def sample_kinds(sampler: BatchSampler, kind: str) -> Kinds:
 
 
 def choose(mask: Tensor, first: T, second: T) -> T:
-    """Rows of ``first`` where the mask (B,) holds, else of ``second``: (nested) NamedTuples of tensors."""
+    """Select rows of ``first`` where the mask (B,) holds, else of ``second``: NamedTuples of tensors."""
     parts = []
     for one, other in zip(first, second, strict=True):
         if isinstance(one, tuple):

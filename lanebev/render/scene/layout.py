@@ -83,7 +83,7 @@ class Layout(NamedTuple):
 
 
 def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layout:
-    """A random road.
+    """Sample a random road.
 
     Args:
         sampler: the randomness.
@@ -183,7 +183,7 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
 
 
 def presence(layout: Layout, slot: Tensor, along: Tensor) -> Tensor:
-    """(B, N) in {0, 1}: boundary ``slot`` (B, N) is marked at arc length ``along`` (B, N) of the world."""
+    """Tell where boundary ``slot`` (B, N) is marked at arc lengths ``along`` (B, N), (B, N) in {0, 1}."""
     period, length, phase, marked = (
         t.gather(1, slot)
         for t in (layout.missing_period, layout.missing_length, layout.missing_phase, layout.marked.float())
@@ -192,7 +192,7 @@ def presence(layout: Layout, slot: Tensor, along: Tensor) -> Tensor:
 
 
 def labelled_slots(layout: Layout, ego_lane: Tensor) -> tuple[Tensor, Tensor]:
-    """Slots of the six labelled boundaries about the ego lane.
+    """Return the slots of the six labelled boundaries about the ego lane.
 
     Args:
         layout: the road.

@@ -78,7 +78,7 @@ class Lights(NamedTuple):
 
 
 def sample_lights(sampler: BatchSampler, night: Tensor, left: Tensor, right: Tensor) -> Lights:
-    """Random lights of the night.
+    """Sample random lights of the night.
 
     Args:
         sampler: the randomness.
@@ -141,7 +141,7 @@ def sample_lights(sampler: BatchSampler, night: Tensor, left: Tensor, right: Ten
 
 
 def night_light(light: Light, lights: Lights) -> Light:
-    """The illumination on a night of these lights."""
+    """Return the illumination on a night with these lights."""
     lamps = 0.25 * lights.lamp.sum(1, keepdim=True) * lights.lamp_colour + lights.spill
     on = (lights.on > 0)[:, None]
     return light._replace(

@@ -78,7 +78,7 @@ class Pavement(NamedTuple):
 
 
 def _tone(sampler: BatchSampler, concrete: Tensor, bright: Tensor) -> Tensor:
-    """(B, 3) reflectance of asphalt or concrete."""
+    """Sample the reflectance of asphalt or concrete, (B, 3)."""
     level = torch.where(concrete, sampler.uniform(0.20, 0.40), sampler.uniform(0.045, 0.17))
     level = torch.where(bright, sampler.uniform(0.33, 0.50), level)
     warm = torch.where(concrete, sampler.uniform(-0.01, 0.07), sampler.uniform(-0.04, 0.04))
@@ -90,7 +90,7 @@ def _tone(sampler: BatchSampler, concrete: Tensor, bright: Tensor) -> Tensor:
 def sample_pavement(
     sampler: BatchSampler, layout: Layout, dotted: Tensor, bright: Tensor, wet: Tensor, median: Tensor
 ) -> Pavement:
-    """A random surface under a layout.
+    """Sample a random surface under a layout.
 
     Args:
         sampler: the randomness.

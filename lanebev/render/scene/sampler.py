@@ -29,25 +29,25 @@ class BatchSampler:
         return BatchSampler(self.batch_size, generator)
 
     def uniform(self, low: float, high: float, *shape: int) -> Tensor:
-        """(B, *shape) uniform in [low, high)."""
+        """Sample uniform numbers in [low, high), (B, *shape)."""
         return low + (high - low) * torch.rand(self.batch_size, *shape, generator=self.generator)
 
     def normal(self, std: float, *shape: int) -> Tensor:
-        """(B, *shape) Gaussian of zero mean."""
+        """Sample Gaussian numbers of zero mean, (B, *shape)."""
         return std * torch.randn(self.batch_size, *shape, generator=self.generator)
 
     def chance(self, probability: float, *shape: int) -> Tensor:
-        """(B, *shape) bool."""
+        """Sample truth values, (B, *shape) bool."""
         return torch.rand(self.batch_size, *shape, generator=self.generator) < probability
 
     def pick(self, weights: list[float] | tuple[float, ...], *shape: int) -> Tensor:
-        """(B, *shape) int64, an index with the given weights."""
+        """Sample indices with the given weights, (B, *shape) int64."""
         cumulative = torch.tensor(weights).cumsum(0)
         draw = torch.rand(self.batch_size, *shape, generator=self.generator) * cumulative[-1]
         return torch.bucketize(draw, cumulative, right=True).clamp(max=len(weights) - 1)
 
     def pick_from(self, values: Sequence[float] | Sequence[tuple[float, ...]], *shape: int) -> Tensor:
-        """(B, *shape, ...) one of the values, all equally likely."""
+        """Sample one of the values, all equally likely, (B, *shape, ...)."""
         return torch.tensor(values)[self.pick([1.0] * len(values), *shape)]
 
 
@@ -100,7 +100,7 @@ def through_tables(function: Callable[[Tensor], Tensor], values: T) -> T:
 
 
 def select_rows(values: T, rows: Tensor | slice) -> T:
-    """Rows of a (nested) NamedTuple of (B, ...) tensors: an index tensor (R,) or a slice."""
+    """Select rows of a (nested) NamedTuple of (B, ...) tensors by an index tensor (R,) or a slice."""
     if isinstance(rows, slice):
         return map_tensors(lambda tensor: tensor[rows], values)
     if _first_of(values).shape[0] == 1:  # a batch of one row has no other: views
@@ -117,7 +117,7 @@ def send(values: T, device: torch.device) -> T:
 
 
 def row_of(values: T, index: int) -> T:
-    """Row ``index`` of a (nested) NamedTuple of (B, ...) tensors, the batch dimension kept."""
+    """Return row ``index`` of a (nested) NamedTuple of (B, ...) tensors, with the batch dimension."""
     return select_rows(values, slice(index, index + 1))
 
 

@@ -56,7 +56,7 @@ class Sensor(NamedTuple):
 
 
 def sample_sensor(sampler: BatchSampler, weather: Weather, bright: Tensor) -> Sensor:
-    """A random camera; ``bright`` (B,) bool overexposes."""
+    """Sample a random camera; ``bright`` (B,) bool overexposes."""
     usual = torch.where(sampler.chance(0.8), sampler.uniform(0.055, 0.22), sampler.uniform(0.2, 0.34))
     exposure = torch.where(bright, sampler.uniform(0.3, 0.75), usual)
     dark = (weather.kind == NIGHT) | (weather.kind == DUSK)

@@ -20,7 +20,7 @@ _PATTERNS = (  # 0 stands for any digit, * for any letter
 
 
 def sample_text(sampler: BatchSampler, length: int) -> Tensor:
-    """(B, length) int64 indices of letters."""
+    """Sample indices of letters, (B, length) int64."""
     blank, first = LETTERS.index(" "), LETTERS.index("K")
     codes = [[{"0": -1.0, "*": -2.0}.get(c, float(LETTERS.find(c))) for c in p] for p in _PATTERNS]
     pattern = sampler.pick_from([tuple(c) for c in codes]).long()[:, :length]

@@ -112,7 +112,7 @@ class Street(NamedTuple):
 def sample_street(
     sampler: BatchSampler, layout: Layout, ego_lane: Tensor, first: Tensor, own: Tensor
 ) -> Street:
-    """What is painted between a street's boundaries and what lies beside it.
+    """Sample the paint between a street's boundaries and what is beside it.
 
     Args:
         sampler: the randomness.
@@ -209,7 +209,7 @@ def sample_street(
 
 
 def no_street(sampler: BatchSampler) -> Street:
-    """Nothing of a street, (B,) of it."""
+    """Return an empty street for B worlds."""
     layoutless = torch.zeros_like
     zero = sampler.uniform(0.0, 0.0)
     two, slots = zero[:, None].repeat(1, 2), zero[:, None].repeat(1, MAX_BOUNDARIES)

@@ -93,7 +93,7 @@ def walls_of(surroundings: Surroundings, row: Tensor, wall: Tensor) -> Wall:
 def sample_surroundings(
     sampler: BatchSampler, left: Tensor, right: Tensor, grey: Tensor, opposite: Tensor, median: Tensor
 ) -> Surroundings:
-    """Random surroundings of a pavement.
+    """Sample random surroundings of a pavement.
 
     Args:
         sampler: the randomness.

@@ -32,7 +32,7 @@ _PLASTER = [(0.5, 0.45, 0.36), (0.42, 0.4, 0.36), (0.22, 0.1, 0.07), (0.3, 0.29,
 def street_edges(
     sampler: BatchSampler, city: Tensor, street: Street, layout: Layout, pavement: Pavement
 ) -> Pavement:
-    """Kerbs near the outer boundaries or beyond a strip for parking or cycling, where city (B,) holds."""
+    """Sample kerbs near the outer boundaries or beyond a parking or cycling strip, where city (B,) holds."""
     plain = torch.where(sampler.chance(0.7, 2), sampler.uniform(0.05, 0.5, 2), sampler.uniform(0.3, 1.5, 2))
     gap = torch.where(street.strip == CYCLING, sampler.uniform(1.1, 2.2, 2), plain)
     bay = torch.where(street.bay > 4.0, sampler.uniform(1.9, 2.6, 2), sampler.uniform(4.3, 5.2, 2))
@@ -75,7 +75,7 @@ def kerb_boundaries(city: Tensor, street: Street, layout: Layout, pavement: Pave
 def street_surroundings(
     sampler: BatchSampler, city: Tensor, street: Street, pavement: Pavement, around: Surroundings
 ) -> Surroundings:
-    """Houses, hedges and trees beyond the pavements, where city (B,) holds."""
+    """Sample houses, hedges and trees beyond the pavements, where city (B,) holds."""
     walks = street.strips.sum(2)
     divided = (street.first == 0) & sampler.chance(0.45)
     opposite = torch.where(divided, pavement.left - walks[:, 0], -math.inf)
@@ -117,7 +117,7 @@ def street_surroundings(
 def city_traffic(
     sampler: BatchSampler, city: Tensor, street: Street, layout: Layout, pavement: Pavement, traffic: Traffic
 ) -> Traffic:
-    """Vehicles that come towards the camera in their own lanes, none on hatching, and parked ones."""
+    """Add oncoming vehicles in their own lanes and parked ones, none on hatching."""
     across = traffic.across[:, :NUM_VEHICLES]
     lane = (torch.searchsorted(layout.across, across.contiguous()) - 1).clamp(0, MAX_BOUNDARIES - 1)
     coming = (lane < street.first[:, None]) | (lane >= (street.first + street.own)[:, None])
@@ -136,7 +136,7 @@ def city_traffic(
 def _sample_parked(
     sampler: BatchSampler, city: Tensor, street: Street, layout: Layout, pavement: Pavement
 ) -> Traffic:
-    """Cars in the parking strips, or with two wheels on the kerb; half of the places on either side."""
+    """Sample cars in parking strips or with two wheels on the kerb; half of the places on either side."""
     one_side = NUM_PARKED // 2
     side = torch.arange(NUM_PARKED, device=city.device) // one_side
     turn = torch.arange(NUM_PARKED, device=city.device) % one_side

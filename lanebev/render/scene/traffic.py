@@ -58,7 +58,7 @@ class Traffic(NamedTuple):
 
 
 def vehicle_shapes(sampler: BatchSampler, count: int, truck: Tensor) -> Tensor:
-    """(B, count, 2, 8): a body and what is above it."""
+    """Sample a body and what is above it, (B, count, 2, 8)."""
     length = sampler.uniform(3.9, 5.1, count)
     half = sampler.uniform(0.86, 0.98, count)
     tall = sampler.chance(0.35, count)  # SUVs and vans
@@ -102,7 +102,7 @@ def sample_traffic(
     bridge_at: Tensor,
     bridge_long: Tensor,
 ) -> Traffic:
-    """Random things along the road.
+    """Sample random objects along the road.
 
     Args:
         sampler: the randomness.
@@ -166,7 +166,7 @@ def _sample_vehicles(sampler: BatchSampler, layout: Layout, ego_lane: Tensor, op
 def _sample_props(
     sampler: BatchSampler, left: Tensor, right: Tensor, bridge_at: Tensor, bridge_long: Tensor
 ) -> Traffic:
-    """A bridge with its piers, a gantry with its legs, three signs, four lamp posts."""
+    """Sample a bridge with its piers, a gantry with its legs, three signs and four lamp posts."""
     one = torch.ones_like(left)[:, None]
     width, middle = (right - left)[:, None], 0.5 * (left + right)[:, None]
     bridge, reach = bridge_at.isfinite()[:, None], 0.5 * bridge_long[:, None]
@@ -239,7 +239,7 @@ def _sample_props(
 
 
 def place_objects(traffic: Traffic, alignment: Alignment, start: Tensor, side: Tensor) -> SceneObjects:
-    """Traffic in the local road frame.
+    """Return the traffic in the local road frame.
 
     Args:
         traffic: in the world.

@@ -47,7 +47,7 @@ class Tunnel(NamedTuple):
 
 
 def sample_tunnel(sampler: BatchSampler, tunnel: Tensor, pavement: Pavement) -> Tunnel:
-    """Random tunnels where tunnel (B,) holds."""
+    """Sample random tunnels where tunnel (B,) holds."""
     hue = sampler.pick_from(_LAMP_COLOURS) * sampler.uniform(0.9, 1.1, 1)
     rows = torch.stack([pavement.left, pavement.right], 1)
     middle = rows.mean(1, keepdim=True)
@@ -68,14 +68,14 @@ def sample_tunnel(sampler: BatchSampler, tunnel: Tensor, pavement: Pavement) -> 
 
 
 def endless(tunnel: Tunnel) -> Tunnel:
-    """A tunnel that one does not come out of, for drives."""
+    """Return a tunnel without an end, for drives."""
     return tunnel._replace(exit=torch.full_like(tunnel.exit, math.inf))
 
 
 def tunnel_surroundings(
     sampler: BatchSampler, tunnel: Tensor, inside: Tunnel, pavement: Pavement, around: Surroundings
 ) -> Surroundings:
-    """Walls up to the ceiling, where tunnel (B,) holds."""
+    """Add walls up to the ceiling, where tunnel (B,) holds."""
     edge = torch.stack([pavement.left, pavement.right], 1).repeat(1, 3)
     gap = torch.cat([sampler.uniform(30, 31, 4), sampler.uniform(0.1, 1.0, 2)], 1)
     near = torch.arange(NUM_WALLS, device=tunnel.device) >= NUM_WALLS - 2
@@ -94,14 +94,14 @@ def tunnel_surroundings(
 
 
 def tunnel_traffic(tunnel: Tensor, traffic: Traffic) -> Traffic:
-    """Vehicles alone: no bridges, signs and lamp posts where tunnel (B,) holds."""
+    """Remove bridges, signs and lamp posts where tunnel (B,) holds; vehicles stay."""
     index = torch.arange(traffic.valid.shape[1], device=tunnel.device)
     vehicle = index < NUM_VEHICLES + NUM_ONCOMING
     return traffic._replace(valid=traffic.valid & (vehicle | ~tunnel[:, None]))
 
 
 def tunnel_light(light: Light, tunnel: Tunnel) -> Light:
-    """The illumination inside: that of the lamps alone."""
+    """Return the illumination inside: that of the lamps alone."""
     on = (tunnel.on > 0)[:, None]
     return light._replace(
         direct=torch.where(on, 0.0, light.direct),

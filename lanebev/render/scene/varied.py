@@ -13,7 +13,7 @@ from lanebev.types import Extrinsics
 
 
 def varied_weather(sampler: BatchSampler, kinds: Kinds, weather: Weather) -> Weather:
-    """Night where it is night, at times with a wet road; dull days of snow; clear air in tunnels."""
+    """Change the weather of nights (at times a wet road), of snow (dull days) and of tunnels (clear air)."""
     wet = torch.where(sampler.chance(0.3), sampler.uniform(0.1, 1.0), 0.0)
     night = kinds.night
     dull = kinds.snow & sampler.chance(0.7)
@@ -27,7 +27,7 @@ def varied_weather(sampler: BatchSampler, kinds: Kinds, weather: Weather) -> Wea
 
 
 def varied_camera(sampler: BatchSampler, kinds: Kinds, sensor: Sensor) -> Sensor:
-    """Noisier and darker cameras at night, worse ones where a world has a bad camera."""
+    """Change cameras: noisier and darker at night, worse where a world has a bad camera."""
     night, camera = kinds.night, kinds.camera
     exposure = torch.where(night, sampler.uniform(0.02, 0.22), sensor.exposure)
     over = torch.where(camera & sampler.chance(0.15), sampler.uniform(1.3, 3.0), 1.0)
@@ -60,7 +60,7 @@ def varied_camera(sampler: BatchSampler, kinds: Kinds, sensor: Sensor) -> Sensor
 
 
 def varied_extrinsics(sampler: BatchSampler, camera: Tensor, pose: Extrinsics) -> Extrinsics:
-    """Heights of lorries and of low cars where a world has an unusual camera, (B,) bool."""
+    """Sample heights of lorries and of low cars where a world has an unusual camera, (B,) bool."""
     height = torch.where(sampler.chance(0.5), sampler.uniform(1.7, 3.0), pose.height)
     return pose._replace(height=torch.where(camera, height, pose.height))
 
@@ -68,7 +68,7 @@ def varied_extrinsics(sampler: BatchSampler, camera: Tensor, pose: Extrinsics) -
 def varied_intrinsics(
     sampler: BatchSampler, camera: Tensor, intrinsics: Tensor, size: tuple[int, int]
 ) -> Tensor:
-    """Wide lenses where a world has an unusual camera, (B,) bool; (B, 3, 3)."""
+    """Sample wide lenses (B, 3, 3) where a world has an unusual camera, (B,) bool."""
     view = sampler.uniform(70, 110).deg2rad()
     wide = camera & sampler.chance(0.4)
     factor = torch.where(wide, 0.5 * size[1] / (0.5 * view).tan() / intrinsics[:, 0, 0], 1.0)

@@ -51,7 +51,7 @@ class Weather(NamedTuple):
 
 
 def sample_weather(sampler: BatchSampler) -> Weather:
-    """Mostly clear days."""
+    """Sample the weather, mostly clear days."""
     kind = sampler.pick([0.66, 0.14, 0.08, 0.06, 0.06])
     clear = sampler.uniform(0.0, 0.25)
     grey = torch.where((kind == OVERCAST) | (kind == RAIN), sampler.uniform(0.7, 1.0), clear)
@@ -68,7 +68,7 @@ def sample_weather(sampler: BatchSampler) -> Weather:
 
 
 def light_of(weather: Weather, road_heading: Tensor) -> Light:
-    """Illumination in the local road frame, whose Z axis points along ``road_heading`` (B,) rad."""
+    """Return the illumination in the local road frame; Z points along ``road_heading`` (B,) rad."""
     azimuth, height = weather.sun_azimuth - road_heading, weather.sun_height
     sun = torch.stack([azimuth.sin() * height.cos(), height.sin(), azimuth.cos() * height.cos()], dim=1)
     night, dusk = weather.kind == NIGHT, weather.kind == DUSK

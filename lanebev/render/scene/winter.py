@@ -36,7 +36,7 @@ class Winter(NamedTuple):
 
 
 def sample_winter(sampler: BatchSampler, snow: Tensor) -> Winter:
-    """Random snow where snow (B,) bool holds."""
+    """Sample random snow where snow (B,) bool holds."""
     level = torch.where(sampler.chance(0.6), sampler.uniform(0.45, 0.85), sampler.uniform(0.18, 0.45))
     blue = sampler.uniform(-0.02, 0.06)
     return Winter(
@@ -52,7 +52,7 @@ def sample_winter(sampler: BatchSampler, snow: Tensor) -> Winter:
 
 
 def snowed_layout(sampler: BatchSampler, snow: Tensor, layout: Layout) -> Layout:
-    """A layout whose boundaries are not seen over long stretches, where snow (B,) holds."""
+    """Return a layout whose boundaries are hidden over long stretches, where snow (B,) holds."""
     slots = MAX_BOUNDARIES
     long = sampler.uniform(10, 60, slots)
     covered = snow[:, None] & sampler.chance(0.6, slots)

@@ -41,7 +41,7 @@ class Works(NamedTuple):
 
 
 def sample_works(sampler: BatchSampler, works: Tensor, layout: Layout) -> tuple[Layout, Works]:
-    """Narrow lanes between yellow lines, and what is left of the old ones, where works (B,) holds."""
+    """Sample narrow lanes between yellow lines, with remains of the old ones, where works (B,) holds."""
     slots = MAX_BOUNDARIES
     index = torch.arange(slots, device=works.device)
     last = layout.exists.sum(1, keepdim=True) - 1
@@ -96,7 +96,7 @@ def sample_works(sampler: BatchSampler, works: Tensor, layout: Layout) -> tuple[
 def works_traffic(
     sampler: BatchSampler, works: Tensor, layout: Layout, traffic: Traffic, count: int
 ) -> Traffic:
-    """Cones, beacons or barriers in the last ``count`` places of the traffic, where works (B,) holds."""
+    """Put cones, beacons or barriers in the last ``count`` places of the traffic, where works (B,) holds."""
     style = sampler.pick([0.4, 0.35, 0.25])[:, None]
     one = torch.ones_like(traffic.along[:, -count:])
     half = torch.where(style == 0, 0.17, torch.where(style == 1, 0.13, 0.25)) * one

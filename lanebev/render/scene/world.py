@@ -125,14 +125,14 @@ def scene_at(world: World, place: Place, alignment: Alignment, lens: Lens) -> Sc
 
 
 def sample_ego_lane(sampler: BatchSampler, layout: Layout) -> Tensor:
-    """(B,) int64, any lane; the leftmost, beside the median, more often."""
+    """Sample any lane, (B,) int64; more often the leftmost, beside the median."""
     lanes = (layout.exists.sum(1) - 1).clamp(min=1)
     share = torch.where(sampler.chance(0.2), 0.0, sampler.uniform(0, 1))
     return (share * lanes).long().clamp(max=7)
 
 
 def sample_world(sampler: BatchSampler, kind: str = "any") -> tuple[World, Tensor]:
-    """Random worlds and an ego lane in each, (B,) int64.
+    """Sample random worlds and an ego lane in each, (B,) int64.
 
     Args:
         sampler: the randomness.
@@ -205,7 +205,7 @@ def sample_world(sampler: BatchSampler, kind: str = "any") -> tuple[World, Tenso
 def _with_street(
     sampler: BatchSampler, kinds: Kinds, layout: Layout, ego_lane: Tensor
 ) -> tuple[Layout, Tensor, Street]:
-    """Streets instead of highways where a world is in a city."""
+    """Replace highways by streets where a world is in a city."""
     city, lane, first, own = sample_city_layout(sampler, layout)
     street = sample_street(sampler, city, lane, first, own)
     city = city._replace(
@@ -221,7 +221,7 @@ def _with_street(
 
 
 def moved_along(world: World, start: Tensor) -> World:
-    """The same worlds with everything that was placed from zero on placed from ``start`` (B,) m on."""
+    """Return the same worlds with everything placed from ``start`` (B,) m on instead of from zero."""
     shift = start[:, None]
     return world._replace(
         layout=world.layout._replace(missing_phase=world.layout.missing_phase - shift),
@@ -235,7 +235,7 @@ def moved_along(world: World, start: Tensor) -> World:
 
 
 def _tinted(surroundings: Surroundings, weather: Weather, lights: Lights) -> Surroundings:
-    """The sky of dusk and night."""
+    """Return the sky of dusk and night."""
     night, dusk = (weather.kind == NIGHT)[:, None], (weather.kind == DUSK)[:, None]
     zenith = torch.where(night, surroundings.zenith * 0.012, surroundings.zenith)
     skyline = torch.where(night, surroundings.skyline * 0.02, surroundings.skyline)

@@ -1,4 +1,4 @@
-"""The templates of pages; what they are given is escaped."""
+"""The templates of pages; values in them are escaped."""
 
 from __future__ import annotations
 
