@@ -15,13 +15,18 @@ _BYTE_ORDER_MARKS = {
     codecs.BOM_UTF16_LE: "utf-16",  # what PowerShell's > writes
     codecs.BOM_UTF16_BE: "utf-16",
 }
+_MOST_FOREIGN = 0.3  # of a text's letters, in an encoding that is not known
 _REPR = reprlib.Repr()
 _REPR.maxlist = _REPR.maxdict = _REPR.maxtuple = 4
 _REPR.maxlevel, _REPR.maxstring = 3, 200
 
 
-def read_text(path: Path) -> str:
+def read_text(path: Path, errors: str = "strict") -> str:
     """Return a text file's content: UTF-8, or UTF-16 where a byte order mark says so.
+
+    Args:
+        path: of the file.
+        errors: "replace" reads files of other encodings, with other letters in place of those beyond ASCII.
 
     Raises:
         ValueError: why the file can't be read, in a few words; the caller says which file.
@@ -29,7 +34,10 @@ def read_text(path: Path) -> str:
     try:
         data = path.read_bytes()
         mark = next((each for each in _BYTE_ORDER_MARKS if data.startswith(each)), b"")
-        return data.decode(_BYTE_ORDER_MARKS.get(mark, "utf-8"))
+        text = data.decode(_BYTE_ORDER_MARKS.get(mark, "utf-8"), errors)
+        if errors == "replace" and text.count("\ufffd") > _MOST_FOREIGN * len(text):
+            raise ValueError("not a text file")
+        return text
     except UnicodeDecodeError as error:
         raise ValueError("not a text file") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path

@@ -83,7 +83,14 @@ def readers() -> dict[str, Reader]:
         "camera.json": Reader(_read_cameras, ".json", _camera_json()),
         "camera.xml": Reader(_read_cameras, ".xml", [_opencv(".xml")]),
         "calib.txt": Reader(
-            _read_cameras, "calib.txt", [b"P2: 721.5377 0 609.5 44.8 0 721.5377 172.8 0.2 0 0 1 0\n"]
+            _read_cameras,
+            "calib.txt",
+            [
+                b"P2: 721.5377 0 609.5 44.8 0 721.5377 172.8 0.2 0 0 1 0\n",
+                b"1 OPENCV 1280 720 800 801 640 360 -0.3 0.1 0.001 -0.002\n",
+                b"[image]\n\nwidth\n640\n\nheight\n480\n\n[a]\n\ncamera matrix\n369 0 320\n0 367 203\n0 0 1\n"
+                b"distortion\n0.19 -0.02 0 0 0\n",
+            ],
         ),
         "lanes.json": Reader(read_lanes, ".json", _tusimple(), 30),
         "openlane.json": Reader(read_lanes, ".json", _openlane(), 20),

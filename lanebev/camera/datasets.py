@@ -1,14 +1,26 @@
-"""Camera files of data sets that state no image size: KITTI, nuScenes, OpenLane."""
+"""Camera files of data sets that state no image size (KITTI, nuScenes, OpenLane), and of COLMAP."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lanebev.camera.parameters import CameraParameters
-from lanebev.camera.parsing import numbers
+from lanebev.camera.parameters import CameraParameters, centre_offset
+from lanebev.camera.parsing import numbers, whole_number
 from lanebev.numbers import finite_numbers
 
+_KITTI = re.compile(r"^[ \t]*P(?:_rect_)?\d+[ \t]*:", re.MULTILINE | re.ASCII)
+_COLMAP = re.compile(r"^[ \t]*\d+[ \t]+([A-Z_]+)[ \t]+(\d{1,6})[ \t]+(\d{1,6})[ \t]+(.+)$", re.MULTILINE)
+_COLMAP_MODELS = {  # names of their parameters
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+}
 _KITTI_SIZES = {  # focal length of the rectified cameras of each recording day -> (height, width)
     721.5377: (375, 1242),
     707.0493: (370, 1224),
@@ -19,11 +31,18 @@ _KITTI_SIZES = {  # focal length of the rectified cameras of each recording day 
 _KITTI_SPREAD = 8  # px, more than rectified images of one camera differ by
 _NUSCENES_SIZE = (900, 1600)
 _OPENLANE_SIZE = (1280, 1920)
+_OFF_CENTRE = 0.2  # shares of the sides, more than any data set's principal point is off the centre
+
+
+def is_kitti(text: str) -> bool:
+    """Return whether a text has a KITTI projection matrix."""
+    return _KITTI.search(text) is not None
 
 
 def kitti(text: str, image_size: tuple[int, int] | None) -> CameraParameters:
     """Read KITTI's ``calib.txt`` or ``calib_cam_to_cam.txt``: the left colour camera's rectified images."""
-    entries = dict(line.split(":", 1) for line in text.splitlines() if ":" in line)
+    lines = (line.split(":", 1) for line in text.splitlines() if ":" in line)
+    entries = {name.strip(): values for name, values in lines}
     names = [f"P_rect_{i:02d}" for i in (2, 3, 0, 1)] + [f"P{i}" for i in (2, 3, 0, 1)]
     name = next((n for n in names if n in entries), None)
     if name is None:
@@ -44,12 +63,39 @@ def kitti(text: str, image_size: tuple[int, int] | None) -> CameraParameters:
     return CameraParameters(matrix, [], "pinhole", size)
 
 
+def is_colmap(text: str) -> bool:
+    """Return whether a text has a line of COLMAP's ``cameras.txt``."""
+    return _COLMAP.search(text) is not None
+
+
+def colmap(text: str) -> CameraParameters:
+    """Read COLMAP's ``cameras.txt`` of one camera.
+
+    Source: COLMAP, sensor/models.h; the centre of its first pixel is at (0.5, 0.5).
+    """
+    found = _COLMAP.findall(text)
+    if len(found) != 1:
+        raise ValueError(f"expected one camera, got {len(found)}; keep the line of yours")
+    name, width, height, values = found[0]
+    if name not in _COLMAP_MODELS:
+        raise ValueError(f"model: expected one of {', '.join(_COLMAP_MODELS)}, got {name}")
+    names = _COLMAP_MODELS[name].split()
+    given = dict(zip(names, finite_numbers(name, values.split(), len(names)), strict=True))
+    fx, fy = (given.get(key, given.get("f", 0.0)) for key in ("fx", "fy"))
+    model = "fisheye" if name.endswith("FISHEYE") else "pinhole"
+    order = "k1 k2 k3 k4" if model == "fisheye" else "k1 k2 p1 p2 k3 k4 k5 k6"
+    distortion = [given.get(key, 0.0) for key in order.split()]
+    matrix = [fx, 0.0, given["cx"] - 0.5, 0.0, fy, given["cy"] - 0.5, 0.0, 0.0, 1.0]
+    return CameraParameters(matrix, distortion, model, (int(height), int(width)))
+
+
 def nuscenes(records: Sequence[Any], image_size: tuple[int, int] | None) -> CameraParameters:
     """Read records of nuScenes' table ``calibrated_sensor``, of one camera; its images are undistorted.
 
     The table has no size of images: nuScenes' are all of one. Other programs write such tables for images of
-    other sizes. Images of another size are those of the record if its principal point is less than half as
-    far from their centre as from that of nuScenes' images, in shares of the sides; else they were resized.
+    other sizes, some with ``width`` and ``height``. Images of another size are those of the record if its
+    principal point is less than half as far from their centre as from that of nuScenes' images, in shares of
+    the sides; else they were resized.
     """
     matrices = [
         numbers(record, "camera_intrinsic", count=9)
@@ -61,23 +107,40 @@ def nuscenes(records: Sequence[Any], image_size: tuple[int, int] | None) -> Came
             f"camera_intrinsic: expected one camera's, got {len(matrices)}; keep the record of your camera, "
             "by its token"
         )
-    known_offset = _centre_offset(matrices[0], _NUSCENES_SIZE)
-    if image_size is not None and 2 * _centre_offset(matrices[0], image_size) < known_offset:
-        return CameraParameters(matrices[0], [], "pinhole", image_size)
-    size = _size("nuScenes'", image_size, _NUSCENES_SIZE)
-    return CameraParameters(matrices[0], [], "pinhole", size or _NUSCENES_SIZE)
-
-
-def _centre_offset(matrix: Sequence[float], image_size: tuple[int, int]) -> float:
-    """Return how far the principal point is from the centre of an image, in shares of its sides."""
-    (height, width), x, y = image_size, matrix[2], matrix[5]
-    return max(abs(x / width - 0.5), abs(y / height - 0.5))
+    record = next(each for each in records if isinstance(each, Mapping) and each.get("camera_intrinsic"))
+    return _of_size(matrices[0], record, image_size, _NUSCENES_SIZE, "nuScenes'")
 
 
 def openlane(fields: Mapping[str, Any], image_size: tuple[int, int] | None) -> CameraParameters:
     """Read the ``intrinsic`` of an OpenLane label or prediction."""
-    size = _size("OpenLane's", image_size, _OPENLANE_SIZE)
-    return CameraParameters(numbers(fields, "intrinsic", count=9), [], "pinhole", size or _OPENLANE_SIZE)
+    matrix = numbers(fields, "intrinsic", count=9)
+    return _of_size(matrix, fields, image_size, _OPENLANE_SIZE, "OpenLane's")
+
+
+def _of_size(
+    matrix: list[float],
+    record: Mapping[str, Any],
+    image_size: tuple[int, int] | None,
+    known: tuple[int, int],
+    whose: str,
+) -> CameraParameters:
+    """Return the camera of a data set's record: of the size that it states, the data set's, or the images'.
+
+    Raises:
+        ValueError: it states none, and the principal point is in the middle of neither.
+    """
+    if record.get("width") is not None and record.get("height") is not None:
+        stated = (whole_number(record, "height"), whole_number(record, "width"))
+        return CameraParameters(matrix, [], "pinhole", stated)
+    offset = centre_offset(matrix, known)
+    if image_size is not None and 2 * centre_offset(matrix, image_size) < offset:
+        return CameraParameters(matrix, [], "pinhole", image_size)
+    if image_size is None and offset > _OFF_CENTRE:
+        raise ValueError(
+            f"expected a camera of {known[1]} x {known[0]} px, {whose}, got a principal point of "
+            f"{matrix[2]:g}, {matrix[5]:g}; add width and height beside it"
+        )
+    return CameraParameters(matrix, [], "pinhole", _size(whose, image_size, known) or known)
 
 
 def _size(

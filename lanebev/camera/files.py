@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from lanebev.camera.datasets import kitti, nuscenes, openlane
+from lanebev.camera.datasets import colmap, is_colmap, is_kitti, kitti, nuscenes, openlane
 from lanebev.camera.formats import camodocal, is_kalibr, kalibr, opencv_or_ros, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
 from lanebev.camera.parsing import parse
@@ -24,13 +24,14 @@ def read_camera(
     """Read a camera file of any of these kinds, told apart by what is in it.
 
     - OpenCV's FileStorage (YAML, XML, JSON) by its calibration programs' keys;
-    - ROS ``camera_info`` (YAML, or a message as ``rostopic`` and ``ros2 topic`` print it), its ``roi`` and
-      ``binning_x``, ``binning_y`` applied;
+    - ROS ``camera_info`` (YAML or INI, or a message as ``rostopic``, ``ros2 topic`` and Foxglove print it),
+      its ``roi`` and ``binning_x``, ``binning_y`` applied;
     - our short YAML: fx, fy, cx, cy, width, height, distortion, model;
     - Kalibr's camchain (the first camera), EuRoC's ``sensor.yaml``, CamOdoCal's YAML (VINS, KITTI-360);
     - KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt``: the left colour camera's rectified images
       (``P_rect_02``, ``P2``), else the lowest number there is;
-    - nuScenes' ``calibrated_sensor`` (the record of one camera) and OpenLane's labels, both JSON.
+    - nuScenes' ``calibrated_sensor`` (the record of one camera) and OpenLane's labels, both JSON;
+    - COLMAP's ``cameras.txt`` of one camera.
 
     KITTI's object and odometry files, nuScenes and OpenLane do not hold the image's size: it is then
     ``image_size``, or the data set's.
@@ -45,11 +46,13 @@ def read_camera(
     """
     path = Path(path)
     try:
-        text = read_text(path)
+        text = read_text(path, "replace")  # of comments and names in other encodings nothing is needed
     except ValueError as error:
         raise ValueError(f"camera file {path}: expected a readable camera file, got: {error}") from error
     try:
-        if path.suffix.lower() == ".txt":
+        if is_colmap(text):
+            return checked(colmap(text))
+        if is_kitti(text) or (path.suffix.lower() == ".txt" and "width" not in text):
             return checked(kitti(text, image_size))
         return _camera(parse(text), image_size, rectified)
     except ValueError as error:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from lanebev.camera.parameters import CameraParameters
+from lanebev.camera.parameters import CameraParameters, centre_offset
 from lanebev.camera.parsing import mapping, number, numbers, required, whole_number
 from lanebev.numbers import shown
 
@@ -17,10 +17,12 @@ _PROJECTION_KEYS = ("projection_matrix", "P", "p")
 _ROTATION_KEYS = ("rectification_matrix", "R", "r")
 _WIDTH_KEYS = ("image_width", "image_Width", "width")
 _HEIGHT_KEYS = ("image_height", "image_Height", "height")
-_MODEL_KEYS = ("distortion_model", "model")
+_MODEL_KEYS = ("distortion_model", "camera_model", "model")
 _IGNORED_KEYS = {
     # ROS camera_info beside the lens
-    "camera_name", "header",
+    "camera_name", "header", "translation", "rotation",
+    # Foxglove's CameraCalibration
+    "timestamp", "frame_id",
     # what OpenCV's calibration programs note down
     "calibration_time", "nframes", "nFrames", "nr_of_frames", "nrOfFrames", "board_width", "board_height",
     "board_size", "square_size", "marker_size", "aspectRatio", "fix_aspect_ratio", "flags", "flagValue",
@@ -130,8 +132,10 @@ def _restates(fields: Mapping[str, Any]) -> bool:
 
 
 def _model(fields: Mapping[str, Any]) -> str:
-    default = "fisheye" if str(fields.get("fisheye_model", "0")).strip() == "1" else "pinhole"
+    fisheye = str(fields.get("fisheye_model", "0")).strip().lower() in ("1", "true")  # true since OpenCV 5
+    default = "fisheye" if fisheye else "pinhole"
     name = next((str(fields[key]).strip() for key in _MODEL_KEYS if fields.get(key) is not None), "")
+    name = name.lower()
     if name not in _MODELS:
         known = ", ".join(each for each in _MODELS if each)
         raise ValueError(f"model: expected one of {known}, got {shown(name)}")
@@ -152,6 +156,7 @@ def _as_taken(camera: CameraParameters, fields: Mapping[str, Any]) -> CameraPara
             f"roi: expected a part of the {columns} x {rows} px, got {width} x {height} at {left}, {top}"
         )
     across, down = (_binning(fields, key) for key in ("binning_x", "binning_y"))
+    _check_full_resolution(camera, (rows // down, columns // across))
     fx, skew, cx, zero, fy, cy, *last = camera.matrix
     matrix = [
         fx / across, skew / across, _binned(cx - left, across),
@@ -159,6 +164,18 @@ def _as_taken(camera: CameraParameters, fields: Mapping[str, Any]) -> CameraPara
         *last,
     ]  # fmt: skip
     return camera._replace(matrix=matrix, image_size=(height // down, width // across))
+
+
+def _check_full_resolution(camera: CameraParameters, binned_size: tuple[int, int]) -> None:
+    """Raise if the matrix is that of the binned images, as drivers have it that were calibrated with them."""
+    height, width = camera.image_size
+    if 2 * centre_offset(camera.matrix, binned_size) < centre_offset(camera.matrix, camera.image_size):
+        rows, columns = binned_size
+        raise ValueError(
+            f"camera_matrix: expected that of the full {width} x {height} px, got a principal point of "
+            f"{camera.matrix[2]:g}, {camera.matrix[5]:g}, in the middle of the binned {columns} x {rows}; "
+            f"if it is theirs, write width {columns}, height {rows} and binning 1"
+        )
 
 
 def _binning(fields: Mapping[str, Any], key: str) -> int:
@@ -196,9 +213,12 @@ def kalibr(fields: Mapping[str, Any]) -> CameraParameters:
         raise ValueError(f"camera_model: expected one of {known}, got {shown('-'.join(names))}")
     model = _KALIBR_MODELS[names]
     intrinsics = numbers(fields, "intrinsics", count=5 if model == "omni" else 4)
+    coefficients = ("distortion_coeffs", "distortion_coefficients")
     distortion = [0.0] * 4
     if names[1] != "none":
-        distortion = numbers(fields, "distortion_coeffs", "distortion_coefficients", count=4)
+        distortion = numbers(fields, *coefficients, count=4)
+    elif any(fields.get(key) for key in coefficients) and any(numbers(fields, *coefficients)):
+        raise ValueError("distortion_model: expected the one of distortion_coeffs, got none; add the entry")
     *xi, fx, fy, cx, cy = intrinsics
     width, height = numbers(fields, "resolution", count=2)
     return CameraParameters(

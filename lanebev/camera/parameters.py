@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -27,6 +28,17 @@ class CameraParameters(NamedTuple):
     distortion: list[float]
     model: str
     image_size: tuple[int, int]
+
+
+def centre_offset(matrix: Sequence[float], image_size: tuple[int, int]) -> float:
+    """Return how far the principal point is from the centre of an image, in shares of its sides.
+
+    Args:
+        matrix: nine entries of the camera matrix, row by row, px.
+        image_size: (height, width) px.
+    """
+    (height, width), x, y = image_size, matrix[2], matrix[5]
+    return max(abs(x / max(width, 1) - 0.5), abs(y / max(height, 1) - 0.5))
 
 
 def checked(camera: CameraParameters, restated: bool = False) -> CameraParameters:

@@ -19,14 +19,26 @@ from lanebev.numbers import finite_numbers, shown
 
 _LARGEST_YAML = 1_000_000  # characters; PyYAML reads some 100,000 a second
 _MOST_NUMBERS = 1_000  # of one matrix
+_TABS = re.compile(r"(?<=\S) *\t[ \t]*")  # between words; PyYAML takes none there, YAML and other readers do
+_ROS_INI = re.compile(r"^\[image\]\s*$", re.MULTILINE)
+_INI_KEYS = {
+    "width": "image_width",
+    "height": "image_height",
+    "camera matrix": "camera_matrix",
+    "distortion": "distortion_coefficients",
+    "rectification": "rectification_matrix",
+    "projection": "projection_matrix",
+}
 
 
 def parse(text: str) -> Any:
     """Return what a camera file says: dicts by key, lists, texts, and None for nothing.
 
     Raises:
-        ValueError: the syntax is none of YAML, JSON and XML, or a key is given twice.
+        ValueError: the syntax is none of YAML, JSON, XML and ROS's INI, or a key is given twice.
     """
+    if _ROS_INI.search(text):
+        return _parse_ini(text)
     start = text.lstrip()[:1]
     if start == "<":
         return _parse_xml(text)
@@ -92,12 +104,26 @@ def _parse_yaml(text: str) -> Any:
     if lines and lines[0].startswith("%YAML"):  # OpenCV writes %YAML:1.0, which YAML does not allow
         lines[0] = ""
     try:
-        documents = yaml.load_all("\n".join(lines), Loader=_TextLoader)
+        documents = yaml.load_all(_TABS.sub(" ", "\n".join(lines)), Loader=_TextLoader)
         return next((each for each in documents if each is not None), None)  # ros2 topic echo ends with ---
     except (yaml.YAMLError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f" at line {mark.line + 1}" if mark else ""
+        if "\\t" in str(getattr(error, "problem", "")):
+            raise ValueError(f"expected YAML, got a tab{where}; indent by spaces") from error
         raise ValueError(f"expected YAML, got a syntax error{where}; is the file cut?") from error
+
+
+def _parse_ini(text: str) -> dict[str, Any]:
+    """Read names on lines of their own and the numbers below them; names of sections are ignored."""
+    entries: list[tuple[str, list[str]]] = []
+    for line in text.splitlines():
+        words = line.split("#")[0].strip()
+        if words[:1].isalpha():
+            entries.append((_INI_KEYS.get(words, words), []))
+        elif entries and not words.startswith("["):
+            entries[-1][1].extend(words.split())
+    return {key: values[0] if len(values) == 1 else values for key, values in _once(entries).items()}
 
 
 def _parse_xml(text: str) -> dict[str, Any]:

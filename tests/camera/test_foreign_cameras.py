@@ -1,0 +1,247 @@
+"""Camera files as more programs write them, each after a public report, and what only looks like one."""
+
+import json
+
+import cv2
+import pytest
+import torch
+
+from lanebev import Camera
+
+# what ROS melodic's camera_calibration writes (image_pipeline#682)
+OST = """image_width: 1640
+image_height: 1232
+camera_name: csi_cam_0
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [ 403.97646,   -0.96635,  871.2187 ,
+            0.     ,  404.70652,  597.37327,
+            0.     ,    0.     ,    1.     ]
+camera_model: fisheye
+distortion_coefficients:
+  rows: 1
+  cols: 4
+  data: [0.175653, -0.031772, 0.000362, -0.000719]
+"""
+MODEL = "camera_model: fisheye"
+MATRIX = [[633.0, 0, 408.0], [0, 633.0, 245.0], [0, 0, 1]]
+
+
+def _read(path, text, **kwargs):
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return Camera.from_file(path, **kwargs)
+
+
+def _is(camera, *parameters):
+    expected = Camera.from_parameters(*parameters)
+    torch.testing.assert_close(camera.intrinsics, expected.intrinsics, rtol=0, atol=1e-9)
+    torch.testing.assert_close(camera.distortion, expected.distortion, rtol=0, atol=0)
+    assert (camera.model, camera.image_size) == (expected.model, expected.image_size)
+
+
+@pytest.mark.parametrize(
+    ("line", "model"),
+    [
+        (MODEL, "fisheye"),
+        ("camera_model: plumb_bob", "pinhole"),
+        ("distortion_model: EQUIDISTANT", "fisheye"),
+        ("fisheye_model: 1", "fisheye"),
+        ("fisheye_model: true", "fisheye"),  # booleans of OpenCV 5
+        ("fisheye_model: 0", "pinhole"),
+        ("fisheye_model: false", "pinhole"),
+    ],
+)
+def test_the_lens_has_the_model_that_the_file_names(tmp_path, line, model):
+    camera = _read(tmp_path / "ost.yaml", OST.replace(MODEL, line))
+    assert camera.model == model
+    assert camera.intrinsics[0, 1] == -0.96635  # skew
+
+
+def test_skew_moves_pixels_as_opencv_moves_them(tmp_path):
+    camera = _read(tmp_path / "ost.yaml", OST)
+    rays = torch.tensor([[0.1, 0.3], [-0.5, 0.2], [0.4, -0.4]], dtype=torch.float64)
+    ideal = rays @ camera.intrinsics[:2, :2].mT + camera.intrinsics[:2, 2]
+    given = (camera.intrinsics.numpy(), camera.distortion.numpy())
+    seen = cv2.fisheye.distortPoints(rays[None].numpy(), *given, alpha=-0.96635 / 403.97646)[0]
+    torch.testing.assert_close(camera.distort_points(ideal), torch.from_numpy(seen), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("\n", "\r\n"),
+        ("1640", "1640\t"),
+        ("1640", "1640\t# px"),
+        ("rows: 3", "rows:\t3"),
+        (",   -0.9", ",\t-0.9"),
+        ("csi", "Stra\u00dfe"),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_ends_of_lines_tabs_between_words_and_foreign_letters(tmp_path, old, new, encoding):
+    plain = _read(tmp_path / "c.yaml", OST)
+    changed = _read(tmp_path / "d.yaml", OST.replace(old, new).encode(encoding))
+    assert changed.fingerprint() == plain.fingerprint()
+
+
+def test_rows_that_are_indented_by_tabs_are_one_clear_line(tmp_path):
+    with pytest.raises(ValueError, match=r"expected YAML, got a tab at line 5; indent by spaces$"):
+        _read(tmp_path / "c.yaml", OST.replace("\n  ", "\n\t"))
+
+
+def test_foxglove_prints_a_cameras_message(tmp_path):
+    fields = {"timestamp": {"sec": 1, "nsec": 2}, "frame_id": "front", "width": 1280, "height": 720}
+    fields |= {"distortion_model": "plumb_bob", "D": [-0.3, 0.1, 0, 0, 0], "R": [], "P": []}
+    camera = _read(tmp_path / "c.json", json.dumps({**fields, "K": [800, 0, 640, 0, 801, 360, 0, 0, 1]}))
+    _is(camera, 800, 801, 640, 360, 1280, 720, [-0.3, 0.1, 0, 0, 0])
+
+
+INI = """# oST version 5.0 parameters
+
+
+[image]
+
+width
+640
+
+height
+480
+
+[mono_left]
+
+camera matrix
+369.344588 0.000000 320.739078
+0.000000 367.154330 203.592450
+0.000000 0.000000 1.000000
+
+distortion
+0.189544 -0.018229 -0.000630 0.000054 -0.000212
+
+rectification
+1.000000 0.000000 0.000000
+0.000000 1.000000 0.000000
+0.000000 0.000000 1.000000
+
+projection
+262.9 0.0 320.9 0.0
+0.0 302.1 188.5 0.0
+0.0 0.0 1.0 0.0
+"""
+
+
+@pytest.mark.parametrize("name", ["ost.txt", "left.ini"])
+def test_ros_ini(tmp_path, name):  # image_common#33
+    distortion = [0.189544, -0.018229, -0.000630, 0.000054, -0.000212]
+    _is(_read(tmp_path / name, INI), 369.344588, 367.15433, 320.739078, 203.59245, 640, 480, distortion)
+    _is(_read(tmp_path / name, INI, rectified=True), 262.9, 302.1, 320.9, 188.5, 640, 480)
+    with pytest.raises(ValueError, match="camera_matrix: expected 9 numbers, got 6"):
+        _read(tmp_path / name, INI.replace("0.000000 0.000000 1.000000\n\ndist", "\ndist"))
+    with pytest.raises(ValueError, match="expected each key once, got 'camera_matrix' twice"):
+        _read(tmp_path / name, INI + INI[INI.index("[mono") :])
+
+
+P = "7.2e+02 0 6.09e+02 4.4e+01 0 7.2e+02 1.7e+02 2.1e-01 0 0 1 2.7e-03"
+
+
+@pytest.mark.parametrize("name", ["0001.txt", "calib", "calib.TXT"])
+@pytest.mark.parametrize(
+    "text",
+    [f"P0: {P}\nP2: {P}\nR_rect 9.9e-01 1\nTr_velo_cam 7.5\n\n", f"  P2 :\t{P}\r\n", f"P_rect_00: {P}\n"],
+)
+def test_kittis_files_by_any_name(tmp_path, name, text):
+    camera = _read(tmp_path / name, text, image_size=(375, 1242))
+    _is(camera, 720, 720, 609, 170, 1242, 375)
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("SIMPLE_PINHOLE 1280 720 800 640 360", ([], "pinhole", 800)),
+        ("PINHOLE 1280 720 800 801 640 360", ([], "pinhole", 801)),
+        ("RADIAL 1280 720 800 640 360 -0.3 0.1", ([-0.3, 0.1, 0, 0, 0, 0, 0, 0], "pinhole", 800)),
+        (
+            "OPENCV 1280 720 800 801 640 360 -0.3 0.1 1e-3 -2e-3",
+            ([-0.3, 0.1, 1e-3, -2e-3, 0, 0, 0, 0], "pinhole", 801),
+        ),
+        (
+            "FULL_OPENCV 1280 720 800 801 640 360 .1 .2 1e-3 0 .03 .04 .05 .06",
+            ([0.1, 0.2, 1e-3, 0, 0.03, 0.04, 0.05, 0.06], "pinhole", 801),
+        ),
+        (
+            "OPENCV_FISHEYE 1280 720 800 801 640 360 .1 .01 0 0",
+            ([0.1, 0.01, 0, 0], "fisheye", 801),
+        ),
+    ],
+)
+def test_colmaps_pixels_begin_at_their_corner(tmp_path, line, expected):  # colmap#2587
+    distortion, model, fy = expected
+    text = f"# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL\n1 {line}\n"
+    camera = _read(tmp_path / "cameras.txt", text)
+    _is(camera, 800, fy, 639.5, 359.5, 1280, 720, distortion, model)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("cameras.txt", "1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1\n", "expected one camera, got 2; keep"),
+        ("cameras.txt", "1 FOV 1280 720 1 1 1 1 1\n", "model: expected one of SIMPLE_PINHOLE, .*, got FOV"),
+        ("cameras.txt", "1 PINHOLE 1280 720 800 800 640\n", "PINHOLE: expected 4 numbers, got 3"),
+        ("calib_velo_to_cam.txt", "R: 7.5 1\nT: 1 2 3\n", "expected a KITTI projection matrix"),
+        (
+            "c.yaml",
+            "{camera_model: pinhole, intrinsics: [800, 800, 640, 360], resolution: [1280, 720], "
+            "distortion_coeffs: [-0.3, 0.1, 0, 0]}",
+            "distortion_model: expected the one of distortion_coeffs, got none",
+        ),
+        (
+            "c.json",
+            json.dumps({"camera_intrinsic": MATRIX}),
+            "got a principal point of 408, 245; add width and",
+        ),
+        (
+            "c.json",
+            json.dumps({"intrinsic": MATRIX}),
+            "expected a camera of 1920 x 1280 px, OpenLane's, got a",
+        ),
+        ("c.json", json.dumps({"intrinsic": {"fx": 1, "u0": 2}}), "intrinsic: expected rows, cols, dt, data"),
+    ],
+)
+def test_what_is_no_camera_is_one_clear_line(tmp_path, name, text, message):
+    with pytest.raises(ValueError, match=message) as error:
+        _read(tmp_path / name, text)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("key", ["camera_intrinsic", "intrinsic"])
+def test_a_data_sets_format_with_other_images(tmp_path, key):
+    stated = json.dumps({key: MATRIX, "width": 800, "height": 450})
+    _is(_read(tmp_path / "c.json", stated, image_size=(900, 1600)), 633, 633, 408, 245, 800, 450)
+    _is(
+        _read(tmp_path / "c.json", json.dumps({key: MATRIX}), image_size=(450, 800)),
+        633,
+        633,
+        408,
+        245,
+        800,
+        450,
+    )
+
+
+def test_a_matrix_of_the_binned_images_is_refused(tmp_path):  # avt_vimba_camera#82
+    fields = {"height": 1544, "width": 2064, "distortion_model": "plumb_bob", "D": [-0.09, 0.08, 0, 0, 0]}
+    fields |= {"binning_x": 4, "binning_y": 4}
+    matrix = [299.54396, 0.0, 254.14465, 0.0, 300.14093, 183.94307, 0.0, 0.0, 1.0]
+    message = (
+        "camera_matrix: expected that of the full 2064 x 1544 px, got .* if it is theirs, write width 516"
+    )
+    with pytest.raises(ValueError, match=message):
+        _read(tmp_path / "c.json", json.dumps({**fields, "K": matrix}))
+    with pytest.raises(ValueError, match=message):
+        _read(
+            tmp_path / "c.json",
+            json.dumps({**fields, "P": [*matrix[:3], 0, *matrix[3:6], 0, 0, 0, 1, 0]}),
+            rectified=True,
+        )
+    full = [4 * matrix[0], 0, 4 * matrix[2], 0, 4 * matrix[4], 4 * matrix[5], 0, 0, 1]
+    assert _read(tmp_path / "c.json", json.dumps({**fields, "K": full})).image_size == (386, 516)
