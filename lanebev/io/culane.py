@@ -12,14 +12,18 @@ from lanebev.io.lane_parsing import FrameLines, Where, checked_pixels, lane_text
 from lanebev.numbers import numbers_or_gaps
 from lanebev.observation.polylines import LaneLine
 
+_NOT_THERE = (
+    -2.0,
+    -1.0,
+)  # x of points that detectors made for TuSimple do not see; else it is a pixel outside
 _GAP = 2.5  # times the usual distance of rows: from there on a line is not seen in between
 
 
 def read_culane(path: str | Path) -> FrameLines:
     """Read CULane's ``.lines.txt``, a line of ``x y x y ...`` per lane; the path without suffix names it.
 
-    A point that is repeated right after itself counts once; ``nan`` is a point that is not there. Where rows
-    are left out, the line is not seen.
+    A point that is repeated right after itself counts once; x of ``nan``, -2 or -1 is a point that is not
+    there. Where rows are left out, the line is not seen.
     """
     path = Path(path)
     lines = []
@@ -33,32 +37,33 @@ def read_culane(path: str | Path) -> FrameLines:
                 raise ValueError(f"expected x y pairs, got {len(values)} numbers; is the file cut?")
             pairs = (pair for pair in zip(values[::2], values[1::2], strict=True) if pair[1] == pair[1])
             points = np.array([point for point, _ in groupby(pairs)]).reshape(-1, 2)
-            _check_culane_rows(points[:, 1], texts[-1] if number == len(rows) and texts else "")
+            if number == len(rows) and texts:
+                _check_last_row(points[:, 1], texts[-1])
+            points[np.isin(points[:, 0], _NOT_THERE), 0] = np.nan
             if np.isfinite(points).all(-1).any():
                 lines.append(LaneLine(_with_gaps(checked_pixels("points", points))))
     return FrameLines(str(path).removesuffix(".txt").removesuffix(".lines"), lines)
 
 
-def _check_culane_rows(y: NDArray[np.float64], last: str) -> None:
-    """Raise unless rows go one way, and the text of the file's last number is not the start of the next row.
+def _check_last_row(y: NDArray[np.float64], last: str) -> None:
+    """Raise if a file without an end of line breaks off within its last number.
 
-    Rows may be left out anywhere. A file that is cut within a number ends with the first digits of a row
-    that would have been the next: 560 became 56.
+    Its rows go one way, then, but for the last: 560 became 56. Rows may be left out anywhere.
     """
     steps = np.diff(y)
     if len(steps) and not (np.all(steps > 0) or np.all(steps < 0)):
         raise ValueError("expected rows in one direction, got others; is the file cut?")
     if len(steps) > 2 and abs(steps[-1]) > _GAP * np.median(np.abs(steps)):
         expected = f"{y[-2] + np.median(steps[:-1]):g}"
-        if expected != last and expected.startswith(last.removesuffix(".")) and last:
+        if expected != last and expected.startswith(last.removesuffix(".")):
             raise ValueError(f"expected evenly spaced rows, got {y[-2]:g} then {y[-1]:g}; is the file cut?")
 
 
 def _with_gaps(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points (P, 2) in order of rows, with a NaN where rows were left out."""
     steps = np.abs(np.diff(points[:, 1]))
-    if not len(steps):
+    if not steps.any():
         return points
-    gaps = np.flatnonzero(steps > _GAP * np.median(steps))
+    gaps = np.flatnonzero(steps > _GAP * np.median(steps[steps > 0]))
     middle = 0.5 * (points[gaps, 1] + points[gaps + 1, 1])
     return np.insert(points, gaps + 1, np.stack([np.full(len(gaps), np.nan), middle], axis=-1), axis=0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +15,9 @@ from lanebev.numbers import finite_numbers, numbers_or_gaps, read_text, shown
 from lanebev.observation.polylines import LaneLine
 
 _FARTHEST = 1e6  # px or m, of any coordinate
+_DECODER = json.JSONDecoder()
+_NO_VALUE = re.compile(r"[\s,]*")  # between JSON values
+_NO_JSON = "expected JSON, got a line that breaks off or is none; is the file cut?"
 
 
 class FrameLines(NamedTuple):
@@ -54,12 +59,45 @@ def lane_text(path: Path) -> str:
 def json_object(text: str) -> dict[str, Any]:
     """Return the object that a JSON text holds; else it is a ValueError."""
     try:
-        fields = json.loads(text)
+        value = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError("expected JSON, got a line that breaks off or is none; is the file cut?") from error
-    if not isinstance(fields, dict):
-        raise ValueError(f"expected a JSON object, got {type(fields).__name__}")
-    return fields
+        raise ValueError(_NO_JSON) from error
+    return as_object(value)
+
+
+def as_object(value: Any) -> dict[str, Any]:
+    """Return the value, if it is a JSON object; else it is a ValueError."""
+    if not isinstance(value, dict):
+        raise ValueError(f"expected a JSON object, got {type(value).__name__}")
+    return value
+
+
+def json_values(path: str | Path, text: str) -> Iterator[tuple[int, Any]]:
+    """Yield the JSON values of a lane file, each with the number of the line on which it begins.
+
+    They follow each other, on lines of their own or not and with commas or not, or are objects in a list.
+
+    Raises:
+        ValueError: after the values before, where the text is no JSON.
+    """
+    place = _begin(text, 0)
+    line = 1 + text.count("\n", 0, place)
+    while place < len(text):
+        with Where(path, line):
+            try:
+                value, end = _DECODER.raw_decode(text, place)
+            except (ValueError, RecursionError) as error:
+                raise ValueError(_NO_JSON) from error
+        listed = isinstance(value, list) and all(isinstance(each, dict) for each in value)
+        yield from ((line, each) for each in (value if listed else [value]))
+        before, place = place, _begin(text, end)
+        line += text.count("\n", before, place)
+
+
+def _begin(text: str, place: int) -> int:
+    """Return the place where the next value begins."""
+    found = _NO_VALUE.match(text, place)
+    return found.end() if found else place
 
 
 def field(fields: Any, key: str, kind: type) -> Any:

@@ -61,7 +61,8 @@ def lane_files(path: str | Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     found = [*path.rglob("*.lines.txt"), *path.rglob("*.json")]
-    return [Path(file) for file in in_natural_order(map(str, found))]
+    seen = (file for file in found if not any(part[0] == "." for part in file.relative_to(path).parts))
+    return [Path(file) for file in in_natural_order(map(str, seen))]  # macOS leaves ._ files
 
 
 def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int | None]:  # noqa: C901 - the rules of one decision

@@ -18,9 +18,11 @@ from lanebev.io.lane_parsing import (
     FrameLines,
     Where,
     as_list,
+    as_object,
     checked_pixels,
     field,
     json_object,
+    json_values,
     lane_text,
     number_array,
 )
@@ -33,15 +35,14 @@ _TUSIMPLE_ROWS = {56: range(160, 720, 10), 48: range(240, 720, 10)}  # of the be
 
 
 def read_tusimple(path: str | Path) -> list[FrameLines]:
-    """Read TuSimple JSON lines: ``lanes``, ``h_samples``, ``raw_file``, and what ours say besides.
+    """Read TuSimple JSON, an object a line or in a list: ``lanes``, ``h_samples``, ``raw_file``, and our own.
 
     Predictions for TuSimple's benchmark leave ``h_samples`` out; theirs are the rows of its labels.
     """
     frames = []
-    for number, text in enumerate(lane_text(Path(path)).split("\n"), start=1):
-        if text.strip():
-            with Where(path, number):
-                frames.append(_tusimple_frame(json_object(text)))
+    for line, value in json_values(path, lane_text(Path(path))):
+        with Where(path, line):
+            frames.append(_tusimple_frame(as_object(value)))
     if not frames:
         raise ValueError(f"lane file {path}: expected TuSimple JSON lines, got an empty file")
     names = [frame.name for frame in frames]
@@ -184,6 +185,8 @@ def _benchmark_rows(lanes: list[Any]) -> list[float]:
 
 
 def _on_h_samples(name: str, values: Any, count: int) -> NDArray[np.float64]:
+    if values == []:  # as some detectors write a lane that they do not see
+        return np.full(count, np.nan)
     if not isinstance(values, list) or len(values) != count:
         got = len(values) if isinstance(values, list) else shown(values)
         raise ValueError(f"{name}: expected {count} numbers, one per h_sample, got {got}")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 from lanebev.types import NUM_BOUNDARIES
 
 _SAME_LINE, _NEXT_BUT_ONE = 0.4, 1.75  # gap between neighbours, in usual gaps
+_FARTHEST = 20.0  # lateral distance over camera height: beyond it a line crosses the road, as stop lines do
+_NARROWEST = 0.25  # lane width over camera height: below it two lines are one, or edges of one marking
 
 
 def boundary_indices(
@@ -20,8 +23,10 @@ def boundary_indices(
 
     The lower half of each line is extended to the bottom of the image; the lines are counted outwards in
     that order, also those that leave the image sideways. A line runs down to its own side of the camera, so
-    its slope tells the side at any yaw. A neighbour much nearer than usual is the other edge of the same
-    marking and gets None; one twice as far as usual is the next but one.
+    its slope tells the side at any yaw. A neighbour much nearer than usual, or nearer than any lane is wide,
+    is the other edge of the same marking, or the line drawn twice, and gets None; one twice as far as usual
+    is the next but one. Nearer than any lane: on a plane, slopes dx/dy of two boundaries differ by their
+    distance over the camera's height, whatever pitch, yaw and focal length are.
 
     Args:
         lines: each (P, 2) px, undistorted; P = 0 and 1 get None.
@@ -32,14 +37,17 @@ def boundary_indices(
     """
     result: list[int | None] = [None] * len(lines)
     drawn = [i for i, line in enumerate(lines) if len(line) > 1 and np.ptp(line[:, 1]) > 0]
-    if not drawn:
+    straight = {i: _lower_half(lines[i]) for i in drawn}
+    slope = {i: found.slope for i, found in straight.items() if abs(found.slope) <= _FARTHEST}
+    if not slope:
         return result
-    bottom = max(float(lines[i][:, 1].max()) for i in drawn)
-    crossings, slopes = zip(*(_crossing(lines[i], bottom) for i in drawn), strict=True)
-    order = np.argsort(crossings)
-    kept = _without_doubles([drawn[k] for k in order], np.asarray(crossings)[order], lines)
-    crossing = {i: crossings[k] for k, i in enumerate(drawn)}
-    left = sum(slopes[drawn.index(i)] < 0 for i in kept)
+    bottom = max(float(lines[i][:, 1].max()) for i in slope)
+    crossing = {i: straight[i].at(bottom) for i in slope}
+    apart = _longest_of_doubles(sorted(slope, key=crossing.__getitem__), slope, _NARROWEST, lines)
+    gaps = np.diff([crossing[i] for i in apart])
+    usual = float(np.median(gaps)) if len(gaps) > 1 else 0.0
+    kept = _longest_of_doubles(apart, crossing, _SAME_LINE * usual, lines)
+    left = sum(slope[i] < 0 for i in kept)
     usual = _usual_gap([crossing[b] - crossing[a] for a, b in pairwise(kept)])
     steps = [2 if crossing[b] - crossing[a] > _NEXT_BUT_ONE * usual else 1 for a, b in pairwise(kept)]
     position = np.concatenate([[0], np.cumsum(steps)]).astype(int)
@@ -53,24 +61,34 @@ def boundary_indices(
     return result
 
 
-def _crossing(points: NDArray[np.float64], bottom: float) -> tuple[float, float]:
-    """Return where the lower half of a line meets the row ``bottom``, and its slope dx/dy there."""
+class _Straight(NamedTuple):
+    """A line through (x, y) px with the slope dx/dy."""
+
+    x: float
+    y: float
+    slope: float
+
+    def at(self, row: float) -> float:
+        """Return the x at which it meets a row."""
+        return self.x + self.slope * (row - self.y)
+
+
+def _lower_half(points: NDArray[np.float64]) -> _Straight:
+    """Fit a straight line to the lower half of a line, by least squares."""
     lower = points[np.argsort(points[:, 1])][-max(4, len(points) // 2) :]
-    y = lower[:, 1] - lower[:, 1].mean()
-    slope = float((y * lower[:, 0]).sum() / max((y * y).sum(), 1e-9))
-    return float(lower[:, 0].mean() + slope * (bottom - lower[:, 1].mean())), slope
+    x, y = lower.mean(axis=0)
+    down = lower[:, 1] - y
+    slope = (down * lower[:, 0]).sum() / max((down * down).sum(), 1e-9)
+    return _Straight(float(x), float(y), float(slope))
 
 
-def _without_doubles(
-    order: list[int], crossings: NDArray[np.float64], lines: Sequence[NDArray[np.float64]]
+def _longest_of_doubles(
+    order: Sequence[int], place: Mapping[int, float], least: float, lines: Sequence[NDArray[np.float64]]
 ) -> list[int]:
-    gaps = np.diff(crossings)
-    if len(gaps) < 2:
-        return order
-    usual = float(np.median(gaps))
-    kept = [order[0]]
-    for i, gap in zip(order[1:], gaps, strict=True):
-        if gap > _SAME_LINE * usual:
+    """Return the lines in order, of neighbours whose places differ by at most ``least`` the longer one."""
+    kept: list[int] = []
+    for i, before in zip(order, [None, *order], strict=False):
+        if before is None or abs(place[i] - place[before]) > least:
             kept.append(i)
         elif len(lines[i]) > len(lines[kept[-1]]):
             kept[-1] = i

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ LINE_SIGMA = 1.5
 VERTICES_PER_LINE = 60
 """At most; more do not make a frame's pose better, only slower."""
 
+_MOST_TURNS = 0.25  # of a line's steps: points with more turns are in no order
 _GAP, _GAP_ROWS = 4.0, 30.0  # between vertices: times the usual distance, and px
 
 
@@ -140,8 +142,9 @@ def _line_vertices(line: LaneLine, image_size: tuple[int, int]) -> NDArray[np.fl
     if line.weight is not None:
         return np.column_stack([line.points, said, line.weight])
     rows = image_rows(image_size[0])
-    x = _on_rows(line.points, rows)
-    sigma = _on_rows(np.column_stack([said, line.points[:, 1]]), rows)
+    part = _one_way(line.points[:, 1])
+    x = _on_rows(line.points[part], rows)
+    sigma = _on_rows(np.column_stack([said, line.points[:, 1]])[part], rows)
     return np.column_stack([x, rows, sigma, np.ones(len(rows))])[_inside(x, image_size[1])]
 
 
@@ -153,6 +156,21 @@ def _inside(x: NDArray[np.float64], width: int) -> NDArray[np.bool_]:
 def _spread(count: int, most: int) -> NDArray[np.int64]:
     """Return at most ``most`` indices of 0..count-1, evenly spread."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
+
+
+def _one_way(y: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the points of the longest part of a line that goes only up or only down; all if it has no order.
+
+    Where a road turns away, its far end may come down again in the image: two points on a row.
+    """
+    there = np.flatnonzero(np.isfinite(y))
+    signs = np.sign(np.diff(y[there]))
+    moves = np.flatnonzero(signs)
+    turns = moves[1:][np.diff(signs[moves]) != 0]
+    if not 0 < len(turns) <= _MOST_TURNS * len(moves):
+        return there
+    parts = [there[first : last + 1] for first, last in pairwise([0, *turns.tolist(), len(there) - 1])]
+    return max(parts, key=lambda part: float(np.ptp(y[part])))
 
 
 def _on_rows(points: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float64]:

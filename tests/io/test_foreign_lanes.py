@@ -1,0 +1,141 @@
+"""Lane files as more detectors write them: lists, empty lanes, lines drawn twice, across the road or back."""
+
+import json
+
+import numpy as np
+import pytest
+
+from lanebev import Camera
+from lanebev.io.lanes import read_lanes
+from lanebev.observation.boundary_order import boundary_indices
+from lanebev.observation.polylines import LaneLine, vertices_from_lines
+
+CAMERA = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720)
+
+
+def _entry(name="1.jpg", **changes):
+    return {"raw_file": name, "h_samples": [500, 510, 520], "lanes": [[5, 6, 7], [900, 910, 920]], **changes}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        json.dumps([_entry(), _entry("2.jpg")]),
+        json.dumps([_entry(), _entry("2.jpg")], indent=2),
+        json.dumps(_entry(), indent=2) + "\n" + json.dumps(_entry("2.jpg"), indent=2),
+        json.dumps(_entry()) + ",\n" + json.dumps(_entry("2.jpg")) + ",\n",
+        json.dumps(_entry()) + json.dumps(_entry("2.jpg")),
+        json.dumps(_entry()) + "\r\n\r\n" + json.dumps(_entry("2.jpg")) + "\r\n",
+    ],
+)
+def test_tusimples_objects_in_any_arrangement(tmp_path, text):
+    (tmp_path / "lanes.json").write_text(text)
+    frames = read_lanes(tmp_path / "lanes.json")
+    assert [frame.name for frame in frames] == ["1.jpg", "2.jpg"]
+    np.testing.assert_array_equal(frames[1].lines[0].points, [[5, 500], [6, 510], [7, 520]])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            json.dumps(_entry()) + "\n\n" + json.dumps(_entry("2"))[:-9],
+            "line 3: expected JSON, got a line that",
+        ),
+        (json.dumps([_entry(), _entry("2")], indent=2)[:-9], "line 1: expected JSON"),
+        (json.dumps(_entry(), indent=2) + "\n5\n", r"line \d\d: expected a JSON object, got int"),
+        ("[1, 2]", "line 1: expected a JSON object, got list"),
+        ("[" * 10_000, "line 1: expected JSON"),
+    ],
+)
+def test_what_breaks_off_names_its_line(tmp_path, text, message):
+    (tmp_path / "lanes.json").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_lanes(tmp_path / "lanes.json")
+
+
+def test_an_empty_lane_is_none(tmp_path):
+    (tmp_path / "lanes.json").write_text(
+        json.dumps(_entry(lanes=[[], [900, 910, 920]], sigma=[None, [1, 1, 1]]))
+    )
+    (line,) = read_lanes(tmp_path / "lanes.json")[0].lines
+    np.testing.assert_array_equal(line.points[:, 0], [900, 910, 920])
+
+
+def test_hidden_files_are_no_lanes(tmp_path):
+    (tmp_path / "1.lines.txt").write_text("5 590 6 580\n")
+    (tmp_path / "._1.lines.txt").write_bytes(b"\x00\x05\x16\x07\x00")  # macOS
+    (tmp_path / ".ipynb_checkpoints").mkdir()
+    (tmp_path / ".ipynb_checkpoints" / "1.lines.txt").write_text("7 590 8 580\n")
+    (frame,) = read_lanes(tmp_path)
+    np.testing.assert_array_equal(frame.lines[0].points, [[5, 590], [6, 580]])
+
+
+@pytest.mark.parametrize("missing", ["-2", "-1", "nan"])
+def test_culane_points_that_are_not_there_draw_no_line(tmp_path, missing):
+    path = tmp_path / "1.lines.txt"
+    path.write_text(f"{missing} 695 {missing} 685 {missing} 675 300 665 310 655 320 645 330 635\n")
+    (line,) = read_lanes(path)[0].lines
+    vertices = vertices_from_lines([line._replace(boundary=2)], CAMERA)
+    seen = vertices.points[0, 2, vertices.weight[0, 2] > 0].numpy()
+    np.testing.assert_allclose(seen, [[325, 640], [315, 650], [305, 660]])  # and not 150 at 670
+
+
+def test_culane_rows_may_repeat_and_turn(tmp_path):
+    path = tmp_path / "1.lines.txt"
+    path.write_text("5 590 7 580 9 580 11 570\n5 590 7 580 9 570 12 575 15 580 18 585\n")
+    first, second = read_lanes(path)[0].lines
+    assert np.isfinite(first.points).all()
+    rows = vertices_from_lines([second._replace(boundary=2)], CAMERA)
+    seen = rows.points[0, 2, rows.weight[0, 2] > 0].numpy()
+    np.testing.assert_array_equal(seen, [[9, 570], [7, 580], [5, 590]])  # the longer way
+
+
+def _fan(*offsets, top=330.0, height=1.5):
+    """Boundaries of a flat straight road at these lateral offsets (m), each (P, 2) px."""
+    rows = np.arange(top, 720.0, 10.0)
+    lines = [np.stack([640 + (rows - 300) * offset / height, rows], axis=-1) for offset in offsets]
+    return [line[(line[:, 0] >= 0) & (line[:, 0] <= 1279)] for line in lines]
+
+
+LEFT, RIGHT = _fan(-1.8, 1.8)
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        ([LEFT, LEFT], [2, None]),
+        ([LEFT, LEFT, RIGHT], [2, None, 3]),
+        ([LEFT, RIGHT, LEFT, RIGHT], [2, 3, None, None]),
+        (_fan(-1.9, -1.7), [2, None]),  # both edges of one marking
+        (_fan(1.7, 1.9), [3, None]),
+        (_fan(-1.9, -1.7, 1.7, 1.9), [2, None, 3, None]),
+        ([LEFT[:12], LEFT[20:], RIGHT], [None, 2, 3]),  # in two pieces
+        (_fan(-5.4, -1.8, 1.8, 5.4, height=6.0), [1, 2, 3, 4]),  # narrow in the image: seen from above
+    ],
+)
+def test_a_line_that_is_drawn_twice_counts_once(lines, expected):
+    assert boundary_indices(lines) == expected
+
+
+@pytest.mark.parametrize("rise", [4.0, -4.0, 25.0, -25.0, 0.0])
+def test_a_line_across_the_road_counts_for_none(rise):
+    across = np.array([[100.0, 600.0], [400.0, 600.0 + rise / 2], [700.0, 600.0 + rise]])
+    assert boundary_indices([across, LEFT, RIGHT]) == [None, 2, 3]
+    assert boundary_indices([across]) == [None]
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_the_end_of_a_line_that_comes_down_again_is_left_out(reverse):
+    up = np.stack([np.linspace(300, 600, 31), np.linspace(700, 400, 31)], axis=-1)
+    down = np.stack([np.linspace(610, 900, 8), np.linspace(405, 440, 8)], axis=-1)
+    whole = np.concatenate([up, down])[:: -1 if reverse else 1]
+    found, expected = (vertices_from_lines([LaneLine(line, 2)], CAMERA) for line in (whole, up))
+    np.testing.assert_array_equal(found.points, expected.points)
+    np.testing.assert_array_equal(found.weight, expected.weight)
+
+
+def test_points_in_no_order_are_a_line_all_the_same():
+    shuffled = np.random.default_rng(0).permutation(LEFT)
+    found, expected = (vertices_from_lines([LaneLine(line, 2)], CAMERA) for line in (shuffled, LEFT))
+    np.testing.assert_array_equal(found.points, expected.points)
