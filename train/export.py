@@ -43,7 +43,8 @@ def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     except OSError as error:
         raise ValueError(f"{path}: expected a checkpoint, got: {error.strerror}") from error
     except (pickle.UnpicklingError, EOFError, KeyError, TypeError, RuntimeError) as error:
-        reason = str(error).partition("\n")[0]
+        missing = f"none with {error}" if isinstance(error, KeyError) else ""
+        reason = missing or str(error).partition("\n")[0]
         raise ValueError(f"{path}: expected a checkpoint of python -m train, got: {reason}") from error
     prefix = "segmenter."
     weights = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}

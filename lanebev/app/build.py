@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import torch
@@ -31,15 +32,24 @@ RunTracker = Tracker[JointState] | Tracker[TwoStageState]
 _LOOKED_AT = 20  # images of a folder, for one of the camera's size
 
 
-def make_camera(config: RunConfig, image_size: tuple[int, int]) -> Camera:
-    """Read the camera file, or make an ideal camera of the field of view and the source's image size.
+def make_camera(
+    config: RunConfig, image_size: tuple[int, int], pixel_aspect: Fraction = Fraction(1)
+) -> Camera:
+    """Read the camera file, or make an ideal camera of the field of view and the source's images.
+
+    Args:
+        config: the settings.
+        image_size: (height, width) px of the source's images.
+        pixel_aspect: width over height of their pixels, of which a camera file's focal lengths know.
 
     Raises:
         ValueError: the file is none of a camera.
     """
     if config.fov is not None:
         height, width = image_size
-        return Camera.from_fov(config.fov, width, height)
+        ideal = Camera.from_fov(config.fov, width, height)
+        (fx, _, cx), (_, fy, cy), _ = ideal.intrinsics.tolist()
+        return Camera.from_parameters(fx, fy * float(pixel_aspect), cx, cy, width, height)
     return Camera.from_file(config.camera, image_size, config.rectified)
 
 

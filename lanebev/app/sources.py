@@ -57,14 +57,15 @@ def camera_of(config: RunConfig, source: FrameSource) -> Camera:
         ValueError: the camera file is none, or the bag has no camera.
     """
     if config.camera or config.fov is not None or not isinstance(source, BagSource):
-        return make_camera(config, source.image_size)
+        return make_camera(config, source.image_size, source.pixel_aspect)
     if source.lens is None:
         raise ValueError(
             f"camera: expected --camera FILE, got none, and bag {source.source} has no calibrated CameraInfo "
             f"beside {source.topic}"
         )
     try:
-        return Camera.from_fields(source.lens, config.rectified)
+        rectified = config.rectified or "image_rect" in source.topic  # by ROS's image_proc, which P is of
+        return Camera.from_fields(source.lens, rectified)
     except ValueError as error:
         raise ValueError(f"camera of bag {source.source}: {error}; give --camera FILE") from error
 

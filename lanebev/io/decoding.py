@@ -27,10 +27,22 @@ def open_video(source: str) -> av.container.InputContainer:
     except (av.error.FFmpegError, OSError) as error:
         reason = error.strerror or "unknown format"
         raise ValueError(f"video {source}: expected a video that opens, got: {reason}; is it cut?") from error
-    if not container.streams.video:
+    if not moving_pictures(container):
         container.close()
         raise ValueError(f"video {source}: expected a video stream, got none")
     return container
+
+
+def moving_pictures(container: av.container.InputContainer) -> list[av.VideoStream]:
+    """Return the video streams that can be decoded and are no cover or thumbnail."""
+    still = av.stream.Disposition.attached_pic
+    known = (stream for stream in container.streams.video if stream.codec_context is not None)
+    return [stream for stream in known if not stream.disposition & still]
+
+
+def video_stream(container: av.container.InputContainer) -> av.VideoStream:
+    """Return the video stream of the largest images, the first of equal ones."""
+    return max(moving_pictures(container), key=lambda stream: (stream.width or 0) * (stream.height or 0))
 
 
 def has_times(container: av.container.InputContainer) -> bool:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import av
 
-from lanebev.io.decoding import decoded, has_times, open_video, packets
+from lanebev.io.decoding import decoded, has_times, open_video, packets, video_stream
 
 _CODECS = ("h264", "hevc", "mpeg4", "mpeg2video", "mjpeg")  # each packet is a frame that is shown
 _KEYS_BEFORE = 2  # in an open group, frames just before a key frame may refer to the one before it
@@ -55,13 +55,13 @@ def begun(source: str, start: float) -> Iterator[Begun]:
                 yield found
                 return
     with open_video(source) as container:
-        stream = container.streams.video[0]
+        stream = video_stream(container)
         yield Begun(container, stream, decoded(container, stream))
 
 
 def _begun_within(container: av.container.InputContainer, start: float) -> Begun | None:
     """Decode from a key frame to the wanted frame; None unless all in between are whole and as expected."""
-    stream = container.streams.video[0]
+    stream = video_stream(container)
     tick = stream.time_base
     sound = has_times(container) and container.format.name != "avi" and stream.codec_context.name in _CODECS
     found = _times_to(container, stream, start) if sound else None

@@ -1,27 +1,34 @@
-"""Frames of a video, a folder, a glob or one image; H.264 output for browsers."""
+"""Frames of a video, a folder, a glob or one image."""
 
 from __future__ import annotations
 
 import glob
-import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from statistics import median
-from types import TracebackType
 
 import av
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.io.decoding import decoded, display_matrix, has_times, open_video, packets, rgb
+from lanebev.io.decoding import (
+    decoded,
+    display_matrix,
+    has_times,
+    moving_pictures,
+    open_video,
+    packets,
+    rgb,
+    video_stream,
+)
 from lanebev.io.frames import ALL, Frame, Selection, taken_frames
 from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
 from lanebev.io.images import IMAGE_SUFFIXES, image_size, is_image, read_image, write_png
 from lanebev.io.seeking import begun
+from lanebev.io.video_writer import VideoWriter
 
 __all__ = [
     "DEFAULT_FPS",
@@ -39,6 +46,7 @@ __all__ = [
 
 DEFAULT_FPS = Fraction(30)
 _SAME_RATE = 0.05  # relative, by which two frame rates may differ and be the same
+_SAME_VIDEO = 2  # factor, by which a video's frames may come faster or slower than its mean rate
 
 
 @dataclass(frozen=True)
@@ -54,6 +62,7 @@ class FrameSource:
         problem: what is wrong with the whole of it, else empty.
         times: s since the first, of images whose names state them; else empty.
         has_times: whether a video says when its frames are shown; else they are evenly spaced.
+        pixel_aspect: width of a pixel over its height, as a video states it; frames are not resized by it.
         selection: which of the frames are taken. ``fps`` and ``count`` are those of the whole source.
         matrix: by which a video's frames are shown, see :func:`lanebev.io.decoding.display_matrix`.
     """
@@ -66,6 +75,7 @@ class FrameSource:
     problem: str = ""
     times: tuple[float, ...] = ()
     has_times: bool = True
+    pixel_aspect: Fraction = Fraction(1)
     selection: Selection = ALL
     matrix: tuple[int, ...] | None = None
 
@@ -163,62 +173,21 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
     if path.is_file():
         return _image_source(source, [source], fps) if is_image(path) else _video_source(source, fps)
     if glob.has_magic(source):
-        paths = in_natural_order(filter(is_image, glob.glob(source, recursive=True)))
+        paths = in_natural_order(filter(is_image, glob.glob(_pattern(source), recursive=True)))
         if not paths:
             raise ValueError(f"{source}: expected images that match, got none; quote the pattern")
         return _image_source(source, paths, fps)
     raise ValueError(f"{source}: expected a video, an image, a folder or a glob of images, got nothing there")
 
 
+def _pattern(source: str) -> str:
+    """Return the glob, with brackets in the names of existing folders taken literally."""
+    folder = next((str(each) for each in Path(source).parents if each.is_dir()), ".")
+    rest = source.removeprefix(folder)
+    return glob.escape(folder) + rest if rest != source and glob.has_magic(rest) else source
+
+
 _HIDING = ("vp8", "libvpx")  # codecs with frames that are decoded and not shown, in packets of their own
-
-
-_TICK = Fraction(1, 90_000)  # s, of what is written
-
-
-class VideoWriter:
-    """H.264, yuv420p, the index in front: plays in browsers. Frames are padded to even sides.
-
-    Use as a context manager; the file is whole only after it closes.
-
-    Args:
-        path: the file.
-        fps: frames per second.
-        crf: x264's quality, less is better.
-    """
-
-    def __init__(self, path: str | Path, fps: Fraction, crf: int = 21) -> None:
-        self._container = av.open(os.path.abspath(path), "w", options={"movflags": "faststart"})
-        self._stream = self._container.add_stream("libx264", rate=fps.limit_denominator(65535))
-        self._stream.pix_fmt = "yuv420p"
-        self._stream.codec_context.time_base = _TICK
-        self._interval, self._next = 1 / fps, Fraction(0)
-        self._stream.options = {"crf": str(crf), "preset": "ultrafast", "bf": "0"}  # else a late gap is cut
-
-    def __enter__(self) -> VideoWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if error is None:
-            for packet in self._stream.encode():
-                self._container.mux(packet)
-        self._container.close()
-
-    def write(self, image: NDArray[np.uint8], time: float | None = None) -> None:
-        """Write (H, W, 3) uint8 RGB, always of one size, shown at ``time`` s or a frame after the last."""
-        height, width = image.shape[:2]
-        if height % 2 or width % 2:
-            image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-        if not self._stream.codec_context.is_open:
-            self._stream.height, self._stream.width = image.shape[:2]
-        frame = av.VideoFrame.from_ndarray(cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420), format="yuv420p")
-        shown = self._next if time is None else max(Fraction(time), self._next - self._interval + _TICK)
-        frame.pts, frame.time_base = round(shown / _TICK), _TICK
-        self._next = shown + self._interval
-        for packet in self._stream.encode(frame):
-            self._container.mux(packet)
 
 
 def _image_source(source: str, paths: Sequence[str], fps: Fraction | None) -> FrameSource:
@@ -244,7 +213,7 @@ def _image_source(source: str, paths: Sequence[str], fps: Fraction | None) -> Fr
 
 def _video_source(source: str, stated: Fraction | None) -> FrameSource:
     with open_video(source) as container:
-        stream = container.streams.video[0]
+        stream = video_stream(container)
         timed = has_times(container)
         own = Fraction((timed and stream.average_rate) or stream.guessed_rate or DEFAULT_FPS)
         fps = own if timed else stated or own
@@ -255,21 +224,30 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
             raise ValueError(f"video {source}: expected at least one whole frame, got none") from error
         matrix = display_matrix(frame)
         size = rgb(frame, matrix).shape[:2]
+        pixel_aspect = _pixel_aspect(frame.width, frame.height, size, stream.sample_aspect_ratio)
+        others = len(moving_pictures(container)) - 1
     with open_video(source) as container:  # the header's count includes frames that an edit list cuts
-        stream = container.streams.video[0]
+        stream = video_stream(container)
         begin, tick = stream.start_time or 0, stream.time_base or 1 / fps
         count, end = 0, Fraction(0)
+        shown: list[int] = []
         telling = stream.codec_context.name not in _HIDING
         for packet in packets(container, stream):
             telling = telling and (packet.pts is not None or not packet.size)
             if packet.pts is not None:
                 count += not packet.is_discard
+                shown.append(packet.pts)
                 end = max(end, packet.pts - begin + max(packet.duration or 0, 1 / fps / tick))
         declared, got = _declared_duration(stream, begin * tick), float(end * tick)
     if not telling:
         with open_video(source) as container:
-            count = sum(1 for _ in decoded(container, container.streams.video[0]))
+            count = sum(1 for _ in decoded(container, video_stream(container)))
     problems = []
+    if timed and (rate := _rate_of_times(shown, tick, own)) != own:
+        problems.append(f"it states {float(own):.4g} frames per second, they come at {float(rate):.4g}")
+        fps = own = rate
+    if others:
+        problems.append(f"it has {others} more video streams; that of {size[1]} x {size[0]} px is used")
     if timed and declared - got > 0.5 / fps:
         problems.append(f"expected {declared:.2f} s as it declares, got {got:.2f} s; is it cut?")
     if not timed and stated is None:
@@ -277,7 +255,25 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
     if timed and stated is not None and abs(own / stated - 1) > _SAME_RATE:
         problems.append(f"its own {float(own):.4g} frames per second are used, not --fps {float(stated):g}")
     problem = f"video {source}: {'; '.join(problems)}" if problems else ""
-    return FrameSource(source, (), fps, count, size, problem, has_times=timed, matrix=matrix)
+    return FrameSource(
+        source, (), fps, count, size, problem, has_times=timed, pixel_aspect=pixel_aspect, matrix=matrix
+    )
+
+
+def _rate_of_times(times: Sequence[int], tick: Fraction, stated: Fraction) -> Fraction:
+    """Return the stated frame rate, or that of the times (ticks) where it is near neither mean nor median."""
+    steps = np.diff(np.unique(times))
+    if not len(steps):
+        return stated
+    median_rate, mean_rate = (1 / Fraction(float(of(steps))) / tick for of in (np.median, np.mean))
+    near = any(1 / _SAME_VIDEO < rate / stated < _SAME_VIDEO for rate in (median_rate, mean_rate))
+    return stated if near else median_rate.limit_denominator(1000)
+
+
+def _pixel_aspect(width: int, height: int, shown: tuple[int, int], stated: Fraction | None) -> Fraction:
+    """Return the width of a pixel over its height in a frame as shown, perhaps turned; 1 if not stated."""
+    aspect = stated or Fraction(1)
+    return aspect if shown == (height, width) else 1 / aspect
 
 
 def _declared_duration(stream: av.VideoStream, begin: Fraction) -> float:

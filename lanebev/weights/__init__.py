@@ -23,6 +23,7 @@ SHIPPED = Path(__file__).with_name("lane_segmenter.safetensors")
 _FORMAT = "lanebev.LaneSegmenter/1"
 _COMPACT_FORMAT = "lanebev.LaneSegmenter/2"  # some tensors are int8 and have a scale beside them
 _SCALE = ".scale"
+_ZIP, _GIT_LFS = b"PK\x03\x04", b"version https://git-lfs"  # with what torch.save's files and pointers begin
 _LARGE = 2**20  # weights; larger ones are 8-bit numbers in a compact file
 _MOST = {"num_boundaries": 64, "base_width": 512, "decoder_width": 512, "context": 16}
 _FORMER_NAMES = {"noise_factor": "sigma_scale", "pose_factor": "pose_sigma_scale"}
@@ -43,6 +44,8 @@ def load_segmenter(path: str | Path | None = None) -> LaneSegmenter:
         config = segmenter_config(json.loads(metadata["config"]))
         segmenter = LaneSegmenter(config)
         segmenter.load_state_dict(tensors, strict=True)
+        if not all(bool(value.isfinite().all()) for value in tensors.values()):
+            raise ValueError("expected finite numbers, got others; was the training unstable?")
     except (LookupError, TypeError, ValueError, RuntimeError, ArithmeticError, AttributeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"{path}: weights do not fit the network they describe: {reason}") from error
@@ -109,7 +112,11 @@ def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, t
     """Read metadata, and every tensor in single precision (counters unchanged)."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a weights file, there is none")
-    if path.suffix == ".ckpt":
+    with open(path, "rb") as file:
+        head = file.read(len(_GIT_LFS))
+    if head == _GIT_LFS:
+        raise ValueError(f"{path}: expected a weights file, got where Git LFS keeps it; run: git lfs pull")
+    if path.suffix == ".ckpt" or head.startswith(_ZIP):
         name = path.with_suffix(".safetensors").name
         raise ValueError(
             f"{path}: expected a weights file, got a checkpoint of training; "

@@ -97,6 +97,15 @@ def test_frames_and_lens_of_a_ros_2_bag(bags, kind):
     assert [frame.source_number for frame in some] == [2, 4]
 
 
+@pytest.mark.parametrize(
+    ("topic", "rectified"), [("/cam/image_rect/compressed", True), ("/cam/image_raw", False)]
+)
+def test_images_that_ros_rectified_have_no_lens(tmp_path, topic, rectified):
+    source = make_source(RunConfig(str(_bag(tmp_path / "bag", topics=(topic,))), ""))
+    camera = camera_of(RunConfig(source.source, ""), source)
+    assert camera.distortion.tolist() == ([] if rectified else CAMERA.distortion.tolist())
+
+
 def _ros1_header(store, number):
     time = START + 0.1 * number
     stamp = store.types["builtin_interfaces/msg/Time"](int(time), round(1e9 * (time % 1)))

@@ -1,5 +1,6 @@
 """The shipped weights: what they say of themselves, and that they see a rendered road."""
 
+import copy
 import json
 from pathlib import Path
 
@@ -88,3 +89,19 @@ def test_a_cut_file_is_one_clear_error(tmp_path):
     cut.write_bytes(Path(SHIPPED).read_bytes()[:100_000])
     with pytest.raises(ValueError, match="expected a whole safetensors file"):
         load_segmenter(cut)
+
+
+def test_what_is_no_weights_file_says_what_it_is(tmp_path, segmenter):
+    path = tmp_path / "w.safetensors"
+    torch.save({"state_dict": {}}, path)  # a checkpoint by another name
+    with pytest.raises(ValueError, match="got a checkpoint of training; make one with: python -m"):
+        load_segmenter(path)
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    with pytest.raises(ValueError, match="run: git lfs pull"):
+        load_segmenter(path)
+    broken = copy.deepcopy(segmenter)
+    with torch.no_grad():
+        broken.head.weight[0, 0] = torch.nan
+    save_segmenter(broken, path)
+    with pytest.raises(ValueError, match="expected finite numbers, got others"):
+        load_segmenter(path)

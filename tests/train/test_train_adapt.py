@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from safetensors.torch import save_file
 
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.boundary_curves import Boundaries
@@ -124,6 +126,7 @@ def test_adapt_config_trains_on_them(run, tmp_path):
     assert next(tmp_path.rglob("last.ckpt")).is_file()
 
 
+@cache
 def torchvision_state():
     """torchvision's names: ours, and the classifier's."""
     torch.manual_seed(1)
@@ -137,6 +140,45 @@ def test_a_classifiers_trunk_is_loaded_by_an_argument(tmp_path):
     model = Segmentation(network=SegmenterConfig(), backbone=str(tmp_path / "resnet18.pth"))
     torch.testing.assert_close(model.segmenter.trunk.layer4[1].conv2.weight, state["layer4.1.conv2.weight"])
     assert model.settings["backbone"] == str(tmp_path / "resnet18.pth")
+
+
+@pytest.mark.parametrize("kind", ["module.pth", "module.safetensors", "checkpoint", "half", "no counters"])
+def test_a_trunk_under_the_names_of_other_programs(tmp_path, kind):
+    state = torchvision_state()
+    path = tmp_path / f"{kind}.pth".replace(".safetensors.pth", ".safetensors")
+    if kind == "half":
+        given = {name: value.half() for name, value in state.items()}
+    elif kind == "no counters":  # torchvision's first file
+        given = {name: value for name, value in state.items() if "num_batches" not in name}
+    else:
+        given = {f"module.{name}": value for name, value in state.items()}  # DataParallel's
+    if kind.endswith("safetensors"):
+        save_file(given, path)
+    else:
+        torch.save({"epoch": 3, "state_dict": given} if kind == "checkpoint" else given, path)
+    trunk = ResNet18()
+    load_backbone(trunk, path)
+    torch.testing.assert_close(trunk.conv1.weight, state["conv1.weight"], rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (ResNet18, "got other objects, or a file that is cut; make one by torch.save"),
+        (
+            lambda: {**torchvision_state(), "bn1.bias": torch.full((64,), torch.nan)},
+            "expected finite numbers",
+        ),
+        (lambda: {"state_dict": {"a": 1}}, "expected a state_dict of tensors, got dict"),
+    ],
+)
+def test_what_is_no_trunk_is_one_line(tmp_path, content, message):
+    torch.save(content(), tmp_path / "a.pth")
+    with pytest.raises(ValueError, match=message) as error:
+        load_backbone(ResNet18(), tmp_path / "a.pth")
+    assert "\n" not in str(error.value)
+    with pytest.raises(ValueError, match=r"none\.safetensors: expected a state_dict, got: No such file"):
+        load_backbone(ResNet18(), tmp_path / "none.safetensors")
 
 
 def test_other_names_or_widths_are_refused_in_one_line(tmp_path):

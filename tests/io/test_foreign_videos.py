@@ -1,0 +1,168 @@
+"""Videos, images and folders as more recorders leave them, each after a public report."""
+
+from fractions import Fraction
+
+import av
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from lanebev.app.build import make_camera
+from lanebev.app.config import RunConfig
+from lanebev.io.images import read_image
+from lanebev.io.video import open_source
+
+SIZE = (48, 64)
+
+
+def _stream(container, size=SIZE, codec="libx264", rate=10, fmt="yuv420p"):
+    stream = container.add_stream(codec, rate=rate)
+    stream.height, stream.width, stream.pix_fmt = *size, fmt
+    return stream
+
+
+def _write(container, stream, times, tick=Fraction(1, 10)):
+    for i, pts in enumerate(times):
+        image = np.full((stream.height, stream.width, 3), 10 * i + 20, np.uint8)
+        frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+        frame.pts, frame.time_base = pts, tick
+        container.mux(stream.encode(frame))
+    container.mux(stream.encode())
+
+
+def _levels(source):
+    return [round((frame.image.mean() - 20) / 10) for frame in source]
+
+
+def test_a_cover_before_the_video_is_passed_over(tmp_path):  # USDX#948, gopro-dashboard-overlay#245
+    path = tmp_path / "v.mp4"
+    with av.open(str(path), "w") as container:
+        cover = _stream(container, (24, 24), "mjpeg", 1, "yuvj420p")
+        cover.disposition = av.stream.Disposition.attached_pic
+        drive = _stream(container)
+        _write(container, cover, [0])
+        _write(container, drive, range(12))
+    source = open_source(str(path))
+    assert (source.image_size, source.count, source.problem) == (SIZE, 12, "")
+    assert _levels(source) == list(range(12))
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_of_several_streams_the_largest_is_used_and_said(tmp_path, first):  # photoprism#3242
+    path = tmp_path / "v.mkv"
+    with av.open(str(path), "w") as container:
+        sizes = [SIZE, (24, 32)] if first else [(24, 32), SIZE]
+        streams = [_stream(container, size) for size in sizes]
+        for stream in streams:
+            _write(container, stream, range(12))
+    source = open_source(str(path))
+    assert source.image_size == SIZE
+    assert source.problem.endswith("v.mkv: it has 1 more video streams; that of 64 x 48 px is used")
+    assert len(list(source)) == source.count == 12
+
+
+def test_a_video_of_covers_only_is_none(tmp_path):
+    path = tmp_path / "v.mp4"
+    with av.open(str(path), "w") as container:
+        cover = _stream(container, (24, 24), "mjpeg", 1, "yuvj420p")
+        cover.disposition = av.stream.Disposition.attached_pic
+        _write(container, cover, [0])
+    with pytest.raises(ValueError, match="expected a video stream, got none"):
+        open_source(str(path))
+
+
+def test_a_frame_rate_that_the_times_belie(tmp_path):  # picamera#541
+    path = tmp_path / "v.mkv"
+    with av.open(str(path), "w") as container:
+        _write(container, _stream(container, rate=1000), range(0, 1200, 100), Fraction(1, 1000))
+    source = open_source(str(path))
+    assert source.fps == 10
+    assert source.problem.endswith("v.mkv: it states 1000 frames per second, they come at 10")
+    np.testing.assert_allclose([frame.dt for frame in source], 0.1, atol=1e-3)
+
+
+@pytest.mark.parametrize("times", [[0, 1, 2, 3, 9, 10, 11, 30], [0, 1, 2, 3, 4, 5000, 5001, 5002]])
+def test_gaps_do_not_make_the_stated_rate_wrong(tmp_path, times):
+    path = tmp_path / "v.mkv"
+    with av.open(str(path), "w") as container:
+        _write(container, _stream(container), times)
+    source = open_source(str(path))
+    assert (source.fps, source.problem) == (10, "")
+    np.testing.assert_allclose([frame.time for frame in source], np.array(times) / 10, atol=1e-3)
+
+
+def test_a_field_of_view_with_pixels_that_are_not_square(tmp_path):  # opencv#4921
+    path = tmp_path / "v.mp4"
+    with av.open(str(path), "w") as container:
+        stream = _stream(container)
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+        _write(container, stream, range(4))
+    source = open_source(str(path))
+    assert (source.image_size, source.pixel_aspect) == (SIZE, Fraction(4, 3))
+    camera = make_camera(RunConfig("a", fov=60.0), SIZE, source.pixel_aspect)
+    square = make_camera(RunConfig("a", fov=60.0), SIZE)
+    assert camera.intrinsics[0].tolist() == square.intrinsics[0].tolist()
+    assert float(camera.intrinsics[1, 1]) == pytest.approx(4 / 3 * float(square.intrinsics[1, 1]))
+
+
+def _picture():
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    return np.stack([3 * x + 20, 4 * y + 20, 60 * ((x < 20) & (y < 30))], axis=-1).astype(np.uint8)
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+@pytest.mark.parametrize("suffix", ["png", "webp", "tif"])
+def test_images_of_other_kinds_are_turned_once(tmp_path, orientation, suffix):  # Pillow#7381
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    path = tmp_path / f"a.{suffix}"
+    Image.fromarray(_picture()).save(path, exif=exif, **({"lossless": True} if suffix == "webp" else {}))
+    expected = {3: np.rot90(_picture(), 2), 6: np.rot90(_picture(), -1), 8: np.rot90(_picture())}
+    np.testing.assert_array_equal(read_image(path), expected[orientation])
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif", "ppm"])
+@pytest.mark.parametrize("alpha", [False, True])
+def test_colours_of_16_bits_keep_their_scale(tmp_path, suffix, alpha):
+    deep = 257 * _picture()[..., ::-1].astype(np.uint16)
+    if alpha and suffix == "png":
+        deep = np.dstack([deep, np.zeros(SIZE, np.uint16)])
+    cv2.imwrite(str(tmp_path / f"a.{suffix}"), deep)
+    np.testing.assert_array_equal(read_image(tmp_path / f"a.{suffix}"), _picture())
+
+
+def test_cmyk_is_not_inverted(tmp_path):
+    Image.fromarray(_picture()).convert("CMYK").save(tmp_path / "a.jpg", quality=98)
+    assert np.abs(read_image(tmp_path / "a.jpg").astype(int) - _picture()).mean() < 2
+
+
+def _folder(path, *names):
+    path.mkdir(parents=True)
+    for name in names:
+        Image.fromarray(_picture()).convert("L" if name.endswith("pgm") else "RGB").save(path / name)
+    return path
+
+
+def test_folders_with_brackets_in_their_names(tmp_path):  # gifski#314
+    folder = _folder(tmp_path / "drive [1] é %d", "1.png", "2.png")
+    nested = _folder(folder / "[a]", "3.png")
+    assert open_source(str(folder)).count == 2
+    assert open_source(f"{folder}/*.png").paths == (f"{folder}/1.png", f"{folder}/2.png")
+    assert open_source(f"{folder}/[12].png").count == 2
+    assert open_source(f"{folder}/**/*.png").count == 3
+    assert open_source(f"{nested}/?.png").paths == (f"{nested}/3.png",)
+    with pytest.raises(ValueError, match="expected images that match, got none"):
+        open_source(f"{folder}/[45].png")
+
+
+def test_relative_globs_have_the_names_that_were_asked_for(tmp_path, monkeypatch):
+    _folder(tmp_path / "a", "1.png")
+    monkeypatch.chdir(tmp_path)
+    assert open_source("a/*.png").paths == ("a/1.png",)
+    assert open_source("*/*.png").paths == ("a/1.png",)
+
+
+def test_a_folder_of_pgm(tmp_path):
+    source = open_source(str(_folder(tmp_path / "a", "1.pgm", "2.pgm")))
+    assert (source.count, source.image_size) == (2, SIZE)
