@@ -19,7 +19,7 @@ def select_rows(rows: Tensor, yes: T, no: T) -> T:
     Args:
         rows: (B,) bool.
         yes: (B, ...) tensor, or a NamedTuple of such.
-        no: of the same shapes.
+        no: values elsewhere, of the same shapes.
     """
     if isinstance(yes, Tensor):
         mask = rows.view(-1, *[1] * (yes.ndim - 1)) if yes.ndim > 1 else rows

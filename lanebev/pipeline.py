@@ -118,7 +118,7 @@ class LaneBEV(nn.Module):
 
         Args:
             weights: another file in the same format; None is the shipped one.
-            grid: of the view.
+            grid: grid of the view.
             calibrator: None is a default :class:`lanebev.JointCalibrator` of the network's boundaries.
             network_width: px; None is what the weights were trained for.
             frozen: see the class.

@@ -47,7 +47,7 @@ class SessionResult(NamedTuple):
         status: what the pose is worth.
         reasons: why the pose is not (fully) determined, or the input is doubtful, in words.
         mount: the slow estimate of how the camera is mounted.
-        mount_needs: of the mount, a sentence for each axis.
+        mount_needs: what the mount estimate still needs, a sentence for each axis.
         calibration: pose, covariance, status and inliers as the calibrator gives them.
         bev: (U, V, 3) bytes in the frame's order of colours, or None.
         valid: (U, V) bool, or None.
@@ -78,11 +78,11 @@ class Session:
         model: network and calibrator; None is :meth:`LaneBEV.from_pretrained`, loaded with the first frame.
         calibrator: in place of the model's; None is a :class:`lanebev.JointCalibrator`.
         lane_width: m.
-        grid: of the bird's-eye view; None for no view.
+        grid: grid of the bird's-eye view; None for no view.
         colours: order of a frame's channels: "bgr" as OpenCV reads them, or "rgb".
         focal_std: standard deviation of the focal length as a share of it, which widens the pose's.
         polyline_sigma: px, standard deviation across their lines of the polylines that are given.
-        device: of the network; the filter runs on the CPU.
+        device: device of the network; the filter runs on the CPU.
 
     Raises:
         TypeError: a camera or a grid of another type.

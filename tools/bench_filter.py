@@ -24,12 +24,12 @@ from train.commands import one_line_errors
 def information_form(
     mean: Tensor, cov: Tensor, innovation: Tensor, jacobian: Tensor, measurement_noise: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The update as the package does it."""
+    """Compute the update as the package does it."""
     return kalman.update(mean, cov, *kalman.information(innovation, jacobian, measurement_noise))
 
 
 def problem(rows: int, seed: int = 0) -> tuple[Tensor, ...]:
-    """A random update with four states, scaled like pitch, yaw and their rates."""
+    """Sample a random update with four states, scaled like pitch, yaw and their rates."""
     generator = torch.Generator().manual_seed(seed)
     root = torch.randn(4, 4, generator=generator, dtype=torch.float64) * 0.03
     jacobian = torch.randn(rows, 4, generator=generator, dtype=torch.float64) * 0.2
@@ -41,7 +41,7 @@ def problem(rows: int, seed: int = 0) -> tuple[Tensor, ...]:
 
 
 def measure(rows: int, seconds: float) -> dict[str, float]:
-    """Median milliseconds of both forms, their ratio, and the largest difference of their results."""
+    """Measure the median ms of both forms, their ratio, and the largest difference of their results."""
     inputs = problem(rows)
     names = dict(zip(("m", "p", "y", "h", "q"), inputs, strict=True))
     milliseconds = {}

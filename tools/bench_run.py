@@ -73,7 +73,7 @@ def _since(begin: tuple[float, float]) -> tuple[float, float]:
 
 @one_line_errors()
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--frames", type=PositiveInt, default=60)
     parser.add_argument("--json", type=Path, help="write the figures here")

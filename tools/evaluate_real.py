@@ -74,7 +74,7 @@ def main() -> None:
 
 
 def parts(options: Any, model: Any, calibrators: dict[str, Any]) -> Iterator[Iterable[Figure]]:
-    """The parts asked for, each an iterable of figures."""
+    """Return the requested parts, each an iterable of figures."""
 
     def wanted(name: str) -> bool:
         return not options.only or options.only in name
@@ -87,7 +87,7 @@ def parts(options: Any, model: Any, calibrators: dict[str, Any]) -> Iterator[Ite
 
 
 def print_table(figures: list[Figure]) -> None:
-    """Here beside the target."""
+    """Print the results beside the targets."""
     table = Table("part", "figure", "calibrator", "here", "target", "met")
     for i, figure in enumerate(figures):
         sign = "≥" if figure.least else "≤"
@@ -104,7 +104,7 @@ def print_table(figures: list[Figure]) -> None:
 
 
 def write_sheet(path: Path, data: Path, calibrator: Any) -> None:
-    """Input, view before and view after of a dozen labelled images, two a row."""
+    """Write input, view before and view after of a dozen labelled images, two in a row."""
     images, segments = tusimple_segments(data)
     camera, grid = tusimple_camera(), BEVGrid()
     level = Extrinsics.from_values(0.0, 0.0, 0.0, 1.5)
@@ -126,7 +126,7 @@ def write_sheet(path: Path, data: Path, calibrator: Any) -> None:
 
 
 def as_json(figures: list[Figure], options: Any, seconds: float) -> dict[str, Any]:
-    """The figures with what they were made with."""
+    """Return the figures with the versions and settings that gave them."""
     return {
         "command": "python tools/evaluate_real.py",
         "lanebev": lanebev.__version__,

@@ -77,7 +77,7 @@ class Reader(NamedTuple):
 
 
 def readers() -> dict[str, Reader]:
-    """Every kind of file that the package reads, with valid ones."""
+    """Return every kind of file that the package reads, with valid ones."""
     return {
         "camera.yaml": Reader(_read_cameras, ".yaml", _camera_yaml(), 30),
         "camera.json": Reader(_read_cameras, ".json", _camera_json()),
@@ -165,7 +165,7 @@ def _written(camera: Camera) -> bytes:
 
 
 def _opencv(suffix: str) -> bytes:
-    """A calibration as OpenCV writes it."""
+    """Return a calibration as OpenCV writes it."""
     storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("image_width", 640)
     storage.write("image_height", 480)

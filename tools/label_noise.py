@@ -45,7 +45,7 @@ LEAST_ROWS, LEAST_SPAN = 6, 100  # rows with paint, and px from the first to the
 
 
 def stripe_centre(row: NDArray[np.uint8], about: float) -> float:
-    """Centre of the one bright stripe within REACH px, or NaN where there is none or more than one."""
+    """Find the centre of the one bright stripe within REACH px, NaN where there is none or more than one."""
     first = round(about) - REACH
     if first < 0 or first + 2 * REACH + 1 > len(row):
         return float("nan")
@@ -74,7 +74,7 @@ def line_offsets(
     line: NDArray[np.float64],
     horizon: float,
 ) -> tuple[Offsets, Offsets] | None:
-    """Of label and network's line (R,) on image rows (R,); None: too little paint. Horizon: its row."""
+    """Compute the offsets of label and network's line (R,) on image rows (R,); None with too little paint."""
     found = []
     for y, one, other in zip(rows, label, line, strict=True):
         if y >= FIRST_ROW and abs(one - other) < APART:
@@ -88,7 +88,7 @@ def line_offsets(
 
 
 def split_half_yaw(segments: LaneSegments, intrinsics: Tensor, prior: FramePrior) -> Tensor:
-    """(n,) rad, half of how far yaws by boundaries 1 and 3 and by 2 and 4 differ, of images with all four.
+    """Compute half the difference of the yaw by boundaries 1 and 3 and by 2 and 4, (n,) rad.
 
     Args:
         segments: (B, N).

@@ -48,7 +48,7 @@ class PseudoTruth(NamedTuple):
 def pseudo_ground_truth(
     segments: LaneSegments, intrinsics: Tensor, lane_width: float, iterations: int = 10
 ) -> PseudoTruth:
-    """Per-frame optimum of the paper's two measurements, annotated lanes taken as they are.
+    """Compute the per-frame optimum of the paper's two measurements with the annotated lanes.
 
     Args:
         segments: (B, N) of annotated boundaries.
@@ -79,7 +79,7 @@ def pseudo_ground_truth(
 
 
 def as_table(truth: PseudoTruth) -> np.ndarray:
-    """(B, 4) in degrees and metres, NaN where the frame's lanes don't determine a value."""
+    """Convert to (B, 4) in degrees and metres, NaN where the frame's lanes do not determine a value."""
     values = truth.extrinsics.stack() * torch.tensor([180 / math.pi] * 3 + [1.0], dtype=torch.float64)
     known = torch.stack(
         [truth.direction_known, truth.direction_known, truth.roll_known, truth.height_known], -1
@@ -88,7 +88,7 @@ def as_table(truth: PseudoTruth) -> np.ndarray:
 
 
 def estimate_table(rows: Sequence[ExtrinsicsRow], frames: Sequence[FrameLines]) -> np.ndarray:
-    """(B, 4) of a run like :func:`as_table`, a row per frame, NaN where the run has no such image."""
+    """Read a run as :func:`as_table`, a row per frame, NaN where the run has no such image."""
     table = np.full((len(frames), len(COLUMNS)), np.nan)
     if any(row.image for row in rows):
         matches = match_frames([row.image for row in rows], frames)
@@ -106,7 +106,7 @@ def estimate_table(rows: Sequence[ExtrinsicsRow], frames: Sequence[FrameLines]) 
 
 
 def plot(table: np.ndarray, estimate: np.ndarray | None, path: Path) -> None:
-    """Pseudo truth, and a run's estimate, of every frame."""
+    """Plot the pseudo truth, and a run's estimate, of every frame."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -25,13 +25,13 @@ GRID = BEVGrid(x=(-10.0, 10.0), z=(5.0, 40.0), resolution=35 / 360)
 
 
 def pose_of(row: dict[str, str]) -> Extrinsics:
-    """The pose of a row of extrinsics.csv, batch size 1."""
+    """Return the pose of a row of extrinsics.csv, batch size 1."""
     angles = [math.radians(float(row[f"{name}_deg"])) for name in ("pitch", "yaw", "roll")]
     return Extrinsics(*torch.tensor([*angles, float(row["height_m"])]).split(1))
 
 
 def bird_view(image: NDArray[np.uint8], camera: Camera, pose: Extrinsics) -> Image.Image:
-    """(H, W, 3) image to its bird's-eye view."""
+    """Convert an image (H, W, 3) to its bird's-eye view."""
     tensor = torch.from_numpy(image.copy()).permute(2, 0, 1)[None] / 255
     lens = camera.distortion[None].float() if camera.distortion.numel() else None
     bev, _ = BEVWarp(GRID)(tensor, camera.intrinsics[None].float(), pose, lens, camera.model)
@@ -39,7 +39,7 @@ def bird_view(image: NDArray[np.uint8], camera: Camera, pose: Extrinsics) -> Ima
 
 
 def side_by_side(titled: list[tuple[str, Image.Image]], gap: int = 8, bar: int = 26) -> Image.Image:
-    """Pictures of one height in a row, each under its title."""
+    """Join pictures of one height in a row, each under its title."""
     width = sum(picture.width for _, picture in titled) + gap * (len(titled) - 1)
     sheet = Image.new("RGB", (width, titled[0][1].height + bar), "white")
     draw, font, x = ImageDraw.Draw(sheet), ImageFont.load_default(15), 0

@@ -45,7 +45,7 @@ class Figure:
         return bool(self.value >= self.target if self.least else self.value <= self.target)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the figure as plain values for JSON."""
         return {**asdict(self), "met": self.met}
 
 
@@ -60,12 +60,12 @@ class Drive(NamedTuple):
 
 
 def tusimple_camera() -> Camera:
-    """1280 x 720, f = 1000 px assumed, centred."""
+    """Return the assumed camera: 1280 x 720, f = 1000 px, centred."""
     return Camera.from_parameters(TUSIMPLE_FOCAL, TUSIMPLE_FOCAL, 640, 360, 1280, 720)
 
 
 def tusimple_segments(data: Path) -> tuple[list[str], LaneSegments]:
-    """Paths of the 88 images and their labelled lanes."""
+    """Return paths of the 88 images and their labelled lanes."""
     frames = read_lanes(data / "tusimple" / "label_data.json")
     images = [str(data / "tusimple" / frame.name) for frame in frames]
     match_frames(images, frames)
@@ -74,7 +74,7 @@ def tusimple_segments(data: Path) -> tuple[list[str], LaneSegments]:
 
 
 def tusimple_labels(data: Path, calibrators: dict[str, Any]) -> Iterable[Figure]:
-    """Lanes from the label file, one image each."""
+    """Evaluate the label file's lanes, one image each."""
     _, segments = tusimple_segments(data)
     count = segments.boundary.shape[0]
     intrinsics = tusimple_camera().intrinsics.expand(count, 3, 3)
@@ -99,7 +99,7 @@ def tusimple_labels(data: Path, calibrators: dict[str, Any]) -> Iterable[Figure]
 
 
 def tusimple_pixels(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable[Figure]:
-    """Lanes from the pixels: against the labels' points, and the pose against that from the labels."""
+    """Evaluate lanes from images against the labels' points, and the pose against that from the labels."""
     from train.metrics import tusimple_score  # needs lightning
 
     images, labelled = tusimple_segments(data)
@@ -130,13 +130,13 @@ def tusimple_pixels(data: Path, model: Any, calibrators: dict[str, Any]) -> Iter
 
 
 def still_segments(images: list[str], model: Any, camera: Camera) -> list[LaneSegments]:
-    """What the network sees on each image, in double precision."""
+    """Return what the network finds in each image, in double precision."""
     observer = NetworkObserver(model, camera)
     return [camera_segments(observer(next(iter(open_source(image)))).vertices, camera) for image in images]
 
 
 def carla_truth(data: Path) -> dict[str, torch.Tensor]:
-    """Pose (4,) in rad and m of each image."""
+    """Return the true pose (4,) in rad and m of each image."""
     lines = (data / "carla" / "truth.csv").read_text().splitlines()
     rows = csv.DictReader(line for line in lines if not line.startswith("#"))
     names = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
@@ -145,7 +145,7 @@ def carla_truth(data: Path) -> dict[str, torch.Tensor]:
 
 
 def carla_stills(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable[Figure]:
-    """Five renderings, one frame each."""
+    """Evaluate five renderings, one frame each."""
     truth = carla_truth(data)
     camera = Camera.from_file(data / "carla" / "camera.yaml")
     names = [name for name in truth if name.endswith(".png")]
@@ -161,7 +161,7 @@ def carla_stills(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterabl
 
 
 def carla_drive(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable[Figure]:
-    """The drive: its straight frames 10-66 against the truth."""
+    """Evaluate the drive's straight frames 10-66 against the truth."""
     camera = Camera.from_file(data / "carla" / "camera.yaml")
     expected = carla_truth(data)["drive.mp4"]
     drives = follow(str(data / "carla" / "drive.mp4"), camera, model, calibrators, CARLA_LANE_WIDTH)
@@ -172,7 +172,7 @@ def carla_drive(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable
 
 
 def udacity(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable[Figure]:
-    """Two highway videos: tracked, and lanes equally wide in the bird's-eye view."""
+    """Evaluate two highway videos: frames tracked, and equal lane widths in the bird's-eye view."""
     camera = Camera.from_file(data / "udacity" / "camera.yaml")
     for video, count in (("highway_a", 76), ("highway_b", 201)):
         path = str(data / "udacity" / f"{video}.mp4")
@@ -189,7 +189,7 @@ def udacity(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable[Fig
 def follow(
     source: str, camera: Camera, model: Any, calibrators: dict[str, Any], lane_width: float
 ) -> dict[str, Drive]:
-    """Every calibrator over the same observations of a video."""
+    """Run every calibrator on the same observations of a video."""
     observer = NetworkObserver(model, camera)
     states = {
         name: calibrator.initial_state(1, dtype=torch.float64) for name, calibrator in calibrators.items()
@@ -243,7 +243,7 @@ def _width_figures(part: str, name: str, drive: Drive, camera: Camera, targets: 
 
 
 def _in_units(pose: torch.Tensor) -> torch.Tensor:
-    """(..., 4) rad and m to deg and cm."""
+    """Convert (..., 4) rad and m to deg and cm."""
     return torch.cat([pose[..., :3].rad2deg(), 100 * pose[..., 3:]], dim=-1)
 
 

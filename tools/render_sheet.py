@@ -24,7 +24,7 @@ COLOURS = [(255, 80, 80), (255, 160, 0), (60, 220, 60), (60, 200, 255), (120, 12
 
 
 def draw_truth(picture: np.ndarray, frame: RenderedFrame, row: int) -> None:
-    """Dots on every visible boundary point (rings where it is hidden)."""
+    """Draw dots on every visible boundary point (rings where it is hidden)."""
     points = frame.boundaries[row].flatten(0, 1)[None]
     taken = distort_points(points, frame.intrinsics[row : row + 1], frame.distortion[row : row + 1])[0]
     taken = taken.unflatten(0, frame.boundaries.shape[1:3])
@@ -37,7 +37,7 @@ def draw_truth(picture: np.ndarray, frame: RenderedFrame, row: int) -> None:
 
 
 def real_frames(folder: Path, count: int, size: tuple[int, int]) -> list[np.ndarray]:
-    """Pictures of a folder, evenly picked, RGB, resized."""
+    """Return pictures of a folder, evenly picked, RGB, resized."""
     paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in (".jpg", ".png"))
     picked = [paths[i] for i in np.linspace(0, len(paths) - 1, min(count, len(paths))).astype(int)]
     pictures = [cv2.imread(str(p)) for p in picked]

@@ -42,7 +42,7 @@ NAMES = ("pitch", "yaw", "roll", "height")
 
 
 def calibrator_named(name: str) -> Calibrator[Any]:
-    """A calibrator with its default settings."""
+    """Return a calibrator with its default settings."""
     calibrator: Calibrator[Any] = (
         lanebev.JointCalibrator() if name == "joint" else lanebev.TwoStageCalibrator()
     )
@@ -57,7 +57,7 @@ def run(
     seed: int,
     smooth: bool = False,
 ) -> dict[str, torch.Tensor]:
-    """Every noise level times every run is one row of the batch.
+    """Run every noise level and every repetition as one row of the batch.
 
     Returns errors (T, V, R, 4), estimates (T, V, R, 4), NEES (T, V, R), truth and unit bound (T, 4), and the
     share of frames in TRACKING (V,). ``smooth``: of every frame from all frames.
@@ -99,7 +99,7 @@ def run(
 
 
 def table(result: dict[str, torch.Tensor]) -> list[dict[str, object]]:
-    """Per noise level: the paper's, this run's and the bound's RMSE, and NEES per degree of freedom."""
+    """Return the RMSE of the paper, this run and the bound, and NEES, for each noise level."""
     rows: list[dict[str, object]] = []
     rmse = result["errors"].square().mean(dim=(0, 2)).sqrt() * UNITS
     unit = result["bound"].square().mean(0).sqrt() * UNITS

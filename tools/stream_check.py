@@ -159,7 +159,7 @@ def resident_mib(process: int) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Play, look, print; 1 if something is out of bounds."""
+    """Play the stream, run on it, print; return 1 if a figure is out of bounds."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--fps", type=float, default=30.0)

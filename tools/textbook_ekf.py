@@ -27,7 +27,7 @@ class TextbookEKF:
     """``initial_state`` and call as ``JointCalibrator``; the state is a list of filterpy filters."""
 
     def initial_state(self, batch_size: int, dtype: torch.dtype = torch.float64) -> list[Any]:
-        """One filter a row, at the prior."""
+        """Return one filter per row, at the prior."""
         from filterpy.kalman import ExtendedKalmanFilter
 
         rows = []
@@ -42,7 +42,7 @@ class TextbookEKF:
     def __call__(
         self, segments: LaneSegments, intrinsics: Tensor, state: list[Any], dt: float, lane_width: float = 3.7
     ) -> tuple[Calibration, list[Any]]:
-        """One frame of every row."""
+        """Process one frame of every row."""
         seen = observe(segments, intrinsics, NUM_BOUNDARIES)
         places = boundary_places(lane_width, NUM_BOUNDARIES, seen.sigma).gather(1, seen.boundary)
         step = torch.full((1,), dt if dt > 0 else 0.0, dtype=torch.float64)

@@ -34,7 +34,7 @@ COLUMNS = ("index", "boundary", "x1", "y1", "x2", "y2", "weight", "sigma")
 
 
 def seen_segments(picture: Path) -> list[tuple[float, ...]]:
-    """Segments of the shipped network in a picture that it is fairly sure of, in the order of COLUMNS."""
+    """Return the shipped network's segments in a clear picture, in the order of COLUMNS."""
     pixels: NDArray[np.uint8] = np.asarray(Image.open(picture))
     image = torch.from_numpy(pixels.copy()).permute(2, 0, 1)[None] / 255
     with torch.inference_mode():

@@ -51,7 +51,7 @@ class CommandLine(LightningCLI):
     """Lightning's, that finds the last checkpoint, and has a word before hours are lost."""
 
     def before_instantiate_classes(self) -> None:
-        """``--ckpt_path last`` is the newest in the run's folder; Lightning looks in a version just begun."""
+        """Let ``--ckpt_path last`` find the newest checkpoint in the run's folder, of any version."""
         config = self.config[str(self.subcommand)]
         if self.subcommand == "predict":
             config.return_predictions = False  # they are written
@@ -70,7 +70,7 @@ class CommandLine(LightningCLI):
         config.ckpt_path = str(found[-1])
 
     def before_fit(self) -> None:
-        """bfloat16 that a CPU only emulates takes ten times as long as float32."""
+        """Warn of bfloat16 on a CPU that only emulates it, which takes ten times as long as float32."""
         on_cpu = isinstance(self.trainer.accelerator, CPUAccelerator)
         half = on_cpu and self.trainer.precision.startswith("bf16")
         if half and not torch.ops.mkldnn._is_mkldnn_bf16_supported():
@@ -81,7 +81,7 @@ class CommandLine(LightningCLI):
 
 
 def main(args: list[str] | None = None) -> None:
-    """Command line."""
+    """Run the command line."""
     torch.set_float32_matmul_precision("high")
     try:
         CommandLine(

@@ -26,6 +26,6 @@ class Photometric(nn.Module):
         )
 
     def forward(self, image: Tensor) -> Tensor:
-        """(B, 3, H, W) in [0, 1] to the same."""
+        """Augment (B, 3, H, W) in [0, 1]."""
         augmented: Tensor = self.steps(image)
         return augmented.clamp(0, 1)

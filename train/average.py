@@ -19,7 +19,7 @@ from train.export import trained_segmenter
 
 
 def average(segmenters: list[LaneSegmenter]) -> LaneSegmenter:
-    """A network with the mean of the weights; counters are the first one's.
+    """Return a network with the mean of the weights; counters are those of the first.
 
     Raises:
         ValueError: networks of different configurations.
@@ -43,7 +43,7 @@ def average(segmenters: list[LaneSegmenter]) -> LaneSegmenter:
 
 @one_line_errors()
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("weights", type=Path, nargs="+", help="weights files or checkpoints")

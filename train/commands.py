@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Bad input, and files that can't be read or written, leave as one line and exit status 2.
+    """Report bad input, and files that cannot be read or written, in one line and exit with status 2.
 
     As a decorator too: ``@one_line_errors()``.
     """

@@ -34,7 +34,7 @@ class Batch(NamedTuple):
 
     @classmethod
     def stack(cls, views: list[LabelledView]) -> Batch:
-        """Views of one size."""
+        """Stack views of one size."""
         return cls(*(torch.from_numpy(np.stack(field)) for field in zip(*views, strict=True)))
 
 
@@ -48,7 +48,7 @@ class Frames(Protocol):
     """A source of labelled images."""
 
     def __call__(self, seed: Seed, first: int = 0) -> Iterator[LabelledImage]:
-        """Endless, in an order that the seed decides, from the ``first``-th on."""
+        """Yield frames without end, in an order that the seed decides, from the ``first``-th on."""
         ...
 
 
@@ -59,7 +59,7 @@ class PoolFrames:
         self.folder, self.pattern, self.resident = Path(folder), pattern, resident
 
     def paths(self) -> list[Path]:
-        """Shards present now.
+        """Return the shards present now.
 
         Raises:
             ValueError: there are none.
@@ -73,7 +73,7 @@ class PoolFrames:
         return paths
 
     def posed(self, seed: Seed, first: int = 0) -> Iterator[Posed]:
-        """Endless: a shuffled mix over ``resident`` shards, each seen once, then the next ones."""
+        """Yield without end a shuffled mix over ``resident`` shards, each seen once, then the next ones."""
         rng = np.random.default_rng(seed)
         while True:
             paths = rng.permutation(np.array(self.paths()))
@@ -87,7 +87,7 @@ class PoolFrames:
                 first = max(0, first - len(order))
 
     def __call__(self, seed: Seed, first: int = 0) -> Iterator[LabelledImage]:
-        """The images alone."""
+        """Yield the images alone."""
         return (image for image, _ in self.posed(seed, first))
 
 
@@ -98,7 +98,7 @@ class LiveFrames:
         self.size, self.batch = size, batch
 
     def posed(self, seed: Seed, first: int = 0) -> Iterator[Posed]:
-        """Endless; the same seed gives the same frames."""
+        """Yield frames without end; the same seed gives the same frames."""
         for block in itertools.count(first // self.batch):
             number = int(np.random.default_rng((*seed, block)).integers(2**62))
             rendered = render_views(self.batch, self.size, torch.Generator().manual_seed(number))
@@ -108,7 +108,7 @@ class LiveFrames:
                     yield image, Pose(*(field[i] for field in poses))
 
     def __call__(self, seed: Seed, first: int = 0) -> Iterator[LabelledImage]:
-        """The images alone."""
+        """Yield the images alone."""
         return (image for image, _ in self.posed(seed, first))
 
 
@@ -223,7 +223,7 @@ class RenderedRoads(L.LightningDataModule):
         return LiveFrames(self.render_size) if pool is None else PoolFrames(pool)
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Endless."""
+        """Return endless training batches."""
         rank, first = run_position(self)
         frames, seed = self._frames(self.pool), (self.seed, rank)
         data = ViewBatches(frames, self.batch_size, self.sizes, self.view, seed, first)
@@ -232,7 +232,7 @@ class RenderedRoads(L.LightningDataModule):
         )
 
     def val_dataloader(self) -> DataLoader[Batch]:
-        """Held-out frames."""
+        """Return held-out frames."""
         frames = self._frames(self.val_pool)
         data = FullBatches(
             frames, self.batch_size, self.val_size, self.view, self.seed + 7_919, self.val_batches

@@ -45,7 +45,7 @@ class ScoredBatch(NamedTuple):
 
 
 def read_entries(layout: Format, root: Path, names: list[str]) -> list[Entry]:
-    """Entries of a data set.
+    """Read the entries of a data set.
 
     Args:
         layout: "tusimple": names are label files whose ``raw_file`` is under the root. "culane": names are
@@ -117,7 +117,7 @@ class EntryFrames:
         self.entries = entries
 
     def __call__(self, seed: Seed, first: int = 0) -> Iterator[LabelledImage]:
-        """Each entry once, then again in another order; from the ``first``-th on."""
+        """Yield each entry once, then again in another order; from the ``first``-th on."""
         rng = np.random.default_rng(seed)
         while True:
             order = rng.permutation(len(self.entries))
@@ -185,7 +185,7 @@ class LaneFiles(L.LightningDataModule):
         self.view, self.seed, self.workers = view or ViewConfig(), seed, workers
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Endless random views."""
+        """Return endless random views."""
         frames = EntryFrames(read_entries(self.layout, self.root, self.train))
         rank, first = run_position(self)
         return DataLoader(
@@ -195,7 +195,7 @@ class LaneFiles(L.LightningDataModule):
         )
 
     def val_dataloader(self) -> DataLoader[ScoredBatch]:
-        """Every image once, whole."""
+        """Return every image once, whole."""
         entries = read_entries(self.layout, self.root, self.val)
         data = ScoredBatches(entries, self.layout, self.batch_size, self.val_size, self.view)
         return DataLoader(data, batch_size=None, collate_fn=_as_it_is)

@@ -30,7 +30,7 @@ class Seen(NamedTuple):
 
 
 def watch(segmenters: Sequence[LaneSegmenter], seed: int, frames: int, fps: float) -> list[Seen]:
-    """A rendered drive through each network, its sigmas as the maps say."""
+    """Run each network on a rendered drive, with the sigmas of its maps."""
     drive = Drive(seed, num_frames=frames, fps=fps)
     models = [_observer(segmenter) for segmenter in segmenters]
     segments: list[list[LaneSegments]] = [[] for _ in segmenters]
@@ -73,7 +73,7 @@ class Followed(NamedTuple):
 
 @torch.inference_mode()
 def follow(seen: Seen, factor: float) -> Followed:
-    """The online calibrator over a drive, all sigmas times ``factor``."""
+    """Run the online calibrator on a drive, all sigmas times ``factor``."""
     calibrator = JointCalibrator()
     state = calibrator.initial_state(1, dtype=torch.float64)
     found = []

@@ -89,7 +89,7 @@ class EndToEnd(Segmentation):
         return loss
 
     def validation_step(self, batch: PoseBatch, batch_idx: int) -> None:  # type: ignore[override]
-        """As ever, and the errors of the pose."""
+        """Compute the loss and recall, and the errors of the pose."""
         super().validation_step(batch, batch_idx)  # type: ignore[arg-type]
         fit = self._fit(self(unpack(batch)[0]), batch)  # type: ignore[arg-type]
         said = fit.observed & fit.valid.unsqueeze(-1)
@@ -125,7 +125,7 @@ class EndToEnd(Segmentation):
 
 
 def gradient_ratio(loss: Tensor, by: Tensor, logits: Tensor) -> Tensor:
-    """How many times longer the gradient of one loss on the logits is than that of another."""
+    """Compute the ratio of the lengths of two losses' gradients on the logits."""
     one, other = (torch.autograd.grad(each, logits, retain_graph=True)[0].norm() for each in (loss, by))
     ratio: Tensor = one / other.clamp(min=torch.finfo(other.dtype).tiny)
     return ratio

@@ -35,7 +35,7 @@ UNIT = (*[math.degrees(1)] * 3, 100.0)  # of rad and m
 
 
 def held_out_frames(drives: int, frames: int, size: tuple[int, int], seed: int) -> tuple[Tensor, ...]:
-    """Images (N, 3, H, W), poses (N, 4), lane widths (N, L - 1), intrinsics (N, 3, 3), of spread-out frames.
+    """Return images (N, 3, H, W), poses (N, 4), lane widths (N, L - 1), intrinsics (N, 3, 3).
 
     Training never sees drives: it is given single views with other seeds.
     """
@@ -50,7 +50,7 @@ def held_out_frames(drives: int, frames: int, size: tuple[int, int], seed: int) 
 
 @torch.no_grad()
 def pose_errors(segmenter: LaneSegmenter, frames: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    """Errors (N, 4) in rad and m, and where the frame says something of the axis (N, 4) bool."""
+    """Return errors (N, 4) in rad and m, and whether the frame determines the axis, (N, 4) bool."""
     extractor = LineExtractor.for_network(segmenter.config, correlation=0)
     errors, said = [], []
     for image, pose, lane_width, intrinsics in zip(*(field.split(8) for field in frames), strict=True):
@@ -65,7 +65,7 @@ def pose_errors(segmenter: LaneSegmenter, frames: tuple[Tensor, ...]) -> tuple[T
 def online_errors(
     segmenters: list[LaneSegmenter], drives: int, frames: int, fps: float, seed: int
 ) -> list[Tensor]:
-    """Errors (N, 4) in rad and m of the joint calibrator on drives, at the size each network runs at."""
+    """Compute the joint calibrator's errors (N, 4) on drives, rad and m, at each network's image size."""
     errors: list[list[Tensor]] = [[] for _ in segmenters]
     for number in range(drives):
         all_seen = watch(segmenters, seed + number, frames, fps)
@@ -75,7 +75,7 @@ def online_errors(
 
 
 def gain(before: Tensor, after: Tensor, counted: Tensor, drives: int) -> dict[str, list[float]]:
-    """By how much the RMSE is lower, 95 % intervals in degrees and centimetres, were other drives drawn.
+    """Compute how much the RMSE is lower, with 95 % intervals over drives, in degrees and centimetres.
 
     Source: paired bootstrap (Efron and Tibshirani 1993) over drives, whose frames are not independent.
 
@@ -107,7 +107,7 @@ def gain(before: Tensor, after: Tensor, counted: Tensor, drives: int) -> dict[st
 
 
 def summary(error: Tensor, counted: Tensor) -> dict[str, Any]:
-    """Root mean square and median of the absolute error per axis, in degrees and centimetres."""
+    """Compute root mean square and median of the absolute error per axis, in degrees and centimetres."""
     unit = error.new_tensor(UNIT)
     report = {}
     for axis, (name, values) in enumerate(zip(AXES, (error * unit).T, strict=True)):
@@ -119,7 +119,7 @@ def summary(error: Tensor, counted: Tensor) -> dict[str, Any]:
 
 @one_line_errors()
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("weights", type=Path, nargs="+")
     parser.add_argument("--drives", type=PositiveInt, default=12)

@@ -88,7 +88,7 @@ def judge_rows(logits: Tensor, frame: RenderedFrame, view: ViewConfig) -> Rows:
 
 
 def _centre(maps: Tensor) -> Tensor:
-    """(B, L, h, w) to the mean column of each row."""
+    """Compute the mean column of each row of (B, L, h, w)."""
     columns = torch.arange(maps.shape[-1], dtype=maps.dtype, device=maps.device)
     return (maps * columns).sum(-1) / maps.sum(-1).clamp(min=1e-6)
 
@@ -156,7 +156,7 @@ def evaluate(
 
 @one_line_errors()
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("weights", type=Path)
     parser.add_argument("--views", type=PositiveInt, default=64, help="of all kinds together, about")

@@ -24,7 +24,7 @@ from train.losses import unweighted_bias
 
 
 def checkpoint_weights(path: Path) -> dict[str, Tensor]:
-    """The segmenter's weights in a Lightning checkpoint, averaged ones where there are any.
+    """Return the segmenter's weights in a Lightning checkpoint, the averaged ones if there are any.
 
     Raises:
         ValueError: no segmenter in it.
@@ -33,7 +33,7 @@ def checkpoint_weights(path: Path) -> dict[str, Tensor]:
 
 
 def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Weights and settings."""
+    """Read weights and settings."""
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         state, settings = checkpoint["state_dict"], dict(checkpoint["settings"])
@@ -83,7 +83,7 @@ def add_to_bias(segmenter: LaneSegmenter, bias: Tensor) -> None:
 
 
 def widen(narrow: dict[str, Tensor], wide: dict[str, Tensor], noise: float = 0.02) -> dict[str, Tensor]:
-    """Weights of a network whose trunk has twice the channels, and which computes the same.
+    """Return weights of a network whose trunk has twice the channels and which computes the same.
 
     Source: Chen et al. 2016, Net2Net: every channel twice, incoming weights halved. A little noise tells the
     twins apart.
@@ -113,7 +113,7 @@ def widen(narrow: dict[str, Tensor], wide: dict[str, Tensor], noise: float = 0.0
 
 
 def checkpoint_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
-    """A checkpoint's network, class weights undone in the last bias, and its training settings.
+    """Return a checkpoint's network, class weights undone in the last bias, and its training settings.
 
     Raises:
         ValueError: no segmenter in it.
@@ -130,7 +130,7 @@ def checkpoint_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
 
 
 def trained_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
-    """The network of a checkpoint or of a weights file, ready for inference, and its training settings.
+    """Return the network of a checkpoint or a weights file, for inference, and its training settings.
 
     Raises:
         ValueError: neither of them.
@@ -183,7 +183,7 @@ def export(
 
 @one_line_errors()
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path, help="or weights file")
     parser.add_argument("out", type=Path)

@@ -35,7 +35,7 @@ class ExtractionError(NamedTuple):
     missed: float
 
     def normalised(self) -> float:
-        """Root mean square of the errors in sigmas; 1 is honest."""
+        """Compute the root mean square of the errors in sigmas; 1 if the sigmas are right."""
         return float((self.distance / self.sigma).square().mean().sqrt())
 
 
@@ -64,7 +64,7 @@ def extraction_error(frame: RenderedFrame, size: tuple[int, int], config: LineCo
 
 
 def distance_to_polyline(points: Tensor, line: Tensor) -> Tensor:
-    """Distance of each point to the nearest piece of a polyline: (..., N, 2) and (..., P, 2) to (..., N)."""
+    """Compute the distance of points (..., N, 2) to the nearest piece of a polyline (..., P, 2), (..., N)."""
     start, along = line[..., None, :-1, :], line.diff(dim=-2).unsqueeze(-3)  # (..., 1, P - 1, 2)
     away = points.unsqueeze(-2) - start
     part = (away * along).sum(-1) / along.square().sum(-1).clamp(min=1e-12)
@@ -73,14 +73,14 @@ def distance_to_polyline(points: Tensor, line: Tensor) -> Tensor:
 
 
 def join(errors: list[ExtractionError]) -> ExtractionError:
-    """Errors of several batches of equally many images as one."""
+    """Join errors of several batches of equally many images."""
     distance, sigma, missed = zip(*errors, strict=True)
     return ExtractionError(torch.cat(distance), torch.cat(sigma), sum(missed) / len(missed))
 
 
 @one_line_errors()
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=PositiveInt, default=64)
     parser.add_argument("--size", type=int, nargs=2, default=(144, 256), metavar=("HEIGHT", "WIDTH"))

@@ -224,7 +224,7 @@ def _commit() -> str:
 
 @one_line_errors()
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--minutes", type=PositiveFloat, default=9.0, help="of the whole command")
     parser.add_argument("--out", type=Path, required=True, help="folder of the results")

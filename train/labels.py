@@ -50,7 +50,7 @@ class LabelledView(NamedTuple):
 
 
 def draw_boundaries(points: Float, shown: Bool, size: tuple[int, int], half_width: float) -> Byte:
-    """Stripes of constant perpendicular half-width about polylines, anti-aliased.
+    """Draw stripes of constant perpendicular half-width about polylines, anti-aliased.
 
     Args:
         points: (L, P, 2) label px, centres at integers.
@@ -77,7 +77,7 @@ def draw_boundaries(points: Float, shown: Bool, size: tuple[int, int], half_widt
 
 
 def _runs(line: Float, mask: Bool) -> list[npt.NDArray[np.int32]]:
-    """Connected pieces of a polyline where the mask holds, in fixed point."""
+    """Return connected pieces of a polyline where the mask holds, in fixed point."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     near = np.clip(np.nan_to_num(line), -1e6, 1e6)  # what is farther is masked, and no int32
     fixed = np.rint(near * 2**_FRACTION_BITS).astype(np.int32)
@@ -85,7 +85,7 @@ def _runs(line: Float, mask: Bool) -> list[npt.NDArray[np.int32]]:
 
 
 def separated(points: Float, exists: Bool, gap: float) -> Bool:
-    """(L, P) where a boundary is at least ``gap`` px from the next one of the same distance ahead.
+    """Return where a boundary is at least ``gap`` px from the next one at the same distance ahead, (L, P).
 
     Towards the horizon the boundaries run together; what cannot be told apart is not worth learning.
     """
@@ -127,7 +127,7 @@ class ViewConfig:
 
 
 def full_view(sample: LabelledImage, size: tuple[int, int], config: ViewConfig) -> LabelledView:
-    """The whole image at (height, width)."""
+    """Return the whole image at (height, width)."""
     height, width = sample.image.shape[:2]
     sy, sx = size[0] / height, size[1] / width
     matrix = np.array([[sx, 0, 0.5 * (sx - 1)], [0, sy, 0.5 * (sy - 1)], [0, 0, 1]])
@@ -137,7 +137,7 @@ def full_view(sample: LabelledImage, size: tuple[int, int], config: ViewConfig) 
 def random_view(
     sample: LabelledImage, size: tuple[int, int], config: ViewConfig, rng: np.random.Generator
 ) -> LabelledView:
-    """A random crop, zoom, stretch, rotation and mirroring of the image at (height, width)."""
+    """Sample a random crop, zoom, stretch, rotation and mirroring of the image at (height, width)."""
     height, width = sample.image.shape[:2]
     scale = size[1] / (width * rng.uniform(*config.scale))
     stretch = np.exp(config.stretch * rng.standard_normal())

@@ -232,7 +232,7 @@ class LiveRoads(L.LightningDataModule):
         self.batches: LiveBatches | None = None  # of the training under way
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Endless."""
+        """Return endless training batches."""
         trainer = self._trainer()
         rank, first = run_position(self)
         every = trainer.accumulate_grad_batches
@@ -251,7 +251,7 @@ class LiveRoads(L.LightningDataModule):
         return DataLoader(self.batches, batch_size=None)
 
     def val_dataloader(self) -> DataLoader[Batch]:
-        """Held-out frames."""
+        """Return held-out frames."""
         device = self._trainer().strategy.root_device
         frames = (self.val_batches, self.val_batch_size, self.val_size)
         return DataLoader(HeldOutBatches(*frames, self.view, self.seed + 7_919, device), batch_size=None)

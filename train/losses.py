@@ -9,7 +9,7 @@ from torch import Tensor
 def boundary_cross_entropy(
     logits: Tensor, target: Tensor, weight: Tensor, class_weight: Tensor | None = None
 ) -> Tensor:
-    """Cross-entropy with soft labels, mean over the pixels that count.
+    """Compute the cross-entropy with soft labels, mean over the pixels that count.
 
     Source: Sect. "Experiments", "a cross entropy loss". Weighting classes moves the probabilities away from
     frequencies; :func:`unweighted_bias` undoes it.
@@ -26,7 +26,7 @@ def boundary_cross_entropy(
 
 
 def row_cross_entropy(logits: Tensor, target: Tensor, weight: Tensor, least: float = 0.5) -> Tensor:
-    """How far each boundary's share of a row's probability is from where the boundary crosses the row.
+    """Compute how far each boundary's share of a row's probability is from its crossing of the row.
 
     Each row of each boundary that is there counts the same, however thin its stripe: this says where, the
     pixels' cross-entropy says whether.
@@ -51,7 +51,7 @@ def row_cross_entropy(logits: Tensor, target: Tensor, weight: Tensor, least: flo
 
 
 def unweighted_bias(class_weight: Tensor) -> Tensor:
-    """What to add to logits trained with class weights, so that their softmax is a frequency (paper.md T4).
+    """Return the bias that makes logits trained with class weights a frequency by softmax (paper.md T4).
 
     With weights w the loss is least at p ∝ w q; adding -log w makes it p = q.
     """

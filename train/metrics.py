@@ -60,7 +60,7 @@ class TuSimpleScore(NamedTuple):
 
 
 def tusimple_score(x: Points, rows: Points, labelled: FrameLines) -> TuSimpleScore:
-    """TuSimple's score of boundaries on image rows against one entry of its label file.
+    """Compute TuSimple's score of boundaries on image rows against one entry of its label file.
 
     Source: the benchmark's README asks for at most four markings, of the current lane and the lanes left and
     right of it, so only the middle four boundaries are handed in.
@@ -83,7 +83,7 @@ def tusimple_lane_score(
     labelled: Sequence[Sequence[float] | Points],
     rows: Sequence[float] | Points,
 ) -> TuSimpleScore:
-    """TuSimple's accuracy, FP and FN of one image.
+    """Compute TuSimple's accuracy, FP and FN of one image.
 
     Source: TuSimple lane detection benchmark, evaluation rules: a point is right within 20 px / cos(angle of
     the label), a row that neither has counts as right, a lane is found at 85 % of rows; of five or more
@@ -116,7 +116,7 @@ def tusimple_lane_score(
 def _row_accuracy(
     predicted: Sequence[float] | Points, labelled: Sequence[float] | Points, rows: Sequence[float] | Points
 ) -> float:
-    """Share of rows on which the two agree."""
+    """Compute the share of rows on which the two agree."""
     p, g, y = (np.asarray(values, float) for values in (predicted, labelled, rows))
     there = g >= 0
     slope = np.polyfit(y[there], g[there], 1)[0] if there.sum() > 1 else 0.0
@@ -132,7 +132,7 @@ class CULaneCounts(NamedTuple):
     false_negatives: int
 
     def f1(self) -> float:
-        """Harmonic mean of precision and recall; 0 where nothing was found."""
+        """Return the harmonic mean of precision and recall; 0 where nothing was found."""
         errors = self.false_positives + self.false_negatives
         return 2 * self.true_positives / max(1, 2 * self.true_positives + errors)
 
@@ -144,7 +144,7 @@ def culane_counts(
     width: int = 30,
     threshold: float = 0.5,
 ) -> CULaneCounts:
-    """CULane's matches of one image.
+    """Count CULane's matches of one image.
 
     Source: Pan et al. 2018 and the CULane evaluation: lanes are splines drawn 30 px wide, matched one to one
     for the largest sum of intersection over union, and found above 0.5. OpenLane's evaluation of lanes in the
@@ -165,7 +165,7 @@ def culane_counts(
 
 
 def _lane_mask(points: Points, image_size: tuple[int, int], width: int) -> npt.NDArray[np.bool_]:
-    """The lane's natural cubic spline over chord length, drawn."""
+    """Draw the lane's natural cubic spline over chord length."""
     points = np.asarray(points, float)
     if len(points) > 2:
         chord = np.concatenate([[0], np.hypot(*np.diff(points, axis=0).T).cumsum()])

@@ -92,7 +92,7 @@ class Segmentation(L.LightningModule):
             load_weights(self.segmenter, Path(init_from), weights)
 
     def forward(self, image: Tensor) -> Tensor:
-        """(B, 3, H, W) in [0, 1] to logits whose softmax is a frequency, class weights undone."""
+        """Convert (B, 3, H, W) in [0, 1] to logits whose softmax is a frequency, class weights removed."""
         bias = unweighted_bias(self.class_weight).view(1, -1, 1, 1)
         return self.segmenter(image).float() + bias  # type: ignore[no-any-return]
 
@@ -112,7 +112,7 @@ class Segmentation(L.LightningModule):
         return self.map_loss(batch, batch_idx)[0]
 
     def map_loss(self, batch: Any, batch_idx: int) -> tuple[Tensor, Tensor]:
-        """Loss of the maps, and the logits, class weights not undone, of an augmented batch."""
+        """Return the loss of the maps, and the logits (class weights not removed) of an augmented batch."""
         image, target, weight = unpack(batch)
         if self.photometric is not None:
             with torch.no_grad(), self._own_randomness(batch_idx):
@@ -127,14 +127,14 @@ class Segmentation(L.LightningModule):
 
     @contextlib.contextmanager
     def _own_randomness(self, batch_idx: int) -> Iterator[None]:
-        """Random numbers by seed, process and batch: a resumed run draws what it would have in one piece."""
+        """Draw random numbers by seed, process and batch, so that a resumed run draws the same."""
         entropy = (int(os.environ.get("PL_GLOBAL_SEED", "0")), self.global_rank, batch_idx)
         with torch.random.fork_rng(devices=[self.device] if self.device.type == "cuda" else []):
             torch.manual_seed(int(np.random.default_rng(entropy).integers(2**62)))
             yield
 
     def validation_step(self, batch: Batch | ScoredBatch, batch_idx: int) -> None:
-        """Loss, and recall of each boundary's points."""
+        """Compute the loss, and the recall of each boundary's points."""
         image, target, weight = unpack(batch.views if isinstance(batch, ScoredBatch) else batch)
         logits = self(image)
         self.log("val/loss", boundary_cross_entropy(logits, target, weight), batch_size=len(image))
@@ -154,7 +154,7 @@ class Segmentation(L.LightningModule):
         self.log("val/recall", self.val_found.sum() / self.val_there.sum().clamp(min=1), prog_bar=True)
 
     def on_test_start(self) -> None:
-        """Intersection over union of all labelled pixels besides, and a benchmark's scores on its data."""
+        """Add the intersection over union of all labelled pixels, and a benchmark's scores on its data."""
         self.iou = MulticlassJaccardIndex(
             1 + self.segmenter.config.num_boundaries,
             average=None,
@@ -164,7 +164,7 @@ class Segmentation(L.LightningModule):
         self.scores = BenchmarkScores()
 
     def test_step(self, batch: Batch | ScoredBatch, batch_idx: int) -> None:
-        """Loss, intersection over union of each boundary, and scores."""
+        """Compute the loss, the intersection over union of each boundary, and scores."""
         views = batch.views if isinstance(batch, ScoredBatch) else batch
         image, target, weight = unpack(views)
         logits = self(image)
@@ -181,11 +181,11 @@ class Segmentation(L.LightningModule):
         self.log_dict({f"test/{name}": value for name, value in self.scores.compute().items()})
 
     def predict_step(self, batch: Batch | ScoredBatch, batch_idx: int) -> Tensor:
-        """Probabilities, (B, 1+L, h, w)."""
+        """Return probabilities, (B, 1+L, h, w)."""
         return self(unpack(batch.views if isinstance(batch, ScoredBatch) else batch)[0]).softmax(1)  # type: ignore[no-any-return]
 
     def configure_optimizers(self) -> Any:
-        """Warm-up, stable, decay."""
+        """Return the optimizer with a learning rate that warms up, stays and decays."""
         settings = self.settings
         decayed = [p for p in self.segmenter.parameters() if p.ndim > 1]
         others = [p for p in self.segmenter.parameters() if p.ndim <= 1]
@@ -223,7 +223,7 @@ _SETTINGS = (
 
 
 def unpack(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
-    """Image in [0, 1], target (B, 1+L, h, w) with its background, weight (B, h, w)."""
+    """Return image in [0, 1], target (B, 1+L, h, w) with its background, weight (B, h, w)."""
     target = batch.target.float() / 255
     background = (1 - target.sum(1, keepdim=True)).clamp(min=0)
     return batch.image.float() / 255, torch.cat([background, target], dim=1), batch.weight.float()

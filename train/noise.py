@@ -40,7 +40,7 @@ class Outcome(NamedTuple):
 
 
 def outcome(seen: Seen, factor: float) -> Outcome:
-    """How the calibrator fares on a drive with all sigmas times ``factor``."""
+    """Return the calibrator's errors on a drive with all sigmas times ``factor``."""
     followed = follow(seen, factor)
     error, covariance = (part[followed.tracking] for part in followed[:2])
     if not len(error):
@@ -53,7 +53,7 @@ def outcome(seen: Seen, factor: float) -> Outcome:
 def compare(
     drives: list[Seen], factors: tuple[float, ...] = FACTORS, over: Callable[..., Iterable[Outcome]] = map
 ) -> dict[float, Outcome]:
-    """Median outcome over the drives, for every factor; ``over`` is :func:`map` or a pool's."""
+    """Compute the median outcome over the drives for every factor; ``over`` is :func:`map` or a pool's."""
     pairs = [(seen, factor) for factor in factors for seen in drives]
     outcomes = list(over(outcome, *zip(*pairs, strict=True)))
     report = {}
@@ -69,7 +69,7 @@ def _watch_one(weights: Path, frames: int, fps: float, seed: int) -> Seen:
 
 @one_line_errors()
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("weights", type=Path)
     parser.add_argument("--drives", type=PositiveInt, default=12)

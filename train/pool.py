@@ -82,12 +82,12 @@ class Shard(NamedTuple):
         )
 
     def pose(self, index: int) -> Pose:
-        """Of one frame."""
+        """Return the pose of one frame."""
         return Pose(*(field[index] for field in self.poses))
 
 
 def labelled_images(frame: RenderedFrame) -> Iterator[LabelledImage]:
-    """The rows of a rendered batch, with boundaries as the lens shows them."""
+    """Return the rows of a rendered batch, with boundaries as the lens shows them."""
     batch, boundaries, count, _ = frame.boundaries.shape
     points = distort_points(frame.boundaries.flatten(1, 2), frame.intrinsics, frame.distortion)
     points = points.unflatten(1, (boundaries, count))
@@ -106,7 +106,7 @@ def labelled_images(frame: RenderedFrame) -> Iterator[LabelledImage]:
 
 
 def camera_poses(frames: list[RenderedFrame]) -> Pose:
-    """The poses of rendered batches, one after the other."""
+    """Return the poses of rendered batches, one after the other."""
     parts = [(f.extrinsics.stack(), f.intrinsics, f.distortion, f.lane_width) for f in frames]
     return Pose(*(torch.cat(field).float().numpy() for field in zip(*parts, strict=True)))
 
@@ -161,7 +161,7 @@ def _read_fields(path: Path, names: tuple[str, ...]) -> list[npt.NDArray[Any]]:
 
 @one_line_errors()
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--shards", type=PositiveInt, default=10)

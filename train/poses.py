@@ -43,7 +43,7 @@ class PoseBatch(NamedTuple):
     def stack(
         cls, samples: list[tuple[LabelledImage, Pose]], size: tuple[int, int], view: ViewConfig
     ) -> PoseBatch:
-        """Frames resized to (height, width)."""
+        """Stack frames resized to (height, width)."""
         views = Batch.stack([full_view(sample, size, view) for sample, _ in samples])
         pose = Pose(*(np.stack(field) for field in zip(*(pose for _, pose in samples), strict=True)))
         taken = [sample.image.shape[:2] for sample, _ in samples]
@@ -82,12 +82,12 @@ class RenderedPoses(RenderedRoads):
     """As :class:`~train.data.RenderedRoads`, but whole frames of ``val_size`` with their poses."""
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:  # type: ignore[override]
-        """Endless."""
+        """Return endless training batches."""
         rank, first = run_position(self)
         return self._batches(self.pool, (self.seed, rank), None, first)
 
     def val_dataloader(self) -> DataLoader[PoseBatch]:  # type: ignore[override]
-        """Held-out frames."""
+        """Return held-out frames."""
         return self._batches(self.val_pool, (self.seed + 7_919,), self.val_batches)
 
     def _batches(
@@ -111,7 +111,7 @@ def fit_poses(
     where_only: bool = False,
     reach: float = 1.0,
 ) -> SingleFrameFit:
-    """Logits of images of (height, width) to each image's pose, in double precision, differentiable.
+    """Estimate each image's pose from logits, differentiable, in double precision.
 
     A frame's gradient is at most ``reach`` times as long as that of most.
 
@@ -136,13 +136,13 @@ class EvenGradients(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, reach: float) -> Tensor:
-        """(B, ...) as it is."""
+        """Return (B, ...) unchanged."""
         ctx.reach = reach
         return x.view_as(x)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        """Each sample's gradient shortened to that; what is not finite is left out."""
+        """Shorten each sample's gradient to the limit; leave out what is not finite."""
         finite = gradient.isfinite().flatten(1).all(1)
         length = torch.where(finite, gradient.nan_to_num(0, 0, 0).flatten(1).norm(dim=1), 0.0)
         factor = (ctx.reach * length.median() / length.clamp(min=1e-12)).clamp(max=1) * finite
@@ -150,7 +150,7 @@ class EvenGradients(torch.autograd.Function):
 
 
 def pose_loss(fit: SingleFrameFit, truth: Tensor, unit: Tensor, with_prior: bool = False) -> Tensor:
-    """Charbonnier loss of what the frame says of its pose, summed over axes, mean over frames with a fit.
+    """Compute the Charbonnier loss of the fitted pose, summed over axes, mean over frames with a fit.
 
     Args:
         fit: of B frames.
@@ -166,7 +166,7 @@ def pose_loss(fit: SingleFrameFit, truth: Tensor, unit: Tensor, with_prior: bool
 
 
 def pose_surprise(fit: SingleFrameFit, truth: Tensor, floor: Tensor, factor: float = 1.0) -> Tensor:
-    """Negative log likelihood of the truth under the fit's own sigmas, summed over axes, mean over frames.
+    """Compute the negative log likelihood of the truth under the fit's sigmas, mean over frames.
 
     A proper score (Gneiting and Raftery 2007): lines that are not seen cost the sigma that they would have
     given, and a line that is none costs what it claims to know. The density is Student's t with 4 degrees of

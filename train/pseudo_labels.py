@@ -153,7 +153,7 @@ def write_labels(result: Path, source: str, out: Path, camera: Camera, reach: in
 
 @one_line_errors()
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("result", type=Path, help="folder that lanebev run made")
     parser.add_argument("source", help="video or images that it ran on")

@@ -55,7 +55,7 @@ class BenchmarkScores:
             self.drawn = CULaneCounts(*(a + b for a, b in zip(self.drawn, counts, strict=True)))
 
     def compute(self) -> dict[str, float]:
-        """Named figures; none where there was nothing to score."""
+        """Return the named figures; none if there was nothing to score."""
         figures: dict[str, float] = {}
         if self.tusimple:
             names = ("accuracy", "false_positives", "false_negatives")
@@ -68,7 +68,7 @@ class BenchmarkScores:
 def drawn_counts(
     rows: BoundaryRows, label: FrameLines, image_size: tuple[int, int], benchmark: str
 ) -> CULaneCounts:
-    """One image's matches by the rules of a benchmark that draws lanes, scaled to the image's height."""
+    """Count one image's matches by the rules of a benchmark that draws lanes."""
     rules = DRAWN[benchmark]
     beside = max(0, len(rows.x) - rules.middle) // 2
     found = [np.stack([x, rows.rows], -1)[np.isfinite(x)] for x in rows.x[beside : len(rows.x) - beside]]
@@ -78,7 +78,7 @@ def drawn_counts(
 
 
 def boundary_rows(logits: Tensor, network_size: tuple[int, int], image_size: tuple[int, int]) -> BoundaryRows:
-    """One image's boundaries on rows of the image as it came."""
+    """Return one image's boundaries on rows of the image as taken."""
     stride = -(-network_size[0] // logits.shape[-2])
     extractor = LineExtractor(LineConfig(stride=stride))
     vertices = extractor.vertices(logits.detach().cpu(), image_size, network_size)

@@ -61,7 +61,7 @@ def _wait(device: torch.device) -> None:
 
 @one_line_errors()
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")

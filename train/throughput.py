@@ -54,16 +54,16 @@ class Throughput(L.Callback):
             self._write(trainer, module, batch)
 
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        """The last row."""
+        """Write the last row."""
         if self.views > self._last[1]:
             self._write(trainer, module)
 
     def state_dict(self) -> dict[str, Any]:
-        """Views seen, which the exported weights tell."""
+        """Return the number of views, which the exported weights state."""
         return {"views": self.views}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on counting."""
+        """Continue the counts."""
         self.views = state_dict["views"]
 
     def _write(self, trainer: L.Trainer, module: L.LightningModule, batch: Batch | None = None) -> None:
@@ -99,5 +99,5 @@ _PARTS = ("rendering", "labelling", "training")
 
 
 def _peak_memory(device: torch.device) -> float:
-    """GiB."""
+    """Return the peak memory, GiB."""
     return torch.cuda.max_memory_allocated(device) / 2**30 if device.type == "cuda" else 0.0

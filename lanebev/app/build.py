@@ -115,7 +115,7 @@ def make_observer(
         config: the settings.
         source: the frames.
         camera: the lens.
-        network: that is there already, with the settings' weights on their device.
+        network: an already loaded network with the weights and device of the settings.
 
     Raises:
         ValueError: lanes that do not fit the source, or see :func:`make_network`.

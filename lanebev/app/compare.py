@@ -12,7 +12,7 @@ def compare(first: str, second: str, out: str) -> str:
 
     Args:
         first: folder of a run.
-        second: of another run on the same frames.
+        second: output folder of another run on the same frames.
         out: the page's file.
 
     Returns:

@@ -64,7 +64,7 @@ class KeptNumbers:
     """Arrays of one shape, one for each frame, stored as their numbers only.
 
     Args:
-        shape: of each.
+        shape: shape of each array.
         folder: where they are kept on disk, in a file without a name; None keeps them in memory.
     """
 

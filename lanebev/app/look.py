@@ -28,8 +28,8 @@ def look(config: RunConfig, path: Path, network: SharedNetwork | None = None) ->
 
     Args:
         config: the settings; those of the estimation have no effect.
-        path: of the file, in which the vertices are in full precision.
-        network: that is there already.
+        path: output file, with the vertices in full precision.
+        network: a network that is already loaded.
 
     Returns:
         how many frames there were.
@@ -58,8 +58,8 @@ def take_parts(paths: Sequence[Path], observer: Observer) -> Observer:
     """Return an observer that takes what :func:`look` wrote of the parts of a source.
 
     Args:
-        paths: of the files, in the order of the parts.
-        observer: of frames that are in none of them.
+        paths: paths of the files, in the order of the parts.
+        observer: observer of frames that are in none of them.
     """
     entries = chain.from_iterable(map(whole_tusimple_lines, paths))
     return TakenUp(entries, cast(RestoringObserver, observer), number_in_source, told=False)

@@ -27,7 +27,7 @@ class Observation(NamedTuple):
     """Lane boundaries found in one frame.
 
     Attributes:
-        vertices: of batch size 1.
+        vertices: vertices of batch size 1.
         pose_sigma_scale: factor on the standard deviations of the pose estimated from them.
     """
 
@@ -55,7 +55,7 @@ class LaneFileObserver:
     """Another detector's lanes, matched to the frames of a source.
 
     Args:
-        entries: of the lane file.
+        entries: entries of the lane file.
         source: the frames; images are matched by the longest common tail of their path, a video by order.
         camera: the lens.
 
@@ -91,7 +91,7 @@ class NetworkObserver:
     """Finds lanes in the images by LaneBEV's network and line extraction.
 
     Args:
-        network: whose segmenter and extractor are used, by itself or in batches with other drives.
+        network: segmenter and extractor, of one drive or shared with others in batches.
         camera: the lens.
     """
 

@@ -45,7 +45,7 @@ class Recorded:
     """Results of one frame.
 
     Attributes:
-        frame: as it came.
+        frame: the input frame.
         name: for ``raw_file`` of lanes.json.
         seen: vertices of batch size 1.
         estimate: what they led to.
@@ -66,14 +66,14 @@ class Recorder:
     Attributes:
         path: gives the path to write an output's name to.
         camera: the lens.
-        fps: of the videos.
+        fps: frame rate of the videos.
         lane_width: m, for the report.
         single: PNGs instead of videos.
         stills: each image on its own.
-        grid: of the bird's-eye view.
+        grid: grid of the bird's-eye view.
         videos: whether there are any.
         smoothed: whether every pose is from the whole drive.
-        rows: of extrinsics.csv, a frame each.
+        rows: rows of extrinsics.csv, one for each frame.
         problems: what went wrong, for the report.
     """
 
@@ -140,9 +140,9 @@ class Recorder:
 
         Args:
             facts: what ran, for the report.
-            title: of the report.
+            title: title of the report.
             truth: a row per frame, of a rendered drive.
-            mount: as it is known at the end.
+            mount: mount estimate at the end.
         """
         write_extrinsics(self.path("extrinsics.csv"), self.rows)
         if self.smoothed:

@@ -65,8 +65,8 @@ def run(
     Args:
         config: what to run.
         progress: wraps the frames, told how many there are.
-        truth: of a rendered drive, a row per frame, for the report.
-        network: that is there already, with the settings' weights on their device.
+        truth: truth of a rendered drive, a row per frame, for the report.
+        network: an already loaded network with the weights and device of the settings.
         parts: what :func:`lanebev.app.look.look` wrote of parts of the source, in order; the network does not
             look at these frames again.
 

@@ -29,7 +29,7 @@ class SharedNetwork:
     for frames that have not come: a drive that ends or fails holds up no other.
 
     Args:
-        model: whose segmenter and extractor are used.
+        model: model with the segmenter and extractor to use.
         most: frames in a batch.
 
     Attributes:

@@ -56,7 +56,7 @@ class KeptStates(Sequence[JointState]):
     A state of six boundaries takes 6 kB, so that an hour at 30 frames a second takes 0.6 GB.
 
     Args:
-        path: of the file.
+        path: path of the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -129,10 +129,10 @@ def smooth_frames(
     What was seen is written to lanes.json, for the second pass or, if this one is killed, for another run.
 
     Args:
-        frames: of a drive, with what is seen in them.
+        frames: frames of a drive, with what is seen in them.
         tracker: with the joint calibrator.
         out: for lanes.json and, meanwhile, the states.
-        source: of the frames.
+        source: name of the frames' source.
     """
     path = out / _STATES
     states, intervals = KeptStates(path), KeptNumbers(1)
@@ -162,9 +162,9 @@ def _smoothed(
     Args:
         states: after every frame.
         intervals: s from the frame before.
-        covariances: of the pose as the calibrator gave it.
+        covariances: covariances of the pose as the calibrator gave it.
         scales: factor on the standard deviations of the pose.
-        tracker: which they are from.
+        tracker: tracker that gave the states.
     """
     steps, count = torch.from_numpy(intervals.all().copy()), len(states)
     result = SmoothedPoses(np.empty((count, 4)), np.empty((count, 4, 4)))

@@ -41,15 +41,15 @@ class TakenUp:
     """Returns an earlier run's observations of the first frames, and another observer's of the others.
 
     Args:
-        entries: of the frames from the first one on.
-        observer: of the others.
+        entries: entries of lanes.json, from the first frame on.
+        observer: observer of the other frames.
         name_of: gives the name of a frame's entry.
         told: whether the report says so.
 
     Attributes:
         frames: how many were taken.
         told: see above.
-        remark: of the other observer.
+        remark: remark of the other observer.
         workers: likewise.
     """
 
@@ -115,7 +115,7 @@ def seen_again(out: OutputFolder, observer: Observer, taken: Observer, source: F
 
     Args:
         out: with the first pass's lanes.json, which is moved.
-        observer: of the frames.
+        observer: observer of the frames.
         taken: what :func:`take_up` made of it.
         source: the frames.
     """

@@ -66,8 +66,8 @@ def opencv_or_ros(fields: Mapping[str, Any], rectified: bool) -> tuple[CameraPar
     pixel's centre is the centre of those it binds together, not their corner: (x + 0.5) / b − 0.5.
 
     Args:
-        fields: of the file.
-        rectified: of the rectified images: the projection matrix P without a lens.
+        fields: fields of the file.
+        rectified: return the camera of rectified images: the projection matrix P without a lens.
 
     Returns:
         the camera, and whether the file states its matrix twice, in K and P, as our own writer does.

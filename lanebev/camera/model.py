@@ -106,7 +106,7 @@ class Camera:
             degrees: angle between the outer edges of the leftmost and the rightmost column.
             width: px.
             height: px.
-            dtype: of the tensors.
+            dtype: dtype of the tensors.
 
         Raises:
             ValueError: an angle that is not between 10 and 179 degrees, or an impossible image size.

@@ -45,7 +45,7 @@ def checked(camera: CameraParameters, restated: bool = False) -> CameraParameter
     """Return the camera without needless coefficients, if a real one could be like it.
 
     Args:
-        camera: as read.
+        camera: camera as read from the file.
         restated: the file states the camera matrix twice, as a program does. Then it may be of a cropped
             image, with its principal point outside of it and a focal length of any number of image sides.
 

@@ -60,8 +60,8 @@ class Calibrator(nn.Module, Generic[StateT]):
 
         Args:
             batch_size: B.
-            dtype: of the state and so of all results, float32 or float64.
-            device: of the state; None is the default device.
+            dtype: dtype of the state and so of all results, float32 or float64.
+            device: device of the state; None is the default device.
         """
         raise NotImplementedError
 
@@ -80,9 +80,9 @@ class Calibrator(nn.Module, Generic[StateT]):
         more. Only where a device has no double precision (MPS) is it computed in single.
 
         Args:
-            segments: of this frame, N per row, 0 too; weight 0 is not there, non-finite counts as not there.
+            segments: N >= 0 segments per row; those of weight 0 or with non-finite numbers are ignored.
             intrinsics: (B, 3, 3) px. A row where they or the widths are not finite and positive sees nothing.
-            state: of the frame before, or ``initial_state(B)``.
+            state: state of the frame before, or ``initial_state(B)``.
             dt: s since that frame, float or (B,). A started row skips a frame that is not later (0 or
                 negative). Where not finite, an interval is assumed.
             lane_width: m, float, (B,) or (B, L-1) per lane.
@@ -129,7 +129,7 @@ class Calibrator(nn.Module, Generic[StateT]):
         Args:
             calibration: after the passes over them.
             state: likewise.
-            segments: of B images.
+            segments: segments of B images.
             intrinsics: (B, 3, 3) px.
             lane_width: m, float, (B,) or (B, L-1).
         """
@@ -139,7 +139,7 @@ class Calibrator(nn.Module, Generic[StateT]):
         """Return the calibration of images of their own whose detector's errors are larger than it says.
 
         Args:
-            calibration: of :meth:`weigh_still`.
+            calibration: calibration of :meth:`weigh_still`.
             factor: on the standard deviations of what an image says of the pose.
         """
         return calibration.with_std_scaled(factor)

@@ -46,7 +46,7 @@ def check_state(state: TensorTuple, kind: type[TensorTuple], rows: int) -> Tenso
     """Check that a state is a NamedTuple of the expected class with so many rows.
 
     Args:
-        state: as the caller gave it.
+        state: state given by the caller.
         kind: the expected class.
         rows: B.
 
@@ -92,7 +92,7 @@ def clean_segments(segments: LaneSegments, num_boundaries: int) -> LaneSegments:
     unusable. The masked entries carry no gradient.
 
     Args:
-        segments: as they came.
+        segments: unchecked segments.
         num_boundaries: L.
 
     Returns:
@@ -120,7 +120,7 @@ def mask_invalid_rows(
     Such rows get placeholder intrinsics and widths, so that all numbers and gradients stay finite.
 
     Args:
-        segments: as they came, see :func:`clean_segments`.
+        segments: unchecked segments, see :func:`clean_segments`.
         intrinsics: (B, 3, 3), unusable where not finite or without a positive focal length.
         lane_width: (B, M) m, unusable where one is not finite and positive.
         num_boundaries: L.

@@ -24,7 +24,7 @@ class Estimate(NamedTuple):
 
     Attributes:
         segments: what the calibrator was given.
-        calibration: of this frame.
+        calibration: calibration of this frame.
         reasons: why the frame is not (fully) tracked.
     """
 
@@ -37,7 +37,7 @@ class Tracker(Generic[StateT]):
     """Estimate pose and mount frame by frame.
 
     Args:
-        calibrator: of the pose.
+        calibrator: calibrator of the pose.
         camera: the lens.
         lane_width: m.
         focal_std: standard deviation of the focal length as a share of it, which widens the pose's.
@@ -70,7 +70,7 @@ class Tracker(Generic[StateT]):
         """Estimate on the next frame of the drive.
 
         Args:
-            vertices: of batch size 1, in pixels of the image as taken.
+            vertices: vertices of batch size 1, in pixels of the image as taken.
             dt: s since the frame before.
             pose_sigma_scale: factor on the standard deviations of the pose.
             speed: m/s of the vehicle, if it is known; the mount learns nothing from a slow one.
@@ -96,7 +96,7 @@ class Tracker(Generic[StateT]):
         """Estimate on an image of its own; nothing is remembered of it.
 
         Args:
-            vertices: of batch size 1, in pixels of the image as taken.
+            vertices: vertices of batch size 1, in pixels of the image as taken.
             pose_sigma_scale: factor on the standard deviations of what the image says of the pose.
         """
         segments = camera_segments(vertices, self.camera)
@@ -122,7 +122,7 @@ class Tracker(Generic[StateT]):
         """Return a calibration with the covariance that goes out.
 
         Args:
-            calibration: as the calibrator gave it.
+            calibration: result of the calibrator.
             pose_sigma_scale: factor on the standard deviations of the pose.
         """
         scaled = calibration.with_std_scaled(pose_sigma_scale)

@@ -47,8 +47,8 @@ def make_part(name: str, model: LaneBEV, camera: Camera) -> Part:
 
     Args:
         name: one of PARTS; "step" has the calibrator of the model.
-        model: whose parts are taken.
-        camera: whose image size and kind of lens are fixed; its numbers remain inputs.
+        model: model to take parts of.
+        camera: camera whose image size and lens model are fixed; its numbers stay inputs.
 
     Raises:
         ValueError: another name.
@@ -153,7 +153,7 @@ class _WithState(nn.Module):
     """A module with a state, which rows of ``reset`` begin anew.
 
     Args:
-        calibrator: whose state it is.
+        calibrator: calibrator whose state it is.
     """
 
     def __init__(self, calibrator: Calibrator[Any]) -> None:

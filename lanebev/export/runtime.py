@@ -27,7 +27,7 @@ class OnnxPart:
     """A part in an ONNX file.
 
     Args:
-        path: of a file that ``lanebev export`` wrote.
+        path: path of a file that ``lanebev export`` wrote.
 
     Raises:
         ValueError: ONNX Runtime is not there, or the file is missing or of something else.
@@ -105,8 +105,8 @@ class OnnxCalibrator(Calibrator[StateT]):
     """Stands in for a calibrator.
 
     Args:
-        part: of the calibrator.
-        calibrator: of which it is the export; knows the state before the first frame and what is in it.
+        part: part of the calibrator.
+        calibrator: exported calibrator, which gives the initial state.
     """
 
     def __init__(self, part: OnnxPart, calibrator: Calibrator[StateT]) -> None:

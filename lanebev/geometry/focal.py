@@ -68,7 +68,7 @@ def with_focal_std(calibration: Calibration, intrinsics: Tensor, focal_std: floa
     :func:`focal_covariance`.
 
     Args:
-        calibration: of B rows.
+        calibration: calibration of B rows.
         intrinsics: (B, 3, 3) px.
         focal_std: standard deviation of the focal length as a share of it, a float or (B,).
 

@@ -21,8 +21,8 @@ class Topic(NamedTuple):
     """A topic of a bag.
 
     Attributes:
-        name: of the topic.
-        kind: of its messages.
+        name: name of the topic.
+        kind: type of its messages.
         size: number of its messages.
     """
 
@@ -35,7 +35,7 @@ class Bag(Protocol):
     """A bag that is open.
 
     Attributes:
-        topics: those of images and lenses.
+        topics: topics of images and lenses.
         duration: s, of all of it.
     """
 

@@ -42,7 +42,7 @@ class BagSource(FrameSource):
     """Images of one topic of a bag.
 
     Attributes:
-        topic: of the images.
+        topic: topic of the images.
         lens: fields of a ``camera_info`` beside them, None if there is none.
     """
 
@@ -79,7 +79,7 @@ def open_bag_source(source: str, topic: str | None = None, fps: Fraction | None 
 
     Args:
         source: an MCAP file, a ROS bag, or the folder of a ROS 2 bag.
-        topic: of the images, None for the only one that has any.
+        topic: topic of the images; None for the only one with images.
         fps: nominal frame rate, None for the mean of the images' times.
 
     Raises:

@@ -73,7 +73,7 @@ def write_calibration(path: str | Path, camera: Camera, mounted: MountCalibratio
     Args:
         path: the file.
         camera: the lens.
-        mounted: of batch size 1.
+        mounted: mount estimate of batch size 1.
     """
     pose = mounted.extrinsics.stack()[0].double()
     std = mounted.covariance[0].diagonal().clamp(min=0).sqrt().double()

@@ -125,7 +125,7 @@ def rgb(frame: av.VideoFrame | str, matrix: Sequence[int] | None) -> NDArray[np.
 
     Args:
         frame: decoded, or what is wrong with a lost one.
-        matrix: of the stream, see :func:`display_matrix`.
+        matrix: matrix of the stream, see :func:`display_matrix`.
 
     Raises:
         ValueError: it is a lost one.

@@ -38,7 +38,7 @@ class Selection(NamedTuple):
     Attributes:
         start: s since the source's first frame, of the first that is taken.
         end: s, before which the last one is.
-        every: of the frames in between, those whose number in the source is a multiple of it.
+        every: take only frames whose number in the source is a multiple of it.
     """
 
     start: float = 0.0

@@ -23,7 +23,7 @@ def natural_order(path: str, decimal: bool = False) -> Key:
     """Return a sort key with numbers by value: 2.jpg before 10.jpg.
 
     Args:
-        path: of a file.
+        path: path of a file.
         decimal: whether 0.05.jpg is a number with a fraction, and before 0.5.jpg.
     """
     match = _DECIMAL.search(path) if decimal else None
@@ -57,7 +57,7 @@ def times_from_names(paths: Sequence[str]) -> tuple[float, ...]:
     a millisecond to a minute.
 
     Args:
-        paths: of the images, in order.
+        paths: paths of the images, in order.
     """
     names = [PurePath(path).name for path in paths]
     seconds = [_SECONDS.search(name) for name in names]

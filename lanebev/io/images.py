@@ -73,7 +73,7 @@ def _eight_bit(image: Image.Image) -> Image.Image:
     """Convert 16-bit grey by its own scale; ``convert`` would clip it at 255.
 
     Raises:
-        OSError: of floating point, whose scale nobody says.
+        OSError: floating-point pixels, whose scale is unknown.
     """
     if image.mode == "F":
         raise OSError("floating point, expected 8 or 16 bits")

@@ -24,8 +24,8 @@ class FrameLines(NamedTuple):
     """The lines of one frame.
 
     Attributes:
-        name: of the frame in the file.
-        lines: as they were drawn.
+        name: name of the frame in the file.
+        lines: lines as they were drawn.
         pose_sigma_scale: factor on the standard deviations of the pose estimated from them; 1 unless stated.
     """
 

@@ -44,7 +44,7 @@ def size_remark(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> st
     """Return what speaks for lanes in pixels of smaller images; empty if nothing does.
 
     Args:
-        frames: of one drive.
+        frames: frames of one drive.
         image_size: (height, width) px of its images.
 
     Raises:

@@ -36,7 +36,7 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
     """Read a TuSimple, CULane or OpenLane file, or a folder of the latter two.
 
     Args:
-        path: of the file or folder.
+        path: path of the file or folder.
         intrinsics: (3, 3) px of the camera, for OpenLane's 3D points in a file without ``intrinsic``.
 
     Raises:

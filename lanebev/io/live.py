@@ -59,7 +59,7 @@ class LiveSource(FrameSource):
     waits instead, and times are those that the stream states.
 
     Attributes:
-        slot: where the thread leaves the frames.
+        slot: place where the thread leaves the frames.
         keep_all: wait for whoever looks.
         figures: what became of the frames.
     """

@@ -43,7 +43,7 @@ def read_openlane(path: str | Path, intrinsics: NDArray[np.float64] | None = Non
     benchmark's predictions if the file has the camera's ``extrinsic``, else in the camera's.
 
     Args:
-        path: of the file.
+        path: path of the file.
         intrinsics: (3, 3) px, for a file that has 3D points and no ``intrinsic``.
     """
     path = Path(path)

@@ -69,7 +69,7 @@ def extrinsics_row(
     Args:
         frame: its number.
         time: s.
-        calibration: of batch size 1.
+        calibration: calibration of batch size 1.
         weight: (1, N) of the frame's segments; those above zero are counted.
         image: the file's path as found, empty for a video.
         reasons: flags such as those of :class:`lanebev.Reason` that hold in this frame.
@@ -135,7 +135,7 @@ def check_inputs_stay(folder: str | Path, inputs: Iterable[str | Path]) -> None:
     """Raise if an output of the run would replace a file that it reads.
 
     Args:
-        folder: where the outputs go.
+        folder: output folder.
         inputs: files that the run reads, its state to resume with left out: that one is meant to be renewed.
 
     Raises:

@@ -22,9 +22,9 @@ class Begun(NamedTuple):
 
     Attributes:
         container: open.
-        stream: of the frames.
+        stream: stream of the frames.
         frames: as of :func:`lanebev.io.decoding.decoded`.
-        number: of the first of them in the whole video.
+        number: number of the first frame in the whole video.
         first: time (s) of the video's first frame as the file has it; None where it is yet to come.
         before: likewise, of the frame before the first of ``frames``.
     """

@@ -39,7 +39,7 @@ def save_state(path: str | Path, contents: Mapping[str, Any]) -> None:
     """Write states and plain values to one safetensors file, whole or not at all.
 
     Args:
-        path: of the file; its folder must exist. An older file stays until the new one is complete.
+        path: path of the file; its folder must exist. An older file stays until the new one is complete.
         contents: by name, NamedTuples of tensors (``JointState``, ``TwoStageState``, ``MountState``), single
             tensors, or values that JSON can hold (str, int, float, bool, None, lists and dicts of them).
 
@@ -98,11 +98,11 @@ def load_state(
     """Read a file of :func:`save_state`. Never half: any problem is reported and nothing is used.
 
     Args:
-        path: of the file.
+        path: path of the file.
         like: by name, states as they are expected (``calibrator.initial_state(1)``): same type, fields,
             shapes and dtypes, else the file is refused. Names that are not in ``like`` come back as dicts
             of tensors by field.
-        device: where the tensors go; None is the CPU.
+        device: device of the tensors; None is the CPU.
 
     Returns:
         states, metadata and the problem, if there was one (a missing file is one too).

@@ -72,7 +72,7 @@ def vertices_from_lines(
     and those that cross fewer than two rows, are left out.
 
     Args:
-        lines: of one frame.
+        lines: lines of one frame.
         camera: the lens.
         num_boundaries: L.
 
@@ -115,7 +115,7 @@ def rows_from_vertices(vertices: BoundaryVertices, image_size: tuple[int, int]) 
     """Interpolate the boundaries of one frame on rows of the image; a gap stays a gap.
 
     Args:
-        vertices: of batch size 1, boundary 0..L-1.
+        vertices: vertices of batch size 1, boundary 0..L-1.
         image_size: (height, width) px.
     """
     rows = image_rows(image_size[0])

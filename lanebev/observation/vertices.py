@@ -32,7 +32,7 @@ class LineConfig:
 
     Attributes:
         stride: px of the network's input per label px.
-        half_width: of the stripes that the network learned, across the line, label px.
+        half_width: half width of the stripes that the network learned, across the line, label px.
         segments: per boundary, S.
         window: half-width of the window about a scan's peak, label px.
         absent, present: share of a stripe's mass at and below which a scan has no boundary, and at and above
@@ -41,7 +41,7 @@ class LineConfig:
             at the horizon, and says nothing; it says less from ``_FADE`` below.
         min_vertices: a boundary with fewer is not seen.
         sigma_floor: least standard deviation of a vertex, label px: what correlates along the line.
-        sigma_scale: of all standard deviations; 1 where the maps are true.
+        sigma_scale: factor on all standard deviations; 1 where the maps are true.
         least_weight: of a vertex; a fainter one is left out: as often it lies on the foot of a barrier as on
             paint.
         correlation: px of the image, vertically, over which a line's errors are one error: vertices nearer

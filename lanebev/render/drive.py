@@ -55,7 +55,7 @@ class Drive:
     """A continuous drive: curves with clothoids, crests, lane changes, suspension, bumps, traffic.
 
     Args:
-        seed: of everything.
+        seed: seed of all random numbers.
         image_size: (H, W); with a camera, its own image size.
         num_frames: length.
         fps: frames per second.
@@ -267,7 +267,7 @@ class Drive:
         """Render one frame with its truth, B = 1; frames can be asked for in any order.
 
         Args:
-            index: of the frame.
+            index: number of the frame.
             device: where to render, and where the result is; by default the CPU.
 
         Raises:
@@ -282,7 +282,7 @@ class Drive:
         """Render frames with their truth, B of them; each is the same whichever are asked for with it.
 
         Args:
-            indices: of the frames, at least one.
+            indices: numbers of the frames, at least one.
             device: where to render, and where the result is; by default the CPU.
             rows: how many are rendered together, see :func:`~lanebev.render.views.render_scenes`.
 

@@ -26,7 +26,7 @@ def boundary_points(
     """Compute the centres of the labelled boundaries in the local road frame.
 
     Args:
-        layout: of the road.
+        layout: layout of the road.
         place: of the camera.
         alignment: seen from there.
         lens: the cameras.

@@ -22,8 +22,8 @@ def lane_curves(segments: LaneSegments, calibration: Calibration, camera: Camera
     A boundary that is seen in pieces is drawn as one, and what fits no road is left out.
 
     Args:
-        segments: of batch size 1, in undistorted pixels.
-        calibration: of batch size 1.
+        segments: segments of batch size 1, in undistorted pixels.
+        calibration: calibration of batch size 1.
         camera: the lens.
 
     Returns:

@@ -32,7 +32,7 @@ def write_text(
         colour: RGB.
         size: px.
         bold: the bold font.
-        anchor: of the text, as Pillow names it: "la" is the left end of its ascender line.
+        anchor: anchor of the text, as Pillow names it: "la" is the left end of its ascender line.
     """
     mask, (left, top) = _letters(text, size, bold, anchor)
     x, y = round(place[0]) + left, round(place[1]) + top

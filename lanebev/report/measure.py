@@ -53,7 +53,7 @@ def measure_boundaries(
     that the vertices' sigmas leave open by more than 3 cm.
 
     Args:
-        segments: of batch size 1, end points in undistorted pixels.
+        segments: segments of batch size 1, end points in undistorted pixels.
         intrinsics: (1, 3, 3).
         extrinsics: each (1,).
         near: m, nearest Z that counts.

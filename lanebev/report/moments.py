@@ -25,7 +25,7 @@ class MomentSampler:
     whole drive stays covered.
 
     Attributes:
-        most_bytes: of all pictures together.
+        most_bytes: largest size in bytes of all pictures together.
         every: frames between two evenly spaced ones now.
     """
 

@@ -74,11 +74,11 @@ def draw_panels(
     Args:
         image: (H, W, 3) as taken.
         camera: its lens.
-        segments: of batch size 1, undistorted.
-        calibration: of batch size 1, on the CPU.
+        segments: segments of batch size 1, undistorted.
+        calibration: calibration of batch size 1, on the CPU.
         headline: what frame this is.
         views: e.g. before and after.
-        grid: of the views.
+        grid: grid of the views.
         reasons: why the frame is not (fully) tracked, in words.
 
     Returns:

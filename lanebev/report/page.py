@@ -36,7 +36,7 @@ class Report:
 
     Attributes:
         title: the source's name.
-        rows: of ``extrinsics.csv``.
+        rows: rows of ``extrinsics.csv``.
         before: (F, L-1) m, lane widths in the view with the pose before.
         after: (F, L-1) m, with the online pose, or the smoothed one.
         lane_width: m, assumed.
@@ -48,7 +48,7 @@ class Report:
         before_title: what "before" is.
         truth: a row per frame, of a rendered drive.
         camera: the lens.
-        mount: as it is known at the end, of batch size 1.
+        mount: mount estimate at the end, of batch size 1.
     """
 
     title: str

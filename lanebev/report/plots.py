@@ -138,7 +138,7 @@ def plot_widths(
         widths: (F, L-1) m, NaN where a lane was not seen.
         lane_width: m, what was assumed.
         limits: m, of the axis, see :func:`width_limits`.
-        xlabel: of the axis.
+        xlabel: label of the axis.
     """
     plot = new_figure("lane width (m)", x_range(x), limits, height=240)
     for lane in np.flatnonzero(np.isfinite(widths).any(0)).tolist():

@@ -19,8 +19,8 @@ class RunFolder:
     """A finished run.
 
     Attributes:
-        name: of its folder.
-        rows: of ``extrinsics.csv``.
+        name: name of its folder.
+        rows: rows of ``extrinsics.csv``.
         settings: label to value, empty if there is no report.
         lens: likewise.
         pictures: of some frames, by number of the frame: name of the view to an address that holds it.

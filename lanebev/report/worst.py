@@ -20,7 +20,7 @@ class Moment(NamedTuple):
     """A frame worth looking at.
 
     Attributes:
-        place: of its row.
+        place: index of its row.
         what: in words.
     """
 
@@ -34,8 +34,8 @@ def scores(
     """Return how remarkable a frame is, by kind of event; a kind that does not occur is left out.
 
     Args:
-        row: of the frame.
-        before: of the two frames before it, fewer at the start.
+        row: row of the frame.
+        before: rows of the two frames before it, fewer at the start.
         settled: tracking began at least SETTLING ago.
     """
     found: dict[str, float] = {}
@@ -57,7 +57,7 @@ def jumps(row: ExtrinsicsRow, earlier: ExtrinsicsRow, before: ExtrinsicsRow) -> 
     """Return by how much pitch, yaw, roll (deg) and height (m) depart from going on as they went.
 
     Args:
-        row: of the frame.
+        row: row of the frame.
         earlier: two frames before.
         before: one frame before.
     """

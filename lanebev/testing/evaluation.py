@@ -58,8 +58,8 @@ def track(
         rows: R Monte Carlo runs.
         sigma: px, noise of an end point.
         per_boundary: segments of each boundary.
-        seed: of pairs and noise.
-        dtype: of the calibrator.
+        seed: seed of pairs and noise.
+        dtype: dtype of the calibrator.
     """
     state = calibrator.initial_state(rows, dtype=dtype)
     intrinsics = CAMERA.to(dtype).expand(rows, 3, 3)
@@ -134,9 +134,9 @@ def recovery(run: Track, usual: Tensor, fps: float = FPS) -> float | None:
     None if it never comes back before the next hard frames or the end.
 
     Args:
-        run: of a drive with hard frames.
+        run: run of a drive with hard frames.
         usual: (4,) or (T, 4) rad and m.
-        fps: of the drive.
+        fps: frame rate of the drive.
     """
     fine = (run.errors.square().mean(1).sqrt() <= 2 * usual).all(-1)  # (T,)
     ends = [k + 1 for k in range(len(fine) - 1) if run.hard[k] and not run.hard[k + 1]]

@@ -109,7 +109,7 @@ def sample_segments(
         spans: (L, 2, 2) px.
         exp: spacing and number of segments.
         rows: R independent draws.
-        generator: of the draws.
+        generator: generator of the draws.
 
     Returns:
         end points (R, L·S, 2, 2) px and boundary (R, L·S).

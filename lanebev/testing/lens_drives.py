@@ -21,7 +21,7 @@ def vertices_through_lens(
         camera: the lens, in double precision.
         sigma: px of the image as taken.
         per_boundary: V vertices.
-        seed: of the noise.
+        seed: seed of the noise.
 
     Returns:
         (T, 6, V), weight 0 where a boundary is not in the image.

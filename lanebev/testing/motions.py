@@ -35,7 +35,7 @@ def sinusoids(
     add up to the largest.
 
     Args:
-        seed: of the draw.
+        seed: seed of the draw.
         largest_deg: sum of the amplitudes of each angle.
         largest_m: sum of the amplitudes of height.
         highest_hz: see above.
@@ -72,7 +72,7 @@ def suspension(seed: int, seconds: float, bumps_per_s: float = 1.5, mount: Pose 
     damping, by up to 1°, 0.7° and 3 cm; yaw swings by 0.3° at 0.2 Hz, as a driver's steering does.
 
     Args:
-        seed: of the draw.
+        seed: seed of the draw.
         seconds: from -2 s to which there are bumps.
         bumps_per_s: on average.
         mount: pose about which it moves.

@@ -64,7 +64,7 @@ def noisy_segments(
         endpoints: (B, N, 2, 2) px.
         boundary: (B, N) int64.
         sigma: px; 0 adds none.
-        generator: of the noise.
+        generator: generator of the noise.
     """
     noise = torch.randn(endpoints.shape, generator=generator, dtype=endpoints.dtype)
     weight = torch.ones(boundary.shape, dtype=endpoints.dtype)
@@ -90,7 +90,7 @@ def lanes(
         boundaries: indices in sight.
         per: segments of each.
         noise: px, standard deviation of an end point.
-        seed: of distances and noise.
+        seed: seed of distances and noise.
         width: m, of every lane.
         offset: m, of the camera to the right of the ego lane's middle.
         bend: 1/m, curvature of the road.

@@ -21,7 +21,7 @@ class CanonicalCells(NamedTuple):
     """Homogeneous coordinates of a virtual camera's pixels in the real one.
 
     Attributes:
-        rays: of directions, as if both cameras were at one place.
+        rays: rays of directions, as if both cameras were at one place.
         down: (B, 1, R) and (B, 1, V), the directions' component towards the road.
         stretch: (B, 3, 1, 1), added for each unit of it: the road is nearer or farther below the real camera.
     """
@@ -51,7 +51,7 @@ class CanonicalView(nn.Module):
     Args:
         intrinsics: (3, 3) px of the virtual camera.
         image_size: (H, W) px of the virtual image.
-        extrinsics: of the virtual camera, of batch size 1; its height is not used with ``keep_height``.
+        extrinsics: pose of the virtual camera, batch size 1; its height is not used with ``keep_height``.
         keep_height: leave every camera at its own height: a rotation only.
     """
 
@@ -92,7 +92,7 @@ class CanonicalView(nn.Module):
         Args:
             image: (B, C, h, w), an image as it was taken or a feature map that covers it.
             intrinsics: (B, 3, 3) px of the real image.
-            extrinsics: of the real camera, each (B,).
+            extrinsics: extrinsics of the real camera, each (B,).
             distortion: (B, D) of its lens, or None for an undistorted image.
             model: "pinhole", "fisheye" or "omni", the lens of ``distortion``.
             image_size: (H, W) px of the image that the intrinsics belong to; None where that is ``image``.

@@ -36,8 +36,8 @@ def cells_and_lens(
         extrinsics: each (B,).
         distortion: (B, D), or None.
         model: "pinhole", "fisheye" or "omni".
-        dtype: of the results.
-        plane_heights: of P planes above the road, m.
+        dtype: dtype of the results.
+        plane_heights: plane heights of P planes above the road, m.
 
     Returns:
         cells of P·U rows, those of the first plane first, and the lens, None for an undistorted image.

@@ -30,7 +30,7 @@ def remap_frame(
     Args:
         frame: (H, W, 3) or (H, W) of bytes, as taken.
         camera: its lens, of the frame's size.
-        extrinsics: of batch size 1.
+        extrinsics: extrinsics of batch size 1.
         grid: the road's rectangle.
 
     Returns:
@@ -67,7 +67,7 @@ def _pixels_of_cells(
 
     Args:
         camera: with its lens.
-        extrinsics: of batch size 1.
+        extrinsics: extrinsics of batch size 1.
         grid: U × V cells.
 
     Returns:

@@ -48,7 +48,7 @@ def image_planes(points: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
 
     Args:
         points: (B, 2, R, V).
-        lens: of each row of the batch.
+        lens: lens of each row of the batch.
 
     Returns:
         (B, 2, R, V) image coordinates, finite, and (B, R, V): zero where the lens does not fold over, else

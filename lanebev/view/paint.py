@@ -43,7 +43,7 @@ class ImageFromBEV(nn.Module):
     For labels, masks or heat maps of the road that are wanted in the image, as a camera takes it.
 
     Args:
-        grid: of the map; default :class:`BEVGrid`.
+        grid: grid of the map; default :class:`BEVGrid`.
         plane_height: m above the road of the plane that the map lies in.
     """
 

@@ -50,7 +50,7 @@ def resampled(
         maps: (B, C, h, w) each.
         cells: homogeneous coordinates, ``normalised_intrinsics`` applied; with a lens in the camera.
         lens: into normalised coordinates, or None.
-        sizes: of every map.
+        sizes: sizes of every map.
         image_size: (H, W) px of the image that the coordinates belong to.
 
     Returns:
@@ -88,8 +88,8 @@ def block_map(block: Block, size: MapSize, image_size: tuple[int, int], out: Ten
     """Compute the coordinates of a map for ``grid_sample``; far away where not seen.
 
     Args:
-        block: of the image.
-        size: of the map.
+        block: block of the image.
+        size: size of the map.
         image_size: (H, W) px.
         out: (B, 2, rows, V) to write to, which may be the block's points.
 
@@ -116,9 +116,9 @@ def map_coordinate(
 
     Args:
         coordinate: (B, R, V), x or y.
-        cells: of the map along it.
+        cells: cells of the map along it.
         stride: px, or None, see :class:`MapSize`.
-        pixels: of the image along it.
+        pixels: pixels of the image along it.
         out: (B, R, V) to write to.
     """
     if stride is not None:  # x of the image to x / stride of the map

@@ -64,8 +64,8 @@ def save_segmenter(
     """Write a segmenter's weights.
 
     Args:
-        segmenter: whose weights.
-        path: of the file.
+        segmenter: network to save.
+        path: path of the file.
         half: store weights of convolutions as float16; norms and biases stay float32.
         compact: store convolutions of more than 2²⁰ weights as :func:`quantised`.
         record: JSON-able facts for the metadata: training, seed, commit, metrics.

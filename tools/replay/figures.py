@@ -65,7 +65,7 @@ def after_shock(run: Track, fps: float) -> list[float]:
 
 
 def as_track(recording: Recording, replayed: Replayed, row: int) -> Track:
-    """Errors, variances and bounds of one drive, R = 1."""
+    """Return errors, variances and bounds of one drive, R = 1."""
     error = (replayed.pose[:, row] - recording.truth).unsqueeze(1)
     covariance = replayed.covariance[:, row].unsqueeze(1)
     nees = (error * torch.linalg.solve(covariance, error)).sum(-1)
@@ -80,7 +80,7 @@ def as_track(recording: Recording, replayed: Replayed, row: int) -> Track:
 
 
 def _bounds(recording: Recording) -> Tensor:
-    """(T, 1, 4) variances of the per-frame bound; inf of a drive that was not generated."""
+    """Return variances (T, 1, 4) of the per-frame bound; inf for a drive that was not generated."""
     if not recording.moments:
         return torch.full((len(recording.truth), 1, 4), torch.inf, dtype=torch.float64)
     return torch.stack(
@@ -94,7 +94,7 @@ def _bounds(recording: Recording) -> Tensor:
 
 
 def _back(run: Track, fps: float) -> float:
-    """Seconds until the errors are below twice the bound after the last frame of the event."""
+    """Return the seconds until the errors are below twice the bound after the last frame of the event."""
     if not run.hard.any():
         return math.nan
     back = recovery(run, run.bounds[:, 0].sqrt(), fps)
@@ -102,7 +102,7 @@ def _back(run: Track, fps: float) -> float:
 
 
 def markdown(rows: list[tuple[str, str, Figures]]) -> str:
-    """Table of drive, calibrator and figures."""
+    """Return the table of drive, calibrator and figures."""
     lines = [
         "| drive | calibrator | RMSE pitch, yaw, roll °, height cm | × bound | NEES/dof | within 3 σ "
         "| in the worst second | back after |",

@@ -67,7 +67,7 @@ class Generated:
 
 
 def _degrees(pitch: float, yaw: float, roll: float, height: float) -> Pose:
-    """Differences in degrees and m as a pose."""
+    """Convert differences in degrees and m to a pose."""
     return math.radians(pitch), math.radians(yaw), math.radians(roll), height
 
 
@@ -88,12 +88,12 @@ def _drive(
 
 
 def _scenario(name: str, fps: float = 30.0, start: float = 0.0) -> Callable[[], list[Moment]]:
-    """Part of a drive of :data:`lanebev.testing.scenarios.SCENARIOS`."""
+    """Return a part of a drive of :data:`lanebev.testing.scenarios.SCENARIOS`."""
     return _drive(SCENARIOS[name][1], fps=fps, start=start)
 
 
 def _in_curve(seed: int) -> Callable[[], list[Moment]]:
-    """From the straight through a clothoid into R = 300 m and half out of it, 75 to 195 m at 30 m/s."""
+    """Return a road from straight through a clothoid to R = 300 m and half out of it, from 75 to 195 m."""
     return _drive(SCENARIOS["curves R 300 m, 5-40 m"][1], sinusoids(seed), start=2.0)
 
 
@@ -112,7 +112,7 @@ def _knock(t: float, moment: Moment) -> Moment:
 
 
 def _cut(t: float, moment: Moment) -> Moment:
-    """Another vehicle's camera on another road, nearer to the left boundary, from one frame to the next."""
+    """Cut to another vehicle's camera on another road, nearer to the left boundary."""
     if t < _CUT_AT:
         return moment
     tag = "cut" if t < _CUT_AT + 0.02 else ""
@@ -125,7 +125,7 @@ def _truck(t: float, moment: Moment) -> Moment:
 
 
 def _unequal(t: float, moment: Moment) -> Moment:
-    """A lane half a metre narrower than its neighbours, as in towns."""
+    """Make a lane half a metre narrower than its neighbours, as in towns."""
     return replace(moment, places=PLACES + torch.tensor([0.1, 0.0, 0.25, -0.25, 0.0, -0.1]).double())
 
 
@@ -138,14 +138,14 @@ def _nothing(first: float, last: float) -> Callable[[float, Moment], Moment]:
 
 
 def _stuck(t: float, moment: Moment) -> Moment:
-    """From 1 s to 2 s the clock stands, then it is right again."""
+    """Stop the clock from 1 s to 2 s; then it is right again."""
     if not 1.0 <= t < 2.0:
         return replace(moment, dt=1.0 + 1 / 30 if round(30 * t) == 60 else moment.dt)
     return replace(moment, dt=0.0, tag="stuck")
 
 
 def _not_positive(t: float, moment: Moment) -> Moment:
-    """From 1 s on no frame is later than the one before: 0 and -1/30 s by turns."""
+    """Give no frame after 1 s a later time than the one before: 0 and -1/30 s by turns."""
     if t < 1.0:
         return moment
     return replace(moment, dt=-1 / 30 if round(30 * t) % 2 else 0.0)

@@ -104,7 +104,7 @@ def record(generated: Generated, seed: int) -> Recording:
 
 
 def _segments(drive: list[Moment], seed: int) -> LaneSegments:
-    """(T, N) segments in the pixels of the ideal camera."""
+    """Convert segments to (T, N) in the pixels of the ideal camera."""
     frames = [found for _, found in observe(drive, 1, SIGMA, SEGMENTS, seed, torch.float64)]
     return LaneSegments._make(torch.cat(parts) for parts in zip(*frames, strict=True))
 
@@ -146,7 +146,7 @@ def replay(calibrator: Calibrator[Any], recordings: Sequence[Recording]) -> Repl
 
 
 def _first_states(calibrator: Calibrator[Any], recordings: Sequence[Recording]) -> Any:
-    """Initial states, and in rows that resume another drive that drive's last state."""
+    """Return initial states; in rows that resume another drive, that drive's last state."""
     state = calibrator.initial_state(len(recordings), dtype=torch.float64)
     for row, recording in enumerate(recordings):
         if recording.resumed is not None:
@@ -168,7 +168,7 @@ def _repeated(state: Any, rows: int) -> Any:
 
 
 def _side_by_side(drives: Sequence[LaneSegments]) -> LaneSegments:
-    """R drives of (T, N) segments to (T, R, N), padded with weight 0."""
+    """Stack R drives of (T, N) segments to (T, R, N), padded with weight 0."""
     most = max(drive.weight.shape[1] for drive in drives)
 
     def padded(part: Tensor) -> Tensor:

@@ -50,7 +50,7 @@ class Difference(NamedTuple):
 
 
 def pose_rows(recording: Recording, replayed: Replayed, row: int) -> list[Row]:
-    """Rows of the file of one drive, every ``STEP``-th frame.
+    """Return rows of the file of one drive, every ``STEP``-th frame.
 
     ``segments`` is how many there are, ``mean_px`` the mean of their end points' coordinates: where these
     differ, it is the drive that changed and not the calibrator.
@@ -73,7 +73,7 @@ def pose_rows(recording: Recording, replayed: Replayed, row: int) -> list[Row]:
 
 
 def mount_rows(mounts: Sequence[MountCalibration], row: int) -> list[Row]:
-    """Rows of the mount estimator's file of one drive, every ``STEP``-th frame."""
+    """Return rows of the mount estimator's file of one drive, every ``STEP``-th frame."""
     return [
         {
             "frame": str(k),
@@ -92,7 +92,7 @@ def mount_rows(mounts: Sequence[MountCalibration], row: int) -> list[Row]:
 
 
 def _numbers(pose: Tensor, std: Tensor) -> Row:
-    """Pose and sigmas in degrees and cm; seven decimals are 1e-5 of the smallest sigma."""
+    """Return pose and sigmas in degrees and cm; seven decimals are 1e-5 of the smallest sigma."""
     named = dict(zip(POSE, (pose * pose.new_tensor(_UNITS)).tolist(), strict=True))
     sigmas = dict(zip(POSE, (std * std.new_tensor(_UNITS)).tolist(), strict=True))
     return {name: f"{value + 0.0:.7f}" for name, value in named.items()} | {
@@ -101,7 +101,7 @@ def _numbers(pose: Tensor, std: Tensor) -> Row:
 
 
 def _sigma_of(name: str) -> str:
-    """pitch_deg to pitch_std_deg."""
+    """Convert a name such as pitch_deg to pitch_std_deg."""
     return name.replace("_", "_std_")
 
 
@@ -145,7 +145,7 @@ def compare(rows: Sequence[Row], reference: Sequence[Row]) -> Difference:
 
 
 def _apart(new: str, old: str, sigma: float) -> float:
-    """Difference of two numbers in sigmas; infinite where one of them is not finite."""
+    """Compute the difference of two numbers in sigmas; infinite if one of them is not finite."""
     if new == old:
         return 0.0
     apart = abs(float(new) - float(old)) / sigma

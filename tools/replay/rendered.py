@@ -55,7 +55,7 @@ class Shock(NamedTuple):
 
 
 def _knocked(t: float) -> Pose:
-    """3° and 25 cm in 0.1 s, for good."""
+    """Return a knock of 3° and 25 cm in 0.1 s that stays."""
     share = min(max((t - _KNOCKED_AT) / 0.1, 0.0), 1.0)
     return moved((0.0, 0.0, 0.0, 0.0), KNOCK, share)
 
@@ -101,7 +101,7 @@ class ShockedDrive(Drive):
     shock: Shock | None = None
 
     def extrinsics_at(self, time: float) -> Extrinsics:
-        """True pose over the road at a time, each (1,)."""
+        """Return the true pose over the road at a time, each (1,)."""
         pose = super().extrinsics_at(time)
         if self.shock is None:
             return pose

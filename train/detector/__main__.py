@@ -79,7 +79,7 @@ def trained(experiment: Experiment, arm: Arm, seed: int, frames: DriveFrames) ->
 
 
 def scores(found: Centres, truth: Centres) -> list[dict[str, Any]]:
-    """Score by range."""
+    """Compute the scores by range."""
     return [{"range": span, **score_range(found, truth, *span)._asdict()} for span in RANGES]
 
 
@@ -126,7 +126,7 @@ def run(experiment: Experiment) -> None:
 
 @one_line_errors()
 def main(args: list[str] | None = None) -> None:
-    """Command line."""
+    """Run the command line."""
     given = experiment_parser(str(__doc__), "python -m train.detector").parse_args(args)
     run(experiment_of(given))
 

@@ -49,7 +49,7 @@ def visible_share(boxes: Tensor, valid: Tensor, view: Tensor) -> Tensor:
 
 
 def in_grid(boxes: Tensor, grid: BEVGrid) -> Tensor:
-    """Whether the centres of boxes (..., 5) fall into a cell, (...) bool."""
+    """Return whether the centres of boxes (..., 5) fall into a cell, (...) bool."""
     cell = grid.bev_from_road_points(boxes[..., :2]).round()
     rows, columns = grid.shape
     return (cell >= 0).all(-1) & (cell[..., 0] < columns) & (cell[..., 1] < rows)

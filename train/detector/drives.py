@@ -62,7 +62,7 @@ class ShakingDrive(Drive):
         self.shake = [SmoothNoise(sampler, a, *hz) for a, hz in zip(SHAKE, _SHAKE_HZ, strict=True)]
 
     def extrinsics_at(self, time: float) -> Extrinsics:
-        """True pose over the road at a time, each (1,)."""
+        """Return the true pose over the road at a time, each (1,)."""
         moves = (off + noise(time) for off, noise in zip(self.mount_error, self.shake, strict=True))
         return Extrinsics(*(a + b for a, b in zip(super().extrinsics_at(time), moves, strict=True)))
 
@@ -165,7 +165,7 @@ def calibrate_online(record: DriveRecord, lanes: LaneBEV, fps: float) -> tuple[T
 
 
 def has_vehicles(seed: int, frames: int, fps: float) -> bool:
-    """Whether a drive has some vehicles in the grid in its middle."""
+    """Return whether a drive has some vehicles in the grid in its middle."""
     frame = ShakingDrive(seed, image_size=(16, 32), num_frames=frames, fps=fps).frame(frames // 2)
     return int((frame.box_valid & in_grid(frame.boxes, GRID)).sum()) >= FEWEST
 
@@ -199,7 +199,7 @@ def read_drive(path: Path) -> DriveRecord:
 
 
 def _jpeg(image: Tensor) -> NDArray[np.uint8]:
-    """(3, H, W) in [0, 1] to bytes."""
+    """Encode (3, H, W) in [0, 1] as JPEG."""
     pixels = (image * 255).round().clamp(0, 255).byte().permute(1, 2, 0).numpy()
     coded: NDArray[np.uint8] = cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 94])[1]
     return coded.ravel()
@@ -207,7 +207,7 @@ def _jpeg(image: Tensor) -> NDArray[np.uint8]:
 
 @one_line_errors()
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--drives", type=PositiveInt, default=160)

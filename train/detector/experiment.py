@@ -109,7 +109,7 @@ def trained_arm(experiment: Experiment, arm: Arm, seed: int) -> DetectorTraining
 
 
 def test_poses(experiment: Experiment, module: DetectorTraining, frames: DriveFrames) -> Tensor:
-    """Poses (N, 4) that an arm tests with; those of a trained lane network are found anew, online."""
+    """Return the poses (N, 4) that an arm tests with; a trained lane network estimates its own, online."""
     if module.lanes is None:
         return arm_poses(module.arm, frames.frames)
     followed = [calibrate_online(record, module.lanes, experiment.fps)[0] for record in frames.records]

@@ -100,7 +100,7 @@ def _after_warm_up(state: JointState) -> JointState:
 
 
 def mirrored(frames: Frames) -> Frames:
-    """Swap left and right; the state of the calibration is left as it is."""
+    """Swap left and right; the state of the calibration is not changed."""
     flip = frames.extrinsics.new_tensor([1.0, -1.0, -1.0, 1.0])
     intrinsics = frames.intrinsics.clone()
     intrinsics[:, 0, 2] = frames.image.shape[-1] - 1 - intrinsics[:, 0, 2]

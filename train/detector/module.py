@@ -97,7 +97,7 @@ class DetectorTraining(L.LightningModule):
             self.lanes.eval()
 
     def _estimated(self, batch: Frames, lanes: LaneBEV) -> Tensor:
-        """Poses (B, 4) by the lane network as it is now, from the states before the frames."""
+        """Estimate the poses (B, 4) by the current lane network, from the states before the frames."""
         image, state = batch.image.float() / 255, batch.state
         width = batch.lane_width.to(state[0].dtype)
         out, _ = lanes(image, batch.intrinsics.double(), state, 1 / self.fps, width, truncation=1, bev=False)
@@ -105,7 +105,7 @@ class DetectorTraining(L.LightningModule):
         return poses
 
     def configure_optimizers(self) -> Any:
-        """One cycle of AdamW."""
+        """Return one cycle of AdamW."""
         groups = [{"params": self.detector.parameters(), "lr": self.learning_rate}]
         if self.lanes is not None:
             rate = self.lane_rate * self.learning_rate

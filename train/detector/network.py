@@ -53,14 +53,14 @@ class VehicleDetector(nn.Module):
         self.register_buffer("place", place, persistent=False)
 
     def features(self, image: Tensor) -> Tensor:
-        """(B, 3, H, W) in [0, 1] to features (B, C, h, w) of the rows from ``top`` on."""
+        """Compute features (B, C, h, w) of the rows from ``top`` on of images (B, 3, H, W) in [0, 1]."""
         taken: Tensor = self.trunk(image[:, :, self.top :] - 0.45)
         return taken
 
     def detect(
         self, features: Tensor, intrinsics: Tensor, extrinsics: Extrinsics, image_size: tuple[int, int]
     ) -> Tensor:
-        """Features to maps (B, 7, U, V).
+        """Convert features to maps (B, 7, U, V).
 
         Args:
             features: (B, C, h, w).
@@ -76,6 +76,6 @@ class VehicleDetector(nn.Module):
         return maps
 
     def forward(self, image: Tensor, intrinsics: Tensor, extrinsics: Extrinsics) -> Tensor:
-        """Image (B, 3, H, W) in [0, 1] to maps (B, 7, U, V)."""
+        """Convert images (B, 3, H, W) in [0, 1] to maps (B, 7, U, V)."""
         size = (image.shape[-2], image.shape[-1])
         return self.detect(self.features(image), intrinsics, extrinsics, size)

@@ -26,7 +26,7 @@ class Centres(NamedTuple):
 
 
 def match_centres(found: Centres, truth: Centres, distance: float) -> NDArray[np.int64]:
-    """Match what was found with the truth, best score first, each with the nearest that is left.
+    """Match found centres with true ones, best score first, each with the nearest that is left.
 
     Source: Caesar et al. 2020, "nuScenes", Sec. 4.1, and nuscenes-devkit ``eval/detection/algo.py``.
 

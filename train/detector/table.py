@@ -64,7 +64,7 @@ def spans_of(results: Results) -> list[tuple[float, float, int]]:
 
 
 def arm_table(results: Results) -> list[str]:
-    """Lines of AP over all ranges, what is won back, and the errors of pitch, yaw, roll and height."""
+    """Return lines of AP over all ranges, the recovered share, and the errors of the pose."""
     lines = [
         "| arm | AP 0.5 m | AP 1 m | AP 2 m | won back of AP 1 m | pose RMSE, ° and cm |",
         "|---|---|---|---|---|---|",
@@ -82,7 +82,7 @@ def arm_table(results: Results) -> list[str]:
 
 
 def range_table(results: Results) -> list[str]:
-    """Lines of AP at 1 m and of the mean error by range."""
+    """Return lines of AP at 1 m and of the mean error by range."""
     spans = spans_of(results)[1:]
     columns = [f"{kind} {low:g}–{high:g} m" for kind in ("AP 1 m,", "error m,") for low, high, _ in spans]
     lines = ["| arm | " + " | ".join(columns) + " |", "|---" * (1 + len(columns)) + "|"]
@@ -95,7 +95,7 @@ def range_table(results: Results) -> list[str]:
 
 
 def offset_table(true: list[dict[str, Any]], distance: float = 1.0) -> list[str]:
-    """Lines of AP with the true pose turned about one axis at a time."""
+    """Return lines of AP with the true pose rotated about one axis at a time."""
     lines = ["| axis | 0° | " + " | ".join(f"{d:g}°" for d in OFFSETS_DEG) + " |"]
     lines.append("|---" * (2 + len(OFFSETS_DEG)) + "|")
     for axis in AXES:
@@ -138,7 +138,7 @@ def plot_offsets(true: list[dict[str, Any]], path: Path) -> None:
 
 @one_line_errors()
 def main(args: list[str] | None = None) -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path, help="folder of results")
     parser.add_argument("--plot", type=Path, help="file of the plot of AP by the angle")

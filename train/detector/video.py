@@ -87,7 +87,7 @@ def write_film(experiment: Experiment, seed: int, path: Path, frames: int) -> No
 
 @one_line_errors()
 def main(args: list[str] | None = None) -> None:
-    """Command line."""
+    """Run the command line."""
     parser = experiment_parser(str(__doc__), "python -m train.detector.video")
     parser.add_argument("--film", type=Path, required=True, help="MP4 file")
     parser.add_argument("--film_seed", type=int, default=1, help="whose arms")

@@ -24,9 +24,9 @@ class Cluster:
     """Where tasks run.
 
     Attributes:
-        address: of a running Ray cluster, None for one on this machine that ends with the call.
+        address: address of a running Ray cluster; None starts one on this machine for this call.
         workers: tasks at a time on this machine, None for one a core.
-        retries: of a task that failed or whose worker died.
+        retries: retries of a task that failed or whose worker died.
         cpus: cores of a task.
         gpus: share of a GPU of a task.
         batch: drives of a task, whose frames the network looks at in one batch.

@@ -36,7 +36,7 @@ def collect_frames(drives: Sequence[Drive], out: str | Path) -> None:
     The columns are those of a run's Parquet file, and ``drive``. A file that is newer than the run stays.
 
     Args:
-        drives: that are finished.
+        drives: finished drives.
         out: folder of the fleet.
     """
     check_installed(["parquet"])

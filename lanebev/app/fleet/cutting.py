@@ -15,7 +15,7 @@ class Part(NamedTuple):
     """A part of a drive; times in s of the source.
 
     Attributes:
-        start: of its first frame.
+        start: time of its first frame.
         end: before which its last frame is; None is the end of the source.
     """
 

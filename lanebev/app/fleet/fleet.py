@@ -65,7 +65,7 @@ def fleet(
     Args:
         manifest: see :func:`lanebev.app.fleet.manifest.read_manifest`.
         out: folder; each drive's outputs go to ``drives/NAME`` in it.
-        cluster: where to run.
+        cluster: cluster to run on.
         root: folder that paths must not leave; None is the manifest's.
         again: try once more what failed in an earlier call.
         part_minutes: length of the parts of longer videos that the network looks at side by side; None cuts

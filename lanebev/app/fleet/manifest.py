@@ -33,9 +33,9 @@ class Drive:
     """A drive to run on.
 
     Attributes:
-        name: unlike that of all other drives; of its folder.
-        camera_id: of the camera, which may have taken many drives.
-        day: as 2026-03-01, or UNKNOWN_DAY.
+        name: unique name of the drive and of its folder.
+        camera_id: identifier of the camera, shared by all its drives.
+        day: date such as 2026-03-01, or UNKNOWN_DAY.
         time: when it began, as in ISO 8601; the day if no more is known; empty if nothing is.
         config: what to run, without the output folder.
     """
@@ -55,7 +55,7 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Driv
     and ``defaults``, settings of all drives. Relative paths begin at the manifest's folder.
 
     Args:
-        path: of the file; CSV if it ends so, else YAML.
+        path: path of the file; .csv is CSV, anything else YAML.
         root: folder that no path may leave, links resolved; None is the manifest's folder.
 
     Raises:

@@ -27,8 +27,8 @@ class DriveMount(NamedTuple):
     """The mount of a camera as estimated from one drive.
 
     Attributes:
-        name: of the drive.
-        time: as in ISO 8601; empty if it is not known.
+        name: name of the drive.
+        time: beginning of the drive in ISO 8601; empty if unknown.
         pose: (4,) rad, rad, rad, m, of this drive alone; NaN on an axis without evidence.
         std: (4,) its standard deviation.
         moved: (4,) whether the camera was moved in this drive or since the one before, axis by axis.

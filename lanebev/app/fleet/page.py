@@ -45,7 +45,7 @@ class CameraMounts:
 
     Attributes:
         camera_id: its name.
-        mounts: of each drive, in order of time.
+        mounts: mounts of each drive, in order of time.
         stretches: between the camera's moves.
     """
 

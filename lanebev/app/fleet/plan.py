@@ -22,9 +22,9 @@ class Task:
     """A run on a drive, or the network alone on a part of it.
 
     Attributes:
-        name: of the drive; of a part of it, with its number.
+        name: name of the drive; for a part of it, followed by its number.
         config: what to run, and the folder to write.
-        fingerprint: of settings and files, to know whether it is done.
+        fingerprint: fingerprint of settings and files, which tells whether it is done.
         parts: what the network is to look at before, if the drive is cut.
         is_part: whether it is one of those.
     """
@@ -46,10 +46,10 @@ class Outcome:
     """Result of a task.
 
     Attributes:
-        name: of the drive.
+        name: name of the drive.
         failure: why it failed, in a line; empty if it did not.
-        frames: of the drive.
-        seconds: that the run took.
+        frames: number of frames of the drive.
+        seconds: duration of the run.
         is_final: a failure that the same files and settings would have again.
     """
 
@@ -69,7 +69,7 @@ def tasks_of(drives: Sequence[Drive], out: str | Path, length: float | None = No
     """Return the task of each drive by its name, with parts where a video is cut.
 
     Args:
-        drives: of the manifest.
+        drives: drives of the manifest.
         out: folder of the fleet.
         length: s of a part, None to cut nothing. Drives with lanes of their own need no network, and are not
             cut.

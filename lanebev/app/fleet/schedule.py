@@ -11,7 +11,7 @@ class Schedule:
     """The drives that are to be run.
 
     Args:
-        tasks: of the drives. Of their parts, those that are not done are begun first.
+        tasks: tasks of the drives. Unfinished parts of drives start first.
     """
 
     def __init__(self, tasks: Sequence[Task]) -> None:

@@ -87,11 +87,11 @@ class _Model(NamedTuple):
     """R fits to compute: rows of observations and the assumptions of each.
 
     Attributes:
-        seen: of R rows.
+        seen: observations of R rows.
         member: (R, M, L) one-hot boundary of each end point.
         places: (R, L) m, of the boundaries from the ego lane's middle.
         std: (R, 2 L + 1) of their deviations (m), headings (rad), and of the road's vertical curvature (1/m).
-        prior: of the frame.
+        prior: prior of the frame.
     """
 
     seen: Observations
@@ -129,9 +129,9 @@ def weigh_readings(
     """Average the pose of every row that has started over all ways to read its image.
 
     Args:
-        calibration: of the likeliest reading.
+        calibration: calibration of the likeliest reading.
         mean: (B, D) of the filter's state with that frame.
-        segments: of the frame, usable.
+        segments: segments of the frame, usable.
         intrinsics: (B, 3, 3) px.
         lane_width: (B, L-1) m.
         cfg: the numbers.
@@ -173,7 +173,7 @@ def average_readings(
         start: (B, 7) parameters near the likeliest reading.
         seen: what was observed.
         positions: (B, L) m, of the boundaries from the ego lane's middle, by the lane widths.
-        prior: of the frame.
+        prior: prior of the frame.
         straight: 1/m and 1/m², sigmas of c0 and c1 of a straight road.
         bends: how probable a bend is; its sigmas are those of ``prior``.
         cfg: the numbers of the readings.

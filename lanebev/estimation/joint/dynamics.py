@@ -35,7 +35,7 @@ class MotionConfig:
         unobserved_scale: least factor on these where the last frame did not determine an angle or the height.
         mean_angle_walk: rad/√s, of the slow mean.
         mean_height_walk: m/√s.
-        offset_density: of the lateral acceleration, m²/s³.
+        offset_density: spectral density of the lateral acceleration, m²/s³.
         offset_memory: s, of the lateral velocity.
         curvature_walk: 1/m/√s, of every knot.
         curvature_step: 1/m, sigma of a step that comes into view.

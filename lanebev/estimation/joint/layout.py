@@ -26,9 +26,9 @@ class Layout(NamedTuple):
     Attributes:
         observed: pose, offset, shape, deviations.
         deviations: m.
-        rates: of pitch, yaw, roll, height and offset, per s.
-        accelerations: of the pose, per s².
-        jerks: of the pose, per s³.
+        rates: rates of pitch, yaw, roll, height and offset, per s.
+        accelerations: accelerations of the pose, per s².
+        jerks: jerks of the pose, per s³.
         means: slow mean of the pose.
         speed: m/s, above ``MotionConfig.speed``.
         size: D.

@@ -25,7 +25,7 @@ class ReadingConfig:
             differ by half a metre.
         askew: rad, likewise, of a boundary's heading against the road's.
         profile: 1/m, likewise, of the road's vertical curvature.
-        share: of the kinds of road, before looking.
+        share: prior probability of the kinds of road, before looking.
         no_boundary: probability that a line bounds no lane: a kerb, an arrow, a cycle path.
         another: probability that the next one doesn't either.
         anywhere: m and rad, of the place and the heading of such a line.

@@ -112,7 +112,7 @@ def is_contrary(
     Args:
         state: after the frame.
         begun: the state that would start from the frame.
-        fit: of the frame.
+        fit: fit of the frame.
         places: (B, N) m, of the segments' boundaries on equal lanes.
         seen: what was observed.
         cfg: the numbers.

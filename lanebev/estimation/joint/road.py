@@ -117,7 +117,7 @@ def straight_or_bend(
         cov: (B, 7, 7).
         straight: (2,) 1/m and 1/m², sigmas of c0 and c1 of a straight road.
         bend: (2,), those of a bend, larger, which the fit had for a prior.
-        share: of roads that are bends, before looking.
+        share: prior probability of roads that are bends, before looking.
 
     Returns:
         mean (B, 7) and covariance (B, 7, 7).

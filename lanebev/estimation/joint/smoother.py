@@ -139,7 +139,7 @@ def smooth_drive(
     filter gave them; so is the last frame before a new start.
 
     Args:
-        calibrations: of every frame, in order, as the calibrator gave them.
+        calibrations: calibrations of every frame, in order, as the calibrator gave them.
         states: after every frame, best in float64.
         dt: (T, B), or (B,) for each frame: s from the frame before, as the calibrator was given it.
         cfg: the calibrator's.
@@ -167,7 +167,7 @@ def smoothed_calibration(calibration: Calibration, state: JointState, smoothed: 
     What the calibration's covariance has beside the filter's, as for lanes that differ, stays.
 
     Args:
-        calibration: of the frame, as the calibrator gave it.
+        calibration: calibration of the frame, as the calibrator gave it.
         state: after the frame.
         smoothed: that state, smoothed.
     """

@@ -48,7 +48,7 @@ class JointConfig:
         assumed_dt: s between frames where it is not finite, or the clock jumped back by more than a second.
         restart_after: s of segments that don't fit before the search starts over.
         lost_after: s without support.
-        readings: of images on their own, how roads and detectors differ from what is assumed.
+        readings: readings of images on their own, how roads and detectors differ from what is assumed.
         doubt_frames: after a jump or a misfit, that are compared, each by itself, with the state.
         contrary_frames: usable frames in a row that have to contradict it.
     """

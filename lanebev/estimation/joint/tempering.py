@@ -17,7 +17,7 @@ def temper_frame(pose: Tensor, covariance: Tensor, prior: FramePrior, factor: fl
     Args:
         pose: (B, 4) pitch, yaw, roll (rad), height (m), with the prior in it.
         covariance: (B, 4, 4).
-        prior: of the frame.
+        prior: prior of the frame.
         factor: on the standard deviations, at least 1.
 
     Returns:

@@ -17,16 +17,16 @@ class MountConfig:
         needed: blocks for a valid estimate.
         lower, upper: validity limits of the mount.
         margin: hysteresis of the limits.
-        largest_std: of the fast pose, for a frame to be used on that axis.
+        largest_std: largest standard deviation of the fast pose, for a frame to be used on that axis.
         block_std: expected scatter of blocks, worth ``prior_blocks`` blocks of evidence.
         prior_blocks: see above.
-        block_correlation: of neighbouring blocks, which slow motion shares.
+        block_correlation: correlation of neighbouring blocks, which slow motion shares.
         prior_pose, prior_std: before anything is seen.
         moved_least: smallest change that counts as a moved camera.
         moved_sigmas: and it must exceed so many sigmas of a block.
         moved_blocks: in so many blocks in a row that agree.
         blend_steps: accepted frames over which a new estimate takes over from the old.
-        drift_std: of the mount's random walk, per square root of an hour without a new block.
+        drift_std: std of the mount's random walk, per square root of an hour without a new block.
         stale_time: s without a new block after which an axis is reported as stale.
         min_speed: m/s.
         max_yaw_rate: rad/s.

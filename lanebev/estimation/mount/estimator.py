@@ -76,8 +76,8 @@ class MountEstimator(nn.Module):
         """Take in one frame, computed in the state's dtype.
 
         Args:
-            calibration: of this frame, from any calibrator.
-            state: of the frame before, or :meth:`initial_state`.
+            calibration: calibration of this frame, from any calibrator.
+            state: state of the frame before, or :meth:`initial_state`.
             dt: s since that frame, float or (B,).
             speed: (B,) m/s of the vehicle, or None if not known.
             yaw_rate: (B,) rad/s of the vehicle, or None.

@@ -30,9 +30,9 @@ def describe_mount(mounted: MountCalibration, config: MountConfig | None = None,
     """Describe the mount, a sentence for each axis: whether it is calibrated, or what it still needs.
 
     Args:
-        mounted: of any batch size.
-        config: of the estimator; None is the default.
-        row: of the batch.
+        mounted: mount estimate of any batch size.
+        config: config of the estimator; None is the default.
+        row: row of the batch.
 
     Returns:
         four sentences, of pitch, yaw, roll and height, such as "roll: needs 20 s of straight driving with two

@@ -60,7 +60,7 @@ def track_direction(
         segments: cleaned, see :func:`lanebev.estimation.checks.clean_segments`.
         rays: (B, N, 2, 3) of the end points.
         intrinsics: (B, 3, 3).
-        state: of the frame before.
+        state: state of the frame before.
         dt: (B,) s.
         draws: (N_loop, 2), see :func:`lanebev.estimation.two_stage.vanishing.segment_pairs`.
         cfg: the numbers.

@@ -232,8 +232,8 @@ def initial_roll_height(
         lane_width: (B, L-1) m, the prior.
         roll_guess: (B,) rad, the middle of the search, and the answer where roll is not observable.
         search_range: rad to either side.
-        num_steps: of the search.
-        num_iterations: of Gauss-Newton.
+        num_steps: number of steps of the search.
+        num_iterations: number of Gauss-Newton steps.
 
     Returns:
         roll (B,) rad and height (B,) m. Height is 1 where no lane is present.

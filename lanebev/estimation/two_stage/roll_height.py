@@ -59,7 +59,7 @@ def track_roll_height(
         boundaries: angles about the direction of stage 1.
         lane_width: (B, L-1) m, the prior.
         direction_cov: (B, 2, 2) of pitch and yaw.
-        state: of the frame before.
+        state: state of the frame before.
         dt: (B,) s.
         fresh: (B,) bool, stage 1 started over.
         cfg: the numbers.

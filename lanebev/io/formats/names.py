@@ -12,9 +12,9 @@ class FormatName(NamedTuple):
 
     Attributes:
         file: its name in a run's folder.
-        module: of this package, with a function ``write``.
+        module: module of this package with a function ``write``.
         needs: modules that must be installed.
-        extra: of lanebev's, which brings them.
+        extra: extra of lanebev that installs them.
     """
 
     file: str

@@ -28,7 +28,7 @@ class StandingPose:
 
     Attributes:
         extrinsics: each (1,), float64.
-        source: where it is from, in words.
+        source: origin of the pose, in words.
     """
 
     extrinsics: Extrinsics
@@ -39,7 +39,7 @@ class RecordedFrame(NamedTuple):
     """A frame's results.
 
     Attributes:
-        row: of ``extrinsics.csv``.
+        row: row of ``extrinsics.csv``.
         pose: each (1,), float64.
         lines: boundaries as fitted; empty if they are not known.
     """
@@ -54,8 +54,8 @@ class RunRecord:
     """A run's results.
 
     Attributes:
-        name: of the run, for titles.
-        rows: of ``extrinsics.csv``, a frame each.
+        name: name of the run, for titles.
+        rows: rows of ``extrinsics.csv``, a frame each.
         covariances: (N, 4, 4) of pitch, yaw, roll (rad) and height (m), a frame each; NaN where not known.
         lanes: boundaries as fitted, a frame each; None if they are not known.
         camera: the lens, None if it is not known.
@@ -123,7 +123,7 @@ def with_images(
     """Return every frame's results with its image (H, W, 3) RGB; None where there is none.
 
     Args:
-        record: of the run.
+        record: record of the run.
         images: frames of the run's source, by rising number; some may be missing.
     """
     pictures = iter(images or ())

@@ -17,7 +17,7 @@ def gaussian_blur(image: Tensor, std: Tensor, largest: float) -> Tensor:
     Args:
         image: (B, C, H, W).
         std: (B,) px; 0 leaves a row as it is.
-        largest: of ``std``, px, on the host.
+        largest: largest value of ``std``, px, on the host.
     """
     reach = max(1, round(_REACH * largest))
     place = torch.arange(reach + 1, device=image.device, dtype=image.dtype)

@@ -132,7 +132,7 @@ def add_lights(
     Args:
         radiance: (B, 3, H, W) linear.
         blocked: (B, H, W) m, Z of the nearest thing that is not the road.
-        lights: of the night.
+        lights: lights of the night.
         sprites: the lights.
         lens: the cameras.
         view: the pixels' rays.

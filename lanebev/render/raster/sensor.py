@@ -35,7 +35,7 @@ def take_image(
 
     Args:
         painted: B views.
-        scene: of the views.
+        scene: scene of the views.
         host: the same on the host, where it is read which rows have what.
         features: what the scenes have.
         generators: B of them, of rain and noise, on the views' device.

@@ -41,7 +41,7 @@ def sky_radiance(
     """Compute the linear radiance of sky and hills, (B, 3, N).
 
     Args:
-        surroundings: of the road.
+        surroundings: surroundings of the road.
         azimuth: (B, N) rad in the world, right positive.
         rise: (B, N) tangent of the elevation.
         sun: (B, N) cosine of the angle to the sun, below -1 where there is none.

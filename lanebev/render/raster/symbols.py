@@ -20,7 +20,7 @@ def symbols(layout: Layout, ground: Ground, lane: Tensor) -> Tensor:
     """Compute the coverage of a pixel by symbols, (B, N).
 
     Args:
-        layout: of the road; the symbol of lane k stands between boundaries k and k + 1.
+        layout: layout of the road; the symbol of lane k stands between boundaries k and k + 1.
         ground: the points.
         lane: (B, N) int64, number of boundaries to their left.
     """

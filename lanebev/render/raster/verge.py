@@ -15,7 +15,7 @@ def verge_albedo(surroundings: Surroundings, ground: Ground, patches: Tensor) ->
     """Compute the linear reflectance of the ground beside the pavement, (B, 3, N).
 
     Args:
-        surroundings: of the road.
+        surroundings: surroundings of the road.
         ground: the points.
         patches: (B, N) slow noise.
     """

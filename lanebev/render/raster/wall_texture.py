@@ -28,7 +28,7 @@ def wall_texture(
     Args:
         wall: (B,) of them.
         kind: CONCRETE, RAIL, TREES, FENCE, SLOPE, HEDGE or HOUSES.
-        style: of trees: a dense row, single crowns or conifers.
+        style: style of trees: a dense row, single crowns or conifers.
         along: (B, N) m in the world.
         up: (B, N) m above the road.
         footprint: (B, N) m per pixel.

@@ -111,8 +111,8 @@ class RoadPoint(NamedTuple):
     Attributes:
         along: m, arc length from the camera's foot.
         across: m, right of the centreline through the camera's foot.
-        sin: of the road's heading there.
-        cos: of the road's heading there.
+        sin: sine of the road's heading there.
+        cos: cosine of the road's heading there.
         curvature: 1/m.
     """
 
@@ -268,7 +268,7 @@ def wall_hit(table: WallTable, ray_x: Tensor) -> tuple[Tensor, Tensor]:
     """Compute where rays meet a wall.
 
     Args:
-        table: of the walls.
+        table: table of the walls.
         ray_x: (B, N) the ray's move to the right per metre forward.
 
     Returns:

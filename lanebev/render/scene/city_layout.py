@@ -36,7 +36,7 @@ def sample_city_layout(sampler: BatchSampler, base: Layout) -> tuple[Layout, Ten
 
     Args:
         sampler: the randomness.
-        base: of the same batch; gives what streets share with highways.
+        base: layout of the same batch; gives what streets share with highways.
 
     Returns:
         the layout; (B,) int64 the ego lane, the own direction's first lane, and its number of lanes.

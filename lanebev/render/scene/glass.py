@@ -29,7 +29,7 @@ class Glass(NamedTuple):
         stamp: strength of a burnt-in text.
         text: (B, T) int64, its letters.
         stamp_place: (B, 2) share of the width and of the height where it begins.
-        stamp_height: of a letter, share of the image's height.
+        stamp_height: height of a letter, share of the image's height.
         stamp_colour: (B, 3).
         stamp_outline: strength of a dark rim of the letters.
         chroma: share of the colour's detail that is lost.

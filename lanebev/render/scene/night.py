@@ -44,7 +44,7 @@ class Lights(NamedTuple):
         spot_size: (B, S) rad.
         spot_colour: (B, S, 3).
         halo: strength of the glare about lights.
-        halo_size: of the image's width.
+        halo_size: fraction of the image's width.
         streak: strength of a line of glare through each light, and its direction, rad, (B, 2).
         mirror: strength of lights mirrored in a wet road.
         smear: m that the road moves while the shutter is open.

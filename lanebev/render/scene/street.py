@@ -61,7 +61,7 @@ class Street(NamedTuple):
         cuts: probability of a sealed cut in 23 m of a lane.
         weeds: strength of weeds along the kerb.
         paint: (B, 3) linear reflectance.
-        opacity: of the paint.
+        opacity: opacity of the paint.
         wear: [0, 1].
     """
 

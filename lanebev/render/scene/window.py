@@ -60,7 +60,7 @@ def window_from_native(
 
     Args:
         sampler: the randomness.
-        config: of the windows.
+        config: config of the windows.
         scale: (B,) the windows' width as a share of the native image's.
         size: (height, width) of the native image and of the window, px.
         vanishing_point: (B, 2) px of the native image as taken.

@@ -57,7 +57,7 @@ class World(NamedTuple):
         shade: (B,) strength of tree shadows on the road.
         kinds: what each world has besides the plain road.
         street: what a city street has.
-        lights: of the night.
+        lights: lights of the night.
         glass: faults of windscreen, lens and recorder.
         winter: snow on the ground.
         works: old lines at road works.
