@@ -1,4 +1,4 @@
-"""Embed lanebev in a network: its features become a bird's-eye view by the pose that the same image shows."""
+"""Embed lanebev in a network: resample its features to a bird's-eye view by the pose from the same image."""
 
 import torch
 from torch import nn

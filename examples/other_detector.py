@@ -1,4 +1,4 @@
-"""Calibrate by the lane boundaries of another detector: polylines in pixels, frame by frame."""
+"""Calibrate with the lane boundaries of another detector: polylines in pixels, frame by frame."""
 
 import numpy as np
 

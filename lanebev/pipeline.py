@@ -53,16 +53,15 @@ class LaneBEV(nn.Module):
             (H, W) of the image and (h, w) of the network's input, and returns vertices in the image's pixels.
         calibrator: e.g. :class:`lanebev.JointCalibrator`.
         warp: default :class:`BEVWarp` on the default grid.
-        network_width: px, the image is resized to this width, its aspect kept to the nearest multiple of 32,
-            before the segmenter; None leaves it as it is.
+        network_width: width, px, to which the image is resized for the segmenter; the height follows by the
+            aspect ratio, rounded to a multiple of 32. None does not resize.
         pose_sigma_scale: factor on the standard deviations of the pose; None takes the segmenter's
             (:class:`SegmenterConfig`), or 1 where it has none.
-        frozen: those of STAGES that do not learn and let no gradient through: they stay in evaluation mode,
-            and no graph is kept of what they compute. With all but the warp frozen, the view is still
-            differentiable in the image.
+        frozen: names of STAGES without training and gradients: they stay in evaluation mode, and no graph of
+            them is kept. With all but the warp frozen, the view is still differentiable in the image.
 
     Raises:
-        ValueError: segmenter and calibrator that number other boundaries, or a stage that does not exist.
+        ValueError: segmenter and calibrator have different numbers of boundaries, or a stage does not exist.
     """
 
     def __init__(
@@ -163,17 +162,17 @@ class LaneBEV(nn.Module):
         Args:
             image: (B, 3, H, W) or (B, T, 3, H, W), RGB in [0, 1], as taken.
             intrinsics: (B, 3, 3) px.
-            state: of the frame before; its dtype is the calibration's. None starts anew in the dtype of the
-                intrinsics, float32 at least.
+            state: state after the frame before; its dtype is the calibration's. None starts a drive in the
+                dtype of the intrinsics, at least float32.
             dt: s since the frame before: float, (B,) or, with T frames, (B, T).
             lane_width: m: float, (B,) or (B, L-1).
             distortion: (B, D) of the lens, or None.
             model: "pinhole", "fisheye" or "omni".
-            reset: (B,) or, with T frames, (B, T) bool: rows whose frame is the first of another drive, which
-                are begun anew; (B,) speaks of the first frame.
-            truncation: frames over which gradients go back through the state: it is detached before every
-                such frame, the first included. None keeps the graph of all frames, also of earlier calls.
-            bev: whether to resample the image; a detector that warps its own features only needs no RGB view.
+            reset: (B,) or, with T frames, (B, T) bool: in these rows the frame is the first of another drive
+                and the state is reset; (B,) applies to the first frame.
+            truncation: number N of frames over which gradients flow through the state: it is detached before
+                the first and then every N-th frame. None keeps the whole graph, also of earlier calls.
+            bev: whether to resample the image; a detector that warps only its own features needs no view.
 
         Returns:
             the output, every tensor with (B, T, ...) where the image has T, and the state after it.

@@ -32,8 +32,8 @@ from lanebev.view.grid import BEVGrid
 logger = logging.getLogger(__name__)
 
 FIRST_DT = 1 / 30  # s before a first frame: it has no frame before
-_LONG_DT = 5.0  # s; steps that are all longer are hardly seconds
-_LOOKED_AT = 5  # steps that are looked at for that
+_LONG_DT = 5.0  # s; if all steps are longer, the stamps are probably not seconds
+_LOOKED_AT = 5  # number of steps that are checked for that
 
 
 class SessionResult(NamedTuple):
@@ -44,9 +44,9 @@ class SessionResult(NamedTuple):
         dt: s since the frame before.
         extrinsics: pitch, yaw, roll (rad) and height (m), each (1,).
         std: their standard deviations, each (1,), in the same units.
-        status: what the pose is worth.
-        reasons: why the pose is not (fully) determined, or the input is doubtful, in words.
-        mount: the slow estimate of how the camera is mounted.
+        status: status of the pose.
+        reasons: why the pose is not, or not fully, determined, or the input is doubtful, in words.
+        mount: the current mount estimate.
         mount_needs: what the mount estimate still needs, a sentence for each axis.
         calibration: pose, covariance, status and inliers as the calibrator gives them.
         bev: (U, V, 3) bytes in the frame's order of colours, or None.
@@ -69,19 +69,19 @@ class SessionResult(NamedTuple):
 class Session:
     """Calibrate a camera live, frame by frame.
 
-    ``session(frame, stamp)`` computes the time step, runs network and calibrator, follows the mount and warps
-    the frame. A frame that cannot be used gives a result that says why; it raises only for arguments that are
-    wrong in every frame.
+    ``session(frame, stamp)`` computes the time step, runs network and calibrator, updates the mount estimate
+    and computes the bird's-eye view. If a frame cannot be used, the result says why; an exception means that
+    the arguments are wrong for every frame.
 
     Args:
         camera: the lens.
         model: network and calibrator; None is :meth:`LaneBEV.from_pretrained`, loaded with the first frame.
-        calibrator: in place of the model's; None is a :class:`lanebev.JointCalibrator`.
+        calibrator: used instead of the model's; None is a :class:`lanebev.JointCalibrator`.
         lane_width: m.
         grid: grid of the bird's-eye view; None for no view.
         colours: order of a frame's channels: "bgr" as OpenCV reads them, or "rgb".
-        focal_std: standard deviation of the focal length as a share of it, which widens the pose's.
-        polyline_sigma: px, standard deviation across their lines of the polylines that are given.
+        focal_std: standard deviation of the focal length as a fraction of it; the pose's contain its effect.
+        polyline_sigma: standard deviation of given polylines across their lines, px.
         device: device of the network; the filter runs on the CPU.
 
     Raises:
@@ -118,7 +118,7 @@ class Session:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything, as for another drive with another camera."""
+        """Reset the state, as for another drive with another camera."""
         self.tracker: Tracker[Any] = Tracker(*self._parts)
         self._stamp: float | None = None
         self._steps: list[float] = []
@@ -131,15 +131,16 @@ class Session:
         polylines: Sequence[ArrayLike | Tensor] | Mapping[int, ArrayLike | Tensor] | None = None,
         speed: float | None = None,
     ) -> SessionResult:
-        """Take in one frame.
+        """Process one frame.
 
         Args:
             frame: (H, W, 3) bytes in the order of ``colours``, or a tensor (3, H, W) of bytes or in [0, 1];
                 None if only polylines are given, or for a frame that was lost.
-            stamp: s, of any epoch; None assumes that the step is as the one before.
-            polylines: lane boundaries that another detector drew, see :meth:`LaneSegments.from_polylines`;
-                the network is not used then.
-            speed: m/s of the vehicle, if it is known: below walking pace nothing is learnt of the mount.
+            stamp: time, s, of any epoch; None assumes the time step of the frame before.
+            polylines: lane boundaries of another detector, used instead of the network; see
+                :meth:`LaneSegments.from_polylines`.
+            speed: speed of the vehicle, m/s, if known; below ``MountConfig.min_speed`` the mount estimate is
+                not updated.
 
         Raises:
             TypeError: a frame that is neither an array nor a tensor, or a stamp that is no number.
@@ -174,7 +175,7 @@ class Session:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the state to a file, from which :meth:`load` goes on exactly.
+        """Write the state to a file, from which :meth:`load` continues exactly.
 
         Raises:
             OSError: the file cannot be written.

@@ -54,7 +54,7 @@ class Status(IntEnum):
     UNINITIALISED = 0  # nothing has been seen yet: the extrinsics are the initial guess
     TRACKING = 1  # this frame's observations were used
     COASTING = 2  # nothing usable in this frame: predicted from earlier ones
-    LOST = 3  # too long without support: the extrinsics are the last that were believed
+    LOST = 3  # too long without usable boundaries: the extrinsics are the last ones that could be trusted
 
 
 @register_pytree
@@ -98,8 +98,8 @@ class Extrinsics(NamedTuple):
 
             camera_from_road[:3, :3] = R_x(θ) R_y(φ) R_z(ψ),
 
-        with the pitch θ, the yaw φ and the roll ψ, each R the right-handed rotation of a vector about an axis
-        that stays. Differentiable.
+        with the pitch θ, the yaw φ and the roll ψ, each R the right-handed rotation of a vector about a fixed
+        axis. Differentiable.
         """
         return camera_from_road_matrix(*self)
 
@@ -120,7 +120,7 @@ class Extrinsics(NamedTuple):
         return intrinsics.to(camera_from_road.dtype) @ camera_from_road[..., :3, :]
 
     def rvec_tvec(self) -> tuple[Tensor, Tensor]:
-        """Return the pose as OpenCV wants it, for points of the road's frame.
+        """Return the pose in OpenCV's form, for points of the road's frame.
 
         Returns:
             rotation vector (B, 3) rad and translation (B, 3) m of :meth:`camera_from_road`, as
@@ -163,7 +163,7 @@ class Calibration(NamedTuple):
         extrinsics: pitch, yaw, roll, height, each (B,).
         covariance: (B, 4, 4) of (pitch, yaw, roll, height).
         status: (B,) int64, values of :class:`Status`.
-        inliers: (B, N) in [0, 1], how far each segment was believed.
+        inliers: (B, N) in [0, 1], weight of each segment as an inlier.
     """
 
     extrinsics: Extrinsics
@@ -174,8 +174,8 @@ class Calibration(NamedTuple):
     def with_std_scaled(self, factor: float) -> Calibration:
         """Return the calibration with all standard deviations times ``factor``.
 
-        A filter takes the errors of two frames as independent, but a network repeats its own: its errors are
-        correlated over frames and do not average out. Source: covariance inflation (Anderson and Anderson
-        1999); Guo et al. 2017 scale a network's probabilities alike.
+        A filter takes the errors of two frames as independent, but a network's errors are correlated over
+        frames and do not average out. Source: covariance inflation (Anderson and Anderson 1999); Guo et al.
+        2017 scale a network's probabilities in the same way.
         """
         return self._replace(covariance=factor**2 * self.covariance)

@@ -23,7 +23,7 @@ import torch
 from lanebev.app.build import make_network
 from lanebev.app.config import RunConfig
 from lanebev.app.demo import write_drive
-from lanebev.app.look import look
+from lanebev.app.part_observation import observe_part
 from lanebev.app.run import run
 from lanebev.app.shared_network import SharedNetwork
 from lanebev.numbers import parse_size
@@ -84,8 +84,8 @@ def measure(config: RunConfig, folder: Path) -> FrameCost:
     network = SharedNetwork(make_network(config.weights, config.device))
     seen = folder / "seen.json"
     warm = replace(config, end=config.start + 0.5)
-    look(warm, folder / "warm.json", network)
-    count, looked = _timed(lambda: look(config, seen, network))
+    observe_part(warm, folder / "warm.json", network)
+    count, looked = _timed(lambda: observe_part(config, seen, network))
     seconds = []
     for number, no_video in enumerate((True, True, False)):  # the first warms up
         own = replace(config, out=str(folder / f"{number}"), formats=("parquet",), no_video=no_video)

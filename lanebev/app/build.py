@@ -88,7 +88,7 @@ def _tracker(calibrator: Calibrator[StateT], config: RunConfig, camera: Camera) 
 
 
 def needs_network(config: RunConfig) -> bool:
-    """Return whether a run looks at images by torch's network."""
+    """Return whether a run uses the network in PyTorch."""
     return config.lanes is None and config.backend == "torch"
 
 

@@ -23,7 +23,7 @@ OK, DOUBT, WRONG = 0, 1, 2
 _WORDS = ("ok", "doubt", "wrong")
 _SAMPLED = 40  # frames
 _SECONDS = 120.0  # of a source, from which they are taken
-_FIELD_OF_VIEW = (25.0, 130.0)  # degrees across, of cameras that look at a road
+_FIELD_OF_VIEW = (25.0, 130.0)  # degrees, horizontal, of cameras in cars
 _OFF_CENTRE = 0.1  # of the image's sides, between its centre and the principal point
 _GAP = 3.0  # times the usual interval
 _LEAST_VERTICES = 4  # of a boundary that is seen
@@ -78,20 +78,22 @@ def doctor(config: RunConfig, progress: Progress | None = None) -> tuple[str, in
     findings = [check_size(camera, source.image_size)]
     if findings[0].level != WRONG:
         findings += [check_field_of_view(camera), check_centre(camera)]
-        sample = look(config, source, camera, progress)
+        sample = sample_frames(config, source, camera, progress)
         findings += [check_times(sample), check_lanes(sample), check_pose(sample)]
     level = max(finding.level for finding in findings)
     lines = [f"{_WORDS[finding.level]:<6} {finding.words}" for finding in findings]
     verdict = (
-        "all is well",
-        "a run will do, but look at what is doubtful",
-        "a run would refuse this camera, or be wrong by it",
+        "all checks passed",
+        "a run is possible, but check what is doubtful",
+        "a run would refuse this camera or give wrong results",
     )[level]
     return "\n".join([*lines, f"{config.source}: {verdict}"]), level
 
 
-def look(config: RunConfig, source: FrameSource, camera: Camera, progress: Progress | None) -> Sample:
-    """Let the network look at some frames, each on its own: the first ones of a stream, else spread out."""
+def sample_frames(
+    config: RunConfig, source: FrameSource, camera: Camera, progress: Progress | None
+) -> Sample:
+    """Run the network on some single frames: the first ones of a stream, else evenly spread ones."""
     count = _SAMPLED if source.is_live else min(source.count, round(_SECONDS * float(source.fps)))
     every = 1 if source.is_live else max(1, count // _SAMPLED)
     if not source.is_live:
@@ -118,12 +120,12 @@ def check_size(camera: Camera, image_size: tuple[int, int]) -> Finding:
     """Compare the camera's image size with the source's, (height, width) px."""
     (height, width), (rows, columns) = camera.image_size, image_size
     if camera.image_size == image_size:
-        return Finding(OK, f"size: {columns} x {rows} px, as the camera's")
+        return Finding(OK, f"size: {columns} x {rows} px, as in the camera file")
     got = f"size: the images are {columns} x {rows} px, the camera is for {width} x {height}"
     if abs(columns * height - rows * width) <= max(width, height):
         remedy = f"the same shape: give Camera.scaled(({rows}, {columns})) if the images were resized"
     else:
-        remedy = "another shape: the images were cropped, or are another camera's"
+        remedy = "another shape: the images were cropped or come from another camera"
     return Finding(WRONG, f"{got}; {remedy}")
 
 
@@ -158,20 +160,20 @@ def check_centre(camera: Camera) -> Finding:
     words = f"principal point: {right:+.0f} px right of the centre, {down:+.0f} px below it"
     if abs(right) <= _OFF_CENTRE * width and abs(down) <= _OFF_CENTRE * height:
         return Finding(OK, words)
-    return Finding(DOUBT, f"{words}: right only if the images were cropped")
+    return Finding(DOUBT, f"{words}: plausible only if the images were cropped")
 
 
 def check_times(sample: Sample) -> Finding:
     """Check if time stamps advance evenly and frames decode."""
     if sample.undecoded:
-        words = f"frames: {sample.undecoded} of {len(sample.boundaries)} that were looked at do not decode"
+        words = f"frames: {sample.undecoded} of {len(sample.boundaries)} do not decode"
         return Finding(DOUBT, words)
     longest = max(sample.steps, default=1.0)
     usual = float(np.median(sample.steps)) if sample.steps else 1.0
     if longest > _GAP * usual:
         return Finding(DOUBT, f"times: a gap of {longest / usual:.0f} times the usual interval")
     if not 0.8 < usual < 1.25:
-        return Finding(DOUBT, f"times: frames come every {usual:.2f} of the interval that the rate says")
+        return Finding(DOUBT, f"times: the frame interval is {usual:.2f} times that of the stated frame rate")
     return Finding(OK, "times: frames are evenly spaced and decode")
 
 
@@ -191,7 +193,7 @@ def check_pose(sample: Sample) -> Finding:
     lanes alone do not tell it, unless the pose gets impossible.
     """
     if not sample.poses:
-        return Finding(DOUBT, "pose: of no frame; lanes were not seen well enough")
+        return Finding(DOUBT, "pose: none, since lanes were not found well enough in any frame")
     pose = np.median(sample.poses, axis=0)
     names = ("pitch", "yaw", "roll", "height")
     units = (" degrees", " degrees", " degrees", " m")
@@ -203,5 +205,5 @@ def check_pose(sample: Sample) -> Finding:
     ]
     if odd:
         cause = "are camera and lane width right?"
-        return Finding(DOUBT, f"pose: {', '.join(odd)} is not that of a camera in a car: {cause}")
-    return Finding(OK, f"pose: {', '.join(values)}; lanes alone do not tell the focal length")
+        return Finding(DOUBT, f"pose: {', '.join(odd)} is not possible for a camera in a car: {cause}")
+    return Finding(OK, f"pose: {', '.join(values)}; lanes do not determine the focal length")

@@ -22,16 +22,16 @@ from lanebev.app.build import (
 from lanebev.app.config import RunConfig
 from lanebev.app.convert import writer
 from lanebev.app.kept import KeptNumbers
-from lanebev.app.look import take_parts
 from lanebev.app.observers import Observer
+from lanebev.app.part_observation import observer_of_parts
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
+from lanebev.app.recovery import facts_of, frame_name, observer_of_second_pass, recover_run
 from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states
 from lanebev.app.shared_network import SharedNetwork
 from lanebev.app.smoothing import SmoothedPoses, smooth_frames
 from lanebev.app.sources import camera_of, ended_by_signals, make_source, observed_frames
 from lanebev.app.summary import mount_facts, run_facts
-from lanebev.app.take_up import facts_of, frame_name, seen_again, take_up
 from lanebev.camera.model import Camera
 from lanebev.io.calibration_file import write_calibration
 from lanebev.io.covariances import write_covariances
@@ -67,8 +67,8 @@ def run(
         progress: wraps the frames, told how many there are.
         truth: truth of a rendered drive, a row per frame, for the report.
         network: an already loaded network with the weights and device of the settings.
-        parts: what :func:`lanebev.app.look.look` wrote of parts of the source, in order; the network does not
-            look at these frames again.
+        parts: files of :func:`lanebev.app.part_observation.observe_part` for parts of the source, in order;
+            the network is not run again on their frames.
 
     Returns:
         what the report page shows.
@@ -90,11 +90,15 @@ def run(
         if config.resume and problem:
             problem += backup_state(config.resume, out)
         progress = None if source.is_live else progress
-        taken = take_parts(parts, observer) if parts else take_up(out, config, source, camera, observer)
+        taken = (
+            observer_of_parts(parts, observer)
+            if parts
+            else recover_run(out, config, source, camera, observer)
+        )
         smoothed, second = None, taken
         if config.smooth:
             smoothed = first_pass(config, source, camera, taken, out, progress)
-            second = seen_again(out, observer, taken, source)
+            second = observer_of_second_pass(out, observer, taken, source)
         recorder = Recorder(
             path=out.__truediv__,
             camera=camera,

@@ -25,8 +25,8 @@ class _Request(NamedTuple):
 class SharedNetwork:
     """Runs the network on frames of several drives, each in its own thread.
 
-    Whoever finds the network free looks at all frames of one size that wait then, as one batch. Nobody waits
-    for frames that have not come: a drive that ends or fails holds up no other.
+    The first thread that finds the network free runs it on all waiting frames of one size, as one batch. No
+    thread waits for frames that have not come, so a drive that ends or fails delays no other.
 
     Args:
         model: model with the segmenter and extractor to use.
@@ -67,7 +67,7 @@ class SharedNetwork:
 
     @torch.inference_mode()
     def _look(self, requests: list[_Request]) -> None:
-        """Look at frames in one batch; where that fails, at each by itself, so that one fails alone."""
+        """Run the network on frames in one batch; if that fails, on each alone: only bad ones fail."""
         try:
             _, found = self.model.boundary_vertices(torch.cat([each.image for each in requests]))
         except Exception as error:

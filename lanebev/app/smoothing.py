@@ -16,7 +16,7 @@ from torch import Tensor
 from lanebev.app.build import RunTracker
 from lanebev.app.kept import KeptNumbers
 from lanebev.app.observers import Observation
-from lanebev.app.take_up import LANES_FILE, frame_name
+from lanebev.app.recovery import LANES_FILE, frame_name
 from lanebev.estimation.joint.layout import POSE
 from lanebev.estimation.joint.smoother import smooth_states, smoothed_calibration
 from lanebev.estimation.joint.state import JointConfig, JointState

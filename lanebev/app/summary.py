@@ -95,7 +95,7 @@ def summary(report: Report, config: RunConfig) -> str:
         middle = {name: float(np.median([getattr(row, name) for row in tracking])) for name in _SHOWN}
         values = "  ".join(f"{name.rsplit('_', 1)[0]} {middle[name]:+.3f} {_SHOWN[name]}" for name in _SHOWN)
         lines.append(f"median  {values}")
-    shown = ("lane width", "mount", "smoothed", "taken up", "stream")
+    shown = ("lane width", "mount", "smoothed", "reused", "stream")
     lines += [f"{label}: {text}" for label, text in report.facts.items() if label.startswith(shown)]
     lines += [f"problem: {problem}" for problem in report.problems[:_PROBLEMS]]
     if len(report.problems) > _PROBLEMS:

@@ -17,7 +17,7 @@ class ViewBefore:
     """Chooses the pose of the view before calibration: level for stills, in a drive the first tracked one.
 
     Args:
-        alone: images on their own.
+        alone: single images, not frames of a drive.
     """
 
     def __init__(self, alone: bool) -> None:

@@ -75,20 +75,20 @@ class Calibrator(nn.Module, Generic[StateT]):
     ) -> tuple[Calibration, StateT]:
         """Estimate the pose of one frame; the results have the state's dtype.
 
-        All is computed in double precision, autocast off: in single precision a lane seen sharply and alone
-        leaves information matrices with a condition number beyond 1e7, which are not positive definite any
-        more. Only where a device has no double precision (MPS) is it computed in single.
+        Everything is computed in double precision without autocast: with one precisely seen lane, information
+        matrices have a condition number beyond 1e7, so in single precision they are not positive definite.
+        Only on a device without double precision (MPS) is single precision used.
 
         Args:
             segments: N >= 0 segments per row; those of weight 0 or with non-finite numbers are ignored.
-            intrinsics: (B, 3, 3) px. A row where they or the widths are not finite and positive sees nothing.
+            intrinsics: (B, 3, 3) px. If they or the widths are not finite and positive, the row is unused.
             state: state of the frame before, or ``initial_state(B)``.
             dt: s since that frame, float or (B,). A started row skips a frame that is not later (0 or
-                negative). Where not finite, an interval is assumed.
+                negative). If it is not finite, an interval is assumed.
             lane_width: m, float, (B,) or (B, L-1) per lane.
 
         Returns:
-            calibration of this frame, in memory of its own, and the state after it.
+            calibration of this frame, which shares no memory with the inputs, and the state after it.
 
         Raises:
             ValueError: a shape that doesn't fit, whole numbers, another calibrator's state.
@@ -124,11 +124,11 @@ class Calibrator(nn.Module, Generic[StateT]):
         intrinsics: Tensor,
         lane_width: float | Tensor,
     ) -> Calibration:
-        """Return the calibration of images of their own, which no other frame will correct.
+        """Return the calibration of single images, which no other frame will correct.
 
         Args:
             calibration: after the passes over them.
-            state: likewise.
+            state: after the passes.
             segments: segments of B images.
             intrinsics: (B, 3, 3) px.
             lane_width: m, float, (B,) or (B, L-1).
@@ -136,11 +136,11 @@ class Calibrator(nn.Module, Generic[StateT]):
         return calibration
 
     def scale_still(self, calibration: Calibration, factor: float) -> Calibration:
-        """Return the calibration of images of their own whose detector's errors are larger than it says.
+        """Scale the standard deviations of single images, whose detector's errors are larger than stated.
 
         Args:
             calibration: calibration of :meth:`weigh_still`.
-            factor: on the standard deviations of what an image says of the pose.
+            factor: factor on the standard deviations of the image's information on the pose.
         """
         return calibration.with_std_scaled(factor)
 

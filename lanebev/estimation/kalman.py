@@ -131,7 +131,7 @@ def smoother_gain(cov: Tensor, transition: Tensor, process_noise: Tensor, linked
         transition: (..., D, D), F, to the later state.
         process_noise: (..., D, D), W.
         linked: (..., D, D) bool, [i, j]: entry j of the later state tells of entry i. Of entries in blocks
-            each block is solved by itself; an entry that tells nothing has a column of zeros.
+            each block is solved separately; an entry without information has a column of zeros.
 
     Returns:
         (..., D, D).

@@ -16,7 +16,7 @@ class Reason(IntFlag):
     ROLL_UNSEEN = 16  # one lane or less, or the frame was not used: roll is as known before, its sigma grows
     HEIGHT_UNSEEN = 32  # no lane, or the frame was not used: height is as known before, its sigma grows
     LANE_CHANGE = 64  # the boundary indices moved by one in this frame
-    RESTARTED = 128  # started, or started anew, in this frame
+    RESTARTED = 128  # started or restarted in this frame
     DIRECTION_UNSEEN = 256  # one boundary or less, or not used: pitch and yaw are not updated
 
 

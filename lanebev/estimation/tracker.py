@@ -25,7 +25,7 @@ class Estimate(NamedTuple):
     Attributes:
         segments: what the calibrator was given.
         calibration: calibration of this frame.
-        reasons: why the frame is not (fully) tracked.
+        reasons: why the frame is not, or not fully, tracked.
     """
 
     segments: LaneSegments
@@ -40,8 +40,8 @@ class Tracker(Generic[StateT]):
         calibrator: calibrator of the pose.
         camera: the lens.
         lane_width: m.
-        focal_std: standard deviation of the focal length as a share of it, which widens the pose's.
-        lane_width_std: m, standard deviation of the lane width, which widens the height's.
+        focal_std: standard deviation of the focal length as a fraction of it; the pose's contain its effect.
+        lane_width_std: standard deviation of the lane width, m; the height's contains its effect.
     """
 
     def __init__(
@@ -61,19 +61,19 @@ class Tracker(Generic[StateT]):
         self.unscaled_covariance: Tensor = torch.zeros(1, 4, 4)  # as the calibrator gave it of the last frame
 
     def states(self) -> dict[str, StateT | MountState]:
-        """Return what is remembered, by name."""
+        """Return the states by name."""
         return {"calibrator": self.state, "mount": self.mount_state}
 
     def drive_frame(
         self, vertices: BoundaryVertices, dt: float, pose_sigma_scale: float, speed: float | None = None
     ) -> Estimate:
-        """Estimate on the next frame of the drive.
+        """Estimate the pose of the next frame of the drive.
 
         Args:
             vertices: vertices of batch size 1, in pixels of the image as taken.
             dt: s since the frame before.
             pose_sigma_scale: factor on the standard deviations of the pose.
-            speed: m/s of the vehicle, if it is known; the mount learns nothing from a slow one.
+            speed: speed of the vehicle, m/s, if known; a slow one does not update the mount estimate.
         """
         segments = camera_segments(vertices, self.camera)
         intrinsics = self.camera.intrinsics[None]
@@ -93,11 +93,11 @@ class Tracker(Generic[StateT]):
         return Estimate(segments, given_out, reasons)
 
     def still(self, vertices: BoundaryVertices, pose_sigma_scale: float) -> Estimate:
-        """Estimate on an image of its own; nothing is remembered of it.
+        """Estimate the pose of a single image; the states do not change.
 
         Args:
             vertices: vertices of batch size 1, in pixels of the image as taken.
-            pose_sigma_scale: factor on the standard deviations of what the image says of the pose.
+            pose_sigma_scale: factor on the standard deviations of the image's information on the pose.
         """
         segments = camera_segments(vertices, self.camera)
         intrinsics = self.camera.intrinsics[None]
@@ -109,9 +109,9 @@ class Tracker(Generic[StateT]):
         return Estimate(segments, self.given_out(calibration, 1.0), reasons)
 
     def _common_error(self, extrinsics: Extrinsics) -> Tensor:
-        """Return the covariance (1, 4, 4) of what focal length and lane width make wrong in all frames alike.
+        """Return the covariance (1, 4, 4) of the errors by focal length and lane width, constant in time.
 
-        A filter does not average it out, nor does the mount.
+        Neither a filter nor the mount estimate averages them out.
         """
         common = lane_width_covariance(extrinsics.height, self.lane_width_std / self.lane_width)
         if self.focal_std:
@@ -119,7 +119,7 @@ class Tracker(Generic[StateT]):
         return common
 
     def given_out(self, calibration: Calibration, pose_sigma_scale: float) -> Calibration:
-        """Return a calibration with the covariance that goes out.
+        """Return a calibration with the output covariance.
 
         Args:
             calibration: result of the calibrator.

@@ -150,7 +150,7 @@ def _warp_part(model: LaneBEV, camera: Camera) -> Part:
 
 
 class _WithState(nn.Module):
-    """A module with a state, which rows of ``reset`` begin anew.
+    """A module with a state, which is reset in the rows of ``reset``.
 
     Args:
         calibrator: calibrator whose state it is.

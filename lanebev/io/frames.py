@@ -54,7 +54,7 @@ ALL = Selection()
 
 
 def taken_frames(frames: Iterable[Frame], selection: Selection) -> Iterator[Frame]:
-    """Return the frames that are taken, numbered anew: from zero, and from the time of the first."""
+    """Return the frames that are taken, with numbers from zero and times from the first."""
     number, first, before = 0, 0.0, 0.0
     for frame in frames:
         if frame.time >= selection.end:

@@ -18,7 +18,7 @@ from lanebev.io.source_names import PIPE
 from lanebev.io.video import DEFAULT_FPS, FrameSource
 
 _TIMEOUT = 10.0  # s without a frame, after which a stream has ended
-_POLL = 0.05  # s between looks at whether it is to stop
+_POLL = 0.05  # s between checks whether to stop
 _LOW_DELAY = {"flags": "low_delay", "rtsp_transport": "tcp"}
 
 
@@ -53,7 +53,7 @@ class LiveFigures:
 class LiveSource(FrameSource):
     """A stream that is read in its own thread, which keeps the newest frame only.
 
-    Frames' times are those of their arrival. Who cannot look at every frame is given the newest, so that the
+    Frames' times are those of their arrival. A slow consumer gets the newest frame only, so that the
     delay is that of one frame however slow the looking is. The thread reads from the opening on, also while
     nobody looks yet, so that nothing queues in the network. With ``keep_all`` nothing is dropped, the stream
     waits instead, and times are those that the stream states.

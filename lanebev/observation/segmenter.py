@@ -140,7 +140,7 @@ class LaneSegmenter(nn.Module):
 def _check_scale(image: Tensor) -> None:
     """Raise ValueError where a finite image is not in [0, 1] but in [0, 255], unless asking is slow.
 
-    To look at the values of another device would wait for it, and a compiled program cannot.
+    Reading values on another device would wait for it, and a compiled program cannot read them.
     """
     if torch.compiler.is_compiling() or image.device.type != "cpu" or not image.numel():
         return

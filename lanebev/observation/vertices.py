@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lanebev.batch import masked_median
 
-_FLOOR = 0.01  # probability that background noise has everywhere; counts as nothing
+_FLOOR = 0.01  # probability of background noise, which counts as 0
 _LEAST_MASS = 1e-3  # px, what is divided by of an empty window
 _PEAK = 2  # half-width of the box whose largest sum is a scan's peak, label px
 _END = 3  # scans at either end of a stripe that its round cap makes crooked

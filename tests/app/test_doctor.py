@@ -35,7 +35,7 @@ def _sample(poses=(GOOD_POSE,), boundaries=(2, 2, 4), steps=(1.0, 1.0), undecode
 @pytest.mark.parametrize(
     ("finding", "level", "word"),
     [
-        (check_size(CAMERA, (360, 640)), OK, "as the camera's"),
+        (check_size(CAMERA, (360, 640)), OK, "as in the camera file"),
         (check_size(CAMERA, (720, 1280)), WRONG, "Camera.scaled((720, 1280))"),
         (check_size(CAMERA, (480, 640)), WRONG, "another shape"),
         (check_field_of_view(CAMERA), OK, "60 degrees across"),
@@ -45,13 +45,13 @@ def _sample(poses=(GOOD_POSE,), boundaries=(2, 2, 4), steps=(1.0, 1.0), undecode
         (check_centre(CAMERA.cropped(100, 0, 260, 640)), DOUBT, "-50 px below"),
         (check_times(_sample()), OK, "evenly spaced"),
         (check_times(_sample(steps=(1.0, 1.0, 5.0))), DOUBT, "a gap of 5 times"),
-        (check_times(_sample(steps=(2.0, 2.0))), DOUBT, "every 2.00 of the interval"),
-        (check_times(_sample(undecoded=2)), DOUBT, "2 of 3 that were looked at do not decode"),
+        (check_times(_sample(steps=(2.0, 2.0))), DOUBT, "is 2.00 times that of the stated"),
+        (check_times(_sample(undecoded=2)), DOUBT, "2 of 3 do not decode"),
         (check_lanes(_sample()), OK, "100% of 3 frames"),
         (check_lanes(_sample(boundaries=(0, 1, 2))), DOUBT, "33% of 3 frames"),
         (check_pose(_sample()), OK, "pitch +2.0 degrees"),
-        (check_pose(_sample(poses=())), DOUBT, "of no frame"),
-        (check_pose(_sample(poses=([2.0, 1.0, 0.5, 9.0],))), DOUBT, "height +9.0 m is not that"),
+        (check_pose(_sample(poses=())), DOUBT, "pose: none"),
+        (check_pose(_sample(poses=([2.0, 1.0, 0.5, 9.0],))), DOUBT, "height +9.0 m is not possible"),
         (check_pose(_sample(poses=([-40.0, 1.0, 20.0, 1.4],))), DOUBT, "pitch -40.0 degrees, roll +20.0"),
     ],
 )

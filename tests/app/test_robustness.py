@@ -22,8 +22,8 @@ import yaml
 from lanebev import Camera
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import NetworkObserver
+from lanebev.app.recovery import recover_run
 from lanebev.app.run import run
-from lanebev.app.take_up import take_up
 from lanebev.cli import main
 from lanebev.io.folder_lock import FolderLock
 from lanebev.io.results import OutputFolder
@@ -163,7 +163,7 @@ def test_a_killed_run_is_taken_up(data, looked, tmp_path, monkeypatch):
     )
     report = run(RunConfig(str(data / "drive.mp4"), str(data / "camera.yaml"), str(out)))
     assert seen == [4, 5]
-    assert report.facts["taken up"] == "what a run that was killed had seen in the first 4 frames"
+    assert report.facts["reused"] == "detections of a run that was killed, in the first 4 frames"
     for name in ("extrinsics.csv", "covariance.csv", "lanes.json", "calibration.yaml"):
         assert (out / name).read_bytes() == (looked / name).read_bytes()
     states = [load_state(folder / "state.safetensors").states for folder in (out, looked)]
@@ -190,7 +190,7 @@ def test_a_killed_run_of_other_settings_is_not_taken_up(data, tmp_path):
     def taken(config):
         """How many of three frames a run takes that finds two whole lines and a half; it is killed too."""
         with contextlib.suppress(KeyError), OutputFolder(config.out) as out:
-            observer = take_up(out, config, source, camera, Looks())
+            observer = recover_run(out, config, source, camera, Looks())
             count = sum(observer(frame) != "looked" for frame in itertools.islice(source, 3))
             assert count == observer.frames
             (out / "lanes.json").write_text("".join(lines[:2]) + lines[2][:20])

@@ -249,7 +249,7 @@ def test_words_say_what_a_moved_or_unusable_axis_is():
         axis_reasons=torch.tensor([[16, 64, 20, 512]]),
     )
     assert describe_mount(mounted, MountConfig()) == [
-        "pitch: begun anew since the camera was moved: needs 20 s of straight driving; 12 s so far",
+        "pitch: restarted because the camera was moved: needs 20 s of straight driving; 12 s so far",
         "yaw: not usable (outside the limits of a usable mount)",
         "roll: needs 20 s of straight driving with two lanes in view; 8 s so far (the vehicle is too slow)",
         "height: calibrated (the latest frames contradict the estimate)",

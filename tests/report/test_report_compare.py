@@ -130,7 +130,7 @@ def test_the_page_shows_both_and_escapes_them(tmp_path):
 
 def test_one_common_frame_makes_a_page():
     page = render_comparison(RunFolder("a", QUIET[:1]), RunFolder("b", QUIET[:3]))
-    assert "1 frames in common" in page
+    assert "common frames: 1" in page
     assert "a report.html is missing" in page
     assert len(page) < 60_000  # without Bokeh
 

@@ -29,7 +29,7 @@ class Cluster:
         retries: retries of a task that failed or whose worker died.
         cpus: cores of a task.
         gpus: share of a GPU of a task.
-        batch: drives of a task, whose frames the network looks at in one batch.
+        batch: drives per task, whose frames the network processes in one batch.
     """
 
     address: str | None = None

@@ -76,7 +76,7 @@ def fleet_page(
         title: name of the fleet's folder.
         drives: all of the manifest.
         outcomes: by name of the drive.
-        verdicts: likewise, of finished drives.
+        verdicts: verdicts of finished drives.
         cameras: the mounts.
     """
     failed = [drive for drive in drives if outcomes[drive.name].failure]

@@ -12,7 +12,7 @@ from lanebev import __version__
 from lanebev.app.config import RunConfig
 from lanebev.app.fleet.cutting import Part, duration, parts_of
 from lanebev.app.fleet.manifest import PATHS, Drive
-from lanebev.app.take_up import size_and_time
+from lanebev.app.recovery import size_and_time
 
 DRIVES, MARK, SEEN = "drives", "fleet.json", "seen.json"
 
@@ -23,10 +23,10 @@ class Task:
 
     Attributes:
         name: name of the drive; for a part of it, followed by its number.
-        config: what to run, and the folder to write.
+        config: settings, with the output folder.
         fingerprint: fingerprint of settings and files, which tells whether it is done.
-        parts: what the network is to look at before, if the drive is cut.
-        is_part: whether it is one of those.
+        parts: tasks of the drive's parts, which run before it, if it is cut.
+        is_part: whether it is such a part.
     """
 
     name: str

@@ -12,10 +12,10 @@ from pathlib import Path
 from lanebev.app.build import make_network, needs_network
 from lanebev.app.config import RunConfig
 from lanebev.app.fleet.plan import Outcome, Task, earlier_outcome, write_mark
-from lanebev.app.look import look
+from lanebev.app.part_observation import observe_part
+from lanebev.app.recovery import size_and_time
 from lanebev.app.run import run
 from lanebev.app.shared_network import SharedNetwork
-from lanebev.app.take_up import size_and_time
 from lanebev.io.results import OutputFolderError
 from lanebev.pipeline import LaneBEV
 
@@ -47,7 +47,7 @@ def _run_task(task: Task, network: SharedNetwork | None) -> Outcome:
     start = time.perf_counter()
     try:
         if task.is_part:
-            frames = look(task.config, task.result, network)
+            frames = observe_part(task.config, task.result, network)
         else:
             frames = len(run(task.config, network=network, parts=[part.result for part in task.parts]).rows)
     except Exception as error:  # whatever it is, it is this drive's only

@@ -167,7 +167,7 @@ def look(params: Tensor, seen: Observations, phase: Tensor | None = None) -> Sig
 
 
 def every_segment(sight: Sight, stride: int) -> Sight:
-    """Keep every so manieth segment only."""
+    """Keep only every n-th segment."""
     directions = sight.directions.unflatten(-1, (-1, 2))[:, :, ::stride].flatten(2)
     z, *curve = (part.unflatten(-1, (-1, 2))[:, ::stride].flatten(1) for part in (sight.z, *sight.curve))
     return sight._replace(directions=directions, z=z, valid=sight.valid[:, ::stride], curve=RoadCurve(*curve))

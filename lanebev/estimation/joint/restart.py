@@ -101,7 +101,7 @@ def is_contrary(
     seen: Observations,
     cfg: JointConfig,
 ) -> Tensor:
-    """Tell whether a frame by itself says something else than the state, and explains itself no worse.
+    """Tell whether a frame contradicts the state: its own fit differs, and is no less likely.
 
     Source: (J19).
 

@@ -27,28 +27,28 @@ class JointConfig:
 
     Attributes:
         num_boundaries: L.
-        iterations: Gauss-Newton steps a frame.
-        start_iterations: likewise of every start that is tried on a first frame.
-        lane_width_std: m, sigma of the lane width prior, a common scale of height; 0: as given.
-        motion: how the state moves.
-        prior: where a start is searched, and what holds before it.
-        open_pose: rad (and 10 of these in m of height), jump admitted where one frame contradicts the motion,
-            at evidence of ten sigmas; as many times more at more.
-        open_curvature, open_step: 1/m, likewise, change of the knots when a bend begins or ends.
-        straight: 1/m and 1/m², sigmas of c0 and c1 of a straight road.
-        bends: how probable it is that a start is on a bend, one of the curvatures of ``prior``.
-        open_deviation: m, sigma of a boundary's deviation on a road of unequal lanes; 0: there are none.
-        evidence_time: s over which a bend's or unequal lanes' evidence is summed.
-        motion_scale_rise: s in which the variance of the pose's motion rises by e where it is half of what
-            it should be.
-        motion_scale_memory: s, decay back to that of ``motion``.
-        motion_scale_most: largest factor on it.
-        min_support: inlier segments (weights summed) of a usable frame.
-        min_share, enter_share: share of inliers to go on tracking, and to begin again.
-        assumed_dt: s between frames where it is not finite, or the clock jumped back by more than a second.
-        restart_after: s of segments that don't fit before the search starts over.
-        lost_after: s without support.
-        readings: readings of images on their own, how roads and detectors differ from what is assumed.
+        iterations: Gauss-Newton steps per frame.
+        start_iterations: Gauss-Newton steps for every start of a first frame.
+        lane_width_std: sigma of the common scale of the lane widths, m; 0: the widths are exact.
+        motion: motion model.
+        prior: prior of a start and range of its search.
+        open_pose: sigma of a jump of the pose if a frame contradicts the motion by ten sigmas, rad (and ten
+            times that in m for the height); proportional to the number of sigmas.
+        open_curvature, open_step: the same for the knots when a bend begins or ends, 1/m.
+        straight: sigmas of c0 and c1 of a straight road, 1/m and 1/m².
+        bends: prior probability that a start is on a bend, with the curvatures of ``prior``.
+        open_deviation: sigma of a boundary's deviation on a road of unequal lanes, m; 0: lanes are equal.
+        evidence_time: time constant of the evidence for a bend or unequal lanes, s.
+        motion_scale_rise: time, s, in which the variance of the pose's motion grows by a factor e if it is
+            half of the right one.
+        motion_scale_memory: time constant, s, of the decay to the variance of ``motion``.
+        motion_scale_most: largest factor on that variance.
+        min_support: sum of inlier weights of a usable frame.
+        min_share, enter_share: fraction of inliers needed to continue tracking, and to start again.
+        assumed_dt: time between frames, s, if dt is not finite or the clock jumped back by more than 1 s.
+        restart_after: time, s, without fitting segments before a new search.
+        lost_after: time, s, without usable segments before the status is LOST.
+        readings: priors of the readings of a single image.
         doubt_frames: after a jump or a misfit, that are compared, each by itself, with the state.
         contrary_frames: usable frames in a row that have to contradict it.
     """

@@ -152,7 +152,7 @@ def posterior_covariance(cov: Tensor, matrix: Tensor, gain: Tensor) -> Tensor:
 
 
 def single_frame(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Judge a frame by itself, on a straight road, under a wide prior.
+    """Compute a frame's own standard deviations, on a straight road with a wide prior.
 
     Args:
         matrix: (B, O, O), its information.

@@ -13,19 +13,19 @@ class MountConfig:
 
     Attributes:
         block_time: s of accepted frames in a block.
-        num_blocks: kept.
-        needed: blocks for a valid estimate.
+        num_blocks: number of blocks kept.
+        needed: number of blocks for a valid estimate.
         lower, upper: validity limits of the mount.
         margin: hysteresis of the limits.
         largest_std: largest standard deviation of the fast pose, for a frame to be used on that axis.
-        block_std: expected scatter of blocks, worth ``prior_blocks`` blocks of evidence.
+        block_std: prior standard deviation of blocks, which counts as ``prior_blocks`` blocks.
         prior_blocks: see above.
-        block_correlation: correlation of neighbouring blocks, which slow motion shares.
-        prior_pose, prior_std: before anything is seen.
+        block_correlation: correlation of neighbouring blocks, due to slow motion.
+        prior_pose, prior_std: mean and standard deviation of the prior.
         moved_least: smallest change that counts as a moved camera.
-        moved_sigmas: and it must exceed so many sigmas of a block.
-        moved_blocks: in so many blocks in a row that agree.
-        blend_steps: accepted frames over which a new estimate takes over from the old.
+        moved_sigmas: number of a block's sigmas that the change must also exceed.
+        moved_blocks: number of consecutive, agreeing blocks that must show the change.
+        blend_steps: number of accepted frames over which the output changes from an old to a new estimate.
         drift_std: std of the mount's random walk, per square root of an hour without a new block.
         stale_time: s without a new block after which an axis is reported as stale.
         min_speed: m/s.

@@ -1,9 +1,9 @@
 """Estimate the camera's mount in the vehicle from the poses of frames.
 
-The fast pose is the mount plus what the suspension and the driver's heading add. Accepted frames are
-averaged in blocks of some seconds, blocks in a running estimate whose uncertainty is their scatter. Each
-axis has its own blocks, so that an axis that the road does not determine does not hold up the others. The
-blocks, limits and gates are those of openpilot's calibrationd; axes, hysteresis, ageing and reasons are ours.
+The pose of a frame is the mount plus the motion on the suspension and the vehicle's heading. Accepted frames
+are averaged in blocks of some seconds, and blocks in a running estimate whose uncertainty is their scatter.
+Each axis has its own blocks, so that an axis that the road does not determine does not delay the others. The
+blocks, limits and gates are those of openpilot's calibrationd; axes, hysteresis, ageing and reasons are new.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _HOUR = 3600.0  # s
 
 
 class MountEstimator(nn.Module):
-    """Estimate the mount from the fast calibration, per row of a batch and axis by axis.
+    """Estimate the mount from the poses of frames, per row of a batch and axis by axis.
 
     Args:
         config: the numbers, or keywords of :class:`MountConfig`.
@@ -73,15 +73,15 @@ class MountEstimator(nn.Module):
         yaw_rate: Tensor | None = None,
         curvature: Tensor | None = None,
     ) -> tuple[MountCalibration, MountState]:
-        """Take in one frame, computed in the state's dtype.
+        """Process one frame, in the state's dtype.
 
         Args:
             calibration: calibration of this frame, from any calibrator.
             state: state of the frame before, or :meth:`initial_state`.
             dt: s since that frame, float or (B,).
-            speed: (B,) m/s of the vehicle, or None if not known.
-            yaw_rate: (B,) rad/s of the vehicle, or None.
-            curvature: (B,) 1/m of the road, or None.
+            speed: speed of the vehicle, (B,) m/s, or None if unknown.
+            yaw_rate: yaw rate of the vehicle, (B,) rad/s, or None.
+            curvature: curvature of the road, (B,) 1/m, or None.
 
         Returns:
             the mount and the state after the frame.

@@ -17,8 +17,8 @@ class MountStatus(IntEnum):
 
     UNCALIBRATED = 0  # not enough blocks yet
     CALIBRATED = 1
-    INVALID = 2  # enough blocks, but outside the limits: mount the camera anew
-    RECALIBRATING = 3  # the camera was moved, or the estimate was contradicted; begun anew
+    INVALID = 2  # enough blocks, but outside the limits: mount the camera again
+    RECALIBRATING = 3  # restarted: the camera was moved, or frames contradicted the estimate
     PARTIAL = 4  # of the mount as a whole: some axes are calibrated, others are not yet
 
 
@@ -36,7 +36,7 @@ class MountReason(IntFlag):
     ROLL_LIMIT = 128
     HEIGHT_LIMIT = 256
     SUSPECT = 512  # the latest evidence contradicts the estimate
-    MOVED = 1024  # the camera was moved: begun anew in this frame
+    MOVED = 1024  # the camera was moved: estimation restarted in this frame
     TIME = 2048  # dt not positive or not finite
     WITHDRAWN = 4096  # dropped in this frame: it dates from before a move, or was contradicted
     STALE = 8192  # no new block for a long time

@@ -54,7 +54,7 @@ def describe_mount(mounted: MountCalibration, config: MountConfig | None = None,
             what = _NEEDS.get(name, "straight driving")
             sentence = f"needs {needed:.0f} s of {what}; {done:.0f} s so far"
             if status == MountStatus.RECALIBRATING:
-                sentence = f"begun anew since the camera was moved: {sentence}"
+                sentence = f"restarted because the camera was moved: {sentence}"
             notes += [text for flag, text in _FRAME_REASONS.items() if reasons & flag]
         unique = list(dict.fromkeys(notes))
         sentences.append(f"{name}: {sentence}" + (f" ({', '.join(unique)})" if unique else ""))

@@ -1,4 +1,4 @@
-"""What a run found, as every format takes it."""
+"""Results of a run, the input of every format."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def frame_name(frame: Frame, source: FrameSource) -> str:
     return frame.name or f"{Path(source.source).name}/{frame.number:06d}"
 
 
-class TakenUp:
+class RecoveredObserver:
     """Returns an earlier run's observations of the first frames, and another observer's of the others.
 
     Args:
@@ -82,18 +82,19 @@ class TakenUp:
 
 
 def facts_of(observer: Observer) -> dict[str, str]:
-    """Return what to say in the report of what was taken up."""
-    if not isinstance(observer, TakenUp) or not (observer.told and observer.frames):
+    """Return the number of reused detections, for the report."""
+    if not isinstance(observer, RecoveredObserver) or not (observer.told and observer.frames):
         return {}
-    return {"taken up": f"what a run that was killed had seen in the first {observer.frames} frames"}
+    return {"reused": f"detections of a run that was killed, in the first {observer.frames} frames"}
 
 
-def take_up(
+def recover_run(
     out: OutputFolder, config: RunConfig, source: FrameSource, camera: Camera, observer: Observer
 ) -> Observer:
-    """Take up the run that was killed in this folder, if it was of the same settings and files.
+    """Return an observer that reuses the detections of a run that was killed in this folder.
 
-    Lanes of another detector are read as they are: nothing is saved by keeping them. A stream begins anew.
+    They are reused only with the same settings and files. Lane files of another detector are read again, and
+    a stream starts again.
     """
     settings = fingerprint(config, source, camera)
     known = out / _SETTINGS
@@ -110,28 +111,32 @@ def take_up(
     return _named(entries, observer, source)
 
 
-def seen_again(out: OutputFolder, observer: Observer, taken: Observer, source: FrameSource) -> Observer:
-    """Return an observer for a second pass, which takes what lanes.json of the first one says was seen.
+def observer_of_second_pass(
+    out: OutputFolder, observer: Observer, taken: Observer, source: FrameSource
+) -> Observer:
+    """Return an observer for a second pass, which reuses the detections in lanes.json of the first one.
 
     Args:
-        out: with the first pass's lanes.json, which is moved.
+        out: output folder with the first pass's lanes.json, which is moved.
         observer: observer of the frames.
-        taken: what :func:`take_up` made of it.
+        taken: result of :func:`recover_run` for it.
         source: the frames.
     """
-    if not isinstance(taken, TakenUp):
+    if not isinstance(taken, RecoveredObserver):
         return observer
     (out / LANES_FILE).replace(out / _SEEN)
     return _named(whole_tusimple_lines(out / _SEEN), observer, source)
 
 
-def _named(entries: Iterator[FrameLines], observer: Observer, source: FrameSource) -> TakenUp:
+def _named(entries: Iterator[FrameLines], observer: Observer, source: FrameSource) -> RecoveredObserver:
     """Return an observer that takes the entries of lanes.json by their names."""
-    return TakenUp(entries, cast(RestoringObserver, observer), lambda frame: frame_name(frame, source))
+    return RecoveredObserver(
+        entries, cast(RestoringObserver, observer), lambda frame: frame_name(frame, source)
+    )
 
 
 def fingerprint(config: RunConfig, source: FrameSource, camera: Camera) -> str:
-    """Return all that decides what a run sees, as text: settings, sizes and times of files, the lens."""
+    """Return all that determines a run's detections as text: settings, sizes and times of files, lens."""
     settings = {name: value for name, value in asdict(config).items() if name != "out"}
     files = [[os.fspath(path), *size_and_time(Path(path))] for path in input_files(config, source)]
     found = {"settings": settings, "files": files, "camera": camera.fingerprint(), "lanebev": __version__}
@@ -139,7 +144,7 @@ def fingerprint(config: RunConfig, source: FrameSource, camera: Camera) -> str:
 
 
 def size_and_time(path: Path) -> tuple[int, int]:
-    """Return a file's size and time of change; zeros where it is none, such as a stream."""
+    """Return a file's size and time of change; zeros if it is not a file, such as a stream."""
     try:
         about = path.stat()
     except OSError:

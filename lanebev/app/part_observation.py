@@ -13,9 +13,9 @@ import numpy as np
 from lanebev.app.build import make_observer, match_image_size
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import Observer
+from lanebev.app.recovery import RecoveredObserver, RestoringObserver
 from lanebev.app.shared_network import SharedNetwork
 from lanebev.app.sources import camera_of, make_source, observed_frames
-from lanebev.app.take_up import RestoringObserver, TakenUp
 from lanebev.io.tusimple import tusimple_line, whole_tusimple_lines
 from lanebev.io.video import Frame
 from lanebev.io.whole_file import whole_file
@@ -23,8 +23,8 @@ from lanebev.io.whole_file import whole_file
 _NO_ROWS, _NO_LANES = np.zeros(0), np.zeros((0, 0))
 
 
-def look(config: RunConfig, path: Path, network: SharedNetwork | None = None) -> int:
-    """Write what is seen in each frame that the settings take, with its number in the whole source.
+def observe_part(config: RunConfig, path: Path, network: SharedNetwork | None = None) -> int:
+    """Write the vertices of each frame that the settings take, with its number in the whole source.
 
     Args:
         config: the settings; those of the estimation have no effect.
@@ -32,7 +32,7 @@ def look(config: RunConfig, path: Path, network: SharedNetwork | None = None) ->
         network: a network that is already loaded.
 
     Returns:
-        how many frames there were.
+        the number of frames.
 
     Raises:
         ValueError: see :func:`lanebev.app.run.run`.
@@ -54,12 +54,12 @@ def number_in_source(frame: Frame) -> str:
     return f"{frame.number if frame.source_number is None else frame.source_number:06d}"
 
 
-def take_parts(paths: Sequence[Path], observer: Observer) -> Observer:
-    """Return an observer that takes what :func:`look` wrote of the parts of a source.
+def observer_of_parts(paths: Sequence[Path], observer: Observer) -> Observer:
+    """Return an observer that reads the files of :func:`observe_part` for the parts of a source.
 
     Args:
         paths: paths of the files, in the order of the parts.
         observer: observer of frames that are in none of them.
     """
     entries = chain.from_iterable(map(whole_tusimple_lines, paths))
-    return TakenUp(entries, cast(RestoringObserver, observer), number_in_source, told=False)
+    return RecoveredObserver(entries, cast(RestoringObserver, observer), number_in_source, told=False)
