@@ -57,6 +57,7 @@ PIECES = [
     b"!!int x",
     b"\n",
 ]
+_CURVELANES = b'{"Lines": [[{"x": "5.0", "y": "590"}, {"x": 7, "y": 580}]]}'
 LONGEST_MESSAGE = 500
 
 
@@ -93,7 +94,7 @@ def readers() -> dict[str, Reader]:
             ],
         ),
         "lanes.json": Reader(read_lanes, ".json", _tusimple(), 30),
-        "openlane.json": Reader(read_lanes, ".json", _openlane(), 20),
+        "openlane.json": Reader(read_lanes, ".json", [*_openlane(), _CURVELANES], 20),
         "culane": Reader(
             read_lanes, ".lines.txt", [b"10 590 12.5 580 15 570 17 560\n500.25 590 510 580 520 570\n"], 20
         ),

@@ -143,8 +143,8 @@ class RunConfig:
     )
     lanes: str | None = option(
         None,
-        "lanes of another detector: TuSimple JSON lines, CULane .lines.txt, OpenLane JSON, or a folder of "
-        "them",
+        "lanes of another detector: JSON of TuSimple, CurveLanes or OpenLane, .lines.txt of CULane, or a "
+        "folder of them",
         "FILE",
     )
     stills: bool = option(False, "treat every image as independent, not as a frame of a drive")

@@ -40,6 +40,12 @@ def make_source(config: RunConfig) -> FrameSource:
         found: FrameSource = open_bag_source(config.source, config.topic, config.frame_rate)
     else:
         found = open_source(config.source, config.frame_rate)
+        stated = found.is_video or found.times or config.frame_rate or config.stills
+        if found.count > 1 and not stated:
+            rate = (
+                f"their names state no times, {float(found.fps):g} frames per second are assumed; state --fps"
+            )
+            found = replace(found, problem=f"{config.source}: {rate}")
     source = replace(found, selection=selection)
     if selection != ALL and not source.taken_count:
         last = source.times[-1] if source.times else float(source.count / source.fps)

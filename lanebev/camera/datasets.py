@@ -60,6 +60,11 @@ def kitti(text: str, image_size: tuple[int, int] | None) -> CameraParameters:
             "add a line 'S_rect_02: WIDTH HEIGHT' with P_rect_02, or use the short YAML"
         )
     matrix = projection[0:3] + projection[4:7] + projection[8:11]
+    if size_name not in entries and centre_offset(matrix, size) > _OFF_CENTRE:
+        raise ValueError(
+            f"{name}: expected a camera of the images' {size[1]} x {size[0]} px, got a principal point of "
+            f"{matrix[2]:g}, {matrix[5]:g}; give the images as they came, or add 'S_rect_02: WIDTH HEIGHT'"
+        )
     return CameraParameters(matrix, [], "pinhole", size)
 
 

@@ -12,9 +12,10 @@ from typing import Any
 import yaml
 
 from lanebev.camera.datasets import colmap, is_colmap, is_kitti, kitti, nuscenes, openlane
-from lanebev.camera.formats import camodocal, is_kalibr, kalibr, opencv_or_ros, without_lens
+from lanebev.camera.formats import opencv_or_ros, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
 from lanebev.camera.parsing import parse
+from lanebev.camera.slam import camodocal, is_kalibr, is_orb_slam, kalibr, orb_slam
 from lanebev.numbers import read_text
 
 
@@ -27,7 +28,8 @@ def read_camera(
     - ROS ``camera_info`` (YAML or INI, or a message as ``rostopic``, ``ros2 topic`` and Foxglove print it),
       its ``roi`` and ``binning_x``, ``binning_y`` applied;
     - our short YAML: fx, fy, cx, cy, width, height, distortion, model;
-    - Kalibr's camchain (the first camera), EuRoC's ``sensor.yaml``, CamOdoCal's YAML (VINS, KITTI-360);
+    - Kalibr's camchain (the first camera), EuRoC's ``sensor.yaml``, CamOdoCal's YAML (VINS, KITTI-360), the
+      settings of ORB-SLAM;
     - KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt``: the left colour camera's rectified images
       (``P_rect_02``, ``P2``), else the lowest number there is;
     - nuScenes' ``calibrated_sensor`` (the record of one camera) and OpenLane's labels, both JSON;
@@ -51,7 +53,8 @@ def read_camera(
         raise ValueError(f"camera file {path}: expected a readable camera file, got: {error}") from error
     try:
         if is_colmap(text):
-            return checked(colmap(text))
+            camera = checked(colmap(text))
+            return without_lens(camera) if rectified else camera
         if is_kitti(text) or (path.suffix.lower() == ".txt" and "width" not in text):
             return checked(kitti(text, image_size))
         return _camera(parse(text), image_size, rectified)
@@ -69,8 +72,9 @@ def _camera(content: Any, image_size: tuple[int, int] | None, rectified: bool) -
         return checked(nuscenes([content], image_size))
     if "intrinsic" in content:
         return checked(openlane(content, image_size))
-    if "model_type" in content or is_kalibr(content):
-        camera = checked(kalibr(content) if is_kalibr(content) else camodocal(content))
+    slam = kalibr if is_kalibr(content) else orb_slam if is_orb_slam(content) else None
+    if slam or "model_type" in content:
+        camera = checked(slam(content) if slam else camodocal(content))
         return without_lens(camera) if rectified else camera
     camera, restated = opencv_or_ros(content, rectified)
     return checked(camera, restated)

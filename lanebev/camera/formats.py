@@ -1,13 +1,12 @@
-"""Formats of camera files: OpenCV, ROS and the short YAML; Kalibr, EuRoC and CamOdoCal."""
+"""Camera files of OpenCV, ROS and our short YAML."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
 from lanebev.camera.parameters import CameraParameters, centre_offset
-from lanebev.camera.parsing import mapping, number, numbers, required, whole_number
+from lanebev.camera.parsing import mapping, number, numbers, whole_number
 from lanebev.numbers import shown
 
 _SHORT_KEYS = {"fx", "fy", "cx", "cy", "width", "height", "distortion", "model"}
@@ -45,15 +44,6 @@ _MODELS = {
     "kannala_brandt": "fisheye",
     "omni": "omni",
     "mei": "omni",
-}
-_KALIBR_MODELS = {  # camera_model, distortion_model of Kalibr, EuRoC and TUM-VI
-    ("pinhole", "none"): "pinhole",
-    ("pinhole", "radtan"): "pinhole",
-    ("pinhole", "radial-tangential"): "pinhole",
-    ("pinhole", "equi"): "fisheye",
-    ("pinhole", "equidistant"): "fisheye",
-    ("omni", "none"): "omni",
-    ("omni", "radtan"): "omni",
 }
 _IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
@@ -188,64 +178,3 @@ def _binning(fields: Mapping[str, Any], key: str) -> int:
 
 def _binned(x: float, factor: int) -> float:
     return x if factor == 1 else (x + 0.5) / factor - 0.5
-
-
-def is_kalibr(fields: Mapping[str, Any]) -> bool:
-    """Tell whether the keys are those of Kalibr's camera chain, or of one camera as in EuRoC."""
-    return "intrinsics" in fields or any(re.fullmatch(r"cam\d+", key, re.ASCII) for key in fields)
-
-
-def kalibr(fields: Mapping[str, Any]) -> CameraParameters:
-    """Read Kalibr's camchain, its first camera, or EuRoC's ``sensor.yaml``.
-
-    Source: Kalibr, wiki, "Supported models" and "Yaml formats".
-    """
-    chain = [key for key in fields if re.fullmatch(r"cam\d+", key, re.ASCII)]
-    if chain:
-        first = min(chain, key=lambda key: int(key[3:10]))
-        fields = mapping(first, fields[first])
-    names = (
-        str(required(fields, ["camera_model"])).strip(),
-        str(fields.get("distortion_model") or "none").strip(),
-    )
-    if names not in _KALIBR_MODELS:
-        known = ", ".join("-".join(each) for each in _KALIBR_MODELS)
-        raise ValueError(f"camera_model: expected one of {known}, got {shown('-'.join(names))}")
-    model = _KALIBR_MODELS[names]
-    intrinsics = numbers(fields, "intrinsics", count=5 if model == "omni" else 4)
-    coefficients = ("distortion_coeffs", "distortion_coefficients")
-    distortion = [0.0] * 4
-    if names[1] != "none":
-        distortion = numbers(fields, *coefficients, count=4)
-    elif any(fields.get(key) for key in coefficients) and any(numbers(fields, *coefficients)):
-        raise ValueError("distortion_model: expected the one of distortion_coeffs, got none; add the entry")
-    *xi, fx, fy, cx, cy = intrinsics
-    width, height = numbers(fields, "resolution", count=2)
-    return CameraParameters(
-        [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
-        [*xi, *distortion],
-        model,
-        (round(height), round(width)),
-    )
-
-
-def camodocal(fields: Mapping[str, Any]) -> CameraParameters:
-    """Read CamOdoCal's YAML, which VINS and KITTI-360's fisheyes use: PINHOLE, KANNALA_BRANDT or MEI."""
-    name = str(required(fields, ["model_type"])).strip().upper()
-    projection = mapping("projection_parameters", required(fields, ["projection_parameters"]))
-    size = (whole_number(fields, "image_height"), whole_number(fields, "image_width"))
-    if name == "KANNALA_BRANDT":
-        fx, fy, cx, cy = (number(projection, key) for key in ("mu", "mv", "u0", "v0"))
-        model, distortion = "fisheye", [number(projection, key) for key in ("k2", "k3", "k4", "k5")]
-    elif name in ("PINHOLE", "MEI"):
-        distorted = mapping("distortion_parameters", required(fields, ["distortion_parameters"]))
-        model, distortion = "pinhole", [number(distorted, key) for key in ("k1", "k2", "p1", "p2")]
-        keys = ("fx", "fy", "cx", "cy")
-        if name == "MEI":
-            mirror = mapping("mirror_parameters", required(fields, ["mirror_parameters"]))
-            model, distortion = "omni", [number(mirror, "xi"), *distortion]
-            keys = ("gamma1", "gamma2", "u0", "v0")
-        fx, fy, cx, cy = (number(projection, key) for key in keys)
-    else:
-        raise ValueError(f"model_type: expected PINHOLE, KANNALA_BRANDT or MEI, got {shown(name)}")
-    return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, model, size)

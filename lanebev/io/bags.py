@@ -152,10 +152,13 @@ def lens_fields(message: Any) -> dict[str, Any]:
 
 
 def _lens(bag: Bag, images: str) -> dict[str, Any] | None:
-    """Return the first lens of the topic beside the images, or of the only one; None if there is none."""
+    """Return the lens of the topic nearest to the images, or of a bag's only camera; None without one."""
+    cameras = sum(each.kind in IMAGE_TYPES and each.size > 0 for each in bag.topics)
     topics = [each.name for each in bag.topics if each.kind in LENS_TYPES and each.size]
-    beside = [name for name in topics if images.startswith(name.rpartition("/")[0] + "/")]
-    for name in beside[:1] or (topics if len(topics) == 1 else []):
+    folders = {name: name.rpartition("/")[0] + "/" for name in topics}
+    beside = [name for name in topics if images.startswith(folders[name])]
+    nearest = [max(beside, key=lambda name: len(folders[name]))] if beside else []
+    for name in nearest or (topics if len(topics) == cameras == 1 else []):
         for _, message in bag.messages(name):
             try:
                 return lens_fields(message)

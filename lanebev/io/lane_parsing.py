@@ -104,7 +104,9 @@ def field(fields: Any, key: str, kind: type) -> Any:
     """Return the value of a key, if it is of this kind; else it is a ValueError."""
     if not isinstance(fields, dict) or not isinstance(fields.get(key), kind):
         got = type(fields.get(key)).__name__ if isinstance(fields, dict) and key in fields else "none"
-        raise ValueError(f"{key}: expected a {kind.__name__}, got {got}; formats: TuSimple, CULane, OpenLane")
+        raise ValueError(
+            f"{key}: expected a {kind.__name__}, got {got}; formats: TuSimple, CULane, CurveLanes, OpenLane"
+        )
     return fields[key]
 
 

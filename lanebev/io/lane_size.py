@@ -11,7 +11,7 @@ from lanebev.io.lanes import FrameLines
 
 _OUTSIDE = 0.1  # share of points below or far beside the images, of which more are of another size
 _BESIDE = 0.5  # image widths beside an image that lines are drawn on to
-_REACHED = 0.7  # of both sides, one of which a drive's lanes reach: they leave images at the bottom
+_REACHED = 0.8  # of both sides, one of which a drive's lanes reach: they leave images at the bottom
 _REACHED_DOWN = 0.55  # of the height, likewise; what is higher is the horizon
 
 

@@ -1,4 +1,4 @@
-"""Lane files of other detectors and data sets: TuSimple, CULane, OpenLane; which frame each belongs to.
+"""Lane files of other detectors and data sets, and which frame each entry belongs to.
 
 Everything here is in pixels of the image as it came. A cut or malformed file is a ``ValueError`` of one line
 that names file and line.
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.io.culane import read_culane
+from lanebev.io.curvelanes import read_curvelanes
 from lanebev.io.image_names import in_natural_order
 from lanebev.io.images import IMAGE_SUFFIXES
 from lanebev.io.lane_parsing import FrameLines, json_object, lane_text
@@ -25,6 +26,7 @@ __all__ = [
     "lane_files",
     "match_frames",
     "read_culane",
+    "read_curvelanes",
     "read_lanes",
     "read_openlane",
     "read_tusimple",
@@ -33,7 +35,7 @@ __all__ = [
 
 
 def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) -> list[FrameLines]:
-    """Read a TuSimple, CULane or OpenLane file, or a folder of the latter two.
+    """Read a TuSimple, CULane, CurveLanes or OpenLane file, or a folder of the latter three.
 
     Args:
         path: path of the file or folder.
@@ -52,7 +54,10 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
         return [read_culane(path)]
     text = lane_text(path)
     start = next((line for line in text.split("\n") if line.strip()), "")
-    return [read_openlane(path, intrinsics)] if _is_openlane(start, text) else read_tusimple(path)
+    if _has_key("Lines", start, text):
+        return [read_curvelanes(path)]
+    openlane = _has_key("lane_lines", start, text)
+    return [read_openlane(path, intrinsics)] if openlane else read_tusimple(path)
 
 
 def lane_files(path: str | Path) -> list[Path]:
@@ -132,8 +137,8 @@ def _parts(name: str) -> tuple[str, ...]:
     return tuple(part for part in path.parts if part not in ("/", "."))
 
 
-def _is_openlane(first_line: str, text: str) -> bool:
+def _has_key(key: str, first_line: str, text: str) -> bool:
     try:
-        return "lane_lines" in json_object(text)
+        return f'"{key}"' in text and key in json_object(text)
     except ValueError:
-        return '"lane_lines"' in first_line
+        return f'"{key}"' in first_line

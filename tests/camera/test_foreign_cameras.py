@@ -245,3 +245,76 @@ def test_a_matrix_of_the_binned_images_is_refused(tmp_path):  # avt_vimba_camera
         )
     full = [4 * matrix[0], 0, 4 * matrix[2], 0, 4 * matrix[4], 4 * matrix[5], 0, 0, 1]
     assert _read(tmp_path / "c.json", json.dumps({**fields, "K": full})).image_size == (386, 516)
+
+
+@pytest.mark.parametrize("rectified", [False, True])
+def test_kittis_camera_of_resized_images_is_refused(tmp_path, rectified):
+    text = "P2: 800 0 700 0 0 800 250 0 0 0 1 0\n"  # of no known recording day
+    _is(
+        _read(tmp_path / "c.txt", text, image_size=(500, 1400), rectified=rectified),
+        800,
+        800,
+        700,
+        250,
+        1400,
+        500,
+    )
+    with pytest.raises(
+        ValueError, match="P2: expected a camera of the images' 700 x 250 px, got a principal"
+    ):
+        _read(tmp_path / "c.txt", text, image_size=(250, 700), rectified=rectified)
+
+
+def test_rectified_images_have_no_lens_of_colmaps(tmp_path):
+    with pytest.raises(ValueError, match="projection_matrix: expected P for rectified images, got none"):
+        _read(tmp_path / "cameras.txt", "1 RADIAL 1280 720 800 640 360 -0.3 0.1\n", rectified=True)
+    camera = _read(tmp_path / "cameras.txt", "1 SIMPLE_PINHOLE 1280 720 800 640 360\n", rectified=True)
+    _is(camera, 800, 800, 639.5, 359.5, 1280, 720)
+
+
+ORB_SLAM = """%YAML:1.0
+
+#--------------------------------------------------------------------------------------------
+Camera.type: "{0}"
+
+Camera{1}.fx: 458.654
+Camera{1}.fy: 457.296
+Camera{1}.cx: 367.215
+Camera{1}.cy: 248.375
+
+Camera{1}.k1: -0.28340811
+Camera{1}.k2: 0.07395907
+{2}
+Camera.width: 752
+Camera.height: 480
+Camera.fps: 20.0
+ORBextractor.nFeatures: 1200
+"""
+
+
+@pytest.mark.parametrize("of", ["", "1"])
+@pytest.mark.parametrize(
+    ("kind", "more", "expected"),
+    [
+        (
+            "PinHole",
+            "Camera{0}.p1: 1e-4\nCamera{0}.p2: 2e-5",
+            ([-0.28340811, 0.07395907, 1e-4, 2e-5, 0], "pinhole"),
+        ),
+        (
+            "KannalaBrandt8",
+            "Camera{0}.k3: 0.1\nCamera{0}.k4: 0.2",
+            ([-0.28340811, 0.07395907, 0.1, 0.2], "fisheye"),
+        ),
+        ("Rectified", "", ([], "pinhole")),
+    ],
+)
+def test_orb_slams_settings(tmp_path, of, kind, more, expected):  # ORB_SLAM3#493
+    camera = _read(tmp_path / "c.yaml", ORB_SLAM.format(kind, of, more.format(of)))
+    _is(camera, 458.654, 457.296, 367.215, 248.375, 752, 480, *expected)
+    with pytest.raises(
+        ValueError, match=r"Camera\.type: expected PinHole, Rectified or KannalaBrandt8, got 'Omni'"
+    ):
+        _read(tmp_path / "c.yaml", ORB_SLAM.format("Omni", of, ""))
+    with pytest.raises(ValueError, match=r"Camera\.height: expected a value, got none"):
+        _read(tmp_path / "c.yaml", ORB_SLAM.format(kind, of, "").replace("Camera.height", "Camera.rows"))

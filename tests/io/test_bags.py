@@ -61,12 +61,17 @@ def _info():
     )
 
 
-def _bag(folder, plugin=StoragePlugin.SQLITE3, topics=("/cam/image/compressed",), lens=True):
+def _bag(
+    folder, plugin=StoragePlugin.SQLITE3, topics=("/cam/image/compressed",), lenses=("/cam/camera_info",)
+):
+    """A bag whose lenses have focal lengths a pixel longer from one to the next."""
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
-        if lens:
+        for more, lens in enumerate(lenses):
             name = "sensor_msgs/msg/CameraInfo"
-            connection = writer.add_connection("/cam/camera_info", name, typestore=STORE)
-            writer.write(connection, round(1e9 * START), STORE.serialize_cdr(_info(), name))
+            connection = writer.add_connection(lens, name, typestore=STORE)
+            info = _info()
+            info.k[0] += more
+            writer.write(connection, round(1e9 * START), STORE.serialize_cdr(info, name))
         for topic in topics:
             name = "sensor_msgs/msg/CompressedImage"
             connection = writer.add_connection(topic, name, typestore=STORE)
@@ -230,7 +235,7 @@ def _fails(capsys, *arguments, word):
 
 
 def test_bags_that_cannot_be_a_source(tmp_path, capsys, monkeypatch):
-    two = _bag(tmp_path / "two", topics=("/a", "/b"), lens=False)
+    two = _bag(tmp_path / "two", topics=("/a", "/b"), lenses=())
     _fails(capsys, "run", two, word="expected one topic of images, got: /a, /b; choose one with --topic")
     _fails(capsys, "run", two, "--topic", "/c", word="expected images on /c, got them on: /a, /b")
     _fails(capsys, "run", two, "--topic", "/a", word="has no calibrated CameraInfo beside /a")

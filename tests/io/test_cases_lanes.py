@@ -200,7 +200,7 @@ def test_lanes_of_larger_images_lie_outside(scale):
         size_remark(_entries(scale), (720, 1280))
 
 
-@pytest.mark.parametrize("scale", [0.25, 0.5, 2 / 3])
+@pytest.mark.parametrize("scale", [0.25, 0.5, 2 / 3, 0.75, 0.78])
 def test_lanes_of_smaller_images_are_noticed(scale):
     remark = size_remark(_entries(scale), (720, 1280))
     assert "of smaller images? state their size with --lanes-size" in remark

@@ -4,9 +4,12 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from lanebev import Camera
-from lanebev.io.lanes import read_lanes
+from lanebev.app.config import RunConfig
+from lanebev.app.sources import make_source
+from lanebev.io.lanes import match_frames, read_lanes
 from lanebev.observation.boundary_order import boundary_indices
 from lanebev.observation.polylines import LaneLine, vertices_from_lines
 
@@ -139,3 +142,44 @@ def test_points_in_no_order_are_a_line_all_the_same():
     shuffled = np.random.default_rng(0).permutation(LEFT)
     found, expected = (vertices_from_lines([LaneLine(line, 2)], CAMERA) for line in (shuffled, LEFT))
     np.testing.assert_array_equal(found.points, expected.points)
+
+
+def test_curvelanes(tmp_path):  # CLRerNet#60
+    (tmp_path / "labels").mkdir()
+    path = tmp_path / "labels" / "a.lines.json"
+    drawn = [
+        [{"y": "590.0", "x": "5.25"}, {"y": 580, "x": 7}, {"x": None, "y": 570}],
+        [],
+        [{"x": "nan", "y": 1}],
+    ]
+    path.write_text(json.dumps({"Lines": drawn}))
+    (frame,) = read_lanes(path.parent)
+    assert match_frames([str(tmp_path / "images" / "a.jpg")], [frame]) == [0]
+    (line,) = frame.lines
+    np.testing.assert_array_equal(line.points, [[5.25, 590], [7, 580], [np.nan, 570]])
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (5, "Lines: expected a list, got int"),
+        ([5], r"Lines\[0\]: expected a list, got 5"),
+        ([[[1, 2]]], r"Lines\[0\]: expected points with x and y, got list"),
+        ([[{"x": "a", "y": 1}]], r"Lines\[0\]: expected finite numbers"),
+        ([[{"x": 1e9, "y": 1}]], r"Lines\[0\]: expected pixels, got 1e\+09"),
+    ],
+)
+def test_what_is_no_curvelanes_is_one_clear_line(tmp_path, lines, message):
+    (tmp_path / "a.lines.json").write_text(json.dumps({"Lines": lines}))
+    with pytest.raises(ValueError, match=message):
+        read_lanes(tmp_path / "a.lines.json")
+
+
+def test_a_folder_whose_names_state_no_times_says_which_rate_is_assumed(tmp_path):
+    for number in range(3):
+        Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / f"{number}.png")
+    assumed = make_source(RunConfig(str(tmp_path), "c")).problem
+    assert assumed.endswith("state no times, 30 frames per second are assumed; state --fps")
+    for settings in ({"fps": 10.0}, {"stills": True}):
+        assert make_source(RunConfig(str(tmp_path), "c", **settings)).problem == ""
+    assert make_source(RunConfig(str(tmp_path / "0.png"), "c")).problem == ""

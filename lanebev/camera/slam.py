@@ -1,0 +1,106 @@
+"""Camera files of Kalibr and EuRoC, of CamOdoCal and VINS, and of ORB-SLAM."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from lanebev.camera.parameters import CameraParameters
+from lanebev.camera.parsing import mapping, number, numbers, required, whole_number
+from lanebev.numbers import shown
+
+_KALIBR_MODELS = {  # camera_model, distortion_model of Kalibr, EuRoC and TUM-VI
+    ("pinhole", "none"): "pinhole",
+    ("pinhole", "radtan"): "pinhole",
+    ("pinhole", "radial-tangential"): "pinhole",
+    ("pinhole", "equi"): "fisheye",
+    ("pinhole", "equidistant"): "fisheye",
+    ("omni", "none"): "omni",
+    ("omni", "radtan"): "omni",
+}
+_ORB_SLAM_MODELS = {  # Camera.type -> model and coefficients
+    "pinhole": ("pinhole", "k1 k2 p1 p2 k3"),
+    "rectified": ("pinhole", ""),
+    "kannalabrandt8": ("fisheye", "k1 k2 k3 k4"),
+}
+
+
+def is_kalibr(fields: Mapping[str, Any]) -> bool:
+    """Tell whether the keys are those of Kalibr's camera chain, or of one camera as in EuRoC."""
+    return "intrinsics" in fields or any(re.fullmatch(r"cam\d+", key, re.ASCII) for key in fields)
+
+
+def kalibr(fields: Mapping[str, Any]) -> CameraParameters:
+    """Read Kalibr's camchain, its first camera, or EuRoC's ``sensor.yaml``.
+
+    Source: Kalibr, wiki, "Supported models" and "Yaml formats".
+    """
+    chain = [key for key in fields if re.fullmatch(r"cam\d+", key, re.ASCII)]
+    if chain:
+        first = min(chain, key=lambda key: int(key[3:10]))
+        fields = mapping(first, fields[first])
+    names = (
+        str(required(fields, ["camera_model"])).strip(),
+        str(fields.get("distortion_model") or "none").strip(),
+    )
+    if names not in _KALIBR_MODELS:
+        known = ", ".join("-".join(each) for each in _KALIBR_MODELS)
+        raise ValueError(f"camera_model: expected one of {known}, got {shown('-'.join(names))}")
+    model = _KALIBR_MODELS[names]
+    intrinsics = numbers(fields, "intrinsics", count=5 if model == "omni" else 4)
+    coefficients = ("distortion_coeffs", "distortion_coefficients")
+    distortion = [0.0] * 4
+    if names[1] != "none":
+        distortion = numbers(fields, *coefficients, count=4)
+    elif any(fields.get(key) for key in coefficients) and any(numbers(fields, *coefficients)):
+        raise ValueError("distortion_model: expected the one of distortion_coeffs, got none; add the entry")
+    *xi, fx, fy, cx, cy = intrinsics
+    width, height = numbers(fields, "resolution", count=2)
+    return CameraParameters(
+        [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        [*xi, *distortion],
+        model,
+        (round(height), round(width)),
+    )
+
+
+def camodocal(fields: Mapping[str, Any]) -> CameraParameters:
+    """Read CamOdoCal's YAML, which VINS and KITTI-360's fisheyes use: PINHOLE, KANNALA_BRANDT or MEI."""
+    name = str(required(fields, ["model_type"])).strip().upper()
+    projection = mapping("projection_parameters", required(fields, ["projection_parameters"]))
+    size = (whole_number(fields, "image_height"), whole_number(fields, "image_width"))
+    if name == "KANNALA_BRANDT":
+        fx, fy, cx, cy = (number(projection, key) for key in ("mu", "mv", "u0", "v0"))
+        model, distortion = "fisheye", [number(projection, key) for key in ("k2", "k3", "k4", "k5")]
+    elif name in ("PINHOLE", "MEI"):
+        distorted = mapping("distortion_parameters", required(fields, ["distortion_parameters"]))
+        model, distortion = "pinhole", [number(distorted, key) for key in ("k1", "k2", "p1", "p2")]
+        keys = ("fx", "fy", "cx", "cy")
+        if name == "MEI":
+            mirror = mapping("mirror_parameters", required(fields, ["mirror_parameters"]))
+            model, distortion = "omni", [number(mirror, "xi"), *distortion]
+            keys = ("gamma1", "gamma2", "u0", "v0")
+        fx, fy, cx, cy = (number(projection, key) for key in keys)
+    else:
+        raise ValueError(f"model_type: expected PINHOLE, KANNALA_BRANDT or MEI, got {shown(name)}")
+    return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, model, size)
+
+
+def is_orb_slam(fields: Mapping[str, Any]) -> bool:
+    """Return whether these are the keys of ORB-SLAM's settings."""
+    return "Camera.fx" in fields or "Camera1.fx" in fields
+
+
+def orb_slam(fields: Mapping[str, Any]) -> CameraParameters:
+    """Read the settings of ORB-SLAM 2 or 3: the camera, the left one of two."""
+    of = "Camera1." if "Camera1.fx" in fields else "Camera."
+    kind = str(fields.get("Camera.type") or "PinHole").strip()
+    if kind.lower() not in _ORB_SLAM_MODELS:
+        raise ValueError(f"Camera.type: expected PinHole, Rectified or KannalaBrandt8, got {shown(kind)}")
+    model, names = _ORB_SLAM_MODELS[kind.lower()]
+    fx, fy, cx, cy = (number(fields, of + key) for key in ("fx", "fy", "cx", "cy"))
+    given = [of + key for key in names.split()]
+    distortion = [number(fields, key) if fields.get(key) is not None else 0.0 for key in given]
+    size = (whole_number(fields, "Camera.height"), whole_number(fields, "Camera.width"))
+    return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, model, size)
