@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -21,6 +22,7 @@ from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
 
 STAGES = ("segmenter", "extractor", "calibrator", "warp")
+_WIDTH_STEP = 64  # px
 
 
 @register_pytree
@@ -55,6 +57,9 @@ class LaneBEV(nn.Module):
         warp: default :class:`BEVWarp` on the default grid.
         network_width: width, px, to which the image is resized for the segmenter; the height follows by the
             aspect ratio, rounded to a multiple of 32. None does not resize.
+        network_pixels: number of pixels that the network's input should have. A wide image, which would have
+            fewer at ``network_width``, is resized to a larger width, at most its own. None: all images are
+            resized to ``network_width``.
         pose_sigma_scale: factor on the standard deviations of the pose; None takes the segmenter's
             (:class:`SegmenterConfig`), or 1 where it has none.
         frozen: names of STAGES without training and gradients: they stay in evaluation mode, and no graph of
@@ -73,6 +78,7 @@ class LaneBEV(nn.Module):
         network_width: int | None = None,
         pose_sigma_scale: float | None = None,
         frozen: Collection[str] = (),
+        network_pixels: int | None = None,
     ) -> None:
         super().__init__()
         if unknown := set(frozen) - set(STAGES):
@@ -92,6 +98,7 @@ class LaneBEV(nn.Module):
         self.calibrator = calibrator
         self.warp = warp or BEVWarp()
         self.network_width = network_width
+        self.network_pixels = network_pixels
         self.pose_sigma_scale = pose_sigma_scale
         self.frozen = frozenset(frozen)
         for stage in self.frozen:
@@ -119,7 +126,8 @@ class LaneBEV(nn.Module):
             weights: another file in the same format; None is the shipped one.
             grid: grid of the view.
             calibrator: None is a default :class:`lanebev.JointCalibrator` of the network's boundaries.
-            network_width: px; None is what the weights were trained for.
+            network_width: px; None is the width that the weights were trained for, and a larger one for wide
+                images, at which the input has about as many pixels as in training.
             frozen: see the class.
 
         Raises:
@@ -129,10 +137,12 @@ class LaneBEV(nn.Module):
         from lanebev.weights import load_segmenter
 
         segmenter = load_segmenter(weights)
-        width = network_width or int(segmenter.image_size[1])
+        rows, columns = map(int, segmenter.image_size)
+        width, pixels = (columns, rows * columns) if network_width is None else (network_width, None)
         extractor = LineExtractor.for_network(segmenter.config)
         calibrator = calibrator or JointCalibrator(num_boundaries=segmenter.config.num_boundaries)
-        return cls(segmenter, extractor, calibrator, BEVWarp(grid), width, frozen=frozen)
+        view = BEVWarp(grid)
+        return cls(segmenter, extractor, calibrator, view, width, frozen=frozen, network_pixels=pixels)
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
@@ -273,8 +283,7 @@ class LaneBEV(nn.Module):
         """Return the (h, w) px to which images of (H, W) px are resized for the segmenter."""
         if self.network_width is None:
             return image_size
-        height, width = image_size
-        return max(32, 32 * round(height * self.network_width / width / 32)), self.network_width
+        return resized_size(image_size, self.network_width, self.network_pixels)
 
     def _resize(self, image: Tensor) -> Tensor:
         size = self.network_size((image.shape[-2], image.shape[-1]))
@@ -288,6 +297,23 @@ class LaneBEV(nn.Module):
             align_corners=False,
         )
         return resized.to(image.dtype)
+
+
+def resized_size(image_size: tuple[int, int], network_width: int, pixels: int | None) -> tuple[int, int]:
+    """Compute the size (h, w) px of a network's input for images of (H, W) px.
+
+    Args:
+        image_size: (H, W).
+        network_width: least w.
+        pixels: number of pixels that the input should have: w is as large as this allows, in steps of 64 px,
+            and at most W. None: w is ``network_width``.
+    """
+    height, width = image_size
+    wanted = network_width
+    if pixels is not None:
+        equal = min(math.sqrt(pixels * width / height), width)
+        wanted = max(network_width, _WIDTH_STEP * int(equal / _WIDTH_STEP))
+    return max(32, 32 * round(height * wanted / width / 32)), wanted
 
 
 def _configured(part: nn.Module, name: str, default: Any = None) -> Any:

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import scipy.stats
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -99,16 +100,32 @@ def summarise(answers: list[Answer], truth: Tensor) -> dict[str, float]:
     tracking = torch.tensor([answer.tracking for answer in answers])
     inside = (error <= SIGMAS * sigma).double().mean(0)
     middle = error.median(0).values
+    low, high = median_interval(error)
     return {
         "images": len(answers),
         "tracking": int(tracking.sum()),
         "pitch_median_deg": float(middle[0]),
         "roll_median_deg": float(middle[1]),
+        "pitch_median_low_deg": float(low[0]),
+        "pitch_median_high_deg": float(high[0]),
+        "roll_median_low_deg": float(low[1]),
+        "roll_median_high_deg": float(high[1]),
         "pitch_within_3_sigma": float(inside[0]),
         "roll_within_3_sigma": float(inside[1]),
         "pitch_worst_deg": float(error[:, 0].max()),
         "roll_worst_deg": float(error[:, 1].max()),
     }
+
+
+def median_interval(error: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute the 95 % interval of the medians (P,) of errors (N, P), were other images drawn.
+
+    Source: how many of N values lie below a median is binomial (David and Nagaraja 2003, Sec. 7.1).
+    """
+    count = len(error)
+    below = int(scipy.stats.binom.ppf(0.025, count, 0.5))
+    ordered = error.sort(0).values
+    return ordered[max(below - 1, 0)], ordered[min(count - below, count - 1)]
 
 
 def kitti_road(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:

@@ -38,6 +38,8 @@ def test_shipped_network_is_the_papers_resnet_18(segmenter):
 def test_from_pretrained_runs_at_the_size_it_was_trained_for(segmenter):
     model = lanebev.LaneBEV.from_pretrained()
     assert model.network_width == segmenter.image_size[1]
+    assert model.network_size((375, 1242)) == (224, 768)
+    assert lanebev.LaneBEV.from_pretrained(network_width=320).network_size((375, 1242)) == (96, 320)
     stride = segmenter.config.output_stride
     logits, segments = model.observe(torch.rand(1, 3, 360, 640), torch.eye(3)[None] * 600)
     assert logits.shape[-1] == segmenter.image_size[1] // stride

@@ -21,7 +21,7 @@ from lanebev import (
 from lanebev.geometry.lens import distort_points
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.segmenter import SegmenterConfig
-from lanebev.pipeline import STAGES
+from lanebev.pipeline import STAGES, resized_size
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes
 from lanebev.types import Extrinsics
@@ -142,6 +142,22 @@ def test_network_sees_its_width_and_the_rest_does_not():
     net = model(network_width=64)
     net(images(1), INTRINSICS[None], None)
     assert net.segmenter.seen == [(1, 3, 32, 64)]
+
+
+@pytest.mark.parametrize(
+    ("image", "size"),
+    [
+        ((720, 1280), (320, 576)),  # what the network was trained for
+        ((512, 1024), (288, 576)),
+        ((480, 640), (448, 576)),
+        ((375, 1242), (224, 768)),  # KITTI
+        ((590, 1640), (256, 704)),  # CULane
+        ((188, 624), (160, 576)),  # no more than it has itself
+    ],
+)
+def test_a_wide_image_has_about_as_many_pixels(image, size):
+    assert resized_size(image, 576, 320 * 576) == size
+    assert resized_size(image, 576, None) == (32 * round(576 * image[0] / image[1] / 32), 576)
 
 
 def test_the_pose_is_less_sure_by_the_networks_factor():

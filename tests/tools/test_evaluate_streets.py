@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lanebev.geometry.rotation import road_from_cam
-from tools.evaluate_streets import Answer, kitti_truth, plane_angles, summarise
+from tools.evaluate_streets import Answer, kitti_truth, median_interval, plane_angles, summarise
 
 
 @pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (0.03, -0.05), (-0.1, 0.2)])
@@ -36,3 +36,11 @@ def test_summary_counts_images_within_three_sigma():
     assert figures["pitch_within_3_sigma"] == pytest.approx(2 / 3)
     assert figures["roll_within_3_sigma"] == pytest.approx(1.0)
     assert figures["roll_worst_deg"] == pytest.approx(2.0)
+
+
+def test_the_interval_of_a_median_holds_it_19_times_in_20():
+    generator = torch.Generator().manual_seed(1)
+    low, high = median_interval(torch.randn(27, 4000, generator=generator))
+    held = ((low <= 0) & (high >= 0)).double().mean()
+    assert 0.97 < held < 0.99  # 0.981; of one order statistic less on either side 0.948, of one more 0.994
+    assert median_interval(torch.tensor([[3.0], [1.0]])) == (1.0, 3.0)
