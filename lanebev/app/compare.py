@@ -8,7 +8,7 @@ from lanebev.report.run_folder import read_run
 
 
 def compare(first: str, second: str, out: str) -> str:
-    """Write a page that compares two output folders of runs; nothing of it if something is amiss.
+    """Write a page that compares two output folders of runs, completely or not at all.
 
     Args:
         first: folder of a run.

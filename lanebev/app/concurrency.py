@@ -55,16 +55,16 @@ def prefetch(items: Iterable[T], depth: int = 4) -> Iterator[T]:
 
 
 def map_ahead(call: Callable[[T], Result], items: Iterable[T], workers: int) -> Generator[tuple[T, Result]]:
-    """Yield each item with what ``call`` makes of it, in order, several calls at a time in threads.
+    """Yield each item with the result of ``call``, in order, with several calls in parallel threads.
 
-    Until the end, torch's threads are shared out among the calls, and its operations in other threads use no
-    more. Several calls of one thread each are faster than one call after another of several threads, which
-    wait for each other at the end of every operation.
+    Meanwhile torch's threads are divided among the calls; its operations in other threads use no more
+    threads than one call. Several calls of one thread each are faster than one call after another with
+    several threads, which wait for each other at the end of every operation.
 
     Args:
-        call: may run in several threads at once.
-        items: made ahead in a thread.
-        workers: calls at a time.
+        call: function that may run in several threads at once.
+        items: input, produced ahead in a thread.
+        workers: number of parallel calls.
     """
     threads = torch.get_num_threads()
     pool = ThreadPoolExecutor(workers, "map_ahead")

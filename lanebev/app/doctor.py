@@ -61,14 +61,15 @@ class Sample:
 
 
 def doctor(config: RunConfig, progress: Progress | None = None) -> tuple[str, int]:
-    """Look at a source and its camera.
+    """Check a source and its camera.
 
     Args:
-        config: source, camera, and what the network needs.
-        progress: wraps the frames that are looked at.
+        config: source, camera, and settings of the network.
+        progress: wraps the frames that are checked.
 
     Returns:
-        what to print, and 0 if all is well, 1 if something is doubtful, 2 if the camera does not fit.
+        the text to print, and 0 if all checks passed, 1 if something is doubtful, 2 if the camera does not
+        fit.
 
     Raises:
         ValueError: source or camera cannot be read.
@@ -189,8 +190,8 @@ def check_lanes(sample: Sample) -> Finding:
 def check_pose(sample: Sample) -> Finding:
     """Check if the median pose of the frames is possible for a camera in a car.
 
-    A focal length that is wrong changes the pitch and yaw of a vanishing point, and hardly anything else:
-    lanes alone do not tell it, unless the pose gets impossible.
+    A wrong focal length changes pitch and yaw, and hardly anything else: lanes alone do not show it, unless
+    the pose becomes impossible.
     """
     if not sample.poses:
         return Finding(DOUBT, "pose: none, since lanes were not found well enough in any frame")

@@ -1,8 +1,8 @@
 """Batched Kalman prediction and update, independent of lanes and cameras.
 
 The update is in information form: N scalar measurements enter as a D × D matrix and a D-vector, so it
-costs O(N D²) where the gain form inverts an N × N matrix (Eq. (15)), and a measurement of weight zero is
-simply not there.
+costs O(N D²) where the gain form inverts an N × N matrix (Eq. (15)), and a measurement of weight zero has no
+effect.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def information(
         innovation: (..., N), measured minus predicted.
         jacobian: (..., N, D), of the predicted measurement by the state.
         measurement_noise: (..., N) variances, > 0 where the weight is.
-        weight: (..., N) in [0, 1], or None for all 1. Zero: not there, whatever the other entries hold.
+        weight: (..., N) in [0, 1], or None for all 1. Measurements of weight 0 are ignored.
 
     Returns:
         (..., D, D) and (..., D).
@@ -130,8 +130,8 @@ def smoother_gain(cov: Tensor, transition: Tensor, process_noise: Tensor, linked
         cov: (..., D, D), P, filtered.
         transition: (..., D, D), F, to the later state.
         process_noise: (..., D, D), W.
-        linked: (..., D, D) bool, [i, j]: entry j of the later state tells of entry i. Of entries in blocks
-            each block is solved separately; an entry without information has a column of zeros.
+        linked: (..., D, D) bool, [i, j]: entry j of the later state has information on entry i. Blocks are
+            solved separately; an entry without information has a column of zeros.
 
     Returns:
         (..., D, D).

@@ -71,10 +71,10 @@ def decoded(  # noqa: C901 - every loop is a way in which files are damaged
 ) -> Iterator[tuple[int | None, av.VideoFrame | str]]:
     """Return frames as they are shown, with the times that the file gives; of a lost one, what was got.
 
-    A packet whose frame does not come is lost if the file is damaged up to there; in a sound one it shows
-    nothing. A frame that the decoder marks as corrupt is lost too. AVI has no times of display, so that the
-    frames of a stream with B-frames come with another's: they take the packets' times in order. No frame
-    threads: they drop what follows the last error.
+    A packet that yields no frame is lost if the file is damaged before it; in an undamaged file it shows
+    nothing. A frame that the decoder marks as corrupt is lost too. AVI has no display times, so the frames of
+    a stream with B-frames come with wrong ones: they get the packets' times in order. Frame threads are not
+    used, because they drop what follows the last error.
     """
     in_order = container.format.name == "avi" and stream.codec_context.has_b_frames
     due: list[int] = []  # times of packets whose frames have not come

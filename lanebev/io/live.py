@@ -24,13 +24,14 @@ _LOW_DELAY = {"flags": "low_delay", "rtsp_transport": "tcp"}
 
 @dataclass
 class LiveFigures:
-    """What became of a stream's frames.
+    """Statistics of a stream's frames.
 
     Attributes:
-        seen: frames that were handed on.
-        dropped: frames that came while an earlier one was looked at, and were replaced by a later one.
-        longest_wait: s from a frame's arrival to when it was handed on.
-        longest_delay: s from a frame's arrival to when the next one was asked for.
+        seen: number of frames that were passed on.
+        dropped: number of frames that arrived during the processing of an earlier one and were replaced by
+            a later one.
+        longest_wait: s from a frame's arrival until it was passed on.
+        longest_delay: s from a frame's arrival until the next one was requested.
         end: why the stream ended, empty if it was stopped or ran out.
     """
 
@@ -53,15 +54,15 @@ class LiveFigures:
 class LiveSource(FrameSource):
     """A stream that is read in its own thread, which keeps the newest frame only.
 
-    Frames' times are those of their arrival. A slow consumer gets the newest frame only, so that the
-    delay is that of one frame however slow the looking is. The thread reads from the opening on, also while
-    nobody looks yet, so that nothing queues in the network. With ``keep_all`` nothing is dropped, the stream
-    waits instead, and times are those that the stream states.
+    Frames' times are those of their arrival. A slow consumer gets the newest frame only, so that the delay
+    stays that of one frame. The thread reads from the opening on, also before the first frame is requested,
+    so that nothing queues in the network. With ``keep_all`` nothing is dropped, the stream waits instead, and
+    times are those that the stream states.
 
     Attributes:
         slot: place where the thread leaves the frames.
-        keep_all: wait for whoever looks.
-        figures: what became of the frames.
+        keep_all: drop no frame; wait for the consumer.
+        figures: statistics of the frames.
     """
 
     slot: _Slot | None = None

@@ -158,10 +158,10 @@ class OutputFolder:
     """A folder whose files appear all together when the work is done, or not at all.
 
     Files are written into a hidden temporary folder in it, or beside it if it is new, so on the same disk.
-    On success they take their place, and outputs of an earlier run that this one did not write anew are
-    removed; files of other names in an existing folder are left alone. On any error the folder is as it was.
-    One process at a time has the temporary folder. One that was killed leaves it behind, for the next to take
-    up or to replace. Hidden files in it are notes for that, and no outputs.
+    On success they are moved into place, and outputs of an earlier run that this one did not write are
+    removed; files of other names in an existing folder stay. On any error the folder is unchanged. Only one
+    process at a time has the temporary folder. A killed process leaves it behind, for the next one to reuse
+    or replace. Hidden files in it serve that purpose and are no outputs.
     """
 
     def __init__(self, folder: str | Path) -> None:

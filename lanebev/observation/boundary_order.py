@@ -21,12 +21,12 @@ def boundary_indices(
 ) -> list[int | None]:
     """Number the lines by boundary: the nearest on the left is L/2 - 1, the nearest on the right L/2.
 
-    The lower half of each line is extended to the bottom of the image; the lines are counted outwards in
-    that order, also those that leave the image sideways. A line runs down to its own side of the camera, so
-    its slope tells the side at any yaw. A neighbour much nearer than usual, or nearer than any lane is wide,
-    is the other edge of the same marking, or the line drawn twice, and gets None; one twice as far as usual
-    is the next but one. Nearer than any lane: on a plane, slopes dx/dy of two boundaries differ by their
-    distance over the camera's height, whatever pitch, yaw and focal length are.
+    The lower half of each line is extended to the bottom of the image, also if the line leaves the image
+    sideways, and the lines are counted outwards in that order. Going down, a line runs to its own side of the
+    camera, so its slope gives the side at any yaw. A neighbour much nearer than usual, or nearer than the
+    narrowest lane, is the other edge of the same marking or the same line drawn twice, and gets None; one
+    twice as far as usual is the next but one. For the narrowest lane: on a plane, the slopes dx/dy of two
+    boundaries differ by their distance over the camera's height, for any pitch, yaw and focal length.
 
     Args:
         lines: each (P, 2) px, undistorted; P = 0 and 1 get None.

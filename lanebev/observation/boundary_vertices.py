@@ -26,7 +26,7 @@ class BoundaryVertices(NamedTuple):
         points: (B, P, V, 2) px, (x, y) of the image as it was taken.
         weight: (B, P, V) in [0, 1], confidence that the boundary is there; 0 is padding or not seen.
         sigma: (B, P, V) px, standard deviation of a vertex' position across its boundary. The errors of any
-            two vertices are independent: where a detector's are not, its sigmas are larger by as much.
+            two vertices count as independent; if a detector's are correlated, its sigmas must be enlarged.
         boundary: (B, P) int64, index of the semantic lane boundary, left to right.
     """
 
@@ -53,8 +53,8 @@ def line_directions(points: Tensor, there: Tensor) -> Tensor:
     """Compute the direction of a line at its vertices, from the vertex before to the one after.
 
     Args:
-        points: (..., V, 2), those that are there in front.
-        there: (..., V) bool.
+        points: (..., V, 2), existing ones first.
+        there: (..., V) bool, whether a point exists.
 
     Returns:
         (..., V, 2), of any length; 0 at a vertex that has no neighbours.

@@ -20,9 +20,9 @@ class LineExtractor(nn.Module):
     """Converts logits to the vertices of lane boundaries, or to :class:`~lanebev.LaneSegments`.
 
     Source: Sect. "Experiments": where a boundary's probability is larger than 0.5, the mean position of its
-    on-pixels, then representative vertices. Deviation: so it is on maps of zeros and ones; on others a pixel
-    counts by its probability, so that gradients flow and a faint line is a line with less weight. Rows are
-    scanned for steep boundaries and columns for shallow ones. A representative vertex is the mean of its
+    on-pixels, then representative vertices. Deviation: pixels are weighted by their probability, so that
+    gradients flow and a faint line has less weight; on maps of zeros and ones this is the paper's rule. Rows
+    are scanned for steep boundaries and columns for shallow ones. A representative vertex is the mean of its
     stretch of the boundary, not one sample of it.
     """
 
@@ -32,16 +32,14 @@ class LineExtractor(nn.Module):
 
     @classmethod
     def for_network(cls, network: SegmenterConfig, correlation: float = NETWORK_CORRELATION) -> LineExtractor:
-        """Return the extractor for a network's maps; for single frames, in which no error lasts, without
-        ``correlation``.
-        """
+        """Return the extractor for a network's maps; for single frames ``correlation`` is not used."""
         stride, factor = network.output_stride, network.sigma_scale
         return cls(LineConfig(stride=stride, sigma_scale=factor, correlation=correlation))
 
     def forward(
         self, logits: Tensor, image_size: tuple[int, int], network_size: tuple[int, int] | None = None
     ) -> LaneSegments:
-        """Extract segments in pixels of the image as it came: undistorted if that was.
+        """Extract segments in pixels of the given image; it must be undistorted if they are to be.
 
         Args:
             logits: as for :meth:`vertices`.
@@ -63,13 +61,13 @@ class LineExtractor(nn.Module):
         """Extract vertices, which :func:`~lanebev.observation.segments.segments_from_vertices` pairs.
 
         Args:
-            logits: (B, 1+L, h, w), background first; of half precision they are raised to float32.
-            image_size: (H, W) of the image in whose pixels the vertices are wanted.
-            network_size: (H', W') of the same image, resized, as the network had it; None is the map's size
-                times the stride.
+            logits: (B, 1+L, h, w), background first; half precision is converted to float32.
+            image_size: (H, W) of the image in whose pixels the vertices are returned.
+            network_size: (H', W') of the network's input, the resized image; None is the map's size times
+                the stride.
 
         Returns:
-            Vertices of L boundaries, at most 2S on each, those that were seen in front.
+            Vertices of L boundaries, at most 2S on each, those with a weight first.
 
         Raises:
             ValueError: another shape, or a map that is not of the network's input by the stride.

@@ -12,8 +12,8 @@ def paper_vertices(probabilities: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Compute the mean position of each row's on-pixels, and sample vertices evenly from these rows.
 
     Source: Sec. VI-A, "for each lane boundary whose probability is larger than 0.5, we extract vertices by
-    searching through the mean position of on-pixels and then sample representative vertices". Rows and even
-    sampling are ours, as the paper names neither. :func:`~lanebev.observation.vertices.scan_vertices` is the
+    searching through the mean position of on-pixels and then sample representative vertices". The paper
+    states neither rows nor even sampling. :func:`~lanebev.observation.vertices.scan_vertices` is the
     differentiable rule that :class:`lanebev.LineExtractor` uses.
 
     Args:

@@ -34,10 +34,10 @@ class LaneLine(NamedTuple):
 
     Attributes:
         points: (P, 2) px, (x, y) of the image as it came; x is NaN in a gap of the line.
-        boundary: index of the semantic boundary if the source says so, else None.
-        sigma: (P,) px, standard deviation of each point across the line if the source says so, else None.
-        weight: (P,) in [0, 1], confidence in each point of a line whose points are vertices with errors of
-            their own; None for a polyline, of which points on rows are taken.
+        boundary: index of the semantic boundary if the source states it, else None.
+        sigma: (P,) px, standard deviation of each point across the line if the source states it, else None.
+        weight: (P,) in [0, 1], confidence in each point, if the points are vertices with independent errors;
+            None for a polyline, which is sampled on rows.
     """
 
     points: NDArray[np.float64]

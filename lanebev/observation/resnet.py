@@ -39,8 +39,8 @@ class BasicBlock(nn.Module):
 class ResNet18(nn.Module):
     """ResNet-18 without its classifier: an image to five feature maps.
 
-    All strided layers are odd and padded alike on both sides, so cell (i, j) of the map of stride s is
-    centred on input pixel (s·j, s·i), exactly, at every level.
+    All strided layers have odd kernels and symmetric padding, so cell (i, j) of the map of stride s is
+    centred exactly on input pixel (s·j, s·i), at every level.
 
     Args:
         base_width: channels of the first stage; 64 is ResNet-18.

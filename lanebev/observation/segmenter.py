@@ -28,12 +28,12 @@ class SegmenterConfig:
         output_stride: 1, 2 or 4 input pixels per logit.
         decoder_width: channels of the decoder.
         context: reach, in cells of stride 8, of each message passing step along the lanes.
-        image_size: (height, width) that the weights were trained for; any other runs, with less accuracy.
-        sigma_scale: factor on the standard deviation of every line vertex, measured for the weights. A
-            network's errors are correlated along a line, so vertices say less together than each alone.
-        pose_sigma_scale: factor on the standard deviations of the estimated pose, measured likewise. The
-            network's errors are correlated over frames, which a filter takes as independent. Larger vertex
-            sigmas are no substitute: they would also hide outliers.
+        image_size: (height, width) that the weights were trained for; other sizes are less accurate.
+        sigma_scale: factor on the standard deviation of every line vertex, measured for the weights. It makes
+            up for errors of the network that are correlated along a line.
+        pose_sigma_scale: factor on the standard deviations of the estimated pose, measured for the weights.
+            The network's errors are correlated over frames, which a filter takes as independent. Larger
+            vertex sigmas instead would also hide outliers.
     """
 
     num_boundaries: int = NUM_BOUNDARIES
@@ -66,10 +66,10 @@ class LaneSegmenter(nn.Module):
 
     Source: Sect. "Experiments", FCN (Shelhamer et al. 2017) on ResNet-18. Deviation: the skips fuse features
     instead of scores, and strip convolutions pass messages along the lanes (after Pan et al. 2018 and Zheng
-    et al. 2021), so that a dashed line is one line.
+    et al. 2021), so that a dashed line becomes one line.
 
-    Logit (i, j) sits on input pixel (x, y) = (s·j, s·i), s the output stride: pixel 0 is under cell 0, and no
-    half pixels appear anywhere (:class:`~lanebev.observation.resnet.ResNet18` says why).
+    Logit (i, j) is centred on input pixel (x, y) = (s·j, s·i), with s the output stride (see
+    :class:`~lanebev.observation.resnet.ResNet18`).
     """
 
     def __init__(self, config: SegmenterConfig | None = None) -> None:
@@ -99,7 +99,7 @@ class LaneSegmenter(nn.Module):
         return self.config.image_size
 
     def forward(self, image: Tensor) -> Tensor:
-        """Segment.
+        """Compute the logits of images.
 
         Args:
             image: (B, 3, H, W) RGB in [0, 1], any size.
@@ -138,7 +138,7 @@ class LaneSegmenter(nn.Module):
 
 
 def _check_scale(image: Tensor) -> None:
-    """Raise ValueError where a finite image is not in [0, 1] but in [0, 255], unless asking is slow.
+    """Raise ValueError if a finite image is in [0, 255] instead of [0, 1], unless the check is slow.
 
     Reading values on another device would wait for it, and a compiled program cannot read them.
     """

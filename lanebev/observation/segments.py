@@ -34,10 +34,10 @@ class LaneSegments(NamedTuple):
     sigma: Tensor
 
     def check(self, num_boundaries: int = NUM_BOUNDARIES) -> LaneSegments:
-        """Check what calibrators leave unchecked, since it would wait for the device: the numbers.
+        """Check the numbers, which calibrators do not check because that would wait for the device.
 
-        To a calibrator a segment that cannot be used is one that is not there. That is right for a detector's
-        bad frame and hides a mistake of the code that makes segments: check its first ones.
+        A calibrator ignores segments that it cannot use. That is right for a bad frame of a detector, but
+        hides a mistake in the code that makes segments; so call this on its first ones.
 
         Args:
             num_boundaries: L.
@@ -47,7 +47,7 @@ class LaneSegments(NamedTuple):
 
         Raises:
             TypeError: a part is no tensor.
-            ValueError: a part has another shape or dtype, or a segment that is there has a boundary index
+            ValueError: a part has another shape or dtype, or a segment with a weight has a boundary index
                 outside 0..L-1, a weight outside 0..1, an end point that is not finite or a sigma that is
                 not positive.
         """
@@ -83,12 +83,13 @@ class LaneSegments(NamedTuple):
     ) -> LaneSegments:
         """Make segments of the lane boundaries that another detector drew in one frame.
 
-        Boundaries are numbered by the side of the ego lane that they lie on, points are taken on rows of the
-        image that are far enough apart for independent errors, undistorted, and paired.
+        Boundaries are numbered by their side of the ego lane. Points are sampled on rows of the image that
+        are far enough apart for independent errors, undistorted, and paired.
 
         Args:
-            polylines: one a boundary, (P, 2) px (x, y) of the image as taken, along the boundary in either
-                direction; x is NaN in a gap. By number where the detector knows it (0..L-1, left to right).
+            polylines: one for each boundary, (P, 2) px (x, y) of the image as taken, along the boundary in
+                either direction; x is NaN in a gap. A mapping from number to polyline if the detector knows
+                the numbers (0..L-1, left to right).
             camera: the lens.
             sigma: px, standard deviation of a polyline across its line.
             num_boundaries: L.
@@ -114,9 +115,9 @@ def segments_from_vertices(
     """Pair the vertices of each boundary to line segments in undistorted pixels.
 
     Source: Sects. VI-A and VI-B, representative vertices sampled and paired. Deviation: not at random, which
-    uses some vertices often and many never. Of K vertices of a boundary, vertex i is paired with vertex
-    i + ceil(K/2): each is used once, so that the errors of all end points are independent, and every segment
-    is half as long as the boundary. Its weight is the smaller one, its variance the mean of its ends'.
+    would use some vertices often and many never. Of K vertices of a boundary, vertex i is paired with vertex
+    i + ceil(K/2). Each is used once, so that the errors of all end points are independent, and every segment
+    is half as long as the boundary. Its weight is the smaller one of its ends, its variance their mean.
 
     Args:
         vertices: (B, P, V).

@@ -35,17 +35,17 @@ class LineConfig:
         half_width: half width of the stripes that the network learned, across the line, label px.
         segments: per boundary, S.
         window: half-width of the window about a scan's peak, label px.
-        absent, present: share of a stripe's mass at and below which a scan has no boundary, and at and above
-            which it has one for sure.
-        twice: share at and above which the scan crosses the boundary more than once, as where it turns back
-            at the horizon, and says nothing; it says less from ``_FADE`` below.
-        min_vertices: a boundary with fewer is not seen.
-        sigma_floor: least standard deviation of a vertex, label px: what correlates along the line.
-        sigma_scale: factor on all standard deviations; 1 where the maps are true.
-        least_weight: of a vertex; a fainter one is left out: as often it lies on the foot of a barrier as on
+        absent, present: fractions of a stripe's mass up to which a scan has no boundary, and from which it
+            surely has one.
+        twice: fraction from which the scan crosses the boundary more than once, as where it turns back at the
+            horizon, and is not used; its weight decreases from ``_FADE`` below.
+        min_vertices: a boundary with fewer counts as not seen.
+        sigma_floor: least standard deviation of a vertex, label px, by errors that correlate along the line.
+        sigma_scale: factor on all standard deviations; 1 for exact maps.
+        least_weight: smallest weight of a vertex; fainter ones are on the foot of a barrier as often as on
             paint.
-        correlation: px of the image, vertically, over which a line's errors are one error: vertices nearer
-            together than this say no more than so many farther apart; 0 where the maps are true.
+        correlation: vertical distance, px of the image, over which a line's errors are fully correlated:
+            vertices nearer to each other count as one observation; 0 for exact maps.
     """
 
     stride: int = 2
@@ -84,10 +84,10 @@ class Vertices(NamedTuple):
     Attributes:
         points: (B, L, V, 2) (x, y) label px.
         normal: (B, L, V, 2) unit vectors across the line, of either sign.
-        weight: (B, L, V) in [0, 1], how sure it is that the boundary is there.
-        density: (B, L, V) in [0, 1], what it counts for in a mean: about 45 degrees, rows and columns share.
-        common_var: (B, L, V) label px², across the line: what neighbouring vertices share.
-        own_var: (B, L, V) label px², across the line: each vertex' own.
+        weight: (B, L, V) in [0, 1], confidence that the boundary is there.
+        density: (B, L, V) in [0, 1], weight in a mean: near 45 degrees rows and columns share it.
+        common_var: (B, L, V) label px², variance across the line that neighbouring vertices share.
+        own_var: (B, L, V) label px², variance across the line of each vertex alone.
     """
 
     points: Tensor
@@ -172,8 +172,7 @@ def counted_probability(probabilities: Tensor) -> Tensor:
 def scan_moments(counted: Tensor, window: int, dim: int) -> tuple[Tensor, Tensor, Tensor]:
     """Compute the mean position, mass and variance of each scan's probability about its peak.
 
-    The window is put about the peak, then about the mean within it; where it lies is a constant to the
-    gradient.
+    The window is centred on the peak, then on the mean within it; gradients take its position as constant.
 
     Args:
         counted: (..., h, w), see :func:`counted_probability`.
@@ -259,8 +258,8 @@ def local_line(position: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
     """Average vertices over stretches of equally many: at most 2S on a boundary, in order along it.
 
-    The mean of points on a parabola lies off it by half of what it lies off their tangents, on average: by
-    that it is moved back. A boundary of n < 2S vertices keeps 2·floor(n/2) of them as they are.
+    The mean of points on a parabola is off it by half of its mean distance from their tangents; it is moved
+    back by that. A boundary of n < 2S vertices keeps 2·floor(n/2) of them unchanged.
     """
     points, normal, weight = vertices.points, vertices.normal, vertices.weight
     stretch, middle, size = stretches(vertices, config)
@@ -288,8 +287,8 @@ def stretches(vertices: Vertices, config: LineConfig) -> tuple[Tensor, Tensor, T
 
     Returns:
         the stretch of each vertex, 0..2S-1; the index of the middle vertex of that stretch; the number of
-        vertices in it: each (B, L, V) int64. All of a boundary with too few vertices are one stretch; what
-        they are for a vertex that is not seen means nothing.
+        vertices in it: each (B, L, V) int64. A boundary with too few vertices is one stretch; the values for
+        unseen vertices are arbitrary.
     """
     count = (vertices.weight > 0).sum(-1, keepdim=True)  # (B, L, 1)
     bins, total = 2 * _half_of(count, config), count.clamp(min=1)
@@ -307,8 +306,8 @@ def stretches(vertices: Vertices, config: LineConfig) -> tuple[Tensor, Tensor, T
 def _as_sure_as_most(variance: Tensor, there: Tensor) -> Tensor:
     """Weigh vertices (B, L, 2S) by their variance and the median variance of their boundary.
 
-    On a clean map an unsure vertex is where there is no line: at its end, at a nick, on a bend of a few px.
-    A map that hedges has unsure ones anyway: there the limit grows as the median variance does.
+    On a clear map a vertex has a large variance only where there is no line: at its end, at a notch, on a
+    bend of a few px. On an unclear map many have; there the limit grows with the median variance.
     """
     typical = masked_median(variance, there).unsqueeze(-1)
     limit = _UNSURE * (typical / _SURE**2).clamp(min=1.0)
@@ -318,8 +317,8 @@ def _as_sure_as_most(variance: Tensor, there: Tensor) -> Tensor:
 def _with_the_middle(vertices: Vertices, middle: Tensor, size: Tensor) -> Tensor:
     """Return which vertices may be averaged with the middle one of their stretch, (B, L, V).
 
-    Not those across a gap, further away than so many scans reach (two for scans that were dropped), nor
-    those of another arm of a boundary that turns back: a chord of a circle makes equal angles with the
+    These are not those across a gap (farther away than so many scans reach, two for dropped scans), nor
+    those on another arm of a boundary that turns back: a chord of a circle makes equal angles with the
     tangents at its ends.
     """
     points, normal = vertices.points.detach(), vertices.normal.detach()

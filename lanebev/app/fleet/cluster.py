@@ -66,11 +66,11 @@ def groups_of(tasks: Sequence[Task], batch: int) -> list[tuple[Task, ...]]:
 
 
 def outcomes(tasks: Sequence[Task], cluster: Cluster) -> Iterator[Outcome]:
-    """Run on drives and yield what became of each, in the order in which they end.
+    """Run tasks and yield their outcomes, in the order in which they end.
 
-    Ray begins a group of tasks again whose worker died; if it dies again and again, its tasks are begun one
-    by one. One that fails is begun again, alone. After ``retries`` it counts as failed; where it was the
-    input's fault, that is noted, and it is not tried again until its files or settings change.
+    Ray restarts a group of tasks whose worker died; if it dies repeatedly, its tasks are started one by one.
+    A task that fails is started again, alone. After ``retries`` it counts as failed. If the cause is bad
+    input, that is noted, and the task is not tried again until its files or settings change.
     """
     ray = _started(cluster)
     try:

@@ -2,8 +2,8 @@
 
 Every reading (:mod:`lanebev.estimation.joint.readings`) is fitted with a deviation and a heading of its own
 for each boundary, Gaussian about the road's, and weighted by its evidence (Laplace's approximation). Source:
-Bayesian model averaging (Hoeting et al. 1999) with Occam's window (Madigan and Raftery 1994), of tempered
-evidence, as is safe where no model is right (Grünwald and van Ommen 2017).
+Bayesian model averaging (Hoeting et al. 1999) with Occam's window (Madigan and Raftery 1994) and tempered
+evidence, since no model is exactly right (Grünwald and van Ommen 2017).
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def weigh_readings(
     lane_width: Tensor,
     cfg: JointConfig,
 ) -> Calibration:
-    """Average the pose of every row that has started over all ways to read its image.
+    """Average the pose of every row that has started over all readings of its image.
 
     Args:
         calibration: calibration of the likeliest reading.
@@ -163,11 +163,11 @@ def average_readings(
     bends: float,
     cfg: ReadingConfig,
 ) -> AveragedPose:
-    """Average a frame's pose over all ways to read it.
+    """Average a frame's pose over all readings.
 
-    The mean is that by the evidence as it is; but where the pose of ``start`` lies within ``_KEEP`` sigmas of
-    the average, and no farther from the prior, it stands, since an average of readings that agree only adds
-    noise. The covariance about it is that by the evidence to a power below 1, which leaves more readings in.
+    The mean uses the evidence itself. If the pose of ``start`` is within ``_KEEP`` sigmas of the mean, and no
+    farther from the prior, it is kept instead, since averaging readings that agree only adds noise. The
+    covariance about it uses the evidence to a power below 1, which keeps more readings.
 
     Args:
         start: (B, 7) parameters near the likeliest reading.
@@ -253,7 +253,7 @@ def _with_half(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Add to (B, C) poses those at half the height, over lines that are half a lane apart.
 
-    The image is the same: only the prior of the height tells, and how likely such lines are.
+    The image is the same: only the prior of the height and that of such lines decide.
     """
     height = mean[..., HEIGHT]
     away = (torch.stack([0.5 * height, height], dim=-1) - prior.height) / prior.height_std

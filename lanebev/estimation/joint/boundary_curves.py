@@ -27,8 +27,8 @@ class Boundaries(NamedTuple):
     Attributes:
         offset: (B, L) m, X at Z = 0, right of the camera.
         heading: (B, L) rad (tangent), own deviation from the common direction.
-        extent: (B, L, 2) m, nearest and farthest Z of believed end points; (0, 0) where not present.
-        present: (B, L) bool, enough believed segments.
+        extent: (B, L, 2) m, nearest and farthest Z of inlier end points; (0, 0) where not present.
+        present: (B, L) bool, enough inlier segments.
         curvature: (B, 2), c0 and c1, common to all.
     """
 
@@ -49,8 +49,8 @@ def fit_boundaries(
 ) -> Boundaries:
     """Fit each boundary's offset and heading by robust least squares on perpendicular pixel distances.
 
-    Real lanes are neither equally wide nor parallel: nothing ties the boundaries here but pose and
-    curvature. The start is the median offset of a boundary's end points.
+    Real lanes are neither equally wide nor parallel: the boundaries have only pose and curvature in common.
+    The start is the median offset of a boundary's end points.
 
     Args:
         segments: (B, N) line segments.
@@ -58,7 +58,7 @@ def fit_boundaries(
         extrinsics: each (B,), of this frame.
         curvature: (B, 2), c0 and c1, or None to fit them to all boundaries together.
         num_boundaries: L.
-        least_support: sum of the believed segments' weights from which a boundary is present.
+        least_support: sum of the inlier segments' weights from which a boundary is present.
 
     Returns:
         The curves.

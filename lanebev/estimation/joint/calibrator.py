@@ -62,9 +62,8 @@ _NO_BOUNDARY = 0.36  # m out of place, three sigmas of what lanes differ, from w
 class JointCalibrator(Calibrator[JointState]):
     """Online calibration by one iterated filter, per row of a batch, state in and state out.
 
-    Deviation from the paper: one stage instead of two, so that roll and height profit from what pitch and
-    yaw know and the other way round; perpendicular pixel distances with propagated noise instead of
-    normals; curved roads, lane changes, unequal lanes.
+    Deviation from the paper: one stage instead of two, so that all axes use all information; perpendicular
+    pixel distances with propagated noise instead of normals; curved roads, lane changes, unequal lanes.
 
     Args:
         config: the numbers, or keywords of :class:`JointConfig`.
@@ -118,8 +117,8 @@ class JointCalibrator(Calibrator[JointState]):
     ) -> tuple[Calibration, JointState]:
         """Process one frame, see :meth:`~lanebev.estimation.calibrator.Calibrator.forward`.
 
-        After a frame that comes late the next dt counts from it. Inliers fit the road; 0 for a boundary too
-        far out of place to bound a lane, as the foot of a barrier, be it for long or in this frame.
+        After a late frame the next dt counts from it. Inliers fit the road; a boundary that deviates too much
+        to bound a lane, such as the foot of a barrier, has 0, whether for long or in this frame only.
         """
         cfg, place = self.config, layout(self.config.num_boundaries)
         if state.mean.shape[-1] != place.size:
@@ -210,7 +209,7 @@ def update_state(
 ) -> tuple[JointState, Tensor, Tensor, Tensor]:
     """Update a prediction by a frame: lane change, iterated robust update, adaptive process noise.
 
-    After the first of the iterations, what contradicts the motion raises the process noise for the others.
+    After the first iteration, evidence against the motion raises the process noise for the others.
 
     Args:
         predicted: state.

@@ -31,19 +31,19 @@ class MotionConfig:
     Attributes:
         bandwidth: Hz, cut-off frequency of the pose's motion.
         angle_std: rad, standard deviation of pitch, yaw and roll about their slow means.
-        height_std: m, likewise.
-        unobserved_scale: least factor on these where the last frame did not determine an angle or the height.
-        mean_angle_walk: rad/√s, of the slow mean.
-        mean_height_walk: m/√s.
+        height_std: m, standard deviation of the height about its slow mean.
+        unobserved_scale: least factor on these if the last frame did not determine an angle or the height.
+        mean_angle_walk: rad/√s, random walk of the slow mean of an angle.
+        mean_height_walk: m/√s, random walk of the slow mean of the height.
         offset_density: spectral density of the lateral acceleration, m²/s³.
-        offset_memory: s, of the lateral velocity.
-        curvature_walk: 1/m/√s, of every knot.
+        offset_memory: s, time constant of the lateral velocity.
+        curvature_walk: 1/m/√s, random walk of every knot.
         curvature_step: 1/m, sigma of a step that comes into view.
-        speed, speed_std: m/s, before anything is known.
-        speed_memory: s, over which it is forgotten.
-        deviation_memory: s, decay of a boundary's deviation where lanes are equal.
-        deviation_walk: m/√s.
-        unequal_memory: s, decay of the deviations on a road of unequal lanes.
+        speed, speed_std: m/s, prior of the speed.
+        speed_memory: s, time constant of the return to it.
+        deviation_memory: s, time constant of a boundary's deviation where lanes are equal.
+        deviation_walk: m/√s, random walk of a boundary's deviation.
+        unequal_memory: s, time constant of the deviations on a road of unequal lanes.
     """
 
     bandwidth: float = 1.0
@@ -241,7 +241,7 @@ def damped_velocity(dt: Tensor, memory: float) -> tuple[Tensor, Tensor]:
 
     Args:
         dt: (B,) s.
-        memory: s, of the velocity.
+        memory: s, time constant of the velocity.
 
     Returns:
         (B, 4) transition of (x, ẋ), row by row, and (B, 4) noise at unit density.

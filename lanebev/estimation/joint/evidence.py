@@ -19,14 +19,12 @@ CALL = 5.0  # sigmas of evidence at which half of the noise is admitted
 
 
 def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor) -> Tensor:
-    """Compute the normalised score of every entry that moves: N(0, 1) each if the motion is as assumed.
+    """Compute the normalised score of every entry that moves: N(0, 1) each if the motion model is right.
 
-    Source: (J14).
-
-    Source: the score test (Rao 1948) for more process noise in one entry. Whether the road bends, and whether
-    its lanes are equal, is asked with the pose free: near and far vertices of one frame tell, and a motion of
-    the pose that its process noise does not expect is no evidence. A detector's errors are correlated along a
-    boundary, so n end points determine its place no better than 1 / (1 / n + ``_SHARED``²) would.
+    Source: (J14), the score test (Rao 1948) for more process noise in one entry. For bends and unequal lanes
+    the pose is free: the test depends on near against far vertices of one frame, and unexpected motion of the
+    pose is no evidence. A detector's errors are correlated along a boundary, so n end points count as
+    1 / (1 / n + ``_SHARED``²).
 
     Args:
         cov: (B, O, O) of the prediction.
@@ -34,7 +32,7 @@ def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor) -> Ten
         count: (B, L) end points that each boundary was seen with.
 
     Returns:
-        (B, 4 + NUM_SHAPE + L) of pose, shape, deviations; 0 where the frame says nothing of an entry.
+        (B, 4 + NUM_SHAPE + L) of pose, shape, deviations; 0 where the frame has no information on an entry.
     """
     free = cov.new_zeros(cov.shape[-1])
     free[POSE] = cov.new_tensor(_FREE_POSE).square()
@@ -66,13 +64,11 @@ def accumulate_evidence(before: Tensor, score: Tensor, dt: Tensor, memory: float
 
 
 def adapt_motion_scale(before: Tensor, score: Tensor, dt: Tensor, cfg: JointConfig) -> Tensor:
-    """Raise the variance of the pose's motion while its scores exceed what they should be, and let it decay.
+    """Raise the variance of the pose's motion while its scores are too large, and let it decay.
 
-    Source: (J17).
-
-    Source: covariance matching (Mehra 1972), axis by axis, as a multiplicative step: a right variance has a
-    squared score of mean 1. Roll that a frame does not determine has the
-    score of the offset: it is given as 1, which changes nothing.
+    Source: (J17), covariance matching (Mehra 1972), axis by axis, as a multiplicative step: with the right
+    variance the squared score has mean 1. If a frame does not determine roll, its score is that of the offset
+    and is given as 1, which changes nothing.
 
     Args:
         before: (B, 4) >= 1, factor on the variance so far.
@@ -88,13 +84,13 @@ def adapt_motion_scale(before: Tensor, score: Tensor, dt: Tensor, cfg: JointConf
 
 
 def adaptive_process_noise(evidence: Tensor, cov: Tensor, cfg: JointConfig) -> Tensor:
-    """Compute the process noise variances (B, O) that the evidence calls for; next to none below 3 sigmas.
+    """Compute the process noise variances (B, O) from the evidence; almost zero below 3 sigmas.
 
     Source: (J16).
 
-    Of the deviations only that of the most contradictory boundary is freed, and to ``open_deviation`` at
-    most: a detector errs on one boundary for seconds, and if all deviations were free, such an error would
-    be taken for a road of unequal lanes, and would turn the roll.
+    Of the deviations only that with the largest score gets noise, and at most ``open_deviation``: a
+    detector's error on one boundary may last for seconds, and if all deviations were free, it would be taken
+    for a road of unequal lanes and change the roll.
 
     Args:
         evidence: (B, 4 + NUM_SHAPE + L).
@@ -116,11 +112,11 @@ def deviation_prior_std(deviations: Tensor, cfg: JointConfig) -> Tensor:
 
     Source: (J20).
 
-    A single boundary out of place is a detector's error, and errors that last let a second one deviate by
-    ``EQUAL`` of ``open_deviation``: that much is subtracted in variance, so that a deviation a little larger
-    than that admits little. Of six deviations three combinations cannot be observed, since changes of
-    offset, height and roll have the same effect, and what is left of independent deviations is smaller than
-    they are. Twice the second largest makes the squared error of roll 1.0 times its variance in the mean.
+    A single deviating boundary is a detector's error, and lasting errors let a second one deviate by
+    ``EQUAL`` of ``open_deviation``. That is subtracted in variance, so that a slightly larger deviation has
+    little effect. Three combinations of six deviations cannot be observed, since changes of offset, height
+    and roll have the same effect, so the estimated deviations are smaller than the true ones. With twice the
+    second largest, the mean squared error of roll is 1.0 times its variance.
     """
     size = cfg.open_deviation
     second = deviations.abs().topk(2, dim=-1).values[:, 1]

@@ -19,12 +19,12 @@ def best_shift(
     sight: Sight,
     lane_width: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Choose by how many lanes the boundary indices moved since the prediction: -1, 0 or 1.
+    """Choose by how many lanes the boundary indices changed since the prediction: -1, 0 or 1.
 
     Source: (J13).
 
     A shift is chosen if it explains the frame far better than none: the camera crossed a line, or the
-    detector numbers the boundaries anew.
+    detector changed its numbering.
 
     Args:
         mean: (B, D) predicted.
@@ -52,7 +52,7 @@ def best_shift(
 
 
 def renumber(mean: Tensor, shift: Tensor, lane_width: Tensor, num_boundaries: int) -> Tensor:
-    """Move offset and deviations of a state by a lane: who changes to the right has boundary k + 1 for k.
+    """Shift offset and deviations of a state by a lane: after a change to the right, boundary k was k + 1.
 
     Args:
         mean: (B, D).

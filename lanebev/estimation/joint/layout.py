@@ -21,7 +21,7 @@ class Layout(NamedTuple):
     """Indices of the state vector for L boundaries.
 
     A frame observes the first entries: pose, offset, shape of the road and the deviation of each boundary
-    from its place. The rest is known through motion only.
+    from its place. The others follow from the motion model only.
 
     Attributes:
         observed: pose, offset, shape, deviations.

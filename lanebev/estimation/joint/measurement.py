@@ -100,8 +100,8 @@ class Residuals(NamedTuple):
 def observe(segments: LaneSegments, intrinsics: Tensor, num_boundaries: int) -> Observations:
     """Prepare segments and intrinsics for the joint estimators.
 
-    What cannot be used, and every segment of a row without usable intrinsics, gets weight 0 and placeholder
-    numbers, so that no row or gradient turns NaN.
+    Unusable segments, and all segments of a row without usable intrinsics, get weight 0 and placeholder
+    numbers, so that no row or gradient becomes NaN.
 
     Args:
         segments: (B, N) line segments.
@@ -185,8 +185,8 @@ def boundary_residuals(
 
     Source: (J4) and (J5).
 
-    Both are taken at the foot point on the boundary. Taken at the noisy point instead, the Jacobian would
-    correlate with the noise, and the fit would be biased by their product.
+    Both are evaluated at the foot point on the boundary. Evaluated at the noisy point, the Jacobian would be
+    correlated with the noise and bias the fit.
 
     Args:
         params: (B, 7), see ``NUM_PARAMS``; with a phase (B, 6 + NUM_STEPS), the shape being a spline.

@@ -1,7 +1,7 @@
 """The readings of a single image: which lines bound lanes, and how equal the lanes are.
 
-One image seldom tells. :mod:`lanebev.estimation.joint.averaging` fits every reading and averages the fits by
-their evidence, so that how much an answer leans on one of them is in its covariance.
+One image seldom decides between them. :mod:`lanebev.estimation.joint.averaging` fits every reading and
+averages the fits by their evidence, so that the covariance contains the differences between them.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class ReadingConfig:
-    """How roads and detectors differ from what is assumed: prior probabilities and standard deviations.
+    """Prior probabilities and standard deviations of the readings of a single image.
 
     Attributes:
-        unequal: m, of a boundary's place, one for each kind of road, from a motorway to a street whose lanes
-            differ by half a metre.
-        askew: rad, likewise, of a boundary's heading against the road's.
-        profile: 1/m, likewise, of the road's vertical curvature.
-        share: prior probability of the kinds of road, before looking.
+        unequal: standard deviation of a boundary's place, m, one for each kind of road, from a motorway to a
+            street whose lanes differ by half a metre.
+        askew: standard deviation of a boundary's heading against the road's, rad, for each kind of road.
+        profile: standard deviation of the road's vertical curvature, 1/m, for each kind of road.
+        share: prior probability of each kind of road.
         no_boundary: probability that a line bounds no lane: a kerb, an arrow, a cycle path.
-        another: probability that the next one doesn't either.
-        anywhere: m and rad, of the place and the heading of such a line.
-        information: power of the evidence, below 1 since no reading is exactly right and a detector's errors
-            are correlated along a boundary.
-        least: weight, as a share of the best reading's, below which a reading is left out.
+        another: probability that the next line does not either.
+        anywhere: standard deviations of the place (m) and heading (rad) of such a line.
+        information: exponent of the evidence, below 1 since no reading is exactly right and a detector's
+            errors are correlated along a boundary.
+        least: weight, as a fraction of the best reading's, below which a reading is left out.
     """
 
     unequal: tuple[float, ...] = (0.0005, 0.4, 0.1, 0.4)
@@ -138,7 +138,7 @@ def log_prior(ways: Readings, there: Tensor, cfg: ReadingConfig) -> Tensor:
 def log_prior_of_half(there: Tensor, cfg: ReadingConfig) -> Tensor:
     """Compute the log odds (B,) that every second line bounds no lane, before looking.
 
-    Arrows in the middle of every lane, or seams of the pavement, halve the spacing of the lines.
+    Arrows in the middle of every lane, or seams of the pavement, halve the distance between lines.
 
     Args:
         there: (B, L) bool, lines that were seen.

@@ -1,7 +1,7 @@
 """Starts of the joint filter: without a state, or with one that does not fit or is contradicted.
 
-After a shock the filter may have taken a wrong pose for unequal lanes or a bend, and be content with it. So
-for a while after every jump each frame is fitted by itself, without what the filter has learned.
+After a shock the filter may explain a wrong pose by unequal lanes or a bend. Therefore, for some frames after
+every jump, each frame is also fitted alone, without the filter's state.
 """
 
 from __future__ import annotations
@@ -105,9 +105,9 @@ def is_contrary(
 
     Source: (J19).
 
-    If the state is right, its error is part of the frame's, so that their difference has no more than the
-    covariance of the frame's fit. The state has the deviations beside, which the fit has not: they must raise
-    the likelihood by more than parameters that mean nothing would (Schwarz 1978).
+    If the state is right, its error is part of the frame's, so the covariance of their difference is at most
+    that of the frame's fit. The state also has deviations, which the fit does not have: they must raise the
+    likelihood by more than the penalty for additional parameters (Schwarz 1978).
 
     Args:
         state: after the frame.

@@ -1,8 +1,8 @@
 """Dynamics of the shape of the road in the joint filter.
 
 The knots of the road's curvature are fixed to the road, and the camera passes them at a speed that is
-estimated too: the curvature that was seen far ahead is the curvature when it is near. Process noise enters at
-the farthest step only, which comes into view. The road frame turns along with the road.
+estimated too: the curvature seen far ahead becomes the curvature near by. Process noise enters only at the
+farthest step, as it comes into view. The road frame turns with the road.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ def turn_along(shape: Tensor, phase: Tensor, way: Tensor) -> Tensor:
     """Compute the shape parameters after the road frame turned with the road over a way.
 
     The shape at a knot is b'' = d²X/dZ² = κ / cos³ of the road's heading there, κ its curvature. The heading
-    falls by κ₀ per metre driven until the knot is reached. On an arc this cancels, to leading order, the
-    change by the knots' coming nearer. Two effects are left out because they improved nothing: a turn also
+    decreases by κ₀ per metre driven until the knot is reached. On an arc this cancels, to leading order, the
+    change because the knots approach. Two effects are left out because they improved nothing: a turn also
     brings knots nearer, by κ₀ b; and an arc determines the speed less well than a clothoid does.
 
     Args:
@@ -107,8 +107,8 @@ def straight_or_bend(
 
     Source: (J18).
 
-    A distant bend and a yaw look alike. To choose the likelier model would be wrong by many standard
-    deviations whenever the other holds, so the difference of the two fits enters the covariance. Source:
+    A distant bend and a yaw have nearly the same effect. Choosing the likelier model would be wrong by many
+    standard deviations if the other holds, so the difference of the two fits enters the covariance. Source:
     Bayesian model averaging (Hoeting et al. 1999) of two Gaussians, moments matched. The straight road is a
     measurement of c0 = c1 = 0 whose noise turns the one prior into the other.
 
@@ -117,7 +117,7 @@ def straight_or_bend(
         cov: (B, 7, 7).
         straight: (2,) 1/m and 1/m², sigmas of c0 and c1 of a straight road.
         bend: (2,), those of a bend, larger, which the fit had for a prior.
-        share: prior probability of roads that are bends, before looking.
+        share: prior probability of bends.
 
     Returns:
         mean (B, 7) and covariance (B, 7, 7).

@@ -1,8 +1,9 @@
 """Joint fit of pose, lateral offset and curvature to all boundaries of one frame, without a start value.
 
-A nonlinear fit from one start gets stuck. So a grid over the horizon (pitch and roll) is tried with a
-robust fit inside that is linear, u = a_k V + u0 + b / V with V below the horizon, and the best pitch for
-every roll starts a robust Gauss-Newton on perpendicular pixel distances whose noise scale is annealed.
+A nonlinear fit from one start can end in a local minimum. So pitch and roll are searched on a grid, with a
+robust linear fit of u = a_k V + u0 + b / V, V below the horizon, at each of its points. The best pitch for
+every roll is the start of robust Gauss-Newton steps on perpendicular pixel distances, with an annealed noise
+scale.
 """
 
 from __future__ import annotations
@@ -42,21 +43,21 @@ _OBSERVED = 0.2  # a parameter is observed if its sigma fell below this part of 
 class FramePrior:
     """Prior of a single frame, as Student's t distributions, and the start of the search.
 
-    Heavy tails: a camera rolled by 20 deg is found, and not pulled back. They decide only what the
-    observations leave open (roll on one lane, all but two numbers on one boundary). The pose of a mount that
-    is known is nearly Gaussian: a vehicle's body does not lean by many of its standard deviations.
+    The heavy tails allow a camera rolled by 20 deg. The prior matters only for what the observations leave
+    open (roll on one lane, all but two numbers on one boundary). About a known mount it is nearly Gaussian: a
+    vehicle's body does not lean by many of its standard deviations.
 
     Attributes:
         pitch, yaw, roll: means, rad.
         height: mean, m.
-        pitch_std, yaw_std, roll_std: rad.
-        height_std: m.
-        offset_std: m, of the ego lane's middle from the camera.
-        curvature_std: 1/m.
-        curvature_rate_std: 1/m².
+        pitch_std, yaw_std, roll_std: standard deviations, rad.
+        height_std: standard deviation, m.
+        offset_std: standard deviation of the ego lane's middle from the camera, m.
+        curvature_std: standard deviation of c0, 1/m.
+        curvature_rate_std: standard deviation of c1, 1/m².
         freedom: degrees of freedom of all of them.
         pitch_range, roll_range: half widths of the search about the means, rad.
-        pitch_steps, roll_steps: hypotheses across each; 1 is the mean alone.
+        pitch_steps, roll_steps: number of values searched in each; 1 is the mean alone.
     """
 
     pitch: float = 0.0
@@ -100,15 +101,15 @@ class FramePrior:
 
 
 def prior_of_mount(pose: Sequence[float], std: Sequence[float]) -> FramePrior:
-    """Make the prior of a frame from how the camera is mounted.
+    """Make the prior of a frame from the camera's mount.
 
-    The vehicle's body moves on its suspension, drives askew in its lane and stands on a road with a
-    crossfall: ``_BODY_STD`` is added to the mount's own standard deviations. The search is as wide as the
-    prior is.
+    ``_BODY_STD`` is added to the mount's own standard deviations, because the vehicle's body moves on its
+    suspension, has a heading in its lane and stands on a road with a crossfall. The range of the search
+    follows the prior.
 
     Args:
         pose: pitch, yaw, roll (rad) and height (m) of the mount.
-        std: their standard deviations; infinite for what is not known, which stays as without a mount.
+        std: their standard deviations; infinite for unknown axes, whose prior is that without a mount.
     """
     usual = FramePrior()
     names = ("pitch", "yaw", "roll", "height")
@@ -136,9 +137,9 @@ class SingleFrameFit(NamedTuple):
         covariance: (B, 7, 7) of all parameters, prior included, noise scaled to the residuals.
         inliers: (B, N) in [0, 1]; 0 for padding.
         scale: (B,) >= 1, factor by which residuals exceed the given sigmas.
-        observed: (B, 4) bool, of pitch, yaw, roll, height: said by the frame rather than by the prior, or
-            known as well as a frame could say by a prior that is sharper than the default.
-        valid: (B,) bool: enough believed segments, pitch and yaw observed.
+        observed: (B, 4) bool, of pitch, yaw, roll, height: determined by the frame rather than by the prior,
+            or by a prior that is as sharp as a frame could be.
+        valid: (B,) bool: enough inlier segments, pitch and yaw observed.
     """
 
     extrinsics: Extrinsics
@@ -167,21 +168,21 @@ def fit_single_frame(
 ) -> SingleFrameFit:
     """Compute the robust maximum a posteriori fit of one frame, for each row of the batch.
 
-    Survives 50 % gross outliers with 5 % wrong boundary indices. What the boundaries in sight do not
-    determine stays at the prior with the prior's covariance. Never raises on contents: a row without
-    usable data has ``valid`` false and the prior's numbers.
+    It works with 50 % gross outliers and 5 % wrong boundary indices. What the visible boundaries do not
+    determine keeps the mean and covariance of the prior. It never raises on contents: a row without usable
+    data has ``valid`` false and the prior's numbers.
 
-    The fit is of the likeliest reading alone, and ``covariance`` takes it for granted:
+    Only the likeliest reading is fitted, and ``covariance`` assumes that it is right:
 
-    * lanes are as wide as ``lane_width`` says. Height is in proportion to it. Where two lanes differ by
-      half a metre, roll is wrong by up to some degrees, many times its sigma;
-    * every boundary bounds a lane and has the index given: what fits no lane is an outlier, but a kerb, or an
-      arrow, that replaces a boundary is believed;
+    * lanes have the width ``lane_width``. Height is proportional to it. If two lanes differ by half a metre,
+      roll is wrong by up to some degrees, many times its sigma;
+    * every boundary bounds a lane and has the given index. What fits no lane is an outlier, but a kerb or an
+      arrow in the place of a boundary is not recognised;
     * roll is observed with two lanes or more, height with one, pitch and yaw with two boundaries. The rest is
-      the prior's: ``observed`` tells.
+      that of the prior, see ``observed``.
 
-    ``calibrate_still`` with the joint calibrator averages over other readings, and its sigmas contain how
-    much an answer leans on these (:mod:`lanebev.estimation.joint.averaging`).
+    ``calibrate_still`` with the joint calibrator averages over other readings, and its sigmas contain the
+    differences between them (:mod:`lanebev.estimation.joint.averaging`).
 
     Args:
         segments: (B, N) line segments.
@@ -296,7 +297,7 @@ def normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tupl
 def student_weight(squared: Tensor, freedom: float) -> Tensor:
     """Compute the weight of a prior, Student's t, at a squared normalised distance.
 
-    One at its mean, not 1 + 1 / ``freedom``: near it the prior counts as the Gaussian that it is given as.
+    It is 1 at the mean, not 1 + 1 / ``freedom``: near the mean the prior is Gaussian with the given sigma.
     """
     return (1 + squared / freedom).reciprocal()
 

@@ -30,8 +30,8 @@ class Link(NamedTuple):
     Attributes:
         predicted: (B, D), mean of the prediction.
         transition: (B, D, D), F.
-        noise: (B, D, D), W, with that which the frame's evidence added.
-        linked: (B, D, D) bool, [i, j]: entry j after tells of entry i before.
+        noise: (B, D, D), W, with the noise that the frame's evidence added.
+        linked: (B, D, D) bool, [i, j]: entry j after has information on entry i before.
     """
 
     predicted: Tensor
@@ -43,9 +43,9 @@ class Link(NamedTuple):
 def link_states(before: JointState, after: JointState, dt: Tensor, cfg: JointConfig) -> Link:
     """Repeat the prediction from one frame's state to the next one's.
 
-    A start takes over nothing of the state before. Where the boundaries' numbers moved, offset and deviations
-    are other quantities. A frame that was skipped moved nothing. Where roll was considered and not estimated,
-    its error and those of the other entries do not tell of each other, as in the filter.
+    A start uses nothing of the state before. Where the boundaries' numbers changed, offset and deviations are
+    other quantities. A skipped frame changed nothing. If roll was considered and not estimated, its error and
+    those of the other entries have no information on each other, as in the filter.
 
     Args:
         before: state after a frame.
@@ -89,8 +89,8 @@ def smooth_states(
     Source: (J27), (J28); Rauch, Tung and Striebel 1965, Särkkä 2013, Sec. 9.1, on the filter's linearisation.
 
     Args:
-        states: after every frame, (B, ...) each, in order; they are looked at from the last one to the first,
-            so that a sequence which reads them from a file does.
+        states: after every frame, (B, ...) each, in order; they are accessed once, from the last to the
+            first, so a sequence that reads them from a file suffices.
         dt: (T, B), or (B,) for each frame: s from the frame before, as the calibrator was given it; the first
             is not used.
         cfg: the calibrator's.
@@ -164,7 +164,7 @@ def _joined(states: Sequence[JointState]) -> JointState:
 def smoothed_calibration(calibration: Calibration, state: JointState, smoothed: JointState) -> Calibration:
     """Replace pose and covariance of a frame's calibration by the smoothed ones.
 
-    What the calibration's covariance has beside the filter's, as for lanes that differ, stays.
+    The terms that the calibration's covariance has besides the filter's, as for unequal lanes, stay.
 
     Args:
         calibration: calibration of the frame, as the calibrator gave it.

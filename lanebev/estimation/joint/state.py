@@ -49,8 +49,9 @@ class JointConfig:
         restart_after: time, s, without fitting segments before a new search.
         lost_after: time, s, without usable segments before the status is LOST.
         readings: priors of the readings of a single image.
-        doubt_frames: after a jump or a misfit, that are compared, each by itself, with the state.
-        contrary_frames: usable frames in a row that have to contradict it.
+        doubt_frames: number of frames after a jump or a misfit that are fitted alone and compared with the
+            state.
+        contrary_frames: number of consecutive usable frames that must contradict it for a restart.
     """
 
     num_boundaries: int = NUM_BOUNDARIES
@@ -104,14 +105,14 @@ class JointState(NamedTuple):
         phase: (B,) m, how far the first knot of the road's curvature lies behind the camera.
         evidence: (B, 10 + L) evidence against the motion, unit variance: the last frame's of the pose, summed
             of shape and deviations.
-        pose_sensitivity: (B, 4, L) change of the pose by a metre that a boundary is out of place, by the last
-            frame that determined the pose.
-        motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, as the drive asks for.
+        pose_sensitivity: (B, 4, L) change of the pose per metre of deviation of a boundary, by the last frame
+            that determined the pose.
+        motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, adapted to the drive.
         early: (B,) s by which the state is ahead of the last frame, which came out of order.
         unseen: (B,) s since the last usable frame.
         misfit: (B,) s for which there were segments that did not fit.
-        doubt: (B,) frames that are still to be compared, each by itself, with the state.
-        contrary: (B,) usable frames in a row that contradicted the state by themselves.
+        doubt: (B,) number of further frames to be fitted alone and compared with the state.
+        contrary: (B,) number of consecutive usable frames that contradicted the state.
         status: (B,) int64, values of Status.
         reasons: (B,) int64, :class:`Reason` flags of the last frame; those of what is unseen decide how the
             next prediction moves.

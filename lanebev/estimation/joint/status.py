@@ -78,13 +78,13 @@ def update_track_status(
 
 
 def single_deviation(deviations: Tensor, variances: Tensor, cfg: JointConfig) -> Tensor:
-    """Compute by how much (B,) m any boundary may be out of place if exactly one is.
+    """Compute how far (B,) m any boundary may deviate if exactly one does.
 
     Source: (J24).
 
-    What the filter's own covariance of the deviations holds is subtracted in variance, so that nothing is
-    missing while lanes turn out to be unequal. Half of six independent deviations can be observed, so their
-    variances sum to three times that of one.
+    The filter's own variance of the deviations is subtracted, so that the sum is right while lanes turn out
+    to be unequal. Half of six independent deviations can be observed, so their variances sum to three times
+    that of one.
 
     Args:
         deviations: (B, L) m.
@@ -104,9 +104,9 @@ def as_calibration(
     """Make the calibration of a state.
 
     Its covariance adds what the filter does not estimate: the common scale of the lane widths; the deviation
-    that any boundary may have if one has; the difference from a frame that contradicts the state; and the
-    effect on height of an error of roll to second order, where roll is not observed. With boundaries at x₁
-    and x₂ seen as they are, h'' = -2 (h - x₁ x₂ / h).
+    of one unknown boundary; the difference from a frame that contradicts the state; and, if roll is not
+    observed, the second-order effect of its error on the height. If the boundaries at x₁ and x₂ stay where
+    they are seen, h'' = -2 (h - x₁ x₂ / h).
 
     Args:
         state: (B, ...).

@@ -85,10 +85,10 @@ def update(
 ) -> Posterior:
     """Update a prediction by one frame, linearised at ``at``; the prediction stays the prior.
 
-    Source: Bell and Cathey 1993, the iterated Kalman filter as Gauss-Newton; Schmidt 1966 for the roll that a
+    Source: Bell and Cathey 1993, the iterated Kalman filter as Gauss-Newton; Schmidt 1966 for roll that a
     frame does not determine: its uncertainty is considered, but it is not estimated. On one lane roll and
-    offset are the same to first order, and what tells them apart is of second order, which a linearised
-    update overrates. The other entries are estimated as if roll were known.
+    offset have the same effect to first order; they differ to second order only, which a linearised update
+    overestimates. The other entries are estimated as if roll were known.
 
     Args:
         predicted: (B, D) mean.
