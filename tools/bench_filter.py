@@ -1,4 +1,4 @@
-"""Information form against the paper's gain form: same result, how much faster.
+"""Compare the information form of the Kalman update with the paper's gain form in time and result.
 
     python -m tools.bench_filter --out out/bench_filter.json
 
@@ -67,7 +67,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--rows", type=PositiveInt, nargs="+", default=[60, 180, 408, 816])
-    parser.add_argument("--seconds", type=PositiveFloat, default=1.0, help="per measurement")
+    parser.add_argument("--seconds", type=PositiveFloat, default=1.0, help="seconds per measurement")
     parser.add_argument("--out", type=Path, default=Path("out/bench_filter.json"))
     args = parser.parse_args()
     args.out.parent.mkdir(parents=True, exist_ok=True)

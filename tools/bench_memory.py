@@ -1,4 +1,4 @@
-"""Memory of what a run keeps of each frame, and of its report: python -m tools.bench_memory."""
+"""Measure the memory that a run needs per frame and for its report: python -m tools.bench_memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long ``lanebev run`` takes for a frame, beside the network's forward pass alone, in one process.
+"""Compare the time of ``lanebev run`` per frame with the network's forward pass alone.
 
     python -m tools.bench_run [--frames 60] [--json FILE] [--profile]
 
@@ -76,7 +76,7 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--frames", type=PositiveInt, default=60)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the results as JSON")
     parser.add_argument("--profile", action="store_true", help="print where the main thread spends its time")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:

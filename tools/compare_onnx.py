@@ -1,4 +1,4 @@
-"""An exported step against PyTorch over the frames of a video: poses and views, each with its own state.
+"""Compare an exported step with PyTorch on a video: poses and views, each with its own state.
 
 ``lanebev export --part step --camera CAMERA --out DIR`` writes DIR/step.onnx.
 """
@@ -26,7 +26,7 @@ LEVEL = 1 / 255
 
 
 class Difference(NamedTuple):
-    """Of one frame: degrees, millimetres, share of view pixels within a level of 8 bits, equal status."""
+    """Differences of one frame: degrees, mm, share of view pixels within a level of 8 bits, equal status."""
 
     angle: float
     height: float
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("video")
     parser.add_argument("--camera", required=True)
     parser.add_argument("--exported", type=Path, default=Path("lanebev-export"), metavar="DIR")
-    parser.add_argument("--calibrator", default="joint", help="of the step")
+    parser.add_argument("--calibrator", default="joint", help="calibrator of the step")
     parser.add_argument("--frames", type=int, default=200)
     options = parser.parse_args(arguments)
     source = open_source(options.video, None)

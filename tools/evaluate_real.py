@@ -1,4 +1,4 @@
-"""All figures on real and third-party images, each beside its target.
+"""Evaluate real and third-party images, with all results beside their targets.
 
     python tools/evaluate_real.py [--data ../shared/data] [--json FILE] [--sheet FILE.png] [--weights FILE]
 
@@ -54,7 +54,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     default = Path(__file__).resolve().parents[2] / "shared" / "data"
     parser.add_argument("--data", type=Path, default=default, help="folder of the data (../shared/data)")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="file for the results as JSON")
     parser.add_argument("--sheet", type=Path, help="write a PNG of a dozen TuSimple images, before and after")
     parser.add_argument("--weights", type=Path, help="other weights than the shipped")
     parser.add_argument("--only", help="run only parts whose name contains this")

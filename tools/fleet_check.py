@@ -1,4 +1,4 @@
-"""lanebev fleet over short rendered drives, workers killed and a file corrupt: python -m tools.fleet_check.
+"""Check lanebev fleet with killed workers and a corrupt file: python -m tools.fleet_check.
 
 Checks that every drive but the corrupt one has the outputs of a single run, to the last digit, that the
 corrupt one is reported, and that a second call does nothing. Then times one worker and several on the same
@@ -38,9 +38,9 @@ PATIENCE = 600.0  # s
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--drives", type=int, default=40)
-    parser.add_argument("--frames", type=int, default=20, help="of each drive (%(default)s)")
+    parser.add_argument("--frames", type=int, default=20, help="frames per drive (%(default)s)")
     parser.add_argument(
-        "--network", type=int, default=4, help="drives that the network looks at (%(default)s)"
+        "--network", type=int, default=4, help="drives on which the network runs (%(default)s)"
     )
     parser.add_argument("--kills", type=int, default=2, help="workers to kill (%(default)s)")
     parser.add_argument("--workers", type=int, default=4)
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = "cut drives that the network looks at into parts of so many seconds"
     parser.add_argument("--part-seconds", type=float, help=words)
     parser.add_argument("--no-timing", action="store_true", help="do not time one worker and --workers")
-    parser.add_argument("--folder", type=Path, help="to leave all in")
+    parser.add_argument("--folder", type=Path, help="folder in which all files are kept")
     args = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as temporary:
         found = check(args, args.folder or Path(temporary))

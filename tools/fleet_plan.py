@@ -1,4 +1,4 @@
-"""What many hours of video take, from a run on some frames: python -m tools.fleet_plan [--hours 100000].
+"""Plan the time and storage of many hours of video: python -m tools.fleet_plan [--hours 100000].
 
 Measures, with one thread, what a frame costs where it is decoded and looked at by the network, and where
 poses are estimated from what was seen, views drawn and outputs written, and the bytes of each output. From
@@ -34,7 +34,7 @@ _OUTPUTS = ("lanes.json", "extrinsics.csv", "covariance.csv", "frames.parquet", 
 
 @dataclass(frozen=True)
 class FrameCost:
-    """What a frame takes on one core.
+    """Processor time and storage of a frame on one core.
 
     Attributes:
         look: s, decoding and network.
@@ -114,13 +114,19 @@ def _cpu_since(begin: os.times_result) -> float:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, plan, print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--hours", type=float, default=1e5, help="of video (%(default)g)")
-    parser.add_argument("--fps", type=float, nargs="+", default=[30.0, 10.0], help="that are taken (30 10)")
-    parser.add_argument("--cores", type=int, default=1000, help="at work (%(default)s)")
-    parser.add_argument("--minutes", type=float, default=10.0, help="of a drive (%(default)g)")
-    parser.add_argument("--frames", type=int, default=100, help="to measure (%(default)s)")
-    parser.add_argument("--size", type=parse_size, default=(720, 1280), metavar="WxH", help="1280x720")
-    parser.add_argument("--video", help="to measure on, with --camera, instead of rendered frames")
+    parser.add_argument("--hours", type=float, default=1e5, help="hours of video (%(default)g)")
+    parser.add_argument("--fps", type=float, nargs="+", default=[30.0, 10.0], help="frame rates (30 10)")
+    parser.add_argument("--cores", type=int, default=1000, help="number of cores (%(default)s)")
+    parser.add_argument("--minutes", type=float, default=10.0, help="minutes per drive (%(default)g)")
+    parser.add_argument("--frames", type=int, default=100, help="number of frames to measure (%(default)s)")
+    parser.add_argument(
+        "--size",
+        type=parse_size,
+        default=(720, 1280),
+        metavar="WxH",
+        help="size of rendered frames (1280x720)",
+    )
+    parser.add_argument("--video", help="video to measure, with --camera, instead of rendered frames")
     parser.add_argument("--camera", default="")
     options = parser.parse_args(arguments)
     begin = time.perf_counter()

@@ -1,4 +1,4 @@
-"""What lane boundaries tell about the focal length, by Fisher's information, on straight roads and in bends.
+"""Compute the Fisher information of lane boundaries on the focal length, on straights and in bends.
 
     python -m tools.focal_information
 
@@ -29,7 +29,7 @@ _NEAR, _FAR, _POINTS, _STEPS = 5.0, 75.0, 60, 400
 
 
 class Information(NamedTuple):
-    """What one frame tells.
+    """Information of one frame.
 
     Attributes:
         share: of the information about the focal length that is left when all else is unknown.

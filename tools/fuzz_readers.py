@@ -1,4 +1,4 @@
-"""Give every reader of files mutated inputs: each is a value or one ValueError of one line, and soon.
+"""Give every reader mutated files: each result must be a value or one ValueError of one line, soon.
 
     python -m tools.fuzz_readers [--count 20000] [--seed 0] [--readers camera.yaml …] [--keep DIR]
 
@@ -371,13 +371,13 @@ def main() -> int:
     """Run."""
     known = readers()
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
-    parser.add_argument("--count", type=int, default=20_000, help="inputs in all (%(default)s)")
+    parser.add_argument("--count", type=int, default=20_000, help="number of inputs (%(default)s)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--limit", type=float, default=10.0, help="s for one input (%(default)s)")
+    parser.add_argument("--limit", type=float, default=10.0, help="time limit per input, s (%(default)s)")
     parser.add_argument(
         "--readers", nargs="+", choices=known, default=list(known), metavar="NAME", help=", ".join(known)
     )
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="where inputs with faults are kept")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="folder in which failing inputs are kept")
     args = parser.parse_args()
     everything = [seed for reader in known.values() for seed in reader.seeds]
     total = sum(known[name].share for name in args.readers)

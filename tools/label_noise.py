@@ -1,4 +1,4 @@
-"""How far TuSimple's labels and the network's lines lie from the paint itself: what limits comparing the two.
+"""Measure the distance of TuSimple's labels and of the network's lines from the paint.
 
     python -m tools.label_noise [--data ../shared/data] [--weights FILE]
 
@@ -61,7 +61,7 @@ def stripe_centre(row: NDArray[np.uint8], about: float) -> float:
 
 
 class Offsets(NamedTuple):
-    """Of a line from its stripe, px to the right: mean over the rows with paint, and at the horizon."""
+    """Offsets of a line from its stripe, px to the right: mean over rows with paint, and at the horizon."""
 
     mean: float
     horizon: float

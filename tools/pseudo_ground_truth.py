@@ -1,4 +1,4 @@
-"""The paper's pseudo ground truth: extrinsics of every frame alone, from annotated lanes.
+"""Compute the paper's pseudo ground truth: single-frame extrinsics from annotated lanes.
 
     python -m tools.pseudo_ground_truth LANES --camera camera.yaml --out pseudo.csv
 
@@ -37,7 +37,7 @@ COLUMNS = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
 
 
 class PseudoTruth(NamedTuple):
-    """Extrinsics each (B,), and what of them the frame's lanes determine."""
+    """Extrinsics, each (B,), and which of them the frame's lanes determine."""
 
     extrinsics: Extrinsics
     direction_known: Tensor  # (B,) two boundaries
@@ -132,7 +132,7 @@ def main() -> None:
     )
     parser.add_argument("lanes", type=Path, help="TuSimple JSON lines, CULane .lines.txt or OpenLane JSON")
     parser.add_argument("--camera", type=Path, required=True)
-    parser.add_argument("--lane-width", type=PositiveFloat, default=3.7, help="m")
+    parser.add_argument("--lane-width", type=PositiveFloat, default=3.7, help="lane width, m")
     parser.add_argument("--estimate", type=Path, help="extrinsics.csv of a run over the same frames")
     parser.add_argument("--out", type=Path, default=Path("out/pseudo_ground_truth.csv"))
     args = parser.parse_args()

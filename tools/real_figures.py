@@ -1,4 +1,4 @@
-"""The figures of ``evaluate_real.py``: each part of the data to numbers beside their targets."""
+"""Results of ``evaluate_real.py``: evaluate each part of the data beside its targets."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ UDACITY_LANE_WIDTH, CARLA_LANE_WIDTH, TUSIMPLE_LANE_WIDTH = 3.66, 3.5, 3.7
 
 @dataclass(frozen=True)
 class Figure:
-    """One number beside its target; ``least`` where more is better."""
+    """One result beside its target; ``least`` if more is better."""
 
     part: str
     name: str
@@ -50,7 +50,7 @@ class Figure:
 
 
 class Drive(NamedTuple):
-    """A drive's poses (F, 4) in rad and m, status (F,), times (F,) s, segments, and those believed."""
+    """A drive's poses (F, 4) in rad and m, status (F,), times (F,) s, segments, and its inliers."""
 
     poses: torch.Tensor
     status: torch.Tensor

@@ -167,10 +167,14 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--calibrator", choices=("two-stage", "joint"), default="two-stage")
-    parser.add_argument("--smooth", action="store_true", help="every frame from all frames; joint only")
+    parser.add_argument(
+        "--smooth", action="store_true", help="estimate every pose from all frames; joint only"
+    )
     parser.add_argument("--runs", type=PositiveInt, default=100, help="Monte Carlo runs per noise level")
     parser.add_argument("--frames", type=PositiveInt, default=300)
-    parser.add_argument("--segments", type=PositiveInt, nargs="+", default=[30, 68], help="per boundary")
+    parser.add_argument(
+        "--segments", type=PositiveInt, nargs="+", default=[30, 68], help="segments per boundary"
+    )
     parser.add_argument("--float32", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/table1"))

@@ -1,4 +1,4 @@
-"""Check that a run on a stream keeps up: a bounded delay, flat memory, and dropped frames that are counted.
+"""Check that a run on a stream keeps up: bounded delay, constant memory, counted dropped frames.
 
     python -m tools.stream_check --minutes 10
 
@@ -49,7 +49,7 @@ _MOST_GROWTH = 1.1  # resident memory at the end over that after the warm-up
 
 @dataclass(frozen=True)
 class StreamFigures:
-    """What a run on a stream did.
+    """Statistics of a run on a stream.
 
     Attributes:
         seconds: that it was watched.
@@ -163,7 +163,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--fps", type=float, default=30.0)
-    parser.add_argument("--size", type=parse_size, default=(360, 640), metavar="WxH", help="640x360")
+    parser.add_argument(
+        "--size", type=parse_size, default=(360, 640), metavar="WxH", help="size of the frames (640x360)"
+    )
     options = parser.parse_args(arguments)
     found = watch(60 * options.minutes, options.fps, options.size)
     print(f"{options.minutes:g} minutes at {options.fps:g} fps on {os.cpu_count()} cores")

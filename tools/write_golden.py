@@ -1,4 +1,4 @@
-"""Write the references of tests/app/test_golden.py anew, after a change that moves them on purpose.
+"""Write the references of tests/app/test_golden.py again, after an intended change.
 
     python -m tools.write_golden [--inputs]
 
@@ -92,7 +92,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--inputs", action="store_true", help="draw the inputs anew too")
+    parser.add_argument("--inputs", action="store_true", help="also draw the inputs again")
     args = parser.parse_args()
     FOLDER.mkdir(exist_ok=True)
     if args.inputs:

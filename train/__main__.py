@@ -27,7 +27,7 @@ from train.export import checkpoint_weights
 
 
 class ClassWriter(BasePredictionWriter):
-    """Each frame's classes as an indexed PNG, numbered as the data come, by process if there are several."""
+    """Writes each frame's classes as an indexed PNG, numbered in the order of the data and by process."""
 
     def __init__(self) -> None:
         super().__init__(write_interval="batch")
@@ -48,7 +48,7 @@ class ClassWriter(BasePredictionWriter):
 
 
 class CommandLine(LightningCLI):
-    """Lightning's, that finds the last checkpoint, and has a word before hours are lost."""
+    """Lightning's command line, which also finds the last checkpoint and warns of slow settings."""
 
     def before_instantiate_classes(self) -> None:
         """Let ``--ckpt_path last`` find the newest checkpoint in the run's folder, of any version."""

@@ -1,4 +1,4 @@
-"""What the camera may do to an image, from kornia."""
+"""Photometric changes of an image by the camera, from kornia."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 
 class Photometric(nn.Module):
-    """Brightness, contrast, colour, blur and noise, each image its own; geometry is left alone."""
+    """Changes brightness, contrast, colour, blur and noise of each image independently; geometry stays."""
 
     def __init__(self, strength: float = 1.0) -> None:
         super().__init__()

@@ -1,8 +1,8 @@
 """The mean of several networks' weights: ``python -m train.average OUT A B``.
 
 Source: Wortsman et al. 2022, "Robust fine-tuning of zero-shot models": between a network and what it was
-fine-tuned to lie networks that are better than both. So are two that were fine-tuned from the same one.
-The training settings in its file are those of the last.
+fine-tuned to lie networks that are better than both. The same holds for two that were fine-tuned from one.
+The training settings in its file are those of the last network.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A trunk that begins with the weights of an image classifier."""
+"""Start a trunk from the weights of an image classifier."""
 
 from __future__ import annotations
 

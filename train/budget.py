@@ -1,4 +1,4 @@
-"""How much of a run's budget of steps or minutes is used, and what depends on it."""
+"""The used fraction of a run's budget of steps or minutes, and what depends on it."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def rate_factor(
 
 @dataclass(frozen=True)
 class Stage:
-    """What a run trains on until a share of its budget is used.
+    """Settings of the training until a fraction of its budget is used.
 
     Attributes:
         until: share of the budget.

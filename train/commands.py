@@ -1,4 +1,4 @@
-"""What the commands of train and tools have in common."""
+"""Error handling that the commands of train and tools share."""
 
 from __future__ import annotations
 

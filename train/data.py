@@ -1,4 +1,4 @@
-"""Batches of views: from a pool on disk, or rendered as training goes."""
+"""Batches of views: from a pool on disk, or rendered during training."""
 
 from __future__ import annotations
 

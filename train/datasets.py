@@ -1,4 +1,4 @@
-"""Labelled images on disk in the layouts of TuSimple, CULane and OpenLane, for training on one's own data."""
+"""Labelled images on disk in the layouts of TuSimple, CULane and OpenLane, for your own data."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Entry(NamedTuple):
 
 
 class ScoredBatch(NamedTuple):
-    """Whole images with what a benchmark needs besides.
+    """Whole images with the additional data that a benchmark's score needs.
 
     Attributes:
         views: images and label maps at the network's size.

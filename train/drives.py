@@ -1,4 +1,4 @@
-"""Held-out rendered drives through a network and the online calibrator."""
+"""Run a network and the online calibrator on held-out rendered drives."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WARM_UP = 10  # frames
 
 
 class Seen(NamedTuple):
-    """What a network saw of a drive: segments, lane widths (L - 1,) and poses (4,) of its frames."""
+    """Detections of a network on a drive: segments, lane widths (L - 1,) and poses (4,) of its frames."""
 
     segments: list[LaneSegments]
     lane_width: list[Tensor]
@@ -58,7 +58,7 @@ def _observer(segmenter: LaneSegmenter) -> LaneBEV:
 
 
 class Followed(NamedTuple):
-    """Of a drive's F frames after the warm-up.
+    """Results on a drive's F frames after the warm-up.
 
     Attributes:
         error: (F, 4) rad and m.

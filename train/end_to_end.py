@@ -1,4 +1,4 @@
-"""Fine-tuning through extractor and calibrator: the network learns what makes the pose right."""
+"""Fine-tune a network through extractor and calibrator by a loss on the pose."""
 
 from __future__ import annotations
 
@@ -12,52 +12,55 @@ from lanebev.geometry.precision import widest_dtype
 from lanebev.observation.lines import LineExtractor
 from train.losses import unweighted_bias
 from train.module import Segmentation, unpack
-from train.poses import PoseBatch, fit_poses, pose_loss, pose_surprise
+from train.poses import PoseBatch, fit_poses, pose_loss, student_t_nll
 
 
 class EndToEnd(Segmentation):
-    """A segmentation that also answers for the pose.
+    """A segmentation trained with an additional loss on the pose.
 
-    Beside the cross-entropy, which keeps the maps what they are, a loss on pitch, yaw, roll and height of a
-    joint single-frame fit to the extracted segments. All of it is differentiable.
+    The loss is on pitch, yaw, roll and height of a joint single-frame fit to the extracted segments, and
+    differentiable in the maps.
 
     Args:
-        pose_weight: of the pose's loss; 0 trains on the same frames with cross-entropy alone. The logged
-            ``gradient/pose_by_maps`` is best below ten, not tens: an adaptive optimizer divides by the size
-            of all gradients, so a pose's that are far longer leave the maps no step to learn by.
-        surprise: the loss is how little the fit, with its sigmas, expected the truth; else the error alone.
-        pose_unit: deg, deg, deg, m: errors of pitch, yaw, roll and height that count as one; for ``surprise``
-            those that are as good as none.
-        error_weight: of the errors beside ``surprise``, of all frames and axes: surprise takes an error well
-            announced for nothing, and the root mean square does not.
-        error_unit: deg, deg, deg, m: what of them counts as one.
-        gradient_reach: how many times longer a frame's gradient may be than that of most.
-        where_only: the pose's loss moves lines, but does not change how much they count.
-        kwargs: as of :class:`~train.module.Segmentation`.
+        pose_weight: weight of the pose's loss; with 0 only the cross-entropy is trained, on the same frames.
+            Keep the logged ``gradient/pose_by_maps`` below ten: an adaptive optimizer divides by the size of
+            all gradients, so with a much longer gradient of the pose the cross-entropy has almost no effect.
+        likelihood: the loss is the negative log likelihood of the true pose under the fit and its sigmas;
+            else it is the error alone.
+        pose_unit: deg, deg, deg, m: unit of the errors; with ``likelihood`` the error below which accuracy
+            does not matter.
+        error_weight: weight of the errors of all frames and axes beside ``likelihood``, which does not
+            penalise a large error with a large sigma.
+        error_unit: deg, deg, deg, m: unit of these errors.
+        max_gradient_ratio: largest ratio of a frame's gradient to the median one.
+        detach_confidence: the pose's loss changes where lines are, but not their weights.
+        kwargs: arguments of :class:`~train.module.Segmentation`.
     """
 
     def __init__(
         self,
         pose_weight: float = 0.05,
         pose_unit: tuple[float, float, float, float] = (0.3, 0.3, 0.6, 0.06),
-        where_only: bool = False,
-        gradient_reach: float = 1.0,
-        surprise: bool = False,
+        detach_confidence: bool = False,
+        max_gradient_ratio: float = 1.0,
+        likelihood: bool = False,
         error_weight: float = 0.0,
         error_unit: tuple[float, float, float, float] = (0.2, 0.4, 0.6, 0.03),
         **kwargs: Any,
     ) -> None:
-        if not (math.isfinite(gradient_reach) and gradient_reach > 0):
-            raise ValueError(f"gradient_reach: expected more than 0 and finite, got {gradient_reach}")
-        if error_weight and not surprise:
-            raise ValueError("error_weight: expected 0 without surprise, whose loss is the errors themselves")
+        if not (math.isfinite(max_gradient_ratio) and max_gradient_ratio > 0):
+            raise ValueError(f"max_gradient_ratio: expected more than 0 and finite, got {max_gradient_ratio}")
+        if error_weight and not likelihood:
+            raise ValueError(
+                "error_weight: expected 0 without likelihood, whose loss is the errors themselves"
+            )
         super().__init__(**kwargs)
         self.settings |= {
             "pose_weight": pose_weight,
             "pose_unit": list(pose_unit),
-            "where_only": where_only,
-            "gradient_reach": gradient_reach,
-            "surprise": surprise,
+            "detach_confidence": detach_confidence,
+            "max_gradient_ratio": max_gradient_ratio,
+            "likelihood": likelihood,
             "error_weight": error_weight,
             "error_unit": list(error_unit),
         }
@@ -74,8 +77,8 @@ class EndToEnd(Segmentation):
         if self.settings["pose_weight"] > 0:
             fit = self._fit(logits + unweighted_bias(self.class_weight).view(1, -1, 1, 1), batch)
             truth = batch.extrinsics.to(widest_dtype(logits.device))
-            if self.settings["surprise"]:
-                pose = pose_surprise(fit, truth, self.unit, self.segmenter.config.pose_sigma_scale)
+            if self.settings["likelihood"]:
+                pose = student_t_nll(fit, truth, self.unit, self.segmenter.config.pose_sigma_scale)
                 if self.settings["error_weight"] > 0:
                     errors = pose_loss(fit, truth, self.error_unit, with_prior=True)
                     pose = pose + self.settings["error_weight"] * errors
@@ -119,8 +122,8 @@ class EndToEnd(Segmentation):
             batch.distortion,
             batch.lane_width,
             self.extractor,
-            self.settings["where_only"],
-            self.settings["gradient_reach"],
+            self.settings["detach_confidence"],
+            self.settings["max_gradient_ratio"],
         )
 
 

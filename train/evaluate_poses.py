@@ -1,10 +1,9 @@
 """Errors of the pose on held-out rendered drives: ``python -m train.evaluate_poses BEFORE AFTER``.
-
-Every weights file (safetensors, or a Lightning checkpoint) sees the same frames. Each frame is taken on its
-own, an axis counting where every network's fit is valid and observes it, and once more, as ``every_frame``,
-counting all, the prior answering for what is not observed; or, with ``--online``, the joint calibrator
-follows each drive, and all frames after its warm-up count, whatever their status. Of every network but the
-first, the 95 % interval of how far its RMSE is below the first's is printed too.
+All weights files (safetensors, or Lightning checkpoints) are evaluated on the same frames. Without
+``--online`` each frame is fitted alone. An axis counts if every network's fit is valid and observes it;
+under ``every_frame`` all count, with the prior for what is not observed. With ``--online`` the joint
+calibrator runs on each drive, and all frames after its warm-up count. For every network but the first, the
+95 % interval of the reduction of its RMSE against the first is printed too.
 """
 
 from __future__ import annotations
@@ -123,13 +122,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("weights", type=Path, nargs="+")
     parser.add_argument("--drives", type=PositiveInt, default=12)
-    parser.add_argument("--frames", type=PositiveInt, help="of each drive: 12, a second apart, or online 40")
     parser.add_argument(
-        "--size", type=int, nargs=2, default=(192, 320), metavar=("HEIGHT", "WIDTH"), help="not online"
+        "--frames", type=PositiveInt, help="frames per drive: 12, one a second, or 40 with --online"
+    )
+    parser.add_argument(
+        "--size",
+        type=int,
+        nargs=2,
+        default=(192, 320),
+        metavar=("HEIGHT", "WIDTH"),
+        help="image size, without --online",
     )
     parser.add_argument("--seed", type=int, default=70_000)
-    parser.add_argument("--online", action="store_true", help="follow each drive with the joint calibrator")
-    parser.add_argument("--fps", type=PositiveFloat, default=10.0, help="of the drives followed online")
+    parser.add_argument("--online", action="store_true", help="run the joint calibrator on each drive")
+    parser.add_argument(
+        "--fps", type=PositiveFloat, default=10.0, help="frame rate of the drives, with --online"
+    )
     args = parser.parse_args()
     args.frames = args.frames or (40 if args.online else 12)
     if args.online and args.frames <= WARM_UP:

@@ -1,11 +1,11 @@
-"""Where a network finds boundaries, and where not: ``python -m train.evaluate_roads WEIGHTS``.
+"""Evaluate where a network finds boundaries: ``python -m train.evaluate_roads WEIGHTS``.
 
 On held-out rendered views, by boundary, distance ahead, kind of road
 (:data:`lanebev.render.scene.kinds.KINDS`) and brightness of the image, over label rows:
 
-    recall    share of the rows with a visible boundary in which it is found where it is
-    error_px  root mean square of its distance from there in those rows, px of the network's input
-    false     rows in which a boundary is claimed and none is, as a share of the rows with one
+    recall    share of the rows with a visible boundary in which it is found at its place
+    error_px  root mean square error of its position in those rows, px of the network's input
+    false     rows in which a boundary is reported where there is none, as a share of the rows with one
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ BRIGHTNESS = (0.0, 0.1, 0.25, 1.01)  # mean of the image
 
 
 class Rows(NamedTuple):
-    """What is so of each label row, (B, L, h).
+    """Truth and detection of each label row, (B, L, h).
 
     Attributes:
         there: a visible boundary.
@@ -159,14 +159,18 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("weights", type=Path)
-    parser.add_argument("--views", type=PositiveInt, default=64, help="of all kinds together, about")
+    parser.add_argument(
+        "--views", type=PositiveInt, default=64, help="number of views, all kinds together (about)"
+    )
     parser.add_argument(
         "--kinds", nargs="+", default=[kind for kind in KINDS if kind not in ("any", "varied")]
     )
     parser.add_argument("--seed", type=int, default=91_000)
     parser.add_argument("--batch", type=PositiveInt, default=32, help="views rendered at once")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--json", action="store_true", help="one JSON object a line in place of the table")
+    parser.add_argument(
+        "--json", action="store_true", help="print one JSON object per line instead of the table"
+    )
     args = parser.parse_args()
     segmenter = trained_segmenter(args.weights)[0].to(args.device)
     views = -(-args.views // len(args.kinds))

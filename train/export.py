@@ -1,6 +1,6 @@
-"""Checkpoints to weights files (``python -m train.export CKPT OUT``), and narrow weights to wide ones.
+"""Convert checkpoints to weights files (``python -m train.export CKPT OUT``), and widen networks.
 
-A weights file may be given too, as ``train.average`` writes it: for other facts in it.
+A weights file, such as one of ``train.average``, may be given too, to change its metadata.
 """
 
 from __future__ import annotations
@@ -185,20 +185,22 @@ def export(
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("checkpoint", type=Path, help="or weights file")
+    parser.add_argument("checkpoint", type=Path, help="checkpoint or weights file")
     parser.add_argument("out", type=Path)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument(
-        "--commit", help="of the code that trained; by default LANEBEV_COMMIT, or the checkout's"
+        "--commit", help="commit of the training code (default: LANEBEV_COMMIT, or the checkout's)"
     )
     parser.add_argument(
-        "--half", action="store_true", help="all convolutions as float16, none as 8-bit numbers"
+        "--half", action="store_true", help="store all convolutions as float16, none as 8-bit numbers"
     )
-    parser.add_argument("--metrics", default="{}", help="JSON, measured on these weights")
-    parser.add_argument("--image-size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="to run at")
-    parser.add_argument("--sigma-scale", type=float, help="as train.noise measured it")
-    parser.add_argument("--pose-sigma-scale", type=float, help="likewise")
-    parser.add_argument("--note", default="", help="what else there is to know")
+    parser.add_argument("--metrics", default="{}", help="metrics of these weights, as JSON")
+    parser.add_argument(
+        "--image-size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="size of the network's input"
+    )
+    parser.add_argument("--sigma-scale", type=float, help="factor measured by train.noise")
+    parser.add_argument("--pose-sigma-scale", type=float, help="factor measured by train.noise")
+    parser.add_argument("--note", default="", help="any note")
     args = parser.parse_args()
     metrics = json.loads(args.metrics)
     given = {

@@ -1,4 +1,4 @@
-"""Line extraction alone, on the masks of rendered roads: ``python -m train.extraction``.
+"""Evaluate line extraction alone on exact masks: ``python -m train.extraction``.
 
 Prints how far the vertices are from the true boundaries, in pixels of the mask, and how that compares with
 the standard deviations they come with.
@@ -22,7 +22,7 @@ from train.commands import one_line_errors
 
 
 class ExtractionError(NamedTuple):
-    """End points of all segments on all images.
+    """Errors of the end points of all segments on all images.
 
     Attributes:
         distance: (K,) px of the mask, from the true boundary, across it.

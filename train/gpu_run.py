@@ -1,17 +1,17 @@
-"""The weights that a GPU makes in a few minutes: ``python -m train.gpu_run --minutes 9 --out OUT``.
+"""Train weights in a few minutes on a GPU: ``python -m train.gpu_run --minutes 9 --out OUT``.
 
-Trains (``configs/gpu.yaml``), exports, measures, and is done in time:
+It trains (``configs/gpu.yaml``), exports and evaluates within the given time:
 
-    OUT/weights.safetensors      averaged weights of the end, with the pose's sigma scale measured
+    OUT/weights.safetensors      final averaged weights, with the measured pose_sigma_scale
     OUT/snapshot-1, -2           the same after a third and two thirds of the training
     OUT/figures.json             views, noise and held-out recall
-    OUT/throughput.csv, fit.log  what the run did with its time
+    OUT/throughput.csv, fit.log  how the run used its time
 
-Training is a process of its own. One that runs out of memory goes on from its last checkpoint with half the
-batch; one that breaks goes on as it was; one that does not end is ended. Whatever happens, the newest
-checkpoint is exported. The noise is that of the second snapshot, on the CPU's cores while training goes on:
-measure the final weights' with ``python -m train.noise`` where there is time. ``--smoke --minutes 1.5`` does
-all of it once, after ``python -m train.smoke``.
+Training runs in a separate process. If it runs out of memory, it continues from its last checkpoint with
+half the batch; after another failure it continues unchanged; if it does not end, it is stopped. The newest
+checkpoint is exported in any case. The noise is measured on the second snapshot, on the CPU while training
+continues; if there is time, measure that of the final weights with ``python -m train.noise``. ``--smoke
+--minutes 1.5`` does everything once, after ``python -m train.smoke``.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class Training:
 
 
 class Measurement:
-    """A command beside the training that prints lines of JSON."""
+    """A command that runs beside the training and prints lines of JSON."""
 
     def __init__(self, *command: str) -> None:
         self._name = command[0]
@@ -226,12 +226,14 @@ def _commit() -> str:
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--minutes", type=PositiveFloat, default=9.0, help="of the whole command")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the results")
-    parser.add_argument("--work", type=Path, help="folder of the checkpoints; a temporary one by default")
+    parser.add_argument("--minutes", type=PositiveFloat, default=9.0, help="duration of the whole command")
+    parser.add_argument("--out", type=Path, required=True, help="output folder")
+    parser.add_argument("--work", type=Path, help="folder of the checkpoints (default: a temporary one)")
     parser.add_argument("--config", type=Path, default=Path("configs/gpu.yaml"))
     parser.add_argument("--seed", type=int, default=21)
-    parser.add_argument("--views", type=PositiveInt, default=384, help="held-out, for the recall")
+    parser.add_argument(
+        "--views", type=PositiveInt, default=384, help="number of held-out views for the recall"
+    )
     parser.add_argument("--smoke", action="store_true", help="time the parts first")
     args, options = parser.parse_known_args()
     begin = time.monotonic()

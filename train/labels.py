@@ -36,7 +36,7 @@ class LabelledImage(NamedTuple):
 
 
 class LabelledView(NamedTuple):
-    """What the network trains on.
+    """Input and target of the network's training.
 
     Attributes:
         image: (3, H, W).
@@ -101,7 +101,7 @@ def separated(points: Float, exists: Bool, gap: float) -> Bool:
 
 @dataclass(frozen=True)
 class ViewConfig:
-    """How views are drawn from a labelled image.
+    """Ranges of the random views of a labelled image.
 
     Attributes:
         output_stride: of the network whose labels these are.

@@ -1,4 +1,4 @@
-"""Views rendered where the network trains, in the training step's own process."""
+"""Render views on the device that trains, in the training step's own process."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def labelled(views: Views, config: ViewConfig) -> Batch:
 
 
 class Block(NamedTuple):
-    """Views rendered together, which become the new ones of several batches."""
+    """Views rendered together, which are the new views of several batches."""
 
     views: Views
     fresh: int  # views of each batch that are new
@@ -100,7 +100,7 @@ class Block(NamedTuple):
 
 
 class LiveBatches(IterableDataset[Batch]):
-    """Endless batches of new views; with ``repeats`` each view is in that many batches on end.
+    """Endless batches of new views; with ``repeats`` each view is in that many consecutive batches.
 
     Of a batch, one ``repeats``-th is new. So a view comes again beside others, and mirrored or not anew.
     Views are rendered for several batches together, since a GPU renders many in little more time than few.

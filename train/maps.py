@@ -1,4 +1,4 @@
-"""Label maps of a whole batch, drawn where its points are: :mod:`train.labels` without OpenCV."""
+"""Label maps of a whole batch on its device: :mod:`train.labels` without OpenCV."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from train.labels import ViewConfig
 
 
 class LabelMaps(NamedTuple):
-    """What a network learns from B images.
+    """Targets of B images.
 
     Attributes:
         target: (B, L, h, w) in [0, 1], the share of each label pixel that each boundary's stripe covers.

@@ -1,4 +1,4 @@
-"""How well lanes are found: held-out recall, and the scores of TuSimple and CULane as they define them."""
+"""Metrics of lane detection: held-out recall, and the scores of TuSimple and CULane."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def point_recall(
 
 
 class TuSimpleScore(NamedTuple):
-    """One image by the TuSimple lane benchmark; a data set's score is the mean over images."""
+    """TuSimple's score of one image; a data set's score is the mean over images."""
 
     accuracy: float
     false_positives: float
@@ -125,7 +125,7 @@ def _row_accuracy(
 
 
 class CULaneCounts(NamedTuple):
-    """Lanes found, made up and missed; counts of several images add up before F1 is taken."""
+    """Counts of lanes found, false and missed; they are summed over images before F1 is computed."""
 
     true_positives: int
     false_positives: int

@@ -30,7 +30,7 @@ _NOT_LABELLED = -1  # class of a pixel without weight
 
 
 class Segmentation(L.LightningModule):
-    """A :class:`LaneSegmenter` learning boundaries.
+    """Training of a :class:`LaneSegmenter`.
 
     Args:
         network: its shape.

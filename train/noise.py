@@ -1,12 +1,10 @@
-"""How much less a network's vertices say together than each by itself: ``python -m train.noise WEIGHTS``.
-
-A network errs alike along a line and from frame to frame. Held-out rendered drives tell what factor on
-all sigmas that is worth: for each factor the calibrator's errors, median over the drives, and NEES/dof,
-which is 1 where its covariance is as large as its errors. A drive alone would take a factor of 4; but with
-sigmas as large as that an outlier is no longer told from a vertex, and single frames lean on the
-prior (``python -m train.evaluate_poses``), so the shipped weights have 2.25 (``python -m train.export
---sigma-scale``). By the square root of the NEES that is left there, their ``--pose-sigma-scale``, the pose's
-sigmas are widened.
+"""Measure the two sigma factors of a network: ``python -m train.noise WEIGHTS``.
+A network's errors are correlated along a line and from frame to frame. On held-out rendered drives this
+command prints, for several factors on all sigmas, the median errors of the calibrator over the drives, and
+NEES/dof, which is 1 if the covariance is as large as the errors. Drives alone would need a factor of 4, but
+with such sigmas outliers cannot be recognised and single frames depend on the prior (``python -m
+train.evaluate_poses``), so the shipped weights have 2.25 (``python -m train.export --sigma-scale``). The
+square root of the remaining NEES is the factor on the pose's sigmas, ``--pose-sigma-scale``.
 """
 
 from __future__ import annotations
@@ -33,7 +31,7 @@ FACTORS = (1.0, 1.5, 2.0, 2.25, 3.0, 4.0, 6.0)
 
 
 class Outcome(NamedTuple):
-    """Of a drive's tracked frames: RMSE (4,) in deg, deg, deg, cm, and NEES/dof; NaN where there are none."""
+    """RMSE (4,) in deg, deg, deg, cm and NEES/dof over a drive's tracked frames; NaN if there are none."""
 
     rmse: Tensor
     nees: Tensor
@@ -73,10 +71,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("weights", type=Path)
     parser.add_argument("--drives", type=PositiveInt, default=12)
-    parser.add_argument("--frames", type=PositiveInt, default=90, help="of each drive")
+    parser.add_argument("--frames", type=PositiveInt, default=90, help="frames per drive")
     parser.add_argument("--fps", type=PositiveFloat, default=20.0)
     parser.add_argument("--seed", type=int, default=81_000)
-    parser.add_argument("--jobs", type=PositiveInt, default=1, help="processes")
+    parser.add_argument("--jobs", type=PositiveInt, default=1, help="number of processes")
     args = parser.parse_args()
     one = partial(_watch_one, args.weights, args.frames, args.fps)
     seeds = range(args.seed, args.seed + args.drives)

@@ -28,7 +28,7 @@ from train.labels import LabelledImage
 
 
 class Pose(NamedTuple):
-    """The camera of a frame over the road, exactly. A shard has N of each.
+    """True pose of the camera over the road. A shard has N.
 
     Attributes:
         extrinsics: (4,) pitch, yaw, roll in rad, height in m.
@@ -165,8 +165,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--shards", type=PositiveInt, default=10)
-    parser.add_argument("--frames", type=PositiveInt, default=64, help="per shard")
-    parser.add_argument("--batch", type=PositiveInt, default=8, help="rendered together")
+    parser.add_argument("--frames", type=PositiveInt, default=64, help="frames per shard")
+    parser.add_argument("--batch", type=PositiveInt, default=8, help="frames rendered together")
     parser.add_argument("--size", type=int, nargs=2, default=(360, 640), metavar=("HEIGHT", "WIDTH"))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--prefix", default="shard")

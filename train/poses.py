@@ -1,4 +1,4 @@
-"""Whole frames with the pose they were taken from, and the pose that a network's logits lead to."""
+"""Whole frames with their true pose, and the pose estimated from a network's logits."""
 
 from __future__ import annotations
 
@@ -108,30 +108,31 @@ def fit_poses(
     distortion: Tensor,
     lane_width: float | Tensor,
     extractor: LineExtractor,
-    where_only: bool = False,
+    detach_confidence: bool = False,
     reach: float = 1.0,
 ) -> SingleFrameFit:
     """Estimate each image's pose from logits, differentiable, in double precision.
 
-    A frame's gradient is at most ``reach`` times as long as that of most.
+    A frame's gradient is at most ``reach`` times as long as the median one.
 
-    With ``where_only`` gradients reach where lines lie, not how much they count: a network cannot get a
-    better pose by seeing fewer of them.
+    With ``detach_confidence`` gradients reach the positions of lines but not their weights: a network cannot
+    get a better pose by finding fewer of them.
     """
     dtype = widest_dtype(logits.device)
-    even: Tensor = EvenGradients.apply(logits.to(dtype), reach)  # type: ignore[no-untyped-call]
+    even: Tensor = GradientClip.apply(logits.to(dtype), reach)  # type: ignore[no-untyped-call]
     intrinsics, distortion = intrinsics.to(dtype), distortion.to(dtype)
     segments = segments_from_vertices(extractor.vertices(even, size, size), intrinsics, distortion)
-    if where_only:
+    if detach_confidence:
         segments = segments._replace(weight=segments.weight.detach(), sigma=segments.sigma.detach())
     width = cast_floating(lane_width, dtype)
     return fit_single_frame(segments, intrinsics, width)
 
 
-class EvenGradients(torch.autograd.Function):
-    """The identity, whose gradient is at most ``reach`` times as long for one sample as for most of a batch.
+class GradientClip(torch.autograd.Function):
+    """The identity, with each sample's gradient at most ``reach`` times as long as the median of the batch.
 
-    A fit close to another solution has a gradient a thousand times that of the others, and says the least.
+    A fit close to another solution has a gradient a thousand times that of the others, and the least
+    information.
     """
 
     @staticmethod
@@ -155,8 +156,8 @@ def pose_loss(fit: SingleFrameFit, truth: Tensor, unit: Tensor, with_prior: bool
     Args:
         fit: of B frames.
         truth: (B, 4).
-        unit: (4,) rad, rad, rad, m: errors that count as one; far larger ones count linearly.
-        with_prior: what the fit took from the prior (roll on one lane) counts too, and frames without a fit.
+        unit: (4,) rad, rad, rad, m: errors of loss one; much larger ones count linearly.
+        with_prior: also count frames without a fit, and axes that have the prior (roll on one lane).
     """
     counted = fit.valid | with_prior
     said = (fit.observed | with_prior) & counted.unsqueeze(-1)
@@ -165,21 +166,21 @@ def pose_loss(fit: SingleFrameFit, truth: Tensor, unit: Tensor, with_prior: bool
     return ((1 + error.square()).sqrt() - 1).sum() / counted.sum().clamp(min=1)
 
 
-def pose_surprise(fit: SingleFrameFit, truth: Tensor, floor: Tensor, factor: float = 1.0) -> Tensor:
+def student_t_nll(fit: SingleFrameFit, truth: Tensor, floor: Tensor, factor: float = 1.0) -> Tensor:
     """Compute the negative log likelihood of the truth under the fit's sigmas, mean over frames.
 
-    A proper score (Gneiting and Raftery 2007): lines that are not seen cost the sigma that they would have
-    given, and a line that is none costs what it claims to know. The density is Student's t with 4 degrees of
-    freedom, so that one frame gone wrong does not decide.
+    It is a proper score (Gneiting and Raftery 2007): a missed line costs because sigmas are larger, a false
+    one because errors are larger than sigmas. The density is Student's t with 4 degrees of freedom, so that
+    one wrong frame does not dominate.
 
     Args:
-        fit: of B frames; where one does not observe an axis, its prior answers for it.
+        fit: fits of B frames; unobserved axes have the prior.
         truth: (B, 4).
-        floor: (4,) rad, rad, rad, m, added to the sigmas in quadrature: smaller errors are as good as none.
-        factor: on the fit's sigmas, see ``SegmenterConfig.pose_sigma_scale``.
+        floor: (4,) rad, rad, rad, m, added to the sigmas in quadrature, so that smaller errors do not matter.
+        factor: factor on the fit's sigmas, see ``SegmenterConfig.pose_sigma_scale``.
     """
     error = fit.extrinsics.stack() - truth
     variance = factor**2 * fit.covariance.diagonal(dim1=-2, dim2=-1)[:, :4] + floor.square()
-    surprise = 2.5 * (error.square() / (4 * variance)).log1p() + 0.5 * (variance / floor.square()).log()
-    usable = surprise.isfinite().all(-1)
-    return torch.where(usable.unsqueeze(-1), surprise, 0.0).sum() / usable.sum().clamp(min=1)
+    nll = 2.5 * (error.square() / (4 * variance)).log1p() + 0.5 * (variance / floor.square()).log()
+    usable = nll.isfinite().all(-1)
+    return torch.where(usable.unsqueeze(-1), nll, 0.0).sum() / usable.sum().clamp(min=1)

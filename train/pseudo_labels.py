@@ -1,11 +1,9 @@
-"""A user's own unlabelled video as training data: ``python -m train.pseudo_labels RESULT SOURCE OUT``.
-
-RESULT is the folder that ``lanebev run`` made of SOURCE. What the network saw there, frame by frame, becomes
-labels that are better than what it saw: all boundaries of a frame are fitted together on the run's pose, a
-boundary's place on the road is the median over neighbouring frames, one that is in less than half of them is
-none, and a dashed or worn one is drawn through (behind vehicles too: who hides what is not known). Frames of
-which the run is not sure, and those of a lane change, are left out. OUT has images and ``labels.json`` in
-TuSimple's layout, for ``configs/adapt.yaml``.
+"""Make training data from unlabelled video: ``python -m train.pseudo_labels RESULT SOURCE OUT``.
+RESULT is the output folder of ``lanebev run`` on SOURCE. The labels are the network's boundaries, improved:
+all boundaries of a frame are fitted together on the run's pose; a boundary's place on the road is the median
+over neighbouring frames; one found in less than half of these is left out; a dashed or worn one is drawn as
+a whole (also behind vehicles, which are not known). Frames with an uncertain pose and those of a lane change
+are left out. OUT has images and ``labels.json`` in TuSimple's layout, for ``configs/adapt.yaml``.
 
 Source: self-training with pseudo-labels (Lee 2013) made consistent over time.
 """
@@ -155,12 +153,17 @@ def write_labels(result: Path, source: str, out: Path, camera: Camera, reach: in
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("result", type=Path, help="folder that lanebev run made")
-    parser.add_argument("source", help="video or images that it ran on")
-    parser.add_argument("out", type=Path, help="new folder")
-    parser.add_argument("--camera", type=Path, required=True, help="file, as given to the run")
-    parser.add_argument("--reach", type=PositiveInt, default=12, help="frames before and after")
-    parser.add_argument("--every", type=PositiveInt, default=3, help="sure frames of which one is written")
+    parser.add_argument("result", type=Path, help="output folder of lanebev run")
+    parser.add_argument("source", help="video or images of that run")
+    parser.add_argument("out", type=Path, help="new folder of the data")
+    parser.add_argument("--camera", type=Path, required=True, help="camera file of the run")
+    parser.add_argument(
+        "--reach",
+        type=PositiveInt,
+        default=12,
+        help="number of frames before and after over which boundaries are smoothed",
+    )
+    parser.add_argument("--every", type=PositiveInt, default=3, help="write every Nth usable frame")
     args = parser.parse_args()
     if args.out.exists():
         parser.error(f"out: expected a new folder, got {args.out}, which is there")

@@ -16,7 +16,7 @@ from train.metrics import CULaneCounts, culane_counts, tusimple_score
 
 
 class DrawnLanes(NamedTuple):
-    """How a benchmark that draws lanes compares them.
+    """Settings of a benchmark that compares drawn lanes.
 
     Attributes:
         height: px, of its images.
@@ -38,7 +38,7 @@ DRAWN = {
 
 
 class BenchmarkScores:
-    """Collects images, then gives the benchmark's figures: TuSimple's accuracy, FP and FN, the others' F1."""
+    """Collects images and computes the benchmark's scores: TuSimple's accuracy, FP and FN, or F1."""
 
     def __init__(self) -> None:
         self.tusimple: list[tuple[float, float, float]] = []

@@ -1,4 +1,4 @@
-"""Views with their labels drawn in, as one image to look at."""
+"""Draw views with their labels on one sheet."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""How fast a device renders, labels and trains: ``python -m train.smoke --out OUT``, in half a minute.
+"""Measure how fast a device renders, labels and trains: ``python -m train.smoke --out OUT``.
 
 Prints frames a second of rendering, of labelling and augmenting, and of training alone, and the peak memory;
-saves a sheet of labelled views. A batch that does not fit in memory is said and passed over.
+saves a sheet of labelled views. A batch that does not fit in memory is reported and skipped.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def _wait(device: torch.device) -> None:
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder")
+    parser.add_argument("--out", type=Path, required=True, help="output folder")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--size", type=int, nargs=2, default=(320, 576), metavar=("HEIGHT", "WIDTH"))
     parser.add_argument("--batches", type=PositiveInt, nargs="+", default=(32, 64, 128))

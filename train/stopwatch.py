@@ -1,4 +1,4 @@
-"""Time of parts of a loop, on the device where they run."""
+"""Measure the time of parts of a loop, on the device where they run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 
 
 class Stopwatch:
-    """Adds up seconds by name. On a GPU these are the GPU's own, and nothing waits until they are read."""
+    """Adds up seconds by name. On a GPU it uses the GPU's clock and waits only when it is read."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device

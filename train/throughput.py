@@ -1,4 +1,4 @@
-"""What a run does with its time, printed and kept as a table."""
+"""Print and store how a training uses its time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from train.stopwatch import Stopwatch
 
 
 class Throughput(L.Callback):
-    """Prints views seen, views a second, and the shares of rendering, labelling and training.
+    """Prints views, views per second, and the shares of rendering, labelling and training.
 
     They are rows of ``throughput.csv`` in the run's folder too.
 

@@ -21,12 +21,12 @@ from train.labels import ViewConfig
 from train.module import unpack
 from train.pool import read_shard, write_shard
 from train.poses import (
-    EvenGradients,
+    GradientClip,
     PoseBatch,
     PoseBatches,
     fit_poses,
     pose_loss,
-    pose_surprise,
+    student_t_nll,
 )
 
 SIZE = (144, 256)
@@ -146,42 +146,42 @@ def test_gradient_of_the_pose_lowers_its_error(batch):
 
 
 def test_fainter_lines_are_no_way_to_a_better_pose(batch):
-    """A map as a whole made fainter lies where it lay: with ``where_only`` that has no gradient."""
+    """A map as a whole made fainter lies where it lay: with ``detach_confidence`` that has no gradient."""
     unit = torch.tensor([0.005, 0.005, 0.01, 0.05], dtype=torch.float64)
     share = (unpack(batch)[1][:, 1:].double() * 0.5).roll(1, dims=-1)
     slopes = []
-    for where_only in (False, True):
+    for detach_confidence in (False, True):
         faint = torch.ones(6, 1, 1, dtype=torch.float64, requires_grad=True)
         maps = torch.cat([1 - (faint * share).sum(1, keepdim=True), faint * share], dim=1)
-        found = fit(maps.clamp(min=1e-6).log(), batch, where_only=where_only)
+        found = fit(maps.clamp(min=1e-6).log(), batch, detach_confidence=detach_confidence)
         (slope,) = torch.autograd.grad(pose_loss(found, batch.extrinsics.double(), unit), faint)
         slopes.append(slope.norm())
     assert slopes[1] < 0.1 * slopes[0]
 
 
-def test_surprise_is_least_where_sigmas_are_the_errors(batch):
+def test_likelihood_is_largest_where_sigmas_are_the_errors(batch):
     """Errors of 0.1: sigmas that say so are better than a tenth of them, and than ten times as much."""
     found = fit(logits_of(batch), batch)
     floor = torch.full((4,), 0.01, dtype=torch.float64)
     truth = found.extrinsics.stack() + 0.1
     sizes = (0.01, 0.1, 1.0)
     eye = torch.eye(7, dtype=torch.float64).expand(len(truth), 7, 7)
-    scores = [pose_surprise(found._replace(covariance=s**2 * eye), truth, floor) for s in sizes]
+    scores = [student_t_nll(found._replace(covariance=s**2 * eye), truth, floor) for s in sizes]
     assert scores[1] < min(scores[0], scores[2])
-    widened = pose_surprise(found._replace(covariance=0.01 * eye), truth, floor, factor=10.0)
+    widened = student_t_nll(found._replace(covariance=0.01 * eye), truth, floor, factor=10.0)
     torch.testing.assert_close(widened, scores[2])
     broken = found._replace(covariance=torch.full_like(eye, torch.nan))
-    assert pose_surprise(broken, truth, floor) == 0
+    assert student_t_nll(broken, truth, floor) == 0
 
 
-def test_surprise_asks_for_what_can_be_seen(batch):
+def test_likelihood_asks_for_what_can_be_seen(batch):
     """Faint maps where the truth is: stronger ones lower the loss, which errors alone don't ask for."""
     floor = torch.tensor([0.0005, 0.0015, 0.002, 0.005], dtype=torch.float64)
     share = unpack(batch)[1][:, 1:].double() * 0.6
     faint = torch.ones(6, 1, 1, dtype=torch.float64, requires_grad=True)
     maps = torch.cat([1 - (faint * share).sum(1, keepdim=True), faint * share], dim=1)
     found = fit(maps.clamp(min=1e-6).log(), batch)
-    (slope,) = torch.autograd.grad(pose_surprise(found, batch.extrinsics.double(), floor), faint)
+    (slope,) = torch.autograd.grad(student_t_nll(found, batch.extrinsics.double(), floor), faint)
     assert slope.isfinite().all()
     assert slope.sum() < 0
 
@@ -190,38 +190,38 @@ def test_surprise_asks_for_what_can_be_seen(batch):
 def test_even_gradients_are_no_longer_than_so_many_medians(reach):
     x = torch.zeros(4, 2, requires_grad=True)
     slope = torch.tensor([[3.0, 4], [0, 1], [300, 400], [float("nan"), 1]])
-    (EvenGradients.apply(x, reach) * slope).sum().backward()
+    (GradientClip.apply(x, reach) * slope).sum().backward()
     # lengths 5, 1, 500 and none: the (lower) median is 1
     long = reach * torch.tensor([0.6, 0.8])
     torch.testing.assert_close(x.grad, torch.stack([long, slope[1], long, torch.zeros(2)]))
 
 
-@pytest.mark.parametrize(("surprise", "error_weight"), [(False, 0.0), (True, 0.0), (True, 2.0)])
-def test_empty_maps_train_on_finite_gradients(batch, trainer, surprise, error_weight):
+@pytest.mark.parametrize(("likelihood", "error_weight"), [(False, 0.0), (True, 0.0), (True, 2.0)])
+def test_empty_maps_train_on_finite_gradients(batch, trainer, likelihood, error_weight):
     torch.manual_seed(0)
     network = SegmenterConfig(base_width=4, decoder_width=4)
-    model = EndToEnd(network=network, augment=0.0, surprise=surprise, error_weight=error_weight)
+    model = EndToEnd(network=network, augment=0.0, likelihood=likelihood, error_weight=error_weight)
     model.trainer = trainer
     model.log = model.log_dict = lambda *args, **kwargs: None
     model.training_step(batch, 0).backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
 
 
-def test_errors_count_beside_surprise(batch, trainer):
+def test_errors_count_beside_likelihood(batch, trainer):
     """Boundaries that are elsewhere: the loss is higher by the errors, as often as they are weighed."""
     losses = []
     for error_weight in (0.0, 1.0, 3.0):
         torch.manual_seed(0)
         network = SegmenterConfig(base_width=4, decoder_width=4)
         model = EndToEnd(
-            network=network, augment=0.0, surprise=True, error_weight=error_weight, pose_weight=1.0
+            network=network, augment=0.0, likelihood=True, error_weight=error_weight, pose_weight=1.0
         )
         model.trainer = trainer
         model.log = model.log_dict = lambda *args, **kwargs: None
         losses.append(model.training_step(batch, 0).detach())
     assert losses[1] > losses[0] + 0.1
     torch.testing.assert_close(losses[2] - losses[0], 3 * (losses[1] - losses[0]), rtol=1e-3, atol=1e-4)
-    with pytest.raises(ValueError, match="error_weight: expected 0 without surprise"):
+    with pytest.raises(ValueError, match="error_weight: expected 0 without likelihood"):
         EndToEnd(error_weight=1.0)
 
 

@@ -37,8 +37,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("kinds", nargs="*", metavar="KIND", help="only these kinds; all by default")
-    parser.add_argument("--write", action="store_true", help="write the references anew")
+    parser.add_argument("kinds", nargs="*", metavar="KIND", help="kinds to replay (default: all)")
+    parser.add_argument("--write", action="store_true", help="write the references that differ")
     args = parser.parse_args(arguments)
     unknown = sorted(set(args.kinds) - set(KINDS))
     if unknown:

@@ -1,4 +1,4 @@
-"""Which drives there are, what the estimators make of them, and how that differs from the references."""
+"""Run the estimators on the drives of a replay and compare the results with the references."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Key = tuple[str, str]
 
 
 class Results(NamedTuple):
-    """What the estimators made of some drives.
+    """Results of the estimators on some drives.
 
     Attributes:
         rows: of the reference files, by drive and estimator.

@@ -1,4 +1,4 @@
-"""How a calibrator does on a drive whose truth is known, as a row of a table."""
+"""Statistics of a calibrator on a drive with known truth, as a row of a table."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tools.replay.recording import Recording, Replayed
 
 
 class Figures(NamedTuple):
-    """Of one drive.
+    """Statistics of one drive.
 
     Attributes:
         rmse: of pitch, yaw, roll in degrees and height in cm.

@@ -1,4 +1,4 @@
-"""The kinds of drive that a replay must hold, and the generated drives among them."""
+"""The kinds of drive of a replay, and the generated drives."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ KINDS = (
 
 @dataclass(frozen=True)
 class Generated:
-    """A drive of known truth, drawn by a seed.
+    """A drive with known truth, drawn with a seed.
 
     Attributes:
         kind: one of :data:`KINDS`.

@@ -1,4 +1,4 @@
-"""One drive as what a calibrator is given, and several of them as rows of one batch."""
+"""The input of a calibrator for one drive, and for several drives as rows of one batch."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Recording(NamedTuple):
 
 
 class Replayed(NamedTuple):
-    """What a calibrator made of R drives of T frames.
+    """Results of a calibrator on R drives of T frames.
 
     Attributes:
         pose: (T, R, 4) rad and m.

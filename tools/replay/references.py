@@ -23,7 +23,7 @@ Row = dict[str, str]
 
 
 class Difference(NamedTuple):
-    """How far rows are from their reference.
+    """Difference of rows from their reference.
 
     Attributes:
         sigmas: by column, the largest difference in sigmas of the reference.

@@ -1,4 +1,4 @@
-"""Drives rendered as pixels and seen by the shipped network: kept as the boundary vertices that it saw.
+"""Render drives and store the boundary vertices that the shipped network finds in them.
 
     python -m tools.replay.rendered [NAME…]
 
@@ -68,7 +68,7 @@ KNOCKED = Shock(_knocked, _KNOCKED_AT, _KNOCKED_AT + 0.1)
 
 @dataclass(frozen=True)
 class Rendered:
-    """What to render.
+    """Settings of a rendered drive.
 
     Attributes:
         kind: one of the replay's kinds.
@@ -96,7 +96,7 @@ RENDERED = {
 
 
 class ShockedDrive(Drive):
-    """A drive with a shock beside its own motion; None is no shock."""
+    """A drive with a shock in addition to its own motion; None is no shock."""
 
     shock: Shock | None = None
 
@@ -160,7 +160,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("names", nargs="*", metavar="NAME", help="only these drives; all by default")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="drives to render (default: all)")
     args = parser.parse_args(arguments)
     unknown = sorted(set(args.names) - set(RENDERED))
     if unknown:

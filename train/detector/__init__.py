@@ -1,1 +1,1 @@
-"""A detector of vehicles on bird's-eye features, and what the camera's pose is worth to it."""
+"""A detector of vehicles on bird's-eye features, and its gain from the camera's pose."""

@@ -1,7 +1,7 @@
 """Drives with a shaking camera on disk: ``python -m train.detector.drives OUT --drives 160 --seed 1``.
 
 A drive is one ``.npz``: JPEG images, the boxes on the road, the true pose, and the pose and state of the
-online calibration on those images. What is there is not rendered again.
+online calibration on those images. Existing files are not rendered again.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _SHAKE_HZ = ((0.15, 2.0), (0.1, 0.8), (0.1, 1.5), (0.2, 2.0))
 
 
 class ShakingDrive(Drive):
-    """A drive whose mount is off and whose camera shakes about it as band-limited noise.
+    """A drive with a displaced mount, about which the camera moves as band-limited noise.
 
     Args:
         seed: of everything.
@@ -211,13 +211,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--drives", type=PositiveInt, default=160)
-    parser.add_argument("--frames", type=PositiveInt, default=12, help="of each drive")
+    parser.add_argument("--frames", type=PositiveInt, default=12, help="frames per drive")
     parser.add_argument("--fps", type=float, default=10.0)
     parser.add_argument("--size", type=int, nargs=2, default=(320, 576), metavar=("HEIGHT", "WIDTH"))
     parser.add_argument(
-        "--network-width", type=PositiveInt, help="px, of the lane network's input; as trained"
+        "--network-width",
+        type=PositiveInt,
+        help="width of the lane network's input, px (default: as trained)",
     )
-    parser.add_argument("--seed", type=int, default=1, help="other seeds, other drives")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the drives")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     lanes = LaneBEV.from_pretrained(network_width=args.network_width).eval()

@@ -1,4 +1,4 @@
-"""Settings of the experiment, and an arm as it was trained."""
+"""Settings of the experiment, and a trained arm."""
 
 from __future__ import annotations
 

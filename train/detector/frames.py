@@ -1,4 +1,4 @@
-"""Frames of drives in memory, as the detector's training takes them."""
+"""Frames of drives in memory, for the detector's training."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Frames(NamedTuple):
 
 
 class DriveFrames(Dataset[Frames]):
-    """All frames of the drives in a folder but those of the warm-up.
+    """All frames of the drives in a folder except those of the warm-up.
 
     Args:
         folder: of the files that :mod:`train.detector.drives` wrote.

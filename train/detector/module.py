@@ -41,7 +41,7 @@ def arm_poses(arm: Arm, frames: Frames, noise: Tensor | None = None) -> Tensor:
 
 
 class DetectorTraining(L.LightningModule):
-    """A :class:`VehicleDetector` learning with one arm's poses.
+    """Training of a :class:`VehicleDetector` with one arm's poses.
 
     Args:
         arm: see :func:`arm_poses`; "tuned" trains the lane network too, by the detector's loss alone.

@@ -1,4 +1,4 @@
-"""What a detector finds in the frames of drives, by given poses."""
+"""Run a detector on frames of drives, with given poses."""
 
 from __future__ import annotations
 

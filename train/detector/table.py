@@ -141,7 +141,7 @@ def main(args: list[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path, help="folder of results")
-    parser.add_argument("--plot", type=Path, help="file of the plot of AP by the angle")
+    parser.add_argument("--plot", type=Path, help="file for the plot of AP by angle")
     given = parser.parse_args(args)
     results = read_results(given.run)
     first = next(iter(results.values()))[0]

@@ -1,4 +1,4 @@
-"""Boxes to the maps of a CenterPoint head, their loss, and maps to boxes.
+"""Convert boxes to the maps of a CenterPoint head and back, and compute the loss.
 
 Source: Zhou et al. 2019, "Objects as Points"; Yin et al. 2021, "Center-based 3D Object Detection and
 Tracking". Maps (B, 7, U, V): logit of a centre; offset of the centre from the cell, columns and rows;

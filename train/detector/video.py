@@ -1,4 +1,4 @@
-"""The arms side by side: ``python -m train.detector.video --config configs/detector.yaml --film FILM.mp4``.
+"""Video of all arms: ``python -m train.detector.video --config configs/detector.yaml --film FILM.mp4``.
 
 Each frame of the test drives shows the image and, for each arm, its bird's-eye view by the pose that it takes
 for true, with the boxes that it finds (red) over those that are there (white).
@@ -90,7 +90,7 @@ def main(args: list[str] | None = None) -> None:
     """Run the command line."""
     parser = experiment_parser(str(__doc__), "python -m train.detector.video")
     parser.add_argument("--film", type=Path, required=True, help="MP4 file")
-    parser.add_argument("--film_seed", type=int, default=1, help="whose arms")
+    parser.add_argument("--film_seed", type=int, default=1, help="seed of the arms that are shown")
     parser.add_argument("--film_frames", type=PositiveInt, default=200)
     given = parser.parse_args(args)
     write_film(experiment_of(given), given.film_seed, given.film, given.film_frames)
