@@ -67,7 +67,7 @@ class Drive:
         hills: factor of the crests; 0 is a flat road.
         lane_changes: whether there are any.
         weather: "any", or "clear" for a clear day.
-        kind: what the world shows, one of :data:`~lanebev.render.scene.kinds.KINDS`.
+        kind: kind of road, one of :data:`~lanebev.render.scene.kinds.KINDS`.
         ideal_sensor: leave out blur, noise and compression.
 
     Attributes:

@@ -45,7 +45,7 @@ def render_scenes(
     rows: int | None = None,
     ideal_sensor: bool = False,
 ) -> RenderedFrame:
-    """Render scenes, and state what is true of the images.
+    """Render scenes, and return the images with their truth.
 
     Args:
         host: B scenes on the CPU.
@@ -118,7 +118,7 @@ def render_views(
         window: render windows about the horizon of images with more pixels; by default whole images. The
             intrinsics are then those of the window; a lens's distortion is the same on the z = 1 plane.
         model: "pinhole" (Brown-Conrady, D = 5) or "fisheye" (Kannala-Brandt, D = 4) lenses.
-        kind: what the worlds show, one of :data:`~lanebev.render.scene.kinds.KINDS`.
+        kind: kind of road, one of :data:`~lanebev.render.scene.kinds.KINDS`.
         ideal_sensor: leave out rain, blur, noise and compression.
         rows: how many scenes are rendered together, see :func:`render_scenes`.
 

@@ -17,7 +17,7 @@ _MIN_VERTICES = 4
 _MIN_ROWS = 50.0  # px of the image that a boundary must cross: on fewer, its vertices err alike
 _MIN_STRETCH = 5.0  # m of road that a boundary must cover
 _LEAST_SCALE = 1e-6  # of the residuals in sigmas
-_WIDTH_STD = 0.03  # m, from which on a width is not told
+_WIDTH_STD = 0.03  # m; a width with a larger standard deviation is left out
 
 
 class RoadBoundaries(NamedTuple):

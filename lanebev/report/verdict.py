@@ -22,8 +22,8 @@ _STATUS_WORDS = {
     "UNINITIALISED": "not yet calibrated",
 }
 _SEVERITY = ("no frames", *_STATUS_WORDS.values(), "not determined", "uncertain")
-_JOINED = 0.5  # s between two intervals of the same kind that are told as one
-_SHORTEST = 0.2  # s of an interval that is told
+_JOINED = 0.5  # s, largest gap between two intervals of the same kind that are joined
+_SHORTEST = 0.2  # s, shortest interval that is listed
 _GAP = 1.0  # s between two frames, and
 _GAP_STEPS = 5.0  # times the usual step, from which on frames are missing
 _TOLD = 8  # findings

@@ -13,7 +13,7 @@ SETTLING = 1.0  # s after the first tracked frame, in which large sigmas and jum
 _STATUSES = ("COASTING", "LOST")
 _LEAST_JUMP = (0.1, 0.1, 0.1, 0.01)  # deg, deg, deg, m: smaller ones are no event
 _LEAST_SIGMAS = 3.0
-_APART = 0.3  # s, that two moments told are apart
+_APART = 0.3  # s, least time between two listed moments
 
 
 class Moment(NamedTuple):

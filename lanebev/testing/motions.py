@@ -66,7 +66,7 @@ def sinusoids(
 
 
 def suspension(seed: int, seconds: float, bumps_per_s: float = 1.5, mount: Pose = MOUNT) -> Motion:
-    """Draw a motion as a car's body on a rough road has: every bump sets its own damped oscillation off.
+    """Draw the motion of a car's body on a rough road: every bump starts a damped oscillation.
 
     Bumps come at random; pitch, roll and height answer at 1.3, 1.7 and 1.5 Hz with a fifth of the critical
     damping, by up to 1°, 0.7° and 3 cm; yaw swings by 0.3° at 0.2 Hz, as a driver's steering does.
@@ -94,7 +94,7 @@ def suspension(seed: int, seconds: float, bumps_per_s: float = 1.5, mount: Pose 
 
 
 def damped(t: float, hz: float, damping: float = 0.2) -> float:
-    """Compute what a damped oscillator answers, t s after a kick, relative to the undamped amplitude.
+    """Compute the response of a damped oscillator t s after an impulse, relative to the undamped amplitude.
 
     Source: impulse response of a second-order system, e^(-ζωt) sin(ω √(1 - ζ²) t).
     """
@@ -103,13 +103,13 @@ def damped(t: float, hz: float, damping: float = 0.2) -> float:
 
 
 def fall(t: float, drop_m: float = 1.2) -> Pose:
-    """Compute how a car that falls onto its wheels differs from where it comes to rest.
+    """Compute the difference of a falling car's pose from its pose at rest.
 
     It begins at rest ``drop_m`` above, 3° nose up and rolled by 2°, falls freely, 1.2 m in half a second,
     turns level as it falls, and its suspension swings at 2.5 Hz: 12 cm, 2° in pitch and 1° in roll at most.
 
     Args:
-        t: s since it was let go.
+        t: s since the beginning of the fall.
         drop_m: height of the fall.
 
     Returns:

@@ -29,7 +29,7 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
     """
 
     state_type = TwoStageState
-    still_passes = 4  # it starts from a guess of roll and height, and its linearisation has to settle
+    still_passes = 4  # it starts from a guess of roll and height, and its linearisation must converge
 
     def __init__(self, config: TwoStageConfig | None = None, **numbers: object) -> None:
         super().__init__()

@@ -84,7 +84,7 @@ def track_direction(
     supported = is_supported(segments, inliers, cfg)
 
     tracking = is_running(state.status)
-    # After a gap the prediction is too wide to tell right segments from wrong: search instead of gating.
+    # After a gap the prediction is too uncertain to recognise outliers: search instead of gating.
     spread = cov[:, :2, :2].diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()
     start = ~tracking | (state.unseen + dt > cfg.reacquire_after) | (spread > cfg.reacquire_spread)
     wanted = start & there.any(-1)

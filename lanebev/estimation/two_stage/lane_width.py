@@ -12,7 +12,7 @@ from lanebev.batch import masked_median
 from lanebev.geometry.linalg import solve_spd
 from lanebev.geometry.rotation import cam_from_world
 
-_MIN_RADIUS = 1e-3  # a ray closer than 0.06 deg to the vanishing direction says nothing about its boundary
+_MIN_RADIUS = 1e-3  # a ray closer than 0.06 deg to the vanishing direction has no information
 _MIN_COSINE = 0.02  # 1.1 deg: a boundary plane closer to the road's own has no foot on it
 
 

@@ -84,7 +84,7 @@ def track_roll_height(
 
     seen = torch.stack([roll_seen, height_seen], dim=-1)
     mean, cov = update_by_widths(boundaries, lane_width, direction_cov, mean, cov, seen, cfg.lane_noise)
-    # Nothing says that widths of wrong boundaries lead anywhere: what has run away starts over.
+    # Widths of wrong boundaries can lead anywhere: impossible values start again.
     possible = (mean[:, 0].abs() < LARGEST_ROLL) & (mean[:, 1] > LEAST_HEIGHT) & (mean[:, 1] < LARGEST_HEIGHT)
     prior = torch.cat([mean.new_tensor(cfg.initial_pose[2:]), mean.new_zeros(2)])
     mean = torch.where(possible.unsqueeze(-1), mean, prior)

@@ -27,7 +27,7 @@ class TwoStageConfig:
     initial_pose: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.5)
     initial_pose_std: tuple[float, float, float, float] = (0.1, 0.1, 0.05, 0.5)
     initial_rate_std: tuple[float, float, float, float] = (0.2, 0.2, 0.2, 0.5)  # per second
-    min_segments: int = 4  # for a vanishing point to be believed
+    min_segments: int = 4  # that must support a vanishing point
     min_inlier_share: float = 0.3
     reacquire_after: float = 0.2  # s without support before the search starts over
     reacquire_spread: float = 0.013  # rad, sigma of the predicted direction at which it does, too
