@@ -55,8 +55,8 @@ def plan(cost: FrameCost, hours: float, fps: float, cores: int, minutes: float) 
     """Return what so many hours of video take.
 
     Args:
-        cost: of a frame.
-        hours: of video.
+        cost: cost of a frame.
+        hours: hours of video.
         fps: frames a second that are taken of it.
         cores: at work.
         minutes: length of a drive, for the number of reports.

@@ -33,7 +33,7 @@ class Information(NamedTuple):
 
     Attributes:
         share: of the information about the focal length that is left when all else is unknown.
-        std: of the focal length, as a share of it.
+        std: standard deviation of the focal length, as a share of it.
         biases: (3,) errors of it by ``UNEVEN``.
     """
 

@@ -66,9 +66,9 @@ class Reader(NamedTuple):
 
     Attributes:
         read: a path, to a value or a ValueError.
-        suffix: of its files' names.
+        suffix: suffix of its files' names.
         seeds: valid files.
-        share: of the inputs, relative to the others.
+        share: share of the inputs, relative to the others.
     """
 
     read: Callable[[Path], Any]

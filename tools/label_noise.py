@@ -93,7 +93,7 @@ def split_half_yaw(segments: LaneSegments, intrinsics: Tensor, prior: FramePrior
     Args:
         segments: (B, N).
         intrinsics: (B, 3, 3).
-        prior: of the fits.
+        prior: prior of the fits.
     """
     yaws, told = [], []
     for half in ((1, 3), (2, 4)):

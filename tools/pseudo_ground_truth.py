@@ -54,7 +54,7 @@ def pseudo_ground_truth(
         segments: (B, N) of annotated boundaries.
         intrinsics: (B, 3, 3) px.
         lane_width: m.
-        iterations: of re-weighting by distance to the vanishing point.
+        iterations: iterations of re-weighting by distance to the vanishing point.
 
     Returns:
         the optimum, per row.

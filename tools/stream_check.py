@@ -52,11 +52,11 @@ class StreamFigures:
     """Statistics of a run on a stream.
 
     Attributes:
-        seconds: that it was watched.
+        seconds: duration of the observation.
         fps: frames a second that the server sends.
         sent: frames that the server had sent when the run was told to end.
         used, dropped: frames of which the run says so.
-        rows: of extrinsics.csv.
+        rows: rows of extrinsics.csv.
         wait: s at most from a frame's arrival to when it was handed on.
         delay: s at most from a frame's arrival to its result.
         memory: MiB, resident, every second after the warm-up.

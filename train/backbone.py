@@ -17,7 +17,7 @@ def load_backbone(trunk: ResNet18, path: Path) -> None:
     """Load torchvision's ResNet-18, strictly by its names; only the classifier ``fc`` is left out.
 
     Args:
-        trunk: of 64 channels.
+        trunk: trunk with 64 channels.
         path: a ``state_dict`` of torch.save, or a safetensors file.
 
     Raises:

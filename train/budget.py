@@ -16,8 +16,8 @@ def used_share(trainer: L.Trainer, step: int | None = None) -> float:
     A run in steps is the same each time; one in minutes depends on the machine's speed.
 
     Args:
-        trainer: of the run.
-        step: of which to tell; by default the next one. The time is always now.
+        trainer: trainer of the run.
+        step: step in question; by default the next one. The time is always now.
     """
     step = trainer.global_step if step is None else step
     by_step = step / trainer.max_steps if trainer.max_steps > 0 else 0.0
@@ -38,8 +38,8 @@ def rate_factor(
     Args:
         step: steps done.
         total: steps of the run; not positive where it has no such end.
-        share: of the budget that is used.
-        warmup_steps: of linear growth.
+        share: used fraction of the budget.
+        warmup_steps: number of steps of linear growth.
         decay_steps: last steps of ``total``, in which the rate falls linearly to zero.
         decay_share: last share of the budget in which it does; 0 for none.
     """

@@ -116,11 +116,11 @@ class ViewBatches(IterableDataset[Batch]):
     """Endless batches of random views, each batch of one size.
 
     Args:
-        frames: of which views are drawn; each is used once.
+        frames: frames of which views are drawn; each is used once.
         batch_size: views per batch.
         sizes: (height, width) of the views; one is drawn for each batch.
         view: how views are drawn.
-        seed: with the worker's number, decides everything.
+        seed: together with the worker's number, decides everything.
         first: batches that an interrupted run had; this one has those that would have followed.
     """
 
@@ -193,10 +193,10 @@ class RenderedRoads(L.LightningDataModule):
         batch_size: views per batch.
         sizes: (height, width) choices of training views; repeat one to have it more often.
         val_size: (height, width) of whole frames in validation.
-        val_batches: of ``batch_size`` frames.
+        val_batches: number of validation batches of ``batch_size`` frames.
         render_size: (height, width) of live renders.
         view: how views are drawn.
-        seed: of the views; validation uses another stream.
+        seed: seed of the views; validation uses another stream.
         workers: processes that draw, and render where there is no pool.
     """
 

@@ -35,7 +35,7 @@ class ScoredBatch(NamedTuple):
         views: images and label maps at the network's size.
         lines: the label of each image, in its own pixels.
         image_sizes: (height, width) of each image as it came.
-        benchmark: whose rules apply.
+        benchmark: the benchmark whose rules apply.
     """
 
     views: Batch
@@ -52,7 +52,7 @@ def read_entries(layout: Format, root: Path, names: list[str]) -> list[Entry]:
             lists of images under the root, each with its ``.lines.txt`` beside it (what follows the image in
             a line of ``train_gt.txt`` is passed over). "openlane": names are folders of JSON files, whose
             ``file_path`` is under the root's ``images``.
-        root: of the data set.
+        root: root of the data set.
         names: relative to the root.
 
     Raises:
@@ -162,7 +162,7 @@ class LaneFiles(L.LightningDataModule):
         sizes: (height, width) choices of training views.
         val_size: (height, width) that whole images are resized to.
         view: how views are drawn.
-        seed: of the views.
+        seed: seed of the views.
         workers: processes that read.
     """
 

@@ -50,7 +50,7 @@ class Rows(NamedTuple):
         off: px of the network's input, between the two centres.
         false: the network claims a boundary where there is none, hidden ones aside.
         distance: m ahead on a flat road; NaN where there is no boundary.
-        brightness: of the image.
+        brightness: brightness of the image.
     """
 
     there: Tensor

@@ -168,9 +168,9 @@ def export(
     """Write a checkpoint's averaged weights as lanebev loads them, with the settings they were trained with.
 
     Args:
-        checkpoint: of Lightning, or a weights file.
+        checkpoint: Lightning checkpoint, or a weights file.
         out: the weights file.
-        changes: of the configuration: ``image_size`` to run at by default, ``sigma_scale`` or
+        changes: changes of the configuration: ``image_size`` to run at by default, ``sigma_scale`` or
             ``pose_sigma_scale``.
         compact: store the largest convolutions as 8-bit numbers: 14.5 MB instead of 22.8.
         record: further facts for the file's metadata.

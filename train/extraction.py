@@ -45,7 +45,7 @@ def extraction_error(frame: RenderedFrame, size: tuple[int, int], config: LineCo
     Args:
         frame: rendered images.
         size: (h, w) of the masks.
-        config: of the extraction; its stripes are drawn.
+        config: config of the extraction; its stripes are drawn.
     """
     masks = boundary_masks(frame, size, config.half_width).double()
     segments = extract_segments(masks, size, config, size)._asdict()

@@ -51,8 +51,8 @@ class Training:
     """A training process and its checkpoints.
 
     Args:
-        config: of ``python -m train fit``.
-        folder: of the run.
+        config: config of ``python -m train fit``.
+        folder: folder of the run.
         log: file of what it says; that is printed too.
         options: further ones of the command line.
     """

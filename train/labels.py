@@ -104,8 +104,8 @@ class ViewConfig:
     """Ranges of the random views of a labelled image.
 
     Attributes:
-        output_stride: of the network whose labels these are.
-        half_width: of the stripes, label px (paper.md T3).
+        output_stride: output stride of the network whose labels these are.
+        half_width: half width of the stripes, label px (paper.md T3).
         gap: least distance of neighbouring boundaries, label px.
         scale: range of the view's width as a share of the image's.
         rotation_deg: standard deviation of the rotation.

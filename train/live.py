@@ -56,8 +56,8 @@ def rendered(
         count: B.
         size: (height, width).
         seed: decides everything, on one kind of device.
-        device: where to render.
-        window: of the views; None for whole images.
+        device: device of the rendering.
+        window: window of the views; None for whole images.
         rows: views whose pixels are computed at once.
     """
     generator = torch.Generator().manual_seed(drawn(seed))
@@ -106,15 +106,15 @@ class LiveBatches(IterableDataset[Batch]):
     Views are rendered for several batches together, since a GPU renders many in little more time than few.
 
     Args:
-        share: of the run's budget that is used at a batch.
+        share: fraction of the run's budget that is used at a batch.
         stages: sizes of views and batches by that share, at the beginning of each block.
         repeats: batches that have each view.
         together: batches whose new views are rendered together, a block.
         view: stride and stripes of the labels, and the probability of mirroring.
-        window: of the views; None for whole images.
-        seed: with the number of the batch, decides everything.
+        window: window of the views; None for whole images.
+        seed: together with the number of the batch, decides everything.
         first: number of the first batch.
-        device: where to render.
+        device: device of the rendering.
         rows: views whose pixels are computed at once.
     """
 
@@ -192,7 +192,7 @@ class LiveRoads(L.LightningDataModule):
 
     Args:
         stages: sizes of views and batches, by the share of the run's steps or minutes that is used.
-        batch_share: of all batch sizes; halve it where memory does not suffice.
+        batch_share: factor on all batch sizes; halve it if memory does not suffice.
         repeats: batches that have each view; more than 1 where rendering takes longer than training.
         together: batches whose new views are rendered together.
         rows: views whose pixels are computed at once, for the memory's sake.
@@ -200,8 +200,8 @@ class LiveRoads(L.LightningDataModule):
         view: stride and stripes of the labels, and the probability of mirroring; the rest of it is not used.
         val_size: (height, width) of whole frames in validation.
         val_batch_size: frames per batch in validation.
-        val_batches: of them.
-        seed: of the views; validation uses another stream.
+        val_batches: number of validation batches.
+        seed: seed of the views; validation uses another stream.
     """
 
     def __init__(

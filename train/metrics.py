@@ -154,8 +154,8 @@ def culane_counts(
         predicted: (P, 2) px points of each lane, in order along it; one of a single point matches none.
         labelled: the same.
         image_size: (height, width).
-        width: of the drawn lanes, px.
-        threshold: of the intersection over union.
+        width: width of the drawn lanes, px.
+        threshold: threshold of the intersection over union.
     """
     p, g = ([lane for lane in lanes if len(lane)] for lanes in (predicted, labelled))
     masks_p, masks_g = ([_lane_mask(lane, image_size, width) for lane in lanes] for lanes in (p, g))

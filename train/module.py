@@ -36,13 +36,13 @@ class Segmentation(L.LightningModule):
         network: its shape.
         optimizer: "sgd" with Nesterov momentum, as in the paper, or "adamw".
         learning_rate: after warm-up.
-        weight_decay: on weights of two dimensions and more.
-        warmup_steps: of linear growth.
+        weight_decay: weight decay, of weights of two dimensions and more.
+        warmup_steps: number of steps of linear growth.
         decay_steps: the last steps of the run, in which the rate falls linearly to zero; before them it
             stays, so that a run can be prolonged at any time (warm-up, stable, decay).
         decay_share: the same as a share of the run's steps or, with ``max_time``, minutes; 0 for none.
         class_weight: (1+L,) of the cross-entropy, or None for ones; undone on export.
-        row_weight: of :func:`row_cross_entropy` beside the cross-entropy; the paper's is 0.
+        row_weight: weight of :func:`row_cross_entropy` beside the cross-entropy; the paper's is 0.
         augment: strength of the photometric augmentation, 0 for none.
         init_from: checkpoint or weights file to begin with; a network of half the width is widened.
         backbone: ``state_dict`` of torchvision's ResNet-18 to begin the trunk with, such as ImageNet's.

@@ -53,7 +53,7 @@ class Shard(NamedTuple):
         painted: (N, L, P) bool.
         visible: (N, L, P) bool.
         vanishing_point: (N, 2) px as taken.
-        poses: of the N frames.
+        poses: poses of the N frames.
     """
 
     jpeg: npt.NDArray[np.uint8]

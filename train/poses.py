@@ -154,7 +154,7 @@ def pose_loss(fit: SingleFrameFit, truth: Tensor, unit: Tensor, with_prior: bool
     """Compute the Charbonnier loss of the fitted pose, summed over axes, mean over frames with a fit.
 
     Args:
-        fit: of B frames.
+        fit: fit of B frames.
         truth: (B, 4).
         unit: (4,) rad, rad, rad, m: errors of loss one; much larger ones count linearly.
         with_prior: also count frames without a fit, and axes that have the prior (roll on one lane).

@@ -48,7 +48,7 @@ def smoothed(curves: Boundaries, reach: int, least: float = 0.5) -> tuple[Bounda
     """Place the boundaries of each frame by the median over its neighbours.
 
     Args:
-        curves: of F frames in order.
+        curves: curves of F frames in order.
         reach: frames before and after.
         least: share of the neighbours in which a boundary must be.
 
@@ -119,11 +119,11 @@ def write_labels(result: Path, source: str, out: Path, camera: Camera, reach: in
 
     Args:
         result: folder of a run.
-        source: of its frames.
+        source: source of its frames.
         out: new folder.
-        camera: that took them.
+        camera: the camera that took them.
         reach: frames before and after that place a boundary.
-        every: of so many sure frames one is written.
+        every: write every Nth usable frame.
     """
     curves, rows = fitted_curves(result, camera)
     curves, steady = smoothed(curves, reach)

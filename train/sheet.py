@@ -32,9 +32,9 @@ def save_sheet(images: Tensor, path: Path, columns: int = 4, width: int = 400) -
     """Save images (B, 3, H, W) uint8 side by side, each ``width`` px wide.
 
     Args:
-        images: of one size.
-        path: of the PNG.
-        columns: of the sheet.
+        images: images, all of one size.
+        path: path of the PNG.
+        columns: columns of the sheet.
         width: px.
     """
     height = round(width * images.shape[-2] / images.shape[-1])

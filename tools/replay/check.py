@@ -32,8 +32,8 @@ class Results(NamedTuple):
     """Results of the estimators on some drives.
 
     Attributes:
-        rows: of the reference files, by drive and estimator.
-        replayed: by calibrator, the drives in their order.
+        rows: rows of the reference files, by drive and estimator.
+        replayed: results by calibrator, the drives in their order.
     """
 
     rows: dict[Key, list[Row]]

@@ -21,7 +21,7 @@ class Figures(NamedTuple):
         ratio: RMSE by the per-frame Cramér-Rao bound, NaN where there is none.
         nees: NEES per degree of freedom; 1 where the covariance is honest.
         within: share of the four parameters within 3 sigma.
-        worst: that share in the second in which it is lowest.
+        worst: the same share in the second in which it is lowest.
         back: s from the end of the event until all errors are below twice the bound; inf if that is never,
             NaN where there is no event.
     """
@@ -55,8 +55,8 @@ def after_shock(run: Track, fps: float) -> list[float]:
     """Compute the RMSE (4,) in degrees and cm of the half second that begins half a second after the event.
 
     Args:
-        run: of a drive with hard frames.
-        fps: of the drive.
+        run: run of a drive with hard frames.
+        fps: frame rate of the drive.
     """
     end = int(run.hard.nonzero().max()) + 1
     half = round(0.5 * fps)

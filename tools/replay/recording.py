@@ -35,7 +35,7 @@ class Recording(NamedTuple):
         hard: (T,) bool, the event's frames.
         resumed: segments and dt of the drive whose last state is the first one here, or None.
         mount: also run the mount estimator.
-        moments: of a generated drive, else empty.
+        moments: moments of a generated drive, else empty.
     """
 
     segments: LaneSegments

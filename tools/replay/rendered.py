@@ -73,7 +73,7 @@ class Rendered:
     Attributes:
         kind: one of the replay's kinds.
         world: kind of the renderer's world.
-        seed: of the drive.
+        seed: seed of the drive.
         shock: what moves the camera beside the drive's own motion; None: nothing.
         mount: also run the mount estimator.
     """

@@ -51,8 +51,8 @@ class ShakingDrive(Drive):
     """A drive with a displaced mount, about which the camera moves as band-limited noise.
 
     Args:
-        seed: of everything.
-        kwargs: as of :class:`~lanebev.render.Drive`.
+        seed: seed of everything.
+        kwargs: arguments of :class:`~lanebev.render.Drive`.
     """
 
     def __init__(self, seed: int, **kwargs: Any) -> None:
@@ -79,7 +79,7 @@ class DriveRecord(NamedTuple):
         online: (N, 4) the same by the online calibration.
         intrinsics: (3, 3) px.
         lane_width: (N, L - 1) m.
-        state: of the calibration before each frame, fields (N, ...) of :class:`JointState`.
+        state: state of the calibration before each frame, fields (N, ...) of :class:`JointState`.
     """
 
     jpeg: NDArray[np.uint8]
@@ -103,7 +103,7 @@ def render_drive(seed: int, frames: int, size: tuple[int, int], fps: float, lane
     """Render a drive, and calibrate it online on the images as they are stored.
 
     Args:
-        seed: of the drive.
+        seed: seed of the drive.
         frames: N.
         size: (H, W).
         fps: frames a second.

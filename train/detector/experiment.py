@@ -25,22 +25,22 @@ class Experiment:
         train: folder of drives to train on.
         test: folder of drives to test on.
         out: folder of checkpoints and results.
-        arms: of :data:`ARMS`; "tuned" begins with what "online" was ``tuned_steps`` before its end.
-        seeds: of each arm.
-        steps: of each training.
+        arms: names of :data:`ARMS`; "tuned" starts from "online" ``tuned_steps`` before its end.
+        seeds: seeds of each arm.
+        steps: number of steps of each training.
         tuned_steps: the last steps of "tuned", through the lane network.
         batch_size: frames a step.
-        tuned_batch_size: likewise through the lane network.
+        tuned_batch_size: frames in a batch of the training through the lane network.
         learning_rate: largest.
         tuned_rate: largest of the last steps of "tuned".
         lane_rate: the lane network's, as a share of it.
         width: channels of the image features.
         bev_width: channels of the bird's-eye features.
         top: px of the image above which nothing is looked at.
-        grid: of the bird's-eye view.
+        grid: grid of the bird's-eye view.
         network_width: px of the lane network's input, as the drives were rendered with.
         fps: frames a second of the drives.
-        precision: of Lightning's trainer.
+        precision: precision of Lightning's trainer.
         accelerator: likewise.
         drives: the first so many of each folder; None: all.
     """

@@ -28,7 +28,7 @@ class Frames(NamedTuple):
         online: (B, 4) of the online calibration.
         intrinsics: (B, 3, 3) px.
         lane_width: (B, L - 1) m.
-        state: of the calibration before the frame.
+        state: state of the calibration before the frame.
     """
 
     image: Tensor
@@ -45,7 +45,7 @@ class DriveFrames(Dataset[Frames]):
     """All frames of the drives in a folder except those of the warm-up.
 
     Args:
-        folder: of the files that :mod:`train.detector.drives` wrote.
+        folder: folder of the files that :mod:`train.detector.drives` wrote.
         grid: boxes elsewhere are left out.
         drives: the first so many; None: all.
 

@@ -45,14 +45,14 @@ class DetectorTraining(L.LightningModule):
 
     Args:
         arm: see :func:`arm_poses`; "tuned" trains the lane network too, by the detector's loss alone.
-        grid: of the bird's-eye view.
+        grid: grid of the bird's-eye view.
         width: channels of the image features.
         bev_width: channels of the bird's-eye features.
         top: px of the image above which nothing is looked at.
         learning_rate: largest, of one cycle (Smith and Topin 2019).
         lane_rate: the lane network's, as a share of it.
         network_width: px of the lane network's input.
-        fps: of the drives.
+        fps: frame rate of the drives.
     """
 
     def __init__(

@@ -25,7 +25,7 @@ class VehicleDetector(nn.Module):
     """Vehicles on the road from one image and the pose of its camera.
 
     Args:
-        grid: of the bird's-eye view.
+        grid: grid of the bird's-eye view.
         width: channels of the image features.
         bev_width: channels of the bird's-eye features.
         top: px of the image above which nothing is looked at.

@@ -30,7 +30,7 @@ def find(
     Args:
         detector: in evaluation mode.
         frames: N of them.
-        poses: of each: (N, 4).
+        poses: poses of each: (N, 4).
         together: frames of a batch.
     """
     size, grid = (frames.image.shape[-2], frames.image.shape[-1]), detector.warp.grid
