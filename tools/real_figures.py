@@ -18,7 +18,7 @@ from lanebev.io.lanes import match_frames, read_lanes
 from lanebev.io.video import open_source
 from lanebev.observation.segments import camera_segments, segments_from_lines
 from lanebev.report.lane_curves import lane_curves
-from lanebev.report.measure import believed, measure_boundaries, spread
+from lanebev.report.measure import measure_boundaries, select_inliers, spread
 from lanebev.report.plots import width_deviation
 
 TUSIMPLE_FOCAL = 1000.0  # px, assumed: the camera is not published
@@ -209,7 +209,7 @@ def follow(
                 )
             poses[name].append(calibration.extrinsics.stack()[0])
             status[name].append(calibration.status[0])
-            lanes[name].append(believed(segments, calibration.inliers))
+            lanes[name].append(select_inliers(segments, calibration.inliers))
     return {
         name: Drive(torch.stack(poses[name]), torch.stack(status[name]), np.array(times), seen, lanes[name])
         for name in calibrators

@@ -19,7 +19,7 @@ from lanebev.types import NUM_BOUNDARIES, Status
 WARM_UP = 10  # frames
 
 
-class Seen(NamedTuple):
+class DriveObservations(NamedTuple):
     """Detections of a network on a drive: segments, lane widths (L - 1,) and poses (4,) of its frames."""
 
     segments: list[LaneSegments]
@@ -29,7 +29,9 @@ class Seen(NamedTuple):
     interval: float
 
 
-def watch(segmenters: Sequence[LaneSegmenter], seed: int, frames: int, fps: float) -> list[Seen]:
+def observe_drive(
+    segmenters: Sequence[LaneSegmenter], seed: int, frames: int, fps: float
+) -> list[DriveObservations]:
     """Run each network on a rendered drive, with the sigmas of its maps."""
     drive = Drive(seed, num_frames=frames, fps=fps)
     models = [_observer(segmenter) for segmenter in segmenters]
@@ -44,7 +46,7 @@ def watch(segmenters: Sequence[LaneSegmenter], seed: int, frames: int, fps: floa
         widths.append(frame.lane_width.double())
         poses.append(frame.extrinsics.stack()[0].double())
     truth = (widths, torch.stack(poses), frame.intrinsics.double(), 1 / fps)
-    return [Seen(own, *truth) for own in segments]
+    return [DriveObservations(own, *truth) for own in segments]
 
 
 def _observer(segmenter: LaneSegmenter) -> LaneBEV:
@@ -57,7 +59,7 @@ def _observer(segmenter: LaneSegmenter) -> LaneBEV:
     return LaneBEV(segmenter, extractor, JointCalibrator(), network_width=config.image_size[1]).eval()
 
 
-class Followed(NamedTuple):
+class CalibratorErrors(NamedTuple):
     """Results on a drive's F frames after the warm-up.
 
     Attributes:
@@ -72,7 +74,7 @@ class Followed(NamedTuple):
 
 
 @torch.inference_mode()
-def follow(seen: Seen, factor: float) -> Followed:
+def run_calibrator(seen: DriveObservations, factor: float) -> CalibratorErrors:
     """Run the online calibrator on a drive, all sigmas times ``factor``."""
     calibrator = JointCalibrator()
     state = calibrator.initial_state(1, dtype=torch.float64)
@@ -82,4 +84,4 @@ def follow(seen: Seen, factor: float) -> Followed:
         out, state = calibrator(noisy, seen.intrinsics, state, seen.interval, width)
         error = out.extrinsics.stack()[0] - pose
         found.append((error, out.covariance[0], out.status[0] == Status.TRACKING))
-    return Followed(*(torch.stack(part)[WARM_UP:] for part in zip(*found, strict=True)))
+    return CalibratorErrors(*(torch.stack(part)[WARM_UP:] for part in zip(*found, strict=True)))

@@ -25,7 +25,7 @@ from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.render import Drive
 from train.commands import one_line_errors
-from train.drives import WARM_UP, follow, watch
+from train.drives import WARM_UP, observe_drive, run_calibrator
 from train.export import trained_segmenter
 from train.poses import fit_poses
 
@@ -67,9 +67,9 @@ def online_errors(
     """Compute the joint calibrator's errors (N, 4) on drives, rad and m, at each network's image size."""
     errors: list[list[Tensor]] = [[] for _ in segmenters]
     for number in range(drives):
-        all_seen = watch(segmenters, seed + number, frames, fps)
+        all_seen = observe_drive(segmenters, seed + number, frames, fps)
         for segmenter, seen, own in zip(segmenters, all_seen, errors, strict=True):
-            own.append(follow(seen, segmenter.config.sigma_scale).error)
+            own.append(run_calibrator(seen, segmenter.config.sigma_scale).error)
     return [torch.cat(own) for own in errors]
 
 

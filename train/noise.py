@@ -23,7 +23,7 @@ from jsonargparse.typing import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from train.commands import one_line_errors
-from train.drives import Seen, follow, watch
+from train.drives import DriveObservations, observe_drive, run_calibrator
 from train.evaluate_poses import AXES
 from train.export import trained_segmenter
 
@@ -37,9 +37,9 @@ class Outcome(NamedTuple):
     nees: Tensor
 
 
-def outcome(seen: Seen, factor: float) -> Outcome:
+def outcome(seen: DriveObservations, factor: float) -> Outcome:
     """Return the calibrator's errors on a drive with all sigmas times ``factor``."""
-    followed = follow(seen, factor)
+    followed = run_calibrator(seen, factor)
     error, covariance = (part[followed.tracking] for part in followed[:2])
     if not len(error):
         return Outcome(seen.poses.new_full((4,), math.nan), seen.poses.new_tensor(math.nan))
@@ -49,7 +49,9 @@ def outcome(seen: Seen, factor: float) -> Outcome:
 
 
 def compare(
-    drives: list[Seen], factors: tuple[float, ...] = FACTORS, over: Callable[..., Iterable[Outcome]] = map
+    drives: list[DriveObservations],
+    factors: tuple[float, ...] = FACTORS,
+    over: Callable[..., Iterable[Outcome]] = map,
 ) -> dict[float, Outcome]:
     """Compute the median outcome over the drives for every factor; ``over`` is :func:`map` or a pool's."""
     pairs = [(seen, factor) for factor in factors for seen in drives]
@@ -61,8 +63,8 @@ def compare(
     return report
 
 
-def _watch_one(weights: Path, frames: int, fps: float, seed: int) -> Seen:
-    return watch([trained_segmenter(weights)[0]], seed, frames, fps)[0]
+def _observe_one(weights: Path, frames: int, fps: float, seed: int) -> DriveObservations:
+    return observe_drive([trained_segmenter(weights)[0]], seed, frames, fps)[0]
 
 
 @one_line_errors()
@@ -76,7 +78,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=81_000)
     parser.add_argument("--jobs", type=PositiveInt, default=1, help="number of processes")
     args = parser.parse_args()
-    one = partial(_watch_one, args.weights, args.frames, args.fps)
+    one = partial(_observe_one, args.weights, args.frames, args.fps)
     seeds = range(args.seed, args.seed + args.drives)
     if args.jobs == 1:
         report = compare([one(seed) for seed in seeds])

@@ -26,7 +26,7 @@ from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video import Frame, VideoWriter, write_png
 from lanebev.observation.segments import LaneSegments
 from lanebev.report.lane_curves import lane_curves
-from lanebev.report.measure import believed, measure_boundaries
+from lanebev.report.measure import measure_boundaries, select_inliers
 from lanebev.report.moments import MomentSampler
 from lanebev.report.overlay import Panel, draw_panels, joined
 from lanebev.report.page import Report, summary_facts, write_report
@@ -91,7 +91,7 @@ class Recorder:
 
     def __post_init__(self) -> None:
         alone = self.single or self.stills
-        self.before_title = "uncalibrated" if alone else "first frame's pose held"
+        self.before_title = "uncalibrated" if alone else "first frame's pose kept"
         self._before = ViewBefore(alone)
         self._coarse = replace(self.grid, resolution=max(self.grid.resolution, _BEFORE_RESOLUTION))
         self._filtered_rows = KeptRows()
@@ -176,7 +176,7 @@ class Recorder:
         self._lanes.write(line + "\n")
         before, after = self._before(calibration), calibration.extrinsics
         intrinsics = self.camera.intrinsics[None].to(segments.endpoints)
-        lanes = believed(segments, calibration.inliers)
+        lanes = select_inliers(segments, calibration.inliers)
         widths = [self._measure(lanes, intrinsics, pose) for pose in (before, after)]
         self._widths.append(np.stack(widths))
         image = frame.image if frame.image is not None else np.zeros((*self.camera.image_size, 3), np.uint8)

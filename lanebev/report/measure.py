@@ -32,7 +32,7 @@ class RoadBoundaries(NamedTuple):
     widths: NDArray[np.float64]
 
 
-def believed(segments: LaneSegments, inliers: Tensor) -> LaneSegments:
+def select_inliers(segments: LaneSegments, inliers: Tensor) -> LaneSegments:
     """Select the inliers of a calibrator, with :attr:`~lanebev.Calibration.inliers` above a half."""
     return segments._replace(weight=torch.where(inliers > 0.5, segments.weight, 0.0))
 

@@ -61,7 +61,7 @@ class Report:
     problems: Sequence[str] = field(default_factory=list)
     is_stills: bool = False
     is_smoothed: bool = False
-    before_title: str = "first frame's pose held"
+    before_title: str = "first frame's pose kept"
     truth: Sequence[ExtrinsicsRow] | None = None
     camera: Camera | None = None
     mount: MountCalibration | None = None

@@ -10,7 +10,7 @@ import torch
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.testing.scenarios import CAMERA, FPS, WIDTH, moments
 from lanebev.testing.scenarios import observe as see
-from train.drives import Seen, watch
+from train.drives import DriveObservations, observe_drive
 from train.noise import compare, outcome
 
 
@@ -21,7 +21,7 @@ def drive():
     segments = [seen._replace(sigma=torch.ones_like(seen.sigma)) for _, seen in course]
     poses = torch.tensor([moment.pose for moment, _ in course], dtype=torch.float64)
     width = [torch.full((1, 5), WIDTH, dtype=torch.float64)] * len(course)
-    return Seen(segments, width, poses, CAMERA[None], 1 / FPS)
+    return DriveObservations(segments, width, poses, CAMERA[None], 1 / FPS)
 
 
 @pytest.mark.slow
@@ -35,7 +35,7 @@ def test_sigmas_half_as_large_as_the_errors_are_found_out(drive):
 def test_watches_a_rendered_drive_through_a_network_without_its_factor():
     torch.manual_seed(0)
     config = SegmenterConfig(base_width=4, decoder_width=4, image_size=(64, 96), sigma_scale=3.0)
-    (seen,) = watch([LaneSegmenter(config).eval()], 5, 2, 20.0)
+    (seen,) = observe_drive([LaneSegmenter(config).eval()], 5, 2, 20.0)
     assert len(seen.segments) == 2
     assert seen.poses.shape == (2, 4)
     assert math.isnan(outcome(seen, 1.0).nees)  # no frame after the warm-up
