@@ -34,6 +34,7 @@ class Moment:
     places: Tensor = field(default_factory=lambda: PLACES)  # (6,) m
     headings: Tensor = field(default_factory=lambda: torch.zeros(6, dtype=torch.float64))  # (6,) tangent
     curvature: Callable[[Tensor], Tensor] | None = None  # of Z ahead, 1/m
+    profile: float = 0.0  # 1/m, vertical curvature of the road, positive over a crest
     visible: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
     shift: int = 0  # wrong numbering of the whole frame
     near: float = 3.5
@@ -127,9 +128,23 @@ def road_curves(moment: Moment, num: int = 400) -> Tensor:
     return torch.stack([x, z.expand_as(x)], dim=-1)
 
 
+def on_flat_road(road: Tensor, height: float, profile: float) -> Tensor:
+    """Compute the points of a flat road that look the same as those of a road over a crest or through a dip.
+
+    Source: the road is ½ κ Z² lower than its tangent plane below the camera, so the ray to it meets that
+    plane at h / (h + ½ κ Z²) of the way.
+
+    Args:
+        road: (..., 2) m, X and Z.
+        height: h, m.
+        profile: κ, 1/m, positive over a crest.
+    """
+    return road * (height / (height + 0.5 * profile * road[..., 1:].square()))
+
+
 def curves(moment: Moment, num: int = 400) -> tuple[Tensor, Tensor]:
     """Return the boundaries from near to far, (6, G, 2) px, and (6, G) bool: in the image."""
-    road = road_curves(moment, num)
+    road = on_flat_road(road_curves(moment, num), moment.pose[3], moment.profile)
     pose = Extrinsics.unstack(torch.tensor([moment.pose], dtype=torch.float64))
     pixels, ahead_ok = image_from_road_points(road.flatten(0, 1)[None], CAMERA[None], pose)
     pixels = pixels[0].view(6, num, 2)
@@ -301,6 +316,7 @@ SCENARIOS: dict[str, tuple[float, Callable[[float, Moment], Moment] | None]] = {
     "straight 5-40 m": (6.0, lambda t, m: replace(m, near=5.0, far=40.0)),
     "sharp bends R 60 m, three boundaries": (20.0, _sharp_bends),
     "curves R 300 m, 5-40 m": (17.0, _curves),
+    "crest R 10 km, 5-40 m": (6.0, lambda t, m: replace(m, near=5.0, far=40.0, profile=1e-4)),
     "50 % outliers, 5 % wrong index": (6.0, lambda t, m: replace(m, outliers=0.5, wrong_index=0.05)),
     "lane change": (8.0, _lane_change),
     "bumps 1 deg in 0.2 s": (6.0, _bumps),

@@ -18,7 +18,7 @@ from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.evaluation import UNITS, WARM_UP, Track, summarise, track
 from lanebev.testing.experiment import Experiment
-from lanebev.testing.scenarios import CAMERA, PLACES, SCENARIOS, WIDTH, Moment, moments, observe
+from lanebev.testing.scenarios import CAMERA, PLACES, SCENARIOS, WIDTH, Moment, curves, moments, observe
 from lanebev.types import Status
 from tools.reproduce_table1 import VARIANCES, run, table
 
@@ -304,3 +304,13 @@ def test_a_cut_in_one_row_leaves_the_others_as_they_are():
             _, alone = calibrator(one, CAMERA[None], alone, moment.dt, WIDTH)
     torch.testing.assert_close(both.mean[:1], alone.mean, rtol=1e-9, atol=1e-12)
     assert both.mean[1, 3] > 2.0  # m: this one started anew
+
+
+def test_a_crest_is_lower_than_its_tangent_plane():
+    """Where the road is 8 cm lower at 40 m its lines are seen 8 cm lower."""
+    moment = Moment((0.0, 0.0, 0.0, 1.5), near=5.0, far=40.0, profile=1e-4)
+    pixels, _ = curves(moment)
+    z = torch.tensor([5.0, 40.0], dtype=torch.float64)
+    rows = CAMERA[1, 1] * (1.5 + 0.5e-4 * z.square()) / z + CAMERA[1, 2]
+    torch.testing.assert_close(pixels[3, [0, -1], 1], rows)
+    torch.testing.assert_close(pixels[3, [0, -1], 0], CAMERA[0, 0] * WIDTH / 2 / z + CAMERA[0, 2])
