@@ -8,6 +8,7 @@ from pathlib import Path
 import lightning as L
 import pytest
 import torch
+import yaml
 from lightning.pytorch.callbacks import Timer
 
 import train.live
@@ -201,3 +202,14 @@ def test_gpu_config_ends_after_its_minutes_with_a_checkpoint(tmp_path):
     assert checkpoint["callbacks"]["Timer"]["time_elapsed"]["train"] >= 5
     rates = [group["lr"] for group in checkpoint["optimizer_states"][0]["param_groups"]]
     assert max(rates) < 1.5e-3  # they fall by the clock, which each group reads for itself
+
+
+@pytest.mark.parametrize(
+    "config", sorted(Path(__file__).parents[2].glob("configs/*.yaml")), ids=lambda path: path.stem
+)
+def test_the_last_checkpoint_is_of_the_last_step(config):
+    """A link would lead to the last one that was due, minutes before the end of a run that its time ends."""
+    callbacks = (yaml.safe_load(config.read_text()).get("trainer") or {}).get("callbacks", [])
+    for each in callbacks:
+        if each["class_path"].endswith("ModelCheckpoint"):
+            assert each["init_args"]["save_last"] is True
