@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from lanebev.app.shared_network import SharedNetwork
 from lanebev.camera.model import Camera
+from lanebev.io.image_names import in_natural_order
 from lanebev.io.lane_size import size_remark
 from lanebev.io.lanes import FrameLines, match_frames
 from lanebev.io.video import Frame, FrameSource
@@ -74,6 +76,7 @@ class LaneFileObserver:
                     f"lanes: expected {source.count} entries, one per frame of {source.source}, got "
                     f"{len(entries)}; is the lane file cut?"
                 )
+            _check_order([entry.name for entry in entries], source.source)
             self.matches: list[int | None] = list(range(len(entries)))
         else:
             self.matches = match_frames(source.paths, entries)
@@ -85,6 +88,19 @@ class LaneFileObserver:
         found = FrameLines(frame.name, []) if entry is None else self.entries[entry]
         lines = [] if frame.image is None else found.lines
         return Observation(vertices_from_lines(lines, self.camera), found.pose_sigma_scale)
+
+
+def _check_order(names: Sequence[str], source: str) -> None:
+    """Raise if the names of a video's entries differ by numbers only, and these do not rise.
+
+    Names that were sorted as texts are such: 1, 10, 2.
+    """
+    alike = len({re.sub(r"\d+", "", name) for name in names}) == 1
+    wrong = [name for name, expected in zip(names, in_natural_order(names), strict=True) if name != expected]
+    if alike and wrong:
+        raise ValueError(
+            f"lanes: expected entries in the order of the frames of {source}, got {wrong[0]!r} out of it"
+        )
 
 
 class NetworkObserver:

@@ -94,9 +94,9 @@ def _check_matrix(matrix: list[float], size: tuple[int, int], restated: bool) ->
 
 
 def _needed(distortion: list[float], model: str) -> list[float]:
-    """Return the coefficients without a zero tilt, and none for a pinhole camera without distortion."""
+    """Return the coefficients without needless zeros, and none for a pinhole camera without distortion."""
     if model == "fisheye":
-        return distortion or [0.0] * 4
+        return [*distortion[:4], *(each for each in distortion[4:] if each)] or [0.0] * 4
     if model == "omni":
         return distortion
     if len(distortion) == 14 and not any(distortion[12:]):

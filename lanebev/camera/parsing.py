@@ -88,11 +88,16 @@ def _construct_text(loader: _TextLoader, node: yaml.ScalarNode) -> str:
     return str(loader.construct_scalar(node))
 
 
+def _construct_list(loader: _TextLoader, node: yaml.SequenceNode) -> list[Any]:
+    return loader.construct_sequence(node, deep=True)
+
+
 _TextLoader.add_implicit_resolver(
     "tag:yaml.org,2002:null", re.compile(r"^(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""]
 )
 for _tag in ("opencv-matrix", "opencv-nd-matrix"):
     _TextLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _construct_mapping)
+_TextLoader.add_constructor("tag:yaml.org,2002:python/tuple", _construct_list)
 for _tag in ("int", "float", "bool", "timestamp"):
     _TextLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _construct_text)
 
@@ -109,6 +114,8 @@ def _parse_yaml(text: str) -> Any:
     except (yaml.YAMLError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f" at line {mark.line + 1}" if mark else ""
+        if isinstance(error, yaml.constructor.ConstructorError) and "!" in text:
+            raise ValueError(f"expected numbers, texts and lists, got another object{where}") from error
         if "\\t" in str(getattr(error, "problem", "")):
             raise ValueError(f"expected YAML, got a tab{where}; indent by spaces") from error
         raise ValueError(f"expected YAML, got a syntax error{where}; is the file cut?") from error

@@ -225,7 +225,7 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
         matrix = display_matrix(frame)
         size = rgb(frame, matrix).shape[:2]
         pixel_aspect = _pixel_aspect(frame.width, frame.height, size, stream.sample_aspect_ratio)
-        others = len(moving_pictures(container)) - 1
+        problems = _remarks(container, frame, size)
     with open_video(source) as container:  # the header's count includes frames that an edit list cuts
         stream = video_stream(container)
         begin, tick = stream.start_time or 0, stream.time_base or 1 / fps
@@ -242,12 +242,9 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
     if not telling:
         with open_video(source) as container:
             count = sum(1 for _ in decoded(container, video_stream(container)))
-    problems = []
     if timed and (rate := _rate_of_times(shown, tick, own)) != own:
         problems.append(f"it states {float(own):.4g} frames per second, they come at {float(rate):.4g}")
         fps = own = rate
-    if others:
-        problems.append(f"it has {others} more video streams; that of {size[1]} x {size[0]} px is used")
     if timed and declared - got > 0.5 / fps:
         problems.append(f"expected {declared:.2f} s as it declares, got {got:.2f} s; is it cut?")
     if not timed and stated is None:
@@ -258,6 +255,20 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
     return FrameSource(
         source, (), fps, count, size, problem, has_times=timed, pixel_aspect=pixel_aspect, matrix=matrix
     )
+
+
+def _remarks(
+    container: av.container.InputContainer, frame: av.VideoFrame, size: tuple[int, int]
+) -> list[str]:
+    """Return what to say of a video by its streams and its first frame."""
+    remarks = []
+    if others := len(moving_pictures(container)) - 1:
+        remarks.append(f"it has {others} more video streams; that of {size[1]} x {size[0]} px is used")
+    if frame.interlaced_frame:
+        remarks.append(
+            "its frames are interlaced, each of two moments; deinterlace it, as by ffmpeg -vf bwdif"
+        )
+    return remarks
 
 
 def _rate_of_times(times: Sequence[int], tick: Fraction, stated: Fraction) -> Fraction:

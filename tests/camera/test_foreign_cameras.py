@@ -3,8 +3,10 @@
 import json
 
 import cv2
+import numpy as np
 import pytest
 import torch
+import yaml
 
 from lanebev import Camera
 
@@ -318,3 +320,28 @@ def test_orb_slams_settings(tmp_path, of, kind, more, expected):  # ORB_SLAM3#49
         _read(tmp_path / "c.yaml", ORB_SLAM.format("Omni", of, ""))
     with pytest.raises(ValueError, match=r"Camera\.height: expected a value, got none"):
         _read(tmp_path / "c.yaml", ORB_SLAM.format(kind, of, "").replace("Camera.height", "Camera.rows"))
+
+
+MESSAGE = (
+    "{K: [500, 0, 320, 0, 500, 240, 0, 0, 1], width: 640, height: 480, distortion_model: equidistant, D: %s}"
+)
+
+
+def test_a_fisheye_may_have_zeros_after_its_coefficients(tmp_path):
+    parameters = (500, 500, 320, 240, 640, 480)
+    _is(
+        _read(tmp_path / "c.yaml", MESSAGE % "[0.1, 0.01, 0, 0, 0]"),
+        *parameters,
+        [0.1, 0.01, 0, 0],
+        "fisheye",
+    )
+    _is(_read(tmp_path / "c.yaml", MESSAGE % "[0, 0, 0, 0, 0]"), *parameters, [0.0] * 4, "fisheye")
+    with pytest.raises(ValueError, match=r"distortion: expected 4 coefficients \(fisheye\), got 5"):
+        _read(tmp_path / "c.yaml", MESSAGE % "[0.1, 0.01, 0, 0, 0.2]")
+
+
+def test_what_python_dumps(tmp_path):
+    fields = {"K": (500.0, 0, 320.0, 0, 500.0, 240.0, 0, 0, 1), "D": (), "width": 640, "height": 480}
+    _is(_read(tmp_path / "c.yaml", yaml.dump(fields)), 500, 500, 320, 240, 640, 480)
+    with pytest.raises(ValueError, match=r"expected numbers, texts and lists, got another object at line 2$"):
+        _read(tmp_path / "c.yaml", yaml.dump({**fields, "K": np.eye(3)}))

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lanebev import Camera
 from lanebev.app.build import make_camera
 from lanebev.app.config import RunConfig
+from lanebev.app.observers import LaneFileObserver
 from lanebev.io.images import read_image
+from lanebev.io.lanes import FrameLines
 from lanebev.io.video import open_source
 
 SIZE = (48, 64)
@@ -104,6 +107,39 @@ def test_a_field_of_view_with_pixels_that_are_not_square(tmp_path):  # opencv#49
     square = make_camera(RunConfig("a", fov=60.0), SIZE)
     assert camera.intrinsics[0].tolist() == square.intrinsics[0].tolist()
     assert float(camera.intrinsics[1, 1]) == pytest.approx(4 / 3 * float(square.intrinsics[1, 1]))
+
+
+def test_interlaced_frames_are_said(tmp_path):
+    path = tmp_path / "v.mkv"
+    with av.open(str(path), "w") as container:
+        stream = _stream(container, codec="mpeg2video")
+        stream.options = {"flags": "+ildct+ilme"}
+        _write(container, stream, range(4))
+    assert "its frames are interlaced, each of two moments; deinterlace it" in open_source(str(path)).problem
+
+
+@pytest.mark.parametrize(
+    ("names", "wrong"),
+    [
+        (["f/1.jpg", "f/10.jpg", "f/2.jpg"], "f/10.jpg"),  # sorted as texts
+        (["f/1.jpg", "f/2.jpg", "f/10.jpg"], ""),
+        (["v.mp4/000000", "v.mp4/000001", "v.mp4/000002"], ""),
+        (["b", "a", "c"], ""),  # of names without numbers nothing is known
+    ],
+)
+def test_lanes_of_a_video_are_in_the_order_of_its_frames(tmp_path, names, wrong):
+    path = tmp_path / "v.mp4"
+    with av.open(str(path), "w") as container:
+        _write(container, _stream(container), range(3))
+    entries = [FrameLines(name, []) for name in names]
+    camera = Camera.from_fov(60.0, 64, 48)
+    if wrong:
+        with pytest.raises(
+            ValueError, match=f"expected entries in the order of the frames of .*, got '{wrong}' out"
+        ):
+            LaneFileObserver(entries, open_source(str(path)), camera)
+    else:
+        assert LaneFileObserver(entries, open_source(str(path)), camera).matches == [0, 1, 2]
 
 
 def _picture():
