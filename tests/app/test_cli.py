@@ -21,7 +21,7 @@ import yaml
 from PIL import Image
 
 from lanebev import Camera, Extrinsics, JointCalibrator, image_from_road_points
-from lanebev.app.config import RunConfig
+from lanebev.app.config import LANE_WIDTH, LANE_WIDTH_STD, RunConfig
 from lanebev.cli import main
 from lanebev.estimation.mount import MountReason
 from lanebev.io.results import CSV_COLUMNS, ExtrinsicsRow, write_extrinsics
@@ -202,7 +202,11 @@ def test_a_lane_file_says_how_much_less_sure_its_pose_is(data, drive, tmp_path):
     assert _run(data, source="drive.mp4", lanes="wide.json", out=tmp_path / "out") == 0
     for row, plain in zip(_table(tmp_path / "out"), _table(drive), strict=True):
         for name, value in row.items():
-            if name.endswith(("std_deg", "std_m")):
+            if name == "height_std_m":  # the lane width's part is not the detector's
+                part = LANE_WIDTH_STD / LANE_WIDTH * float(plain["height_m"])
+                own = math.sqrt(float(plain[name]) ** 2 - part**2)
+                assert float(value) == pytest.approx(math.hypot(2 * own, part), abs=2e-5)
+            elif name.endswith(("std_deg", "std_m")):
                 assert float(value) == pytest.approx(2 * float(plain[name]), abs=2e-6)
             else:
                 assert value == plain[name]
