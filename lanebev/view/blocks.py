@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,6 +15,10 @@ from lanebev.view.projection import Cells, CellSums, image_coordinates, outside_
 from lanebev.view.tiles import Interpolant, interpolant
 
 BLOCK = 1 << 17  # cells: a dozen float32 planes of so many fit a cache of a few MB
+
+_EXACT_BLOCK = 1 << 14  # cells of a block that is computed cell by cell, which takes two dozen planes
+
+Memory = Callable[[int, int], Tensor]
 
 
 class Block(NamedTuple):
@@ -31,14 +36,18 @@ class Block(NamedTuple):
     points: Tensor
     outside: Tensor | None
 
-    def invalid(self) -> Tensor:
-        """Return which are not seen, (B, last - first, V) bool."""
-        if self.outside is None:
-            return torch.zeros_like(self.points[:, 0], dtype=torch.bool)
-        return self.outside.bool()
+    def valid(self, out: Tensor | None = None) -> Tensor:
+        """Return which are seen, (B, last - first, V) bool.
+
+        Args:
+            out: of that shape, all true, to write to.
+        """
+        if self.outside is not None:
+            return torch.eq(self.outside, 0, out=out)
+        return torch.ones_like(self.points[:, 0], dtype=torch.bool) if out is None else out
 
 
-def blocks(cells: Cells, lens: Lens | None, limit: float, out: Tensor | None = None) -> Iterator[Block]:
+def blocks(cells: Cells, lens: Lens | None, limit: float, memory: Memory | None = None) -> Iterator[Block]:
     """Project cells, block by block, in order.
 
     float32 cells on a CPU are interpolated where that is as exact, see :mod:`lanebev.view.tiles`; a GPU would
@@ -48,20 +57,24 @@ def blocks(cells: Cells, lens: Lens | None, limit: float, out: Tensor | None = N
         cells: as of :func:`resampled`.
         lens: into normalised coordinates, or None.
         limit: up to which coordinates are not beyond the centres of a map's outermost cells.
-        out: (B, 2, R, V) to write points to.
+        memory: gives (B, 2, last - first, V) for the points of rows first to last - 1, which then have no
+            graph.
     """
     batch, rows, columns = cells.shape
-    most = max(1, BLOCK // max(1, batch * columns))  # rows
-    if torch.compiler.is_compiling():  # compiled code has no planes in between
-        most = rows
     if isinstance(cells, CellSums) and _may_choose(cells):
         curves = interpolant(cells, lens, limit)
         if curves is not None:
-            for start, end in _tile_groups(curves, max(1, most // curves.rows.size)):
-                yield _tile_block(curves, cells, lens, start, end, out)
+            most = BLOCK // (batch * columns * curves.rows.size)
+            for start, end in _tile_groups(curves, max(1, most)):
+                if curves.smooth[:, start:end].any():
+                    yield _tile_block(curves, cells, lens, start, end, memory)
+                else:
+                    span = curves.row(start), curves.row(end)
+                    yield from _exact_blocks(cells, lens, span, _EXACT_BLOCK, memory)
             return
-    for first in range(0, rows, most):
-        yield _exact_block(cells, lens, first, min(first + most, rows), out)
+    # compiled code has no planes in between
+    size = batch * rows * columns if torch.compiler.is_compiling() else BLOCK
+    yield from _exact_blocks(cells, lens, (0, rows), size, memory)
 
 
 def _may_choose(cells: CellSums) -> bool:
@@ -70,16 +83,23 @@ def _may_choose(cells: CellSums) -> bool:
     return by_row.dtype == torch.float32 and by_row.device.type == "cpu" and not traced()
 
 
-def _exact_block(cells: Cells, lens: Lens | None, first: int, last: int, out: Tensor | None) -> Block:
-    points, hidden = image_coordinates(cells.rows(first, last), lens)
-    if out is not None:
-        points = out[:, :, first:last].copy_(points)
-    return Block(first, last, points, outside_image(points, hidden))
+def _exact_blocks(
+    cells: Cells, lens: Lens | None, rows: tuple[int, int], size: int, memory: Memory | None
+) -> Iterator[Block]:
+    """Rows from the first to below the second, cell by cell, in blocks of so many cells."""
+    batch, _, columns = cells.shape
+    step = max(1, size // max(1, batch * columns))
+    for first in range(*rows, step):
+        last = min(first + step, rows[1])
+        points, hidden = image_coordinates(cells.rows(first, last), lens)
+        if memory is not None:
+            points = memory(first, last).copy_(points)
+        yield Block(first, last, points, outside_image(points, hidden))
 
 
 def _tile_groups(curves: Interpolant, most: int) -> Iterator[tuple[int, int]]:
     """Yield ranges of at most so many tiles that are computed in the same way."""
-    kinds = list(zip(curves.smooth.all(0).tolist(), curves.inside, strict=True))
+    kinds = np.stack([curves.smooth.all(0), curves.inside], axis=-1).tolist()
     for _, group in itertools.groupby(range(len(kinds)), key=kinds.__getitem__):
         tiles = list(group)
         for start in range(0, len(tiles), most):
@@ -87,22 +107,24 @@ def _tile_groups(curves: Interpolant, most: int) -> Iterator[tuple[int, int]]:
 
 
 def _tile_block(
-    curves: Interpolant, cells: CellSums, lens: Lens | None, start: int, end: int, out: Tensor | None
+    curves: Interpolant, cells: CellSums, lens: Lens | None, start: int, end: int, memory: Memory | None
 ) -> Block:
     """Rows of tiles start to end - 1: those of each image by its polynomials where they are exact."""
     first, last = curves.row(start), curves.row(end)
     smooth = curves.smooth[:, start:end].all(1)
-    if not smooth.any():
-        return _exact_block(cells, lens, first, last, out)
-    points = curves.points(start, end) if out is None else curves.write(start, end, out)
+    if memory is None:
+        points = curves.points(start, end)
+    else:
+        points = curves.write(start, end, memory(first, last))
     if curves.inside[start]:
         return Block(first, last, points, None)
-    outside = outside_image(points, torch.zeros_like(points[:, 0]))
+    outside = outside_image(points)
     if not smooth.all():
         exact, hidden = image_coordinates(cells.rows(first, last), lens)
-        outside = torch.where(smooth[:, None, None], outside, outside_image(exact, hidden))
-        exact = torch.where(smooth[:, None, None, None], points, exact)
-        points = exact if out is None else points.copy_(exact)
+        whole = torch.from_numpy(smooth)[:, None, None]
+        outside = torch.where(whole, outside, outside_image(exact, hidden))
+        exact = torch.where(whole.unsqueeze(1), points, exact)
+        points = exact if memory is None else points.copy_(exact)
     return Block(first, last, points, outside)
 
 

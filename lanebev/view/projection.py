@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lanebev.geometry.precision import full_precision
 from lanebev.view.lens import Lens, image_planes
 
 LEAST_DEPTH = 1e-3  # in front of the camera; m for cells of the road
@@ -51,6 +52,7 @@ class CellSums(NamedTuple):
         return self.by_row[..., first:last].unsqueeze(-1) + self.by_column.unsqueeze(-2)
 
 
+@full_precision
 def normalised_intrinsics(intrinsics: Tensor, image_size: tuple[int, int]) -> Tensor:
     """Convert intrinsics to coordinates in which the image, with the edges of its outer pixels, is [-1, 1].
 
@@ -61,9 +63,8 @@ def normalised_intrinsics(intrinsics: Tensor, image_size: tuple[int, int]) -> Te
         image_size: (H, W) px.
     """
     height, width = image_size
-    scale = intrinsics.new_tensor([2 / width, 2 / height, 1.0]).unsqueeze(-1)
-    shift = intrinsics.new_tensor([1 / width - 1, 1 / height - 1, 0.0]).unsqueeze(-1)
-    return intrinsics * scale + intrinsics[..., 2:, :] * shift
+    rows = [[2 / width, 0.0, 1 / width - 1], [0.0, 2 / height, 1 / height - 1], [0.0, 0.0, 1.0]]
+    return intrinsics.new_tensor(rows) @ intrinsics
 
 
 def image_coordinates(cells: Tensor, lens: Lens | None) -> tuple[Tensor, Tensor]:
@@ -87,16 +88,16 @@ def image_coordinates(cells: Tensor, lens: Lens | None) -> tuple[Tensor, Tensor]
     return points, hidden + beyond
 
 
-def outside_image(points: Tensor, hidden: Tensor) -> Tensor:
+def outside_image(points: Tensor, hidden: Tensor | None = None) -> Tensor:
     """Mark what an image does not show.
 
     Args:
         points: (B, 2, R, V) normalised coordinates.
-        hidden: (B, R, V), zero where seen.
+        hidden: (B, R, V), zero where seen; None where all are in front of the camera and its lens.
 
     Returns:
         (B, R, V), zero where seen and inside the image, else positive; without gradient.
     """
     beyond = F.hardshrink(points.detach(), 1.0)  # zero in [-1, 1]
     x, y = beyond.unbind(1)
-    return torch.addcmul(torch.addcmul(hidden, x, x), y, y)
+    return torch.addcmul(x * x if hidden is None else torch.addcmul(hidden, x, x), y, y)

@@ -56,18 +56,49 @@ def resampled(
     Returns:
         (B, C, R, V) of each map in its dtype, and (B, 1, R, V) bool: valid.
     """
+    at, valid = sampling_maps(cells, lens, sizes, image_size)
+    return [_sample(each, where) for each, where in zip(maps, at, strict=True)], valid
+
+
+def sampling_maps(
+    cells: Cells, lens: Lens | None, sizes: Sequence[MapSize], image_size: tuple[int, int]
+) -> tuple[list[Tensor], Tensor]:
+    """Compute where to sample maps of one image.
+
+    Args:
+        cells: as of :func:`resampled`.
+        lens: as of :func:`resampled`.
+        sizes: of every map.
+        image_size: (H, W) px.
+
+    Returns:
+        (B, 2, R, V) of each map, coordinates for ``grid_sample``, far away where not seen, in memory that is
+        kept where there is no graph; and (B, 1, R, V) bool: valid.
+    """
     limit = min(1 - 1 / side for size in sizes for side in (size.width, size.height))
-    kept = _kept_maps(len(maps), cells) if _may_overwrite() else None
-    parts: list[list[Tensor]] = [[] for _ in maps]
-    invalid = []
-    for block in blocks(cells, lens, limit, kept[0] if kept else None):
-        for number in reversed(range(len(maps))):  # the first map may take the place of the points
-            out = kept[number][:, :, block.first : block.last] if kept else None
-            parts[number].append(block_map(block, sizes[number], image_size, out))
-        invalid.append(block.invalid())
-    at = kept or [torch.cat(part, dim=2) for part in parts]
-    found = [_sample(each, where) for each, where in zip(maps, at, strict=True)]
-    return found, torch.cat(invalid, dim=1).logical_not().unsqueeze(1)
+    if _may_overwrite():
+        return _maps_written(cells, lens, sizes, image_size, limit)
+    parts: list[list[Tensor]] = [[] for _ in sizes]
+    valid = []
+    for block in blocks(cells, lens, limit):
+        for part, size in zip(parts, sizes, strict=True):
+            part.append(block_map(block, size, image_size))
+        valid.append(block.valid())
+    return [torch.cat(part, dim=2) for part in parts], torch.cat(valid, dim=1).unsqueeze(1)
+
+
+def _maps_written(
+    cells: Cells, lens: Lens | None, sizes: Sequence[MapSize], image_size: tuple[int, int], limit: float
+) -> tuple[list[Tensor], Tensor]:
+    """Do the same without a graph, in memory that is kept."""
+    maps = _kept_maps(len(sizes), cells)
+    valid = torch.ones(cells.shape, dtype=torch.bool, device=maps[0].device)
+    for block in blocks(cells, lens, limit, lambda first, last: maps[0][:, :, first:last]):
+        rows = slice(block.first, block.last)
+        for number in reversed(range(len(sizes))):  # the first map takes the place of the points
+            block_map(block, sizes[number], image_size, maps[number][:, :, rows])
+        block.valid(valid[:, rows])
+    return maps, valid.unsqueeze(1)
 
 
 def _may_overwrite() -> bool:

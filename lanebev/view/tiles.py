@@ -1,6 +1,6 @@
 """Interpolate where cells are seen: exact at a few cells of each tile, polynomials for the others.
 
-Perspective and lens are smooth functions of a cell's row and column: the polynomial through 10 × 10 cells of
+Perspective and lens are smooth functions of a cell's row and column: the polynomial through 12 × 12 cells of
 a tile of 64 × 128 is as exact as float32 itself. Whether it is, its Chebyshev coefficients tell; tiles in
 which they do not fall off are computed cell by cell.
 
@@ -23,9 +23,10 @@ from lanebev.geometry.precision import autocast_off
 from lanebev.view.lens import Lens
 from lanebev.view.projection import CellSums, image_coordinates
 
-_ROWS, _ROW_NODES = 64, 10
-_COLUMNS, _COLUMN_NODES = 128, 10
+_ROWS, _ROW_NODES = 64, 12
+_COLUMNS, _COLUMN_NODES = 128, 12
 _TOLERANCE = 4e-6  # of half the image, .004 px of 1920; what float32 rounds is a quarter of it
+_HIGHEST = 2  # degrees of which the coefficients tell what those of higher ones would add
 _OUTSIDE = 0.25  # share of the distance to the image by which a tile that is not in it may be off
 
 
@@ -37,29 +38,24 @@ class Axis(NamedTuple):
         overlap: cells of the last tile that the one before has too.
         nodes: (T, n) int64, the cells of each tile that are computed, its first and last among them.
         weights: (size, n), values at the cells of a tile from those at its nodes.
-        coefficients: (n, n), Chebyshev coefficients from values at the nodes.
     """
 
     size: int
     overlap: int
     nodes: NDArray[np.int64]
     weights: NDArray[np.float32]
-    coefficients: NDArray[np.float32]
 
 
 @lru_cache(maxsize=64)
 def axis_tiles(cells: int, size: int, nodes: int) -> Axis | None:
-    """Divide ``cells`` into tiles of ``size``; None if there are less than two cells a node."""
+    """Divide ``cells`` into tiles of ``size``; None if there are less than three cells a node."""
     size = min(size, cells)
-    if size < 2 * nodes:
+    if size < 3 * nodes:
         return None
     first = np.minimum(np.arange(0, cells, size), cells - size)
     of_tile = tile_nodes(size, nodes)
-    weights, coefficients = interpolation(size, of_tile)
-    return Axis(
-        size, len(first) * size - cells, first[:, None] + of_tile,
-        weights.astype(np.float32), coefficients.astype(np.float32),
-    )  # fmt: skip
+    weights, _ = interpolation(size, of_tile)
+    return Axis(size, len(first) * size - cells, first[:, None] + of_tile, weights.astype(np.float32))
 
 
 def tile_nodes(cells: int, nodes: int) -> NDArray[np.int64]:
@@ -80,20 +76,35 @@ def interpolation(cells: int, nodes: NDArray[np.int64]) -> tuple[NDArray[np.floa
     return chebvander(np.linspace(-1, 1, cells), degree) @ coefficients, coefficients
 
 
+@lru_cache(maxsize=64)
+def tile_coefficients(rows: int, row_nodes: int, columns: int, column_nodes: int) -> NDArray[np.float32]:
+    """Compute the matrix from values at all nodes of a tile to its Chebyshev coefficients.
+
+    Returns:
+        (nodes, coefficients), those of the two highest degrees of rows or columns last.
+    """
+    _, by_row = interpolation(rows, tile_nodes(rows, row_nodes))
+    _, by_column = interpolation(columns, tile_nodes(columns, column_nodes))
+    degree = np.indices((row_nodes, column_nodes)).reshape(2, -1)
+    highest = (degree[0] >= row_nodes - _HIGHEST) | (degree[1] >= column_nodes - _HIGHEST)
+    matrix = np.kron(by_row, by_column)[np.argsort(highest, kind="stable")]
+    return np.ascontiguousarray(matrix.T, np.float32)
+
+
 class Interpolant(NamedTuple):
     """Image coordinates of all cells, as polynomials along the rows of each tile.
 
     Attributes:
         rows: tiles of rows.
         values: (B, 2, T, n, V) at the nodes of the rows.
-        smooth: (B, T) bool, whether the polynomials are exact; where not, they mean nothing.
-        inside: (T,) of bool, whether all cells are surely seen, and their coordinates in [-limit, limit].
+        smooth: (B, T), whether the polynomials are exact; where not, they mean nothing.
+        inside: (T,), whether all cells are surely seen, and their coordinates in [-limit, limit].
     """
 
     rows: Axis
     values: Tensor
-    smooth: Tensor
-    inside: list[bool]
+    smooth: NDArray[np.bool_]
+    inside: NDArray[np.bool_]
 
     def row(self, tile: int) -> int:
         """Return the first row of a tile that the one before has not, or the number of all rows."""
@@ -110,15 +121,13 @@ class Interpolant(NamedTuple):
         return torch.cat([before.flatten(2, 3), own], dim=2)
 
     def write(self, first: int, last: int, out: Tensor) -> Tensor:
-        """Write those coordinates to their rows of ``out``, (B, 2, R, V), which are returned."""
-        weights = torch.from_numpy(self.rows.weights)
-        with autocast_off(out.device):
-            for tile in range(first, last):
-                rows = out[:, :, self.row(tile) : self.row(tile + 1)]
-                own = weights[self.rows.size - rows.shape[2] :].expand(2 * len(out), -1, -1)
-                values = self.values[:, :, tile].flatten(0, 1)
-                torch.bmm(own, values, out=rows.view(len(own), -1, rows.shape[3]))
-        return out[:, :, self.row(first) : self.row(last)]
+        """Write those coordinates to ``out``, (B, 2, rows, V), without a graph."""
+        values, cells = self.values.numpy(), out.numpy()  # whose small products take half as long
+        for tile in range(first, last):
+            start, end = self.row(tile) - self.row(first), self.row(tile + 1) - self.row(first)
+            weights = self.rows.weights[self.rows.size - (end - start) :]
+            np.matmul(weights, values[:, :, tile], out=cells[:, :, start:end])
+        return out
 
 
 def interpolant(cells: CellSums, lens: Lens | None, limit: float) -> Interpolant | None:
@@ -134,54 +143,56 @@ def interpolant(cells: CellSums, lens: Lens | None, limit: float) -> Interpolant
     rows, columns = axis_tiles(count, _ROWS, _ROW_NODES), axis_tiles(width, _COLUMNS, _COLUMN_NODES)
     if rows is None or columns is None:
         return None
-    by_row, by_column = (
-        part[..., torch.from_numpy(axis.nodes.reshape(-1))]
-        for part, axis in zip(cells, (rows, columns), strict=True)
+    nodes = CellSums(
+        *(
+            part.index_select(-1, torch.from_numpy(axis.nodes.reshape(-1)))
+            for part, axis in zip(cells, (rows, columns), strict=True)
+        )
     )
-    nodes = CellSums(by_row, by_column)
     points, hidden = image_coordinates(nodes.rows(0, nodes.shape[1]), lens)
-    with autocast_off(points.device):
-        values = _along_columns(points.unflatten(3, columns.nodes.shape), columns)
-        error, most, least = _sizes(points.detach(), rows, columns)
-    seen = _by_tiles(hidden, rows, columns).amax((3, 4)) == 0  # (B, T, S)
-    smooth = seen & (error <= (_OUTSIDE * (least - 1)).clamp(min=_TOLERANCE))
+    values = _along_columns(points.unflatten(3, columns.nodes.shape), columns)
+    error, most, least = _sizes(_by_tiles(points, rows, columns), rows.size, columns.size)
+    seen = _by_tiles(hidden, rows, columns).max(-1) == 0  # (B, T, S)
+    smooth = seen & (error <= np.maximum(_OUTSIDE * (least - 1), _TOLERANCE))
     inside = smooth & (most <= limit)
-    return Interpolant(
-        rows, values.unflatten(2, rows.nodes.shape), smooth.all(2), inside.all(2).all(0).tolist()
-    )
+    return Interpolant(rows, values.unflatten(2, rows.nodes.shape), smooth.all(2), inside.all((0, 2)))
 
 
-def _by_tiles(values: Tensor, rows: Axis, columns: Axis) -> Tensor:
-    """Values (..., T·n, S·m) at all nodes as (..., T, S, n, m)."""
-    tiles: Tensor = values.unflatten(-1, columns.nodes.shape).unflatten(-3, rows.nodes.shape)
-    return tiles.transpose(-3, -2)
+def _by_tiles(values: Tensor, rows: Axis, columns: Axis) -> NDArray[np.float32]:
+    """Values (..., T·n, S·m) at all nodes as (..., T, S, n·m), without gradient."""
+    tiles = values.detach().unflatten(-1, columns.nodes.shape).unflatten(-3, rows.nodes.shape)
+    array: NDArray[np.float32] = tiles.transpose(-3, -2).flatten(-2).numpy()
+    return array
 
 
 def _along_columns(nodes: Tensor, columns: Axis) -> Tensor:
     """Values at all columns, (..., V), from those at the nodes, (..., S, m)."""
-    values = nodes @ torch.from_numpy(columns.weights).mT  # (..., S, size)
+    if nodes.requires_grad:
+        with autocast_off(nodes.device):
+            values = nodes @ torch.from_numpy(columns.weights).mT  # (..., S, size)
+    else:  # in half the time
+        values = torch.from_numpy(nodes.flatten(0, -2).numpy() @ columns.weights.T)
+        values = values.view(*nodes.shape[:-1], -1)
     if columns.overlap == 0:
         return values.flatten(-2)
     return torch.cat([values[..., :-1, :].flatten(-2), values[..., -1, columns.overlap :]], dim=-1)
 
 
-def _sizes(points: Tensor, rows: Axis, columns: Axis) -> tuple[Tensor, Tensor, Tensor]:
+def _sizes(values: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float32]:
     """Bound tiles' polynomials by their coefficients.
 
     Args:
-        points: (B, 2, T·n, S·m) at the nodes.
-        rows: T tiles.
-        columns: S tiles.
+        values: (B, 2, T, S, n·m) at the nodes.
+        rows: of a tile.
+        columns: of a tile.
 
     Returns:
-        error: what the last two coefficients of rows and columns sum up to.
-        most: the sum of all, which no coordinate exceeds.
-        least: of the coordinate that is farther from the image at all nodes, at the nearest: each (B, T, S).
+        (3, B, T, S): what the coefficients of the highest degrees sum up to; the sum of all, which no
+        coordinate exceeds; of the coordinate that is farther from the image at all nodes, at the nearest.
     """
-    values = _by_tiles(points, rows, columns).contiguous()
-    by_column = values @ torch.from_numpy(columns.coefficients).mT
-    size = (by_column.mT.contiguous() @ torch.from_numpy(rows.coefficients).mT).abs()  # (B, 2, T, S, m, n)
-    most = size.sum((-2, -1))
-    rest = size[..., :-2, :-2].sum((-2, -1))
-    least = values.abs().amin((-2, -1))
-    return (most - rest).amax(1), most.amax(1), least.amax(1)
+    matrix = tile_coefficients(rows, _ROW_NODES, columns, _COLUMN_NODES)
+    size = np.abs(values.reshape(-1, values.shape[-1]) @ matrix).reshape(values.shape)
+    low = (_ROW_NODES - _HIGHEST) * (_COLUMN_NODES - _HIGHEST)
+    error = size[..., low:].sum(-1)
+    bounds: NDArray[np.float32] = np.stack([error, size.sum(-1), np.abs(values).min(-1)]).max(2)
+    return bounds
