@@ -9,12 +9,12 @@ dependencies = ["torch", "kornia", "numpy", "cv2", "safetensors"]
 
 
 def lanebev(**arguments: Any) -> LaneBEV:
-    """Return the whole, with the shipped weights; arguments of ``LaneBEV.from_pretrained``."""
+    """Return the whole model with the shipped weights; see ``LaneBEV.from_pretrained`` for arguments."""
     return LaneBEV.from_pretrained(**arguments)
 
 
 def lane_segmenter(**arguments: Any) -> LaneSegmenter:
-    """Return the network, with the shipped weights or those of ``path``."""
+    """Return the segmentation network with the shipped weights or those of ``path``."""
     return load_segmenter(**arguments)
 
 
