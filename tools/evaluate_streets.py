@@ -1,11 +1,13 @@
 """Figures on single images of streets, by day and by night, from pixels.
 
     python -m tools.evaluate_streets [--data ../shared/data] [--weights FILE] [--json FILE] [--sheets FOLDER]
+    python -m tools.evaluate_streets --rendered 24 [--width 576]
 
 ``kitti_road``: the road plane of the lidar is the truth of pitch and roll (0.1 to 0.2 degrees), yaw has none.
 ``kitti_road_with_prior``: the same with the median of these as a mount that is known.
 ``culane``: frames at night whose camera is not published; a field of view of 60 degrees is assumed, and only
 the number of calibrated frames counts. ``streets``: two images with a known pose. Nothing here is trained on.
+``--rendered``: in place of these, rendered views of all kinds of road, as wide as KITTI's images.
 """
 
 from __future__ import annotations
@@ -20,22 +22,25 @@ import cv2
 import numpy as np
 import scipy.stats
 import torch
+from jsonargparse.typing import PositiveInt
 from numpy.typing import NDArray
 from torch import Tensor
 
 import lanebev
-from lanebev import BEVGrid, Camera, JointCalibrator, LaneBEV, Status
+from lanebev import BEVGrid, Calibration, Camera, JointCalibrator, LaneBEV, LaneSegments, Status
 from lanebev.estimation.joint.single_frame import FramePrior, prior_of_mount
 from lanebev.estimation.tracker import Tracker
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.io.video import read_image
 from lanebev.observation.frames import check_frame, network_image
+from lanebev.render import render_views
 from lanebev.report.overlay import draw_panels
 from train.commands import one_line_errors
 
 KITTI_LANE_WIDTH = 3.5  # m
 ASSUMED_FOV = 60.0  # deg, of a camera that is not published
 SIGMAS = 3.0
+RENDERED_SEED, RENDERED_ROWS, RENDERED_SIZE = 621, 8, (375, 1242)  # views at once; px, as KITTI's images
 MOUNT_STD = 0.001  # rad, of the median pose where it is given as a prior
 
 
@@ -74,22 +79,34 @@ def calibrate(
     image = read_image(path)
     with torch.inference_mode():
         frame = network_image(check_frame(image, camera.image_size), torch.device("cpu"))
-        _, vertices = model.boundary_vertices(frame)
-        tracker = Tracker(JointCalibrator(prior=prior or FramePrior()), camera, lane_width)
-        segments, calibration, _ = tracker.still(vertices, model.pose_sigma_scale)
+        segments, calibration = calibrate_frame(model, frame, camera, lane_width, prior)
         picture = draw_panels(image, camera, segments, calibration, path.name, (), BEVGrid())[0]
+    return as_answer(path.name, calibration), picture
+
+
+def calibrate_frame(
+    model: LaneBEV, frame: Tensor, camera: Camera, lane_width: float, prior: FramePrior | None = None
+) -> tuple[LaneSegments, Calibration]:
+    """Calibrate one frame (1, 3, H, W) in [0, 1], as taken."""
+    _, vertices = model.boundary_vertices(frame)
+    tracker = Tracker(JointCalibrator(prior=prior or FramePrior()), camera, lane_width)
+    segments, calibration, _ = tracker.still(vertices, model.pose_sigma_scale)
+    return segments, calibration
+
+
+def as_answer(name: str, calibration: Calibration) -> Answer:
+    """Take angles and standard deviations from a calibration of batch size 1."""
     pitch, yaw, roll, height = calibration.extrinsics
     down = road_from_cam(pitch, yaw, roll)[0, 1]
     sigma = calibration.covariance[0].diagonal().sqrt()
-    answer = Answer(
-        path.name,
+    return Answer(
+        name,
         plane_angles(down).rad2deg(),
         sigma[[0, 2]].rad2deg(),
         float(height[0]),
         float(sigma[3]),
         int(calibration.status[0]) == Status.TRACKING,
     )
-    return answer, picture
 
 
 def summarise(answers: list[Answer], truth: Tensor) -> dict[str, float]:
@@ -190,6 +207,24 @@ def streets(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]
     return figures
 
 
+def rendered(model: LaneBEV, views: int) -> dict[str, float]:
+    """Rendered views of all kinds of road, each with the mean of its lane widths."""
+    generator = torch.Generator().manual_seed(RENDERED_SEED)
+    answers, truth = [], []
+    with torch.inference_mode():
+        for start in range(0, views, RENDERED_ROWS):
+            frame = render_views(min(RENDERED_ROWS, views - start), RENDERED_SIZE, generator)
+            pitch, yaw, roll, _ = (part.double() for part in frame.extrinsics)
+            truth.append(plane_angles(road_from_cam(pitch, yaw, roll)[:, 1]))
+            for row, image in enumerate(frame.image):
+                lens = (frame.intrinsics[row].double(), frame.distortion[row].double())
+                camera = Camera(*lens, "pinhole", RENDERED_SIZE)
+                width = float(frame.lane_width[row].mean())
+                calibration = calibrate_frame(model, image[None], camera, width)[1]
+                answers.append(as_answer(f"{start + row}", calibration))
+    return summarise(answers, torch.cat(truth))
+
+
 def save_sheet(
     folder: Path | None, name: str, pictures: list[NDArray[np.uint8]], columns: int, width: int
 ) -> None:
@@ -216,18 +251,32 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, help="other weights than the shipped")
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--sheets", type=Path, help="write contact sheets with the segments into this folder")
+    parser.add_argument(
+        "--width", type=PositiveInt, help="px of the network's input, for images of any proportions"
+    )
+    parser.add_argument(
+        "--rendered", type=PositiveInt, metavar="N", help="evaluate on N rendered views instead"
+    )
     options = parser.parse_args()
+    model = LaneBEV.from_pretrained(options.weights, network_width=options.width).eval()
+    if options.rendered:
+        report({"rendered": rendered(model, options.rendered)}, options.json)
+        return
     for name in ("kitti_road", "culane", "streets"):
         if not (options.data / name).is_dir():
             raise ValueError(f"{options.data}: expected the folder {name}, got none; give --data")
-    model = LaneBEV.from_pretrained(options.weights).eval()
     figures = {
         part.__name__: part(model, options.data, options.sheets)
         for part in (kitti_road, kitti_road_with_prior, culane, streets)
     }
+    report(figures, options.json)
+
+
+def report(figures: dict[str, dict[str, float]], file: Path | None) -> None:
+    """Print the figures of each part, and write them as JSON if a file is given."""
     print(json.dumps(figures, indent=1))
-    if options.json is not None:
-        options.json.write_text(json.dumps({"lanebev": lanebev.__version__, **figures}, indent=1) + "\n")
+    if file is not None:
+        file.write_text(json.dumps({"lanebev": lanebev.__version__, **figures}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

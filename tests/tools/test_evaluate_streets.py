@@ -5,7 +5,10 @@ import math
 import pytest
 import torch
 
+from lanebev import JointCalibrator, LaneBEV, LaneSegmenter, LineExtractor
 from lanebev.geometry.rotation import road_from_cam
+from lanebev.observation.segmenter import SegmenterConfig
+from tools import evaluate_streets
 from tools.evaluate_streets import Answer, kitti_truth, median_interval, plane_angles, summarise
 
 
@@ -44,3 +47,14 @@ def test_the_interval_of_a_median_holds_it_19_times_in_20():
     held = ((low <= 0) & (high >= 0)).double().mean()
     assert 0.97 < held < 0.99  # 0.981; of one order statistic less on either side 0.948, of one more 0.994
     assert median_interval(torch.tensor([[3.0], [1.0]])) == (1.0, 3.0)
+
+
+def test_rendered_views(monkeypatch):
+    """A network that has learned nothing sees nothing: the answer is the prior's."""
+    monkeypatch.setattr(evaluate_streets, "RENDERED_SIZE", (64, 192))
+    config = SegmenterConfig(base_width=8, decoder_width=8, image_size=(64, 192))
+    torch.manual_seed(1)
+    model = LaneBEV(LaneSegmenter(config), LineExtractor.for_network(config), JointCalibrator()).eval()
+    figures = evaluate_streets.rendered(model, 2)
+    assert (figures["images"], figures["tracking"]) == (2, 0)
+    assert figures["pitch_within_3_sigma"] == 1.0
