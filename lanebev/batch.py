@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from enum import IntFlag
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_flatten, tree_unflatten
+
+from lanebev.tensors import constant, map_tensors
 
 T = TypeVar("T")
 FlagT = TypeVar("FlagT", bound=IntFlag)
@@ -31,15 +34,68 @@ def select_rows(rows: Tensor, yes: T, no: T) -> T:
 def may_skip(wanted: Tensor) -> bool:
     """Tell whether a costly step, such as a search, can be left out because no row wants its result.
 
-    The one place where the maths asks the device. A compiled or exported program cannot, and always searches.
+    Beside :func:`replace_rows` the one place where the maths asks the device. A compiled or exported program
+    cannot, and always searches.
     """
     return not torch.compiler.is_compiling() and not bool(wanted.any())
+
+
+def replace_rows(rows: Tensor, values: T, function: Callable[..., T], *operands: Any) -> T:
+    """Replace some rows of ``values`` by a costly function's result, which is computed for these rows only.
+
+    The device is asked how many rows there are. A compiled program has both ways (``torch.cond``): it
+    computes the function for all rows where there is any, else not at all. An exported one always does.
+
+    Args:
+        rows: (B,) bool.
+        values: (B, ...) tensor, or a NamedTuple of such.
+        function: of the operands, to what ``values`` is; each row's result depends on that row alone.
+        operands: (B, ...) tensors, or NamedTuples of such.
+    """
+    if torch.compiler.is_exporting():
+        return select_rows(rows, function(*operands), values)
+    if torch.compiler.is_compiling():
+        return _replace_rows_in_program(rows, values, function, operands)
+    index = rows.nonzero().squeeze(-1)
+    if index.shape[0] == 0:
+        return values
+    if index.shape[0] == rows.shape[0]:
+        return function(*operands)
+    chosen = (map_tensors(lambda part: part.index_select(0, index), operand) for operand in operands)
+    return _put_rows(index, function(*chosen), values)
+
+
+def _replace_rows_in_program(
+    rows: Tensor, values: T, function: Callable[..., T], operands: tuple[Any, ...]
+) -> T:
+    """As :func:`replace_rows`, by ``torch.cond``, of plain tuples of tensors none of which is a view."""
+    parts, structure = tree_flatten((rows, values, operands))
+    parts = [part.clone() for part in parts]
+    results = tree_flatten(values)[1]
+
+    def anew(*parts: Tensor) -> tuple[Tensor, ...]:
+        rows, values, operands = tree_unflatten(parts, structure)
+        return tuple(tree_flatten(select_rows(rows, function(*operands), values))[0])
+
+    def kept(*parts: Tensor) -> tuple[Tensor, ...]:
+        return tuple(part.clone() for part in parts[1 : 1 + results.num_leaves])
+
+    found: T = tree_unflatten(torch.cond(rows.any(), anew, kept, tuple(parts)), results)
+    return found
+
+
+def _put_rows(index: Tensor, rows: T, values: T) -> T:
+    """``values`` with ``rows`` at the places (K,) of the index."""
+    if isinstance(values, Tensor):
+        return cast(T, values.index_copy(0, index, cast(Tensor, rows)))
+    pairs = zip(cast("tuple[Tensor, ...]", rows), cast("tuple[Tensor, ...]", values), strict=True)
+    return type(values)(*(_put_rows(index, *pair) for pair in pairs))
 
 
 def flags(conditions: Mapping[FlagT, Tensor]) -> Tensor:
     """Return the bits of the reasons whose conditions (B,) hold, (B,) int64; no two share a bit."""
     holds = torch.stack(list(conditions.values()), dim=-1)
-    bits = torch.tensor([int(reason) for reason in conditions], device=holds.device)
+    bits = constant(tuple(map(int, conditions)), like=holds, dtype=torch.int64)
     total: Tensor = (holds * bits).sum(-1)
     return total
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar, cast
+from functools import lru_cache
+from typing import Any, TypeVar, cast
 
+import torch
 from torch import Tensor
 
 T = TypeVar("T")
@@ -17,3 +19,41 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: T) -> T:
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return cast(T, type(value)(*(map_tensors(function, part) for part in value)))
     return value
+
+
+def constant(numbers: tuple[Any, ...], like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+    """Return a tensor of given numbers, made once per dtype and device; not to be changed in place.
+
+    A compiled or exported program has it as a constant of its own.
+
+    Args:
+        numbers: tuple of numbers, or of such tuples.
+        like: whose device, and dtype unless it is given, it has.
+        dtype: of the result.
+    """
+    kind = dtype or like.dtype
+    if torch.compiler.is_exporting():
+        return _computed_constant(numbers, kind, like.device)
+    if torch.compiler.is_compiling():
+        return torch.tensor(numbers, dtype=kind, device=like.device)
+    return _constant(numbers, kind, like.device)
+
+
+def _computed_constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Compute a constant: literals in a branch of ``torch.cond`` cannot be exported to ONNX (torch 2.13)."""
+    shape: list[int] = []
+    first: Any = numbers
+    while isinstance(first, tuple):
+        shape.append(len(first))
+        first = first[0]
+    flat = list(numbers)
+    for _ in shape[1:]:
+        flat = [number for row in flat for number in row]
+    each = {number: torch.full((1,), number, dtype=dtype, device=device) for number in set(flat)}
+    return torch.cat([each[number] for number in flat]).view(shape)
+
+
+@lru_cache(maxsize=256)
+def _constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(mode=False):  # one that is made in it could not be used for gradients
+        return torch.tensor(numbers, dtype=dtype, device=device)

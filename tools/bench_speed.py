@@ -200,14 +200,14 @@ def extractors() -> Calls:
 
 
 def calibrators(rows: int, per_boundary: int) -> Calls:
-    """One frame of each calibrator that has started."""
+    """One frame of each calibrator that is sure of its start: see ``JointConfig.doubt_frames``."""
     one = lanes(per=per_boundary, noise=0.5)
     seen = LaneSegments(*(part.expand(rows, *part.shape[1:]) for part in one))
     intrinsics = INTRINSICS.expand(rows, 3, 3)
     calls: dict[str, Callable[[], object]] = {}
     for name, calibrator in (("joint", JointCalibrator()), ("two-stage", TwoStageCalibrator())):
         state: Any = calibrator.initial_state(1, dtype=torch.float64)
-        for _ in range(3):  # of one row, which the others equal
+        for _ in range(20):  # of one row, which the others equal
             _, state = calibrator(one, INTRINSICS.expand(1, 3, 3), state, 1 / 30)
         state = map_tensors(lambda part: part.expand(rows, *part.shape[1:]).clone(), state)
         calls[name] = partial(calibrator, seen, intrinsics, state, 1 / 30)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lanebev.geometry.lens import check_intrinsics, placeholder_intrinsics, usable_cameras
 from lanebev.observation.segments import LaneSegments
+from lanebev.tensors import constant
 from lanebev.types import Calibration, Status, TensorTuple, check_tensor
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
@@ -103,7 +104,7 @@ def clean_segments(segments: LaneSegments, num_boundaries: int) -> LaneSegments:
     known = (boundary >= 0) & (boundary < num_boundaries)
     long = (ends[..., 1, :] - ends[..., 0, :]).abs().amax(-1) > _MIN_LENGTH
     good = finite & known & long & (ends.abs().amax((-2, -1)) < 1e6)
-    harmless = ends.new_tensor([[0.0, 0.0], [1.0, 1.0]])
+    harmless = constant(((0.0, 0.0), (1.0, 1.0)), like=ends)
     return LaneSegments(
         torch.where(good[..., None, None], ends, harmless),
         torch.where(good, boundary, 0),

@@ -19,6 +19,7 @@ from lanebev.geometry.distortion import (
 )
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.undistortion import undistort_plane
+from lanebev.tensors import constant
 from lanebev.types import check_tensor
 
 __all__ = [
@@ -80,7 +81,7 @@ def usable_cameras(intrinsics: Tensor) -> Tensor:
 
 def placeholder_intrinsics(like: Tensor) -> Tensor:
     """Return (3, 3) intrinsics that replace unusable ones, so that no number or gradient becomes NaN."""
-    return torch.diag(like.new_tensor([_HARMLESS_FOCAL, _HARMLESS_FOCAL, 1.0]))
+    return constant(((_HARMLESS_FOCAL, 0.0, 0.0), (0.0, _HARMLESS_FOCAL, 0.0), (0.0, 0.0, 1.0)), like=like)
 
 
 def check_points(points: Tensor, size: int = 2) -> None:

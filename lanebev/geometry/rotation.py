@@ -11,6 +11,25 @@ from kornia.geometry import rotation_matrix_to_axis_angle
 from torch import Tensor
 
 from lanebev.geometry.precision import full_precision
+from lanebev.tensors import constant
+
+_FACTORS = (  # of cosine, of sine and of neither: R(θ), R(φ), R(ψ)
+    (
+        ((0, 0, 0), (0, 1, 0), (0, 0, 1)),
+        ((1, 0, 0), (0, 0, 0), (0, 0, 1)),
+        ((1, 0, 0), (0, 1, 0), (0, 0, 0)),
+    ),
+    (
+        ((0, 0, 0), (0, 0, -1), (0, 1, 0)),
+        ((0, 0, 1), (0, 0, 0), (-1, 0, 0)),
+        ((0, 1, 0), (-1, 0, 0), (0, 0, 0)),
+    ),
+    (
+        ((1, 0, 0), (0, 0, 0), (0, 0, 0)),
+        ((0, 0, 0), (0, 1, 0), (0, 0, 0)),
+        ((0, 0, 0), (0, 0, 0), (0, 0, 1)),
+    ),
+)
 
 
 def _rotation(rows: list[list[Tensor]]) -> Tensor:
@@ -70,7 +89,19 @@ def road_from_cam(pitch: Tensor, yaw: Tensor, roll: Tensor) -> Tensor:
     Returns:
         (..., 3, 3) rotation.
     """
-    return rotation_z(roll) @ (rotation_x(pitch) @ rotation_y(yaw)).mT
+    return road_from_cam_and_roll(torch.stack([pitch, yaw, roll], dim=-1))[0]
+
+
+def road_from_cam_and_roll(angles: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute the rotation of :func:`road_from_cam` from (..., 3) pitch, yaw and roll, and its factor R(ψ).
+
+    Autocast is off already.
+    Each factor is linear in cosine and sine of its angle, so that all three are computed at once.
+    """
+    of_cos, of_sin, rest = constant(_FACTORS, like=angles)  # each (3, 3, 3)
+    cos, sin = angles.cos()[..., None, None], angles.sin()[..., None, None]
+    by_pitch, by_yaw, by_roll = torch.addcmul(torch.addcmul(rest, cos, of_cos), sin, of_sin).unbind(-3)
+    return by_roll @ (by_pitch @ by_yaw).mT, by_roll
 
 
 @full_precision
@@ -83,10 +114,16 @@ def angles_from_matrix(road_from_cam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     Returns:
         pitch, yaw, roll: (...,) rad; pitch and yaw in (-pi/2, pi/2), roll in (-pi, pi].
     """
-    pitch, yaw = pitch_yaw_from_vanishing_dir(road_from_cam[..., 2, :])
-    road_from_world = road_from_cam @ cam_from_world(pitch, yaw)
-    roll = torch.atan2(road_from_world[..., 0, 1], road_from_world[..., 0, 0])
+    pitch, yaw, roll = pitch_yaw_roll(road_from_cam).unbind(-1)
     return pitch, yaw, roll
+
+
+def pitch_yaw_roll(road_from_cam: Tensor) -> Tensor:
+    """Compute the angles of :func:`angles_from_matrix` as (..., 3), autocast being off already."""
+    pitch, yaw = pitch_yaw_from_vanishing_dir(road_from_cam[..., 2, :])
+    road_from_world = road_from_cam @ rotation_x(pitch) @ rotation_y(yaw)
+    roll = torch.atan2(road_from_world[..., 0, 1], road_from_world[..., 0, 0])
+    return torch.stack([pitch, yaw, roll], dim=-1)
 
 
 def vanishing_dir_from_pitch_yaw(pitch: Tensor, yaw: Tensor) -> Tensor:

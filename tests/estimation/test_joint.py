@@ -38,6 +38,8 @@ from lanebev.estimation.joint.state import JointConfig, state_from_fit
 from lanebev.estimation.joint.status import single_deviation
 from lanebev.estimation.joint.update import (
     frame_information,
+    membership,
+    observed_jacobian,
     posterior_covariance,
     update,
 )
@@ -468,10 +470,10 @@ def test_update_equals_a_plain_gauss_newton_on_all_data():
     seen = observe(frames[5][1], cameras(2), 6)
     places = boundary_places(WIDTH, 6, seen.sigma).gather(1, seen.boundary)
     places = places + state.mean[:, PLACE.deviations].gather(1, seen.boundary)
-    member = torch.nn.functional.one_hot(seen.boundary, 6).double().repeat_interleave(2, dim=1)
     at = boundary_residuals(state.mean[:, :NUM_COMMON], places, seen, state.phase)
     scale, doubt = torch.ones(2, dtype=DOUBLE), state.cov[:, PLACE.observed, PLACE.observed]
-    frame = frame_information(at, scale, doubt, member, seen)
+    full = observed_jacobian(at.jacobian, membership(seen.boundary, 6, like=doubt))
+    frame = frame_information(at, full, scale, doubt, seen)
     estimated = torch.ones_like(state.mean)
     result = update(state.mean, state.cov, state.mean, frame, estimated)
     cov = posterior_covariance(state.cov, frame.matrix, result.gain)

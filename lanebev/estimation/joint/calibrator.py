@@ -46,6 +46,8 @@ from lanebev.estimation.joint.update import (
     boundary_deviation,
     estimated_entries,
     frame_information,
+    membership,
+    observed_jacobian,
     posterior_covariance,
     single_frame,
     update,
@@ -229,23 +231,24 @@ def update_state(
     shift, scale = best_shift(predicted.mean, positions, seen, sight, width)
     prior, cov = renumber(predicted.mean, shift, width, num), predicted.cov
     places = positions.gather(1, seen.boundary)  # (B, N)
-    member = torch.nn.functional.one_hot(seen.boundary, num).to(places).repeat_interleave(2, dim=1)
+    member = membership(seen.boundary, num, like=places)
     at, doubt, evidence = prior, cov[:, place.observed, place.observed], predicted.evidence
     for iteration in range(cfg.iterations):
         params, own = at[:, :NUM_COMMON], at[:, place.deviations].gather(1, seen.boundary)
         if iteration == 0:
             feet = foot_rays(params, places + own, seen, sight)
             residuals = boundary_residuals(params, places + own, seen, predicted.phase, feet, sight)
+            jacobian = observed_jacobian(residuals.jacobian, member)
         else:  # the Jacobian stays
             distance, valid = boundary_distances(params, places + own, seen, feet, predicted.phase)
             residuals = residuals._replace(distance=distance, valid=valid)
-        frame = frame_information(residuals, scale, doubt, member, seen)
+        frame = frame_information(residuals, jacobian, scale, doubt, seen)
         alone, sensitivity = single_frame(frame.matrix)
         estimated = estimated_entries(alone, place)
         result = update(prior, cov, at, frame, estimated)
         if iteration == 0:
             believed = (frame.trust * seen.weight).repeat_interleave(2, dim=1).unsqueeze(1)
-            score = normalized_score(doubt, frame, (believed @ member).squeeze(1))
+            score = normalized_score(doubt, frame, torch.bmm(believed, member.mT).squeeze(1))
             evidence = accumulate_evidence(evidence, score, step, cfg.evidence_time)
             told = torch.where(estimated[:, POSE] > 0, score[:, POSE], 1.0)  # 1 changes nothing
             motion_scale = adapt_motion_scale(predicted.motion_scale, told, step, cfg)
@@ -260,7 +263,7 @@ def update_state(
         motion_scale=motion_scale,
         reasons=flag(shift != 0, Reason.LANE_CHANGE),
     )
-    agreed = agreement(frame, (at - last)[:, place.observed], seen)
+    agreed = agreement(frame, jacobian, (at - last)[:, place.observed], seen)
     apart = torch.maximum(at[:, place.deviations].abs(), boundary_deviation(last, frame).abs())
     lane = (apart < _NO_BOUNDARY).gather(1, seen.boundary)
     return updated, frame.trust, torch.where((seen.weight > 0) & lane, agreed, 0.0), alone

@@ -7,6 +7,7 @@ second.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,6 +21,9 @@ from torch import Tensor
 
 from lanebev.estimation.joint.layout import NUM_POSE, SHAPE, Layout, layout
 from lanebev.estimation.joint.measurement import OFFSET
+from lanebev.tensors import constant
+
+Rows = tuple[tuple[float, ...], ...]
 
 _ORDER = 4  # of the low-pass: the pose and three derivatives
 
@@ -75,10 +79,10 @@ class LowPass(NamedTuple):
         covariance: (4, 4), stationary.
     """
 
-    modes: NDArray[np.float64]
-    decays: NDArray[np.float64]
-    turns: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    modes: Rows
+    decays: tuple[float, ...]
+    turns: tuple[float, ...]
+    covariance: Rows
 
 
 def butterworth() -> LowPass:
@@ -99,16 +103,48 @@ def butterworth() -> LowPass:
     drive[-1, -1] = 1.0
     lyapunov = np.kron(eye, companion) + np.kron(companion, eye)
     covariance = np.linalg.solve(lyapunov, -drive.ravel()).reshape(_ORDER, _ORDER)
-    return LowPass(modes, values[upper].real, values[upper].imag, covariance / covariance[0, 0])
+    return LowPass(
+        _as_rows(modes),
+        tuple(values[upper].real.tolist()),
+        tuple(values[upper].imag.tolist()),
+        _as_rows(covariance / covariance[0, 0]),
+    )
 
 
-_LOW_PASS = butterworth()
+def _as_rows(matrix: NDArray[np.float64]) -> Rows:
+    return tuple(map(tuple, matrix.tolist()))
+
+
+_UNIT = butterworth()
 
 
 def pose_covariance(bandwidth: float, like: Tensor) -> Tensor:
     """Return the stationary covariance (4, 4) of value and three derivatives, at unit variance of value."""
-    powers = like.new_tensor([(2 * math.pi * bandwidth) ** k for k in range(_ORDER)])
-    return powers.unsqueeze(-1) * torch.as_tensor(_LOW_PASS.covariance).to(like) * powers
+    return constant(_covariance(bandwidth), like=like)
+
+
+def pose_variances(bandwidth: float) -> tuple[float, ...]:
+    """Return the diagonal of :func:`pose_covariance`."""
+    return tuple(row[k] for k, row in enumerate(_covariance(bandwidth)))
+
+
+@lru_cache(maxsize=16)
+def _covariance(bandwidth: float) -> Rows:
+    cutoff = 2 * math.pi * bandwidth
+    rows = enumerate(_UNIT.covariance)
+    return tuple(tuple(cutoff ** (i + k) * value for k, value in enumerate(row)) for i, row in rows)
+
+
+@lru_cache(maxsize=16)
+def _modes(bandwidth: float) -> tuple[Rows, tuple[float, ...], tuple[float, ...]]:
+    """The low-pass with this cut-off frequency (Hz): modes, those of cosines first; decays and turns, 1/s."""
+    cutoff = 2 * math.pi * bandwidth
+    powers = [cutoff ** (i - k) for i in range(_ORDER) for k in range(_ORDER)]
+    modes = tuple(
+        tuple(value * power for value, power in zip(_UNIT.modes[m], powers, strict=True))
+        for m in (0, 2, 1, 3)
+    )
+    return modes, tuple(cutoff * part for part in _UNIT.decays), tuple(cutoff * part for part in _UNIT.turns)
 
 
 def pose_transition(dt: Tensor, bandwidth: float) -> tuple[Tensor, Tensor]:
@@ -123,13 +159,11 @@ def pose_transition(dt: Tensor, bandwidth: float) -> tuple[Tensor, Tensor]:
     Returns:
         (B, 4, 4) F of value and three derivatives, and (B, 4, 4) W = S - F S Fᵀ.
     """
-    cutoff = 2 * math.pi * bandwidth
-    modes, decays, turns = (torch.as_tensor(part).to(dt) for part in _LOW_PASS[:3])
-    time = cutoff * dt.unsqueeze(-1)
+    modes, decays, turns = (constant(part, like=dt) for part in _modes(bandwidth))
+    time = dt.unsqueeze(-1)
     fade, angle = (time * decays).exp(), time * turns
-    mixed = torch.stack([fade * angle.cos(), fade * angle.sin()], dim=-1).flatten(1)  # (B, 4)
-    powers = dt.new_tensor([[cutoff ** (i - k) for k in range(_ORDER)] for i in range(_ORDER)])
-    transition = powers * (mixed @ modes).unflatten(-1, (_ORDER, _ORDER))
+    mixed = torch.cat([fade * angle.cos(), fade * angle.sin()], dim=-1)  # (B, 4)
+    transition = (mixed @ modes).unflatten(-1, (_ORDER, _ORDER))
     covariance = pose_covariance(bandwidth, dt)
     return transition, covariance - transition @ covariance @ transition.mT
 
@@ -170,11 +204,11 @@ def motion(
     """
     num = place.deviations.stop - place.deviations.start
     swing, drive = pose_transition(dt, cfg.bandwidth)
-    to_mean = torch.eye(_ORDER, dtype=dt.dtype, device=dt.device)[:, :1] - swing[:, :, :1]
+    to_mean = constant(((1,), (0,), (0,), (0,)), like=dt) - swing[:, :, :1]
     chain = torch.cat([swing, to_mean], dim=-1).flatten(1)  # (B, 20)
     slide, push = damped_velocity(dt, cfg.offset_memory)
     fade = (-dt / cfg.speed_memory).exp()
-    memory = torch.where(unequal > 0, cfg.unequal_memory, dt.new_tensor(cfg.deviation_memory))
+    memory = torch.where(unequal > 0, cfg.unequal_memory, constant((cfg.deviation_memory,), like=dt))
     settle = (-dt / memory).exp()
     still = torch.ones_like(pose_scale)
     moves = [
@@ -186,13 +220,13 @@ def motion(
         fade.unsqueeze(-1),
         settle.unsqueeze(-1).expand(-1, num),
     ]
-    std = dt.new_tensor([cfg.angle_std] * 3 + [cfg.height_std])
-    walk = dt.new_tensor([cfg.mean_angle_walk] * 3 + [cfg.mean_height_walk])
+    std = constant((*[cfg.angle_std] * 3, cfg.height_std), like=dt)
+    walk = constant((*[cfg.mean_angle_walk**2] * 3, cfg.mean_height_walk**2), like=dt)
     variance = (pose_scale * std).square()
     wander = cfg.deviation_walk**2 * dt + unequal.square() * (1 - settle * settle)
     noises = [
         (variance.unsqueeze(-1) * drive.flatten(1).unsqueeze(1)).flatten(1),
-        walk.square() * dt.unsqueeze(-1),
+        walk * dt.unsqueeze(-1),
         cfg.offset_density * push,
         road.noise + cfg.curvature_walk**2 * dt.unsqueeze(-1),
         (2 * cfg.speed_std**2 / cfg.speed_memory) * dt.unsqueeze(-1),
@@ -202,26 +236,25 @@ def motion(
     return _scatter(moves, of_moves, place.size), _scatter(noises, of_noises, place.size)
 
 
-def _scatter(parts: list[Tensor], places: NDArray[np.int64], size: int) -> Tensor:
+def _scatter(parts: list[Tensor], places: tuple[int, ...], size: int) -> Tensor:
     """(B, D, D) of zeros with the values (B, K) at flat places (K,)."""
     values = torch.cat(parts, dim=-1)
-    index = torch.as_tensor(places, device=values.device).expand(values.shape[0], -1)
+    index = constant(places, like=values, dtype=torch.int64).expand(values.shape[0], -1)
     flat = values.new_zeros(values.shape[0], size * size).scatter(1, index, values)
     matrix: Tensor = flat.unflatten(1, (size, size))
     return matrix
 
 
 @lru_cache(maxsize=16)
-def _places(num_boundaries: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _places(num_boundaries: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Flat indices, in the order of :func:`motion`, of the entries of F and of W."""
     place = layout(num_boundaries)
 
-    def block(rows: Sequence[int], columns: Sequence[int]) -> NDArray[np.int64]:
-        entries: NDArray[np.int64] = place.size * np.array(rows)[:, None] + np.array(columns)
-        return entries.ravel()
+    def block(rows: Sequence[int], columns: Sequence[int]) -> list[int]:
+        return [place.size * row + column for row in rows for column in columns]
 
-    def diagonal(entries: slice) -> NDArray[np.int64]:
-        return (place.size + 1) * np.arange(entries.start, entries.stop)
+    def diagonal(entries: slice) -> list[int]:
+        return [(place.size + 1) * entry for entry in range(entries.start, entries.stop)]
 
     chains = [place.chain(axis) for axis in range(NUM_POSE)]
     slide = (OFFSET, place.rates.start + OFFSET)
@@ -233,7 +266,7 @@ def _places(num_boundaries: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     noises = [block(chain[:_ORDER], chain[:_ORDER]) for chain in chains]
     noises += [diagonal(place.means), block(slide, slide), diagonal(SHAPE), diagonal(speed)]
     noises += [diagonal(place.deviations)]
-    return np.concatenate(moves), np.concatenate(noises)
+    return tuple(itertools.chain(*moves)), tuple(itertools.chain(*noises))
 
 
 def damped_velocity(dt: Tensor, memory: float) -> tuple[Tensor, Tensor]:
@@ -250,5 +283,7 @@ def damped_velocity(dt: Tensor, memory: float) -> tuple[Tensor, Tensor]:
     one, zero = torch.ones_like(dt), torch.zeros_like(dt)
     transition = torch.stack([one, memory * (1 - fade), zero, fade], dim=-1)
     short = dt.clamp(max=memory)  # the velocity's variance stops growing there
-    noise = torch.stack([short**2 * dt / 3, short * short / 2, short * short / 2, short], dim=-1)
+    square = short * short
+    half = square / 2
+    noise = torch.stack([square * dt / 3, half, half, short], dim=-1)
     return transition, noise

@@ -9,6 +9,7 @@ from torch.nn.functional import pad
 from lanebev.estimation.joint.layout import DEVIATIONS, NUM_POSE, NUM_SHAPE, POSE, SHAPE
 from lanebev.estimation.joint.state import JointConfig
 from lanebev.estimation.joint.update import FrameInformation, information_kept
+from lanebev.tensors import constant
 
 _SHARED = 0.2  # sigmas by which all end points of a boundary may be off alike
 _KNOWN = 1e-3  # share of a prediction-free score's variance below which the prediction determines the entry
@@ -34,9 +35,9 @@ def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor) -> Ten
     Returns:
         (B, 4 + NUM_SHAPE + L) of pose, shape, deviations; 0 where the frame has no information on an entry.
     """
-    free = cov.new_zeros(cov.shape[-1])
-    free[POSE] = cov.new_tensor(_FREE_POSE).square()
-    priors = torch.cat([cov, cov + free.diag()])  # (2 B, O, O)
+    freed = constant(tuple(sigma**2 for sigma in _FREE_POSE), like=cov)
+    free = pad(freed, (0, cov.shape[-1] - NUM_POSE)).diag()
+    priors = torch.cat([cov, cov + free])  # (2 B, O, O)
     matrix = torch.cat([frame.matrix, frame.matrix])
     kept = information_kept(priors, matrix)
     score = torch.bmm(kept, torch.cat([frame.vector, frame.vector]).unsqueeze(-1)).view(2, -1, cov.shape[-1])
@@ -99,9 +100,10 @@ def adaptive_process_noise(evidence: Tensor, cov: Tensor, cfg: JointConfig) -> T
     """
     parts = evidence.square().split([NUM_POSE, NUM_SHAPE, cfg.num_boundaries], dim=-1)
     worst = [part.amax(-1, keepdim=True) for part in parts]
-    pose, bend, own = (0.01 * torch.sigmoid(0.5 * (most - CALL**2)) * most for most in worst)
-    jump = evidence.new_tensor([cfg.open_pose] * 3 + [10 * cfg.open_pose, 0.0]).square()
-    change = evidence.new_tensor([cfg.open_curvature] + [cfg.open_step] * (NUM_SHAPE - 1)).square()
+    most = torch.cat(worst, dim=-1)
+    pose, bend, own = (0.01 * torch.sigmoid(0.5 * (most - CALL**2)) * most).split(1, dim=-1)
+    jump = constant((*[cfg.open_pose**2] * 3, (10 * cfg.open_pose) ** 2, 0.0), like=evidence)
+    change = constant((cfg.open_curvature**2, *[cfg.open_step**2] * (NUM_SHAPE - 1)), like=evidence)
     room = cfg.open_deviation**2 - cov.diagonal(dim1=1, dim2=2)[:, DEVIATIONS]
     freed = (parts[2] == worst[2]) * own.clamp(max=1.0) * room.clamp(min=0.0)
     return torch.cat([pose * jump, bend * change, freed], dim=-1)

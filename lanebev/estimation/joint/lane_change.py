@@ -8,6 +8,7 @@ from torch import Tensor
 from lanebev.estimation.joint.layout import NUM_COMMON
 from lanebev.estimation.joint.measurement import OFFSET, Observations, Sight, every_segment, sampson_distances
 from lanebev.estimation.joint.robust import log_likelihood, start_scale
+from lanebev.tensors import constant
 
 _SEGMENTS = 96  # that decide, at least
 
@@ -41,7 +42,7 @@ def best_shift(
     stride = max(1, places.shape[-1] // _SEGMENTS)
     sight = every_segment(sight, stride)
     places, weight, sigma = (part[:, ::stride] for part in (places, seen.weight, seen.sigma))
-    shifts = mean.new_tensor([0.0, -1.0, 1.0])
+    shifts = constant((0.0, -1.0, 1.0), like=mean)
     moved = places + (shifts[:, None] * lane_width)[:, :, None]  # (3, B, N)
     distance = sampson_distances(mean[:, :NUM_COMMON], moved, sight)
     scales = start_scale(distance, sigma, weight * sight.valid)  # (3, B)

@@ -17,6 +17,7 @@ tangent, n·d / |∂(n·d)/∂p|: exact for straight boundaries, of second order
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -26,8 +27,9 @@ from torch.nn.functional import pad
 from lanebev.estimation.checks import as_lane_width, check_segments, mask_invalid_rows
 from lanebev.estimation.joint.road_curve import RoadCurve, road_basis, road_curve
 from lanebev.geometry.lens import cam_from_image
-from lanebev.geometry.rotation import road_from_cam
+from lanebev.geometry.rotation import road_from_cam_and_roll
 from lanebev.observation.segments import LaneSegments
+from lanebev.tensors import constant
 
 PITCH, YAW, ROLL, HEIGHT, OFFSET, CURVATURE, CURVATURE_RATE = range(7)
 NUM_PARAMS = 7
@@ -68,6 +70,7 @@ class Sight(NamedTuple):
 
     Attributes:
         rotation: (B, 3, 3), road_from_cam.
+        by_roll: (B, 3, 3), its factor R(ψ).
         directions: (B, 3, M), right, down, ahead.
         by_pixel: (B, 3, 2), derivative of a direction by its pixel.
         z: (B, M) m, distance at which the end point meets the road, at most ``FARTHEST``.
@@ -76,6 +79,7 @@ class Sight(NamedTuple):
     """
 
     rotation: Tensor
+    by_roll: Tensor
     directions: Tensor
     by_pixel: Tensor
     z: Tensor
@@ -145,9 +149,15 @@ def boundary_places(lane_width: float | Tensor, num_boundaries: int, like: Tenso
         ValueError: lane_width of another shape.
     """
     widths = as_lane_width(lane_width, like, num_boundaries)
-    edges = torch.cat([torch.zeros_like(widths[:, :1]), widths.cumsum(-1)], dim=-1)
-    ego = num_boundaries // 2 - 1
-    return edges - 0.5 * (edges[:, ego] + edges[:, ego + 1]).unsqueeze(-1)
+    return widths @ constant(_places_by_widths(num_boundaries), like=widths)
+
+
+@lru_cache(maxsize=16)
+def _places_by_widths(num_boundaries: int) -> tuple[tuple[float, ...], ...]:
+    """X of each boundary from the middle of the ego lane by the width of each lane: (L-1) × L."""
+    lanes, ego = range(num_boundaries - 1), num_boundaries // 2 - 1
+    middle = [0.5 * ((lane < ego) + (lane <= ego)) for lane in lanes]
+    return tuple(tuple((lane < k) - middle[lane] for k in range(num_boundaries)) for lane in lanes)
 
 
 def look(params: Tensor, seen: Observations, phase: Tensor | None = None) -> Sight:
@@ -158,12 +168,12 @@ def look(params: Tensor, seen: Observations, phase: Tensor | None = None) -> Sig
         seen: what was observed.
         phase: likewise.
     """
-    rotation = road_from_cam(*params[:, :HEIGHT].unbind(-1))
+    rotation, by_roll = road_from_cam_and_roll(params[:, :HEIGHT])
     directions = torch.bmm(rotation, seen.rays)
     height = params[:, HEIGHT, None]
     z, valid = _meet_road(directions, height), _before_farthest(directions, height)
     curve = road_curve(z, params[:, NUM_STRAIGHT:], phase)
-    return Sight(rotation, directions, torch.bmm(rotation, seen.cam_from_image), z, valid, curve)
+    return Sight(rotation, by_roll, directions, torch.bmm(rotation, seen.cam_from_image), z, valid, curve)
 
 
 def every_segment(sight: Sight, stride: int) -> Sight:
@@ -212,7 +222,9 @@ def boundary_residuals(
     distance = (normal * sight.directions).sum(1) / size
 
     turning = torch.linalg.cross(normal, foot, dim=1)  # ∂(n·d)/∂angle = n · (-axis × d) = axis · (n × d)
-    by_angles = torch.bmm(_axes(sight.rotation, params[:, ROLL]), turning)
+    # pitch turns about the camera's x, seen in the road's axes, yaw about the rolled y, roll about z
+    axes = torch.cat([sight.rotation[:, :, :1], sight.by_roll[:, :, 1:]], dim=-1).mT
+    by_angles = torch.bmm(axes, turning)
     x, down, ahead = foot.unbind(1)
     up = -down
     by_height, by_offset = x - slope * ahead, up + 0.5 * up * curve.heading.square()
@@ -229,7 +241,7 @@ def boundary_distances(
     phase: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Compute the distances of :func:`boundary_residuals` alone, (B, N, 2) px, and their validity (B, N)."""
-    rotation = road_from_cam(*params[:, :HEIGHT].unbind(-1))
+    rotation, _ = road_from_cam_and_roll(params[:, :HEIGHT])
     directions, height = torch.bmm(rotation, seen.rays), params[:, HEIGHT, None]
     valid = _before_farthest(directions, height)
     z = _meet_road(torch.bmm(rotation, feet), height)
@@ -286,14 +298,6 @@ def sampson_distances(params: Tensor, places: Tensor, sight: Sight) -> Tensor:
 def _of_valid(distance: Tensor, valid: Tensor) -> Tensor:
     """(…, B, M) distances to (…, B, N, 2), zero where not valid."""
     return torch.where(valid.unsqueeze(-1), distance.unflatten(-1, (-1, 2)), 0.0)
-
-
-def _axes(rotation: Tensor, roll: Tensor) -> Tensor:
-    """Axes, in the road frame, about which pitch, yaw and roll turn a direction backwards; (B, 3, 3) rows."""
-    zero, one = torch.zeros_like(roll), torch.ones_like(roll)
-    entries = [*rotation[:, :, 0].unbind(-1), roll.sin(), roll.cos(), zero, zero, zero, one]
-    axes: Tensor = torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
-    return axes
 
 
 def _pixel_gradient(normal: Tensor, by_pixel: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,10 +6,13 @@ every jump, each frame is also fitted alone, without the filter's state.
 
 from __future__ import annotations
 
+from functools import partial
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-from lanebev.batch import flag, may_skip, select_rows
+from lanebev.batch import flag, replace_rows, select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.evidence import CALL
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, layout
@@ -31,6 +34,20 @@ _FAR = 25.7  # χ² of pose and offset, five degrees of freedom, exceeded by cha
 _FEW = 0.5  # share of the segments that fit, below which the state is in doubt
 
 
+class Compared(NamedTuple):
+    """A state, compared with what its last frame says by itself.
+
+    Attributes:
+        state: after the frame, or begun from it.
+        inliers: (B, N), of the state.
+        apart: (B, 4), difference of the pose from that of a frame that contradicts the state, else 0.
+    """
+
+    state: JointState
+    inliers: Tensor
+    apart: Tensor
+
+
 def restart(
     state: JointState,
     agreed: Tensor,
@@ -38,10 +55,11 @@ def restart(
     seen: Observations,
     positions: Tensor,
     cfg: JointConfig,
-) -> tuple[JointState, Tensor, Tensor]:
+) -> Compared:
     """Start rows from this frame alone if it determines the pose, and if no state, or a worse one, is there.
 
-    A state that a second frame contradicts is COASTING until enough of them did.
+    A state that a second frame contradicts is COASTING until enough of them did. Only rows without a state,
+    or with one in doubt, are compared with the frame.
 
     Args:
         state: after the frame.
@@ -50,26 +68,44 @@ def restart(
         seen: what was observed.
         positions: (B, L) m, of the boundaries from the ego lane's middle.
         cfg: the numbers.
-
-    Returns:
-        the state; the inliers; and the difference (B, 4), or (1, 4), of the pose from that of a frame that
-        contradicts it, else 0.
     """
-    total = seen.weight.sum(-1).clamp(min=1e-6)
-    state = state._replace(doubt=remaining_doubt(state, (agreed * seen.weight).sum(-1) / total, cfg))
-    there = (seen.weight > 0).any(-1)
-    wanted = (~is_running(state.status) | (~supported & (state.misfit > cfg.restart_after))) & there
-    asked = wanted | (is_running(state.status) & there & (state.doubt > 0))
-    if may_skip(asked):
-        kept = state._replace(contrary=torch.zeros_like(state.contrary))
-        return kept, agreed, state.mean.new_zeros(1, NUM_POSE)
+    total = seen.weight.sum(-1)
+    share = (agreed * seen.weight).sum(-1) / total.clamp(min=1e-6)
+    state = state._replace(doubt=remaining_doubt(state, share, cfg))
+    running = is_running(state.status)
+    wanted = ~running | (~supported & (state.misfit > cfg.restart_after))
+    asked = (wanted | (state.doubt > 0)) & (total > 0)
+    unasked = state._replace(contrary=torch.zeros_like(state.contrary))
+    kept = Compared(unasked, agreed, torch.zeros_like(state.mean[:, POSE]))
+    compare = partial(compare_with_frame, cfg=cfg)
+    return replace_rows(asked, kept, compare, state, agreed, wanted, seen, positions)
+
+
+def compare_with_frame(
+    state: JointState,
+    agreed: Tensor,
+    wanted: Tensor,
+    seen: Observations,
+    positions: Tensor,
+    cfg: JointConfig,
+) -> Compared:
+    """Fit the frame by itself and compare the state with it, or begin it anew.
+
+    Args:
+        state: after the frame.
+        agreed: (B, N), inliers.
+        wanted: (B,) bool, to begin anew from any usable frame.
+        seen: what was observed.
+        positions: (B, L) m, of the boundaries from the ego lane's middle.
+        cfg: the numbers.
+    """
     places = positions.gather(1, seen.boundary)
     fit = fit_observations(seen, places, cfg.prior, iterations=cfg.start_iterations)
-    share = (fit.inliers * seen.weight).sum(-1) / total
-    usable = fit.valid & (share >= cfg.enter_share)
+    total = seen.weight.sum(-1).clamp(min=1e-6)
+    usable = fit.valid & ((fit.inliers * seen.weight).sum(-1) / total >= cfg.enter_share)
     begun = state_of_fit(fit, state, cfg)
-    contrary = asked & usable & is_contrary(state, begun, fit, places, seen, cfg)
-    count = torch.where(usable | ~asked, (state.contrary + 1) * contrary, state.contrary)
+    contrary = usable & is_contrary(state, begun, fit, places, seen, cfg)
+    count = torch.where(usable, (state.contrary + 1) * contrary, state.contrary)
     fresh = usable & (wanted | (count >= cfg.contrary_frames))
     doubted = contrary & ~fresh
     kept = state._replace(
@@ -78,7 +114,8 @@ def restart(
         reasons=state.reasons | flag(doubted & (count > 1), Reason.FEW_INLIERS),
     )
     apart = torch.where(doubted.unsqueeze(-1), (begun.mean - state.mean)[:, POSE], 0.0)
-    return select_rows(fresh, begun, kept), torch.where(fresh.unsqueeze(-1), fit.inliers, agreed), apart
+    inliers = torch.where(fresh.unsqueeze(-1), fit.inliers, agreed)
+    return Compared(select_rows(fresh, begun, kept), inliers, apart)
 
 
 def remaining_doubt(state: JointState, share: Tensor, cfg: JointConfig) -> Tensor:

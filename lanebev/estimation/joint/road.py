@@ -20,12 +20,21 @@ from lanebev.estimation.joint.layout import SHAPE, Layout
 from lanebev.estimation.joint.measurement import CURVATURE
 from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS
 from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
+from lanebev.tensors import constant
 
 CLEAR_BEND = (20.0, 40.0)  # chi-square of the five steps of curvature between which they come to tell speed
 ENTRY = KNOT_SPACING / 3  # m, way over which a step comes into view
 _SLOPE = 0.5 * (np.eye(1 + NUM_STEPS) + np.eye(1 + NUM_STEPS, k=1))  # at a knot, by the steps about it
 _SLOPE[0] = np.eye(1 + NUM_STEPS)[1]
 _CHANGE = np.diff(_SLOPE, axis=0, prepend=0.0) / KNOT_SPACING  # of the shape parameters by a metre, 1/m
+_CHANGE_BY_SHAPE = tuple(map(tuple, _CHANGE.T.tolist()))
+_ORDER = range(1 + NUM_STEPS)
+_KNOTS = tuple(KNOT_SPACING * knot for knot in _ORDER)  # m, from the first
+_BEHIND = tuple(KNOT_SPACING * (NUM_STEPS - 1 - step) for step in range(NUM_STEPS))  # m
+_PASSED = (  # row 0 takes up the steps up to the last knot passed, the others are moved by the knots passed
+    tuple(tuple(k - i if i == 0 or k > 0 else math.inf for k in _ORDER) for i in _ORDER),
+    tuple(tuple(k - i if i > 0 else math.inf for k in _ORDER) for i in _ORDER),
+)
 
 
 def propagate_road_shape(
@@ -68,11 +77,10 @@ def _renumbering(passed: Tensor) -> Tensor:
 
     Row and column 0 are the curvature at the first knot: it takes up the steps up to the last knot passed.
     """
-    order = torch.arange(1 + NUM_STEPS, dtype=passed.dtype, device=passed.device)
+    least, most = constant(_PASSED, like=passed)  # knots, between which an entry is one
     passed = passed[:, None, None]
-    steps = order[:, None] + passed == order  # (B, NUM_SHAPE, NUM_SHAPE), right below row 0
-    taken = (order <= passed) & (order[:, None] == 0)
-    return torch.where(order[:, None] == 0, taken, steps & (order > 0)).to(passed.dtype)
+    transition: Tensor = ((passed >= least) & (passed <= most)).to(passed.dtype)
+    return transition
 
 
 def turn_along(shape: Tensor, phase: Tensor, way: Tensor) -> Tensor:
@@ -94,7 +102,7 @@ def turn_along(shape: Tensor, phase: Tensor, way: Tensor) -> Tensor:
     to_knots = (0.5 * KNOT_SPACING * (bend[:, 1:] + bend[:, :-1])).cumsum(-1)
     to_here = 0.5 * behind * (bend[:, :1] + here)
     heading = (pad(to_knots, (1, 0)) - to_here).atan()
-    places = KNOT_SPACING * torch.arange(1 + NUM_STEPS, dtype=shape.dtype, device=shape.device)
+    places = constant(_KNOTS, like=shape)
     after = heading - here * torch.minimum(way.unsqueeze(-1), (places - behind).clamp(min=0.0))
     bend = bend * (heading.cos() / after.cos().clamp(min=0.6)) ** 3
     return torch.cat([bend[:, :1], bend.diff(dim=-1)], dim=-1)
@@ -153,7 +161,7 @@ def _change_per_metre(shape: Tensor, cov: Tensor) -> Tensor:
     filter would estimate from it that the vehicle stands still. So the change is faded in between the two
     values of χ² in ``CLEAR_BEND``.
     """
-    change = shape @ torch.as_tensor(_CHANGE).to(shape).mT
+    change = shape @ constant(_CHANGE_BY_SHAPE, like=shape)
     steps, spread = shape[:, 1:], cov[:, 1:, 1:]
     size = spread.diagonal(dim1=1, dim2=2).rsqrt()  # (B, NUM_STEPS)
     factor = cholesky(size.unsqueeze(-1) * spread * size.unsqueeze(-2))
@@ -169,7 +177,8 @@ def _share_in_view(phase: Tensor, gone: Tensor, passed: Tensor) -> Tensor:
     The farthest step comes in over ``ENTRY`` metres and not when a knot is passed, so that rounding does not
     decide in which of two frames its noise is added.
     """
-    behind = torch.arange(NUM_STEPS - 1, -1, -1, dtype=gone.dtype, device=gone.device) * KNOT_SPACING
-    since = behind - KNOT_SPACING * passed.unsqueeze(-1)  # m, less the way, since a step came into view
+    since = constant(_BEHIND, like=gone) - KNOT_SPACING * passed.unsqueeze(
+        -1
+    )  # m, less the way, since a step came into view
     after, before = gone.unsqueeze(-1) + since, phase.unsqueeze(-1) + since
     return (after.clamp(0.0, ENTRY) - before.clamp(0.0, ENTRY)) / ENTRY

@@ -29,9 +29,10 @@ from lanebev.estimation.joint.measurement import (
 from lanebev.estimation.joint.robust import anneal_scale, inlier_weights, log_likelihood, noise_scale
 from lanebev.geometry.linalg import inverse_spd, solve_spd
 from lanebev.geometry.precision import full_precision
-from lanebev.geometry.rotation import angles_from_matrix, road_from_cam
+from lanebev.geometry.rotation import pitch_yaw_roll, road_from_cam_and_roll
 from lanebev.observation.segments import LaneSegments
-from lanebev.types import NUM_BOUNDARIES, Extrinsics
+from lanebev.tensors import constant
+from lanebev.types import NUM_BOUNDARIES, Extrinsics, map_tensors
 
 _ANNEALING = (0.1, 0.06, 0.035, 0.02, 0.02)  # scales of the linear fits, of the focal length
 _BODY_STD = (0.003, 0.015, 0.008, 0.03)  # rad, rad, rad, m of a frame's pose about the mount
@@ -91,13 +92,13 @@ class FramePrior:
 
     def mean(self, like: Tensor) -> Tensor:
         """Return the means (7,), in the order of ``measurement``."""
-        return like.new_tensor([self.pitch, self.yaw, self.roll, self.height, 0.0, 0.0, 0.0])
+        return constant((self.pitch, self.yaw, self.roll, self.height, 0.0, 0.0, 0.0), like=like)
 
     def std(self, like: Tensor) -> Tensor:
         """(7,) in the order of ``joint_model``."""
         angles = (self.pitch_std, self.yaw_std, self.roll_std)
         shape = (self.curvature_std, self.curvature_rate_std)
-        return like.new_tensor([*angles, self.height_std, self.offset_std, *shape])
+        return constant((*angles, self.height_std, self.offset_std, *shape), like=like)
 
 
 def prior_of_mount(pose: Sequence[float], std: Sequence[float]) -> FramePrior:
@@ -211,11 +212,11 @@ def fit_observations(
     seen: Observations, places: Tensor, prior: FramePrior, start_segments: int = 96, iterations: int = 8
 ) -> SingleFrameFit:
     """As :func:`fit_single_frame`, of segments made ready and places (B, N) of their boundaries, m."""
-    with torch.no_grad():
-        fewer, fewer_places = spread_subset(seen, places, start_segments)
-        starts = linear_starts(fewer, fewer_places, prior)  # (B, S, 7)
-        params, scale = _best_start(starts, fewer, fewer_places, prior, iterations)
-        params, scale, _ = refine(params, scale, places, seen, prior, iterations=3)
+    fixed, fixed_places = map_tensors(Tensor.detach, seen), places.detach()
+    fewer, fewer_places = spread_subset(fixed, fixed_places, start_segments)
+    starts = linear_starts(fewer, fewer_places, prior)  # (B, S, 7)
+    params, scale = _best_start(starts, fewer, fewer_places, prior, iterations)
+    params, scale, _ = refine(params, scale, fixed_places, fixed, prior, iterations=3)
     params, scale, information = refine(params, scale, places, seen, prior, iterations=2)
 
     residuals = boundary_residuals(params, places, seen)
@@ -343,7 +344,8 @@ def linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Tens
     pitch = prior.pitch + prior.pitch_range * _spread(prior.pitch_steps, like)
     roll = prior.roll + prior.roll_range * _spread(prior.roll_steps, like)
     pitch, roll = (grid.flatten() for grid in torch.meshgrid(pitch, roll, indexing="ij"))  # (H,)
-    axes = road_from_cam(pitch, torch.zeros_like(pitch), roll)  # (H, 3, 3) rows right, down, forward
+    angles = torch.stack([pitch, torch.zeros_like(pitch), roll], dim=-1)
+    axes, _ = road_from_cam_and_roll(angles)  # (H, 3, 3) rows right, down, forward
     right, below, ahead = torch.einsum("hij,bjm->ibhm", axes, seen.rays).unbind(0)  # each (B, H, M)
     valid = (below > 0.005) & (ahead > 0.1)
     below = torch.where(valid, below, 1.0)
@@ -352,10 +354,10 @@ def linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Tens
     weight = seen.weight.repeat_interleave(2, dim=1).unsqueeze(1) * valid
     regressors = torch.stack([below, place * below, ahead, bend], dim=-1)  # (B, H, M, 4)
 
-    mean = like.new_tensor([0.0, 1.0 / prior.height, 0.0, 0.0])
+    mean = constant((0.0, 1.0 / prior.height, 0.0, 0.0), like=like)
     slack = prior.height_std / prior.height / prior.height
     lateral, bent = prior.offset_std / prior.height, prior.curvature_std * prior.height
-    std = like.new_tensor([lateral, slack, prior.yaw_std, bent])
+    std = constant((lateral, slack, prior.yaw_std, bent), like=like)
     precision = (std / 0.02).square().reciprocal()
     solution = mean.expand(*right.shape[:2], 4)
     for scale in _ANNEALING:
@@ -388,9 +390,8 @@ def _params_from_linear(solution: Tensor, axes: Tensor) -> Tensor:
     turned = torch.stack([cos * right - sin * ahead, below, cos * ahead + sin * right], dim=-2)
     scale = per_metre.clamp(min=0.2).reciprocal()
     height = (scale * cos.squeeze(-1)).clamp(0.4, 4.0)
-    angles = torch.stack(angles_from_matrix(turned), dim=-1)
     rest = torch.stack([height, across * scale, bend / height, torch.zeros_like(height)], dim=-1)
-    return torch.cat([angles, rest], dim=-1)
+    return torch.cat([pitch_yaw_roll(turned), rest], dim=-1)
 
 
 def _best_start(

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint.dynamics import MotionConfig, pose_covariance
-from lanebev.estimation.joint.layout import NUM_POSE, POSE, SHAPE, STEPS, layout
+from lanebev.estimation.joint.dynamics import MotionConfig, pose_variances
+from lanebev.estimation.joint.layout import NUM_POSE, NUM_SHAPE, STEPS, layout
 from lanebev.estimation.joint.measurement import CURVATURE, NUM_PARAMS, NUM_STRAIGHT
 from lanebev.estimation.joint.readings import ReadingConfig
 from lanebev.estimation.joint.road import straight_or_bend
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
 from lanebev.estimation.joint.single_frame import FramePrior
 from lanebev.estimation.reasons import Reason
+from lanebev.tensors import constant
 from lanebev.types import NUM_BOUNDARIES, map_tensors, register_pytree
 
 _OFFSET_RATE_STD = 0.5  # m/s, of a start
@@ -148,25 +150,40 @@ def state_from_fit(params: Tensor, param_cov: Tensor, cfg: JointConfig) -> tuple
     Returns:
         mean (B, D) and covariance (B, D, D).
     """
-    place, motion = layout(cfg.num_boundaries), cfg.motion
-    straight, bend = params.new_tensor(cfg.straight), cfg.prior.std(params)[CURVATURE:]
+    motion = cfg.motion
+    straight, bend = constant(cfg.straight, like=params), cfg.prior.std(params)[CURVATURE:]
     params, param_cov = straight_or_bend(params, param_cov, straight, bend, cfg.bends)
-    copies = params.new_zeros(place.size, NUM_PARAMS)  # state entries as functions of the parameters
-    copies[:NUM_STRAIGHT, :NUM_STRAIGHT] = torch.eye(NUM_STRAIGHT)
-    copies[CURVATURE, CURVATURE] = 1.0
-    copies[STEPS, CURVATURE + 1] = KNOT_SPACING
-    copies[place.means, POSE] = torch.eye(NUM_POSE)
-    swing = params.new_tensor([motion.angle_std] * 3 + [motion.height_std]).square()
-    derivatives = pose_covariance(motion.bandwidth, params).diagonal()
-    own = params.new_zeros(place.size)
-    own[SHAPE] = motion.curvature_step**2
-    own[place.deviations] = motion.deviation_walk**2
-    own[place.rates] = torch.cat([swing * derivatives[1], params.new_tensor([_OFFSET_RATE_STD**2])])
-    own[place.accelerations] = swing * derivatives[2]
-    own[place.jerks] = swing * derivatives[3]
-    own[place.means] = swing
-    own[place.speed] = motion.speed_std**2
+    copies = constant(_by_parameters(cfg.num_boundaries), like=params)
+    own = constant(_start_variances(cfg.num_boundaries, motion), like=params)
     return params @ copies.mT, copies @ param_cov @ copies.mT + own.diag()
+
+
+@lru_cache(maxsize=16)
+def _by_parameters(num_boundaries: int) -> tuple[tuple[float, ...], ...]:
+    """The state's entries by the parameters of one frame, D × 7; the slow mean begins at the pose."""
+    place = layout(num_boundaries)
+    factors = {(k, k): 1.0 for k in (*range(NUM_STRAIGHT), CURVATURE)}
+    factors |= {(step, CURVATURE + 1): KNOT_SPACING for step in range(STEPS.start, STEPS.stop)}
+    factors |= {(place.means.start + axis, axis): 1.0 for axis in range(NUM_POSE)}
+    return tuple(tuple(factors.get((k, p), 0.0) for p in range(NUM_PARAMS)) for k in range(place.size))
+
+
+@lru_cache(maxsize=16)
+def _start_variances(num_boundaries: int, motion: MotionConfig) -> tuple[float, ...]:
+    """Variances (D,) of a start beside those of the frame's fit."""
+    swing = (*[motion.angle_std**2] * 3, motion.height_std**2)
+    _, rate, acceleration, jerk = pose_variances(motion.bandwidth)
+    return (
+        *[0.0] * NUM_STRAIGHT,
+        *[motion.curvature_step**2] * NUM_SHAPE,
+        *[motion.deviation_walk**2] * num_boundaries,
+        *(rate * variance for variance in swing),
+        _OFFSET_RATE_STD**2,
+        *(acceleration * variance for variance in swing),
+        *(jerk * variance for variance in swing),
+        *swing,
+        motion.speed_std**2,
+    )
 
 
 def unobserved_mask(reasons: Tensor) -> Tensor:

@@ -8,13 +8,15 @@ from torch import Tensor
 from lanebev.batch import flags, select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.evidence import EQUAL
-from lanebev.estimation.joint.layout import NUM_POSE, POSE, layout
+from lanebev.estimation.joint.layout import POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL, Observations
 from lanebev.estimation.joint.state import JointConfig, JointState, unobserved_mask
 from lanebev.estimation.joint.update import UNSEEN
 from lanebev.estimation.reasons import Reason
+from lanebev.tensors import constant
 from lanebev.types import Calibration, Extrinsics, Status
 
+_ONLY_HEIGHT = (0.0, 0.0, 0.0, 1.0)
 _DOUBTFUL = 0.6  # m out of place, below which a single boundary may stand for several
 
 
@@ -52,7 +54,7 @@ def update_track_status(
     misfit = torch.where(supported, 0.0, predicted.misfit + torch.where(empty, 0.0, step))
     coasting = torch.where(unseen > cfg.lost_after, int(Status.LOST), int(Status.COASTING))
     idle = torch.where(running, coasting, predicted.status)
-    blind = ~supported.unsqueeze(-1) | (single_frame_std[:, POSE] > single_frame_std.new_tensor(UNSEEN))
+    blind = ~supported.unsqueeze(-1) | (single_frame_std[:, POSE] > constant(UNSEEN, like=single_frame_std))
     conditions = {
         Reason.NO_SEGMENTS: empty,
         Reason.FEW_INLIERS: ~(empty | supported),
@@ -111,7 +113,7 @@ def as_calibration(
     Args:
         state: (B, ...).
         inliers: (B, N).
-        apart: (B, 4) or (1, 4), pose of a frame that contradicts the state, less the state's; else 0.
+        apart: (B, 4), pose of a frame that contradicts the state, less the state's; else 0.
         positions: (B, L) m, of the boundaries from the ego lane's middle.
         cfg: the numbers.
     """
@@ -125,7 +127,7 @@ def as_calibration(
     own = layout(cfg.num_boundaries).deviations
     variances = state.cov.diagonal(dim1=1, dim2=2)[:, own]
     by_lanes = single_deviation(state.mean[:, own], variances, cfg)[:, None, None] * state.pose_sensitivity
-    only_height = torch.arange(NUM_POSE, device=cov.device) == HEIGHT
-    cov = cov + by_lanes @ by_lanes.mT + apart.unsqueeze(-1) * apart.unsqueeze(-2)
-    cov = cov + (only_height * more.unsqueeze(-1)).diag_embed()
+    only_height = constant(_ONLY_HEIGHT, like=cov)
+    added = torch.cat([by_lanes, apart.unsqueeze(-1)], dim=-1)
+    cov = torch.baddbmm(cov, added, added.mT) + (only_height * more.unsqueeze(-1)).diag_embed()
     return Calibration(Extrinsics.unstack(state.mean[:, POSE]), cov, state.status, inliers)

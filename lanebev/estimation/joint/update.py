@@ -18,6 +18,7 @@ from lanebev.estimation.joint.measurement import (
 from lanebev.estimation.joint.robust import anneal_scale, inlier_weights, noise_scale
 from lanebev.estimation.kalman import symmetrise
 from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
+from lanebev.tensors import constant
 
 UNSEEN = (0.01, 0.01, 0.01, 0.3)
 """Standard deviations (rad, m) of the pose from one frame alone, above which it is not determined."""
@@ -59,25 +60,44 @@ class Posterior(NamedTuple):
     gain: Tensor
 
 
+def membership(boundary: Tensor, num_boundaries: int, like: Tensor) -> Tensor:
+    """Tell which end points are on which boundary, (B, L, M) of 1 and 0, for boundaries (B, N)."""
+    numbers = torch.arange(num_boundaries, device=boundary.device).unsqueeze(-1)
+    return (boundary.repeat_interleave(2, dim=1).unsqueeze(1) == numbers).to(like.dtype)
+
+
+def observed_jacobian(jacobian: Tensor, member: Tensor) -> Tensor:
+    """Extend a Jacobian by the deviations, each of which moves its own end points as the offset does.
+
+    Args:
+        jacobian: (B, 11, M) of the distances by the common entries.
+        member: (B, L, M) of :func:`membership`.
+
+    Returns:
+        (B, O, M).
+    """
+    return torch.cat([jacobian, member * jacobian[:, OFFSET : OFFSET + 1]], dim=1)
+
+
 def frame_information(
-    residuals: Residuals, scale: Tensor, doubt: Tensor, member: Tensor, seen: Observations
+    residuals: Residuals, jacobian: Tensor, scale: Tensor, doubt: Tensor, seen: Observations
 ) -> FrameInformation:
     """Weigh a frame's linearised measurements and sum them up.
 
     Args:
         residuals: at the point of linearisation.
+        jacobian: (B, O, M) of :func:`observed_jacobian`.
         scale: (B,) noise scale so far; it is lowered.
         doubt: (B, O, O), covariance of the point of linearisation. A residual within it is not an outlier.
-        member: (B, M, L), one-hot boundary of each end point.
         seen: what was observed.
     """
-    unsure = _predicted_variance(residuals.jacobian, doubt, seen.boundary)
+    unsure = _predicted_variance(jacobian[:, :NUM_COMMON], doubt, seen.boundary)
     gate = (seen.sigma.square() + unsure / scale.square().unsqueeze(-1)).sqrt()
     trust = inlier_weights(residuals.distance, residuals.valid, gate, scale, seen.focal)
     used = trust * seen.weight
     scale = anneal_scale(scale, noise_scale(residuals.distance, seen.sigma, used))
     weight = used / (seen.sigma * scale.unsqueeze(-1)).square()
-    return FrameInformation(*_normal_equations(residuals, weight, member), trust, scale, residuals)
+    return FrameInformation(*_normal_equations(jacobian, residuals.distance, weight), trust, scale, residuals)
 
 
 def update(
@@ -161,7 +181,7 @@ def single_frame(matrix: Tensor) -> tuple[Tensor, Tensor]:
         (B, 5) standard deviations of pose and offset, and (B, 4, L) change of the pose by a metre that a
         boundary is out of place.
     """
-    prior = matrix.new_tensor(_WIDE_PRIOR).square().reciprocal().diag()
+    prior = constant(tuple(sigma**-2 for sigma in _WIDE_PRIOR), like=matrix).diag()
     cov = inverse_spd(matrix[:, :NUM_STRAIGHT, :NUM_STRAIGHT] + prior)
     sensitivity = torch.bmm(cov[:, :NUM_POSE], matrix[:, :NUM_STRAIGHT, NUM_COMMON:])
     return cov.diagonal(dim1=1, dim2=2).sqrt(), sensitivity
@@ -169,7 +189,7 @@ def single_frame(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 def estimated_entries(single_frame_std: Tensor, place: Layout) -> Tensor:
     """(B, D): 0 for roll, its derivatives and slow mean where a frame does not determine roll, else 1."""
-    about_roll = single_frame_std.new_tensor([float(i in place.chain(ROLL)) for i in range(place.size)])
+    about_roll = constant(tuple(float(i in place.chain(ROLL)) for i in range(place.size)), single_frame_std)
     return 1.0 - (single_frame_std[:, ROLL, None] > UNSEEN[ROLL]) * about_roll
 
 
@@ -181,35 +201,34 @@ def boundary_deviation(mean: Tensor, frame: FrameInformation) -> Tensor:
     return torch.where(known > _NO_INFORMATION, moved, 0.0)
 
 
-def agreement(frame: FrameInformation, moved: Tensor, seen: Observations) -> Tensor:
+def agreement(frame: FrameInformation, jacobian: Tensor, moved: Tensor, seen: Observations) -> Tensor:
     """Compute each segment's inlier probability (B, N) by its own noise, at a state near the linearisation.
 
     The update's weights allow for the uncertainty of the prediction; these do not.
 
     Args:
         frame: linearised nearby.
+        jacobian: (B, O, M) of :func:`observed_jacobian`.
         moved: (B, O), the state less that at which the frame was linearised.
         seen: what was observed.
     """
-    common, own = moved[:, :NUM_COMMON], moved[:, NUM_COMMON:]
-    jacobian = frame.residuals.jacobian
-    change = torch.bmm(common.unsqueeze(1), jacobian).unflatten(-1, (-1, 2)).squeeze(1)
-    by_own = jacobian[:, OFFSET].unflatten(-1, (-1, 2)) * own.gather(1, seen.boundary).unsqueeze(-1)
-    distance = frame.residuals.distance + change + by_own
-    focal = seen.focal
-    return inlier_weights(distance, frame.residuals.valid, seen.sigma, frame.scale, focal)
+    change = torch.bmm(moved.unsqueeze(1), jacobian).view_as(frame.residuals.distance)
+    distance = frame.residuals.distance + change
+    return inlier_weights(distance, frame.residuals.valid, seen.sigma, frame.scale, seen.focal)
 
 
-def _normal_equations(at: Residuals, weight: Tensor, member: Tensor) -> tuple[Tensor, Tensor]:
-    """Λ (B, O, O) and Hᵀ Q⁻¹ y (B, O); a boundary's deviation moves its end points as the offset does.
+def _normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Λ (B, O, O) and Hᵀ Q⁻¹ y (B, O), for (B, O, M), (B, N, 2) and (B, N).
 
-    Source: (J8).
+    Source: (J8). No end point has two deviations, and its own moves it as the offset does: their block of Λ
+    is diagonal, and the offset's row holds it.
     """
-    by_deviation = member.mT * at.jacobian[:, OFFSET : OFFSET + 1]  # (B, L, M)
-    jacobian = torch.cat([at.jacobian, by_deviation], dim=1)
-    weighted = jacobian * weight.repeat_interleave(2, dim=1).unsqueeze(1)
-    against = torch.bmm(weighted, at.distance.flatten(1).unsqueeze(-1)).squeeze(-1)
-    return torch.bmm(weighted, jacobian.mT), -against
+    weight = weight.repeat_interleave(2, dim=1)  # (B, M)
+    common = torch.bmm(jacobian[:, :NUM_COMMON] * weight.unsqueeze(1), jacobian.mT)  # (B, 11, O)
+    shared = common[:, :, NUM_COMMON:]
+    own = torch.cat([shared.mT, shared[:, OFFSET].diag_embed()], dim=-1)
+    against = torch.bmm(jacobian, (weight * distance.flatten(1)).unsqueeze(-1)).squeeze(-1)
+    return torch.cat([common, own], dim=1), -against
 
 
 def _predicted_variance(jacobian: Tensor, cov: Tensor, boundary: Tensor) -> Tensor:
