@@ -43,8 +43,8 @@ def may_skip(wanted: Tensor) -> bool:
 def replace_rows(rows: Tensor, values: T, function: Callable[..., T], *operands: Any) -> T:
     """Replace some rows of ``values`` by a costly function's result, which is computed for these rows only.
 
-    The device is asked how many rows there are. A compiled program has both ways (``torch.cond``): it
-    computes the function for all rows where there is any, else not at all. An exported one always does.
+    The device is asked how many rows there are. A compiled or exported program has both ways
+    (``torch.cond``): it computes the function for all rows where there is any, else not at all.
 
     Args:
         rows: (B,) bool.
@@ -52,8 +52,6 @@ def replace_rows(rows: Tensor, values: T, function: Callable[..., T], *operands:
         function: of the operands, to what ``values`` is; each row's result depends on that row alone.
         operands: (B, ...) tensors, or NamedTuples of such.
     """
-    if torch.compiler.is_exporting():
-        return select_rows(rows, function(*operands), values)
     if torch.compiler.is_compiling():
         return _replace_rows_in_program(rows, values, function, operands)
     index = rows.nonzero().squeeze(-1)

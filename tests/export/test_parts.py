@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from onnx import load as load_onnx
 
 from lanebev import (
     BEVGrid,
@@ -14,9 +15,11 @@ from lanebev import (
     Status,
     TwoStageCalibrator,
 )
-from lanebev.export.parts import calibrator_part, make_part
+from lanebev.batch import replace_rows
+from lanebev.export.parts import Part, calibrator_part, make_part
 from lanebev.export.runtime import OnnxCalibrator, OnnxPart
 from lanebev.export.write import export_program, write_onnx
+from lanebev.tensors import constant
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes, no_lanes, stack_rows
 
@@ -92,6 +95,21 @@ def test_a_row_that_is_reset_begins_anew():
     for fresh, kept, value in zip(calibrator.initial_state(1, torch.float64), after, begun, strict=True):
         assert torch.equal(value[:1], fresh)
         assert torch.equal(value[1:], kept)
+
+
+@pytest.mark.slow
+def test_rows_that_ask_are_computed_anew_in_an_if(tmp_path):
+    class Module(torch.nn.Module):
+        def forward(self, asks, value):
+            return (replace_rows(asks, value, lambda part: part * constant((2.0, 3.0), like=part), value),)
+
+    value = torch.tensor([[4.0, 2.0], [-1.0, 1.0], [9.0, 1.0]], dtype=torch.float64)
+    part = onnx(Part(Module(), {"asks": value[:2, 0] > 0, "value": value[:2]}, ("out",)), tmp_path)
+    kinds = {node.op_type for node in load_onnx(tmp_path / "part.onnx").graph.node}
+    assert "If" in kinds
+    assert not {"Mul", "Where"} & kinds  # they are in its branch
+    assert part({"asks": value[:, 0] > 5, "value": value})["out"].tolist() == [[4, 2], [-1, 1], [18, 3]]
+    assert torch.equal(part({"asks": value[:, 0] > 10, "value": value})["out"], value)
 
 
 def test_names_and_facts():
