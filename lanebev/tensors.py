@@ -56,4 +56,4 @@ def _computed_constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: tor
 @lru_cache(maxsize=256)
 def _constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     with torch.inference_mode(mode=False):  # one that is made in it could not be used for gradients
-        return torch.tensor(numbers, dtype=dtype, device=device)
+        return torch.tensor(numbers, dtype=dtype).to(device)

@@ -102,7 +102,7 @@ class Calibrator(nn.Module, Generic[StateT]):
         segments, intrinsics, widths = mask_invalid_rows(
             padded(segments), intrinsics, widths, self.num_boundaries
         )
-        with autocast_off(like.device):
+        with autocast_off(like.device, like.dtype):
             calibration, state = self.step(
                 segments, intrinsics, cast_floating(state, like.dtype), as_batch(dt, like), widths
             )

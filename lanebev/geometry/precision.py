@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from functools import reduce, wraps
 from typing import ParamSpec, TypeVar, cast
 
@@ -38,20 +39,27 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _is_precise(tensors: list[Tensor]) -> bool:
-    """Tell whether there is nothing to raise: one dtype of full precision, and no autocast.
+    """Tell whether there is nothing to raise: one dtype of full precision, and no autocast of it.
 
-    A compiled or exported program may be called under autocast later, and is never sure.
+    Autocast leaves double precision as it is. A compiled or exported program may be called under autocast
+    later, so single precision in it is never sure.
     """
-    if torch.compiler.is_compiling() or len({tensor.dtype for tensor in tensors}) != 1:
+    dtypes = {tensor.dtype for tensor in tensors}
+    if dtypes == {torch.float64}:
+        return True
+    if torch.compiler.is_compiling() or dtypes != {torch.float32}:
         return False
-    dtype, device = tensors[0].dtype, tensors[0].device.type
-    autocast = torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
-    return dtype in (torch.float32, torch.float64) and not autocast
+    device = tensors[0].device.type
+    return not (torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device))
 
 
-def autocast_off(device: torch.device) -> torch.autocast:
-    """Return a context in which operations on ``device`` keep the dtype of their arguments."""
-    return torch.autocast(device.type, enabled=False)
+def autocast_off(device: torch.device, dtype: torch.dtype = torch.float32) -> AbstractContextManager[object]:
+    """Return a context in which operations on ``device`` keep the dtype of their arguments, ``dtype``.
+
+    Autocast leaves double precision as it is, so an exported program needs no region for it (one with a
+    ``torch.cond`` inside could not be saved, torch 2.13).
+    """
+    return nullcontext() if dtype == torch.float64 else torch.autocast(device.type, enabled=False)
 
 
 def common_dtype(*tensors: Tensor) -> torch.dtype:

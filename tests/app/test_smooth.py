@@ -69,7 +69,19 @@ def data(tmp_path_factory):
 
 def arguments(data, out, *more):
     camera, lanes = str(data / "camera.yaml"), str(data / "lanes.json")
-    return ["run", str(data / "drive.mp4"), "--camera", camera, "--lanes", lanes, "--out", str(out), *more]
+    return [
+        "run",
+        str(data / "drive.mp4"),
+        "--camera",
+        camera,
+        "--lanes",
+        lanes,
+        "--lane-width",
+        "3.7",
+        "--out",
+        str(out),
+        *more,
+    ]
 
 
 def poses(path):

@@ -88,7 +88,7 @@ class JointCalibrator(Calibrator[JointState]):
         cfg = self.config
         like = torch.zeros((), dtype=dtype, device=device)
         params = cfg.prior.mean(like).repeat(batch_size, 1)
-        with autocast_off(like.device):
+        with autocast_off(like.device, like.dtype):
             spread = cfg.prior.std(like).square().diag().repeat(batch_size, 1, 1)
             mean, cov = state_from_fit(params, spread, cfg)
         none = torch.zeros(batch_size, dtype=torch.int64, device=device)
@@ -155,7 +155,7 @@ class JointCalibrator(Calibrator[JointState]):
         segments, intrinsics = cast_floating(segments, like.dtype), cast_floating(intrinsics, like.dtype)
         widths = as_lane_width(lane_width, like, self.num_boundaries)
         segments, intrinsics, widths = mask_invalid_rows(segments, intrinsics, widths, self.num_boundaries)
-        with autocast_off(like.device):
+        with autocast_off(like.device, like.dtype):
             weighed = weigh_readings(calibration, like, segments, intrinsics, widths, self.config)
         return cast_floating(weighed, calibration.covariance.dtype)
 
@@ -164,7 +164,7 @@ class JointCalibrator(Calibrator[JointState]):
         given = calibration.covariance
         like = given.to(widest_dtype(given.device))
         pose = calibration.extrinsics.stack().to(like)
-        with autocast_off(like.device):
+        with autocast_off(like.device, like.dtype):
             tempered = temper_frame(pose, like, self.config.prior, factor)
         begun = is_running(calibration.status)
         pose, covariance = (select_rows(begun, *both) for both in zip(tempered, (pose, like), strict=True))
