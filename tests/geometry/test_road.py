@@ -160,6 +160,15 @@ def test_covariance_is_infinite_where_there_is_no_road():
     assert BEVGrid().bev_from_road_covariance(cov)[0, 0].diagonal().tolist() == [math.inf, math.inf]
 
 
+def test_autocast_leaves_double_precision_as_it_is():
+    """So ``full_precision`` and ``autocast_off`` do nothing for it."""
+    numbers = torch.linspace(0.1, 2.0, 12, dtype=torch.float64).view(3, 4)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = numbers @ numbers.mT, torch.baddbmm(numbers[None], numbers[None, :, :3], numbers[None, :3])
+    expected = numbers @ numbers.mT, torch.baddbmm(numbers[None], numbers[None, :, :3], numbers[None, :3])
+    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
+
+
 def test_points_keep_their_digits_under_autocast_and_in_mixed_dtypes():
     e = Extrinsics(*(v.float() for v in pose(0.02, 0.01, -0.01, 1.5)))
     single = K.float()
