@@ -7,9 +7,11 @@ from torch import Tensor, nn
 
 from lanebev.geometry.precision import full_precision
 from lanebev.observation.boundary_vertices import BoundaryVertices, line_directions, move_to_front
+from lanebev.observation.scans import scan_vertices
 from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.observation.segments import LaneSegments, pair_vertices
-from lanebev.observation.vertices import LineConfig, representative_vertices, scan_vertices
+from lanebev.observation.vertices import LineConfig, representative_vertices
+from lanebev.tensors import constant
 from lanebev.types import check_tensor
 
 NETWORK_CORRELATION = 10.0
@@ -98,11 +100,13 @@ def extract_vertices(
             f"{config.stride}, got {rows} x {columns}; see LineExtractor.for_network"
         )
     found = representative_vertices(scan_vertices(probabilities, config), config)
-    scale = probabilities.new_tensor([image_size[1] / network_size[1], image_size[0] / network_size[0]])
-    points = (config.stride * found.points + 0.5) * scale - 0.5  # network pixel s·j under cell j
+    resized = (image_size[1] / network_size[1], image_size[0] / network_size[0])
+    scale = constant(resized, like=probabilities)
+    offset = constant(tuple(0.5 * side - 0.5 for side in resized), like=probabilities)
+    points = config.stride * scale * found.points + offset  # network pixel s·j under cell j
     weight = torch.where(found.weight >= config.least_weight, found.weight, 0.0)
-    stretch = config.stride * _across_scale(line_directions(points, found.density > 0), scale)
-    sigma = config.sigma_scale * stretch * (found.common_var + found.own_var).sqrt()
+    stretch = _across_scale(line_directions(points, found.density > 0), scale)
+    sigma = (config.sigma_scale * config.stride) * stretch * (found.common_var + found.own_var).sqrt()
     if config.correlation > 0:
         sigma = sigma * _redundancy(points[..., 1], weight > 0, config.correlation).unsqueeze(-1)
     index = torch.arange(boundaries, device=points.device).expand(batch, -1)

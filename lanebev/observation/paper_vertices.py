@@ -13,7 +13,7 @@ def paper_vertices(probabilities: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
     Source: Sec. VI-A, "for each lane boundary whose probability is larger than 0.5, we extract vertices by
     searching through the mean position of on-pixels and then sample representative vertices". The paper
-    states neither rows nor even sampling. :func:`~lanebev.observation.vertices.scan_vertices` is the
+    states neither rows nor even sampling. :func:`~lanebev.observation.scans.scan_vertices` is the
     differentiable rule that :class:`lanebev.LineExtractor` uses.
 
     Args:

@@ -145,18 +145,19 @@ def pair_vertices(vertices: BoundaryVertices) -> LaneSegments:
         segments with N = P·(V // 2), in the pixels of the vertices.
     """
     points, weight, sigma, boundary = vertices
-    batch, lines, most = weight.shape
+    most = weight.shape[-1]
     count = (weight > 0).sum(-1, keepdim=True)  # (B, P, 1)
     half = count // 2
-    first = torch.arange(most // 2, device=points.device).expand(batch, lines, -1)  # (B, P, V // 2)
-    second = (first + count - half).clamp(max=most - 1)
+    first = torch.arange(most // 2, device=points.device)
+    second = (first + count - half).clamp(max=most - 1)  # (B, P, V // 2)
     seen = first < half
-    ends = torch.stack([take(points, first), take(points, second)], dim=-2)  # (B, P, V // 2, 2, 2)
-    smaller = torch.minimum(weight.gather(-1, first), weight.gather(-1, second))
-    variance = 0.5 * (sigma.gather(-1, first).square() + sigma.gather(-1, second).square())
+    ends = torch.stack([points[:, :, : most // 2], take(points, second)], dim=-2)  # (B, P, V // 2, 2, 2)
+    smaller = torch.minimum(weight[..., : most // 2], weight.gather(-1, second))
+    variance = sigma.square()
+    variance = 0.5 * (variance[..., : most // 2] + variance.gather(-1, second))
     return LaneSegments(
         endpoints=torch.where(seen[..., None, None], ends, 0.0).flatten(1, 2),
-        boundary=boundary.unsqueeze(-1).expand_as(first).flatten(1),
+        boundary=boundary.unsqueeze(-1).expand_as(second).flatten(1),
         weight=torch.where(seen, smaller, 0.0).flatten(1),
         sigma=torch.where(seen, variance, 1.0).sqrt().flatten(1),
     )

@@ -3,7 +3,15 @@ import pytest
 import torch
 
 from lanebev.observation.lines import LineExtractor, extract_segments
-from lanebev.observation.vertices import LineConfig, local_line, row_moments, scan_vertices
+from lanebev.observation.scans import (
+    GAP,
+    counted_probability,
+    local_line,
+    make_scans,
+    scan_moments,
+    scan_vertices,
+)
+from lanebev.observation.vertices import LineConfig
 from lanebev.render import render_views
 from train.extraction import distance_to_polyline, extraction_error
 
@@ -110,7 +118,7 @@ def test_scans_that_cross_twice_say_nothing():
     """The columns right of a hook's bend cross it twice."""
     hook = torch.maximum(stripe((20, 20), (100, 40)), stripe((100, 40), (20, 60)))
     vertices = scan_vertices(hook[None, None], CONFIG)
-    columns = vertices.weight[0, 0, ROWS:]
+    columns = vertices.weight[0, 0, ROWS + GAP :]
     assert (columns[90:96] == 0).all()
     assert (columns[40:60] > 0.9).all()  # where only the upper one is near its peak
 
@@ -143,10 +151,11 @@ def test_zeros_and_ones_are_the_papers_rule():
     maps = torch.zeros(1, 1, 40, 60, dtype=torch.float64)
     for row in range(40):
         maps[0, 0, row, 20 + row // 4 : 23 + row // 4] = 1  # three on-pixels: mean 21 + row // 4
-    position, mass, _ = row_moments(maps, window=6)
-    torch.testing.assert_close(position[0, 0], 21.0 + torch.arange(40, dtype=torch.float64) // 4)
-    torch.testing.assert_close(mass[0, 0], torch.full((40,), 3.0, dtype=torch.float64))
-    below = row_moments(torch.zeros_like(maps), window=6)[1]
+    scans = make_scans(40, 60, 6, maps.device)
+    position, mass, _ = scan_moments(counted_probability(maps, 6), 6, scans)
+    torch.testing.assert_close(position[0, 0, :40], 21.0 + torch.arange(40, dtype=torch.float64) // 4)
+    torch.testing.assert_close(mass[0, 0, :40], torch.full((40,), 3.0, dtype=torch.float64))
+    below = scan_moments(counted_probability(torch.zeros_like(maps), 6), 6, scans)[1]
     assert (below == 0).all()
 
 
@@ -261,7 +270,8 @@ def test_sigma_is_across_the_line_also_where_an_image_is_wider_than_its_map(star
 
 def test_vertices_count_is_static():
     vertices = scan_vertices(torch.rand(2, 3, 20, 30), CONFIG)
-    assert vertices.points.shape == (2, 3, 50, 2)
+    assert vertices.points.shape == (2, 3, 50 + GAP, 2)
+    assert (vertices.weight[..., 20 : 20 + GAP] == 0).all()
     segments = LineExtractor(CONFIG)(torch.randn(2, 4, 20, 30), (40, 60))
     assert segments.endpoints.shape == (2, 3 * CONFIG.segments, 2, 2)
 

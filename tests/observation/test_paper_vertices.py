@@ -3,7 +3,8 @@
 import torch
 
 from lanebev.observation.paper_vertices import paper_vertices
-from lanebev.observation.vertices import LineConfig, scan_vertices
+from lanebev.observation.scans import scan_vertices
+from lanebev.observation.vertices import LineConfig
 
 
 def test_mean_of_on_pixels_by_hand():

@@ -1,17 +1,18 @@
 """The scans and stretches of the extractor against their definitions, written out."""
 
+import pytest
 import torch
 
-from lanebev.observation.vertices import (
-    LineConfig,
-    Vertices,
+from lanebev.observation.scans import (
+    GAP,
     box_peak,
     counted_probability,
-    representative_vertices,
+    first_maximum_,
+    make_scans,
     scan_moments,
     scan_vertices,
-    stretches,
 )
+from lanebev.observation.vertices import LineConfig, Vertices, representative_vertices, stretches
 
 
 def maps(seed=0, size=(2, 3, 40, 60)):
@@ -26,16 +27,19 @@ def maps(seed=0, size=(2, 3, 40, 60)):
 
 
 def test_columns_are_rows_of_the_transposed_map():
-    counted = counted_probability(maps())
-    rows, columns = scan_moments(counted.mT.contiguous(), 6, -1), scan_moments(counted, 6, -2)
-    for row, column in zip(rows, columns, strict=True):
-        torch.testing.assert_close(row, column)
+    counted = counted_probability(maps(), 6)
+    straight = scan_moments(counted, 6, make_scans(40, 60, 6, counted.device))
+    turned = scan_moments(counted.mT, 6, make_scans(60, 40, 6, counted.device))
+    for part, other in zip(straight, turned, strict=True):
+        torch.testing.assert_close(part[..., :40], other[..., 60 + GAP :])
+        torch.testing.assert_close(part[..., 40 + GAP :], other[..., :60])
 
 
 def test_moments_are_those_of_the_window_about_the_mean():
     """Cell by cell, windows that reach over the edge included."""
-    counted = counted_probability(maps())
-    position, mass, variance = scan_moments(counted, 4, -1)
+    counted = counted_probability(maps(), 0)
+    scans = make_scans(40, 60, 4, counted.device)
+    position, mass, variance = scan_moments(counted_probability(maps(), 4), 4, scans)
     for index in ((0, 0, 10), (0, 0, 39), (1, 1, 0), (0, 1, 7), (1, 2, 5)):
         values = counted[index].tolist()
         sums = [sum(values[max(0, i - 2) : i + 3]) for i in range(60)]
@@ -54,8 +58,25 @@ def test_moments_are_those_of_the_window_about_the_mean():
 def test_the_first_of_equal_peaks_is_taken():
     row = torch.zeros(1, 1, 1, 20)
     row[..., 8:10] = 1.0
-    padded = torch.nn.functional.pad(row, (6, 6))
+    padded = torch.nn.functional.pad(row, (6, 6, 6, 6))
     assert box_peak(padded, 6, -1).item() == 7  # of boxes 7 to 10 that hold both
+    assert box_peak(padded.mT, 6, -2).item() == 7
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dim", [-1, -2])
+def test_first_maximum_is_that_of_max(dtype, dim):
+    """Ties, neighbouring numbers of the dtype, zeros, small numbers; of NaN only that it is an index."""
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randint(0, 4, (50, 30, 40), generator=generator).to(dtype)
+    values[:10] = 1.0 + torch.finfo(dtype).eps * values[:10]
+    values[10:20] *= 1e-9
+    values[20] = 0.0
+    expected = values.max(dim).indices
+    values[49, 7] = torch.nan
+    found = first_maximum_(values.clone(), dim)
+    assert torch.equal(found[:49], expected[:49])
+    assert ((found >= 0) & (found < values.shape[dim])).all()
 
 
 def test_windows_narrower_than_a_peak_and_maps_of_nan_have_vertices():
