@@ -6,7 +6,6 @@ import itertools
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,24 +26,14 @@ class Block(NamedTuple):
     Attributes:
         first, last: rows.
         points: (B, 2, last - first, V) normalised coordinates.
-        outside: (B, last - first, V), zero where seen, else positive; None where all are seen and none beyond
-            the centres of the maps' outermost cells.
+        outside: (B, last - first, V), zero where seen, else at least 1; None where all are seen and none lies
+            beyond the centres of the maps' outermost cells.
     """
 
     first: int
     last: int
     points: Tensor
     outside: Tensor | None
-
-    def valid(self, out: Tensor | None = None) -> Tensor:
-        """Return which are seen, (B, last - first, V) bool.
-
-        Args:
-            out: of that shape, all true, to write to.
-        """
-        if self.outside is not None:
-            return torch.eq(self.outside, 0, out=out)
-        return torch.ones_like(self.points[:, 0], dtype=torch.bool) if out is None else out
 
 
 def blocks(cells: Cells, lens: Lens | None, limit: float, memory: Memory | None = None) -> Iterator[Block]:
@@ -64,12 +53,10 @@ def blocks(cells: Cells, lens: Lens | None, limit: float, memory: Memory | None 
     if isinstance(cells, CellSums) and _may_choose(cells):
         curves = interpolant(cells, lens, limit)
         if curves is not None:
-            most = BLOCK // (batch * columns * curves.rows.size)
-            for start, end in _tile_groups(curves, max(1, most)):
-                if curves.smooth[:, start:end].any():
-                    yield _tile_block(curves, cells, lens, start, end, memory)
+            for tile, span in enumerate(itertools.pairwise(curves.rows.edges)):
+                if curves.smooth[:, tile].any():
+                    yield _tile_block(curves, cells, lens, tile, span, memory)
                 else:
-                    span = curves.row(start), curves.row(end)
                     yield from _exact_blocks(cells, lens, span, _EXACT_BLOCK, memory)
             return
     # compiled code has no planes in between
@@ -97,35 +84,27 @@ def _exact_blocks(
         yield Block(first, last, points, outside_image(points, hidden))
 
 
-def _tile_groups(curves: Interpolant, most: int) -> Iterator[tuple[int, int]]:
-    """Yield ranges of at most so many tiles that are computed in the same way."""
-    kinds = np.stack([curves.smooth.all(0), curves.inside], axis=-1).tolist()
-    for _, group in itertools.groupby(range(len(kinds)), key=kinds.__getitem__):
-        tiles = list(group)
-        for start in range(0, len(tiles), most):
-            yield tiles[start], tiles[min(start + most, len(tiles)) - 1] + 1
-
-
 def _tile_block(
-    curves: Interpolant, cells: CellSums, lens: Lens | None, start: int, end: int, memory: Memory | None
+    curves: Interpolant,
+    cells: CellSums,
+    lens: Lens | None,
+    tile: int,
+    rows: tuple[int, int],
+    memory: Memory | None,
 ) -> Block:
-    """Rows of tiles start to end - 1: those of each image by its polynomials where they are exact."""
-    first, last = curves.row(start), curves.row(end)
-    smooth = curves.smooth[:, start:end].all(1)
-    if memory is None:
-        points = curves.points(start, end)
-    else:
-        points = curves.write(start, end, memory(first, last))
-    if curves.inside[start]:
-        return Block(first, last, points, None)
-    outside = outside_image(points)
+    """Rows of a tile: those of each image by its polynomials where they are exact."""
+    points = curves.points(tile, None if memory is None else memory(*rows))
+    if curves.inside[tile]:
+        return Block(*rows, points, None)
+    outside = outside_image(points, curves.hidden(tile))
+    smooth = curves.smooth[:, tile]
     if not smooth.all():
-        exact, hidden = image_coordinates(cells.rows(first, last), lens)
+        exact, hidden = image_coordinates(cells.rows(*rows), lens)
         whole = torch.from_numpy(smooth)[:, None, None]
         outside = torch.where(whole, outside, outside_image(exact, hidden))
         exact = torch.where(whole.unsqueeze(1), points, exact)
         points = exact if memory is None else points.copy_(exact)
-    return Block(first, last, points, outside)
+    return Block(*rows, points, outside)
 
 
 def traced() -> bool:

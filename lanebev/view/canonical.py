@@ -113,11 +113,7 @@ class CanonicalView(nn.Module):
         if distortion is not None and distortion.shape[-1] > 0:
             lens = make_lens(image_from_cam.to(dtype), distortion.to(dtype), model)
         cells = self._cells(None if lens else image_from_cam, extrinsics)
-        cells = CanonicalCells(
-            CellSums(*(part.to(dtype) for part in cells.rays)),
-            CellSums(*(part.to(dtype) for part in cells.down)),
-            cells.stretch.to(dtype),
-        )
+        cells = CanonicalCells(cells.rays.to(dtype), cells.down.to(dtype), cells.stretch.to(dtype))
         (view,), valid = resampled([image], cells, lens, [MapSize(image.shape[-2], image.shape[-1])], size)
         return view, valid
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import road_from_cam
+from lanebev.tensors import constant
 from lanebev.types import Extrinsics
 from lanebev.view.grid import BEVGrid
 from lanebev.view.lens import Lens, make_lens
 from lanebev.view.projection import CellSums
+from lanebev.view.tiles import road_edges
 
 _BEHIND = -1e6  # m, depth given to planes that are not below the camera
 
@@ -47,7 +50,7 @@ def cells_and_lens(
     else:
         sums = cell_sums(grid, plane_heights, None, extrinsics)
         lens = make_lens(image_from_cam.to(dtype), distortion.to(dtype), model)
-    return CellSums(*(part.to(dtype) for part in sums)), lens
+    return sums.to(dtype), lens
 
 
 @full_precision
@@ -65,9 +68,23 @@ def cell_sums(
     matrix = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll).mT
     if image_from_cam is not None:
         matrix = image_from_cam @ matrix
-    x, z = grid.axes(matrix.dtype, matrix.device)
+    x, z = (BEVGrid.axes if torch.compiler.is_compiling() else _axes)(grid, matrix.dtype, matrix.device)
     right, down, forward = matrix[..., None].unbind(-2)  # (B, 3, 1)
-    below = extrinsics.height.unsqueeze(-1) - matrix.new_tensor(plane_heights)  # (B, P)
-    by_row = (down * below.unsqueeze(1)).unsqueeze(-1) + (forward * z).unsqueeze(-2)  # (B, 3, P, U)
-    by_row = torch.where((below > 0)[:, None, :, None], by_row, _BEHIND)
-    return CellSums(by_row.flatten(2), right * x)
+    below = extrinsics.height.unsqueeze(-1) - constant(tuple(plane_heights), like=matrix)  # (B, P)
+    offset = torch.where((below > 0).unsqueeze(1), down * below.unsqueeze(1), _BEHIND)  # (B, 3, P)
+    by_row = torch.addcmul(offset.unsqueeze(-1), forward.unsqueeze(-1), z)  # (B, 3, P, U)
+    return CellSums(by_row.flatten(2), right * x, _edges(grid, len(plane_heights)))
+
+
+@lru_cache(maxsize=64)
+def _axes(grid: BEVGrid, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    with torch.inference_mode(mode=False):  # ones that are made in it could not be used for gradients
+        return grid.axes(dtype, device)
+
+
+@lru_cache(maxsize=64)
+def _edges(grid: BEVGrid, planes: int) -> tuple[int, ...]:
+    """Return the first rows of tiles of all planes, and the number of all rows."""
+    rows = grid.shape[0]
+    edges = road_edges(grid.z[1], grid.resolution, rows)
+    return (*(plane * rows + edge for plane in range(planes) for edge in edges[:-1]), planes * rows)

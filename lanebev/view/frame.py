@@ -12,12 +12,12 @@ from torch import Tensor
 
 from lanebev.camera.model import Camera
 from lanebev.types import Extrinsics
-from lanebev.view.blocks import Block, blocks
+from lanebev.view.blocks import blocks
 from lanebev.view.cells import cell_sums
 from lanebev.view.grid import BEVGrid
 from lanebev.view.kept import KeptArrays
 from lanebev.view.lens import Lens, make_lens
-from lanebev.view.projection import CellSums, normalised_intrinsics
+from lanebev.view.projection import normalised_intrinsics
 from lanebev.view.sampling import MapSize, block_map
 
 _kept = KeptArrays()
@@ -52,12 +52,13 @@ def remap_frame(
     size = camera.image_size
     image_from_cam, lens = _projection(camera)
     extrinsics = Extrinsics(*(part.cpu() for part in extrinsics))
-    cells = CellSums(*(part.float() for part in cell_sums(grid, (0.0,), image_from_cam, extrinsics)))
-    bev, valid = np.empty((*grid.shape, *frame.shape[2:]), np.uint8), np.ones(grid.shape, np.bool_)
+    cells = cell_sums(grid, (0.0,), image_from_cam, extrinsics).to(torch.float32)
+    bev, valid = np.empty((*grid.shape, *frame.shape[2:]), np.uint8), np.empty(grid.shape, np.bool_)
     for block in blocks(cells, lens, 1 - 1 / min(size), partial(_points, grid.shape[1])):
         rows = slice(block.first, block.last)
-        cv2.remap(frame, *_fixed_point_pixels(block, size), cv2.INTER_LINEAR, bev[rows])
-        block.valid(torch.from_numpy(valid[None, rows]))
+        points = block_map(block, MapSize(*size), size, block.points)[0]
+        np.less_equal(points[0].numpy(), 1, out=valid[rows])
+        cv2.remap(frame, *_fixed_point_pixels(points, size), cv2.INTER_LINEAR, bev[rows])
     return bev, valid
 
 
@@ -66,17 +67,18 @@ def _points(columns: int, first: int, last: int) -> Tensor:
     return torch.from_numpy(_kept("points", (1, 2, last - first, columns), np.float32))
 
 
-def _fixed_point_pixels(block: Block, size: tuple[int, int]) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """Compute where a camera sees the cells of a block, far from the image where not, as cv2.remap wants it.
+def _fixed_point_pixels(
+    points: Tensor, size: tuple[int, int]
+) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+    """Convert normalised coordinates to pixels as cv2.remap wants them.
 
     Args:
-        block: of batch size 1.
+        points: (2, rows, V), which are overwritten.
         size: (H, W) px.
 
     Returns:
         (rows, V, 2) whole px and (rows, V) parts of px, in memory that is kept.
     """
-    points = block_map(block, MapSize(*size), size, block.points)[0]
     x, y = (
         torch.add(plane.new_tensor((side - 1) / 2), plane, alpha=side / 2, out=plane).numpy()
         for plane, side in zip(points, reversed(size), strict=True)

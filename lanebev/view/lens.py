@@ -32,6 +32,22 @@ class Lens(NamedTuple):
     squared_limit: Tensor
     tilt: Tensor | None
 
+    def without_limit(self) -> Lens:
+        """Return the lens continued beyond where it folds over."""
+        return self._replace(squared_limit=torch.full_like(self.squared_limit, torch.inf))
+
+    def excess(self, cells: Tensor) -> Tensor:
+        """Compute what is positive where the lens folds over, x² + y² - limit z².
+
+        Args:
+            cells: (B, 3, R, V) in the camera, in front of it.
+
+        Returns:
+            (B, 1, R, V), quadratic in the cells.
+        """
+        x, y, z = cells.square().unbind(1)
+        return torch.addcmul(x + y, self.squared_limit, z, value=-1).unsqueeze(1)
+
 
 def make_lens(image_from_cam: Tensor, distortion: Tensor, model: str) -> Lens:
     """Take apart intrinsics (B, 3, 3) and distortion (B, D)."""
@@ -51,13 +67,13 @@ def image_planes(points: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
         lens: lens of each row of the batch.
 
     Returns:
-        (B, 2, R, V) image coordinates, finite, and (B, R, V): zero where the lens does not fold over, else
-        positive, without gradient.
+        (B, 2, R, V) image coordinates, finite, and (B, R, V): zero where the lens does not fold over, else at
+        least 1, without gradient.
     """
     x, y = points.unbind(1)
     squared_radius = torch.addcmul(x * x, y, y)
     clamped = torch.minimum(squared_radius, lens.squared_limit)  # beyond it no gradient, and no overflow
-    beyond = (squared_radius - clamped).detach()
+    beyond = (squared_radius - clamped).detach().sign()
     points = distort_planes(points, clamped, lens.coefficients, lens.model)
     if lens.tilt is not None:
         points, behind = tilt_planes(points, lens.tilt)
@@ -127,10 +143,10 @@ def tilt_planes(points: Tensor, homography: Tensor) -> tuple[Tensor, Tensor]:
     """Transform (B, 2, R, V) points by a homography (B, 3, 3, 1, 1).
 
     Returns:
-        (B, 2, R, V), finite, and (B, R, V): zero where the point stays in front, else positive.
+        (B, 2, R, V), finite, and (B, R, V): zero where the point stays in front, else 1.
     """
     x, y = points.unsqueeze(2).unbind(1)  # (B, 1, R, V)
     mapped = homography[:, :, 0] * x + homography[:, :, 1] * y + homography[:, :, 2]
     depth = mapped[:, 2:]
     ahead = depth.clamp(min=1e-6)
-    return mapped[:, :2] / ahead, (ahead - depth).detach().squeeze(1)
+    return mapped[:, :2] / ahead, (ahead - depth).detach().sign().squeeze(1)

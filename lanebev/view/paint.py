@@ -84,7 +84,7 @@ class ImageFromBEV(nn.Module):
         size, dtype = self.grid.shape, common_dtype(bev)
         cells: CellSums | PixelCells
         if distortion is None or distortion.shape[-1] == 0:
-            cells = CellSums(*(part.to(dtype) for part in self._sums(intrinsics, extrinsics, image_size)))
+            cells = self._sums(intrinsics, extrinsics, image_size).to(dtype)
         else:
             points = self._points(intrinsics, extrinsics, image_size, distortion, model)
             cells = PixelCells(points.to(dtype))

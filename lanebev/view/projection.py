@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lanebev.geometry.precision import full_precision
+from lanebev.tensors import constant
 from lanebev.view.lens import Lens, image_planes
 
 LEAST_DEPTH = 1e-3  # in front of the camera; m for cells of the road
@@ -37,15 +38,22 @@ class CellSums(NamedTuple):
     Attributes:
         by_row: (B, 3, R).
         by_column: (B, 3, V).
+        edges: rows between which perspective is smooth, see :func:`lanebev.view.tiles.road_edges`; empty for
+            tiles of equal sizes.
     """
 
     by_row: Tensor
     by_column: Tensor
+    edges: tuple[int, ...] = ()
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """(B, R, V)."""
         return self.by_row.shape[0], self.by_row.shape[2], self.by_column.shape[2]
+
+    def to(self, dtype: torch.dtype) -> CellSums:
+        """Return the same in another dtype."""
+        return self._replace(by_row=self.by_row.to(dtype), by_column=self.by_column.to(dtype))
 
     def rows(self, first: int, last: int) -> Tensor:
         """Return those of rows first to last - 1, (B, 3, last - first, V)."""
@@ -63,8 +71,8 @@ def normalised_intrinsics(intrinsics: Tensor, image_size: tuple[int, int]) -> Te
         image_size: (H, W) px.
     """
     height, width = image_size
-    rows = [[2 / width, 0.0, 1 / width - 1], [0.0, 2 / height, 1 / height - 1], [0.0, 0.0, 1.0]]
-    return intrinsics.new_tensor(rows) @ intrinsics
+    rows = ((2 / width, 0.0, 1 / width - 1), (0.0, 2 / height, 1 / height - 1), (0.0, 0.0, 1.0))
+    return constant(rows, like=intrinsics) @ intrinsics
 
 
 def image_coordinates(cells: Tensor, lens: Lens | None) -> tuple[Tensor, Tensor]:
@@ -76,12 +84,12 @@ def image_coordinates(cells: Tensor, lens: Lens | None) -> tuple[Tensor, Tensor]
 
     Returns:
         (B, 2, R, V) coordinates, finite everywhere, and (B, R, V): zero in front of the camera and where the
-        lens does not fold over, else positive.
+        lens does not fold over, else at least 1.
     """
     depth = cells[:, 2]
     ahead = depth.clamp(min=LEAST_DEPTH)
     points = cells[:, :2] / ahead.unsqueeze(1)
-    hidden = (ahead - depth).detach()
+    hidden = (ahead - depth).detach().sign()
     if lens is None:
         return points, hidden
     points, beyond = image_planes(points, lens)
@@ -93,10 +101,11 @@ def outside_image(points: Tensor, hidden: Tensor | None = None) -> Tensor:
 
     Args:
         points: (B, 2, R, V) normalised coordinates.
-        hidden: (B, R, V), zero where seen; None where all are in front of the camera and its lens.
+        hidden: (B, R, V), zero where seen, else at least 1; None where all are in front of the camera
+            and its lens.
 
     Returns:
-        (B, R, V), zero where seen and inside the image, else positive; without gradient.
+        (B, R, V), zero where seen and inside the image, else at least 1; without gradient.
     """
     beyond = F.hardshrink(points.detach(), 1.0)  # zero in [-1, 1]
     x, y = beyond.unbind(1)

@@ -20,7 +20,7 @@ from lanebev.view.projection import Cells
 
 _kept = KeptArrays()
 
-_PUSH = 1e4  # factor that moves what lies outside away from the map, even a millimetre above the road
+_PUSH = 4.0  # half widths of a map by which what lies outside is moved away from it
 _FEW = 8  # channels of which a copy costs less than to sample one image with one thread
 
 
@@ -56,13 +56,21 @@ def resampled(
     Returns:
         (B, C, R, V) of each map in its dtype, and (B, 1, R, V) bool: valid.
     """
-    at, valid = sampling_maps(cells, lens, sizes, image_size)
-    return [_sample(each, where) for each, where in zip(maps, at, strict=True)], valid
+    at = sampling_maps(cells, lens, sizes, image_size)
+    sampled = [_sample(each, where) for each, where in zip(maps, at, strict=True)]
+    return sampled, _at_most_one(at[0][:, :1])
+
+
+def _at_most_one(values: Tensor) -> Tensor:
+    """Return where values are at most 1, bool."""
+    if values.device.type == "cpu" and not traced():
+        return torch.from_numpy(values.detach().numpy() <= 1)  # in a quarter of torch's time
+    return values <= 1
 
 
 def sampling_maps(
     cells: Cells, lens: Lens | None, sizes: Sequence[MapSize], image_size: tuple[int, int]
-) -> tuple[list[Tensor], Tensor]:
+) -> list[Tensor]:
     """Compute where to sample maps of one image.
 
     Args:
@@ -72,33 +80,29 @@ def sampling_maps(
         image_size: (H, W) px.
 
     Returns:
-        (B, 2, R, V) of each map, coordinates for ``grid_sample``, far away where not seen, in memory that is
-        kept where there is no graph; and (B, 1, R, V) bool: valid.
+        (B, 2, R, V) of each map, coordinates for ``grid_sample``, x above 1 where not seen, in memory that is
+        kept where there is no graph.
     """
     limit = min(1 - 1 / side for size in sizes for side in (size.width, size.height))
     if _may_overwrite():
         return _maps_written(cells, lens, sizes, image_size, limit)
     parts: list[list[Tensor]] = [[] for _ in sizes]
-    valid = []
     for block in blocks(cells, lens, limit):
         for part, size in zip(parts, sizes, strict=True):
             part.append(block_map(block, size, image_size))
-        valid.append(block.valid())
-    return [torch.cat(part, dim=2) for part in parts], torch.cat(valid, dim=1).unsqueeze(1)
+    return [torch.cat(part, dim=2) for part in parts]
 
 
 def _maps_written(
     cells: Cells, lens: Lens | None, sizes: Sequence[MapSize], image_size: tuple[int, int], limit: float
-) -> tuple[list[Tensor], Tensor]:
+) -> list[Tensor]:
     """Do the same without a graph, in memory that is kept."""
     maps = _kept_maps(len(sizes), cells)
-    valid = torch.ones(cells.shape, dtype=torch.bool, device=maps[0].device)
     for block in blocks(cells, lens, limit, lambda first, last: maps[0][:, :, first:last]):
         rows = slice(block.first, block.last)
         for number in reversed(range(len(sizes))):  # the first map takes the place of the points
             block_map(block, sizes[number], image_size, maps[number][:, :, rows])
-        block.valid(valid[:, rows])
-    return maps, valid.unsqueeze(1)
+    return maps
 
 
 def _may_overwrite() -> bool:
@@ -116,7 +120,7 @@ def _kept_maps(count: int, cells: Cells) -> list[Tensor]:
 
 
 def block_map(block: Block, size: MapSize, image_size: tuple[int, int], out: Tensor | None = None) -> Tensor:
-    """Compute the coordinates of a map for ``grid_sample``; far away where not seen.
+    """Compute the coordinates of a map for ``grid_sample``; x is above 1 where not seen.
 
     Args:
         block: block of the image.

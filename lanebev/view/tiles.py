@@ -1,8 +1,9 @@
 """Interpolate where cells are seen: exact at a few cells of each tile, polynomials for the others.
 
 Perspective and lens are smooth functions of a cell's row and column: the polynomial through 12 × 12 cells of
-a tile of 64 × 128 is as exact as float32 itself. Whether it is, its Chebyshev coefficients tell; tiles in
-which they do not fall off are computed cell by cell.
+a tile is as exact as float32 itself. Whether it is, its Chebyshev coefficients tell; tiles in which they do
+not fall off are computed cell by cell. A lens that folds over is smooth too: it is continued beyond the fold,
+and which cells lie beyond tells a quadratic function of row and column.
 
 Source: Trefethen, Approximation Theory and Approximation Practice, ch. 3 (coefficients from values), 8
 (they fall off geometrically and bound the error where a function is analytic).
@@ -23,39 +24,103 @@ from lanebev.geometry.precision import autocast_off
 from lanebev.view.lens import Lens
 from lanebev.view.projection import CellSums, image_coordinates
 
-_ROWS, _ROW_NODES = 64, 12
-_COLUMNS, _COLUMN_NODES = 128, 12
+_NODES = 12  # of a tile, along its rows and along its columns
+_LEAST_ROWS = 3 * _NODES  # of a tile
+_GROWTH = 0.5  # share of its least depth that the depth grows by within a tile
+_COLUMNS = 128  # of a tile; half as many of a lens
 _TOLERANCE = 4e-6  # of half the image, .004 px of 1920; what float32 rounds is a quarter of it
-_HIGHEST = 2  # degrees of which the coefficients tell what those of higher ones would add
+_LOW = _NODES - 2  # the coefficients of this degree and higher tell what those of higher ones would add
+_SUMS = np.stack([np.ones(_NODES), np.arange(_NODES) >= _LOW], axis=1).astype(np.float32)
 _OUTSIDE = 0.25  # share of the distance to the image by which a tile that is not in it may be off
 
 
-class Axis(NamedTuple):
-    """Tiles of one size along the rows or the columns of a grid; the last overlaps the one before.
+class RowTiles(NamedTuple):
+    """Tiles along the rows of a grid, of any sizes.
 
     Attributes:
-        size: cells of a tile.
-        overlap: cells of the last tile that the one before has too.
-        nodes: (T, n) int64, the cells of each tile that are computed, its first and last among them.
-        weights: (size, n), values at the cells of a tile from those at its nodes.
+        edges: (T + 1), the first row of each, and the number of all rows.
+        nodes: (T·n,), the rows of each tile that are computed, its first and last among them.
+        weights: T of (size, n), values at the rows of a tile from those at its nodes.
+        coefficients: (T, n, n), Chebyshev coefficients from the values at its nodes.
+    """
+
+    edges: tuple[int, ...]
+    nodes: NDArray[np.int64]
+    weights: list[NDArray[np.float32]]
+    coefficients: NDArray[np.float32]
+
+
+class ColumnTiles(NamedTuple):
+    """Tiles of one size along the columns of a grid; the last overlaps the one before.
+
+    Attributes:
+        size: columns of a tile.
+        overlap: columns of the last tile that the one before has too.
+        nodes: (S·m,), as of :class:`RowTiles`.
+        weights: (size, m).
+        coefficients: (m, m).
     """
 
     size: int
     overlap: int
     nodes: NDArray[np.int64]
     weights: NDArray[np.float32]
+    coefficients: NDArray[np.float32]
 
 
 @lru_cache(maxsize=64)
-def axis_tiles(cells: int, size: int, nodes: int) -> Axis | None:
-    """Divide ``cells`` into tiles of ``size``; None if there are less than three cells a node."""
-    size = min(size, cells)
-    if size < 3 * nodes:
+def row_tiles(edges: tuple[int, ...]) -> RowTiles | None:
+    """Prepare tiles of rows; None if one has less than three rows a node."""
+    sizes = np.diff(edges).tolist()
+    if min(sizes) < _LEAST_ROWS:
         return None
-    first = np.minimum(np.arange(0, cells, size), cells - size)
-    of_tile = tile_nodes(size, nodes)
-    weights, _ = interpolation(size, of_tile)
-    return Axis(size, len(first) * size - cells, first[:, None] + of_tile, weights.astype(np.float32))
+    nodes = [tile_nodes(size, _NODES) for size in sizes]
+    matrices = [interpolation(size, each) for size, each in zip(sizes, nodes, strict=True)]
+    return RowTiles(
+        edges,
+        np.concatenate([first + each for first, each in zip(edges, nodes, strict=False)]),
+        [weights.astype(np.float32) for weights, _ in matrices],
+        np.stack([coefficients for _, coefficients in matrices]).astype(np.float32),
+    )
+
+
+@lru_cache(maxsize=64)
+def column_tiles(columns: int, size: int) -> ColumnTiles | None:
+    """Divide columns into tiles of ``size``; None if there are less than three a node."""
+    size = min(size, columns)
+    if size < 3 * _NODES:
+        return None
+    first = np.minimum(np.arange(0, columns, size), columns - size)
+    nodes = tile_nodes(size, _NODES)
+    weights, coefficients = (matrix.astype(np.float32) for matrix in interpolation(size, nodes))
+    return ColumnTiles(
+        size, len(first) * size - columns, (first[:, None] + nodes).reshape(-1), weights, coefficients
+    )
+
+
+def road_edges(far: float, step: float, rows: int) -> tuple[int, ...]:
+    """Divide the rows of a plane such that perspective is smooth in each tile: in proportion to their depth.
+
+    Args:
+        far: depth of the first row, m.
+        step: by which each row is nearer than the one before, m.
+        rows: of the plane.
+
+    Returns:
+        (T + 1), see :class:`RowTiles`.
+    """
+    edges = [rows]
+    while edges[0] > 0:
+        near = far / step - edges[0]  # rows from the camera to the tile
+        first = edges[0] - max(_LEAST_ROWS, int(_GROWTH * near))
+        edges.insert(0, first if first >= _LEAST_ROWS else 0)
+    return tuple(edges)
+
+
+@lru_cache(maxsize=64)
+def equal_edges(rows: int) -> tuple[int, ...]:
+    """Divide rows into tiles of about 64."""
+    return tuple(np.linspace(0, rows, max(1, rows // 64) + 1).astype(int).tolist())
 
 
 def tile_nodes(cells: int, nodes: int) -> NDArray[np.int64]:
@@ -76,58 +141,40 @@ def interpolation(cells: int, nodes: NDArray[np.int64]) -> tuple[NDArray[np.floa
     return chebvander(np.linspace(-1, 1, cells), degree) @ coefficients, coefficients
 
 
-@lru_cache(maxsize=64)
-def tile_coefficients(rows: int, row_nodes: int, columns: int, column_nodes: int) -> NDArray[np.float32]:
-    """Compute the matrix from values at all nodes of a tile to its Chebyshev coefficients.
-
-    Returns:
-        (nodes, coefficients), those of the two highest degrees of rows or columns last.
-    """
-    _, by_row = interpolation(rows, tile_nodes(rows, row_nodes))
-    _, by_column = interpolation(columns, tile_nodes(columns, column_nodes))
-    degree = np.indices((row_nodes, column_nodes)).reshape(2, -1)
-    highest = (degree[0] >= row_nodes - _HIGHEST) | (degree[1] >= column_nodes - _HIGHEST)
-    matrix = np.kron(by_row, by_column)[np.argsort(highest, kind="stable")]
-    return np.ascontiguousarray(matrix.T, np.float32)
-
-
 class Interpolant(NamedTuple):
     """Image coordinates of all cells, as polynomials along the rows of each tile.
 
     Attributes:
         rows: tiles of rows.
         values: (B, 2, T, n, V) at the nodes of the rows.
+        excess: (B, 1, T, n, V), positive where the lens folds over; None where it nowhere does.
         smooth: (B, T), whether the polynomials are exact; where not, they mean nothing.
+        folds: (T,), whether the lens may fold over.
         inside: (T,), whether all cells are surely seen, and their coordinates in [-limit, limit].
     """
 
-    rows: Axis
+    rows: RowTiles
     values: Tensor
+    excess: Tensor | None
     smooth: NDArray[np.bool_]
+    folds: NDArray[np.bool_]
     inside: NDArray[np.bool_]
 
-    def row(self, tile: int) -> int:
-        """Return the first row of a tile that the one before has not, or the number of all rows."""
-        count = len(self.inside) * self.rows.size - self.rows.overlap
-        return min(tile * self.rows.size, count)
+    def points(self, tile: int, out: Tensor | None = None) -> Tensor:
+        """Return coordinates of the cells of a tile, (B, 2, rows, V).
 
-    def points(self, first: int, last: int) -> Tensor:
-        """Return coordinates of the rows of tiles first to last - 1, (B, 2, rows, V)."""
-        with autocast_off(self.values.device):
-            points = torch.from_numpy(self.rows.weights) @ self.values[:, :, first:last]
-        if self.rows.overlap == 0 or last < len(self.inside):
-            return points.flatten(2, 3)
-        before, own = points[:, :, :-1], points[:, :, -1, self.rows.overlap :]
-        return torch.cat([before.flatten(2, 3), own], dim=2)
+        Args:
+            tile: number of the tile.
+            out: of that shape, to write to without a graph.
+        """
+        return _product(self.rows.weights[tile], self.values[:, :, tile], out)
 
-    def write(self, first: int, last: int, out: Tensor) -> Tensor:
-        """Write those coordinates to ``out``, (B, 2, rows, V), without a graph."""
-        values, cells = self.values.numpy(), out.numpy()  # whose small products take half as long
-        for tile in range(first, last):
-            start, end = self.row(tile) - self.row(first), self.row(tile + 1) - self.row(first)
-            weights = self.rows.weights[self.rows.size - (end - start) :]
-            np.matmul(weights, values[:, :, tile], out=cells[:, :, start:end])
-        return out
+    def hidden(self, tile: int) -> Tensor | None:
+        """Return (B, rows, V), zero where the lens does not fold over, else 1; None where it nowhere does."""
+        if self.excess is None or not self.folds[tile]:
+            return None
+        excess = _product(self.rows.weights[tile], self.excess[:, :, tile])
+        return excess.squeeze(1).clamp_(min=0.0).sign_()
 
 
 def interpolant(cells: CellSums, lens: Lens | None, limit: float) -> Interpolant | None:
@@ -140,33 +187,61 @@ def interpolant(cells: CellSums, lens: Lens | None, limit: float) -> Interpolant
         limit: see :class:`Interpolant`.
     """
     _, count, width = cells.shape
-    rows, columns = axis_tiles(count, _ROWS, _ROW_NODES), axis_tiles(width, _COLUMNS, _COLUMN_NODES)
+    rows = row_tiles(cells.edges or equal_edges(count))
+    columns = column_tiles(width, _COLUMNS // 2 if lens else _COLUMNS)
     if rows is None or columns is None:
         return None
     nodes = CellSums(
-        *(
-            part.index_select(-1, torch.from_numpy(axis.nodes.reshape(-1)))
-            for part, axis in zip(cells, (rows, columns), strict=True)
-        )
-    )
-    points, hidden = image_coordinates(nodes.rows(0, nodes.shape[1]), lens)
-    values = _along_columns(points.unflatten(3, columns.nodes.shape), columns)
-    error, most, least = _sizes(_by_tiles(points, rows, columns), rows.size, columns.size)
-    seen = _by_tiles(hidden, rows, columns).max(-1) == 0  # (B, T, S)
+        cells.by_row.index_select(-1, torch.from_numpy(rows.nodes)),
+        cells.by_column.index_select(-1, torch.from_numpy(columns.nodes)),
+    ).rows(0, len(rows.nodes))
+    points, hidden = image_coordinates(nodes, lens and lens.without_limit())
+    shape = rows.coefficients.shape[:2]
+
+    def by_tiles(values: Tensor) -> NDArray[np.float32]:
+        """(B, k, T·n, S·m) as (B, k, T, n, S, m), without gradient."""
+        array: NDArray[np.float32] = values.detach().numpy()
+        return array.reshape(*array.shape[:2], *shape, -1, _NODES)
+
+    error, most, least = tile_bounds(by_tiles(points), rows, columns)
+    seen = by_tiles(hidden.unsqueeze(1))[:, 0].max(2).max(-1) == 0  # (B, T, S)
     smooth = seen & (error <= np.maximum(_OUTSIDE * (least - 1), _TOLERANCE))
-    inside = smooth & (most <= limit)
-    return Interpolant(rows, values.unflatten(2, rows.nodes.shape), smooth.all(2), inside.all((0, 2)))
+    excess, folds = None, np.zeros(len(rows.weights), np.bool_)
+    if lens is not None:
+        over = lens.excess(nodes.detach())
+        folds = by_tiles(over).max((0, 1, 3, 4, 5)) > 0
+        excess = _along_columns(over, columns).unflatten(2, shape) if folds.any() else None
+    inside = (smooth & (most <= limit)).all((0, 2)) & ~folds
+    values = _along_columns(points, columns).unflatten(2, shape)
+    return Interpolant(rows, values, excess, smooth.all(2), folds, inside)
 
 
-def _by_tiles(values: Tensor, rows: Axis, columns: Axis) -> NDArray[np.float32]:
-    """Values (..., T·n, S·m) at all nodes as (..., T, S, n·m), without gradient."""
-    tiles = values.detach().unflatten(-1, columns.nodes.shape).unflatten(-3, rows.nodes.shape)
-    array: NDArray[np.float32] = tiles.transpose(-3, -2).flatten(-2).numpy()
-    return array
+def tile_bounds(
+    values: NDArray[np.float32], rows: RowTiles, columns: ColumnTiles
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Bound tiles' polynomials by their coefficients.
+
+    Args:
+        values: (B, 2, T, n, S, m) at the nodes.
+        rows: tiles.
+        columns: tiles.
+
+    Returns:
+        (B, T, S) each: what the coefficients of the highest degrees sum up to; the sum of all, which no
+        coordinate exceeds; of the coordinate that is farther from the image at all nodes, at the nearest.
+    """
+    along = values.reshape(-1, _NODES) @ columns.coefficients.T
+    size = np.abs(rows.coefficients @ along.reshape(*values.shape[:4], -1))
+    sums = (size.reshape(-1, _NODES) @ _SUMS).reshape(*values.shape[:5], 2)  # of the columns' degrees
+    most = sums[..., 0].sum(3)
+    error = sums[:, :, :, :_LOW, :, 1].sum(3) + sums[:, :, :, _LOW:, :, 0].sum(3)
+    least = np.abs(values).min(3).min(-1)
+    return error.max(1), most.max(1), least.max(1)
 
 
-def _along_columns(nodes: Tensor, columns: Axis) -> Tensor:
-    """Values at all columns, (..., V), from those at the nodes, (..., S, m)."""
+def _along_columns(nodes: Tensor, columns: ColumnTiles) -> Tensor:
+    """Values at all columns, (B, k, R, V), from those at the nodes, (B, k, R, S·m)."""
+    nodes = nodes.unflatten(-1, (-1, _NODES))
     if nodes.requires_grad:
         with autocast_off(nodes.device):
             values = nodes @ torch.from_numpy(columns.weights).mT  # (..., S, size)
@@ -178,21 +253,10 @@ def _along_columns(nodes: Tensor, columns: Axis) -> Tensor:
     return torch.cat([values[..., :-1, :].flatten(-2), values[..., -1, columns.overlap :]], dim=-1)
 
 
-def _sizes(values: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float32]:
-    """Bound tiles' polynomials by their coefficients.
-
-    Args:
-        values: (B, 2, T, S, n·m) at the nodes.
-        rows: of a tile.
-        columns: of a tile.
-
-    Returns:
-        (3, B, T, S): what the coefficients of the highest degrees sum up to; the sum of all, which no
-        coordinate exceeds; of the coordinate that is farther from the image at all nodes, at the nearest.
-    """
-    matrix = tile_coefficients(rows, _ROW_NODES, columns, _COLUMN_NODES)
-    size = np.abs(values.reshape(-1, values.shape[-1]) @ matrix).reshape(values.shape)
-    low = (_ROW_NODES - _HIGHEST) * (_COLUMN_NODES - _HIGHEST)
-    error = size[..., low:].sum(-1)
-    bounds: NDArray[np.float32] = np.stack([error, size.sum(-1), np.abs(values).min(-1)]).max(2)
-    return bounds
+def _product(weights: NDArray[np.float32], values: Tensor, out: Tensor | None = None) -> Tensor:
+    """Multiply weights (rows, n) with values (..., n, V); no graph with ``out``, or of values without one."""
+    if out is None and values.requires_grad:
+        with autocast_off(values.device):
+            return torch.from_numpy(weights) @ values
+    small = values.detach().numpy()  # whose small products take half as long
+    return torch.from_numpy(np.matmul(weights, small, out=None if out is None else out.numpy()))

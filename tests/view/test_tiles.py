@@ -1,5 +1,7 @@
 """Interpolated sampling maps against those computed cell by cell, and what is not interpolated."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,16 @@ from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics
 from lanebev.view.blocks import blocks
 from lanebev.view.cells import cells_and_lens
 from lanebev.view.projection import image_coordinates, normalised_intrinsics, outside_image
-from lanebev.view.tiles import axis_tiles, interpolant, interpolation, tile_coefficients, tile_nodes
+from lanebev.view.tiles import (
+    column_tiles,
+    equal_edges,
+    interpolant,
+    interpolation,
+    road_edges,
+    row_tiles,
+    tile_bounds,
+    tile_nodes,
+)
 
 SIZE = (1020, 1920)
 GRID = BEVGrid(x=(-10.24, 10.24), z=(3.0, 43.96), resolution=0.08)  # 512 x 256
@@ -57,8 +68,17 @@ def test_interpolated_cells_are_as_exact_as_float32_cell_by_cell(lens, values):
     )
     assert off < rounded + 4e-4  # px
     assert off < (2e-3 if values is USUAL else 0.02)  # some of the wild are 2 cm over the road
-    valid = torch.cat([block.valid() for block in found], dim=1)
-    assert (valid == outside).double().mean() < 1e-4  # on the edge itself
+    seen = (
+        torch.cat(
+            [
+                torch.zeros_like(block.points[:, 0]) if block.outside is None else block.outside
+                for block in found
+            ],
+            dim=1,
+        )
+        == 0
+    )
+    assert (seen == outside).double().mean() < 1e-4  # on the edge itself
     assert (~outside).double().mean() > 0.01
 
 
@@ -66,11 +86,30 @@ def test_interpolated_cells_are_as_exact_as_float32_cell_by_cell(lens, values):
 def test_most_tiles_of_a_usual_view_are_interpolated_and_seen_as_a_whole(lens):
     cells, model = prepared(lens, USUAL, torch.float32)
     curves = interpolant(cells, model, 0.999)
-    assert curves.smooth.mean() >= 0.75  # at 8 cm; more of a finer grid
-    assert sum(curves.inside) >= 0.5 * len(curves.inside)
+    rows = np.diff(curves.rows.edges)
+    assert curves.smooth.mean(0) @ rows >= 0.75 * GRID.shape[0]  # at 8 cm; more of a finer grid
+    assert curves.inside @ rows >= 0.5 * GRID.shape[0]
     _, outside = exact(lens, USUAL)
-    for tile, inside in enumerate(curves.inside):
-        assert not (inside and outside[:, curves.row(tile) : curves.row(tile + 1)].any())
+    for first, last, inside in zip(curves.rows.edges, curves.rows.edges[1:], curves.inside, strict=False):
+        assert not (inside and outside[:, first:last].any())
+
+
+def test_cells_beyond_a_fold_are_interpolated_and_not_seen():
+    """By a lens that images them beside those that it shows."""
+    fine = BEVGrid(x=(-10.24, 10.24), z=(3.0, 43.96), resolution=0.04)
+    cells, model = prepared("8 coefficients", USUAL[:1], torch.float32, fine)
+    curves = interpolant(cells, model, 0.999)
+    assert curves.smooth.all()
+    assert curves.folds.any()
+    _, hidden = image_coordinates(cells.rows(0, fine.shape[0]), model)
+    found = [curves.hidden(tile) for tile in range(len(curves.folds))]
+    for tile, (first, last) in enumerate(itertools.pairwise(curves.rows.edges)):
+        expected = hidden[:, first:last]
+        if found[tile] is None:
+            assert (expected == 0).all()
+        else:
+            assert (found[tile] != expected).double().mean() < 1e-4  # on the fold itself
+    assert max(part.mean() for part in found if part is not None) > 0.1
 
 
 def test_a_row_of_the_batch_does_not_depend_on_the_others():
@@ -106,14 +145,37 @@ def test_gradients_of_interpolated_maps_are_those_of_exact_ones():
         torch.testing.assert_close(single.double(), double, rtol=1e-3, atol=1e-4 * double.abs().max().item())
 
 
-@pytest.mark.parametrize("cells", [64, 65, 90, 128, 401, 1140])
-def test_tiles_cover_an_axis(cells):
-    axis = axis_tiles(cells, 64, 10)
-    assert axis.nodes[0, 0] == 0
-    assert axis.nodes[-1, -1] == cells - 1
-    assert (np.diff(axis.nodes, axis=1) > 0).all()
-    assert len(axis.nodes) * axis.size - axis.overlap == cells
-    assert axis_tiles(19, 64, 10) is None
+@pytest.mark.parametrize("columns", [64, 65, 90, 128, 401, 1140])
+def test_tiles_cover_all_columns(columns):
+    tiles = column_tiles(columns, 64)
+    nodes = tiles.nodes.reshape(-1, 12)
+    assert nodes[0, 0] == 0
+    assert nodes[-1, -1] == columns - 1
+    assert (np.diff(nodes, axis=1) > 0).all()
+    assert len(nodes) * tiles.size - tiles.overlap == columns
+    assert column_tiles(35, 64) is None
+
+
+@pytest.mark.parametrize("rows", [20, 36, 71, 73, 1024])
+def test_tiles_cover_all_rows_and_are_in_proportion_to_their_depth(rows):
+    edges = np.array(road_edges(3.0 + 0.04 * rows, 0.04, rows))
+    assert (edges[0], edges[-1]) == (0, rows)
+    depth = 3.0 + 0.04 * (rows - edges)
+    assert (depth[1:-1] <= 1.5 * depth[2:] + 1e-9).all()
+    assert (np.diff(edges) >= min(rows, 36)).all()
+    assert len(edges) <= 8
+    tiles = row_tiles(tuple(edges.tolist()))
+    if rows < 36:
+        assert tiles is None
+    else:
+        assert set(edges[:-1]) | set(edges[1:] - 1) <= set(tiles.nodes)
+    assert sum(np.diff(equal_edges(rows))) == rows
+
+
+def test_rows_behind_the_camera_are_divided_too():
+    edges = np.diff(road_edges(4.0, 0.1, 200))
+    assert edges.min() >= 36
+    assert edges.sum() == 200
 
 
 def test_interpolation_reproduces_polynomials_and_finds_their_coefficients():
@@ -131,14 +193,13 @@ def test_a_grid_of_few_cells_is_computed_cell_by_cell():
     assert interpolant(cells, model, 0.999) is None
 
 
-def test_coefficients_of_a_tile_are_those_of_its_polynomial_highest_degrees_last():
-    rows, columns, nodes = 40, 50, 6
-    x, y = (np.linspace(-1, 1, side)[tile_nodes(side, nodes)] for side in (columns, rows))
-    values = (2 * y[:, None] ** 2 - 1) * x[None] + 3 * (
-        16 * x**5 - 20 * x**3 + 5 * x
-    )  # T2(y) T1(x) + 3 T5(x)
-    found = values.reshape(-1) @ tile_coefficients(rows, nodes, columns, nodes)
-    expected = np.zeros(nodes * nodes)
-    expected[2 * 4 + 1] = 1  # of the 4 x 4 lower degrees, row by row
-    expected[16 + 1] = 3  # after them: degree 0 of y, 5 of x
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+def test_a_tile_is_bounded_by_its_coefficients():
+    rows, columns = row_tiles((0, 40)), column_tiles(50, 64)
+    y, x = (np.linspace(-1, 1, side)[tile_nodes(side, 12)] for side in (40, 50))
+    low = (2 * y[:, None] ** 2 - 1) * x  # T2(y) T1(x)
+    high = np.polynomial.chebyshev.chebval(x, [0] * 10 + [3]) + 0 * y[:, None]  # 3 T10(x)
+    values = np.stack([low + high, low + 9]).astype(np.float32)[None, :, None, :, None, :]
+    error, most, least = (bound.item() for bound in tile_bounds(values, rows, columns))
+    assert error == pytest.approx(3, abs=1e-4)
+    assert most == pytest.approx(10, abs=1e-4)
+    assert least == pytest.approx(8, abs=0.05)  # of y, at the node nearest to where low is -1
