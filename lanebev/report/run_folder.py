@@ -11,6 +11,9 @@ from typing import Any
 
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
 
+FIRST_NUMBER = "first frame, in the source"
+"""Label of the setting that says the number of a run's first frame in the whole source."""
+_TAKEN = {FIRST_NUMBER: 0, "--every": 1}  # with the values of a run that took all frames
 _PICTURE = re.compile(r"data:image/jpeg;base64,[A-Za-z0-9+/=]*")
 
 
@@ -32,6 +35,11 @@ class RunFolder:
     lens: Mapping[str, str] = field(default_factory=dict)
     pictures: Mapping[int, Mapping[str, str]] = field(default_factory=dict)
 
+    def source_numbers(self) -> list[int]:
+        """Return the frames' numbers in the whole source, by the settings that say which were taken."""
+        first, every = (_whole(self.settings.get(name, ""), value) for name, value in _TAKEN.items())
+        return [first + every * row.frame for row in self.rows]
+
 
 def read_run(folder: str | Path) -> RunFolder:
     """Read a run's folder; ``report.html`` in it may be missing or another program's.
@@ -51,6 +59,10 @@ def read_run(folder: str | Path) -> RunFolder:
     return RunFolder(
         folder.resolve().name, rows, _texts(run.get("settings")), _texts(run.get("lens")), _pictures(data)
     )
+
+
+def _whole(text: str, default: int) -> int:
+    return int(text) if text.isdecimal() else default
 
 
 def _json(page: str, name: str) -> dict[str, Any]:
