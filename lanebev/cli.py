@@ -18,9 +18,10 @@ from typing import Any, NoReturn
 
 from lanebev import __version__
 from lanebev.app.completion import PrintCompletion
-from lanebev.app.config import RunConfig, parse_path, read_settings
+from lanebev.app.config import RunConfig, parse_path
 from lanebev.app.export_config import ExportConfig
 from lanebev.app.progress import Item, Progress
+from lanebev.app.settings_file import read_settings
 from lanebev.io.formats.names import FORMATS
 
 DESCRIPTION = "Online camera-to-road calibration from lane boundaries, and a stable bird's-eye view."

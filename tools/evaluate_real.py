@@ -1,6 +1,7 @@
 """Evaluate real and third-party images, with all results beside their targets.
 
-    python tools/evaluate_real.py [--data ../shared/data] [--json FILE] [--sheet FILE.png] [--weights FILE]
+    python tools/evaluate_real.py [--data ../shared/data] [--json FILE] [--sheet FILE.png]
+        [--weights FILE] [--width PX] [--only PART]
 
 Nothing of these images has been trained on.
 """
@@ -18,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jsonargparse.typing import PositiveInt
 from PIL import Image
 from rich.console import Console
 from rich.table import Table
@@ -57,13 +59,14 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for the results as JSON")
     parser.add_argument("--sheet", type=Path, help="write a PNG of a dozen TuSimple images, before and after")
     parser.add_argument("--weights", type=Path, help="other weights than the shipped")
+    parser.add_argument("--width", type=PositiveInt, help="px of the network's input, instead of its own")
     parser.add_argument("--only", help="run only parts whose name contains this")
     options = parser.parse_args()
     missing = [f"{name}/{file}" for name, file in NEEDED.items() if not (options.data / name / file).exists()]
     if missing:
         raise ValueError(f"{options.data}: missing {', '.join(missing)}; give the folder with --data")
     calibrators = {name: make_calibrator(name) for name in ("two-stage", "joint")}
-    model = lanebev.LaneBEV.from_pretrained(options.weights)
+    model = lanebev.LaneBEV.from_pretrained(options.weights, network_width=options.width)
     start = time.monotonic()
     figures = [figure for part in parts(options, model, calibrators) for figure in part]
     print_table(figures)

@@ -13,7 +13,10 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
@@ -25,9 +28,10 @@ from torch import Tensor
 from lanebev.batch import masked_median
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.boundary_curves import Boundaries, boundary_polylines, fit_boundaries
+from lanebev.io.frames import ALL, Frame, Selection
 from lanebev.io.lanes import read_lanes
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
-from lanebev.io.video import open_source
+from lanebev.io.video import FrameSource, open_source
 from lanebev.observation.polylines import image_rows
 from lanebev.observation.segments import segments_from_lines
 from lanebev.types import Extrinsics
@@ -114,8 +118,16 @@ def poses(rows: list[ExtrinsicsRow], like: Tensor) -> Extrinsics:
     return Extrinsics(pitch, yaw, roll, like.new_tensor([row.height_m for row in rows]))
 
 
-def write_labels(result: Path, source: str, out: Path, camera: Camera, reach: int, every: int) -> int:
-    """Write images and ``labels.json``, and return how many.
+def write_labels(
+    result: Path,
+    source: str,
+    out: Path,
+    camera: Camera,
+    reach: int,
+    stride: int,
+    selection: Selection = ALL,
+) -> int:
+    """Write images and ``labels.json``, and return how many; nothing is left of a folder that fails.
 
     Args:
         result: folder of a run.
@@ -123,30 +135,59 @@ def write_labels(result: Path, source: str, out: Path, camera: Camera, reach: in
         out: new folder.
         camera: the camera that took them.
         reach: frames before and after that place a boundary.
-        every: write every Nth usable frame.
+        stride: write every Nth usable frame.
+        selection: frames that the run took of the source.
+
+    Raises:
+        ValueError: no frame is usable, or the frames are not those of the run.
     """
     curves, rows = fitted_curves(result, camera)
     curves, steady = smoothed(curves, reach)
     x = label_rows(curves, camera, poses(rows, curves.offset))
     sure = [row.status == "TRACKING" and bool(fine) for row, fine in zip(rows, steady, strict=True)]
-    chosen = set([number for number, is_sure in enumerate(sure) if is_sure][::every])
+    chosen = set([number for number, is_sure in enumerate(sure) if is_sure][::stride])
     if not chosen:
         raise ValueError(f"{result}: expected frames that are TRACKING, got none; is it the right camera?")
-    (out / "images").mkdir(parents=True)
-    h_samples = image_rows(camera.image_size[0]).tolist()
-    written = 0
-    with (out / "labels.json").open("w") as file:
-        for frame in open_source(source):
-            if frame.number not in chosen or frame.image is None:
-                continue
-            name = f"images/{frame.number:06d}.jpg"
-            Image.fromarray(frame.image).save(out / name, quality=95)
-            there = [k for k in range(x.shape[1]) if np.isfinite(x[frame.number, k]).sum() > 1]
-            lanes = [np.nan_to_num(x[frame.number, k], nan=-2.0).round(2).tolist() for k in there]
-            entry = {"raw_file": name, "h_samples": h_samples, "lanes": lanes, "boundary": there}
-            file.write(json.dumps(entry) + "\n")
-            written += 1
-    return written
+    with TemporaryDirectory(dir=out.parent, prefix=f"{out.name}-") as folder:
+        made = Path(folder) / out.name
+        (made / "images").mkdir(parents=True)
+        frames = frames_of_run(replace(open_source(source), selection=selection), len(rows), result)
+        entries = [
+            write_entry(made, frame, x[frame.number])
+            for frame in frames
+            if frame.image is not None and frame.number in chosen
+        ]
+        (made / "labels.json").write_text("".join(json.dumps(entry) + "\n" for entry in entries))
+        made.rename(out)
+    return len(entries)
+
+
+def frames_of_run(source: FrameSource, count: int, result: Path) -> Iterator[Frame]:
+    """Yield the frames of a source, which must be as many as a run's.
+
+    Raises:
+        ValueError: another number of frames.
+    """
+    got = 0
+    for frame in source:
+        yield frame
+        got += 1
+    if got != count:
+        raise ValueError(
+            f"{source.source}: expected the {count} frames of {result}, got {got}; give the --start, --end "
+            "and --every of that run"
+        )
+
+
+def write_entry(out: Path, frame: Frame, x: NDArray[np.float64]) -> dict[str, object]:
+    """Write the image of a frame, and return its entry of ``labels.json`` with boundaries (L, R) px."""
+    assert frame.image is not None
+    name = f"images/{frame.number:06d}.jpg"
+    Image.fromarray(frame.image).save(out / name, quality=95)
+    there = [k for k in range(len(x)) if np.isfinite(x[k]).sum() > 1]
+    lanes = [np.nan_to_num(x[k], nan=-2.0).round(2).tolist() for k in there]
+    h_samples = image_rows(frame.image.shape[0]).tolist()
+    return {"raw_file": name, "h_samples": h_samples, "lanes": lanes, "boundary": there}
 
 
 @one_line_errors()
@@ -163,12 +204,16 @@ def main() -> None:
         default=12,
         help="number of frames before and after over which boundaries are smoothed",
     )
-    parser.add_argument("--every", type=PositiveInt, default=3, help="write every Nth usable frame")
+    parser.add_argument("--stride", type=PositiveInt, default=3, help="write every Nth usable frame")
+    parser.add_argument("--start", type=float, default=0.0, help="as given to the run")
+    parser.add_argument("--end", type=float, default=math.inf, help="as given to the run")
+    parser.add_argument("--every", type=PositiveInt, default=1, help="as given to the run")
     args = parser.parse_args()
     if args.out.exists():
         parser.error(f"out: expected a new folder, got {args.out}, which is there")
     camera = Camera.from_file(args.camera)
-    count = write_labels(args.result, args.source, args.out, camera, args.reach, args.every)
+    selection = Selection(args.start, args.end, args.every)
+    count = write_labels(args.result, args.source, args.out, camera, args.reach, args.stride, selection)
     print(f"{args.out}: {count} labelled images")
 
 

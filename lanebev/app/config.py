@@ -1,20 +1,17 @@
-"""Settings of a run and their defaults, from the command line or a YAML file. Imports nothing heavy."""
+"""Settings of a run and their defaults. Imports nothing heavy."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from fractions import Fraction
-from pathlib import Path
 from typing import TypeVar
-
-import yaml
 
 from lanebev.io.formats.names import FORMATS, parse_formats
 from lanebev.io.source_names import is_bag
-from lanebev.numbers import parse_size, read_text
+from lanebev.numbers import parse_size
 
 T = TypeVar("T")
 
@@ -295,53 +292,3 @@ class RunConfig:
             )
         if self.rectified and self.fov is not None:
             raise ValueError("rectified: expected a camera file with a projection matrix, got --fov")
-
-
-def read_settings(path: str | Path) -> dict[str, object]:
-    """Read the settings of a YAML file, with names and values as on the command line.
-
-    Raises:
-        ValueError: the file is missing or not a YAML mapping, or has an unknown name or a bad value.
-    """
-    try:
-        given = yaml.safe_load(read_text(Path(path)))
-    except (ValueError, yaml.YAMLError) as error:
-        reason = "not YAML" if isinstance(error, yaml.YAMLError) else error
-        raise ValueError(f"config {path}: expected a YAML file of settings, got: {reason}") from error
-    if not isinstance(given, dict):
-        raise ValueError(f"config {path}: expected a YAML file of settings, got {type(given).__name__}")
-    try:
-        return parsed_settings(given)
-    except ValueError as error:
-        raise ValueError(f"config {path}: {error}") from error
-
-
-def parsed_settings(given: Mapping[str, object]) -> dict[str, object]:
-    """Parse the names and values of a YAML file to settings, as the command line does.
-
-    Raises:
-        ValueError: an unknown name, or a value that its setting does not allow.
-    """
-    known = {setting.name: setting for setting in fields(RunConfig)}
-    values: dict[str, object] = {}
-    for key, value in given.items():
-        name = str(key).replace("-", "_")
-        if name not in known:
-            raise ValueError(f"expected one of {', '.join(known)}, got {key!r}")
-        try:
-            values[name] = _parsed(value, known[name].default, known[name].metadata["parse"])
-        except ValueError as error:
-            raise ValueError(f"{key}: {error}") from error
-    return values
-
-
-def _parsed(value: object, default: object, parse: Callable[[str], object]) -> object:
-    """Parse a value of a YAML file as the command line does."""
-    if isinstance(default, bool) or isinstance(value, bool):
-        if not isinstance(value, bool) or not isinstance(default, bool):
-            expected = "true or false" if isinstance(default, bool) else "a text or number"
-            raise ValueError(f"expected {expected}, got {value!r}")
-        return value
-    if not isinstance(value, (str, int, float)):
-        raise ValueError(f"expected a text or number, got {value!r}")
-    return parse(str(value))

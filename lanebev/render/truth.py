@@ -7,12 +7,12 @@ from torch import Tensor
 
 from lanebev.geometry.lens import denormalise_points, distort_points
 from lanebev.render.frame import RenderedFrame
-from lanebev.render.raster.constants import constant
 from lanebev.render.scene.alignment import Alignment, elevation_at, hidden_by_crest, local_from_road
 from lanebev.render.scene.camera import Lens
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout, labelled_slots, presence
 from lanebev.render.scene.traffic import NUM_ONCOMING, NUM_VEHICLES
 from lanebev.render.scene.world import Place, Scene
+from lanebev.tensors import constant
 from lanebev.types import NUM_BOUNDARIES
 
 NUM_POINTS = 72
@@ -61,7 +61,7 @@ def project(points: Tensor, lens: Lens, size: tuple[int, int]) -> tuple[Tensor, 
     depth = camera[..., 2:]
     front = depth[..., 0] > 0.05
     ideal = denormalise_points(camera[..., :2] / depth.clamp(min=0.05), lens.intrinsics)
-    limit = constant(ideal.device, size[1], size[0])
+    limit = constant((size[1], size[0]), ideal)
     near = ((ideal > -0.6 * limit) & (ideal < 1.6 * limit)).all(-1)
     tame = torch.where(near[..., None], ideal, 0.5 * limit)
     taken = distort_points(tame, lens.intrinsics, lens.distortion, lens.model)

@@ -6,7 +6,8 @@ from dataclasses import fields
 
 import pytest
 
-from lanebev.app.config import RunConfig, read_settings
+from lanebev.app.config import RunConfig
+from lanebev.app.settings_file import read_settings
 from lanebev.app.summary import setting_words
 from lanebev.cli import main, parser
 

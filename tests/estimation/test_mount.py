@@ -277,6 +277,8 @@ def test_row_alone_equals_row_in_batch():
 
 
 def test_bad_numbers_are_named():
+    with pytest.raises(ValueError, match="lower: expected a tuple of 4 numbers"):
+        MountEstimator(lower=(0.0, 1.0))
     with pytest.raises(ValueError, match="moved_blocks, needed, num_blocks"):
         MountEstimator(needed=2)
     with pytest.raises(ValueError, match="block_time: expected a positive"):

@@ -15,6 +15,7 @@ from safetensors.torch import save_file
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.boundary_curves import Boundaries
 from lanebev.geometry.road import image_from_road_points
+from lanebev.io.frames import Selection
 from lanebev.io.results import ExtrinsicsRow, write_extrinsics
 from lanebev.observation.polylines import image_rows
 from lanebev.observation.resnet import ResNet18
@@ -71,7 +72,7 @@ def run(tmp_path):
 def test_what_was_missed_once_is_labelled_and_what_strayed_in_once_is_not(run, tmp_path):
     result, source = run
     out = tmp_path / "out"
-    assert write_labels(result, str(source), out, CAMERA, reach=3, every=1) == FRAMES - 1
+    assert write_labels(result, str(source), out, CAMERA, reach=3, stride=1) == FRAMES - 1
     entries = read_entries("tusimple", out, ["labels.json"])
     assert len(entries) == FRAMES - 1  # the run was not sure of the last
     for entry in entries:
@@ -84,6 +85,18 @@ def test_what_was_missed_once_is_labelled_and_what_strayed_in_once_is_not(run, t
     sample = labelled_image(entries[0])
     assert sample.painted[2].any()
     assert not sample.painted[5].any()
+
+
+def test_labels_are_those_of_the_frames_that_the_run_took(run, tmp_path):
+    result, source = run
+    for number in range(FRAMES, 2 * FRAMES):
+        Image.new("RGB", (640, 360)).save(source / f"{number:03d}.png")
+    with pytest.raises(ValueError, match=r"expected the 9 frames of .* got 18; give the --start"):
+        write_labels(result, str(source), tmp_path / "out", CAMERA, 3, 1)
+    assert {path.name for path in tmp_path.iterdir()} == {"result", "frames"}
+    assert write_labels(result, str(source), tmp_path / "out", CAMERA, 3, 1, Selection(every=2)) == FRAMES - 1
+    with Image.open(tmp_path / "out" / "images" / "000005.jpg") as image:
+        assert image.getpixel((0, 0)) == (0, 0, 0)  # the source's frame 10
 
 
 def curves(offset, present):
@@ -112,7 +125,7 @@ def test_frames_beyond_both_ends_do_not_count():
 @pytest.mark.filterwarnings("ignore")
 def test_adapt_config_trains_on_them(run, tmp_path):
     result, source = run
-    write_labels(result, str(source), tmp_path / "out", CAMERA, reach=3, every=2)
+    write_labels(result, str(source), tmp_path / "out", CAMERA, reach=3, stride=2)
     config = Path(__file__).parents[2] / "configs" / "adapt.yaml"
     small = ["network.base_width=4", "network.decoder_width=4", "init_from=null"]
     data = [f"root={tmp_path}/out", "batch_size=2", "sizes=[[48,80]]", "val_size=[48,80]", "workers=0"]

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import yaml
 
-from lanebev.app.config import RunConfig, parsed_settings
+from lanebev.app.config import RunConfig
+from lanebev.app.settings_file import parsed_settings
 from lanebev.numbers import read_text, shown
 
 UNKNOWN_DAY = "unknown"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 PerAxis = tuple[float, float, float, float]
 
@@ -63,3 +63,8 @@ class MountConfig:
             )
         if not self.block_time > 0:
             raise ValueError(f"block_time: expected a positive time in s, got {self.block_time}")
+        for setting in fields(self):
+            value = getattr(self, setting.name)
+            if isinstance(setting.default, tuple) and not (isinstance(value, tuple) and len(value) == 4):
+                expected = "a tuple of 4 numbers, of pitch, yaw, roll and height"
+                raise ValueError(f"{setting.name}: expected {expected}, got {value!r}")

@@ -13,8 +13,10 @@ from torch import Tensor, nn
 
 from lanebev.batch import flag
 from lanebev.estimation.checks import as_batch, check_new_state, check_state
+from lanebev.estimation.mount.blocks import add_frame, block_index, newest_age, push_block
 from lanebev.estimation.mount.config import MountConfig
 from lanebev.estimation.mount.results import MountCalibration, MountReason, MountState, MountStatus
+from lanebev.tensors import constant
 from lanebev.types import Calibration, Extrinsics, Status, check_calibration
 
 _LIMIT_REASONS = (
@@ -98,12 +100,12 @@ class MountEstimator(nn.Module):
         step = as_batch(dt, pose)
         frame_why = self._frame_gates(calibration.status, pose, step, speed, yaw_rate, curvature)
         known = pose.isfinite().all(-1, keepdim=True) & variance.isfinite()
-        sure = known & (variance < variance.new_tensor(cfg.largest_std).square())
+        sure = known & (variance < constant(cfg.largest_std, variance).square())
         why = frame_why.unsqueeze(-1) | flag(~sure, MountReason.UNSURE)  # (B, 4)
 
         used = why == 0
         elapsed = torch.where(step.isfinite() & (step > 0), step, 0.0).unsqueeze(-1)  # (B, 1)
-        state = _add(state, used, pose, variance, elapsed, cfg.block_time)
+        state = add_frame(state, used, pose, variance, elapsed, cfg.block_time)
         doubtful = (frame_why == 0).unsqueeze(-1) & known & ~sure
         state = self._weigh_doubtful(state, doubtful, used, pose, variance, elapsed)
         shown_before, *_ = self._estimate(state)
@@ -127,7 +129,7 @@ class MountEstimator(nn.Module):
         why = why | flag(~enough, MountReason.FEW_BLOCKS) | torch.where(enough, limits, 0)
         why = why | flag(suspect, MountReason.SUSPECT) | flag(moved, MountReason.MOVED)
         why = why | flag(withdrawn, MountReason.WITHDRAWN)
-        why = why | flag(_newest_age(state) > cfg.stale_time, MountReason.STALE)
+        why = why | flag(newest_age(state) > cfg.stale_time, MountReason.STALE)
         state = state._replace(status=status, reasons=why)
 
         shown = state.blend * state.former + (1 - state.blend) * mean
@@ -158,7 +160,7 @@ class MountEstimator(nn.Module):
 
     def _bound(self, scatter: Tensor, noise: Tensor) -> Tensor:
         """Return the deviation (B, 4) from the estimate that counts as a moved camera."""
-        least = scatter.new_tensor(self.config.moved_least)
+        least = constant(self.config.moved_least, scatter)
         return torch.maximum(least, self.config.moved_sigmas * (scatter + noise).sqrt())
 
     def _weigh_doubtful(
@@ -194,16 +196,16 @@ class MountEstimator(nn.Module):
         moved = full & (suspect >= cfg.moved_blocks)
 
         # blocks that were suspected and then not confirmed are dropped
-        index = _index(state)
+        index = block_index(state)
         dropped = full & (suspect <= 1) & (state.suspect > 0)
         kept = torch.where(dropped.unsqueeze(1) & (index < state.suspect.unsqueeze(1)), 0.0, state.filled)
         state = state._replace(filled=torch.where(full.unsqueeze(1), kept, state.filled))
         empty = torch.where(full, 0.0, 1.0)
         return state._replace(
-            blocks=_push(state.blocks, block, full),
-            variances=_push(state.variances, noise, full),
-            filled=_push(state.filled, torch.ones_like(block), full),
-            ages=_push(state.ages, state.begun, full),
+            blocks=push_block(state.blocks, block, full),
+            variances=push_block(state.variances, noise, full),
+            filled=push_block(state.filled, torch.ones_like(block), full),
+            ages=push_block(state.ages, state.begun, full),
             pose_sum=state.pose_sum * empty,
             variance_sum=state.variance_sum * empty,
             seconds=state.seconds * empty,
@@ -232,7 +234,7 @@ class MountEstimator(nn.Module):
 
     def _trusted(self, state: MountState) -> Tensor:
         """Return the weights (B, K, 4) of the blocks that nothing contradicts."""
-        return state.filled * (_index(state) >= state.suspect.unsqueeze(1))
+        return state.filled * (block_index(state) >= state.suspect.unsqueeze(1))
 
     def _scatter(self, state: MountState) -> tuple[Tensor, Tensor, Tensor]:
         """Return the mean of the trusted blocks, one block's variance about it, their number, (B, 4) each."""
@@ -241,7 +243,7 @@ class MountEstimator(nn.Module):
         count = trusted.sum(1)
         mean = (trusted * state.blocks).sum(1) / count.clamp(min=1.0)
         squared = (trusted * (state.blocks - mean.unsqueeze(1)).square()).sum(1)
-        prior = cfg.prior_blocks * mean.new_tensor(cfg.block_std).square()
+        prior = cfg.prior_blocks * constant(cfg.block_std, mean).square()
         return mean, (squared + prior) / (count - 1 + cfg.prior_blocks), count
 
     def _estimate(self, state: MountState) -> tuple[Tensor, Tensor, Tensor]:
@@ -254,11 +256,11 @@ class MountEstimator(nn.Module):
         noise_now = state.variance_sum / state.seconds.clamp(min=1e-6)
         noise = (self._trusted(state) * state.variances).sum(1) + part * noise_now
         safe = some.clamp(min=1e-3)
-        prior, prior_var = mean.new_tensor(cfg.prior_pose), mean.new_tensor(cfg.prior_std).square()
+        prior, prior_var = constant(cfg.prior_pose, mean), constant(cfg.prior_std, mean).square()
         both = (count * mean + now) / safe
         # errors of the fast pose are common to all blocks (lane width), so they do not average out
         variance = (1 + 2 * cfg.block_correlation) * scatter / safe + noise / safe
-        variance = variance + mean.new_tensor(cfg.drift_std).square() * _newest_age(state) / _HOUR
+        variance = variance + constant(cfg.drift_std, mean).square() * newest_age(state) / _HOUR
         return (
             torch.where(some > 1e-3, both, prior),
             torch.where(some > 1e-3, torch.minimum(variance, prior_var), prior_var),
@@ -268,10 +270,10 @@ class MountEstimator(nn.Module):
     def _limits(self, mean: Tensor, invalid: Tensor) -> tuple[Tensor, Tensor]:
         """Return flags and bools (B, 4) of limits that are broken; the margin keeps them from flickering."""
         cfg = self.config
-        lower, upper, margin = (mean.new_tensor(v) for v in (cfg.lower, cfg.upper, cfg.margin))
+        lower, upper, margin = (constant(v, mean) for v in (cfg.lower, cfg.upper, cfg.margin))
         slack = torch.where(invalid, -margin, margin)
         broken = (mean < lower - slack) | (mean > upper + slack)
-        flags = torch.tensor([int(name) for name in _LIMIT_REASONS], device=mean.device)
+        flags = constant(_LIMIT_REASONS, mean, torch.int64)
         return broken * flags, broken
 
 
@@ -294,35 +296,4 @@ def _answer(
         axis_status=status,
         axis_progress=progress,
         axis_reasons=why,
-    )
-
-
-def _index(state: MountState) -> Tensor:
-    """Return the blocks' numbers, (1, K, 1), the newest first."""
-    return torch.arange(state.blocks.shape[1], device=state.blocks.device).view(1, -1, 1)
-
-
-def _newest_age(state: MountState) -> Tensor:
-    """Return the s (B, 4) since the newest block was begun; 0 where there is none."""
-    ages = torch.where(state.filled > 0, state.ages, torch.inf).amin(1)
-    return torch.where(ages.isfinite(), ages, 0.0)
-
-
-def _push(values: Tensor, new: Tensor, full: Tensor) -> Tensor:
-    """Put (B, 4) in front of (B, K, 4) where ``full`` (B, 4) holds; the last falls out."""
-    return torch.where(full.unsqueeze(1), torch.cat([new.unsqueeze(1), values[:, :-1]], 1), values)
-
-
-def _add(
-    state: MountState, used: Tensor, pose: Tensor, variance: Tensor, elapsed: Tensor, longest: float
-) -> MountState:
-    """Add the frame, weighted by its time, to the current block of each axis that uses it; let time pass."""
-    part = torch.where(used, elapsed.clamp(max=longest), 0.0)
-    open_block = (state.seconds > 0) | used
-    return state._replace(
-        ages=state.ages + elapsed.unsqueeze(1),
-        pose_sum=state.pose_sum + part * torch.where(used, pose, 0.0),
-        variance_sum=state.variance_sum + part * torch.where(used, variance, 0.0),
-        seconds=state.seconds + part,
-        begun=torch.where(open_block, state.begun + elapsed, 0.0),
     )

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from lanebev.render.raster.blocks import Blocks, make_blocks
-from lanebev.render.raster.constants import colour
+from lanebev.render.raster.colour import colour
 from lanebev.render.raster.features import Features
 from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.markings import near_marking, paint
@@ -69,7 +69,7 @@ def ground_radiance(
         retro = 1 + 2.5 * coverage + 8.0 * studs
         beam = headlight_irradiance(x, ground.z) * retro
         beam = beam * (light.headlight * (1 - world.lights.on[row]))[:, None]
-        lit = lit + beam[:, None] * colour(beam.device, 1.0, 0.95, 0.85)
+        lit = lit + beam[:, None] * colour(beam, 1.0, 0.95, 0.85)
         if features.night:
             lights = select_rows(world.lights, row)
             lamps, own = night_irradiance(lights, x, ground.z, ground.along, ground.across)

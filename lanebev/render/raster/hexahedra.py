@@ -7,10 +7,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.constants import constant
 from lanebev.render.raster.select import as_float, choose
 from lanebev.render.scene.camera import Lens
 from lanebev.render.scene.objects import SceneObjects
+from lanebev.tensors import constant
 
 RIGHT, LEFT, FRONT, REAR, TOP, BOTTOM = range(6)  # faces in the object's own frame
 NEVER = 1e9  # m
@@ -109,8 +109,8 @@ def entry_depth(time: Tensor, enters: Tensor) -> Tensor:
         time: (12, ...) Z, m, see :func:`plane_times`.
         enters: (12, ...) 1 where a ray enters its plane's half space, else 0.
     """
-    entry = torch.lerp(constant(time.device, -NEVER)[0], time, enters).unflatten(0, (2, 6)).amax(1)
-    leave = torch.lerp(time, constant(time.device, NEVER)[0], enters).unflatten(0, (2, 6)).amin(1)
+    entry = torch.lerp(constant((-NEVER,), time)[0], time, enters).unflatten(0, (2, 6)).amax(1)
+    leave = torch.lerp(time, constant((NEVER,), time)[0], enters).unflatten(0, (2, 6)).amin(1)
     return choose((entry < leave) & (entry > 0), entry, NEVER)
 
 
@@ -152,7 +152,7 @@ def bounding_boxes(objects: SceneObjects, lens: Lens, height: Tensor, size: tupl
     seen = objects.valid & (points[..., 2].amax(-1) > 0.5)
     points = torch.cat([points[..., :2], points[..., 2:].clamp(min=0.3)], dim=-1)
     pixels = lens.pixels_as_taken(points.flatten(1, 2), size).unflatten(1, points.shape[1:3])
-    limit = constant(pixels.device, size[1], size[0])
+    limit = constant((size[1], size[0]), pixels)
     low_px = (pixels.amin(2).floor() - 1).clamp(min=0).minimum(limit)
     high_px = (pixels.amax(2).ceil() + 2).clamp(min=0).minimum(limit)
     return torch.cat([low_px, high_px], dim=-1).where(seen[..., None], 0.0).long()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.constants import colour as colour_of
+from lanebev.render.raster.colour import colour as colour_of
 from lanebev.render.raster.noise import CLOUD, hash01, sample_noise, smoothstep
 from lanebev.render.scene.surroundings import Wall
 
@@ -43,7 +43,7 @@ def house_front(
     gone = hash01(house, row, 2.0) < 0.16
     inside = (along / wide + 7 * seed - house) * wide
     tone = 0.65 + 0.6 * hash01(house, row, 3.0)
-    warm = (hash01(house, row, 4.0) - 0.5)[:, None] * colour_of(colour.device, 0.5, 0.1, -0.4)
+    warm = (hash01(house, row, 4.0) - 0.5)[:, None] * colour_of(colour, 0.5, 0.1, -0.4)
     stain = 1 + 0.08 * sample_noise(CLOUD, along / 40.0 + seed, up / 25.0)
     albedo = colour * (tone * stain)[:, None] * (1 + warm)
 
@@ -57,7 +57,7 @@ def house_front(
     tint = 0.03 + 0.10 * hash01((inside / spacing).floor(), (up / _FLOOR).floor(), 8.0)
     albedo = albedo + (tint[:, None] - albedo) * (0.92 * glass)[:, None]
     roof = (hash01(house, row, 9.0) < 0.5) * smoothstep(0.0, 0.1, up - 0.82 * tall)
-    tiles = colour_of(albedo.device, 0.10, 0.05, 0.04) * (0.4 + 0.7 * tone)[:, None]
+    tiles = colour_of(albedo, 0.10, 0.05, 0.04) * (0.4 + 0.7 * tone)[:, None]
     albedo = albedo + (tiles - albedo) * roof[:, None]
 
     cell = (inside / torch.where(shop, 4.2, spacing)).floor() + 31.0 * house
@@ -71,4 +71,4 @@ def lit_windows(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> Ten
     """Compute the radiance of the windows of walls of houses at night, (B, 3, N)."""
     height, seed = wall.height[:, None], wall.seed[:, None]
     _, _, lit = house_front(wall.colour[..., None], height, seed, along, up, footprint)
-    return (0.5 * seed * lit)[:, None] * colour_of(lit.device, 1.0, 0.8, 0.5)
+    return (0.5 * seed * lit)[:, None] * colour_of(lit, 1.0, 0.8, 0.5)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from lanebev.render.raster.constants import constant
+from lanebev.tensors import constant
 
 # Quantisation of luminance and chrominance, ITU-T T.81, tables K.1 and K.2
 _LUMINANCE = (
@@ -49,12 +49,12 @@ def compress(image: Tensor, quality: Tensor) -> Tensor:
     red, green, blue = functional.pad(image, (0, -width % 16, 0, -height % 16), mode="replicate").unbind(1)
     luma = torch.add(0.299 * red, green, alpha=0.587).add_(blue, alpha=0.114)
     small = functional.avg_pool2d(torch.stack([blue - luma, red - luma], dim=1), 2)
-    chroma = constant(image.device, 0.5643, 0.7133)[:, None, None]
+    chroma = constant((0.5643, 0.7133), image)[:, None, None]
 
     quality = quality.clamp(1, 100).floor()
     scale = torch.where(quality < 50, 5000 / quality, 200 - 2 * quality)
-    luma = _quantised(luma[:, None] - 0.5, scale, constant(image.device, *_LUMINANCE)) + 0.5
-    small = _quantised(small * chroma, scale, constant(image.device, *_CHROMINANCE)) / chroma
+    luma = _quantised(luma[:, None] - 0.5, scale, constant(_LUMINANCE, image)) + 0.5
+    small = _quantised(small * chroma, scale, constant(_CHROMINANCE, image)) / chroma
     blue_part, red_part = small.unbind(1)
     green_part = (-0.299 / 0.587) * red_part - (0.114 / 0.587) * blue_part
     parts = torch.stack([red_part, green_part, blue_part], dim=1)[:, :, :, None, :, None]

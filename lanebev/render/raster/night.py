@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from lanebev.render.raster.constants import constant
 from lanebev.render.raster.noise import sample_line, smoothstep
 from lanebev.render.raster.rays import View
 from lanebev.render.scene.alignment import Alignment, elevation_at, local_from_road, z_from_arc
@@ -16,6 +15,7 @@ from lanebev.render.scene.camera import Lens
 from lanebev.render.scene.night import NUM_LAMPS, Lights
 from lanebev.render.scene.objects import TRUCK, SceneObjects
 from lanebev.render.scene.world import Place
+from lanebev.tensors import constant
 
 _GLARE_GRID, _MIRROR_GRID = (8, 8), (4, 2)  # px of the image to one of the coarse pictures
 _FAR = 1000.0  # m, where distant lights are put
@@ -103,7 +103,7 @@ def _vehicle_lamps(lights: Lights, lens: Lens, objects: SceneObjects) -> Sprites
     end = torch.where(coming, body[..., 3] + 0.05, body[..., 2] - 0.05)
     points, shines = [], []
     shown = objects.valid & (objects.kind <= TRUCK)
-    red, white = constant(body.device, 1.0, 0.03, 0.02), constant(body.device, 1.0, 0.93, 0.8)
+    red, white = constant((1.0, 0.03, 0.02), body), constant((1.0, 0.93, 0.8), body)
     for side in (-0.8, 0.8):
         aside = side * body[..., 0]
         x, z = objects.x + aside * cos + end * sin, objects.z - aside * sin + end * cos
@@ -157,7 +157,7 @@ def add_lights(
     radiance = radiance + _discs(colour, pixel, radius.clamp(max=0.02 * width), size)
     halo = colour * (sprites.glare * lights.halo[:, None])[..., None]
     radiance = radiance + _glare(halo, pixel, radius, lights, size)
-    mirrored = sprites.point * constant(z.device, 1.0, -1.0, 1.0)
+    mirrored = sprites.point * constant((1.0, -1.0, 1.0), z)
     eye = lens.extrinsics.height[:, None]
     mirrored = mirrored + torch.stack([0 * z, 2 * eye.expand_as(z), 0 * z], -1)
     below = lens.pixels_as_taken(mirrored, size)

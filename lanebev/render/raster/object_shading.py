@@ -7,10 +7,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.constants import constant
 from lanebev.render.raster.hexahedra import BOTTOM, FRONT, LEFT, REAR, RIGHT, TOP
 from lanebev.render.scene.objects import BRIDGE, SIGN, TRUCK, SceneObjects
 from lanebev.render.scene.weather import Light
+from lanebev.tensors import constant
 
 
 class Point(NamedTuple):
@@ -95,7 +95,7 @@ def _point(
 
 def _vehicle_surface(colour: Tensor, p: Point, vehicle: Tensor, truck: Tensor) -> tuple[Tensor, Tensor]:
     """Add the features of cars and trucks to the reflectance (N, 3); also (N,) bool: on a lamp."""
-    dark = constant(colour.device, 0.012, 0.012, 0.013)
+    dark = constant((0.012, 0.012, 0.013), colour)
     surface = _car_glass(colour, p, vehicle & ~truck)
     below = vehicle & (p.up < torch.where(truck, 1.0, 0.28))
     surface = _put(surface, below & (p.face < TOP), dark)
@@ -106,7 +106,7 @@ def _vehicle_surface(colour: Tensor, p: Point, vehicle: Tensor, truck: Tensor) -
     wheel = torch.hypot(wheel_z, p.up - radius)
     tyre = vehicle & p.side & (wheel < radius) & ~p.upper
     surface = _put(surface, tyre, dark * 1.5)
-    surface = _put(surface, tyre & (wheel < 0.6 * radius), constant(colour.device, 0.25, 0.25, 0.26))
+    surface = _put(surface, tyre & (wheel < 0.6 * radius), constant((0.25, 0.25, 0.26), colour))
     tyre_end = vehicle & p.end & (p.up < 2 * radius) & (p.up < 0.36 + 0.6 * truck)
     surface = _put(surface, tyre_end & (p.aside > 0.62) & (p.aside < 0.95), dark * 1.8)
     surface, lamp = _car_end(surface, p, vehicle & ~truck & p.end & ~p.upper)
@@ -128,7 +128,7 @@ def _car_end(surface: Tensor, p: Point, end: Tensor) -> tuple[Tensor, Tensor]:
     bumper = end & (p.level < 0.42) & (p.level > 0.28)
     surface = torch.where(bumper[:, None], surface * 0.6, surface)
     plate = end & (p.x.abs() < 0.26) & (p.level > 0.45) & (p.level < 0.62)
-    surface = _put(surface, plate, constant(surface.device, 0.5, 0.5, 0.5))
+    surface = _put(surface, plate, constant((0.5, 0.5, 0.5), surface))
     gap = end & ((p.level - 0.93).abs() < 0.03)
     surface = torch.where(gap[:, None], surface * 0.5, surface)
     return surface, end & (p.level > 0.7) & (p.level < 0.86) & (p.aside > 0.7)
@@ -138,8 +138,8 @@ def _truck_end(surface: Tensor, p: Point, end: Tensor, car_lamp: Tensor) -> tupl
     """Add lamps and doors at a truck's ends to the reflectance; also (N,) bool: on a lamp of any vehicle."""
     lamp = car_lamp | (end & (p.up > 1.0) & (p.up < 1.15) & (p.aside > 0.7))
     red, white = lamp & (p.face == REAR), lamp & (p.face == FRONT)
-    surface = _put(surface, red, constant(surface.device, 0.28, 0.012, 0.01))
-    surface = _put(surface, white, constant(surface.device, 0.6, 0.6, 0.6))
+    surface = _put(surface, red, constant((0.28, 0.012, 0.01), surface))
+    surface = _put(surface, white, constant((0.6, 0.6, 0.6), surface))
     edge = (p.x.abs() < 0.03) | (p.aside > 0.96) | (p.level > 0.98)
     doors = end & (p.face == REAR) & edge & (p.up > 1.0)
     return torch.where(doors[:, None], surface * 0.5, surface), lamp
@@ -155,7 +155,7 @@ def _sign_surface(surface: Tensor, colour: Tensor, p: Point, sign: Tensor) -> Te
     ink = ((letter * 12.9898 + row * 78.233).sin() * 43758.5453) % 1.0 > 0.4
     inside = ((level * 3.4) % 1.0 > 0.35) & ((across * wide * 2.7) % 1.0 > 0.25) & (across.abs() < 0.85)
     white = rim | (ink & inside & (level > 0.1) & (level < 0.9))
-    face = torch.where(white[:, None], constant(colour.device, 0.6, 0.6, 0.6), colour)
+    face = torch.where(white[:, None], constant((0.6, 0.6, 0.6), colour), colour)
     return _put(surface, sign & p.end & p.upper, face)
 
 
@@ -185,7 +185,7 @@ def _illumination(light: Light, heading: Tensor, p: Point, vehicle: Tensor) -> T
     lit = light.direct * facing[:, None] + light.ambient * open_sky[:, None]
     distance = p.depth.clamp(1.0, 1e4)
     beam = light.headlight * 60 / (distance * distance + 60) * (p.face == REAR)
-    return lit + beam[:, None] * constant(lit.device, 1.0, 0.95, 0.85)
+    return lit + beam[:, None] * constant((1.0, 0.95, 0.85), lit)
 
 
 def _lamp_radiance(light: Light, braking: Tensor, p: Point, lamp: Tensor) -> Tensor:
@@ -194,8 +194,8 @@ def _lamp_radiance(light: Light, braking: Tensor, p: Point, lamp: Tensor) -> Ten
     tail = lamp & (p.face == REAR) & (braking | night)
     red = (0.35 + 0.5 * braking.float()) * tail
     white = 2.5 * (lamp & (p.face == FRONT) & night)
-    glow = red[:, None] * constant(red.device, 0.9, 0.04, 0.02)
-    return glow + white[:, None] * constant(red.device, 1.0, 0.95, 0.8)
+    glow = red[:, None] * constant((0.9, 0.04, 0.02), red)
+    return glow + white[:, None] * constant((1.0, 0.95, 0.8), red)
 
 
 def _put(surface: Tensor, where: Tensor, value: Tensor) -> Tensor:

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from lanebev.render.raster.canvas import Canvas
-from lanebev.render.raster.constants import constant
 from lanebev.render.raster.hexahedra import (
     NEVER,
     Hexahedra,
@@ -28,6 +27,7 @@ from lanebev.render.raster.tiles import TILE, TILE_PIXELS
 from lanebev.render.scene.objects import SceneObjects
 from lanebev.render.scene.sampler import map_tensors, select_rows
 from lanebev.render.scene.world import Scene
+from lanebev.tensors import constant
 
 _SUBPIXELS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))  # rotated grid
 _OVERLAP = 0.6  # m that something may be nearer than an object and still be hidden by it
@@ -151,14 +151,14 @@ def _subpixels(
     normal: Tensor, distance: Tensor, ray_x: Tensor, ray_y: Tensor, limit: Tensor, step: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute the share of pixels that objects cover before a limit, least Z and its face, (N,) each."""
-    shift = constant(step.device, *(v for pair in _SUBPIXELS for v in pair)).view(-1, 2, 1)
+    shift = constant(_SUBPIXELS, step)[..., None]
     fine_x = ray_x + shift[:, 0] * step[0] + shift[:, 1] * step[2]  # (4, N)
     fine_y = ray_y + shift[:, 0] * step[1] + shift[:, 1] * step[3]
     time, moved = plane_times(normal, distance, fine_x, fine_y)
     enters = as_float(moved < 0)
     depth = entry_depth(time, enters).amin(0)
     seen = as_float(depth < limit)
-    nearest = torch.lerp(constant(step.device, NEVER)[0], depth, seen).amin(0)
+    nearest = torch.lerp(constant((NEVER,), step)[0], depth, seen).amin(0)
     face = entered_face(time, enters, nearest.expand_as(depth)).amax(0).clamp(min=0)
     return seen.mean(0), nearest, face
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.constants import constant
+from lanebev.tensors import constant
 
 
 def indices_where(mask: Tensor) -> Tensor:
@@ -50,7 +50,7 @@ def as_float(mask: Tensor) -> Tensor:
 
 def choose(mask: Tensor, yes: Tensor | float, no: Tensor | float) -> Tensor:
     """Return ``yes`` where a mask holds, else ``no``, exactly as ``torch.where``; both finite, float32."""
-    yes, no = (v if isinstance(v, Tensor) else constant(mask.device, v)[0] for v in (yes, no))
+    yes, no = (v if isinstance(v, Tensor) else constant((v,), mask, torch.float32)[0] for v in (yes, no))
     return torch.lerp(no, yes, as_float(mask))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.constants import colour
+from lanebev.render.raster.colour import colour
 from lanebev.render.raster.features import Features
 from lanebev.render.raster.noise import CLOUD, sample_line, sample_noise, smoothstep
 from lanebev.render.raster.select import as_float, choose
@@ -64,7 +64,7 @@ def sky_radiance(
         near = sun.clamp(min=0)
         fourth = near.square().square()
         glow = 0.5 * fourth * fourth.square() + 6 * torch.exp(400 * (near - 1))
-        sky = sky + glow[:, None] * colour(sky.device, 1.0, 0.93, 0.8)
+        sky = sky + glow[:, None] * colour(sky, 1.0, 0.93, 0.8)
     for ridge, distance in ((0, 0.75), (1, 0.5)):
         height = surroundings.hill_height[:, ridge, None]
         top = height * (1 + 0.45 * sample_line(azimuth * (1 / 6.2832) + 0.4 * ridge))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from lanebev.render.raster.constants import colour
+from lanebev.render.raster.colour import colour
 from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.noise import GRAIN, sample_grain
 from lanebev.render.raster.select import choose, remainder
@@ -24,7 +24,7 @@ def verge_albedo(surroundings: Surroundings, ground: Ground, patches: Tensor) ->
     grass = choose(right, surroundings.verge[:, 1, :, None], surroundings.verge[:, 0, :, None])
     tufts = sample_grain(GRAIN, along / 19.0, across / 17.0) / (1 + ground.reach_along / 0.15)
     shade = (1 + 0.3 * tufts + 0.22 * patches).clamp(0.25, 2.0)
-    dry = colour(grass.device, 1.25, 1.05, 0.8)
+    dry = colour(grass, 1.25, 1.05, 0.8)
     grass = grass * shade[:, None] * choose((patches > 0.7)[:, None], dry, 1.0)
     inside = surroundings.opposite.clamp(min=-1e6)[:, None] - across  # m into the opposite carriageway
     other = (inside > 0) & (inside < 13.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.constants import colour
+from lanebev.render.raster.colour import colour
 from lanebev.render.raster.houses import house_front
 from lanebev.render.raster.noise import (
     CLOUD,
@@ -90,7 +90,7 @@ def _slope(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Te
     top = wall.height[:, None] * (0.75 + 0.3 * sample_line(along / 420.0 + seed).clamp(-1.5, 1.5))
     tufts = sample_noise(CLOUD, along / 60.0 + seed, up / 25.0)
     bush = smoothstep(0.5, 0.9, sample_noise(CLOUD, along / 90.0, up / 60.0 + seed))
-    shade = (1 + 0.2 * tufts)[:, None] * (1 - bush[:, None] * colour(bush.device, 0.75, 0.6, 0.7))
+    shade = (1 + 0.2 * tufts)[:, None] * (1 - bush[:, None] * colour(bush, 0.75, 0.6, 0.7))
     return wall.colour[..., None] * shade, _standing(top, up, footprint)
 
 
