@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -121,6 +122,8 @@ def test_the_lanes_of_a_part_of_a_video_fit_the_same_part(data, tmp_path, capsys
     assert capsys.readouterr().out.startswith("3 frames in common")
     pairs = common_frames(*(read_run(tmp_path / name) for name in ("whole", "first")))
     assert [(a.frame, b.frame) for a, b in pairs] == [(6, 0), (8, 1), (10, 2)]
+    taken = replace(open_source(f"{data}/drive.mp4"), selection=read_run(tmp_path / "first").selection())
+    assert [frame.source_number for frame in taken] == [6, 8, 10]
 
 
 @pytest.mark.parametrize(
