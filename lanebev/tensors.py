@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
-from typing import Any, TypeVar, cast
+from functools import lru_cache, wraps
+from typing import Any, ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -19,6 +20,26 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: T) -> T:
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return cast(T, type(value)(*(map_tensors(function, part) for part in value)))
     return value
+
+
+def made_once(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorate a function of hashable arguments that makes tensors, to be called once for each of them.
+
+    A compiled or exported program makes its own. Nobody may change the tensors in place.
+    """
+
+    @lru_cache(maxsize=256)
+    def kept(*args: Any, **kwargs: Any) -> T:
+        with torch.inference_mode(mode=False):  # tensors that are made in it could not be used for gradients
+            return cast("Callable[..., T]", function)(*args, **kwargs)
+
+    @wraps(function)
+    def once(*args: P.args, **kwargs: P.kwargs) -> T:
+        if torch.compiler.is_compiling():
+            return function(*args, **kwargs)
+        return cast("Callable[..., T]", kept)(*args, **kwargs)
+
+    return once
 
 
 def constant(numbers: tuple[Any, ...], like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
@@ -34,8 +55,6 @@ def constant(numbers: tuple[Any, ...], like: Tensor, dtype: torch.dtype | None =
     kind = dtype or like.dtype
     if torch.compiler.is_exporting():
         return _computed_constant(numbers, kind, like.device)
-    if torch.compiler.is_compiling():
-        return torch.tensor(numbers, dtype=kind, device=like.device)
     return _constant(numbers, kind, like.device)
 
 
@@ -53,7 +72,6 @@ def _computed_constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: tor
     return torch.cat([each[number] for number in flat]).view(shape)
 
 
-@lru_cache(maxsize=256)
+@made_once
 def _constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    with torch.inference_mode(mode=False):  # one that is made in it could not be used for gradients
-        return torch.tensor(numbers, dtype=dtype).to(device)
+    return torch.tensor(numbers, dtype=dtype, device=device)

@@ -18,6 +18,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lanebev.tensors import made_once
+
 MODELS = ("pinhole", "fisheye", "omni")
 DISTORTION_LENGTHS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "omni": (5,)}
 _OTHER_NAMES = {"mei": "omni"}
@@ -246,8 +248,7 @@ def max_undistorted_radius(distortion: Tensor, model: str = "pinhole", limit: fl
         (B,) radius on the undistorted z = 1 plane.
     """
     check_lens(distortion, model)
-    steps = torch.linspace(0.0, 1.0, _REACH_STEPS + 1, dtype=distortion.dtype, device=distortion.device)
-    steps = steps.expand(*distortion.shape[:-1], -1)
+    steps = _fractions(distortion.dtype, distortion.device).expand(*distortion.shape[:-1], -1)
     angle = 0.9999 * 0.5 * math.pi * steps
     if lens_model(model) == "fisheye":
         radius, (value, _) = angle.tan(), fisheye_distance(angle, distortion)
@@ -259,6 +260,11 @@ def max_undistorted_radius(distortion: Tensor, model: str = "pinhole", limit: fl
         value = radius * (radial_scale(radius * radius, distortion)[0] if distortion.shape[-1] else 1.0)
     grows = value.diff(dim=-1) > 0
     return torch.where(grows, radius[..., -1:], radius[..., :-1]).amin(-1)  # the first that doesn't
+
+
+@made_once
+def _fractions(dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.linspace(0.0, 1.0, _REACH_STEPS + 1, dtype=dtype, device=device)
 
 
 def _matrix(entries: list[Tensor]) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import road_from_cam
-from lanebev.tensors import constant
+from lanebev.tensors import constant, made_once
 from lanebev.types import Extrinsics
 from lanebev.view.grid import BEVGrid
 from lanebev.view.lens import Lens, make_lens
@@ -18,6 +18,7 @@ from lanebev.view.projection import CellSums
 from lanebev.view.tiles import road_edges
 
 _BEHIND = -1e6  # m, depth given to planes that are not below the camera
+_axes = made_once(BEVGrid.axes)
 
 
 def cells_and_lens(
@@ -68,18 +69,12 @@ def cell_sums(
     matrix = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll).mT
     if image_from_cam is not None:
         matrix = image_from_cam @ matrix
-    x, z = (BEVGrid.axes if torch.compiler.is_compiling() else _axes)(grid, matrix.dtype, matrix.device)
+    x, z = _axes(grid, matrix.dtype, matrix.device)
     right, down, forward = matrix[..., None].unbind(-2)  # (B, 3, 1)
     below = extrinsics.height.unsqueeze(-1) - constant(tuple(plane_heights), like=matrix)  # (B, P)
     offset = torch.where((below > 0).unsqueeze(1), down * below.unsqueeze(1), _BEHIND)  # (B, 3, P)
     by_row = torch.addcmul(offset.unsqueeze(-1), forward.unsqueeze(-1), z)  # (B, 3, P, U)
     return CellSums(by_row.flatten(2), right * x, _edges(grid, len(plane_heights)))
-
-
-@lru_cache(maxsize=64)
-def _axes(grid: BEVGrid, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    with torch.inference_mode(mode=False):  # ones that are made in it could not be used for gradients
-        return grid.axes(dtype, device)
 
 
 @lru_cache(maxsize=64)

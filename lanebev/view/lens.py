@@ -32,10 +32,6 @@ class Lens(NamedTuple):
     squared_limit: Tensor
     tilt: Tensor | None
 
-    def without_limit(self) -> Lens:
-        """Return the lens continued beyond where it folds over."""
-        return self._replace(squared_limit=torch.full_like(self.squared_limit, torch.inf))
-
     def excess(self, cells: Tensor) -> Tensor:
         """Compute what is positive where the lens folds over, x² + y² - limit z².
 
@@ -59,26 +55,29 @@ def make_lens(image_from_cam: Tensor, distortion: Tensor, model: str) -> Lens:
     return Lens(distortion, lens_model(model), focal, skew, upper[:, :, 2], limit, tilt)
 
 
-def image_planes(points: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
+def image_planes(points: Tensor, lens: Lens, continued: bool = False) -> tuple[Tensor, Tensor]:
     """Project points of the ideal z = 1 plane to the image.
 
     Args:
         points: (B, 2, R, V).
         lens: lens of each row of the batch.
+        continued: beyond where the lens folds over, too; then coordinates may be of any size.
 
     Returns:
         (B, 2, R, V) image coordinates, finite, and (B, R, V): zero where the lens does not fold over, else at
-        least 1, without gradient.
+        least 1, without gradient; zero too where it is continued.
     """
     x, y = points.unbind(1)
     squared_radius = torch.addcmul(x * x, y, y)
-    clamped = torch.minimum(squared_radius, lens.squared_limit)  # beyond it no gradient, and no overflow
+    # beyond the fold no gradient, and no overflow
+    clamped = squared_radius if continued else torch.minimum(squared_radius, lens.squared_limit)
     beyond = (squared_radius - clamped).detach().sign()
     points = distort_planes(points, clamped, lens.coefficients, lens.model)
     if lens.tilt is not None:
         points, behind = tilt_planes(points, lens.tilt)
         beyond = beyond + behind
-    return torch.addcmul(points * lens.focal, points[:, 1:], lens.skew) + lens.centre, beyond
+    points = torch.addcmul(torch.addcmul(lens.centre, points, lens.focal), points[:, 1:], lens.skew)
+    return points, beyond
 
 
 def distort_planes(points: Tensor, squared_radius: Tensor, distortion: Tensor, model: str) -> Tensor:

@@ -75,12 +75,13 @@ def normalised_intrinsics(intrinsics: Tensor, image_size: tuple[int, int]) -> Te
     return constant(rows, like=intrinsics) @ intrinsics
 
 
-def image_coordinates(cells: Tensor, lens: Lens | None) -> tuple[Tensor, Tensor]:
+def image_coordinates(cells: Tensor, lens: Lens | None, continued: bool = False) -> tuple[Tensor, Tensor]:
     """Project cells.
 
     Args:
         cells: (B, 3, R, V) homogeneous coordinates in the image, or with a lens in the camera.
         lens: None for an undistorted image.
+        continued: see :func:`lanebev.view.lens.image_planes`.
 
     Returns:
         (B, 2, R, V) coordinates, finite everywhere, and (B, R, V): zero in front of the camera and where the
@@ -92,7 +93,7 @@ def image_coordinates(cells: Tensor, lens: Lens | None) -> tuple[Tensor, Tensor]
     hidden = (ahead - depth).detach().sign()
     if lens is None:
         return points, hidden
-    points, beyond = image_planes(points, lens)
+    points, beyond = image_planes(points, lens, continued)
     return points, hidden + beyond
 
 

@@ -195,7 +195,7 @@ def interpolant(cells: CellSums, lens: Lens | None, limit: float) -> Interpolant
         cells.by_row.index_select(-1, torch.from_numpy(rows.nodes)),
         cells.by_column.index_select(-1, torch.from_numpy(columns.nodes)),
     ).rows(0, len(rows.nodes))
-    points, hidden = image_coordinates(nodes, lens and lens.without_limit())
+    points, hidden = image_coordinates(nodes, lens, continued=True)
     shape = rows.coefficients.shape[:2]
 
     def by_tiles(values: Tensor) -> NDArray[np.float32]:
