@@ -28,12 +28,13 @@ from torch import Tensor
 from lanebev.batch import masked_median
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.boundary_curves import Boundaries, boundary_polylines, fit_boundaries
-from lanebev.io.frames import ALL, Frame, Selection
+from lanebev.io.frames import Frame
 from lanebev.io.lanes import read_lanes
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
-from lanebev.io.video import FrameSource, open_source
+from lanebev.io.video import open_source
 from lanebev.observation.polylines import image_rows
 from lanebev.observation.segments import segments_from_lines
+from lanebev.report.run_folder import read_run
 from lanebev.types import Extrinsics
 from train.commands import one_line_errors
 
@@ -118,15 +119,7 @@ def poses(rows: list[ExtrinsicsRow], like: Tensor) -> Extrinsics:
     return Extrinsics(pitch, yaw, roll, like.new_tensor([row.height_m for row in rows]))
 
 
-def write_labels(
-    result: Path,
-    source: str,
-    out: Path,
-    camera: Camera,
-    reach: int,
-    stride: int,
-    selection: Selection = ALL,
-) -> int:
+def write_labels(result: Path, source: str, out: Path, camera: Camera, reach: int, stride: int) -> int:
     """Write images and ``labels.json``, and return how many; nothing is left of a folder that fails.
 
     Args:
@@ -136,7 +129,6 @@ def write_labels(
         camera: the camera that took them.
         reach: frames before and after that place a boundary.
         stride: write every Nth usable frame.
-        selection: frames that the run took of the source.
 
     Raises:
         ValueError: no frame is usable, or the frames are not those of the run.
@@ -151,7 +143,7 @@ def write_labels(
     with TemporaryDirectory(dir=out.parent, prefix=f"{out.name}-") as folder:
         made = Path(folder) / out.name
         (made / "images").mkdir(parents=True)
-        frames = frames_of_run(replace(open_source(source), selection=selection), len(rows), result)
+        frames = frames_of_run(source, result)
         entries = [
             write_entry(made, frame, x[frame.number])
             for frame in frames
@@ -162,20 +154,20 @@ def write_labels(
     return len(entries)
 
 
-def frames_of_run(source: FrameSource, count: int, result: Path) -> Iterator[Frame]:
-    """Yield the frames of a source, which must be as many as a run's.
+def frames_of_run(source: str, result: Path) -> Iterator[Frame]:
+    """Yield the frames that a run took of its source.
 
     Raises:
-        ValueError: another number of frames.
+        ValueError: they are not as many as the run has.
     """
+    run = read_run(result)
     got = 0
-    for frame in source:
+    for frame in replace(open_source(source), selection=run.selection()):
         yield frame
         got += 1
-    if got != count:
+    if got != len(run.rows):
         raise ValueError(
-            f"{source.source}: expected the {count} frames of {result}, got {got}; give the --start, --end "
-            "and --every of that run"
+            f"{source}: expected the {len(run.rows)} frames of {result}, got {got}; is it another?"
         )
 
 
@@ -205,15 +197,11 @@ def main() -> None:
         help="number of frames before and after over which boundaries are smoothed",
     )
     parser.add_argument("--stride", type=PositiveInt, default=3, help="write every Nth usable frame")
-    parser.add_argument("--start", type=float, default=0.0, help="as given to the run")
-    parser.add_argument("--end", type=float, default=math.inf, help="as given to the run")
-    parser.add_argument("--every", type=PositiveInt, default=1, help="as given to the run")
     args = parser.parse_args()
     if args.out.exists():
         parser.error(f"out: expected a new folder, got {args.out}, which is there")
     camera = Camera.from_file(args.camera)
-    selection = Selection(args.start, args.end, args.every)
-    count = write_labels(args.result, args.source, args.out, camera, args.reach, args.stride, selection)
+    count = write_labels(args.result, args.source, args.out, camera, args.reach, args.stride)
     print(f"{args.out}: {count} labelled images")
 
 

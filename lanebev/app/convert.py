@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, cast
 
@@ -12,6 +13,7 @@ from lanebev.io.formats.names import FORMATS, check_installed
 from lanebev.io.formats.record import RunRecord
 from lanebev.io.video import Frame, open_source
 from lanebev.io.whole_file import whole_file
+from lanebev.report.run_folder import read_run
 
 
 class Writer(Protocol):
@@ -53,7 +55,9 @@ def convert(
             installed.
     """
     write, record = writer(to), read_record(run, camera)
-    source = None if images is None else open_source(images)
+    source = None
+    if images is not None:
+        source = replace(open_source(images), selection=read_run(run).selection())
     path = Path(run) / FORMATS[to].file if out is None else Path(out)
     with whole_file(path) as whole:
         write(whole, record, source)

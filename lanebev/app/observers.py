@@ -58,7 +58,8 @@ class LaneFileObserver:
 
     Args:
         entries: entries of the lane file.
-        source: the frames; images are matched by the longest common tail of their path, a video by order.
+        source: the frames; images are matched by the longest common tail of their path, a video by order: an
+            entry for each frame of it, or for each that is taken.
         camera: the lens.
 
     Raises:
@@ -70,8 +71,9 @@ class LaneFileObserver:
     def __init__(self, entries: Sequence[FrameLines], source: FrameSource, camera: Camera) -> None:
         self.entries, self.camera = entries, camera
         self.remark = size_remark(entries, camera.image_size)
+        self._of_taken = source.is_video and len(entries) == source.taken_count
         if source.is_video:
-            if len(entries) != source.count:
+            if len(entries) != source.count and not self._of_taken:
                 raise ValueError(
                     f"lanes: expected {source.count} entries, one per frame of {source.source}, got "
                     f"{len(entries)}; is the lane file cut?"
@@ -83,7 +85,9 @@ class LaneFileObserver:
 
     def __call__(self, frame: Frame) -> Observation:
         """See :class:`Observer`."""
-        number = frame.number if frame.source_number is None else frame.source_number
+        number = frame.number
+        if frame.source_number is not None and not self._of_taken:
+            number = frame.source_number
         entry = self.matches[number] if number < len(self.matches) else None
         found = FrameLines(frame.name, []) if entry is None else self.entries[entry]
         lines = [] if frame.image is None else found.lines

@@ -30,6 +30,7 @@ from lanebev.report.measure import measure_boundaries, select_inliers
 from lanebev.report.moments import MomentSampler
 from lanebev.report.overlay import Panel, draw_panels, joined
 from lanebev.report.page import Report, summary_facts, write_report
+from lanebev.report.run_folder import FIRST_NUMBER
 from lanebev.report.verdict import reason_words
 from lanebev.report.worst import EventScores
 from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics
@@ -95,6 +96,7 @@ class Recorder:
         self._before = ViewBefore(alone)
         self._coarse = replace(self.grid, resolution=max(self.grid.resolution, _BEFORE_RESOLUTION))
         self._filtered_rows = KeptRows()
+        self._first_number: int | None = None
         self._widths = KeptNumbers(2, NUM_BOUNDARIES - 1, folder=self.path("."))
         self._moments, self._scores = MomentSampler(), EventScores()
 
@@ -118,6 +120,8 @@ class Recorder:
         frame = done.frame
         if frame.problem:
             self._note(f"frame {frame.number}: {frame.problem}")
+        if not len(self.rows):
+            self._first_number = frame.source_number
         self.rows.append(_row(done, done.estimate.calibration))
         if self.smoothed and done.filtered is not None:
             self._filtered_rows.append(_row(done, done.filtered))
@@ -164,7 +168,8 @@ class Recorder:
             camera=self.camera,
             mount=mount,
         )
-        report.facts = {**facts, **summary_facts(report)}
+        began = {} if self._first_number is None else {FIRST_NUMBER: str(self._first_number)}
+        report.facts = {**facts, **began, **summary_facts(report)}
         write_report(self.path("report.html"), report)
         return report
 

@@ -53,17 +53,17 @@ class AxisDifference:
         return [_ANGLE.format(value) for value in values]
 
 
-def common_frames(first: Sequence[ExtrinsicsRow], second: Sequence[ExtrinsicsRow]) -> list[Pair]:
-    """Return the rows of the same frames: of images by the name of their file, else by number.
+def common_frames(first: RunFolder, second: RunFolder) -> list[Pair]:
+    """Return the rows of the same frames: of images by the name of their file, else by number in the source.
 
     Raises:
         ValueError: there are none.
     """
-    keys = _names(first), _names(second)
+    keys: tuple[Sequence[object], Sequence[object]] = _names(first.rows), _names(second.rows)
     if not (keys[0] and keys[1]):
-        keys = [str(row.frame) for row in first], [str(row.frame) for row in second]
-    of_second = dict(zip(keys[1], second, strict=True))
-    pairs = [(row, of_second[key]) for row, key in zip(first, keys[0], strict=True) if key in of_second]
+        keys = first.source_numbers(), second.source_numbers()
+    of_second = dict(zip(keys[1], second.rows, strict=True))
+    pairs = [(row, of_second[key]) for row, key in zip(first.rows, keys[0], strict=True) if key in of_second]
     if not pairs:
         raise ValueError("compare: expected two runs with frames in common, got none")
     return pairs
@@ -109,7 +109,7 @@ def render_comparison(first: RunFolder, second: RunFolder) -> str:
     Raises:
         ValueError: they have no frame in common.
     """
-    pairs = common_frames(first.rows, second.rows)
+    pairs = common_frames(first, second)
     stills = bool(pairs[0][0].image) and len({row.time_s for row, _ in pairs}) == 1
     found = differences(pairs)
     shown = shown_frames([row for row, _ in pairs], [each.at for each in found])
@@ -156,7 +156,7 @@ def render_comparison(first: RunFolder, second: RunFolder) -> str:
 
 def comparison_summary(first: RunFolder, second: RunFolder) -> str:
     """Return what to print: the frames in common, how each axis differs, the settings that do."""
-    pairs = common_frames(first.rows, second.rows)
+    pairs = common_frames(first, second)
     lines = [f"{len(pairs)} frames in common; {second.name} minus {first.name}:"]
     for each in differences(pairs):
         mean, rms, largest = each.words

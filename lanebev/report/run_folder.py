@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lanebev.io.frames import Selection
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
 
+FIRST_NUMBER = "first frame, in the source"
+"""Label of the setting that says the number of a run's first frame in the whole source."""
 _PICTURE = re.compile(r"data:image/jpeg;base64,[A-Za-z0-9+/=]*")
 
 
@@ -32,6 +36,19 @@ class RunFolder:
     lens: Mapping[str, str] = field(default_factory=dict)
     pictures: Mapping[int, Mapping[str, str]] = field(default_factory=dict)
 
+    def selection(self) -> Selection:
+        """Return which frames of its source the run took, by its settings; all where there are none."""
+        return Selection(
+            _number(self.settings.get("--start", ""), 0.0),
+            _number(self.settings.get("--end", ""), math.inf),
+            _whole(self.settings.get("--every", ""), 1),
+        )
+
+    def source_numbers(self) -> list[int]:
+        """Return the frames' numbers in the whole source, by the settings that say which were taken."""
+        first, every = _whole(self.settings.get(FIRST_NUMBER, ""), 0), self.selection().every
+        return [first + every * row.frame for row in self.rows]
+
 
 def read_run(folder: str | Path) -> RunFolder:
     """Read a run's folder; ``report.html`` in it may be missing or another program's.
@@ -51,6 +68,17 @@ def read_run(folder: str | Path) -> RunFolder:
     return RunFolder(
         folder.resolve().name, rows, _texts(run.get("settings")), _texts(run.get("lens")), _pictures(data)
     )
+
+
+def _whole(text: str, default: int) -> int:
+    return int(text) if text.isdecimal() else default
+
+
+def _number(text: str, default: float) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return default
 
 
 def _json(page: str, name: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -20,6 +21,8 @@ from lanebev.io.live import open_live
 from lanebev.io.results import read_extrinsics
 from lanebev.io.source_names import is_live
 from lanebev.io.video import VideoWriter, open_source
+from lanebev.report.comparison import common_frames
+from lanebev.report.run_folder import read_run
 from tests.app.rtsp_server import RtspServer, transport_stream
 from tools.stream_check import MjpegServer
 
@@ -86,6 +89,41 @@ def test_lanes_go_with_the_frames_that_are_taken(data, tmp_path):
     seen = (tmp_path / "out" / "lanes.json").read_text().splitlines()
     for line, number in zip(seen, (6, 8, 10), strict=True):
         assert f"[{50 - number}.0, 90.0]" in line
+
+
+def test_the_lanes_of_a_part_of_a_video_fit_the_same_part(data, tmp_path, capsys):
+    lines = [
+        f'{{"raw_file": "{number}", "h_samples": [90, 100, 110], "lanes": [[{50 - number}, 45, 40]]}}'
+        for number in range(20)
+    ]
+    (tmp_path / "lanes.json").write_text("\n".join(lines))
+    fixed = [
+        "run",
+        f"{data}/drive.mp4",
+        "--camera",
+        f"{data}/camera.yaml",
+        "--no-video",
+        "--grid",
+        "3:20,-5:5/0.25",
+    ]
+    part = ["--start", "0.5", "--end", "1.1", "--every", "2"]
+    whole = [*fixed, "--lanes", f"{tmp_path}/lanes.json", "--out", f"{tmp_path}/whole"]
+    first = [*fixed, *part, "--lanes", f"{tmp_path}/lanes.json", "--out", f"{tmp_path}/first"]
+    again = [*fixed, *part, "--lanes", f"{tmp_path}/first/lanes.json", "--out", f"{tmp_path}/again"]
+    for arguments in (whole, first, again):
+        assert main(arguments) == 0
+    assert (tmp_path / "first" / "extrinsics.csv").read_text() == (
+        tmp_path / "again" / "extrinsics.csv"
+    ).read_text()
+    other = [*fixed, "--lanes", f"{tmp_path}/first/lanes.json", "--out", f"{tmp_path}/no"]
+    _fails(capsys, *other, word="expected 20 entries")
+    page = tmp_path / "page.html"
+    assert main(["compare", f"{tmp_path}/whole", f"{tmp_path}/first", "--out", f"{page}"]) == 0
+    assert capsys.readouterr().out.startswith("3 frames in common")
+    pairs = common_frames(*(read_run(tmp_path / name) for name in ("whole", "first")))
+    assert [(a.frame, b.frame) for a, b in pairs] == [(6, 0), (8, 1), (10, 2)]
+    taken = replace(open_source(f"{data}/drive.mp4"), selection=read_run(tmp_path / "first").selection())
+    assert [frame.source_number for frame in taken] == [6, 8, 10]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from lanebev.report.comparison import (
     render_comparison,
 )
 from lanebev.report.page import write_report
-from lanebev.report.run_folder import RunFolder, read_run
+from lanebev.report.run_folder import FIRST_NUMBER, RunFolder, read_run
 from tests.report.report_data import FRAMES, eventful_report, eventful_rows
 
 HOSTILE = "</script><script>alert(1)</script>\"'<img src=x onerror=alert(2)>"
@@ -35,18 +35,28 @@ def _write_run(folder, report):
 
 
 def test_frames_are_matched_by_number():
-    pairs = common_frames(QUIET[:30], QUIET[20:])
+    pairs = common_frames(RunFolder("a", QUIET[:30]), RunFolder("b", QUIET[20:]))
     assert [(a.frame, b.frame) for a, b in pairs] == [(i, i) for i in range(20, 30)]
     with pytest.raises(ValueError, match="expected two runs with frames in common, got none"):
-        common_frames(QUIET[:10], QUIET[20:])
+        common_frames(RunFolder("a", QUIET[:10]), RunFolder("b", QUIET[20:]))
+
+
+def test_frames_of_parts_of_a_source_are_matched_by_their_number_in_it():
+    """Run a took every fourth frame from 0 on, run b all from 6 on."""
+    a = RunFolder("a", QUIET[:10], {"--every": "4", FIRST_NUMBER: "0"})
+    b = RunFolder("b", QUIET[:12], {"--every": "1", FIRST_NUMBER: "6"})
+    assert [(x.frame, y.frame) for x, y in common_frames(a, b)] == [(2, 2), (3, 6), (4, 10)]
 
 
 def test_images_are_matched_by_the_name_of_their_file():
     first = [row._replace(image=f"/a/{row.frame}.jpg") for row in QUIET[:4]]
     second = [row._replace(frame=i, image=f"/b/{row.frame}.jpg") for i, row in enumerate(QUIET[2:6])]
-    assert [(a.frame, b.frame) for a, b in common_frames(first, second)] == [(2, 0), (3, 1)]
+    assert [(a.frame, b.frame) for a, b in common_frames(RunFolder("a", first), RunFolder("b", second))] == [
+        (2, 0),
+        (3, 1),
+    ]
     alike = [row._replace(image=f"/{row.frame}/same.jpg") for row in QUIET[:4]]
-    assert len(common_frames(alike, alike)) == 4
+    assert len(common_frames(RunFolder("a", alike), RunFolder("b", alike))) == 4
 
 
 def test_differences_have_the_known_answer():

@@ -10,7 +10,7 @@ import torch
 from lanebev.pipeline import LaneBEV
 from lanebev.types import Extrinsics
 from lanebev.view.grid import BEVGrid
-from train.detector.__main__ import main
+from train.detector.__main__ import main, trained
 from train.detector.drives import (
     MOUNT_ERROR,
     NOMINAL,
@@ -22,8 +22,9 @@ from train.detector.drives import (
     render_drive,
     write_drive,
 )
-from train.detector.frames import DriveFrames, mirrored
-from train.detector.module import NOISE, arm_poses
+from train.detector.experiment import Experiment
+from train.detector.frames import DriveFrames, StepBatches, mirrored
+from train.detector.module import NOISE, DetectorTraining, arm_poses, one_cycle
 from train.detector.network import VehicleDetector
 from train.detector.predict import OFFSETS_DEG, offset_poses
 from train.detector.table import main as show
@@ -106,6 +107,40 @@ def test_a_mirrored_frame_is_seen_by_a_mirrored_camera(folder):
     torch.testing.assert_close(pixels[1][:, 1], pixels[0][:, 1])
 
 
+def test_each_pass_has_every_frame_once_and_a_continued_one_the_same_frames():
+    batches = list(StepBatches(count=7, size=2, steps=8, seed=1))
+    assert len(batches) == 8
+    for first in (0, 3):
+        assert len({row for batch in batches[first : first + 3] for row in batch}) == 6
+    assert batches[:3] != batches[3:6]
+    assert list(StepBatches(7, 2, 8, 1, begin=4)) == batches[4:]
+    assert list(StepBatches(7, 2, 8, 2)) != batches
+    with pytest.raises(ValueError, match="batch_size: expected at most 7, the number of frames, got 8"):
+        StepBatches(7, 8, 8, 1)
+
+
+def test_the_cycle_is_that_of_torch():
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+    cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1.0, 101, pct_start=0.16, final_div_factor=1e9)
+    for step in range(100):
+        assert one_cycle(step / 100, rise=0.1516) == pytest.approx(cycle.get_last_lr()[0], abs=1e-6)
+        optimizer.step()
+        cycle.step()
+    assert (one_cycle(0.0), one_cycle(0.15), one_cycle(1.0)) == pytest.approx((0.04, 1.0, 0.0))
+    assert one_cycle(0.075) == pytest.approx(0.52)
+    assert one_cycle(0.575) == pytest.approx(0.5)
+
+
+def test_gradients_of_detector_and_lane_network_are_clipped_separately():
+    module = DetectorTraining("nominal", GRID, 8, 8, top=32)
+    near, far = (torch.nn.Parameter(torch.zeros(2)) for _ in range(2))
+    near.grad, far.grad = torch.tensor([0.3, 0.4]), torch.tensor([300.0, 400.0])
+    optimizer = torch.optim.SGD([{"params": [near]}, {"params": [far]}], lr=1.0)
+    module.configure_gradient_clipping(optimizer, gradient_clip_val=5.0)
+    torch.testing.assert_close(near.grad, torch.tensor([0.3, 0.4]))
+    torch.testing.assert_close(far.grad, torch.tensor([3.0, 4.0]))
+
+
 def test_offsets_turn_one_axis_of_every_frame_by_the_angle():
     poses = torch.rand(50, 4)
     turned = offset_poses(poses)
@@ -139,7 +174,7 @@ def test_rows_of_the_detector_do_not_influence_each_other_and_the_pose_has_a_gra
 def test_the_experiment_runs_is_not_repeated_and_makes_its_table(folder, tmp_path, capsys):
     arguments = [
         "--config=configs/detector.yaml", f"--train={folder}", f"--test={folder}", f"--out={tmp_path}/run",
-        "--steps=2", "--tuned_steps=1", "--seeds=[1]", "--batch_size=2", "--tuned_batch_size=1", "--top=32",
+        "--steps=2", "--tuned_steps=1", "--seeds=[1]", "--batch_size=2", "--top=32",
         "--width=8", "--bev_width=8", "--grid.resolution=2.0", "--network_width=160", "--accelerator=cpu",
     ]  # fmt: skip
     main(arguments)
@@ -159,6 +194,49 @@ def test_the_experiment_runs_is_not_repeated_and_makes_its_table(folder, tmp_pat
     film([*arguments, f"--film={tmp_path}/film.mp4", "--film_frames=2"])
     with av.open(str(tmp_path / "film.mp4")) as video:
         assert sum(1 for _ in video.decode(video=0)) == 2
+
+
+def small(folder, out, **settings):
+    """Return an experiment of four steps of two frames, the last two of "tuned" with the lane network."""
+    fixed = {"steps": 4, "tuned_steps": 2, "batch_size": 2, "top": 32, "width": 8, "bev_width": 8}
+    return Experiment(
+        folder, folder, out, grid=GRID, network_width=160, accelerator="cpu", **{**fixed, **settings}
+    )
+
+
+def weights(module):
+    return {name: part.clone() for name, part in module.detector.state_dict().items()}
+
+
+@pytest.mark.slow
+def test_the_tuned_arm_differs_from_the_online_one_by_the_lane_networks_training_alone(folder, tmp_path):
+    frames = DriveFrames(folder, GRID)
+    online = weights(trained(small(folder, tmp_path), "online", 1, frames))
+    still = trained(small(folder, tmp_path, lane_rate=1e-12), "tuned", 1, frames)
+    for name, part in weights(still).items():
+        torch.testing.assert_close(part, online[name], atol=1e-4, rtol=1e-4)
+    before = LaneBEV.from_pretrained(network_width=160).segmenter.state_dict()
+    (tmp_path / "tuned-1/last.ckpt").unlink()
+    moved = trained(small(folder, tmp_path, lane_rate=1e-4), "tuned", 1, frames)
+    assert moved.trainer.global_step == 4
+    change = {name: part - before[name] for name, part in moved.lanes.segmenter.state_dict().items()}
+    assert 1e-6 < max(float(each.abs().max()) for each in change.values()) < 2.1e-4
+    assert not any(each.any() for name, each in change.items() if "running" in name)
+
+
+@pytest.mark.slow
+def test_an_interrupted_training_ends_as_one_without_interruption(folder, tmp_path):
+    frames = DriveFrames(folder, GRID)
+    whole = weights(trained(small(folder, tmp_path), "noisy", 1, frames))
+    (tmp_path / "noisy-1/step=2.ckpt").rename(tmp_path / "noisy-1/last.ckpt")
+    again = weights(trained(small(folder, tmp_path), "noisy", 1, frames))
+    for name, part in again.items():
+        torch.testing.assert_close(part, whole[name], atol=0, rtol=0)
+
+
+def test_the_last_steps_are_a_part_of_the_training(tmp_path):
+    with pytest.raises(ValueError, match="tuned_steps: expected a divisor of steps 4 that is smaller, got 3"):
+        small(tmp_path, tmp_path, tuned_steps=3)
 
 
 @pytest.mark.slow

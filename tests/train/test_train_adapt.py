@@ -15,7 +15,6 @@ from safetensors.torch import save_file
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.boundary_curves import Boundaries
 from lanebev.geometry.road import image_from_road_points
-from lanebev.io.frames import Selection
 from lanebev.io.results import ExtrinsicsRow, write_extrinsics
 from lanebev.observation.polylines import image_rows
 from lanebev.observation.resnet import ResNet18
@@ -91,10 +90,12 @@ def test_labels_are_those_of_the_frames_that_the_run_took(run, tmp_path):
     result, source = run
     for number in range(FRAMES, 2 * FRAMES):
         Image.new("RGB", (640, 360)).save(source / f"{number:03d}.png")
-    with pytest.raises(ValueError, match=r"expected the 9 frames of .* got 18; give the --start"):
+    with pytest.raises(ValueError, match=r"expected the 9 frames of .* got 18"):
         write_labels(result, str(source), tmp_path / "out", CAMERA, 3, 1)
     assert {path.name for path in tmp_path.iterdir()} == {"result", "frames"}
-    assert write_labels(result, str(source), tmp_path / "out", CAMERA, 3, 1, Selection(every=2)) == FRAMES - 1
+    settings = '{"settings": {"--every": "2", "--end": "not given"}}'
+    (result / "report.html").write_text(f'<script type="application/json" id="run">{settings}</script>')
+    assert write_labels(result, str(source), tmp_path / "out", CAMERA, 3, 1) == FRAMES - 1
     with Image.open(tmp_path / "out" / "images" / "000005.jpg") as image:
         assert image.getpixel((0, 0)) == (0, 0, 0)  # the source's frame 10
 

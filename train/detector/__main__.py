@@ -14,20 +14,20 @@ from dataclasses import asdict
 from typing import Any
 
 import lightning as L
-import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.utils.data import DataLoader
 
 from train.commands import one_line_errors
 from train.detector.experiment import (
     Experiment,
-    checkpoint_weights,
+    begun_checkpoint,
+    checkpoint_step,
     experiment_of,
     experiment_parser,
     new_module,
     test_poses,
 )
-from train.detector.frames import DriveFrames
+from train.detector.frames import DriveFrames, StepBatches
 from train.detector.module import ARMS, Arm, DetectorTraining
 from train.detector.precision import Centres, score_range
 from train.detector.predict import find, offset_poses, pose_rmse, true_centres
@@ -37,22 +37,23 @@ RANGES = ((5.0, 53.0), (5.0, 20.0), (20.0, 35.0), (35.0, 53.0))
 
 
 def trained(experiment: Experiment, arm: Arm, seed: int, frames: DriveFrames) -> DetectorTraining:
-    """Train an arm, or go on with it from its last checkpoint.
+    """Train an arm, or go on with it from its last checkpoint; "tuned" continues "online".
 
     Raises:
         ValueError: "tuned" before "online".
     """
     L.seed_everything(seed, verbose=False)
-    module, folder = new_module(experiment, arm), experiment.out / f"{arm}-{seed}"
-    steps, batch = int(experiment.steps), experiment.batch_size
-    if arm == "tuned":
-        steps, batch = int(experiment.tuned_steps), experiment.tuned_batch_size
-        begin = experiment.out / f"online-{seed}" / f"step={experiment.steps - steps}.ckpt"
-        if not begin.exists():
-            raise ValueError(f"arms: expected 'online' before 'tuned', got no {begin}")
-        module.load_state_dict(checkpoint_weights(begin), strict=False)
-    every = max(1, min(experiment.tuned_steps, steps))
-    keep = ModelCheckpoint(folder, "{step}", every_n_train_steps=every, save_top_k=-1, save_last=True)
+    module, steps = new_module(experiment, arm, seed), int(experiment.steps)
+    last = begun_checkpoint(experiment, arm, seed)
+    begin = 0 if last is None else checkpoint_step(last)
+    batches = StepBatches(len(frames), experiment.batch_size, steps, seed, begin)
+    keep = ModelCheckpoint(
+        experiment.out / f"{arm}-{seed}",
+        "{step}",
+        every_n_train_steps=int(experiment.tuned_steps),
+        save_top_k=-1,
+        save_last=True,
+    )
     trainer = L.Trainer(
         max_steps=steps,
         precision=experiment.precision,  # type: ignore[arg-type]  # Lightning checks it
@@ -60,20 +61,16 @@ def trained(experiment: Experiment, arm: Arm, seed: int, frames: DriveFrames) ->
         devices=1,
         logger=False,
         callbacks=[keep],
+        use_distributed_sampler=False,
         gradient_clip_val=5.0,
         enable_model_summary=False,
         enable_progress_bar=False,
     )
-    order = torch.Generator().manual_seed(seed)
-    loader = DataLoader(
-        frames, batch, shuffle=True, drop_last=True, generator=order, collate_fn=lambda frames: frames
-    )
-    last = folder / "last.ckpt"
     trainer.fit(
         module,
-        loader,
-        ckpt_path=str(last) if last.exists() else None,
-        weights_only=False if last.exists() else None,
+        DataLoader(frames, batch_sampler=batches, collate_fn=lambda frames: frames),
+        ckpt_path=None if last is None else str(last),
+        weights_only=None if last is None else False,
     )
     return module.eval().cpu()
 

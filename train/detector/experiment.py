@@ -25,15 +25,13 @@ class Experiment:
         train: folder of drives to train on.
         test: folder of drives to test on.
         out: folder of checkpoints and results.
-        arms: names of :data:`ARMS`; "tuned" starts from "online" ``tuned_steps`` before its end.
+        arms: names of :data:`ARMS`; "tuned" continues "online" as it was ``tuned_steps`` before its end.
         seeds: seeds of each arm.
         steps: number of steps of each training.
         tuned_steps: the last steps of "tuned", through the lane network.
         batch_size: frames a step.
-        tuned_batch_size: frames in a batch of the training through the lane network.
-        learning_rate: largest.
-        tuned_rate: largest of the last steps of "tuned".
-        lane_rate: the lane network's, as a share of it.
+        learning_rate: the detector's largest.
+        lane_rate: the lane network's largest.
         width: channels of the image features.
         bev_width: channels of the bird's-eye features.
         top: px of the image above which nothing is looked at.
@@ -53,10 +51,8 @@ class Experiment:
     steps: PositiveInt = 6000
     tuned_steps: PositiveInt = 600
     batch_size: PositiveInt = 8
-    tuned_batch_size: PositiveInt = 4
     learning_rate: PositiveFloat = 3e-3
-    tuned_rate: PositiveFloat = 1e-3
-    lane_rate: PositiveFloat = 0.01
+    lane_rate: PositiveFloat = 1e-4
     width: PositiveInt = 32
     bev_width: PositiveInt = 48
     top: int = 96
@@ -68,23 +64,28 @@ class Experiment:
     drives: PositiveInt | None = None
 
     def __post_init__(self) -> None:
-        if self.tuned_steps >= self.steps:
-            raise ValueError(f"tuned_steps: expected fewer than steps {self.steps}, got {self.tuned_steps}")
+        if self.tuned_steps >= self.steps or self.steps % self.tuned_steps:
+            raise ValueError(
+                f"tuned_steps: expected a divisor of steps {self.steps} that is smaller, got "
+                f"{self.tuned_steps}"
+            )
 
 
-def new_module(experiment: Experiment, arm: Arm) -> DetectorTraining:
+def new_module(experiment: Experiment, arm: Arm, seed: int) -> DetectorTraining:
     """Build what an arm trains."""
-    tuned = arm == "tuned"
     return DetectorTraining(
         arm,
         experiment.grid,
         experiment.width,
         experiment.bev_width,
         experiment.top,
-        experiment.tuned_rate if tuned else experiment.learning_rate,
+        experiment.learning_rate,
         experiment.lane_rate,
+        experiment.steps,
+        experiment.tuned_steps,
         experiment.network_width,
         experiment.fps,
+        seed,
     )
 
 
@@ -92,6 +93,26 @@ def checkpoint_weights(path: Path) -> dict[str, Any]:
     """Return the weights of a checkpoint."""
     state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
     return state
+
+
+def checkpoint_step(path: Path) -> int:
+    """Return the number of steps that a checkpoint has done."""
+    return int(torch.load(path, map_location="cpu", weights_only=True)["global_step"])
+
+
+def begun_checkpoint(experiment: Experiment, arm: Arm, seed: int) -> Path | None:
+    """Return the checkpoint that the training of an arm continues: its last, or that of "online"; or None.
+
+    Raises:
+        ValueError: "tuned" before "online".
+    """
+    last = experiment.out / f"{arm}-{seed}" / "last.ckpt"
+    if last.exists() or arm != "tuned":
+        return last if last.exists() else None
+    path = experiment.out / f"online-{seed}" / f"step={experiment.steps - experiment.tuned_steps}.ckpt"
+    if not path.exists():
+        raise ValueError(f"arms: expected 'online' before 'tuned', got no {path}")
+    return path
 
 
 def trained_arm(experiment: Experiment, arm: Arm, seed: int) -> DetectorTraining:
@@ -103,7 +124,7 @@ def trained_arm(experiment: Experiment, arm: Arm, seed: int) -> DetectorTraining
     last = experiment.out / f"{arm}-{seed}" / "last.ckpt"
     if not last.exists():
         raise ValueError(f"{arm}-{seed}: expected a trained arm, got no {last}; run python -m train.detector")
-    module = new_module(experiment, arm)
+    module = new_module(experiment, arm, seed)
     module.load_state_dict(checkpoint_weights(last))
     return module.eval()
 

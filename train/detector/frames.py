@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, Sampler
 
 from lanebev.estimation.joint.state import JointState
 from lanebev.view.grid import BEVGrid
@@ -97,6 +98,43 @@ def frames_of(records: list[DriveRecord], grid: BEVGrid) -> Frames:
 def _after_warm_up(state: JointState) -> JointState:
     """Return the states of the frames after the warm-up."""
     return JointState(*(part[WARM_UP:] for part in state))
+
+
+class StepBatches(Sampler[list[int]]):
+    """The frames of each step of a training: shuffled, all of them once before any twice.
+
+    They depend on the seed and the step only, so that arms and continued trainings see the same.
+
+    Args:
+        count: number of frames; must be ``size`` or more.
+        size: frames of a batch; the rest of a pass is left out.
+        steps: number of steps of the training.
+        seed: seed of the order.
+        begin: number of steps done before.
+
+    Raises:
+        ValueError: fewer frames than a batch.
+    """
+
+    def __init__(self, count: int, size: int, steps: int, seed: int, begin: int = 0) -> None:
+        if count < size:
+            raise ValueError(f"batch_size: expected at most {count}, the number of frames, got {size}")
+        self.count, self.size, self.steps = count, size, steps
+        self.seed, self.begin = seed, begin
+
+    def __len__(self) -> int:
+        """Return the number of steps of the whole training."""
+        return self.steps
+
+    def __iter__(self) -> Iterator[list[int]]:
+        """Yield the rows of each step from ``begin`` on."""
+        generator = torch.Generator().manual_seed(self.seed)
+        each = self.count // self.size
+        for step in range(self.steps):
+            if step % each == 0:
+                order = torch.randperm(self.count, generator=generator).split(self.size)
+            if step >= self.begin:
+                yield order[step % each].tolist()
 
 
 def mirrored(frames: Frames) -> Frames:

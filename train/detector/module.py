@@ -44,15 +44,19 @@ class DetectorTraining(L.LightningModule):
     """Training of a :class:`VehicleDetector` with one arm's poses.
 
     Args:
-        arm: see :func:`arm_poses`; "tuned" trains the lane network too, by the detector's loss alone.
+        arm: see :func:`arm_poses`; "tuned" trains the lane network too, by the detector's loss alone, and
+            must continue a training of "online".
         grid: grid of the bird's-eye view.
         width: channels of the image features.
         bev_width: channels of the bird's-eye features.
         top: px of the image above which nothing is looked at.
-        learning_rate: largest, of one cycle (Smith and Topin 2019).
-        lane_rate: the lane network's, as a share of it.
+        learning_rate: the detector's largest, see :func:`one_cycle`.
+        lane_rate: the lane network's largest, of a cycle of its own over the ``tuned_steps``.
+        steps: number of steps of the training.
+        tuned_steps: the last steps, which train the lane network of "tuned".
         network_width: px of the lane network's input.
         fps: frame rate of the drives.
+        seed: seed of the mirroring and of the noise.
     """
 
     def __init__(
@@ -63,28 +67,33 @@ class DetectorTraining(L.LightningModule):
         bev_width: int = 48,
         top: int = 96,
         learning_rate: float = 3e-3,
-        lane_rate: float = 0.01,
+        lane_rate: float = 1e-4,
+        steps: int = 6000,
+        tuned_steps: int = 600,
         network_width: int | None = None,
         fps: float = 10.0,
+        seed: int = 1,
     ) -> None:
         super().__init__()
         self.arm, self.grid = arm, grid
-        self.fps = fps
+        self.fps, self.seed = fps, seed
         self.learning_rate = float(learning_rate)  # a plain number, which a checkpoint may hold
         self.lane_rate = float(lane_rate)
+        self.steps, self.tuned_steps = int(steps), int(tuned_steps)
         self.detector = VehicleDetector(grid, width, bev_width, top)
         self.lanes: LaneBEV | None = None
         if arm == "tuned":
             self.lanes = LaneBEV.from_pretrained(network_width=network_width)
 
     def training_step(self, batch: Frames, batch_idx: int) -> Tensor:
-        """Find the boxes of a batch by the arm's poses."""
-        if self.lanes is None:
-            if bool(torch.rand(()) < 0.5):
-                batch = mirrored(batch)
-            poses = arm_poses(self.arm, batch, torch.randn_like(batch.extrinsics))
-        else:
-            poses = self._estimated(batch, self.lanes)
+        """Find the boxes of a batch by the arm's poses, in half of the steps mirrored."""
+        if self.lanes is not None:
+            batch = batch._replace(online=self._estimated(batch, self.lanes))
+        random = torch.Generator().manual_seed(1_000_003 * self.seed + self.global_step)
+        if bool(torch.rand((), generator=random) < 0.5):
+            batch = mirrored(batch)
+        noise = torch.randn(batch.extrinsics.shape, generator=random).to(batch.extrinsics)
+        poses = arm_poses(self.arm, batch, noise)
         image = batch.image.float() / 255
         maps = self.detector(image, batch.intrinsics, Extrinsics.unstack(poses)).float()
         loss = detection_loss(maps, batch.boxes, batch.seen, self.grid)
@@ -105,16 +114,52 @@ class DetectorTraining(L.LightningModule):
         return poses
 
     def configure_optimizers(self) -> Any:
-        """Return one cycle of AdamW."""
-        groups = [{"params": self.detector.parameters(), "lr": self.learning_rate}]
+        """Return AdamW with one cycle of the detector's learning rate, and one of the lane network's."""
+        begin = self.steps - self.tuned_steps
+        groups = [{"params": self.detector.parameters(), "lr": self.learning_rate, "weight_decay": 0.01}]
+        cycles = [lambda step: one_cycle(step / self.steps)]
         if self.lanes is not None:
-            rate = self.lane_rate * self.learning_rate
-            groups.append({"params": self.lanes.segmenter.parameters(), "lr": rate})
-        optimizer = torch.optim.AdamW(groups, weight_decay=0.01)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer,
-            [group["lr"] for group in optimizer.param_groups],
-            int(self.trainer.max_steps),  # plain, as the rates are
-            pct_start=0.15,
-        )
+            lanes = self.lanes.segmenter.parameters()
+            groups.append({"params": lanes, "lr": self.lane_rate, "weight_decay": 0.0})
+            cycles.append(lambda step: one_cycle((step - begin) / self.tuned_steps))
+        optimizer = torch.optim.AdamW(groups)
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, cycles)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clip the gradients of detector and lane network separately: neither shortens the other's."""
+        for group in optimizer.param_groups:
+            torch.nn.utils.clip_grad_norm_(group["params"], gradient_clip_val or math.inf)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the lane network to a checkpoint of a training without it."""
+        if self.lanes is None or any(name.startswith("lanes.") for name in checkpoint["state_dict"]):
+            return
+        checkpoint["state_dict"] |= {f"lanes.{name}": part for name, part in self.lanes.state_dict().items()}
+        optimizer, schedule = checkpoint["optimizer_states"][0], checkpoint["lr_schedulers"][0]
+        (detector,) = optimizer["param_groups"]
+        first, count = len(detector["params"]), len(list(self.lanes.segmenter.parameters()))
+        rates = {"initial_lr": self.lane_rate, "lr": self.lane_rate * one_cycle(0.0), "weight_decay": 0.0}
+        added = {**detector, **rates, "params": [*range(first, first + count)]}
+        optimizer["param_groups"] = [detector, added]
+        schedule["base_lrs"] = [*schedule["base_lrs"], rates["initial_lr"]]
+        schedule["_last_lr"] = [*schedule["_last_lr"], rates["lr"]]
+        schedule["lr_lambdas"] = [*schedule["lr_lambdas"], None]
+
+
+def one_cycle(done: float, rise: float = 0.15) -> float:
+    """Compute the learning rate as a fraction of the largest: up from 1/25 and down to 0, by half cosines.
+
+    Source: Smith and Topin 2019, "Super-Convergence"; of torch's OneCycleLR without the momentum's cycle.
+
+    Args:
+        done: fraction of the training that is done.
+        rise: fraction of the training in which the rate rises.
+    """
+    first, last, share = (1 / 25, 1.0, done / rise) if done < rise else (1.0, 0.0, (done - rise) / (1 - rise))
+    return last + (first - last) * 0.5 * (1 + math.cos(math.pi * min(max(share, 0.0), 1.0)))
