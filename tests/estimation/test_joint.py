@@ -18,12 +18,14 @@ from lanebev.estimation.joint.dynamics import (
 )
 from lanebev.estimation.joint.evidence import adapt_motion_scale, deviation_prior_std
 from lanebev.estimation.joint.lane_change import renumber
-from lanebev.estimation.joint.layout import NUM_COMMON, NUM_SHAPE, SHAPE, STEPS, layout
+from lanebev.estimation.joint.layout import NUM_COMMON, SHAPE, STEPS, layout
 from lanebev.estimation.joint.measurement import (
     CURVATURE,
     HEIGHT,
+    NUM_SHAPE,
     OFFSET,
     ROLL,
+    VERTICAL,
     boundary_distances,
     boundary_places,
     boundary_residuals,
@@ -261,6 +263,7 @@ def test_spline_jacobian_equals_jacfwd():
     params = torch.zeros(2, NUM_COMMON, dtype=DOUBLE)
     params[:, :5] = torch.tensor([*moment.pose, moment.offset], dtype=DOUBLE)
     params[:, SHAPE] = 1e-5 * torch.randn(2, NUM_SHAPE, generator=generator, dtype=DOUBLE)
+    params[:, VERTICAL] = torch.tensor([1e-4, -3e-4], dtype=DOUBLE)  # over a crest and through a dip
     phase = torch.tensor([0.0, 7.3], dtype=DOUBLE)
     found = boundary_residuals(params, places, seen, phase)
     full = torch.func.jacfwd(lambda p: boundary_residuals(p, places, seen, phase).distance)(params)
@@ -379,7 +382,8 @@ def test_motion_of_each_axis_scales_and_unequal_lanes_forget():
     cfg, dt = MotionConfig(), torch.full((2,), 0.1, dtype=DOUBLE)
     scale = torch.tensor([[1.0] * 4, [1.0, 1.0, 2.0, 1.0]], dtype=DOUBLE)
     unequal = torch.tensor([0.0, 0.12], dtype=DOUBLE)
-    transition, noise = motion(dt, scale, unequal, no_road(2), PLACE, cfg)
+    vertical = torch.tensor([1e-4, 0.0], dtype=DOUBLE)
+    transition, noise = motion(dt, scale, unequal, vertical, no_road(2), PLACE, cfg)
     move, density = pose_transition(dt[:1], cfg.bandwidth)
     for row in range(2):
         *chain, mean = PLACE.chain(ROLL)
@@ -394,6 +398,10 @@ def test_motion_of_each_axis_scales_and_unequal_lanes_forget():
     assert transition[1, own, own] == pytest.approx(settled)
     assert noise[1, own, own] == pytest.approx(0.12**2 * (1 - settled**2) + 0.1 * cfg.deviation_walk**2)
     assert noise[0, own, own] == pytest.approx(0.1 * cfg.deviation_walk**2)
+    level = math.exp(-0.1 / cfg.vertical_curvature_memory)
+    assert transition[0, VERTICAL, VERTICAL] == pytest.approx(level)
+    assert noise[0, VERTICAL, VERTICAL] == pytest.approx(1e-8 * (1 - level**2))  # keeps the variance
+    assert noise[1, VERTICAL, VERTICAL] == 0
 
 
 def test_motion_scale_follows_the_scores_and_decays():
@@ -515,14 +523,14 @@ def test_distances_at_the_feet_are_those_of_the_residuals_and_close_to_them_near
     places = boundary_places(WIDTH, 6, seen.sigma).gather(1, seen.boundary)
     params = torch.zeros(2, NUM_COMMON, dtype=DOUBLE)
     params[:, :5] = torch.tensor([*moment.pose, moment.offset], dtype=DOUBLE)
-    params[:, SHAPE.start] = 1e-5
+    params[:, SHAPE.start], params[:, VERTICAL] = 1e-5, 1e-4
     phase = torch.tensor([0.0, 7.3], dtype=DOUBLE)
     feet = foot_rays(params, places, seen, look(params, seen, phase))
     residuals = boundary_residuals(params, places, seen, phase, feet)
     distance, valid = boundary_distances(params, places, seen, feet, phase)
     torch.testing.assert_close(distance, residuals.distance)
     assert torch.equal(valid, residuals.valid)
-    moved = params + torch.tensor([2e-4, 2e-4, 2e-4, 2e-3, 2e-3] + [0.0] * NUM_SHAPE, dtype=DOUBLE)
+    moved = params + torch.tensor([2e-4, 2e-4, 2e-4, 2e-3, 2e-3] + [0.0] * (NUM_SHAPE + 1), dtype=DOUBLE)
     old_feet, _ = boundary_distances(moved, places, seen, feet, phase)
     torch.testing.assert_close(
         old_feet, boundary_residuals(moved, places, seen, phase).distance, rtol=0, atol=2e-3
@@ -741,14 +749,15 @@ def test_deviations_change_their_numbers_with_the_boundaries(shift):
     expected = torch.where((k >= 0) & (k < 6), k + 1.0, 0.0).double()
     torch.testing.assert_close(moved[:, PLACE.deviations], expected.expand(2, -1))
     torch.testing.assert_close(moved[:, OFFSET] - mean[:, OFFSET], lanes * WIDTH)
-    rest = [i for i in range(PLACE.size) if i != OFFSET and not 11 <= i < 17]
+    renumbered = (OFFSET, *range(PLACE.size)[PLACE.deviations])
+    rest = [i for i in range(PLACE.size) if i not in renumbered]
     assert torch.equal(moved[:, rest], mean[:, rest])
 
 
 def test_a_clothoids_steps_are_its_rate_by_the_knots_spacing():
     calibrator = JointCalibrator()
     params = torch.tensor([[0.0, 0, 0, 1.5, 0, 2e-3, 1e-4]], dtype=DOUBLE)
-    mean, _ = state_from_fit(params, 1e-12 * torch.eye(7, dtype=DOUBLE)[None], calibrator.config)
+    mean, _ = state_from_fit(params, 1e-12 * torch.eye(7, dtype=DOUBLE)[None], 0 * params, calibrator.config)
     torch.testing.assert_close(mean[:, CURVATURE], params[:, 5])
     torch.testing.assert_close(mean[0, STEPS], torch.full((NUM_STEPS,), 1e-4 * KNOT_SPACING, dtype=DOUBLE))
 
@@ -778,6 +787,6 @@ def test_speed_wanders_about_its_mean_as_far_as_it_says():
     cfg = MotionConfig()
     time, equal = torch.tensor([1 / 30], dtype=DOUBLE), torch.zeros(1, dtype=DOUBLE)
     one = torch.ones(1, 4, dtype=DOUBLE)
-    transition, noise = motion(time, one, equal, no_road(), PLACE, cfg)
+    transition, noise = motion(time, one, equal, equal, no_road(), PLACE, cfg)
     fade, more = transition[0, PLACE.speed, PLACE.speed], noise[0, PLACE.speed, PLACE.speed]
     assert float(more / (1 - fade**2)) == pytest.approx(cfg.speed_std**2, rel=0.01)

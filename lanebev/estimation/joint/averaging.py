@@ -19,7 +19,6 @@ from lanebev.batch import select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.layout import STEPS
 from lanebev.estimation.joint.measurement import (
-    FARTHEST,
     HEIGHT,
     NUM_PARAMS,
     OFFSET,
@@ -297,15 +296,9 @@ def _linearise(params: Tensor, own: Tensor, model: _Model) -> _Linear:
     sight = look(params, seen)
     feet = foot_rays(params, places, seen, sight)
     at = boundary_residuals(params, places, seen, feet=feet, sight=sight)
-    _, down, ahead = (sight.rotation @ feet).unbind(1)
-    height = params[:, HEIGHT, None]
-    z = (
-        height * ahead / torch.maximum(down, ahead.clamp(min=1e-3) * height / FARTHEST)
-    )  # (R, M) m, of the feet
     by_place = at.jacobian[:, OFFSET].unsqueeze(-1) * model.member  # (R, M, L)
-    by_heading = by_place * z.unsqueeze(-1)
-    by_profile = at.jacobian[:, HEIGHT] * (0.5 * z.square())
-    by_rest = torch.cat([by_heading, by_profile.unsqueeze(-1)], dim=-1)
+    by_heading = by_place * at.z.unsqueeze(-1)
+    by_rest = torch.cat([by_heading, at.by_vertical_curvature.unsqueeze(-1)], dim=-1)
     moved = (by_rest @ own[:, num:].unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, 2))
     distance = at.distance + moved * at.valid.unsqueeze(-1)
     return _Linear(distance, torch.cat([at.jacobian, by_place.mT, by_rest.mT], dim=1), at.valid)

@@ -22,11 +22,13 @@ from lanebev.estimation.joint.evidence import (
     adaptive_process_noise,
     deviation_prior_std,
     normalized_score,
+    vertical_curvature_prior_std,
 )
 from lanebev.estimation.joint.lane_change import best_shift, renumber
-from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, NUM_SHAPE, POSE, SHAPE, STEPS, layout
+from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, SHAPE, STEPS, layout
 from lanebev.estimation.joint.measurement import (
     CURVATURE,
+    VERTICAL,
     Observations,
     boundary_distances,
     boundary_places,
@@ -90,14 +92,14 @@ class JointCalibrator(Calibrator[JointState]):
         params = cfg.prior.mean(like).repeat(batch_size, 1)
         with autocast_off(like.device, like.dtype):
             spread = cfg.prior.std(like).square().diag().repeat(batch_size, 1, 1)
-            mean, cov = state_from_fit(params, spread, cfg)
+            mean, cov = state_from_fit(params, spread, torch.zeros_like(params), cfg)
         none = torch.zeros(batch_size, dtype=torch.int64, device=device)
         zero = torch.zeros(batch_size, dtype=dtype, device=device)
         return JointState(
             mean=mean,
             cov=cov,
             phase=zero.clone(),
-            evidence=mean.new_zeros(batch_size, NUM_POSE + NUM_SHAPE + cfg.num_boundaries),
+            evidence=mean.new_zeros(batch_size, NUM_POSE + NUM_COMMON - CURVATURE + cfg.num_boundaries),
             pose_sensitivity=mean.new_zeros(batch_size, NUM_POSE, cfg.num_boundaries),
             motion_scale=mean.new_ones(batch_size, NUM_POSE),
             early=zero.clone(),
@@ -203,7 +205,8 @@ def state_motion(state: JointState, dt: Tensor, cfg: JointConfig) -> tuple[RoadM
     unobserved = unobserved_mask(state.reasons)
     scale = torch.where(unobserved, scale.clamp(min=cfg.motion.unobserved_scale), scale)
     unequal = deviation_prior_std(state.mean[:, place.deviations], cfg)
-    return road, *motion(dt, scale, unequal, road, place, cfg.motion)
+    vertical = vertical_curvature_prior_std(state.mean[:, VERTICAL], state.cov[:, VERTICAL, VERTICAL], cfg)
+    return road, *motion(dt, scale, unequal, vertical, road, place, cfg.motion)
 
 
 def update_state(
@@ -248,7 +251,7 @@ def update_state(
         result = update(prior, cov, at, frame, estimated)
         if iteration == 0:
             believed = (frame.trust * seen.weight).repeat_interleave(2, dim=1).unsqueeze(1)
-            score = normalized_score(doubt, frame, torch.bmm(believed, member.mT).squeeze(1))
+            score = normalized_score(doubt, frame, torch.bmm(believed, member.mT).squeeze(1), seen.weight)
             evidence = accumulate_evidence(evidence, score, step, cfg.evidence_time)
             told = torch.where(estimated[:, POSE] > 0, score[:, POSE], 1.0)  # 1 changes nothing
             motion_scale = adapt_motion_scale(predicted.motion_scale, told, step, cfg)

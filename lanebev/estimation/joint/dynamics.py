@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lanebev.estimation.joint.layout import NUM_POSE, SHAPE, Layout, layout
-from lanebev.estimation.joint.measurement import OFFSET
+from lanebev.estimation.joint.measurement import OFFSET, VERTICAL
 from lanebev.tensors import constant
 
 Rows = tuple[tuple[float, ...], ...]
@@ -41,6 +41,9 @@ class MotionConfig:
         mean_height_walk: m/√s, random walk of the slow mean of the height.
         offset_density: spectral density of the lateral acceleration, m²/s³.
         offset_memory: s, time constant of the lateral velocity.
+        vertical_curvature_std: 1/m, standard deviation of the road's vertical curvature where nothing says
+            that it is curved.
+        vertical_curvature_memory: s, time constant of the return to it.
         curvature_walk: 1/m/√s, random walk of every knot.
         curvature_step: 1/m, sigma of a step that comes into view.
         speed, speed_std: m/s, prior of the speed.
@@ -58,6 +61,8 @@ class MotionConfig:
     mean_height_walk: float = 1e-3
     offset_density: float = 0.2
     offset_memory: float = 2.0
+    vertical_curvature_std: float = 1e-6
+    vertical_curvature_memory: float = 5.0
     curvature_walk: float = 2e-6
     curvature_step: float = 1e-4
     speed: float = 20.0
@@ -187,7 +192,13 @@ class RoadMotion(NamedTuple):
 
 
 def motion(
-    dt: Tensor, pose_scale: Tensor, unequal: Tensor, road: RoadMotion, place: Layout, cfg: MotionConfig
+    dt: Tensor,
+    pose_scale: Tensor,
+    unequal: Tensor,
+    vertical: Tensor,
+    road: RoadMotion,
+    place: Layout,
+    cfg: MotionConfig,
 ) -> tuple[Tensor, Tensor]:
     """Compute transition and process noise of the whole state.
 
@@ -195,6 +206,7 @@ def motion(
         dt: (B,) s, >= 0.
         pose_scale: (B, 4), factor on the pose's standard deviations about its slow mean.
         unequal: (B,) m, standard deviation of the deviations on a road of unequal lanes; 0 on equal lanes.
+        vertical: (B,) 1/m, standard deviation of the road's vertical curvature.
         road: how the shape moves.
         place: indices.
         cfg: the numbers.
@@ -210,6 +222,7 @@ def motion(
     fade = (-dt / cfg.speed_memory).exp()
     memory = torch.where(unequal > 0, cfg.unequal_memory, constant((cfg.deviation_memory,), like=dt))
     settle = (-dt / memory).exp()
+    level = (-dt / cfg.vertical_curvature_memory).exp()
     still = torch.ones_like(pose_scale)
     moves = [
         chain.repeat(1, NUM_POSE),
@@ -219,6 +232,7 @@ def motion(
         road.by_speed,
         fade.unsqueeze(-1),
         settle.unsqueeze(-1).expand(-1, num),
+        level.unsqueeze(-1),
     ]
     std = constant((*[cfg.angle_std] * 3, cfg.height_std), like=dt)
     walk = constant((*[cfg.mean_angle_walk**2] * 3, cfg.mean_height_walk**2), like=dt)
@@ -231,6 +245,7 @@ def motion(
         road.noise + cfg.curvature_walk**2 * dt.unsqueeze(-1),
         (2 * cfg.speed_std**2 / cfg.speed_memory) * dt.unsqueeze(-1),
         wander.unsqueeze(-1).expand(-1, num),
+        (vertical.square() * (1 - level * level)).unsqueeze(-1),
     ]
     of_moves, of_noises = _places(num)
     return _scatter(moves, of_moves, place.size), _scatter(noises, of_noises, place.size)
@@ -262,10 +277,11 @@ def _places(num_boundaries: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     speed = slice(place.speed, place.speed + 1)
     moves = [block(chain[:_ORDER], chain) for chain in chains]
     moves += [diagonal(place.means), block(slide, slide), block(shape, shape), block(shape, [place.speed])]
-    moves += [diagonal(speed), diagonal(place.deviations)]
+    vertical = slice(VERTICAL, VERTICAL + 1)
+    moves += [diagonal(speed), diagonal(place.deviations), diagonal(vertical)]
     noises = [block(chain[:_ORDER], chain[:_ORDER]) for chain in chains]
     noises += [diagonal(place.means), block(slide, slide), diagonal(SHAPE), diagonal(speed)]
-    noises += [diagonal(place.deviations)]
+    noises += [diagonal(place.deviations), diagonal(vertical)]
     return tuple(itertools.chain(*moves)), tuple(itertools.chain(*noises))
 
 

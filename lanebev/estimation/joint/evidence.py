@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lanebev.estimation.joint.layout import DEVIATIONS, NUM_POSE, NUM_SHAPE, POSE, SHAPE
+from lanebev.estimation.joint.layout import DEVIATIONS, NUM_POSE, POSE, SHAPE
+from lanebev.estimation.joint.measurement import NUM_SHAPE, VERTICAL
 from lanebev.estimation.joint.state import JointConfig
 from lanebev.estimation.joint.update import FrameInformation, information_kept
 from lanebev.tensors import constant
@@ -16,24 +17,29 @@ _KNOWN = 1e-3  # share of a prediction-free score's variance below which the pre
 _FREE_POSE = (0.05, 0.05, 0.05, 0.3)  # rad, m: sigmas added where the pose is free
 _LARGEST_EXCESS = 4.0  # of a squared score; a larger one is a jump
 EQUAL = 0.1  # of the deviations of unequal lanes, up to which lanes are equal
+_RAISED = 0.01  # share of segments over the horizon, above which the others are too low
+_CURVED = 3.0  # sigmas of a vertical curvature from which the road is taken for a crest or a dip
 CALL = 5.0  # sigmas of evidence at which half of the noise is admitted
 
 
-def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor) -> Tensor:
+def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor, weight: Tensor) -> Tensor:
     """Compute the normalised score of every entry that moves: N(0, 1) each if the motion model is right.
 
     Source: (J14), the score test (Rao 1948) for more process noise in one entry. For bends and unequal lanes
     the pose is free: the test depends on near against far vertices of one frame, and unexpected motion of the
-    pose is no evidence. A detector's errors are correlated along a boundary, so n end points count as
-    1 / (1 / n + ``_SHARED``²).
+    pose is no evidence. A detector's errors are correlated along a boundary, so for its deviation and for the
+    vertical curvature its n end points count as 1 / (1 / n + ``_SHARED``²). Where the noise raises end points
+    over the horizon, those that are left are too low and look like a dip: then the vertical curvature has 0.
 
     Args:
         cov: (B, O, O) of the prediction.
         frame: linearised at the prediction.
         count: (B, L) end points that each boundary was seen with.
+        weight: (B, N) of the segments.
 
     Returns:
-        (B, 4 + NUM_SHAPE + L) of pose, shape, deviations; 0 where the frame has no information on an entry.
+        (B, 5 + NUM_SHAPE + L) of pose, shape, vertical curvature, deviations; 0 where the frame has no
+        information on an entry.
     """
     freed = constant(tuple(sigma**2 for sigma in _FREE_POSE), like=cov)
     free = pad(freed, (0, cov.shape[-1] - NUM_POSE)).diag()
@@ -43,13 +49,17 @@ def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor) -> Ten
     score = torch.bmm(kept, torch.cat([frame.vector, frame.vector]).unsqueeze(-1)).view(2, -1, cov.shape[-1])
     variance = torch.bmm(kept, matrix).diagonal(dim1=1, dim2=2).view_as(score)
     known = variance > (_KNOWN * frame.matrix.diagonal(dim1=1, dim2=2)).clamp(min=0.0)
-    inflation = pad(_SHARED**2 * count, (cov.shape[-1] - count.shape[-1], 0)) + 1
+    usual = count.square().sum(-1, keepdim=True) / count.sum(-1, keepdim=True).clamp(min=1.0)
+    alike = torch.cat([usual, count], dim=-1)  # of the vertical curvature, and of each boundary
+    inflation = pad(_SHARED**2 * alike, (cov.shape[-1] - alike.shape[-1], 0)) + 1
     normal = torch.where(known, score * torch.where(known, variance * inflation, 1.0).rsqrt(), 0.0)
-    return torch.cat([normal[0, :, POSE], normal[1, :, SHAPE], normal[1, :, DEVIATIONS]], dim=-1)
+    raised = (weight * ~frame.residuals.valid).sum(-1) > _RAISED * weight.sum(-1)
+    crest = torch.where(raised, 0.0, normal[1, :, VERTICAL]).unsqueeze(-1)
+    return torch.cat([normal[0, :, POSE], normal[1, :, SHAPE], crest, normal[1, :, DEVIATIONS]], dim=-1)
 
 
 def accumulate_evidence(before: Tensor, score: Tensor, dt: Tensor, memory: float) -> Tensor:
-    """Accumulate the scores of shape and deviations at unit variance; use those of the pose directly.
+    """Accumulate the scores of the road and deviations at unit variance; use those of the pose directly.
 
     Source: (J15).
 
@@ -94,19 +104,19 @@ def adaptive_process_noise(evidence: Tensor, cov: Tensor, cfg: JointConfig) -> T
     for a road of unequal lanes and change the roll.
 
     Args:
-        evidence: (B, 4 + NUM_SHAPE + L).
+        evidence: (B, 5 + NUM_SHAPE + L).
         cov: (B, O, O), predicted.
         cfg: the numbers.
     """
-    parts = evidence.square().split([NUM_POSE, NUM_SHAPE, cfg.num_boundaries], dim=-1)
+    parts = evidence.square().split([NUM_POSE, NUM_SHAPE, 1, cfg.num_boundaries], dim=-1)
     worst = [part.amax(-1, keepdim=True) for part in parts]
     most = torch.cat(worst, dim=-1)
-    pose, bend, own = (0.01 * torch.sigmoid(0.5 * (most - CALL**2)) * most).split(1, dim=-1)
+    pose, bend, crest, own = (0.01 * torch.sigmoid(0.5 * (most - CALL**2)) * most).split(1, dim=-1)
     jump = constant((*[cfg.open_pose**2] * 3, (10 * cfg.open_pose) ** 2, 0.0), like=evidence)
     change = constant((cfg.open_curvature**2, *[cfg.open_step**2] * (NUM_SHAPE - 1)), like=evidence)
     room = cfg.open_deviation**2 - cov.diagonal(dim1=1, dim2=2)[:, DEVIATIONS]
-    freed = (parts[2] == worst[2]) * own.clamp(max=1.0) * room.clamp(min=0.0)
-    return torch.cat([pose * jump, bend * change, freed], dim=-1)
+    freed = (parts[3] == worst[3]) * own.clamp(max=1.0) * room.clamp(min=0.0)
+    return torch.cat([pose * jump, bend * change, crest * cfg.open_vertical_curvature**2, freed], dim=-1)
 
 
 def deviation_prior_std(deviations: Tensor, cfg: JointConfig) -> Tensor:
@@ -125,3 +135,18 @@ def deviation_prior_std(deviations: Tensor, cfg: JointConfig) -> Tensor:
     excess = second.square() - (EQUAL * size) ** 2
     unequal = excess > 0
     return torch.where(unequal, 2 * torch.where(unequal, excess, 1.0).sqrt(), 0.0).clamp(max=size)
+
+
+def vertical_curvature_prior_std(curvature: Tensor, variance: Tensor, cfg: JointConfig) -> Tensor:
+    """Compute the prior standard deviation (B,) 1/m of the vertical curvature from its estimate.
+
+    Source: (J21). Otherwise the prior of a plane road would pull the estimate to 0 all along a crest.
+
+    Args:
+        curvature: (B,) 1/m, estimate.
+        variance: (B,) 1/m², of it.
+        cfg: the numbers.
+    """
+    excess = (curvature.square() - _CURVED**2 * variance).clamp(min=0.0)
+    std: Tensor = (cfg.motion.vertical_curvature_std**2 + excess).sqrt()
+    return std

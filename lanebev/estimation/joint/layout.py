@@ -5,26 +5,24 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import NamedTuple
 
-from lanebev.estimation.joint.measurement import CURVATURE, NUM_STRAIGHT
-from lanebev.estimation.joint.road_curve import NUM_STEPS
+from lanebev.estimation.joint.measurement import CURVATURE, NUM_STRAIGHT, VERTICAL
 
 NUM_POSE = 4
-NUM_SHAPE = 1 + NUM_STEPS
-NUM_COMMON = NUM_STRAIGHT + NUM_SHAPE  # entries that all boundaries depend on
+NUM_COMMON = VERTICAL + 1  # entries that all boundaries depend on
 POSE = slice(0, NUM_POSE)
-SHAPE = slice(CURVATURE, NUM_COMMON)  # 1/m: curvature at the first knot, then its steps
-STEPS = slice(CURVATURE + 1, NUM_COMMON)
+SHAPE = slice(CURVATURE, VERTICAL)  # 1/m: curvature at the first knot, then its steps
+STEPS = slice(CURVATURE + 1, VERTICAL)
 DEVIATIONS = slice(NUM_COMMON, None)  # m, of what a frame observes: each boundary from its place
 
 
 class Layout(NamedTuple):
     """Indices of the state vector for L boundaries.
 
-    A frame observes the first entries: pose, offset, shape of the road and the deviation of each boundary
-    from its place. The others follow from the motion model only.
+    A frame observes the first entries: pose, offset, shape and vertical curvature of the road and the
+    deviation of each boundary from its place. The others follow from the motion model only.
 
     Attributes:
-        observed: pose, offset, shape, deviations.
+        observed: pose, offset, shape, vertical curvature, deviations.
         deviations: m.
         rates: rates of pitch, yaw, roll, height and offset, per s.
         accelerations: accelerations of the pose, per s².

@@ -1,18 +1,19 @@
 """The measurement of the joint estimators: end points against projected lane boundaries, in pixels.
 
-The equations (J1) to (J28) that this package cites are in docs/method/joint.md.
+The equations (J1) to (J30) that this package cites are in docs/method/joint.md.
 
-Boundary k lies on the flat road at X_k(Z) = b(Z) + x_k (1 + b'(Z)² / 2), with x_k = offset + (its place in
+Boundary k lies on the road at X_k(Z) = b(Z) + x_k (1 + b'(Z)² / 2), with x_k = offset + (its place in
 the ego lane's frame): parallel curves, to second order in their heading b'. The bend b is linear in the
 shape parameters: c0 Z²/2 + c1 Z³/6 (third-order clothoid), or the double integral of a curvature that is
-linear between knots. A ray d = road_from_cam K⁻¹ p meets the road at (X, Z) = h (d_x, d_z) / d_y, so the
-boundary is the zero of
+linear between knots. The road is h + κ Z²/2 below the camera, κ its vertical curvature, positive over a
+crest; on a plane road a ray d = road_from_cam K⁻¹ p meets it at (X, Z) = h (d_x, d_z) / d_y. The boundary is
+seen where d is parallel to (X_k, h + κ Z²/2, Z), and
 
-    G(d) = h d_x - X_k(h d_z / d_y) d_y,
+    n = (h - κ Z²/2, Z X' - X, κ Z X - (h + κ Z²/2) X')
 
-whose gradient by d at the foot point is the normal of the plane through the camera and the boundary's
-tangent there, n = (h, Z X' - X, -h X'). The perpendicular distance in pixels is that of the end point to this
-tangent, n·d / |∂(n·d)/∂p|: exact for straight boundaries, of second order in the distance for curved ones.
+is the normal of the plane through the camera and the boundary's tangent there. The perpendicular distance in
+pixels is that of the end point to this tangent, n·d / |∂(n·d)/∂p|: exact for straight boundaries, of second
+order in the distance for curved ones.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lanebev.estimation.checks import as_lane_width, check_segments, mask_invalid_rows
-from lanebev.estimation.joint.road_curve import RoadCurve, road_basis, road_curve
+from lanebev.estimation.joint.road_curve import NUM_STEPS, RoadCurve, road_basis, road_curve
 from lanebev.geometry.lens import cam_from_image
 from lanebev.geometry.rotation import road_from_cam_and_roll
 from lanebev.observation.segments import LaneSegments
@@ -38,7 +39,15 @@ NUM_PARAMS = 7
 NUM_STRAIGHT = 5
 """Those of a straight road."""
 
+NUM_SHAPE = 1 + NUM_STEPS
+"""Those of a bend that is a spline: the curvature at the first knot and its steps from knot to knot."""
+
+VERTICAL = NUM_STRAIGHT + NUM_SHAPE
+"""Index of the vertical curvature (1/m), the last parameter of a road whose bend is a spline."""
+
 FARTHEST = 200.0  # m; beyond it a pixel is tens of metres and the flat road is fiction
+
+_BEFORE_CREST = 0.8  # of the distance at which a crest hides the road, up to which points are on the road
 
 _AHEAD = 1e-3  # of a direction's component ahead; below it a point is not in front of the camera
 
@@ -65,6 +74,18 @@ class Observations(NamedTuple):
     cam_from_image: Tensor
 
 
+class Profile(NamedTuple):
+    """The road below the camera's path, h + κ Z²/2.
+
+    Attributes:
+        height: (B, 1) m, h, of the camera over the road below it.
+        curvature: (B, 1) 1/m, κ, positive over a crest.
+    """
+
+    height: Tensor
+    curvature: Tensor
+
+
 class Sight(NamedTuple):
     """End points seen from a pose, in the road's axes.
 
@@ -75,6 +96,7 @@ class Sight(NamedTuple):
         by_pixel: (B, 3, 2), derivative of a direction by its pixel.
         z: (B, M) m, distance at which the end point meets the road, at most ``FARTHEST``.
         valid: (B, N) bool, both end points meet the road nearer than that.
+        profile: of the road.
         curve: (B, M) each, the road's middle line at z.
     """
 
@@ -84,6 +106,7 @@ class Sight(NamedTuple):
     by_pixel: Tensor
     z: Tensor
     valid: Tensor
+    profile: Profile
     curve: RoadCurve
 
 
@@ -93,11 +116,15 @@ class Residuals(NamedTuple):
     Attributes:
         distance: (B, N, 2) px, positive right of the boundary.
         jacobian: (B, P, M) of the distance by the frame's parameters; finite also where not valid.
+        by_vertical_curvature: (B, M), likewise by the road's vertical curvature.
+        z: (B, M) m, distance of the foot points.
         valid: (B, N) bool, both end points on the road and nearer than 200 m.
     """
 
     distance: Tensor
     jacobian: Tensor
+    by_vertical_curvature: Tensor
+    z: Tensor
     valid: Tensor
 
 
@@ -170,10 +197,12 @@ def look(params: Tensor, seen: Observations, phase: Tensor | None = None) -> Sig
     """
     rotation, by_roll = road_from_cam_and_roll(params[:, :HEIGHT])
     directions = torch.bmm(rotation, seen.rays)
-    height = params[:, HEIGHT, None]
-    z, valid = _meet_road(directions, height), _before_farthest(directions, height)
-    curve = road_curve(z, params[:, NUM_STRAIGHT:], phase)
-    return Sight(rotation, by_roll, directions, torch.bmm(rotation, seen.cam_from_image), z, valid, curve)
+    profile = _profile(params, phase)
+    z, valid = _meet_road(directions, profile), _before_farthest(directions, profile)
+    curve = road_curve(z, _shape(params, phase), phase)
+    return Sight(
+        rotation, by_roll, directions, torch.bmm(rotation, seen.cam_from_image), z, valid, profile, curve
+    )
 
 
 def every_segment(sight: Sight, stride: int) -> Sight:
@@ -199,7 +228,8 @@ def boundary_residuals(
     correlated with the noise and bias the fit.
 
     Args:
-        params: (B, 7), see ``NUM_PARAMS``; with a phase (B, 6 + NUM_STEPS), the shape being a spline.
+        params: (B, 7), see ``NUM_PARAMS``, of a plane road; with a phase (B, ``VERTICAL`` + 1), the bend
+            being a spline.
         places: (B, N) m, X of each segment's boundary at Z = 0 less the offset.
         seen: what was observed.
         phase: (B,) m, how far the first knot lies behind the camera, 0 to KNOT_SPACING; or None.
@@ -211,13 +241,13 @@ def boundary_residuals(
     """
     sight = look(params, seen, phase) if sight is None else sight
     feet = foot_rays(params, places, seen, sight) if feet is None else feet
-    height = params[:, HEIGHT, None]
+    profile = _profile(params, phase)
     foot = torch.bmm(sight.rotation, feet)
-    z = _meet_road(foot, height)
+    z = _meet_road(foot, profile)
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (B, M)
-    basis, shape = road_basis(z, phase), params[:, None, NUM_STRAIGHT:]
+    basis, shape = road_basis(z, phase), _shape(params, phase).unsqueeze(1)
     curve = RoadCurve(*(torch.bmm(shape, part).squeeze(1) for part in basis))
-    normal, slope = _tangent_plane(z, x_k, height, curve)
+    normal, slope = _tangent_plane(z, x_k, profile, curve)
     _, size = _pixel_gradient(normal, sight.by_pixel)  # (B, M)
     distance = (normal * sight.directions).sum(1) / size
 
@@ -226,11 +256,14 @@ def boundary_residuals(
     axes = torch.cat([sight.rotation[:, :, :1], sight.by_roll[:, :, 1:]], dim=-1).mT
     by_angles = torch.bmm(axes, turning)
     x, down, ahead = foot.unbind(1)
-    up = -down
+    up = profile.curvature * z * ahead - down  # -n_x of the foot, per metre of Z
     by_height, by_offset = x - slope * ahead, up + 0.5 * up * curve.heading.square()
     by_shape = torch.addcmul(basis[0], (x_k * curve.heading).unsqueeze(1), basis[1]) * up.unsqueeze(1)
-    jacobian = torch.cat([by_angles, torch.stack([by_height, by_offset], dim=1), by_shape], dim=1)
-    return Residuals(_of_valid(distance, sight.valid), jacobian / size.unsqueeze(1), sight.valid)
+    by_vertical = (0.5 * z * z * by_height).unsqueeze(1)  # the road is lower by Z²/2 per unit of it
+    by_all = torch.cat([by_angles, torch.stack([by_height, by_offset], dim=1), by_shape, by_vertical], dim=1)
+    jacobian = by_all / size.unsqueeze(1)
+    given = jacobian[:, :-1] if phase is None else jacobian
+    return Residuals(_of_valid(distance, sight.valid), given, jacobian[:, -1], z, sight.valid)
 
 
 def boundary_distances(
@@ -242,11 +275,11 @@ def boundary_distances(
 ) -> tuple[Tensor, Tensor]:
     """Compute the distances of :func:`boundary_residuals` alone, (B, N, 2) px, and their validity (B, N)."""
     rotation, _ = road_from_cam_and_roll(params[:, :HEIGHT])
-    directions, height = torch.bmm(rotation, seen.rays), params[:, HEIGHT, None]
-    valid = _before_farthest(directions, height)
-    z = _meet_road(torch.bmm(rotation, feet), height)
+    directions, profile = torch.bmm(rotation, seen.rays), _profile(params, phase)
+    valid = _before_farthest(directions, profile)
+    z = _meet_road(torch.bmm(rotation, feet), profile)
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)
-    normal, _ = _tangent_plane(z, x_k, height, road_curve(z, params[:, NUM_STRAIGHT:], phase))
+    normal, _ = _tangent_plane(z, x_k, profile, road_curve(z, _shape(params, phase), phase))
     _, size = _pixel_gradient(normal, torch.bmm(rotation, seen.cam_from_image))
     return _of_valid((normal * directions).sum(1) / size, valid), valid
 
@@ -265,9 +298,8 @@ def foot_rays(params: Tensor, places: Tensor, seen: Observations, sight: Sight) 
     Returns:
         (B, 3, M) camera rays, z = 1.
     """
-    height = params[:, HEIGHT, None]
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)
-    normal, _ = _tangent_plane(sight.z, x_k, height, sight.curve)
+    normal, _ = _tangent_plane(sight.z, x_k, sight.profile, sight.curve)
     gradient, size = _pixel_gradient(normal, sight.by_pixel)  # (B, 2, M) 1/px
     reach = (FOOT_RANGE * seen.focal).unsqueeze(-1)
     distance = (normal * sight.directions).sum(1) / size
@@ -289,7 +321,7 @@ def sampson_distances(params: Tensor, places: Tensor, sight: Sight) -> Tensor:
         (H, B, N, 2) px, zero where not valid.
     """
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (H, B, M)
-    normal, _ = _tangent_plane(sight.z, x_k, params[:, HEIGHT, None], sight.curve)
+    normal, _ = _tangent_plane(sight.z, x_k, sight.profile, sight.curve)
     _, size = _pixel_gradient(normal, sight.by_pixel)
     distance = (normal * sight.directions).sum(-2) / size
     return _of_valid(distance, sight.valid)
@@ -306,30 +338,47 @@ def _pixel_gradient(normal: Tensor, by_pixel: Tensor) -> tuple[Tensor, Tensor]:
     return gradient, gradient.square().sum(-2).sqrt()
 
 
-def _meet_road(directions: Tensor, height: Tensor) -> Tensor:
-    """Distance Z (B, M) at which directions (B, 3, M) meet the road, at most that of ``FARTHEST``.
+def _shape(params: Tensor, phase: Tensor | None) -> Tensor:
+    """The parameters of the bend, (B, K): a clothoid's, or with a phase a spline's."""
+    return params[:, NUM_STRAIGHT : None if phase is None else VERTICAL]
 
-    Source: (J1).
+
+def _profile(params: Tensor, phase: Tensor | None) -> Profile:
+    """Height and vertical curvature, 0 for a single frame."""
+    height = params[:, HEIGHT, None]
+    return Profile(height, torch.zeros_like(height) if phase is None else params[:, VERTICAL, None])
+
+
+def _meet_road(directions: Tensor, profile: Profile) -> Tensor:
+    """Distance Z (B, M) at which directions (B, 3, M) meet the road, at most the farthest.
+
+    Source: (J1), for a vertical curvature the nearer root of κ Z²/2 - (d_y / d_z) Z + h = 0.
     """
-    ahead = directions[:, 2].clamp(min=_AHEAD)
-    down = torch.maximum(directions[:, 1], ahead * _least_slope(height))
-    return height * ahead / down
+    height, curvature = profile
+    slope = torch.maximum(directions[:, 1] / directions[:, 2].clamp(min=_AHEAD), _least_slope(profile))
+    return 2 * height / (slope + (slope * slope - 2 * curvature * height).sqrt())
 
 
-def _before_farthest(directions: Tensor, height: Tensor) -> Tensor:
-    """(B, N) bool: both end points, of directions (B, 3, M), meet the road nearer than ``FARTHEST``."""
+def _before_farthest(directions: Tensor, profile: Profile) -> Tensor:
+    """(B, N) bool: both end points, of directions (B, 3, M), meet the road nearer than the farthest."""
     down, ahead = directions[:, 1], directions[:, 2]
-    on_road = (ahead > _AHEAD) & (down > ahead * _least_slope(height))
+    on_road = (ahead > _AHEAD) & (down > ahead * _least_slope(profile))
     valid: Tensor = on_road.unflatten(-1, (-1, 2)).all(-1)
     return valid
 
 
-def _least_slope(height: Tensor) -> Tensor:
-    """Slope (B, 1) of the direction to the point of the road at ``FARTHEST``, down by ahead."""
-    return height.clamp(min=0.1) / FARTHEST
+def _least_slope(profile: Profile) -> Tensor:
+    """Slope (B, 1), down by ahead, of the direction to the farthest point of the road.
+
+    It is at ``FARTHEST``, or nearer than the point where the sight touches a crest, √(2 h / κ).
+    """
+    height, curvature = profile.height.clamp(min=0.1), profile.curvature
+    touching = 2 * _BEFORE_CREST**2 / FARTHEST**2 * height  # 1/m, whose crest is as far as FARTHEST
+    farthest = FARTHEST * (touching / torch.maximum(curvature, touching)).sqrt()
+    return height / farthest + 0.5 * curvature * farthest
 
 
-def _tangent_plane(z: Tensor, x_k: Tensor, height: Tensor, curve: RoadCurve) -> tuple[Tensor, Tensor]:
+def _tangent_plane(z: Tensor, x_k: Tensor, profile: Profile, curve: RoadCurve) -> tuple[Tensor, Tensor]:
     """Normal n (…, B, 3, M) of the plane through the camera and a boundary's tangent, and its slope X'(Z).
 
     Source: (J2) and (J4).
@@ -337,10 +386,13 @@ def _tangent_plane(z: Tensor, x_k: Tensor, height: Tensor, curve: RoadCurve) -> 
     Args:
         z: (B, M) m.
         x_k: (…, B, M) m.
-        height: (B, 1) m.
+        profile: of the road.
         curve: at z.
     """
     tilt = x_k * curve.heading
     slope = torch.addcmul(curve.heading, tilt, curve.curvature)
     out = torch.addcmul(x_k + curve.bend, tilt, curve.heading, value=0.5)
-    return torch.stack([height.expand_as(out), z * slope - out, -height * slope], dim=-2), slope
+    lower = 0.5 * profile.curvature * z * z
+    across, deep = profile.height - lower, profile.height + lower
+    along = torch.addcmul(profile.curvature * z * out, deep, slope, value=-1)
+    return torch.stack([across.expand_as(out), z * slope - out, along], dim=-2), slope

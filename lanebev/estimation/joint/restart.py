@@ -173,7 +173,7 @@ def is_contrary(
 
 def state_of_fit(fit: SingleFrameFit, before: JointState, cfg: JointConfig) -> JointState:
     """Make a state of one frame's fit; nothing of the state before is kept."""
-    mean, cov = state_from_fit(fit.params(), fit.covariance, cfg)
+    mean, cov = state_from_fit(fit.params(), fit.covariance, fit.by_vertical_curvature, cfg)
     zero = torch.zeros_like(before.unseen)
     return JointState(
         mean=mean,

@@ -136,6 +136,8 @@ class SingleFrameFit(NamedTuple):
         offset: (B,) m, X of the ego lane's middle, positive right of the camera.
         curvature: (B, 2), c0 (1/m, positive to the right) and c1 (1/m²) of X(Z) = x_k + c0 Z²/2 + c1 Z³/6.
         covariance: (B, 7, 7) of all parameters, prior included, noise scaled to the residuals.
+        by_vertical_curvature: (B, 7), change of the parameters per 1/m of vertical curvature of the road,
+            which the fit takes as plane.
         inliers: (B, N) in [0, 1]; 0 for padding.
         scale: (B,) >= 1, factor by which residuals exceed the given sigmas.
         observed: (B, 4) bool, of pitch, yaw, roll, height: determined by the frame rather than by the prior,
@@ -147,6 +149,7 @@ class SingleFrameFit(NamedTuple):
     offset: Tensor
     curvature: Tensor
     covariance: Tensor
+    by_vertical_curvature: Tensor
     inliers: Tensor
     scale: Tensor
     observed: Tensor
@@ -222,6 +225,9 @@ def fit_observations(
     residuals = boundary_residuals(params, places, seen)
     trust = inlier_weights(residuals.distance, residuals.valid, seen.sigma, scale, seen.focal)
     covariance = inverse_spd(information)
+    precision = residuals.valid * trust * seen.weight / (seen.sigma * scale.unsqueeze(-1)).square()
+    along = residuals.by_vertical_curvature * precision.repeat_interleave(2, dim=1)
+    by_vertical = covariance @ residuals.jacobian @ along.unsqueeze(-1)
     std = covariance.diagonal(dim1=-2, dim2=-1)[:, :OFFSET].sqrt()
     usual = FramePrior().std(params)[:OFFSET]
     observed = std < _OBSERVED * torch.maximum(prior.std(params)[:OFFSET], usual)
@@ -232,6 +238,7 @@ def fit_observations(
         offset=params[:, OFFSET],
         curvature=params[:, OFFSET + 1 :],
         covariance=covariance,
+        by_vertical_curvature=by_vertical.squeeze(-1),
         inliers=torch.where(seen.weight > 0, trust, 0.0),
         scale=scale,
         observed=observed,

@@ -8,10 +8,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lanebev.estimation.joint.dynamics import MotionConfig, pose_variances
-from lanebev.estimation.joint.layout import NUM_POSE, NUM_SHAPE, STEPS, layout
-from lanebev.estimation.joint.measurement import CURVATURE, NUM_PARAMS, NUM_STRAIGHT
+from lanebev.estimation.joint.layout import NUM_POSE, STEPS, layout
+from lanebev.estimation.joint.measurement import CURVATURE, NUM_PARAMS, NUM_SHAPE, NUM_STRAIGHT, VERTICAL
 from lanebev.estimation.joint.readings import ReadingConfig
 from lanebev.estimation.joint.road import straight_or_bend
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
@@ -39,6 +40,8 @@ class JointConfig:
         open_curvature, open_step: the same for the knots when a bend begins or ends, 1/m.
         straight: sigmas of c0 and c1 of a straight road, 1/m and 1/m².
         bends: prior probability that a start is on a bend, with the curvatures of ``prior``.
+        open_vertical_curvature: the same for the vertical curvature when a crest or a dip begins or ends,
+            1/m.
         open_deviation: sigma of a boundary's deviation on a road of unequal lanes, m; 0: lanes are equal.
         evidence_time: time constant of the evidence for a bend or unequal lanes, s.
         motion_scale_rise: time, s, in which the variance of the pose's motion grows by a factor e if it is
@@ -65,6 +68,7 @@ class JointConfig:
     open_pose: float = 0.01
     open_curvature: float = 3e-4
     open_step: float = 1e-3
+    open_vertical_curvature: float = 2e-4
     straight: tuple[float, float] = (1e-4, 3e-6)
     bends: float = 0.2
     open_deviation: float = 0.12
@@ -97,6 +101,10 @@ class JointConfig:
             raise ValueError(f"bends: expected a probability between 0 and 1, got {self.bends}")
 
 
+REAL_ROADS = JointConfig(motion=MotionConfig(vertical_curvature_std=5e-5))
+"""Numbers for roads that are not plane: with crests and dips of R = 20 km as the standard deviation."""
+
+
 @register_pytree
 class JointState(NamedTuple):
     """The state of the calibrator between frames, tensors only.
@@ -105,8 +113,8 @@ class JointState(NamedTuple):
         mean: (B, D), see :class:`~lanebev.estimation.joint.layout.Layout`.
         cov: (B, D, D).
         phase: (B,) m, how far the first knot of the road's curvature lies behind the camera.
-        evidence: (B, 10 + L) evidence against the motion, unit variance: the last frame's of the pose, summed
-            of shape and deviations.
+        evidence: (B, 11 + L) evidence against the motion, unit variance: the last frame's of the pose, summed
+            of shape, vertical curvature and deviations.
         pose_sensitivity: (B, 4, L) change of the pose per metre of deviation of a boundary, by the last frame
             that determined the pose.
         motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, adapted to the drive.
@@ -139,12 +147,17 @@ class JointState(NamedTuple):
         return map_tensors(Tensor.detach, self)
 
 
-def state_from_fit(params: Tensor, param_cov: Tensor, cfg: JointConfig) -> tuple[Tensor, Tensor]:
+def state_from_fit(
+    params: Tensor, param_cov: Tensor, by_vertical: Tensor, cfg: JointConfig
+) -> tuple[Tensor, Tensor]:
     """Start a state from one frame's fit.
+
+    The fit takes the road as plane: see :func:`with_vertical_curvature`.
 
     Args:
         params: (B, 7), see ``NUM_PARAMS``.
         param_cov: (B, 7, 7).
+        by_vertical: (B, 7), change of the fit per 1/m of vertical curvature.
         cfg: the numbers.
 
     Returns:
@@ -153,19 +166,42 @@ def state_from_fit(params: Tensor, param_cov: Tensor, cfg: JointConfig) -> tuple
     motion = cfg.motion
     straight, bend = constant(cfg.straight, like=params), cfg.prior.std(params)[CURVATURE:]
     params, param_cov = straight_or_bend(params, param_cov, straight, bend, cfg.bends)
+    params = pad(params, (0, 1))  # the vertical curvature's mean is 0
+    param_cov = with_vertical_curvature(param_cov, by_vertical, motion.vertical_curvature_std)
     copies = constant(_by_parameters(cfg.num_boundaries), like=params)
     own = constant(_start_variances(cfg.num_boundaries, motion), like=params)
     return params @ copies.mT, copies @ param_cov @ copies.mT + own.diag()
 
 
+def with_vertical_curvature(cov: Tensor, by_vertical: Tensor, std: float) -> Tensor:
+    """Add the road's vertical curvature κ to the covariance of a fit that takes it as 0.
+
+    Source: (J22). The fit is off by g κ and the estimate 0 of κ by -κ, so both errors are correlated.
+
+    Args:
+        cov: (B, P, P) of the fit.
+        by_vertical: (B, P), g, change of the fit per 1/m.
+        std: 1/m, prior standard deviation of κ.
+
+    Returns:
+        (B, P + 1, P + 1), κ last.
+    """
+    error = std * pad(by_vertical, (0, 1), value=-1.0).unsqueeze(-1)
+    return pad(cov, (0, 1, 0, 1)) + error @ error.mT
+
+
 @lru_cache(maxsize=16)
 def _by_parameters(num_boundaries: int) -> tuple[tuple[float, ...], ...]:
-    """The state's entries by the parameters of one frame, D × 7; the slow mean begins at the pose."""
+    """The state's entries by parameters and vertical curvature of one frame, D × 8.
+
+    The slow mean begins at the pose.
+    """
     place = layout(num_boundaries)
     factors = {(k, k): 1.0 for k in (*range(NUM_STRAIGHT), CURVATURE)}
     factors |= {(step, CURVATURE + 1): KNOT_SPACING for step in range(STEPS.start, STEPS.stop)}
+    factors |= {(VERTICAL, NUM_PARAMS): 1.0}
     factors |= {(place.means.start + axis, axis): 1.0 for axis in range(NUM_POSE)}
-    return tuple(tuple(factors.get((k, p), 0.0) for p in range(NUM_PARAMS)) for k in range(place.size))
+    return tuple(tuple(factors.get((k, p), 0.0) for p in range(NUM_PARAMS + 1)) for k in range(place.size))
 
 
 @lru_cache(maxsize=16)
@@ -176,6 +212,7 @@ def _start_variances(num_boundaries: int, motion: MotionConfig) -> tuple[float, 
     return (
         *[0.0] * NUM_STRAIGHT,
         *[motion.curvature_step**2] * NUM_SHAPE,
+        0.0,
         *[motion.deviation_walk**2] * num_boundaries,
         *(rate * variance for variance in swing),
         _OFFSET_RATE_STD**2,

@@ -82,7 +82,7 @@ def update_track_status(
 def single_deviation(deviations: Tensor, variances: Tensor, cfg: JointConfig) -> Tensor:
     """Compute how far (B,) m any boundary may deviate if exactly one does.
 
-    Source: (J24).
+    Source: (J26).
 
     The filter's own variance of the deviations is subtracted, so that the sum is right while lanes turn out
     to be unequal. Half of six independent deviations can be observed, so their variances sum to three times

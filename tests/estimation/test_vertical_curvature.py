@@ -1,0 +1,122 @@
+"""The road's vertical curvature in the joint calibrator."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.evidence import vertical_curvature_prior_std
+from lanebev.estimation.joint.layout import NUM_COMMON
+from lanebev.estimation.joint.measurement import (
+    HEIGHT,
+    VERTICAL,
+    boundary_places,
+    boundary_residuals,
+    look,
+    observe,
+)
+from lanebev.estimation.joint.single_frame import fit_single_frame
+from lanebev.estimation.joint.state import JointConfig, with_vertical_curvature
+from lanebev.observation.segments import LaneSegments
+from lanebev.testing.scenarios import CAMERA, FPS, WIDTH, Moment, moments
+from lanebev.testing.scenarios import observe as see
+
+torch.set_num_threads(1)
+DOUBLE = torch.float64
+
+
+def crest(
+    vertical: float, frames: int = 1, rows: int = 2, sigma: float = 0.0, far: float = 40.0
+) -> list[tuple[Moment, LaneSegments]]:
+    """Return a drive over a crest, or through a dip, whose segments are given a sigma of 1 px at least."""
+    drive = moments(frames / FPS, lambda t, m: replace(m, near=5.0, far=far, profile=vertical))
+    seen = list(see(drive, rows, sigma, 20, 3, DOUBLE))
+    return [(moment, one._replace(sigma=one.sigma.clamp(min=1.0))) for moment, one in seen]
+
+
+def run(calibrator: JointCalibrator, frames: list[tuple[Moment, LaneSegments]]):
+    rows = frames[0][1].boundary.shape[0]
+    state = calibrator.initial_state(rows, dtype=DOUBLE)
+    for moment, segments in frames:
+        out, state = calibrator(segments, CAMERA.expand(rows, 3, 3), state, moment.dt, WIDTH)
+    return out, state
+
+
+@pytest.mark.parametrize("vertical", [3e-4, -3e-4])
+def test_boundaries_over_a_crest_and_through_a_dip_are_exact(vertical):
+    """No distance is left at the true vertical curvature, and some pixels are on a plane road."""
+    moment, segments = crest(vertical, far=50.0)[0]
+    seen = observe(segments, CAMERA.expand(2, 3, 3), 6)
+    places = boundary_places(WIDTH, 6, seen.sigma).gather(1, seen.boundary)
+    params = torch.zeros(2, NUM_COMMON, dtype=DOUBLE)
+    params[:, :5] = torch.tensor([*moment.pose, moment.offset], dtype=DOUBLE)
+    none = torch.zeros(2, dtype=DOUBLE)
+    params[:, VERTICAL] = vertical
+    found = boundary_residuals(params, places, seen, none)
+    assert found.valid[seen.weight > 0].all()
+    assert found.distance.abs().max() < 1e-3  # px; the drive's curves are polygons
+    assert found.z.max() == pytest.approx(50.0, rel=0.1)
+    params[:, VERTICAL] = 0.0
+    assert boundary_residuals(params, places, seen, none).distance.abs().max() > 3.0
+
+
+def test_the_road_behind_a_crest_is_not_seen():
+    """Over R = 1 km from 1.5 m up the sight touches the road at 55 m; points count up to 0.8 of that."""
+    z = torch.tensor([[20.0, 30.0], [35.0, 43.0], [30.0, 45.0]], dtype=DOUBLE)
+    slopes = 1.5 / z + 0.5e-3 * z
+    ends = torch.stack([torch.zeros_like(z), slopes], dim=-1) * 1050.0 + CAMERA[:2, 2]
+    one = torch.ones(1, 3, dtype=DOUBLE)
+    segments = LaneSegments(ends[None], torch.full((1, 3), 2), one, one)
+    seen = observe(segments, CAMERA[None], 6)
+    params = torch.zeros(1, NUM_COMMON, dtype=DOUBLE)
+    params[:, HEIGHT], params[:, VERTICAL] = 1.5, 1e-3
+    sight = look(params, seen, torch.zeros(1, dtype=DOUBLE))
+    torch.testing.assert_close(sight.z[0, :5], z.flatten()[:5])
+    assert sight.valid.tolist() == [[True, True, False]]
+    assert sight.z.isfinite().all()
+
+
+def test_a_start_knows_how_a_crest_would_change_it():
+    """The pose of a plane road, fitted to a crest, is off by the derivative times the curvature."""
+    curvature = 1e-5
+    moment, segments = crest(curvature)[0]
+    fit = fit_single_frame(segments, CAMERA.expand(2, 3, 3), WIDTH)
+    error = fit.extrinsics.stack() - torch.tensor(moment.pose, dtype=DOUBLE)
+    pitch, height = (curvature * fit.by_vertical_curvature[:, [0, HEIGHT]]).unbind(-1)
+    torch.testing.assert_close(error[:, 0], pitch, rtol=0.05, atol=0.0)
+    torch.testing.assert_close(error[:, HEIGHT], height, rtol=0.05, atol=0.0)
+    assert (pitch.abs() > math.radians(0.005)).all()
+
+
+def test_the_vertical_curvature_of_a_start_is_correlated_with_the_error_that_it_causes():
+    cov, by = torch.eye(3, dtype=DOUBLE)[None], torch.tensor([[2.0, 0.0, -1.0]], dtype=DOUBLE)
+    found = with_vertical_curvature(cov, by, 0.5)[0]
+    expected = [[2.0, 0, -0.5, -0.5], [0, 1, 0, 0], [-0.5, 0, 1.25, 0.25], [-0.5, 0, 0.25, 0.25]]
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=DOUBLE))
+
+
+def test_a_clear_vertical_curvature_is_its_own_prior():
+    cfg = JointConfig(motion=MotionConfig(vertical_curvature_std=3e-5))
+    curvature = torch.tensor([0.0, 2e-5, -5e-5], dtype=DOUBLE)
+    found = vertical_curvature_prior_std(curvature, torch.full((3,), 1e-10, dtype=DOUBLE), cfg)
+    torch.testing.assert_close(found, torch.tensor([3e-5, 3e-5, 5e-5], dtype=DOUBLE), rtol=1e-6, atol=0.0)
+
+
+def test_a_crest_in_one_row_is_estimated_and_leaves_the_other_as_it_is():
+    calibrator = JointCalibrator()
+    curved, plane = (crest(p, frames=30, rows=1, sigma=0.5) for p in (1e-4, 0.0))
+    pairs = [
+        (moment, LaneSegments(*(torch.cat(parts) for parts in zip(one, other, strict=True))))
+        for (moment, one), (_, other) in zip(curved, plane, strict=True)
+    ]
+    both, state = run(calibrator, pairs)
+    alone, _ = run(calibrator, plane)
+    assert state.mean[:, VERTICAL].tolist() == [pytest.approx(1e-4, rel=0.15), pytest.approx(0.0, abs=2e-6)]
+    truth = torch.tensor(curved[-1][0].pose, dtype=DOUBLE)
+    assert (both.extrinsics.stack() - truth)[0, 0].abs() < math.radians(0.02)  # 0.09° on a plane road
+    torch.testing.assert_close(both.extrinsics.stack()[1], alone.extrinsics.stack()[0])
