@@ -3,6 +3,8 @@
 
 ONNX Runtime has Atan, Tan and Softplus in single precision only and no Where of truth values; ONNX has no
 Cholesky factor and no solve with triangular matrices. They are written here in operators that both have.
+PyTorch's exporter rounds numbers, such as those of ``full``, ``clamp`` and ``where``, to single precision;
+here they keep theirs.
 ``torch.onnx.export`` takes :func:`translations` as its ``custom_translation_table``.
 """
 
@@ -81,6 +83,12 @@ def translations() -> dict[Callable[..., Any], Callable[..., Any]]:
         aten.tan.default: tangent,
         aten.softplus.default: softplus,
         aten.where.self: where,
+        aten.full.default: full,
+        aten.full_like.default: full_like,
+        aten.new_full.default: new_full,
+        aten.scalar_tensor.default: scalar_tensor,
+        aten.masked_fill.Scalar: masked_fill,
+        aten.linspace.default: linspace,
         aten.linalg_cholesky_ex.default: cholesky_ex,
         aten.linalg_solve_triangular.default: solve_triangular,
         aten.cholesky_solve.default: cholesky_solve,
@@ -131,6 +139,38 @@ def where(condition: Any, yes: Any, no: Any) -> Any:
     return op.Where(condition, yes, no)
 
 
+def full(size: Any, fill_value: Any, dtype: int = -1, **_: Any) -> Any:
+    """Return a tensor of one number, in the precision of ``dtype``."""
+    return op.Expand(_number(fill_value, dtype), op.Cast(size, to=ir.DataType.INT64))
+
+
+def full_like(like: Any, fill_value: Any, dtype: int = -1, **_: Any) -> Any:
+    """Return a tensor of one number, as large as another one, in its precision or that of ``dtype``."""
+    return op.Expand(_number(fill_value, like.dtype if dtype == -1 else dtype), op.Shape(like))
+
+
+def new_full(like: Any, size: Any, fill_value: Any, dtype: int = -1, **_: Any) -> Any:
+    """Return a tensor of one number, in the precision of another one or that of ``dtype``."""
+    return full(size, fill_value, like.dtype if dtype == -1 else dtype)
+
+
+def linspace(start: float, end: float, steps: int, dtype: int = -1, **_: Any) -> Any:
+    """Return ``steps`` numbers from ``start`` to ``end``."""
+    single = dtype in (-1, ir.DataType.FLOAT)
+    numbers = torch.linspace(start, end, steps, dtype=torch.float32 if single else torch.float64)
+    return op.Constant(value=ir.tensor(numbers.numpy()))
+
+
+def masked_fill(values: Any, mask: Any, number: Any) -> Any:
+    """Replace values by a number where a mask holds."""
+    return op.Where(mask, _number(number, values.dtype), values)
+
+
+def scalar_tensor(value: Any, dtype: int = -1, **_: Any) -> Any:
+    """Return a number in the precision of ``dtype``."""
+    return _number(value, dtype)
+
+
 def cholesky_ex(matrix: Any, upper: bool = False, check_errors: bool = False) -> Any:
     """Compute the lower Cholesky factor; the second result, unused, says of no error."""
     assert not upper
@@ -164,6 +204,15 @@ def cholesky_inverse(factor: Any, upper: bool = False) -> Any:
 def _double(value: float) -> Any:
     """Return a constant in double precision."""
     return op.Constant(value=ir.tensor(value, dtype=ir.DataType.DOUBLE))
+
+
+def _number(value: Any, dtype: Any) -> Any:
+    """Return a constant of a Python number, or a cast tensor; -1 is PyTorch's default for the number."""
+    default = {bool: ir.DataType.BOOL, int: ir.DataType.INT64}.get(type(value), ir.DataType.FLOAT)
+    kind = default if dtype == -1 else ir.DataType(dtype)
+    if isinstance(value, bool | int | float):
+        return op.Constant(value=ir.tensor(value, dtype=kind))
+    return op.Cast(value, to=kind)
 
 
 def _typed(value: Any, like: Any) -> Any:

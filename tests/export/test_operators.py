@@ -84,6 +84,41 @@ def test_equals_pytorch(session, arguments, name):
     torch.testing.assert_close(found, expected, rtol=3e-7 if single else 1e-13, atol=absolute)
 
 
+class Numbers(torch.nn.Module):
+    """Operators that take a number which single precision cannot hold."""
+
+    def forward(self, x):
+        return (
+            torch.full((2,), 0.1, dtype=x.dtype),
+            torch.full_like(x, 0.1),
+            x.new_full((2,), 0.1),
+            torch.full((2,), 7),
+            torch.full((2,), True),
+            torch.where(x > 0, x, 0.1),
+            x.masked_fill(x > 0, 0.1),
+            x.clamp(-0.1, 0.1),
+            torch.where(x > 0.1, 1.0, torch.inf) + x,
+            torch.linspace(0, 1, 11, dtype=x.dtype),
+            torch.linspace(-0.3, 0.3, 7, dtype=x.dtype),
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_numbers_are_not_rounded(tmp_path, dtype):
+    x = torch.tensor([-0.7, 0.1, 0.3], dtype=dtype)
+    program = torch.export.export(Numbers(), (x,), dynamic_shapes=({0: Dim("rows")},))
+    path = tmp_path / "numbers.onnx"
+    torch.onnx.export(
+        program, dynamo=True, verbose=False, optimize=False, custom_translation_table=translations()
+    ).save(path)
+    session = onnxruntime.InferenceSession(path)
+    found = session.run(None, {session.get_inputs()[0].name: x.numpy()})
+    for one, other in zip(found, Numbers()(x), strict=True):
+        torch.testing.assert_close(torch.from_numpy(one), other, rtol=0, atol=0)
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_matrix_that_is_not_positive_leaves_other_rows_alone(session, arguments):
