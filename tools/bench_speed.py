@@ -4,9 +4,10 @@
     python -m tools.bench_speed --parts warp frame --threads 1 --cpu-time
 
 Prints and writes (bench_speed.json, bench_speed.md, and an SVG plot of every growing cost) medians and
-interquartile ranges in ms; ratios come first, each to the first line of its table. Alternatives take turns
-within one run, so that all of them see the same machine. ``--cpu-time`` takes the processor's time instead of
-the clock's: of one thread, and for a machine that others use too.
+interquartile ranges in ms; ratios come first, each to the first line of its table. Targets (TARGETS) are
+marked as met or missed, and the last table has all ratios, bold where missed. Alternatives take turns within
+one run, so that all of them see the same machine. ``--cpu-time`` takes the processor's time instead of the
+clock's: of one thread, and for a machine that others use too.
 
 - ``warp``: 1920 × 1020 px, three channels, or 64 channels at stride 8, to 1024 × 512 cells, against a bare
   ``grid_sample`` with its grid at hand and kornia's ``warp_perspective``; ``gradients``: and back.
@@ -62,6 +63,14 @@ BROWN = [-0.2, 0.03, 0.001, -0.001, 0.005]
 RATIONAL = [-0.2, 0.03, 0.001, -0.001, 0.005, 0.1, 0.05, 0.01]
 FISHEYE = [-0.05, 0.01, -0.003, 0.001]
 POSE = [0.03, 0.02, 0.01, 1.5]
+TARGETS = {  # largest ratio, or time
+    "BEVWarp": ("ratio", 1.2),
+    "BEVWarp, 5 coefficients": ("ratio", 1.3),
+    "BEVWarp, 8 coefficients": ("ratio", 1.3),
+    "BEVWarp, fisheye": ("ratio", 1.3),
+    "remap_frame": ("ratio", 1.2),
+    "LineExtractor": ("ms", 4.0),
+}
 _ONCE = 10  # times the seconds of an alternative, above which a call is measured once, without one to warm up
 
 
@@ -98,6 +107,24 @@ def measure(calls: Calls, seconds: float, clock: Callable[[], float]) -> Table:
     return {name: {"ratio": entry["ms"] / base, **entry} for name, entry in table.items()}
 
 
+def judged(table: Table) -> Table:
+    """Add to entries with a target whether they meet it, to two decimals."""
+    return {
+        name: {**entry, "met": round(entry[TARGETS[name][0]], 2) <= TARGETS[name][1]}
+        if name in TARGETS
+        else entry
+        for name, entry in table.items()
+    }
+
+
+def verdict(name: str, entry: Mapping[str, float]) -> str:
+    """Say whether a target is met; nothing of an entry without one."""
+    if "met" not in entry:
+        return ""
+    what, most = TARGETS[name]
+    return f"{'met' if entry['met'] else 'missed'}: {what} at most {most:g}"
+
+
 def sampling_grid(batch: int) -> Tensor:
     """What the warp samples at, as ``grid_sample`` takes it."""
     intrinsics = camera().intrinsics.float().expand(batch, 3, 3)
@@ -129,13 +156,14 @@ def warps(batch: int, channels: int, stride: int) -> Calls:
     }
 
 
-def backwards(batch: int) -> Calls:
+def backwards(batch: int, channels: int, stride: int) -> Calls:
     """The same with gradients of the image and of what it is sampled at."""
-    image = torch.rand(batch, 3, *SIZE, requires_grad=True)
+    image = torch.rand(batch, channels, SIZE[0] // stride, SIZE[1] // stride, requires_grad=True)
     grid = sampling_grid(batch).requires_grad_()
     values = torch.tensor([POSE]).repeat(batch, 1).requires_grad_()
     ideal, warp = camera().intrinsics.float().expand(batch, 3, 3), BEVWarp(GRID)
-    weight = torch.rand(batch, 3, *GRID.shape)
+    coarse = torch.diag(torch.tensor([1 / stride, 1 / stride, 1.0]))
+    weight = torch.rand(batch, channels, *GRID.shape)
 
     def both(forward: Callable[[], Tensor]) -> Callable[[], object]:
         def run() -> None:
@@ -144,21 +172,22 @@ def backwards(batch: int) -> Calls:
 
         return run
 
-    def warped(lens: Tensor | None) -> Tensor:
-        bev: Tensor = warp(image, ideal, Extrinsics.unstack(values), lens)[0]
-        return bev
+    def warped(distortion: list[float] | None = None, model: str = "pinhole") -> Callable[[], object]:
+        lens = None if distortion is None else torch.tensor([distortion]).expand(batch, -1)
+        return both(lambda: warp(image, ideal, Extrinsics.unstack(values), lens, model, SIZE)[0])
 
     def by_kornia() -> Tensor:
-        homography = bev_from_image(Extrinsics.unstack(values), ideal, GRID)
+        homography = bev_from_image(Extrinsics.unstack(values), coarse @ ideal, GRID)
         bev: Tensor = warp_perspective(image, homography, GRID.shape)
         return bev
 
-    lens = torch.tensor([BROWN]).expand(batch, -1)
     return {
         "grid_sample": both(lambda: F.grid_sample(image, grid, align_corners=False)),
         "kornia warp_perspective": both(by_kornia),
-        "BEVWarp": both(lambda: warped(None)),
-        "BEVWarp, 5 coefficients": both(lambda: warped(lens)),
+        "BEVWarp": warped(),
+        "BEVWarp, 5 coefficients": warped(BROWN),
+        "BEVWarp, 8 coefficients": warped(RATIONAL),
+        "BEVWarp, fisheye": warped(FISHEYE, "fisheye"),
     }
 
 
@@ -234,8 +263,9 @@ TABLES: dict[str, list[tuple[str, Callable[[], Calls]]]] = {
         ("64 channels at stride 8", lambda: warps(1, 64, 8)),
     ],
     "gradients": [
-        ("one image and back", lambda: backwards(1)),
-        ("8 images and back", lambda: backwards(8)),
+        ("one image and back", lambda: backwards(1, 3, 1)),
+        ("8 images and back", lambda: backwards(8, 3, 1)),
+        ("64 channels at stride 8 and back", lambda: backwards(1, 64, 8)),
     ],
     "frame": [
         ("a frame of bytes", lambda: frames("pinhole")),
@@ -256,11 +286,28 @@ GROWTHS: dict[str, Growth] = {
 
 def shown(title: str, table: Table) -> str:
     """A markdown table, ratios first."""
-    lines = [f"**{title}**", "", "| | ratio | ms | quartiles |", "|---|---|---|---|"]
+    lines = [f"**{title}**", "", "| | ratio | ms | quartiles | target |", "|---|---|---|---|---|"]
     for name, entry in table.items():
         quartiles = f"{entry['low']:.2f} to {entry['high']:.2f}"
-        lines.append(f"| {name} | {entry['ratio']:.2f} | {entry['ms']:.2f} | {quartiles} |")
+        lines.append(
+            f"| {name} | {entry['ratio']:.2f} | {entry['ms']:.2f} | {quartiles} | {verdict(name, entry)} |"
+        )
     return "\n".join([*lines, ""])
+
+
+def overview(tables: Mapping[str, Table]) -> str:
+    """A markdown table of all ratios, bold where a target is missed, and how many are met."""
+    names = list(dict.fromkeys(name for table in tables.values() for name in table))
+    lines = [f"| | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
+    for title, table in tables.items():
+        row = [_ratio(table[name]) if name in table else "" for name in names]
+        lines.append(f"| {title} | {' | '.join(row)} |")
+    met = [entry["met"] for table in tables.values() for entry in table.values() if "met" in entry]
+    return "\n".join(["**ratios**", "", *lines, "", f"{sum(map(int, met))} of {len(met)} targets met", ""])
+
+
+def _ratio(entry: Mapping[str, float]) -> str:
+    return f"{entry['ratio']:.2f}" if entry.get("met", True) else f"**{entry['ratio']:.2f}**"
 
 
 def grown(title: str, results: dict[int, Table]) -> str:
@@ -314,11 +361,12 @@ def run(
     out.mkdir(parents=True, exist_ok=True)
     results: dict[str, Any] = {}
     texts = []
+    tables: dict[str, Table] = {}
     for part in parts:
         for title, calls in TABLES.get(part, []):
             with torch.set_grad_enabled(part == "gradients"):
-                table = measure(calls(), seconds, clock)
-            results[title] = table
+                table = judged(measure(calls(), seconds, clock))
+            results[title] = tables[title] = table
             texts.append(shown(title, table))
             print(texts[-1], flush=True)
         if part in GROWTHS:
@@ -335,6 +383,9 @@ def run(
             texts.append(grown(title, by_size))
             print(texts[-1], flush=True)
             plot(title, by_size, out / f"{part}.svg")
+    if tables:
+        texts.append(overview(tables))
+        print(texts[-1], flush=True)
     report = {**facts(torch.get_num_threads()), "clock": clock.__name__, "results": results}
     (out / "bench_speed.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     (out / "bench_speed.md").write_text("\n".join(texts), encoding="utf-8")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lanebev.camera.model import Camera
+from lanebev.tensors import constant
 from lanebev.types import Extrinsics
 from lanebev.view.blocks import blocks
 from lanebev.view.cells import cell_sums
@@ -79,9 +80,10 @@ def _fixed_point_pixels(
     Returns:
         (rows, V, 2) whole px and (rows, V) parts of px, in memory that is kept.
     """
+    centre = constant(((size[1] - 1) / 2, (size[0] - 1) / 2), like=points)
     x, y = (
-        torch.add(plane.new_tensor((side - 1) / 2), plane, alpha=side / 2, out=plane).numpy()
-        for plane, side in zip(points, reversed(size), strict=True)
+        torch.add(middle, plane, alpha=side / 2, out=plane).numpy()
+        for middle, plane, side in zip(centre, points, reversed(size), strict=True)
     )
     whole, parts = _kept("whole", (*x.shape, 2), np.int16), _kept("parts", x.shape, np.uint16)
     cv2.convertMaps(x, y, cv2.CV_16SC2, whole, parts)
