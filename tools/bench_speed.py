@@ -10,7 +10,8 @@ one run, so that all of them see the same machine. ``--cpu-time`` takes the proc
 clock's: of one thread, and for a machine that others use too.
 
 - ``warp``: 1920 × 1020 px, three channels, or 64 channels at stride 8, to 1024 × 512 cells, against a bare
-  ``grid_sample`` with its grid at hand and kornia's ``warp_perspective``; ``gradients``: and back.
+  ``grid_sample`` with its grid at hand and kornia's ``warp_perspective``; ``gradients``: and back;
+  ``stages``: what is done before the resampling.
 - ``frame``: one frame of bytes through the lens, against ``cv2.remap`` with its maps at hand, and with its
   maps computed, as they must be when the pose is another in every frame.
 - ``extractor``: seven maps of 160 × 288.
@@ -51,7 +52,11 @@ from lanebev import (
 )
 from lanebev.tensors import map_tensors
 from lanebev.testing.segments import INTRINSICS, lanes
+from lanebev.view.cells import cells_and_lens
 from lanebev.view.frame import remap_frame
+from lanebev.view.lens import Lens
+from lanebev.view.projection import CellSums, normalised_intrinsics
+from lanebev.view.sampling import MapSize, sampling_maps
 from train.commands import one_line_errors
 
 Calls = Mapping[str, Callable[[], object]]
@@ -153,6 +158,32 @@ def warps(batch: int, channels: int, stride: int) -> Calls:
         "BEVWarp, 5 coefficients": with_lens(BROWN),
         "BEVWarp, 8 coefficients": with_lens(RATIONAL),
         "BEVWarp, fisheye": with_lens(FISHEYE, "fisheye"),
+    }
+
+
+def stages(distortion: list[float] | None) -> Calls:
+    """The stages of a view of one image: alone, in a warm cache, and before the resampling."""
+    image, grid, warp, extrinsics = torch.rand(1, 3, *SIZE), sampling_grid(1), BEVWarp(GRID), poses(1)
+    ideal = camera().intrinsics.float()[None]
+    lens = None if distortion is None else torch.tensor([distortion])
+
+    def matrices() -> tuple[CellSums, Lens | None]:
+        scaled = normalised_intrinsics(ideal, SIZE)
+        return cells_and_lens(GRID, scaled, extrinsics, lens, "pinhole", torch.float32)
+
+    def maps() -> object:
+        return sampling_maps(*matrices(), [MapSize(*SIZE)], SIZE)
+
+    def sample() -> Tensor:
+        return F.grid_sample(image, grid, align_corners=False)
+
+    return {
+        "grid_sample": sample,
+        "matrices alone": matrices,
+        "matrices and map alone": maps,
+        "matrices, grid_sample": lambda: (matrices(), sample()),
+        "matrices, map, grid_sample": lambda: (maps(), sample()),
+        "all of BEVWarp": lambda: warp(image, ideal, extrinsics, lens, image_size=SIZE),
     }
 
 
@@ -261,6 +292,10 @@ TABLES: dict[str, list[tuple[str, Callable[[], Calls]]]] = {
         ("one image", lambda: warps(1, 3, 1)),
         ("8 images", lambda: warps(8, 3, 1)),
         ("64 channels at stride 8", lambda: warps(1, 64, 8)),
+    ],
+    "stages": [
+        ("stages without a lens", lambda: stages(None)),
+        ("stages with 5 coefficients", lambda: stages(BROWN)),
     ],
     "gradients": [
         ("one image and back", lambda: backwards(1, 3, 1)),
