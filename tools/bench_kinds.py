@@ -19,6 +19,7 @@ from torch import Tensor
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.dynamics import MotionConfig
 from lanebev.estimation.joint.single_frame import FramePrior
+from lanebev.estimation.joint.state import REAL_ROADS
 from lanebev.estimation.joint.update import UNSEEN
 from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, within_sigmas
 from lanebev.testing.motions import Pose, fall, landing_time, moved, sinusoids
@@ -35,7 +36,9 @@ ALLOWED = 15
 """Frames after a shock that ratio and NEES leave out: so long it may take to come back."""
 
 _IN_CURVE = "motion up to 1.5°, 1.2 Hz, R 300 m"
+_CREST = "crest or dip, R 5 to 20 km"
 _GIVEN = ", speed given"
+_REAL = ", REAL_ROADS"
 
 Change = Callable[[float, Moment], Moment]
 
@@ -113,9 +116,11 @@ def measure_all(count: int) -> dict[str, dict[str, Any]]:
     )
     print("|---|---|---|---|---|---|")
     results = {}
-    for kind in (*KINDS, *(f"{kind}{_GIVEN}" for kind in KINDS if kind.startswith(_IN_CURVE))):
-        calibrator = speed_given() if kind.endswith(_GIVEN) else JointCalibrator()
-        found = measure(kind.removesuffix(_GIVEN), seeds, calibrator)
+    others = (f"{kind}{_GIVEN}" for kind in KINDS if kind.startswith(_IN_CURVE))
+    for kind in (*KINDS, *others, f"{_CREST}{_REAL}"):
+        calibrator = JointCalibrator(REAL_ROADS if kind.endswith(_REAL) else None)
+        calibrator = speed_given() if kind.endswith(_GIVEN) else calibrator
+        found = measure(kind.removesuffix(_GIVEN).removesuffix(_REAL), seeds, calibrator)
         ratio = " ".join("–" if math.isnan(value) else f"{value:.2f}" for value in found.ratio)
         back = f"{min(found.back):.0f} to {max(found.back):.0f}" if found.back else ""
         nees = f"{found.nees:.2f} | {found.nees_seen:.2f}"
@@ -204,6 +209,13 @@ def _resumed(seed: int) -> Generated:
     return replace(_drawn(seed, change), resumed=lambda: moments(1.0, before))
 
 
+def _crest(seed: int) -> Generated:
+    """Drive over a crest or through a dip of R = 5 to 20 km, seen from 5 to 40 m."""
+    random = Random(seed)
+    vertical = random.choice((-1.0, 1.0)) / random.uniform(5e3, 20e3)
+    return _drawn(seed, lambda t, moment: replace(moment, near=5.0, far=40.0, profile=vertical))
+
+
 def _unequal(seed: int, std: float) -> Generated:
     """Put every boundary out of its place for good, independently, by a normal deviate."""
     random = Random(seed)
@@ -250,6 +262,7 @@ def _rolled_ego_lane_of(kind: str, seed: int) -> Generated:
 
 KINDS: dict[str, Callable[[int], Generated]] = {
     **_ALL_LANES,
+    _CREST: _crest,
     "lanes unequal by 2 cm": partial(_unequal, std=0.02),
     "lanes unequal by 10 cm": partial(_unequal, std=0.1),
     **{f"{kind}, ego lane": partial(_ego_lane_of, kind) for kind in _ALL_LANES},
