@@ -11,6 +11,7 @@ from lanebev.app.build import make_calibrator
 from lanebev.app.export_config import ExportConfig
 from lanebev.camera.model import Camera
 from lanebev.export.parts import make_part
+from lanebev.export.quantize import quantize_segmenter, rendered_views
 from lanebev.export.write import write_onnx, write_program
 from lanebev.pipeline import LaneBEV
 
@@ -39,6 +40,9 @@ def export(config: ExportConfig) -> str:
                 logger.info("exporting %s", name)
                 path = Path(partial, f"{name}{SUFFIXES[config.format]}")
                 write(make_part(name, model, camera), path)
+                if config.int8 and name == "segmenter":
+                    logger.info("quantising %s", name)
+                    quantize_segmenter(path, rendered_views(model.network_size(camera.image_size)))
                 lines.append(f"{out / path.name}: {path.stat().st_size / 1e6:.1f} MB")
             for path in Path(partial).iterdir():
                 os.replace(path, out / path.name)

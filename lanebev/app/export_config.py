@@ -21,6 +21,7 @@ class ExportConfig:
         out: output folder.
         calibrator: calibrator of the step, one of CALIBRATORS.
         weights: weights file of the network; None is the shipped one.
+        int8: the segmenter's convolutions compute with 8-bit numbers; the other files stay in float.
     """
 
     camera: str = option("", "camera file, whose image size and lens model the export keeps", "FILE")
@@ -33,10 +34,13 @@ class ExportConfig:
         choices=CALIBRATORS,
     )
     weights: str | None = option(None, "weights of the network instead of the shipped ones", "FILE")
+    int8: bool = option(False, "quantise the segmenter's convolutions to 8 bits, by rendered views")
 
     def __post_init__(self) -> None:
         if not self.camera:
             raise ValueError("camera: expected --camera FILE, got none")
+        if self.int8 and (self.format != "onnx" or "segmenter" not in self.parts):
+            raise ValueError("int8: expected --format onnx and the part segmenter with it, got another")
 
     @property
     def parts(self) -> tuple[str, ...]:

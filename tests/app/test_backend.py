@@ -96,6 +96,9 @@ def test_settings_are_checked():
         ExportConfig()
     assert ExportConfig(camera="c", part="warp").parts == ("warp",)
     assert ExportConfig(camera="c", calibrator="two-stage").parts[2] == "two-stage"
+    for other in ({"format": "torch-export"}, {"part": "warp"}):
+        with pytest.raises(ValueError, match="int8: expected --format onnx and the part segmenter"):
+            ExportConfig(camera="c", int8=True, **other)
     with pytest.raises(ValueError, match="backend: expected torch or onnxruntime, got 'tvm'"):
         RunConfig(source="s", camera="c", backend="tvm")
     with pytest.raises(ValueError, match="weights: expected --backend torch with it, got onnxruntime"):

@@ -17,6 +17,7 @@ from lanebev import (
 )
 from lanebev.batch import replace_rows
 from lanebev.export.parts import Part, calibrator_part, make_part
+from lanebev.export.quantize import quantize_segmenter
 from lanebev.export.runtime import OnnxCalibrator, OnnxPart
 from lanebev.export.write import export_program, write_onnx
 from lanebev.tensors import constant
@@ -68,6 +69,27 @@ def test_a_part_equals_eager_for_any_batch(name, distortion, tolerance, tmp_path
         with torch.no_grad():
             expected = dict(zip(part.outputs, part.module(*inputs.values()), strict=True))
         equals(other(inputs), expected, tolerance)
+
+
+@pytest.mark.slow
+def test_a_segmenter_of_8_bits_is_near_that_of_float(tmp_path):
+    """Weights and activations are stored with 8 bits, names and facts stay, logits differ by a little."""
+    part = make_part("segmenter", model(), camera())
+    path = tmp_path / "part.onnx"
+    write_onnx(part, path)
+    size, facts = path.stat().st_size, OnnxPart(path).facts
+    generator = torch.Generator().manual_seed(0)
+    images = [torch.rand(1, *part.inputs["image"].shape[1:], generator=generator) for _ in range(4)]
+    quantize_segmenter(path, [{"image": image.numpy()} for image in images])
+    other = OnnxPart(path)
+    assert other.facts == facts
+    assert list(other.inputs) == ["image"]
+    assert path.stat().st_size < 0.6 * size
+    image = torch.cat(images[:2])
+    with torch.no_grad():
+        (expected,) = part.module(image)
+    off = (other({"image": image})["logits"] - expected).abs()
+    assert 0 < off.mean() < 0.05 * expected.std()
 
 
 @pytest.mark.slow
