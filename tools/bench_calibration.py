@@ -21,6 +21,7 @@ import platform
 import resource
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from jsonargparse.typing import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.state import REAL_ROADS
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.evaluation import NAMES, UNITS, WARM_UP, rms, summarise, track
@@ -42,7 +44,9 @@ CALIBRATORS: dict[str, Callable[[], Any]] = {
     "joint": JointCalibrator,
     "two-stage": TwoStageCalibrator,
     "textbook EKF": TextbookEKF,
+    "joint-real-roads": partial(JointCalibrator, REAL_ROADS),
 }
+DEFAULT = ("joint", "two-stage", "textbook EKF")
 
 
 def compare(
@@ -186,7 +190,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--calibrators", nargs="+", choices=list(CALIBRATORS), default=list(CALIBRATORS))
+    parser.add_argument("--calibrators", nargs="+", choices=list(CALIBRATORS), default=DEFAULT)
     parser.add_argument("--scenarios", nargs="+", choices=list(SCENARIOS), default=list(SCENARIOS))
     parser.add_argument("--rows", type=PositiveInt, default=32, help="Monte Carlo runs")
     parser.add_argument("--sigma", type=PositiveFloat, default=1.0, help="noise of an end point, px")
