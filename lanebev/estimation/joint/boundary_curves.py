@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import masked_median
-from lanebev.estimation.joint.measurement import FARTHEST, observe
+from lanebev.estimation.joint.measurement import observe
+from lanebev.estimation.joint.road_profile import FARTHEST
 from lanebev.geometry.road import image_from_road_points
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.observation.segments import LaneSegments

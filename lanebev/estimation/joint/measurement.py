@@ -27,6 +27,7 @@ from torch.nn.functional import pad
 
 from lanebev.estimation.checks import as_lane_width, check_segments, mask_invalid_rows
 from lanebev.estimation.joint.road_curve import NUM_STEPS, RoadCurve, road_basis, road_curve
+from lanebev.estimation.joint.road_profile import Profile, before_farthest, meet_road
 from lanebev.geometry.lens import cam_from_image
 from lanebev.geometry.rotation import road_from_cam_and_roll
 from lanebev.observation.segments import LaneSegments
@@ -44,12 +45,6 @@ NUM_SHAPE = 1 + NUM_STEPS
 
 VERTICAL = NUM_STRAIGHT + NUM_SHAPE
 """Index of the vertical curvature (1/m), the last parameter of a road whose bend is a spline."""
-
-FARTHEST = 200.0  # m; beyond it a pixel is tens of metres and the flat road is fiction
-
-_BEFORE_CREST = 0.8  # of the distance at which a crest hides the road, up to which points are on the road
-
-_AHEAD = 1e-3  # of a direction's component ahead; below it a point is not in front of the camera
 
 FOOT_RANGE = 0.02  # of the focal length; a foot point farther off is an outlier's, perhaps above the horizon
 
@@ -72,18 +67,6 @@ class Observations(NamedTuple):
     sigma: Tensor
     focal: Tensor
     cam_from_image: Tensor
-
-
-class Profile(NamedTuple):
-    """The road below the camera's path, h + κ Z²/2.
-
-    Attributes:
-        height: (B, 1) m, h, of the camera over the road below it.
-        curvature: (B, 1) 1/m, κ, positive over a crest.
-    """
-
-    height: Tensor
-    curvature: Tensor
 
 
 class Sight(NamedTuple):
@@ -198,7 +181,7 @@ def look(params: Tensor, seen: Observations, phase: Tensor | None = None) -> Sig
     rotation, by_roll = road_from_cam_and_roll(params[:, :HEIGHT])
     directions = torch.bmm(rotation, seen.rays)
     profile = _profile(params, phase)
-    z, valid = _meet_road(directions, profile), _before_farthest(directions, profile)
+    z, valid = meet_road(directions, profile), before_farthest(directions, profile)
     curve = road_curve(z, _shape(params, phase), phase)
     return Sight(
         rotation, by_roll, directions, torch.bmm(rotation, seen.cam_from_image), z, valid, profile, curve
@@ -243,7 +226,7 @@ def boundary_residuals(
     feet = foot_rays(params, places, seen, sight) if feet is None else feet
     profile = _profile(params, phase)
     foot = torch.bmm(sight.rotation, feet)
-    z = _meet_road(foot, profile)
+    z = meet_road(foot, profile)
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (B, M)
     basis, shape = road_basis(z, phase), _shape(params, phase).unsqueeze(1)
     curve = RoadCurve(*(torch.bmm(shape, part).squeeze(1) for part in basis))
@@ -276,8 +259,8 @@ def boundary_distances(
     """Compute the distances of :func:`boundary_residuals` alone, (B, N, 2) px, and their validity (B, N)."""
     rotation, _ = road_from_cam_and_roll(params[:, :HEIGHT])
     directions, profile = torch.bmm(rotation, seen.rays), _profile(params, phase)
-    valid = _before_farthest(directions, profile)
-    z = _meet_road(torch.bmm(rotation, feet), profile)
+    valid = before_farthest(directions, profile)
+    z = meet_road(torch.bmm(rotation, feet), profile)
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)
     normal, _ = _tangent_plane(z, x_k, profile, road_curve(z, _shape(params, phase), phase))
     _, size = _pixel_gradient(normal, torch.bmm(rotation, seen.cam_from_image))
@@ -347,35 +330,6 @@ def _profile(params: Tensor, phase: Tensor | None) -> Profile:
     """Height and vertical curvature, 0 for a single frame."""
     height = params[:, HEIGHT, None]
     return Profile(height, torch.zeros_like(height) if phase is None else params[:, VERTICAL, None])
-
-
-def _meet_road(directions: Tensor, profile: Profile) -> Tensor:
-    """Distance Z (B, M) at which directions (B, 3, M) meet the road, at most the farthest.
-
-    Source: (J1), for a vertical curvature the nearer root of κ Z²/2 - (d_y / d_z) Z + h = 0.
-    """
-    height, curvature = profile
-    slope = torch.maximum(directions[:, 1] / directions[:, 2].clamp(min=_AHEAD), _least_slope(profile))
-    return 2 * height / (slope + (slope * slope - 2 * curvature * height).sqrt())
-
-
-def _before_farthest(directions: Tensor, profile: Profile) -> Tensor:
-    """(B, N) bool: both end points, of directions (B, 3, M), meet the road nearer than the farthest."""
-    down, ahead = directions[:, 1], directions[:, 2]
-    on_road = (ahead > _AHEAD) & (down > ahead * _least_slope(profile))
-    valid: Tensor = on_road.unflatten(-1, (-1, 2)).all(-1)
-    return valid
-
-
-def _least_slope(profile: Profile) -> Tensor:
-    """Slope (B, 1), down by ahead, of the direction to the farthest point of the road.
-
-    It is at ``FARTHEST``, or nearer than the point where the sight touches a crest, √(2 h / κ).
-    """
-    height, curvature = profile.height.clamp(min=0.1), profile.curvature
-    touching = 2 * _BEFORE_CREST**2 / FARTHEST**2 * height  # 1/m, whose crest is as far as FARTHEST
-    farthest = FARTHEST * (touching / torch.maximum(curvature, touching)).sqrt()
-    return height / farthest + 0.5 * curvature * farthest
 
 
 def _tangent_plane(z: Tensor, x_k: Tensor, profile: Profile, curve: RoadCurve) -> tuple[Tensor, Tensor]:

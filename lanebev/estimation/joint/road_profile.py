@@ -1,0 +1,55 @@
+"""The road's height profile, h + κ Z²/2 below the camera, and where directions meet it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+FARTHEST = 200.0  # m; beyond it a pixel is tens of metres, and the shape of the road is not known
+
+_BEFORE_CREST = 0.8  # of the distance at which a crest hides the road, up to which points are on the road
+
+_AHEAD = 1e-3  # of a direction's component ahead; below it a point is not in front of the camera
+
+
+class Profile(NamedTuple):
+    """The road below the camera's path, h + κ Z²/2.
+
+    Attributes:
+        height: (B, 1) m, h, of the camera over the road below it.
+        curvature: (B, 1) 1/m, κ, positive over a crest.
+    """
+
+    height: Tensor
+    curvature: Tensor
+
+
+def meet_road(directions: Tensor, profile: Profile) -> Tensor:
+    """Compute the distance Z (B, M) at which directions (B, 3, M) meet the road, at most the farthest.
+
+    Source: (J1), for a vertical curvature the nearer root of κ Z²/2 - (d_y / d_z) Z + h = 0.
+    """
+    height, curvature = profile
+    slope = torch.maximum(directions[:, 1] / directions[:, 2].clamp(min=_AHEAD), _least_slope(profile))
+    return 2 * height / (slope + (slope * slope - 2 * curvature * height).sqrt())
+
+
+def before_farthest(directions: Tensor, profile: Profile) -> Tensor:
+    """Return (B, N) bool: both end points, of directions (B, 3, M), meet the road before the farthest."""
+    down, ahead = directions[:, 1], directions[:, 2]
+    on_road = (ahead > _AHEAD) & (down > ahead * _least_slope(profile))
+    valid: Tensor = on_road.unflatten(-1, (-1, 2)).all(-1)
+    return valid
+
+
+def _least_slope(profile: Profile) -> Tensor:
+    """Compute the slope (B, 1), down by ahead, of the direction to the farthest point of the road.
+
+    It is at ``FARTHEST``, or nearer than the point where the sight touches a crest, √(2 h / κ).
+    """
+    height, curvature = profile.height.clamp(min=0.1), profile.curvature
+    touching = 2 * _BEFORE_CREST**2 / FARTHEST**2 * height  # 1/m, whose crest is as far as FARTHEST
+    farthest = FARTHEST * (touching / torch.maximum(curvature, touching)).sqrt()
+    return height / farthest + 0.5 * curvature * farthest
