@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -126,8 +125,7 @@ class LaneBEV(nn.Module):
         Args:
             weights: another file in the same format; None is the shipped one.
             grid: grid of the view.
-            calibrator: None is a :class:`lanebev.JointCalibrator` for real roads (``REAL_ROADS``) and the
-                network's boundaries.
+            calibrator: None is a default :class:`lanebev.JointCalibrator` of the network's boundaries.
             network_width: px; None is the width that the weights were trained for, and a larger one for wide
                 images, at which the input has about as many pixels as in training.
             frozen: see the class.
@@ -136,15 +134,13 @@ class LaneBEV(nn.Module):
             ValueError: a weights file that doesn't fit the network.
         """
         from lanebev.estimation.joint.calibrator import JointCalibrator
-        from lanebev.estimation.joint.state import REAL_ROADS
         from lanebev.weights import load_segmenter
 
         segmenter = load_segmenter(weights)
         rows, columns = map(int, segmenter.image_size)
         width, pixels = (columns, rows * columns) if network_width is None else (network_width, None)
         extractor = LineExtractor.for_network(segmenter.config)
-        numbers = replace(REAL_ROADS, num_boundaries=segmenter.config.num_boundaries)
-        calibrator = calibrator or JointCalibrator(numbers)
+        calibrator = calibrator or JointCalibrator(num_boundaries=segmenter.config.num_boundaries)
         view = BEVWarp(grid)
         return cls(segmenter, extractor, calibrator, view, width, frozen=frozen, network_pixels=pixels)
 

@@ -16,7 +16,6 @@ from torch import Tensor
 from lanebev.camera.model import Camera, check_camera
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.state import REAL_ROADS
 from lanebev.estimation.mount import MountCalibration, describe_mount
 from lanebev.estimation.reasons import Reason, describe_reasons
 from lanebev.estimation.tracker import Tracker
@@ -115,7 +114,7 @@ class Session:
         self.camera, self.grid, self.colours, self.device = camera, grid, colours, torch.device(device)
         self.polyline_sigma = polyline_sigma
         self._model = model
-        self._parts = (calibrator or JointCalibrator(REAL_ROADS), camera, float(lane_width), focal_std)
+        self._parts = (calibrator or JointCalibrator(), camera, float(lane_width), focal_std)
         self.reset()
 
     def reset(self) -> None:

@@ -74,4 +74,4 @@ def _computed_constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: tor
 
 @made_once
 def _constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    return torch.tensor(numbers, dtype=dtype, device=device)
+    return torch.tensor(numbers, dtype=dtype).to(device)

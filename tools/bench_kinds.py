@@ -19,7 +19,7 @@ from torch import Tensor
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.dynamics import MotionConfig
 from lanebev.estimation.joint.single_frame import FramePrior
-from lanebev.estimation.joint.state import REAL_ROADS
+from lanebev.estimation.joint.state import HILLY_ROADS
 from lanebev.estimation.joint.update import UNSEEN
 from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, within_sigmas
 from lanebev.testing.motions import Pose, fall, landing_time, moved, sinusoids
@@ -38,7 +38,7 @@ ALLOWED = 15
 _IN_CURVE = "motion up to 1.5°, 1.2 Hz, R 300 m"
 _CREST = "crest or dip, R 5 to 20 km"
 _GIVEN = ", speed given"
-_REAL = ", REAL_ROADS"
+_HILLY = ", HILLY_ROADS"
 
 Change = Callable[[float, Moment], Moment]
 
@@ -117,10 +117,10 @@ def measure_all(count: int) -> dict[str, dict[str, Any]]:
     print("|---|---|---|---|---|---|")
     results = {}
     others = (f"{kind}{_GIVEN}" for kind in KINDS if kind.startswith(_IN_CURVE))
-    for kind in (*KINDS, *others, f"{_CREST}{_REAL}"):
-        calibrator = JointCalibrator(REAL_ROADS if kind.endswith(_REAL) else None)
+    for kind in (*KINDS, *others, f"{_CREST}{_HILLY}"):
+        calibrator = JointCalibrator(HILLY_ROADS if kind.endswith(_HILLY) else None)
         calibrator = speed_given() if kind.endswith(_GIVEN) else calibrator
-        found = measure(kind.removesuffix(_GIVEN).removesuffix(_REAL), seeds, calibrator)
+        found = measure(kind.removesuffix(_GIVEN).removesuffix(_HILLY), seeds, calibrator)
         ratio = " ".join("–" if math.isnan(value) else f"{value:.2f}" for value in found.ratio)
         back = f"{min(found.back):.0f} to {max(found.back):.0f}" if found.back else ""
         nees = f"{found.nees:.2f} | {found.nees_seen:.2f}"

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,7 +29,6 @@ from torch import Tensor
 import lanebev
 from lanebev import BEVGrid, Calibration, Camera, JointCalibrator, LaneBEV, LaneSegments, Status
 from lanebev.estimation.joint.single_frame import FramePrior, prior_of_mount
-from lanebev.estimation.joint.state import REAL_ROADS
 from lanebev.estimation.tracker import Tracker
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.io.video import read_image
@@ -91,7 +89,7 @@ def calibrate_frame(
 ) -> tuple[LaneSegments, Calibration]:
     """Calibrate one frame (1, 3, H, W) in [0, 1], as taken."""
     _, vertices = model.boundary_vertices(frame)
-    tracker = Tracker(JointCalibrator(replace(REAL_ROADS, prior=prior or FramePrior())), camera, lane_width)
+    tracker = Tracker(JointCalibrator(prior=prior or FramePrior()), camera, lane_width)
     segments, calibration, _ = tracker.still(vertices, model.pose_sigma_scale)
     return segments, calibration
 

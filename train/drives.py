@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.state import REAL_ROADS
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.observation.segments import LaneSegments
@@ -57,9 +56,7 @@ def _observer(segmenter: LaneSegmenter) -> LaneBEV:
             f"num_boundaries: expected the drives' {NUM_BOUNDARIES}, got {config.num_boundaries}"
         )
     extractor = LineExtractor.for_network(config)
-    return LaneBEV(
-        segmenter, extractor, JointCalibrator(REAL_ROADS), network_width=config.image_size[1]
-    ).eval()
+    return LaneBEV(segmenter, extractor, JointCalibrator(), network_width=config.image_size[1]).eval()
 
 
 class CalibratorErrors(NamedTuple):
@@ -79,7 +76,7 @@ class CalibratorErrors(NamedTuple):
 @torch.inference_mode()
 def run_calibrator(seen: DriveObservations, factor: float) -> CalibratorErrors:
     """Run the online calibrator on a drive, all sigmas times ``factor``."""
-    calibrator = JointCalibrator(REAL_ROADS)
+    calibrator = JointCalibrator()
     state = calibrator.initial_state(1, dtype=torch.float64)
     found = []
     for segments, width, pose in zip(seen.segments, seen.lane_width, seen.poses, strict=True):

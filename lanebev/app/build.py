@@ -15,7 +15,7 @@ from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator, StateT
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.single_frame import prior_of_mount
-from lanebev.estimation.joint.state import REAL_ROADS, JointState
+from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.tracker import Tracker
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.estimation.two_stage.state import TwoStageState
@@ -60,8 +60,8 @@ def make_grid(config: RunConfig) -> BEVGrid:
 
 
 def make_calibrator(name: str) -> JointCalibrator | TwoStageCalibrator:
-    """Make the calibrator of this name, one of CALIBRATORS, with the settings for real roads."""
-    return TwoStageCalibrator() if name == "two-stage" else JointCalibrator(REAL_ROADS)
+    """Make the calibrator of this name, one of CALIBRATORS, with default settings."""
+    return TwoStageCalibrator() if name == "two-stage" else JointCalibrator()
 
 
 def make_tracker(config: RunConfig, camera: Camera) -> RunTracker:
@@ -73,10 +73,10 @@ def make_tracker(config: RunConfig, camera: Camera) -> RunTracker:
     if config.calibrator == "two-stage":
         return _tracker(TwoStageCalibrator(), config, camera)
     if config.mount is None:
-        return _tracker(JointCalibrator(REAL_ROADS), config, camera)
+        return _tracker(JointCalibrator(), config, camera)
     mount = read_mount(config.mount)
     prior = prior_of_mount(mount.pose.tolist(), mount.std.tolist())
-    return _tracker(JointCalibrator(replace(REAL_ROADS, prior=prior)), config, camera)
+    return _tracker(JointCalibrator(prior=prior), config, camera)
 
 
 def _tracker(calibrator: Calibrator[StateT], config: RunConfig, camera: Camera) -> Tracker[StateT]:

@@ -19,7 +19,7 @@ from lanebev.app.observers import Observation
 from lanebev.app.recovery import LANES_FILE, frame_name
 from lanebev.estimation.joint.layout import POSE
 from lanebev.estimation.joint.smoother import smooth_states, smoothed_calibration
-from lanebev.estimation.joint.state import REAL_ROADS, JointState
+from lanebev.estimation.joint.state import JointConfig, JointState
 from lanebev.estimation.tracker import Estimate
 from lanebev.io.lanes import tusimple_line
 from lanebev.io.results import OutputFolder
@@ -168,7 +168,7 @@ def _smoothed(
     """
     steps, count = torch.from_numpy(intervals.all().copy()), len(states)
     result = SmoothedPoses(np.empty((count, 4)), np.empty((count, 4, 4)))
-    backward = zip(range(count - 1, -1, -1), smooth_states(states, steps, REAL_ROADS), strict=True)
+    backward = zip(range(count - 1, -1, -1), smooth_states(states, steps, JointConfig()), strict=True)
     for number, smoothed in backward:
         state = states[number]
         given = torch.from_numpy(covariances.all()[number : number + 1].copy())

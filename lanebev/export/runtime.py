@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +14,6 @@ from torch import Tensor, nn
 from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator, StateT
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.state import REAL_ROADS
 from lanebev.export.write import METADATA, MISSING
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.segments import LaneSegments
@@ -169,7 +167,7 @@ def onnx_model(folder: Path, camera: Camera) -> LaneBEV:
     return LaneBEV(
         OnnxSegmenter(segmenter),
         OnnxExtractor(extractor, camera),  # type: ignore[arg-type]  # LaneBEV asks it for vertices only
-        JointCalibrator(replace(REAL_ROADS, num_boundaries=segmenter.facts["num_boundaries"])),
+        JointCalibrator(num_boundaries=segmenter.facts["num_boundaries"]),
         network_width=extractor.facts["network_size"][1],
     )
 

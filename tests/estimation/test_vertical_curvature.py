@@ -109,7 +109,7 @@ def test_a_clear_vertical_curvature_is_its_own_prior():
 
 def test_a_crest_in_one_row_is_estimated_and_leaves_the_other_as_it_is():
     calibrator = JointCalibrator()
-    curved, plane = (crest(p, frames=30, rows=1, sigma=0.5) for p in (1e-4, 0.0))
+    curved, plane = (crest(p, frames=100, rows=1, sigma=0.5) for p in (1e-4, 0.0))
     pairs = [
         (moment, LaneSegments(*(torch.cat(parts) for parts in zip(one, other, strict=True))))
         for (moment, one), (_, other) in zip(curved, plane, strict=True)

@@ -101,7 +101,7 @@ class JointConfig:
             raise ValueError(f"bends: expected a probability between 0 and 1, got {self.bends}")
 
 
-REAL_ROADS = JointConfig(motion=MotionConfig(vertical_curvature_std=2e-5))
+HILLY_ROADS = JointConfig(motion=MotionConfig(vertical_curvature_std=2e-5))
 """Numbers for roads that are not plane: with crests and dips of R = 50 km as the standard deviation."""
 
 
