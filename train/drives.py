@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.state import JointConfig
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.observation.segments import LaneSegments
@@ -74,9 +75,11 @@ class CalibratorErrors(NamedTuple):
 
 
 @torch.inference_mode()
-def run_calibrator(seen: DriveObservations, factor: float) -> CalibratorErrors:
-    """Run the online calibrator on a drive, all sigmas times ``factor``."""
-    calibrator = JointCalibrator()
+def run_calibrator(
+    seen: DriveObservations, factor: float, config: JointConfig | None = None
+) -> CalibratorErrors:
+    """Run the online calibrator with these numbers on a drive, all sigmas times ``factor``."""
+    calibrator = JointCalibrator(config)
     state = calibrator.initial_state(1, dtype=torch.float64)
     found = []
     for segments, width, pose in zip(seen.segments, seen.lane_width, seen.poses, strict=True):

@@ -22,6 +22,7 @@ import torch
 from jsonargparse.typing import PositiveFloat, PositiveInt
 from torch import Tensor
 
+from lanebev.estimation.joint.state import HILLY_ROADS, JointConfig
 from train.commands import one_line_errors
 from train.drives import DriveObservations, observe_drive, run_calibrator
 from train.evaluate_poses import AXES
@@ -37,9 +38,17 @@ class Outcome(NamedTuple):
     nees: Tensor
 
 
-def outcome(seen: DriveObservations, factor: float) -> Outcome:
+class Summary(NamedTuple):
+    """Median RMSE (4,), median and mean NEES/dof over drives, as in :class:`Outcome`."""
+
+    rmse: Tensor
+    nees: Tensor
+    mean_nees: Tensor
+
+
+def outcome(seen: DriveObservations, factor: float, config: JointConfig | None = None) -> Outcome:
     """Return the calibrator's errors on a drive with all sigmas times ``factor``."""
-    followed = run_calibrator(seen, factor)
+    followed = run_calibrator(seen, factor, config)
     error, covariance = (part[followed.tracking] for part in followed[:2])
     if not len(error):
         return Outcome(seen.poses.new_full((4,), math.nan), seen.poses.new_tensor(math.nan))
@@ -52,14 +61,16 @@ def compare(
     drives: list[DriveObservations],
     factors: tuple[float, ...] = FACTORS,
     over: Callable[..., Iterable[Outcome]] = map,
-) -> dict[float, Outcome]:
-    """Compute the median outcome over the drives for every factor; ``over`` is :func:`map` or a pool's."""
-    pairs = [(seen, factor) for factor in factors for seen in drives]
+    config: JointConfig | None = None,
+) -> dict[float, Summary]:
+    """Summarise the outcomes over the drives for every factor; ``over`` is :func:`map` or a pool's."""
+    pairs = [(seen, factor, config) for factor in factors for seen in drives]
     outcomes = list(over(outcome, *zip(*pairs, strict=True)))
     report = {}
     for number, factor in enumerate(factors):
         rmse, nees = zip(*outcomes[number * len(drives) : (number + 1) * len(drives)], strict=True)
-        report[factor] = Outcome(torch.stack(rmse).nanmedian(0).values, torch.stack(nees).nanmedian())
+        every = torch.stack(nees)
+        report[factor] = Summary(torch.stack(rmse).nanmedian(0).values, every.nanmedian(), every.nanmean())
     return report
 
 
@@ -76,22 +87,25 @@ def main() -> None:
     parser.add_argument("--frames", type=PositiveInt, default=90, help="frames per drive")
     parser.add_argument("--fps", type=PositiveFloat, default=20.0)
     parser.add_argument("--seed", type=int, default=81_000)
+    parser.add_argument("--hilly", action="store_true", help="with the numbers for hilly roads")
     parser.add_argument("--jobs", type=PositiveInt, default=1, help="number of processes")
     args = parser.parse_args()
     one = partial(_observe_one, args.weights, args.frames, args.fps)
     seeds = range(args.seed, args.seed + args.drives)
+    config = HILLY_ROADS if args.hilly else None
     if args.jobs == 1:
-        report = compare([one(seed) for seed in seeds])
+        report = compare([one(seed) for seed in seeds], config=config)
     else:
         context = torch.multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(
             args.jobs, context, initializer=torch.set_num_threads, initargs=(1,)
         ) as pool:
-            report = compare(list(pool.map(one, seeds)), over=pool.map)
-    for factor, (rmse, nees) in report.items():
+            report = compare(list(pool.map(one, seeds)), over=pool.map, config=config)
+    for factor, (rmse, nees, mean) in report.items():
         errors = dict(zip(AXES, (round(value, 3) for value in rmse.tolist()), strict=True))
         line = {"weights": args.weights.name, "factor": factor, **errors}
         left = {"nees_per_dof": round(float(nees), 2), "pose_sigma_scale": round(float(nees) ** 0.5, 2)}
+        left["mean_nees_per_dof"] = round(float(mean), 2)
         print(json.dumps({**line, **left}))
 
 
