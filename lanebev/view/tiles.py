@@ -242,21 +242,19 @@ def tile_bounds(
 def _along_columns(nodes: Tensor, columns: ColumnTiles) -> Tensor:
     """Values at all columns, (B, k, R, V), from those at the nodes, (B, k, R, S·m)."""
     nodes = nodes.unflatten(-1, (-1, _NODES))
-    if nodes.requires_grad:
-        with autocast_off(nodes.device):
-            values = nodes @ torch.from_numpy(columns.weights).mT  # (..., S, size)
-    else:  # in half the time
-        values = torch.from_numpy(nodes.flatten(0, -2).numpy() @ columns.weights.T)
-        values = values.view(*nodes.shape[:-1], -1)
+    with autocast_off(nodes.device):
+        values = nodes @ torch.from_numpy(columns.weights).mT  # (..., S, size)
     if columns.overlap == 0:
         return values.flatten(-2)
     return torch.cat([values[..., :-1, :].flatten(-2), values[..., -1, columns.overlap :]], dim=-1)
 
 
 def _product(weights: NDArray[np.float32], values: Tensor, out: Tensor | None = None) -> Tensor:
-    """Multiply weights (rows, n) with values (..., n, V); no graph with ``out``, or of values without one."""
-    if out is None and values.requires_grad:
-        with autocast_off(values.device):
+    """Multiply weights (rows, n) with values (..., n, V); no graph with ``out``.
+
+    Not by NumPy: the threads of its BLAS wait busily for the next product, and PyTorch's wait for them.
+    """
+    with autocast_off(values.device):
+        if out is None:
             return torch.from_numpy(weights) @ values
-    small = values.detach().numpy()  # whose small products take half as long
-    return torch.from_numpy(np.matmul(weights, small, out=None if out is None else out.numpy()))
+        return torch.matmul(torch.from_numpy(weights), values.detach(), out=out)
