@@ -75,7 +75,7 @@ def setting_words(value: object) -> str:
         return "yes" if value else "no"
     if isinstance(value, tuple):
         return ", ".join(map(str, value)) or "none"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return f"{value:.12g}" if isinstance(value, float) else str(value)  # compare and convert read it back
 
 
 def mount_facts(mounted: MountCalibration) -> dict[str, str]:

@@ -16,6 +16,7 @@ import pytest
 from lanebev import Camera
 from lanebev.app.config import RunConfig, parse_grid
 from lanebev.app.sources import make_source
+from lanebev.app.summary import setting_words
 from lanebev.cli import main
 from lanebev.io.live import open_live
 from lanebev.io.results import read_extrinsics
@@ -124,6 +125,7 @@ def test_the_lanes_of_a_part_of_a_video_fit_the_same_part(data, tmp_path, capsys
     assert [(a.frame, b.frame) for a, b in pairs] == [(6, 0), (8, 1), (10, 2)]
     taken = replace(open_source(f"{data}/drive.mp4"), selection=read_run(tmp_path / "first").selection())
     assert [frame.source_number for frame in taken] == [6, 8, 10]
+    assert float(setting_words(12345.678901)) == 12345.678901
 
 
 @pytest.mark.parametrize(
