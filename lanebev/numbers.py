@@ -102,3 +102,16 @@ def parse_size(text: str) -> tuple[int, int]:
     if match is None or 0 in (size := (int(match[2]), int(match[1]))):
         raise ValueError(f"lanes size: expected WIDTHxHEIGHT in px, such as 1280x720, got {text!r}")
     return size
+
+
+def parse_crop(text: str) -> tuple[int, int, int, int]:
+    """Return (top, left, height, width) of a text such as ``1280x480+0+240``: WIDTHxHEIGHT+LEFT+TOP.
+
+    Raises:
+        ValueError: another text, or sides that are no image's.
+    """
+    size, *corner = text.split("+")
+    if len(corner) != 2 or not all(re.fullmatch(r"\s*\d{1,6}\s*", each, re.ASCII) for each in corner):
+        raise ValueError(f"lanes crop: expected WIDTHxHEIGHT+LEFT+TOP, such as 1280x480+0+240, got {text!r}")
+    left, top = map(int, corner)
+    return top, left, *parse_size(size)

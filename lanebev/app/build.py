@@ -21,7 +21,7 @@ from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.estimation.two_stage.state import TwoStageState
 from lanebev.export.runtime import onnx_calibrator, onnx_model
 from lanebev.io.calibration_file import read_mount
-from lanebev.io.lane_size import resized_lanes
+from lanebev.io.lane_size import lanes_of_whole_images
 from lanebev.io.lanes import lane_files, read_lanes
 from lanebev.io.video import FrameSource, image_size
 from lanebev.pipeline import LaneBEV
@@ -122,8 +122,8 @@ def make_observer(
     """
     if config.lanes is not None:
         entries = read_lanes(config.lanes, camera.intrinsics.double().numpy())
-        if config.lanes_size is not None:
-            entries = resized_lanes(entries, config.lanes_size, camera.image_size)
+        if config.lanes_size is not None or config.lanes_crop is not None:
+            entries = lanes_of_whole_images(entries, config.lanes_size, config.lanes_crop, camera.image_size)
         return LaneFileObserver(entries, source, camera)
     if config.backend == "onnxruntime":
         return NetworkObserver(onnx_model(Path(config.exported), camera), camera)

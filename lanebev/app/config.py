@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from lanebev.io.formats.names import FORMATS, parse_formats
 from lanebev.io.source_names import is_bag
-from lanebev.numbers import parse_size
+from lanebev.numbers import parse_crop, parse_size
 
 T = TypeVar("T")
 
@@ -96,7 +96,10 @@ class RunConfig:
         calibrator: one of CALIBRATORS.
         fps: frame rate of a folder, a glob or a raw stream, Hz; None takes it from names or stream, else 30.
             A video states its own.
-        lanes_size: (height, width) px of the images that ``lanes`` was drawn on; None is the source's size.
+        lanes_size: (height, width) px of the images that ``lanes`` was drawn on; None is the size of
+            ``lanes_crop``, or else of the source.
+        lanes_crop: (top, left, height, width) px of the part of the source's images that ``lanes`` was drawn
+            on; None is all of them.
         fov: horizontal field of view (degrees) of an ideal camera, instead of a camera file.
         focal_std: standard deviation of the focal length as a fraction of it; None is 0 with a camera file
             and FOV_FOCAL_STD with ``fov``.
@@ -157,6 +160,13 @@ class RunConfig:
     )
     lanes_size: tuple[int, int] | None = option(
         None, "size of the images that --lanes was drawn on, if not the source's", "WxH", parse_size
+    )
+    lanes_crop: tuple[int, int, int, int] | None = option(
+        None,
+        "part of the source's images that --lanes was drawn on, such as 1280x480+0+240; --lanes-size is the "
+        "size to which it was then resized",
+        "WxH+LEFT+TOP",
+        parse_crop,
     )
     fov: float | None = option(
         None,
@@ -253,6 +263,12 @@ class RunConfig:
             )
         if self.stills and self.resume:
             raise ValueError("resume: expected a drive, got --stills; images on their own have no state")
+        self._check_lanes()
+
+    def _check_lanes(self) -> None:
+        for name, value in (("lanes size", self.lanes_size), ("lanes crop", self.lanes_crop)):
+            if value is not None and not self.lanes:
+                raise ValueError(f"{name}: expected --lanes with it, got none")
         if self.lanes and self.weights:
             raise ValueError(
                 "weights: expected the network's lanes, got --lanes as well; leave one of them out"

@@ -64,6 +64,10 @@ def _other_settings(config: RunConfig) -> dict[str, str]:
     settings["lane_width_std"] = config.taken_lane_width[1]
     near, far, left, right, step = config.grid
     settings["grid"] = f"{near:g}:{far:g},{left:g}:{right:g}/{step:g}"
+    if config.lanes_size is not None:
+        settings["lanes_size"] = "{1}x{0}".format(*config.lanes_size)
+    if config.lanes_crop is not None:
+        settings["lanes_crop"] = "{3}x{2}+{1}+{0}".format(*config.lanes_crop)
     return {f"--{name.replace('_', '-')}": setting_words(value) for name, value in settings.items()}
 
 

@@ -1,7 +1,8 @@
-"""Lanes in pixels of images of another size: brought to the right one, or noticed."""
+"""Lanes in pixels of images of another size, or of parts of images: converted, or noticed."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,6 +13,10 @@ from lanebev.io.lanes import FrameLines
 _OUTSIDE = 0.1  # share of points below or far beside the images, of which more are of another size
 _BESIDE = 0.5  # image widths beside an image that lines are drawn on to
 _REACHED = 0.8  # of both sides, one of which a drive's lanes reach: they leave images at the bottom
+_REACHED_UNCROPPED = 0.85  # of the height, likewise, by lanes whose horizon is not above ...
+_HIGHEST_HORIZON = 0.28  # ... this share of it
+_LOOKED_AT = 50  # frames, for the horizon
+_LEAST_SPREAD = 0.01  # of the lines' slopes, px per row, squared and summed
 _REACHED_DOWN = 0.55  # of the height, likewise; what is higher is the horizon
 
 
@@ -40,8 +45,39 @@ def resized_lanes(
     ]
 
 
+def lanes_of_whole_images(
+    frames: Sequence[FrameLines],
+    size: tuple[int, int] | None,
+    crop: tuple[int, int, int, int] | None,
+    image_size: tuple[int, int],
+) -> list[FrameLines]:
+    """Convert lanes that were drawn on parts of the images, perhaps resized, to pixels of the whole images.
+
+    Args:
+        frames: lanes in pixels of what they were drawn on.
+        size: (height, width) px of that; None is the size of the part.
+        crop: (top, left, height, width) px of the part; None is all of the images.
+        image_size: (height, width) px of the whole images.
+
+    Raises:
+        ValueError: the part reaches beyond the images.
+    """
+    top, left, height, width = crop or (0, 0, *image_size)
+    if top + height > image_size[0] or left + width > image_size[1]:
+        raise ValueError(
+            f"lanes crop: expected a part of the {image_size[1]} x {image_size[0]} px, got {width} x "
+            f"{height} at {left}, {top}"
+        )
+    resized = resized_lanes(frames, size or (height, width), (height, width))
+    corner = np.array([left, top])
+    return [
+        frame._replace(lines=[line._replace(points=line.points + corner) for line in frame.lines])
+        for frame in resized
+    ]
+
+
 def size_remark(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> str:
-    """Return what speaks for lanes in pixels of smaller images; empty if nothing does.
+    """Return what speaks for lanes in pixels of smaller or cropped images; empty if nothing does.
 
     Args:
         frames: frames of one drive.
@@ -68,7 +104,41 @@ def size_remark(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> st
             f"lanes: none of them reaches beyond {x.max():.0f}, {y.max():.0f} in images of "
             f"{width} x {height} px; of smaller images? state their size with --lanes-size WIDTHxHEIGHT"
         )
+    horizon = meeting_row(frames)
+    if y.max() < _REACHED_UNCROPPED * height and horizon < _HIGHEST_HORIZON * height:
+        rest = height - math.ceil(y.max())
+        return (
+            f"lanes: none of them reaches below row {y.max():.0f} of {height}, and they meet at row "
+            f"{horizon:.0f}; of images whose top was cut off? state the part with --lanes-crop "
+            f"WIDTHxHEIGHT+LEFT+TOP, such as {width}x{height - rest}+0+{rest}"
+        )
     return ""
+
+
+def meeting_row(frames: Sequence[FrameLines]) -> float:
+    """Return the row at which the near parts of lines meet, the median over frames; NaN if none do.
+
+    It is roughly that of the horizon. Of each frame it is the row of the point with the least sum of squared
+    horizontal distances from the lines' near two thirds.
+    """
+    rows = [_meeting_row(frame) for frame in frames[:: max(1, len(frames) // _LOOKED_AT)]]
+    known = [row for row in rows if math.isfinite(row)]
+    return float(np.median(known)) if known else math.nan
+
+
+def _meeting_row(frame: FrameLines) -> float:
+    """Return the row of one frame; NaN with fewer than two lines that differ in direction."""
+    slopes, offsets = [], []
+    for line in frame.lines:
+        points = line.points[np.isfinite(line.points).all(-1)]
+        near = points[points[:, 1] >= np.quantile(points[:, 1], 1 / 3)] if len(points) else points
+        if len(near) >= 2 and np.ptp(near[:, 1]) > 0:
+            slope, offset = np.polyfit(near[:, 1], near[:, 0], 1)  # x = slope y + offset
+            slopes.append(slope)
+            offsets.append(offset)
+    spread = np.array(slopes) - np.mean(slopes) if slopes else np.zeros(0)
+    variance = float(spread @ spread)
+    return -float(spread @ np.array(offsets)) / variance if variance > _LEAST_SPREAD else math.nan
 
 
 def _all_points(frames: Sequence[FrameLines]) -> NDArray[np.float64]:

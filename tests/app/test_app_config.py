@@ -19,9 +19,17 @@ def _file(folder, text):
 
 def test_settings_of_a_file_are_those_of_the_command_line(tmp_path):
     text = "source: a.mp4\ncamera: c.yaml\nlane-width: 3.5\nstills: true\nlanes_size: 640x360\nfps: 12\n"
+    text += "lanes: l.json\nlanes-crop: 640x240+0+120\n"
     config = RunConfig(**read_settings(_file(tmp_path, text)))
     assert config == RunConfig(
-        "a.mp4", "c.yaml", lane_width=3.5, stills=True, lanes_size=(360, 640), fps=12.0
+        "a.mp4",
+        "c.yaml",
+        lane_width=3.5,
+        stills=True,
+        fps=12.0,
+        lanes="l.json",
+        lanes_size=(360, 640),
+        lanes_crop=(120, 0, 240, 640),
     )
 
 
@@ -53,6 +61,8 @@ def test_a_bad_file_is_one_line_that_names_it(tmp_path, text, message):
         ({"calibrator": "x"}, "calibrator: expected joint or two-stage, got 'x'"),
         ({"camera": ""}, "camera: expected --camera FILE, or --fov DEG .*, got none"),
         ({"source": ""}, "source: expected a path, got none"),
+        ({"lanes_size": (360, 640)}, "lanes size: expected --lanes with it, got none"),
+        ({"lanes_crop": (0, 0, 360, 640)}, "lanes crop: expected --lanes with it, got none"),
         ({"lanes": "l.json", "weights": "w"}, "weights: expected the network's lanes, got --lanes as well"),
     ],
 )

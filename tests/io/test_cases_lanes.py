@@ -13,10 +13,10 @@ from PIL import Image
 from lanebev import Camera
 from lanebev.app.config import RunConfig
 from lanebev.app.run import run
-from lanebev.io.lane_size import resized_lanes, size_remark
+from lanebev.io.lane_size import lanes_of_whole_images, meeting_row, resized_lanes, size_remark
 from lanebev.io.lanes import FrameLines, read_culane, read_lanes, tusimple_line
 from lanebev.io.openlane import camera_from_ground_points
-from lanebev.numbers import parse_size
+from lanebev.numbers import parse_crop, parse_size
 from lanebev.observation.polylines import LaneLine, vertices_from_lines
 
 CAMERA = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720)
@@ -213,6 +213,50 @@ def test_lanes_of_their_images_get_no_remark():
     assert size_remark(bonnet, (720, 1280)) == ""
 
 
+def _moved(entries, right, down):
+    shift = np.array([right, down])
+    return [
+        entry._replace(lines=[line._replace(points=line.points + shift) for line in entry.lines])
+        for entry in entries
+    ]
+
+
+def test_lines_meet_at_the_horizon():
+    assert meeting_row(_entries()) == pytest.approx(HORIZON, abs=1e-6)
+    assert meeting_row([*_entries(), FrameLines("1.png", [])]) == pytest.approx(HORIZON, abs=1e-6)
+    parallel = [LaneLine(np.array([[x, 500.0], [x, 600.0]])) for x in (100.0, 700.0)]
+    assert math.isnan(meeting_row([FrameLines("0.png", parallel), FrameLines("1.png", parallel[:1])]))
+
+
+@pytest.mark.parametrize("top", [110, 180, 240, 280])
+def test_lanes_of_images_whose_top_was_cut_off_are_noticed(top):
+    remark = size_remark(_moved(_entries(), 0, -top), (720, 1280))
+    assert f"they meet at row {HORIZON - top:.0f}; of images whose top was cut off?" in remark
+    assert f"such as 1280x{720 - 20 - top}+0+{top + 20}" in remark  # the lowest row of the lanes is 700
+    assert size_remark(_moved(_entries(), 0, -top), (720 - top, 1280)) == ""  # so were the images
+
+
+@pytest.mark.parametrize("size", [None, (320, 800)])
+def test_lanes_of_a_stated_part_are_moved_to_their_place(size):
+    crop = (240, 100, 480, 1180)  # top, left, height, width
+    drawn = _moved(_entries(), -100, -240)
+    drawn = drawn if size is None else resized_lanes(drawn, crop[2:], size)
+    (whole,) = lanes_of_whole_images(drawn, size, crop, (720, 1280))
+    for line, expected in zip(whole.lines, _entries()[0].lines, strict=True):
+        np.testing.assert_allclose(line.points, expected.points, atol=1e-9)
+    with pytest.raises(
+        ValueError, match="lanes crop: expected a part of the 1280 x 600 px, got 1180 x 480 at"
+    ):
+        lanes_of_whole_images(drawn, size, crop, (600, 1280))
+
+
+@pytest.mark.parametrize("text", ["1280x480", "1280x480+0", "1280+0+240", "1280x480+0-240", "0x480+0+0", ""])
+def test_crops_that_are_none_are_one_clear_line(text):
+    with pytest.raises(ValueError, match=r"lanes (crop: expected WIDTHxHEIGHT\+LEFT\+TOP|size: expected)"):
+        parse_crop(text)
+    assert parse_crop("1280x480+10+240") == (240, 10, 480, 1280)
+
+
 @given(st.floats(0.1, 8), st.integers(2, 3000), st.integers(2, 3000))
 def test_resized_lanes_come_back(scale, width, height):
     size = (max(1, round(height * scale)), max(1, round(width * scale)))
@@ -251,3 +295,4 @@ def test_a_run_takes_lanes_of_a_stated_size_and_remarks_others(tmp_path):
     assert report.problems == []
     assert report.rows[0].pitch_deg == pytest.approx(math.degrees(math.atan(59.5 / 1000)), abs=0.1)
     assert report.rows[0].height_m == pytest.approx(1.5, abs=0.1)
+    assert report.facts["--lanes-size"] == "640x360"
