@@ -5,14 +5,14 @@ import time
 
 import pytest
 
-from tools import bench_speed
+from tools.bench_speed import measuring, parts, scene, tables, views
 
 
 @pytest.mark.slow
 def test_tables_and_growth_are_written(tmp_path, monkeypatch):
-    monkeypatch.setattr(bench_speed, "SIZE", (60, 120))
-    monkeypatch.setattr(bench_speed, "GRID", bench_speed.BEVGrid(resolution=2.0))
-    bench_speed.run(["warp", "frame", "cells"], 0.01, 10_000, tmp_path, time.perf_counter)
+    monkeypatch.setattr(scene, "SIZE", (60, 120))
+    monkeypatch.setattr(scene, "GRID", scene.BEVGrid(resolution=2.0))
+    parts.run(["warp", "frame", "cells"], 0.01, 10_000, tmp_path, time.perf_counter)
     report = json.loads((tmp_path / "bench_speed.json").read_text())
     assert set(report["results"]) >= {"one image", "8 images", "a frame of bytes", "cells of the view"}
     table = report["results"]["one image"]
@@ -28,8 +28,8 @@ def test_tables_and_growth_are_written(tmp_path, monkeypatch):
 
 def test_alternatives_give_the_same(monkeypatch):
     """The peers sample what the warp samples; edges differ."""
-    monkeypatch.setattr(bench_speed, "GRID", bench_speed.BEVGrid(resolution=0.5))
-    calls = bench_speed.warps(1, 3, 1)
+    monkeypatch.setattr(scene, "GRID", scene.BEVGrid(resolution=0.5))
+    calls = views.warps(1, 3, 1)
     grid, kornia, warp = (calls[name]() for name in ("grid_sample", "kornia warp_perspective", "BEVWarp"))
     seen = warp[1].expand_as(warp[0])
     for other in (grid, kornia):
@@ -37,14 +37,14 @@ def test_alternatives_give_the_same(monkeypatch):
 
 
 def test_sizes_grow_until_a_call_takes_too_long(tmp_path, monkeypatch):
-    monkeypatch.setattr(bench_speed, "cells", lambda resolution: {"sleep": lambda: time.sleep(0.05)})
-    report = bench_speed.run(["cells"], 0.01, 10_000_000, tmp_path, time.perf_counter, longest=0.02)
+    monkeypatch.setattr(views, "cells", lambda resolution: {"sleep": lambda: time.sleep(0.05)})
+    report = parts.run(["cells"], 0.01, 10_000_000, tmp_path, time.perf_counter, longest=0.02)
     assert list(report["results"]["cells of the view"]) == ["10000"]
 
 
 def test_targets_are_met_or_missed_to_two_decimals():
     entry = {"ms": 3.0, "low": 3.0, "high": 3.0}
-    table = bench_speed.judged(
+    table = measuring.judged(
         {
             "grid_sample": {"ratio": 1.0, **entry},
             "BEVWarp": {"ratio": 1.204, **entry},
@@ -53,11 +53,11 @@ def test_targets_are_met_or_missed_to_two_decimals():
         }
     )
     assert [each.get("met") for each in table.values()] == [None, True, False, True]
-    text = bench_speed.shown("one image", table)
+    text = tables.shown("one image", table)
     assert "met: ratio at most 1.2 |" in text
     assert "missed: ratio at most 1.3 |" in text
     assert "met: ms at most 4 |" in text
-    text = bench_speed.overview(
+    text = tables.overview(
         {"one image": table, "another": {"remap_frame": {"ratio": 1.1, "met": True, **entry}}}
     )
     assert "| one image | 1.00 | 1.20 | **1.31** | 25.00 |  |" in text
