@@ -14,7 +14,6 @@ import argparse
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -25,13 +24,13 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from lanebev.app.sources import source_of_run
 from lanebev.batch import masked_median
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.boundary_curves import Boundaries, boundary_polylines, fit_boundaries
 from lanebev.io.frames import Frame
 from lanebev.io.lanes import read_lanes
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
-from lanebev.io.video import open_source
 from lanebev.observation.polylines import image_rows
 from lanebev.observation.segments import segments_from_lines
 from lanebev.report.run_folder import read_run
@@ -162,7 +161,7 @@ def frames_of_run(source: str, result: Path) -> Iterator[Frame]:
     """
     run = read_run(result)
     got = 0
-    for frame in replace(open_source(source), selection=run.selection()):
+    for frame in source_of_run(source, run):
         yield frame
         got += 1
     if got != len(run.rows):

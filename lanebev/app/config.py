@@ -36,6 +36,11 @@ def parse_path(text: str) -> str:
     return text
 
 
+def frame_rate(fps: float | None) -> Fraction | None:
+    """Return a frame rate (Hz) as a fraction, None for none."""
+    return None if fps is None else Fraction(fps).limit_denominator(1000)
+
+
 def parse_grid(text: str) -> tuple[float, float, float, float, float]:
     """Return (near, far, left, right, resolution) in m from a text such as ``3:60,-10:10/0.05``.
 
@@ -237,7 +242,7 @@ class RunConfig:
     @property
     def frame_rate(self) -> Fraction | None:
         """``fps`` as a fraction."""
-        return None if self.fps is None else Fraction(self.fps).limit_denominator(1000)
+        return frame_rate(self.fps)
 
     def __post_init__(self) -> None:
         if not self.source:

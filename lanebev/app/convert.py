@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, cast
 
+from lanebev.app.sources import source_of_run
 from lanebev.io.formats.folder import read_record
 from lanebev.io.formats.names import FORMATS, check_installed
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.video import Frame, open_source
+from lanebev.io.video import Frame
 from lanebev.io.whole_file import whole_file
 from lanebev.report.run_folder import read_run
 
@@ -51,13 +51,13 @@ def convert(
         what to print.
 
     Raises:
-        ValueError: the folder is no run's, something that the format needs is not in it, or a library is not
-            installed.
+        ValueError: the folder is no run's, something that the format needs is not in it, the images are not
+            the run's, or a library is not installed.
     """
     write, record = writer(to), read_record(run, camera)
     source = None
     if images is not None:
-        source = replace(open_source(images), selection=read_run(run).selection())
+        source = source_of_run(images, read_run(run))
     path = Path(run) / FORMATS[to].file if out is None else Path(out)
     with whole_file(path) as whole:
         write(whole, record, source)

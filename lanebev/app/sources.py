@@ -8,11 +8,12 @@ import signal
 import threading
 from collections.abc import Generator, Iterator
 from dataclasses import replace
+from fractions import Fraction
 from types import FrameType
 
 from lanebev.app.build import make_camera
 from lanebev.app.concurrency import map_ahead
-from lanebev.app.config import RunConfig
+from lanebev.app.config import RunConfig, frame_rate
 from lanebev.app.observers import Observation, Observer
 from lanebev.camera.model import Camera
 from lanebev.io.bags import BagSource, open_bag_source
@@ -20,6 +21,7 @@ from lanebev.io.frames import ALL, Frame, Selection
 from lanebev.io.live import LiveSource, open_live
 from lanebev.io.source_names import is_bag, is_live
 from lanebev.io.video import FrameSource, open_source
+from lanebev.report.run_folder import RunFolder
 
 
 def make_source(config: RunConfig) -> FrameSource:
@@ -36,10 +38,8 @@ def make_source(config: RunConfig) -> FrameSource:
             if given:
                 raise ValueError(f"source {config.source}: expected no {name} with a stream, got it")
         return open_live(config.source, config.frame_rate, config.keep_all, selection)
-    if is_bag(config.source):
-        found: FrameSource = open_bag_source(config.source, config.topic, config.frame_rate)
-    else:
-        found = open_source(config.source, config.frame_rate)
+    found = _opened(config.source, config.topic, config.frame_rate)
+    if not isinstance(found, BagSource):
         stated = found.is_video or found.times or config.frame_rate or config.stills
         if found.count > 1 and not stated:
             rate = (
@@ -54,6 +54,20 @@ def make_source(config: RunConfig) -> FrameSource:
             f"{config.source} is {last:.2f} s long"
         )
     return source
+
+
+def _opened(source: str, topic: str | None, fps: Fraction | None) -> FrameSource:
+    return open_bag_source(source, topic, fps) if is_bag(source) else open_source(source, fps)
+
+
+def source_of_run(source: str, run: RunFolder) -> FrameSource:
+    """Open the source of a finished run again, with its frame rate, topic and the frames that it took.
+
+    Raises:
+        ValueError: nothing there, or nothing that decodes.
+    """
+    found = _opened(source, run.topic, frame_rate(run.fps))
+    return replace(found, selection=run.selection())
 
 
 def camera_of(config: RunConfig, source: FrameSource) -> Camera:

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 _NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS: raw streams, whose times ffmpeg makes up
 _MARKED = "one that the decoder marks as damaged"
+_EARLY = "one before the first key frame"
+_CARELESS = ("mpeg4", "msmpeg4v2", "msmpeg4v3", "h263", "flv1", "wmv1", "wmv2", "mpeg1video")
+"""Codecs whose decoders show grey frames, or others' remains, before the first key frame of a cut stream."""
 
 
 def open_video(source: str) -> av.container.InputContainer:
@@ -72,14 +75,15 @@ def decoded(  # noqa: C901 - every loop is a way in which files are damaged
     """Return frames as they are shown, with the times that the file gives; of a lost one, what was got.
 
     A packet that yields no frame is lost if the file is damaged before it; in an undamaged file it shows
-    nothing. A frame that the decoder marks as corrupt is lost too. AVI has no display times, so the frames of
-    a stream with B-frames come with wrong ones: they get the packets' times in order. Frame threads are not
-    used, because they drop what follows the last error.
+    nothing. A frame that the decoder marks as corrupt is lost too, and one without a key frame before it. AVI
+    has no display times, so the frames of a stream with B-frames come with wrong ones: they get the packets'
+    times in order. Frame threads are not used, because they drop what follows the last error.
     """
     in_order = container.format.name == "avi" and stream.codec_context.has_b_frames
     due: list[int] = []  # times of packets whose frames have not come
     lost: set[int] = set()
     damage = ""
+    keyed = stream.codec_context.name not in _CARELESS
     for packet in packets(container, stream):
         if packet.pts is not None and not packet.is_discard:
             bisect.insort(due, packet.pts)
@@ -103,7 +107,8 @@ def decoded(  # noqa: C901 - every loop is a way in which files are damaged
             while due and pts is not None and due[0] <= pts:
                 if (earlier := due.pop(0)) < pts and damage:
                     yield earlier, damage
-            yield pts, _MARKED if frame.is_corrupt else frame
+            keyed = keyed or frame.key_frame
+            yield pts, _MARKED if frame.is_corrupt else frame if keyed else _EARLY
     if damage:
         yield from ((pts, damage) for pts in due)
 

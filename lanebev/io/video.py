@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -60,7 +61,8 @@ class FrameSource:
         count: number of frames; of a damaged video an estimate.
         image_size: (height, width) of the first frame that decodes.
         problem: what is wrong with the whole of it, else empty.
-        times: s since the first, of images whose names state them; else empty.
+        times: s since the first, of images whose names state them and of a video's frames by its packets;
+            else empty.
         has_times: whether a video says when its frames are shown; else they are evenly spaced.
         pixel_aspect: width of a pixel over its height, as a video states it; frames are not resized by it.
         selection: which of the frames are taken. ``fps`` and ``count`` are those of the whole source.
@@ -86,7 +88,7 @@ class FrameSource:
 
     @property
     def taken_count(self) -> int:
-        """Number of frames that are taken; of a video an estimate."""
+        """Number of frames that are taken; of a damaged video an estimate."""
         times = self.times or (float(index / self.fps) for index in range(self.count))
         return sum(self.selection.takes(*each) for each in enumerate(times))
 
@@ -217,11 +219,7 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
         timed = has_times(container)
         own = Fraction((timed and stream.average_rate) or stream.guessed_rate or DEFAULT_FPS)
         fps = own if timed else stated or own
-        frames = (frame for _, frame in decoded(container, stream) if not isinstance(frame, str))
-        try:
-            frame = next(frames)
-        except (av.error.FFmpegError, StopIteration) as error:
-            raise ValueError(f"video {source}: expected at least one whole frame, got none") from error
+        lost, first, frame = _first_whole(source, decoded(container, stream))
         matrix = display_matrix(frame)
         size = rgb(frame, matrix).shape[:2]
         pixel_aspect = _pixel_aspect(frame.width, frame.height, size, stream.sample_aspect_ratio)
@@ -229,32 +227,60 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
     with open_video(source) as container:  # the header's count includes frames that an edit list cuts
         stream = video_stream(container)
         begin, tick = stream.start_time or 0, stream.time_base or 1 / fps
-        count, end = 0, Fraction(0)
-        shown: list[int] = []
+        end, edited = Fraction(0), False
+        shown = [pts for pts in lost if first is not None and pts < first]
         telling = stream.codec_context.name not in _HIDING
         for packet in packets(container, stream):
             telling = telling and (packet.pts is not None or not packet.size)
             if packet.pts is not None:
-                count += not packet.is_discard
-                shown.append(packet.pts)
+                edited = edited or packet.is_discard
+                if not packet.is_discard and (first is None or packet.pts >= first):
+                    shown.append(
+                        packet.pts
+                    )  # what precedes the first frame is not shown: it lacks a key frame
                 end = max(end, packet.pts - begin + max(packet.duration or 0, 1 / fps / tick))
         declared, got = _declared_duration(stream, begin * tick), float(end * tick)
+    count = len(shown)
     if not telling:
         with open_video(source) as container:
             count = sum(1 for _ in decoded(container, video_stream(container)))
     if timed and (rate := _rate_of_times(shown, tick, own)) != own:
         problems.append(f"it states {float(own):.4g} frames per second, they come at {float(rate):.4g}")
         fps = own = rate
-    if timed and declared - got > 0.5 / fps:
+    if timed and declared - got > (1.5 if edited else 0.5) / fps:  # an edit list may begin within a frame
         problems.append(f"expected {declared:.2f} s as it declares, got {got:.2f} s; is it cut?")
     if not timed and stated is None:
         problems.append(f"it has no times, and is taken for {float(fps):g} frames per second; state --fps")
     if timed and stated is not None and abs(own / stated - 1) > _SAME_RATE:
         problems.append(f"its own {float(own):.4g} frames per second are used, not --fps {float(stated):g}")
     problem = f"video {source}: {'; '.join(problems)}" if problems else ""
-    return FrameSource(
-        source, (), fps, count, size, problem, has_times=timed, pixel_aspect=pixel_aspect, matrix=matrix
-    )
+    times = _times_since_first(shown, tick, fps) if timed and telling else ()
+    return FrameSource(source, (), fps, count, size, problem, times, timed, pixel_aspect, matrix=matrix)
+
+
+def _first_whole(
+    source: str, frames: Iterable[tuple[int | None, av.VideoFrame | str]]
+) -> tuple[list[int], int | None, av.VideoFrame]:
+    """Return the times (ticks) of the frames lost before the first whole one, its own, and that frame."""
+    lost: list[int] = []
+    with contextlib.suppress(av.error.FFmpegError):
+        for pts, frame in frames:
+            if isinstance(frame, av.VideoFrame):
+                return lost, pts, frame
+            lost += [] if pts is None else [pts]
+    raise ValueError(f"video {source}: expected at least one whole frame, got none")
+
+
+def _times_since_first(shown: Sequence[int], tick: Fraction, fps: Fraction) -> tuple[float, ...]:
+    """Return the times of frames, s since the first, by those of their packets (ticks) in any order.
+
+    A frame that is not later than the one before is taken for the next by the frame rate.
+    """
+    times: list[Fraction] = []
+    for pts in sorted(shown):
+        time = pts * tick
+        times.append(time if not times or time > times[-1] else times[-1] + 1 / fps)
+    return tuple(float(time - times[0]) for time in times)
 
 
 def _remarks(

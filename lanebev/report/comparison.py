@@ -54,13 +54,15 @@ class AxisDifference:
 
 
 def common_frames(first: RunFolder, second: RunFolder) -> list[Pair]:
-    """Return the rows of the same frames: of images by the name of their file, else by number in the source.
+    """Return the rows of the same frames: of images by name, else by number in the source.
+
+    The name is the end of the path, as long as it must be to tell the frames of each run apart.
 
     Raises:
         ValueError: there are none.
     """
-    keys: tuple[Sequence[object], Sequence[object]] = _names(first.rows), _names(second.rows)
-    if not (keys[0] and keys[1]):
+    keys: tuple[Sequence[object], Sequence[object]] | None = _names(first.rows, second.rows)
+    if keys is None:
         keys = first.source_numbers(), second.source_numbers()
     of_second = dict(zip(keys[1], second.rows, strict=True))
     pairs = [(row, of_second[key]) for row, key in zip(first.rows, keys[0], strict=True) if key in of_second]
@@ -167,10 +169,18 @@ def comparison_summary(first: RunFolder, second: RunFolder) -> str:
     return "\n".join(lines)
 
 
-def _names(rows: Sequence[ExtrinsicsRow]) -> list[str]:
-    """Return the names of the images, none where they do not tell the frames apart."""
-    names = [PurePath(row.image).name for row in rows]
-    return names if all(names) and len(set(names)) == len(names) else []
+def _names(
+    first: Sequence[ExtrinsicsRow], second: Sequence[ExtrinsicsRow]
+) -> tuple[list[tuple[str, ...]], list[tuple[str, ...]]] | None:
+    """Return the names of the images of both runs; None where they do not tell the frames apart."""
+    parts = [[PurePath(row.image).parts for row in rows] for rows in (first, second)]
+    if not all(each for names in parts for each in names):
+        return None
+    for length in range(1, max(len(each) for names in parts for each in names) + 1):
+        ends = [[each[-length:] for each in names] for names in parts]
+        if all(len(set(names)) == len(names) for names in ends):
+            return ends[0], ends[1]
+    return None
 
 
 def _measured(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.bool_]:

@@ -44,6 +44,18 @@ class RunFolder:
             _whole(self.settings.get("--every", ""), 1),
         )
 
+    @property
+    def fps(self) -> float | None:
+        """The frame rate that the run was given, Hz; None if it was given none."""
+        value = _number(self.settings.get("--fps", ""), math.nan)
+        return value if value > 0 else None
+
+    @property
+    def topic(self) -> str | None:
+        """The topic of the images that the run was given; None if it was given none."""
+        topic = self.settings.get("--topic", "not given")
+        return None if topic == "not given" else topic
+
     def source_numbers(self) -> list[int]:
         """Return the frames' numbers in the whole source, by the settings that say which were taken."""
         first, every = _whole(self.settings.get(FIRST_NUMBER, ""), 0), self.selection().every

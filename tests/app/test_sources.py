@@ -9,15 +9,17 @@ import threading
 import time
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lanebev import Camera
 from lanebev.app.config import RunConfig, parse_grid
-from lanebev.app.sources import make_source
+from lanebev.app.sources import make_source, source_of_run
 from lanebev.app.summary import setting_words
 from lanebev.cli import main
+from lanebev.io.images import write_png
 from lanebev.io.live import open_live
 from lanebev.io.results import read_extrinsics
 from lanebev.io.source_names import is_live
@@ -126,6 +128,22 @@ def test_the_lanes_of_a_part_of_a_video_fit_the_same_part(data, tmp_path, capsys
     taken = replace(open_source(f"{data}/drive.mp4"), selection=read_run(tmp_path / "first").selection())
     assert [frame.source_number for frame in taken] == [6, 8, 10]
     assert float(setting_words(12345.678901)) == 12345.678901
+
+
+def test_the_source_of_a_run_has_its_frame_rate(data, tmp_path):
+    (tmp_path / "images").mkdir()
+    for number in range(8):
+        write_png(tmp_path / "images" / f"{number}.png", _image(number))
+    source = f"{tmp_path}/images"
+    (tmp_path / "lanes.json").write_text('{"raw_file": "0.png", "h_samples": [90], "lanes": []}')
+    fixed = ["run", source, "--camera", f"{data}/camera.yaml", "--no-video", "--grid", "3:20,-5:5/0.25"]
+    part = ["--fps", "10", "--start", "0.25", "--end", "0.65", "--lanes", f"{tmp_path}/lanes.json"]
+    assert main([*fixed, *part, "--out", f"{tmp_path}/out"]) == 0
+    run = read_run(tmp_path / "out")
+    assert (run.fps, run.topic) == (10.0, None)
+    names = [Path(row.image).name for row in run.rows]
+    assert names == [f"{number}.png" for number in (3, 4, 5, 6)]
+    assert [Path(frame.name).name for frame in source_of_run(source, run)] == names
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Videos, images and folders as more recorders leave them, each after a public report."""
 
+import math
+from dataclasses import replace
 from fractions import Fraction
 
 import av
@@ -12,6 +14,7 @@ from lanebev import Camera
 from lanebev.app.build import make_camera
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import LaneFileObserver
+from lanebev.io.frames import Selection
 from lanebev.io.images import read_image
 from lanebev.io.lanes import FrameLines
 from lanebev.io.video import open_source
@@ -93,6 +96,70 @@ def test_gaps_do_not_make_the_stated_rate_wrong(tmp_path, times):
     source = open_source(str(path))
     assert (source.fps, source.problem) == (10, "")
     np.testing.assert_allclose([frame.time for frame in source], np.array(times) / 10, atol=1e-3)
+
+
+@pytest.mark.parametrize("times", [[0, 58, 91, 150, 200, 270, 290, 333], [0, 33, 66, 4000, 4033, 4066, 4100]])
+@pytest.mark.parametrize("suffix", ["mkv", "mp4"])
+def test_the_number_of_frames_that_are_taken_is_exact_where_times_vary(tmp_path, times, suffix):
+    path = tmp_path / f"v.{suffix}"
+    with av.open(str(path), "w") as container:
+        stream = _stream(container, rate=30)
+        stream.codec_context.time_base = Fraction(1, 1000)
+        _write(container, stream, times, Fraction(1, 1000))
+    source = open_source(str(path))
+    np.testing.assert_allclose([frame.time for frame in source], np.array(times) / 1000, atol=1e-9)
+    for start, end, every in ((0.06, 0.3, 1), (0.0, 4.04, 2), (0.1, 3.9, 1), (0.25, math.inf, 3)):
+        part = replace(source, selection=Selection(start, end, every))
+        expected = [i for i, t in enumerate(times) if start <= t / 1000 < end and i % every == 0]
+        assert [frame.source_number for frame in part] == expected
+        assert part.taken_count == len(expected)
+        if expected:  # what a run on this part writes is given back to it
+            LaneFileObserver([FrameLines(str(i), []) for i in expected], part, Camera.from_fov(60, 64, 48))
+
+
+def _cut(path, out, packets):
+    """Copy a stream without its first packets, as programs do that cut without a key frame."""
+    with av.open(str(path)) as whole, av.open(str(out), "w") as container:
+        stream = whole.streams.video[0]
+        copy = container.add_stream_from_template(stream)
+        for packet in [each for each in whole.demux(stream) if each.dts is not None][packets:]:
+            packet.stream = copy
+            container.mux(packet)
+
+
+def test_an_edit_list_that_begins_within_a_frame_is_no_cut(tmp_path):  # as phones trim
+    path = tmp_path / "v.mp4"
+    with av.open(str(path), "w") as container:
+        stream = _stream(container, rate=30)
+        stream.codec_context.time_base = Fraction(1, 1000)
+        _write(container, stream, [-100 + 33 * i for i in range(20)], Fraction(1, 1000))
+    source = open_source(str(path))
+    assert (_levels(source), source.count, source.problem) == (list(range(4, 20)), 16, "")
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv", "ts"])
+def test_frames_before_the_first_key_frame_are_not_counted(tmp_path, suffix):
+    with av.open(str(tmp_path / f"v.{suffix}"), "w") as container:
+        stream = _stream(container)
+        stream.gop_size, stream.codec_context.options = 12, {"x264-params": "scenecut=0"}
+        _write(container, stream, range(20))
+    _cut(tmp_path / f"v.{suffix}", tmp_path / f"cut.{suffix}", 5)
+    source = open_source(str(tmp_path / f"cut.{suffix}"))
+    assert _levels(source) == list(range(12, 20))
+    assert source.count == source.taken_count == 8
+
+
+def test_a_decoder_that_shows_frames_before_the_first_key_frame_is_not_believed(tmp_path):
+    with av.open(str(tmp_path / "v.mkv"), "w") as container:
+        stream = _stream(container, codec="mpeg4")
+        stream.gop_size, stream.codec_context.options = 12, {"sc_threshold": "1000000000"}
+        _write(container, stream, range(20))
+    _cut(tmp_path / "v.mkv", tmp_path / "cut.mkv", 5)
+    source = open_source(str(tmp_path / "cut.mkv"))
+    frames = list(source)
+    assert len(frames) == source.count == 15
+    assert [frame.image is None for frame in frames] == [True] * 7 + [False] * 8
+    assert frames[0].problem == "expected a whole frame, got: one before the first key frame"
 
 
 def test_a_field_of_view_with_pixels_that_are_not_square(tmp_path):  # opencv#4921

@@ -18,7 +18,7 @@ from lanebev.io.covariances import diagonal_covariances, read_covariances, write
 from lanebev.io.formats.folder import read_record
 from lanebev.io.formats.names import FORMATS, parse_formats
 from lanebev.io.formats.openpilot import openpilot_angles
-from lanebev.io.formats.record import RunRecord, pose_from_degrees
+from lanebev.io.formats.record import RunRecord, pose_from_degrees, with_images
 from lanebev.io.formats.ros_tf import static_transform
 from lanebev.io.images import write_png
 from lanebev.io.results import ExtrinsicsRow, write_extrinsics
@@ -233,6 +233,22 @@ def _images():
     """The run's images; that of frame 1 was lost."""
     for number in (0, 2, 3, 4):
         yield Frame(number, number / 30, 1 / 30, "", np.full((240, 416, 3), 10 * number, np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"time": 0.2}, r"images: expected frame 3 at 0.100 s as in the run, got it at 0.200 s"),
+        ({"name": "other/7.png"}, r"images: expected 3.png as frame 3, got other/7.png"),
+    ],
+)
+def test_images_that_are_not_the_runs_are_refused(changed, message):
+    frames = [frame._replace(**changed) if frame.number == 3 else frame for frame in _images()]
+    with pytest.raises(ValueError, match=message):
+        list(with_images(RECORD, frames))
+    more = [*_images(), *(frame._replace(number=FRAMES) for frame in list(_images())[:1])]
+    with pytest.raises(ValueError, match="images: expected the 5 frames of the run, got more of them"):
+        list(with_images(RECORD, more))
 
 
 def test_mcap_by_its_library(tmp_path):

@@ -59,6 +59,16 @@ def test_images_are_matched_by_the_name_of_their_file():
     assert len(common_frames(RunFolder("a", alike), RunFolder("b", alike))) == 4
 
 
+def test_images_of_the_same_name_are_matched_by_as_much_of_their_path_as_tells_them_apart():
+    def run(*images):
+        return RunFolder(
+            "r", [row._replace(image=image) for row, image in zip(eventful_rows(), images, strict=False)]
+        )
+
+    both, second = run("all/a/0.jpg", "all/a/1.jpg", "all/b/0.jpg"), run("b/0.jpg", "b/1.jpg")
+    assert [(a.image, b.image) for a, b in common_frames(both, second)] == [("all/b/0.jpg", "b/0.jpg")]
+
+
 def test_differences_have_the_known_answer():
     second = _changed(QUIET, pitch_deg=0.1, height_m=-0.02)
     second[7] = second[7]._replace(pitch_deg=QUIET[7].pitch_deg - 1.0)

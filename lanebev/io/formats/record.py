@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import repeat
+from pathlib import PurePath
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,8 @@ from lanebev.types import Extrinsics
 
 Lines = Mapping[int, NDArray[np.float64]]
 """Boundaries of a frame by index: (P, 2) px of the image as taken."""
+
+_SAME_TIME = 2e-3  # s, by which times of one frame may differ: files have microseconds
 
 
 @dataclass(frozen=True)
@@ -125,14 +128,34 @@ def with_images(
     Args:
         record: record of the run.
         images: frames of the run's source, by rising number; some may be missing.
+
+    Raises:
+        ValueError: the frames are not the run's: they have other names or times, or there are more of them.
     """
-    pictures = iter(images or ())
+    pictures = iter(() if images is None else images)
     picture = next(pictures, None)
     for frame in record.frames():
         while picture is not None and picture.number < frame.row.frame:
             picture = next(pictures, None)
-        found = picture is not None and picture.number == frame.row.frame
-        yield frame, picture.image if picture is not None and found else None
+        if picture is not None and picture.number == frame.row.frame:
+            _check_same(picture, frame.row)
+            yield frame, picture.image
+        else:
+            yield frame, None
+    if next(pictures, None) is not None:
+        raise ValueError(f"images: expected the {len(record.rows)} frames of the run, got more of them")
+
+
+def _check_same(picture: Frame, row: ExtrinsicsRow) -> None:
+    """Raise if a frame is not the run's of its number: by the name of its image, or else by its time."""
+    if picture.name and row.image:
+        if PurePath(picture.name).name != PurePath(row.image).name:
+            raise ValueError(f"images: expected {row.image} as frame {row.frame}, got {picture.name}")
+    elif abs(picture.time - row.time_s) > _SAME_TIME:
+        raise ValueError(
+            f"images: expected frame {row.frame} at {row.time_s:.3f} s as in the run, got it at "
+            f"{picture.time:.3f} s; is it the run's source?"
+        )
 
 
 def vertex_lines(vertices: BoundaryVertices) -> Lines:
