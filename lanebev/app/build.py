@@ -153,11 +153,3 @@ def match_image_size(camera: Camera, source: FrameSource) -> FrameSource:
         f"camera: expected one for the source's {columns} x {rows} px, got one for {width} x {height}; "
         "give the calibration of these images or resize them"
     )
-
-
-def lens_remark(camera: Camera) -> str:
-    """Return a remark on the number of pixels that the lens cannot image; empty if there are none."""
-    share = camera.share_without_rays()
-    if share == 0:
-        return ""
-    return f"camera: {share:.2%} of the pixels cannot be undistorted by the lens; lanes there are left out"

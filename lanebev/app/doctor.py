@@ -12,6 +12,14 @@ import torch
 
 from lanebev.app.build import make_observer, make_tracker
 from lanebev.app.config import RunConfig
+from lanebev.app.plausibility import (
+    FIELD_OF_VIEW,
+    field_of_view,
+    model_remark,
+    pose_remark,
+    pose_words,
+    resized_remark,
+)
 from lanebev.app.progress import Progress
 from lanebev.app.sources import camera_of, make_source
 from lanebev.camera.model import Camera
@@ -23,12 +31,10 @@ OK, DOUBT, WRONG = 0, 1, 2
 _WORDS = ("ok", "doubt", "wrong")
 _SAMPLED = 40  # frames
 _SECONDS = 120.0  # of a source, from which they are taken
-_FIELD_OF_VIEW = (25.0, 130.0)  # degrees, horizontal, of cameras in cars
 _OFF_CENTRE = 0.1  # of the image's sides, between its centre and the principal point
 _GAP = 3.0  # times the usual interval
 _LEAST_VERTICES = 4  # of a boundary that is seen
 _SHARE_SEEN = 0.5  # of frames with two boundaries
-_POSE = ((-15.0, 25.0), (-15.0, 15.0), (-8.0, 8.0), (0.8, 4.0))  # pitch, yaw, roll (degrees), height (m)
 
 
 class Finding(NamedTuple):
@@ -78,7 +84,7 @@ def doctor(config: RunConfig, progress: Progress | None = None) -> tuple[str, in
     camera = camera_of(config, source)
     findings = [check_size(camera, source.image_size)]
     if findings[0].level != WRONG:
-        findings += [check_field_of_view(camera), check_centre(camera)]
+        findings += [check_field_of_view(camera), check_centre(camera), check_lens(camera)]
         sample = sample_frames(config, source, camera, progress)
         findings += [check_times(sample), check_lanes(sample), check_pose(sample)]
     level = max(finding.level for finding in findings)
@@ -130,20 +136,9 @@ def check_size(camera: Camera, image_size: tuple[int, int]) -> Finding:
     return Finding(WRONG, f"{got}; {remedy}")
 
 
-def field_of_view(camera: Camera) -> float:
-    """Return the angle (degrees) between the left and the right edge; 180 if the lens has no rays there."""
-    height, width = camera.image_size
-    edges = camera.intrinsics.new_tensor([[0.0, 0.5 * (height - 1)], [width - 1.0, 0.5 * (height - 1)]])
-    points, valid = camera.undistort_points(edges)
-    if not bool(valid.all()):
-        return 180.0
-    rays = torch.cat([points, points.new_ones(2, 1)], dim=1) @ camera.intrinsics.inverse().mT
-    return math.degrees(sum(math.atan(abs(float(ray[0] / ray[2]))) for ray in rays))
-
-
 def check_field_of_view(camera: Camera) -> Finding:
     """Check the focal length by the field of view that it gives the images."""
-    angle, (low, high) = field_of_view(camera), _FIELD_OF_VIEW
+    angle, (low, high) = field_of_view(camera), FIELD_OF_VIEW
     focal = float(camera.intrinsics[0, 0])
     words = f"focal length: {focal:.0f} px, {angle:.0f} degrees across"
     if low <= angle <= high or camera.model != "pinhole":
@@ -161,7 +156,14 @@ def check_centre(camera: Camera) -> Finding:
     words = f"principal point: {right:+.0f} px right of the centre, {down:+.0f} px below it"
     if abs(right) <= _OFF_CENTRE * width and abs(down) <= _OFF_CENTRE * height:
         return Finding(OK, words)
-    return Finding(DOUBT, f"{words}: plausible only if the images were cropped")
+    return Finding(DOUBT, resized_remark(camera) or f"{words}: plausible only if the images were cropped")
+
+
+def check_lens(camera: Camera) -> Finding:
+    """Check if the distortion coefficients are like those of the lens model."""
+    count, remark = len(camera.distortion), model_remark(camera)
+    words = f"lens: {camera.model}, {count} distortion coefficients"
+    return Finding(DOUBT, f"{words}: {remark}") if remark else Finding(OK, words)
 
 
 def check_times(sample: Sample) -> Finding:
@@ -195,16 +197,7 @@ def check_pose(sample: Sample) -> Finding:
     """
     if not sample.poses:
         return Finding(DOUBT, "pose: none, since lanes were not found well enough in any frame")
-    pose = np.median(sample.poses, axis=0)
-    names = ("pitch", "yaw", "roll", "height")
-    units = (" degrees", " degrees", " degrees", " m")
-    values = [f"{n} {v:+.1f}{u}" for n, v, u in zip(names, pose, units, strict=True)]
-    odd = [
-        value
-        for value, number, (low, high) in zip(values, pose, _POSE, strict=True)
-        if not low <= number <= high
-    ]
-    if odd:
-        cause = "are camera and lane width right?"
-        return Finding(DOUBT, f"pose: {', '.join(odd)} is not possible for a camera in a car: {cause}")
-    return Finding(OK, f"pose: {', '.join(values)}; lanes do not determine the focal length")
+    pose = np.median(sample.poses, axis=0).tolist()
+    if odd := pose_remark(pose):
+        return Finding(DOUBT, odd)
+    return Finding(OK, f"pose: {', '.join(pose_words(pose))}; lanes do not determine the focal length")

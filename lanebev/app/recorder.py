@@ -17,6 +17,7 @@ from torch import Tensor
 from lanebev.app.concurrency import Background
 from lanebev.app.kept import KeptNumbers, KeptRows
 from lanebev.app.observers import Observation
+from lanebev.app.plausibility import drive_remark
 from lanebev.app.views import ViewBefore, bird_view
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration
@@ -160,7 +161,7 @@ class Recorder:
             lane_width=self.lane_width,
             facts=facts,
             moments=self._moments.moments,
-            problems=self.problems,
+            problems=[*self.problems, *filter(None, [drive_remark(self.rows)])],
             is_stills=self.stills,
             is_smoothed=self.smoothed,
             before_title=self.before_title,

@@ -13,7 +13,6 @@ import torch
 
 from lanebev.app.build import (
     input_files,
-    lens_remark,
     make_grid,
     make_observer,
     make_tracker,
@@ -24,6 +23,7 @@ from lanebev.app.convert import writer
 from lanebev.app.kept import KeptNumbers
 from lanebev.app.observers import Observer
 from lanebev.app.part_observation import observer_of_parts
+from lanebev.app.plausibility import camera_remarks
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.recovery import facts_of, frame_name, observer_of_second_pass, recover_run
@@ -110,7 +110,7 @@ def run(
             videos=not config.no_video,
             smoothed=config.smooth,
         )
-        recorder.problems += filter(None, (source.problem, problem, observer.remark, lens_remark(camera)))
+        recorder.problems += filter(None, (source.problem, problem, observer.remark, *camera_remarks(camera)))
         covariances = KeptNumbers(4, 4, folder=out / ".")
         frames = observed_frames(source, second)
         with recorder, closing(frames), ended_by_signals(source):

@@ -16,16 +16,21 @@ from lanebev.app.doctor import (
     check_centre,
     check_field_of_view,
     check_lanes,
+    check_lens,
     check_pose,
     check_size,
     check_times,
-    field_of_view,
 )
+from lanebev.app.plausibility import camera_remarks, field_of_view, model_remark, pose_remark
 from lanebev.cli import main
 from lanebev.io.video import VideoWriter
 
 CAMERA = Camera.from_fov(60.0, 640, 360)
 GOOD_POSE = [2.0, -1.0, 0.5, 1.4]
+
+
+def _lens(focal, distortion, model="pinhole", width=640):
+    return Camera.from_parameters(focal, focal, width / 2, 180, width, 360, distortion, model)
 
 
 def _sample(poses=(GOOD_POSE,), boundaries=(2, 2, 4), steps=(1.0, 1.0), undecoded=0):
@@ -43,6 +48,8 @@ def _sample(poses=(GOOD_POSE,), boundaries=(2, 2, 4), steps=(1.0, 1.0), undecode
         (check_field_of_view(Camera.from_fov(150.0, 640, 360)), DOUBT, "150 degrees across"),
         (check_centre(CAMERA), OK, "+0 px right"),
         (check_centre(CAMERA.cropped(100, 0, 260, 640)), DOUBT, "-50 px below"),
+        (check_lens(CAMERA), OK, "lens: pinhole, 0 distortion coefficients"),
+        (check_lens(_lens(286, (-0.0048, 0.0414, -0.0389, 0.0066))), DOUBT, "then model: fisheye is missing"),
         (check_times(_sample()), OK, "evenly spaced"),
         (check_times(_sample(steps=(1.0, 1.0, 5.0))), DOUBT, "a gap of 5 times"),
         (check_times(_sample(steps=(2.0, 2.0))), DOUBT, "is 2.00 times that of the stated"),
@@ -58,6 +65,40 @@ def _sample(poses=(GOOD_POSE,), boundaries=(2, 2, 4), steps=(1.0, 1.0), undecode
 def test_findings(finding, level, word):
     assert finding.level == level
     assert word in finding.words
+
+
+FISHEYES = [(286, (-0.0048, 0.0414, -0.0389, 0.0066)), (190, (0.0035, 0.0007, -0.002, 0.0002))]
+FISHEYES += [(278, (-0.0137, 0.0207, -0.0127, 0.0025)), (320, (-0.05, 0.1, -0.1, 0.03))]
+LENSES = [(390, (-0.283, 0.0739, 0.0002, 0.00002)), (517, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))]
+LENSES += [(452, (-0.373, 0.204, 0.0022, 0.0014, -0.0723)), (350, (-0.17, 0.025, 0, 0, 0))]
+LENSES += [(600, (0.05, -0.2, 0.012, -0.008, 0.1)), (224, ()), (500, (-0.3, 0.1, 0.001, 0.0005))]
+
+
+def test_the_lens_model_that_coefficients_are_like():
+    for focal, given in FISHEYES:
+        assert model_remark(_lens(focal, given, "fisheye")) == ""
+        (remark,) = camera_remarks(_lens(focal, given))
+        assert "are they k1 k2 k3 k4 of a fisheye? then model: fisheye is missing" in remark
+    for focal, given in LENSES:
+        assert model_remark(_lens(focal, given)) == ""
+    (remark,) = camera_remarks(_lens(*LENSES[0], "fisheye"))
+    assert "is like one of plumb_bob, not of a fisheye" in remark
+
+
+def test_a_camera_that_was_calibrated_at_another_size():
+    small = Camera.from_parameters(600, 600, 319.5, 179.5, 640, 360)
+    wrong = Camera.from_parameters(600, 600, 319.5, 179.5, 960, 540)
+    (remark,) = camera_remarks(wrong)
+    assert "320, 180 is in the middle of images of 640 x 360 px, not of 960 x 540" in remark
+    assert check_centre(wrong).words == remark.removeprefix("camera: ")
+    assert camera_remarks(small) == camera_remarks(small.cropped(100, 0, 260, 640)) == []
+    (remark,) = camera_remarks(Camera.from_fov(10.0, 640, 360))
+    assert "10 degrees of view across, where cameras on cars have 25 to 130" in remark
+
+
+def test_a_pose_that_no_camera_in_a_car_has():
+    assert pose_remark(GOOD_POSE) == ""
+    assert pose_remark([2.0, -17.2, 0.5, 0.5]).startswith("pose: yaw -17.2 degrees, height +0.5 m is not")
 
 
 def test_field_of_view_of_a_lens():

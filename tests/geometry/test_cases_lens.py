@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics
-from lanebev.app.build import lens_remark
+from lanebev.app.plausibility import lens_remark
 from lanebev.geometry import undistortion
 from lanebev.geometry.distortion import (
     brown_conrady,
@@ -217,7 +217,7 @@ def test_what_cannot_be_inverted_is_said_and_has_no_gradient():
 def test_a_run_says_what_its_lens_cannot_have_imaged():
     assert lens_remark(_camera(PINCUSHION)) == ""
     remark = lens_remark(_camera([-0.3, 0.0, 0.0, 0.0], focal=600.0))
-    assert re.match(r"camera: \d+\.\d\d% of the pixels cannot be undistorted by the lens", remark)
+    assert re.match(r"\d+\.\d\d% of the pixels cannot be undistorted by the lens", remark)
 
 
 def test_segments_that_the_lens_cannot_have_imaged_weigh_nothing():

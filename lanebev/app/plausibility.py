@@ -1,0 +1,138 @@
+"""What speaks against a camera or a pose: values that cameras in cars do not have."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from lanebev.camera.model import Camera
+from lanebev.camera.parameters import centre_offset
+from lanebev.io.results import ExtrinsicsRow
+
+FIELD_OF_VIEW = (25.0, 130.0)
+"""Degrees, horizontal, of cameras in cars with a pinhole model."""
+_POSE = ((-15.0, 25.0), (-15.0, 15.0), (-8.0, 8.0), (0.8, 4.0))  # pitch, yaw, roll (degrees), height (m)
+_RESCALED = (
+    0.08,
+    0.02,
+)  # least offset of a principal point, and how much that in x and y may differ, in sides
+_TANGENTIAL = 0.025  # coefficient; of real lenses at most 0.01
+_WIDE = 95.0  # degrees, from which on lenses distort
+_STRAIGHT = 0.93  # of the distance from the centre without distortion: wide lenses image an edge nearer to it
+_FISHEYE = (-0.15, 0.02)  # below k1, and above |k3| and |k4|: coefficients of plumb_bob
+
+
+def camera_remarks(camera: Camera) -> list[str]:
+    """Return what speaks against a camera: its lens, or a wrong size of images, model or focal length."""
+    found = (lens_remark(camera), resized_remark(camera), model_remark(camera), view_remark(camera))
+    return [f"camera: {remark}" for remark in found if remark]
+
+
+def field_of_view(camera: Camera) -> float:
+    """Return the angle (degrees) between the left and the right edge; 180 if the lens has no rays there."""
+    height, width = camera.image_size
+    edges = camera.intrinsics.new_tensor([[0.0, 0.5 * (height - 1)], [width - 1.0, 0.5 * (height - 1)]])
+    if not bool(camera.undistort_points(edges)[1].all()):
+        return 180.0
+    rays = camera.rays(edges)
+    return math.degrees(sum(math.atan(abs(float(ray[0] / ray[2]))) for ray in rays))
+
+
+def pose_words(pose: Sequence[float]) -> list[str]:
+    """Return pitch, yaw, roll (degrees) and height (m) with their names and units."""
+    names, units = ("pitch", "yaw", "roll", "height"), (" degrees", " degrees", " degrees", " m")
+    return [f"{name} {value:+.1f}{unit}" for name, value, unit in zip(names, pose, units, strict=True)]
+
+
+def pose_remark(pose: Sequence[float]) -> str:
+    """Return a remark on pitch, yaw, roll (degrees) and height (m) that no car's camera has; else nothing."""
+    odd = [
+        words
+        for words, value, (low, high) in zip(pose_words(pose), pose, _POSE, strict=True)
+        if not low <= value <= high
+    ]
+    if not odd:
+        return ""
+    return f"pose: {', '.join(odd)} is not possible for a camera in a car: are camera and lane width right?"
+
+
+def drive_remark(rows: Iterable[ExtrinsicsRow]) -> str:
+    """Return a remark on the median pose of the frames that were tracked; empty if nothing is odd."""
+    poses = [
+        (row.pitch_deg, row.yaw_deg, row.roll_deg, row.height_m) for row in rows if row.status == "TRACKING"
+    ]
+    return pose_remark(np.median(poses, axis=0).tolist()) if poses else ""
+
+
+def lens_remark(camera: Camera) -> str:
+    """Return a remark on the number of pixels that the lens cannot image; else nothing."""
+    share = camera.share_without_rays()
+    return (
+        f"{share:.2%} of the pixels cannot be undistorted by the lens; lanes there are left out"
+        if share
+        else ""
+    )
+
+
+def resized_remark(camera: Camera) -> str:
+    """Return a remark on a principal point that is in the middle of images of another size; else nothing."""
+    (height, width), matrix = camera.image_size, camera.intrinsics.flatten().tolist()
+    x, y = matrix[2] / width - 0.5, matrix[5] / height - 0.5
+    least, most = _RESCALED
+    if centre_offset(matrix, camera.image_size) < least or abs(x - y) > most:
+        return ""
+    other = f"{2 * matrix[2] + 1:.0f} x {2 * matrix[5] + 1:.0f}"
+    return (
+        f"the principal point {matrix[2]:.0f}, {matrix[5]:.0f} is in the middle of images of {other} px, not "
+        f"of {width} x {height}: was it calibrated at another size? see Camera.scaled"
+    )
+
+
+def model_remark(camera: Camera) -> str:
+    """Return a remark on coefficients that are typical of another lens model; else nothing."""
+    given = camera.distortion.tolist()
+    if camera.model == "fisheye":
+        below, least = _FISHEYE
+        if given[0] < below and max(map(abs, given[2:])) < least:
+            return (
+                f"distortion {_listed(given)} is like one of plumb_bob, not of a fisheye: is the model right?"
+            )
+        return ""
+    if camera.model != "pinhole" or len(given) not in (4, 5) or any(given[4:]) or 0.0 in given[2:4]:
+        return ""
+    angle, asked = field_of_view(camera), "are they k1 k2 k3 k4 of a fisheye? then model: fisheye is missing"
+    if max(map(abs, given[2:4])) > _TANGENTIAL:
+        return f"distortion {_listed(given)} has more tangential distortion than lenses have; {asked}"
+    if angle > _WIDE and _drawn_in(camera) > _STRAIGHT:
+        return f"distortion {_listed(given)} hardly distorts, with {angle:.0f} degrees of view; {asked}"
+    return ""
+
+
+def _drawn_in(camera: Camera) -> float:
+    """Return how far from the centre the lens images the left edge, as a share of an ideal lens's distance.
+
+    It is 0 if the lens has no ray there.
+    """
+    edge, centre = (
+        camera.intrinsics.new_tensor([[0.0, float(camera.intrinsics[1, 2])]]),
+        camera.intrinsics[0, 2],
+    )
+    ideal, valid = camera.undistort_points(edge)
+    return float(centre / (centre - ideal[0, 0])) if bool(valid.all()) else 0.0
+
+
+def view_remark(camera: Camera) -> str:
+    """Return a remark on a focal length that gives an odd field of view; else nothing."""
+    angle, (low, high) = field_of_view(camera), FIELD_OF_VIEW
+    if low <= angle <= high or angle == 180.0 or camera.model != "pinhole":  # 180: see share_without_rays
+        return ""
+    return (
+        f"{angle:.0f} degrees of view across, where cameras on cars have {low:g} to {high:g}: was it "
+        "calibrated at another size?"
+    )
+
+
+def _listed(coefficients: Sequence[float]) -> str:
+    return ", ".join(f"{value:.3g}" for value in coefficients[:4])
