@@ -82,6 +82,18 @@ class LaneFileObserver:
             self.matches: list[int | None] = list(range(len(entries)))
         else:
             self.matches = match_frames(source.paths, entries)
+            self.remark = "; ".join(filter(None, [self.remark, self._unmatched(source.taken_numbers)]))
+
+    def _unmatched(self, taken: Sequence[int]) -> str:
+        """Return how many of the images that are taken have no entry; empty if all have one."""
+        without = [number for number in taken if self.matches[number] is None]
+        if not without:
+            return ""
+        unused = len(self.entries) - sum(match is not None for match in self.matches)
+        words = (
+            f"lanes: {len(without)} of {len(taken)} images have no entry, the first is number {without[0]}"
+        )
+        return f"{words}; {unused} entries have no image" if unused else words
 
     def __call__(self, frame: Frame) -> Observation:
         """See :class:`Observer`."""

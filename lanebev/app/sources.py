@@ -18,6 +18,7 @@ from lanebev.app.observers import Observation, Observer
 from lanebev.camera.model import Camera
 from lanebev.io.bags import BagSource, open_bag_source
 from lanebev.io.frames import ALL, Frame, Selection
+from lanebev.io.image_names import drives_remark
 from lanebev.io.live import LiveSource, open_live
 from lanebev.io.source_names import is_bag, is_live
 from lanebev.io.video import FrameSource, open_source
@@ -39,13 +40,14 @@ def make_source(config: RunConfig) -> FrameSource:
                 raise ValueError(f"source {config.source}: expected no {name} with a stream, got it")
         return open_live(config.source, config.frame_rate, config.keep_all, selection)
     found = _opened(config.source, config.topic, config.frame_rate)
-    if not isinstance(found, BagSource):
-        stated = found.is_video or found.times or config.frame_rate or config.stills
-        if found.count > 1 and not stated:
-            rate = (
-                f"their names state no times, {float(found.fps):g} frames per second are assumed; state --fps"
-            )
-            found = replace(found, problem=f"{config.source}: {rate}")
+    remarks = [found.problem]
+    if found.paths and not config.stills:
+        remarks.append(drives_remark(found.paths))
+        if found.count > 1 and not (found.times or config.frame_rate):
+            rate = f"{float(found.fps):g} frames per second are assumed"
+            remarks.append(f"their names state no times, {rate}; state --fps")
+    said = [each if each is found.problem else f"{config.source}: {each}" for each in remarks if each]
+    found = replace(found, problem="; ".join(said))
     source = replace(found, selection=selection)
     if selection != ALL and not source.taken_count:
         last = source.times[-1] if source.times else float(source.count / source.fps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from itertools import pairwise
@@ -15,6 +16,10 @@ _STAMP = re.compile(rf"(?<!\d)(\d{{13,19}}){_SUFFIXES}", re.ASCII)
 _EPOCH = (1_000_000_000, 4_102_444_800)  # s: September 2001 to 2100
 _STEPS = (Fraction(1, 2000), Fraction(60))  # s between two frames of a drive
 _NANOSECONDS = (8, 9)  # digits: a float of seconds since 1970 has 7 at most, of seconds since a start 17
+
+_MOST_ALIKE = (
+    0.5  # of the images, of which more with the same number or name are of several cameras or drives
+)
 
 Key = list[tuple[int, Fraction, str]]
 
@@ -79,6 +84,36 @@ def times_from_names(paths: Sequence[str]) -> tuple[float, ...]:
     if not (since_1970 and all(_STEPS[0] <= step <= _STEPS[1] for step in steps)):
         return ()
     return tuple(float(time - times[0]) for time in times)
+
+
+def drives_remark(paths: Sequence[str]) -> str:
+    """Return what speaks for images of several cameras or drives, where one is expected; else nothing.
+
+    Files of the same numbers in one folder are those of several cameras, or images and masks. Files of the
+    same names in several folders are those of several drives.
+
+    Args:
+        paths: paths of the images.
+    """
+    numbers: dict[tuple[PurePath, tuple[str, ...]], list[str]] = defaultdict(list)
+    folders: dict[str, list[PurePath]] = defaultdict(list)
+    for path in map(PurePath, paths):
+        numbers[path.parent, tuple(re.findall(r"\d+", path.stem))].append(path.name)
+        folders[path.name].append(path.parent)
+    alike = [names for (_, found), names in numbers.items() if found and len(names) > 1]
+    if alike and sum(map(len, alike)) > _MOST_ALIKE * len(paths):
+        return (
+            f"several images have the same number, such as {alike[0][0]} and {alike[0][1]}, and are taken "
+            "for frames one after another; give those of one camera as a quoted glob"
+        )
+    twice = [(name, found) for name, found in folders.items() if len(found) > 1]
+    if sum(len(found) for _, found in twice) > _MOST_ALIKE * len(paths):
+        name, (first, second, *_) = twice[0]
+        return (
+            f"images of several folders have the same name, such as {name} in {first} and {second}, and are "
+            "taken for one drive; give a run each, or --stills"
+        )
+    return ""
 
 
 def _are_decimal(fractions: Sequence[str]) -> bool:

@@ -46,6 +46,7 @@ __all__ = [
 ]
 
 DEFAULT_FPS = Fraction(30)
+_DARK = 24  # of 255; 12 bits in 16 give 15 at most
 _SAME_RATE = 0.05  # relative, by which two frame rates may differ and be the same
 _SAME_VIDEO = 2  # factor, by which a video's frames may come faster or slower than its mean rate
 
@@ -87,10 +88,15 @@ class FrameSource:
         return False
 
     @property
+    def taken_numbers(self) -> list[int]:
+        """Numbers of the frames that are taken; of a damaged video an estimate."""
+        times = self.times or (float(index / self.fps) for index in range(self.count))
+        return [number for number, time in enumerate(times) if self.selection.takes(number, time)]
+
+    @property
     def taken_count(self) -> int:
         """Number of frames that are taken; of a damaged video an estimate."""
-        times = self.times or (float(index / self.fps) for index in range(self.count))
-        return sum(self.selection.takes(*each) for each in enumerate(times))
+        return len(self.taken_numbers)
 
     @property
     def is_video(self) -> bool:
@@ -196,21 +202,35 @@ def _image_source(source: str, paths: Sequence[str], fps: Fraction | None) -> Fr
     problem = ""
     for path in paths:
         try:
-            size = read_image(path).shape[:2]
+            image = read_image(path)
             break
         except ValueError as error:
             problem = problem or str(error)
     else:
         raise ValueError(problem)
-    times = times_from_names(paths)
-    if not times:
-        return FrameSource(source, tuple(paths), fps or DEFAULT_FPS, len(paths), size)
-    own = 1 / Fraction(median(np.diff(times).tolist())).limit_denominator(1_000_000)
-    if fps is None:
-        return FrameSource(source, tuple(paths), own, len(paths), size, times=times)
-    differs = abs(own / fps - 1) > _SAME_RATE
-    problem = f"{source}: its names state {float(own):.4g} frames per second, --fps {float(fps):g} was given"
-    return FrameSource(source, tuple(paths), fps, len(paths), size, problem if differs else "")
+    size, times = image.shape[:2], times_from_names(paths)
+    remarks = [_dark_remark(image)]
+    rate = fps or DEFAULT_FPS
+    if times:
+        own = 1 / Fraction(median(np.diff(times).tolist())).limit_denominator(1_000_000)
+        times, rate = (times, own) if fps is None else ((), fps)
+        if abs(own / rate - 1) > _SAME_RATE:
+            remarks.append(
+                f"its names state {float(own):.4g} frames per second, --fps {float(rate):g} was given"
+            )
+    said = "; ".join(filter(None, remarks))
+    problem = f"{source}: {said}" if said else ""
+    return FrameSource(source, tuple(paths), rate, len(paths), size, problem, times)
+
+
+def _dark_remark(image: NDArray[np.uint8]) -> str:
+    """Return a remark on an image whose brightest pixel is nearly black; else nothing."""
+    if not 0 < image.max() < _DARK:
+        return ""
+    return (
+        f"the first image is nearly black, its brightest value {image.max()} of 255; are values of 10 or 12 "
+        "bits stored in 16? multiply them by 64 or 16"
+    )
 
 
 def _video_source(source: str, stated: Fraction | None) -> FrameSource:

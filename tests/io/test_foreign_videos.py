@@ -14,7 +14,9 @@ from lanebev import Camera
 from lanebev.app.build import make_camera
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import LaneFileObserver
+from lanebev.app.sources import make_source
 from lanebev.io.frames import Selection
+from lanebev.io.image_names import drives_remark
 from lanebev.io.images import read_image
 from lanebev.io.lanes import FrameLines
 from lanebev.io.video import open_source
@@ -269,3 +271,60 @@ def test_relative_globs_have_the_names_that_were_asked_for(tmp_path, monkeypatch
 def test_a_folder_of_pgm(tmp_path):
     source = open_source(str(_folder(tmp_path / "a", "1.pgm", "2.pgm")))
     assert (source.count, source.image_size) == (2, SIZE)
+
+
+@pytest.mark.parametrize("bits", [10, 12])
+def test_images_of_few_bits_stored_in_many_are_noticed(tmp_path, bits):
+    values = np.random.default_rng(0).integers(0, 2**bits, (48, 64)).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "1.png"), values)
+    assert "nearly black, its brightest value" in open_source(str(tmp_path / "1.png")).problem
+    cv2.imwrite(str(tmp_path / "1.png"), values * 2 ** (16 - bits))
+    assert open_source(str(tmp_path / "1.png")).problem == ""
+
+
+PAIRS = [f"{number:04d}_{side}.png" for number in range(4) for side in ("left", "right")]
+MASKS = [f"{number}{suffix}" for number in range(4) for suffix in (".jpg", "_mask.png")]
+CLIPS = [f"clips/{clip}/{number}.jpg" for clip in ("a", "b") for number in range(4)]
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (PAIRS, "the same number, such as 0000_left.png and 0000_right.png, and are taken for frames one"),
+        (MASKS, "the same number, such as 0.jpg and 0_mask.png, and"),
+        (CLIPS, "the same name, such as 0.jpg in clips/a and clips/b, and are taken for one drive"),
+        (PAIRS[::2], ""),
+        (["a/left.jpg", "a/right.jpg", "1.jpg", "1b.jpg", "2.jpg", "3.jpg", "4.jpg"], ""),
+        ([f"2024-05-01_12-30-{second}_{number}.jpg" for second in (1, 2) for number in range(3)], ""),
+    ],
+)
+def test_images_of_several_cameras_or_drives_are_noticed(names, words):
+    remark = drives_remark(names)
+    assert words in remark
+    assert bool(words) == bool(remark)
+
+
+def test_a_run_says_that_images_are_of_several_cameras(tmp_path):
+    for name in PAIRS:
+        Image.fromarray(_picture()).save(tmp_path / name)
+    source = make_source(RunConfig(str(tmp_path), fov=60.0))
+    assert "several images have the same number" in source.problem
+    assert "30 frames per second are assumed" in source.problem
+    assert make_source(RunConfig(str(tmp_path), fov=60.0, stills=True)).problem == ""
+    assert make_source(RunConfig(f"{tmp_path}/*_left.png", fov=60.0, fps=10)).problem == ""
+
+
+def test_images_without_lanes_are_counted(tmp_path):
+    """As where names of lanes begin at 1 and those of images at 0."""
+    for number in range(6):
+        Image.fromarray(_picture()).save(tmp_path / f"{number}.png")
+    camera = Camera.from_fov(60, *_picture().shape[1::-1])
+    entries = [FrameLines(f"{number}.png", []) for number in range(1, 7)]
+    source = open_source(str(tmp_path))
+    remark = "lanes: 1 of 6 images have no entry, the first is number 0; 1 entries have no image"
+    assert LaneFileObserver(entries, source, camera).remark == remark
+    part = replace(source, selection=Selection(0.01))
+    assert LaneFileObserver(entries, part, camera).remark == ""
+    assert LaneFileObserver(entries[:3], part, camera).remark.endswith(
+        "2 of 5 images have no entry, the first is number 4"
+    )
