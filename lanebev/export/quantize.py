@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lanebev.export.write import MISSING
+from lanebev.export.write import MISSING, quiet_logs
 from lanebev.render import render_views
 
 VIEWS = 32
@@ -57,7 +57,7 @@ def quantize_segmenter(path: Path, feeds: Iterable[Feed]) -> None:
             return next(self.feeds, None)
 
     facts = onnx.load(path).metadata_props
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, quiet_logs():
         simple, small = Path(folder, "simple.onnx"), Path(folder, "small.onnx")
         quant_pre_process(path, simple, skip_symbolic_shape=True)
         convolutions = [node.name for node in onnx.load(simple).graph.node if node.op_type == "Conv"]

@@ -48,7 +48,7 @@ def write_onnx(part: Part, path: Path) -> None:
         from lanebev.export.operators import translations
     except ImportError as error:
         raise ValueError(f"onnx: {MISSING} ({error})") from error
-    with torch.no_grad(), warnings.catch_warnings(), _quiet():
+    with torch.no_grad(), warnings.catch_warnings(), quiet_logs():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
             export_program(part),
@@ -65,8 +65,8 @@ def write_onnx(part: Part, path: Path) -> None:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep what the exporter logs of optional packages and of its own steps to itself."""
+def quiet_logs() -> Iterator[None]:
+    """Suppress what ONNX's packages log up to warnings, of optional packages and of their own steps."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

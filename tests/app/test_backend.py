@@ -1,5 +1,6 @@
 """A run by exported parts: the same rows, and one line about files that are missing or of another camera."""
 
+import csv
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from lanebev.app.export_config import PARTS, ExportConfig
 from lanebev.app.run import run
 from lanebev.cli import main
 from lanebev.export import parts, runtime
+from lanebev.export.quantize import rendered_views
 
 FRAME = Path(__file__).parents[1] / "golden" / "frame.png"
 CAMERA = "{fx: 300, fy: 300, cx: 159.5, cy: 89.5, width: 320, height: 180, distortion: [-0.1, 0.01, 0, 0]}"
@@ -58,6 +60,27 @@ def test_the_rows_are_the_same(folder, calibrator, monkeypatch):
     rows = (folder / "torch" / "extrinsics.csv").read_text()
     assert rows.count("TRACKING") == 2
     assert (folder / "onnxruntime" / "extrinsics.csv").read_text() == rows
+
+
+@pytest.mark.slow
+def test_a_run_by_a_segmenter_of_8_bits_finds_about_the_same_pose(folder, monkeypatch, caplog):
+    monkeypatch.setattr("lanebev.app.export.rendered_views", lambda size: rendered_views(size, 2))
+    part = {"part": "segmenter", "int8": True, "out": str(folder)}
+    assert "segmenter.onnx" in export(ExportConfig(camera=str(folder / "camera.yaml"), **part))
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+    exported = runtime.OnnxPart
+    monkeypatch.setattr(
+        runtime, "OnnxPart", lambda path: (exported if path.stem == "segmenter" else EagerPart)(path)
+    )
+    rows = {}
+    for backend in ("torch", "onnxruntime"):
+        out = folder / backend
+        run(settings(folder, calibrator="two-stage", backend=backend, out=str(out)))
+        rows[backend] = list(csv.DictReader((out / "extrinsics.csv").open()))
+    assert [row["status"] for row in rows["onnxruntime"]] == [row["status"] for row in rows["torch"]]
+    for name in ("pitch", "yaw", "roll"):
+        float_, int8 = (float(rows[backend][1][f"{name}_deg"]) for backend in ("torch", "onnxruntime"))
+        assert 0 < abs(int8 - float_) < float(rows["torch"][1][f"{name}_std_deg"])
 
 
 @pytest.mark.slow
