@@ -19,6 +19,8 @@ from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.mount import MountCalibration, describe_mount
 from lanebev.estimation.reasons import Reason, describe_reasons
 from lanebev.estimation.tracker import Tracker
+from lanebev.io.lane_size import size_doubt
+from lanebev.io.lanes import FrameLines
 from lanebev.io.state import load_state, save_state
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.frames import check_frame, network_image
@@ -34,6 +36,7 @@ logger = logging.getLogger(__name__)
 FIRST_DT = 1 / 30  # s before a first frame: it has no frame before
 _LONG_DT = 5.0  # s; if all steps are longer, the stamps are probably not seconds
 _LOOKED_AT = 5  # number of steps that are checked for that
+_LANES_LOOKED_AT = 20  # frames whose polylines are checked together for the size of their images
 
 
 class SessionResult(NamedTuple):
@@ -122,6 +125,8 @@ class Session:
         self.tracker: Tracker[Any] = Tracker(*self._parts)
         self._stamp: float | None = None
         self._steps: list[float] = []
+        self._drawn: list[FrameLines] = []
+        self._doubt = ""
 
     def __call__(
         self,
@@ -166,7 +171,10 @@ class Session:
             extrinsics=calibration.extrinsics,
             std=Extrinsics.unstack(std),
             status=Status(int(calibration.status[0])),
-            reasons=remarks + lost + describe_reasons(reasons & ~Reason.TIME if remarks else reasons),
+            reasons=remarks
+            + lost
+            + ([self._doubt] if self._doubt else [])
+            + describe_reasons(reasons & ~Reason.TIME if remarks else reasons),
             mount=mounted,
             mount_needs=describe_mount(mounted, self.tracker.mount_estimator.config),
             calibration=calibration,
@@ -235,12 +243,23 @@ class Session:
         """Return the frame's vertices and the scale of the pose's sigmas that their detector needs."""
         if polylines is not None or image is None:
             lines = lines_from_polylines([] if polylines is None else polylines, self.polyline_sigma)
+            self._look_at_size(FrameLines("", lines))
             return vertices_from_lines(lines, self.camera), 1.0
         if self._model is None:
             self._model = LaneBEV.from_pretrained()
         model = self._model.eval().to(self.device)
         _, vertices = model.boundary_vertices(network_image(image, self.device))
         return map_tensors(Tensor.cpu, vertices), model.pose_sigma_scale
+
+    def _look_at_size(self, lines: FrameLines) -> None:
+        """Doubt polylines in pixels of other images, by all of some frames together."""
+        self._drawn += [lines] if lines.lines else []
+        if len(self._drawn) == _LANES_LOOKED_AT:
+            doubt = size_doubt(self._drawn, self.camera.image_size)
+            self._doubt = f"polylines: {doubt.words}" if doubt else ""
+            if doubt:
+                logger.warning(self._doubt)
+            self._drawn = []
 
 
 def _as_bytes(image: Tensor) -> NDArray[np.uint8]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +77,20 @@ def lanes_of_whole_images(
     ]
 
 
+class SizeDoubt(NamedTuple):
+    """What speaks for lanes in pixels of other images.
+
+    Attributes:
+        words: what was found, and a question.
+        remedy: what to state at the command line.
+        is_outside: whether lanes lie outside the images.
+    """
+
+    words: str
+    remedy: str
+    is_outside: bool = False
+
+
 def size_remark(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> str:
     """Return what speaks for lanes in pixels of smaller or cropped images; empty if nothing does.
 
@@ -86,33 +101,58 @@ def size_remark(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> st
     Raises:
         ValueError: lanes lie outside the images, so that they are in pixels of larger ones.
     """
+    doubt = size_doubt(frames, image_size)
+    if doubt is None:
+        return ""
+    words = f"lanes: {doubt.words} {doubt.remedy}"
+    if doubt.is_outside:
+        raise ValueError(words)
+    return words
+
+
+def size_doubt(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> SizeDoubt | None:
+    """Return what speaks for lanes in pixels of larger, smaller or cropped images; None if nothing does.
+
+    Args:
+        frames: frames of one drive.
+        image_size: (height, width) px of its images.
+    """
     points = _all_points(frames)
     if not len(points):
-        return ""
+        return None
     height, width = image_size
     x, y = points.T
+    size = "state their size with --lanes-size WIDTHxHEIGHT"
     outside = (y >= height) | (x < -_BESIDE * width) | (x > (1 + _BESIDE) * width)
     if outside.mean() > _OUTSIDE:
-        raise ValueError(
-            f"lanes: expected points in images of {width} x {height} px, got {outside.mean():.0%} outside of "
-            f"them, the farthest at {x.max():.0f}, {y.max():.0f}; of images of another size? state it "
-            "with --lanes-size WIDTHxHEIGHT"
+        return SizeDoubt(
+            f"expected points in images of {width} x {height} px, got {outside.mean():.0%} outside of them, "
+            f"the farthest at {x.max():.0f}, {y.max():.0f}; of images of another size?",
+            size,
+            is_outside=True,
+        )
+    if points.min() >= 0 and points.max() <= 1:
+        return SizeDoubt(
+            "all points lie between 0 and 1; are they shares of the sides instead of pixels?",
+            "multiply them by the sides",
         )
     low = y.max() < _REACHED * height and x.max() < _REACHED * width
     if low or y.max() < _REACHED_DOWN * height:
-        return (
-            f"lanes: none of them reaches beyond {x.max():.0f}, {y.max():.0f} in images of "
-            f"{width} x {height} px; of smaller images? state their size with --lanes-size WIDTHxHEIGHT"
+        return SizeDoubt(
+            f"none of them reaches beyond {x.max():.0f}, {y.max():.0f} in images of {width} x {height} px; "
+            "of smaller images?",
+            size,
         )
     horizon = meeting_row(frames)
     if y.max() < _REACHED_UNCROPPED * height and horizon < _HIGHEST_HORIZON * height:
         rest = height - math.ceil(y.max())
-        return (
-            f"lanes: none of them reaches below row {y.max():.0f} of {height}, and they meet at row "
-            f"{horizon:.0f}; of images whose top was cut off? state the part with --lanes-crop "
-            f"WIDTHxHEIGHT+LEFT+TOP, such as {width}x{height - rest}+0+{rest}"
+        return SizeDoubt(
+            f"none of them reaches below row {y.max():.0f} of {height}, and they meet at row {horizon:.0f}; "
+            "of images whose top was cut off?",
+            "state the part with --lanes-crop WIDTHxHEIGHT+LEFT+TOP, "
+            f"such as {width}x{height - rest}+0+{rest}",
         )
-    return ""
+    return None
 
 
 def meeting_row(frames: Sequence[FrameLines]) -> float:

@@ -97,6 +97,28 @@ def test_milliseconds_are_noticed():
     assert any("expected seconds, got milli- or nanoseconds?" in text for text in said[6])
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda line: line, ""),
+        (lambda line: line / 2, "of smaller images?"),
+        (lambda line: line * 2, "of images of another size?"),
+        (lambda line: line / np.array([640, 360]), "shares of the sides instead of pixels?"),
+        (lambda line: line - np.array([0, 110]), "of images whose top was cut off?"),
+    ],
+)
+def test_polylines_in_pixels_of_other_images_are_noticed(change, words):
+    session = Session(CAMERA)
+    drawn = [change(line[(line >= 0).all(-1)]) for line in map(np.asarray, lines())]
+    said = [session(polylines=drawn, stamp=k / 20).reasons for k in range(21)]
+    assert not any(text.startswith("polylines: ") for texts in said[:19] for text in texts)
+    remarks = [text for text in said[-1] if text.startswith("polylines: ")]
+    assert len(remarks) == bool(words)
+    assert all(words in remark for remark in remarks)
+    session.reset()
+    assert not any(text.startswith("polylines: ") for text in session(polylines=drawn, stamp=0.0).reasons)
+
+
 def test_a_saved_session_goes_on_exactly(tmp_path):
     one, other = Session(CAMERA), Session(CAMERA)
     for k in range(6):
