@@ -77,16 +77,20 @@ def lens_remark(camera: Camera) -> str:
 
 
 def resized_remark(camera: Camera) -> str:
-    """Return a remark on a principal point that is in the middle of images of another size; else nothing."""
+    """Return a remark on a principal point in the middle of images of another size; else nothing."""
     (height, width), matrix = camera.image_size, camera.intrinsics.flatten().tolist()
-    x, y = matrix[2] / width - 0.5, matrix[5] / height - 0.5
     least, most = _RESCALED
-    if centre_offset(matrix, camera.image_size) < least or abs(x - y) > most:
+    offset = centre_offset(matrix, camera.image_size)
+    words = f"the principal point {matrix[2]:.0f}, {matrix[5]:.0f} is in the middle of images of"
+    if offset > least > centre_offset(matrix, (width, height)):
+        return (
+            f"{words} {height} x {width} px, not of {width} x {height}: are cx and cy, or the sides, swapped?"
+        )
+    if offset < least or abs(matrix[2] / width - matrix[5] / height) > most:
         return ""
     other = f"{2 * matrix[2] + 1:.0f} x {2 * matrix[5] + 1:.0f}"
     return (
-        f"the principal point {matrix[2]:.0f}, {matrix[5]:.0f} is in the middle of images of {other} px, not "
-        f"of {width} x {height}: was it calibrated at another size? see Camera.scaled"
+        f"{words} {other} px, not of {width} x {height}: was it calibrated at another size? see Camera.scaled"
     )
 
 

@@ -92,6 +92,10 @@ def test_a_camera_that_was_calibrated_at_another_size():
     assert "320, 180 is in the middle of images of 640 x 360 px, not of 960 x 540" in remark
     assert check_centre(wrong).words == remark.removeprefix("camera: ")
     assert camera_remarks(small) == camera_remarks(small.cropped(100, 0, 260, 640)) == []
+    (remark,) = camera_remarks(Camera.from_parameters(600, 600, 179.5, 319.5, 640, 360))
+    assert (
+        "180, 320 is in the middle of images of 360 x 640 px, not of 640 x 360: are cx and cy, or" in remark
+    )
     (remark,) = camera_remarks(Camera.from_fov(10.0, 640, 360))
     assert "10 degrees of view across, where cameras on cars have 25 to 130" in remark
 
