@@ -11,11 +11,9 @@ from torch import Tensor
 
 from lanebev.view.lens import Lens
 from lanebev.view.projection import Cells, CellSums, image_coordinates, outside_image
-from lanebev.view.tiles import Interpolant, interpolant
+from lanebev.view.tiles import ONE_THREAD, Interpolant, interpolant
 
 BLOCK = 1 << 17  # cells: a dozen float32 planes of so many fit a cache of a few MB
-
-_EXACT_BLOCK = 1 << 14  # cells of a block that is computed cell by cell, which takes two dozen planes
 
 Memory = Callable[[int, int], Tensor]
 
@@ -54,10 +52,13 @@ def blocks(cells: Cells, lens: Lens | None, limit: float, memory: Memory | None 
         curves = interpolant(cells, lens, limit)
         if curves is not None:
             for tile, span in enumerate(itertools.pairwise(curves.rows.edges)):
-                if curves.smooth[:, tile].any():
+                if not curves.smooth[:, tile].any():
+                    yield from _exact_blocks(cells, lens, span, ONE_THREAD, memory)
+                elif curves.inside[tile] or memory is None:
                     yield _tile_block(curves, cells, lens, tile, span, memory)
                 else:
-                    yield from _exact_blocks(cells, lens, span, _EXACT_BLOCK, memory)
+                    for first, last in _spans(span, ONE_THREAD // (batch * columns)):
+                        yield _tile_block(curves, cells, lens, tile, (first, last), memory)
             return
     # compiled code has no planes in between
     size = batch * rows * columns if torch.compiler.is_compiling() else BLOCK
@@ -75,9 +76,7 @@ def _exact_blocks(
 ) -> Iterator[Block]:
     """Rows from the first to below the second, cell by cell, in blocks of so many cells."""
     batch, _, columns = cells.shape
-    step = max(1, size // max(1, batch * columns))
-    for first in range(*rows, step):
-        last = min(first + step, rows[1])
+    for first, last in _spans(rows, size // max(1, batch * columns)):
         points, hidden = image_coordinates(cells.rows(first, last), lens)
         if memory is not None:
             points = memory(first, last).copy_(points)
@@ -93,10 +92,11 @@ def _tile_block(
     memory: Memory | None,
 ) -> Block:
     """Rows of a tile: those of each image by its polynomials where they are exact."""
-    points = curves.points(tile, None if memory is None else memory(*rows))
+    inner = slice(*(row - curves.rows.edges[tile] for row in rows))
+    points = curves.points(tile, inner, None if memory is None else memory(*rows))
     if curves.inside[tile]:
         return Block(*rows, points, None)
-    outside = outside_image(points, curves.hidden(tile))
+    outside = outside_image(points, curves.hidden(tile, inner))
     smooth = curves.smooth[:, tile]
     if not smooth.all():
         exact, hidden = image_coordinates(cells.rows(*rows), lens)
@@ -105,6 +105,12 @@ def _tile_block(
         exact = torch.where(whole.unsqueeze(1), points, exact)
         points = exact if memory is None else points.copy_(exact)
     return Block(*rows, points, outside)
+
+
+def _spans(rows: tuple[int, int], step: int) -> Iterator[tuple[int, int]]:
+    """Divide rows from the first to below the second, into spans of so many, of one at least."""
+    step = max(1, step)
+    return ((first, min(first + step, rows[1])) for first in range(*rows, step))
 
 
 def traced() -> bool:

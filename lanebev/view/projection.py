@@ -108,6 +108,5 @@ def outside_image(points: Tensor, hidden: Tensor | None = None) -> Tensor:
     Returns:
         (B, R, V), zero where seen and inside the image, else at least 1; without gradient.
     """
-    beyond = F.hardshrink(points.detach(), 1.0)  # zero in [-1, 1]
-    x, y = beyond.unbind(1)
+    x, y = (F.hardshrink(each, 1.0) for each in points.detach().unbind(1))  # zero in [-1, 1]
     return torch.addcmul(x * x if hidden is None else torch.addcmul(hidden, x, x), y, y)

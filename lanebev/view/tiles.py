@@ -24,6 +24,8 @@ from lanebev.geometry.precision import autocast_off
 from lanebev.view.lens import Lens
 from lanebev.view.projection import CellSums, image_coordinates
 
+ONE_THREAD = 1 << 15  # numbers up to which PyTorch computes with one thread
+
 _NODES = 12  # of a tile, along its rows and along its columns
 _LEAST_ROWS = 3 * _NODES  # of a tile
 _GROWTH = 0.5  # share of its least depth that the depth grows by within a tile
@@ -31,6 +33,7 @@ _COLUMNS = 128  # of a tile; half as many of a lens
 _TOLERANCE = 4e-6  # of half the image, .004 px of 1920; what float32 rounds is a quarter of it
 _LOW = _NODES - 2  # the coefficients of this degree and higher tell what those of higher ones would add
 _SUMS = np.stack([np.ones(_NODES), np.arange(_NODES) >= _LOW], axis=1).astype(np.float32)
+_PRODUCT = 1 << 18  # multiplications up to which NumPy's BLAS uses one thread
 _OUTSIDE = 0.25  # share of the distance to the image by which a tile that is not in it may be off
 
 
@@ -160,20 +163,21 @@ class Interpolant(NamedTuple):
     folds: NDArray[np.bool_]
     inside: NDArray[np.bool_]
 
-    def points(self, tile: int, out: Tensor | None = None) -> Tensor:
-        """Return coordinates of the cells of a tile, (B, 2, rows, V).
+    def points(self, tile: int, rows: slice, out: Tensor | None = None) -> Tensor:
+        """Return coordinates of cells of a tile, (B, 2, rows, V).
 
         Args:
             tile: number of the tile.
+            rows: rows of the tile.
             out: of that shape, to write to without a graph.
         """
-        return _product(self.rows.weights[tile], self.values[:, :, tile], out)
+        return _product(self.rows.weights[tile][rows], self.values[:, :, tile], out)
 
-    def hidden(self, tile: int) -> Tensor | None:
+    def hidden(self, tile: int, rows: slice) -> Tensor | None:
         """Return (B, rows, V), zero where the lens does not fold over, else 1; None where it nowhere does."""
         if self.excess is None or not self.folds[tile]:
             return None
-        excess = _product(self.rows.weights[tile], self.excess[:, :, tile])
+        excess = _product(self.rows.weights[tile][rows], self.excess[:, :, tile])
         return excess.squeeze(1).clamp_(min=0.0).sign_()
 
 
@@ -186,7 +190,7 @@ def interpolant(cells: CellSums, lens: Lens | None, limit: float) -> Interpolant
         lens: into normalised coordinates, or None.
         limit: see :class:`Interpolant`.
     """
-    _, count, width = cells.shape
+    batch, count, width = cells.shape
     rows = row_tiles(cells.edges or equal_edges(count))
     columns = column_tiles(width, _COLUMNS // 2 if lens else _COLUMNS)
     if rows is None or columns is None:
@@ -194,8 +198,13 @@ def interpolant(cells: CellSums, lens: Lens | None, limit: float) -> Interpolant
     nodes = CellSums(
         cells.by_row.index_select(-1, torch.from_numpy(rows.nodes)),
         cells.by_column.index_select(-1, torch.from_numpy(columns.nodes)),
-    ).rows(0, len(rows.nodes))
-    points, hidden = image_coordinates(nodes, lens, continued=True)
+    )
+    step = max(1, ONE_THREAD // (3 * batch * len(columns.nodes)))
+    parts = [nodes.rows(first, first + step) for first in range(0, len(rows.nodes), step)]
+    points, hidden = (
+        torch.cat(each, dim=-2)
+        for each in zip(*(image_coordinates(part, lens, continued=True) for part in parts), strict=True)
+    )
     shape = rows.coefficients.shape[:2]
 
     def by_tiles(values: Tensor) -> NDArray[np.float32]:
@@ -208,7 +217,7 @@ def interpolant(cells: CellSums, lens: Lens | None, limit: float) -> Interpolant
     smooth = seen & (error <= np.maximum(_OUTSIDE * (least - 1), _TOLERANCE))
     excess, folds = None, np.zeros(len(rows.weights), np.bool_)
     if lens is not None:
-        over = lens.excess(nodes.detach())
+        over = torch.cat([lens.excess(part.detach()) for part in parts], dim=-2)
         folds = by_tiles(over).max((0, 1, 3, 4, 5)) > 0
         excess = _along_columns(over, columns).unflatten(2, shape) if folds.any() else None
     inside = (smooth & (most <= limit)).all((0, 2)) & ~folds
@@ -230,9 +239,10 @@ def tile_bounds(
         (B, T, S) each: what the coefficients of the highest degrees sum up to; the sum of all, which no
         coordinate exceeds; of the coordinate that is farther from the image at all nodes, at the nearest.
     """
-    along = values.reshape(-1, _NODES) @ columns.coefficients.T
+    along = small_products(values.reshape(-1, _NODES), columns.coefficients.T)
     size = np.abs(rows.coefficients @ along.reshape(*values.shape[:4], -1))
-    sums = (size.reshape(-1, _NODES) @ _SUMS).reshape(*values.shape[:5], 2)  # of the columns' degrees
+    sums = small_products(size.reshape(-1, _NODES), _SUMS)  # of the columns' degrees
+    sums = sums.reshape(*values.shape[:5], 2)
     most = sums[..., 0].sum(3)
     error = sums[:, :, :, :_LOW, :, 1].sum(3) + sums[:, :, :, _LOW:, :, 0].sum(3)
     least = np.abs(values).min(3).min(-1)
@@ -242,19 +252,44 @@ def tile_bounds(
 def _along_columns(nodes: Tensor, columns: ColumnTiles) -> Tensor:
     """Values at all columns, (B, k, R, V), from those at the nodes, (B, k, R, S·m)."""
     nodes = nodes.unflatten(-1, (-1, _NODES))
-    with autocast_off(nodes.device):
-        values = nodes @ torch.from_numpy(columns.weights).mT  # (..., S, size)
+    if nodes.requires_grad:
+        with autocast_off(nodes.device):
+            values = nodes @ torch.from_numpy(columns.weights).mT  # (..., S, size)
+    else:
+        each = nodes.numpy().reshape(-1, _NODES)
+        values = torch.from_numpy(small_products(each, columns.weights.T)).view(*nodes.shape[:-1], -1)
     if columns.overlap == 0:
         return values.flatten(-2)
     return torch.cat([values[..., :-1, :].flatten(-2), values[..., -1, columns.overlap :]], dim=-1)
 
 
 def _product(weights: NDArray[np.float32], values: Tensor, out: Tensor | None = None) -> Tensor:
-    """Multiply weights (rows, n) with values (..., n, V); no graph with ``out``.
-
-    Not by NumPy: the threads of its BLAS wait busily for the next product, and PyTorch's wait for them.
-    """
+    """Multiply weights (rows, n) with values (..., n, V); no graph with ``out``."""
+    if out is not None:
+        small_products(weights, values.detach().numpy(), out.numpy())
+        return out
+    if not values.requires_grad:
+        return torch.from_numpy(small_products(weights, values.numpy()))
     with autocast_off(values.device):
-        if out is None:
-            return torch.from_numpy(weights) @ values
-        return torch.matmul(torch.from_numpy(weights), values.detach(), out=out)
+        return torch.from_numpy(weights) @ values
+
+
+def small_products(
+    left: NDArray[np.float32], right: NDArray[np.float32], out: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
+    """Multiply (rows, n) with (..., n, V), in products so small that NumPy computes each with one thread.
+
+    Threads that start for each product would take longer than the product, and wait for those of PyTorch.
+
+    Args:
+        left: matrix.
+        right: matrices.
+        out: (..., rows, V) to write to.
+    """
+    if out is None:
+        out = np.empty((*right.shape[:-2], len(left), right.shape[-1]), np.float32)
+    step = max(1, _PRODUCT // max(1, right.shape[-2] * right.shape[-1]))
+    for first in range(0, len(left), step):
+        rows = slice(first, first + step)
+        np.matmul(left[rows], right, out=out[..., rows, :])
+    return out

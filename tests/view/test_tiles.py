@@ -17,6 +17,7 @@ from lanebev.view.tiles import (
     interpolation,
     road_edges,
     row_tiles,
+    small_products,
     tile_bounds,
     tile_nodes,
 )
@@ -102,7 +103,7 @@ def test_cells_beyond_a_fold_are_interpolated_and_not_seen():
     assert curves.smooth.all()
     assert curves.folds.any()
     _, hidden = image_coordinates(cells.rows(0, fine.shape[0]), model)
-    found = [curves.hidden(tile) for tile in range(len(curves.folds))]
+    found = [curves.hidden(tile, slice(None)) for tile in range(len(curves.folds))]
     for tile, (first, last) in enumerate(itertools.pairwise(curves.rows.edges)):
         expected = hidden[:, first:last]
         if found[tile] is None:
@@ -186,6 +187,22 @@ def test_interpolation_reproduces_polynomials_and_finds_their_coefficients():
     np.testing.assert_allclose(weights.sum(1), 1, atol=1e-12)
     fourth = 8 * t**4 - 8 * t**2 + 1  # Chebyshev polynomial of degree 4
     np.testing.assert_allclose(coefficients @ fourth[nodes], [0, 0, 0, 0, 1, 0], atol=1e-12)
+
+
+def test_small_products_are_those_of_the_whole(monkeypatch):
+    """Of matrices in place, too, and of rows that are more than one product may have."""
+    rng = np.random.default_rng(0)
+    left, right = (rng.normal(size=shape).astype(np.float32) for shape in ((50, 12), (3, 2, 12, 700)))
+    sizes = []
+    multiply = np.matmul
+    monkeypatch.setattr(np, "matmul", lambda a, b, out: sizes.append(len(a)) or multiply(a, b, out=out))
+    out = np.zeros((3, 2, 60, 700), np.float32)
+    small_products(left, right, out[:, :, 5:55])
+    np.testing.assert_allclose(out[:, :, 5:55], left @ right, atol=1e-5)
+    assert (out[:, :, :5] == 0).all()
+    assert (out[:, :, 55:] == 0).all()
+    assert sizes == [31, 19]  # 31 x 12 x 700 are just below 2 ** 18
+    np.testing.assert_allclose(small_products(left, right[0]), left @ right[0], atol=1e-5)
 
 
 def test_a_grid_of_few_cells_is_computed_cell_by_cell():
