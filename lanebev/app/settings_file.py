@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -11,6 +12,34 @@ import yaml
 from lanebev.app.config import RunConfig
 from lanebev.numbers import read_text
 
+_FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """SafeLoader that leaves numbers and dates as texts."""
+
+    yaml_implicit_resolvers = {}  # noqa: RUF012 - so it is in the base class
+
+
+for _tag, _pattern, _begin in (
+    ("null", "~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", "true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("merge", "<<", ["<"]),
+):
+    _PlainLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), _begin)
+
+
+def load_plain_yaml(text: str) -> object:
+    """Load YAML, with null, true and false, and all other plain values as texts.
+
+    YAML 1.1 would make 15 of a camera 017, 510 of a drive 8:30, and false of a road called No.
+
+    Raises:
+        yaml.YAMLError: the text is none.
+    """
+    loaded: object = yaml.load(text, _PlainLoader)
+    return loaded
+
 
 def read_settings(path: str | Path) -> dict[str, object]:
     """Read the settings of a YAML file, with names and values as on the command line.
@@ -19,7 +48,7 @@ def read_settings(path: str | Path) -> dict[str, object]:
         ValueError: the file is missing or not a YAML mapping, or has an unknown name or a bad value.
     """
     try:
-        given = yaml.safe_load(read_text(Path(path)))
+        given = load_plain_yaml(read_text(Path(path)))
     except (ValueError, yaml.YAMLError) as error:
         reason = "not YAML" if isinstance(error, yaml.YAMLError) else error
         raise ValueError(f"config {path}: expected a YAML file of settings, got: {reason}") from error
@@ -52,6 +81,8 @@ def parsed_settings(given: Mapping[str, object]) -> dict[str, object]:
 
 def _parsed(value: object, default: object, parse: Callable[[str], object]) -> object:
     """Parse a value of a YAML file as the command line does."""
+    if isinstance(default, bool) and isinstance(value, str):
+        value = _FLAGS.get(value.lower(), value)
     if isinstance(default, bool) or isinstance(value, bool):
         if not isinstance(value, bool) or not isinstance(default, bool):
             expected = "true or false" if isinstance(default, bool) else "a text or number"

@@ -33,14 +33,23 @@ def test_settings_of_a_file_are_those_of_the_command_line(tmp_path):
     )
 
 
+def test_numbers_of_a_file_are_decimal_and_names_stay_as_they_are(tmp_path):
+    """YAML 1.1 would read 8 s, 61 s and a flag."""
+    text = "source: No\ncamera: 017\nstart: 010\nend: 12e1\nresume: 1:01\nno-video: yes\n"
+    given = read_settings(_file(tmp_path, text))
+    assert given == {
+        "source": "No", "camera": "017", "start": 10.0, "end": 120.0, "resume": "1:01", "no_video": True,
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("lane_widht: 3", "expected one of source, camera, .*, got 'lane_widht'"),
         ("lane_width: wide", "lane_width: could not convert"),
-        ("stills: 1", "stills: expected true or false, got 1"),
+        ("stills: 1", "stills: expected true or false, got '1'"),
         ("lane_width: true", "lane_width: expected a text or number, got True"),
-        ("source: [1]", r"source: expected a text or number, got \[1\]"),
+        ("source: [1]", r"source: expected a text or number, got \['1'\]"),
         ("lanes_size: 3", "lanes_size: .*expected WIDTHxHEIGHT"),
         ("- 1", "expected a YAML file of settings, got list"),
         ("{", "expected a YAML file of settings, got: not YAML"),

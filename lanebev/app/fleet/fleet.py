@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lanebev.app.fleet.cluster import Cluster, check_ray, outcomes
 from lanebev.app.fleet.collect import FRAMES, collect_frames
 from lanebev.app.fleet.manifest import Drive, read_manifest
-from lanebev.app.fleet.mounts import Stretch, drive_mounts, stretches
+from lanebev.app.fleet.mounts import Stretch, days, drive_mounts, stretches
 from lanebev.app.fleet.page import CameraMounts, DriveVerdict, fleet_page
 from lanebev.app.fleet.plan import Outcome, Task, drive_folder, earlier_outcome, tasks_of
 from lanebev.app.progress import Progress
@@ -109,12 +109,16 @@ def fleet(
     return FleetResult(found, ran, _summary(found, ran, out))
 
 
+def in_order(drives: Sequence[Drive]) -> list[Drive]:
+    """Return the drives of each camera together, in order of time; those of an unknown time come first."""
+    return sorted(drives, key=lambda drive: (drive.camera_id, days(drive.time) if drive.time else -math.inf))
+
+
 def camera_mounts(drives: Sequence[Drive], out: str | Path) -> list[CameraMounts]:
     """Return the mount of each camera over its finished drives, in order of time."""
-    ordered = sorted(drives, key=lambda drive: (drive.camera_id, drive.time))
     like = {"mount": MountEstimator().initial_state(1, dtype=torch.float64)}
     found = []
-    for camera_id, own in groupby(ordered, key=lambda drive: drive.camera_id):
+    for camera_id, own in groupby(in_order(drives), key=lambda drive: drive.camera_id):
         states: list[tuple[str, str, MountState]] = []
         for drive in own:
             loaded = load_state(drive_folder(out, drive.name) / STATE_FILE, like)

@@ -15,7 +15,7 @@ from pathlib import Path
 import yaml
 
 from lanebev.app.config import RunConfig
-from lanebev.app.settings_file import parsed_settings
+from lanebev.app.settings_file import load_plain_yaml, parsed_settings
 from lanebev.numbers import read_text, shown
 
 UNKNOWN_DAY = "unknown"
@@ -108,7 +108,7 @@ def _rows(path: Path) -> list[Row]:
         text = read_text(path)
         if path.suffix.lower() == ".csv":
             return _csv_rows(text)
-        given = yaml.safe_load(text)
+        given = load_plain_yaml(text)
     except (ValueError, yaml.YAMLError, csv.Error) as error:
         reason = "not YAML" if isinstance(error, yaml.YAMLError) else error
         raise ValueError(f"manifest {path}: expected YAML or CSV, got: {reason}") from error
@@ -117,10 +117,10 @@ def _rows(path: Path) -> list[Row]:
         if unknown := [key for key in given if key not in ("drives", "defaults")]:
             raise ValueError(f"manifest {path}: expected drives and defaults, got {shown(unknown[0])}")
         defaults, given = given.get("defaults") or {}, given.get("drives")
-    is_good = isinstance(given, list) and all(isinstance(row, dict) for row in (*given, defaults))
-    if not is_good:
+    drives: list[Row] = given if isinstance(given, list) else []
+    if drives is not given or not all(isinstance(row, dict) for row in (*drives, defaults)):
         raise ValueError(f"manifest {path}: expected a list of drives, each with video and camera")
-    return [{str(key): value for key, value in {**defaults, **row}.items()} for row in given]
+    return [{str(key): value for key, value in {**defaults, **row}.items()} for row in drives]
 
 
 def _csv_rows(text: str) -> list[Row]:

@@ -1,8 +1,11 @@
 """The manifest of a fleet: rows, defaults, names, and paths that leave its folder."""
 
+from pathlib import Path
+
 import pytest
 import yaml
 
+from lanebev.app.fleet.fleet import in_order
 from lanebev.app.fleet.manifest import UNKNOWN_DAY, read_manifest
 from lanebev.cli import main
 
@@ -37,6 +40,23 @@ def test_a_row_a_drive(write, tmp_path):
     assert (first.config.lane_width, first.config.rectified) == (3.5, True)
     assert (second.name, second.camera_id, second.day, second.time) == ("b-x", "cam", UNKNOWN_DAY, "")
     assert (second.config.lane_width, second.config.rectified) == (None, False)
+
+
+def test_names_in_yaml_are_those_that_were_written(write):
+    text = (
+        "- {video: 007.mp4, camera: c.yaml, camera_id: 017, name: 8:30, stills: no, time: 2026-03-01T08:30Z}"
+    )
+    (drive,) = read_manifest(write(text))
+    assert (drive.camera_id, drive.name, drive.time) == ("017", "8:30", "2026-03-01T08:30:00+00:00")
+    assert Path(drive.config.source).name == "007.mp4"
+    assert not drive.config.stills
+
+
+def test_drives_are_in_order_of_time_in_any_time_zone(write):
+    times = {"b": "2026-03-01T08:30+02:00", "c": "2026-03-01T07:00Z", "d": "2026-03-01T02:00-06:00", "a": ""}
+    rows = [{"video": f"{name}.mp4", "camera": "c.yaml", "time": time} for name, time in times.items()]
+    drives = read_manifest(write([{key: value for key, value in row.items() if value} for row in rows]))
+    assert [drive.name for drive in in_order(drives[::-1])] == ["a", "b", "c", "d"]
 
 
 def test_yaml_with_defaults_says_the_same(write):
