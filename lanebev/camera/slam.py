@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
+from lanebev.camera.approximation import (
+    Array,
+    double_sphere,
+    extended_unified,
+    field_of_view,
+    kannala_brandt_like,
+)
 from lanebev.camera.parameters import CameraParameters
 from lanebev.camera.parsing import mapping, number, numbers, required, whole_number
 from lanebev.numbers import shown
@@ -18,6 +26,12 @@ _KALIBR_MODELS = {  # camera_model, distortion_model of Kalibr, EuRoC and TUM-VI
     ("pinhole", "equidistant"): "fisheye",
     ("omni", "none"): "omni",
     ("omni", "radtan"): "omni",
+}
+_KALIBR_RADIAL: dict[tuple[str, str], tuple[int, int, Callable[..., Array]]] = {
+    # numbers before fx in the intrinsics, and of distortion_coeffs; the distance by the angle and by these
+    ("ds", "none"): (2, 0, double_sphere),
+    ("eucm", "none"): (2, 0, extended_unified),
+    ("pinhole", "fov"): (0, 1, field_of_view),
 }
 _ORB_SLAM_MODELS = {  # Camera.type -> model and coefficients
     "pinhole": ("pinhole", "k1 k2 p1 p2 k3"),
@@ -34,6 +48,9 @@ def is_kalibr(fields: Mapping[str, Any]) -> bool:
 def kalibr(fields: Mapping[str, Any]) -> CameraParameters:
     """Read Kalibr's camchain, its first camera, or EuRoC's ``sensor.yaml``.
 
+    A double sphere (``ds``), extended unified (``eucm``) or FOV camera becomes the nearest Kannala-Brandt
+    one, see :func:`~lanebev.camera.approximation.kannala_brandt_like`.
+
     Source: Kalibr, wiki, "Supported models" and "Yaml formats".
     """
     chain = [key for key in fields if re.fullmatch(r"cam\d+", key, re.ASCII)]
@@ -44,8 +61,10 @@ def kalibr(fields: Mapping[str, Any]) -> CameraParameters:
         str(required(fields, ["camera_model"])).strip(),
         str(fields.get("distortion_model") or "none").strip(),
     )
+    if names in _KALIBR_RADIAL:
+        return _radial(fields, *_KALIBR_RADIAL[names])
     if names not in _KALIBR_MODELS:
-        known = ", ".join("-".join(each) for each in _KALIBR_MODELS)
+        known = ", ".join("-".join(each) for each in (*_KALIBR_MODELS, *_KALIBR_RADIAL))
         raise ValueError(f"camera_model: expected one of {known}, got {shown('-'.join(names))}")
     model = _KALIBR_MODELS[names]
     intrinsics = numbers(fields, "intrinsics", count=5 if model == "omni" else 4)
@@ -63,6 +82,29 @@ def kalibr(fields: Mapping[str, Any]) -> CameraParameters:
         model,
         (round(height), round(width)),
     )
+
+
+def _radial(
+    fields: Mapping[str, Any], before: int, after: int, radius: Callable[..., Array]
+) -> CameraParameters:
+    """Return the Kannala-Brandt camera that is nearest to a radial one of Kalibr.
+
+    Args:
+        fields: fields of the camera.
+        before: number of the lens's parameters in ``intrinsics``, before fx.
+        after: number of those in ``distortion_coeffs``.
+        radius: distance from the principal point by the angle and by the parameters.
+    """
+    *shape, fx, fy, cx, cy = numbers(fields, "intrinsics", count=before + 4)
+    if after:
+        shape += numbers(fields, "distortion_coeffs", count=after)
+    width, height = numbers(fields, "resolution", count=2)
+    if not (fx > 0 and fy > 0):
+        raise ValueError(f"intrinsics: expected positive focal lengths, got {fx:g}, {fy:g}")
+    corner = math.hypot(max(cx, width - 1 - cx) / fx, max(cy, height - 1 - cy) / fy)
+    scale, distortion = kannala_brandt_like(lambda angle: radius(angle, *shape), corner, max(fx, fy))
+    matrix = [scale * fx, 0.0, cx, 0.0, scale * fy, cy, 0.0, 0.0, 1.0]
+    return CameraParameters(matrix, distortion, "fisheye", (round(height), round(width)))
 
 
 def camodocal(fields: Mapping[str, Any]) -> CameraParameters:
