@@ -3,7 +3,7 @@
 from lanebev import weights
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.state import JointConfig
+from lanebev.estimation.joint.state import HILLY_ROADS, JointConfig
 from lanebev.estimation.mount import MountCalibration, MountConfig, MountEstimator, MountReason, MountStatus
 from lanebev.estimation.reasons import Reason
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
@@ -28,6 +28,7 @@ from lanebev.view.paint import ImageFromBEV
 from lanebev.view.warp import BEVWarp
 
 __all__ = [
+    "HILLY_ROADS",
     "BEVGrid",
     "BEVWarp",
     "Calibration",

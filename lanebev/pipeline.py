@@ -30,10 +30,12 @@ class LaneBEVOutput(NamedTuple):
     """Output for one frame, or for every frame with (B, T) input.
 
     Attributes:
-        bev: (B, 3, U, V), zero where not valid; None where it was not asked for.
+        bev: (B, 3, U, V), zero where not valid; None where it was not asked for. It follows the vertical
+            curvature of the road where the calibrator estimates one.
         valid: (B, 1, U, V) bool; None likewise.
         calibration: extrinsics, covariance, status, inliers.
-        bev_from_image: (B, 3, 3) homography from undistorted pixels to BEV pixels.
+        bev_from_image: (B, 3, 3) homography from undistorted pixels to BEV pixels of a plane road, which
+            touches the road below the camera.
         segments: what the calibrator was given, in undistorted pixels of the image.
         logits: (B, 1 + L, h, w) of the network.
     """
@@ -230,8 +232,9 @@ class LaneBEV(nn.Module):
             if bev:
                 with self._gradients("warp"):
                     view, valid = self.warp(
-                        frames[:, step], intrinsics, calibration.extrinsics, distortion, model
-                    )
+                        frames[:, step], intrinsics, calibration.extrinsics, distortion, model,
+                        **self._road_shape(state),
+                    )  # fmt: skip
             homography = bev_from_image(calibration.extrinsics, intrinsics, self.warp.grid)
             logits_now = logits.reshape(batch, steps, *logits.shape[1:])[:, step]
             outputs.append(LaneBEVOutput(view, valid, calibration, homography, now, logits_now))
@@ -265,7 +268,7 @@ class LaneBEV(nn.Module):
             logits (B, 1 + L, h, w) and vertices in pixels of the image as taken. A row whose image is not
             finite counts as black and has none, so that it spoils neither other rows nor gradients.
         """
-        resized = self._resize(image)
+        resized = self._resize(image).contiguous()  # a network rounds otherwise for another order in memory
         finite = resized.isfinite().flatten(1).all(1)  # (B,)
         with self._gradients("segmenter"):
             logits = self.segmenter(torch.where(finite[:, None, None, None], resized, 0.0))
@@ -274,6 +277,11 @@ class LaneBEV(nn.Module):
             vertices = self.extractor.vertices(logits, (height, width), (rows, columns))
         weight = torch.where(finite[:, None, None], vertices.weight, 0.0)
         return logits, vertices._replace(weight=weight)
+
+    def _road_shape(self, state: Any) -> dict[str, Tensor]:
+        """Return the argument of the warp that describes a road that is not a plane, if there is one."""
+        curvature = getattr(self.calibrator, "vertical_curvature", lambda _: None)(state)
+        return {} if curvature is None else {"vertical_curvature": curvature}
 
     def _gradients(self, stage: str) -> AbstractContextManager[object]:
         """Return the context of a stage: without gradients if it is frozen."""

@@ -54,6 +54,8 @@ class SessionResult(NamedTuple):
         calibration: pose, covariance, status and inliers as the calibrator gives them.
         bev: (U, V, 3) bytes in the frame's order of colours, or None.
         valid: (U, V) bool, or None.
+        vertical_curvature: (1,) 1/m of the road, positive over a crest, which the view follows; None where
+            the calibrator takes the road as plane.
     """
 
     stamp: float | None
@@ -67,6 +69,7 @@ class SessionResult(NamedTuple):
     calibration: Calibration
     bev: NDArray[np.uint8] | None
     valid: NDArray[np.bool_] | None
+    vertical_curvature: Tensor | None = None
 
 
 class Session:
@@ -157,12 +160,14 @@ class Session:
         lost = ["no frame was given"] if frame is None and polylines is None else []
         with torch.inference_mode():
             vertices, scale = self._vertices(pixels, polylines)
-            _, calibration, reasons = self.tracker.drive_frame(vertices, dt, scale, speed)
+            _, calibration, reasons, vertical_curvature = self.tracker.drive_frame(vertices, dt, scale, speed)
         mounted = self.tracker.mount
         assert mounted is not None  # after a frame
         bev, valid = None, None
         if self.grid is not None and pixels is not None:
-            bev, valid = remap_frame(_as_bytes(pixels), self.camera, calibration.extrinsics, self.grid)
+            bev, valid = remap_frame(
+                _as_bytes(pixels), self.camera, calibration.extrinsics, self.grid, vertical_curvature
+            )
             bev = bev if self.colours == "rgb" else np.ascontiguousarray(bev[..., ::-1])
         std = calibration.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
         return SessionResult(
@@ -180,6 +185,7 @@ class Session:
             calibration=calibration,
             bev=bev,
             valid=valid,
+            vertical_curvature=vertical_curvature,
         )
 
     def save(self, path: str | Path) -> None:

@@ -1,7 +1,7 @@
 """Evaluate real and third-party images, with all results beside their targets.
 
     python tools/evaluate_real.py [--data ../shared/data] [--json FILE] [--sheet FILE.png]
-        [--weights FILE] [--width PX] [--only PART]
+        [--weights FILE] [--width PX] [--only PART] [--hilly]
 
 Nothing of these images has been trained on.
 """
@@ -61,11 +61,14 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, help="other weights than the shipped")
     parser.add_argument("--width", type=PositiveInt, help="px of the network's input, instead of its own")
     parser.add_argument("--only", help="run only parts whose name contains this")
+    parser.add_argument("--hilly", action="store_true", help="the joint calibrator with HILLY_ROADS")
     options = parser.parse_args()
     missing = [f"{name}/{file}" for name, file in NEEDED.items() if not (options.data / name / file).exists()]
     if missing:
         raise ValueError(f"{options.data}: missing {', '.join(missing)}; give the folder with --data")
     calibrators = {name: make_calibrator(name) for name in ("two-stage", "joint")}
+    if options.hilly:
+        calibrators["joint"] = lanebev.JointCalibrator(lanebev.HILLY_ROADS)
     model = lanebev.LaneBEV.from_pretrained(options.weights, network_width=options.width)
     start = time.monotonic()
     figures = [figure for part in parts(options, model, calibrators) for figure in part]

@@ -90,8 +90,8 @@ def calibrate_frame(
     """Calibrate one frame (1, 3, H, W) in [0, 1], as taken."""
     _, vertices = model.boundary_vertices(frame)
     tracker = Tracker(JointCalibrator(prior=prior or FramePrior()), camera, lane_width)
-    segments, calibration, _ = tracker.still(vertices, model.pose_sigma_scale)
-    return segments, calibration
+    estimate = tracker.still(vertices, model.pose_sigma_scale)
+    return estimate.segments, estimate.calibration
 
 
 def as_answer(name: str, calibration: Calibration) -> Answer:

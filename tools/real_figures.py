@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -50,13 +50,17 @@ class Figure:
 
 
 class Drive(NamedTuple):
-    """A drive's poses (F, 4) in rad and m, status (F,), times (F,) s, segments, and its inliers."""
+    """A drive's poses (F, 4) in rad and m, status (F,), times (F,) s, segments and inliers of each frame.
+
+    ``curvatures`` are the road's vertical ones, (1,) 1/m each, or None for a plane.
+    """
 
     poses: torch.Tensor
     status: torch.Tensor
     times: np.ndarray
     segments: list[LaneSegments]
     lanes: list[LaneSegments]
+    curvatures: list[torch.Tensor | None]
 
 
 def tusimple_camera() -> Camera:
@@ -195,6 +199,7 @@ def follow(
         name: calibrator.initial_state(1, dtype=torch.float64) for name, calibrator in calibrators.items()
     }
     poses: dict[str, list[torch.Tensor]] = {name: [] for name in calibrators}
+    curvatures: dict[str, list[torch.Tensor | None]] = {name: [] for name in calibrators}
     status: dict[str, list[torch.Tensor]] = {name: [] for name in calibrators}
     lanes: dict[str, list[LaneSegments]] = {name: [] for name in calibrators}
     times, seen = [], []
@@ -208,10 +213,18 @@ def follow(
                     segments, camera.intrinsics[None], states[name], frame.dt, lane_width
                 )
             poses[name].append(calibration.extrinsics.stack()[0])
+            curvatures[name].append(calibrator.vertical_curvature(states[name]))
             status[name].append(calibration.status[0])
             lanes[name].append(select_inliers(segments, calibration.inliers))
     return {
-        name: Drive(torch.stack(poses[name]), torch.stack(status[name]), np.array(times), seen, lanes[name])
+        name: Drive(
+            torch.stack(poses[name]),
+            torch.stack(status[name]),
+            np.array(times),
+            seen,
+            lanes[name],
+            curvatures[name],
+        )
         for name in calibrators
     }
 
@@ -222,22 +235,29 @@ def _width_figures(part: str, name: str, drive: Drive, camera: Camera, targets: 
         yield Figure(part, "lane width deviation, online", name, float("nan"), 5.0, "cm")
         return
 
-    def deviation(seen: list[LaneSegments], pose_of: Callable[[int], torch.Tensor]) -> float:
+    plane: list[torch.Tensor | None] = [None] * len(drive.poses)
+
+    def deviation(
+        seen: list[LaneSegments], poses: torch.Tensor, curvatures: list[torch.Tensor | None]
+    ) -> float:
         widths = [
-            measure_boundaries(segments, camera.intrinsics[None], Extrinsics.unstack(pose_of(i)[None])).widths
-            for i, segments in enumerate(seen)
+            measure_boundaries(
+                segments, camera.intrinsics[None], Extrinsics.unstack(pose[None]), vertical_curvature=vertical
+            ).widths
+            for segments, pose, vertical in zip(seen, poses, curvatures, strict=True)
         ]
         return 100 * width_deviation(np.array(widths))
 
-    def both(seen: list[LaneSegments]) -> tuple[float, float]:
-        first = drive.poses[int(tracked[0])]
-        return deviation(seen, lambda _: first), deviation(seen, lambda i: drive.poses[i])
-
-    fixed, online = both(drive.lanes)
+    first = drive.poses[int(tracked[0])].expand_as(drive.poses)
+    fixed = deviation(drive.lanes, first, plane)
+    online = deviation(drive.lanes, drive.poses, drive.curvatures)
     target = max(5.0, fixed / 3) if targets else None
     yield Figure(part, "lane width deviation, first frame's pose", name, fixed, None, "cm")
     yield Figure(part, "lane width deviation, online", name, online, target, "cm")
-    fixed, online = both(drive.segments)
+    on_plane = deviation(drive.lanes, drive.poses, plane)
+    yield Figure(part, "the same, the road taken as plane", name, on_plane, None, "cm")
+    fixed = deviation(drive.segments, first, plane)
+    online = deviation(drive.segments, drive.poses, drive.curvatures)
     yield Figure(part, "the same of all that was detected, first pose", name, fixed, None, "cm")
     yield Figure(part, "the same of all that was detected, online", name, online, None, "cm")
 

@@ -15,7 +15,7 @@ from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator, StateT
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.single_frame import prior_of_mount
-from lanebev.estimation.joint.state import JointState
+from lanebev.estimation.joint.state import HILLY_ROADS, JointConfig, JointState
 from lanebev.estimation.tracker import Tracker
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.estimation.two_stage.state import TwoStageState
@@ -72,11 +72,20 @@ def make_tracker(config: RunConfig, camera: Camera) -> RunTracker:
     """
     if config.calibrator == "two-stage":
         return _tracker(TwoStageCalibrator(), config, camera)
+    return _tracker(JointCalibrator(joint_config(config)), config, camera)
+
+
+def joint_config(config: RunConfig) -> JointConfig:
+    """Return the numbers of the joint calibrator, with the prior and the roads of the settings.
+
+    Raises:
+        ValueError: ``mount`` is no calibration of a mount.
+    """
+    roads = HILLY_ROADS if config.hilly else JointConfig()
     if config.mount is None:
-        return _tracker(JointCalibrator(), config, camera)
+        return roads
     mount = read_mount(config.mount)
-    prior = prior_of_mount(mount.pose.tolist(), mount.std.tolist())
-    return _tracker(JointCalibrator(prior=prior), config, camera)
+    return replace(roads, prior=prior_of_mount(mount.pose.tolist(), mount.std.tolist()))
 
 
 def _tracker(calibrator: Calibrator[StateT], config: RunConfig, camera: Camera) -> Tracker[StateT]:

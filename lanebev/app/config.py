@@ -126,6 +126,7 @@ class RunConfig:
         topic: topic of the images in a bag with several.
         keep_all: drop no frame of a stream.
         smooth: estimate every pose from all frames of the drive, in two passes over the source.
+        hilly: expect crests and dips everywhere on the road, instead of only where they are evident.
     """
 
     source: str = option(
@@ -225,6 +226,7 @@ class RunConfig:
     topic: str | None = option(None, "topic of the images in a bag with several", "NAME")
     keep_all: bool = option(False, "drop no frame of a stream: it waits, and its own times are used")
     smooth: bool = option(False, "estimate every pose from all frames of the drive, in two passes")
+    hilly: bool = option(False, "expect crests and dips everywhere on the road (default: only where evident)")
 
     @property
     def relative_focal_std(self) -> float:
@@ -256,10 +258,7 @@ class RunConfig:
             raise ValueError(f"lane width: expected 1 to 10 m, got {width:g}")
         if self.fps is not None and not (math.isfinite(self.fps) and 0.01 <= self.fps <= 10_000):
             raise ValueError(f"fps: expected 0.01 to 10000 frames per second, got {self.fps:g}")
-        if self.calibrator not in CALIBRATORS:
-            raise ValueError(f"calibrator: expected {' or '.join(CALIBRATORS)}, got {self.calibrator!r}")
-        if self.mount and self.calibrator != "joint":
-            raise ValueError(f"mount: expected --calibrator joint with it, got {self.calibrator}")
+        self._check_calibrator()
         self._check_backend()
         if self.smooth and (self.calibrator != "joint" or self.stills):
             expected = "a drive" if self.stills else "--calibrator joint"
@@ -287,11 +286,18 @@ class RunConfig:
         if self.every < 1:
             raise ValueError(f"every: expected 1 or more, got {self.every}")
 
+    def _check_calibrator(self) -> None:
+        if self.calibrator not in CALIBRATORS:
+            raise ValueError(f"calibrator: expected {' or '.join(CALIBRATORS)}, got {self.calibrator!r}")
+        for name in ("mount", "hilly"):
+            if getattr(self, name) and self.calibrator != "joint":
+                raise ValueError(f"{name}: expected --calibrator joint with it, got {self.calibrator}")
+
     def _check_backend(self) -> None:
         if self.backend not in BACKENDS:
             raise ValueError(f"backend: expected {' or '.join(BACKENDS)}, got {self.backend!r}")
-        if self.backend != "torch" and (self.mount or self.weights):
-            given = "mount" if self.mount else "weights"
+        given = next((name for name in ("mount", "hilly", "weights") if getattr(self, name)), None)
+        if self.backend != "torch" and given:
             raise ValueError(
                 f"{given}: expected --backend torch with it, got {self.backend}; an exported calibrator and "
                 "network have their own"

@@ -176,19 +176,19 @@ class Recorder:
 
     @torch.inference_mode()
     def _draw(self, done: Recorded) -> None:
-        frame, (segments, calibration, reasons) = done.frame, done.estimate
-        curves = lane_curves(segments, calibration, self.camera)
+        frame, (segments, calibration, reasons, vertical) = done.frame, done.estimate
+        curves = lane_curves(segments, calibration, self.camera, vertical)
         line = tusimple_line(done.name, *curves, *done.seen)
         self._lanes.write(line + "\n")
         before, after = self._before(calibration), calibration.extrinsics
         intrinsics = self.camera.intrinsics[None].to(segments.endpoints)
         lanes = select_inliers(segments, calibration.inliers)
-        widths = [self._measure(lanes, intrinsics, pose) for pose in (before, after)]
+        widths = [self._measure(lanes, intrinsics, *road) for road in ((before, None), (after, vertical))]
         self._widths.append(np.stack(widths))
         image = frame.image if frame.image is not None else np.zeros((*self.camera.image_size, 3), np.uint8)
         place = frame.name if self.single or self.stills else f"frame {frame.number}   {frame.time:.2f} s"
-        bev = bird_view(self.grid, frame.image, self.camera, after)
-        views = [Panel("after", bev, after)]
+        bev = bird_view(self.grid, frame.image, self.camera, after, vertical)
+        views = [Panel("after", bev, after, vertical)]
         if before is not None:
             coarse = bird_view(self._coarse, frame.image, self.camera, before)
             views.insert(0, Panel("before", coarse, before))
@@ -216,11 +216,16 @@ class Recorder:
             self._overlay.write(picture, shown)
 
     def _measure(
-        self, segments: LaneSegments, intrinsics: Tensor, pose: Extrinsics | None
+        self,
+        segments: LaneSegments,
+        intrinsics: Tensor,
+        pose: Extrinsics | None,
+        vertical_curvature: Tensor | None,
     ) -> NDArray[np.float64]:
         if pose is None:
             return np.full(NUM_BOUNDARIES - 1, np.nan)
-        return measure_boundaries(segments, intrinsics, pose).widths
+        measured = measure_boundaries(segments, intrinsics, pose, vertical_curvature=vertical_curvature)
+        return measured.widths
 
 
 def _row(done: Recorded, calibration: Calibration) -> ExtrinsicsRow:

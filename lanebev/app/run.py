@@ -13,6 +13,7 @@ import torch
 
 from lanebev.app.build import (
     input_files,
+    joint_config,
     make_grid,
     make_observer,
     make_tracker,
@@ -159,4 +160,4 @@ def first_pass(
     with closing(observed_frames(source, observer)) as frames:
         logger.info("first of two passes")
         shown = progress(frames, source.taken_count) if progress else frames
-        return smooth_frames(shown, tracker, out, source)
+        return smooth_frames(shown, tracker, out, source, joint_config(config))

@@ -18,6 +18,7 @@ from lanebev.app.kept import KeptNumbers
 from lanebev.app.observers import Observation
 from lanebev.app.recovery import LANES_FILE, frame_name
 from lanebev.estimation.joint.layout import POSE
+from lanebev.estimation.joint.measurement import VERTICAL
 from lanebev.estimation.joint.smoother import smooth_states, smoothed_calibration
 from lanebev.estimation.joint.state import JointConfig, JointState
 from lanebev.estimation.tracker import Estimate
@@ -36,18 +37,20 @@ class SmoothedPoses(NamedTuple):
     Attributes:
         poses: (F, 4) rad, rad, rad, m.
         covariances: (F, 4, 4).
+        vertical_curvatures: (F,) 1/m, of the road.
     """
 
     poses: NDArray[np.float64]
     covariances: NDArray[np.float64]
+    vertical_curvatures: NDArray[np.float64]
 
     def of(self, estimate: Estimate, number: int) -> Estimate:
-        """Return a frame's estimate with the smoothed pose and its covariance."""
-        pose, covariance = (torch.from_numpy(part[number : number + 1].copy()) for part in self)
+        """Return a frame's estimate with the smoothed pose, its covariance and the road's curvature."""
+        pose, covariance, vertical = (torch.from_numpy(part[number : number + 1].copy()) for part in self)
         calibration = estimate.calibration._replace(
             extrinsics=Extrinsics.unstack(pose), covariance=covariance
         )
-        return estimate._replace(calibration=calibration)
+        return estimate._replace(calibration=calibration, vertical_curvature=vertical)
 
 
 class KeptStates(Sequence[JointState]):
@@ -123,6 +126,7 @@ def smooth_frames(
     tracker: RunTracker,
     out: OutputFolder,
     source: FrameSource,
+    config: JointConfig,
 ) -> SmoothedPoses:
     """Track all frames, and then smooth from the last one to the first.
 
@@ -133,6 +137,7 @@ def smooth_frames(
         tracker: with the joint calibrator.
         out: for lanes.json and, meanwhile, the states.
         source: name of the frames' source.
+        config: numbers of the tracker's calibrator.
     """
     path = out / _STATES
     states, intervals = KeptStates(path), KeptNumbers(1)
@@ -145,7 +150,7 @@ def smooth_frames(
             intervals.append(np.array([frame.dt]))
             covariances.append(tracker.unscaled_covariance[0].double().cpu().numpy())
             scales.append(np.array([seen.pose_sigma_scale]))
-        smoothed = _smoothed(states, intervals, covariances, scales, tracker)
+        smoothed = _smoothed(states, intervals, covariances, scales, tracker, config)
     path.unlink()
     return smoothed
 
@@ -156,6 +161,7 @@ def _smoothed(
     covariances: KeptNumbers,
     scales: KeptNumbers,
     tracker: RunTracker,
+    config: JointConfig,
 ) -> SmoothedPoses:
     """Smooth kept states.
 
@@ -165,10 +171,11 @@ def _smoothed(
         covariances: covariances of the pose as the calibrator gave it.
         scales: factor on the standard deviations of the pose.
         tracker: tracker that gave the states.
+        config: numbers of its calibrator.
     """
     steps, count = torch.from_numpy(intervals.all().copy()), len(states)
-    result = SmoothedPoses(np.empty((count, 4)), np.empty((count, 4, 4)))
-    backward = zip(range(count - 1, -1, -1), smooth_states(states, steps, JointConfig()), strict=True)
+    result = SmoothedPoses(np.empty((count, 4)), np.empty((count, 4, 4)), np.empty(count))
+    backward = zip(range(count - 1, -1, -1), smooth_states(states, steps, config), strict=True)
     for number, smoothed in backward:
         state = states[number]
         given = torch.from_numpy(covariances.all()[number : number + 1].copy())
@@ -178,4 +185,5 @@ def _smoothed(
         calibration = tracker.given_out(smoothed_calibration(filtered, state, smoothed), scale)
         result.poses[number] = calibration.extrinsics.stack()[0].numpy()
         result.covariances[number] = calibration.covariance[0].numpy()
+        result.vertical_curvatures[number] = float(smoothed.mean[0, VERTICAL])
     return result

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from lanebev.camera.model import Camera
 from lanebev.types import Calibration, Extrinsics, Status
@@ -31,9 +32,13 @@ class ViewBefore:
 
 
 def bird_view(
-    grid: BEVGrid, image: NDArray[np.uint8] | None, camera: Camera, extrinsics: Extrinsics | None
+    grid: BEVGrid,
+    image: NDArray[np.uint8] | None,
+    camera: Camera,
+    extrinsics: Extrinsics | None,
+    vertical_curvature: Tensor | None = None,
 ) -> NDArray[np.uint8]:
     """Resample a frame to (U, V, 3) uint8 RGB, black where the camera does not see, or nothing is known."""
     if image is None or extrinsics is None:
         return np.zeros((*grid.shape, 3), np.uint8)
-    return remap_frame(image, camera, extrinsics, grid)[0]
+    return remap_frame(image, camera, extrinsics, grid, vertical_curvature)[0]

@@ -40,7 +40,7 @@ class Calibrator(nn.Module, Generic[StateT]):
     """Estimate the pose frame by frame, per row of a batch: state in, state out.
 
     A subclass sets the attributes and defines :meth:`initial_state`, :meth:`step` and, where it estimates
-    the road's curvature, :meth:`curvature`.
+    the road's curvature, :meth:`curvature` and :meth:`vertical_curvature`.
 
     Attributes:
         state_type: the class of the state.
@@ -146,6 +146,10 @@ class Calibrator(nn.Module, Generic[StateT]):
 
     def curvature(self, state: StateT) -> Tensor | None:
         """Return the road's curvature at the camera, (B,) 1/m, positive to the right, or None."""
+        return None
+
+    def vertical_curvature(self, state: StateT) -> Tensor | None:
+        """Return the road's vertical curvature, (B,) 1/m, positive over a crest, or None for a plane road."""
         return None
 
     def reasons(self, state: StateT) -> Tensor:

@@ -26,11 +26,13 @@ class Estimate(NamedTuple):
         segments: what the calibrator was given.
         calibration: calibration of this frame.
         reasons: why the frame is not, or not fully, tracked.
+        vertical_curvature: (1,) 1/m of the road, positive over a crest; None for a plane road.
     """
 
     segments: LaneSegments
     calibration: Calibration
     reasons: Reason
+    vertical_curvature: Tensor | None = None
 
 
 class Tracker(Generic[StateT]):
@@ -90,7 +92,7 @@ class Tracker(Generic[StateT]):
         )
         self.mount = mount._replace(covariance=mount.covariance + self._common_error(mount.extrinsics))
         reasons = Reason(int(self.calibrator.reasons(self.state)[0]))
-        return Estimate(segments, given_out, reasons)
+        return Estimate(segments, given_out, reasons, self.calibrator.vertical_curvature(self.state))
 
     def still(self, vertices: BoundaryVertices, pose_sigma_scale: float) -> Estimate:
         """Estimate the pose of a single image; the states do not change.

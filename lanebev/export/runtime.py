@@ -149,6 +149,10 @@ class OnnxCalibrator(Calibrator[StateT]):
         """See :meth:`~lanebev.estimation.calibrator.Calibrator.curvature`."""
         return self.calibrator.curvature(state)
 
+    def vertical_curvature(self, state: StateT) -> Tensor | None:
+        """See :meth:`~lanebev.estimation.calibrator.Calibrator.vertical_curvature`."""
+        return self.calibrator.vertical_curvature(state)
+
 
 def onnx_model(folder: Path, camera: Camera) -> LaneBEV:
     """Make a model of the segmenter and the extractor in a folder; its calibrator is PyTorch's.

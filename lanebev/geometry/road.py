@@ -9,6 +9,14 @@ from torch import Tensor
 
 from lanebev.geometry.lens import cam_from_image, check_points, normalise_points
 from lanebev.geometry.precision import full_precision
+from lanebev.geometry.road_profile import (
+    Profile,
+    check_vertical_curvature,
+    depth_below,
+    in_sight,
+    meet_road,
+    meets_before_farthest,
+)
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import Extrinsics, check_extrinsics
 
@@ -59,7 +67,7 @@ def great_circle_normals(rays: Tensor) -> Tensor:
 
 @full_precision
 def road_from_image_points(
-    points: Tensor, intrinsics: Tensor, extrinsics: Extrinsics
+    points: Tensor, intrinsics: Tensor, extrinsics: Extrinsics, vertical_curvature: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Project undistorted pixels to the road.
 
@@ -67,21 +75,35 @@ def road_from_image_points(
         points: (B, N, 2) px.
         intrinsics: (B, 3, 3).
         extrinsics: each (B,).
+        vertical_curvature: (B,) 1/m, of a road that is not a plane, positive over a crest; see (J1).
 
     Returns:
-        (B, N, 2) m, (X right, Z along the lanes), and (B, N) bool, false above the horizon or behind.
+        (B, N, 2) m, (X right, Z along the lanes), and (B, N) bool, false above the horizon or behind; of a
+        road with a vertical curvature also beyond 200 m, and where a crest hides it.
     """
     check_points(points)
     rays = rays_from_pixels(points, intrinsics) @ _road_from_cam(extrinsics).mT  # (B, N, 3)
+    if vertical_curvature is not None:
+        return _on_curved_road(rays.mT, extrinsics.height, vertical_curvature)
     x, down, z = rays.unbind(-1)
     valid = down > 1e-6
     scale = extrinsics.height.unsqueeze(-1) / torch.where(valid, down, 1.0)
     return torch.stack([x * scale, z * scale], dim=-1), valid & (scale > 0)
 
 
+def _on_curved_road(directions: Tensor, height: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:
+    """Project directions (B, 3, N) in the road's axes to a road with a vertical curvature."""
+    check_vertical_curvature(curvature, len(height))
+    profile = Profile(height.unsqueeze(-1), curvature.unsqueeze(-1))
+    valid = meets_before_farthest(directions, profile) & (profile.height > 0)
+    x, _, ahead = directions.unbind(1)
+    z = meet_road(directions, profile)
+    return torch.stack([x / torch.where(valid, ahead, 1.0) * z, z], dim=-1), valid
+
+
 @full_precision
 def image_from_road_points(
-    points: Tensor, intrinsics: Tensor, extrinsics: Extrinsics
+    points: Tensor, intrinsics: Tensor, extrinsics: Extrinsics, vertical_curvature: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Project road points to undistorted pixels.
 
@@ -89,17 +111,26 @@ def image_from_road_points(
         points: (B, N, 2) m, (X right, Z along the lanes).
         intrinsics: (B, 3, 3).
         extrinsics: each (B,).
+        vertical_curvature: (B,) 1/m, of a road that is not a plane, positive over a crest; see (J1).
 
     Returns:
-        (B, N, 2) px, and (B, N) bool, false behind the camera, and for one that is not above the road.
+        (B, N, 2) px, and (B, N) bool, false behind the camera or a crest, and for one that is not above the
+        road.
     """
     check_points(points)
     rotation = _road_from_cam(extrinsics)
     x, z = points.unbind(-1)
-    road = torch.stack([x, extrinsics.height.unsqueeze(-1).expand_as(x), z], dim=-1)
+    below = extrinsics.height.unsqueeze(-1)
+    valid = below > 0
+    if vertical_curvature is not None:
+        check_vertical_curvature(vertical_curvature, len(below))
+        curvature = vertical_curvature.unsqueeze(-1)
+        valid = valid & in_sight(below, curvature, z)
+        below = depth_below(below, curvature, z)
+    road = torch.stack([x, below.expand_as(x), z], dim=-1)
     pixels = road @ rotation @ intrinsics.mT  # rows: (K R_cam_from_road p)ᵀ
     depth = pixels[..., 2]
-    valid = (depth > 1e-3) & (extrinsics.height > 0).unsqueeze(-1)
+    valid = valid & (depth > 1e-3)
     return pixels[..., :2] / torch.where(valid, depth, 1.0).unsqueeze(-1), valid
 
 

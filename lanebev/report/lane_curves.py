@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.boundary_curves import boundary_polylines, fit_boundaries
@@ -16,7 +17,9 @@ _LEAST_REACH = 60.0  # m ahead that a boundary is drawn at least: all lead to on
 _POINTS = 96  # of a curve
 
 
-def lane_curves(segments: LaneSegments, calibration: Calibration, camera: Camera) -> BoundaryRows:
+def lane_curves(
+    segments: LaneSegments, calibration: Calibration, camera: Camera, vertical_curvature: Tensor | None = None
+) -> BoundaryRows:
     """Fit a curve to every boundary, with the calibrated pose and one curvature for all.
 
     A boundary that is seen in pieces is drawn as one, and what fits no road is left out.
@@ -25,6 +28,7 @@ def lane_curves(segments: LaneSegments, calibration: Calibration, camera: Camera
         segments: segments of batch size 1, in undistorted pixels.
         calibration: calibration of batch size 1.
         camera: the lens.
+        vertical_curvature: (1,) 1/m of the road, or None for a plane.
 
     Returns:
         (L, R) px of the image as it came; none of them where the pose is not known.
@@ -34,10 +38,13 @@ def lane_curves(segments: LaneSegments, calibration: Calibration, camera: Camera
     if int(calibration.status[0]) not in (Status.TRACKING, Status.COASTING):
         return BoundaryRows(rows, x)
     intrinsics = camera.intrinsics[None].to(segments.endpoints)
-    curves = fit_boundaries(segments, intrinsics, calibration.extrinsics, least_support=_LEAST_SUPPORT)
+    pose = calibration.extrinsics
+    curves = fit_boundaries(
+        segments, intrinsics, pose, least_support=_LEAST_SUPPORT, vertical_curvature=vertical_curvature
+    )
     far = curves.extent[..., 1].clamp(min=_LEAST_REACH)
     curves = curves._replace(extent=torch.stack([torch.ones_like(far), far], dim=-1))
-    lines, shown = boundary_polylines(curves, intrinsics, calibration.extrinsics, num_points=_POINTS)
+    lines, shown = boundary_polylines(curves, intrinsics, pose, _POINTS, vertical_curvature)
     for own, line, there in zip(x, lines[0], shown[0], strict=True):
         points = camera.distort_points(line[there]).double().numpy()
         if len(points) > 1:

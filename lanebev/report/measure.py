@@ -44,6 +44,7 @@ def measure_boundaries(
     near: float = 5.0,
     far: float = 40.0,
     num_boundaries: int = NUM_BOUNDARIES,
+    vertical_curvature: Tensor | None = None,
 ) -> RoadBoundaries:
     """Measure a frame's boundaries in the bird's-eye view that these extrinsics give.
 
@@ -59,8 +60,11 @@ def measure_boundaries(
         near: m, nearest Z that counts.
         far: m, farthest.
         num_boundaries: L.
+        vertical_curvature: (1,) 1/m of the road, or None for a plane.
     """
-    points, valid = road_from_image_points(segments.endpoints.flatten(1, 2), intrinsics, extrinsics)
+    points, valid = road_from_image_points(
+        segments.endpoints.flatten(1, 2), intrinsics, extrinsics, vertical_curvature
+    )
     boundary = segments.boundary[0].repeat_interleave(2).numpy()
     seen = (valid[0] & (segments.weight[0] > 0).repeat_interleave(2)).numpy()
     x, z = points[0].double().numpy().T

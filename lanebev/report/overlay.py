@@ -38,11 +38,12 @@ _HEAD, _LEFT = 44, 34  # px of a panel above its view, and left of it
 
 @dataclass(frozen=True)
 class Panel:
-    """A bird's-eye view, the words above it, and the pose it was made with ((1,) each)."""
+    """A bird's-eye view, the words above it, and pose and vertical curvature it was made with, (1,) each."""
 
     title: str
     bev: Picture
     extrinsics: Extrinsics
+    vertical_curvature: Tensor | None = None
 
 
 def draw_frame(
@@ -224,7 +225,9 @@ def _draw_bev_boundaries(
     bev: Picture, view: Panel, grid: BEVGrid, camera: Camera, segments: LaneSegments
 ) -> None:
     intrinsics = camera.intrinsics[None].to(segments.endpoints)
-    points, valid = road_from_image_points(segments.endpoints.flatten(1, 2), intrinsics, view.extrinsics)
+    points, valid = road_from_image_points(
+        segments.endpoints.flatten(1, 2), intrinsics, view.extrinsics, view.vertical_curvature
+    )
     ends = grid.bev_from_road_points(points[0]).reshape(-1, 2, 2) * (bev.shape[0] / grid.shape[0])
     kept = (segments.weight[0] > 0) & valid[0].reshape(-1, 2).all(-1)
     soft = bev.copy()

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from lanebev.geometry.precision import full_precision
+from lanebev.geometry.road_profile import in_sight
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.tensors import constant, made_once
 from lanebev.types import Extrinsics
@@ -29,6 +30,7 @@ def cells_and_lens(
     model: str,
     dtype: torch.dtype,
     plane_heights: Sequence[float] = (0.0,),
+    vertical_curvature: Tensor | None = None,
 ) -> tuple[CellSums, Lens | None]:
     """Prepare the projection of cells.
 
@@ -42,29 +44,37 @@ def cells_and_lens(
         model: "pinhole", "fisheye" or "omni".
         dtype: dtype of the results.
         plane_heights: plane heights of P planes above the road, m.
+        vertical_curvature: (B,) 1/m of the road, or None for a plane.
 
     Returns:
         cells of P·U rows, those of the first plane first, and the lens, None for an undistorted image.
     """
     if distortion is None or distortion.shape[-1] == 0:
-        sums, lens = cell_sums(grid, plane_heights, image_from_cam, extrinsics), None
+        sums, lens = cell_sums(grid, plane_heights, image_from_cam, extrinsics, vertical_curvature), None
     else:
-        sums = cell_sums(grid, plane_heights, None, extrinsics)
+        sums = cell_sums(grid, plane_heights, None, extrinsics, vertical_curvature)
         lens = make_lens(image_from_cam.to(dtype), distortion.to(dtype), model)
     return sums.to(dtype), lens
 
 
 @full_precision
 def cell_sums(
-    grid: BEVGrid, plane_heights: Sequence[float], image_from_cam: Tensor | None, extrinsics: Extrinsics
+    grid: BEVGrid,
+    plane_heights: Sequence[float],
+    image_from_cam: Tensor | None,
+    extrinsics: Extrinsics,
+    vertical_curvature: Tensor | None = None,
 ) -> CellSums:
     """Compute the homogeneous image coordinates of all cells of all planes.
+
+    A vertical curvature lowers the cells of a row by the same, κ Z²/2, so they stay a sum of two parts.
 
     Args:
         grid: U × V cells.
         plane_heights: P heights of planes above the road, m.
         image_from_cam: (B, 3, 3), the intrinsics; None leaves camera coordinates, m.
         extrinsics: each (B,).
+        vertical_curvature: (B,) 1/m of the road, or None for a plane.
     """
     matrix = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll).mT
     if image_from_cam is not None:
@@ -74,7 +84,20 @@ def cell_sums(
     below = extrinsics.height.unsqueeze(-1) - constant(tuple(plane_heights), like=matrix)  # (B, P)
     offset = torch.where((below > 0).unsqueeze(1), down * below.unsqueeze(1), _BEHIND)  # (B, 3, P)
     by_row = torch.addcmul(offset.unsqueeze(-1), forward.unsqueeze(-1), z)  # (B, 3, P, U)
+    if vertical_curvature is not None:
+        lower = 0.5 * vertical_curvature.unsqueeze(-1) * z * z  # (B, U)
+        by_row = torch.addcmul(by_row, down.unsqueeze(-1), lower[:, None, None])
     return CellSums(by_row.flatten(2), right * x, _edges(grid, len(plane_heights)))
+
+
+@full_precision
+def rows_in_sight(
+    grid: BEVGrid, plane_heights: Sequence[float], extrinsics: Extrinsics, vertical_curvature: Tensor
+) -> Tensor:
+    """Tell which rows of cells, (B, P·U), no crest hides; arguments as of :func:`cell_sums`."""
+    _, z = _axes(grid, vertical_curvature.dtype, vertical_curvature.device)
+    below = extrinsics.height.unsqueeze(-1) - constant(tuple(plane_heights), like=vertical_curvature)
+    return in_sight(below.unsqueeze(-1), vertical_curvature[:, None, None], z).flatten(1)
 
 
 @lru_cache(maxsize=64)

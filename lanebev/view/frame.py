@@ -14,7 +14,7 @@ from lanebev.camera.model import Camera
 from lanebev.tensors import constant
 from lanebev.types import Extrinsics
 from lanebev.view.blocks import blocks
-from lanebev.view.cells import cell_sums
+from lanebev.view.cells import cell_sums, rows_in_sight
 from lanebev.view.grid import BEVGrid
 from lanebev.view.kept import KeptArrays
 from lanebev.view.lens import Lens, make_lens
@@ -26,7 +26,11 @@ _kept = KeptArrays()
 
 @torch.inference_mode()
 def remap_frame(
-    frame: NDArray[np.uint8], camera: Camera, extrinsics: Extrinsics, grid: BEVGrid
+    frame: NDArray[np.uint8],
+    camera: Camera,
+    extrinsics: Extrinsics,
+    grid: BEVGrid,
+    vertical_curvature: Tensor | None = None,
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Resample one frame to the bird's-eye view, as :class:`~lanebev.BEVWarp` does, by ``cv2.remap``.
 
@@ -35,6 +39,7 @@ def remap_frame(
         camera: its lens, of the frame's size.
         extrinsics: extrinsics of batch size 1.
         grid: the road's rectangle.
+        vertical_curvature: (1,) 1/m of the road, or None for a plane.
 
     Returns:
         (U, V, 3) or (U, V) bytes, zero where not valid, and (U, V) bool. cv2 rounds coordinates to 1/32 px.
@@ -53,13 +58,17 @@ def remap_frame(
     size = camera.image_size
     image_from_cam, lens = _projection(camera)
     extrinsics = Extrinsics(*(part.cpu() for part in extrinsics))
-    cells = cell_sums(grid, (0.0,), image_from_cam, extrinsics).to(torch.float32)
+    curvature = None if vertical_curvature is None else vertical_curvature.cpu()
+    cells = cell_sums(grid, (0.0,), image_from_cam, extrinsics, curvature).to(torch.float32)
     bev, valid = np.empty((*grid.shape, *frame.shape[2:]), np.uint8), np.empty(grid.shape, np.bool_)
     for block in blocks(cells, lens, 1 - 1 / min(size), partial(_points, grid.shape[1])):
         rows = slice(block.first, block.last)
         points = block_map(block, MapSize(*size), size, block.points)[0]
         np.less_equal(points[0].numpy(), 1, out=valid[rows])
         cv2.remap(frame, *_fixed_point_pixels(points, size), cv2.INTER_LINEAR, bev[rows])
+    if curvature is not None:
+        hidden = ~rows_in_sight(grid, (0.0,), extrinsics, curvature)[0].numpy()
+        bev[hidden], valid[hidden] = 0, False
     return bev, valid
 
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from lanebev.geometry.lens import invert_distortion
 from lanebev.geometry.precision import common_dtype, full_precision
+from lanebev.geometry.road import road_from_image_points
 from lanebev.types import Extrinsics
 from lanebev.view.checks import check_cameras, check_image, check_size
 from lanebev.view.grid import BEVGrid, bev_from_image
@@ -60,6 +61,7 @@ class ImageFromBEV(nn.Module):
         image_size: tuple[int, int],
         distortion: Tensor | None = None,
         model: str = "pinhole",
+        vertical_curvature: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Resample.
 
@@ -70,6 +72,7 @@ class ImageFromBEV(nn.Module):
             image_size: (H, W) px of the image.
             distortion: (B, D) of the lens, or None for an undistorted image.
             model: "pinhole", "fisheye" or "omni", the lens of ``distortion``.
+            vertical_curvature: (B,) 1/m of the road, positive over a crest, or None for a plane.
 
         Returns:
             (B, C, H, W), zero where not valid, and valid (B, 1, H, W) bool: pixels that show the rectangle.
@@ -83,7 +86,12 @@ class ImageFromBEV(nn.Module):
         check_cameras(bev.shape[0], intrinsics, extrinsics, distortion, model)
         size, dtype = self.grid.shape, common_dtype(bev)
         cells: CellSums | PixelCells
-        if distortion is None or distortion.shape[-1] == 0:
+        if vertical_curvature is not None:
+            points = self._curved_points(
+                intrinsics, extrinsics, image_size, distortion, model, vertical_curvature
+            )
+            cells = PixelCells(points.to(dtype))
+        elif distortion is None or distortion.shape[-1] == 0:
             cells = self._sums(intrinsics, extrinsics, image_size).to(dtype)
         else:
             points = self._points(intrinsics, extrinsics, image_size, distortion, model)
@@ -107,12 +115,34 @@ class ImageFromBEV(nn.Module):
         model: str,
     ) -> Tensor:
         homography = self._homography(intrinsics, extrinsics)
-        y, x = (torch.arange(side, dtype=homography.dtype, device=homography.device) for side in image_size)
-        taken = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(1, -1, 2)
-        pixels, valid = invert_distortion(taken.expand(len(homography), -1, 2), intrinsics, distortion, model)
+        taken = _all_pixels(image_size, homography)
+        pixels, valid = invert_distortion(taken, intrinsics, distortion, model)
         points = homography[..., :2] @ pixels.mT + homography[..., 2:]  # (B, 3, H·W)
         points = torch.where(valid.unsqueeze(1), points, _ABOVE)
         cells: Tensor = points.unflatten(-1, image_size)
+        return cells
+
+    @full_precision
+    def _curved_points(
+        self,
+        intrinsics: Tensor,
+        extrinsics: Extrinsics,
+        image_size: tuple[int, int],
+        distortion: Tensor | None,
+        model: str,
+        vertical_curvature: Tensor,
+    ) -> Tensor:
+        """Compute where every pixel meets the curved road, (B, 3, H, W), homogeneous in [-1, 1]."""
+        pixels, valid = _all_pixels(image_size, intrinsics), None
+        if distortion is not None and distortion.shape[-1]:
+            pixels, valid = invert_distortion(pixels, intrinsics, distortion, model)
+        below = extrinsics._replace(height=extrinsics.height - self.plane_height)
+        road, on_road = road_from_image_points(pixels, intrinsics, below, vertical_curvature)
+        bev = self.grid.bev_from_road_points(road).mT  # (B, 2, H·W)
+        to_unit = normalised_intrinsics(torch.eye(3).to(bev), self.grid.shape)
+        points = to_unit[:, :2] @ bev + to_unit[:, 2:]
+        seen = on_road if valid is None else on_road & valid
+        cells: Tensor = torch.where(seen.unsqueeze(1), points, _ABOVE).unflatten(-1, image_size)
         return cells
 
     def _homography(self, intrinsics: Tensor, extrinsics: Extrinsics) -> Tensor:
@@ -122,3 +152,10 @@ class ImageFromBEV(nn.Module):
         matrix = bev_from_image(extrinsics._replace(height=height), intrinsics, self.grid)
         slope = normalised_intrinsics(matrix, self.grid.shape) * height[:, None, None]  # last row: of a ray
         return torch.where((below > 0)[:, None, None], slope, _ABOVE)
+
+
+def _all_pixels(image_size: tuple[int, int], like: Tensor) -> Tensor:
+    """Return the pixels of an image, (B, H·W, 2), for every (3, 3) of ``like``."""
+    y, x = (torch.arange(side, dtype=like.dtype, device=like.device) for side in image_size)
+    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(1, -1, 2)
+    return pixels.expand(len(like), -1, 2)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import overload
 
+import torch
 from torch import Tensor, nn
 
 from lanebev.geometry.precision import common_dtype
+from lanebev.geometry.road_profile import check_vertical_curvature
 from lanebev.types import Extrinsics
-from lanebev.view.cells import cells_and_lens
+from lanebev.view.cells import cells_and_lens, rows_in_sight
 from lanebev.view.checks import check_cameras, check_image, check_size
 from lanebev.view.grid import BEVGrid
 from lanebev.view.projection import image_coordinates, normalised_intrinsics
@@ -46,6 +48,7 @@ class BEVWarp(nn.Module):
         model: str = "pinhole",
         image_size: tuple[int, int] | None = None,
         strides: float | None = None,
+        vertical_curvature: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]: ...
 
     @overload
@@ -58,6 +61,7 @@ class BEVWarp(nn.Module):
         model: str = "pinhole",
         image_size: tuple[int, int] | None = None,
         strides: Sequence[float] | None = None,
+        vertical_curvature: Tensor | None = None,
     ) -> tuple[list[Tensor], Tensor]: ...
 
     def forward(
@@ -69,6 +73,7 @@ class BEVWarp(nn.Module):
         model: str = "pinhole",
         image_size: tuple[int, int] | None = None,
         strides: float | Sequence[float] | None = None,
+        vertical_curvature: Tensor | None = None,
     ) -> tuple[Tensor | list[Tensor], Tensor]:
         """Resample.
 
@@ -84,11 +89,13 @@ class BEVWarp(nn.Module):
             strides: of the map, or of each map, px: cell j is centred on pixel stride · j, as those of a
                 convolutional trunk with symmetric padding. None: cells are evenly spread over the image, as
                 those of pooling or patches.
+            vertical_curvature: (B,) 1/m of the road, positive over a crest, such as a calibrator's
+                ``vertical_curvature(state)``; None for a plane.
 
         Returns:
             bev (B, C, U, V), zero where not valid, or a list of one for each map; and valid (B, 1, U, V)
-            bool: in front of the camera and inside the image. With P plane heights, bev (B, C, P, U, V) and
-            valid (B, 1, P, U, V).
+            bool: in front of the camera, inside the image, and not hidden by a crest. With P plane heights,
+            bev (B, C, P, U, V) and valid (B, 1, P, U, V).
 
         Raises:
             TypeError: an argument of another kind.
@@ -97,11 +104,17 @@ class BEVWarp(nn.Module):
         maps = [image] if isinstance(image, Tensor) or not isinstance(image, Sequence) else list(image)
         sizes, size = _map_sizes(maps, strides, image_size)
         check_cameras(maps[0].shape[0], intrinsics, extrinsics, distortion, model)
+        if vertical_curvature is not None:
+            check_vertical_curvature(vertical_curvature, maps[0].shape[0])
+        heights = self.plane_heights or (0.0,)
         cells, lens = cells_and_lens(
             self.grid, normalised_intrinsics(intrinsics, size), extrinsics, distortion, model,
-            common_dtype(*maps), self.plane_heights or (0.0,),
+            common_dtype(*maps), heights, vertical_curvature,
         )  # fmt: skip
         sampled, valid = resampled(maps, cells, lens, sizes, size)
+        if vertical_curvature is not None:
+            shown = rows_in_sight(self.grid, heights, extrinsics, vertical_curvature)[:, None, :, None]
+            sampled, valid = [torch.where(shown, each, 0.0) for each in sampled], valid & shown
         bevs = [self._planes(each) for each in sampled]
         return bevs[0] if maps[0] is image else bevs, self._planes(valid)
 
@@ -111,18 +124,24 @@ class BEVWarp(nn.Module):
         extrinsics: Extrinsics,
         distortion: Tensor | None = None,
         model: str = "pinhole",
+        vertical_curvature: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Compute where every cell is seen.
 
         Returns:
-            (B, U·V, 2) px of the image as taken, and (B, U·V) bool, in front; with P plane heights P·U·V.
+            (B, U·V, 2) px of the image as taken, and (B, U·V) bool, in front and not hidden by a crest; with
+            P plane heights P·U·V.
         """
+        heights = self.plane_heights or (0.0,)
         cells, lens = cells_and_lens(
             self.grid, intrinsics, extrinsics, distortion, model, common_dtype(intrinsics),
-            self.plane_heights or (0.0,),
+            heights, vertical_curvature,
         )  # fmt: skip
         points, hidden = image_coordinates(cells.rows(0, cells.shape[1]), lens)
-        return points.flatten(2).mT, hidden.flatten(1) == 0
+        ahead = hidden == 0
+        if vertical_curvature is not None:
+            ahead = ahead & rows_in_sight(self.grid, heights, extrinsics, vertical_curvature).unsqueeze(-1)
+        return points.flatten(2).mT, ahead.flatten(1)
 
     def _planes(self, sampled: Tensor) -> Tensor:
         """Reshape (B, C, P·U, V) to (B, C, P, U, V) if there are several planes."""

@@ -16,6 +16,7 @@ from lanebev.io.results import extrinsics_row
 from lanebev.io.video import VideoWriter, open_source
 from lanebev.render import Drive
 
+torch.set_num_threads(1)  # a run divides the threads among frames, and sums over threads round otherwise
 FRAMES, LANE_WIDTH = 5, 3.6
 pytestmark = pytest.mark.slow
 

@@ -71,3 +71,34 @@ def test_without_a_pose_there_are_no_curves(status, there):
     segments = LaneSegments(points, torch.full((1, 12), 3), ones, ones)
     found = lane_curves(segments, _calibration(segments, Status[status]), CAMERA)
     assert np.isfinite(found.x[3]).any() == there
+
+
+def test_curves_follow_a_crest():
+    """They end where they were drawn, and on a plane road they would not."""
+    crest = torch.tensor([5e-4], dtype=torch.float64)
+    z = torch.linspace(1 / 6, 1 / 50, 24, dtype=torch.float64) ** -1
+    drawn = [
+        image_from_road_points(
+            torch.stack([PLACES[index] + 0.5 * CURVATURE * z**2, z], dim=-1)[None],
+            CAMERA.intrinsics[None],
+            POSE,
+            crest,
+        )[0][0]
+        for index in (1, 2, 3, 4)
+    ]
+    ends = torch.cat([torch.stack([points[:-1], points[1:]], dim=1) for points in drawn])[None]
+    boundary = torch.arange(1, 5).repeat_interleave(23)[None]
+    ones = torch.ones(1, 92, dtype=torch.float64)
+    segments = LaneSegments(ends, boundary, ones, 0.3 * ones)
+
+    def largest_error(vertical):
+        found, errors = lane_curves(segments, _calibration(segments), CAMERA, vertical), []
+        for index, points in zip((1, 2, 3, 4), drawn, strict=True):
+            true = CAMERA.distort_points(points).numpy()
+            order = np.argsort(true[:, 1])
+            at = np.interp(found.rows, true[order, 1], true[order, 0], np.nan, np.nan)
+            errors.append(np.nanmax(np.abs(found.x[index] - at)))
+        return max(errors)
+
+    assert largest_error(crest) < 1.0
+    assert largest_error(None) > 3.0

@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from lanebev import (
+    HILLY_ROADS,
     BEVGrid,
     BEVWarp,
     JointCalibrator,
@@ -18,6 +19,7 @@ from lanebev import (
     Status,
     TwoStageCalibrator,
 )
+from lanebev.estimation.joint.measurement import VERTICAL
 from lanebev.geometry.lens import distort_points
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.segmenter import SegmenterConfig
@@ -92,6 +94,23 @@ def test_one_frame():
     assert state.status.tolist() == [Status.TRACKING] * 2
 
 
+def test_the_view_follows_the_roads_vertical_curvature():
+    """It is the warp's own with what the calibrator says of the road, in every row."""
+    layer = model()
+    layer.calibrator = JointCalibrator(HILLY_ROADS)
+    image, intrinsics = images(2), INTRINSICS.expand(2, 3, 3)
+    out, state = layer(image, intrinsics)
+    state = state._replace(mean=state.mean.clone())
+    state.mean[:, VERTICAL] = torch.tensor([2e-3, -2e-3], dtype=torch.float64)
+    out, state = layer(image, intrinsics, state)
+    curvature = layer.calibrator.vertical_curvature(state)
+    pose = out.calibration.extrinsics
+    expected, valid = layer.warp(image, intrinsics, pose, vertical_curvature=curvature)
+    assert torch.equal(out.bev, expected)
+    assert torch.equal(out.valid, valid)
+    assert (out.bev - layer.warp(image, intrinsics, pose)[0]).abs().amax((1, 2, 3)).min() > 0.01
+
+
 def test_frames_at_once_equal_frames_one_by_one():
     net, frames = model(), images(2, 3)
     dt = torch.tensor([[0.1, 0.03, 0.04], [0.1, 0.05, 0.02]], dtype=torch.float64)
@@ -158,6 +177,17 @@ def test_network_sees_its_width_and_the_rest_does_not():
 def test_a_wide_image_has_about_as_many_pixels(image, size):
     assert resized_size(image, 576, 320 * 576) == size
     assert resized_size(image, 576, None) == (32 * round(576 * image[0] / image[1] / 32), 576)
+
+
+def test_the_order_of_an_image_in_memory_changes_nothing():
+    layer = LaneBEV.from_pretrained().eval()
+    image = torch.rand(1, 3, 96, 160, generator=torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        found = [
+            layer.boundary_vertices(image.contiguous(memory_format=order))[0]
+            for order in (torch.contiguous_format, torch.channels_last)
+        ]
+    assert torch.equal(*found)
 
 
 def test_the_pose_is_less_sure_by_the_networks_factor():

@@ -16,13 +16,13 @@ POSE = Extrinsics.from_values(0.03, -0.02, 0.01, 1.4)
 OFFSETS = {1: -5.3, 2: -1.7, 3: 2.0, 4: 5.7}  # lanes of 3.6, 3.7 and 3.7 m
 
 
-def _segments(bend=0.0, noise=0.0):
+def _segments(bend=0.0, noise=0.0, vertical=None):
     """Six vertices, three segments, on each boundary of a road with curvature 2 · bend."""
     z = torch.linspace(6.0, 38.0, 16, dtype=torch.float64)
     ends, boundary = [], []
     for index, offset in OFFSETS.items():
         road = torch.stack([offset + bend * z * z, z], dim=-1)[None]
-        pixels = image_from_road_points(road, INTRINSICS, POSE)[0][0]
+        pixels = image_from_road_points(road, INTRINSICS, POSE, vertical)[0][0]
         pixels = pixels + noise * torch.randn(16, 2, generator=torch.Generator().manual_seed(index)).double()
         ends.append(torch.stack([pixels[:8], pixels[8:]], dim=1))
         boundary += [index] * 8
@@ -47,6 +47,15 @@ def test_measured_widths_are_those_of_the_road(bend):
     assert np.isnan(measured.widths[[0, 4]]).all()
     assert spread(measured.direction) < 1e-3
     assert abs(spread(measured.widths) - 0.1) < 0.01
+
+
+def test_measured_widths_over_a_crest_need_its_curvature():
+    crest = torch.tensor([4e-4], dtype=torch.float64)
+    segments = _segments(vertical=crest)
+    measured = measure_boundaries(segments, INTRINSICS, POSE, vertical_curvature=crest)
+    np.testing.assert_allclose(measured.widths[1:4], [3.6, 3.7, 3.7], atol=0.01)
+    on_plane = measure_boundaries(segments, INTRINSICS, POSE)
+    assert (np.abs(on_plane.widths[1:4] - [3.6, 3.7, 3.7]) > 0.03).all()
 
 
 def test_a_wrong_pitch_fans_the_boundaries_out():

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from lanebev.batch import masked_median
 from lanebev.estimation.joint.measurement import observe
-from lanebev.estimation.joint.road_profile import FARTHEST
 from lanebev.geometry.road import image_from_road_points
+from lanebev.geometry.road_profile import Profile, meet_road, meets_before_farthest
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.observation.segments import LaneSegments
 from lanebev.types import NUM_BOUNDARIES, Extrinsics
@@ -47,6 +47,7 @@ def fit_boundaries(
     curvature: Tensor | None = None,
     num_boundaries: int = NUM_BOUNDARIES,
     least_support: float = 2.0,
+    vertical_curvature: Tensor | None = None,
 ) -> Boundaries:
     """Fit each boundary's offset and heading by robust least squares on perpendicular pixel distances.
 
@@ -60,6 +61,7 @@ def fit_boundaries(
         curvature: (B, 2), c0 and c1, or None to fit them to all boundaries together.
         num_boundaries: L.
         least_support: sum of the inlier segments' weights from which a boundary is present.
+        vertical_curvature: (B,) 1/m of the road, or None for a plane.
 
     Returns:
         The curves.
@@ -70,12 +72,14 @@ def fit_boundaries(
     seen = observe(segments, intrinsics, num_boundaries)
     given = intrinsics.new_zeros(intrinsics.shape[0], 2) if curvature is None else curvature
     rotation = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)
-    x, down, ahead = (rotation @ seen.rays).unbind(1)  # each (B, 2N)
+    directions = rotation @ seen.rays
     height = extrinsics.height.unsqueeze(-1)
-    on_road = (down * FARTHEST > height * ahead) & (ahead > 1e-3)
-    down = torch.where(on_road, down, 1.0)
-    z = height * ahead / down
-    across = height * x / down  # (B, 2N) m
+    curved = torch.zeros_like(height) if vertical_curvature is None else vertical_curvature.unsqueeze(-1)
+    profile = Profile(height, curved)
+    on_road, z = meets_before_farthest(directions, profile), meet_road(directions, profile)
+    x, _, ahead = directions.unbind(1)  # each (B, 2N)
+    scale = z / torch.where(on_road, ahead, 1.0)  # of a direction to its point on the road
+    across = scale * x  # (B, 2N) m
     lateral = across - _bend(z, given)
     focal = seen.focal.unsqueeze(-1)
     boundary = seen.boundary.repeat_interleave(2, dim=1)
@@ -88,7 +92,7 @@ def fit_boundaries(
     heading = torch.zeros_like(offset)
     for _ in range(_REWEIGHTINGS):
         residual = lateral.unsqueeze(1) - offset.unsqueeze(-1) - heading.unsqueeze(-1) * z.unsqueeze(1)
-        per_metre = _pixels_per_metre(offset, down, height, focal)  # (B, L, 2N)
+        per_metre = _pixels_per_metre(offset, scale, height, focal)  # (B, L, 2N)
         far_off = residual * per_metre / (_TOLERANCE * focal.unsqueeze(-1))
         trust = (1 + far_off.square()).square().reciprocal()
         precision = member * trust * (per_metre / sigma.unsqueeze(1)).square()  # 1/m²
@@ -115,6 +119,7 @@ def boundary_polylines(
     intrinsics: Tensor,
     extrinsics: Extrinsics,
     num_points: int = 64,
+    vertical_curvature: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return the seen part of each boundary as a polyline in the undistorted image, near to far.
 
@@ -123,6 +128,7 @@ def boundary_polylines(
         intrinsics: (B, 3, 3).
         extrinsics: each (B,).
         num_points: P.
+        vertical_curvature: (B,) 1/m of the road, or None for a plane.
 
     Returns:
         (B, L, P, 2) px, and (B, L, P) bool: boundary present and point before the camera. Points may lie
@@ -136,7 +142,8 @@ def boundary_polylines(
     z = inverse.reciprocal()  # (B, L, P)
     x = boundaries.offset.unsqueeze(-1) + boundaries.heading.unsqueeze(-1) * z
     x = x + _bend(z.flatten(1), boundaries.curvature).view_as(z)
-    pixels, ahead = image_from_road_points(torch.stack([x, z], dim=-1).flatten(1, 2), intrinsics, extrinsics)
+    road = torch.stack([x, z], dim=-1).flatten(1, 2)
+    pixels, ahead = image_from_road_points(road, intrinsics, extrinsics, vertical_curvature)
     return pixels.view(*z.shape, 2), ahead.view_as(z) & boundaries.present.unsqueeze(-1)
 
 
@@ -146,10 +153,10 @@ def _bend(z: Tensor, curvature: Tensor) -> Tensor:
     return z * z * (c0 / 2 + c1 * z / 6)
 
 
-def _pixels_per_metre(offset: Tensor, down: Tensor, height: Tensor, focal: Tensor) -> Tensor:
+def _pixels_per_metre(offset: Tensor, scale: Tensor, height: Tensor, focal: Tensor) -> Tensor:
     """Compute the perpendicular pixels in the image per lateral metre on the road, (B, L, 2N)."""
     steepness = (1 + (offset / height).square()).rsqrt()
-    return (down * focal / height).unsqueeze(1) * steepness.unsqueeze(-1)
+    return (focal / scale).unsqueeze(1) * steepness.unsqueeze(-1)
 
 
 def _fit_line(

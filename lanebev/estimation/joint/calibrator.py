@@ -179,6 +179,10 @@ class JointCalibrator(Calibrator[JointState]):
         first, steps = state.mean[:, CURVATURE], state.mean[:, STEPS]
         return first + (share * steps)[:, 0]
 
+    def vertical_curvature(self, state: JointState) -> Tensor:
+        """Return the road's vertical curvature κ of (J1), (B,) 1/m, positive over a crest."""
+        return state.mean[:, VERTICAL]
+
 
 def elapsed(dt: Tensor, state: JointState, cfg: JointConfig) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Compute the time to predict over; whether to skip the frame; how far ahead the state is; if guessed."""

@@ -27,8 +27,8 @@ from torch.nn.functional import pad
 
 from lanebev.estimation.checks import as_lane_width, check_segments, mask_invalid_rows
 from lanebev.estimation.joint.road_curve import NUM_STEPS, RoadCurve, road_basis, road_curve
-from lanebev.estimation.joint.road_profile import Profile, before_farthest, meet_road
 from lanebev.geometry.lens import cam_from_image
+from lanebev.geometry.road_profile import Profile, before_farthest, meet_road
 from lanebev.geometry.rotation import road_from_cam_and_roll
 from lanebev.observation.segments import LaneSegments
 from lanebev.tensors import constant

@@ -7,11 +7,20 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lanebev.types import check_tensor
+
 FARTHEST = 200.0  # m; beyond it a pixel is tens of metres, and the shape of the road is not known
 
 _BEFORE_CREST = 0.8  # of the distance at which a crest hides the road, up to which points are on the road
 
 _AHEAD = 1e-3  # of a direction's component ahead; below it a point is not in front of the camera
+
+
+def check_vertical_curvature(curvature: Tensor, batch: int) -> None:
+    """Raise TypeError or ValueError unless this is a tensor (B,)."""
+    check_tensor("vertical_curvature", curvature)
+    if curvature.shape != (batch,):
+        raise ValueError(f"vertical_curvature: expected ({batch},) 1/m, got {tuple(curvature.shape)}")
 
 
 class Profile(NamedTuple):
@@ -36,12 +45,36 @@ def meet_road(directions: Tensor, profile: Profile) -> Tensor:
     return 2 * height / (slope + (slope * slope - 2 * curvature * height).sqrt())
 
 
+def meets_before_farthest(directions: Tensor, profile: Profile) -> Tensor:
+    """Return (B, M) bool: these directions, (B, 3, M), meet the road before the farthest."""
+    down, ahead = directions[:, 1], directions[:, 2]
+    return (ahead > _AHEAD) & (down > ahead * _least_slope(profile))
+
+
 def before_farthest(directions: Tensor, profile: Profile) -> Tensor:
     """Return (B, N) bool: both end points, of directions (B, 3, M), meet the road before the farthest."""
-    down, ahead = directions[:, 1], directions[:, 2]
-    on_road = (ahead > _AHEAD) & (down > ahead * _least_slope(profile))
-    valid: Tensor = on_road.unflatten(-1, (-1, 2)).all(-1)
+    valid: Tensor = meets_before_farthest(directions, profile).unflatten(-1, (-1, 2)).all(-1)
     return valid
+
+
+def depth_below(height: Tensor, curvature: Tensor, z: Tensor) -> Tensor:
+    """Compute how far the road is below the camera at a distance z, m: h + κ Z²/2, (J1).
+
+    Args:
+        height: m, h.
+        curvature: 1/m, κ.
+        z: m; the shapes of the three are broadcast.
+    """
+    return torch.addcmul(height, 0.5 * curvature, z * z)
+
+
+def in_sight(height: Tensor, curvature: Tensor, z: Tensor) -> Tensor:
+    """Tell whether the road at a distance z is this side of the point where a sight line touches a crest.
+
+    Source: the line through the camera that touches h + κ Z²/2 does so at Z = √(2 h / κ). Arguments as of
+    :func:`depth_below`.
+    """
+    return curvature * z * z < 2 * height
 
 
 def _least_slope(profile: Profile) -> Tensor:
