@@ -2,9 +2,10 @@
 
     python -m tools.bench_int8 [--views 64] [--drives 4] [--data ../shared/data]
 
-Both files compute by ONNX Runtime in one thread. Recall, error and false boundaries are those of
-``train.evaluate_roads``, the errors of the pose the medians over drives of ``train.noise``, both on held-out
-rendered roads; with ``--data`` also the figures on TuSimple's images of ``tools.real_figures``.
+Both files compute by ONNX Runtime; the processor time is that of all its threads together. Recall, error and
+false boundaries are those of ``train.evaluate_roads``, the errors of the pose the medians over drives of
+``train.noise``, both on held-out rendered roads; with ``--data`` also the figures on TuSimple's images of
+``tools.real_figures``.
 """
 
 from __future__ import annotations
