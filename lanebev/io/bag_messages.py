@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -84,6 +84,14 @@ def _unreadable(path: Path, error: Exception) -> ValueError:
     return ValueError(f"bag {path}: expected one that can be read, got: {reason[:160]}; is it cut?")
 
 
+def _joined(topics: Iterable[Topic]) -> list[Topic]:
+    """Return each topic once, with the messages of all its publishers."""
+    sizes: dict[tuple[str, str], int] = {}
+    for topic in topics:
+        sizes[topic.name, topic.kind] = sizes.get((topic.name, topic.kind), 0) + topic.size
+    return [Topic(*key, size) for key, size in sizes.items()]
+
+
 class _RosBag:
     """A ROS bag by rosbags."""
 
@@ -91,7 +99,7 @@ class _RosBag:
         self._reader = reader
         known = {*IMAGE_TYPES, *LENS_TYPES}
         connections = [each for each in reader.connections if each.msgtype in known]
-        self.topics = [Topic(each.topic, each.msgtype, each.msgcount) for each in connections]
+        self.topics = _joined(Topic(each.topic, each.msgtype, each.msgcount) for each in connections)
         self.duration = 1e-9 * reader.duration
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
@@ -114,12 +122,13 @@ class _Mcap:
             raise ValueError("no summary at its end")
         figures = summary.statistics
         self.duration = 1e-9 * (figures.message_end_time - figures.message_start_time)
-        self.topics = []
+        topics = []
         for number, channel in summary.channels.items():
             schema = summary.schemas.get(channel.schema_id)
             if schema is not None and schema.name in {*IMAGE_TYPES, *LENS_TYPES}:
                 count = figures.channel_message_counts.get(number, 0)
-                self.topics.append(Topic(channel.topic, schema.name, count))
+                topics.append(Topic(channel.topic, schema.name, count))
+        self.topics = _joined(topics)
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         for _, _, message, decoded in self._reader.iter_decoded_messages([topic]):

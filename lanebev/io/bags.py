@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.io.bag_messages import IMAGE_TYPES, LENS_TYPES, Bag, Topic, open_bag
-from lanebev.io.frames import Frame
+from lanebev.io.frames import ALL, Frame
 from lanebev.io.video import DEFAULT_FPS, FrameSource
 
 _PLAIN = {  # encoding of ROS to channels, and to OpenCV's conversion to RGB
@@ -49,15 +50,30 @@ class BagSource(FrameSource):
     topic: str = ""
     lens: Mapping[str, Any] | None = field(default=None, compare=False)
 
+    @property
+    def taken_numbers(self) -> list[int]:
+        """Numbers of the frames that are taken, by the times in all messages if not all are."""
+        if self.selection == ALL:
+            return list(range(self.count))
+        times = self._times()
+        return [number for number, time in enumerate(times) if self.selection.takes(number, time)]
+
+    def _times(self) -> Iterator[float]:
+        """Yield the times of the frames, s since the first, up to where the bag cannot be read."""
+        first = before = None
+        with contextlib.suppress(ValueError), open_bag(Path(self.source)) as bag:
+            for logged, message in bag.messages(self.topic):
+                before = _later(_stamp(message, logged), before, float(1 / self.fps))
+                first = before if first is None else first
+                yield before - first
+
     def _video_frames(self) -> Iterator[Frame]:
         first = before = None
         number, interval = 0, float(1 / self.fps)
         try:
             with open_bag(Path(self.source)) as bag:
                 for number, (logged, message) in enumerate(bag.messages(self.topic)):
-                    time = _stamp(message, logged)
-                    if before is not None and time <= before:
-                        time = before + interval
+                    time = _later(_stamp(message, logged), before, interval)
                     first = time if first is None else first
                     dt = interval if before is None else time - before
                     image, problem = None, ""
@@ -176,6 +192,11 @@ def _image_topic(source: str, topics: Sequence[Topic], wanted: str | None) -> To
         remedy = "; choose one with --topic" if found else ""
         raise ValueError(f"bag {source}: expected one topic of images, got: {names}{remedy}")
     return next(iter(found.values())) if wanted is None else found[wanted]
+
+
+def _later(time: float, before: float | None, interval: float) -> float:
+    """Return a frame's time (s), or an interval after the frame before if it is not later than that."""
+    return time if before is None or time > before else before + interval
 
 
 def _stamp(message: Any, logged: int) -> float:

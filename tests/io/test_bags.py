@@ -140,6 +140,36 @@ def _ros1_bag(path):
     return path
 
 
+def test_the_number_of_frames_that_are_taken_is_exact_where_times_vary(tmp_path):
+    name = "sensor_msgs/msg/CompressedImage"
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection("/image", name, typestore=STORE)
+        for number in (0, 1, 2, 7, 8, 9):  # tenths of a second
+            message = STORE.serialize_cdr(_compressed(number), name)
+            writer.write(connection, round(1e9 * (START + 0.1 * number)), message)
+    config = RunConfig(str(tmp_path / "bag"), "", start=0.15, end=0.85)
+    source = make_source(config)
+    assert [frame.source_number for frame in source] == source.taken_numbers == [2, 3, 4]
+    assert make_source(replace(config, start=0.3, end=0.75)).taken_count == 1
+    with pytest.raises(ValueError, match="expected some of the 6 frames to be taken, got none"):
+        make_source(replace(config, start=0.3, end=0.65))
+
+
+def test_a_topic_of_several_publishers_is_one(tmp_path):  # as rosbag writes them, a connection each
+    store, name = get_typestore(Stores.ROS1_NOETIC), "sensor_msgs/msg/CompressedImage"
+    with Writer1(tmp_path / "two.bag") as writer:
+        connections = [writer.add_connection("/image", name, typestore=store, callerid=c) for c in "ab"]
+        for number in range(COUNT):
+            header = _ros1_header(store, number)
+            data = cv2.imencode(".png", _picture(number)[..., ::-1])[1].reshape(-1)
+            message = store.serialize_ros1(store.types[name](header, "png", data), name)
+            logged = round(1e9 * (START + 0.1 * number))
+            writer.write(connections[number % 2], logged, message)
+    source = open_bag_source(str(tmp_path / "two.bag"))
+    assert [frame.image[0, 0, 0] for frame in source] == [20 * number for number in range(COUNT)]
+    assert source.count == source.taken_count == COUNT
+
+
 def test_frames_and_lens_of_a_ros_1_bag(tmp_path):
     config = RunConfig(str(_ros1_bag(tmp_path / "drive.bag")), "")
     source = make_source(config)
