@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -9,8 +10,11 @@ from typing import Any, Literal, NamedTuple
 import lightning as L
 import numpy as np
 from jsonargparse.typing import PositiveInt
+from lightning.pytorch.utilities import rank_zero_warn
 from torch.utils.data import DataLoader, IterableDataset
 
+from lanebev.io.images import image_size
+from lanebev.io.lane_size import size_remark
 from lanebev.io.lanes import FrameLines, read_culane, read_openlane, read_tusimple
 from lanebev.io.video import read_image
 from lanebev.observation.boundary_order import boundary_indices
@@ -18,6 +22,7 @@ from lanebev.types import NUM_BOUNDARIES
 from train.data import Batch, Seed, ViewBatches, run_position
 from train.labels import LabelledImage, ViewConfig, full_view
 
+_LOOKED_AT = 20  # entries, for the size of their images
 Format = Literal["tusimple", "culane", "openlane"]
 
 
@@ -73,6 +78,22 @@ def read_entries(layout: Format, root: Path, names: list[str]) -> list[Entry]:
     if not entries:
         raise ValueError(f"{root}: expected labelled images in {', '.join(names) or 'a list'}, found none")
     return entries
+
+
+def check_sizes(entries: list[Entry]) -> None:
+    """Warn if lines seem to be in pixels of smaller or cropped images, by some entries of each image size.
+
+    Raises:
+        ValueError: they lie outside the images, so that they are in pixels of larger ones.
+    """
+    of_size: dict[tuple[int, int], list[FrameLines]] = defaultdict(list)
+    for entry in entries[:: max(1, len(entries) // _LOOKED_AT)]:
+        size = image_size(entry.image)
+        if size is not None:
+            of_size[size].append(entry.lines)
+    for size, frames in of_size.items():
+        if remark := size_remark(frames, size):
+            rank_zero_warn(f"{frames[0].name} and others: {remark.partition('?')[0]}?")
 
 
 def _lines(path: Path) -> list[str]:
@@ -186,7 +207,9 @@ class LaneFiles(L.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Return endless random views."""
-        frames = EntryFrames(read_entries(self.layout, self.root, self.train))
+        entries = read_entries(self.layout, self.root, self.train)
+        check_sizes(entries)
+        frames = EntryFrames(entries)
         rank, first = run_position(self)
         return DataLoader(
             ViewBatches(frames, self.batch_size, self.sizes, self.view, (self.seed, rank), first),
@@ -197,6 +220,7 @@ class LaneFiles(L.LightningDataModule):
     def val_dataloader(self) -> DataLoader[ScoredBatch]:
         """Return every image once, whole."""
         entries = read_entries(self.layout, self.root, self.val)
+        check_sizes(entries)
         data = ScoredBatches(entries, self.layout, self.batch_size, self.val_size, self.view)
         return DataLoader(data, batch_size=None, collate_fn=_as_it_is)
 

@@ -1,4 +1,5 @@
 import json
+import warnings
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ from lanebev.io.lanes import FrameLines
 from lanebev.observation.polylines import BoundaryRows, LaneLine
 from train.__main__ import main
 from train.data import Batch, ViewBatches
-from train.datasets import EntryFrames, LaneFiles, ScoredBatch, labelled_image, read_entries
+from train.datasets import EntryFrames, LaneFiles, ScoredBatch, check_sizes, labelled_image, read_entries
 from train.labels import ViewConfig
 from train.scores import DRAWN, BenchmarkScores, drawn_counts
 
@@ -185,3 +186,29 @@ def test_errors(root):
     line = LaneLine(np.zeros((0, 2)))
     blank = labelled_image(entry._replace(image=root / "driver/0.jpg", lines=FrameLines("a", [line])))
     assert not blank.painted.any()
+
+
+def test_labels_in_pixels_of_other_images_are_noticed(root):
+    entries = read_entries("culane", root, ["list.txt"])
+
+    def scaled(factor, down=0.0):
+        return [
+            entry._replace(
+                lines=entry.lines._replace(
+                    lines=[
+                        line._replace(points=line.points * factor - [0, down]) for line in entry.lines.lines
+                    ]
+                )
+            )
+            for entry in entries
+        ]
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_sizes(entries)
+    with pytest.raises(ValueError, match="lanes: expected points in images of 640 x 360 px, got"):
+        check_sizes(scaled(2.0))
+    with pytest.warns(match=r"driver/0 and others: lanes: none of them reaches .*; of smaller images\?"):
+        check_sizes(scaled(0.5))
+    with pytest.warns(match=r"of images whose top was cut off\?"):
+        check_sizes(scaled(1.0, 70.0))
