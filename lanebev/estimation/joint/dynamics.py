@@ -45,7 +45,7 @@ class MotionConfig:
             that it is curved.
         vertical_curvature_memory: s, time constant of the return to it.
         curvature_walk: 1/m/√s, random walk of every knot.
-        curvature_step: 1/m, sigma of a step that comes into view.
+        curvature_step: 1/m, sigma of a step that comes into view on a straight road.
         speed, speed_std: m/s, prior of the speed.
         speed_memory: s, time constant of the return to it.
         deviation_memory: s, time constant of a boundary's deviation where lanes are equal.

@@ -19,6 +19,7 @@ _LARGEST_EXCESS = 4.0  # of a squared score; a larger one is a jump
 EQUAL = 0.1  # of the deviations of unequal lanes, up to which lanes are equal
 _RAISED = 0.01  # share of segments over the horizon, above which the others are too low
 _CURVED = 3.0  # sigmas of a vertical curvature from which the road is taken for a crest or a dip
+_ACCUMULATED = 0.85  # of the sum of the pose's scores counts, since a detector's errors last
 CALL = 5.0  # sigmas of evidence at which half of the noise is admitted
 _CREST_CALL = 7.0  # likewise, for the vertical curvature: lasting errors of far boundaries look like one
 
@@ -60,9 +61,10 @@ def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor, weight
 
 
 def accumulate_evidence(before: Tensor, score: Tensor, dt: Tensor, memory: float) -> Tensor:
-    """Accumulate the scores of the road and deviations at unit variance; use those of the pose directly.
+    """Accumulate the scores at unit variance; of the pose the larger of this frame's and the sum counts.
 
-    Source: (J15).
+    Source: (J15); Page 1954, cumulative sum. A jump of the pose is evident in one frame, a fall only in
+    several. Once evidence of the pose added noise, its sum begins anew.
 
     Args:
         before: (B, M), evidence so far.
@@ -71,8 +73,12 @@ def accumulate_evidence(before: Tensor, score: Tensor, dt: Tensor, memory: float
         memory: s.
     """
     fade = (-dt / memory).exp().unsqueeze(-1)
-    slow = before * fade + (1 - fade * fade).clamp(min=1e-12).sqrt() * score
-    return torch.cat([score[:, :NUM_POSE], slow[:, NUM_POSE:]], dim=-1)
+    answered = before[:, :NUM_POSE].abs() > CALL  # by noise in the last frame
+    before = torch.cat([torch.where(answered, 0.0, before[:, :NUM_POSE]), before[:, NUM_POSE:]], dim=-1)
+    total = before * fade + (1 - fade * fade).clamp(min=1e-12).sqrt() * score
+    now, pose = score[:, :NUM_POSE], _ACCUMULATED * total[:, :NUM_POSE]
+    larger = torch.where(now.abs() > pose.abs(), now, pose)
+    return torch.cat([larger, total[:, NUM_POSE:]], dim=-1)
 
 
 def adapt_motion_scale(before: Tensor, score: Tensor, dt: Tensor, cfg: JointConfig) -> Tensor:

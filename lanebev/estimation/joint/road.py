@@ -22,8 +22,10 @@ from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS
 from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
 from lanebev.tensors import constant
 
-CLEAR_BEND = (20.0, 40.0)  # chi-square of the five steps of curvature between which they come to tell speed
+CLEAR_BEND = (10.0, 20.0)  # chi-square of the five steps of curvature between which they come to tell speed
 ENTRY = KNOT_SPACING / 3  # m, way over which a step comes into view
+_BENT = 3.0  # sigmas of the curvature at the farthest knot from which the road is taken to bend there
+_BEND_STEP = 0.07  # of that curvature: standard deviation of the next step, in a bend
 _SLOPE = 0.5 * (np.eye(1 + NUM_STEPS) + np.eye(1 + NUM_STEPS, k=1))  # at a knot, by the steps about it
 _SLOPE[0] = np.eye(1 + NUM_STEPS)[1]
 _CHANGE = np.diff(_SLOPE, axis=0, prepend=0.0) / KNOT_SPACING  # of the shape parameters by a metre, 1/m
@@ -62,7 +64,8 @@ def propagate_road_shape(
     moved = _renumbering(passed)
     change = _change_per_metre(shape, shape_cov)
     both = torch.bmm(moved, torch.stack([shape, dt.unsqueeze(-1) * change], dim=-1))  # (B, NUM_SHAPE, 2)
-    seen = cfg.curvature_step**2 * _share_in_view(phase, gone, passed)
+    step = step_variance(shape, shape_cov, cfg).unsqueeze(-1)
+    seen = step * _share_in_view(phase, gone, passed)
     return RoadMotion(
         shape=both[..., 0],
         phase=gone - passed * KNOT_SPACING,
@@ -70,6 +73,23 @@ def propagate_road_shape(
         by_speed=both[..., 1],
         noise=pad(seen, (1, 0)),
     )
+
+
+def step_variance(shape: Tensor, shape_cov: Tensor, cfg: MotionConfig) -> Tensor:
+    """Compute the variance (B,) 1/m² of the step of curvature that comes into view.
+
+    Source: (J12). In a clothoid the curvature changes from knot to knot by much more than on a road that is
+    nearly straight, and a bend that was entered is also left again.
+
+    Args:
+        shape: (B, NUM_SHAPE).
+        shape_cov: (B, NUM_SHAPE, NUM_SHAPE).
+        cfg: the numbers.
+    """
+    farthest, variance = shape.sum(-1), shape_cov.sum((1, 2))  # of the curvature at the last knot
+    excess = (farthest.square() - _BENT**2 * variance).clamp(min=0.0)
+    total: Tensor = cfg.curvature_step**2 + _BEND_STEP**2 * excess
+    return total
 
 
 def _renumbering(passed: Tensor) -> Tensor:

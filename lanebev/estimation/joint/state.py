@@ -43,7 +43,7 @@ class JointConfig:
         open_vertical_curvature: the same for the vertical curvature when a crest or a dip begins or ends,
             1/m.
         open_deviation: sigma of a boundary's deviation on a road of unequal lanes, m; 0: lanes are equal.
-        evidence_time: time constant of the evidence for a bend or unequal lanes, s.
+        evidence_time: time constant of the evidence, s.
         motion_scale_rise: time, s, in which the variance of the pose's motion grows by a factor e if it is
             half of the right one.
         motion_scale_memory: time constant, s, of the decay to the variance of ``motion``.
@@ -113,8 +113,8 @@ class JointState(NamedTuple):
         mean: (B, D), see :class:`~lanebev.estimation.joint.layout.Layout`.
         cov: (B, D, D).
         phase: (B,) m, how far the first knot of the road's curvature lies behind the camera.
-        evidence: (B, 11 + L) evidence against the motion, unit variance: the last frame's of the pose, summed
-            of shape, vertical curvature and deviations.
+        evidence: (B, 11 + L) evidence against the motion, unit variance: accumulated, of the pose the last
+            frame's where it is larger.
         pose_sensitivity: (B, 4, L) change of the pose per metre of deviation of a boundary, by the last frame
             that determined the pose.
         motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, adapted to the drive.

@@ -1,0 +1,84 @@
+"""Evidence against the motion model, and the process noise of a road that bends."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.evidence import CALL, accumulate_evidence
+from lanebev.estimation.joint.measurement import NUM_SHAPE
+from lanebev.estimation.joint.road import step_variance
+from tools.bench_kinds import measure
+
+torch.set_num_threads(1)
+DOUBLE = torch.float64
+MEMORY = 0.15
+DT = torch.full((1,), 1 / 30, dtype=DOUBLE)
+
+
+def accumulated(score: float, frames: int, entry: int) -> list[float]:
+    """Evidence of one entry after frames that all have the same score."""
+    evidence, found = torch.zeros(1, 17, dtype=DOUBLE), []
+    for _ in range(frames):
+        evidence = accumulate_evidence(evidence, torch.full_like(evidence, score), DT, MEMORY)
+        found.append(float(evidence[0, entry]))
+    return found
+
+
+def test_scores_of_the_road_add_up_at_unit_variance():
+    ratio = math.exp(-1 / 30 / MEMORY)
+    last = accumulated(1.0, 200, entry=8)[-1]
+    assert last == pytest.approx(math.sqrt(1 - ratio**2) / (1 - ratio))
+    generator = torch.Generator().manual_seed(0)
+    evidence = torch.zeros(4000, 17, dtype=DOUBLE)
+    for _ in range(40):
+        score = torch.randn(evidence.shape, generator=generator, dtype=DOUBLE)
+        evidence = accumulate_evidence(evidence, score, DT.expand(4000), MEMORY)
+    assert evidence[:, 4:].std() == pytest.approx(1.0, abs=0.02)
+    assert evidence[:, :4].std() == pytest.approx(1.2, abs=0.05)  # the larger of two
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_of_the_pose_one_large_score_counts_at_once_and_many_smaller_ones_together(sign):
+    assert accumulated(8.0 * sign, 1, entry=0) == [8.0 * sign]
+    many = [sign * value for value in accumulated(4.5 * sign, 12, entry=0)]
+    assert many[0] == 4.5 < CALL < max(many)
+    assert sign * accumulated(2.0 * sign, 50, entry=0)[-1] < CALL
+
+
+def test_evidence_of_the_pose_that_was_answered_is_not_counted_again():
+    before = torch.zeros(1, 17, dtype=DOUBLE)
+    before[0, 0], before[0, 1], before[0, 8] = CALL + 1, CALL - 1, CALL + 1
+    after = accumulate_evidence(before, torch.zeros_like(before), DT, MEMORY)
+    assert after[0, 0] == 0
+    assert after[0, 1] > 2.5
+    assert after[0, 8] == pytest.approx((CALL + 1) * math.exp(-1 / 30 / MEMORY))
+
+
+def test_the_next_step_may_be_larger_where_the_road_bends():
+    cfg = MotionConfig()
+    shape = torch.zeros(3, NUM_SHAPE, dtype=DOUBLE)
+    shape[1, 0], shape[2, 0] = 2.9e-4, 3.3e-3
+    cov = torch.zeros(3, NUM_SHAPE, NUM_SHAPE, dtype=DOUBLE)
+    cov[:, 0, 0] = 1e-8
+    straight, unclear, bend = step_variance(shape, cov, cfg).sqrt().tolist()
+    assert straight == unclear == cfg.curvature_step
+    assert bend == pytest.approx(math.hypot(cfg.curvature_step, 0.07 * math.sqrt(3.3e-3**2 - 9e-8)))
+
+
+@pytest.mark.slow
+def test_a_fall_with_only_the_ego_lane_in_view_is_followed():
+    found = measure("drop, ego lane", range(60_000, 60_006))
+    assert found.within >= 0.97
+    assert max(found.back) <= 15
+
+
+@pytest.mark.slow
+def test_yaw_in_bends_is_near_its_bound():
+    """The bound knows the shape of the road; before the bend's own process noise the ratio was 1.4."""
+    found = measure("motion up to 1.5°, 1.2 Hz, R 300 m", range(60_000, 60_006))
+    assert found.ratio[1] < 1.3
+    assert found.within >= 0.97
