@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lanebev.camera.model import Camera
-from lanebev.tensors import constant
 from lanebev.types import Extrinsics
 from lanebev.view.blocks import blocks
 from lanebev.view.cells import cell_sums, rows_in_sight
@@ -42,7 +41,8 @@ def remap_frame(
         vertical_curvature: (1,) 1/m of the road, or None for a plane.
 
     Returns:
-        (U, V, 3) or (U, V) bytes, zero where not valid, and (U, V) bool. cv2 rounds coordinates to 1/32 px.
+        (U, V, 3) or (U, V) bytes, zero where not valid, and (U, V) bool. OpenCV before 5 rounds coordinates
+        to 1/32 px.
 
     Raises:
         ValueError: a frame of another type or size than the camera's.
@@ -60,43 +60,26 @@ def remap_frame(
     extrinsics = Extrinsics(*(part.cpu() for part in extrinsics))
     curvature = None if vertical_curvature is None else vertical_curvature.cpu()
     cells = cell_sums(grid, (0.0,), image_from_cam, extrinsics, curvature).to(torch.float32)
-    bev, valid = np.empty((*grid.shape, *frame.shape[2:]), np.uint8), np.empty(grid.shape, np.bool_)
-    for block in blocks(cells, lens, 1 - 1 / min(size), partial(_points, grid.shape[1])):
-        rows = slice(block.first, block.last)
-        points = block_map(block, MapSize(*size), size, block.points)[0]
-        np.less_equal(points[0].numpy(), 1, out=valid[rows])
-        cv2.remap(frame, *_fixed_point_pixels(points, size), cv2.INTER_LINEAR, bev[rows])
+    points = _kept("points", (1, 2, *grid.shape), np.float32)
+    memory = torch.from_numpy(points)
+    for block in blocks(cells, lens, 1 - 1 / min(size), lambda first, last: memory[:, :, first:last]):
+        block_map(block, MapSize(*size), size, block.points)
+    valid = points[0, 0] <= 1
+    bev = np.empty((*grid.shape, *frame.shape[2:]), np.uint8)
+    x, y = _pixels(points[0], size)
+    cv2.remap(frame, x, y, cv2.INTER_LINEAR, bev)  # at once, by all of its threads
     if curvature is not None:
         hidden = ~rows_in_sight(grid, (0.0,), extrinsics, curvature)[0].numpy()
         bev[hidden], valid[hidden] = 0, False
     return bev, valid
 
 
-def _points(columns: int, first: int, last: int) -> Tensor:
-    """Return memory that is kept for the points of a block."""
-    return torch.from_numpy(_kept("points", (1, 2, last - first, columns), np.float32))
-
-
-def _fixed_point_pixels(
-    points: Tensor, size: tuple[int, int]
-) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """Convert normalised coordinates to pixels as cv2.remap wants them.
-
-    Args:
-        points: (2, rows, V), which are overwritten.
-        size: (H, W) px.
-
-    Returns:
-        (rows, V, 2) whole px and (rows, V) parts of px, in memory that is kept.
-    """
-    centre = constant(((size[1] - 1) / 2, (size[0] - 1) / 2), like=points)
-    x, y = (
-        torch.add(middle, plane, alpha=side / 2, out=plane).numpy()
-        for middle, plane, side in zip(centre, points, reversed(size), strict=True)
-    )
-    whole, parts = _kept("whole", (*x.shape, 2), np.int16), _kept("parts", x.shape, np.uint16)
-    cv2.convertMaps(x, y, cv2.CV_16SC2, whole, parts)
-    return whole, parts
+def _pixels(points: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Convert normalised coordinates (2, U, V) to pixels of an image of size (H, W), in place."""
+    sides = np.array([size[1], size[0]], np.float32)[:, None, None]
+    points *= sides / 2
+    points += (sides - 1) / 2
+    return points
 
 
 @lru_cache(maxsize=8)
