@@ -11,7 +11,7 @@ clock's: of one thread, and for a machine that others use too.
 
 - ``warp``: 1920 × 1020 px, three channels, or 64 channels at stride 8, to 1024 × 512 cells, against a bare
   ``grid_sample`` with its grid at hand and kornia's ``warp_perspective``; ``gradients``: and back;
-  ``stages``: what is done before the resampling.
+  ``stages``: what is done before the resampling; ``compiled`` (if asked for): by inductor.
 - ``frame``: one frame of bytes through the lens, against ``cv2.remap`` with its maps at hand, and with its
   maps computed, as they must be when the pose is another in every frame.
 - ``extractor``: seven maps of 160 × 288.
@@ -38,7 +38,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     every = [*TABLES, *GROWTHS]
-    parser.add_argument("--parts", nargs="+", choices=every, default=every)
+    usual = [part for part in every if part != "compiled"]
+    parser.add_argument("--parts", nargs="+", choices=every, default=usual)
     parser.add_argument("--threads", type=PositiveInt, default=2)
     parser.add_argument("--cpu-time", action="store_true", help="processor time, with --threads 1")
     parser.add_argument("--seconds", type=PositiveFloat, default=5.0, help="per alternative (%(default)s)")

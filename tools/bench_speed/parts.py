@@ -28,6 +28,10 @@ TABLES: dict[str, list[tuple[str, Callable[[], Calls]]]] = {
         ("stages without a lens", lambda: views.stages(None)),
         ("stages with 5 coefficients", lambda: views.stages(scene.BROWN)),
     ],
+    "compiled": [
+        ("compiled without a lens", lambda: views.compiled(None)),
+        ("compiled with 5 coefficients", lambda: views.compiled(scene.BROWN)),
+    ],
     "gradients": [
         ("one image and back", lambda: views.backwards(1, 3, 1)),
         ("8 images and back", lambda: views.backwards(8, 3, 1)),

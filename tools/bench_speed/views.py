@@ -71,6 +71,20 @@ def stages(distortion: list[float] | None) -> Calls:
     }
 
 
+def compiled(distortion: list[float] | None) -> Calls:
+    """The warp of one image, and the same compiled by inductor, which needs a C++ compiler."""
+    image, grid = torch.rand(1, 3, *scene.SIZE), scene.sampling_grid(1)
+    ideal, extrinsics, warp = scene.camera().intrinsics.float()[None], scene.poses(1), BEVWarp(scene.GRID)
+    lens = None if distortion is None else torch.tensor([distortion])
+    compiled_warp = torch.compile(warp, fullgraph=True)
+    compiled_warp(image, ideal, extrinsics, lens, image_size=scene.SIZE)  # a minute, which is not measured
+    return {
+        "grid_sample": lambda: F.grid_sample(image, grid, align_corners=False),
+        "BEVWarp": lambda: warp(image, ideal, extrinsics, lens, image_size=scene.SIZE),
+        "torch.compile": lambda: compiled_warp(image, ideal, extrinsics, lens, image_size=scene.SIZE),
+    }
+
+
 def backwards(batch: int, channels: int, stride: int) -> Calls:
     """The warp and its peers, and the gradients of the image and of what it is sampled at."""
     image = torch.rand(batch, channels, scene.SIZE[0] // stride, scene.SIZE[1] // stride, requires_grad=True)
