@@ -12,6 +12,7 @@ from torch import Tensor
 from lanebev.app.shared_network import SharedNetwork
 from lanebev.camera.model import Camera
 from lanebev.io.image_names import in_natural_order
+from lanebev.io.lane_order import check_boundary_order
 from lanebev.io.lane_size import size_remark
 from lanebev.io.lanes import FrameLines, match_frames
 from lanebev.io.video import Frame, FrameSource
@@ -71,6 +72,9 @@ class LaneFileObserver:
     def __init__(self, entries: Sequence[FrameLines], source: FrameSource, camera: Camera) -> None:
         self.entries, self.camera = entries, camera
         self.remark = size_remark(entries, camera.image_size)
+        if not any(entry.lines for entry in entries):
+            self.remark = "lanes: none of the entries has a line"
+        check_boundary_order(entries)
         self._of_taken = source.is_video and len(entries) == source.taken_count
         if source.is_video:
             if len(entries) != source.count and not self._of_taken:

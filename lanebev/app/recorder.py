@@ -18,6 +18,7 @@ from lanebev.app.concurrency import Background
 from lanebev.app.kept import KeptNumbers, KeptRows
 from lanebev.app.observers import Observation
 from lanebev.app.plausibility import drive_remark
+from lanebev.app.repeats import RepeatedFrames
 from lanebev.app.views import ViewBefore, bird_view
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration
@@ -100,6 +101,7 @@ class Recorder:
         self._first_number: int | None = None
         self._widths = KeptNumbers(2, NUM_BOUNDARIES - 1, folder=self.path("."))
         self._moments, self._scores = MomentSampler(), EventScores()
+        self._repeats = RepeatedFrames()
 
     def __enter__(self) -> Recorder:
         self._stack = ExitStack()
@@ -121,6 +123,7 @@ class Recorder:
         frame = done.frame
         if frame.problem:
             self._note(f"frame {frame.number}: {frame.problem}")
+        self._repeats.add(frame.image)
         if not len(self.rows):
             self._first_number = frame.source_number
         self.rows.append(_row(done, done.estimate.calibration))
@@ -153,6 +156,7 @@ class Recorder:
         if self.smoothed:
             write_extrinsics(self.path("filtered.csv"), self._filtered_rows)
         before, after = self._widths.all().transpose(1, 0, 2)
+        remarks = ("" if self.stills else self._repeats.remark(), drive_remark(self.rows))
         report = Report(
             title=title,
             rows=self.rows,
@@ -161,7 +165,7 @@ class Recorder:
             lane_width=self.lane_width,
             facts=facts,
             moments=self._moments.moments,
-            problems=[*self.problems, *filter(None, [drive_remark(self.rows)])],
+            problems=[*self.problems, *filter(None, remarks)],
             is_stills=self.stills,
             is_smoothed=self.smoothed,
             before_title=self.before_title,

@@ -13,6 +13,7 @@ from PIL import Image
 from lanebev import Camera
 from lanebev.app.config import RunConfig
 from lanebev.app.run import run
+from lanebev.io.lane_order import check_boundary_order
 from lanebev.io.lane_size import lanes_of_whole_images, meeting_row, resized_lanes, size_remark
 from lanebev.io.lanes import FrameLines, read_culane, read_lanes, tusimple_line
 from lanebev.io.openlane import camera_from_ground_points
@@ -219,6 +220,18 @@ def _moved(entries, right, down):
         entry._replace(lines=[line._replace(points=line.points + shift) for line in entry.lines])
         for entry in entries
     ]
+
+
+def test_boundary_numbers_that_fall_from_left_to_right_are_refused():
+    def numbered(*numbers):
+        lines = [line._replace(boundary=n) for n, line in zip(numbers, _entries()[0].lines, strict=True)]
+        return FrameLines("0.png", lines)
+
+    check_boundary_order([numbered(1, 2, 3, 4), numbered(0, 1, 2, 3), numbered(None, None, None, None)])
+    check_boundary_order([numbered(1, 2, 3, 4), numbered(4, 3, 2, 1)])  # one frame's mistake
+    check_boundary_order([])
+    with pytest.raises(ValueError, match="rise from left to right, got falling ones in 3 of 3 pairs of neig"):
+        check_boundary_order([numbered(4, 3, 2, 1), FrameLines("1.png", [])])
 
 
 def test_lines_meet_at_the_horizon():

@@ -1,0 +1,59 @@
+"""Frames that show the image before them again, as of videos that were brought to a higher frame rate.
+
+Their errors are those of the frame before, and the camera seems to stand and jump.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+_STRIDE = 8  # px, of the pixels that are compared
+_NEAR = 2  # frames before and after, among which the largest change is that of the drive
+_MOVING = 1.0  # grey levels of 255 on average, of a change that counts
+_REPEATED = 0.2  # of the largest change near by; compression alone changes a repeated image by up to 0.1
+_MANY, _FEW = 0.1, 4  # of the frames, and in number: those at a cut or a stop
+
+
+def repeated(changes: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which frames repeat the one before: they change far less than frames near by.
+
+    Args:
+        changes: (N,) mean absolute difference from the frame before, grey levels; NaN where there is none.
+
+    Returns:
+        (N,).
+    """
+    padded = np.pad(np.nan_to_num(changes), _NEAR)
+    largest = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEAR + 1).max(-1)
+    found: NDArray[np.bool_] = (largest > _MOVING) & (changes < _REPEATED * largest)
+    return found
+
+
+class RepeatedFrames:
+    """Counts the repeated frames of a drive."""
+
+    def __init__(self) -> None:
+        self._before: NDArray[np.int16] | None = None
+        self._changes: list[float] = []
+
+    def add(self, image: NDArray[np.uint8] | None) -> None:
+        """Take the next frame (H, W, 3), None if it was lost."""
+        seen = None if image is None else image[::_STRIDE, ::_STRIDE].astype(np.int16)
+        change = math.nan
+        if seen is not None and self._before is not None:
+            change = float(np.abs(seen - self._before).mean())
+        self._changes.append(change)
+        self._before = seen
+
+    def remark(self) -> str:
+        """Return what to say of the drive; empty if few frames are repeated."""
+        count = int(repeated(np.array(self._changes)).sum()) if self._changes else 0
+        if count <= max(_FEW, _MANY * len(self._changes)):
+            return ""
+        return (
+            f"{count} of {len(self._changes)} frames repeat the one before, so that the camera seems to stand"
+            " and jump; leave them out, as by ffmpeg -vf mpdecimate, or --every 2 if they are every second"
+        )
