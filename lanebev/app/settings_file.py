@@ -37,7 +37,11 @@ def load_plain_yaml(text: str) -> object:
     Raises:
         yaml.YAMLError: the text is none.
     """
-    loaded: object = yaml.load(text, _PlainLoader)
+    loader = _PlainLoader(text)
+    try:
+        loaded: object = loader.get_single_data()
+    finally:
+        loader.dispose()
     return loaded
 
 
