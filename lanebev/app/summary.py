@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
 
@@ -12,11 +14,14 @@ from lanebev.app.config import RunConfig
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration, MountReason, MountStatus, describe_mount
 from lanebev.io.live import LiveSource
+from lanebev.io.results import ExtrinsicsRow
 from lanebev.io.video import FrameSource
 from lanebev.report.page import Report
+from lanebev.report.verdict import reason_words
 
 _SHOWN = {"pitch_deg": "deg", "yaw_deg": "deg", "roll_deg": "deg", "height_m": "m"}
 _PROBLEMS = 5  # that are printed
+_REASONS = 2  # likewise
 
 
 def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[str, str]:
@@ -91,6 +96,17 @@ def mount_facts(mounted: MountCalibration) -> dict[str, str]:
     return {"mount": f"{status}, {float(mounted.progress[0]):.0f} %{why}", "mount, axis by axis": words}
 
 
+def untracked_words(rows: Iterable[ExtrinsicsRow]) -> list[str]:
+    """Return the most frequent reasons of frames that are not tracked, in a line; none if all are."""
+    others = [row for row in rows if row.status != "TRACKING"]
+    names = ([name for name in row.reasons.split("|") if name not in ("", "NO_START")] for row in others)
+    reasons = Counter(words for each in names for words in reason_words(each))  # NO_START has another cause
+    if not reasons:
+        return []
+    words = ", ".join(f"{word} (in {count})" for word, count in reasons.most_common(_REASONS))
+    return [f"{len(others)} not tracked: {words}"]
+
+
 def summary(report: Report, config: RunConfig) -> str:
     """Return what to print when a run is done."""
     tracking = [row for row in report.rows if row.status == "TRACKING"]
@@ -99,6 +115,7 @@ def summary(report: Report, config: RunConfig) -> str:
         middle = {name: float(np.median([getattr(row, name) for row in tracking])) for name in _SHOWN}
         values = "  ".join(f"{name.rsplit('_', 1)[0]} {middle[name]:+.3f} {_SHOWN[name]}" for name in _SHOWN)
         lines.append(f"median  {values}")
+    lines += untracked_words(report.rows)
     shown = ("lane width", "mount", "smoothed", "reused", "stream")
     lines += [f"{label}: {text}" for label, text in report.facts.items() if label.startswith(shown)]
     lines += [f"problem: {problem}" for problem in report.problems[:_PROBLEMS]]

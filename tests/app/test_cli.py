@@ -22,6 +22,7 @@ from PIL import Image
 
 from lanebev import Camera, Extrinsics, JointCalibrator, image_from_road_points
 from lanebev.app.config import LANE_WIDTH, LANE_WIDTH_STD, RunConfig
+from lanebev.app.summary import untracked_words
 from lanebev.cli import main
 from lanebev.estimation.mount import MountReason
 from lanebev.io.results import CSV_COLUMNS, ExtrinsicsRow, write_extrinsics
@@ -119,6 +120,18 @@ def test_a_run_on_a_video_finds_the_pose(drive):
     np.testing.assert_allclose(found[:3], np.degrees(POSE[:3]), atol=0.1)
     assert abs(found[3] - POSE[3]) < 0.02
     assert int(rows[0]["segments"]) >= 16
+
+
+def test_the_summary_says_why_frames_are_not_tracked():
+    def row(number, status, reasons):
+        numbers = (0.0, 0.0, 0.0, 1.5, 0.1, 0.1, 0.1, 0.1)
+        return ExtrinsicsRow(number, number / 10, *numbers, status, 0, "", reasons)
+
+    rows = [row(i, "UNINITIALISED", "NO_SEGMENTS|NO_START") for i in range(3)]
+    rows += [row(3, "COASTING", "FEW_INLIERS"), row(4, "TRACKING", "ROLL_UNSEEN")]
+    expected = "4 not tracked: no lane boundaries seen (in 3), what was seen does not fit the road (in 1)"
+    assert untracked_words(rows) == [expected]
+    assert untracked_words(rows[4:]) == []
 
 
 def test_every_output_is_there_and_whole(drive):
