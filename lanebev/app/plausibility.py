@@ -19,6 +19,7 @@ _RESCALED = (
     0.02,
 )  # least offset of a principal point, and how much that in x and y may differ, in sides
 _TANGENTIAL = 0.025  # coefficient; of real lenses at most 0.01
+_SAME_VIEW = 2.0  # degrees, by which fields of view of one camera may differ
 _WIDE = 95.0  # degrees, from which on lenses distort
 _STRAIGHT = 0.93  # of the distance from the centre without distortion: wide lenses image an edge nearer to it
 _FISHEYE = (-0.15, 0.02)  # below k1, and above |k3| and |k4|: coefficients of plumb_bob
@@ -28,6 +29,26 @@ def camera_remarks(camera: Camera) -> list[str]:
     """Return what speaks against a camera: its lens, or a wrong size of images, model or focal length."""
     found = (lens_remark(camera), resized_remark(camera), model_remark(camera), view_remark(camera))
     return [f"camera: {remark}" for remark in found if remark]
+
+
+def mount_remark(path: str | None, camera: Camera) -> str:
+    """Return a remark on a ``calibration.yaml`` whose camera sees another angle than this one; else nothing.
+
+    That of resized images sees the same.
+    """
+    if path is None:
+        return ""
+    try:
+        other = field_of_view(Camera.from_file(path))
+    except ValueError:  # a mount without a camera
+        return ""
+    own = field_of_view(camera)
+    if abs(other - own) <= _SAME_VIEW:
+        return ""
+    return (
+        f"mount {path}: its camera has {other:.0f} degrees of view across, this one {own:.0f}; is it of "
+        "another camera?"
+    )
 
 
 def field_of_view(camera: Camera) -> float:

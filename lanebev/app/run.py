@@ -24,7 +24,7 @@ from lanebev.app.convert import writer
 from lanebev.app.kept import KeptNumbers
 from lanebev.app.observers import Observer
 from lanebev.app.part_observation import observer_of_parts
-from lanebev.app.plausibility import camera_remarks
+from lanebev.app.plausibility import camera_remarks, mount_remark
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.recovery import facts_of, frame_name, observer_of_second_pass, recover_run
@@ -111,7 +111,8 @@ def run(
             videos=not config.no_video,
             smoothed=config.smooth,
         )
-        recorder.problems += filter(None, (source.problem, problem, observer.remark, *camera_remarks(camera)))
+        doubts = (mount_remark(config.mount, camera), *camera_remarks(camera))
+        recorder.problems += filter(None, (source.problem, problem, observer.remark, *doubts))
         covariances = KeptNumbers(4, 4, folder=out / ".")
         frames = observed_frames(source, second)
         with recorder, closing(frames), ended_by_signals(source):

@@ -21,7 +21,7 @@ from lanebev.app.doctor import (
     check_size,
     check_times,
 )
-from lanebev.app.plausibility import camera_remarks, field_of_view, model_remark, pose_remark
+from lanebev.app.plausibility import camera_remarks, field_of_view, model_remark, mount_remark, pose_remark
 from lanebev.cli import main
 from lanebev.io.video import VideoWriter
 
@@ -98,6 +98,15 @@ def test_a_camera_that_was_calibrated_at_another_size():
     )
     (remark,) = camera_remarks(Camera.from_fov(10.0, 640, 360))
     assert "10 degrees of view across, where cameras on cars have 25 to 130" in remark
+
+
+def test_a_mount_of_another_camera(tmp_path):
+    CAMERA.to_file(tmp_path / "calibration.yaml")
+    path = str(tmp_path / "calibration.yaml")
+    assert mount_remark(None, CAMERA) == mount_remark(path, CAMERA.scaled((720, 1280))) == ""
+    assert mount_remark(str(tmp_path / "none.yaml"), CAMERA) == ""
+    remark = mount_remark(path, Camera.from_fov(90.0, 640, 360))
+    assert "its camera has 60 degrees of view across, this one 90; is it of another camera?" in remark
 
 
 def test_a_pose_that_no_camera_in_a_car_has():
