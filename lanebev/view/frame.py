@@ -55,7 +55,7 @@ def remap_frame(
             f"frame: expected the camera's {height} x {width}, got {frame.shape[0]} x {frame.shape[1]}; "
             "see Camera.scaled"
         )
-    size = camera.image_size
+    size, frame = camera.image_size, np.ascontiguousarray(frame)  # else cv2 copies it for every block
     image_from_cam, lens = _projection(camera)
     extrinsics = Extrinsics(*(part.cpu() for part in extrinsics))
     curvature = None if vertical_curvature is None else vertical_curvature.cpu()

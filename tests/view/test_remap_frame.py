@@ -75,6 +75,15 @@ def test_a_skewed_camera_is_seen_as_by_the_module():
     assert np.abs(bev - expected[0].permute(1, 2, 0).numpy()).max() < 1.0
 
 
+def test_the_order_of_a_frame_in_memory_changes_nothing():
+    """As of channels that were turned round, which cv2 would copy for every block of rows."""
+    image = frame()
+    expected, there = remap_frame(image, camera(), POSE, GRID)
+    bev, valid = remap_frame(np.ascontiguousarray(image[..., ::-1])[..., ::-1], camera(), POSE, GRID)
+    assert np.array_equal(bev, expected)
+    assert np.array_equal(valid, there)
+
+
 def test_frames_of_another_kind_are_refused():
     with pytest.raises(ValueError, match=r"frame: expected \(H, W, 3\) of uint8, got .* of float64"):
         remap_frame(frame().astype(float), camera(), POSE, GRID)
