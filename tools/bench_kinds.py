@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.dynamics import MotionConfig
-from lanebev.estimation.joint.single_frame import FramePrior
+from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.state import HILLY_ROADS
 from lanebev.estimation.joint.update import UNSEEN
 from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, within_sigmas

@@ -28,7 +28,7 @@ from torch import Tensor
 
 import lanebev
 from lanebev import BEVGrid, Calibration, Camera, JointCalibrator, LaneBEV, LaneSegments, Status
-from lanebev.estimation.joint.single_frame import FramePrior, prior_of_mount
+from lanebev.estimation.joint.frame_prior import FramePrior, prior_of_mount
 from lanebev.estimation.tracker import Tracker
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.io.video import read_image

@@ -20,7 +20,8 @@ from torch import Tensor, nn
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.calibrator import JointCalibrator, predict_state
 from lanebev.estimation.joint.layout import NUM_COMMON, SHAPE, layout
-from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, VERTICAL, boundary_places
+from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, VERTICAL
+from lanebev.estimation.joint.observations import boundary_places
 from lanebev.estimation.joint.road_curve import road_curve
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason

@@ -14,7 +14,7 @@ from lanebev.app.shared_network import SharedNetwork
 from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator, StateT
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.single_frame import prior_of_mount
+from lanebev.estimation.joint.frame_prior import prior_of_mount
 from lanebev.estimation.joint.state import HILLY_ROADS, JointConfig, JointState
 from lanebev.estimation.tracker import Tracker
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.joint.measurement import NUM_PARAMS, boundary_residuals
-from lanebev.estimation.joint.measurement import observe as make_ready
+from lanebev.estimation.joint.observations import observe as make_ready
 from lanebev.estimation.joint.single_frame import normal_equations
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.scenarios import CAMERA, FPS, PLACES, WIDTH, Moment, observe

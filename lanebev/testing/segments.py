@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint.measurement import boundary_places
+from lanebev.estimation.joint.observations import boundary_places
 from lanebev.geometry.road import image_from_road_points
 from lanebev.observation.segments import LaneSegments
 from lanebev.types import Extrinsics

@@ -10,7 +10,7 @@ from lanebev import Camera, Extrinsics, LaneBEV, Status, image_from_road_points
 from lanebev.app.build import make_camera, make_tracker
 from lanebev.app.config import FOV_FOCAL_STD, RunConfig
 from lanebev.app.observers import NetworkObserver
-from lanebev.estimation.joint.single_frame import FramePrior, prior_of_mount
+from lanebev.estimation.joint.frame_prior import FramePrior, prior_of_mount
 from lanebev.geometry.road import lane_width_covariance
 from lanebev.io.video import Frame
 from lanebev.observation.polylines import LaneLine, vertices_from_lines

@@ -17,6 +17,7 @@ from lanebev.estimation.joint.dynamics import (
     pose_transition,
 )
 from lanebev.estimation.joint.evidence import adapt_motion_scale, deviation_prior_std
+from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.lane_change import renumber
 from lanebev.estimation.joint.layout import NUM_COMMON, SHAPE, STEPS, layout
 from lanebev.estimation.joint.measurement import (
@@ -27,15 +28,13 @@ from lanebev.estimation.joint.measurement import (
     ROLL,
     VERTICAL,
     boundary_distances,
-    boundary_places,
     boundary_residuals,
     foot_rays,
     look,
-    observe,
 )
+from lanebev.estimation.joint.observations import boundary_places, observe
 from lanebev.estimation.joint.road import propagate_road_shape, straight_or_bend, turn_along
 from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS, road_basis, road_curve
-from lanebev.estimation.joint.single_frame import FramePrior
 from lanebev.estimation.joint.state import JointConfig, state_from_fit
 from lanebev.estimation.joint.status import single_deviation
 from lanebev.estimation.joint.update import (

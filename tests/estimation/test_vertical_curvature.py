@@ -12,14 +12,8 @@ from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.dynamics import MotionConfig
 from lanebev.estimation.joint.evidence import vertical_curvature_prior_std
 from lanebev.estimation.joint.layout import NUM_COMMON
-from lanebev.estimation.joint.measurement import (
-    HEIGHT,
-    VERTICAL,
-    boundary_places,
-    boundary_residuals,
-    look,
-    observe,
-)
+from lanebev.estimation.joint.measurement import HEIGHT, VERTICAL, boundary_residuals, look
+from lanebev.estimation.joint.observations import boundary_places, observe
 from lanebev.estimation.joint.single_frame import fit_single_frame
 from lanebev.estimation.joint.state import JointConfig, with_vertical_curvature
 from lanebev.observation.segments import LaneSegments

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from lanebev import Calibration, Extrinsics, JointCalibrator, LaneSegments, Status, image_from_road_points
-from lanebev.estimation.joint.measurement import boundary_residuals, observe
+from lanebev.estimation.joint.measurement import boundary_residuals
+from lanebev.estimation.joint.observations import observe
 from lanebev.geometry.focal import pose_by_log_focal, with_focal_std
 from lanebev.testing.scenarios import CAMERA, moments, swing
 from lanebev.testing.scenarios import observe as see

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import masked_median
-from lanebev.estimation.joint.measurement import observe
+from lanebev.estimation.joint.observations import observe
 from lanebev.geometry.road import image_from_road_points
 from lanebev.geometry.road_profile import Profile, meet_road, meets_before_farthest
 from lanebev.geometry.rotation import road_from_cam

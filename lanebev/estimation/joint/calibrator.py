@@ -29,14 +29,12 @@ from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, SHAPE, S
 from lanebev.estimation.joint.measurement import (
     CURVATURE,
     VERTICAL,
-    Observations,
     boundary_distances,
-    boundary_places,
     boundary_residuals,
     foot_rays,
     look,
-    observations,
 )
+from lanebev.estimation.joint.observations import Observations, boundary_places, observations
 from lanebev.estimation.joint.restart import restart
 from lanebev.estimation.joint.road import propagate_road_shape
 from lanebev.estimation.joint.road_curve import KNOT_SPACING

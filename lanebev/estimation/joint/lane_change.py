@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.joint.layout import NUM_COMMON
-from lanebev.estimation.joint.measurement import OFFSET, Observations, Sight, every_segment, sampson_distances
+from lanebev.estimation.joint.measurement import OFFSET, Sight, every_segment, sampson_distances
+from lanebev.estimation.joint.observations import Observations
 from lanebev.estimation.joint.robust import log_likelihood, start_scale
 from lanebev.tensors import constant
 

@@ -16,13 +16,8 @@ from lanebev.batch import flag, replace_rows, select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.evidence import CALL
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, layout
-from lanebev.estimation.joint.measurement import (
-    HEIGHT,
-    NUM_STRAIGHT,
-    ROLL,
-    Observations,
-    boundary_residuals,
-)
+from lanebev.estimation.joint.measurement import HEIGHT, NUM_STRAIGHT, ROLL, boundary_residuals
+from lanebev.estimation.joint.observations import Observations
 from lanebev.estimation.joint.robust import log_likelihood
 from lanebev.estimation.joint.single_frame import SingleFrameFit, fit_observations
 from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit

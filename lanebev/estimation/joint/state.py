@@ -11,12 +11,12 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lanebev.estimation.joint.dynamics import MotionConfig, pose_variances
+from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.layout import NUM_POSE, STEPS, layout
 from lanebev.estimation.joint.measurement import CURVATURE, NUM_PARAMS, NUM_SHAPE, NUM_STRAIGHT, VERTICAL
 from lanebev.estimation.joint.readings import ReadingConfig
 from lanebev.estimation.joint.road import straight_or_bend
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
-from lanebev.estimation.joint.single_frame import FramePrior
 from lanebev.estimation.reasons import Reason
 from lanebev.tensors import constant
 from lanebev.types import NUM_BOUNDARIES, map_tensors, register_pytree

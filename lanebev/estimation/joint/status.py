@@ -9,7 +9,8 @@ from lanebev.batch import flags, select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.evidence import EQUAL
 from lanebev.estimation.joint.layout import POSE, layout
-from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL, Observations
+from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL
+from lanebev.estimation.joint.observations import Observations
 from lanebev.estimation.joint.state import JointConfig, JointState, unobserved_mask
 from lanebev.estimation.joint.update import UNSEEN
 from lanebev.estimation.reasons import Reason

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from lanebev.estimation.joint.single_frame import FramePrior, student_weight
+from lanebev.estimation.joint.frame_prior import FramePrior, student_weight
 from lanebev.geometry.linalg import inverse_spd
 
 

@@ -8,13 +8,8 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, Layout
-from lanebev.estimation.joint.measurement import (
-    NUM_STRAIGHT,
-    OFFSET,
-    ROLL,
-    Observations,
-    Residuals,
-)
+from lanebev.estimation.joint.measurement import NUM_STRAIGHT, OFFSET, ROLL, Residuals
+from lanebev.estimation.joint.observations import Observations
 from lanebev.estimation.joint.robust import anneal_scale, inlier_weights, noise_scale
 from lanebev.estimation.kalman import symmetrise
 from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower

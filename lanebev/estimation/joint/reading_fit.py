@@ -1,0 +1,165 @@
+"""Robust fits of an image's readings, each with its own deviations and headings of the boundaries."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot, softplus
+
+from lanebev.estimation.joint.frame_prior import FramePrior, student_log, student_weight
+from lanebev.estimation.joint.measurement import (
+    HEIGHT,
+    NUM_PARAMS,
+    OFFSET,
+    boundary_residuals,
+    foot_rays,
+    look,
+)
+from lanebev.estimation.joint.observations import Observations
+from lanebev.estimation.joint.readings import Readings
+from lanebev.estimation.joint.robust import (
+    anneal_scale,
+    inlier_log_odds,
+    inlier_weights,
+    noise_scale,
+    start_scale,
+)
+from lanebev.geometry.linalg import cholesky, inverse_spd, solve_spd
+
+
+class Model(NamedTuple):
+    """R fits to compute: rows of observations and the assumptions of each.
+
+    Attributes:
+        seen: observations of R rows.
+        member: (R, M, L) one-hot boundary of each end point.
+        places: (R, L) m, of the boundaries from the ego lane's middle.
+        std: (R, 2 L + 1) of their deviations (m), headings (rad), and of the road's vertical curvature (1/m).
+        prior: prior of the frame.
+    """
+
+    seen: Observations
+    member: Tensor
+    places: Tensor
+    std: Tensor
+    prior: FramePrior
+
+
+class Linear(NamedTuple):
+    """A fit linearised: distances (R, N, 2) px, Jacobian (R, 7 + 2 L + 1, M), validity (R, N)."""
+
+    distance: Tensor
+    jacobian: Tensor
+    valid: Tensor
+
+
+class Fits(NamedTuple):
+    """R fits: params (R, 7), own (R, 2 L + 1), covariance (R, 7, 7) of params, log evidence (R,)."""
+
+    params: Tensor
+    own: Tensor
+    covariance: Tensor
+    evidence: Tensor
+
+
+def reading_model(
+    seen: Observations, positions: Tensor, ways: Readings, repeats: int, prior: FramePrior
+) -> Model:
+    """Make the rows of C readings and of as many repeats of each, for B frames."""
+    num, ego = positions.shape[-1], positions.shape[-1] // 2 - 1
+    width = positions[:, ego + 1] - positions[:, ego]
+    places = positions.unsqueeze(1) + ways.shift * width[:, None, None]  # (B, C, L)
+    own = [ways.place_std, ways.heading_std, ways.profile_std.unsqueeze(-1)]
+    std = torch.cat(own, dim=-1).expand(len(positions), -1, -1)
+    many = Observations(*(part.repeat_interleave(places.shape[1] * repeats, dim=0) for part in seen))
+    return Model(
+        seen=many,
+        member=one_hot(many.boundary, num).to(positions).repeat_interleave(2, dim=1),
+        places=places.repeat_interleave(repeats, dim=1).flatten(0, 1),
+        std=std.repeat_interleave(repeats, dim=1).flatten(0, 1),
+        prior=prior,
+    )
+
+
+def _linearise(params: Tensor, own: Tensor, model: Model) -> Linear:
+    """Linearise the distances by parameters, deviations, headings and the road's profile.
+
+    A boundary at heading η is at x_k + η Z: to first order its end points move as the offset moves them, η Z.
+    A road that falls by κ Z² / 2 is as far below the camera as if the height were greater by that. Z is that
+    of the foot point: at the noisy end point the derivatives would correlate with the noise.
+    """
+    seen, num = model.seen, model.places.shape[-1]
+    places = (model.places + own[:, :num]).gather(1, seen.boundary)
+    sight = look(params, seen)
+    feet = foot_rays(params, places, seen, sight)
+    at = boundary_residuals(params, places, seen, feet=feet, sight=sight)
+    by_place = at.jacobian[:, OFFSET].unsqueeze(-1) * model.member  # (R, M, L)
+    by_heading = by_place * at.z.unsqueeze(-1)
+    by_rest = torch.cat([by_heading, at.by_vertical_curvature.unsqueeze(-1)], dim=-1)
+    moved = (by_rest @ own[:, num:].unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, 2))
+    distance = at.distance + moved * at.valid.unsqueeze(-1)
+    return Linear(distance, torch.cat([at.jacobian, by_place.mT, by_rest.mT], dim=1), at.valid)
+
+
+def _own_lines(params: Tensor, model: Model) -> Tensor:
+    """Fit all but the parameters, (R, 2 L + 1), all segments believed: no line begins as an outlier."""
+    none = torch.zeros_like(model.std)
+    at = _linearise(params, none, model)
+    jacobian = at.jacobian[:, NUM_PARAMS:]
+    weighted = jacobian * _per_end(at.valid * model.seen.weight / model.seen.sigma.square())
+    information = weighted @ jacobian.mT + model.std.square().reciprocal().diag_embed()
+    return -solve_spd(information, weighted @ at.distance.flatten(1).unsqueeze(-1)).squeeze(-1)
+
+
+def fit_readings(params: Tensor, model: Model, steps: int) -> Fits:
+    """Compute the robust maximum a posteriori fit of every row, with its evidence."""
+    seen, prior = model.seen, model.prior
+    mean, std = prior.mean(params), prior.std(params)
+    at_prior = torch.cat([mean.expand_as(params), torch.zeros_like(model.std)], dim=-1)
+    own = _own_lines(params, model)
+    at = _linearise(params, own, model)
+    scale = start_scale(at.distance, seen.sigma, seen.weight * at.valid)
+    for step in range(steps + 1):
+        trust = inlier_weights(at.distance, at.valid, seen.sigma, scale, seen.focal) * seen.weight
+        scale = anneal_scale(scale, noise_scale(at.distance, seen.sigma, trust))
+        weighted = at.jacobian * _per_end(at.valid * trust / (seen.sigma * scale.unsqueeze(-1)).square())
+        away = ((params - mean) / std).square()
+        of_prior = student_weight(away, prior.freedom) / std.square()
+        held = torch.cat([of_prior, model.std.square().reciprocal()], dim=-1)
+        information = weighted @ at.jacobian.mT + held.diag_embed()
+        if step == steps:
+            break
+        found = torch.cat([params, own], dim=-1)
+        gradient = (weighted @ at.distance.flatten(1).unsqueeze(-1)).squeeze(-1) + held * (found - at_prior)
+        change = solve_spd(information, gradient.unsqueeze(-1)).squeeze(-1)
+        too_far = (change[:, :NUM_PARAMS] / std).abs().amax(-1, keepdim=True)
+        found = found - change / too_far.clamp(min=1.0)
+        params, own = found[:, :NUM_PARAMS], found[:, NUM_PARAMS:]
+        height = params[:, HEIGHT : HEIGHT + 1].clamp(min=0.2)
+        params = torch.cat([params[:, :HEIGHT], height, params[:, HEIGHT + 1 :]], dim=-1)
+        at = _linearise(params, own, model)
+    odds = inlier_log_odds(at.distance, seen.sigma, scale, seen.focal)
+    likelihood = (seen.weight * torch.where(at.valid, softplus(odds), 0.0)).sum(-1)
+    of_lines = -0.5 * (own / model.std).square().sum(-1) - model.std.log().sum(-1)
+    evidence = likelihood + student_log(away, prior.freedom) + of_lines - _half_log_det(information)
+    good = evidence.isfinite() & params.isfinite().all(-1)
+    return Fits(
+        params=torch.where(good.unsqueeze(-1), params, mean),
+        own=own,
+        covariance=inverse_spd(information)[:, :NUM_PARAMS, :NUM_PARAMS],
+        evidence=torch.where(good, evidence, -1e30),
+    )
+
+
+def _per_end(weight: Tensor) -> Tensor:
+    """(R, N) of segments to (R, 1, M) of their end points."""
+    return weight.repeat_interleave(2, dim=1).unsqueeze(1)
+
+
+def _half_log_det(matrix: Tensor) -> Tensor:
+    """Half the log determinant (R,) of positive definite matrices, scaled to a unit diagonal meanwhile."""
+    size = matrix.diagonal(dim1=1, dim2=2).sqrt()
+    factor = cholesky(matrix / (size.unsqueeze(-1) * size.unsqueeze(-2)))
+    return (factor.diagonal(dim1=1, dim2=2).log() + size.log()).sum(-1)
