@@ -248,12 +248,13 @@ def max_undistorted_radius(distortion: Tensor, model: str = "pinhole", limit: fl
         (B,) radius on the undistorted z = 1 plane.
     """
     check_lens(distortion, model)
-    steps = _fractions(distortion.dtype, distortion.device).expand(*distortion.shape[:-1], -1)
-    angle = 0.9999 * 0.5 * math.pi * steps
+    steps, angle, radius, sine, cosine = (
+        part.expand(*distortion.shape[:-1], -1) for part in _reaches(distortion.dtype, distortion.device)
+    )
     if lens_model(model) == "fisheye":
-        radius, (value, _) = angle.tan(), fisheye_distance(angle, distortion)
+        value, _ = fisheye_distance(angle, distortion)
     elif lens_model(model) == "omni":
-        radius, seen = angle.tan(), angle.sin() / (angle.cos() + distortion[..., :1])
+        seen = sine / (cosine + distortion[..., :1])
         value = seen * radial_scale(seen * seen, distortion[..., 1:])[0]
     else:
         radius = limit * steps
@@ -263,8 +264,11 @@ def max_undistorted_radius(distortion: Tensor, model: str = "pinhole", limit: fl
 
 
 @made_once
-def _fractions(dtype: torch.dtype, device: torch.device) -> Tensor:
-    return torch.linspace(0.0, 1.0, _REACH_STEPS + 1, dtype=dtype, device=device)
+def _reaches(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
+    """Return fractions from 0 to 1, those of 90 degrees as angles, and their tangents, sines and cosines."""
+    steps = torch.linspace(0.0, 1.0, _REACH_STEPS + 1, dtype=dtype, device=device)
+    angle = 0.9999 * 0.5 * math.pi * steps
+    return steps, angle, angle.tan(), angle.sin(), angle.cos()
 
 
 def _matrix(entries: list[Tensor]) -> Tensor:

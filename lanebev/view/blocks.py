@@ -52,12 +52,14 @@ def blocks(cells: Cells, lens: Lens | None, limit: float, memory: Memory | None 
         curves = interpolant(cells, lens, limit)
         if curves is not None:
             for tile, span in enumerate(itertools.pairwise(curves.rows.edges)):
-                if not curves.smooth[:, tile].any():
-                    yield from _exact_blocks(cells, lens, span, ONE_THREAD, memory)
+                smooth = curves.smooth[:, tile]
+                if not smooth.any():
+                    yield from _exact_blocks(cells, lens, span, ONE_THREAD // 3, memory)
                 elif curves.inside[tile] or memory is None:
                     yield _tile_block(curves, cells, lens, tile, span, memory)
                 else:
-                    for first, last in _spans(span, ONE_THREAD // (batch * columns)):
+                    planes = batch * (1 if smooth.all() else 3)  # cell by cell, all coordinates at once
+                    for first, last in _spans(span, ONE_THREAD // (planes * columns)):
                         yield _tile_block(curves, cells, lens, tile, (first, last), memory)
             return
     # compiled code has no planes in between

@@ -1,6 +1,9 @@
 """Interpolated sampling maps against those computed cell by cell, and what is not interpolated."""
 
 import itertools
+import os
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics
 from lanebev.view.blocks import blocks
 from lanebev.view.cells import cells_and_lens
 from lanebev.view.projection import image_coordinates, normalised_intrinsics, outside_image
+from lanebev.view.sampling import MapSize, sampling_maps
 from lanebev.view.tiles import (
     column_tiles,
     equal_edges,
@@ -203,6 +207,33 @@ def test_small_products_are_those_of_the_whole(monkeypatch):
     assert (out[:, :, 55:] == 0).all()
     assert sizes == [31, 19]  # 31 x 12 x 700 are just below 2 ** 18
     np.testing.assert_allclose(small_products(left, right[0]), left @ right[0], atol=1e-5)
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="no list of threads and their times")
+@pytest.mark.parametrize("lens", [lens for lens in LENSES if lens != "fisheye"])  # atan starts MKL's threads
+def test_one_thread_computes_where_to_sample(lens):
+    """PyTorch's and BLAS's would wait for each other at every short operation."""
+
+    def others_time():
+        tasks = Path("/proc/self/task").glob("*/schedstat")
+        return sum(int(each.read_text().split()[0]) for each in tasks if each.parent.name != str(os.getpid()))
+
+    def computed():
+        with torch.no_grad():
+            sampling_maps(*prepared(lens, USUAL, torch.float32), [MapSize(*SIZE)], SIZE)
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        computed()  # makes constants
+        started = others_time()
+        torch.rand(1 << 17).sin_()
+        time.sleep(0.05)  # until the others no longer wait busily
+        before = others_time()
+        computed()
+        assert others_time() == before > started
+    finally:
+        torch.set_num_threads(threads)
 
 
 def test_a_grid_of_few_cells_is_computed_cell_by_cell():
