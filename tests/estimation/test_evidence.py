@@ -11,7 +11,9 @@ from lanebev.estimation.joint.dynamics import MotionConfig
 from lanebev.estimation.joint.evidence import CALL, accumulate_evidence
 from lanebev.estimation.joint.measurement import NUM_SHAPE
 from lanebev.estimation.joint.road import step_variance
+from lanebev.testing.scenarios import Moment
 from tools.bench_kinds import measure
+from tools.told_road import shape_of
 
 torch.set_num_threads(1)
 DOUBLE = torch.float64
@@ -82,3 +84,11 @@ def test_yaw_in_bends_is_near_its_bound():
     found = measure("motion up to 1.5°, 1.2 Hz, R 300 m", range(60_000, 60_006))
     assert found.ratio[1] < 1.3
     assert found.within >= 0.97
+
+
+def test_the_shape_that_a_filter_is_told_is_that_of_the_road():
+    """A clothoid of 1e-5 /m² begins 20 m ahead; the first knot is 4 m behind."""
+    moment = Moment((0.0, 0.0, 0.0, 1.5), curvature=lambda s: 1e-5 * (s - 20.0).clamp(min=0.0))
+    shape = shape_of(moment, torch.tensor([4.0], dtype=DOUBLE))
+    expected = torch.tensor([0.0, 0.0, 0.0, 6e-5, 1e-4, 1e-4], dtype=DOUBLE)
+    torch.testing.assert_close(shape[0], expected, atol=2e-7, rtol=0)

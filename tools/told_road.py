@@ -1,0 +1,68 @@
+"""The joint filter when it is told the shape of the road: what remains to be estimated is the pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.layout import SHAPE
+from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS
+from lanebev.estimation.joint.state import JointState
+from lanebev.observation.segments import LaneSegments
+from lanebev.testing.scenarios import Moment
+from lanebev.types import Calibration
+
+_STEP = 0.01  # m along the road
+_KNOWN = 1e-9  # 1/m, standard deviation of the shape
+
+
+class ToldRoad(JointCalibrator):
+    """The joint filter whose state is given the true shape of the road before every frame.
+
+    It counts the frames, so it is good for one drive, or for several over the same road at the same speed.
+
+    Args:
+        drive: moments, each with a curvature.
+        speed: m/s.
+    """
+
+    def __init__(self, drive: Sequence[Moment], speed: float) -> None:
+        super().__init__(motion=MotionConfig(speed=speed, speed_std=0.5))
+        self.drive, self.frame = drive, 0
+
+    def step(
+        self, segments: LaneSegments, intrinsics: Tensor, state: JointState, dt: Tensor, lane_width: Tensor
+    ) -> tuple[Calibration, JointState]:
+        """Process one frame, the road of the frame before being known."""
+        if self.frame:
+            shape = shape_of(self.drive[self.frame - 1], state.phase)
+            mean, cov = state.mean.clone(), state.cov.clone()
+            mean[:, SHAPE] = shape
+            cov[:, SHAPE], cov[:, :, SHAPE] = 0.0, 0.0
+            cov.diagonal(dim1=1, dim2=2)[:, SHAPE] = _KNOWN**2
+            state = state._replace(mean=mean, cov=cov)
+        self.frame += 1
+        return super().step(segments, intrinsics, state, dt, lane_width)
+
+
+def shape_of(moment: Moment, phase: Tensor) -> Tensor:
+    """Compute d²X/dZ² of the road's middle at the first knot, and its steps (B, 1 + NUM_STEPS), 1/m.
+
+    Args:
+        moment: with a curvature by the distance along the road.
+        phase: (B,) m, how far the first knot lies behind the camera.
+    """
+    assert moment.curvature is not None
+    along = torch.arange(0.0, 80.0, _STEP, dtype=phase.dtype)
+    curvature = moment.curvature(along)
+    heading = torch.nn.functional.pad(torch.cumulative_trapezoid(curvature, dx=_STEP), (1, 0))
+    ahead = torch.nn.functional.pad(torch.cumulative_trapezoid(heading.cos(), dx=_STEP), (1, 0))
+    knots = KNOT_SPACING * torch.arange(1 + NUM_STEPS, dtype=phase.dtype) - phase.unsqueeze(-1)
+    nearest = torch.searchsorted(ahead, knots.clamp(min=0.0)).clamp(max=len(along) - 1)
+    at_knots = (curvature / heading.cos() ** 3)[nearest]
+    at_knots[:, 0] = moment.curvature(-phase)
+    return torch.cat([at_knots[:, :1], at_knots.diff(dim=-1)], dim=-1)
