@@ -130,8 +130,9 @@ def write_labels(result: Path, source: str, out: Path, camera: Camera, reach: in
         stride: write every Nth usable frame.
 
     Raises:
-        ValueError: no frame is usable, or the frames are not those of the run.
+        ValueError: no frame is usable, or the frames or the camera are not those of the run.
     """
+    check_camera_of_run(result, camera)
     curves, rows = fitted_curves(result, camera)
     curves, steady = smoothed(curves, reach)
     x = label_rows(curves, camera, poses(rows, curves.offset))
@@ -153,6 +154,17 @@ def write_labels(result: Path, source: str, out: Path, camera: Camera, reach: in
     return len(entries)
 
 
+def check_camera_of_run(result: Path, camera: Camera) -> None:
+    """Raise unless a camera is that of a run, by the ``calibration.yaml`` in its folder.
+
+    Raises:
+        ValueError: it is another.
+    """
+    path = result / "calibration.yaml"
+    if path.is_file() and Camera.from_file(path).fingerprint() != camera.fingerprint():
+        raise ValueError(f"camera: expected that of the run, got another; {path} is the run's")
+
+
 def frames_of_run(source: str, result: Path) -> Iterator[Frame]:
     """Yield the frames that a run took of its source.
 
@@ -171,8 +183,14 @@ def frames_of_run(source: str, result: Path) -> Iterator[Frame]:
 
 
 def write_entry(out: Path, frame: Frame, x: NDArray[np.float64]) -> dict[str, object]:
-    """Write the image of a frame, and return its entry of ``labels.json`` with boundaries (L, R) px."""
+    """Write the image of a frame, and return its entry of ``labels.json`` with boundaries (L, R) px.
+
+    Raises:
+        ValueError: the image has another number of rows than the boundaries.
+    """
     assert frame.image is not None
+    if len(image_rows(frame.image.shape[0])) != x.shape[1]:
+        raise ValueError(f"camera: expected one of images {frame.image.shape[0]} px high, got another")
     name = f"images/{frame.number:06d}.jpg"
     Image.fromarray(frame.image).save(out / name, quality=95)
     there = [k for k in range(len(x)) if np.isfinite(x[k]).sum() > 1]

@@ -100,6 +100,17 @@ def test_labels_are_those_of_the_frames_that_the_run_took(run, tmp_path):
         assert image.getpixel((0, 0)) == (0, 0, 0)  # the source's frame 10
 
 
+def test_a_camera_that_is_not_the_runs_is_refused(run, tmp_path):
+    result, source = run
+    with pytest.raises(ValueError, match="camera: expected one of images 360 px high, got another"):
+        write_labels(result, str(source), tmp_path / "out", CAMERA.scaled((720, 1280)), 3, 1)
+    CAMERA.to_file(result / "calibration.yaml")
+    with pytest.raises(ValueError, match=r"expected that of the run, got another; .*calibration.yaml is the"):
+        write_labels(result, str(source), tmp_path / "out", CAMERA.cropped(0, 4, 360, 640), 3, 1)
+    assert {path.name for path in tmp_path.iterdir()} == {"result", "frames"}
+    assert write_labels(result, str(source), tmp_path / "out", CAMERA, 3, 1) == FRAMES - 1
+
+
 def curves(offset, present):
     zero = torch.zeros_like(offset)
     extent = torch.stack([zero + 3, zero + 40], dim=-1)
