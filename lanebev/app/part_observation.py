@@ -37,7 +37,7 @@ def observe_part(config: RunConfig, path: Path, network: SharedNetwork | None = 
     Raises:
         ValueError: see :func:`lanebev.app.run.run`.
     """
-    source = make_source(config)
+    source = make_source(config, may_take_none=True)
     camera = camera_of(config, source)
     source = match_image_size(camera, source)
     frames = observed_frames(source, make_observer(config, source, camera, network))

@@ -25,8 +25,12 @@ from lanebev.io.video import FrameSource, open_source
 from lanebev.report.run_folder import RunFolder
 
 
-def make_source(config: RunConfig) -> FrameSource:
+def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
     """Open the source, with the frames that the settings take.
+
+    Args:
+        config: the settings.
+        may_take_none: whether they may take no frame, as a part of a drive that lies in a gap.
 
     Raises:
         ValueError: nothing there, nothing that decodes, no frame that is taken, or a setting that a stream
@@ -49,7 +53,7 @@ def make_source(config: RunConfig) -> FrameSource:
     said = [each if each is found.problem else f"{config.source}: {each}" for each in remarks if each]
     found = replace(found, problem="; ".join(said))
     source = replace(found, selection=selection)
-    if selection != ALL and not source.taken_count:
+    if selection != ALL and not may_take_none and not source.taken_count:
         last = source.times[-1] if source.times else float(source.count / source.fps)
         raise ValueError(
             f"start, end, every: expected some of the {source.count} frames to be taken, got none; "

@@ -16,6 +16,7 @@ from lanebev.app.fleet.manifest import Drive
 from lanebev.app.fleet.plan import Outcome, earlier_outcome, is_done, tasks_of, write_mark
 from lanebev.app.fleet.schedule import Schedule
 from lanebev.app.observers import NetworkObserver
+from lanebev.app.part_observation import observe_part
 from lanebev.app.run import run
 from lanebev.io.state import load_state
 from lanebev.io.video import VideoWriter
@@ -54,6 +55,23 @@ def test_a_long_video_has_parts(tmp_path, drive):
     uncut.append(tasks_of([lanes], tmp_path, 3.0))
     assert [each["one"].parts for each in uncut] == [(), (), ()]
     assert uncut[0]["one"].fingerprint == task.fingerprint
+
+
+def test_a_part_in_a_gap_of_the_times_has_no_frames(tmp_path):
+    with VideoWriter(tmp_path / "a.mp4", Fraction(5)) as writer:
+        for time in (0.0, 0.2, 0.4, 8.0, 8.2, 8.4):
+            writer.write(np.zeros((32, 32, 3), np.uint8), time)
+    config = RunConfig(str(tmp_path / "a.mp4"), fov=60.0, lanes=str(tmp_path / "lanes.json"))
+    Path(config.lanes).write_text(
+        "".join(f'{{"raw_file": "{k}", "h_samples": [9], "lanes": []}}\n' for k in range(6))
+    )
+    counts = [
+        observe_part(replace(config, start=start, end=end), tmp_path / "part.json")
+        for start, end in ((0.0, 3.0), (3.0, 6.0), (6.0, None))
+    ]
+    assert counts == [3, 0, 3]
+    with pytest.raises(ValueError, match="expected some of the 6 frames to be taken, got none"):
+        run(replace(config, start=3.0, end=6.0, out=str(tmp_path / "out")))
 
 
 def test_parts_come_first_and_the_whole_when_all_are_there(tmp_path, drive):
