@@ -10,12 +10,12 @@ from torch import Tensor
 from lanebev.geometry.lens import cam_from_image, check_points, normalise_points
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.road_profile import (
-    Profile,
     check_vertical_curvature,
     depth_below,
     in_sight,
     meet_road,
     meets_before_farthest,
+    road_profile,
 )
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import Extrinsics, check_extrinsics
@@ -94,7 +94,7 @@ def road_from_image_points(
 def _on_curved_road(directions: Tensor, height: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:
     """Project directions (B, 3, N) in the road's axes to a road with a vertical curvature."""
     check_vertical_curvature(curvature, len(height))
-    profile = Profile(height.unsqueeze(-1), curvature.unsqueeze(-1))
+    profile = road_profile(height.unsqueeze(-1), curvature.unsqueeze(-1))
     valid = meets_before_farthest(directions, profile) & (profile.height > 0)
     x, _, ahead = directions.unbind(1)
     z = meet_road(directions, profile)

@@ -29,10 +29,23 @@ class Profile(NamedTuple):
     Attributes:
         height: (B, 1) m, h, of the camera over the road below it.
         curvature: (B, 1) 1/m, κ, positive over a crest.
+        least_slope: (B, 1), down by ahead, of the direction to the farthest point of the road.
     """
 
     height: Tensor
     curvature: Tensor
+    least_slope: Tensor
+
+
+def road_profile(height: Tensor, curvature: Tensor) -> Profile:
+    """Return the profile of a height (B, 1) m and a vertical curvature (B, 1) 1/m.
+
+    Its farthest point is at ``FARTHEST``, or nearer than where the sight touches a crest, √(2 h / κ).
+    """
+    positive = height.clamp(min=0.1)
+    touching = 2 * _BEFORE_CREST**2 / FARTHEST**2 * positive  # 1/m, whose crest is as far as FARTHEST
+    farthest = FARTHEST * (touching / torch.maximum(curvature, touching)).sqrt()
+    return Profile(height, curvature, positive / farthest + 0.5 * curvature * farthest)
 
 
 def meet_road(directions: Tensor, profile: Profile) -> Tensor:
@@ -40,15 +53,15 @@ def meet_road(directions: Tensor, profile: Profile) -> Tensor:
 
     Source: (J1), for a vertical curvature the nearer root of κ Z²/2 - (d_y / d_z) Z + h = 0.
     """
-    height, curvature = profile
-    slope = torch.maximum(directions[:, 1] / directions[:, 2].clamp(min=_AHEAD), _least_slope(profile))
+    height, curvature, least = profile
+    slope = torch.maximum(directions[:, 1] / directions[:, 2].clamp(min=_AHEAD), least)
     return 2 * height / (slope + (slope * slope - 2 * curvature * height).sqrt())
 
 
 def meets_before_farthest(directions: Tensor, profile: Profile) -> Tensor:
     """Return (B, M) bool: these directions, (B, 3, M), meet the road before the farthest."""
     down, ahead = directions[:, 1], directions[:, 2]
-    return (ahead > _AHEAD) & (down > ahead * _least_slope(profile))
+    return (ahead > _AHEAD) & (down > ahead * profile.least_slope)
 
 
 def before_farthest(directions: Tensor, profile: Profile) -> Tensor:
@@ -75,14 +88,3 @@ def in_sight(height: Tensor, curvature: Tensor, z: Tensor) -> Tensor:
     :func:`depth_below`.
     """
     return curvature * z * z < 2 * height
-
-
-def _least_slope(profile: Profile) -> Tensor:
-    """Compute the slope (B, 1), down by ahead, of the direction to the farthest point of the road.
-
-    It is at ``FARTHEST``, or nearer than the point where the sight touches a crest, √(2 h / κ).
-    """
-    height, curvature = profile.height.clamp(min=0.1), profile.curvature
-    touching = 2 * _BEFORE_CREST**2 / FARTHEST**2 * height  # 1/m, whose crest is as far as FARTHEST
-    farthest = FARTHEST * (touching / torch.maximum(curvature, touching)).sqrt()
-    return height / farthest + 0.5 * curvature * farthest

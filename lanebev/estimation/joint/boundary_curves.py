@@ -10,7 +10,7 @@ from torch import Tensor
 from lanebev.batch import masked_median
 from lanebev.estimation.joint.observations import observe
 from lanebev.geometry.road import image_from_road_points
-from lanebev.geometry.road_profile import Profile, meet_road, meets_before_farthest
+from lanebev.geometry.road_profile import meet_road, meets_before_farthest, road_profile
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.observation.segments import LaneSegments
 from lanebev.types import NUM_BOUNDARIES, Extrinsics
@@ -75,7 +75,7 @@ def fit_boundaries(
     directions = rotation @ seen.rays
     height = extrinsics.height.unsqueeze(-1)
     curved = torch.zeros_like(height) if vertical_curvature is None else vertical_curvature.unsqueeze(-1)
-    profile = Profile(height, curved)
+    profile = road_profile(height, curved)
     on_road, z = meets_before_farthest(directions, profile), meet_road(directions, profile)
     x, _, ahead = directions.unbind(1)  # each (B, 2N)
     scale = z / torch.where(on_road, ahead, 1.0)  # of a direction to its point on the road

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from lanebev.estimation.joint.observations import Observations
 from lanebev.estimation.joint.road_curve import NUM_STEPS, RoadCurve, road_basis, road_curve
-from lanebev.geometry.road_profile import Profile, before_farthest, meet_road
+from lanebev.geometry.road_profile import Profile, before_farthest, meet_road, road_profile
 from lanebev.geometry.rotation import road_from_cam_and_roll
 
 PITCH, YAW, ROLL, HEIGHT, OFFSET, CURVATURE, CURVATURE_RATE = range(7)
@@ -140,8 +140,7 @@ def boundary_residuals(
     """
     sight = look(params, seen, phase) if sight is None else sight
     feet = foot_rays(params, places, seen, sight) if feet is None else feet
-    profile = _profile(params, phase)
-    foot = torch.bmm(sight.rotation, feet)
+    foot, profile = torch.bmm(sight.rotation, feet), sight.profile
     z = meet_road(foot, profile)
     x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (B, M)
     basis, shape = road_basis(z, phase), _shape(params, phase).unsqueeze(1)
@@ -245,7 +244,7 @@ def _shape(params: Tensor, phase: Tensor | None) -> Tensor:
 def _profile(params: Tensor, phase: Tensor | None) -> Profile:
     """Height and vertical curvature, 0 for a single frame."""
     height = params[:, HEIGHT, None]
-    return Profile(height, torch.zeros_like(height) if phase is None else params[:, VERTICAL, None])
+    return road_profile(height, torch.zeros_like(height) if phase is None else params[:, VERTICAL, None])
 
 
 def _tangent_plane(z: Tensor, x_k: Tensor, profile: Profile, curve: RoadCurve) -> tuple[Tensor, Tensor]:
