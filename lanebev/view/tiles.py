@@ -22,9 +22,8 @@ from torch import Tensor
 
 from lanebev.geometry.precision import autocast_off
 from lanebev.view.lens import Lens
+from lanebev.view.one_thread import ONE_THREAD, small_products
 from lanebev.view.projection import CellSums, image_coordinates
-
-ONE_THREAD = 1 << 15  # numbers up to which PyTorch computes with one thread
 
 _NODES = 12  # of a tile, along its rows and along its columns
 _LEAST_ROWS = 3 * _NODES  # of a tile
@@ -33,7 +32,6 @@ _COLUMNS = 128  # of a tile; half as many of a lens
 _TOLERANCE = 4e-6  # of half the image, .004 px of 1920; what float32 rounds is a quarter of it
 _LOW = _NODES - 2  # the coefficients of this degree and higher tell what those of higher ones would add
 _SUMS = np.stack([np.ones(_NODES), np.arange(_NODES) >= _LOW], axis=1).astype(np.float32)
-_PRODUCT = 1 << 18  # multiplications up to which NumPy's BLAS uses one thread
 _OUTSIDE = 0.25  # share of the distance to the image by which a tile that is not in it may be off
 
 
@@ -272,24 +270,3 @@ def _product(weights: NDArray[np.float32], values: Tensor, out: Tensor | None = 
         return torch.from_numpy(small_products(weights, values.numpy()))
     with autocast_off(values.device):
         return torch.from_numpy(weights) @ values
-
-
-def small_products(
-    left: NDArray[np.float32], right: NDArray[np.float32], out: NDArray[np.float32] | None = None
-) -> NDArray[np.float32]:
-    """Multiply (rows, n) with (..., n, V), in products so small that NumPy computes each with one thread.
-
-    Threads that start for each product would take longer than the product, and wait for those of PyTorch.
-
-    Args:
-        left: matrix.
-        right: matrices.
-        out: (..., rows, V) to write to.
-    """
-    if out is None:
-        out = np.empty((*right.shape[:-2], len(left), right.shape[-1]), np.float32)
-    step = max(1, _PRODUCT // max(1, right.shape[-2] * right.shape[-1]))
-    for first in range(0, len(left), step):
-        rows = slice(first, first + step)
-        np.matmul(left[rows], right, out=out[..., rows, :])
-    return out

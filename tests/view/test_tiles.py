@@ -12,6 +12,7 @@ import torch
 from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics
 from lanebev.view.blocks import blocks
 from lanebev.view.cells import cells_and_lens
+from lanebev.view.one_thread import small_products
 from lanebev.view.projection import image_coordinates, normalised_intrinsics, outside_image
 from lanebev.view.sampling import MapSize, sampling_maps
 from lanebev.view.tiles import (
@@ -21,7 +22,6 @@ from lanebev.view.tiles import (
     interpolation,
     road_edges,
     row_tiles,
-    small_products,
     tile_bounds,
     tile_nodes,
 )
