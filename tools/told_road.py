@@ -23,7 +23,8 @@ _KNOWN = 1e-9  # 1/m, standard deviation of the shape
 class ToldRoad(JointCalibrator):
     """The joint filter whose state is given the true shape of the road before every frame.
 
-    It counts the frames, so it is good for one drive, or for several over the same road at the same speed.
+    It counts the frames since ``initial_state``, so the rows of a batch must drive over the same road at the
+    same speed.
 
     Args:
         drive: moments, each with a curvature.
@@ -33,6 +34,13 @@ class ToldRoad(JointCalibrator):
     def __init__(self, drive: Sequence[Moment], speed: float) -> None:
         super().__init__(motion=MotionConfig(speed=speed, speed_std=0.5))
         self.drive, self.frame = drive, 0
+
+    def initial_state(
+        self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
+    ) -> JointState:
+        """See :class:`~lanebev.JointCalibrator`; the next frame is the first of the drive again."""
+        self.frame = 0
+        return super().initial_state(batch_size, dtype, device)
 
     def step(
         self, segments: LaneSegments, intrinsics: Tensor, state: JointState, dt: Tensor, lane_width: Tensor

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,9 +12,10 @@ from lanebev.estimation.joint.dynamics import MotionConfig
 from lanebev.estimation.joint.evidence import CALL, accumulate_evidence
 from lanebev.estimation.joint.measurement import NUM_SHAPE
 from lanebev.estimation.joint.road import step_variance
-from lanebev.testing.scenarios import Moment
+from lanebev.testing.evaluation import track
+from lanebev.testing.scenarios import FPS, Moment, moments
 from tools.bench_kinds import measure
-from tools.told_road import shape_of
+from tools.told_road import ToldRoad, shape_of
 
 torch.set_num_threads(1)
 DOUBLE = torch.float64
@@ -43,6 +45,16 @@ def test_scores_of_the_road_add_up_at_unit_variance():
     assert evidence[:, :4].std() == pytest.approx(1.2, abs=0.05)  # the larger of two
 
 
+def test_evidence_of_the_pose_fades_in_every_frame_also_by_a_factor():
+    ratio = math.exp(-1 / 30 / MEMORY)
+    one = torch.zeros(1, 17, dtype=DOUBLE)
+    one[0, 0] = 3.0
+    after = accumulate_evidence(one, torch.zeros_like(one), DT, MEMORY)
+    assert after[0, 0] == pytest.approx(3.0 * 0.85 * ratio)
+    steady = 0.85 * math.sqrt(1 - ratio**2) / (1 - 0.85 * ratio)  # of constant scores of 1
+    assert accumulated(1.0, 200, entry=0)[-1] == pytest.approx(steady)
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_of_the_pose_one_large_score_counts_at_once_and_many_smaller_ones_together(sign):
     assert accumulated(8.0 * sign, 1, entry=0) == [8.0 * sign]
@@ -51,7 +63,7 @@ def test_of_the_pose_one_large_score_counts_at_once_and_many_smaller_ones_togeth
     assert sign * accumulated(2.0 * sign, 50, entry=0)[-1] < CALL
 
 
-def test_evidence_of_the_pose_that_was_answered_is_not_counted_again():
+def test_evidence_of_the_pose_begins_anew_after_it_exceeded_the_threshold():
     before = torch.zeros(1, 17, dtype=DOUBLE)
     before[0, 0], before[0, 1], before[0, 8] = CALL + 1, CALL - 1, CALL + 1
     after = accumulate_evidence(before, torch.zeros_like(before), DT, MEMORY)
@@ -92,3 +104,10 @@ def test_the_shape_that_a_filter_is_told_is_that_of_the_road():
     shape = shape_of(moment, torch.tensor([4.0], dtype=DOUBLE))
     expected = torch.tensor([0.0, 0.0, 0.0, 6e-5, 1e-4, 1e-4], dtype=DOUBLE)
     torch.testing.assert_close(shape[0], expected, atol=2e-7, rtol=0)
+
+
+def test_a_filter_that_is_told_the_road_begins_again_with_every_drive():
+    drive = moments(3 / FPS, lambda _, moment: replace(moment, curvature=lambda s: 1e-4 * s))
+    told = ToldRoad(drive, speed=30.0)
+    first, second = (track(told, drive, rows=1) for _ in range(2))
+    assert torch.equal(first.errors, second.errors)

@@ -19,7 +19,7 @@ _LARGEST_EXCESS = 4.0  # of a squared score; a larger one is a jump
 EQUAL = 0.1  # of the deviations of unequal lanes, up to which lanes are equal
 _RAISED = 0.01  # share of segments over the horizon, above which the others are too low
 _CURVED = 3.0  # sigmas of a vertical curvature from which the road is taken for a crest or a dip
-_ACCUMULATED = 0.85  # of the sum of the pose's scores counts, since a detector's errors last
+_POSE_DECAY = 0.85  # factor per frame on the pose's evidence, since a detector's errors last over frames
 CALL = 5.0  # sigmas of evidence at which half of the noise is admitted
 _CREST_CALL = 7.0  # likewise, for the vertical curvature: lasting errors of far boundaries look like one
 
@@ -30,7 +30,7 @@ def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor, weight
     Source: (J14), the score test (Rao 1948) for more process noise in one entry. For bends and unequal lanes
     the pose is free: the test depends on near against far vertices of one frame, and unexpected motion of the
     pose is no evidence. A detector's errors are correlated along a boundary, so for its deviation and for the
-    vertical curvature its n end points count as 1 / (1 / n + ``_SHARED``²). Where the noise raises end points
+    vertical curvature its n end points count as 1 / (1 / n + 0.2²). Where the noise raises end points
     over the horizon, those that are left are too low and look like a dip: then the vertical curvature has 0.
 
     Args:
@@ -61,10 +61,13 @@ def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor, weight
 
 
 def accumulate_evidence(before: Tensor, score: Tensor, dt: Tensor, memory: float) -> Tensor:
-    """Accumulate the scores at unit variance; of the pose the larger of this frame's and the sum counts.
+    """Accumulate the scores, those of shape, vertical curvature and deviations at unit variance.
 
-    Source: (J15); Page 1954, cumulative sum. A jump of the pose is evident in one frame, a fall only in
-    several. Once evidence of the pose added noise, its sum begins anew.
+    Source: (J15); Page 1954, cumulative sum. The pose's evidence is the larger of this frame's score and
+    0.85 times the accumulated value: a jump of the pose is evident in one frame, a fall only in several. The
+    0.85 is applied in every frame, so the pose's evidence fades faster than with ``memory``, by a factor that
+    depends on the frame rate, and has no unit variance. Where it exceeded ``CALL`` in the last frame, it is
+    accumulated from 0 again.
 
     Args:
         before: (B, M), evidence so far.
@@ -73,10 +76,10 @@ def accumulate_evidence(before: Tensor, score: Tensor, dt: Tensor, memory: float
         memory: s.
     """
     fade = (-dt / memory).exp().unsqueeze(-1)
-    answered = before[:, :NUM_POSE].abs() > CALL  # by noise in the last frame
-    before = torch.cat([torch.where(answered, 0.0, before[:, :NUM_POSE]), before[:, NUM_POSE:]], dim=-1)
+    exceeded = before[:, :NUM_POSE].abs() > CALL
+    before = torch.cat([torch.where(exceeded, 0.0, before[:, :NUM_POSE]), before[:, NUM_POSE:]], dim=-1)
     total = before * fade + (1 - fade * fade).clamp(min=1e-12).sqrt() * score
-    now, pose = score[:, :NUM_POSE], _ACCUMULATED * total[:, :NUM_POSE]
+    now, pose = score[:, :NUM_POSE], _POSE_DECAY * total[:, :NUM_POSE]
     larger = torch.where(now.abs() > pose.abs(), now, pose)
     return torch.cat([larger, total[:, NUM_POSE:]], dim=-1)
 

@@ -79,7 +79,8 @@ class FramePrior:
 def prior_of_mount(pose: Sequence[float], std: Sequence[float]) -> FramePrior:
     """Make the prior of a frame from the camera's mount.
 
-    ``_BODY_STD`` is added to the mount's own standard deviations, because the vehicle's body moves on its
+    The variances of a vehicle's body about the mount are added to the mount's own. Their standard deviations
+    are 0.003 rad in pitch, 0.015 rad in yaw, 0.008 rad in roll and 0.03 m in height: the body moves on its
     suspension, has a heading in its lane and stands on a road with a crossfall. The range of the search
     follows the prior.
 

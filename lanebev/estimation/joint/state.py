@@ -113,8 +113,7 @@ class JointState(NamedTuple):
         mean: (B, D), see :class:`~lanebev.estimation.joint.layout.Layout`.
         cov: (B, D, D).
         phase: (B,) m, how far the first knot of the road's curvature lies behind the camera.
-        evidence: (B, 11 + L) evidence against the motion, unit variance: accumulated, of the pose the last
-            frame's where it is larger.
+        evidence: (B, 11 + L) evidence against the motion, the accumulated scores of (J15).
         pose_sensitivity: (B, 4, L) change of the pose per metre of deviation of a boundary, by the last frame
             that determined the pose.
         motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, adapted to the drive.
