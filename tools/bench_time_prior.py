@@ -77,24 +77,23 @@ def run_drive(segmenter: Any, number: int, frames: int, event: str) -> dict[str,
 
 
 def summarise(drives: list[dict[str, Any]]) -> dict[str, float]:
-    """Compute the figures of one prior over drives."""
+    """Compute the figures of one prior over drives; those of the pose are NaN if no frame is TRACKING."""
     there, seen, behind, behind_seen, false = torch.stack([drive["rows"] for drive in drives]).sum(0).tolist()
     errors, nees, tracked = [], [], []
     for drive in drives:
         error, own, tracking = (torch.stack(part) for part in zip(*drive["poses"], strict=True))
         tracked.append(tracking.double().mean())
-        if tracking.any():
-            rmse = error[tracking].square().mean(0).sqrt()
-            errors.append(torch.cat([rmse[:3].rad2deg(), 100 * rmse[3:]]))
-            nees.append(own[tracking].mean())
-    middle = torch.stack(errors).median(0).values.tolist()
+        rmse = error[tracking].square().mean(0).sqrt()
+        errors.append(torch.cat([rmse[:3].rad2deg(), 100 * rmse[3:]]))
+        nees.append(own[tracking].mean())
+    middle = torch.stack(errors).nanmedian(0).values.tolist()
     return {
         "recall": seen / max(there, 1),
         "recall behind vehicles": behind_seen / max(behind, 1),
         "false": false / max(there, 1),
         **dict(zip(("pitch, deg", "yaw, deg", "roll, deg", "height, cm"), middle, strict=True)),
-        "NEES/dof, median": float(torch.stack(nees).median()),
-        "NEES/dof, mean": float(torch.stack(nees).mean()),
+        "NEES/dof, median": float(torch.stack(nees).nanmedian()),
+        "NEES/dof, mean": float(torch.stack(nees).nanmean()),
         "TRACKING": float(torch.stack(tracked).mean()),
     }
 
@@ -131,6 +130,8 @@ def main() -> None:
     parser.add_argument("--event", choices=("none", "cut", "wrong"), default="none", help="in the middle")
     parser.add_argument("--data", type=Path, help="folder that has the drives of tools/evaluate_real.py")
     options = parser.parse_args()
+    if options.event == "none" and options.frames <= WARM_UP:
+        parser.error(f"--frames: expected more than the warm-up of {WARM_UP}, got {options.frames}")
     torch.set_num_threads(1)
     segmenter = load_segmenter().eval()
     if options.data is not None:

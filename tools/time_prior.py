@@ -76,13 +76,16 @@ class PriorCalibrator(JointCalibrator):
     def __init__(self, prior: tuple[float, float], camera: Camera, network_size: tuple[int, int]) -> None:
         super().__init__()
         self.prior, self.camera, self.network_size = prior, camera, network_size
-        self.forget()
+        self.last: JointState | None = None
+        self.dt = torch.zeros(1, dtype=torch.float64)
+        self.places = torch.zeros(self.num_boundaries, dtype=torch.float64)  # m, of the boundaries
+        self.presence = torch.zeros_like(self.places)
+        self.reach = torch.zeros_like(self.places)  # m, how far ahead a boundary was seen
 
     def forget(self) -> None:
         """Forget the drive."""
-        self.last: JointState | None = None
-        self.presence = torch.zeros(self.num_boundaries, dtype=torch.float64)
-        self.reach = self.presence.clone()  # m, how far ahead a boundary was seen
+        self.last = None
+        self.presence, self.reach = torch.zeros_like(self.presence), torch.zeros_like(self.reach)
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None

@@ -11,7 +11,7 @@ from lanebev import Camera, Extrinsics
 from lanebev.geometry.road import road_from_image_points
 from lanebev.testing.scenarios import CAMERA, FPS, IMAGE, PLACES, WIDTH, moments, observe
 from lanebev.types import Status
-from tools.bench_time_prior import summarise
+from tools.bench_time_prior import main, summarise
 from tools.time_prior import PriorCalibrator, draw, predicted_rays
 
 STRIDE = 10
@@ -86,12 +86,14 @@ def test_there_is_no_prior_where_it_may_be_wrong():
     assert calibrator.add_prior(logits) is logits
 
 
-def test_figures_of_known_drives():
-    def drive(error: float, tracking: bool) -> dict:
-        rows = torch.tensor([10.0, 9.0, 4.0, 1.0, 2.0])
-        one = torch.full((4,), error, dtype=torch.float64)
-        return {"rows": rows, "poses": [(one, torch.tensor(error), torch.tensor(tracking))] * 2}
+def drive(error: float, tracking: bool) -> dict:
+    """The sums and errors of a drive of two frames."""
+    rows = torch.tensor([10.0, 9.0, 4.0, 1.0, 2.0])
+    one = torch.full((4,), error, dtype=torch.float64)
+    return {"rows": rows, "poses": [(one, torch.tensor(error), torch.tensor(tracking))] * 2}
 
+
+def test_figures_of_known_drives():
     found = summarise([drive(0.1, True), drive(0.3, True), drive(0.2, True), drive(9.0, False)])
     assert found["recall"] == pytest.approx(0.9)
     assert found["recall behind vehicles"] == pytest.approx(0.25)
@@ -100,3 +102,18 @@ def test_figures_of_known_drives():
     assert found["height, cm"] == pytest.approx(20)
     assert found["NEES/dof, mean"] == pytest.approx(0.2)
     assert found["TRACKING"] == pytest.approx(0.75)
+
+
+def test_without_a_frame_tracking_the_figures_of_the_pose_are_unknown():
+    found = summarise([drive(9.0, False)])
+    assert found["recall"] == pytest.approx(0.9)
+    assert found["TRACKING"] == 0
+    assert math.isnan(found["pitch, deg"])
+    assert math.isnan(found["NEES/dof, median"])
+
+
+def test_fewer_frames_than_the_warm_up_are_refused(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["bench_time_prior", "--frames", "10"])
+    with pytest.raises(SystemExit, match="2"):
+        main()
+    assert "--frames: expected more than the warm-up of 10, got 10" in capsys.readouterr().err
