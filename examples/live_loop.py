@@ -6,6 +6,8 @@ import cv2
 
 import lanebev
 
+if len(sys.argv) != 3:
+    sys.exit("usage: python live_loop.py VIDEO DEGREES_OF_VIEW")
 video, degrees = cv2.VideoCapture(sys.argv[1]), float(sys.argv[2])
 width, height = (int(video.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
 session = lanebev.Session(lanebev.Camera.from_fov(degrees, width, height), focal_std=0.05)

@@ -65,4 +65,6 @@ def main(model, source, out):
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 4:
+        sys.exit("usage: python onnx_only.py step.onnx VIDEO OUT.csv")
     main(*sys.argv[1:])

@@ -110,8 +110,9 @@ def parse_crop(text: str) -> tuple[int, int, int, int]:
     Raises:
         ValueError: another text, or sides that are no image's.
     """
-    size, *corner = text.split("+")
-    if len(corner) != 2 or not all(re.fullmatch(r"\s*\d{1,6}\s*", each, re.ASCII) for each in corner):
+    number = r"\s*(\d{1,6})\s*"
+    match = re.fullmatch(rf"{number}[x×X]{number}\+{number}\+{number}", text, re.ASCII)
+    width, height, left, top = map(int, match.groups()) if match else (0, 0, 0, 0)
+    if not (width and height):
         raise ValueError(f"lanes crop: expected WIDTHxHEIGHT+LEFT+TOP, such as 1280x480+0+240, got {text!r}")
-    left, top = map(int, corner)
-    return top, left, *parse_size(size)
+    return top, left, height, width

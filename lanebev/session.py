@@ -262,10 +262,11 @@ class Session:
         self._drawn += [lines] if lines.lines else []
         if len(self._drawn) == _LANES_LOOKED_AT:
             doubt = size_doubt(self._drawn, self.camera.image_size)
-            self._doubt = f"polylines: {doubt.words}" if doubt else ""
-            if doubt:
-                logger.warning(self._doubt)
-            self._drawn = []
+            remedy = "give pixels of the camera's images, or a camera by Camera.scaled or Camera.cropped"
+            words = f"polylines: {doubt.words} {remedy}" if doubt else ""
+            if words and not self._doubt:  # once, as long as it lasts
+                logger.warning(words)
+            self._doubt, self._drawn = words, []
 
 
 def _as_bytes(image: Tensor) -> NDArray[np.uint8]:

@@ -14,7 +14,7 @@ from lightning.pytorch.utilities import rank_zero_warn
 from torch.utils.data import DataLoader, IterableDataset
 
 from lanebev.io.images import image_size
-from lanebev.io.lane_size import size_remark
+from lanebev.io.lane_size import size_doubt
 from lanebev.io.lanes import FrameLines, read_culane, read_openlane, read_tusimple
 from lanebev.io.video import read_image
 from lanebev.observation.boundary_order import boundary_indices
@@ -92,8 +92,14 @@ def check_sizes(entries: list[Entry]) -> None:
         if size is not None:
             of_size[size].append(entry.lines)
     for size, frames in of_size.items():
-        if remark := size_remark(frames, size):
-            rank_zero_warn(f"{frames[0].name} and others: {remark.partition('?')[0]}?")
+        doubt = size_doubt(frames, size)
+        if doubt is None:
+            continue
+        remedy = "take the images that were labelled, or convert the labels to pixels of these"
+        words = f"{frames[0].name} and others: lanes: {doubt.words} {remedy}"
+        if doubt.is_outside:
+            raise ValueError(words)
+        rank_zero_warn(words)
 
 
 def _lines(path: Path) -> list[str]:

@@ -189,14 +189,17 @@ def write_entry(out: Path, frame: Frame, x: NDArray[np.float64]) -> dict[str, ob
         ValueError: the image has another number of rows than the boundaries.
     """
     assert frame.image is not None
-    if len(image_rows(frame.image.shape[0])) != x.shape[1]:
-        raise ValueError(f"camera: expected one of images {frame.image.shape[0]} px high, got another")
+    rows = image_rows(frame.image.shape[0])
+    if len(rows) != x.shape[1]:
+        raise ValueError(
+            f"camera: expected one of images {frame.image.shape[0]} px high, with {len(rows)} rows of "
+            f"boundaries, got one with {x.shape[1]}; give the camera of the run"
+        )
     name = f"images/{frame.number:06d}.jpg"
     Image.fromarray(frame.image).save(out / name, quality=95)
     there = [k for k in range(len(x)) if np.isfinite(x[k]).sum() > 1]
     lanes = [np.nan_to_num(x[k], nan=-2.0).round(2).tolist() for k in there]
-    h_samples = image_rows(frame.image.shape[0]).tolist()
-    return {"raw_file": name, "h_samples": h_samples, "lanes": lanes, "boundary": there}
+    return {"raw_file": name, "h_samples": rows.tolist(), "lanes": lanes, "boundary": there}
 
 
 @one_line_errors()

@@ -36,7 +36,7 @@ def parse_path(text: str) -> str:
     return text
 
 
-def frame_rate(fps: float | None) -> Fraction | None:
+def rate_as_fraction(fps: float | None) -> Fraction | None:
     """Return a frame rate (Hz) as a fraction, None for none."""
     return None if fps is None else Fraction(fps).limit_denominator(1000)
 
@@ -244,7 +244,7 @@ class RunConfig:
     @property
     def frame_rate(self) -> Fraction | None:
         """``fps`` as a fraction."""
-        return frame_rate(self.fps)
+        return rate_as_fraction(self.fps)
 
     def __post_init__(self) -> None:
         if not self.source:

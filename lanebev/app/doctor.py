@@ -13,12 +13,13 @@ import torch
 from lanebev.app.build import make_observer, make_tracker
 from lanebev.app.config import RunConfig
 from lanebev.app.plausibility import (
-    FIELD_OF_VIEW,
     field_of_view,
+    lens_remark,
     model_remark,
     pose_remark,
     pose_words,
     resized_remark,
+    view_remark,
 )
 from lanebev.app.progress import Progress
 from lanebev.app.sources import camera_of, make_source
@@ -138,14 +139,10 @@ def check_size(camera: Camera, image_size: tuple[int, int]) -> Finding:
 
 def check_field_of_view(camera: Camera) -> Finding:
     """Check the focal length by the field of view that it gives the images."""
-    angle, (low, high) = field_of_view(camera), FIELD_OF_VIEW
-    focal = float(camera.intrinsics[0, 0])
-    words = f"focal length: {focal:.0f} px, {angle:.0f} degrees across"
-    if low <= angle <= high or camera.model != "pinhole":
-        return Finding(OK, words)
-    return Finding(
-        DOUBT, f"{words}, where cameras on cars have {low:g} to {high:g}: was it calibrated at another size?"
-    )
+    words = f"focal length: {float(camera.intrinsics[0, 0]):.0f} px"
+    if remark := view_remark(camera):
+        return Finding(DOUBT, f"{words}, {remark}")
+    return Finding(OK, f"{words}, {field_of_view(camera):.0f} degrees of view across")
 
 
 def check_centre(camera: Camera) -> Finding:
@@ -160,8 +157,8 @@ def check_centre(camera: Camera) -> Finding:
 
 
 def check_lens(camera: Camera) -> Finding:
-    """Check if the distortion coefficients are like those of the lens model."""
-    count, remark = len(camera.distortion), model_remark(camera)
+    """Check if the lens images all pixels, and if its coefficients are like those of the lens model."""
+    count, remark = len(camera.distortion), model_remark(camera) or lens_remark(camera)
     words = f"lens: {camera.model}, {count} distortion coefficients"
     return Finding(DOUBT, f"{words}: {remark}") if remark else Finding(OK, words)
 
@@ -190,10 +187,10 @@ def check_lanes(sample: Sample) -> Finding:
 
 
 def check_pose(sample: Sample) -> Finding:
-    """Check if the median pose of the frames is possible for a camera in a car.
+    """Check if the median pose of the frames is usual for a camera in a car.
 
     A wrong focal length changes pitch and yaw, and hardly anything else: lanes alone do not show it, unless
-    the pose becomes impossible.
+    the pose becomes unusual.
     """
     if not sample.poses:
         return Finding(DOUBT, "pose: none, since lanes were not found well enough in any frame")

@@ -1,4 +1,4 @@
-"""What speaks against a camera or a pose: values that cameras in cars do not have."""
+"""What speaks against a camera or a pose: values that are unusual for cameras in cars."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ from lanebev.camera.model import Camera
 from lanebev.camera.parameters import centre_offset
 from lanebev.io.results import ExtrinsicsRow
 
-FIELD_OF_VIEW = (25.0, 130.0)
-"""Degrees, horizontal, of cameras in cars with a pinhole model."""
+_FIELD_OF_VIEW = (25.0, 130.0)  # degrees, horizontal, of cameras in cars with a pinhole model
 _POSE = ((-15.0, 25.0), (-15.0, 15.0), (-8.0, 8.0), (0.8, 4.0))  # pitch, yaw, roll (degrees), height (m)
 _RESCALED = (
     0.08,
     0.02,
 )  # least offset of a principal point, and how much that in x and y may differ, in sides
-_TANGENTIAL = 0.025  # coefficient; of real lenses at most 0.01
+_MOST_TANGENTIAL = 0.025  # coefficient of a lens that is not doubted
 _SAME_VIEW = 2.0  # degrees, by which fields of view of one camera may differ
 _WIDE = 95.0  # degrees, from which on lenses distort
-_STRAIGHT = 0.93  # of the distance from the centre without distortion: wide lenses image an edge nearer to it
-_FISHEYE = (-0.15, 0.02)  # below k1, and above |k3| and |k4|: coefficients of plumb_bob
+_MOST_EDGE_RATIO = 0.93  # of an edge's distance from the centre to an ideal lens's, of wide lenses
+_PLUMB_BOB = (-0.15, 0.02)  # most of k1, and of |k3| and |k4|, that are like plumb_bob's
 
 
 def camera_remarks(camera: Camera) -> list[str]:
@@ -68,7 +67,7 @@ def pose_words(pose: Sequence[float]) -> list[str]:
 
 
 def pose_remark(pose: Sequence[float]) -> str:
-    """Return a remark on pitch, yaw, roll (degrees) and height (m) that no car's camera has; else nothing."""
+    """Return a remark on pitch, yaw, roll (degrees), height (m) unusual for a car's camera; else nothing."""
     odd = [
         words
         for words, value, (low, high) in zip(pose_words(pose), pose, _POSE, strict=True)
@@ -76,7 +75,7 @@ def pose_remark(pose: Sequence[float]) -> str:
     ]
     if not odd:
         return ""
-    return f"pose: {', '.join(odd)} is not possible for a camera in a car: are camera and lane width right?"
+    return f"pose: {', '.join(odd)} is unusual for a camera in a car: are camera and lane width right?"
 
 
 def drive_remark(rows: Iterable[ExtrinsicsRow]) -> str:
@@ -119,7 +118,7 @@ def model_remark(camera: Camera) -> str:
     """Return a remark on coefficients that are typical of another lens model; else nothing."""
     given = camera.distortion.tolist()
     if camera.model == "fisheye":
-        below, least = _FISHEYE
+        below, least = _PLUMB_BOB
         if given[0] < below and max(map(abs, given[2:])) < least:
             return (
                 f"distortion {_listed(given)} is like one of plumb_bob, not of a fisheye: is the model right?"
@@ -128,15 +127,15 @@ def model_remark(camera: Camera) -> str:
     if camera.model != "pinhole" or len(given) not in (4, 5) or any(given[4:]) or 0.0 in given[2:4]:
         return ""
     angle, asked = field_of_view(camera), "are they k1 k2 k3 k4 of a fisheye? then model: fisheye is missing"
-    if max(map(abs, given[2:4])) > _TANGENTIAL:
-        return f"distortion {_listed(given)} has more tangential distortion than lenses have; {asked}"
-    if angle > _WIDE and _drawn_in(camera) > _STRAIGHT:
+    if max(map(abs, given[2:4])) > _MOST_TANGENTIAL:
+        return f"distortion {_listed(given)} has more tangential distortion than is usual; {asked}"
+    if angle > _WIDE and _edge_ratio(camera) > _MOST_EDGE_RATIO:
         return f"distortion {_listed(given)} hardly distorts, with {angle:.0f} degrees of view; {asked}"
     return ""
 
 
-def _drawn_in(camera: Camera) -> float:
-    """Return how far from the centre the lens images the left edge, as a share of an ideal lens's distance.
+def _edge_ratio(camera: Camera) -> float:
+    """Return the left edge's distance from the centre, as a share of that of a lens without distortion.
 
     It is 0 if the lens has no ray there.
     """
@@ -150,7 +149,7 @@ def _drawn_in(camera: Camera) -> float:
 
 def view_remark(camera: Camera) -> str:
     """Return a remark on a focal length that gives an odd field of view; else nothing."""
-    angle, (low, high) = field_of_view(camera), FIELD_OF_VIEW
+    angle, (low, high) = field_of_view(camera), _FIELD_OF_VIEW
     if low <= angle <= high or angle == 180.0 or camera.model != "pinhole":  # 180: see share_without_rays
         return ""
     return (

@@ -101,7 +101,7 @@ class Recorder:
         self._first_number: int | None = None
         self._widths = KeptNumbers(2, NUM_BOUNDARIES - 1, folder=self.path("."))
         self._moments, self._scores = MomentSampler(), EventScores()
-        self._repeats = RepeatedFrames()
+        self._repeats = RepeatedFrames(self.path("."))
 
     def __enter__(self) -> Recorder:
         self._stack = ExitStack()
@@ -165,7 +165,7 @@ class Recorder:
             lane_width=self.lane_width,
             facts=facts,
             moments=self._moments.moments,
-            problems=[*self.problems, *filter(None, remarks)],
+            problems=[*filter(None, remarks), *self.problems],  # those of frames last
             is_stills=self.stills,
             is_smoothed=self.smoothed,
             before_title=self.before_title,

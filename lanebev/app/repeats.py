@@ -6,9 +6,12 @@ Their errors are those of the frame before, and the camera seems to stand and ju
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lanebev.app.kept import KeptNumbers
 
 _STRIDE = 8  # px, of the pixels that are compared
 _NEAR = 2  # frames before and after, among which the largest change is that of the drive
@@ -33,11 +36,15 @@ def repeated(changes: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 class RepeatedFrames:
-    """Counts the repeated frames of a drive."""
+    """Counts the repeated frames of a drive.
 
-    def __init__(self) -> None:
+    Args:
+        folder: where a number for each frame is kept on disk; None keeps them in memory.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
         self._before: NDArray[np.int16] | None = None
-        self._changes: list[float] = []
+        self._changes = KeptNumbers(folder=folder)
 
     def add(self, image: NDArray[np.uint8] | None) -> None:
         """Take the next frame (H, W, 3), None if it was lost."""
@@ -45,15 +52,16 @@ class RepeatedFrames:
         change = math.nan
         if seen is not None and self._before is not None:
             change = float(np.abs(seen - self._before).mean())
-        self._changes.append(change)
+        self._changes.append(np.array(change))
         self._before = seen
 
     def remark(self) -> str:
         """Return what to say of the drive; empty if few frames are repeated."""
-        count = int(repeated(np.array(self._changes)).sum()) if self._changes else 0
-        if count <= max(_FEW, _MANY * len(self._changes)):
+        changes = self._changes.all()
+        count = int(repeated(changes).sum()) if len(changes) else 0
+        if count <= max(_FEW, _MANY * len(changes)):
             return ""
         return (
-            f"{count} of {len(self._changes)} frames repeat the one before, so that the camera seems to stand"
+            f"{count} of {len(changes)} frames repeat the one before, so that the camera seems to stand"
             " and jump; leave them out, as by ffmpeg -vf mpdecimate, or --every 2 if they are every second"
         )

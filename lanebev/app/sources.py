@@ -13,7 +13,7 @@ from types import FrameType
 
 from lanebev.app.build import make_camera
 from lanebev.app.concurrency import map_ahead
-from lanebev.app.config import RunConfig, frame_rate
+from lanebev.app.config import RunConfig, rate_as_fraction
 from lanebev.app.observers import Observation, Observer
 from lanebev.camera.model import Camera
 from lanebev.io.bags import BagSource, open_bag_source
@@ -72,7 +72,7 @@ def source_of_run(source: str, run: RunFolder) -> FrameSource:
     Raises:
         ValueError: nothing there, or nothing that decodes.
     """
-    found = _opened(source, run.topic, frame_rate(run.fps))
+    found = _opened(source, run.topic, rate_as_fraction(run.fps))
     return replace(found, selection=run.selection())
 
 

@@ -39,7 +39,7 @@ def extended_unified(angle: Array, alpha: float, beta: float) -> Array:
     return radius
 
 
-def field_of_view(angle: Array, omega: float) -> Array:
+def fov_model(angle: Array, omega: float) -> Array:
     """Return the distance at which an FOV camera images angles (rad), for a focal length of 1.
 
     Source: Devernay and Faugeras 2001, Eq. (13).
@@ -65,10 +65,14 @@ def kannala_brandt_like(radius: Radius, corner: float, focal: float) -> tuple[fl
     angles = _WIDEST * np.linspace(0.0, 1.0, _SAMPLES + 1)[1:]
     with np.errstate(all="ignore"):
         values = radius(angles)
-    if not (np.isfinite(values).all() and values[0] > 0 and (np.diff(values) > 0).all()):
-        raise ValueError("intrinsics: expected a lens that images larger angles farther out, got another")
-    seen = max(8, int(np.searchsorted(values, corner)) + 1)
+        reached = values >= corner
+    seen = max(8, int(reached.argmax()) + 1) if reached.any() else _SAMPLES
     angles, values = angles[:seen], values[:seen]
+    if not (np.isfinite(values).all() and values[0] > 0 and (np.diff(values) > 0).all()):
+        raise ValueError(
+            "intrinsics: expected a lens that images larger angles farther out up to the image's corners, "
+            "got one that does not; calibrate with pinhole-equi"
+        )
     powers = angles[:, None] ** np.array([1, 3, 5, 7, 9])
     solution = np.linalg.lstsq(powers, values, rcond=None)[0]
     error = focal * float(np.abs(powers @ solution - values).max())

@@ -11,7 +11,7 @@ from lanebev.camera.approximation import (
     Array,
     double_sphere,
     extended_unified,
-    field_of_view,
+    fov_model,
     kannala_brandt_like,
 )
 from lanebev.camera.parameters import CameraParameters
@@ -31,7 +31,7 @@ _KALIBR_RADIAL: dict[tuple[str, str], tuple[int, int, Callable[..., Array]]] = {
     # numbers before fx in the intrinsics, and of distortion_coeffs; the distance by the angle and by these
     ("ds", "none"): (2, 0, double_sphere),
     ("eucm", "none"): (2, 0, extended_unified),
-    ("pinhole", "fov"): (0, 1, field_of_view),
+    ("pinhole", "fov"): (0, 1, fov_model),
 }
 _ORB_SLAM_MODELS = {  # Camera.type -> model and coefficients
     "pinhole": ("pinhole", "k1 k2 p1 p2 k3"),

@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -50,9 +51,9 @@ class BagSource(FrameSource):
     topic: str = ""
     lens: Mapping[str, Any] | None = field(default=None, compare=False)
 
-    @property
+    @cached_property  # once: the times are in all messages
     def taken_numbers(self) -> list[int]:
-        """Numbers of the frames that are taken, by the times in all messages if not all are."""
+        """Numbers of the frames that are taken, by their times if not all are."""
         if self.selection == ALL:
             return list(range(self.count))
         times = self._times()

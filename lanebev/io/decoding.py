@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 _NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS: raw streams, whose times ffmpeg makes up
 _MARKED = "one that the decoder marks as damaged"
 _EARLY = "one before the first key frame"
-_CARELESS = ("mpeg4", "msmpeg4v2", "msmpeg4v3", "h263", "flv1", "wmv1", "wmv2", "mpeg1video")
+_WITHOUT_KEY_CHECK = ("mpeg4", "msmpeg4v2", "msmpeg4v3", "h263", "flv1", "wmv1", "wmv2", "mpeg1video")
 """Codecs whose decoders show grey frames, or others' remains, before the first key frame of a cut stream."""
 
 
@@ -83,7 +83,7 @@ def decoded(  # noqa: C901 - every loop is a way in which files are damaged
     due: list[int] = []  # times of packets whose frames have not come
     lost: set[int] = set()
     damage = ""
-    keyed = stream.codec_context.name not in _CARELESS
+    keyed = stream.codec_context.name not in _WITHOUT_KEY_CHECK
     for packet in packets(container, stream):
         if packet.pts is not None and not packet.is_discard:
             bisect.insort(due, packet.pts)
@@ -108,9 +108,16 @@ def decoded(  # noqa: C901 - every loop is a way in which files are damaged
                 if (earlier := due.pop(0)) < pts and damage:
                     yield earlier, damage
             keyed = keyed or frame.key_frame
-            yield pts, _MARKED if frame.is_corrupt else frame if keyed else _EARLY
+            yield pts, _if_whole(frame, keyed)
     if damage:
         yield from ((pts, damage) for pts in due)
+
+
+def _if_whole(frame: av.VideoFrame, keyed: bool) -> av.VideoFrame | str:
+    """Return a frame, or what is wrong with it; ``keyed`` tells whether a key frame came."""
+    if frame.is_corrupt:
+        return _MARKED
+    return frame if keyed else _EARLY
 
 
 def display_matrix(frame: av.VideoFrame) -> tuple[int, ...] | None:

@@ -12,9 +12,9 @@ from lanebev.io.lane_parsing import FrameLines
 
 
 def check_boundary_order(frames: Sequence[FrameLines]) -> None:
-    """Raise if the boundary numbers fall from left to right in most frames that state them.
+    """Raise if the boundary numbers fall from left to right in most pairs of neighbours.
 
-    Two neighbours are compared on the lowest row that both reach.
+    Two neighbours of a frame that states the numbers are compared on the lowest row that both reach.
 
     Raises:
         ValueError: they fall.
@@ -23,7 +23,7 @@ def check_boundary_order(frames: Sequence[FrameLines]) -> None:
     if 2 * sum(rising) < len(rising):
         raise ValueError(
             "lanes: expected boundary numbers that rise from left to right, got falling ones in "
-            f"{len(rising) - sum(rising)} of {len(rising)} pairs of neighbours"
+            f"{len(rising) - sum(rising)} of {len(rising)} pairs of neighbours; number them in that order"
         )
 
 

@@ -14,8 +14,8 @@ from lanebev.io.lanes import FrameLines
 _OUTSIDE = 0.1  # share of points below or far beside the images, of which more are of another size
 _BESIDE = 0.5  # image widths beside an image that lines are drawn on to
 _REACHED = 0.8  # of both sides, one of which a drive's lanes reach: they leave images at the bottom
-_REACHED_UNCROPPED = 0.85  # of the height, likewise, by lanes whose horizon is not above ...
-_HIGHEST_HORIZON = 0.28  # ... this share of it
+_REACHED_UNCROPPED = 0.85  # of the height, likewise, by lanes whose horizon is above _HIGHEST_HORIZON
+_HIGHEST_HORIZON = 0.28  # of the height, counted from above
 _LOOKED_AT = 50  # frames, for the horizon
 _LEAST_SPREAD = 0.01  # of the lines' slopes, px per row, squared and summed
 _REACHED_DOWN = 0.55  # of the height, likewise; what is higher is the horizon
@@ -61,10 +61,11 @@ def lanes_of_whole_images(
         image_size: (height, width) px of the whole images.
 
     Raises:
-        ValueError: the part reaches beyond the images.
+        ValueError: the part is empty or reaches beyond the images.
     """
     top, left, height, width = crop or (0, 0, *image_size)
-    if top + height > image_size[0] or left + width > image_size[1]:
+    inside = top >= 0 and left >= 0 and top + height <= image_size[0] and left + width <= image_size[1]
+    if not (inside and height > 0 and width > 0):
         raise ValueError(
             f"lanes crop: expected a part of the {image_size[1]} x {image_size[0]} px, got {width} x "
             f"{height} at {left}, {top}"

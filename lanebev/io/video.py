@@ -254,10 +254,9 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
             telling = telling and (packet.pts is not None or not packet.size)
             if packet.pts is not None:
                 edited = edited or packet.is_discard
+                # what precedes the first frame is not shown: it lacks a key frame
                 if not packet.is_discard and (first is None or packet.pts >= first):
-                    shown.append(
-                        packet.pts
-                    )  # what precedes the first frame is not shown: it lacks a key frame
+                    shown.append(packet.pts)
                 end = max(end, packet.pts - begin + max(packet.duration or 0, 1 / fps / tick))
         declared, got = _declared_duration(stream, begin * tick), float(end * tick)
     count = len(shown)

@@ -76,7 +76,7 @@ def test_a_camera_images_points_where_its_paper_says(tmp_path, model, distortion
     ("model", "distortion", "shape", "words"),
     [
         ("ds", "none", (-1.5, 0.5), "expected a lens that images larger angles farther out"),
-        ("eucm", "none", (0.5, -2.0), "expected a lens that images larger angles farther out"),
+        ("eucm", "none", (0.5, -20.0), "up to the image's corners, got one that does not; calibrate with"),
         ("pinhole", "fov", (0.0,), "expected a lens that images larger angles farther out"),
         ("pinhole", "fov", (2.6,), r"equals within 0.5 px, got one off by \d"),
         ("pinhole", "fov", (0.9, 0.1), "distortion_coeffs: expected 1 number"),
@@ -96,3 +96,13 @@ def test_a_kannala_brandt_lens_is_its_own_nearest():
     scale, found = kannala_brandt_like(radius, 1.0, 300.0)
     assert scale == pytest.approx(1.2, abs=1e-9)
     assert found == pytest.approx(k, abs=1e-6)
+
+
+def test_what_the_lens_does_outside_the_image_does_not_count():
+    def radius(angle):
+        return angle * (1 - 0.2 * angle**2)  # turns at 74 degrees, where it is 0.86
+
+    scale, found = kannala_brandt_like(radius, 0.7, 300.0)
+    assert (scale, *found) == pytest.approx((1.0, -0.2, 0.0, 0.0, 0.0), abs=1e-6)
+    with pytest.raises(ValueError, match="expected a lens that images larger angles farther out"):
+        kannala_brandt_like(radius, 0.9, 300.0)

@@ -67,6 +67,12 @@ def test_an_example_is_short(path):
     assert len(code) <= 20
 
 
+@pytest.mark.parametrize("name", ["live_loop.py", "onnx_only.py", "own_video.py"])
+def test_an_example_without_arguments_says_how_it_is_called(name, monkeypatch, tmp_path):
+    with pytest.raises(SystemExit, match=f"usage: python {name} "):
+        run_example(name, monkeypatch, tmp_path)
+
+
 def test_another_detectors_boundaries(monkeypatch, tmp_path, capsys):
     run_example("other_detector.py", monkeypatch, tmp_path)
     values = [float(word) for word in capsys.readouterr().out.replace(",", "").split() if word[-1].isdigit()]

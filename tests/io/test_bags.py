@@ -16,7 +16,7 @@ from lanebev import Camera
 from lanebev.app.config import RunConfig
 from lanebev.app.sources import camera_of, make_source
 from lanebev.cli import main
-from lanebev.io.bags import message_image, open_bag_source
+from lanebev.io.bags import BagSource, message_image, open_bag_source
 from lanebev.io.formats.mcap import write
 from lanebev.io.formats.record import RunRecord
 from lanebev.io.frames import Frame
@@ -140,7 +140,7 @@ def _ros1_bag(path):
     return path
 
 
-def test_the_number_of_frames_that_are_taken_is_exact_where_times_vary(tmp_path):
+def test_the_number_of_frames_that_are_taken_is_exact_where_times_vary(tmp_path, monkeypatch):
     name = "sensor_msgs/msg/CompressedImage"
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         connection = writer.add_connection("/image", name, typestore=STORE)
@@ -151,6 +151,9 @@ def test_the_number_of_frames_that_are_taken_is_exact_where_times_vary(tmp_path)
     source = make_source(config)
     assert [frame.source_number for frame in source] == source.taken_numbers == [2, 3, 4]
     assert make_source(replace(config, start=0.3, end=0.75)).taken_count == 1
+    with monkeypatch.context() as patch:  # the bag is read once
+        patch.setattr(BagSource, "_times", lambda self: pytest.fail("it was read again"))
+        assert (source.taken_count, source.taken_numbers) == (3, [2, 3, 4])
     with pytest.raises(ValueError, match="expected some of the 6 frames to be taken, got none"):
         make_source(replace(config, start=0.3, end=0.65))
 

@@ -247,7 +247,7 @@ def test_images_that_are_not_the_runs_are_refused(changed, message):
     with pytest.raises(ValueError, match=message):
         list(with_images(RECORD, frames))
     more = [*_images(), *(frame._replace(number=FRAMES) for frame in list(_images())[:1])]
-    with pytest.raises(ValueError, match="images: expected the 5 frames of the run, got more of them"):
+    with pytest.raises(ValueError, match="images: expected the 5 frames of the run, got number 6 too; is it"):
         list(with_images(RECORD, more))
 
 

@@ -142,8 +142,11 @@ def with_images(
             yield frame, picture.image
         else:
             yield frame, None
-    if next(pictures, None) is not None:
-        raise ValueError(f"images: expected the {len(record.rows)} frames of the run, got more of them")
+    if (more := next(pictures, None)) is not None:
+        raise ValueError(
+            f"images: expected the {len(record.rows)} frames of the run, got number {more.number + 1} too; "
+            "is it the run's source?"
+        )
 
 
 def _check_same(picture: Frame, row: ExtrinsicsRow) -> None:
