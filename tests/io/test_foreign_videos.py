@@ -20,6 +20,7 @@ from lanebev.io.image_names import drives_remark
 from lanebev.io.images import read_image
 from lanebev.io.lanes import FrameLines
 from lanebev.io.video import open_source
+from lanebev.observation.polylines import LaneLine
 
 SIZE = (48, 64)
 
@@ -319,12 +320,16 @@ def test_images_without_lanes_are_counted(tmp_path):
     for number in range(6):
         Image.fromarray(_picture()).save(tmp_path / f"{number}.png")
     camera = Camera.from_fov(60, *_picture().shape[1::-1])
-    entries = [FrameLines(f"{number}.png", []) for number in range(1, 7)]
+    height, width = _picture().shape[:2]
+    line = LaneLine(np.array([[0.5 * width, 0.5 * height], [width - 1.0, height - 1.0]]))
+    entries = [FrameLines(f"{number}.png", [line]) for number in range(1, 7)]
     source = open_source(str(tmp_path))
     remark = "lanes: 1 of 6 images have no entry, the first is number 0; 1 entries have no image"
     assert LaneFileObserver(entries, source, camera).remark == remark
     part = replace(source, selection=Selection(0.01))
     assert LaneFileObserver(entries, part, camera).remark == ""
+    empty = [entry._replace(lines=[]) for entry in entries]
+    assert LaneFileObserver(empty, part, camera).remark == "lanes: none of the entries has a line"
     assert LaneFileObserver(entries[:3], part, camera).remark.endswith(
         "2 of 5 images have no entry, the first is number 4"
     )
