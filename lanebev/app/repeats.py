@@ -1,6 +1,6 @@
 """Frames that show the image before them again, as of videos that were brought to a higher frame rate.
 
-Their errors are those of the frame before, and the camera seems to stand and jump.
+Their errors are those of the frame before. The motion stops in them and is twice as large in the next frame.
 """
 
 from __future__ import annotations
@@ -62,6 +62,6 @@ class RepeatedFrames:
         if count <= max(_FEW, _MANY * len(changes)):
             return ""
         return (
-            f"{count} of {len(changes)} frames repeat the one before, so that the camera seems to stand"
-            " and jump; leave them out, as by ffmpeg -vf mpdecimate, or --every 2 if they are every second"
+            f"{count} of {len(changes)} frames repeat the one before: the motion stops in them and is larger"
+            " in the next; leave them out, as by ffmpeg -vf mpdecimate, or --every 2 if they are every second"
         )
