@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.io.bag_messages import IMAGE_TYPES, LENS_TYPES, Bag, Topic, open_bag
+from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import ALL, Frame
-from lanebev.io.video import DEFAULT_FPS, FrameSource
 
 _PLAIN = {  # encoding of ROS to channels, and to OpenCV's conversion to RGB
     "rgb8": (3, None),

@@ -13,9 +13,9 @@ from fractions import Fraction
 import av
 
 from lanebev.io.decoding import display_matrix, rgb
+from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import ALL, Frame, Selection
 from lanebev.io.source_names import PIPE
-from lanebev.io.video import DEFAULT_FPS, FrameSource
 
 _TIMEOUT = 10.0  # s without a frame, after which a stream has ended
 _POLL = 0.05  # s between checks whether to stop

@@ -1,0 +1,123 @@
+"""Frames of a video or of images, iterated as often as wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanebev.io.decoding import rgb
+from lanebev.io.frames import ALL, Frame, Selection, taken_frames
+from lanebev.io.images import read_image
+from lanebev.io.seeking import begun
+
+DEFAULT_FPS = Fraction(30)
+
+
+@dataclass(frozen=True)
+class FrameSource:
+    """A video or a list of images, iterated frame by frame, as often as wanted.
+
+    Attributes:
+        source: what the user gave.
+        paths: the images in order; empty for a video.
+        fps: nominal frame rate.
+        count: number of frames; of a damaged video an estimate.
+        image_size: (height, width) of the first frame that decodes.
+        problem: what is wrong with the whole of it, else empty.
+        times: s since the first, of images whose names state them and of a video's frames by its packets;
+            else empty.
+        has_times: whether a video says when its frames are shown; else they are evenly spaced.
+        pixel_aspect: width of a pixel over its height, as a video states it; frames are not resized by it.
+        selection: which of the frames are taken. ``fps`` and ``count`` are those of the whole source.
+        matrix: by which a video's frames are shown, see :func:`lanebev.io.decoding.display_matrix`.
+    """
+
+    source: str
+    paths: tuple[str, ...]
+    fps: Fraction
+    count: int
+    image_size: tuple[int, int]
+    problem: str = ""
+    times: tuple[float, ...] = ()
+    has_times: bool = True
+    pixel_aspect: Fraction = Fraction(1)
+    selection: Selection = ALL
+    matrix: tuple[int, ...] | None = None
+
+    @property
+    def is_live(self) -> bool:
+        """Whether the frames come when they come, once, until it is stopped."""
+        return False
+
+    @property
+    def taken_numbers(self) -> list[int]:
+        """Numbers of the frames that are taken; of a damaged video an estimate."""
+        times = self.times or (float(index / self.fps) for index in range(self.count))
+        return [number for number, time in enumerate(times) if self.selection.takes(number, time)]
+
+    @property
+    def taken_count(self) -> int:
+        """Number of frames that are taken; of a damaged video an estimate."""
+        return len(self.taken_numbers)
+
+    @property
+    def is_video(self) -> bool:
+        """Whether the frames come out of one container."""
+        return not self.paths
+
+    @property
+    def is_single(self) -> bool:
+        """Whether it is one image given by its own path."""
+        return len(self.paths) == 1 and self.paths[0] == self.source
+
+    def __iter__(self) -> Iterator[Frame]:
+        frames = self._video_frames() if self.is_video else self._image_frames()
+        return frames if self.selection == ALL else taken_frames(frames, self.selection)
+
+    def _image_frames(self) -> Iterator[Frame]:
+        for index, path in enumerate(self.paths):
+            image, problem = None, ""
+            time, dt = float(index / self.fps), float(1 / self.fps)
+            if self.times:
+                time, dt = self.times[index], self.times[index] - self.times[index - 1] if index else dt
+            if self.selection.takes(index, time):
+                try:
+                    image = self._right_size(read_image(path))
+                except ValueError as error:
+                    problem = str(error)
+            yield Frame(index, time, dt, path, image, problem)
+
+    def _video_frames(self) -> Iterator[Frame]:
+        damaged, told = False, False  # since the last key frame
+        with begun(self.source, self.selection.start) as video:
+            first, before, tick = video.first, video.before, video.stream.time_base
+            for index, (pts, frame) in enumerate(video.frames, start=video.number):
+                timed = pts is not None and self.has_times
+                time = pts * tick if timed else (first or 0) + index / self.fps
+                if before is not None and time <= before:  # AVI has no times of display
+                    time = before + 1 / self.fps
+                first = time if first is None else first
+                dt = float(1 / self.fps) if before is None else float(time - before)
+                image, problem = None, ""
+                if isinstance(frame, str) or frame.key_frame:
+                    damaged, told = isinstance(frame, str), False
+                elif damaged and not told:
+                    problem, told = "up to the next key frame, images may show a lost frame's damage", True
+                if self.selection.takes(index, float(time - first)):
+                    try:
+                        image = self._right_size(rgb(frame, self.matrix))
+                    except ValueError as error:
+                        problem = str(error)
+                yield Frame(index, float(time - first), dt, "", image, problem)
+                before = time
+
+    def _right_size(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        if image.shape[:2] != self.image_size:
+            height, width = self.image_size
+            got = f"{image.shape[1]} x {image.shape[0]}"
+            raise ValueError(f"expected {width} x {height} like the first frame, got {got}")
+        return image
