@@ -142,7 +142,8 @@ def check_field_of_view(camera: Camera) -> Finding:
     words = f"focal length: {float(camera.intrinsics[0, 0]):.0f} px"
     if remark := view_remark(camera):
         return Finding(DOUBT, f"{words}, {remark}")
-    return Finding(OK, f"{words}, {field_of_view(camera):.0f} degrees of view across")
+    angle = field_of_view(camera)  # 180 where the lens has no rays at the edge, see check_lens
+    return Finding(OK, f"{words}, {angle:.0f} degrees of view across" if angle < 180.0 else words)
 
 
 def check_centre(camera: Camera) -> Finding:

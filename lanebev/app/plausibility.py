@@ -13,10 +13,7 @@ from lanebev.io.results import ExtrinsicsRow
 
 _FIELD_OF_VIEW = (25.0, 130.0)  # degrees, horizontal, of cameras in cars with a pinhole model
 _POSE = ((-15.0, 25.0), (-15.0, 15.0), (-8.0, 8.0), (0.8, 4.0))  # pitch, yaw, roll (degrees), height (m)
-_RESCALED = (
-    0.08,
-    0.02,
-)  # least offset of a principal point, and how much that in x and y may differ, in sides
+_RESCALED = (0.08, 0.02)  # sides: least offset of a principal point, most difference of that in x and y
 _MOST_TANGENTIAL = 0.025  # coefficient of a lens that is not doubted
 _SAME_VIEW = 2.0  # degrees, by which fields of view of one camera may differ
 _WIDE = 95.0  # degrees, from which on lenses distort

@@ -50,6 +50,8 @@ def _sample(poses=(GOOD_POSE,), boundaries=(2, 2, 4), steps=(1.0, 1.0), undecode
         (check_centre(CAMERA.cropped(100, 0, 260, 640)), DOUBT, "-50 px below"),
         (check_lens(CAMERA), OK, "lens: pinhole, 0 distortion coefficients"),
         (check_lens(_lens(286, (-0.0048, 0.0414, -0.0389, 0.0066))), DOUBT, "then model: fisheye is missing"),
+        (check_field_of_view(_lens(200, (-0.3, 0.03, 0.0, 0.0))), OK, "focal length: 200 px"),
+        (check_lens(_lens(200, (-0.3, 0.03, 0.0, 0.0))), DOUBT, "of the pixels cannot be undistorted"),
         (check_times(_sample()), OK, "evenly spaced"),
         (check_times(_sample(steps=(1.0, 1.0, 5.0))), DOUBT, "a gap of 5 times"),
         (check_times(_sample(steps=(2.0, 2.0))), DOUBT, "is 2.00 times that of the stated"),
