@@ -393,7 +393,8 @@ def test_a_refused_state_is_kept_beside_what_replaces_it(data, tmp_path, capsys)
     assert (out / names[0]).read_bytes() == before[0]
 
 
-def test_a_damaged_image_in_a_drive_is_a_row(data, tmp_path, capsys):
+def test_a_damaged_image_in_a_drive_is_a_row(data, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("lanebev.app.recorder.drive_remark", lambda rows: "pose: odd")
     shutil.copytree(data / "images", tmp_path / "images")
     (tmp_path / "images" / "2.png").write_bytes((tmp_path / "images" / "2.png").read_bytes()[:2000])
     assert _run(data, source=tmp_path / "images", out=tmp_path / "out") == 0
@@ -401,7 +402,9 @@ def test_a_damaged_image_in_a_drive_is_a_row(data, tmp_path, capsys):
     assert len(rows) == FRAMES
     assert rows[2]["status"] == "COASTING"
     assert rows[2]["segments"] == "0"
-    assert "problem: frame 2" in capsys.readouterr().out
+    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("problem: ")]
+    assert said[0] == "problem: pose: odd"  # doubts about the drive come first
+    assert said[-1].startswith("problem: frame 2")
     assert "truncated" in (tmp_path / "out" / "report.html").read_text()
 
 
