@@ -79,7 +79,8 @@ def road_from_image_points(
 
     Returns:
         (B, N, 2) m, (X right, Z along the lanes), and (B, N) bool, false above the horizon or behind; of a
-        road with a vertical curvature also beyond 200 m, and where a crest hides it.
+        road with a vertical curvature also beyond 200 m, and beyond 0.8 of the distance at which a crest
+        begins to hide it.
     """
     check_points(points)
     rays = rays_from_pixels(points, intrinsics) @ _road_from_cam(extrinsics).mT  # (B, N, 3)
@@ -94,8 +95,9 @@ def road_from_image_points(
 def _on_curved_road(directions: Tensor, height: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:
     """Project directions (B, 3, N) in the road's axes to a road with a vertical curvature."""
     check_vertical_curvature(curvature, len(height))
-    profile = road_profile(height.unsqueeze(-1), curvature.unsqueeze(-1))
-    valid = meets_before_farthest(directions, profile) & (profile.height > 0)
+    above = height.unsqueeze(-1) > 0
+    profile = road_profile(torch.where(above, height.unsqueeze(-1), 1.0), curvature.unsqueeze(-1))
+    valid = meets_before_farthest(directions, profile) & above
     x, _, ahead = directions.unbind(1)
     z = meet_road(directions, profile)
     return torch.stack([x / torch.where(valid, ahead, 1.0) * z, z], dim=-1), valid
@@ -114,8 +116,8 @@ def image_from_road_points(
         vertical_curvature: (B,) 1/m, of a road that is not a plane, positive over a crest; see (J1).
 
     Returns:
-        (B, N, 2) px, and (B, N) bool, false behind the camera or a crest, and for one that is not above the
-        road.
+        (B, N, 2) px, and (B, N) bool, false behind the camera, beyond 0.8 of the distance at which a crest
+        begins to hide the road, and for a camera that is not above the road.
     """
     check_points(points)
     rotation = _road_from_cam(extrinsics)

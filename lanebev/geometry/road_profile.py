@@ -20,7 +20,9 @@ def check_vertical_curvature(curvature: Tensor, batch: int) -> None:
     """Raise TypeError or ValueError unless this is a tensor (B,)."""
     check_tensor("vertical_curvature", curvature)
     if curvature.shape != (batch,):
-        raise ValueError(f"vertical_curvature: expected ({batch},) 1/m, got {tuple(curvature.shape)}")
+        raise ValueError(
+            f"vertical_curvature: expected ({batch},) 1/m, one for each camera, got {tuple(curvature.shape)}"
+        )
 
 
 class Profile(NamedTuple):
@@ -82,9 +84,10 @@ def depth_below(height: Tensor, curvature: Tensor, z: Tensor) -> Tensor:
 
 
 def in_sight(height: Tensor, curvature: Tensor, z: Tensor) -> Tensor:
-    """Tell whether the road at a distance z is this side of the point where a sight line touches a crest.
+    """Tell whether the road at a distance z can be seen over a crest.
 
-    Source: the line through the camera that touches h + κ Z²/2 does so at Z = √(2 h / κ). Arguments as of
+    Source: the line through the camera that touches h + κ Z²/2 does so at Z = √(2 h / κ). The limit is 0.8 of
+    that, as in :func:`road_profile`: beyond it a pixel is many metres of road. Arguments as of
     :func:`depth_below`.
     """
-    return curvature * z * z < 2 * height
+    return curvature * z * z < 2 * _BEFORE_CREST**2 * height

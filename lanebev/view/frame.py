@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lanebev.camera.model import Camera
+from lanebev.geometry.road_profile import check_vertical_curvature
 from lanebev.types import Extrinsics
 from lanebev.view.blocks import blocks
 from lanebev.view.cells import cell_sums, rows_in_sight
@@ -45,7 +46,7 @@ def remap_frame(
         to 1/32 px.
 
     Raises:
-        ValueError: a frame of another type or size than the camera's.
+        ValueError: a frame of another type or size than the camera's, or a curvature of another shape.
     """
     if frame.dtype != np.uint8 or frame.ndim not in (2, 3):
         raise ValueError(f"frame: expected (H, W, 3) of uint8, got {frame.shape} of {frame.dtype}")
@@ -55,10 +56,13 @@ def remap_frame(
             f"frame: expected the camera's {height} x {width}, got {frame.shape[0]} x {frame.shape[1]}; "
             "see Camera.scaled"
         )
-    size, frame = camera.image_size, np.ascontiguousarray(frame)  # else cv2 copies it for every block
+    size = camera.image_size
     image_from_cam, lens = _projection(camera)
     extrinsics = Extrinsics(*(part.cpu() for part in extrinsics))
-    curvature = None if vertical_curvature is None else vertical_curvature.cpu()
+    curvature = None
+    if vertical_curvature is not None:
+        check_vertical_curvature(vertical_curvature, 1)
+        curvature = vertical_curvature.cpu()
     cells = cell_sums(grid, (0.0,), image_from_cam, extrinsics, curvature).to(torch.float32)
     points = _kept("points", (1, 2, *grid.shape), np.float32)
     memory = torch.from_numpy(points)

@@ -132,6 +132,8 @@ class BEVWarp(nn.Module):
             (B, U·V, 2) px of the image as taken, and (B, U·V) bool, in front and not hidden by a crest; with
             P plane heights P·U·V.
         """
+        if vertical_curvature is not None:
+            check_vertical_curvature(vertical_curvature, intrinsics.shape[0])
         heights = self.plane_heights or (0.0,)
         cells, lens = cells_and_lens(
             self.grid, intrinsics, extrinsics, distortion, model, common_dtype(intrinsics),

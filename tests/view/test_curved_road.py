@@ -57,17 +57,39 @@ def test_without_curvature_it_is_the_plane():
 
 
 def test_a_crest_hides_the_road_behind_it():
-    """A sight line from 1.5 m touches a crest of R = 2500 m at √(2 · 1.5 · 2500) = 86.6 m."""
-    road = torch.tensor([[[0.0, 86.0], [0.0, 87.0]]], dtype=DOUBLE)
+    """A sight line from 1.5 m touches R = 2500 m at √(2 · 1.5 · 2500) = 86.6 m; 0.8 of it is shown."""
+    road = torch.tensor([[[0.0, 69.0], [0.0, 69.5]]], dtype=DOUBLE)
     _, seen = image_from_road_points(road, K, LEVEL, CREST)
     assert seen.tolist() == [[True, False]]
     grid = BEVGrid(x=(-2.0, 2.0), z=(20.0, 120.0), resolution=0.5)
     bev, valid = BEVWarp(grid)(image(), K, LEVEL, vertical_curvature=CREST)
     _, z = grid.axes(DOUBLE)
-    assert torch.equal(valid[0, 0, :, 4], z < math.sqrt(2 * 1.5 * 2500))
+    assert torch.equal(valid[0, 0, :, 4], z < 0.8 * math.sqrt(2 * 1.5 * 2500))
     assert (bev[:, :, ~valid[0, 0, :, 4]] == 0).all()
     _, ahead = BEVWarp(grid).image_points(K, LEVEL, vertical_curvature=CREST)
     assert torch.equal(ahead, valid.flatten(1))
+
+
+def test_points_just_before_the_limit_are_seen_both_ways():
+    road = torch.tensor([[[1.0, 0.79 * math.sqrt(2 * 1.5 * 2500)]]], dtype=DOUBLE)
+    pixels, ahead = image_from_road_points(road, K, LEVEL, CREST)
+    back, valid = road_from_image_points(pixels, K, LEVEL, CREST)
+    assert ahead.all()
+    assert valid.all()
+    torch.testing.assert_close(back, road)
+
+
+@pytest.mark.parametrize("height", [-2.0, 0.0])
+def test_a_camera_that_is_not_above_the_road_spoils_no_other_row(height):
+    """Nor its gradients: in a dip, the square root of what such a camera sees is not real."""
+    heights = torch.tensor([height, 1.4], dtype=DOUBLE, requires_grad=True)
+    pose = Extrinsics(*(part.expand(2) for part in POSE))._replace(height=heights)
+    pixels = torch.tensor([[[320.0, 160.0], [320.0, 300.0]]], dtype=DOUBLE).expand(2, 2, 2)
+    road, valid = road_from_image_points(pixels, K.expand(2, 3, 3), pose, DIP.expand(2))
+    assert not valid[0].any()
+    road[1].sum().backward()
+    assert road.isfinite().all()
+    assert heights.grad.isfinite().all()
 
 
 def test_directions_over_the_crest_are_not_on_the_road():
@@ -167,9 +189,16 @@ def test_a_map_is_painted_where_the_road_is(distortion, curvature):
 
 
 def test_a_curvature_of_another_shape_is_refused():
-    with pytest.raises(ValueError, match=r"vertical_curvature: expected \(1,\) 1/m, got \(2,\)"):
+    with pytest.raises(ValueError, match=r"vertical_curvature: expected \(1,\) 1/m, .*, got \(2,\)"):
         BEVWarp(GRID)(image(), K, POSE, vertical_curvature=torch.zeros(2))
     with pytest.raises(TypeError, match="vertical_curvature"):
         BEVWarp(GRID)(image(), K, POSE, vertical_curvature=1e-4)
     with pytest.raises(ValueError, match=r"vertical_curvature: expected \(1,\)"):
         road_from_image_points(torch.zeros(1, 3, 2), K, POSE, torch.zeros(1, 1))
+    with pytest.raises(ValueError, match=r"vertical_curvature: expected \(1,\)"):
+        BEVWarp(GRID).image_points(K, POSE, vertical_curvature=torch.zeros(2))
+    frame = np.zeros((360, 640, 3), np.uint8)
+    with pytest.raises(TypeError, match="vertical_curvature"):
+        remap_frame(frame, camera(), POSE, GRID, 1e-4)
+    with pytest.raises(ValueError, match=r"vertical_curvature: expected \(1,\)"):
+        remap_frame(frame, camera(), POSE, GRID, torch.zeros(2))

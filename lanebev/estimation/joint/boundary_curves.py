@@ -10,7 +10,12 @@ from torch import Tensor
 from lanebev.batch import masked_median
 from lanebev.estimation.joint.observations import observe
 from lanebev.geometry.road import image_from_road_points
-from lanebev.geometry.road_profile import meet_road, meets_before_farthest, road_profile
+from lanebev.geometry.road_profile import (
+    check_vertical_curvature,
+    meet_road,
+    meets_before_farthest,
+    road_profile,
+)
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.observation.segments import LaneSegments
 from lanebev.types import NUM_BOUNDARIES, Extrinsics
@@ -70,6 +75,8 @@ def fit_boundaries(
         ValueError: shapes that do not fit.
     """
     seen = observe(segments, intrinsics, num_boundaries)
+    if vertical_curvature is not None:
+        check_vertical_curvature(vertical_curvature, intrinsics.shape[0])
     given = intrinsics.new_zeros(intrinsics.shape[0], 2) if curvature is None else curvature
     rotation = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)
     directions = rotation @ seen.rays
