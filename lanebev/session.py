@@ -213,6 +213,7 @@ class Session:
         fresh.state, fresh.mount_state = loaded.states["calibrator"], loaded.states["mount"]
         self.tracker = fresh
         self._stamp, self._steps = clock.get("stamp"), list(clock.get("steps", []))
+        self._doubt, self._drawn = "", []
 
     def _rgb(self, frame: NDArray[np.uint8] | Tensor) -> Tensor:
         """Check a frame and return it as (3, H, W) RGB."""

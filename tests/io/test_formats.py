@@ -249,6 +249,9 @@ def test_images_that_are_not_the_runs_are_refused(changed, message):
     more = [*_images(), *(frame._replace(number=FRAMES) for frame in list(_images())[:1])]
     with pytest.raises(ValueError, match="images: expected the 5 frames of the run, got number 6 too; is it"):
         list(with_images(RECORD, more))
+    without_last = [frame for frame in more if frame.number != FRAMES - 1]
+    with pytest.raises(ValueError, match="images: expected the 5 frames of the run, got number 6 too; is it"):
+        list(with_images(RECORD, without_last))
 
 
 def test_mcap_by_its_library(tmp_path):

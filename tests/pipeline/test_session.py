@@ -107,8 +107,9 @@ def test_milliseconds_are_noticed():
         (lambda line: line - np.array([0, 110]), "of images whose top was cut off?"),
     ],
 )
-def test_polylines_in_pixels_of_other_images_are_noticed(caplog, change, words):
+def test_polylines_in_pixels_of_other_images_are_noticed(caplog, tmp_path, change, words):
     session = Session(CAMERA)
+    session.save(tmp_path / "new.safetensors")
     drawn = [change(line[(line >= 0).all(-1)]) for line in map(np.asarray, lines())]
     said = [session(polylines=drawn, stamp=k / 20).reasons for k in range(41)]
     assert len(caplog.records) == bool(words)  # once, as long as it lasts
@@ -116,8 +117,10 @@ def test_polylines_in_pixels_of_other_images_are_noticed(caplog, change, words):
     remarks = [text for text in said[-1] if text.startswith("polylines: ")]
     assert len(remarks) == bool(words)
     assert all(f"{words} give pixels of the camera's images, or a camera by" in remark for remark in remarks)
-    session.reset()
-    assert not any(text.startswith("polylines: ") for text in session(polylines=drawn, stamp=0.0).reasons)
+    for begin_anew in (lambda: session.load(tmp_path / "new.safetensors"), session.reset):
+        begin_anew()
+        again = session(polylines=drawn, stamp=0.0).reasons
+        assert not any(text.startswith("polylines: ") for text in again)
 
 
 def test_a_saved_session_goes_on_exactly(tmp_path):

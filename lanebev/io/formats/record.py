@@ -137,15 +137,15 @@ def with_images(
     for frame in record.frames():
         while picture is not None and picture.number < frame.row.frame:
             picture = next(pictures, None)
+        image = None
         if picture is not None and picture.number == frame.row.frame:
             _check_same(picture, frame.row)
-            yield frame, picture.image
-        else:
-            yield frame, None
-    if (more := next(pictures, None)) is not None:
+            image, picture = picture.image, next(pictures, None)
+        yield frame, image
+    if picture is not None:
         raise ValueError(
-            f"images: expected the {len(record.rows)} frames of the run, got number {more.number + 1} too; "
-            "is it the run's source?"
+            f"images: expected the {len(record.rows)} frames of the run, got number {picture.number + 1} "
+            "too; is it the run's source?"
         )
 
 
