@@ -36,6 +36,8 @@ class _Parser(argparse.ArgumentParser):
     """Reports an error in one line."""
 
     def error(self, message: str) -> NoReturn:
+        if message.startswith("unrecognized arguments: ") and " -" not in message:
+            message += "; a glob needs quotes"
         self.exit(2, f"{self.prog}: error: {message}; see {self.prog} --help\n")
 
 

@@ -148,14 +148,14 @@ def input_files(config: RunConfig, source: FrameSource) -> list[str | Path]:
 
 
 def match_image_size(camera: Camera, source: FrameSource) -> FrameSource:
-    """Return the source with the camera's image size: its first frame's or, if that is a stray, another's.
+    """Return the source with the camera's image size: that of most of its frames, or of some.
 
     Raises:
         ValueError: the camera file is for images of another size.
     """
     if camera.image_size == source.image_size:
         return source
-    if any(image_size(path) == camera.image_size for path in source.paths[1:_LOOKED_AT]):
+    if any(image_size(path) == camera.image_size for path in source.paths[:_LOOKED_AT]):
         return replace(source, image_size=camera.image_size)
     (height, width), (rows, columns) = camera.image_size, source.image_size
     raise ValueError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from itertools import islice
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from lanebev.app.plausibility import (
     field_of_view,
     lens_remark,
     model_remark,
+    pixel_remark,
     pose_remark,
     pose_words,
     resized_remark,
@@ -86,6 +88,7 @@ def doctor(config: RunConfig, progress: Progress | None = None) -> tuple[str, in
     findings = [check_size(camera, source.image_size)]
     if findings[0].level != WRONG:
         findings += [check_field_of_view(camera), check_centre(camera), check_lens(camera)]
+        findings.append(check_pixels(camera, source.pixel_aspect))
         sample = sample_frames(config, source, camera, progress)
         findings += [check_times(sample), check_lanes(sample), check_pose(sample)]
     level = max(finding.level for finding in findings)
@@ -162,6 +165,13 @@ def check_lens(camera: Camera) -> Finding:
     count, remark = len(camera.distortion), model_remark(camera) or lens_remark(camera)
     words = f"lens: {camera.model}, {count} distortion coefficients"
     return Finding(DOUBT, f"{words}: {remark}") if remark else Finding(OK, words)
+
+
+def check_pixels(camera: Camera, pixel_aspect: Fraction) -> Finding:
+    """Compare the focal lengths with the width of the video's pixels over their height."""
+    if remark := pixel_remark(camera, pixel_aspect):
+        return Finding(DOUBT, f"pixels: {remark}")
+    return Finding(OK, f"pixels: {float(pixel_aspect):.4g} times as wide as high, as by the focal lengths")
 
 
 def check_times(sample: Sample) -> Finding:

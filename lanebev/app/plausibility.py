@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from fractions import Fraction
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lanebev.camera.model import Camera
 from lanebev.camera.parameters import centre_offset
@@ -18,12 +20,26 @@ _MOST_TANGENTIAL = 0.025  # coefficient of a lens that is not doubted
 _SAME_VIEW = 2.0  # degrees, by which fields of view of one camera may differ
 _WIDE = 95.0  # degrees, from which on lenses distort
 _MOST_EDGE_RATIO = 0.93  # of an edge's distance from the centre to an ideal lens's, of wide lenses
+_BAR, _BAR_NOISE = 24, 8  # of 255: the most of a black bar, and how much it varies in a column
+_BAR_WIDTH = 0.02  # of the image, the least
+_SAME_PIXELS = 0.05  # relative, by which a camera file may differ from the width of pixels over their height
 _PLUMB_BOB = (-0.15, 0.02)  # most of k1, and of |k3| and |k4|, that are like plumb_bob's
 
 
-def camera_remarks(camera: Camera) -> list[str]:
-    """Return what speaks against a camera: its lens, or a wrong size of images, model or focal length."""
-    found = (lens_remark(camera), resized_remark(camera), model_remark(camera), view_remark(camera))
+def camera_remarks(camera: Camera, pixel_aspect: Fraction = Fraction(1)) -> list[str]:
+    """Return what speaks against a camera: its lens, or a wrong size of images, model or focal length.
+
+    Args:
+        camera: of the settings.
+        pixel_aspect: width of a pixel over its height, as the video states it; 1 if it does not.
+    """
+    found = (
+        lens_remark(camera),
+        resized_remark(camera),
+        model_remark(camera),
+        view_remark(camera),
+        pixel_remark(camera, pixel_aspect),
+    )
     return [f"camera: {remark}" for remark in found if remark]
 
 
@@ -111,6 +127,23 @@ def resized_remark(camera: Camera) -> str:
     )
 
 
+def pixel_remark(camera: Camera, pixel_aspect: Fraction) -> str:
+    """Return a remark on focal lengths of pixels of another shape than the video's; else nothing.
+
+    The focal lengths of a lens are equal in mm, so fy / fx in pixels is the width of a pixel over its height.
+    """
+    own, stated = float(camera.intrinsics[1, 1] / camera.intrinsics[0, 0]), float(pixel_aspect)
+    if abs(own / stated - 1) <= _SAME_PIXELS:
+        return ""
+    words = f"fy / fx is {own:.2f}, of pixels {own:.2f} times as wide as high"
+    if stated == 1.0:
+        return f"{words}: were images squeezed, or is a focal length wrong?"
+    return (
+        f"{words}, but the video states {stated:.2f} times: is fx that of frames as players show them? "
+        f"then divide it by {stated:.4g}"
+    )
+
+
 def model_remark(camera: Camera) -> str:
     """Return a remark on coefficients that are typical of another lens model; else nothing."""
     given = camera.distortion.tolist()
@@ -152,6 +185,21 @@ def view_remark(camera: Camera) -> str:
     return (
         f"{angle:.0f} degrees of view across, where cameras on cars have {low:g} to {high:g}: was it "
         "calibrated at another size?"
+    )
+
+
+def bars_remark(image: NDArray[np.uint8] | None) -> str:
+    """Return a remark on black bars at the left and the right of an image (H, W, 3); else nothing."""
+    if image is None:
+        return ""
+    brightest, darkest = image.max((0, 2)), image.min((0, 2))  # (W,)
+    inside = np.flatnonzero((brightest > _BAR) | (brightest - darkest > _BAR_NOISE))
+    width = image.shape[1]
+    if not len(inside) or min(left := inside[0], right := width - 1 - inside[-1]) < _BAR_WIDTH * width:
+        return ""
+    return (
+        f"fov: images have black bars, {left} px wide at the left and {right} px at the right; the field of "
+        "view must include them: cut them off, or give a camera file"
     )
 
 

@@ -24,14 +24,14 @@ from lanebev.app.convert import writer
 from lanebev.app.kept import KeptNumbers
 from lanebev.app.observers import Observer
 from lanebev.app.part_observation import observer_of_parts
-from lanebev.app.plausibility import camera_remarks, mount_remark
+from lanebev.app.plausibility import bars_remark, camera_remarks, mount_remark
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.recovery import facts_of, frame_name, observer_of_second_pass, recover_run
 from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states
 from lanebev.app.shared_network import SharedNetwork
 from lanebev.app.smoothing import SmoothedPoses, smooth_frames
-from lanebev.app.sources import camera_of, ended_by_signals, make_source, observed_frames
+from lanebev.app.sources import camera_of, ended_by_signals, first_image, make_source, observed_frames
 from lanebev.app.summary import mount_facts, run_facts
 from lanebev.camera.model import Camera
 from lanebev.io.calibration_file import write_calibration
@@ -111,8 +111,8 @@ def run(
             videos=not config.no_video,
             smoothed=config.smooth,
         )
-        doubts = (mount_remark(config.mount, camera), *camera_remarks(camera))
-        recorder.problems += filter(None, (source.problem, problem, observer.remark, *doubts))
+        doubts = (source.problem, problem, observer.remark, *remarks(config, source, camera))
+        recorder.problems += filter(None, doubts)
         covariances = KeptNumbers(4, 4, folder=out / ".")
         frames = observed_frames(source, second)
         with recorder, closing(frames), ended_by_signals(source):
@@ -145,6 +145,13 @@ def run(
             for name in config.formats:
                 writer(name)(out / FORMATS[name].file, record, None if source.is_live else source)
         return report
+
+
+def remarks(config: RunConfig, source: FrameSource, camera: Camera) -> list[str]:
+    """Return what speaks against the camera, the field of view and the mount of the settings."""
+    bars = "" if config.fov is None else bars_remark(first_image(source))
+    mount = mount_remark(config.mount, camera)
+    return [*filter(None, (bars, mount)), *camera_remarks(camera, source.pixel_aspect)]
 
 
 def first_pass(

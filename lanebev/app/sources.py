@@ -11,6 +11,9 @@ from dataclasses import replace
 from fractions import Fraction
 from types import FrameType
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lanebev.app.build import make_camera
 from lanebev.app.concurrency import map_ahead
 from lanebev.app.config import RunConfig, rate_as_fraction
@@ -94,6 +97,11 @@ def camera_of(config: RunConfig, source: FrameSource) -> Camera:
         return Camera.from_fields(source.lens, rectified)
     except ValueError as error:
         raise ValueError(f"camera of bag {source.source}: {error}; give --camera FILE") from error
+
+
+def first_image(source: FrameSource) -> NDArray[np.uint8] | None:
+    """Return the first frame's image, (H, W, 3); None of a stream, and of a frame that does not decode."""
+    return None if source.is_live else next(iter(source)).image
 
 
 def observed_frames(source: FrameSource, observer: Observer) -> Generator[tuple[Frame, Observation]]:

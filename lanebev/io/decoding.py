@@ -6,6 +6,7 @@ import bisect
 import os
 import struct
 from collections.abc import Iterator, Sequence
+from fractions import Fraction
 
 import av
 import numpy as np
@@ -29,7 +30,8 @@ def open_video(source: str) -> av.container.InputContainer:
         container = av.open(os.path.abspath(source), metadata_errors="replace")
     except (av.error.FFmpegError, OSError) as error:
         reason = error.strerror or "unknown format"
-        raise ValueError(f"video {source}: expected a video that opens, got: {reason}; is it cut?") from error
+        words = f"video {source}: expected a video that opens, got: {reason}; is it a video, and whole?"
+        raise ValueError(words) from error
     if not moving_pictures(container):
         container.close()
         raise ValueError(f"video {source}: expected a video stream, got none")
@@ -130,6 +132,18 @@ def display_matrix(frame: av.VideoFrame) -> tuple[int, ...] | None:
         if data.type.name == "DISPLAYMATRIX":
             return struct.unpack("9i", bytes(data)[:36])
     return None
+
+
+def pixel_aspect(stream: av.VideoStream, frame: av.VideoFrame, shown: tuple[int, int]) -> Fraction:
+    """Return the width of a pixel over its height as the stream states it; 1 if it does not.
+
+    Args:
+        stream: of the frame.
+        frame: decoded.
+        shown: (height, width) px of the frame as shown, perhaps turned.
+    """
+    stated = stream.sample_aspect_ratio or Fraction(1)
+    return stated if shown == (frame.height, frame.width) else 1 / stated
 
 
 def rgb(frame: av.VideoFrame | str, matrix: Sequence[int] | None) -> NDArray[np.uint8]:

@@ -26,7 +26,7 @@ class FrameSource:
         paths: the images in order; empty for a video.
         fps: nominal frame rate.
         count: number of frames; of a damaged video an estimate.
-        image_size: (height, width) of the first frame that decodes.
+        image_size: (height, width) of the first frame that decodes; of images the most frequent one.
         problem: what is wrong with the whole of it, else empty.
         times: s since the first, of images whose names state them and of a video's frames by its packets;
             else empty.
@@ -119,5 +119,5 @@ class FrameSource:
         if image.shape[:2] != self.image_size:
             height, width = self.image_size
             got = f"{image.shape[1]} x {image.shape[0]}"
-            raise ValueError(f"expected {width} x {height} like the first frame, got {got}")
+            raise ValueError(f"expected {width} x {height} like the other frames, got {got}")
         return image

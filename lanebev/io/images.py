@@ -7,13 +7,14 @@ import warnings
 import zlib
 from pathlib import Path
 
+import av
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".jfif", ".jp2")
 
-
+_LYING = (5, 6, 7, 8)  # EXIF orientations whose images are shown with their sides exchanged
 _UNREADABLE = (  # what Pillow raises of files that are cut or none
     OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, EOFError, MemoryError,
     struct.error, zlib.error, Image.DecompressionBombError,
@@ -28,16 +29,21 @@ def is_image(path: str | Path) -> bool:
 def read_image(path: str | Path) -> NDArray[np.uint8]:
     """Read an image as (H, W, 3) uint8 RGB, upright by its EXIF orientation, as viewers and OpenCV show it.
 
-    A file that is cut is an error, not an image with a grey half.
+    A file that is cut is an error, not an image with a grey half; an animation is one too, not its first
+    picture.
 
     Raises:
-        ValueError: the file is missing, cut or no image.
+        ValueError: the file is missing, cut, damaged or no image, or contains several.
     """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of odd EXIF; errors are errors
             with Image.open(path) as image:
-                return np.asarray(_eight_bit(_upright(image)).convert("RGB"))
+                _check_single(image)
+                pixels = np.asarray(_eight_bit(_upright(image)).convert("RGB"))
+                if image.format in ("JPEG", "MPO") and is_damaged_jpeg(Path(path).read_bytes()):
+                    raise OSError("damaged JPEG data")
+                return pixels
     except _UNREADABLE as error:
         if isinstance(error, UnidentifiedImageError):
             reason = "no image or one whose header is cut"
@@ -56,17 +62,66 @@ def image_size(path: str | Path) -> tuple[int, int] | None:
     return height, width
 
 
+def stated_size(path: str | Path) -> tuple[int, int] | None:
+    """Return (height, width) of an image as shown, by its header alone; None if that cannot be read."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path) as image:
+                width, height = image.size
+                return (width, height) if _orientation(image) in _LYING else (height, width)
+    except _UNREADABLE:
+        return None
+
+
 def write_png(path: str | Path, image: NDArray[np.uint8]) -> None:
     """Write (H, W, 3) uint8 RGB to a PNG file."""
     Image.fromarray(image).save(path)
 
 
-def _upright(image: Image.Image) -> Image.Image:
+def is_damaged_jpeg(data: bytes) -> bool:
+    """Return whether ffmpeg finds damage in a JPEG file, which Pillow shows as garbage without a word.
+
+    Damage that happens to be valid code stays unnoticed.
+    """
+    decoder = av.CodecContext.create("mjpeg", "r")
+    decoder.options = {"err_detect": "explode"}
     try:
-        turned = image.getexif().get(ExifTags.Base.Orientation, 1) != 1
+        decoder.decode(av.Packet(data))
+    except av.error.InvalidDataError:
+        return True
+    except av.error.FFmpegError:  # kinds of JPEG that ffmpeg does not know
+        return False
+    return False
+
+
+def _check_single(image: Image.Image) -> None:
+    """Raise if a file is an animation or has pages, all of one size; those of a camera file are previews.
+
+    Raises:
+        OSError: it is, with the number of pictures.
+    """
+    count = getattr(image, "n_frames", 1)
+    if count == 1 or image.format not in ("PNG", "TIFF", "WEBP"):
+        return
+    size = image.size
+    image.seek(1)
+    same = image.size == size
+    image.seek(0)
+    if same:
+        raise OSError(f"{count} pictures in one file; write them as a video or as a folder of images")
+
+
+def _orientation(image: Image.Image) -> int:
+    """Return the orientation in the image's EXIF data, 1 if there is none."""
+    try:
+        return int(image.getexif().get(ExifTags.Base.Orientation, 1))
     except (SyntaxError, struct.error, ValueError, KeyError, TypeError):  # of odd EXIF
-        turned = False
-    return ImageOps.exif_transpose(image) if turned else image
+        return 1
+
+
+def _upright(image: Image.Image) -> Image.Image:
+    return image if _orientation(image) == 1 else ImageOps.exif_transpose(image)
 
 
 def _eight_bit(image: Image.Image) -> Image.Image:

@@ -12,7 +12,7 @@ from fractions import Fraction
 
 import av
 
-from lanebev.io.decoding import display_matrix, rgb
+from lanebev.io.decoding import display_matrix, pixel_aspect, rgb
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import ALL, Frame, Selection
 from lanebev.io.source_names import PIPE
@@ -197,7 +197,8 @@ def open_live(
         stream = container.streams.video[0]
         first = next(container.decode(stream))
         matrix = display_matrix(first)
-        image = rgb(first, matrix)
+        size = rgb(first, matrix).shape[:2]
+        aspect = pixel_aspect(stream, first, size)
     except (av.error.FFmpegError, StopIteration, OSError) as error:
         container.close()
         raise ValueError(f"stream {name}: expected a frame, got none") from error
@@ -207,8 +208,10 @@ def open_live(
     slot.put(first)
     thread = threading.Thread(target=_read, args=(container, slot, figures), name="stream", daemon=True)
     thread.start()
-    size = image.shape[:2]
-    live = LiveSource(source, (), rate, 0, size, matrix=matrix, slot=slot, keep_all=keep_all, figures=figures)
+    live = LiveSource(
+        source, (), rate, 0, size, pixel_aspect=aspect, matrix=matrix,
+        slot=slot, keep_all=keep_all, figures=figures,
+    )  # fmt: skip
     weakref.finalize(live, slot.stop)  # of a run that ended before its first frame
     return live
 

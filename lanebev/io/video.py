@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import glob
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -21,13 +22,14 @@ from lanebev.io.decoding import (
     moving_pictures,
     open_video,
     packets,
+    pixel_aspect,
     rgb,
     video_stream,
 )
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import Frame
 from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
-from lanebev.io.images import IMAGE_SUFFIXES, image_size, is_image, read_image, write_png
+from lanebev.io.images import IMAGE_SUFFIXES, image_size, is_image, read_image, stated_size, write_png
 from lanebev.io.video_writer import VideoWriter
 
 __all__ = [
@@ -44,6 +46,7 @@ __all__ = [
     "write_png",
 ]
 
+_LOOKED_AT = 20  # images, for the most frequent size
 _DARK = 24  # of 255; 12 bits in 16 give 15 at most
 _SAME_RATE = 0.05  # relative, by which two frame rates may differ and be the same
 _SAME_VIDEO = 2  # factor, by which a video's frames may come faster or slower than its mean rate
@@ -66,10 +69,7 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
         there = (p for p in path.iterdir() if is_image(p) and p.name[0] != ".")  # macOS leaves ._ files
         paths = in_natural_order(map(str, there))
         if not paths:
-            raise ValueError(
-                f"{source}: expected images in the folder, got none; for those in folders below it give "
-                f"a quoted glob such as '{path}/**/*.jpg'"
-            )
+            raise ValueError(f"{source}: expected images in the folder, got none; {_folder_remedy(path)}")
         return _image_source(source, paths, fps)
     if path.is_file():
         return _image_source(source, [source], fps) if is_image(path) else _video_source(source, fps)
@@ -78,7 +78,24 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
         if not paths:
             raise ValueError(f"{source}: expected images that match, got none; quote the pattern")
         return _image_source(source, paths, fps)
-    raise ValueError(f"{source}: expected a video, an image, a folder or a glob of images, got nothing there")
+    remedy = ""
+    if re.search(r"%\d*d", source):
+        remedy = "; give the folder, or a quoted glob with * for the number"
+    elif source.startswith("file:"):
+        remedy = "; give the path without file://"
+    raise ValueError(
+        f"{source}: expected a video, an image, a folder or a glob of images, got nothing there{remedy}"
+    )
+
+
+def _folder_remedy(folder: Path) -> str:
+    """Return what to give instead of a folder without images."""
+    endings = sorted({each.suffix for each in folder.iterdir() if each.is_file() and each.name[0] != "."})
+    below = f"for images in folders below it give a quoted glob such as '{folder}/**/*.jpg'"
+    if not endings:
+        return below
+    known = " ".join(IMAGE_SUFFIXES)
+    return f"its files end with {' '.join(endings[:5])}, images with {known}; give a video itself; {below}"
 
 
 def _pattern(source: str) -> str:
@@ -89,15 +106,7 @@ def _pattern(source: str) -> str:
 
 
 def _image_source(source: str, paths: Sequence[str], fps: Fraction | None) -> FrameSource:
-    problem = ""
-    for path in paths:
-        try:
-            image = read_image(path)
-            break
-        except ValueError as error:
-            problem = problem or str(error)
-    else:
-        raise ValueError(problem)
+    image = _typical_image(paths)
     size, times = image.shape[:2], times_from_names(paths)
     remarks = [_dark_remark(image)]
     rate = fps or DEFAULT_FPS
@@ -111,6 +120,29 @@ def _image_source(source: str, paths: Sequence[str], fps: Fraction | None) -> Fr
     said = "; ".join(filter(None, remarks))
     problem = f"{source}: {said}" if said else ""
     return FrameSource(source, tuple(paths), rate, len(paths), size, problem, times)
+
+
+def _typical_image(paths: Sequence[str]) -> NDArray[np.uint8]:
+    """Return the first whole image whose size is the most frequent one of the first images.
+
+    Raises:
+        ValueError: none decodes; the error is that of the first.
+    """
+    sizes = Counter(filter(None, map(stated_size, paths[:_LOOKED_AT])))
+    usual = sizes.most_common(1)[0][0] if sizes else None
+    found, problem = None, ""
+    for path in paths:
+        try:
+            image = read_image(path)
+        except ValueError as error:
+            problem = problem or str(error)
+            continue
+        if usual in (None, image.shape[:2]):
+            return image
+        found = image if found is None else found
+    if found is None:
+        raise ValueError(problem)
+    return found
 
 
 def _dark_remark(image: NDArray[np.uint8]) -> str:
@@ -132,7 +164,7 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
         lost, first, frame = _first_whole(source, decoded(container, stream))
         matrix = display_matrix(frame)
         size = rgb(frame, matrix).shape[:2]
-        pixel_aspect = _pixel_aspect(frame.width, frame.height, size, stream.sample_aspect_ratio)
+        aspect = pixel_aspect(stream, frame, size)
         problems = _remarks(container, frame, size)
     with open_video(source) as container:  # the header's count includes frames that an edit list cuts
         stream = video_stream(container)
@@ -164,7 +196,7 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
         problems.append(f"its own {float(own):.4g} frames per second are used, not --fps {float(stated):g}")
     problem = f"video {source}: {'; '.join(problems)}" if problems else ""
     times = _times_since_first(shown, tick, fps) if timed and telling else ()
-    return FrameSource(source, (), fps, count, size, problem, times, timed, pixel_aspect, matrix=matrix)
+    return FrameSource(source, (), fps, count, size, problem, times, timed, aspect, matrix=matrix)
 
 
 def _first_whole(
@@ -214,12 +246,6 @@ def _rate_of_times(times: Sequence[int], tick: Fraction, stated: Fraction) -> Fr
     median_rate, mean_rate = (1 / Fraction(float(of(steps))) / tick for of in (np.median, np.mean))
     near = any(1 / _SAME_VIDEO < rate / stated < _SAME_VIDEO for rate in (median_rate, mean_rate))
     return stated if near else median_rate.limit_denominator(1000)
-
-
-def _pixel_aspect(width: int, height: int, shown: tuple[int, int], stated: Fraction | None) -> Fraction:
-    """Return the width of a pixel over its height in a frame as shown, perhaps turned; 1 if not stated."""
-    aspect = stated or Fraction(1)
-    return aspect if shown == (height, width) else 1 / aspect
 
 
 def _declared_duration(stream: av.VideoStream, begin: Fraction) -> float:

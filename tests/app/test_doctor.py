@@ -17,11 +17,19 @@ from lanebev.app.doctor import (
     check_field_of_view,
     check_lanes,
     check_lens,
+    check_pixels,
     check_pose,
     check_size,
     check_times,
 )
-from lanebev.app.plausibility import camera_remarks, field_of_view, model_remark, mount_remark, pose_remark
+from lanebev.app.plausibility import (
+    bars_remark,
+    camera_remarks,
+    field_of_view,
+    model_remark,
+    mount_remark,
+    pose_remark,
+)
 from lanebev.cli import main
 from lanebev.io.video import VideoWriter
 
@@ -52,6 +60,8 @@ def _sample(poses=(GOOD_POSE,), boundaries=(2, 2, 4), steps=(1.0, 1.0), undecode
         (check_lens(_lens(286, (-0.0048, 0.0414, -0.0389, 0.0066))), DOUBT, "then model: fisheye is missing"),
         (check_field_of_view(_lens(200, (-0.3, 0.03, 0.0, 0.0))), OK, "focal length: 200 px"),
         (check_lens(_lens(200, (-0.3, 0.03, 0.0, 0.0))), DOUBT, "of the pixels cannot be undistorted"),
+        (check_pixels(CAMERA, Fraction(1)), OK, "1 times as wide as high"),
+        (check_pixels(CAMERA, Fraction(4, 3)), DOUBT, "but the video states 1.33 times: is fx that"),
         (check_times(_sample()), OK, "evenly spaced"),
         (check_times(_sample(steps=(1.0, 1.0, 5.0))), DOUBT, "a gap of 5 times"),
         (check_times(_sample(steps=(2.0, 2.0))), DOUBT, "is 2.00 times that of the stated"),
@@ -100,6 +110,30 @@ def test_a_camera_that_was_calibrated_at_another_size():
     )
     (remark,) = camera_remarks(Camera.from_fov(10.0, 640, 360))
     assert "10 degrees of view across, where cameras on cars have 25 to 130" in remark
+
+
+def test_focal_lengths_of_pixels_that_are_not_square():
+    squeezed = Camera.from_parameters(450, 600, 239.5, 179.5, 480, 360)
+    square = Camera.from_parameters(600, 600, 239.5, 179.5, 480, 360)
+    assert camera_remarks(squeezed, Fraction(4, 3)) == camera_remarks(square) == []
+    assert camera_remarks(Camera.from_parameters(600, 625, 239.5, 179.5, 480, 360)) == []  # 4 %
+    (remark,) = camera_remarks(square, Fraction(4, 3))
+    assert remark.endswith(
+        "the video states 1.33 times: is fx that of frames as players show them? then divide it by 1.333"
+    )
+    (remark,) = camera_remarks(squeezed)
+    assert "fy / fx is 1.33, of pixels 1.33 times as wide as high: were images squeezed, or" in remark
+
+
+def test_black_bars_left_and_right():
+    image = np.full((36, 64, 3), 128, np.uint8)
+    assert bars_remark(None) == bars_remark(image) == bars_remark(np.zeros_like(image)) == ""
+    image[:, :8] = image[:, -10:] = 16
+    assert bars_remark(image).startswith("fov: images have black bars, 8 px wide at the left and 10 px at")
+    image[20, 3] = 30  # not evenly black: the dark edge of an image
+    image[20, -3] = 0
+    image[:, -10:] = np.arange(36)[:, None, None] % 20
+    assert bars_remark(image) == ""
 
 
 def test_a_mount_of_another_camera(tmp_path):

@@ -178,7 +178,7 @@ def test_an_image_of_another_size_is_a_frame_without_image(tmp_path):
     first, second = open_source(str(tmp_path))
     assert first.image is not None
     assert second.image is None
-    assert second.problem == "expected 64 x 48 like the first frame, got 40 x 32"
+    assert second.problem == "expected 64 x 48 like the other frames, got 40 x 32"
 
 
 def test_a_damaged_stretch_of_a_video_does_not_end_it(tmp_path):
