@@ -102,13 +102,14 @@ def test_what_is_no_source_says_what_to_give(tmp_path, monkeypatch, source, word
 
 
 def test_a_stream_with_pixels_that_are_not_square(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (20, 288, 352, 3), dtype=np.uint8)
     with av.open(str(tmp_path / "v.ts"), "w") as container:
-        stream = container.add_stream("libx264", rate=25)
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        stream.codec_context.sample_aspect_ratio = Fraction(16, 11)
-        for _ in range(3):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8))))
+        stream = container.add_stream("mpeg2video", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 352, 288, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(12, 11)
+        for image in noise:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
         container.mux(stream.encode())
     source = open_live(str(tmp_path / "v.ts"))
-    assert source.pixel_aspect == Fraction(16, 11)
+    assert source.pixel_aspect == Fraction(12, 11)
     source.stop()
