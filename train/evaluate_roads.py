@@ -13,6 +13,8 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import math
+import time
 from collections import defaultdict
 from pathlib import Path
 from typing import NamedTuple
@@ -37,6 +39,8 @@ from train.metrics import row_recall
 
 TOLERANCE = 2.5  # label px
 DISTANCES = (0.0, 10.0, 20.0, 40.0, 80.0, float("inf"))  # m
+OWN_KINDS = tuple(kind for kind in KINDS if kind not in ("any", "varied"))  # those that are no mixture
+HELD_OUT_SEED = 91_000
 _BEYOND = 1e9  # m, of a row above the horizon of a flat road
 BRIGHTNESS = (0.0, 0.1, 0.25, 1.01)  # mean of the image
 
@@ -87,12 +91,6 @@ def judge_rows(logits: Tensor, frame: RenderedFrame, view: ViewConfig) -> Rows:
     )
 
 
-def _centre(maps: Tensor) -> Tensor:
-    """Compute the mean column of each row of (B, L, h, w)."""
-    columns = torch.arange(maps.shape[-1], dtype=maps.dtype, device=maps.device)
-    return (maps * columns).sum(-1) / maps.sum(-1).clamp(min=1e-6)
-
-
 class Sums(NamedTuple):
     """Counts of rows, and the sum of squared distances."""
 
@@ -136,22 +134,46 @@ def groups(rows: Rows, kind: str) -> dict[tuple[str, str], Tensor]:
 
 @torch.inference_mode()
 def evaluate(
-    segmenter: LaneSegmenter, views: int, kinds: list[str], seed: int, batch: int
+    segmenter: LaneSegmenter,
+    views: int,
+    kinds: list[str],
+    seed: int,
+    batch: int,
+    deadline: float = math.inf,
 ) -> dict[tuple[str, str], Sums]:
-    """Evaluate a network, on its device, on so many views of each kind of road at its own size."""
+    """Evaluate a network, on its device, on rendered views of its own size.
+
+    Args:
+        segmenter: the network.
+        views: number of views of each kind of road.
+        kinds: kinds of road, which take turns, so that each has its share if time runs out.
+        seed: seed of the views.
+        batch: views rendered together.
+        deadline: time of :func:`time.monotonic` at which no further batch begins that would not end before
+            it, if it takes as long as the longest so far.
+    """
     device = next(segmenter.parameters()).device
     view = ViewConfig(output_stride=segmenter.config.output_stride)
     total: dict[tuple[str, str], Sums] = defaultdict(Sums)
-    for number, kind in enumerate(kinds):
-        for start in range(0, views, batch):
-            count = min(batch, views - start)
-            generator = torch.Generator().manual_seed(drawn((seed, number, start)))
-            frame = render_views(count, segmenter.image_size, generator, device=device, kind=kind)
-            rows = judge_rows(segmenter(frame.image), frame, view)
-            for name, mask in groups(rows, kind).items():
-                sums = zip(total[name], add_up(rows, mask), strict=True)
-                total[name] = Sums(*(a + b for a, b in sums))
+    longest, begin = 0.0, time.monotonic()
+    for start, (number, kind) in itertools.product(range(0, views, batch), enumerate(kinds)):
+        if begin + longest > deadline:
+            break
+        count = min(batch, views - start)
+        generator = torch.Generator().manual_seed(drawn((seed, number, start)))
+        frame = render_views(count, segmenter.image_size, generator, device=device, kind=kind)
+        rows = judge_rows(segmenter(frame.image), frame, view)
+        for name, mask in groups(rows, kind).items():
+            sums = zip(total[name], add_up(rows, mask), strict=True)
+            total[name] = Sums(*(a + b for a, b in sums))
+        now = time.monotonic()
+        longest, begin = max(longest, now - begin), now
     return dict(sorted(total.items(), key=lambda item: item[0][0]))
+
+
+def records(total: dict[tuple[str, str], Sums]) -> list[dict[str, str | float]]:
+    """Return the figures of all groups."""
+    return [{"by": by, "name": name, **sums.figures()} for (by, name), sums in total.items()]
 
 
 @one_line_errors()
@@ -162,11 +184,9 @@ def main() -> None:
     parser.add_argument(
         "--views", type=PositiveInt, default=64, help="number of views, all kinds together (about)"
     )
-    parser.add_argument(
-        "--kinds", nargs="+", default=[kind for kind in KINDS if kind not in ("any", "varied")]
-    )
-    parser.add_argument("--seed", type=int, default=91_000)
-    parser.add_argument("--batch", type=PositiveInt, default=32, help="views rendered at once")
+    parser.add_argument("--kinds", nargs="+", default=list(OWN_KINDS))
+    parser.add_argument("--seed", type=int, default=HELD_OUT_SEED)
+    parser.add_argument("--batch", type=PositiveInt, default=32, help="views rendered together")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument(
         "--json", action="store_true", help="print one JSON object per line instead of the table"
@@ -176,11 +196,10 @@ def main() -> None:
     views = -(-args.views // len(args.kinds))
     total = evaluate(segmenter, views, args.kinds, args.seed, args.batch)
     table = Table("by", "", "rows", "recall", "error_px", "false")
-    for (by, name), sums in total.items():
-        figures = sums.figures()
-        table.add_row(by, name, *(f"{value:g}" for value in figures.values()))
+    for record in records(total):
+        table.add_row(*(f"{value:g}" if isinstance(value, float) else value for value in record.values()))
         if args.json:
-            print(json.dumps({"by": by, "name": name, **figures}))
+            print(json.dumps(record))
     if not args.json:
         Console().print(table)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 
 import torch
 from torch import Tensor
@@ -32,6 +33,7 @@ from lanebev.render.scene.world import (
     scene_at,
 )
 from lanebev.render.truth import frame_truth
+from lanebev.tensors import one_thread
 
 _ROWS_ON_CPU, _ROWS_ELSEWHERE = 1, 64  # scenes rendered together: on a processor, what its cache holds
 
@@ -58,7 +60,10 @@ def render_scenes(
     """
     where = torch.device(device or "cpu")
     rows = rows or (_ROWS_ON_CPU if where.type == "cpu" else _ROWS_ELSEWHERE)
-    with autocast_off(where):
+    alone = (
+        nullcontext() if where.type == "cpu" else one_thread()
+    )  # elsewhere the host computes only small tensors
+    with autocast_off(where), alone:
         scene = send(host, where)
         prepared = prepare(scene, size)
         parts = []
@@ -135,6 +140,7 @@ def render_views(
     return render_scenes(scene, image_size, seeds, device=device, rows=rows, ideal_sensor=ideal_sensor)
 
 
+@one_thread()
 def sample_scene(
     batch_size: int,
     image_size: tuple[int, int],

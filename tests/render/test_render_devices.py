@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
-from typing import Any
-from unittest import mock
-
 import pytest
 import torch
 from torch import Tensor
 
-from lanebev.render import Drive, RenderedFrame, WindowConfig, render_views
+from lanebev.render import Drive, RenderedFrame, WindowConfig, render_views, views
 from lanebev.render.scene.kinds import KINDS
 from lanebev.render.scene.sampler import row_of, select_rows, send, tensors_of
 from lanebev.render.scene.world import Scene
 from lanebev.render.views import render_scenes, sample_scene
-from tests.render.other_device import ELSEWHERE, Elsewhere, OtherDevice
+from tools.other_device import ELSEWHERE, Elsewhere, other_device
 
 SIZE = (64, 112)
 cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
@@ -37,21 +32,6 @@ def assert_same(first: RenderedFrame, second: RenderedFrame, share: float = 0.0)
             assert ((one.cpu() - other.cpu()).abs() > 1 / 255).float().mean() <= share
         elif isinstance(one, Tensor):
             torch.testing.assert_close(one.cpu(), other.cpu(), atol=2e-3, rtol=1e-4, msg=name)
-
-
-@contextmanager
-def other_device() -> Iterator[OtherDevice]:
-    """Generators and autocast know nothing of a device that is none."""
-
-    def of_cpu(device: Any = None) -> torch.Generator:
-        return torch._C.Generator()
-
-    with (
-        OtherDevice() as device,
-        mock.patch.object(torch, "Generator", of_cpu),
-        mock.patch.object(torch, "autocast", return_value=nullcontext()),
-    ):
-        yield device
 
 
 def test_the_same_seed_gives_the_same_frames_bit_for_bit() -> None:
@@ -92,6 +72,22 @@ def test_waits_and_launches_do_not_grow_with_the_batch() -> None:
     (waits, launches), (more_waits, more_launches) = counts
     assert more_waits == waits
     assert more_launches < 1.4 * launches  # kinds of road and of wall that the smaller batch has not
+
+
+def test_scenes_are_sampled_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    place = views.sample_place
+    monkeypatch.setattr(views, "sample_place", lambda *a: seen.append(torch.get_num_threads()) or place(*a))
+    monkeypatch.setattr(views, "scene_at", None)  # breaks
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with pytest.raises(TypeError):
+            scene_of(2, 1)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    assert seen == [1]
 
 
 def test_frames_of_a_drive_are_those_asked_for_one_by_one() -> None:

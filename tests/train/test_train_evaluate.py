@@ -9,7 +9,8 @@ import torch
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.render import render_views
-from train.evaluate_roads import Sums, add_up, evaluate, groups, judge_rows
+from train import evaluate_roads
+from train.evaluate_roads import Sums, add_up, evaluate, groups, judge_rows, records
 from train.labels import ViewConfig
 from train.maps import boundaries_as_taken, label_maps
 
@@ -77,3 +78,17 @@ def test_evaluates_a_network():
     network = LaneSegmenter(SegmenterConfig(base_width=4, decoder_width=4, image_size=(48, 80))).eval()
     found = evaluate(network, 1, ["highway"], 3, 1)
     assert found["kind", "highway"].there > 0
+
+
+def test_kinds_take_turns_until_the_time_is_up(monkeypatch):
+    clock = iter(range(0, 1000, 10))  # each batch takes 10 s
+    monkeypatch.setattr(evaluate_roads.time, "monotonic", lambda: next(clock))
+    begun = []
+    render = evaluate_roads.render_views
+    monkeypatch.setattr(
+        evaluate_roads, "render_views", lambda *a, **k: begun.append(k["kind"]) or render(*a, **k)
+    )
+    network = LaneSegmenter(SegmenterConfig(base_width=4, decoder_width=4, image_size=(48, 80))).eval()
+    found = evaluate(network, 9, ["highway", "night"], 3, 1, deadline=35.0)
+    assert begun == ["highway", "night", "highway"]  # a fourth would end at 40
+    assert {record["name"] for record in records(found) if record["by"] == "kind"} == {"highway", "night"}

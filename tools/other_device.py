@@ -6,16 +6,23 @@ on a real accelerator; what waits for the device, and what is launched on it, is
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from typing import Any
+from unittest import mock
 
 import torch
+import torch._dynamo  # a dispatch mode imports it, and its annotations need torch.Generator as it is
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 ELSEWHERE = torch.device("meta")
 _COPIES = ("aten::_to_copy", "aten::copy_")
+_INTO_TABLES = ("aten::scatter_", "aten::index_copy_", "aten::index_put_", "aten::index_add_")
+_FROM_TABLES = ("aten::index_select", "aten::gather", "aten::index", "aten::take")
 _WAITS = ("aten::_local_scalar_dense", "aten::nonzero", "aten::equal")
 
 
@@ -26,7 +33,7 @@ class Elsewhere(torch.Tensor):
 
     @staticmethod
     def __new__(cls, here: Tensor) -> Elsewhere:
-        made = torch.Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
+        made = torch.Tensor._make_wrapper_subclass(
             cls,
             here.size(),
             strides=here.stride(),
@@ -42,7 +49,9 @@ class Elsewhere(torch.Tensor):
         return self.cpu().tolist()
 
     @classmethod
-    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(  # type: ignore[override]
+        cls, func: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         raise AssertionError(f"{func}: used outside of OtherDevice")
 
 
@@ -52,12 +61,14 @@ class OtherDevice(TorchDispatchMode):
     Attributes:
         launches: operations carried out elsewhere that compute, by name; views do not.
         waits: those of them that wait for the device.
+        read_and_written: bytes of the elements that they read and write, about.
     """
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.launches: Counter[str] = Counter()
         self.waits: Counter[str] = Counter()
+        self.read_and_written = 0
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
@@ -66,11 +77,7 @@ class OtherDevice(TorchDispatchMode):
         tensors = [v for v in values if isinstance(v, Tensor)]
         away = [t for t in tensors if isinstance(t, Elsewhere)]
         target = kwargs.get("device")
-        if away and name not in _COPIES:
-            strangers = [t for t in tensors if not isinstance(t, Elsewhere) and t.ndim > 0]
-            if strangers:
-                shapes = [(tuple(t.shape), t.device.type) for t in tensors]
-                raise AssertionError(f"{name}: tensors of two devices meet: {shapes}")
+        _check_one_device(name, tensors)
         to_elsewhere = ELSEWHERE in (target, str(target)) if target is not None else bool(away)
         if name == "aten::copy_":
             to_elsewhere = isinstance(args[0], Elsewhere)
@@ -83,6 +90,8 @@ class OtherDevice(TorchDispatchMode):
             self.waits[name] += 1
         plain_args, plain = tree_map(lambda v: v.here if isinstance(v, Elsewhere) else v, (args, kwargs))
         result = func(*plain_args, **plain)
+        if (away or to_elsewhere) and not views:
+            self.read_and_written += _bytes(name, plain_args, result)
         if not to_elsewhere or name == "aten::_local_scalar_dense":
             return result
         if func._schema.is_mutable and away and args and isinstance(args[0], Elsewhere):
@@ -90,3 +99,42 @@ class OtherDevice(TorchDispatchMode):
             if first and first[0] is args[0].here:
                 return args[0]
         return tree_map(lambda v: Elsewhere(v) if isinstance(v, Tensor) else v, result)
+
+
+def _check_one_device(name: str, tensors: list[Tensor]) -> None:
+    """Refuse operations, other than copies, on tensors of both devices; numbers may come from the host."""
+    strangers = [t for t in tensors if not isinstance(t, Elsewhere) and t.ndim > 0]
+    if strangers and any(isinstance(t, Elsewhere) for t in tensors) and name not in _COPIES:
+        shapes = [(tuple(t.shape), t.device.type) for t in tensors]
+        raise AssertionError(f"{name}: tensors of two devices meet: {shapes}")
+
+
+def _bytes(name: str, args: tuple[Any, ...], result: Any) -> int:
+    """Return the bytes that an operation reads and writes; of a table, those of the elements it looks up."""
+    tensors = [value for value in tree_flatten((args, result))[0] if isinstance(value, Tensor)]
+    if name in _INTO_TABLES:
+        return 3 * _own_bytes(tensors[-2])  # the new values, read and written, and their places
+    if name in _FROM_TABLES:
+        return 3 * _own_bytes(tensors[-1])
+    return sum(map(_own_bytes, tensors))
+
+
+def _own_bytes(tensor: Tensor) -> int:
+    """Return the bytes of a tensor's elements; those that it repeats count once."""
+    strides = zip(tensor.shape, tensor.stride(), strict=True)
+    return tensor.element_size() * math.prod(size for size, stride in strides if stride)
+
+
+@contextmanager
+def other_device() -> Iterator[OtherDevice]:
+    """Enter a context in which generators and autocast know nothing of a device that is none."""
+
+    def of_cpu(device: Any = None) -> torch.Generator:
+        return torch._C.Generator()
+
+    with (
+        OtherDevice() as device,
+        mock.patch.object(torch, "Generator", of_cpu),
+        mock.patch.object(torch, "autocast", return_value=nullcontext()),
+    ):
+        yield device
