@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -12,17 +11,18 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.batch import select_rows
+from lanebev.clips import drive_starts, frame_intervals, stack_frames
 from lanebev.geometry.lens import check_intrinsics
 from lanebev.geometry.precision import autocast_off, common_dtype
 from lanebev.observation.boundary_vertices import BoundaryVertices
+from lanebev.observation.frames import check_images, resize_image, resized_size
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segments import LaneSegments, segments_from_vertices
-from lanebev.types import Calibration, check_tensor, register_pytree
+from lanebev.types import Calibration, register_pytree
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
 
 STAGES = ("segmenter", "extractor", "calibrator", "warp")
-_WIDTH_STEP = 64  # px
 
 
 @register_pytree
@@ -192,21 +192,13 @@ class LaneBEV(nn.Module):
         Raises:
             ValueError: shapes that don't fit, or an image of whole numbers.
         """
-        check_tensor("image", image)
-        if image.ndim not in (4, 5) or image.shape[-3] != 3:
-            raise ValueError(f"image: expected (B, 3, H, W) or (B, T, 3, H, W), got {tuple(image.shape)}")
-        if not image.is_floating_point():
-            raise ValueError(
-                f"image: expected floating point in [0, 1], got {image.dtype}; divide bytes by 255"
-            )
-        if 0 in image.shape[1:]:  # B may be 0
-            raise ValueError(f"image: expected frames with pixels, got {tuple(image.shape)}")
+        check_images(image)
         check_intrinsics(intrinsics, image.shape[0])
         if truncation is not None and truncation < 1:
             raise ValueError(f"truncation: expected 1 frame or more, or None, got {truncation}")
         frames = image if image.ndim == 5 else image.unsqueeze(1)
         batch, steps = frames.shape[:2]
-        begins = None if reset is None else _begins(reset, batch, steps)
+        begins = None if reset is None else drive_starts(reset, batch, steps)
         if state is None or begins is not None:
             dtype = common_dtype(intrinsics) if state is None else state[0].dtype
             fresh = self.initial_state(batch, dtype, image.device)
@@ -217,7 +209,7 @@ class LaneBEV(nn.Module):
             None if distortion is None else distortion.repeat_interleave(steps, 0),
             model,
         )
-        intervals = _intervals(dt, batch, steps, intrinsics)
+        intervals = frame_intervals(dt, batch, steps, intrinsics)
         outputs = []
         for step in range(steps):
             now = LaneSegments(*(part.reshape(batch, steps, *part.shape[1:])[:, step] for part in segments))
@@ -238,7 +230,7 @@ class LaneBEV(nn.Module):
             homography = bev_from_image(calibration.extrinsics, intrinsics, self.warp.grid)
             logits_now = logits.reshape(batch, steps, *logits.shape[1:])[:, step]
             outputs.append(LaneBEVOutput(view, valid, calibration, homography, now, logits_now))
-        return (outputs[0] if image.ndim == 4 else _stack(outputs)), state
+        return (outputs[0] if image.ndim == 4 else stack_frames(outputs)), state
 
     def observe(
         self, image: Tensor, intrinsics: Tensor, distortion: Tensor | None = None, model: str = "pinhole"
@@ -268,7 +260,10 @@ class LaneBEV(nn.Module):
             logits (B, 1 + L, h, w) and vertices in pixels of the image as taken. A row whose image is not
             finite counts as black and has none, so that it spoils neither other rows nor gradients.
         """
-        resized = self._resize(image).contiguous()  # a network rounds otherwise for another order in memory
+        size = self.network_size((image.shape[-2], image.shape[-1]))
+        resized = resize_image(
+            image, size
+        ).contiguous()  # a network rounds otherwise for another order in memory
         finite = resized.isfinite().flatten(1).all(1)  # (B,)
         with self._gradients("segmenter"):
             logits = self.segmenter(torch.where(finite[:, None, None, None], resized, 0.0))
@@ -293,67 +288,7 @@ class LaneBEV(nn.Module):
             return image_size
         return resized_size(image_size, self.network_width, self.network_pixels)
 
-    def _resize(self, image: Tensor) -> Tensor:
-        size = self.network_size((image.shape[-2], image.shape[-1]))
-        if size == image.shape[-2:]:
-            return image
-        resized = nn.functional.interpolate(
-            image.to(common_dtype(image)),  # of half precision there is no kernel on the CPU
-            size=size,
-            mode="bilinear",
-            antialias=True,
-            align_corners=False,
-        )
-        return resized.to(image.dtype)
-
-
-def resized_size(image_size: tuple[int, int], network_width: int, pixels: int | None) -> tuple[int, int]:
-    """Compute the size (h, w) px of a network's input for images of (H, W) px.
-
-    Args:
-        image_size: (H, W).
-        network_width: least w.
-        pixels: number of pixels that the input should have: w is as large as this allows, in steps of 64 px,
-            and at most W. None: w is ``network_width``.
-    """
-    height, width = image_size
-    wanted = network_width
-    if pixels is not None:
-        equal = min(math.sqrt(pixels * width / height), width)
-        wanted = max(network_width, _WIDTH_STEP * int(equal / _WIDTH_STEP))
-    return max(32, 32 * round(height * wanted / width / 32)), wanted
-
 
 def _configured(part: nn.Module, name: str, default: Any = None) -> Any:
     """Return a setting of a module's ``config``, if it has one."""
     return getattr(getattr(part, "config", None), name, default)
-
-
-def _intervals(dt: float | Tensor, batch: int, steps: int, like: Tensor) -> Tensor:
-    """Convert time steps to (B, T) s, at least float32, on the device of ``like``."""
-    intervals = torch.as_tensor(dt, dtype=common_dtype(like), device=like.device)
-    got = tuple(intervals.shape)
-    if intervals.ndim < 2:
-        intervals = intervals.reshape(-1, 1)
-    if intervals.ndim > 2 or intervals.shape[0] not in (1, batch) or intervals.shape[1] not in (1, steps):
-        raise ValueError(f"dt: expected a float, ({batch},) or ({batch}, {steps}), got {got}")
-    return intervals.expand(batch, steps)
-
-
-def _begins(reset: Tensor, batch: int, steps: int) -> Tensor:
-    """Return which frames begin a drive, (B, T) bool."""
-    check_tensor("reset", reset)
-    if reset.dtype != torch.bool or reset.shape not in ((batch,), (batch, steps)):
-        raise ValueError(
-            f"reset: expected bool ({batch},) or ({batch}, {steps}), got {reset.dtype} {tuple(reset.shape)}"
-        )
-    return reset if reset.ndim == 2 else nn.functional.pad(reset.unsqueeze(-1), (0, steps - 1))
-
-
-def _stack(outputs: list[Any]) -> Any:
-    """Stack per-frame (nested) tuples of tensors to one of (B, T, ...) tensors; None stays."""
-    if outputs[0] is None:
-        return None
-    if isinstance(outputs[0], Tensor):
-        return torch.stack(outputs, dim=1)
-    return type(outputs[0])(*(_stack(list(parts)) for parts in zip(*outputs, strict=True)))

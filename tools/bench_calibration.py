@@ -34,7 +34,8 @@ from lanebev.estimation.joint.state import HILLY_ROADS
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.evaluation import NAMES, UNITS, WARM_UP, rms, summarise, track
-from lanebev.testing.scenarios import CAMERA, FPS, SCENARIOS, WIDTH, moments, observe
+from lanebev.testing.moments import CAMERA, FPS, WIDTH, moments, observe
+from lanebev.testing.scenarios import SCENARIOS
 from lanebev.types import Status
 from tools.bench_kinds import measure_all
 from tools.textbook_ekf import TextbookEKF

@@ -22,8 +22,9 @@ from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.state import HILLY_ROADS
 from lanebev.estimation.joint.update import UNSEEN
 from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, within_sigmas
+from lanebev.testing.moments import FPS, PLACES, Moment, moments
 from lanebev.testing.motions import Pose, fall, landing_time, moved, sinusoids
-from lanebev.testing.scenarios import FPS, PLACES, SCENARIOS, Moment, moments
+from lanebev.testing.scenarios import SCENARIOS
 from tools.replay.figures import as_track
 from tools.replay.kinds import EGO_LANE, FRAMES, Generated
 from tools.replay.recording import record, replay

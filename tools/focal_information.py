@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from lanebev.geometry.rotation import road_from_cam
-from lanebev.testing.scenarios import CAMERA, IMAGE, PLACES
+from lanebev.testing.moments import CAMERA, IMAGE, PLACES
 
 RADII = (math.inf, 3000.0, 1000.0, 300.0, 150.0, 60.0)
 POSE = (0.03, 0.02, 0.01, 1.5, 0.2)  # pitch, yaw, roll (rad), height, offset (m)

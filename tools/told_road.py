@@ -13,7 +13,7 @@ from lanebev.estimation.joint.layout import SHAPE
 from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS
 from lanebev.estimation.joint.state import JointState
 from lanebev.observation.segments import LaneSegments
-from lanebev.testing.scenarios import Moment
+from lanebev.testing.moments import Moment
 from lanebev.types import Calibration
 
 _STEP = 0.01  # m along the road

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
-from typing import TypeVar
 
-from lanebev.io.formats.names import FORMATS, parse_formats
+from lanebev.app.options import check_grid, check_types, option, parse_grid
+from lanebev.io.formats.names import FORMATS, check_formats, parse_formats
 from lanebev.io.source_names import is_bag
 from lanebev.numbers import parse_crop, parse_size
-
-T = TypeVar("T")
-
-_MOST_CELLS = 4096  # pixels a side of the bird's-eye view, which H.264 encodes
 
 CALIBRATORS = ("joint", "two-stage")
 BACKENDS = ("torch", "onnxruntime")
@@ -25,65 +19,9 @@ LANE_WIDTH, LANE_WIDTH_STD = 3.7, 0.2
 """Mean and standard deviation (m) of an unknown lane width: most main roads have lanes of 3.25 to 3.75 m."""
 
 
-def parse_path(text: str) -> str:
-    """Return a path unchanged.
-
-    Raises:
-        ValueError: the path is empty.
-    """
-    if not text:
-        raise ValueError("expected a path, got an empty string")
-    return text
-
-
 def rate_as_fraction(fps: float | None) -> Fraction | None:
     """Return a frame rate (Hz) as a fraction, None for none."""
     return None if fps is None else Fraction(fps).limit_denominator(1000)
-
-
-def parse_grid(text: str) -> tuple[float, float, float, float, float]:
-    """Return (near, far, left, right, resolution) in m from a text such as ``3:60,-10:10/0.05``.
-
-    Raises:
-        ValueError: the text has another form, or the picture would be empty or too large.
-    """
-    number = r"([-+]?\d+(?:\.\d*)?|[-+]?\.\d+)"
-    match = re.fullmatch(rf"{number}:{number},{number}:{number}/{number}", text.replace(" ", ""), re.ASCII)
-    if match is None:
-        raise ValueError(f"grid: expected NEAR:FAR,LEFT:RIGHT/STEP, such as 3:60,-10:10/0.05, got {text!r}")
-    near, far, left, right, step = map(float, match.groups())
-    if not (0 < near < far and left < right and step > 0):
-        raise ValueError(f"grid: expected 0 < NEAR < FAR, LEFT < RIGHT and a STEP above 0, got {text}")
-    rows, columns = (far - near) / step, (right - left) / step
-    if not (16 <= rows <= _MOST_CELLS and 16 <= columns <= _MOST_CELLS):
-        got = f"{columns:.0f} x {rows:.0f}"
-        raise ValueError(f"grid: expected 16 to {_MOST_CELLS} pixels a side, got {got} of {text}")
-    return near, far, left, right, step
-
-
-def option(
-    default: T,
-    words: str,
-    metavar: str = "",
-    parse: Callable[[str], object] = parse_path,
-    choices: tuple[str, ...] = (),
-) -> T:
-    """Return a dataclass field with its ``--help`` text and its parser.
-
-    Args:
-        default: value if the option is not given.
-        words: help text; {} in it is replaced by the default.
-        metavar: name of the value in ``--help``.
-        parse: converts the text to the value; options with a boolean default are flags instead.
-        choices: all allowed values, if there are few.
-    """
-    metadata = {
-        "help": words.replace("{}", str(default)),
-        "metavar": metavar,
-        "parse": parse,
-        "choices": choices,
-    }
-    return field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -247,6 +185,9 @@ class RunConfig:
         return rate_as_fraction(self.fps)
 
     def __post_init__(self) -> None:
+        check_types(self)
+        check_grid(self.grid)
+        check_formats(self.formats)
         if not self.source:
             raise ValueError("source: expected a path, got none")
         self._check_lens()
@@ -270,6 +211,14 @@ class RunConfig:
         self._check_lanes()
 
     def _check_lanes(self) -> None:
+        sizes = {"lanes size": (self.lanes_size, 2, (1, 1)), "lanes crop": (self.lanes_crop, 4, (0, 0, 1, 1))}
+        for name, (value, count, least) in sizes.items():
+            if value is None:
+                continue
+            whole = len(value) == count and all(isinstance(each, int) for each in value)
+            if not (whole and all(each >= low for each, low in zip(value, least, strict=True))):
+                names = ("top", "left", "height", "width")[-count:]
+                raise ValueError(f"{name}: expected whole px of an image, ({', '.join(names)}), got {value}")
         for name, value in (("lanes size", self.lanes_size), ("lanes crop", self.lanes_crop)):
             if value is not None and not self.lanes:
                 raise ValueError(f"{name}: expected --lanes with it, got none")

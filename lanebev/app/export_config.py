@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lanebev.app.config import CALIBRATORS, option
+from lanebev.app.config import CALIBRATORS
+from lanebev.app.options import check_types, option
 
 FORMATS = ("onnx", "torch-export")
 PARTS = ("segmenter", "extractor", "warp", "joint", "two-stage", "step")
@@ -37,6 +38,7 @@ class ExportConfig:
     int8: bool = option(False, "quantise the segmenter's convolutions to 8 bits, by rendered views")
 
     def __post_init__(self) -> None:
+        check_types(self)
         if not self.camera:
             raise ValueError("camera: expected --camera FILE, got none")
         if self.int8 and (self.format != "onnx" or "segmenter" not in self.parts):

@@ -1,13 +1,19 @@
-"""Convert frames of cameras and decoders to the network's input."""
+"""Convert frames of cameras and decoders to the network's input, and resize them."""
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
+
+from lanebev.geometry.precision import common_dtype
+from lanebev.types import check_tensor
+
+_WIDTH_STEP = 64  # px
 
 
 def check_frame(frame: NDArray[np.uint8] | Tensor, image_size: tuple[int, int]) -> Tensor:
@@ -34,7 +40,8 @@ def check_frame(frame: NDArray[np.uint8] | Tensor, image_size: tuple[int, int]) 
             return torch.from_numpy(np.ascontiguousarray(frame)).permute(2, 0, 1)
     if not isinstance(frame, Tensor):
         raise TypeError(
-            f"frame: expected an array or a tensor, got {type(frame).__qualname__}; lanes go to polylines="
+            f"frame: expected a NumPy array or a tensor, got {type(frame).__qualname__}; convert an image of "
+            "PIL with np.asarray; lanes go to polylines="
         )
     if frame.shape not in ((3, height, width), (1, 3, height, width)):
         raise ValueError(
@@ -51,11 +58,60 @@ def _remedy(frame: NDArray[np.generic], image_size: tuple[int, int]) -> str:
     if frame.shape[:2] != image_size:
         return "for images of another size see Camera.scaled"
     if frame.ndim != 3 or frame.shape[2] != 3:
-        return "for a grey image repeat its channel three times"
-    return "convert to bytes 0 to 255 with .astype('uint8')"
+        return "for a grey image repeat its channel three times, of one with alpha take frame[..., :3]"
+    if np.issubdtype(frame.dtype, np.floating):
+        return "multiply by 255 if it is in [0, 1], then .astype('uint8')"
+    return "convert to bytes 0 to 255 with .astype('uint8'), after dividing 16 bits by 257"
+
+
+def check_images(image: Tensor) -> None:
+    """Raise unless these are images (B, 3, H, W), or clips (B, T, 3, H, W), of floating point.
+
+    Raises:
+        TypeError: not a tensor.
+        ValueError: another shape, no pixels, or whole numbers.
+    """
+    check_tensor("image", image)
+    if image.ndim not in (4, 5) or image.shape[-3] != 3:
+        raise ValueError(f"image: expected (B, 3, H, W) or (B, T, 3, H, W), got {tuple(image.shape)}")
+    if not image.is_floating_point():
+        raise ValueError(f"image: expected floating point in [0, 1], got {image.dtype}; divide bytes by 255")
+    if 0 in image.shape[1:]:  # B may be 0
+        raise ValueError(f"image: expected frames with pixels, got {tuple(image.shape)}")
 
 
 def network_image(frame: Tensor, device: torch.device) -> Tensor:
     """Return a frame (3, H, W) as the network takes it: (1, 3, H, W) in [0, 1], single precision."""
     image = frame.to(device)[None]
     return image.float().div_(255) if image.dtype == torch.uint8 else image.float()
+
+
+def resized_size(image_size: tuple[int, int], network_width: int, pixels: int | None) -> tuple[int, int]:
+    """Compute the size (h, w) px of a network's input for images of (H, W) px.
+
+    Args:
+        image_size: (H, W).
+        network_width: least w.
+        pixels: number of pixels that the input should have: w is as large as this allows, in steps of 64 px,
+            and at most W. None: w is ``network_width``.
+    """
+    height, width = image_size
+    wanted = network_width
+    if pixels is not None:
+        equal = min(math.sqrt(pixels * width / height), width)
+        wanted = max(network_width, _WIDTH_STEP * int(equal / _WIDTH_STEP))
+    return max(32, 32 * round(height * wanted / width / 32)), wanted
+
+
+def resize_image(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """Resize images (B, C, H, W) to (h, w) px, bilinearly and without aliases; the dtype stays."""
+    if size == image.shape[-2:]:
+        return image
+    resized = nn.functional.interpolate(
+        image.to(common_dtype(image)),  # of half precision there is no kernel on the CPU
+        size=size,
+        mode="bilinear",
+        antialias=True,
+        align_corners=False,
+    )
+    return resized.to(image.dtype)

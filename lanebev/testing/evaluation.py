@@ -12,7 +12,7 @@ from lanebev.estimation.joint.measurement import NUM_PARAMS, boundary_residuals
 from lanebev.estimation.joint.observations import observe as make_ready
 from lanebev.estimation.joint.single_frame import normal_equations
 from lanebev.observation.segments import LaneSegments
-from lanebev.testing.scenarios import CAMERA, FPS, PLACES, WIDTH, Moment, observe
+from lanebev.testing.moments import CAMERA, FPS, PLACES, WIDTH, Moment, observe
 from lanebev.types import Status
 
 NAMES = ("pitch_deg", "yaw_deg", "roll_deg", "height_cm")
@@ -54,7 +54,7 @@ def track(
 
     Args:
         calibrator: with ``initial_state`` and a call as ``JointCalibrator``.
-        drive: from ``lanebev.testing.scenarios.moments``.
+        drive: from :func:`lanebev.testing.moments.moments`.
         rows: R Monte Carlo runs.
         sigma: px, noise of an end point.
         per_boundary: segments of each boundary.

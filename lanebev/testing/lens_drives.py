@@ -8,7 +8,7 @@ from torch import Tensor
 from lanebev.camera.model import Camera
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.observation.boundary_vertices import BoundaryVertices
-from lanebev.testing.scenarios import Moment, resample, road_curves
+from lanebev.testing.moments import Moment, resample, road_curves
 
 
 def vertices_through_lens(

@@ -3,10 +3,13 @@
 import subprocess
 import sys
 from dataclasses import fields
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lanebev.app.config import RunConfig
+from lanebev.app.export_config import ExportConfig
 from lanebev.app.settings_file import read_settings
 from lanebev.app.summary import setting_words
 from lanebev.cli import main, parser
@@ -40,6 +43,52 @@ def test_numbers_of_a_file_are_decimal_and_names_stay_as_they_are(tmp_path):
     assert given == {
         "source": "No", "camera": "017", "start": 10.0, "end": 120.0, "resume": "1:01", "no_video": True,
     }  # fmt: skip
+
+
+def test_paths_may_be_paths_and_numbers_of_numpy(tmp_path):
+    config = RunConfig(
+        Path("a.mp4"), Path("c.yaml"), tmp_path, lane_width=np.float32(3.5), every=np.int64(2),
+        grid=[3, 30, -5, 5, 0.1], formats=["jsonl"],
+    )  # fmt: skip
+    assert (config.source, config.camera, config.out) == ("a.mp4", "c.yaml", str(tmp_path))
+    assert (config.grid, config.formats) == ((3, 30, -5, 5, 0.1), ("jsonl",))
+    assert ExportConfig(Path("c.yaml")).camera == "c.yaml"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"source": 3}, "source: expected a text or a path, got 3"),
+        ({"lane_width": "3.7"}, "lane width: expected a number, got '3.7'"),
+        ({"fps": True}, "fps: expected a number, got True"),
+        ({"every": 1.5}, "every: expected a whole number, got 1.5"),
+        ({"stills": "yes"}, "stills: expected True or False, got 'yes'"),
+        ({"formats": "parquet"}, "formats: expected a tuple, got 'parquet'"),
+        ({"camera": None}, "camera: expected a text or a path, got None"),
+    ],
+)
+def test_settings_of_other_types_are_named(settings, message):
+    with pytest.raises(TypeError, match=message):
+        RunConfig(**{"source": "a.mp4", "camera": "c.yaml", **settings})
+    with pytest.raises(TypeError, match="int8: expected True or False, got 1"):
+        ExportConfig("c.yaml", int8=1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"lanes_crop": (0, 0, -1, 5)}, r"lanes crop: expected whole px .*\(top, left, height, width\), got"),
+        ({"lanes_crop": (0, 0, 240)}, r"got \(0, 0, 240\)"),
+        ({"lanes_crop": (0.5, 0, 240, 320)}, r"got \(0\.5, 0, 240, 320\)"),
+        ({"lanes_size": (0, 640)}, r"lanes size: expected whole px of an image, \(height, width\), got \(0,"),
+        ({"formats": ("csv",)}, "formats: expected some of parquet, .*, got 'csv'"),
+        ({"grid": (3, 60, -10)}, r"grid: expected the numbers \(near, far, left, right, resolution\), got"),
+        ({"grid": (3, 60, 10, -10, 0.05)}, "grid: expected 0 < NEAR < FAR, LEFT < RIGHT and a STEP above 0"),
+    ],
+)
+def test_settings_are_checked_when_they_are_made(settings, message):
+    with pytest.raises(ValueError, match=message):
+        RunConfig("a.mp4", "c.yaml", lanes="l.json", **settings)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from lanebev.cli import main
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.io.state import load_state
 from lanebev.io.video import VideoWriter
-from lanebev.testing.scenarios import swing
+from lanebev.testing.moments import swing
 
 HEIGHT, WIDTH, FRAMES, FPS = 240, 416, 20, 25
 CAMERA = Camera.from_parameters(330, 330, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)

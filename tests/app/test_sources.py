@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from lanebev import Camera
-from lanebev.app.config import RunConfig, parse_grid
+from lanebev.app.config import RunConfig
+from lanebev.app.options import parse_grid
 from lanebev.app.sources import make_source, source_of_run
 from lanebev.app.summary import setting_words
 from lanebev.cli import main

@@ -12,6 +12,7 @@ LAYERS = (  # from the bottom: a package imports packages of lower layers only, 
     {"numbers", "tensors"},
     {"geometry.rotation"},  # angles to matrices, which Extrinsics offers as methods
     {"types", "batch"},
+    {"clips"},
     {"geometry"},
     {"camera"},
     {"observation"},

@@ -13,7 +13,7 @@ from lanebev.estimation.joint.evidence import CALL, accumulate_evidence
 from lanebev.estimation.joint.measurement import NUM_SHAPE
 from lanebev.estimation.joint.road import step_variance
 from lanebev.testing.evaluation import track
-from lanebev.testing.scenarios import FPS, Moment, moments
+from lanebev.testing.moments import FPS, Moment, moments
 from tools.bench_kinds import measure
 from tools.told_road import ToldRoad, shape_of
 

@@ -46,8 +46,8 @@ from lanebev.estimation.joint.update import (
 )
 from lanebev.estimation.reasons import Reason
 from lanebev.observation.segments import LaneSegments
-from lanebev.testing.scenarios import CAMERA, FPS, PLACES, WIDTH, moments
-from lanebev.testing.scenarios import observe as see
+from lanebev.testing.moments import CAMERA, FPS, PLACES, WIDTH, moments
+from lanebev.testing.moments import observe as see
 from lanebev.types import Status
 
 torch.set_num_threads(1)

@@ -18,7 +18,8 @@ from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.evaluation import UNITS, WARM_UP, Track, summarise, track
 from lanebev.testing.experiment import Experiment
-from lanebev.testing.scenarios import CAMERA, PLACES, SCENARIOS, WIDTH, Moment, curves, moments, observe
+from lanebev.testing.moments import CAMERA, PLACES, WIDTH, Moment, curves, moments, observe
+from lanebev.testing.scenarios import SCENARIOS
 from lanebev.types import Status
 from tools.reproduce_table1 import VARIANCES, run, table
 

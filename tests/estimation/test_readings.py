@@ -10,7 +10,7 @@ from lanebev import JointCalibrator, LaneSegments, Status
 from lanebev.estimation.joint.averaging import distance, mixture_moments, window
 from lanebev.estimation.joint.readings import ReadingConfig, log_prior, log_prior_of_half, readings
 from lanebev.estimation.still import calibrate_still
-from lanebev.testing.scenarios import CAMERA, Moment, observe
+from lanebev.testing.moments import CAMERA, Moment, observe
 from lanebev.testing.segments import INTRINSICS, POSE, lanes, no_lanes, stack_rows
 
 DOUBLE = torch.float64

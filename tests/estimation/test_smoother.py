@@ -15,7 +15,7 @@ from lanebev.estimation.joint.smoother import link_states, smooth_drive, smooth_
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.precision import cast_floating
 from lanebev.testing.evaluation import frame_bound, rms
-from lanebev.testing.scenarios import CAMERA, FPS, WIDTH, moments, observe
+from lanebev.testing.moments import CAMERA, FPS, WIDTH, moments, observe
 from lanebev.types import map_tensors
 
 torch.set_num_threads(1)

@@ -17,8 +17,8 @@ from lanebev.estimation.joint.observations import boundary_places, observe
 from lanebev.estimation.joint.single_frame import fit_single_frame
 from lanebev.estimation.joint.state import JointConfig, with_vertical_curvature
 from lanebev.observation.segments import LaneSegments
-from lanebev.testing.scenarios import CAMERA, FPS, WIDTH, Moment, moments
-from lanebev.testing.scenarios import observe as see
+from lanebev.testing.moments import CAMERA, FPS, WIDTH, Moment, moments
+from lanebev.testing.moments import observe as see
 
 torch.set_num_threads(1)
 DOUBLE = torch.float64

@@ -9,8 +9,8 @@ from lanebev import Calibration, Extrinsics, JointCalibrator, LaneSegments, Stat
 from lanebev.estimation.joint.measurement import boundary_residuals
 from lanebev.estimation.joint.observations import observe
 from lanebev.geometry.focal import pose_by_log_focal, with_focal_std
-from lanebev.testing.scenarios import CAMERA, moments, swing
-from lanebev.testing.scenarios import observe as see
+from lanebev.testing.moments import CAMERA, moments, swing
+from lanebev.testing.moments import observe as see
 from tools.focal_information import frame_information
 
 INTRINSICS = torch.tensor([[[1000.0, 0, 640], [0, 1000.0, 360], [0, 0, 1]]], dtype=torch.float64)

@@ -15,10 +15,11 @@ from lanebev.io.lanes import read_lanes
 from lanebev.io.state import load_state
 from lanebev.io.video import open_source
 from lanebev.weights import load_segmenter
-from tools import fuzz_readers
-from tools.fuzz_readers import fault, mutated
+from tools.fuzz_readers.__main__ import fault
+from tools.fuzz_readers.mutations import mutated
+from tools.fuzz_readers.readers import readers
 
-READERS = fuzz_readers.readers()
+READERS = readers()
 SEEDS = [seed for reader in READERS.values() for seed in reader.seeds]
 thorough = settings(
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]

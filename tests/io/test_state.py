@@ -11,7 +11,7 @@ from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.mount import MountEstimator
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.io.state import VERSION, load_state, save_state
-from lanebev.testing.scenarios import CAMERA, FPS, moments, observe
+from lanebev.testing.moments import CAMERA, FPS, moments, observe
 
 
 @pytest.fixture

@@ -22,8 +22,9 @@ from lanebev import (
 from lanebev.estimation.joint.measurement import VERTICAL
 from lanebev.geometry.lens import distort_points
 from lanebev.observation.boundary_vertices import BoundaryVertices
+from lanebev.observation.frames import resized_size
 from lanebev.observation.segmenter import SegmenterConfig
-from lanebev.pipeline import STAGES, resized_size
+from lanebev.pipeline import STAGES
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes
 from lanebev.types import Extrinsics

@@ -9,7 +9,7 @@ import torch
 
 from lanebev import Camera, Extrinsics
 from lanebev.geometry.road import road_from_image_points
-from lanebev.testing.scenarios import CAMERA, FPS, IMAGE, PLACES, WIDTH, moments, observe
+from lanebev.testing.moments import CAMERA, FPS, IMAGE, PLACES, WIDTH, moments, observe
 from lanebev.types import Status
 from tools.bench_time_prior import main, summarise
 from tools.time_prior import PriorCalibrator, draw, predicted_rays

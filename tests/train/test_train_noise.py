@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
-from lanebev.testing.scenarios import CAMERA, FPS, WIDTH, moments
-from lanebev.testing.scenarios import observe as see
+from lanebev.testing.moments import CAMERA, FPS, WIDTH, moments
+from lanebev.testing.moments import observe as see
 from train.drives import DriveObservations, observe_drive
 from train.noise import compare, outcome
 

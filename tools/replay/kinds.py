@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 import torch
 
 from lanebev.camera.model import Camera
+from lanebev.testing.moments import PLACES, Moment, moments, swing
 from lanebev.testing.motions import Motion, Pose, fall, landing_time, moved, sinusoids, suspension
-from lanebev.testing.scenarios import PLACES, SCENARIOS, Moment, moments, swing
+from lanebev.testing.scenarios import SCENARIOS
 
 FRAMES = 120
 """Of every drive, so that all of them are rows of one batch."""
@@ -54,7 +55,7 @@ class Generated:
     Attributes:
         kind: one of :data:`KINDS`.
         moments: the truth of every frame; called once.
-        camera: the lens; None is the ideal camera of :mod:`lanebev.testing.scenarios`.
+        camera: the lens; None is the ideal camera of :mod:`lanebev.testing.moments`.
         resumed: the drive whose last state is the first one here; None begins anew.
         mount: also run the mount estimator.
     """

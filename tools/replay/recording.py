@@ -14,7 +14,7 @@ from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.mount import MountCalibration, MountEstimator
 from lanebev.observation.segments import LaneSegments, camera_segments
 from lanebev.testing.lens_drives import vertices_through_lens
-from lanebev.testing.scenarios import CAMERA, WIDTH, Moment, observe
+from lanebev.testing.moments import CAMERA, WIDTH, Moment, observe
 from lanebev.types import Calibration
 from tools.replay.kinds import Generated
 

@@ -44,11 +44,21 @@ def parse_formats(text: str) -> tuple[str, ...]:
         ValueError: another name, or none.
     """
     names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
-    unknown = [name for name in names if name not in FORMATS]
-    if unknown or not names:
-        got = unknown[0] if unknown else text
-        raise ValueError(f"formats: expected some of {', '.join(FORMATS)}, separated by commas, got {got!r}")
+    if not names:
+        raise ValueError(f"formats: expected some of {', '.join(FORMATS)}, separated by commas, got {text!r}")
+    check_formats(names)
     return names
+
+
+def check_formats(names: Iterable[str]) -> None:
+    """Raise unless these are names of formats.
+
+    Raises:
+        ValueError: one of them is none.
+    """
+    for name in names:
+        if name not in FORMATS:
+            raise ValueError(f"formats: expected some of {', '.join(FORMATS)}, got {name!r}")
 
 
 def check_installed(names: Iterable[str]) -> None:

@@ -1,28 +1,11 @@
-"""Give every reader mutated files: each result must be a value or one ValueError of one line, soon.
-
-    python -m tools.fuzz_readers [--count 20000] [--seed 0] [--readers camera.yaml …] [--keep DIR]
-
-Inputs are valid files of each kind with bytes, numbers, lines and pieces changed, moved, left out or taken
-from another kind. A traceback, a message of several lines and an input that takes longer than ``--limit``
-seconds are faults: each kind is printed once, and kept with ``--keep``. Exit status 1 if there is any.
-"""
+"""Every kind of file that the package reads, with valid files of it."""
 
 from __future__ import annotations
 
-import argparse
 import io
 import json
-import random
-import re
-import signal
-import sys
 import tempfile
-import time
-import traceback
-import warnings
-from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,23 +25,7 @@ from lanebev.io.state import load_state, save_state
 from lanebev.io.video import open_source
 from lanebev.weights import load_segmenter, read_metadata
 
-NUMBERS = [b"0", b"-1", b"1e308", b"1e-308", b"nan", b".inf", b"0640", b"9" * 40, b"1e999", b"-0.0", b"null"]
-PIECES = [
-    b"",
-    b"\xef\xbb\xbf",
-    b"\x00",
-    b"\xff\xfe",
-    b"---\n",
-    b"{",
-    b"[",
-    b"]",
-    b'"',
-    b"&a [*a]",
-    b"!!int x",
-    b"\n",
-]
 _CURVELANES = b'{"Lines": [[{"x": "5.0", "y": "590"}, {"x": 7, "y": 580}]]}'
-LONGEST_MESSAGE = 500
 
 
 class Reader(NamedTuple):
@@ -260,149 +227,3 @@ def _videos() -> list[bytes]:
             for i in range(6):
                 writer.write(np.full((16, 16, 3), 40 * i, np.uint8))
         return [path.read_bytes()]
-
-
-def mutated(data: bytes, others: list[bytes], draw: random.Random) -> bytes:
-    """Return a file with one to four changes, by chance."""
-    for _ in range(draw.choice((1, 1, 2, 4))):
-        data = draw.choice(_MUTATIONS)(data, others, draw)[:200_000]
-    return data
-
-
-def _flip(data: bytes, _: list[bytes], draw: random.Random) -> bytes:
-    changed = bytearray(data or b" ")
-    for _i in range(draw.choice((1, 1, 8))):
-        changed[draw.randrange(len(changed))] = draw.randrange(256)
-    return bytes(changed)
-
-
-def _cut(data: bytes, _: list[bytes], draw: random.Random) -> bytes:
-    return data[: draw.randrange(len(data) + 1)]
-
-
-def _leave_out(data: bytes, _: list[bytes], draw: random.Random) -> bytes:
-    start, end = sorted(draw.randrange(len(data) + 1) for _i in range(2))
-    return data[:start] + data[end:]
-
-
-def _repeat(data: bytes, _: list[bytes], draw: random.Random) -> bytes:
-    start, end = sorted(draw.randrange(len(data) + 1) for _i in range(2))
-    return data[:end] + data[start:end] * draw.choice((1, 2, 30)) + data[end:]
-
-
-def _insert(data: bytes, _: list[bytes], draw: random.Random) -> bytes:
-    place = draw.randrange(len(data) + 1)
-    return data[:place] + draw.choice(PIECES) * draw.choice((1, 1, 1, 500)) + data[place:]
-
-
-def _change_number(data: bytes, _: list[bytes], draw: random.Random) -> bytes:
-    found = list(re.finditer(rb"-?\d[\d.e+-]*", data))
-    if not found:
-        return data
-    number = draw.choice(found)
-    return data[: number.start()] + draw.choice(NUMBERS) + data[number.end() :]
-
-
-def _change_text(data: bytes, _: list[bytes], draw: random.Random) -> bytes:
-    found = list(re.finditer(rb"[A-Za-z_]\w+", data))
-    if not found:
-        return data
-    word, other = draw.choice(found), draw.choice(found)
-    return data[: word.start()] + other[0] + data[word.end() :]
-
-
-def _mix(data: bytes, others: list[bytes], draw: random.Random) -> bytes:
-    other = draw.choice(others)
-    return data[: draw.randrange(len(data) + 1)] + other[draw.randrange(len(other) + 1) :]
-
-
-def _mix_lines(data: bytes, others: list[bytes], draw: random.Random) -> bytes:
-    lines = data.split(b"\n")
-    lines.insert(draw.randrange(len(lines) + 1), draw.choice(draw.choice(others).split(b"\n")))
-    if draw.random() < 0.5:
-        del lines[draw.randrange(len(lines))]
-    return b"\n".join(lines)
-
-
-_MUTATIONS: list[Callable[[bytes, list[bytes], random.Random], bytes]] = [
-    _flip, _cut, _leave_out, _repeat, _insert, _change_number, _change_number, _change_text, _mix, _mix_lines,
-]  # fmt: skip
-
-
-@contextmanager
-def _time_limit(seconds: float) -> Iterator[None]:
-    def stop(*_: object) -> None:
-        raise TimeoutError(f"more than {seconds:g} s")
-
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-
-
-def fault(reader: Reader, data: bytes, folder: Path, limit: float = 10.0) -> str:
-    """Read an input; return what is wrong with how that ended, empty if nothing is."""
-    path = folder / f"input{reader.suffix}"
-    path.write_bytes(data)
-    try:
-        with warnings.catch_warnings(), _time_limit(limit):
-            warnings.simplefilter("error", RuntimeWarning)  # of numbers that overflow
-            reader.read(path)
-    except ValueError as error:
-        text = str(error)
-        if isinstance(error, UnicodeError):
-            return "a UnicodeError, no ValueError of our own"
-        if not text or len(text.splitlines()) > 1 or "\n" in text:
-            return f"a message of {len(text.splitlines())} lines: {text[:200]!r}"
-        if len(text) > LONGEST_MESSAGE + len(str(path)):
-            return f"a message of {len(text)} characters: {text[:200]}…"
-        return ""
-    except Exception as error:
-        where = [line for line in traceback.extract_tb(error.__traceback__) if "lanebev" in line.filename]
-        place = f"{Path(where[-1].filename).name}:{where[-1].lineno}" if where else "?"
-        return f"{type(error).__name__} at {place}: {' '.join(str(error).split())[:200]}"
-    return ""
-
-
-def main() -> int:
-    """Run."""
-    known = readers()
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
-    parser.add_argument("--count", type=int, default=20_000, help="number of inputs (%(default)s)")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--limit", type=float, default=10.0, help="time limit per input, s (%(default)s)")
-    parser.add_argument(
-        "--readers", nargs="+", choices=known, default=list(known), metavar="NAME", help=", ".join(known)
-    )
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="folder in which failing inputs are kept")
-    args = parser.parse_args()
-    everything = [seed for reader in known.values() for seed in reader.seeds]
-    total = sum(known[name].share for name in args.readers)
-    faults: Counter[str] = Counter()
-    with tempfile.TemporaryDirectory() as folder:
-        for name in args.readers:
-            reader, draw, slowest = known[name], random.Random(f"{args.seed} {name}"), 0.0
-            count = round(args.count * reader.share / total)
-            for _ in range(count):
-                data = mutated(draw.choice(reader.seeds), everything, draw)
-                begin = time.perf_counter()
-                found = fault(reader, data, Path(folder), args.limit)
-                slowest = max(slowest, time.perf_counter() - begin)
-                if found:
-                    kind = f"{name}: {found}"
-                    if not faults[kind]:
-                        print(kind, flush=True)
-                        if args.keep:
-                            args.keep.mkdir(parents=True, exist_ok=True)
-                            (args.keep / f"{len(faults)}-{name}{reader.suffix}").write_bytes(data)
-                    faults[kind] += 1
-            print(f"{name}: {count} inputs, the slowest took {slowest:.2f} s", flush=True)
-    print(f"{args.count} inputs, {sum(faults.values())} faults of {len(faults)} kinds")
-    return 1 if faults else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,110 @@
+"""Fields of settings that are options of the command line too, and their parsers. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import field, fields
+from numbers import Integral, Real
+from typing import TypeVar
+
+T = TypeVar("T")
+
+_TYPES: dict[str, tuple[type | tuple[type, ...], str]] = {
+    "str": (str, "a text or a path"),
+    "bool": (bool, "True or False"),
+    "int": (Integral, "a whole number"),
+    "float": (Real, "a number"),
+    "tuple": ((tuple, list), "a tuple"),
+}
+_MOST_CELLS = 4096  # pixels a side of the bird's-eye view, which H.264 encodes
+
+
+def parse_path(text: str) -> str:
+    """Return a path unchanged.
+
+    Raises:
+        ValueError: the path is empty.
+    """
+    if not text:
+        raise ValueError("expected a path, got an empty string")
+    return text
+
+
+def parse_grid(text: str) -> tuple[float, float, float, float, float]:
+    """Return (near, far, left, right, resolution) in m from a text such as ``3:60,-10:10/0.05``.
+
+    Raises:
+        ValueError: the text has another form, or the picture would be empty or too large.
+    """
+    number = r"([-+]?\d+(?:\.\d*)?|[-+]?\.\d+)"
+    match = re.fullmatch(rf"{number}:{number},{number}:{number}/{number}", text.replace(" ", ""), re.ASCII)
+    if match is None:
+        raise ValueError(f"grid: expected NEAR:FAR,LEFT:RIGHT/STEP, such as 3:60,-10:10/0.05, got {text!r}")
+    return check_grid(tuple(map(float, match.groups())))
+
+
+def check_grid(grid: Sequence[float]) -> tuple[float, float, float, float, float]:
+    """Return (near, far, left, right, resolution) in m, unless it is no range of a bird's-eye view.
+
+    Raises:
+        ValueError: not five numbers, or the picture would be empty or too large.
+    """
+    if len(grid) != 5 or not all(map(math.isfinite, grid)):
+        raise ValueError(f"grid: expected the numbers (near, far, left, right, resolution), got {grid}")
+    near, far, left, right, step = map(float, grid)
+    text = f"{near:g}:{far:g},{left:g}:{right:g}/{step:g}"
+    if not (0 < near < far and left < right and step > 0):
+        raise ValueError(f"grid: expected 0 < NEAR < FAR, LEFT < RIGHT and a STEP above 0, got {text}")
+    rows, columns = (far - near) / step, (right - left) / step
+    if not (16 <= rows <= _MOST_CELLS and 16 <= columns <= _MOST_CELLS):
+        got = f"{columns:.0f} x {rows:.0f}"
+        raise ValueError(f"grid: expected 16 to {_MOST_CELLS} pixels a side, got {got} of {text}")
+    return near, far, left, right, step
+
+
+def check_types(settings: object) -> None:
+    """Raise unless the values of settings have the types of their fields; paths become texts, lists tuples.
+
+    Raises:
+        TypeError: another type; the message names the setting.
+    """
+    for each in fields(settings):  # type: ignore[arg-type]  # a dataclass
+        kind, value = str(each.type).removesuffix(" | None"), getattr(settings, each.name)
+        if value is None and kind != each.type:
+            continue
+        if isinstance(value, os.PathLike):
+            value = os.fspath(value)
+        kind = "tuple" if kind.startswith("tuple[") else kind
+        known, words = _TYPES[kind]
+        if not isinstance(value, known) or (isinstance(value, bool) and kind != "bool"):
+            name = each.name.replace("_", " ")
+            raise TypeError(f"{name}: expected {words}, got {value!r}")
+        object.__setattr__(settings, each.name, tuple(value) if isinstance(value, list) else value)
+
+
+def option(
+    default: T,
+    words: str,
+    metavar: str = "",
+    parse: Callable[[str], object] = parse_path,
+    choices: tuple[str, ...] = (),
+) -> T:
+    """Return a dataclass field with its ``--help`` text and its parser.
+
+    Args:
+        default: value if the option is not given.
+        words: help text; {} in it is replaced by the default.
+        metavar: name of the value in ``--help``.
+        parse: converts the text to the value; options with a boolean default are flags instead.
+        choices: all allowed values, if there are few.
+    """
+    metadata = {
+        "help": words.replace("{}", str(default)),
+        "metavar": metavar,
+        "parse": parse,
+        "choices": choices,
+    }
+    return field(default=default, metadata=metadata)
