@@ -7,6 +7,7 @@ import math
 import re
 import reprlib
 from collections.abc import Sequence
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,16 @@ def read_text(path: Path, errors: str = "strict") -> str:
         raise ValueError("not a text file") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
         raise ValueError(getattr(error, "strerror", None) or str(error)) from error
+
+
+def check_number(name: str, value: object, expected: str = "a number") -> None:
+    """Raise unless an argument is a number of Python or NumPy; a truth value is none.
+
+    Raises:
+        TypeError: naming the argument, and what came.
+    """
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name}: expected {expected}, got {type(value).__qualname__}")
 
 
 def shown(value: Any, most: int = 60) -> str:

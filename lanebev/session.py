@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -19,23 +20,22 @@ from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.mount import MountCalibration, describe_mount
 from lanebev.estimation.reasons import Reason, describe_reasons
 from lanebev.estimation.tracker import Tracker
+from lanebev.io.frame_clock import FrameClock
 from lanebev.io.lane_size import size_doubt
 from lanebev.io.lanes import FrameLines
 from lanebev.io.state import load_state, save_state
+from lanebev.numbers import check_number
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.frames import check_frame, network_image
 from lanebev.observation.polylines import LINE_SIGMA, lines_from_polylines, vertices_from_lines
 from lanebev.pipeline import LaneBEV
-from lanebev.tensors import map_tensors
+from lanebev.tensors import map_tensors, usable_device
 from lanebev.types import Calibration, Extrinsics, Status
 from lanebev.view.frame import remap_frame
 from lanebev.view.grid import BEVGrid
 
 logger = logging.getLogger(__name__)
 
-FIRST_DT = 1 / 30  # s before a first frame: it has no frame before
-_LONG_DT = 5.0  # s; if all steps are longer, the stamps are probably not seconds
-_LOOKED_AT = 5  # number of steps that are checked for that
 _LANES_LOOKED_AT = 20  # frames whose polylines are checked together for the size of their images
 
 
@@ -82,7 +82,8 @@ class Session:
     Args:
         camera: the lens.
         model: network and calibrator; None is :meth:`LaneBEV.from_pretrained`, loaded with the first frame.
-        calibrator: used instead of the model's; None is a :class:`lanebev.JointCalibrator`.
+        calibrator: used instead of the model's; None is the model's, without a model a
+            :class:`lanebev.JointCalibrator`.
         lane_width: m.
         grid: grid of the bird's-eye view; None for no view.
         colours: order of a frame's channels: "bgr" as OpenCV reads them, or "rgb".
@@ -91,8 +92,8 @@ class Session:
         device: device of the network; the filter runs on the CPU.
 
     Raises:
-        TypeError: a camera or a grid of another type.
-        ValueError: an argument out of range.
+        TypeError: an argument of another type.
+        ValueError: an argument out of range, or a device that PyTorch cannot use here.
     """
 
     def __init__(
@@ -109,25 +110,31 @@ class Session:
         device: torch.device | str = "cpu",
     ) -> None:
         check_camera(camera)
-        if grid is not None and not isinstance(grid, BEVGrid):
-            raise TypeError(f"grid: expected a lanebev.BEVGrid or None, got {type(grid).__qualname__}")
+        _check_type("model", model, LaneBEV)
+        _check_type("calibrator", calibrator, Calibrator)
+        _check_type("grid", grid, BEVGrid)
+        for name, value in (("lane_width", lane_width), ("focal_std", focal_std)):
+            check_number(name, value)
+        check_number("polyline_sigma", polyline_sigma)
         if colours not in ("bgr", "rgb"):
             raise ValueError(f"colours: expected 'bgr' or 'rgb', got {colours!r}")
         if not (math.isfinite(lane_width) and 1.0 < lane_width < 10.0):
             raise ValueError(f"lane_width: expected 1 to 10 m, got {lane_width}")
+        if not 0.0 <= focal_std < 1.0:
+            raise ValueError(f"focal_std: expected a fraction of the focal length, 0 to 1, got {focal_std}")
         if not (math.isfinite(polyline_sigma) and polyline_sigma > 0):
             raise ValueError(f"polyline_sigma: expected more than 0 px, got {polyline_sigma}")
-        self.camera, self.grid, self.colours, self.device = camera, grid, colours, torch.device(device)
+        self.camera, self.grid, self.colours, self.device = camera, grid, colours, usable_device(device)
         self.polyline_sigma = polyline_sigma
         self._model = model
-        self._parts = (calibrator or JointCalibrator(), camera, float(lane_width), focal_std)
+        own = JointCalibrator() if model is None else deepcopy(model.calibrator).cpu()
+        self._parts: tuple[Any, ...] = (calibrator or own, camera, float(lane_width), float(focal_std))
         self.reset()
 
     def reset(self) -> None:
         """Reset the state, as for another drive with another camera."""
         self.tracker: Tracker[Any] = Tracker(*self._parts)
-        self._stamp: float | None = None
-        self._steps: list[float] = []
+        self._clock = FrameClock()
         self._drawn: list[FrameLines] = []
         self._doubt = ""
 
@@ -151,12 +158,16 @@ class Session:
                 not updated.
 
         Raises:
-            TypeError: a frame that is neither an array nor a tensor, or a stamp that is no number.
-            ValueError: a frame of another size than the camera's or of other numbers, or a stamp that is not
-                finite.
+            TypeError: a frame that is neither an array nor a tensor, or a stamp or speed that is no number.
+            ValueError: a frame of another size than the camera's or of other numbers, or a stamp or speed
+                that is not finite.
         """
+        if speed is not None:
+            check_number("speed", speed, "m/s as a number, or None")
+            if not math.isfinite(speed):
+                raise ValueError(f"speed: expected finite m/s, or None if it is not known, got {speed}")
         pixels = None if frame is None else self._rgb(frame)
-        dt, remarks = self._step(stamp)
+        dt, remarks = self._clock.step(stamp)
         lost = ["no frame was given"] if frame is None and polylines is None else []
         with torch.inference_mode():
             vertices, scale = self._vertices(pixels, polylines)
@@ -194,7 +205,7 @@ class Session:
         Raises:
             OSError: the file cannot be written.
         """
-        clock = {"stamp": self._stamp, "steps": self._steps}
+        clock = self._clock.values()
         save_state(path, {**self.tracker.states(), "camera": self.camera.fingerprint(), "clock": clock})
 
     def load(self, path: str | Path) -> None:
@@ -209,38 +220,15 @@ class Session:
             raise ValueError(loaded.problem)
         if loaded.metadata.get("camera") != self.camera.fingerprint():
             raise ValueError(f"{path}: expected the state of this camera, got another camera's")
-        clock = loaded.metadata.get("clock") or {}
         fresh.state, fresh.mount_state = loaded.states["calibrator"], loaded.states["mount"]
         self.tracker = fresh
-        self._stamp, self._steps = clock.get("stamp"), list(clock.get("steps", []))
+        self._clock = FrameClock(**(loaded.metadata.get("clock") or {}))
         self._doubt, self._drawn = "", []
 
     def _rgb(self, frame: NDArray[np.uint8] | Tensor) -> Tensor:
         """Check a frame and return it as (3, H, W) RGB."""
         image = check_frame(frame, self.camera.image_size)
         return image if self.colours == "rgb" else image.flip(0)
-
-    def _step(self, stamp: float | None) -> tuple[float, list[str]]:
-        """Return the time since the frame before, and what is doubtful about it."""
-        if stamp is None:
-            return (self._steps[-1] if self._steps else FIRST_DT), []
-        if not isinstance(stamp, (int, float, np.number)):
-            raise TypeError(f"stamp: expected seconds as a number, got {type(stamp).__qualname__}")
-        if not math.isfinite(stamp):
-            raise ValueError(f"stamp: expected finite seconds, got {stamp}")
-        if self._stamp is None:
-            self._stamp = float(stamp)
-            return FIRST_DT, []
-        dt = float(stamp) - self._stamp
-        self._stamp = float(stamp)
-        if dt <= 0:
-            return dt, [f"the time stamp does not advance: {dt:g} s after the frame before"]
-        self._steps = [*self._steps[-_LOOKED_AT + 1 :], dt]
-        if len(self._steps) == _LOOKED_AT and min(self._steps) > _LONG_DT:
-            remark = f"time stamps advance by {dt:g} a frame: expected seconds, got milli- or nanoseconds?"
-            logger.warning(remark)
-            return dt, [remark]
-        return dt, []
 
     def _vertices(
         self,
@@ -268,6 +256,13 @@ class Session:
             if words and not self._doubt:  # once, as long as it lasts
                 logger.warning(words)
             self._doubt, self._drawn = words, []
+
+
+def _check_type(name: str, value: object, expected: type) -> None:
+    """Raise TypeError unless a value is None or of this type."""
+    if value is not None and not isinstance(value, expected):
+        kind = f"the class {value.__qualname__}" if isinstance(value, type) else type(value).__qualname__
+        raise TypeError(f"{name}: expected a lanebev.{expected.__qualname__} or None, got {kind}")
 
 
 def _as_bytes(image: Tensor) -> NDArray[np.uint8]:

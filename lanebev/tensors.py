@@ -38,6 +38,21 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
+def usable_device(device: torch.device | str | int) -> torch.device:
+    """Return a device by its name.
+
+    Raises:
+        ValueError: PyTorch cannot use it here.
+    """
+    try:
+        found = torch.device(device)
+        torch.empty(0, device=found)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"device: expected one that torch can use here, got {device}: {reason}") from error
+    return found
+
+
 def made_once(function: Callable[P, T]) -> Callable[P, T]:
     """Decorate a function of hashable arguments that makes tensors, to be called once for each of them.
 

@@ -6,8 +6,6 @@ from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
-import torch
-
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import LaneFileObserver, NetworkObserver, Observer
 from lanebev.app.shared_network import SharedNetwork
@@ -25,6 +23,7 @@ from lanebev.io.lane_size import lanes_of_whole_images
 from lanebev.io.lanes import lane_files, read_lanes
 from lanebev.io.video import FrameSource, image_size
 from lanebev.pipeline import LaneBEV
+from lanebev.tensors import usable_device
 from lanebev.view.grid import BEVGrid
 
 RunTracker = Tracker[JointState] | Tracker[TwoStageState]
@@ -107,12 +106,8 @@ def make_network(weights: str | None, device: str) -> LaneBEV:
     Raises:
         ValueError: weights that do not fit the network, or a device that is not there.
     """
-    model = LaneBEV.from_pretrained(weights)
-    try:
-        return model.to(torch.device(device))
-    except (RuntimeError, AssertionError) as error:  # what torch raises of devices that it cannot use
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"device: expected one that torch can use here, got {device}: {reason}") from error
+    found = usable_device(device)
+    return LaneBEV.from_pretrained(weights).to(found)
 
 
 def make_observer(

@@ -11,7 +11,7 @@ from lanebev.geometry.lens import cam_from_image, check_intrinsics
 from lanebev.geometry.precision import common_dtype, full_precision
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import Extrinsics
-from lanebev.view.checks import check_cameras, check_image, check_size
+from lanebev.view.checks import check_cameras, check_covers, check_image, check_size
 from lanebev.view.lens import make_lens
 from lanebev.view.projection import CellSums, normalised_intrinsics
 from lanebev.view.sampling import MapSize, resampled
@@ -87,7 +87,7 @@ class CanonicalView(nn.Module):
         model: str = "pinhole",
         image_size: tuple[int, int] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Resample.
+        """Resample an image or a feature map as the virtual camera would see it.
 
         Args:
             image: (B, C, h, w), an image as it was taken or a feature map that covers it.
@@ -107,6 +107,7 @@ class CanonicalView(nn.Module):
         check_image(image)
         size = image_size or (image.shape[-2], image.shape[-1])
         check_size(size)
+        check_covers(image, size)
         check_cameras(image.shape[0], intrinsics, extrinsics, distortion, model)
         dtype, image_from_cam = common_dtype(image), normalised_intrinsics(intrinsics, size)
         lens = None

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
 from lanebev.geometry.distortion import check_lens
 from lanebev.geometry.lens import check_intrinsics
 from lanebev.types import Extrinsics, check_extrinsics, check_tensor
+
+_SAME_SHAPE = 1.25  # factor between height over width of a map and of the image that it covers, padded
 
 
 def check_image(image: Tensor, name: str = "image") -> None:
@@ -26,6 +29,19 @@ def check_size(size: object) -> None:
     """Raise TypeError unless this is a pair, (height, width)."""
     if not (isinstance(size, Sequence) and len(size) == 2):
         raise TypeError(f"image_size: expected (height, width) in px, got {size!r}")
+
+
+def check_covers(image: Tensor, size: tuple[int, int]) -> None:
+    """Raise ValueError if a map (B, C, h, w) has the shape of an image of (W, H) px, not of (H, W) px."""
+    if torch.compiler.is_compiling():
+        return
+    (rows, columns), (height, width) = image.shape[-2:], size
+    stated, swapped = (rows * width) / (columns * height), (rows * height) / (columns * width)
+    if not 1 / _SAME_SHAPE < stated < _SAME_SHAPE and 1 / _SAME_SHAPE < swapped < _SAME_SHAPE:
+        raise ValueError(
+            f"image_size: expected (height, width), got {size} with a map of {rows} x {columns} cells: are "
+            "they swapped?"
+        )
 
 
 def check_cameras(

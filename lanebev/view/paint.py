@@ -63,7 +63,7 @@ class ImageFromBEV(nn.Module):
         model: str = "pinhole",
         vertical_curvature: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Resample.
+        """Resample a map of the road as the camera would see it.
 
         Args:
             bev: (B, C, u, v), of the grid's shape, or of another resolution of the same rectangle.

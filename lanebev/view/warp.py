@@ -12,7 +12,7 @@ from lanebev.geometry.precision import common_dtype
 from lanebev.geometry.road_profile import check_vertical_curvature
 from lanebev.types import Extrinsics
 from lanebev.view.cells import cells_and_lens, rows_in_sight
-from lanebev.view.checks import check_cameras, check_image, check_size
+from lanebev.view.checks import check_cameras, check_covers, check_image, check_size
 from lanebev.view.grid import BEVGrid
 from lanebev.view.projection import image_coordinates, normalised_intrinsics
 from lanebev.view.sampling import MapSize, resampled
@@ -75,7 +75,7 @@ class BEVWarp(nn.Module):
         strides: float | Sequence[float] | None = None,
         vertical_curvature: Tensor | None = None,
     ) -> tuple[Tensor | list[Tensor], Tensor]:
-        """Resample.
+        """Resample images or feature maps to the bird's-eye view.
 
         Args:
             image: (B, C, h, w), an image as it was taken or a feature map that covers it, or a sequence of
@@ -171,5 +171,7 @@ def _map_sizes(
             raise ValueError("image_size: expected (H, W) px of the image that maps belong to, got None")
         image_size = (maps[0].shape[-2], maps[0].shape[-1])
     check_size(image_size)
+    for each in maps:
+        check_covers(each, image_size)
     sizes = [MapSize(each.shape[-2], each.shape[-1], step) for each, step in zip(maps, steps, strict=True)]
     return sizes, image_size

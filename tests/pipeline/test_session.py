@@ -13,6 +13,7 @@ from lanebev import (
     Camera,
     Extrinsics,
     JointCalibrator,
+    LaneBEV,
     Session,
     Status,
     TwoStageCalibrator,
@@ -176,13 +177,17 @@ def test_a_lost_frame_is_said():
 
 def test_careless_arguments_are_named():
     session = Session(CAMERA)
-    with pytest.raises(ValueError, match=r"frame: expected \(360, 640, 3\) uint8, .* float64; convert to"):
+    with pytest.raises(ValueError, match=r"expected \(360, 640, 3\) uint8, .* float64; multiply by 255"):
         session(np.zeros((360, 640, 3)))
+    with pytest.raises(ValueError, match=r"uint8, .* uint16; convert to bytes 0 to 255"):
+        session(np.zeros((360, 640, 3), np.uint16))
+    with pytest.raises(ValueError, match=r"of one with alpha take frame\[\.\.\., :3\]"):
+        session(np.zeros((360, 640, 4), np.uint8))
     with pytest.raises(ValueError, match="for a grey image repeat its channel"):
         session(np.zeros((360, 640), np.uint8))
     with pytest.raises(ValueError, match=r"frame: expected \(360, 640, 3\) uint8, the camera's size"):
         session(np.zeros((720, 1280, 3), np.uint8))
-    with pytest.raises(TypeError, match=r"frame: expected an array or a tensor, got list; .* polylines="):
+    with pytest.raises(TypeError, match=r"frame: expected a NumPy array or a tensor, got list; .* polyl"):
         session([0])
     with pytest.raises(TypeError, match="stamp: expected seconds as a number, got str"):
         session(stamp="12")
@@ -200,6 +205,39 @@ def test_careless_arguments_are_named():
         Session(CAMERA, lane_width=370)
     with pytest.raises(ValueError, match="colours: expected 'bgr' or 'rgb'"):
         Session(CAMERA, colours="gray")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"model": "weights"}, TypeError, "model: expected a lanebev.LaneBEV or None, got str"),
+        ({"calibrator": JointCalibrator}, TypeError, "Calibrator or None, got the class JointCalibrator"),
+        ({"lane_width": "3.7"}, TypeError, "lane_width: expected a number, got str"),
+        ({"focal_std": -0.1}, ValueError, "focal_std: expected a fraction of the focal length, 0 to 1, got"),
+        ({"focal_std": 5}, ValueError, "0 to 1, got 5"),
+        ({"device": "gpu"}, ValueError, "device: expected one that torch can use here, got gpu: "),
+        ({"device": "cuda:99"}, ValueError, "device: expected one that torch can use here, got cuda:99: "),
+    ],
+)
+def test_arguments_of_a_session_are_checked(arguments, error, message):
+    with pytest.raises(error, match=message):
+        Session(CAMERA, **arguments)
+
+
+def test_a_speed_is_a_finite_number():
+    session = Session(CAMERA)
+    with pytest.raises(TypeError, match="speed: expected m/s as a number, or None, got str"):
+        session(stamp=0.0, speed="20")
+    with pytest.raises(ValueError, match="speed: expected finite m/s, or None if it is not known, got nan"):
+        session(stamp=0.0, speed=math.nan)
+
+
+def test_a_session_uses_the_calibrator_of_its_model():
+    model = LaneBEV.from_pretrained(calibrator=TwoStageCalibrator())
+    session = Session(CAMERA, model=model)
+    assert isinstance(session.tracker.calibrator, TwoStageCalibrator)
+    own = JointCalibrator()
+    assert Session(CAMERA, model=model, calibrator=own).tracker.calibrator is own
 
 
 def test_every_reason_has_words():

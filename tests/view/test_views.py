@@ -99,6 +99,9 @@ def test_arguments_of_several_maps_are_checked():
         warp(ramp(), K, extrinsics, strides=4)
     with pytest.raises(ValueError, match="strides: expected 2, one for each map, got 3"):
         warp([ramp(), ramp()], K, extrinsics, image_size=(180, 320), strides=[1, 2, 4])
+    for views in (warp, CanonicalView(K[0], (180, 320), extrinsics)):
+        with pytest.raises(ValueError, match=r"\(height, width\), got \(320, 180\) with a map .* swapped"):
+            views(torch.rand(1, 2, 23, 40), K, extrinsics, image_size=(320, 180))
     with pytest.raises(ValueError, match="image: expected maps of 1 images, got 2"):
         warp([ramp(), ramp(batch=2)], K, extrinsics, image_size=(180, 320))
     with pytest.raises(ValueError, match="image: expected one map at least, got none"):

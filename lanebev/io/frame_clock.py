@@ -1,0 +1,61 @@
+"""Time steps between the frames of a live source, by their stamps."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from lanebev.numbers import check_number
+
+logger = logging.getLogger(__name__)
+
+FIRST_DT = 1 / 30  # s before a first frame: it has no frame before
+_LONG_DT = 5.0  # s; if all steps are longer, the stamps are probably not seconds
+_LOOKED_AT = 5  # number of steps that are checked for that
+
+
+@dataclass
+class FrameClock:
+    """Time steps by stamps.
+
+    Attributes:
+        stamp: of the last frame, s of any epoch; None before the first one.
+        steps: s, the latest time steps.
+    """
+
+    stamp: float | None = None
+    steps: list[float] = field(default_factory=list)
+
+    def values(self) -> dict[str, Any]:
+        """Return the attributes by name, for a file."""
+        return asdict(self)
+
+    def step(self, stamp: float | None) -> tuple[float, list[str]]:
+        """Return the time since the frame before (s), and what is doubtful about it.
+
+        Args:
+            stamp: of this frame, s; None assumes the time step of the frame before.
+
+        Raises:
+            TypeError: not a number.
+            ValueError: not finite.
+        """
+        if stamp is None:
+            return (self.steps[-1] if self.steps else FIRST_DT), []
+        check_number("stamp", stamp, "seconds as a number")
+        if not math.isfinite(stamp):
+            raise ValueError(f"stamp: expected finite seconds, got {stamp}")
+        before, self.stamp = self.stamp, float(stamp)
+        if before is None:
+            return FIRST_DT, []
+        dt = self.stamp - before
+        if dt <= 0:
+            return dt, [f"the time stamp does not advance: {dt:g} s after the frame before"]
+        self.steps = [*self.steps[-_LOOKED_AT + 1 :], dt]
+        if len(self.steps) == _LOOKED_AT and min(self.steps) > _LONG_DT:
+            remark = f"time stamps advance by {dt:g} a frame: expected seconds, got milli- or nanoseconds?"
+            logger.warning(remark)
+            return dt, [remark]
+        return dt, []
