@@ -10,6 +10,7 @@ from __future__ import annotations
 from itertools import accumulate
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,9 +39,10 @@ class Blocks(NamedTuple):
 
     def of_rows(self, rows: list[int]) -> Tensor:
         """Return which blocks belong to some of the rows, (T',) int64."""
-        ends = list(accumulate(self.counts))
-        chosen = [t for r in rows for t in range(ends[r] - self.counts[r], ends[r])]
-        return torch.tensor(chosen, dtype=torch.long).to(self.row.device, non_blocking=True)
+        counts, chosen = np.array(self.counts, dtype=np.int64), np.array(rows, dtype=np.int64)
+        first, count = (counts.cumsum() - counts)[chosen], counts[chosen]
+        within = np.arange(count.sum()) - np.repeat(count.cumsum() - count, count)
+        return torch.from_numpy(np.repeat(first, count) + within).to(self.row.device, non_blocking=True)
 
     def sum_rows(self, values: Tensor) -> Tensor:
         """Sum the values (C, T) of blocks over those of each row, (C, R), always in the same order."""

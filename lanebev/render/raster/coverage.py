@@ -16,7 +16,7 @@ def stripe_coverage(distance: Tensor, width: Tensor, footprint: Tensor) -> Tenso
         width: m.
         footprint: m per pixel, across the stripe.
     """
-    scale = 1 / (PSF * 2**0.5 * footprint)
+    scale = (PSF * 2**0.5 * footprint).reciprocal()
     half = 0.5 * width
     return 0.5 * (torch.erf((distance + half) * scale) - torch.erf((distance - half) * scale))
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.filters import gaussian_blur
+from lanebev.render.raster.filters import blur_reach, gaussian_blur
 from lanebev.render.raster.noise import CLOUD, sample_noise
 from lanebev.render.raster.randomness import uniform_rows
 from lanebev.render.raster.select import as_float
@@ -72,10 +72,10 @@ def rain(image: Tensor, wet: Tensor, generators: Sequence[torch.Generator]) -> T
     image = image + falling * (0.9 - image)
 
     wide = 0.012 * width
-    blurred = gaussian_blur(image, image.new_full((batch,), wide), wide)
+    blurred = gaussian_blur(image, image.new_full((batch,), wide), [blur_reach(wide)] * batch)
     mask = _drops(wet, uniform_rows((_MOST_DROPS, 3), generators, image.device), (height, width))
     narrow = 0.0025 * width
-    mask = gaussian_blur(mask[:, None], image.new_full((batch,), narrow), narrow)
+    mask = gaussian_blur(mask[:, None], image.new_full((batch,), narrow), [blur_reach(narrow)] * batch)
     shifted = blurred.roll(-(height // 12), dims=2) * 1.05
     return (image + mask * (shifted - image) * 0.8).clamp(0, 1)
 

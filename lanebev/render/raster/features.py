@@ -36,6 +36,7 @@ class KindRows(NamedTuple):
         snow: snow.
         tunnel: tunnels.
         night: nights with lights.
+        headlight: the camera's own headlights on other nights and at dusk.
         glass: faults of windscreen, lens and recorder.
     """
 
@@ -44,6 +45,7 @@ class KindRows(NamedTuple):
     snow: list[int]
     tunnel: list[int]
     night: list[int]
+    headlight: list[int]
     glass: list[int]
 
 
@@ -71,7 +73,7 @@ class Features(NamedTuple):
         symbols: arrows, words, diamonds.
         night: a night of the kinds of road.
         rows: on which rows there are which kinds.
-        shading: which walls throw a shadow on the road.
+        shading: on which rows each wall throws a shadow on the road.
         walls: (row, wall) of each wall that is there.
         looks: (kind, style) of each of these; trees come in several styles.
     """
@@ -96,7 +98,7 @@ class Features(NamedTuple):
     symbols: bool
     night: bool
     rows: KindRows
-    shading: list[int]
+    shading: list[list[int]]
     walls: list[list[int]]
     looks: list[list[int]]
 
@@ -139,9 +141,10 @@ def features_of(scene: Scene) -> Features:
             snow=_rows(kinds.snow),
             tunnel=_rows(world.tunnel.on > 0),
             night=_rows(world.lights.on > 0),
-            glass=_rows(kinds.camera | kinds.night),
+            headlight=_rows((scene.light.headlight > 0) & (world.lights.on == 0)),
+            glass=_rows(kinds.camera),
         ),
-        shading=_rows((shadow_lengths(around, scene.light) > SHORTEST_SHADOW).any(0)),
+        shading=[_rows(wall) for wall in (shadow_lengths(around, scene.light) > SHORTEST_SHADOW).unbind(1)],
         walls=there.nonzero().tolist(),
         looks=torch.stack([around.wall_kind, style], dim=-1)[there].tolist(),
     )

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from lanebev.render.raster.select import indices_where, put, take
 from lanebev.render.scene.glyphs import TEXTS
 
 GLYPH_LENGTH, GLYPH_WIDTH = 5.0, 2.0  # m of a picture along and across the road
@@ -126,11 +127,21 @@ def glyph_coverage(glyph: Tensor, x: Tensor, y: Tensor, reach_x: Tensor, reach_y
     Returns:
         (...,) in [0, 1].
     """
+    covered = torch.zeros_like(x)
+    painted = indices_where(glyph >= 0)  # few
+    x, y, reach_x, reach_y = (take(t, painted) for t in (x, y, reach_x, reach_y))
+    value = _mean_paint(take(glyph, painted), x, y, reach_x, reach_y)
+    put(covered.view(1, -1), painted, value[None])
+    return covered
+
+
+def _mean_paint(glyph: Tensor, x: Tensor, y: Tensor, reach_x: Tensor, reach_y: Tensor) -> Tensor:
+    """Average the paint of glyphs over pixels, see :func:`glyph_coverage`; no glyph is negative."""
     table = _integral_table(x.device)
     across, along = _COLUMNS / GLYPH_WIDTH, _ROWS / GLYPH_LENGTH
     wide, tall = (reach_x * across).clamp(min=1.0), (reach_y * along).clamp(min=1.0)
     column, row = (x + 0.5 * GLYPH_WIDTH) * across, y * along
-    base = glyph.clamp(min=0) * ((_ROWS + 1) * (_COLUMNS + 1))
+    base = glyph * ((_ROWS + 1) * (_COLUMNS + 1))
 
     def painted_below(r: Tensor, c: Tensor) -> Tensor:
         r, c = r.clamp(0, _ROWS), c.clamp(0, _COLUMNS)
@@ -143,4 +154,4 @@ def glyph_coverage(glyph: Tensor, x: Tensor, y: Tensor, reach_x: Tensor, reach_y
 
     r0, r1, c0, c1 = row - 0.5 * tall, row + 0.5 * tall, column - 0.5 * wide, column + 0.5 * wide
     inside = painted_below(r1, c1) - painted_below(r0, c1) - painted_below(r1, c0) + painted_below(r0, c0)
-    return torch.where(glyph >= 0, inside / (wide * tall), 0.0).clamp(0, 1)
+    return (inside / (wide * tall)).clamp(0, 1)

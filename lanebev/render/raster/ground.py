@@ -7,16 +7,16 @@ from torch import Tensor
 
 from lanebev.render.raster.blocks import Blocks, make_blocks
 from lanebev.render.raster.colour import colour
-from lanebev.render.raster.features import Features
+from lanebev.render.raster.features import Features, KindRows
 from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.markings import near_marking, paint
 from lanebev.render.raster.night import night_irradiance
 from lanebev.render.raster.noise import blotches, smoothstep
-from lanebev.render.raster.select import put, take, take_channels
+from lanebev.render.raster.select import lines_of, put, take, take_channels
 from lanebev.render.raster.shadows import shadows
 from lanebev.render.raster.surface import LanePlace, pavement_albedo, place_in_lanes
 from lanebev.render.raster.symbols import symbols
-from lanebev.render.raster.varied import city_ground, snow_ground, works_ground
+from lanebev.render.raster.varied import add_roadside, add_street, snow_ground, works_ground
 from lanebev.render.raster.verge import verge_albedo
 from lanebev.render.scene.sampler import select_rows
 from lanebev.render.scene.world import Scene
@@ -62,20 +62,52 @@ def ground_radiance(
     albedo, (coverage, studs) = albedo.view(shape).transpose(0, 1), coverage.view(2, *paved.shape)
 
     x = ray_x * ground.z
-    sunlit, open_sky = shadows(scene, row, x, ground, features)
+    sunlit, open_sky = shadows(scene, below, x, ground, features)
     lit = light.direct[..., None] * (light.sun[:, 1, None] * sunlit)[:, None]
     lit = lit + light.ambient[..., None] * open_sky[:, None]
-    if features.headlight:
-        retro = 1 + 2.5 * coverage + 8.0 * studs
-        beam = headlight_irradiance(x, ground.z) * retro
-        beam = beam * (light.headlight * (1 - world.lights.on[row]))[:, None]
-        lit = lit + beam[:, None] * colour(beam, 1.0, 0.95, 0.85)
-        if features.night:
-            lights = select_rows(world.lights, row)
-            lamps, own = night_irradiance(lights, x, ground.z, ground.along, ground.across)
-            lit = lit + lamps + own * retro[:, None]
+    _add_headlights(scene, below, x, ground, coverage, studs, features.rows, lit)
     gloss = _gloss(scene, row, ray_x, ray_y, sunlit, open_sky, blotch[2], features)
     return albedo * lit + gloss * paved[:, None]
+
+
+def _add_headlights(
+    scene: Scene,
+    below: Blocks,
+    x: Tensor,
+    ground: Ground,
+    coverage: Tensor,
+    studs: Tensor,
+    rows: KindRows,
+    lit: Tensor,
+) -> None:
+    """Add the own headlights, and at night street lamps, to the irradiance (T, 3, N); changes it.
+
+    Args:
+        scene: B of them.
+        below: the points, in blocks.
+        x: (T, N) m, right of the camera's foot.
+        ground: (T, N) points.
+        coverage: (T, N) by paint, which throws the headlights' light back.
+        studs: (T, N) coverage by studs, which do so more.
+        rows: on which rows there are which kinds.
+        lit: irradiance over pi.
+    """
+    for name, own_rows in (("headlight", rows.headlight), ("night", rows.night)):
+        index = below.of_rows(own_rows)
+        if not len(index):
+            continue
+        row = below.row.index_select(0, index)
+        own_x, painted, studded, under = (lines_of(t, index) for t in (x, coverage, studs, lit))
+        z, along, across = (lines_of(t, index) for t in ground[:3])
+        retro = 1 + 2.5 * painted + 8.0 * studded
+        if name == "headlight":
+            beam = headlight_irradiance(own_x, z) * retro
+            beam = beam * scene.light.headlight[row, None]
+            light = under + beam[:, None] * colour(beam, 1.0, 0.95, 0.85)
+        else:
+            lamps, beam = night_irradiance(select_rows(scene.world.lights, row), own_x, z, along, across)
+            light = under + lamps + beam * retro[:, None]
+        lit.index_copy_(0, index, light)
 
 
 def _albedo(
@@ -128,17 +160,16 @@ def _add_kinds(
         row = below.row.index_select(0, index)
         part = select_rows(ground, index)
         own, painted = (t.view(len(t), *paved.shape) for t in (albedo, coverage))
-        base, paint_on = own.index_select(1, index).transpose(0, 1), painted[0].index_select(0, index)
+        channels, paint_on = own.index_select(1, index), painted[0].index_select(0, index)
+        base = channels.transpose(0, 1)
         road, blotch = paved.index_select(0, index), stain.index_select(0, index)
-        layout, pavement = select_rows(scene.world.layout, row), select_rows(scene.world.pavement, row)
         if name == "city":
-            eye, height = scene.place.across[row], scene.lens.extrinsics.height[row]
-            street = select_rows(scene.world.street, row)
-            over = (part, base, road, paint_on, blotch)
-            base, paint_on = city_ground(street, layout, pavement, eye, height, *over)
+            add_roadside(scene, row, part, road, channels)
+            add_street(scene, row, part, road, channels, paint_on, blotch)
         elif name == "works":
             base, paint_on = works_ground(select_rows(scene.world.works, row), part, base, road, paint_on)
         else:
+            layout, pavement = select_rows(scene.world.layout, row), select_rows(scene.world.pavement, row)
             winter = select_rows(scene.world.winter, row)
             base, paint_on = snow_ground(winter, layout, pavement, part, base, road, paint_on, blotch)
         own.index_copy_(1, index, base.transpose(0, 1))

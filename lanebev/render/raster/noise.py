@@ -127,4 +127,4 @@ def hash01(a: Tensor, b: Tensor, salt: float) -> Tensor:
 def smoothstep(low: float | Tensor, high: float | Tensor, value: Tensor) -> Tensor:
     """Return 0 below low and 1 above high, smooth between."""
     t = ((value - low) / (high - low)).clamp(0, 1)
-    return t * t * (3 - 2 * t)
+    return t * t * torch.rsub(t, 3, alpha=2)

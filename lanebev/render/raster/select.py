@@ -43,6 +43,11 @@ def put(values: Tensor, place: Tensor, new: Tensor) -> None:
     values.scatter_(1, index, new.reshape(len(values), -1))
 
 
+def lines_of(values: Tensor, index: Tensor) -> Tensor:
+    """Return lines of a tensor at ascending places, each at most once; of all of them the tensor itself."""
+    return values if len(index) == len(values) else values.index_select(0, index)
+
+
 def as_float(mask: Tensor) -> Tensor:
     """Return 1 where a mask holds, else 0, float32."""
     return mask.contiguous().view(torch.uint8).float()

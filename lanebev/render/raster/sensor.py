@@ -10,8 +10,8 @@ from torch import Tensor
 from lanebev.render.raster.effects import add_bonnet, rain
 from lanebev.render.raster.exposure import expose
 from lanebev.render.raster.features import Features
-from lanebev.render.raster.filters import gaussian_blur
-from lanebev.render.raster.glass import behind_glass, frame_cover, recorded
+from lanebev.render.raster.filters import blur_reach, gaussian_blur
+from lanebev.render.raster.glass import behind_glass, frame_cover, recorded, shaken
 from lanebev.render.raster.jpeg import compress
 from lanebev.render.raster.paint import Painted
 from lanebev.render.raster.randomness import normal_rows
@@ -68,13 +68,14 @@ def take_image(
         image.index_copy_(0, rows, rain(image.index_select(0, rows), wet, drawn))
     windscreens = torch.tensor(faulty, dtype=torch.long).to(device, non_blocking=True)
     glass = select_rows(scene.world.glass, windscreens)
+    moved = host.world.glass.shake.any(1)
+    if bool(moved.any()):
+        rows = rows_with(moved)
+        shake = scene.world.glass.shake.index_select(0, rows)
+        image.index_copy_(0, rows, shaken(image.index_select(0, rows), shake))
     if faulty:
         image.index_copy_(0, windscreens, behind_glass(image.index_select(0, windscreens), glass))
-    scale = image.shape[3] / _REFERENCE_WIDTH
-    largest = float(host.world.sensor.blur.amax()) * scale
-    if largest >= _SHARP:
-        std = sensor.blur * scale
-        image = gaussian_blur(image, std * (std >= _SHARP), largest)
+    _blur(image, host.world.sensor.blur * (image.shape[3] / _REFERENCE_WIDTH))
     image = add_noise(image, sensor, generators)
     if faulty:
         image.index_copy_(0, windscreens, recorded(image.index_select(0, windscreens), glass))
@@ -87,6 +88,17 @@ def take_image(
         quality = sensor.jpeg.index_select(0, rows)
         image.index_copy_(0, rows, compress(image.index_select(0, rows), quality))
     return image
+
+
+def _blur(image: Tensor, std: Tensor) -> None:
+    """Blur images (B, C, H, W) by Gaussians of (B,) px, on the host, if that shows; changes the images."""
+    most, order = std.sort(descending=True, stable=True)
+    most = most[most >= _SHARP]
+    if len(most):
+        rows = order[: len(most)].to(image.device, non_blocking=True)
+        reach = [blur_reach(each) for each in most.tolist()]
+        own = most.to(image.device, non_blocking=True)
+        image.index_copy_(0, rows, gaussian_blur(image.index_select(0, rows), own, reach))
 
 
 def add_noise(image: Tensor, sensor: Sensor, generators: Sequence[torch.Generator]) -> Tensor:

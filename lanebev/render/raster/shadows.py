@@ -7,10 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lanebev.render.raster.blocks import Blocks
 from lanebev.render.raster.features import SHORTEST_SHADOW, STEEPEST, Features, shadow_lengths
 from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.noise import CLOUD, sample_line, sample_noise, smoothstep
-from lanebev.render.raster.select import as_float, choose, indices_where, take
+from lanebev.render.raster.select import as_float, choose, indices_where, lines_of, take
 from lanebev.render.scene.objects import TRUCK, SceneObjects
 from lanebev.render.scene.sampler import select_rows
 from lanebev.render.scene.surroundings import FENCE, HEDGE, RAIL, TREES, Surroundings
@@ -22,18 +23,19 @@ _PIECE = 64  # pixels that are looked at together for a vehicle's shadow
 
 
 def shadows(
-    scene: Scene, row: Tensor, x: Tensor, ground: Ground, features: Features
+    scene: Scene, below: Blocks, x: Tensor, ground: Ground, features: Features
 ) -> tuple[Tensor, Tensor]:
     """Compute the share of the sun, and of the sky, that reaches the ground, (T, N) both.
 
     Args:
         scene: B of them.
-        row: (T,) which scene each row of the points belongs to.
+        below: T blocks of points.
         x: (T, N) m, right of the camera's foot.
         ground: (T, N) points.
         features: what any of the scenes has.
     """
-    light, world = select_rows(scene.light, row), scene.world
+    row, world = below.row, scene.world
+    light = select_rows(scene.light, row)
     sunlit, open_sky = _vehicle_shadows(scene.light, row, x, ground, scene.objects)
     if features.bridge:
         shade, under = _bridge_shadow(world.bridge[row], light, ground)
@@ -43,8 +45,13 @@ def shadows(
             sunlit = sunlit * (1 - world.shade[row, None] * _crown_shadow(world, row, ground))
         around = select_rows(world.surroundings, row)
         lengths = shadow_lengths(around, light)
-        for wall in features.shading:
-            sunlit = sunlit * _wall_shadow(around, wall, lengths[:, wall, None], ground)
+        for wall, rows in enumerate(features.shading):
+            index = below.of_rows(rows)
+            if len(index):
+                own = around if len(index) == len(row) else select_rows(around, index)
+                part = Ground(*(lines_of(t, index) for t in ground))
+                shadow = _wall_shadow(own, wall, lines_of(lengths, index)[:, wall, None], part)
+                sunlit.index_copy_(0, index, lines_of(sunlit, index) * shadow)
     return sunlit, open_sky
 
 

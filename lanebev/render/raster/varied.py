@@ -5,51 +5,106 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lanebev.render.raster.blocks import make_blocks
 from lanebev.render.raster.coverage import dash_coverage, stripe_coverage
 from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.roadside import roadside
+from lanebev.render.raster.select import put, take, take_channels
 from lanebev.render.raster.street import lane_coordinates, street_paint
 from lanebev.render.raster.street_surface import ironwork, strips, tracks
 from lanebev.render.raster.winter import snow_cover
 from lanebev.render.scene.layout import Layout
 from lanebev.render.scene.pavement import Pavement
+from lanebev.render.scene.sampler import select_rows
 from lanebev.render.scene.street import Street
 from lanebev.render.scene.winter import Winter
 from lanebev.render.scene.works import NUM_OLD, Works
+from lanebev.render.scene.world import Scene
+
+
+def add_roadside(scene: Scene, row: Tensor, ground: Ground, paved: Tensor, albedo: Tensor) -> None:
+    """Put what is beside streets over a plain verge; changes the linear reflectance (3, T, N).
+
+    Args:
+        scene: B of them.
+        row: (T,) int64, not decreasing, the scene of each line of points.
+        ground: (T, N) points.
+        paved: (T, N) share of the pixel on the carriageway.
+        albedo: linear reflectance of the plain road and its verge.
+    """
+    beside = make_blocks(paved < 1, row=row, num_rows=len(scene.place.along))
+    own = beside.row
+    along, across, reach_along, reach_across = (take(t, beside.place) for t in ground[1:])
+    colours, share = roadside(
+        select_rows(scene.world.street, own),
+        select_rows(scene.world.pavement, own),
+        along,
+        across,
+        reach_along,
+        reach_across,
+        scene.place.across[own],
+        scene.lens.extrinsics.height[own],
+    )
+    planes = albedo.view(3, -1)
+    under = take_channels(planes, beside.place)
+    share = share * (1 - take(paved, beside.place))
+    put(planes, beside.place, under + (colours.transpose(0, 1) - under) * share)
+
+
+def add_street(
+    scene: Scene, row: Tensor, ground: Ground, paved: Tensor, albedo: Tensor, painted: Tensor, blotch: Tensor
+) -> None:
+    """Put what is on streets over plain roads; changes the linear reflectance and the coverage by paint.
+
+    Args:
+        scene: B of them.
+        row: (T,) int64, not decreasing, the scene of each line of points.
+        ground: (T, N) points.
+        paved: (T, N) share of the pixel on the carriageway.
+        albedo: (3, T, N) linear reflectance of the plain road.
+        painted: (T, N) share of the pixel under the boundaries' paint.
+        blotch: (T, N) slow noise.
+    """
+    road = make_blocks(paved > 0, row=row, num_rows=len(scene.place.along))
+    world, place = scene.world, road.place
+    planes = albedo.view(3, -1)
+    base, covered = city_ground(
+        select_rows(world.street, road.row),
+        select_rows(world.layout, road.row),
+        select_rows(world.pavement, road.row),
+        Ground(*(take(t, place) for t in ground)),
+        take_channels(planes, place).transpose(0, 1),
+        take(painted, place),
+        take(blotch, place),
+    )
+    put(planes, place, base.transpose(0, 1))
+    put(painted.view(1, -1), place, covered[None])
 
 
 def city_ground(
     street: Street,
     layout: Layout,
     pavement: Pavement,
-    eye_across: Tensor,
-    eye_height: Tensor,
     ground: Ground,
     albedo: Tensor,
-    paved: Tensor,
     painted: Tensor,
     blotch: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Put a street's ground over that of a plain road.
+    """Put what is on a street over a plain road.
 
     Args:
         street: what it has.
         layout: its boundaries.
         pavement: its edges.
-        eye_across: (B,) m, the camera's place.
-        eye_height: (B,) m.
         ground: (B, N) points.
-        albedo: (B, 3, N) linear reflectance of the plain road and its verge.
-        paved: (B, N) share of the pixel on the carriageway.
-        painted: (B, N) share of it under the boundaries' paint.
+        albedo: (B, 3, N) linear reflectance of the plain road and of what is beside it.
+        painted: (B, N) share of the pixel under the boundaries' paint.
         blotch: (B, N) slow noise.
 
     Returns:
         albedo and painted of the street.
     """
     here = (ground.along, ground.across, ground.reach_along, ground.reach_across)
-    beside, share = roadside(street, pavement, *here, eye_across, eye_height)
-    albedo = albedo + (beside - albedo) * (share * (1 - paved))[:, None]
     coloured = strips(street, layout, pavement, ground.across, ground.reach_across, albedo)
     albedo = albedo + (coloured - albedo) * (1 - painted)[:, None]
     lane, inside, _, on_lane = lane_coordinates(layout, ground.across)
