@@ -66,7 +66,7 @@ def replace_rows(rows: Tensor, values: T, function: Callable[..., T], *operands:
 def _replace_rows_in_program(
     rows: Tensor, values: T, function: Callable[..., T], operands: tuple[Any, ...]
 ) -> T:
-    """As :func:`replace_rows`, by ``torch.cond``, of plain tuples of tensors none of which is a view."""
+    """Replace rows as :func:`replace_rows` does, by ``torch.cond``, of tensors none of which is a view."""
     parts, structure = tree_flatten((rows, values, operands))
     parts = [part.clone() for part in parts]
     results = tree_flatten(values)[1]
@@ -83,7 +83,7 @@ def _replace_rows_in_program(
 
 
 def _put_rows(index: Tensor, rows: T, values: T) -> T:
-    """``values`` with ``rows`` at the places (K,) of the index."""
+    """Return ``values`` with ``rows`` at the places (K,) of the index."""
     if isinstance(values, Tensor):
         return cast(T, values.index_copy(0, index, cast(Tensor, rows)))
     pairs = zip(cast("tuple[Tensor, ...]", rows), cast("tuple[Tensor, ...]", values), strict=True)

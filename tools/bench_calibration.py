@@ -53,7 +53,7 @@ DEFAULT = ("joint", "two-stage", "textbook EKF")
 def compare(
     names: list[str], scenarios: list[str], rows: int, seconds: float | None, sigma: float
 ) -> dict[str, Any]:
-    """All scenarios with all calibrators: figures by scenario and calibrator."""
+    """Run all scenarios with all calibrators; return figures by scenario and calibrator."""
     results: dict[str, Any] = {}
     usual: dict[str, Tensor] = {}
     for scenario in scenarios:
@@ -96,7 +96,7 @@ def _seconds(value: float | None) -> str:
 
 
 def markdown(results: dict[str, Any]) -> str:
-    """The README's table."""
+    """Return the table of docs/benchmarks/synthetic.md."""
     lines = [
         "| drive | calibrator | pitch ° | yaw ° | roll ° | height cm | × bound | NEES/dof | tracking "
         "| hard frames: pitch, yaw, roll °, height cm | recovery |",
@@ -117,7 +117,7 @@ def markdown(results: dict[str, Any]) -> str:
 
 
 def stream(frames: int, rows: int, per_boundary: int = 8, seed: int = 0) -> dict[str, Any]:
-    """An endless straight drive, its observations drawn from one period of the motion and re-noised.
+    """Yield an endless straight drive, its observations drawn from one period of the motion and re-noised.
 
     The same frames go to a float32 and a float64 calibrator.
 
@@ -168,13 +168,13 @@ def stream(frames: int, rows: int, per_boundary: int = 8, seed: int = 0) -> dict
 
 
 def smallest_eigenvalue(cov: Tensor) -> float:
-    """Of the correlation matrices of (B, D, D): positive if and only if all covariances are."""
+    """Return the least eigenvalue of correlation matrices (B, D, D): positive if all covariances are."""
     size = cov.double().diagonal(dim1=1, dim2=2).rsqrt()
     return float(torch.linalg.eigvalsh(size.unsqueeze(-1) * cov.double() * size.unsqueeze(-2)).min())
 
 
 def speed(calibrator: Any, frames: int = 60) -> dict[str, float]:
-    """Milliseconds a frame of one row, 180 segments, float64 and one thread; median and quartiles."""
+    """Return milliseconds a frame of one row, 180 segments, float64 and one thread; median and quartiles."""
     drive = list(observe(moments(frames / FPS), 1, 1.0, 30, 0, torch.float64))
     state, took = calibrator.initial_state(1, dtype=torch.float64), []
     with torch.inference_mode():

@@ -146,12 +146,12 @@ def median_interval(error: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def kitti_road(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
-    """German city streets against the lidar's road plane."""
+    """Evaluate German city streets against the lidar's road plane."""
     return _kitti_road(model, data, sheets, None)
 
 
 def kitti_road_with_prior(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
-    """The same, with the median of the true pitch and roll as the pose that ``--mount`` gives."""
+    """Evaluate the same with the median of the true pitch and roll as the pose that ``--mount`` gives."""
     calibs = sorted((data / "kitti_road" / "calib").glob("*.txt"))
     pitch, roll = torch.stack([kitti_truth(path) for path in calibs]).median(0).values.tolist()
     pose, std = (pitch, 0.0, roll, 0.0), (MOUNT_STD, torch.inf, MOUNT_STD, torch.inf)
@@ -175,7 +175,7 @@ def _kitti_road(
 
 
 def culane(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
-    """Night frames: how many are calibrated."""
+    """Evaluate night frames: how many are calibrated."""
     paths = sorted((data / "culane").rglob("*.jpg"))
     height, width = read_image(paths[0]).shape[:2]
     camera = Camera.from_fov(ASSUMED_FOV, width, height)
@@ -185,7 +185,7 @@ def culane(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
 
 
 def streets(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
-    """Two images with a known pose, in sigmas, and six to look at."""
+    """Evaluate two images with a known pose, in sigmas, and six to look at."""
     lines = (data / "streets" / "truth.csv").read_text().splitlines()
     rows = {row["image"]: row for row in csv.DictReader(line for line in lines if not line.startswith("#"))}
     figures: dict[str, float] = {}
@@ -208,7 +208,7 @@ def streets(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]
 
 
 def rendered(model: LaneBEV, views: int) -> dict[str, float]:
-    """Rendered views of all kinds of road, each with the mean of its lane widths."""
+    """Evaluate rendered views of all kinds of road, each with the mean of its lane widths."""
     generator = torch.Generator().manual_seed(RENDERED_SEED)
     answers, truth = [], []
     with torch.inference_mode():
@@ -244,7 +244,7 @@ def save_sheet(
 
 @one_line_errors()
 def main() -> None:
-    """Command line."""
+    """Run the evaluation from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     default = Path(__file__).resolve().parents[2] / "shared" / "data"
     parser.add_argument("--data", type=Path, default=default, help="folder of the data (../shared/data)")

@@ -143,7 +143,7 @@ def read_shard(path: Path) -> Shard:
 
 
 def shard_size(path: Path) -> int:
-    """Number of a shard's frames, without reading them.
+    """Return the number of a shard's frames, without reading them.
 
     Raises:
         ValueError: not a shard.

@@ -56,7 +56,7 @@ class SharedNetwork:
         return own.answer.result()
 
     def _taken(self, own: _Request) -> list[_Request]:
-        """Take this frame, and as many others of its size as a batch holds, off the list."""
+        """Remove this frame, and as many others of its size as a batch holds, from the list."""
         with self._changing:
             alike = [
                 each for each in self._waiting if each is not own and each.image.shape == own.image.shape

@@ -140,7 +140,7 @@ class Camera:
 
     @classmethod
     def from_fields(cls, fields: Mapping[str, Any], rectified: bool = False) -> Camera:
-        """Take the fields of a ROS ``camera_info`` message: width, height, distortion_model, D, K, R, P, roi.
+        """Make a camera of a ROS ``camera_info``: width, height, distortion_model, D, K, R, P, roi.
 
         Args:
             fields: by name.

@@ -69,6 +69,6 @@ def inverse_spd(matrix: Tensor) -> Tensor:
 
 
 def _scaled_factor(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale (..., D) to a unit diagonal, and the Cholesky factor of the scaled matrix."""
+    """Return the scale (..., D) to a unit diagonal and the Cholesky factor of the scaled matrix."""
     size = matrix.diagonal(dim1=-2, dim2=-1).rsqrt()
     return size, cholesky(size.unsqueeze(-1) * matrix * size.unsqueeze(-2))

@@ -68,7 +68,7 @@ def common_dtype(*tensors: Tensor) -> torch.dtype:
 
 
 def widest_dtype(device: torch.device) -> torch.dtype:
-    """Double precision, but single where a device has no double (MPS)."""
+    """Return double precision, or single where a device has no double (MPS)."""
     return torch.float32 if device.type == "mps" else torch.float64
 
 

@@ -54,7 +54,7 @@ _HIDING = ("vp8", "libvpx")  # codecs with frames that are decoded and not shown
 
 
 def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
-    """Look at what the user gave and check that a frame of it decodes.
+    """Open what the user gave as a source of frames, and check that a frame of it decodes.
 
     Args:
         source: a video, a folder of images, a glob (recursive with ``**``) or one image.

@@ -183,7 +183,7 @@ def _with_the_middle(points: Tensor, normal: Tensor, middle: Tensor, size: Tenso
 
 
 def _half_of(count: Tensor, config: LineConfig) -> Tensor:
-    """Number of pairs of a boundary with so many vertices."""
+    """Return the number of pairs of a boundary with so many vertices."""
     half = (count // 2).clamp(max=config.segments)
     return torch.where(count >= config.min_vertices, half, 0)
 

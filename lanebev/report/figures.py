@@ -61,7 +61,7 @@ def new_figure(label: str, x_range: Any, limits: tuple[float, float], height: in
 
 
 def finish(plot: Any, is_last: bool, xlabel: str, legend: bool) -> None:
-    """Give a drawn figure its look, and the line that marks the frame shown."""
+    """Style a drawn figure, and add the line that marks the frame shown."""
     plot.add_layout(Span(location=0, dimension="height", line_color="#d1242f", name=_NOW, visible=False))
     plot.toolbar.logo = None
     plot.outline_line_color = None

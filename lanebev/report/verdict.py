@@ -212,7 +212,7 @@ def _finding(subject: str, what: str, first: int, last: int, times: NDArray[np.f
 
 
 def _end(times: NDArray[np.float64], last: int) -> float:
-    """Time until which a frame stands: that of the next, or a usual step later."""
+    """Return the time of the next frame, s, or a usual step later."""
     usual = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     following = float(times[last + 1]) if last + 1 < len(times) else np.inf
     return min(following, float(times[last]) + max(usual, 0.0))

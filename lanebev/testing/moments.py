@@ -163,7 +163,7 @@ def resample(z: Tensor, x: Tensor, at: Tensor) -> Tensor:
 def _exact(
     moment: Moment, rows: int, per_boundary: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """End points (R, N, 2, 2), boundary (R, N), weight (R, N): points every 30 px, paired at random."""
+    """Return end points (R, N, 2, 2), boundary and weight (R, N): points every 30 px, paired at random."""
     pixels, inside = curves(moment)
     ends, weights = [], []
     for k in range(6):

@@ -69,7 +69,7 @@ def blocks(cells: Cells, lens: Lens | None, limit: float, memory: Memory | None 
 
 
 def _may_choose(cells: CellSums) -> bool:
-    """Whether what is computed may depend on values, and interpolation is as exact as the numbers."""
+    """Tell whether what is computed may depend on values, and interpolation is as exact as the numbers."""
     by_row = cells.by_row
     return by_row.dtype == torch.float32 and by_row.device.type == "cpu" and not traced()
 
@@ -77,7 +77,7 @@ def _may_choose(cells: CellSums) -> bool:
 def _exact_blocks(
     cells: Cells, lens: Lens | None, rows: tuple[int, int], size: int, memory: Memory | None
 ) -> Iterator[Block]:
-    """Rows from the first to below the second, cell by cell, in blocks of so many cells."""
+    """Yield rows from the first to below the second, cell by cell, in blocks of so many cells."""
     batch, _, columns = cells.shape
     for first, last in _spans(rows, size // max(1, batch * columns)):
         points, hidden = image_coordinates(cells.rows(first, last), lens)
@@ -94,7 +94,7 @@ def _tile_block(
     rows: tuple[int, int],
     memory: Memory | None,
 ) -> Block:
-    """Rows of a tile: those of each image by its polynomials where they are exact."""
+    """Yield rows of a tile: those of each image by its polynomials where they are exact."""
     inner = slice(*(row - curves.rows.edges[tile] for row in rows))
     points = curves.points(tile, inner, None if memory is None else memory(*rows))
     if curves.inside[tile]:

@@ -46,7 +46,7 @@ class Lens(NamedTuple):
 
 
 def make_lens(image_from_cam: Tensor, distortion: Tensor, model: str) -> Lens:
-    """Take apart intrinsics (B, 3, 3) and distortion (B, D)."""
+    """Make a lens of intrinsics (B, 3, 3) and distortion (B, D)."""
     upper = image_from_cam[:, :2, :, None, None]  # (B, 2, 3, 1, 1)
     focal = torch.stack([upper[:, 0, 0], upper[:, 1, 1]], dim=1)
     skew = torch.stack([upper[:, 0, 1], torch.zeros_like(upper[:, 0, 1])], dim=1)

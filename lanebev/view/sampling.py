@@ -106,12 +106,12 @@ def _maps_written(
 
 
 def _may_overwrite() -> bool:
-    """Whether results need no graph, be it of gradients or of operations."""
+    """Tell whether results need no graph, be it of gradients or of operations."""
     return not (torch.is_grad_enabled() or traced())
 
 
 def _kept_maps(count: int, cells: Cells) -> list[Tensor]:
-    """Memory for maps; the device's own store of memory elsewhere than on a CPU."""
+    """Return memory for maps; elsewhere than on a CPU the device's own store of memory."""
     like = cells.rows(0, 0)
     shape = (cells.shape[0], 2, *cells.shape[1:])
     if like.device.type != "cpu":
@@ -176,7 +176,7 @@ def _sample(features: Tensor, at: Tensor) -> Tensor:
 
 
 def _strips(features: Tensor, at: Tensor) -> int:
-    """Number of strips of rows to be sampled as if they were images of a batch.
+    """Return the number of strips of rows to be sampled as if they were images of a batch.
 
     ``grid_sample`` divides its work on a CPU by images: of one image, one thread does all. A copy puts the
     strips together, and gradients of the image would be computed once for each.

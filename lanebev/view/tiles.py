@@ -206,7 +206,7 @@ def interpolant(cells: CellSums, lens: Lens | None, limit: float) -> Interpolant
     shape = rows.coefficients.shape[:2]
 
     def by_tiles(values: Tensor) -> NDArray[np.float32]:
-        """(B, k, T·n, S·m) as (B, k, T, n, S, m), without gradient."""
+        """Reshape (B, k, T·n, S·m) to (B, k, T, n, S, m), without gradient."""
         array: NDArray[np.float32] = values.detach().numpy()
         return array.reshape(*array.shape[:2], *shape, -1, _NODES)
 
@@ -248,7 +248,7 @@ def tile_bounds(
 
 
 def _along_columns(nodes: Tensor, columns: ColumnTiles) -> Tensor:
-    """Values at all columns, (B, k, R, V), from those at the nodes, (B, k, R, S·m)."""
+    """Interpolate values at all columns, (B, k, R, V), from those at the nodes, (B, k, R, S·m)."""
     nodes = nodes.unflatten(-1, (-1, _NODES))
     if nodes.requires_grad:
         with autocast_off(nodes.device):

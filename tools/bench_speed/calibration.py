@@ -16,7 +16,7 @@ from tools.bench_speed.measuring import Calls
 
 
 def extractors() -> Calls:
-    """Seven maps with six stripes, as the shipped network makes them of 576 × 320 px."""
+    """Make calls on seven maps with six stripes, as the shipped network makes them of 576 × 320 px."""
     rows, columns = torch.arange(160.0).unsqueeze(-1), torch.arange(288.0)
     slopes = torch.tensor([-1.6, -1.0, -0.4, 0.3, 0.9, 1.5])
     middle = 144 + slopes[:, None, None] * (rows - 30)
@@ -31,7 +31,7 @@ def extractors() -> Calls:
 
 
 def calibrators(rows: int, per_boundary: int) -> Calls:
-    """One frame of each calibrator that is sure of its start: see ``JointConfig.doubt_frames``."""
+    """Make calls of one frame of each calibrator, sure of its start: see ``JointConfig.doubt_frames``."""
     one = lanes(per=per_boundary, noise=0.5)
     seen = LaneSegments(*(part.expand(rows, *part.shape[1:]) for part in one))
     intrinsics = INTRINSICS.expand(rows, 3, 3)

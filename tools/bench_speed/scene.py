@@ -24,7 +24,7 @@ def poses(batch: int) -> Extrinsics:
 
 
 def sampling_grid(batch: int) -> Tensor:
-    """What the warp samples at, as ``grid_sample`` takes it."""
+    """Return where the warp samples, as ``grid_sample`` takes it."""
     intrinsics = camera().intrinsics.float().expand(batch, 3, 3)
     points, _ = BEVWarp(GRID).image_points(intrinsics, poses(batch))
     size = torch.tensor([SIZE[1], SIZE[0]])

@@ -9,7 +9,7 @@ from tools.bench_speed.measuring import Table, verdict
 
 
 def shown(title: str, table: Table) -> str:
-    """A markdown table, ratios first."""
+    """Return a markdown table, ratios first."""
     lines = [f"**{title}**", "", "| | ratio | ms | quartiles | target |", "|---|---|---|---|---|"]
     for name, entry in table.items():
         quartiles = f"{entry['low']:.2f} to {entry['high']:.2f}"
@@ -20,7 +20,7 @@ def shown(title: str, table: Table) -> str:
 
 
 def overview(tables: Mapping[str, Table]) -> str:
-    """A markdown table of all ratios, bold where a target is missed, and how many are met."""
+    """Return a markdown table of all ratios, bold where a target is missed, and how many are met."""
     names = list(dict.fromkeys(name for table in tables.values() for name in table))
     lines = [f"| | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
     for title, table in tables.items():
@@ -35,7 +35,7 @@ def _ratio(entry: Mapping[str, float]) -> str:
 
 
 def grown(title: str, results: dict[int, Table]) -> str:
-    """A markdown table of ms by size."""
+    """Return a markdown table of ms by size."""
     names = list(next(iter(results.values())))
     lines = [f"**ms by {title}**", "", f"| {title} | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
     for size, table in results.items():
@@ -44,7 +44,7 @@ def grown(title: str, results: dict[int, Table]) -> str:
 
 
 def plot(title: str, results: dict[int, Table], path: Path) -> None:
-    """Cost against size, both logarithmic."""
+    """Plot time against size, both logarithmic."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5, 3.2), layout="constrained")

@@ -23,7 +23,7 @@ from tools.bench_speed.measuring import Calls
 
 
 def warps(batch: int, channels: int, stride: int) -> Calls:
-    """The warp and its peers on one image or feature map."""
+    """Make calls of the warp and its peers on one image or feature map."""
     image = torch.rand(batch, channels, scene.SIZE[0] // stride, scene.SIZE[1] // stride)
     grid, warp, extrinsics = scene.sampling_grid(batch), BEVWarp(scene.GRID), scene.poses(batch)
     ideal = scene.camera().intrinsics.float().expand(batch, 3, 3)
@@ -45,7 +45,7 @@ def warps(batch: int, channels: int, stride: int) -> Calls:
 
 
 def stages(distortion: list[float] | None) -> Calls:
-    """The stages of a view of one image: alone, in a warm cache, and before the resampling."""
+    """Make calls of the stages of a view of one image: alone, in a warm cache, and before the resampling."""
     image, grid = torch.rand(1, 3, *scene.SIZE), scene.sampling_grid(1)
     warp, extrinsics = BEVWarp(scene.GRID), scene.poses(1)
     ideal = scene.camera().intrinsics.float()[None]
@@ -72,7 +72,7 @@ def stages(distortion: list[float] | None) -> Calls:
 
 
 def compiled(distortion: list[float] | None) -> Calls:
-    """The warp of one image, and the same compiled by inductor, which needs a C++ compiler."""
+    """Make calls of the warp of one image, and the same compiled by inductor, which needs a C++ compiler."""
     image, grid = torch.rand(1, 3, *scene.SIZE), scene.sampling_grid(1)
     ideal, extrinsics, warp = scene.camera().intrinsics.float()[None], scene.poses(1), BEVWarp(scene.GRID)
     lens = None if distortion is None else torch.tensor([distortion])
@@ -86,7 +86,7 @@ def compiled(distortion: list[float] | None) -> Calls:
 
 
 def backwards(batch: int, channels: int, stride: int) -> Calls:
-    """The warp and its peers, and the gradients of the image and of what it is sampled at."""
+    """Make calls of the warp and its peers, and the gradients of the image and of what it is sampled at."""
     image = torch.rand(batch, channels, scene.SIZE[0] // stride, scene.SIZE[1] // stride, requires_grad=True)
     grid = scene.sampling_grid(batch).requires_grad_()
     values = torch.tensor([scene.POSE]).repeat(batch, 1).requires_grad_()
@@ -121,7 +121,7 @@ def backwards(batch: int, channels: int, stride: int) -> Calls:
 
 
 def frames(model: str) -> Calls:
-    """One frame of bytes through a lens."""
+    """Make calls on one frame of bytes through a lens."""
     taken = scene.camera(scene.FISHEYE if model == "fisheye" else scene.BROWN, model)
     frame = np.random.default_rng(0).integers(0, 255, (*scene.SIZE, 3), np.uint8)
     extrinsics = Extrinsics(*(value.double() for value in scene.poses(1)))
@@ -143,7 +143,7 @@ def frames(model: str) -> Calls:
 
 
 def cells(resolution: float) -> Calls:
-    """The warp on grids of one rectangle."""
+    """Make calls of the warp on grids of one rectangle."""
     grid = BEVGrid(scene.GRID.x, scene.GRID.z, resolution)
     image, ideal, warp = torch.rand(1, 3, *scene.SIZE), scene.camera().intrinsics[None].float(), BEVWarp(grid)
     lens = torch.tensor([scene.BROWN])

@@ -67,7 +67,7 @@ def fault(reader: Reader, data: bytes, folder: Path, limit: float = 10.0) -> str
 
 
 def main() -> int:
-    """Run."""
+    """Read mutated files and print each kind of fault once."""
     known = readers()
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("--count", type=int, default=20_000, help="number of inputs (%(default)s)")
