@@ -171,7 +171,8 @@ def check_pixels(camera: Camera, pixel_aspect: Fraction) -> Finding:
     """Compare the focal lengths with the width of the video's pixels over their height."""
     if remark := pixel_remark(camera, pixel_aspect):
         return Finding(DOUBT, f"pixels: {remark}")
-    return Finding(OK, f"pixels: {float(pixel_aspect):.4g} times as wide as high, as by the focal lengths")
+    shape = "square" if pixel_aspect == 1 else f"{float(pixel_aspect):.4g} times as wide as high"
+    return Finding(OK, f"pixels: {shape}, as the focal lengths say")
 
 
 def check_times(sample: Sample) -> Finding:

@@ -12,7 +12,7 @@ import numpy as np
 from lanebev import __version__
 from lanebev.app.config import RunConfig
 from lanebev.camera.model import Camera
-from lanebev.estimation.mount import MountCalibration, MountReason, MountStatus, describe_mount
+from lanebev.estimation.mount import MountCalibration, MountStatus, describe_mount
 from lanebev.io.live import LiveSource
 from lanebev.io.results import ExtrinsicsRow
 from lanebev.io.video import FrameSource
@@ -51,8 +51,8 @@ def lane_width_words(config: RunConfig) -> str:
     width, std = config.taken_lane_width
     words = f"{width:.4g} m"
     if std:
-        words += f", standard deviation {std:.2g} m: {std / width:.1%} of the height"
-    return words if config.lane_width is not None else words + "; --lane-width states that of the road"
+        words += f" with a standard deviation of {std:.2g} m, so {std / width:.1%} of the height"
+    return words if config.lane_width is not None else f"assumed, {words}; give the road's by --lane-width"
 
 
 def smoothing_facts(config: RunConfig) -> dict[str, str]:
@@ -90,10 +90,9 @@ def setting_words(value: object) -> str:
 def mount_facts(mounted: MountCalibration) -> dict[str, str]:
     """Return how far the mount is calibrated, for the report."""
     status = MountStatus(int(mounted.status[0])).name
-    reasons = MountReason(int(mounted.reasons[0]))
-    why = f" ({reasons.name})" if reasons else ""
-    words = "; ".join(describe_mount(mounted))
-    return {"mount": f"{status}, {float(mounted.progress[0]):.0f} %{why}", "mount, axis by axis": words}
+    axes = dict(sentence.split(": ", 1) for sentence in describe_mount(mounted))
+    facts = {f"mount, {axis}": words for axis, words in axes.items()}
+    return {"mount": f"{status}, {float(mounted.progress[0]):.0f} % of the driving that it needs"} | facts
 
 
 def untracked_words(rows: Iterable[ExtrinsicsRow]) -> list[str]:
@@ -110,13 +109,13 @@ def untracked_words(rows: Iterable[ExtrinsicsRow]) -> list[str]:
 def summary(report: Report, config: RunConfig) -> str:
     """Return what to print when a run is done."""
     tracking = [row for row in report.rows if row.status == "TRACKING"]
-    lines = [f"{len(report.rows)} frames, {len(tracking)} TRACKING"]
+    lines = [f"{len(report.rows)} frame{'s'[: len(report.rows) != 1]}, {len(tracking)} TRACKING"]
     if tracking:
         middle = {name: float(np.median([getattr(row, name) for row in tracking])) for name in _SHOWN}
         values = "  ".join(f"{name.rsplit('_', 1)[0]} {middle[name]:+.3f} {_SHOWN[name]}" for name in _SHOWN)
         lines.append(f"median  {values}")
     lines += untracked_words(report.rows)
-    shown = ("lane width", "mount", "smoothed", "reused", "stream")
+    shown = ("lane width", "standard deviation of lane widths", "mount", "smoothed", "reused", "stream")
     lines += [f"{label}: {text}" for label, text in report.facts.items() if label.startswith(shown)]
     lines += [f"problem: {problem}" for problem in report.problems[:_PROBLEMS]]
     if len(report.problems) > _PROBLEMS:

@@ -182,7 +182,7 @@ def summary_facts(report: Report) -> dict[str, str]:
     """Return the scatter of lane widths before and after, where lanes were seen."""
     names = {report.before_title: report.before, "calibrated": report.after}
     return {
-        f"lane width σ, {name}": f"{100 * width_deviation(widths):.1f} cm"
+        f"standard deviation of lane widths, {name}": f"{100 * width_deviation(widths):.1f} cm"
         for name, widths in names.items()
         if np.isfinite(widths).sum() > 1
     }

@@ -60,7 +60,7 @@ def _sample(poses=(GOOD_POSE,), boundaries=(2, 2, 4), steps=(1.0, 1.0), undecode
         (check_lens(_lens(286, (-0.0048, 0.0414, -0.0389, 0.0066))), DOUBT, "then model: fisheye is missing"),
         (check_field_of_view(_lens(200, (-0.3, 0.03, 0.0, 0.0))), OK, "focal length: 200 px"),
         (check_lens(_lens(200, (-0.3, 0.03, 0.0, 0.0))), DOUBT, "of the pixels cannot be undistorted"),
-        (check_pixels(CAMERA, Fraction(1)), OK, "1 times as wide as high"),
+        (check_pixels(CAMERA, Fraction(1)), OK, "pixels: square, as the focal lengths say"),
         (check_pixels(CAMERA, Fraction(4, 3)), DOUBT, "but the video states 1.33 times: is fx that"),
         (check_times(_sample()), OK, "evenly spaced"),
         (check_times(_sample(steps=(1.0, 1.0, 5.0))), DOUBT, "a gap of 5 times"),
