@@ -106,12 +106,12 @@ def nees_of_determined(error: Tensor, covariance: Tensor, bound: Tensor) -> floa
 
 
 def speed_given() -> JointCalibrator:
-    """Return the joint filter of somebody who knows the speed of the drives in bends, to 0.5 m/s."""
+    """Return the joint filter with the speed of the drives in bends as prior, to 0.5 m/s."""
     return JointCalibrator(motion=MotionConfig(speed=30.0, speed_std=0.5))
 
 
 def informed(kind: str) -> JointCalibrator:
-    """Return the joint filter that knows what the name of a row says is given."""
+    """Return the joint filter with the priors that the name of a row says are given."""
     if kind.endswith(_TOLD):
         return ToldRoad(KINDS[_IN_CURVE](FIRST_SEED).moments(), speed=30.0)
     if kind.endswith(_GIVEN):

@@ -30,7 +30,7 @@ from lanebev.app.build import make_calibrator
 from lanebev.app.views import bird_view
 from lanebev.estimation.still import calibrate_still
 from lanebev.io.video import open_source
-from lanebev.report.overlay import Panel, draw_frame
+from lanebev.report.overlay import Panel, draw_panels, joined
 from tools.real_figures import (
     Figure,
     carla_drive,
@@ -125,7 +125,7 @@ def write_sheet(path: Path, data: Path, calibrator: Any) -> None:
             for title, extrinsics in (("before", level), ("after", calibration.extrinsics))
         )
         name = "/".join(Path(images[i]).parts[-3:])
-        picture = draw_frame(frame.image, camera, one, calibration, name, views, grid)
+        picture = joined(draw_panels(frame.image, camera, one, calibration, name, views, grid))
         pictures.append(np.asarray(Image.fromarray(picture).resize((919, 360), Image.Resampling.LANCZOS)))
     rows = [np.concatenate(pictures[k : k + 2], axis=1) for k in range(0, len(pictures), 2)]
     Image.fromarray(np.concatenate(rows, axis=0)).save(path)

@@ -3,9 +3,9 @@
     python -m tools.label_noise [--data ../shared/data] [--weights FILE]
 
 On rows where a label and the network's line pass the same stripe, the stripe's centre is measured in the
-image: the centroid of what is brighter than halfway between the ground and the stripe. A line whose distance
-from the paint shrinks to nothing at the horizon lies beside it on the road and says the same of the yaw; what
-is left of it there is an error of the yaw. Prints medians over lines, in px of the image: the mean distance,
+image: the centroid of what is brighter than halfway between the ground and the stripe. A distance that is
+zero at the horizon is an offset on the road and does not change the yaw; a distance at the horizon is an
+error of the yaw. Prints medians over lines, in px of the image: the mean distance,
 and the distance at the horizon by a straight line through all distances.
 
 And how far the labels agree with themselves: the yaw by two of an image's lines against that by two others.

@@ -3,7 +3,7 @@
     python -m tools.pseudo_ground_truth LANES --camera camera.yaml --out pseudo.csv
 
 Source: Sec. VI-C. Pitch and yaw minimise Eq. (11) over the frame's segments, roll and height then Eq. (19);
-no filter, so a frame knows nothing of its neighbours. With --estimate, the root-mean-square difference of a
+no filter, so each frame is estimated alone. With --estimate, the root-mean-square difference of a
 run's extrinsics.csv to it is printed and both are drawn; images are paired by their paths, a video's frames
 by order.
 """

@@ -104,9 +104,9 @@ def clean_segments(segments: LaneSegments, num_boundaries: int) -> LaneSegments:
     known = (boundary >= 0) & (boundary < num_boundaries)
     long = (ends[..., 1, :] - ends[..., 0, :]).abs().amax(-1) > _MIN_LENGTH
     good = finite & known & long & (ends.abs().amax((-2, -1)) < 1e6)
-    harmless = constant(((0.0, 0.0), (1.0, 1.0)), like=ends)
+    placeholder = constant(((0.0, 0.0), (1.0, 1.0)), like=ends)
     return LaneSegments(
-        torch.where(good[..., None, None], ends, harmless),
+        torch.where(good[..., None, None], ends, placeholder),
         torch.where(good, boundary, 0),
         torch.where(good, weight, 0.0).clamp_max(1.0),
         torch.where(good, sigma, 1.0).clamp_min(_MIN_SIGMA),

@@ -21,7 +21,7 @@ def calibrate_still(
     A calibrator that starts with a search needs one pass. One that starts with a guess takes several
     (:attr:`Calibrator.still_passes`), each with its share of the information. Source: with the end points'
     variance times the number of passes, all passes together say as much as the image does once (progressive
-    update), so the covariance stays honest while the linearisation settles.
+    update), so the covariance stays that of the image while the point of linearisation converges.
 
     Args:
         calibrator: any.

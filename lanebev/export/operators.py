@@ -216,7 +216,7 @@ def _number(value: Any, dtype: Any) -> Any:
 
 
 def _typed(value: Any, like: Any) -> Any:
-    """Return a value that knows its type, that of another."""
+    """Return a value with the type of another, unless it has one."""
     if value.dtype is None:
         value.dtype = like.dtype
     return value

@@ -1,4 +1,4 @@
-"""Angles to matrices and back. The only file that knows the signs.
+"""Angles to matrices and back. The only file that defines the signs of angles.
 
 Frames: camera x right, y down, z forward (OpenCV); road X right, Y down, Z along the lanes.
 Matrices are named ``dst_from_src`` and act on column vectors.

@@ -59,7 +59,7 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
     Args:
         source: a video, a folder of images, a glob (recursive with ``**``) or one image.
         fps: frame rate of a folder, a glob or a raw stream. None is that of images whose names state their
-            times, of a raw stream what it says or ffmpeg guesses, else 30. A video knows its own.
+            times, of a raw stream what it says or ffmpeg guesses, else 30. A video states its own.
 
     Raises:
         ValueError: nothing there, no images in it, or the only (or every) image does not decode.

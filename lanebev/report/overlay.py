@@ -46,20 +46,6 @@ class Panel:
     vertical_curvature: Tensor | None = None
 
 
-def draw_frame(
-    image: Picture,
-    camera: Camera,
-    segments: LaneSegments,
-    calibration: Calibration,
-    headline: str,
-    views: tuple[Panel, ...],
-    grid: BEVGrid,
-    reasons: str = "",
-) -> Picture:
-    """Return the pictures of :func:`draw_panels` as one, (720, W', 3)."""
-    return joined(draw_panels(image, camera, segments, calibration, headline, views, grid, reasons))
-
-
 def draw_panels(
     image: Picture,
     camera: Camera,
@@ -123,9 +109,9 @@ def _draw_boundaries(
     """Draw vertices as dots, each boundary's as one line through them; outliers are grey."""
     ends = _to_image(camera, segments.endpoints[0].flatten(0, 1)).reshape(-1, 2, 2) * scale
     there = segments.weight[0] > 0
-    believed = there & (inliers[0] > 0.5)
-    _dots(shown, _fixed(ends[there & ~believed].flatten(0, 1)), 2, _QUIET)
-    lines = list(_polylines(ends, segments.boundary[0], believed))
+    used = there & (inliers[0] > 0.5)
+    _dots(shown, _fixed(ends[there & ~used].flatten(0, 1)), 2, _QUIET)
+    lines = list(_polylines(ends, segments.boundary[0], used))
     soft = shown.copy()
     for colour, points in lines:
         cv2.polylines(soft, [points], False, colour, 7, cv2.LINE_AA, _SUBPIXEL)

@@ -8,7 +8,7 @@ import torch
 
 from lanebev import BEVGrid, Calibration, Camera, Extrinsics, LaneSegments, Status, image_from_road_points
 from lanebev.report.measure import measure_boundaries, spread
-from lanebev.report.overlay import BOUNDARY_COLOURS, PANEL_HEIGHT, Panel, draw_frame, draw_panels
+from lanebev.report.overlay import BOUNDARY_COLOURS, PANEL_HEIGHT, Panel, draw_panels, joined
 
 CAMERA = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720)
 INTRINSICS = CAMERA.intrinsics[None]
@@ -91,7 +91,9 @@ def test_overlay_draws_what_is_believed(status, height, width):
     grid = BEVGrid()
     view = Panel("after", np.zeros((*grid.shape, 3), np.uint8), POSE)
     image = np.full((height, width, 3), 90, np.uint8)
-    picture = draw_frame(image, camera, segments, _calibration(segments, status), "frame 1", (view,), grid)
+    picture = joined(
+        draw_panels(image, camera, segments, _calibration(segments, status), "frame 1", (view,), grid)
+    )
     assert picture.shape[0] == PANEL_HEIGHT
     assert picture.dtype == np.uint8
     scale = 720 / height
@@ -111,7 +113,7 @@ def test_overlay_tells_the_reasons():
     assert (told[:-34] == without[:-34]).all()
     assert (told[-34:].max(-1) > 200).sum() > (without[-34:].max(-1) > 200).sum() + 100  # letters
     assert (bev == same).all()
-    assert draw_frame(*arguments).shape == (720, told.shape[1] + 8 + bev.shape[1], 3)
+    assert joined(draw_panels(*arguments)).shape == (720, told.shape[1] + 8 + bev.shape[1], 3)
 
 
 def test_overlay_of_an_empty_frame_and_of_a_wide_lens():
@@ -125,7 +127,7 @@ def test_overlay_of_an_empty_frame_and_of_a_wide_lens():
             extrinsics=POSE._replace(pitch=torch.tensor([pitch]).double())
         )
         assert (
-            draw_frame(image, fisheye, segments, calibration, "f", (view, view), grid).shape[0]
+            joined(draw_panels(image, fisheye, segments, calibration, "f", (view, view), grid)).shape[0]
             == PANEL_HEIGHT
         )
 
@@ -135,6 +137,8 @@ def test_overlay_of_a_strip_is_no_wider_than_video_codecs_take(shape):
     camera = Camera.from_parameters(1000, 1000, shape[1] / 2, shape[0] / 2, shape[1], shape[0])
     view = Panel("after", np.zeros((*BEVGrid().shape, 3), np.uint8), POSE)
     image = np.full((*shape, 3), 90, np.uint8)
-    picture = draw_frame(image, camera, _segments(), _calibration(_segments()), "f", (view,), BEVGrid())
+    picture = joined(
+        draw_panels(image, camera, _segments(), _calibration(_segments()), "f", (view,), BEVGrid())
+    )
     assert picture.shape[0] == PANEL_HEIGHT
     assert picture.shape[1] < 4096

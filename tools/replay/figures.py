@@ -19,7 +19,7 @@ class Figures(NamedTuple):
     Attributes:
         rmse: of pitch, yaw, roll in degrees and height in cm.
         ratio: RMSE by the per-frame Cramér-Rao bound, NaN where there is none.
-        nees: NEES per degree of freedom; 1 where the covariance is honest.
+        nees: NEES per degree of freedom; 1 where the covariance is right.
         within: share of the four parameters within 3 sigma.
         worst: the same share in the second in which it is lowest.
         back: s from the end of the event until all errors are below twice the bound; inf if that is never,

@@ -153,7 +153,7 @@ def predict_roll_height(
     eye = torch.eye(4, dtype=dt.dtype, device=dt.device)
     still = eye * dt.new_tensor([1.0, 1.0, 0.0, 0.0])
     transition = torch.where(moving.unsqueeze(-1), transition, still)
-    # What is not known yet stays at its prior; what was known and is not seen forgets at its noise.
+    # What is not known yet keeps its prior; the variance of what was known and is not seen grows.
     known = torch.stack([state.roll_known, state.height_known] * 2, dim=-1)
     known = known.unsqueeze(-1) & known.unsqueeze(-2)
     mean, cov = kalman.predict(state.roll_height_mean, state.roll_height_cov, transition, noise * known)

@@ -45,7 +45,7 @@ class TwoStageConfig:
 
 @register_pytree
 class TwoStageState(NamedTuple):
-    """Everything the calibrator remembers, tensors only.
+    """State of the calibrator between frames, tensors only.
 
     Attributes:
         direction_mean: (B, 4) pitch, yaw and their rates; direction_cov: (B, 4, 4).
