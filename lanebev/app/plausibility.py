@@ -23,6 +23,7 @@ _MOST_EDGE_RATIO = 0.93  # of an edge's distance from the centre to an ideal len
 _BAR, _BAR_NOISE = 24, 8  # of 255: the most of a black bar, and how much it varies in a column
 _BAR_WIDTH = 0.02  # of the image, the least
 _SAME_PIXELS = 0.05  # relative, by which a camera file may differ from the width of pixels over their height
+_MOST_PINCUSHION = 1.25  # the same ratio of any lens
 _PLUMB_BOB = (-0.15, 0.02)  # most of k1, and of |k3| and |k4|, that are like plumb_bob's
 
 
@@ -154,13 +155,20 @@ def model_remark(camera: Camera) -> str:
                 f"distortion {_listed(given)} is like one of plumb_bob, not of a fisheye: is the model right?"
             )
         return ""
-    if camera.model != "pinhole" or len(given) not in (4, 5) or any(given[4:]) or 0.0 in given[2:4]:
+    if camera.model != "pinhole" or len(given) < 4:
         return ""
-    angle, asked = field_of_view(camera), "are they k1 k2 k3 k4 of a fisheye? then model: fisheye is missing"
+    angle, ratio, asked = field_of_view(camera), _edge_ratio(camera), "is the order k1 k2 p1 p2 k3?"
+    if may_be_fisheye := not any(given[4:]) and 0.0 not in given[2:4]:
+        asked = "are they k1 k2 k3 k4 of a fisheye? then model: fisheye is missing"
     if max(map(abs, given[2:4])) > _MOST_TANGENTIAL:
         return f"distortion {_listed(given)} has more tangential distortion than is usual; {asked}"
-    if angle > _WIDE and _edge_ratio(camera) > _MOST_EDGE_RATIO:
+    if may_be_fisheye and angle > _WIDE and ratio > _MOST_EDGE_RATIO:
         return f"distortion {_listed(given)} hardly distorts, with {angle:.0f} degrees of view; {asked}"
+    if ratio > _MOST_PINCUSHION:
+        return (
+            f"distortion {_listed(given)} moves the left edge {ratio:.1f} times as far from the centre, "
+            "more than is usual: are sign and order of the coefficients right?"
+        )
     return ""
 
 

@@ -85,6 +85,11 @@ def _check_matrix(matrix: list[float], size: tuple[int, int], restated: bool) ->
         return
     if not 0.4 < fx / fy < 2.5:
         raise ValueError(f"fx / fy: expected nearly square pixels, got {fx:g} / {fy:g}")
+    if 0 < cx < 1 and 0 < cy < 1 and min(size) > 1:
+        raise ValueError(
+            f"cx, cy: expected px, got {cx:g}, {cy:g}; multiply shares of the image's sides by "
+            f"{width} and {height}"
+        )
     for name, centre, side in (("cx", cx, width), ("cy", cy, height)):
         if not 0 < centre < side:
             raise ValueError(

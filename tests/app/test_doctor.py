@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lanebev import Camera
+from lanebev.app.build import match_image_size
 from lanebev.app.doctor import (
     DOUBT,
     OK,
@@ -31,7 +32,7 @@ from lanebev.app.plausibility import (
     pose_remark,
 )
 from lanebev.cli import main
-from lanebev.io.video import VideoWriter
+from lanebev.io.video import VideoWriter, open_source
 
 CAMERA = Camera.from_fov(60.0, 640, 360)
 GOOD_POSE = [2.0, -1.0, 0.5, 1.4]
@@ -95,6 +96,22 @@ def test_the_lens_model_that_coefficients_are_like():
         assert model_remark(_lens(focal, given)) == ""
     (remark,) = camera_remarks(_lens(*LENSES[0], "fisheye"))
     assert "is like one of plumb_bob, not of a fisheye" in remark
+
+
+def test_coefficients_in_another_order_or_of_another_sign():
+    (remark,) = camera_remarks(_lens(600, (-0.1, 0.05, 0.04, 0.0, 0.001)))  # k1 k2 k3 p1 p2
+    assert "more tangential distortion than is usual; is the order k1 k2 p1 p2 k3?" in remark
+    (remark,) = camera_remarks(_lens(500, (1.5, 0.0, 0.0, 0.0)))
+    assert "moves the left edge 1.3 times as far from the centre, more than is usual" in remark
+
+
+def test_a_camera_of_images_that_were_turned(data):
+    Camera.from_fov(40.0, 360, 640).to_file(data / "portrait.yaml")
+    source = open_source(str(data / "drive.mp4"))
+    with pytest.raises(
+        ValueError, match=r"640 x 360 px, got one for 360 x 640; .* before the images were tur"
+    ):
+        match_image_size(Camera.from_file(data / "portrait.yaml"), source)
 
 
 def test_a_camera_that_was_calibrated_at_another_size():

@@ -128,6 +128,10 @@ def test_kitti_file_of_an_unknown_camera_needs_a_size(tmp_path):
         ({"fx": 100_000.0}, "fx: expected"),
         ({"fy": 300.0}, "square pixels"),
         ({"cx": 2000.0}, "cx: expected a principal point inside the image, 0 to 1280, got 2000"),
+        (
+            {"cx": 0.5, "cy": 0.49},
+            "cx, cy: expected px, got 0.5, 0.49; multiply shares of the image's sides by 1280",
+        ),
         ({"cy": -3.0}, "cy: expected"),
         ({"cy": float("nan")}, "cy: expected finite numbers, got .nan"),
         ({"fx": "wide"}, "fx: expected finite numbers, got wide"),
