@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from lanebev.camera.model import Camera, check_camera
+from lanebev.camera.plausibility import camera_remarks
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.mount import MountCalibration, describe_mount
@@ -91,6 +92,8 @@ class Session:
         polyline_sigma: standard deviation of given polylines across their lines, px.
         device: device of the network; the filter runs on the CPU.
 
+    What speaks against the camera, as ``lanebev doctor`` says it, is logged as a warning.
+
     Raises:
         TypeError: an argument of another type.
         ValueError: an argument out of range, or a device that PyTorch cannot use here.
@@ -129,6 +132,8 @@ class Session:
         self._model = model
         own = JointCalibrator() if model is None else deepcopy(model.calibrator).cpu()
         self._parts: tuple[Any, ...] = (calibrator or own, camera, float(lane_width), float(focal_std))
+        for remark in camera_remarks(camera):
+            logger.warning(remark)
         self.reset()
 
     def reset(self) -> None:

@@ -13,19 +13,18 @@ import torch
 
 from lanebev.app.build import make_observer, make_tracker
 from lanebev.app.config import RunConfig
-from lanebev.app.plausibility import (
+from lanebev.app.plausibility import pose_remark, pose_words
+from lanebev.app.progress import Progress
+from lanebev.app.sources import camera_of, make_source
+from lanebev.camera.model import Camera
+from lanebev.camera.plausibility import (
     field_of_view,
     lens_remark,
     model_remark,
     pixel_remark,
-    pose_remark,
-    pose_words,
     resized_remark,
     view_remark,
 )
-from lanebev.app.progress import Progress
-from lanebev.app.sources import camera_of, make_source
-from lanebev.camera.model import Camera
 from lanebev.io.frames import Selection
 from lanebev.io.video import FrameSource
 from lanebev.types import Status

@@ -1,47 +1,20 @@
-"""What speaks against a camera or a pose: values that are unusual for cameras in cars."""
+"""What speaks against a pose, a mount or the images of a run."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
-from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.camera.model import Camera
-from lanebev.camera.parameters import centre_offset
+from lanebev.camera.plausibility import field_of_view
 from lanebev.io.results import ExtrinsicsRow
 
-_FIELD_OF_VIEW = (25.0, 130.0)  # degrees, horizontal, of cameras in cars with a pinhole model
 _POSE = ((-15.0, 25.0), (-15.0, 15.0), (-8.0, 8.0), (0.8, 4.0))  # pitch, yaw, roll (degrees), height (m)
-_RESCALED = (0.08, 0.02)  # sides: least offset of a principal point, most difference of that in x and y
-_MOST_TANGENTIAL = 0.025  # coefficient of a lens that is not doubted
 _SAME_VIEW = 2.0  # degrees, by which fields of view of one camera may differ
-_WIDE = 95.0  # degrees, from which on lenses distort
-_MOST_EDGE_RATIO = 0.93  # of an edge's distance from the centre to an ideal lens's, of wide lenses
 _BAR, _BAR_NOISE = 24, 8  # of 255: the most of a black bar, and how much it varies in a column
 _BAR_WIDTH = 0.02  # of the image, the least
-_SAME_PIXELS = 0.05  # relative, by which a camera file may differ from the width of pixels over their height
-_MOST_PINCUSHION = 1.25  # the same ratio of any lens
-_PLUMB_BOB = (-0.15, 0.02)  # most of k1, and of |k3| and |k4|, that are like plumb_bob's
-
-
-def camera_remarks(camera: Camera, pixel_aspect: Fraction = Fraction(1)) -> list[str]:
-    """Return what speaks against a camera: its lens, or a wrong size of images, model or focal length.
-
-    Args:
-        camera: of the settings.
-        pixel_aspect: width of a pixel over its height, as the video states it; 1 if it does not.
-    """
-    found = (
-        lens_remark(camera),
-        resized_remark(camera),
-        model_remark(camera),
-        view_remark(camera),
-        pixel_remark(camera, pixel_aspect),
-    )
-    return [f"camera: {remark}" for remark in found if remark]
 
 
 def mount_remark(path: str | None, camera: Camera) -> str:
@@ -62,16 +35,6 @@ def mount_remark(path: str | None, camera: Camera) -> str:
         f"mount {path}: its camera has {other:.0f} degrees of view across, this one {own:.0f}; is it of "
         "another camera?"
     )
-
-
-def field_of_view(camera: Camera) -> float:
-    """Return the angle (degrees) between the left and the right edge; 180 if the lens has no rays there."""
-    height, width = camera.image_size
-    edges = camera.intrinsics.new_tensor([[0.0, 0.5 * (height - 1)], [width - 1.0, 0.5 * (height - 1)]])
-    if not bool(camera.undistort_points(edges)[1].all()):
-        return 180.0
-    rays = camera.rays(edges)
-    return math.degrees(sum(math.atan(abs(float(ray[0] / ray[2]))) for ray in rays))
 
 
 def pose_words(pose: Sequence[float]) -> list[str]:
@@ -100,102 +63,6 @@ def drive_remark(rows: Iterable[ExtrinsicsRow]) -> str:
     return pose_remark(np.median(poses, axis=0).tolist()) if poses else ""
 
 
-def lens_remark(camera: Camera) -> str:
-    """Return a remark on the number of pixels that the lens cannot image; else nothing."""
-    share = camera.share_without_rays()
-    return (
-        f"{share:.2%} of the pixels cannot be undistorted by the lens; lanes there are left out"
-        if share
-        else ""
-    )
-
-
-def resized_remark(camera: Camera) -> str:
-    """Return a remark on a principal point in the middle of images of another size; else nothing."""
-    (height, width), matrix = camera.image_size, camera.intrinsics.flatten().tolist()
-    least, most = _RESCALED
-    offset = centre_offset(matrix, camera.image_size)
-    words = f"the principal point {matrix[2]:.0f}, {matrix[5]:.0f} is in the middle of images of"
-    if offset > least > centre_offset(matrix, (width, height)):
-        return (
-            f"{words} {height} x {width} px, not of {width} x {height}: are cx and cy, or the sides, swapped?"
-        )
-    if offset < least or abs(matrix[2] / width - matrix[5] / height) > most:
-        return ""
-    other = f"{2 * matrix[2] + 1:.0f} x {2 * matrix[5] + 1:.0f}"
-    return (
-        f"{words} {other} px, not of {width} x {height}: was it calibrated at another size? see Camera.scaled"
-    )
-
-
-def pixel_remark(camera: Camera, pixel_aspect: Fraction) -> str:
-    """Return a remark on focal lengths of pixels of another shape than the video's; else nothing.
-
-    The focal lengths of a lens are equal in mm, so fy / fx in pixels is the width of a pixel over its height.
-    """
-    own, stated = float(camera.intrinsics[1, 1] / camera.intrinsics[0, 0]), float(pixel_aspect)
-    if abs(own / stated - 1) <= _SAME_PIXELS:
-        return ""
-    words = f"fy / fx is {own:.2f}, of pixels {own:.2f} times as wide as high"
-    if stated == 1.0:
-        return f"{words}: were images squeezed, or is a focal length wrong?"
-    return (
-        f"{words}, but the video states {stated:.2f} times: is fx that of frames as players show them? "
-        f"then divide it by {stated:.4g}"
-    )
-
-
-def model_remark(camera: Camera) -> str:
-    """Return a remark on coefficients that are typical of another lens model; else nothing."""
-    given = camera.distortion.tolist()
-    if camera.model == "fisheye":
-        below, least = _PLUMB_BOB
-        if given[0] < below and max(map(abs, given[2:])) < least:
-            return (
-                f"distortion {_listed(given)} is like one of plumb_bob, not of a fisheye: is the model right?"
-            )
-        return ""
-    if camera.model != "pinhole" or len(given) < 4:
-        return ""
-    angle, ratio, asked = field_of_view(camera), _edge_ratio(camera), "is the order k1 k2 p1 p2 k3?"
-    if may_be_fisheye := not any(given[4:]) and 0.0 not in given[2:4]:
-        asked = "are they k1 k2 k3 k4 of a fisheye? then model: fisheye is missing"
-    if max(map(abs, given[2:4])) > _MOST_TANGENTIAL:
-        return f"distortion {_listed(given)} has more tangential distortion than is usual; {asked}"
-    if may_be_fisheye and angle > _WIDE and ratio > _MOST_EDGE_RATIO:
-        return f"distortion {_listed(given)} hardly distorts, with {angle:.0f} degrees of view; {asked}"
-    if ratio > _MOST_PINCUSHION:
-        return (
-            f"distortion {_listed(given)} moves the left edge {ratio:.1f} times as far from the centre, "
-            "more than is usual: are sign and order of the coefficients right?"
-        )
-    return ""
-
-
-def _edge_ratio(camera: Camera) -> float:
-    """Return the left edge's distance from the centre, as a share of that of a lens without distortion.
-
-    It is 0 if the lens has no ray there.
-    """
-    edge, centre = (
-        camera.intrinsics.new_tensor([[0.0, float(camera.intrinsics[1, 2])]]),
-        camera.intrinsics[0, 2],
-    )
-    ideal, valid = camera.undistort_points(edge)
-    return float(centre / (centre - ideal[0, 0])) if bool(valid.all()) else 0.0
-
-
-def view_remark(camera: Camera) -> str:
-    """Return a remark on a focal length that gives an odd field of view; else nothing."""
-    angle, (low, high) = field_of_view(camera), _FIELD_OF_VIEW
-    if low <= angle <= high or angle == 180.0 or camera.model != "pinhole":  # 180: see share_without_rays
-        return ""
-    return (
-        f"{angle:.0f} degrees of view across, where cameras on cars have {low:g} to {high:g}: was it "
-        "calibrated at another size?"
-    )
-
-
 def bars_remark(image: NDArray[np.uint8] | None) -> str:
     """Return a remark on black bars at the left and the right of an image (H, W, 3); else nothing."""
     if image is None:
@@ -209,7 +76,3 @@ def bars_remark(image: NDArray[np.uint8] | None) -> str:
         f"fov: images have black bars, {left} px wide at the left and {right} px at the right; the field of "
         "view must include them: cut them off, or give a camera file"
     )
-
-
-def _listed(coefficients: Sequence[float]) -> str:
-    return ", ".join(f"{value:.3g}" for value in coefficients[:4])

@@ -24,7 +24,7 @@ from lanebev.app.convert import writer
 from lanebev.app.kept import KeptNumbers
 from lanebev.app.observers import Observer
 from lanebev.app.part_observation import observer_of_parts
-from lanebev.app.plausibility import bars_remark, camera_remarks, mount_remark
+from lanebev.app.plausibility import bars_remark, mount_remark
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.recovery import facts_of, frame_name, observer_of_second_pass, recover_run
@@ -34,6 +34,7 @@ from lanebev.app.smoothing import SmoothedPoses, smooth_frames
 from lanebev.app.sources import camera_of, ended_by_signals, first_image, make_source, observed_frames
 from lanebev.app.summary import mount_facts, run_facts
 from lanebev.camera.model import Camera
+from lanebev.camera.plausibility import camera_remarks
 from lanebev.io.calibration_file import write_calibration
 from lanebev.io.covariances import write_covariances
 from lanebev.io.formats.folder import read_record

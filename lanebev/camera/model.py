@@ -91,7 +91,23 @@ class Camera:
         model: str = "pinhole",
         dtype: torch.dtype = torch.float64,
     ) -> Camera:
-        """Make a camera from plain numbers, in pixels."""
+        """Make a camera from plain numbers.
+
+        Args:
+            fx: focal length along x, px.
+            fy: focal length along y, px.
+            cx: x of the principal point, px; the centre of the first pixel is 0.
+            cy: y of the principal point, px.
+            width: of the images, px.
+            height: of the images, px.
+            distortion: coefficients in OpenCV's order; empty for none.
+            model: "pinhole", "fisheye" or "omni".
+            dtype: dtype of the tensors.
+
+        Raises:
+            ValueError: focal lengths that are not positive, an impossible image size, a number of
+                coefficients that the model does not have, or numbers that are not finite.
+        """
         intrinsics = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=dtype)
         return cls(intrinsics, torch.tensor(list(distortion), dtype=dtype), model, (height, width))
 

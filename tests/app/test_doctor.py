@@ -23,14 +23,8 @@ from lanebev.app.doctor import (
     check_size,
     check_times,
 )
-from lanebev.app.plausibility import (
-    bars_remark,
-    camera_remarks,
-    field_of_view,
-    model_remark,
-    mount_remark,
-    pose_remark,
-)
+from lanebev.app.plausibility import bars_remark, mount_remark, pose_remark
+from lanebev.camera.plausibility import camera_remarks, field_of_view, model_remark
 from lanebev.cli import main
 from lanebev.io.video import VideoWriter, open_source
 
@@ -126,7 +120,9 @@ def test_a_camera_that_was_calibrated_at_another_size():
         "180, 320 is in the middle of images of 360 x 640 px, not of 640 x 360: are cx and cy, or" in remark
     )
     (remark,) = camera_remarks(Camera.from_fov(10.0, 640, 360))
-    assert "10 degrees of view across, where cameras on cars have 25 to 130" in remark
+    assert "10 degrees of view across, where cameras on cars have 25 to 130: was it calibrated" in remark
+    (remark,) = camera_remarks(Camera.from_parameters(4.2, 4.2, 319.5, 179.5, 640, 360))
+    assert remark.endswith("are the focal lengths in pixels?")
 
 
 def test_focal_lengths_of_pixels_that_are_not_square():

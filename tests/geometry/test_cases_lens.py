@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics
-from lanebev.app.plausibility import lens_remark
+from lanebev.camera.plausibility import lens_remark
 from lanebev.geometry import undistortion
 from lanebev.geometry.distortion import (
     brown_conrady,

@@ -224,6 +224,13 @@ def test_arguments_of_a_session_are_checked(arguments, error, message):
         Session(CAMERA, **arguments)
 
 
+def test_a_doubtful_camera_is_said_once(caplog):
+    session = Session(Camera.from_parameters(4.2, 4.2, 319.5, 179.5, 640, 360))  # mm
+    session(stamp=0.0)
+    (record,) = caplog.records
+    assert record.message.startswith("camera: 178 degrees of view across, where cameras on cars have 25 to")
+
+
 def test_a_speed_is_a_finite_number():
     session = Session(CAMERA)
     with pytest.raises(TypeError, match="speed: expected m/s as a number, or None, got str"):
