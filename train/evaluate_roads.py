@@ -33,9 +33,9 @@ from lanebev.render.scene.kinds import KINDS
 from train.commands import one_line_errors
 from train.export import trained_segmenter
 from train.labels import ViewConfig
-from train.live import drawn
 from train.maps import boundaries_as_taken, label_maps
 from train.metrics import row_recall
+from train.rendering import drawn
 
 TOLERANCE = 2.5  # label px
 DISTANCES = (0.0, 10.0, 20.0, 40.0, 80.0, float("inf"))  # m

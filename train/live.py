@@ -4,88 +4,21 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import lightning as L
 import numpy as np
 import torch
 from jsonargparse.typing import PositiveFloat, PositiveInt
-from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
-from lanebev.render import WindowConfig, render_views
+from lanebev.render import WindowConfig
 from train.budget import Stage, stage_at, used_share
 from train.data import Batch, Seed, run_position
 from train.labels import ViewConfig
-from train.maps import boundaries_as_taken, label_maps
+from train.rendering import Scenes, Views, labelled, mirrored, rendered, sampled, shown
 from train.stopwatch import Stopwatch
-
-
-class Views(NamedTuple):
-    """Rendered images and their boundaries.
-
-    Attributes:
-        image: (B, 3, H, W) uint8 RGB.
-        points: (B, L, P, 2) px as taken.
-        painted: (B, L, P) bool, the boundary exists and is marked there.
-        visible: (B, L, P) bool, and nothing stands in front of it.
-    """
-
-    image: Tensor
-    points: Tensor
-    painted: Tensor
-    visible: Tensor
-
-
-def drawn(seed: Seed) -> int:
-    """Return one number drawn by several."""
-    return int(np.random.default_rng(seed).integers(2**62))
-
-
-def rendered(
-    count: int,
-    size: tuple[int, int],
-    seed: Seed,
-    device: torch.device,
-    window: WindowConfig | None,
-    rows: int,
-) -> Views:
-    """Render views.
-
-    Args:
-        count: B.
-        size: (height, width).
-        seed: decides everything, on one kind of device.
-        device: device of the rendering.
-        window: window of the views; None for whole images.
-        rows: views whose pixels are computed at once.
-    """
-    generator = torch.Generator().manual_seed(drawn(seed))
-    frame = render_views(count, size, generator, device=device, window=window, rows=rows)
-    image = (255 * frame.image).round_().clamp_(0, 255).byte()
-    return Views(image, boundaries_as_taken(frame), frame.painted > 0.5, frame.visible > 0.5)
-
-
-def mirrored(views: Views, which: Tensor) -> Views:
-    """Mirror some images and renumber their boundaries.
-
-    Args:
-        views: B of them.
-        which: (B,) bool.
-    """
-    width = views.image.shape[-1]
-    across = torch.cat([width - 1 - views.points[..., :1], views.points[..., 1:]], dim=-1)
-    other = Views(views.image.flip(-1), across.flip(1), views.painted.flip(1), views.visible.flip(1))
-    return Views(
-        *(torch.where(which.view(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(views, other, strict=True))
-    )
-
-
-def labelled(views: Views, config: ViewConfig) -> Batch:
-    """Draw the views' labels."""
-    size = (views.image.shape[-2], views.image.shape[-1])
-    maps = label_maps(views.points, views.painted, views.visible, size, config)
-    return Batch(views.image, (255 * maps.target).round_().byte(), maps.weight.byte())
 
 
 class Block(NamedTuple):
@@ -140,26 +73,61 @@ class LiveBatches(IterableDataset[Batch]):
     def __iter__(self) -> Iterator[Batch]:
         """Render, mirror, label."""
         blocks: dict[int, Block] = {}
-        for number in itertools.count(self.first):
-            with self.watch.time("rendering"):
-                wanted = range(max(0, number - self.repeats + 1), number + 1)
-                needed = sorted({each // self.together for each in wanted})
-                blocks = {each: blocks.get(each) or self._render(each) for each in needed}
-                parts = [blocks[each // self.together].part(each % self.together) for each in wanted]
-                same = [part for part in parts if part.image.shape == parts[-1].image.shape]
-                views = Views(*(torch.cat(field) for field in zip(*same, strict=True)))
-            with self.watch.time("labelling"):
-                rng = np.random.default_rng((*self.seed, number))
-                which = torch.from_numpy(rng.random(len(views.image)) < self.view.flip)
-                batch = labelled(mirrored(views, which.to(self.device)), self.view)
-            yield batch
+        with ThreadPoolExecutor(1) as pool:
+            ahead = ScenesAhead(pool, self._sample)
+            for number in itertools.count(self.first):
+                with self.watch.time("rendering"):
+                    wanted = range(max(0, number - self.repeats + 1), number + 1)
+                    needed = sorted({each // self.together for each in wanted})
+                    blocks = {each: blocks.get(each) or self._render(each, ahead) for each in needed}
+                    parts = [blocks[each // self.together].part(each % self.together) for each in wanted]
+                    same = [part for part in parts if part.image.shape == parts[-1].image.shape]
+                    views = Views(*(torch.cat(field) for field in zip(*same, strict=True)))
+                with self.watch.time("labelling"):
+                    rng = np.random.default_rng((*self.seed, number))
+                    which = torch.from_numpy(rng.random(len(views.image)) < self.view.flip)
+                    batch = labelled(mirrored(views, which.to(self.device)), self.view)
+                yield batch
 
-    def _render(self, block: int) -> Block:
-        stage = stage_at(self.stages, self.share(block * self.together))
-        fresh = max(1, stage.batch_size // self.repeats)
+    def _render(self, block: int, ahead: ScenesAhead) -> Block:
+        stage = self._stage(block)
+        views = shown(ahead.take(block, stage), stage.size, self.device, self.rows)
+        ahead.begin(block + 1, self._stage(block + 1))
+        return Block(views, self._fresh(stage))
+
+    def _stage(self, block: int) -> Stage:
+        return stage_at(self.stages, self.share(block * self.together))
+
+    def _fresh(self, stage: Stage) -> int:
+        count: int = stage.batch_size // self.repeats
+        return max(1, count)
+
+    def _sample(self, block: int, stage: Stage) -> Scenes:
         seed = (*self.seed, block, 1)
-        views = rendered(fresh * self.together, stage.size, seed, self.device, self.window, self.rows)
-        return Block(views, fresh)
+        return sampled(self._fresh(stage) * self.together, stage.size, seed, self.window)
+
+
+class ScenesAhead:
+    """Samples the next block's scenes on another thread, while the device renders and trains.
+
+    Args:
+        pool: the thread.
+        sample: samples the scenes of a block and a stage; always the same for these.
+    """
+
+    def __init__(self, pool: ThreadPoolExecutor, sample: Callable[[int, Stage], Scenes]) -> None:
+        self._pool, self._sample = pool, sample
+        self._next: tuple[int, Stage, Future[Scenes]] | None = None
+
+    def begin(self, block: int, stage: Stage) -> None:
+        """Begin to sample a block's scenes."""
+        self._next = (block, stage, self._pool.submit(self._sample, block, stage))
+
+    def take(self, block: int, stage: Stage) -> Scenes:
+        """Return the scenes, which are sampled now if others were begun, as where a stage has ended since."""
+        if self._next is None or self._next[:2] != (block, stage):
+            return self._sample(block, stage)
+        return self._next[2].result()
 
 
 class HeldOutBatches(IterableDataset[Batch]):

@@ -20,8 +20,8 @@ from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.render import WindowConfig
 from train.commands import one_line_errors
 from train.labels import ViewConfig
-from train.live import labelled, rendered
 from train.module import Segmentation, unpack
+from train.rendering import labelled, rendered
 from train.sheet import labelled_view, save_sheet
 
 

@@ -130,14 +130,27 @@ def render_views(
     Raises:
         ValueError: no images asked for, an image smaller than 16 px, an unknown lens model or kind.
     """
+    scene, seeds = sample_views(batch_size, image_size, generator, window=window, model=model, kind=kind)
+    return render_scenes(scene, image_size, seeds, device=device, rows=rows, ideal_sensor=ideal_sensor)
+
+
+def sample_views(
+    batch_size: int,
+    image_size: tuple[int, int],
+    generator: torch.Generator,
+    *,
+    window: WindowConfig | None = None,
+    model: str = "pinhole",
+    kind: str = "any",
+) -> tuple[Scene, list[int]]:
+    """Sample on the CPU what :func:`render_views` renders from the same arguments: B scenes and B seeds."""
     if batch_size < 1 or min(image_size) < 16:
         raise ValueError(
             f"expected batch_size >= 1 and image_size >= (16, 16), got {batch_size} and {tuple(image_size)}"
         )
     generator = _on_cpu(generator)
     scene = sample_scene(batch_size, image_size, generator, window=window, model=model, kind=kind)
-    seeds: list[int] = torch.randint(2**62, (batch_size,), generator=generator).tolist()
-    return render_scenes(scene, image_size, seeds, device=device, rows=rows, ideal_sensor=ideal_sensor)
+    return scene, torch.randint(2**62, (batch_size,), generator=generator).tolist()
 
 
 @one_thread()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import lightning as L
@@ -16,9 +18,10 @@ from lanebev.render import WindowConfig
 from train.__main__ import main
 from train.budget import Stage, rate_factor, stage_at, used_share
 from train.labels import ViewConfig
-from train.live import HeldOutBatches, LiveBatches, Views, labelled, mirrored, rendered
+from train.live import HeldOutBatches, LiveBatches, ScenesAhead
 from train.maps import separated
 from train.module import Segmentation
+from train.rendering import Views, drawn, labelled, mirrored, rendered
 from train.stopwatch import Stopwatch
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of Lightning about itself
@@ -36,14 +39,16 @@ def views():
 def instant(monkeypatch):
     """Views of noise, by the same seeds, in no time."""
 
-    def noise(count, size, seed, *_):
-        generator = torch.Generator().manual_seed(train.live.drawn(seed))
+    def noise(drawn, size, *_):
+        count, seed = drawn
+        generator = torch.Generator().manual_seed(seed)
         image = torch.randint(256, (count, 3, *size), generator=generator, dtype=torch.uint8)
         points = torch.rand(count, 6, 12, 2, generator=generator) * size[0]
         there = torch.ones(count, 6, 12, dtype=torch.bool)
         return Views(image, points, there, there)
 
-    monkeypatch.setattr(train.live, "rendered", noise)
+    monkeypatch.setattr(train.live, "sampled", lambda count, _, seed, __: (count, drawn(seed)))
+    monkeypatch.setattr(train.live, "shown", noise)
 
 
 def batches(first, repeats=2, flip=0.5):
@@ -93,6 +98,25 @@ def test_an_interrupted_stream_goes_on_where_it_was():
     for first in range(1, 7):
         (next_one,) = taken(first, 1)
         assert all(torch.equal(a, b) for a, b in zip(next_one, whole[first], strict=True))
+
+
+def test_scenes_ahead_are_those_of_their_block_also_after_another_stage_has_begun():
+    sampled = []
+
+    def sample(block, stage):
+        sampled.append((block, stage, threading.current_thread() is threading.main_thread()))
+        return sampled[-1][:2]
+
+    first, second = STAGES
+    with ThreadPoolExecutor(1) as pool:
+        ahead = ScenesAhead(pool, sample)
+        assert ahead.take(0, first) == (0, first)
+        ahead.begin(1, first)
+        assert ahead.take(1, first) == (1, first)
+        ahead.begin(2, first)
+        assert ahead.take(2, second) == (2, second)
+    on_main = {True: [(0, first), (2, second)], False: [(1, first), (2, first)]}
+    assert {here: [(b, s) for b, s, main in sampled if main is here] for here in (True, False)} == on_main
 
 
 def test_held_out_frames_are_the_same_each_time():
