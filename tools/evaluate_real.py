@@ -8,7 +8,6 @@ Nothing of these images has been trained on.
 
 from __future__ import annotations
 
-import argparse
 import json
 import platform
 import sys
@@ -31,6 +30,7 @@ from lanebev.app.views import bird_view
 from lanebev.estimation.still import calibrate_still
 from lanebev.io.video import open_source
 from lanebev.report.overlay import Panel, draw_panels, joined
+from tools.arguments import evaluation_parser
 from tools.real_figures import (
     Figure,
     carla_drive,
@@ -53,12 +53,9 @@ SHEET = tuple(range(0, 88, 8))  # and the last: a dozen
 
 @one_line_errors()
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    default = Path(__file__).resolve().parents[2] / "shared" / "data"
-    parser.add_argument("--data", type=Path, default=default, help="folder of the data (../shared/data)")
+    parser = evaluation_parser(__doc__)
     parser.add_argument("--json", type=Path, help="file for the results as JSON")
     parser.add_argument("--sheet", type=Path, help="write a PNG of a dozen TuSimple images, before and after")
-    parser.add_argument("--weights", type=Path, help="other weights than the shipped")
     parser.add_argument("--width", type=PositiveInt, help="px of the network's input, instead of its own")
     parser.add_argument("--only", help="run only parts whose name contains this")
     parser.add_argument("--hilly", action="store_true", help="the joint calibrator with HILLY_ROADS")

@@ -12,7 +12,6 @@ the number of calibrated frames counts. ``streets``: two images with a known pos
 
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 from pathlib import Path
@@ -35,6 +34,7 @@ from lanebev.io.video import read_image
 from lanebev.observation.frames import check_frame, network_image
 from lanebev.render import render_views
 from lanebev.report.overlay import draw_panels
+from tools.arguments import evaluation_parser
 from train.commands import one_line_errors
 
 KITTI_LANE_WIDTH = 3.5  # m
@@ -245,10 +245,7 @@ def save_sheet(
 @one_line_errors()
 def main() -> None:
     """Run the evaluation from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    default = Path(__file__).resolve().parents[2] / "shared" / "data"
-    parser.add_argument("--data", type=Path, default=default, help="folder of the data (../shared/data)")
-    parser.add_argument("--weights", type=Path, help="other weights than the shipped")
+    parser = evaluation_parser(__doc__)
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--sheets", type=Path, help="write contact sheets with the segments into this folder")
     parser.add_argument(

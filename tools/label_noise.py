@@ -14,8 +14,6 @@ Half of the difference estimates, in the median over images, the error of the ya
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -33,6 +31,7 @@ from lanebev.estimation.still import calibrate_still
 from lanebev.io.lanes import read_lanes
 from lanebev.io.video import open_source
 from lanebev.observation.polylines import rows_from_vertices
+from tools.arguments import evaluation_parser
 from tools.real_figures import TUSIMPLE_FOCAL, TUSIMPLE_LANE_WIDTH, tusimple_camera, tusimple_segments
 from train.commands import one_line_errors
 
@@ -109,10 +108,7 @@ def split_half_yaw(segments: LaneSegments, intrinsics: Tensor, prior: FramePrior
 
 @one_line_errors()
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    default = Path(__file__).resolve().parents[2] / "shared" / "data"
-    parser.add_argument("--data", type=Path, default=default, help="folder of the data (../shared/data)")
-    parser.add_argument("--weights", type=Path, help="other weights than the shipped")
+    parser = evaluation_parser(__doc__)
     options = parser.parse_args()
     labels = options.data / "tusimple" / "label_data.json"
     if not labels.exists():

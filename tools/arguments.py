@@ -1,0 +1,20 @@
+"""Options that several evaluations have."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def evaluation_parser(description: str | None) -> argparse.ArgumentParser:
+    """Return a parser with the folder of the evaluation data and the network's weights as options.
+
+    Args:
+        description: docstring of the program, shown as it is.
+    """
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the data (../shared/data)")
+    parser.add_argument("--weights", type=Path, help="other weights than the shipped")
+    return parser
