@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from enum import IntEnum
 from typing import NamedTuple, Protocol, TypeVar
@@ -15,6 +16,7 @@ from lanebev.geometry.rotation import (
     road_from_camera_matrix,
     rotation_vector,
 )
+from lanebev.numbers import check_number
 from lanebev.tensors import map_tensors as map_tensors  # noqa: PLC0414 - part of this module too
 
 TupleClass = TypeVar("TupleClass", bound=type)
@@ -74,7 +76,19 @@ class Extrinsics(NamedTuple):
     def from_values(
         cls, pitch: float, yaw: float, roll: float, height: float, dtype: torch.dtype = torch.float64
     ) -> Extrinsics:
-        """Return extrinsics of batch size 1 from plain numbers in rad and m."""
+        """Return extrinsics of batch size 1 from plain numbers in rad and m.
+
+        Raises:
+            TypeError: not numbers.
+            ValueError: angles of 90 degrees or more, as numbers of degrees are, or not finite numbers.
+        """
+        for name, angle in (("pitch", pitch), ("yaw", yaw), ("roll", roll)):
+            check_number(name, angle)
+            if not abs(angle) < math.pi / 2:
+                raise ValueError(f"{name}: expected rad within ±pi/2, got {angle:g}; see math.radians")
+        check_number("height", height)
+        if not math.isfinite(height):
+            raise ValueError(f"height: expected finite m, got {height:g}")
         return cls(*(torch.full((1,), value, dtype=dtype) for value in (pitch, yaw, roll, height)))
 
     def stack(self) -> Tensor:

@@ -23,10 +23,12 @@ class FrameClock:
     Attributes:
         stamp: of the last frame, s of any epoch; None before the first one.
         steps: s, the latest time steps.
+        is_doubted: whether a warning of missing stamps was logged.
     """
 
     stamp: float | None = None
     steps: list[float] = field(default_factory=list)
+    is_doubted: bool = False
 
     def values(self) -> dict[str, Any]:
         """Return the attributes by name, for a file."""
@@ -43,6 +45,9 @@ class FrameClock:
             ValueError: not finite.
         """
         if stamp is None:
+            if self.stamp is None and not self.is_doubted:
+                logger.warning("no time stamps are given: frames are assumed to be 1/30 s apart")
+                self.is_doubted = True
             return (self.steps[-1] if self.steps else FIRST_DT), []
         check_number("stamp", stamp, "seconds as a number")
         if not math.isfinite(stamp):

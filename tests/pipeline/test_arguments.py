@@ -1,5 +1,7 @@
 """A careless caller's mistake is one error that names the argument and what was expected."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -194,3 +196,17 @@ def test_lanebev_cameras(model):
         model(IMAGE, K[0])
     with pytest.raises(TypeError, match=r"logits: expected a torch.Tensor, got numpy.ndarray"):
         model.extractor(np.zeros((1, 7, 16, 24)), (64, 96))
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "message"),
+    [
+        ((2.0, 0.0, 0.0, 1.5), ValueError, "pitch: expected rad within ±pi/2, got 2; see math.radians"),
+        ((0.0, 0.0, math.nan, 1.5), ValueError, "roll: expected rad"),
+        ((0.0, 0.0, 0.0, math.inf), ValueError, "height: expected finite m, got inf"),
+        (("0", 0.0, 0.0, 1.5), TypeError, "pitch: expected a number, got str"),
+    ],
+)
+def test_extrinsics_from_values(values, error, message):
+    with pytest.raises(error, match=message):
+        Extrinsics.from_values(*values)

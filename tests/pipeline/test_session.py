@@ -231,6 +231,14 @@ def test_a_doubtful_camera_is_said_once(caplog):
     assert record.message.startswith("camera: 178 degrees of view across, where cameras on cars have 25 to")
 
 
+def test_missing_stamps_are_said_once(caplog):
+    session = Session(CAMERA)
+    assert [session(polylines=lines()).dt for _ in range(2)] == [1 / 30, 1 / 30]
+    assert [record.message for record in caplog.records] == [
+        "no time stamps are given: frames are assumed to be 1/30 s apart"
+    ]
+
+
 def test_a_speed_is_a_finite_number():
     session = Session(CAMERA)
     with pytest.raises(TypeError, match="speed: expected m/s as a number, or None, got str"):
