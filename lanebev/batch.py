@@ -15,6 +15,8 @@ from lanebev.tensors import constant, map_tensors
 T = TypeVar("T")
 FlagT = TypeVar("FlagT", bound=IntFlag)
 
+_BLOCK = 2_000_000  # numbers of a block of rows
+
 
 def select_rows(rows: Tensor, yes: T, no: T) -> T:
     """Take whole rows of ``yes`` where ``rows`` holds and of ``no`` elsewhere.
@@ -88,6 +90,31 @@ def _put_rows(index: Tensor, rows: T, values: T) -> T:
         return cast(T, values.index_copy(0, index, cast(Tensor, rows)))
     pairs = zip(cast("tuple[Tensor, ...]", rows), cast("tuple[Tensor, ...]", values), strict=True)
     return type(values)(*(_put_rows(index, *pair) for pair in pairs))
+
+
+def in_blocks(numbers: int, function: Callable[..., T], *operands: Any) -> T:
+    """Apply a function to a large batch in blocks of rows, one after the other, and join the results.
+
+    On a CPU the intermediate values of a large batch leave its caches, and the memory allocator returns them
+    to the operating system and asks for them again. GPUs, and programs that are compiled or exported, compute
+    all rows at once.
+
+    Args:
+        numbers: that the function holds at once for each row, about; a block has 2 million of them, 16 MB.
+        function: of the operands, to tensors or tuples of tensors (B, ...); each row's result depends on that
+            row alone.
+        operands: (B, ...) tensors, or NamedTuples of such.
+    """
+    parts, structure = tree_flatten(operands)
+    if torch.compiler.is_compiling() or parts[0].device.type != "cpu":
+        return function(*operands)
+    count = round(numbers * parts[0].shape[0] / _BLOCK)
+    if count < 2:
+        return function(*operands)
+    blocks = zip(*(part.chunk(count) for part in parts), strict=True)
+    results = [tree_flatten(function(*tree_unflatten(list(block), structure))) for block in blocks]
+    joined = [torch.cat(same) for same in zip(*(leaves for leaves, _ in results), strict=True)]
+    return cast(T, tree_unflatten(joined, results[0][1]))
 
 
 def flags(conditions: Mapping[FlagT, Tensor]) -> Tensor:

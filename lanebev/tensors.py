@@ -104,5 +104,11 @@ def _computed_constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: tor
 
 
 @made_once
+def identity(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return the identity matrix, made once per size, dtype and device; not to be changed in place."""
+    return torch.eye(size, dtype=dtype, device=device)
+
+
+@made_once
 def _constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.tensor(numbers, dtype=dtype).to(device)

@@ -58,7 +58,7 @@ class TextbookEKF:
         found = boundary_residuals(params, places, seen)
         used = (found.valid & (seen.weight > 0)).numpy()
         for row, ekf in enumerate(state):
-            keep = np.repeat(used[row], 2)
+            keep = np.tile(used[row], 2)
             if not keep.any():
                 continue
             jacobian = np.zeros((int(keep.sum()), 2 * _SIZE))
@@ -69,7 +69,7 @@ class TextbookEKF:
                 np.zeros(ekf.dim_z),
                 HJacobian=lambda _, value=jacobian: value,
                 Hx=lambda _, value=distance: value,
-                R=np.diag(np.repeat(seen.sigma[row].square().numpy(), 2)[keep]),
+                R=np.diag(np.tile(seen.sigma[row].square().numpy(), 2)[keep]),
             )
         pose = torch.from_numpy(np.stack([ekf.x[:4] for ekf in state]))
         cov = torch.from_numpy(np.stack([ekf.P[:4, :4] for ekf in state]))

@@ -22,7 +22,7 @@ from lanebev.estimation.joint.calibrator import JointCalibrator, predict_state
 from lanebev.estimation.joint.layout import NUM_COMMON, SHAPE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, VERTICAL
 from lanebev.estimation.joint.observations import boundary_places
-from lanebev.estimation.joint.road_curve import road_curve
+from lanebev.estimation.joint.road_curve import road_curve, road_shape
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.lens import denormalise_points
@@ -41,7 +41,7 @@ _CROSSING = 0.3  # m from a line, nearer than which boundaries may be renumbered
 def predicted_rays(state: JointState, places: Tensor, z: Tensor) -> Tensor:
     """Compute rays (L, P, 3) in the camera's axes to the boundaries of a state at z (P,) m, by (J2)."""
     params = state.mean[:, layout(len(places)).observed]  # (1, 12 + L)
-    curve = road_curve(z.unsqueeze(0), params[:, SHAPE], state.phase)
+    curve = road_curve(z.unsqueeze(0), road_shape(params[:, SHAPE], state.phase))
     x_k = (params[0, OFFSET] + places + params[0, NUM_COMMON:]).unsqueeze(-1)  # (L, 1)
     across = curve.bend + x_k * (1 + 0.5 * curve.heading.square())
     down = params[0, HEIGHT] + 0.5 * params[0, VERTICAL] * z.square()

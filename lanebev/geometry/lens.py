@@ -132,7 +132,8 @@ def cam_from_image(intrinsics: Tensor) -> Tensor:
     cx, cy = intrinsics[..., 0, 2], intrinsics[..., 1, 2]
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     along = -skew / (fx * fy)
-    entries = [1 / fx, along, -cx / fx - along * cy, zero, 1 / fy, -cy / fy, zero, zero, one]
+    per_x, per_y = fx.reciprocal(), fy.reciprocal()
+    entries = [per_x, along, -cx * per_x - along * cy, zero, per_y, -cy * per_y, zero, zero, one]
     inverse: Tensor = torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
     return inverse
 

@@ -67,9 +67,9 @@ def meets_before_farthest(directions: Tensor, profile: Profile) -> Tensor:
 
 
 def before_farthest(directions: Tensor, profile: Profile) -> Tensor:
-    """Return (B, N) bool: both end points, of directions (B, 3, M), meet the road before the farthest."""
-    valid: Tensor = meets_before_farthest(directions, profile).unflatten(-1, (-1, 2)).all(-1)
-    return valid
+    """Return (B, N) bool: both end points, of directions (B, 3, 2 N), meet the road before the farthest."""
+    first, second = meets_before_farthest(directions, profile).chunk(2, dim=-1)
+    return first & second
 
 
 def depth_below(height: Tensor, curvature: Tensor, z: Tensor) -> Tensor:

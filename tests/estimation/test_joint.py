@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from lanebev import batch
 from lanebev.estimation.joint.calibrator import JointCalibrator, predict_state
 from lanebev.estimation.joint.dynamics import (
     MotionConfig,
@@ -29,20 +30,27 @@ from lanebev.estimation.joint.measurement import (
     VERTICAL,
     boundary_distances,
     boundary_residuals,
-    foot_rays,
+    foot_points,
     look,
 )
 from lanebev.estimation.joint.observations import boundary_places, observe
 from lanebev.estimation.joint.road import propagate_road_shape, straight_or_bend, turn_along
-from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS, road_basis, road_curve
+from lanebev.estimation.joint.road_curve import (
+    KNOT_SPACING,
+    NUM_STEPS,
+    curve_by_shape,
+    road_curve,
+    road_shape,
+)
 from lanebev.estimation.joint.state import JointConfig, state_from_fit
 from lanebev.estimation.joint.status import single_deviation
 from lanebev.estimation.joint.update import (
     frame_information,
+    kalman_gain,
     membership,
     observed_jacobian,
+    observed_step,
     posterior_covariance,
-    update,
 )
 from lanebev.estimation.reasons import Reason
 from lanebev.observation.segments import LaneSegments
@@ -240,6 +248,17 @@ def test_row_alone_equals_row_in_batch_beside_degenerate_rows():
     assert (out.status[:2] == Status.UNINITIALISED).all()
 
 
+def test_a_batch_in_blocks_equals_one_at_once(monkeypatch):
+    frames = drive(6, rows=5)
+    expected, state = run(JointCalibrator(), frames)
+    monkeypatch.setattr(batch, "_BLOCK", 20_000)  # two rows
+    found, after = run(JointCalibrator(), frames)
+    torch.testing.assert_close(found.extrinsics.stack(), expected.extrinsics.stack(), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(found.inliers, expected.inliers, rtol=1e-6, atol=1e-9)
+    for part, other in zip(after, state, strict=True):
+        torch.testing.assert_close(part, other, rtol=1e-6, atol=1e-9)
+
+
 def test_order_of_segments_and_of_end_points_does_not_matter():
     frames = drive(5)
     mixed = []
@@ -268,7 +287,7 @@ def test_spline_jacobian_equals_jacfwd():
     full = torch.func.jacfwd(lambda p: boundary_residuals(p, places, seen, phase).distance)(params)
     expected = torch.stack([full[row, :, :, row] for row in range(2)]).flatten(1, 2)
     # taken at the foot point, some tenths of a pixel away, where it is the total derivative
-    near = found.valid.repeat_interleave(2, dim=1) & (found.distance.flatten(1).abs() < 1.0)
+    near = found.valid.repeat(1, 2) & (found.distance.flatten(1).abs() < 1.0)
     gap = (found.jacobian.mT - expected) / expected.abs().amax(1, keepdim=True)
     assert near.sum() > 100
     assert gap[near].abs().max() < 0.01
@@ -301,9 +320,11 @@ def test_the_curve_is_the_sum_of_its_basis_and_the_integral_of_its_curvature(pha
     shape = 1e-3 * torch.randn(2, NUM_SHAPE, generator=generator, dtype=DOUBLE)
     z = torch.linspace(0.0, 90.0, 9001, dtype=DOUBLE).expand(2, -1)
     behind = torch.full((2,), phase, dtype=DOUBLE)
-    curve = road_curve(z, shape, behind)
-    for part, basis in zip(curve, road_basis(z, behind), strict=True):
-        torch.testing.assert_close((shape.unsqueeze(1) @ basis).squeeze(1), part)
+    road = road_shape(shape, behind)
+    curve = road_curve(z, road)
+    tilt = torch.linspace(-3.0, 3.0, 9001, dtype=DOUBLE).expand(2, -1)
+    total = (shape.unsqueeze(1) @ curve_by_shape(z, tilt, road)).squeeze(1)
+    torch.testing.assert_close(total, curve.bend + tilt * curve.heading)
     heading = torch.cumulative_trapezoid(curve.curvature, dx=0.01)
     torch.testing.assert_close(curve.heading[:, 1:], heading, rtol=1e-5, atol=1e-9)
     torch.testing.assert_close(
@@ -481,22 +502,25 @@ def test_update_equals_a_plain_gauss_newton_on_all_data():
     scale, doubt = torch.ones(2, dtype=DOUBLE), state.cov[:, PLACE.observed, PLACE.observed]
     full = observed_jacobian(at.jacobian, membership(seen.boundary, 6, like=doubt))
     frame = frame_information(at, full, scale, doubt, seen)
-    estimated = torch.ones_like(state.mean)
-    result = update(state.mean, state.cov, state.mean, frame, estimated)
-    cov = posterior_covariance(state.cov, frame.matrix, result.gain)
+    estimated, mean = torch.ones_like(state.mean), state.mean[:, PLACE.observed]
+    moved = observed_step(mean, doubt, mean, frame, estimated[:, PLACE.observed])
+    gain = kalman_gain(state.cov, moved, frame, estimated)
+    change = (gain @ moved.pull.unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(change[:, PLACE.observed], moved.mean - mean, rtol=1e-6, atol=1e-12)
+    cov = posterior_covariance(state.cov, frame.matrix, gain)
     for row in range(2):
         jacobian = torch.zeros(at.jacobian.shape[-1], PLACE.size, dtype=DOUBLE)
         jacobian[:, :NUM_COMMON] = at.jacobian[row].mT
-        boundary = seen.boundary[row].repeat_interleave(2)
+        boundary = seen.boundary[row].repeat(2)
         jacobian[torch.arange(len(boundary)), NUM_COMMON + boundary] = at.jacobian[row, OFFSET]
         weight = frame.trust[row] * seen.weight[row] / (frame.scale[row] * seen.sigma[row]) ** 2
-        weight = weight.repeat_interleave(2).sqrt()
+        weight = weight.repeat(2).sqrt()
         root = torch.linalg.inv(torch.linalg.cholesky(state.cov[row]))
         rows = torch.cat([jacobian * weight.unsqueeze(-1), root])
         right = torch.cat([-at.distance[row].flatten() * weight, torch.zeros(len(root), dtype=DOUBLE)])
         step = torch.linalg.lstsq(rows, right.unsqueeze(-1)).solution.squeeze(-1)
         std = state.cov[row].diagonal().sqrt()
-        assert ((result.mean[row] - state.mean[row] - step) / std).abs().max() < 1e-6
+        assert ((change[row] - step) / std).abs().max() < 1e-6
         expected = torch.linalg.inv(rows.mT @ rows)
         assert ((cov[row] - expected) / std / std.unsqueeze(-1)).abs().max() < 1e-6
 
@@ -524,7 +548,7 @@ def test_distances_at_the_feet_are_those_of_the_residuals_and_close_to_them_near
     params[:, :5] = torch.tensor([*moment.pose, moment.offset], dtype=DOUBLE)
     params[:, SHAPE.start], params[:, VERTICAL] = 1e-5, 1e-4
     phase = torch.tensor([0.0, 7.3], dtype=DOUBLE)
-    feet = foot_rays(params, places, seen, look(params, seen, phase))
+    feet = foot_points(params, places, seen, look(params, seen, phase))
     residuals = boundary_residuals(params, places, seen, phase, feet)
     distance, valid = boundary_distances(params, places, seen, feet, phase)
     torch.testing.assert_close(distance, residuals.distance)

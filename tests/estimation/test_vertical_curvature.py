@@ -70,7 +70,7 @@ def test_the_road_behind_a_crest_is_not_seen():
     params = torch.zeros(1, NUM_COMMON, dtype=DOUBLE)
     params[:, HEIGHT], params[:, VERTICAL] = 1.5, 1e-3
     sight = look(params, seen, torch.zeros(1, dtype=DOUBLE))
-    torch.testing.assert_close(sight.z[0, :5], z.flatten()[:5])
+    torch.testing.assert_close(sight.z[0, :5], z.mT.flatten()[:5])
     assert sight.valid.tolist() == [[True, True, False]]
     assert sight.z.isfinite().all()
 

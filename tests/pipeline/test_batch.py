@@ -2,7 +2,8 @@ import pytest
 import torch
 from torch.export import Dim
 
-from lanebev.batch import flags, order_true_first, replace_rows
+from lanebev import batch
+from lanebev.batch import flags, in_blocks, order_true_first, replace_rows
 from lanebev.estimation.reasons import Reason
 from lanebev.tensors import constant
 from lanebev.types import Extrinsics
@@ -51,6 +52,23 @@ def test_rows_are_replaced_by_a_function_of_them_alone():
     assert replace_rows(rows & False, VALUES, function, VALUES, FACTOR) is VALUES
     assert seen == []
     assert torch.equal(_replaced(VALUES, FACTOR), REPLACED)
+
+
+@pytest.mark.parametrize(("block", "counts"), [(30, [3]), (16, [2, 1]), (10, [1, 1, 1]), (1, [1, 1, 1])])
+def test_a_function_is_applied_to_blocks_of_rows(monkeypatch, block, counts):
+    monkeypatch.setattr(batch, "_BLOCK", block)
+    seen = []
+
+    def function(pose, factor):
+        seen.append(factor.shape[0])
+        return _turned(pose, factor), factor.sum(-1)
+
+    pose = Extrinsics.unstack(VALUES)
+    turned, total = in_blocks(10, function, pose, FACTOR)
+    assert seen == counts
+    assert isinstance(turned, Extrinsics)
+    assert torch.equal(turned.stack(), _turned(pose, FACTOR).stack())
+    assert torch.equal(total, FACTOR.sum(-1))
 
 
 def test_gradients_flow_through_rows_that_are_replaced_and_kept():

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import masked_median
-from lanebev.estimation.joint.observations import observe
+from lanebev.estimation.joint.observations import observe, per_end
 from lanebev.geometry.road import image_from_road_points
 from lanebev.geometry.road_profile import (
     check_vertical_curvature,
@@ -79,7 +79,7 @@ def fit_boundaries(
         check_vertical_curvature(vertical_curvature, intrinsics.shape[0])
     given = intrinsics.new_zeros(intrinsics.shape[0], 2) if curvature is None else curvature
     rotation = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)
-    directions = rotation @ seen.rays
+    directions = rotation @ seen.cam_from_image @ seen.pixels
     height = extrinsics.height.unsqueeze(-1)
     curved = torch.zeros_like(height) if vertical_curvature is None else vertical_curvature.unsqueeze(-1)
     profile = road_profile(height, curved)
@@ -89,11 +89,11 @@ def fit_boundaries(
     across = scale * x  # (B, 2N) m
     lateral = across - _bend(z, given)
     focal = seen.focal.unsqueeze(-1)
-    boundary = seen.boundary.repeat_interleave(2, dim=1)
+    boundary = per_end(seen.boundary)
     member = torch.nn.functional.one_hot(boundary, num_boundaries).mT.to(z.dtype)  # (B, L, 2N)
-    weight = seen.weight.repeat_interleave(2, dim=1) * on_road
+    weight = per_end(seen.weight) * on_road
     member = member * weight.unsqueeze(1)
-    sigma = seen.sigma.repeat_interleave(2, dim=1)
+    sigma = per_end(seen.sigma)
 
     offset = masked_median(lateral.unsqueeze(1).expand_as(member), member > 0)  # (B, L)
     heading = torch.zeros_like(offset)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
-from lanebev.batch import flag, select_rows
+from lanebev.batch import flag, in_blocks, select_rows
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.checks import (
     as_lane_width,
@@ -31,7 +33,7 @@ from lanebev.estimation.joint.measurement import (
     VERTICAL,
     boundary_distances,
     boundary_residuals,
-    foot_rays,
+    foot_points,
     look,
 )
 from lanebev.estimation.joint.observations import Observations, boundary_places, observations
@@ -46,11 +48,12 @@ from lanebev.estimation.joint.update import (
     boundary_deviation,
     estimated_entries,
     frame_information,
+    kalman_gain,
     membership,
     observed_jacobian,
+    observed_step,
     posterior_covariance,
     single_frame,
-    update,
 )
 from lanebev.estimation.kalman import predict
 from lanebev.estimation.reasons import Reason
@@ -131,7 +134,10 @@ class JointCalibrator(Calibrator[JointState]):
         step, skip, early, guessed = elapsed(dt, state, cfg)
 
         predicted = predict_state(state, step, cfg)
-        updated, trust, agreed, alone = update_state(predicted, positions, seen, step, cfg)
+        numbers = 6 * place.size**2 + place.observed.stop * seen.pixels.shape[-1]  # above all the Jacobian
+        updated, trust, agreed, alone = in_blocks(
+            numbers, partial(update_state, cfg=cfg), predicted, positions, seen, step
+        )
         after, supported = update_track_status(predicted, updated, trust, alone, step, seen, cfg)
         after, agreed, apart = restart(after, agreed, supported, seen, positions, cfg)
         after = after._replace(reasons=after.reasons | flag(guessed, Reason.TIME))
@@ -185,7 +191,7 @@ class JointCalibrator(Calibrator[JointState]):
 def elapsed(dt: Tensor, state: JointState, cfg: JointConfig) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Compute the time to predict over; whether to skip the frame; how far ahead the state is; if guessed."""
     due = dt - state.early
-    guessed = ~(due > -1.0) | ~dt.isfinite()
+    guessed = ~((due > -1.0) & (due < torch.inf))
     due = torch.where(guessed, cfg.assumed_dt, due)
     skip = (due <= 0) & is_running(state.status)
     return due.clamp(0.0, 60.0), skip, torch.where(skip, -due, 0.0), guessed
@@ -237,11 +243,12 @@ def update_state(
     prior, cov = renumber(predicted.mean, shift, width, num), predicted.cov
     places = positions.gather(1, seen.boundary)  # (B, N)
     member = membership(seen.boundary, num, like=places)
-    at, doubt, evidence = prior, cov[:, place.observed, place.observed], predicted.evidence
+    before, evidence = prior[:, place.observed], predicted.evidence
+    at, doubt = before, cov[:, place.observed, place.observed]
     for iteration in range(cfg.iterations):
-        params, own = at[:, :NUM_COMMON], at[:, place.deviations].gather(1, seen.boundary)
+        params, own = at[:, :NUM_COMMON], at[:, NUM_COMMON:].gather(1, seen.boundary)
         if iteration == 0:
-            feet = foot_rays(params, places + own, seen, sight)
+            feet = foot_points(params, places + own, seen, sight)
             residuals = boundary_residuals(params, places + own, seen, predicted.phase, feet, sight)
             jacobian = observed_jacobian(residuals.jacobian, member)
         else:  # the Jacobian stays
@@ -250,25 +257,29 @@ def update_state(
         frame = frame_information(residuals, jacobian, scale, doubt, seen)
         alone, sensitivity = single_frame(frame.matrix)
         estimated = estimated_entries(alone, place)
-        result = update(prior, cov, at, frame, estimated)
+        moved = observed_step(
+            before, cov[:, place.observed, place.observed], at, frame, estimated[:, place.observed]
+        )
+        used = cov
         if iteration == 0:
-            believed = (frame.trust * seen.weight).repeat_interleave(2, dim=1).unsqueeze(1)
-            score = normalized_score(doubt, frame, torch.bmm(believed, member.mT).squeeze(1), seen.weight)
+            believed = 2.0 * torch.bmm(member, (frame.trust * seen.weight).unsqueeze(-1)).squeeze(-1)
+            score = normalized_score(doubt, frame, believed, seen.weight)
             evidence = accumulate_evidence(evidence, score, step, cfg.evidence_time)
             told = torch.where(estimated[:, POSE] > 0, score[:, POSE], 1.0)  # 1 changes nothing
             motion_scale = adapt_motion_scale(predicted.motion_scale, told, step, cfg)
             noise = adaptive_process_noise(evidence, doubt, cfg)
             cov = cov + torch.nn.functional.pad(noise, (0, place.size - noise.shape[-1])).diag_embed()
-        last, at, doubt, scale = at, result.mean, result.observed_cov, frame.scale
+        last, at, doubt, scale = at, moved.mean, moved.cov, frame.scale
+    gain = kalman_gain(used, moved, frame, estimated)
     updated = predicted._replace(
-        mean=at,
-        cov=posterior_covariance(cov, frame.matrix, result.gain),
+        mean=torch.baddbmm(prior.unsqueeze(-1), gain, moved.pull.unsqueeze(-1)).squeeze(-1),
+        cov=posterior_covariance(cov, frame.matrix, gain),
         evidence=evidence,
         pose_sensitivity=sensitivity,
         motion_scale=motion_scale,
         reasons=flag(shift != 0, Reason.LANE_CHANGE),
     )
-    agreed = agreement(frame, jacobian, (at - last)[:, place.observed], seen)
-    apart = torch.maximum(at[:, place.deviations].abs(), boundary_deviation(last, frame).abs())
+    agreed = agreement(frame, jacobian, at - last, seen)
+    apart = torch.maximum(at[:, NUM_COMMON:].abs(), boundary_deviation(last, frame).abs())
     lane = (apart < _NO_BOUNDARY).gather(1, seen.boundary)
     return updated, frame.trust, torch.where((seen.weight > 0) & lane, agreed, 0.0), alone

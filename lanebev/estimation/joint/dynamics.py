@@ -219,13 +219,12 @@ def motion(
     to_mean = constant(((1,), (0,), (0,), (0,)), like=dt) - swing[:, :, :1]
     chain = torch.cat([swing, to_mean], dim=-1).flatten(1)  # (B, 20)
     slide, push = damped_velocity(dt, cfg.offset_memory)
-    fade = (-dt / cfg.speed_memory).exp()
-    memory = torch.where(unequal > 0, cfg.unequal_memory, constant((cfg.deviation_memory,), like=dt))
-    settle = (-dt / memory).exp()
-    level = (-dt / cfg.vertical_curvature_memory).exp()
+    memories = (cfg.speed_memory, cfg.vertical_curvature_memory, cfg.deviation_memory, cfg.unequal_memory)
+    fade, level, slow, fast = (dt.unsqueeze(-1) / constant(memories, like=dt)).neg().exp().unbind(-1)
+    settle = torch.where(unequal > 0, fast, slow)
     still = torch.ones_like(pose_scale)
     moves = [
-        chain.repeat(1, NUM_POSE),
+        *[chain] * NUM_POSE,
         still,
         slide,
         road.transition.flatten(1),
@@ -247,22 +246,16 @@ def motion(
         wander.unsqueeze(-1).expand(-1, num),
         (vertical.square() * (1 - level * level)).unsqueeze(-1),
     ]
-    of_moves, of_noises = _places(num)
-    return _scatter(moves, of_moves, place.size), _scatter(noises, of_noises, place.size)
-
-
-def _scatter(parts: list[Tensor], places: tuple[int, ...], size: int) -> Tensor:
-    """(B, D, D) of zeros with the values (B, K) at flat places (K,)."""
-    values = torch.cat(parts, dim=-1)
-    index = constant(places, like=values, dtype=torch.int64).expand(values.shape[0], -1)
-    flat = values.new_zeros(values.shape[0], size * size).scatter(1, index, values)
-    matrix: Tensor = flat.unflatten(1, (size, size))
-    return matrix
+    values = torch.cat([*moves, *noises], dim=-1)
+    index = constant(_places(num), like=values, dtype=torch.int64).expand(values.shape[0], -1)
+    flat = values.new_zeros(values.shape[0], 2 * place.size**2).scatter(1, index, values)
+    transition, noise = flat.unflatten(1, (2, place.size, place.size)).unbind(1)
+    return transition, noise
 
 
 @lru_cache(maxsize=16)
-def _places(num_boundaries: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Flat indices, in the order of :func:`motion`, of the entries of F and of W."""
+def _places(num_boundaries: int) -> tuple[int, ...]:
+    """Flat indices, in the order of :func:`motion`, of the entries of F and, after it, W."""
     place = layout(num_boundaries)
 
     def block(rows: Sequence[int], columns: Sequence[int]) -> list[int]:
@@ -282,7 +275,7 @@ def _places(num_boundaries: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     noises = [block(chain[:_ORDER], chain[:_ORDER]) for chain in chains]
     noises += [diagonal(place.means), block(slide, slide), diagonal(SHAPE), diagonal(speed)]
     noises += [diagonal(place.deviations), diagonal(vertical)]
-    return tuple(itertools.chain(*moves)), tuple(itertools.chain(*noises))
+    return (*itertools.chain(*moves), *(place.size**2 + entry for entry in itertools.chain(*noises)))
 
 
 def damped_velocity(dt: Tensor, memory: float) -> tuple[Tensor, Tensor]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -9,7 +12,7 @@ from torch.nn.functional import pad
 from lanebev.estimation.joint.layout import DEVIATIONS, NUM_POSE, POSE, SHAPE
 from lanebev.estimation.joint.measurement import NUM_SHAPE, VERTICAL
 from lanebev.estimation.joint.state import JointConfig
-from lanebev.estimation.joint.update import FrameInformation, information_kept
+from lanebev.estimation.joint.update import FrameInformation, innovation_score
 from lanebev.tensors import constant
 
 _SHARED = 0.2  # sigmas by which all end points of a boundary may be off alike
@@ -43,13 +46,13 @@ def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor, weight
         (B, 5 + NUM_SHAPE + L) of pose, shape, vertical curvature, deviations; 0 where the frame has no
         information on an entry.
     """
-    freed = constant(tuple(sigma**2 for sigma in _FREE_POSE), like=cov)
-    free = pad(freed, (0, cov.shape[-1] - NUM_POSE)).diag()
-    priors = torch.cat([cov, cov + free])  # (2 B, O, O)
-    matrix = torch.cat([frame.matrix, frame.matrix])
-    kept = information_kept(priors, matrix)
-    score = torch.bmm(kept, torch.cat([frame.vector, frame.vector]).unsqueeze(-1)).view(2, -1, cov.shape[-1])
-    variance = torch.bmm(kept, matrix).diagonal(dim1=1, dim2=2).view_as(score)
+    priors = torch.cat([cov, cov + constant(_free_pose(cov.shape[-1]), like=cov)])  # (2 B, O, O)
+    score, variance = (
+        part.unflatten(0, (2, -1))
+        for part in innovation_score(
+            priors, torch.cat([frame.matrix, frame.matrix]), torch.cat([frame.vector, frame.vector])
+        )
+    )
     known = variance > (_KNOWN * frame.matrix.diagonal(dim1=1, dim2=2)).clamp(min=0.0)
     usual = count.square().sum(-1, keepdim=True) / count.sum(-1, keepdim=True).clamp(min=1.0)
     alike = torch.cat([usual, count], dim=-1)  # of the vertical curvature, and of each boundary
@@ -58,6 +61,13 @@ def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor, weight
     raised = (weight * ~frame.residuals.valid).sum(-1) > _RAISED * weight.sum(-1)
     crest = torch.where(raised, 0.0, normal[1, :, VERTICAL]).unsqueeze(-1)
     return torch.cat([normal[0, :, POSE], normal[1, :, SHAPE], crest, normal[1, :, DEVIATIONS]], dim=-1)
+
+
+@lru_cache(maxsize=16)
+def _free_pose(count: int) -> tuple[tuple[float, ...], ...]:
+    """The covariance O × O that is added where the pose is free."""
+    added = [sigma**2 for sigma in _FREE_POSE] + [0.0] * (count - NUM_POSE)
+    return tuple(tuple(value * (k == i) for k in range(count)) for i, value in enumerate(added))
 
 
 def accumulate_evidence(before: Tensor, score: Tensor, dt: Tensor, memory: float) -> Tensor:
@@ -76,12 +86,14 @@ def accumulate_evidence(before: Tensor, score: Tensor, dt: Tensor, memory: float
         memory: s.
     """
     fade = (-dt / memory).exp().unsqueeze(-1)
-    exceeded = before[:, :NUM_POSE].abs() > CALL
-    before = torch.cat([torch.where(exceeded, 0.0, before[:, :NUM_POSE]), before[:, NUM_POSE:]], dim=-1)
-    total = before * fade + (1 - fade * fade).clamp(min=1e-12).sqrt() * score
-    now, pose = score[:, :NUM_POSE], _POSE_DECAY * total[:, :NUM_POSE]
-    larger = torch.where(now.abs() > pose.abs(), now, pose)
-    return torch.cat([larger, total[:, NUM_POSE:]], dim=-1)
+    others = before.shape[-1] - NUM_POSE
+    decay, call, now = (
+        constant((of_pose,) * NUM_POSE + (of_others,) * others, like=before)
+        for of_pose, of_others in ((_POSE_DECAY, 1.0), (CALL, math.inf), (1.0, 0.0))
+    )
+    before = torch.where(before.abs() > call, 0.0, before)
+    total = decay * (before * fade + (1 - fade * fade).clamp(min=1e-12).sqrt() * score)
+    return torch.where((now * score).abs() > total.abs(), score, total)
 
 
 def adapt_motion_scale(before: Tensor, score: Tensor, dt: Tensor, cfg: JointConfig) -> Tensor:
@@ -122,7 +134,7 @@ def adaptive_process_noise(evidence: Tensor, cov: Tensor, cfg: JointConfig) -> T
     worst = [part.amax(-1, keepdim=True) for part in parts]
     most = torch.cat(worst, dim=-1)
     call = constant((CALL, CALL, _CREST_CALL, CALL), like=evidence)
-    pose, bend, crest, own = (0.01 * torch.sigmoid(0.5 * (most - call.square())) * most).split(1, dim=-1)
+    pose, bend, crest, own = (0.01 * torch.sigmoid(0.5 * (most - call.square())) * most).chunk(4, dim=-1)
     jump = constant((*[cfg.open_pose**2] * 3, (10 * cfg.open_pose) ** 2, 0.0), like=evidence)
     change = constant((cfg.open_curvature**2, *[cfg.open_step**2] * (NUM_SHAPE - 1)), like=evidence)
     room = cfg.open_deviation**2 - cov.diagonal(dim1=1, dim2=2)[:, DEVIATIONS]

@@ -8,7 +8,7 @@ from torch import Tensor
 from lanebev.estimation.joint.layout import NUM_COMMON
 from lanebev.estimation.joint.measurement import OFFSET, Sight, every_segment, sampson_distances
 from lanebev.estimation.joint.observations import Observations
-from lanebev.estimation.joint.robust import log_likelihood, start_scale
+from lanebev.estimation.joint.robust import log_likelihood, scaled_variance, squared_distance, start_scale
 from lanebev.tensors import constant
 
 _SEGMENTS = 96  # that decide, at least
@@ -47,10 +47,11 @@ def best_shift(
     moved = places + (shifts[:, None] * lane_width)[:, :, None]  # (3, B, N)
     distance = sampson_distances(mean[:, :NUM_COMMON], moved, sight)
     scales = start_scale(distance, sigma, weight * sight.valid)  # (3, B)
-    scores = log_likelihood(distance, sight.valid, weight, sigma, scales.amin(0), seen.focal)  # (3, B)
+    squared, variance = squared_distance(distance), scaled_variance(sigma, scales.amin(0))
+    scores = log_likelihood(squared, sight.valid, weight, variance, seen.focal)  # (3, B)
     clear = scores[1:].amax(0) > 2.0 * scores[0] + 10.0
     best = torch.where(clear, 1 + scores[1:].argmax(0), 0)  # (B,)
-    return shifts[best], scales.gather(0, best.unsqueeze(0)).squeeze(0)
+    return shifts.gather(0, best), scales.gather(0, best.unsqueeze(0)).squeeze(0)
 
 
 def renumber(mean: Tensor, shift: Tensor, lane_width: Tensor, num_boundaries: int) -> Tensor:

@@ -22,9 +22,18 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from lanebev.estimation.joint.observations import Observations
-from lanebev.estimation.joint.road_curve import NUM_STEPS, RoadCurve, road_basis, road_curve
+from lanebev.estimation.joint.observations import Observations, by_ends, per_end
+from lanebev.estimation.joint.road_curve import (
+    NUM_STEPS,
+    Clothoid,
+    RoadCurve,
+    Spline,
+    curve_by_shape,
+    road_curve,
+    road_shape,
+)
 from lanebev.geometry.road_profile import Profile, before_farthest, meet_road, road_profile
 from lanebev.geometry.rotation import road_from_cam_and_roll
 
@@ -50,21 +59,23 @@ class Sight(NamedTuple):
     Attributes:
         rotation: (B, 3, 3), road_from_cam.
         by_roll: (B, 3, 3), its factor R(ψ).
-        directions: (B, 3, M), right, down, ahead.
-        by_pixel: (B, 3, 2), derivative of a direction by its pixel.
+        road_from_image: (B, 3, 3), from a pixel (x, y, 1) to its direction right, down, ahead.
+        pixels: (B, 3, M), (x, y, 1).
         z: (B, M) m, distance at which the end point meets the road, at most ``FARTHEST``.
         valid: (B, N) bool, both end points meet the road nearer than that.
         profile: of the road.
+        road: its middle line.
         curve: (B, M) each, the road's middle line at z.
     """
 
     rotation: Tensor
     by_roll: Tensor
-    directions: Tensor
-    by_pixel: Tensor
+    road_from_image: Tensor
+    pixels: Tensor
     z: Tensor
     valid: Tensor
     profile: Profile
+    road: Clothoid | Spline
     curve: RoadCurve
 
 
@@ -72,7 +83,7 @@ class Residuals(NamedTuple):
     """Perpendicular distances of end points to their boundaries.
 
     Attributes:
-        distance: (B, N, 2) px, positive right of the boundary.
+        distance: (B, 2, N) px, positive right of the boundary.
         jacobian: (B, P, M) of the distance by the frame's parameters; finite also where not valid.
         by_vertical_curvature: (B, M), likewise by the road's vertical curvature.
         z: (B, M) m, distance of the foot points.
@@ -87,7 +98,7 @@ class Residuals(NamedTuple):
 
 
 def look(params: Tensor, seen: Observations, phase: Tensor | None = None) -> Sight:
-    """Compute rays of the end points in road axes and where they meet the road.
+    """Compute where the rays of the end points meet the road.
 
     Args:
         params: as in :func:`boundary_residuals`.
@@ -95,20 +106,20 @@ def look(params: Tensor, seen: Observations, phase: Tensor | None = None) -> Sig
         phase: likewise.
     """
     rotation, by_roll = road_from_cam_and_roll(params[:, :HEIGHT])
-    directions = torch.bmm(rotation, seen.rays)
-    profile = _profile(params, phase)
+    road_from_image, profile = torch.bmm(rotation, seen.cam_from_image), _profile(params, phase)
+    directions = torch.bmm(road_from_image, seen.pixels)
     z, valid = meet_road(directions, profile), before_farthest(directions, profile)
-    curve = road_curve(z, _shape(params, phase), phase)
-    return Sight(
-        rotation, by_roll, directions, torch.bmm(rotation, seen.cam_from_image), z, valid, profile, curve
-    )
+    road = _road(params, phase)
+    curve = road_curve(z, road)
+    return Sight(rotation, by_roll, road_from_image, seen.pixels, z, valid, profile, road, curve)
 
 
 def every_segment(sight: Sight, stride: int) -> Sight:
     """Keep only every n-th segment."""
-    directions = sight.directions.unflatten(-1, (-1, 2))[:, :, ::stride].flatten(2)
-    z, *curve = (part.unflatten(-1, (-1, 2))[:, ::stride].flatten(1) for part in (sight.z, *sight.curve))
-    return sight._replace(directions=directions, z=z, valid=sight.valid[:, ::stride], curve=RoadCurve(*curve))
+    pixels, z, *curve = (
+        by_ends(part)[..., ::stride].flatten(-2) for part in (sight.pixels, sight.z, *sight.curve)
+    )
+    return sight._replace(pixels=pixels, z=z, valid=sight.valid[:, ::stride], curve=RoadCurve(*curve))
 
 
 def boundary_residuals(
@@ -132,34 +143,34 @@ def boundary_residuals(
         places: (B, N) m, X of each segment's boundary at Z = 0 less the offset.
         seen: what was observed.
         phase: (B,) m, how far the first knot lies behind the camera, 0 to KNOT_SPACING; or None.
-        feet: (B, 3, M) rays to the foot points, by :func:`foot_rays` at parameters nearby; None finds them.
+        feet: (B, 3, M) foot points, by :func:`foot_points` at parameters nearby; None finds them.
         sight: from this pose, if it is known already.
 
     Returns:
         Distances, zero where not valid, Jacobian, validity.
     """
     sight = look(params, seen, phase) if sight is None else sight
-    feet = foot_rays(params, places, seen, sight) if feet is None else feet
-    foot, profile = torch.bmm(sight.rotation, feet), sight.profile
-    z = meet_road(foot, profile)
-    x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (B, M)
-    basis, shape = road_basis(z, phase), _shape(params, phase).unsqueeze(1)
-    curve = RoadCurve(*(torch.bmm(shape, part).squeeze(1) for part in basis))
+    feet = foot_points(params, places, seen, sight) if feet is None else feet
+    foot, profile = torch.bmm(sight.road_from_image, feet), sight.profile
+    z, x_k = meet_road(foot, profile), _lateral(params, places)
+    curve = road_curve(z, sight.road)
     normal, slope = _tangent_plane(z, x_k, profile, curve)
-    _, size = _pixel_gradient(normal, sight.by_pixel)  # (B, M)
-    distance = (normal * sight.directions).sum(1) / size
+    line = torch.bmm(sight.road_from_image.mT, normal)
+    per_pixel = _per_pixel(line)
+    distance = (line * sight.pixels).sum(1) * per_pixel
 
-    turning = torch.linalg.cross(normal, foot, dim=1)  # ∂(n·d)/∂angle = n · (-axis × d) = axis · (n × d)
+    foot = foot * per_pixel.unsqueeze(1)
+    x, down, ahead = foot.unbind(1)
     # pitch turns about the camera's x, seen in the road's axes, yaw about the rolled y, roll about z
     axes = torch.cat([sight.rotation[:, :, :1], sight.by_roll[:, :, 1:]], dim=-1).mT
-    by_angles = torch.bmm(axes, turning)
-    x, down, ahead = foot.unbind(1)
+    by_angles = torch.bmm(axes, _cross(normal, foot))  # ∂(n·d)/∂angle = n · (-axis × d) = axis · (n × d)
     up = profile.curvature * z * ahead - down  # -n_x of the foot, per metre of Z
     by_height, by_offset = x - slope * ahead, up + 0.5 * up * curve.heading.square()
-    by_shape = torch.addcmul(basis[0], (x_k * curve.heading).unsqueeze(1), basis[1]) * up.unsqueeze(1)
+    by_shape = curve_by_shape(z, x_k * curve.heading, sight.road) * up.unsqueeze(1)
     by_vertical = (0.5 * z * z * by_height).unsqueeze(1)  # the road is lower by Z²/2 per unit of it
-    by_all = torch.cat([by_angles, torch.stack([by_height, by_offset], dim=1), by_shape, by_vertical], dim=1)
-    jacobian = by_all / size.unsqueeze(1)
+    jacobian = torch.cat(
+        [by_angles, torch.stack([by_height, by_offset], dim=1), by_shape, by_vertical], dim=1
+    )
     given = jacobian[:, :-1] if phase is None else jacobian
     return Residuals(_of_valid(distance, sight.valid), given, jacobian[:, -1], z, sight.valid)
 
@@ -171,18 +182,18 @@ def boundary_distances(
     feet: Tensor,
     phase: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Compute the distances of :func:`boundary_residuals` alone, (B, N, 2) px, and their validity (B, N)."""
+    """Compute the distances of :func:`boundary_residuals` alone, (B, 2, N) px, and their validity (B, N)."""
     rotation, _ = road_from_cam_and_roll(params[:, :HEIGHT])
-    directions, profile = torch.bmm(rotation, seen.rays), _profile(params, phase)
-    valid = before_farthest(directions, profile)
-    z = meet_road(torch.bmm(rotation, feet), profile)
-    x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)
-    normal, _ = _tangent_plane(z, x_k, profile, road_curve(z, _shape(params, phase), phase))
-    _, size = _pixel_gradient(normal, torch.bmm(rotation, seen.cam_from_image))
-    return _of_valid((normal * directions).sum(1) / size, valid), valid
+    road_from_image, profile = torch.bmm(rotation, seen.cam_from_image), _profile(params, phase)
+    valid = before_farthest(torch.bmm(road_from_image, seen.pixels), profile)
+    z = meet_road(torch.bmm(road_from_image, feet), profile)
+    curve = road_curve(z, _road(params, phase))
+    normal, _ = _tangent_plane(z, _lateral(params, places), profile, curve)
+    line = torch.bmm(road_from_image.mT, normal)
+    return _of_valid((line * seen.pixels).sum(1) * _per_pixel(line), valid), valid
 
 
-def foot_rays(params: Tensor, places: Tensor, seen: Observations, sight: Sight) -> Tensor:
+def foot_points(params: Tensor, places: Tensor, seen: Observations, sight: Sight) -> Tensor:
     """Find the foot point of every end point on its boundary, by one Newton step in the image.
 
     A foot point is moved by ``FOOT_RANGE`` at most: an end point farther off is an outlier.
@@ -194,15 +205,16 @@ def foot_rays(params: Tensor, places: Tensor, seen: Observations, sight: Sight) 
         sight: with the same parameters.
 
     Returns:
-        (B, 3, M) camera rays, z = 1.
+        (B, 3, M) px, (x, y, 1).
     """
-    x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)
-    normal, _ = _tangent_plane(sight.z, x_k, sight.profile, sight.curve)
-    gradient, size = _pixel_gradient(normal, sight.by_pixel)  # (B, 2, M) 1/px
+    normal, _ = _tangent_plane(sight.z, _lateral(params, places), sight.profile, sight.curve)
+    line = torch.bmm(sight.road_from_image.mT, normal)
+    per_pixel = _per_pixel(line)
     reach = (FOOT_RANGE * seen.focal).unsqueeze(-1)
-    distance = (normal * sight.directions).sum(1) / size
-    step = distance.clamp(-reach, reach) / size
-    return torch.baddbmm(seen.rays, seen.cam_from_image, step.unsqueeze(1) * gradient, alpha=-1)
+    distance = (line * sight.pixels).sum(1) * per_pixel
+    step = distance.clamp(-reach, reach) * per_pixel
+    points = torch.addcmul(sight.pixels[:, :2], step.unsqueeze(1), line[:, :2], value=-1)
+    return pad(points, (0, 0, 0, 1), value=1.0)
 
 
 def sampson_distances(params: Tensor, places: Tensor, sight: Sight) -> Tensor:
@@ -216,29 +228,36 @@ def sampson_distances(params: Tensor, places: Tensor, sight: Sight) -> Tensor:
         sight: with the same parameters.
 
     Returns:
-        (H, B, N, 2) px, zero where not valid.
+        (H, B, 2, N) px, zero where not valid.
     """
-    x_k = (places + params[:, OFFSET, None]).repeat_interleave(2, dim=-1)  # (H, B, M)
-    normal, _ = _tangent_plane(sight.z, x_k, sight.profile, sight.curve)
-    _, size = _pixel_gradient(normal, sight.by_pixel)
-    distance = (normal * sight.directions).sum(-2) / size
-    return _of_valid(distance, sight.valid)
+    normal, _ = _tangent_plane(sight.z, _lateral(params, places), sight.profile, sight.curve)
+    line = sight.road_from_image.mT @ normal
+    return _of_valid((line * sight.pixels).sum(-2) * _per_pixel(line), sight.valid)
 
 
 def _of_valid(distance: Tensor, valid: Tensor) -> Tensor:
-    """(…, B, M) distances to (…, B, N, 2), zero where not valid."""
-    return torch.where(valid.unsqueeze(-1), distance.unflatten(-1, (-1, 2)), 0.0)
+    """(…, B, M) distances to (…, B, 2, N), zero where not valid."""
+    return torch.where(valid.unsqueeze(-2), by_ends(distance), 0.0)
 
 
-def _pixel_gradient(normal: Tensor, by_pixel: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradient of n·d by the pixel (…, B, 2, M), and its length (…, B, M), for normals (…, B, 3, M)."""
-    gradient = by_pixel.mT @ normal
-    return gradient, gradient.square().sum(-2).sqrt()
+def _per_pixel(line: Tensor) -> Tensor:
+    """1 / |∂(n·d)/∂p| (…, M) px, for the lines l (…, 3, M) in which planes n appear, l·(x, y, 1) = n·d."""
+    return line[..., :2, :].square().sum(-2).rsqrt()
 
 
-def _shape(params: Tensor, phase: Tensor | None) -> Tensor:
-    """The parameters of the bend, (B, K): a clothoid's, or with a phase a spline's."""
-    return params[:, NUM_STRAIGHT : None if phase is None else VERTICAL]
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """Compute a × b, (B, 3, M): (x, y, z) is turned to (y, z, x) three times, which is fast."""
+    return torch.addcmul(a * b.roll(-1, 1), a.roll(-1, 1), b, value=-1).roll(-1, 1)
+
+
+def _lateral(params: Tensor, places: Tensor) -> Tensor:
+    """X of every end point's boundary at Z = 0, (…, B, M) m, for places (…, B, N) less the offset."""
+    return per_end(places + params[:, OFFSET, None])
+
+
+def _road(params: Tensor, phase: Tensor | None) -> Clothoid | Spline:
+    """The middle line of the road: a clothoid, or with a phase a spline."""
+    return road_shape(params[:, NUM_STRAIGHT : None if phase is None else VERTICAL], phase)
 
 
 def _profile(params: Tensor, phase: Tensor | None) -> Profile:
@@ -261,7 +280,7 @@ def _tangent_plane(z: Tensor, x_k: Tensor, profile: Profile, curve: RoadCurve) -
     tilt = x_k * curve.heading
     slope = torch.addcmul(curve.heading, tilt, curve.curvature)
     out = torch.addcmul(x_k + curve.bend, tilt, curve.heading, value=0.5)
-    lower = 0.5 * profile.curvature * z * z
-    across, deep = profile.height - lower, profile.height + lower
-    along = torch.addcmul(profile.curvature * z * out, deep, slope, value=-1)
+    climb = profile.curvature * z  # slope of the road, positive downwards
+    across, deep = (torch.addcmul(profile.height, climb, z, value=half) for half in (-0.5, 0.5))
+    along = torch.addcmul(climb * out, deep, slope, value=-1)
     return torch.stack([across.expand_as(out), z * slope - out, along], dim=-2), slope

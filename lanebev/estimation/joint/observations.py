@@ -16,18 +16,18 @@ from lanebev.tensors import constant
 
 
 class Observations(NamedTuple):
-    """Prepared segments: rays computed once per frame, weight zero for bad entries. M = 2 N end points.
+    """Prepared segments, weight zero for bad entries. M = 2 N end points.
 
     Attributes:
-        rays: (B, 3, M), z = 1; end point e of segment n is entry 2 n + e.
+        pixels: (B, 3, M), (x, y, 1) of the end points; end point e of segment n is entry e N + n.
         boundary: (B, N) int64, 0..L-1.
         weight: (B, N) in [0, 1].
         sigma: (B, N) px.
         focal: (B,) px, of x.
-        cam_from_image: (B, 3, 2), derivative of a ray by its pixel.
+        cam_from_image: (B, 3, 3), K⁻¹.
     """
 
-    rays: Tensor
+    pixels: Tensor
     boundary: Tensor
     weight: Tensor
     sigma: Tensor
@@ -56,16 +56,26 @@ def observe(segments: LaneSegments, intrinsics: Tensor, num_boundaries: int) -> 
 
 def observations(segments: LaneSegments, intrinsics: Tensor) -> Observations:
     """Prepare what went through :func:`~lanebev.estimation.checks.mask_invalid_rows`."""
-    inverse = cam_from_image(intrinsics)
-    pixels = pad(segments.endpoints.flatten(1, 2).mT, (0, 0, 0, 1), value=1.0)  # (B, 3, M)
+    pixels = segments.endpoints.permute(0, 3, 2, 1).flatten(2)  # (B, 2, M)
     return Observations(
-        rays=torch.bmm(inverse, pixels),
+        pixels=pad(pixels, (0, 0, 0, 1), value=1.0),
         boundary=segments.boundary,
         weight=segments.weight,
         sigma=segments.sigma,
         focal=intrinsics[:, 0, 0],
-        cam_from_image=inverse[..., :2],
+        cam_from_image=cam_from_image(intrinsics),
     )
+
+
+def per_end(value: Tensor) -> Tensor:
+    """Repeat values (…, N) of segments for their end points, (…, M)."""
+    return torch.cat([value, value], dim=-1)
+
+
+def by_ends(value: Tensor) -> Tensor:
+    """Split values (…, M) of end points by the segments' ends, (…, 2, N)."""
+    ends: Tensor = value.unflatten(-1, (2, -1))
+    return ends
 
 
 def boundary_places(lane_width: float | Tensor, num_boundaries: int, like: Tensor) -> Tensor:

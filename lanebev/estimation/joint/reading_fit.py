@@ -14,16 +14,18 @@ from lanebev.estimation.joint.measurement import (
     NUM_PARAMS,
     OFFSET,
     boundary_residuals,
-    foot_rays,
+    foot_points,
     look,
 )
-from lanebev.estimation.joint.observations import Observations
+from lanebev.estimation.joint.observations import Observations, by_ends, per_end
 from lanebev.estimation.joint.readings import Readings
 from lanebev.estimation.joint.robust import (
     anneal_scale,
     inlier_log_odds,
     inlier_weights,
     noise_scale,
+    scaled_variance,
+    squared_distance,
     start_scale,
 )
 from lanebev.geometry.linalg import cholesky, inverse_spd, solve_spd
@@ -48,7 +50,7 @@ class Model(NamedTuple):
 
 
 class Linear(NamedTuple):
-    """A fit linearised: distances (R, N, 2) px, Jacobian (R, 7 + 2 L + 1, M), validity (R, N)."""
+    """A fit linearised: distances (R, 2, N) px, Jacobian (R, 7 + 2 L + 1, M), validity (R, N)."""
 
     distance: Tensor
     jacobian: Tensor
@@ -76,7 +78,7 @@ def reading_model(
     many = Observations(*(part.repeat_interleave(places.shape[1] * repeats, dim=0) for part in seen))
     return Model(
         seen=many,
-        member=one_hot(many.boundary, num).to(positions).repeat_interleave(2, dim=1),
+        member=one_hot(per_end(many.boundary), num).to(positions),
         places=places.repeat_interleave(repeats, dim=1).flatten(0, 1),
         std=std.repeat_interleave(repeats, dim=1).flatten(0, 1),
         prior=prior,
@@ -93,13 +95,13 @@ def _linearise(params: Tensor, own: Tensor, model: Model) -> Linear:
     seen, num = model.seen, model.places.shape[-1]
     places = (model.places + own[:, :num]).gather(1, seen.boundary)
     sight = look(params, seen)
-    feet = foot_rays(params, places, seen, sight)
+    feet = foot_points(params, places, seen, sight)
     at = boundary_residuals(params, places, seen, feet=feet, sight=sight)
     by_place = at.jacobian[:, OFFSET].unsqueeze(-1) * model.member  # (R, M, L)
     by_heading = by_place * at.z.unsqueeze(-1)
     by_rest = torch.cat([by_heading, at.by_vertical_curvature.unsqueeze(-1)], dim=-1)
-    moved = (by_rest @ own[:, num:].unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, 2))
-    distance = at.distance + moved * at.valid.unsqueeze(-1)
+    moved = by_ends((by_rest @ own[:, num:].unsqueeze(-1)).squeeze(-1))
+    distance = at.distance + moved * at.valid.unsqueeze(-2)
     return Linear(distance, torch.cat([at.jacobian, by_place.mT, by_rest.mT], dim=1), at.valid)
 
 
@@ -108,7 +110,8 @@ def _own_lines(params: Tensor, model: Model) -> Tensor:
     none = torch.zeros_like(model.std)
     at = _linearise(params, none, model)
     jacobian = at.jacobian[:, NUM_PARAMS:]
-    weighted = jacobian * _per_end(at.valid * model.seen.weight / model.seen.sigma.square())
+    weight = at.valid * model.seen.weight / model.seen.sigma.square()
+    weighted = jacobian * per_end(weight).unsqueeze(1)
     information = weighted @ jacobian.mT + model.std.square().reciprocal().diag_embed()
     return -solve_spd(information, weighted @ at.distance.flatten(1).unsqueeze(-1)).squeeze(-1)
 
@@ -122,9 +125,11 @@ def fit_readings(params: Tensor, model: Model, steps: int) -> Fits:
     at = _linearise(params, own, model)
     scale = start_scale(at.distance, seen.sigma, seen.weight * at.valid)
     for step in range(steps + 1):
-        trust = inlier_weights(at.distance, at.valid, seen.sigma, scale, seen.focal) * seen.weight
-        scale = anneal_scale(scale, noise_scale(at.distance, seen.sigma, trust))
-        weighted = at.jacobian * _per_end(at.valid * trust / (seen.sigma * scale.unsqueeze(-1)).square())
+        squared, variance = squared_distance(at.distance), scaled_variance(seen.sigma, scale)
+        trust = inlier_weights(squared, at.valid, variance, seen.focal) * seen.weight
+        scale = anneal_scale(scale, noise_scale(squared, seen.sigma, trust))
+        weight = at.valid * trust / scaled_variance(seen.sigma, scale)
+        weighted = at.jacobian * per_end(weight).unsqueeze(1)
         away = ((params - mean) / std).square()
         of_prior = student_weight(away, prior.freedom) / std.square()
         held = torch.cat([of_prior, model.std.square().reciprocal()], dim=-1)
@@ -140,7 +145,8 @@ def fit_readings(params: Tensor, model: Model, steps: int) -> Fits:
         height = params[:, HEIGHT : HEIGHT + 1].clamp(min=0.2)
         params = torch.cat([params[:, :HEIGHT], height, params[:, HEIGHT + 1 :]], dim=-1)
         at = _linearise(params, own, model)
-    odds = inlier_log_odds(at.distance, seen.sigma, scale, seen.focal)
+    squared, variance = squared_distance(at.distance), scaled_variance(seen.sigma, scale)
+    odds = inlier_log_odds(squared, variance, seen.focal)
     likelihood = (seen.weight * torch.where(at.valid, softplus(odds), 0.0)).sum(-1)
     of_lines = -0.5 * (own / model.std).square().sum(-1) - model.std.log().sum(-1)
     evidence = likelihood + student_log(away, prior.freedom) + of_lines - _half_log_det(information)
@@ -151,11 +157,6 @@ def fit_readings(params: Tensor, model: Model, steps: int) -> Fits:
         covariance=inverse_spd(information)[:, :NUM_PARAMS, :NUM_PARAMS],
         evidence=torch.where(good, evidence, -1e30),
     )
-
-
-def _per_end(weight: Tensor) -> Tensor:
-    """(R, N) of segments to (R, 1, M) of their end points."""
-    return weight.repeat_interleave(2, dim=1).unsqueeze(1)
 
 
 def _half_log_det(matrix: Tensor) -> Tensor:

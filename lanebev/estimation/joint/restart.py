@@ -18,7 +18,7 @@ from lanebev.estimation.joint.evidence import CALL
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, NUM_STRAIGHT, ROLL, boundary_residuals
 from lanebev.estimation.joint.observations import Observations
-from lanebev.estimation.joint.robust import log_likelihood
+from lanebev.estimation.joint.robust import log_likelihood, scaled_variance, squared_distance
 from lanebev.estimation.joint.single_frame import SingleFrameFit, fit_observations
 from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit
 from lanebev.estimation.reasons import Reason
@@ -158,8 +158,9 @@ def is_contrary(
     own = state.mean[:, layout(cfg.num_boundaries).deviations].gather(1, seen.boundary)
     with_state = boundary_residuals(state.mean[:, :NUM_COMMON], places + own, seen, state.phase)
     alone = boundary_residuals(fit.params(), places, seen)
+    variance = scaled_variance(seen.sigma, fit.scale)
     by_state, by_fit = (
-        log_likelihood(at.distance, at.valid, seen.weight, seen.sigma, fit.scale, seen.focal)
+        log_likelihood(squared_distance(at.distance), at.valid, seen.weight, variance, seen.focal)
         for at in (with_state, alone)
     )
     penalty = 0.5 * cfg.num_boundaries * seen.weight.sum(-1).clamp(min=1.0).log()

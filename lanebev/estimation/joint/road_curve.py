@@ -6,13 +6,43 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+
+from lanebev.tensors import constant
 
 KNOT_SPACING = 10.0  # m
 NUM_STEPS = 5
 """Steps of curvature between knots, where the shape is a spline: c at the first knot and these, 1/m."""
 
 _SQUARE, _CUBE = KNOT_SPACING / 2, KNOT_SPACING**2 / 6  # heading and bend of a unit ramp, one spacing on
+_KNOTS = tuple(map(float, range(1 + NUM_STEPS)))  # knot spacings, from the first
+_BEGIN_AND_END = tuple(
+    tuple(float(k == j) - (k == j + 1) for k in range(1 + NUM_STEPS)) for j in range(NUM_STEPS)
+)
+
+
+class Clothoid(NamedTuple):
+    """Coefficients of a clothoid, each (B, 1): the curvature at Z = 0, 1/m, and its rate, 1/m²."""
+
+    curvature: Tensor
+    rate: Tensor
+
+
+class Spline(NamedTuple):
+    """Coefficients of a curvature that is linear between knots.
+
+    Attributes:
+        first: (B, 1) 1/m, curvature at the first knot.
+        past: (B, 1 + NUM_STEPS, 1), how far the camera is past each knot, in knot spacings.
+        changes: (B, 1, 1 + NUM_STEPS) 1/m, by which the slope per knot spacing changes at each knot.
+        turned: (B, 1), heading at the camera because of the step that began behind it.
+        moved: (B, 1) m, bend, likewise.
+    """
+
+    first: Tensor
+    past: Tensor
+    changes: Tensor
+    turned: Tensor
+    moved: Tensor
 
 
 class RoadCurve(NamedTuple):
@@ -29,89 +59,72 @@ class RoadCurve(NamedTuple):
     curvature: Tensor
 
 
-def road_curve(z: Tensor, shape: Tensor, phase: Tensor | None) -> RoadCurve:
-    """Compute the middle line of the road, with zero bend and heading at Z = 0.
-
-    Source: (J3).
+def road_shape(shape: Tensor, phase: Tensor | None) -> Clothoid | Spline:
+    """Compute the coefficients of the road's middle line.
 
     Args:
-        z: (B, M) m.
         shape: (B, 2), c0 and c1 of a clothoid; with a phase (B, 1 + NUM_STEPS), curvature at the first knot
             and its steps from knot to knot.
         phase: (B,) m, how far the first knot lies behind the camera, or None.
-
-    Returns:
-        bend, heading and curvature at z.
     """
     if phase is None:
-        c0, c1 = (part.unsqueeze(-1) for part in shape.unbind(-1))
-        return RoadCurve(z * z * (c0 / 2 + c1 * z / 6), z * (c0 + c1 * z / 2), c0 + c1 * z)
-    return _spline_curve(z, shape, phase)
-
-
-def _spline_curve(z: Tensor, shape: Tensor, phase: Tensor) -> RoadCurve:
-    """The curve of a curvature that is linear between knots: its slope changes at each knot."""
-    past = _past_knots(z, phase)
-    square = past * past
-    steps = shape[:, 1:]
-    changes = (pad(steps, (0, 1)) - pad(steps, (1, 0))).unsqueeze(1)  # (B, 1, 1 + NUM_STEPS), of the slope
-    first, (turned, moved) = shape[:, :1], _behind(phase)
-    turned, moved = turned * steps[:, :1], moved * steps[:, :1]
-    turning = first * z
-    by_square, by_cube = changes.mul(_SQUARE), changes.mul(_CUBE)
-    return RoadCurve(
-        bend=(z * (0.5 * turning - turned) - moved) + torch.bmm(by_cube, square * past).squeeze(1),
-        heading=(turning - turned) + torch.bmm(by_square, square).squeeze(1),
-        curvature=first + torch.bmm(changes, past).squeeze(1),
+        return Clothoid(shape[:, :1], shape[:, 1:])
+    steps, past = shape[:, 1:], phase.unsqueeze(-1) / KNOT_SPACING
+    heading, bend = _behind(past)
+    return Spline(
+        first=shape[:, :1],
+        past=(past - constant(_KNOTS, like=past)).unsqueeze(-1),
+        changes=(steps @ constant(_BEGIN_AND_END, like=steps)).unsqueeze(1),
+        turned=heading * steps[:, :1],
+        moved=bend * steps[:, :1],
     )
 
 
-def _past_knots(z: Tensor, phase: Tensor) -> Tensor:
-    """Distances (B, 1 + NUM_STEPS, M) past the knots, in knot spacings, 0 before a knot."""
-    knots = torch.arange(1 + NUM_STEPS, dtype=z.dtype, device=z.device).unsqueeze(-1)
-    past = ((z + phase.unsqueeze(-1)) / KNOT_SPACING).unsqueeze(1) - knots
-    return past.clamp(min=0.0)
+def road_curve(z: Tensor, road: Clothoid | Spline) -> RoadCurve:
+    """Compute bend, heading and curvature of the road's middle line at z (B, M) m, bend and heading 0 at 0.
+
+    Source: (J3).
+    """
+    if isinstance(road, Clothoid):
+        c0, c1 = road
+        return RoadCurve(z * z * (c0 / 2 + c1 * z / 6), z * (c0 + c1 * z / 2), c0 + c1 * z)
+    past = _past_knots(z, road)
+    square, turning = past * past, road.first * z
+    bend = torch.addcmul(-road.moved, z, torch.sub(0.5 * turning, road.turned))
+    return RoadCurve(
+        bend=torch.baddbmm(bend.unsqueeze(1), road.changes, square * past, alpha=_CUBE).squeeze(1),
+        heading=torch.baddbmm(
+            (turning - road.turned).unsqueeze(1), road.changes, square, alpha=_SQUARE
+        ).squeeze(1),
+        curvature=torch.baddbmm(road.first.unsqueeze(1), road.changes, past).squeeze(1),
+    )
 
 
-def _behind(phase: Tensor) -> tuple[Tensor, Tensor]:
-    """Heading and bend (B, 1) at the camera for a unit first step: what lies behind it, of that step only."""
-    first = (phase / KNOT_SPACING).unsqueeze(-1)
-    square = first * first
-    return _SQUARE * square, _CUBE * (square * first)
-
-
-def road_basis(z: Tensor, phase: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute bend, heading and curvature for a unit value of every shape parameter, each (B, K, M).
+def curve_by_shape(z: Tensor, tilt: Tensor, road: Clothoid | Spline) -> Tensor:
+    """Compute bend + tilt · heading for a unit value of every shape parameter, (B, K, M).
 
     Args:
         z: (B, M) m.
-        phase: as in :func:`road_curve`.
+        tilt: (B, M) m.
+        road: whose knots count.
     """
-    return _polynomial(z) if phase is None else _spline(z, phase)
+    first = z * torch.add(tilt, z, alpha=0.5)
+    if isinstance(road, Clothoid):
+        return torch.stack([first, 0.5 * z * z * (z / 3 + tilt)], 1)
+    past = _past_knots(z, road)
+    ramps = past * past * torch.add((_SQUARE * tilt).unsqueeze(1), past, alpha=_CUBE)
+    steps = ramps[:, :-1] - ramps[:, 1:]  # a step rises from 0 at its knot to 1 at the next
+    heading, bend = _behind(road.past[:, 0])
+    head = steps[:, 0] - torch.addcmul(bend, heading, z + tilt)
+    return torch.cat([torch.stack([first, head], 1), steps[:, 1:]], 1)
 
 
-def _polynomial(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Bend, heading and curvature at (B, M) for unit c0 and unit c1, each (B, 2, M)."""
-    half = 0.5 * z * z
-    bend, heading = torch.stack([half, half * z / 3], 1), torch.stack([z, half], 1)
-    return bend, heading, torch.stack([torch.ones_like(z), z], 1)
+def _past_knots(z: Tensor, road: Spline) -> Tensor:
+    """Distances (B, 1 + NUM_STEPS, M) past the knots, in knot spacings, 0 before a knot."""
+    return torch.add(road.past, z.unsqueeze(1), alpha=1 / KNOT_SPACING).clamp(min=0.0)
 
 
-def _spline(z: Tensor, phase: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Bend, heading and curvature at (B, M) for a unit curvature and unit steps, each (B, 1 + NUM_STEPS, M).
-
-    A step rises from 0 at its knot to 1 at the next, so it is the difference of the ramps from both. Bend and
-    heading are zero at Z = 0.
-    """
-    past, one = _past_knots(z, phase), z.unsqueeze(1)
+def _behind(past: Tensor) -> tuple[Tensor, Tensor]:
+    """Heading and bend (B, 1) at the camera for a unit first step, of which ``past`` spacings are behind."""
     square = past * past
-    turned, moved = (part.unsqueeze(-1) for part in _behind(phase))
-    rise, heading, bend = (
-        part[:, :-1] - part[:, 1:] for part in (past, _SQUARE * square, _CUBE * (square * past))
-    )
-    head_bend = bend[:, :1] - (moved + turned * one)
-    return (
-        torch.cat([0.5 * one * one, head_bend, bend[:, 1:]], 1),
-        torch.cat([one, heading[:, :1] - turned, heading[:, 1:]], 1),
-        torch.cat([torch.ones_like(one), rise], 1),
-    )
+    return _SQUARE * square, _CUBE * (square * past)

@@ -16,53 +16,59 @@ OUTLIER_ODDS = 0.3  # prior odds of a gross outlier
 SCALE_PRIOR = 20.0  # segments' worth of belief in the sigmas as they were given
 
 
-def inlier_log_odds(distance: Tensor, sigma: Tensor, scale: Tensor, focal: Tensor) -> Tensor:
+def squared_distance(distance: Tensor) -> Tensor:
+    """Compute a segment's squared distance (…, N), the sum of those (…, 2, N) of its end points."""
+    first, second = distance.unbind(-2)
+    return torch.addcmul(first * first, second, second)
+
+
+def scaled_variance(sigma: Tensor, scale: Tensor) -> Tensor:
+    """Compute the variance s² σ² (B, N) px² for sigmas (B, N) px and noise scales (B,)."""
+    return (sigma * scale.unsqueeze(-1)).square()
+
+
+def inlier_log_odds(squared: Tensor, variance: Tensor, focal: Tensor) -> Tensor:
     """Compute the log odds that a segment is an inlier.
 
     Source: (J6).
 
     Args:
-        distance: (B, N, 2) px, of both end points.
-        sigma: (B, N) px.
-        scale: (B,) factor on sigma.
+        squared: (..., B, N) px², sum of the squared distances of both end points.
+        variance: (B, N) px², of an end point.
         focal: (B,) px.
 
     Returns:
         (B, N): log of inlier over outlier density.
     """
-    variance = (sigma * scale.unsqueeze(-1)).square()
-    spread = (OUTLIER_RANGE * focal).square() / (2.0 * math.pi * OUTLIER_ODDS)
-    chi2 = distance.square().sum(-1) / variance
-    return torch.sub((spread.unsqueeze(-1) / variance).log(), chi2, alpha=0.5)
+    spread = focal.square() * (OUTLIER_RANGE**2 / (2.0 * math.pi * OUTLIER_ODDS))  # px²
+    return torch.sub((spread.unsqueeze(-1) / variance).log(), squared / variance, alpha=0.5)
 
 
-def inlier_weights(distance: Tensor, valid: Tensor, sigma: Tensor, scale: Tensor, focal: Tensor) -> Tensor:
+def inlier_weights(squared: Tensor, valid: Tensor, variance: Tensor, focal: Tensor) -> Tensor:
     """Compute the probability (B, N) that a segment is an inlier, 0 where not valid."""
-    return torch.where(valid, inlier_log_odds(distance, sigma, scale, focal).sigmoid(), 0.0)
+    return torch.where(valid, inlier_log_odds(squared, variance, focal).sigmoid(), 0.0)
 
 
-def log_likelihood(
-    distance: Tensor, valid: Tensor, weight: Tensor, sigma: Tensor, scale: Tensor, focal: Tensor
-) -> Tensor:
+def log_likelihood(squared: Tensor, valid: Tensor, weight: Tensor, variance: Tensor, focal: Tensor) -> Tensor:
     """Compute the log likelihood ratio (B,) of a frame: the mixture against outliers alone."""
-    log_odds = inlier_log_odds(distance, sigma, scale, focal)
+    log_odds = inlier_log_odds(squared, variance, focal)
     return (weight * torch.where(valid, torch.nn.functional.softplus(log_odds), 0.0)).sum(-1)
 
 
-def noise_scale(distance: Tensor, sigma: Tensor, weight: Tensor) -> Tensor:
+def noise_scale(squared: Tensor, sigma: Tensor, weight: Tensor) -> Tensor:
     """Compute the factor by which the residuals of inliers exceed their sigmas, at least 1.
 
     Source: (J7).
 
     Args:
-        distance: (B, N, 2) px.
+        squared: (B, N) px², see :func:`inlier_log_odds`.
         sigma: (B, N) px.
         weight: (B, N) in [0, 1].
 
     Returns:
         (B,) root of the mean squared normalised distance, drawn to 1 by ``SCALE_PRIOR`` segments.
     """
-    chi2 = distance.square().sum(-1) / sigma.square()
+    chi2 = squared / sigma.square()
     total = SCALE_PRIOR + 0.5 * (weight * chi2).sum(-1)
     return (total / (SCALE_PRIOR + weight.sum(-1))).sqrt().clamp(min=1.0)
 
@@ -78,7 +84,7 @@ def start_scale(distance: Tensor, sigma: Tensor, weight: Tensor) -> Tensor:
     It is right with up to two outliers in three.
 
     Args:
-        distance: (..., B, N, 2) px, at the predicted parameters.
+        distance: (..., B, 2, N) px, at the predicted parameters.
         sigma: (B, N) px.
         weight: (B, N), 0 where there is nothing.
 
@@ -86,7 +92,7 @@ def start_scale(distance: Tensor, sigma: Tensor, weight: Tensor) -> Tensor:
         (..., B) at least 1.
     """
     there = weight > 0
-    worst = (distance.abs().amax(-1) / sigma).masked_fill(~there, torch.inf)  # (B, N)
+    worst = torch.where(there, distance.abs().amax(-2) / sigma, torch.inf)  # (B, N)
     count = there.sum(-1, keepdim=True)
     rank = (0.3 * count.to(distance.dtype)).long().clamp(max=worst.shape[-1] - 1).expand(*worst.shape[:-1], 1)
     value = worst.sort(dim=-1).values.gather(-1, rank).squeeze(-1)

@@ -16,8 +16,15 @@ from torch import Tensor
 from lanebev.estimation.checks import as_lane_width, check_segments, mask_invalid_rows
 from lanebev.estimation.joint.frame_prior import FramePrior, student_log, student_weight
 from lanebev.estimation.joint.measurement import HEIGHT, NUM_PARAMS, OFFSET, boundary_residuals
-from lanebev.estimation.joint.observations import Observations, boundary_places, observations
-from lanebev.estimation.joint.robust import anneal_scale, inlier_weights, log_likelihood, noise_scale
+from lanebev.estimation.joint.observations import Observations, boundary_places, observations, per_end
+from lanebev.estimation.joint.robust import (
+    anneal_scale,
+    inlier_weights,
+    log_likelihood,
+    noise_scale,
+    scaled_variance,
+    squared_distance,
+)
 from lanebev.estimation.joint.start_search import LAST_SCALE, linear_starts, spread_subset
 from lanebev.geometry.linalg import inverse_spd, solve_spd
 from lanebev.geometry.precision import full_precision
@@ -122,10 +129,11 @@ def fit_observations(
     params, scale, information = refine(params, scale, places, seen, prior, iterations=2)
 
     residuals = boundary_residuals(params, places, seen)
-    trust = inlier_weights(residuals.distance, residuals.valid, seen.sigma, scale, seen.focal)
+    squared, variance = squared_distance(residuals.distance), scaled_variance(seen.sigma, scale)
+    trust = inlier_weights(squared, residuals.valid, variance, seen.focal)
     covariance = inverse_spd(information)
-    precision = residuals.valid * trust * seen.weight / (seen.sigma * scale.unsqueeze(-1)).square()
-    along = residuals.by_vertical_curvature * precision.repeat_interleave(2, dim=1)
+    precision = residuals.valid * trust * seen.weight / variance
+    along = residuals.by_vertical_curvature * per_end(precision)
     by_vertical = covariance @ residuals.jacobian @ along.unsqueeze(-1)
     std = covariance.diagonal(dim1=-2, dim2=-1)[:, :OFFSET].sqrt()
     usual = FramePrior().std(params)[:OFFSET]
@@ -176,11 +184,12 @@ def refine(
     information = precision.diag().expand(*params.shape, NUM_PARAMS)  # overwritten unless iterations == 0
     for _ in range(iterations):
         residuals = boundary_residuals(params, places, seen)
-        sigma = (seen.sigma.square() + (blur / scale).square().unsqueeze(-1)).sqrt()
-        trust = inlier_weights(residuals.distance, residuals.valid, sigma, scale, focal) * seen.weight
-        fitted = noise_scale(residuals.distance, seen.sigma, trust)
+        blurred = scaled_variance(seen.sigma, scale) + blur.square().unsqueeze(-1)
+        squared = squared_distance(residuals.distance)
+        trust = inlier_weights(squared, residuals.valid, blurred, focal) * seen.weight
+        fitted = noise_scale(squared, seen.sigma, trust)
         scale = anneal_scale(scale, fitted)
-        by_noise = trust / ((seen.sigma * scale.unsqueeze(-1)).square() + blur.square().unsqueeze(-1))
+        by_noise = trust / (scaled_variance(seen.sigma, scale) + blur.square().unsqueeze(-1))
         blur = 0.5 * blur
         information, gradient = normal_equations(
             residuals.jacobian, residuals.distance, by_noise * residuals.valid
@@ -196,8 +205,8 @@ def refine(
 
 
 def normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute Jᵀ W J and Jᵀ W r, (B, P, P) and (B, P), from (B, P, 2N), (B, N, 2) and a weight (B, N)."""
-    weighted = jacobian * weight.repeat_interleave(2, dim=1).unsqueeze(1)
+    """Compute Jᵀ W J and Jᵀ W r, (B, P, P) and (B, P), from (B, P, 2N), (B, 2, N) and a weight (B, N)."""
+    weighted = jacobian * per_end(weight).unsqueeze(1)
     return weighted @ jacobian.mT, (weighted @ distance.flatten(1).unsqueeze(-1)).squeeze(-1)
 
 
@@ -214,7 +223,9 @@ def _best_start(
     blur = LAST_SCALE * focal
     params, scale, _ = refine(starts.flatten(0, 1), scale, many_places, many, prior, iterations, blur)
     residuals = boundary_residuals(params, many_places, many)
-    score = log_likelihood(residuals.distance, residuals.valid, many.weight, many.sigma, scale, focal)
+    squared = squared_distance(residuals.distance)
+    variance = scaled_variance(many.sigma, scale)
+    score = log_likelihood(squared, residuals.valid, many.weight, variance, focal)
     away = (params - prior.mean(params)) / prior.std(params)
     score = score + student_log(away.square(), prior.freedom)
     score = torch.where(params.isfinite().all(-1), score, -torch.inf)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.joint.frame_prior import FramePrior, student_log
-from lanebev.estimation.joint.observations import Observations
+from lanebev.estimation.joint.observations import Observations, per_end
 from lanebev.geometry.linalg import solve_spd
 from lanebev.geometry.rotation import pitch_yaw_roll, road_from_cam_and_roll
 from lanebev.tensors import constant
@@ -24,9 +24,9 @@ def spread_subset(seen: Observations, places: Tensor, count: int) -> tuple[Obser
         return seen, places
     order = torch.arange(total, dtype=places.dtype, device=places.device) * 0.6180339887498949 % 1.0
     index = ((seen.weight > 0).to(places.dtype) + order).topk(count, dim=-1).indices  # (B, count)
-    ends = torch.stack([2 * index, 2 * index + 1], dim=-1).flatten(1)  # (B, 2 count)
+    ends = torch.cat([index, index + total], dim=-1)  # (B, 2 count)
     picked = seen._replace(
-        rays=seen.rays.gather(2, ends.unsqueeze(1).expand(-1, 3, -1)),
+        pixels=seen.pixels.gather(2, ends.unsqueeze(1).expand(-1, 3, -1)),
         boundary=seen.boundary.gather(1, index),
         weight=seen.weight.gather(1, index),
         sigma=seen.sigma.gather(1, index),
@@ -55,12 +55,13 @@ def linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Tens
     pitch, roll = (grid.flatten() for grid in torch.meshgrid(pitch, roll, indexing="ij"))  # (H,)
     angles = torch.stack([pitch, torch.zeros_like(pitch), roll], dim=-1)
     axes, _ = road_from_cam_and_roll(angles)  # (H, 3, 3) rows right, down, forward
-    right, below, ahead = torch.einsum("hij,bjm->ibhm", axes, seen.rays).unbind(0)  # each (B, H, M)
+    rays = torch.bmm(seen.cam_from_image, seen.pixels)
+    right, below, ahead = torch.einsum("hij,bjm->ibhm", axes, rays).unbind(0)  # each (B, H, M)
     valid = (below > 0.005) & (ahead > 0.1)
     below = torch.where(valid, below, 1.0)
     bend = ahead * ahead / (2 * below)
-    place = places.repeat_interleave(2, dim=1).unsqueeze(1)  # (B, 1, M)
-    weight = seen.weight.repeat_interleave(2, dim=1).unsqueeze(1) * valid
+    place = per_end(places).unsqueeze(1)  # (B, 1, M)
+    weight = per_end(seen.weight).unsqueeze(1) * valid
     regressors = torch.stack([below, place * below, ahead, bend], dim=-1)  # (B, H, M, 4)
 
     mean = constant((0.0, 1.0 / prior.height, 0.0, 0.0), like=like)

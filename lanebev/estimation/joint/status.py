@@ -48,7 +48,7 @@ def update_track_status(
     support, total = (seen.weight * trust).sum(-1), seen.weight.sum(-1)
     share = support / total.clamp(min=1e-6)
     least = torch.where(predicted.status == int(Status.TRACKING), cfg.min_share, cfg.enter_share)
-    finite = torch.cat([updated.mean, updated.cov.flatten(1)], dim=-1).isfinite().all(-1)
+    finite = (updated.mean.sum(-1) + updated.cov.sum((1, 2))).isfinite()  # as the sum of what is not, is not
     supported = running & finite & (support >= cfg.min_support) & (share >= least)
     empty = total < 1e-3
     unseen = torch.where(supported, 0.0, predicted.unseen + step)
@@ -123,7 +123,7 @@ def as_calibration(
     left, right = (positions[:, ego : ego + 2] + state.mean[:, OFFSET, None]).unbind(-1)
     bend = height - left * right / height.clamp(min=0.1)
     more = 3.0 * (bend * cov[:, ROLL, ROLL]).square() * unobserved_mask(state.reasons)[:, ROLL]
-    width = positions.diff(dim=-1).mean(-1)
+    width = (positions[:, -1] - positions[:, 0]) / (cfg.num_boundaries - 1)
     more = more + (cfg.lane_width_std / width * height).square()
     own = layout(cfg.num_boundaries).deviations
     variances = state.cov.diagonal(dim1=1, dim2=2)[:, own]

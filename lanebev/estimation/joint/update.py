@@ -9,11 +9,17 @@ from torch import Tensor
 
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, Layout
 from lanebev.estimation.joint.measurement import NUM_STRAIGHT, OFFSET, ROLL, Residuals
-from lanebev.estimation.joint.observations import Observations
-from lanebev.estimation.joint.robust import anneal_scale, inlier_weights, noise_scale
+from lanebev.estimation.joint.observations import Observations, by_ends, per_end
+from lanebev.estimation.joint.robust import (
+    anneal_scale,
+    inlier_weights,
+    noise_scale,
+    scaled_variance,
+    squared_distance,
+)
 from lanebev.estimation.kalman import symmetrise
 from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
-from lanebev.tensors import constant
+from lanebev.tensors import constant, identity
 
 UNSEEN = (0.01, 0.01, 0.01, 0.3)
 """Standard deviations (rad, m) of the pose from one frame alone, above which it is not determined."""
@@ -41,37 +47,38 @@ class FrameInformation(NamedTuple):
     residuals: Residuals
 
 
-class Posterior(NamedTuple):
-    """Result of an update.
+class Step(NamedTuple):
+    """A Gauss-Newton step of the O observed entries.
 
     Attributes:
-        mean: (B, D).
-        observed_cov: (B, O, O) of the observed entries, roll taken as known where it is not estimated.
-        gain: (B, D, O), the Kalman gain is gain · Hᵀ Q⁻¹; zero for what is not estimated.
+        mean: (B, O) after it.
+        cov: (B, O, O), roll taken as known where it is not estimated.
+        pull: (B, O), Hᵀ Q⁻¹ y of the linearisation, seen from the prediction.
     """
 
     mean: Tensor
-    observed_cov: Tensor
-    gain: Tensor
+    cov: Tensor
+    pull: Tensor
 
 
 def membership(boundary: Tensor, num_boundaries: int, like: Tensor) -> Tensor:
-    """Tell which end points are on which boundary, (B, L, M) of 1 and 0, for boundaries (B, N)."""
+    """Tell which segments are on which boundary, (B, L, N) of 1 and 0, for boundaries (B, N)."""
     numbers = torch.arange(num_boundaries, device=boundary.device).unsqueeze(-1)
-    return (boundary.repeat_interleave(2, dim=1).unsqueeze(1) == numbers).to(like.dtype)
+    return (boundary.unsqueeze(1) == numbers).to(like.dtype)
 
 
 def observed_jacobian(jacobian: Tensor, member: Tensor) -> Tensor:
     """Extend a Jacobian by the deviations, each of which moves its own end points as the offset does.
 
     Args:
-        jacobian: (B, 11, M) of the distances by the common entries.
-        member: (B, L, M) of :func:`membership`.
+        jacobian: (B, 12, M) of the distances by the common entries.
+        member: (B, L, N) of :func:`membership`.
 
     Returns:
         (B, O, M).
     """
-    return torch.cat([jacobian, member * jacobian[:, OFFSET : OFFSET + 1]], dim=1)
+    own = member.unsqueeze(2) * by_ends(jacobian[:, OFFSET : OFFSET + 1])  # (B, L, 2, N)
+    return torch.cat([jacobian, own.flatten(2)], dim=1)
 
 
 def frame_information(
@@ -87,41 +94,55 @@ def frame_information(
         seen: what was observed.
     """
     unsure = _predicted_variance(jacobian[:, :NUM_COMMON], doubt, seen.boundary)
-    gate = (seen.sigma.square() + unsure / scale.square().unsqueeze(-1)).sqrt()
-    trust = inlier_weights(residuals.distance, residuals.valid, gate, scale, seen.focal)
+    squared = squared_distance(residuals.distance)
+    gate = scaled_variance(seen.sigma, scale) + unsure
+    trust = inlier_weights(squared, residuals.valid, gate, seen.focal)
     used = trust * seen.weight
-    scale = anneal_scale(scale, noise_scale(residuals.distance, seen.sigma, used))
-    weight = used / (seen.sigma * scale.unsqueeze(-1)).square()
+    scale = anneal_scale(scale, noise_scale(squared, seen.sigma, used))
+    weight = used / scaled_variance(seen.sigma, scale)
     return FrameInformation(*_normal_equations(jacobian, residuals.distance, weight), trust, scale, residuals)
 
 
-def update(
+def observed_step(
     predicted: Tensor, cov: Tensor, at: Tensor, frame: FrameInformation, estimated: Tensor
-) -> Posterior:
-    """Update a prediction by one frame, linearised at ``at``; the prediction stays the prior.
+) -> Step:
+    """Update the observed entries of a prediction by one frame; the prediction stays the prior.
 
     Source: Bell and Cathey 1993, the iterated Kalman filter as Gauss-Newton; Schmidt 1966 for roll that a
     frame does not determine: its uncertainty is considered, but it is not estimated. On one lane roll and
     offset have the same effect to first order; they differ to second order only, which a linearised update
-    overestimates. The other entries are estimated as if roll were known.
+    overestimates. The other entries are estimated as if roll were known. G of (J9) is here the updated
+    covariance.
 
     Args:
-        predicted: (B, D) mean.
+        predicted: (B, O) mean.
+        cov: (B, O, O) of the prediction.
+        at: (B, O), where the frame was linearised.
+        frame: its information.
+        estimated: (B, O), 0 for entries that are considered only, else 1.
+    """
+    moved = (at - predicted).unsqueeze(-1)
+    pull = torch.baddbmm(frame.vector.unsqueeze(-1), frame.matrix, moved)
+    free = estimated.clamp(min=_FIXED)
+    known = updated_covariance(free.unsqueeze(-1) * cov * free.unsqueeze(-2), frame.matrix)
+    mean = predicted + estimated * torch.bmm(known, pull).squeeze(-1)
+    return Step(mean, known, pull.squeeze(-1))
+
+
+def kalman_gain(cov: Tensor, step: Step, frame: FrameInformation, estimated: Tensor) -> Tensor:
+    """Compute G (B, D, O) of (J9); the Kalman gain is G Hᵀ Q⁻¹. Rows that are not estimated are zero.
+
+    Args:
         cov: (B, D, D) of the prediction.
-        at: (B, D), where the frame was linearised.
+        step: the last.
         frame: its information.
         estimated: (B, D), 0 for entries that are considered only, else 1.
     """
     count = frame.vector.shape[-1]
-    moved = at[:, :count] - predicted[:, :count]
-    pull = torch.baddbmm(frame.vector.unsqueeze(-1), frame.matrix, moved.unsqueeze(-1))
-    free = estimated.clamp(min=_FIXED)
-    prior = free.unsqueeze(-1) * cov[:, :, :count] * free[:, None, :count]  # (B, D, O)
-    observed_cov = updated_covariance(prior[:, :count], frame.matrix)
+    free = estimated[:, :count].clamp(min=_FIXED)
+    prior = cov[:, :, :count] * free.unsqueeze(1)  # (B, D, O)
     known = torch.bmm(prior, frame.matrix)
-    gain = estimated.unsqueeze(-1) * torch.baddbmm(prior, known, observed_cov, alpha=-1)
-    mean = torch.baddbmm(predicted.unsqueeze(-1), gain, pull).squeeze(-1)
-    return Posterior(mean, observed_cov, gain)
+    return estimated.unsqueeze(-1) * torch.baddbmm(prior, known, step.cov, alpha=-1)
 
 
 def updated_covariance(cov: Tensor, matrix: Tensor) -> Tensor:
@@ -134,16 +155,30 @@ def updated_covariance(cov: Tensor, matrix: Tensor) -> Tensor:
         matrix: (B, O, O), Λ.
     """
     root = cholesky(cov)
-    eye = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device)
+    eye = identity(cov.shape[-1], cov.dtype, cov.device)
     factor = cholesky(torch.baddbmm(eye, torch.bmm(root.mT, matrix), root))
     half = solve_lower(factor, root.mT)
     return torch.bmm(half.mT, half)
 
 
-def information_kept(cov: Tensor, matrix: Tensor) -> Tensor:
-    """Compute (I + Λ P)⁻¹, by which Hᵀ Q⁻¹ y becomes the score Hᵀ S⁻¹ y; arguments as before."""
-    eye = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device)
-    return torch.baddbmm(eye, matrix, updated_covariance(cov, matrix), alpha=-1)
+def innovation_score(cov: Tensor, matrix: Tensor, vector: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute the score Hᵀ S⁻¹ y (B, O) of the innovation and its variance, the diagonal of Hᵀ S⁻¹ H.
+
+    Source: (J14). With P = L Lᵀ and I + Lᵀ Λ L = F Fᵀ, Hᵀ S⁻¹ [H, y] is [Λ, λ] - Λ L (F Fᵀ)⁻¹ Lᵀ [Λ, λ].
+
+    Args:
+        cov: (B, O, O), P, positive definite.
+        matrix: (B, O, O), Λ.
+        vector: (B, O), λ.
+    """
+    root = cholesky(cov)
+    eye = identity(cov.shape[-1], cov.dtype, cov.device)
+    seen = torch.bmm(root.mT, torch.cat([matrix, vector.unsqueeze(-1)], dim=-1))  # (B, O, O + 1)
+    factor = cholesky(torch.baddbmm(eye, seen[:, :, :-1], root))
+    white = solve_lower(factor, seen)
+    known, pull = white[:, :, :-1], white[:, :, -1:]
+    score = torch.baddbmm(vector.unsqueeze(-1), known.mT, pull, alpha=-1).squeeze(-1)
+    return score, matrix.diagonal(dim1=1, dim2=2) - known.square().sum(1)
 
 
 def posterior_covariance(cov: Tensor, matrix: Tensor, gain: Tensor) -> Tensor:
@@ -160,10 +195,9 @@ def posterior_covariance(cov: Tensor, matrix: Tensor, gain: Tensor) -> Tensor:
     """
     count = matrix.shape[-1]
     seen = torch.bmm(matrix, cov[:, :count])  # (B, O, D)
-    crossed = torch.bmm(gain, seen)  # (B, D, D)
     inner = torch.baddbmm(matrix, seen[:, :, :count], matrix)
-    added = torch.bmm(torch.bmm(gain, inner), gain.mT)
-    return symmetrise(cov - crossed - crossed.mT + added)
+    less = torch.baddbmm(seen, inner, gain.mT, beta=2.0, alpha=-1)
+    return symmetrise(torch.baddbmm(cov, gain, less, alpha=-1))  # the terms of (J10), of which two are equal
 
 
 def single_frame(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -184,8 +218,8 @@ def single_frame(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 def estimated_entries(single_frame_std: Tensor, place: Layout) -> Tensor:
     """(B, D): 0 for roll, its derivatives and slow mean where a frame does not determine roll, else 1."""
-    about_roll = constant(tuple(float(i in place.chain(ROLL)) for i in range(place.size)), single_frame_std)
-    return 1.0 - (single_frame_std[:, ROLL, None] > UNSEEN[ROLL]) * about_roll
+    others = constant(tuple(float(i not in place.chain(ROLL)) for i in range(place.size)), single_frame_std)
+    return torch.where(single_frame_std[:, ROLL, None] > UNSEEN[ROLL], others, 1.0)
 
 
 def boundary_deviation(mean: Tensor, frame: FrameInformation) -> Tensor:
@@ -208,31 +242,32 @@ def agreement(frame: FrameInformation, jacobian: Tensor, moved: Tensor, seen: Ob
         seen: what was observed.
     """
     change = torch.bmm(moved.unsqueeze(1), jacobian).view_as(frame.residuals.distance)
-    distance = frame.residuals.distance + change
-    return inlier_weights(distance, frame.residuals.valid, seen.sigma, frame.scale, seen.focal)
+    squared = squared_distance(frame.residuals.distance + change)
+    variance = scaled_variance(seen.sigma, frame.scale)
+    return inlier_weights(squared, frame.residuals.valid, variance, seen.focal)
 
 
 def _normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Λ (B, O, O) and Hᵀ Q⁻¹ y (B, O), for (B, O, M), (B, N, 2) and (B, N).
+    """Λ (B, O, O) and Hᵀ Q⁻¹ y (B, O), for (B, O, M), (B, 2, N) and (B, N).
 
     Source: (J8). No end point has two deviations, and its own moves it as the offset does: their block of Λ
     is diagonal, and the offset's row holds it.
     """
-    weight = weight.repeat_interleave(2, dim=1)  # (B, M)
-    common = torch.bmm(jacobian[:, :NUM_COMMON] * weight.unsqueeze(1), jacobian.mT)  # (B, 11, O)
-    shared = common[:, :, NUM_COMMON:]
-    own = torch.cat([shared.mT, shared[:, OFFSET].diag_embed()], dim=-1)
-    against = torch.bmm(jacobian, (weight * distance.flatten(1)).unsqueeze(-1)).squeeze(-1)
-    return torch.cat([common, own], dim=1), -against
+    weight = per_end(weight)  # (B, M)
+    common = torch.bmm(jacobian, (jacobian[:, :NUM_COMMON] * weight.unsqueeze(1)).mT)  # (B, O, 12)
+    shared = common[:, NUM_COMMON:]
+    own = torch.cat([shared.mT, shared[:, :, OFFSET].diag_embed()], dim=1)
+    against = torch.bmm((weight * distance.flatten(1)).unsqueeze(1), jacobian.mT).squeeze(1)
+    return torch.cat([common, own], dim=-1), -against
 
 
 def _predicted_variance(jacobian: Tensor, cov: Tensor, boundary: Tensor) -> Tensor:
-    """(B, N) px², h P hᵀ of a segment's end points, their mean, for (B, 11, M) and (B, O, O).
+    """(B, N) px², h P hᵀ of a segment's end points, their mean, for (B, 12, M) and (B, O, O).
 
     Correlations between deviations and the common entries are left out: they lower it.
     """
-    common = (torch.bmm(cov[:, :NUM_COMMON, :NUM_COMMON], jacobian) * jacobian).sum(1)  # (B, M)
+    common = by_ends(torch.bmm(cov[:, :NUM_COMMON, :NUM_COMMON], jacobian) * jacobian).sum((1, 2))  # (B, N)
     own = cov.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:].gather(1, boundary)  # (B, N)
-    shift = jacobian[:, OFFSET].square().unflatten(-1, (-1, 2)).sum(-1)
-    total: Tensor = torch.addcmul(common.unflatten(-1, (-1, 2)).sum(-1), own, shift)
+    shift = squared_distance(by_ends(jacobian[:, OFFSET]))
+    total: Tensor = torch.addcmul(common, own, shift)
     return 0.5 * total
