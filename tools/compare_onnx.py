@@ -24,7 +24,8 @@ from lanebev.app.export import export
 from lanebev.app.export_config import ExportConfig
 from lanebev.app.run import run
 from lanebev.camera.model import Camera
-from lanebev.export.parts import Part, make_part
+from lanebev.export.part import Part
+from lanebev.export.parts import make_part
 from lanebev.export.runtime import OnnxPart
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
 from lanebev.io.video import open_source

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from lanebev.app.config import CALIBRATORS
 from lanebev.app.options import check_types, option
+from lanebev.export.names import PARTS
 
 FORMATS = ("onnx", "torch-export")
-PARTS = ("segmenter", "extractor", "warp", "joint", "two-stage", "step")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import torch
 from torch.export import Dim, ExportedProgram
 
 from lanebev import __version__
-from lanebev.export.parts import Part
+from lanebev.export.part import Part
 
 METADATA = "lanebev"
 """Key of the facts, as JSON, in an ONNX file's metadata."""

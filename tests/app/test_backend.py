@@ -10,10 +10,11 @@ from PIL import Image
 from lanebev import Camera, LaneBEV
 from lanebev.app.config import RunConfig
 from lanebev.app.export import export
-from lanebev.app.export_config import PARTS, ExportConfig
+from lanebev.app.export_config import ExportConfig
 from lanebev.app.run import run
 from lanebev.cli import main
 from lanebev.export import parts, runtime
+from lanebev.export.names import PARTS
 from lanebev.export.quantize import rendered_views
 
 FRAME = Path(__file__).parents[1] / "golden" / "frame.png"

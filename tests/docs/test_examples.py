@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from torch import nn
 
-from lanebev.export.parts import Part
+from lanebev.export.part import Part
 from lanebev.export.write import write_onnx
 from lanebev.io.video import VideoWriter
 

@@ -16,9 +16,11 @@ from lanebev import (
     TwoStageCalibrator,
 )
 from lanebev.batch import replace_rows
-from lanebev.export.parts import Part, calibrator_part, make_part
+from lanebev.export.part import Part
+from lanebev.export.parts import make_part
 from lanebev.export.quantize import quantize_segmenter
 from lanebev.export.runtime import OnnxCalibrator, OnnxPart
+from lanebev.export.state_parts import calibrator_part
 from lanebev.export.write import export_program, write_onnx
 from lanebev.tensors import constant
 from lanebev.testing.segments import INTRINSICS as K
