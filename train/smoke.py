@@ -1,7 +1,8 @@
 """Measure how fast a device renders, labels and trains: ``python -m train.smoke --out OUT``.
 
-Prints frames a second of rendering, of labelling and augmenting, and of training alone, and the peak memory;
-saves a sheet of labelled views. A batch that does not fit in memory is reported and skipped.
+Prints frames a second of rendering, of labelling and augmenting, and of training alone, the time of the first
+call and the peak memory; on a GPU also of training after cuDNN has searched for its fastest kernels. Saves a
+sheet of labelled views. A batch that does not fit in memory is reported and skipped.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from train.rendering import labelled, rendered
 from train.sheet import labelled_view, save_sheet
 
 
-def seconds(work: Callable[[], Any], device: torch.device, repeats: int) -> float:
-    """Time a call on a device, the least of several, after one that is not counted."""
+def seconds(work: Callable[[], Any], device: torch.device, repeats: int) -> tuple[float, float]:
+    """Time a call on a device: the first, and the least of several after that."""
     taken = []
     for _ in range(repeats + 1):
         _wait(device)
@@ -34,7 +35,7 @@ def seconds(work: Callable[[], Any], device: torch.device, repeats: int) -> floa
         work()
         _wait(device)
         taken.append(time.perf_counter() - begin)
-    return min(taken[1:])
+    return taken[0], min(taken[1:])
 
 
 def report(name: str, count: int, work: Callable[[], Any], device: torch.device, repeats: int) -> None:
@@ -43,14 +44,16 @@ def report(name: str, count: int, work: Callable[[], Any], device: torch.device,
     if cuda:
         torch.cuda.reset_peak_memory_stats(device)
     try:
-        each = seconds(work, device, repeats)
+        first, each = seconds(work, device, repeats)
     except torch.OutOfMemoryError:
         print(f"{name} B={count}: out of memory", flush=True)
         torch.cuda.empty_cache()
         return
     peak = torch.cuda.max_memory_allocated(device) / 2**30 if cuda else 0.0
     print(
-        f"{name} B={count}: {count / each:.0f} frames/s, {1e3 * each:.1f} ms, peak {peak:.1f} GiB", flush=True
+        f"{name} B={count}: {count / each:.0f} frames/s, {1e3 * each:.1f} ms, at first {1e3 * first:.0f} ms, "
+        f"peak {peak:.1f} GiB",
+        flush=True,
     )
 
 
@@ -72,13 +75,13 @@ def main() -> None:
     args = parser.parse_args()
     device, size, repeats = torch.device(args.device), tuple(args.size), args.repeats
     torch.set_float32_matmul_precision("high")
-    torch.backends.cudnn.benchmark = True
     args.out.mkdir(parents=True, exist_ok=True)
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
     print(f"{name}, torch {torch.__version__}, {size[0]} x {size[1]}", flush=True)
 
     view, window = ViewConfig(), WindowConfig()
-    for count in args.batches:
+    together = (512, 1024) if device.type == "cuda" else ()  # as many as configs/gpu.yaml renders together
+    for count in (*args.batches, *together):
         report(
             "rendering",
             count,
@@ -111,6 +114,9 @@ def main() -> None:
     for count in sorted({len(batch.image), min(args.batches)}):
         part = type(batch)(*(field[:count] for field in batch))
         report("training", count, partial(step, part), device, repeats)
+    if device.type == "cuda":
+        torch.backends.cudnn.benchmark = True
+        report("training after a search for kernels", count, partial(step, part), device, repeats)
 
 
 if __name__ == "__main__":
