@@ -102,7 +102,7 @@ class LaneSegmenter(nn.Module):
         """Compute the logits of images.
 
         Args:
-            image: (B, 3, H, W) RGB in [0, 1], any size.
+            image: (B, 3, H, W) RGB in [0, 1], any size; converted to the dtype of the network.
 
         Returns:
             (B, 1+L, ceil(H/s), ceil(W/s)) logits: background is channel 0, boundary k is channel 1+k.
@@ -119,6 +119,8 @@ class LaneSegmenter(nn.Module):
                 f"image: expected floating point in [0, 1], got {image.dtype}; divide bytes by 255"
             )
         _check_scale(image)
+        if image.dtype != self.mean.dtype:
+            image = image.to(self.mean.dtype)
         stem, c2, c3, c4, c5 = self.trunk((image - self.mean) / self.std)
         lateral2, lateral3, lateral4, lateral5 = self.lateral
         x = lateral5(c5) + self.position(_positions(c5))

@@ -318,6 +318,15 @@ def test_a_model_of_half_precision_resizes_too():
     assert out.calibration.covariance.dtype == torch.float32
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
+def test_images_of_another_precision_than_the_network(dtype):
+    net, image = small(), images(1).to(dtype)
+    out, _ = net(image, INTRINSICS[None].float())
+    same, _ = net(image.float(), INTRINSICS[None].float())
+    assert torch.equal(out.logits, same.logits)
+    assert out.bev.dtype == dtype
+
+
 def test_gradients_flow_under_autocast():
     net, frames = model().float(), images(1).float().requires_grad_()
     with torch.autocast("cpu", torch.bfloat16):
