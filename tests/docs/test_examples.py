@@ -73,6 +73,11 @@ def test_an_example_without_arguments_says_how_it_is_called(name, monkeypatch, t
         run_example(name, monkeypatch, tmp_path)
 
 
+def test_a_live_loop_on_nothing_is_one_line(monkeypatch, tmp_path):
+    with pytest.raises(SystemExit, match="expected a video or the number of a camera, got none"):
+        run_example("live_loop.py", monkeypatch, tmp_path, "none.mp4", 60)
+
+
 def test_another_detectors_boundaries(monkeypatch, tmp_path, capsys):
     run_example("other_detector.py", monkeypatch, tmp_path)
     values = [float(word) for word in capsys.readouterr().out.replace(",", "").split() if word[-1].isdigit()]
