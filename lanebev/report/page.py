@@ -209,8 +209,8 @@ def _width_sentence(report: Report) -> str:
     before, after = width_deviation(report.before), width_deviation(report.after)
     if not math.isfinite(after):
         return ""
-    compared = f", {100 * before:.1f} cm with the {report.before_title}" if math.isfinite(before) else ""
-    return f"Lane widths in the bird's-eye view scatter by {100 * after:.1f} cm (σ){compared}."
+    compared = f"; {report.before_title}: {100 * before:.1f} cm" if math.isfinite(before) else ""
+    return f"Standard deviation of lane widths in the bird's-eye view: {100 * after:.1f} cm{compared}."
 
 
 def _plain(values: NDArray[np.float64], digits: int) -> Any:
