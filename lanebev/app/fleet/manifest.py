@@ -142,9 +142,12 @@ def _drive(given: Row, base: Path, inside: Path) -> Drive:
     for name in _REFUSED:
         if name in row:
             raise ValueError(f"expected video, camera, {', '.join(_OWN)} or settings of a run, got {name}")
-    video = row.get("video")
+    if "video" not in row:
+        remedy = "; columns are separated by commas" if any(set(";\t") & set(key) for key in row) else ""
+        raise ValueError(f"expected video, the drive's path, got only {', '.join(row)}{remedy}")
+    video = row["video"]
     if not (isinstance(video, str) and video):
-        raise ValueError(f"video: expected a path, got {shown(row.get('video', 'none'))}")
+        raise ValueError(f"video: expected a path, got {shown(video)}")
     settings = {("source" if key == "video" else key): value for key, value in row.items() if key not in _OWN}
     values = parsed_settings(settings)
     for key in PATHS:

@@ -42,6 +42,11 @@ def test_a_row_a_drive(write, tmp_path):
     assert (second.config.lane_width, second.config.rectified) == (None, False)
 
 
+def test_a_table_with_semicolons_says_what_separates_columns(write):
+    with pytest.raises(ValueError, match="got only video;camera; columns are separated by commas"):
+        read_manifest(write("video;camera\na.mp4;c.yaml\n", "manifest.csv"))
+
+
 def test_names_in_yaml_are_those_that_were_written(write):
     text = (
         "- {video: 007.mp4, camera: c.yaml, camera_id: 017, name: 8:30, stills: no, time: 2026-03-01T08:30Z}"
@@ -95,7 +100,8 @@ def test_a_path_that_leaves_the_folder_is_refused(write, tmp_path, key, text):
     ("rows", "words"),
     [
         ([], "at least one drive"),
-        ([{"camera": "c.yaml"}], "drive 1: video: expected a path, got 'none'"),
+        ([{"camera": "c.yaml"}], "drive 1: expected video, the drive's path, got only camera"),
+        ([{"video": [1]}], r"drive 1: video: expected a path, got \["),
         ([{"video": "a.mp4"}], "drive 1: camera: expected"),
         ([{"video": "a.mp4", "camera": "c", "out": "x"}], "drive 1: expected video, .* got out"),
         ([{"video": "a.mp4", "camera": "c", "widht": 3}], "drive 1: expected one of .* got 'widht'"),
