@@ -16,7 +16,7 @@ from lanebev.camera.formats import opencv_or_ros, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
 from lanebev.camera.parsing import parse
 from lanebev.camera.slam import camodocal, is_kalibr, is_orb_slam, kalibr, orb_slam
-from lanebev.numbers import read_text
+from lanebev.numbers import read_text, shown
 
 
 def read_camera(
@@ -66,6 +66,8 @@ def _camera(content: Any, image_size: tuple[int, int] | None, rectified: bool) -
     """Return the camera of a file's content, whose format its keys tell."""
     if isinstance(content, list):
         return checked(nuscenes(content, image_size))
+    if isinstance(content, str):
+        raise ValueError(f"expected keys with a colon and a space, such as fx: 1150, got {shown(content)}")
     if not isinstance(content, dict) or not content:
         raise ValueError("expected keys such as fx, fy, cx, cy, width, height, got none; is the file empty?")
     if "camera_intrinsic" in content:

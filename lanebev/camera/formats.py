@@ -62,11 +62,13 @@ def opencv_or_ros(fields: Mapping[str, Any], rectified: bool) -> tuple[CameraPar
     Returns:
         the camera, and whether the file states its matrix twice, in K and P, as our own writer does.
     """
-    short = "fx" in fields or "fy" in fields
+    short = not {"fx", "fy", "cx", "cy"}.isdisjoint(fields)
     unknown = sorted(set(fields) - (_SHORT_KEYS if short else _KNOWN_KEYS))
     if unknown:
         known = "fx, fy, cx, cy, width, height, distortion, model"
-        raise ValueError(f"unknown key {shown(unknown[0])}; expected {known}, or those of OpenCV or ROS")
+        case = ", in small letters" if unknown[0].lower() in _SHORT_KEYS else ""
+        words = f"unknown key {shown(unknown[0])}; expected {known}{case}, or those of OpenCV or ROS"
+        raise ValueError(words)
     if short:
         return _short(fields, rectified), False
     size = (whole_number(fields, *_HEIGHT_KEYS), whole_number(fields, *_WIDTH_KEYS))
