@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import pytest
 import torch
 from torch import Tensor
 
 from lanebev.render import Drive, RenderedFrame, WindowConfig, render_views, views
+from lanebev.render.raster.blocks import make_blocks, multiply_rows
 from lanebev.render.scene.kinds import KINDS
 from lanebev.render.scene.sampler import row_of, select_rows, send, tensors_of
 from lanebev.render.scene.world import Scene
@@ -15,6 +18,12 @@ from tools.other_device import ELSEWHERE, Elsewhere, other_device
 
 SIZE = (64, 112)
 cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+
+
+class Number(NamedTuple):
+    """A number for each block."""
+
+    value: Tensor
 
 
 def generator(seed: int) -> torch.Generator:
@@ -104,6 +113,17 @@ def test_selected_rows_are_those_of_every_tensor(rows: Tensor) -> None:
     for one, other in zip(tensors_of(select_rows(scene, rows)), tensors_of(scene), strict=True):
         assert torch.equal(one, other[rows])
         assert one.dtype == other.dtype
+
+
+@pytest.mark.parametrize("rows", [[0, 2], [0, 1, 2], []])
+def test_a_factor_of_some_rows_leaves_the_others_alone(rows: list[int]) -> None:
+    mask = torch.rand(3, 100, generator=generator(10)) < torch.tensor([[0.9], [0.5], [0.2]])
+    blocks = make_blocks(mask, size=16)
+    values = torch.ones(blocks.place.shape)
+    number = Number(torch.tensor([2.0, 3.0, 5.0])[blocks.row])
+    multiply_rows(values, blocks, rows, lambda own, place: own.value[:, None] * place, number, blocks.place)
+    chosen = torch.isin(blocks.row, torch.tensor(rows))[:, None]
+    assert torch.equal(values, torch.where(chosen, number.value[:, None] * blocks.place, 1.0))
 
 
 def test_what_is_sent_elsewhere_arrives() -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import sys
 
 import pytest
 
+from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from train import gpu_run
-from train.gpu_run import Measurement, Training, pose_scale, train_until
+from train.evaluate_roads import OWN_KINDS
+from train.gpu_run import Measurement, Training, held_out_recall, pose_scale, train_until
 
 
 class Clock:
@@ -105,6 +108,17 @@ def test_measurements_are_lines_of_json_and_end_in_time(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     assert Measurement("says").result(60) == [{"a": 1}]
     assert Measurement("hangs").result(1) in ([{"a": 2}], [])
+
+
+def test_recall_is_measured_on_all_kinds_within_the_time_and_breaks_nothing(tmp_path, monkeypatch, capsys):
+    network = LaneSegmenter(SegmenterConfig(base_width=4, decoder_width=4, image_size=(32, 48))).eval()
+    monkeypatch.setattr(gpu_run, "trained_segmenter", lambda _: (network,))
+    found = held_out_recall(tmp_path, len(OWN_KINDS), math.inf)
+    assert {record["name"] for record in found if record["by"] == "kind"} == set(OWN_KINDS)
+    assert held_out_recall(tmp_path, len(OWN_KINDS), -math.inf) == []
+    monkeypatch.undo()
+    assert held_out_recall(tmp_path / "none.safetensors", 1, math.inf) == []
+    assert "none.safetensors" in capsys.readouterr().out
 
 
 def test_scale_of_the_pose_is_that_measured_with_the_sigma_scale_and_never_below_one():

@@ -7,14 +7,17 @@ without work on pixels that have not what is shaded.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from lanebev.render.raster.select import count_where, indices_where
+from lanebev.render.scene.sampler import select_rows
+from lanebev.tensors import map_tensors
 
 BLOCK = 1024  # pixels
 
@@ -92,3 +95,32 @@ def make_blocks(mask: Tensor, size: int = BLOCK, row: Tensor | None = None, num_
     within = within + torch.arange(size, device=device)
     source = start[rows][:, None] + torch.minimum(within, (count[rows] - 1)[:, None])
     return Blocks(rows, place.index_select(0, source.flatten()).view(source.shape), count, counts)
+
+
+def multiply_rows(
+    values: Tensor,
+    blocks: Blocks,
+    rows: list[int],
+    factor: Callable[..., Tensor],
+    parameters: tuple[Any, ...],
+    *planes: Tensor | tuple[Any, ...],
+) -> None:
+    """Multiply the values of the blocks of some rows by a factor that is 1 elsewhere; changes the values.
+
+    Args:
+        values: (T, ...).
+        blocks: T of them.
+        rows: rows in question.
+        factor: factor of T' blocks by their parameters and planes.
+        parameters: NamedTuple of (T, ...) tensors, few numbers for each block.
+        planes: tensors (T, S) or NamedTuples of them.
+    """
+    index = blocks.of_rows(rows)
+    if not len(index):
+        return
+    if len(index) == len(values):
+        values.mul_(factor(parameters, *planes))
+        return
+    parts = (map_tensors(lambda tensor: tensor.index_select(0, index), plane) for plane in planes)
+    changed = values.index_select(0, index) * factor(select_rows(parameters, index), *parts)
+    values.index_copy_(0, index, changed)

@@ -50,7 +50,7 @@ class KindRows(NamedTuple):
 
 
 class Features(NamedTuple):
-    """True where at least one scene of the batch has it.
+    """What scenes of the batch have: true where at least one has it, or the rows that do.
 
     Attributes:
         sun: direct light that casts shadows.
@@ -82,16 +82,16 @@ class Features(NamedTuple):
     headlight: bool
     wet: bool
     cloud: bool
-    bridge: bool
+    bridge: list[int]
     bloom: bool
-    crowns: bool
+    crowns: list[int]
     deck: bool
     middle_seam: bool
     joint: bool
     crack: bool
     skid: bool
-    patch: bool
-    gutter: tuple[bool, bool]
+    patch: list[int]
+    gutter: tuple[list[int], list[int]]
     studs: bool
     double: bool
     ghost: bool
@@ -120,16 +120,16 @@ def features_of(scene: Scene) -> Features:
         headlight=some(scene.light.headlight),
         wet=some(pavement.wet),
         cloud=some(world.surroundings.cloud),
-        bridge=bool(world.bridge.isfinite().any()),
+        bridge=_rows(world.bridge.isfinite().any(1)),
         bloom=some(world.sensor.bloom),
-        crowns=some(world.shade),
+        crowns=_rows(world.shade != 0),
         deck=some(pavement.deck_length),
         middle_seam=some(pavement.middle_seam),
         joint=some(pavement.joint),
         crack=some(pavement.crack),
         skid=some(pavement.skid),
-        patch=some(pavement.patch),
-        gutter=(some(pavement.gutter_width[:, 0]), some(pavement.gutter_width[:, 1])),
+        patch=_rows(pavement.patch != 0),
+        gutter=(_rows(pavement.gutter_width[:, 0] != 0), _rows(pavement.gutter_width[:, 1] != 0)),
         studs=some(layout.stud_period),
         double=some(layout.separation),
         ghost=some(layout.ghost),

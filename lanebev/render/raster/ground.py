@@ -126,7 +126,7 @@ def _albedo(
     layout = select_rows(scene.world.layout, road.row)
     pavement = select_rows(scene.world.pavement, road.row)
     lanes = place_in_lanes(layout, part.across)
-    bare = pavement_albedo(pavement, layout, part, lanes, stain, features)
+    bare = pavement_albedo(road, pavement, layout, part, lanes, stain, features)
     put(albedo, road.place, bare.transpose(0, 1))
     _add_paint(scene, road.row, road.place, part, lanes, stain[2], features, albedo, coverage)
 
@@ -158,11 +158,11 @@ def _add_kinds(
         if not len(index):
             continue
         row = below.row.index_select(0, index)
-        part = select_rows(ground, index)
+        part = Ground(*(lines_of(t, index) for t in ground))
         own, painted = (t.view(len(t), *paved.shape) for t in (albedo, coverage))
         channels, paint_on = own.index_select(1, index), painted[0].index_select(0, index)
         base = channels.transpose(0, 1)
-        road, blotch = paved.index_select(0, index), stain.index_select(0, index)
+        road, blotch = lines_of(paved, index), lines_of(stain, index)
         if name == "city":
             add_roadside(scene, row, part, road, channels)
             add_street(scene, row, part, road, channels, paint_on, blotch)

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.blocks import Blocks
+from lanebev.render.raster.blocks import Blocks, multiply_rows
 from lanebev.render.raster.features import SHORTEST_SHADOW, STEEPEST, Features, shadow_lengths
 from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.noise import CLOUD, sample_line, sample_noise, smoothstep
-from lanebev.render.raster.select import as_float, choose, indices_where, lines_of, take
+from lanebev.render.raster.select import as_float, choose, indices_where, take
 from lanebev.render.scene.objects import TRUCK, SceneObjects
+from lanebev.render.scene.pavement import Pavement
 from lanebev.render.scene.sampler import select_rows
 from lanebev.render.scene.surroundings import FENCE, HEDGE, RAIL, TREES, Surroundings
 from lanebev.render.scene.weather import Light
-from lanebev.render.scene.world import Scene, World
+from lanebev.render.scene.world import Scene
 
 BRIDGE_UNDERSIDE = 6.2  # m, of all bridges as far as their shadows go
 _PIECE = 64  # pixels that are looked at together for a vehicle's shadow
@@ -37,46 +39,70 @@ def shadows(
     row, world = below.row, scene.world
     light = select_rows(scene.light, row)
     sunlit, open_sky = _vehicle_shadows(scene.light, row, x, ground, scene.objects)
-    if features.bridge:
-        shade, under = _bridge_shadow(world.bridge[row], light, ground)
-        sunlit, open_sky = sunlit * (1 - shade), open_sky * (1 - 0.8 * under)
+    seen = _Shaders(world.bridge[row], light, world.shade[row], select_rows(world.pavement, row))
+    multiply_rows(sunlit, below, features.bridge, _bridge_shadow, seen, ground)
+    multiply_rows(open_sky, below, features.bridge, _bridge_cover, seen, ground)
     if features.sun:
-        if features.crowns:
-            sunlit = sunlit * (1 - world.shade[row, None] * _crown_shadow(world, row, ground))
+        multiply_rows(sunlit, below, features.crowns, _crown_shadow, seen, ground)
         around = select_rows(world.surroundings, row)
-        lengths = shadow_lengths(around, light)
+        walls = _Walls(around, shadow_lengths(around, light))
         for wall, rows in enumerate(features.shading):
-            index = below.of_rows(rows)
-            if len(index):
-                own = around if len(index) == len(row) else select_rows(around, index)
-                part = Ground(*(lines_of(t, index) for t in ground))
-                shadow = _wall_shadow(own, wall, lines_of(lengths, index)[:, wall, None], part)
-                sunlit.index_copy_(0, index, lines_of(sunlit, index) * shadow)
+            multiply_rows(sunlit, below, rows, partial(_wall_shadow, wall), walls, ground)
     return sunlit, open_sky
 
 
-def _bridge_shadow(bridge: Tensor, light: Light, ground: Ground) -> tuple[Tensor, Tensor]:
-    """Compute the shade of bridges (B, 2) m along, and how far points are below them."""
-    climb = light.sun[:, 1, None].clamp(min=STEEPEST)
+class _Shaders(NamedTuple):
+    """What bridges and trees over the road do to the light, of T blocks.
+
+    Attributes:
+        bridge: (T, 2) m along, of a bridge's beginning and end.
+        light: the light.
+        shade: (T,) strength of the trees' shade.
+        pavement: its edges.
+    """
+
+    bridge: Tensor
+    light: Light
+    shade: Tensor
+    pavement: Pavement
+
+
+class _Walls(NamedTuple):
+    """Walls beside the road, and the lengths (T, W) of their shadows towards it, m."""
+
+    around: Surroundings
+    length: Tensor
+
+
+def _bridge_shadow(seen: _Shaders, ground: Ground) -> Tensor:
+    """Compute the share of the sun that bridges leave."""
+    climb = seen.light.sun[:, 1, None].clamp(min=STEEPEST)
     soft = 0.15 + ground.reach_along
-    begin, end = bridge.clamp(max=1e6).unsqueeze(-1).unbind(1)
-    shift = ground.along + BRIDGE_UNDERSIDE * light.sun[:, 2, None] / climb
-    shade = ((shift - begin) / soft + 0.5).clamp(0, 1) * ((end - shift) / soft + 0.5).clamp(0, 1)
+    begin, end = seen.bridge.clamp(max=1e6).unsqueeze(-1).unbind(1)
+    shift = ground.along + BRIDGE_UNDERSIDE * seen.light.sun[:, 2, None] / climb
+    return 1 - ((shift - begin) / soft + 0.5).clamp(0, 1) * ((end - shift) / soft + 0.5).clamp(0, 1)
+
+
+def _bridge_cover(seen: _Shaders, ground: Ground) -> Tensor:
+    """Compute the share of the sky that bridges leave."""
+    begin, end = seen.bridge.clamp(max=1e6).unsqueeze(-1).unbind(1)
     under = smoothstep(begin - 5, begin + 4, ground.along) * smoothstep(end + 5, end - 4, ground.along)
-    return shade, under
+    return 1 - 0.8 * under
 
 
-def _crown_shadow(world: World, row: Tensor, ground: Ground) -> Tensor:
-    """Compute the dappled shade of trees that reach over the road, thicker towards its edges."""
+def _crown_shadow(seen: _Shaders, ground: Ground) -> Tensor:
+    """Compute the share of the sun that trees over the road leave: less towards its edges."""
     crown = sample_noise(CLOUD, ground.along / 110.0, ground.across / 70.0)
     gaps = sample_noise(CLOUD, ground.along / 21.0, ground.across / 16.0)
-    left, right = world.pavement.left[row, None], world.pavement.right[row, None]
+    left, right = seen.pavement.left[:, None], seen.pavement.right[:, None]
     edge = torch.minimum(ground.across - left, right - ground.across)
-    return smoothstep(0.2, 0.75, crown + 0.35 * gaps - 0.09 * edge.clamp(min=0) + 0.25)
+    dappled = smoothstep(0.2, 0.75, crown + 0.35 * gaps - 0.09 * edge.clamp(min=0) + 0.25)
+    return 1 - seen.shade[:, None] * dappled
 
 
-def _wall_shadow(around: Surroundings, wall: int, length: Tensor, ground: Ground) -> Tensor:
-    """Compute the shadow, (B, 1) m long, along the road beside a wall; 1 where there is none."""
+def _wall_shadow(wall: int, walls: _Walls, ground: Ground) -> Tensor:
+    """Compute the share of the sun that a wall leaves."""
+    around, length = walls.around, walls.length[:, wall, None]
     kind, side = around.wall_kind[:, wall, None], 1.0 if wall % 2 else -1.0
     leafy = (kind == TREES) | (kind == HEDGE)
     crowns = 0.55 + 0.2 * sample_line(ground.along / 60.0 + around.wall_seed[:, wall, None])

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from lanebev.render.raster.blocks import Blocks, multiply_rows
 from lanebev.render.raster.coverage import dash_coverage, stripe_coverage
 from lanebev.render.raster.features import Features
 from lanebev.render.raster.footprint import Ground
@@ -80,12 +82,19 @@ def place_in_lanes(layout: Layout, across: Tensor) -> LanePlace:
 
 
 def pavement_albedo(
-    pavement: Pavement, layout: Layout, ground: Ground, lanes: LanePlace, blotch: Tensor, features: Features
+    road: Blocks,
+    pavement: Pavement,
+    layout: Layout,
+    ground: Ground,
+    lanes: LanePlace,
+    blotch: Tensor,
+    features: Features,
 ) -> Tensor:
     """Compute the linear reflectance of the bare surface, (B, 3, N).
 
     Args:
-        pavement: the surface.
+        road: B blocks of points.
+        pavement: their surface.
         layout: its boundaries.
         ground: the points.
         lanes: where they lie.
@@ -95,11 +104,9 @@ def pavement_albedo(
     shade = 1 + _weathering(pavement, ground, lanes.inside, blotch[0])
     shade = shade * pavement.lane_tone.gather(1, lanes.lane)
     shade = shade * (1 - _lines(pavement, layout, ground, lanes, blotch, features))
-    if features.patch:
-        shade = shade * _patches(pavement, ground, lanes)
-    for side in (0, 1):
-        if features.gutter[side]:
-            shade = shade * _gutter(pavement, ground, side, blotch[0])
+    multiply_rows(shade, road, features.patch, _patches, pavement, ground, lanes)
+    for side, rows in enumerate(features.gutter):
+        multiply_rows(shade, road, rows, partial(_gutter, side), pavement, ground, blotch[0])
     shade = (shade * (1 - 0.5 * pavement.wet)[:, None]).clamp(min=0.08)
     colour = choose(lanes.on_shoulder[:, None], pavement.shoulder[..., None], pavement.base[..., None])
     if features.deck:
@@ -167,7 +174,7 @@ def _patches(pavement: Pavement, ground: Ground, lanes: LanePlace) -> Tensor:
     return 1 + covered * (tone - 1) * as_float(exists)
 
 
-def _gutter(pavement: Pavement, ground: Ground, side: int, mottle: Tensor) -> Tensor:
+def _gutter(side: int, pavement: Pavement, ground: Ground, mottle: Tensor) -> Tensor:
     """Compute the factor (B, N) of the strip along an edge, a line beside a barrier's foot, not a marking."""
     edge = (pavement.left, pavement.right)[side]
     width = pavement.gutter_width[:, side, None] * (1 + 0.15 * sample_line(ground.along / 70.0 + side))
