@@ -79,7 +79,7 @@ def run(
         ValueError: bad input; one line says which and what would be right.
     """
     check_installed(config.formats)
-    source = make_source(config)
+    config, source = opened(config)
     check_inputs_stay(config.out, input_files(config, source))
     camera = camera_of(config, source)
     source = match_image_size(camera, source)
@@ -146,6 +146,19 @@ def run(
             for name in config.formats:
                 writer(name)(out / FORMATS[name].file, record, None if source.is_live else source)
         return report
+
+
+def opened(config: RunConfig) -> tuple[RunConfig, FrameSource]:
+    """Open the source; the settings are those of a still if it is one image.
+
+    A drive's first frame has smaller standard deviations, because the frames after it correct it.
+
+    Raises:
+        ValueError: see :func:`~lanebev.app.sources.make_source`.
+    """
+    source = make_source(config)
+    is_still = source.is_single and not (config.resume or config.smooth)
+    return (replace(config, stills=True) if is_still else config), source
 
 
 def remarks(config: RunConfig, source: FrameSource, camera: Camera) -> list[str]:

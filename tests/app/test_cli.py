@@ -254,6 +254,20 @@ def test_one_image_gives_pictures(data, tmp_path):
     assert {"bev.png", "overlay.png"} <= names
     assert not {"bev.mp4", "overlay.mp4"} & names
     assert len(_table(tmp_path / "out")) == 1
+    assert "calibration.yaml" not in names
+
+
+def test_one_image_is_a_still(data, tmp_path):
+    """As a drive's first frame its lanes would be taken for equal, and roll for much surer."""
+    joint = ("--calibrator", "joint")
+    assert _run(data, *joint, source="images/3.png", out=tmp_path / "image") == 0
+    assert _run(data, *joint, "--stills", source="images/3.png", out=tmp_path / "still") == 0
+    assert _table(tmp_path / "image") == _table(tmp_path / "still")
+    (tmp_path / "folder").mkdir()
+    shutil.copy(data / "images" / "3.png", tmp_path / "folder")
+    assert _run(data, *joint, source=tmp_path / "folder", out=tmp_path / "drive") == 0
+    (image,), (frame,) = _table(tmp_path / "image"), _table(tmp_path / "drive")
+    assert float(image["roll_std_deg"]) > 2 * float(frame["roll_std_deg"])
 
 
 @pytest.mark.slow
