@@ -12,9 +12,11 @@ from lanebev import Camera, LaneBEV, Session
 from lanebev.app.build import make_calibrator
 from lanebev.app.config import RunConfig
 from lanebev.app.run import run
+from lanebev.estimation.still import calibrate_still
 from lanebev.io.results import extrinsics_row
-from lanebev.io.video import VideoWriter, open_source
+from lanebev.io.video import VideoWriter, open_source, write_png
 from lanebev.render import Drive
+from lanebev.tensors import map_tensors
 
 torch.set_num_threads(1)  # a run divides the threads among frames, and sums over threads round otherwise
 FRAMES, LANE_WIDTH = 5, 3.6
@@ -71,3 +73,24 @@ def test_one_road(drive, tmp_path, calibrator):
     assert [row.segments for row in by_lanes.rows] == [row.segments for row in rows]
     np.testing.assert_allclose(_numbers(by_run.rows), _numbers(rows), atol=1e-6, rtol=0)
     np.testing.assert_allclose(_numbers(by_lanes.rows), _numbers(rows), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("calibrator", ["joint", "two-stage"])
+def test_one_road_of_a_still(drive, tmp_path, calibrator):
+    """The calls of docs/tutorials/embed.md give what a run on one image gives."""
+    frame = next(iter(open_source(str(drive / "drive.mp4"))))
+    write_png(tmp_path / "image.png", frame.image)
+    config = {"camera": str(drive / "camera.yaml"), "lane_width": LANE_WIDTH, "calibrator": calibrator}
+    (by_run,) = run(RunConfig(str(tmp_path / "image.png"), out=str(tmp_path / "run"), **config)).rows
+    camera = Camera.from_file(drive / "camera.yaml")
+    model = LaneBEV.from_pretrained(calibrator=make_calibrator(calibrator)).eval()
+    image = torch.from_numpy(frame.image.copy()).permute(2, 0, 1)[None] / 255
+    intrinsics = camera.intrinsics[None]
+    with torch.inference_mode():
+        out, _ = model(image, intrinsics, distortion=camera.distortion[None], model=camera.model)
+        segments = map_tensors(lambda part: part.double() if part.is_floating_point() else part, out.segments)
+        still = calibrate_still(model.calibrator, segments, intrinsics, lane_width=LANE_WIDTH)
+        still = model.calibrator.scale_still(still, model.pose_sigma_scale)
+    row = extrinsics_row(0, 0.0, still, segments.weight, "")
+    assert row.status == by_run.status == "TRACKING"
+    np.testing.assert_allclose(_numbers([row]), _numbers([by_run]), atol=1e-6, rtol=0)
