@@ -299,7 +299,7 @@ def test_resuming_gives_what_an_uninterrupted_run_gives(data, tmp_path, calibrat
 
 @pytest.mark.slow
 def test_a_damaged_state_is_reported_and_a_missing_one_refused(data, tmp_path, capsys):
-    assert _run(data, source="images/3.png", out=tmp_path / "out") == 0
+    assert _run(data, source="images/[3].png", out=tmp_path / "out") == 0
     state = tmp_path / "out" / "state.safetensors"
     state.write_bytes(state.read_bytes()[:-5])
     assert _run(data, "--resume", str(tmp_path / "out"), source="images/3.png", out=tmp_path / "next") == 0
@@ -314,7 +314,7 @@ def test_a_damaged_state_is_reported_and_a_missing_one_refused(data, tmp_path, c
 def test_the_state_of_the_other_calibrator_is_a_mistake(data, tmp_path, capsys):
     for one, other in (("joint", "two-stage"), ("two-stage", "joint")):
         folder = tmp_path / one
-        assert _run(data, "--calibrator", one, source="images/3.png", out=folder) == 0
+        assert _run(data, "--calibrator", one, source="images/[3].png", out=folder) == 0
         capsys.readouterr()
         before = {path.name: path.read_bytes() for path in folder.iterdir()}
         arguments = ["run", data / "images", "--camera", data / "camera.yaml", "--lanes", data / "lanes.json"]
@@ -392,7 +392,7 @@ def test_a_lane_file_may_begin_with_a_byte_order_mark(data, tmp_path):
 def test_a_refused_state_is_kept_beside_what_replaces_it(data, tmp_path, capsys):
     out, names = tmp_path / "out", ("state.safetensors", "calibration.yaml")
     (tmp_path / "link").symlink_to(out, target_is_directory=True)
-    assert _run(data, source="images/3.png", out=out) == 0
+    assert _run(data, source="images/[3].png", out=out) == 0
     for number in ("", "1"):  # the second does not take the place of the first
         (out / names[0]).write_bytes((out / names[0]).read_bytes()[: -5 - len(number)])
         before = [(out / name).read_bytes() for name in names]
