@@ -42,6 +42,7 @@ from train.export import checkout_commit, export, trained_segmenter
 START = 25.0  # s, imports and the first batch
 EXPORT = 6.0  # s, reading a checkpoint and writing weights
 RECALL = 25.0  # s at most
+SMOKE = 120.0  # s at most, before the given time begins
 GRACE = 20.0  # s, a training may take to end by itself
 SHARES = (1 / 3, 2 / 3)
 RESTARTS = 6
@@ -224,6 +225,14 @@ def _commit() -> str:
         return "unknown"
 
 
+def time_parts(out: Path, seconds: float) -> None:
+    """Run ``train.smoke``, for so long at most. What goes wrong is printed."""
+    try:
+        subprocess.run([sys.executable, "-m", "train.smoke", "--out", str(out)], timeout=seconds, check=False)
+    except subprocess.TimeoutExpired:
+        print("gpu_run: train.smoke took too long and is ended", flush=True)
+
+
 def held_out_recall(weights: Path, views: int, deadline: float) -> list[dict[str, Any]]:
     """Evaluate weights on held-out views, on the GPU if there is one, until a time of ``time.monotonic``.
 
@@ -257,9 +266,7 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     work = args.work or Path(tempfile.mkdtemp(prefix="lanebev-"))
     if args.smoke:
-        subprocess.run(
-            [sys.executable, "-m", "train.smoke", "--out", str(args.out)], timeout=120, check=False
-        )
+        time_parts(args.out, SMOKE)
     end = time.monotonic() + 60 * args.minutes
     record = {"seed": args.seed, "commit": _commit()}
     seeds = [f"--seed_everything={args.seed}", f"--data.init_args.seed={args.seed}"]

@@ -10,7 +10,7 @@ import pytest
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from train import gpu_run
 from train.evaluate_roads import OWN_KINDS
-from train.gpu_run import Measurement, Training, held_out_recall, pose_scale, train_until
+from train.gpu_run import Measurement, Training, held_out_recall, pose_scale, time_parts, train_until
 
 
 class Clock:
@@ -119,6 +119,11 @@ def test_recall_is_measured_on_all_kinds_within_the_time_and_breaks_nothing(tmp_
     monkeypatch.undo()
     assert held_out_recall(tmp_path / "none.safetensors", 1, math.inf) == []
     assert "none.safetensors" in capsys.readouterr().out
+
+
+def test_timing_the_parts_ends_in_time_and_the_run_goes_on(tmp_path, capsys):
+    time_parts(tmp_path, 0.01)
+    assert "took too long" in capsys.readouterr().out
 
 
 def test_scale_of_the_pose_is_that_measured_with_the_sigma_scale_and_never_below_one():
