@@ -15,7 +15,7 @@ from lanebev.tensors import constant, map_tensors
 T = TypeVar("T")
 FlagT = TypeVar("FlagT", bound=IntFlag)
 
-_BLOCK = 2_000_000  # numbers of a block of rows
+_BLOCK = 1_000_000  # numbers of a block of rows
 
 
 def select_rows(rows: Tensor, yes: T, no: T) -> T:
@@ -100,7 +100,7 @@ def in_blocks(numbers: int, function: Callable[..., T], *operands: Any) -> T:
     all rows at once.
 
     Args:
-        numbers: that the function holds at once for each row, about; a block has 2 million of them, 16 MB.
+        numbers: that the function holds at once for each row, about; a block has a million of them, 8 MB.
         function: of the operands, to tensors or tuples of tensors (B, ...); each row's result depends on that
             row alone.
         operands: (B, ...) tensors, or NamedTuples of such.

@@ -57,7 +57,8 @@ def meet_road(directions: Tensor, profile: Profile) -> Tensor:
     """
     height, curvature, least = profile
     slope = torch.maximum(directions[:, 1] / directions[:, 2].clamp(min=_AHEAD), least)
-    return 2 * height / (slope + (slope * slope - 2 * curvature * height).sqrt())
+    twice = 2 * height
+    return twice / (slope + (slope * slope - curvature * twice).sqrt())
 
 
 def meets_before_farthest(directions: Tensor, profile: Profile) -> Tensor:

@@ -323,8 +323,8 @@ def test_the_curve_is_the_sum_of_its_basis_and_the_integral_of_its_curvature(pha
     road = road_shape(shape, behind)
     curve = road_curve(z, road)
     tilt = torch.linspace(-3.0, 3.0, 9001, dtype=DOUBLE).expand(2, -1)
-    total = (shape.unsqueeze(1) @ curve_by_shape(z, tilt, road)).squeeze(1)
-    torch.testing.assert_close(total, curve.bend + tilt * curve.heading)
+    total = (shape.unsqueeze(1) @ curve_by_shape(z, 2 + tilt, tilt, road)).squeeze(1)
+    torch.testing.assert_close(total, (2 + tilt) * curve.bend + tilt * curve.heading)
     heading = torch.cumulative_trapezoid(curve.curvature, dx=0.01)
     torch.testing.assert_close(curve.heading[:, 1:], heading, rtol=1e-5, atol=1e-9)
     torch.testing.assert_close(

@@ -15,7 +15,8 @@ clock's: of one thread, and for a machine that others use too.
 - ``frame``: one frame of bytes through the lens, against ``cv2.remap`` with its maps at hand, and with its
   maps computed, as they must be when the pose is another in every frame.
 - ``extractor``: seven maps of 160 × 288.
-- ``rows``, ``segments``, ``cells``: calibrators by rows of a batch and by segments, the warp by cells.
+- ``rows``, ``dense``, ``segments``, ``cells``: calibrators by rows of a batch, with 30 and with 408 segments
+  each, and by segments, the warp by cells.
 """
 
 from __future__ import annotations

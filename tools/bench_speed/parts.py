@@ -49,6 +49,11 @@ GROWTHS: dict[str, Growth] = {
         [1, 4, 16, 64, 256, 1024, 4096],
         lambda rows: calibration.calibrators(rows, 5),
     ),
+    "dense": (
+        "rows of 408 segments",
+        [1, 16, 256],
+        lambda rows: calibration.calibrators(rows, 68),
+    ),
     "segments": (
         "segments",
         [12, 36, 120, 1200, 10_200],

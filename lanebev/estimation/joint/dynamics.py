@@ -220,7 +220,8 @@ def motion(
     chain = torch.cat([swing, to_mean], dim=-1).flatten(1)  # (B, 20)
     slide, push = damped_velocity(dt, cfg.offset_memory)
     memories = (cfg.speed_memory, cfg.vertical_curvature_memory, cfg.deviation_memory, cfg.unequal_memory)
-    fade, level, slow, fast = (dt.unsqueeze(-1) / constant(memories, like=dt)).neg().exp().unbind(-1)
+    step, unequal, vertical = (part.unsqueeze(-1) for part in (dt, unequal, vertical))  # (B, 1)
+    fade, level, slow, fast = (-step / constant(memories, like=dt)).exp().chunk(4, dim=-1)
     settle = torch.where(unequal > 0, fast, slow)
     still = torch.ones_like(pose_scale)
     moves = [
@@ -229,22 +230,22 @@ def motion(
         slide,
         road.transition.flatten(1),
         road.by_speed,
-        fade.unsqueeze(-1),
-        settle.unsqueeze(-1).expand(-1, num),
-        level.unsqueeze(-1),
+        fade,
+        settle.expand(-1, num),
+        level,
     ]
     std = constant((*[cfg.angle_std] * 3, cfg.height_std), like=dt)
     walk = constant((*[cfg.mean_angle_walk**2] * 3, cfg.mean_height_walk**2), like=dt)
     variance = (pose_scale * std).square()
-    wander = cfg.deviation_walk**2 * dt + unequal.square() * (1 - settle * settle)
+    wander = cfg.deviation_walk**2 * step + unequal.square() * (1 - settle * settle)
     noises = [
         (variance.unsqueeze(-1) * drive.flatten(1).unsqueeze(1)).flatten(1),
-        walk * dt.unsqueeze(-1),
+        walk * step,
         cfg.offset_density * push,
-        road.noise + cfg.curvature_walk**2 * dt.unsqueeze(-1),
-        (2 * cfg.speed_std**2 / cfg.speed_memory) * dt.unsqueeze(-1),
-        wander.unsqueeze(-1).expand(-1, num),
-        (vertical.square() * (1 - level * level)).unsqueeze(-1),
+        road.noise + cfg.curvature_walk**2 * step,
+        (2 * cfg.speed_std**2 / cfg.speed_memory) * step,
+        wander.expand(-1, num),
+        vertical.square() * (1 - level * level),
     ]
     values = torch.cat([*moves, *noises], dim=-1)
     index = constant(_places(num), like=values, dtype=torch.int64).expand(values.shape[0], -1)

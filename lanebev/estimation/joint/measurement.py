@@ -166,7 +166,7 @@ def boundary_residuals(
     by_angles = torch.bmm(axes, _cross(normal, foot))  # ∂(n·d)/∂angle = n · (-axis × d) = axis · (n × d)
     up = profile.curvature * z * ahead - down  # -n_x of the foot, per metre of Z
     by_height, by_offset = x - slope * ahead, up + 0.5 * up * curve.heading.square()
-    by_shape = curve_by_shape(z, x_k * curve.heading, sight.road) * up.unsqueeze(1)
+    by_shape = curve_by_shape(z, up, up * x_k * curve.heading, sight.road)
     by_vertical = (0.5 * z * z * by_height).unsqueeze(1)  # the road is lower by Z²/2 per unit of it
     jacobian = torch.cat(
         [by_angles, torch.stack([by_height, by_offset], dim=1), by_shape, by_vertical], dim=1
@@ -252,7 +252,7 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 def _lateral(params: Tensor, places: Tensor) -> Tensor:
     """X of every end point's boundary at Z = 0, (…, B, M) m, for places (…, B, N) less the offset."""
-    return per_end(places + params[:, OFFSET, None])
+    return per_end(places + params[:, OFFSET : OFFSET + 1])
 
 
 def _road(params: Tensor, phase: Tensor | None) -> Clothoid | Spline:
@@ -262,8 +262,8 @@ def _road(params: Tensor, phase: Tensor | None) -> Clothoid | Spline:
 
 def _profile(params: Tensor, phase: Tensor | None) -> Profile:
     """Height and vertical curvature, 0 for a single frame."""
-    height = params[:, HEIGHT, None]
-    return road_profile(height, torch.zeros_like(height) if phase is None else params[:, VERTICAL, None])
+    height = params[:, HEIGHT : HEIGHT + 1]
+    return road_profile(height, torch.zeros_like(height) if phase is None else params[:, VERTICAL:])
 
 
 def _tangent_plane(z: Tensor, x_k: Tensor, profile: Profile, curve: RoadCurve) -> tuple[Tensor, Tensor]:

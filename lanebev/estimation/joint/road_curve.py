@@ -100,22 +100,24 @@ def road_curve(z: Tensor, road: Clothoid | Spline) -> RoadCurve:
     )
 
 
-def curve_by_shape(z: Tensor, tilt: Tensor, road: Clothoid | Spline) -> Tensor:
-    """Compute bend + tilt · heading for a unit value of every shape parameter, (B, K, M).
+def curve_by_shape(z: Tensor, by_bend: Tensor, by_heading: Tensor, road: Clothoid | Spline) -> Tensor:
+    """Compute the derivative of a function of bend and heading by every shape parameter, (B, K, M).
 
     Args:
         z: (B, M) m.
-        tilt: (B, M) m.
+        by_bend: (B, M), its derivative by the bend.
+        by_heading: (B, M), likewise.
         road: whose knots count.
     """
-    first = z * torch.add(tilt, z, alpha=0.5)
+    first = z * torch.addcmul(by_heading, by_bend, z, value=0.5)
     if isinstance(road, Clothoid):
-        return torch.stack([first, 0.5 * z * z * (z / 3 + tilt)], 1)
+        return torch.stack([first, 0.5 * z * z * (by_bend * z / 3 + by_heading)], 1)
     past = _past_knots(z, road)
-    ramps = past * past * torch.add((_SQUARE * tilt).unsqueeze(1), past, alpha=_CUBE)
+    of_square, of_cube = (_SQUARE * by_heading).unsqueeze(1), (_CUBE * by_bend).unsqueeze(1)
+    ramps = past * past * torch.addcmul(of_square, of_cube, past)
     steps = ramps[:, :-1] - ramps[:, 1:]  # a step rises from 0 at its knot to 1 at the next
     heading, bend = _behind(road.past[:, 0])
-    head = steps[:, 0] - torch.addcmul(bend, heading, z + tilt)
+    head = steps[:, 0] - torch.addcmul(by_bend * bend, heading, torch.addcmul(by_heading, by_bend, z))
     return torch.cat([torch.stack([first, head], 1), steps[:, 1:]], 1)
 
 

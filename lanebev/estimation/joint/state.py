@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -224,8 +223,5 @@ def _start_variances(num_boundaries: int, motion: MotionConfig) -> tuple[float, 
 
 def unobserved_mask(reasons: Tensor) -> Tensor:
     """Tell what of pitch, yaw, roll and height the last frame did not determine, (B, 4) bool."""
-    direction, roll, height = (
-        (reasons & int(reason)) != 0
-        for reason in (Reason.DIRECTION_UNSEEN, Reason.ROLL_UNSEEN, Reason.HEIGHT_UNSEEN)
-    )
-    return torch.stack([direction, direction, roll, height], dim=-1)
+    bits = (Reason.DIRECTION_UNSEEN, Reason.DIRECTION_UNSEEN, Reason.ROLL_UNSEEN, Reason.HEIGHT_UNSEEN)
+    return (reasons.unsqueeze(-1) & constant(tuple(map(int, bits)), like=reasons)) != 0

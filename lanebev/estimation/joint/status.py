@@ -11,7 +11,7 @@ from lanebev.estimation.joint.evidence import EQUAL
 from lanebev.estimation.joint.layout import POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL
 from lanebev.estimation.joint.observations import Observations
-from lanebev.estimation.joint.state import JointConfig, JointState, unobserved_mask
+from lanebev.estimation.joint.state import JointConfig, JointState
 from lanebev.estimation.joint.update import UNSEEN
 from lanebev.estimation.reasons import Reason
 from lanebev.tensors import constant
@@ -122,7 +122,8 @@ def as_calibration(
     height, ego = state.mean[:, HEIGHT], cfg.num_boundaries // 2 - 1
     left, right = (positions[:, ego : ego + 2] + state.mean[:, OFFSET, None]).unbind(-1)
     bend = height - left * right / height.clamp(min=0.1)
-    more = 3.0 * (bend * cov[:, ROLL, ROLL]).square() * unobserved_mask(state.reasons)[:, ROLL]
+    roll_unseen = (state.reasons & int(Reason.ROLL_UNSEEN)) != 0
+    more = 3.0 * (bend * cov[:, ROLL, ROLL]).square() * roll_unseen
     width = (positions[:, -1] - positions[:, 0]) / (cfg.num_boundaries - 1)
     more = more + (cfg.lane_width_std / width * height).square()
     own = layout(cfg.num_boundaries).deviations
