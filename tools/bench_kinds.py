@@ -39,6 +39,7 @@ ALLOWED = 15
 
 _IN_CURVE = "motion up to 1.5°, 1.2 Hz, R 300 m"
 _CREST = "crest or dip, R 5 to 20 km"
+_HILLS = "crests and dips in turn"
 _GIVEN = ", speed given"
 _TOLD = ", speed and road given"
 _HILLY = ", HILLY_ROADS"
@@ -129,7 +130,7 @@ def measure_all(count: int) -> dict[str, dict[str, Any]]:
     print("|---|---|---|---|---|---|")
     results = {}
     others = (f"{kind}{what}" for kind in KINDS if kind.startswith(_IN_CURVE) for what in (_GIVEN, _TOLD))
-    for kind in (*KINDS, *others, f"{_CREST}{_HILLY}"):
+    for kind in (*KINDS, *others, f"{_CREST}{_HILLY}", f"{_HILLS}{_HILLY}"):
         found = measure(
             kind.removesuffix(_GIVEN).removesuffix(_TOLD).removesuffix(_HILLY), seeds, informed(kind)
         )
@@ -228,6 +229,19 @@ def _crest(seed: int) -> Generated:
     return _drawn(seed, lambda t, moment: replace(moment, near=5.0, far=40.0, profile=vertical))
 
 
+def _hills(seed: int) -> Generated:
+    """Drive over crests and through dips in turn, of R = 5 to 20 km at the sharpest, one in 3 to 8 s."""
+    random = Random(seed)
+    sharpest, duration = 1 / random.uniform(5e3, 20e3), random.uniform(3.0, 8.0)
+    first = random.uniform(0.0, 2 * math.pi)
+
+    def change(t: float, moment: Moment) -> Moment:
+        vertical = sharpest * math.sin(first + math.pi * t / duration)
+        return replace(moment, near=5.0, far=40.0, profile=vertical)
+
+    return _drawn(seed, change)
+
+
 def _unequal(seed: int, std: float) -> Generated:
     """Put every boundary out of its place for good, independently, by a normal deviate."""
     random = Random(seed)
@@ -275,6 +289,7 @@ def _rolled_ego_lane_of(kind: str, seed: int) -> Generated:
 KINDS: dict[str, Callable[[int], Generated]] = {
     **_ALL_LANES,
     _CREST: _crest,
+    _HILLS: _hills,
     "lanes unequal by 2 cm": partial(_unequal, std=0.02),
     "lanes unequal by 10 cm": partial(_unequal, std=0.1),
     **{f"{kind}, ego lane": partial(_ego_lane_of, kind) for kind in _ALL_LANES},

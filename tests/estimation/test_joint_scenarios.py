@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.reasons import Reason
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.observation.segments import LaneSegments
@@ -51,16 +52,28 @@ def hard_part(run: Track) -> tuple[torch.Tensor, torch.Tensor, float]:
 
 
 @pytest.mark.slow
-def test_table1_is_at_the_bound_with_an_honest_covariance():
-    """8 runs of 50 frames: 400 errors a cell, so three standard errors above the target pass."""
+@pytest.mark.parametrize(
+    ("vertical_std", "pitch_limit"), [(1e-6, 1.0), (FramePrior().vertical_curvature_std, 1.1)]
+)
+def test_table1_is_at_the_bound_with_an_honest_covariance(vertical_std, pitch_limit):
+    """8 runs of 50 frames: 400 errors a cell, so three standard errors above the target pass.
+
+    The bound is that of a road known to be plane. Not to know it costs a tenth in pitch in these frames.
+    """
     runs, count = 8, 50
+    calibrator = JointCalibrator(prior=FramePrior(vertical_curvature_std=vertical_std))
     with torch.inference_mode():
-        rows = table(run(JointCalibrator(), replace(Experiment(), num_frames=count), runs, torch.float64, 0))
+        rows = table(run(calibrator, replace(Experiment(), num_frames=count), runs, torch.float64, 0))
     assert len(rows) == len(VARIANCES)
     slack = 1 + 3 / math.sqrt(2 * runs * count)
     for row in rows:
         ratio = [here / bound for here, bound in zip(row["here"], row["bound"], strict=True)]
-        limits = [1.0, 1.2, 1.0, 1.0]  # yaw: the start weighs six times as much in 50 frames as in 300
+        limits = [
+            pitch_limit,
+            1.2,
+            1.0,
+            1.0,
+        ]  # yaw: the start weighs six times as much in 50 frames as in 300
         assert all(r < limit * slack for r, limit in zip(ratio, limits, strict=True)), (
             row["variance"],
             ratio,
@@ -71,8 +84,8 @@ def test_table1_is_at_the_bound_with_an_honest_covariance():
 
 @pytest.mark.slow
 def test_half_of_all_segments_wrong_costs_at_most_half_more():
-    clean = bench("straight", last=2.2)
-    dirty = bench("50 % outliers, 5 % wrong index", last=2.2)
+    clean = bench("straight", last=4.4)
+    dirty = bench("50 % outliers, 5 % wrong index", last=4.4)
     assert (rmse(dirty) < 1.5 * rmse(clean) * 1.1).all()  # four rows: six per cent of noise in each
     assert (dirty.status == Status.TRACKING).all()
     assert summarise(dirty)["nees_per_dof"] < 1.25

@@ -258,7 +258,7 @@ def test_a_skipped_frame_has_the_pose_of_the_frame_before():
 def test_with_one_lane_roll_and_the_other_entries_are_smoothed_each_by_themselves():
     """Else their correlated errors, that the filter does not correct, make pitch worse than the filter's."""
     seen, calibrations, states, intervals, config = drive(
-        lambda t, moment: replace(moment, visible=(2, 3)), seconds=1.2
+        lambda t, moment: replace(moment, visible=(2, 3)), seconds=2.0
     )
     linked = link_states(states[-2], states[-1], intervals[-1], config).linked
     assert not linked[0, PLACE.chain(ROLL)[0], PLACE.chain(0)[0]]

@@ -22,6 +22,7 @@ KINDS = (
     "strong motion in a curve",
     "suspension",
     "sharp bends",
+    "crest",
     "drop",
     "knock",
     "cut",
@@ -102,6 +103,10 @@ def _only(visible: tuple[int, ...], moment: Moment) -> Moment:
     return replace(moment, visible=visible)
 
 
+def _hill(t: float, moment: Moment) -> Moment:
+    return replace(moment, near=5.0, far=40.0, profile=1e-4 * math.cos(t))
+
+
 def _drop(t: float, moment: Moment) -> Moment:
     tag = "falling" if t < landing_time() else ""
     return replace(moment, pose=moved(moment.pose, fall(t)), tag=tag)
@@ -180,6 +185,9 @@ GENERATED: dict[str, Generated] = {
     "suspension": Generated("suspension", _drive(motion=suspension(6, 4.0))),
     # R = 60 m at 15 m/s, boundaries 1, 2, 3 in sight, 45 to 105 m.
     "sharp-bends": Generated("sharp bends", _scenario("sharp bends R 60 m, three boundaries", start=3.0)),
+    "crest": Generated("crest", _scenario("crest R 10 km, 5-40 m")),
+    # From a crest into a dip of R = 10 km.
+    "crest-and-dip": Generated("crest", _drive(_hill)),
     "drop": Generated("drop", _drive(_drop)),
     "drop-ego-lane": Generated("drop", _drive(_in_ego_lane(_drop))),
     "knock": Generated("knock", _drive(_knock)),

@@ -24,7 +24,6 @@ _RAISED = 0.01  # share of segments over the horizon, above which the others are
 _CURVED = 3.0  # sigmas of a vertical curvature from which the road is taken for a crest or a dip
 _POSE_DECAY = 0.85  # factor per frame on the pose's evidence, since a detector's errors last over frames
 CALL = 5.0  # sigmas of evidence at which half of the noise is admitted
-_CREST_CALL = 7.0  # likewise, for the vertical curvature: lasting errors of far boundaries look like one
 
 
 def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor, weight: Tensor) -> Tensor:
@@ -133,8 +132,7 @@ def adaptive_process_noise(evidence: Tensor, cov: Tensor, cfg: JointConfig) -> T
     parts = evidence.square().split([NUM_POSE, NUM_SHAPE, 1, cfg.num_boundaries], dim=-1)
     worst = [part.amax(-1, keepdim=True) for part in parts]
     most = torch.cat(worst, dim=-1)
-    call = constant((CALL, CALL, _CREST_CALL, CALL), like=evidence)
-    pose, bend, crest, own = (0.01 * torch.sigmoid(0.5 * (most - call.square())) * most).chunk(4, dim=-1)
+    pose, bend, crest, own = (0.01 * torch.sigmoid(0.5 * (most - CALL**2)) * most).chunk(4, dim=-1)
     jump = constant((*[cfg.open_pose**2] * 3, (10 * cfg.open_pose) ** 2, 0.0), like=evidence)
     change = constant((cfg.open_curvature**2, *[cfg.open_step**2] * (NUM_SHAPE - 1)), like=evidence)
     room = cfg.open_deviation**2 - cov.diagonal(dim1=1, dim2=2)[:, DEVIATIONS]

@@ -31,6 +31,7 @@ class FramePrior:
         offset_std: standard deviation of the ego lane's middle from the camera, m.
         curvature_std: standard deviation of c0, 1/m.
         curvature_rate_std: standard deviation of c1, 1/m².
+        vertical_curvature_std: standard deviation of the vertical curvature where a drive starts, 1/m.
         freedom: degrees of freedom of all of them.
         pitch_range, roll_range: half widths of the search about the means, rad.
         pitch_steps, roll_steps: number of values searched in each; 1 is the mean alone.
@@ -47,6 +48,7 @@ class FramePrior:
     offset_std: float = 1.5
     curvature_std: float = 2e-3
     curvature_rate_std: float = 2e-5
+    vertical_curvature_std: float = 3e-5
     freedom: float = 4.0
     pitch_range: float = 0.24
     roll_range: float = 0.4

@@ -101,7 +101,7 @@ class JointConfig:
 
 
 HILLY_ROADS = JointConfig(motion=MotionConfig(vertical_curvature_std=2e-5))
-"""Numbers for roads that are not plane: with crests and dips of R = 50 km as the standard deviation."""
+"""Numbers for roads that are nowhere plane: a vertical curvature of R = 50 km as the standard deviation."""
 
 
 @register_pytree
@@ -161,13 +161,12 @@ def state_from_fit(
     Returns:
         mean (B, D) and covariance (B, D, D).
     """
-    motion = cfg.motion
     straight, bend = constant(cfg.straight, like=params), cfg.prior.std(params)[CURVATURE:]
     params, param_cov = straight_or_bend(params, param_cov, straight, bend, cfg.bends)
     params = pad(params, (0, 1))  # the vertical curvature's mean is 0
-    param_cov = with_vertical_curvature(param_cov, by_vertical, motion.vertical_curvature_std)
+    param_cov = with_vertical_curvature(param_cov, by_vertical, cfg.prior.vertical_curvature_std)
     copies = constant(_by_parameters(cfg.num_boundaries), like=params)
-    own = constant(_start_variances(cfg.num_boundaries, motion), like=params)
+    own = constant(_start_variances(cfg.num_boundaries, cfg.motion), like=params)
     return params @ copies.mT, copies @ param_cov @ copies.mT + own.diag()
 
 
