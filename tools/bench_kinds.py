@@ -249,6 +249,12 @@ def _unequal(seed: int, std: float) -> Generated:
     return _drawn(seed, lambda t, moment: replace(moment, places=PLACES + out))
 
 
+def _two_lanes(seed: int, std: float) -> Generated:
+    """Leave two lanes in view, which the same pose fits whether they are equal or not."""
+    drive = _unequal(seed, std)
+    return replace(drive, moments=lambda: [replace(one, visible=(1, 2, 3)) for one in drive.moments()])
+
+
 def mounted_roll(seed: int) -> float:
     """Draw the roll of a mount, rad, normal with the standard deviation of the estimator's prior.
 
@@ -292,6 +298,10 @@ KINDS: dict[str, Callable[[int], Generated]] = {
     _HILLS: _hills,
     "lanes unequal by 2 cm": partial(_unequal, std=0.02),
     "lanes unequal by 10 cm": partial(_unequal, std=0.1),
+    "two lanes in view": partial(_two_lanes, std=0.0),
+    **{
+        f"two lanes in view, unequal by {size} cm": partial(_two_lanes, std=size / 100) for size in (2, 5, 10)
+    },
     **{f"{kind}, ego lane": partial(_ego_lane_of, kind) for kind in _ALL_LANES},
     **{
         f"{kind}, ego lane, roll drawn": partial(_rolled_ego_lane_of, kind)

@@ -43,7 +43,7 @@ from lanebev.estimation.joint.road_curve import (
     road_shape,
 )
 from lanebev.estimation.joint.state import JointConfig, state_from_fit
-from lanebev.estimation.joint.status import single_deviation
+from lanebev.estimation.joint.status import single_deviation, unverified_deviation
 from lanebev.estimation.joint.update import (
     frame_information,
     kalman_gain,
@@ -475,6 +475,37 @@ def test_one_boundary_out_of_place_counts_until_the_filter_holds_unequal_lanes()
     found = single_deviation(out, held.unsqueeze(-1).expand(-1, 6), cfg)
     expected = torch.tensor([size, size * math.sqrt(0.75), 0.0, 0.0], dtype=DOUBLE)
     torch.testing.assert_close(found, expected)
+
+
+def test_deviations_that_three_boundaries_cannot_show_count_until_a_fourth_is_seen():
+    sensitivity = torch.zeros(3, 4, 6, dtype=DOUBLE)
+    sensitivity[:, ROLL, 1:4] = torch.tensor([-0.05, 0.1, -0.05], dtype=DOUBLE)
+    sensitivity[1, HEIGHT, 4], sensitivity[2, HEIGHT, 4] = 5e-4, 0.03
+    none = torch.zeros(3, 6, dtype=DOUBLE)
+    found = unverified_deviation(sensitivity, none, JointConfig(lane_deviation_std=0.1))
+    torch.testing.assert_close(found, torch.tensor([0.1, 0.1 * math.sqrt(0.75), 0.0], dtype=DOUBLE))
+    held = torch.full((3, 6), 0.02**2 / 3, dtype=DOUBLE)  # half of their sum is 0.02²
+    left = unverified_deviation(sensitivity, held, JointConfig(lane_deviation_std=0.1))
+    assert left[0] == pytest.approx(math.sqrt(0.1**2 - 0.02**2))
+
+
+@pytest.mark.parametrize("visible", [(1, 2, 3), (2, 3, 4)])
+def test_two_lanes_that_differ_are_within_the_standard_deviations(visible):
+    """Nothing shows that a lane is 10 cm wider than the other: roll and height are wrong, and may be."""
+    places = PLACES.clone()
+    places[visible[0]] += 0.05
+    places[visible[2]] += 0.05
+    drive = moments(0.5, lambda t, m: replace(m, visible=visible, places=places))
+    calibrator = JointCalibrator()
+    state = calibrator.initial_state(2, dtype=DOUBLE)
+    for moment, segments in see(drive, 2, 1.0, 20, 0, DOUBLE):
+        calibration, state = calibrator(segments, CAMERA.expand(2, 3, 3), state, moment.dt, WIDTH)
+    error = calibration.extrinsics.stack() - torch.tensor(moment.pose, dtype=DOUBLE)
+    sigma = calibration.covariance.diagonal(dim1=1, dim2=2).sqrt()
+    assert (error.abs() < 3 * sigma).all()
+    assert (error[:, ROLL].abs() > math.radians(0.2)).all()
+    assert (sigma[:, ROLL] < math.radians(1.0)).all()
+    assert (sigma[:, :2] < math.radians(0.1)).all()  # pitch and yaw do not depend on it
 
 
 def test_minutes_of_nothing_keep_the_covariance_positive_and_bounded():

@@ -206,6 +206,9 @@ GENERATED: dict[str, Generated] = {
     "misnumbered": Generated("outliers", _scenario("whole frames misnumbered")),
     "unequal-lanes": Generated("unequal lanes", _scenario("unequal lanes")),
     "narrow-lane": Generated("unequal lanes", _drive(_unequal)),
+    "two-unequal-lanes": Generated(
+        "unequal lanes", _drive(lambda t, m: _only((2, 3, 4), replace(_unequal(t, m), tag="")))
+    ),
     "gap-2-s": Generated("gap", _drive(_nothing(1.0, 3.0))),
     "gap-6-s": Generated("gap", _drive(_nothing(1.5, 7.5), fps=12.0)),
     "clock-irregular": Generated("clock", _scenario("bad clock")),

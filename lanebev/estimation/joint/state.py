@@ -32,6 +32,8 @@ class JointConfig:
         iterations: Gauss-Newton steps per frame.
         start_iterations: Gauss-Newton steps for every start of a first frame.
         lane_width_std: sigma of the common scale of the lane widths, m; 0: the widths are exact.
+        lane_deviation_std: sigma of a boundary's deviation where too few are in view to tell whether lanes
+            are equal, m; 0: lanes are equal.
         motion: motion model.
         prior: prior of a start and range of its search.
         open_pose: sigma of a jump of the pose if a frame contradicts the motion by ten sigmas, rad (and ten
@@ -62,6 +64,7 @@ class JointConfig:
     iterations: int = 2
     start_iterations: int = 8
     lane_width_std: float = 0.0
+    lane_deviation_std: float = 0.05
     motion: MotionConfig = field(default_factory=MotionConfig)
     prior: FramePrior = field(default_factory=FramePrior)
     open_pose: float = 0.01

@@ -18,6 +18,8 @@ from lanebev.tensors import constant
 from lanebev.types import Calibration, Extrinsics, Status
 
 _ONLY_HEIGHT = (0.0, 0.0, 0.0, 1.0)
+_FITTED = 3  # boundaries that a pose of equal lanes always fits: by offset, roll and height
+_IN_VIEW = 0.002  # rad/m or m/m: change of roll or height by a boundary's deviation from which it counts
 _DOUBTFUL = 0.6  # m out of place, below which a single boundary may stand for several
 
 
@@ -101,15 +103,33 @@ def single_deviation(deviations: Tensor, variances: Tensor, cfg: JointConfig) ->
     return torch.where(alone, torch.where(alone, missing, 1.0).sqrt(), 0.0)
 
 
+def unverified_deviation(sensitivity: Tensor, variances: Tensor, cfg: JointConfig) -> Tensor:
+    """Compute how far (B,) m every boundary may deviate where too few are in view to show that any does.
+
+    Source: (J26). Three boundaries fit a pose of equal lanes, however unequal the lanes are; a fourth shows
+    whether they are. As in :func:`single_deviation`, what the filter has in its own variances is subtracted.
+
+    Args:
+        sensitivity: (B, 4, L) change of the pose per metre of deviation of a boundary; 0 if not in view.
+        variances: (B, L) m², of the deviations by the filter.
+        cfg: the numbers.
+    """
+    in_view = (sensitivity[:, ROLL:].abs().amax(1) / _IN_VIEW).clamp(max=1.0)
+    further = (in_view.sum(-1) - _FITTED).clamp(0.0, 1.0)
+    missing = cfg.lane_deviation_std**2 * (1 - further) - 0.5 * variances.sum(-1)
+    left = missing > 0
+    return torch.where(left, torch.where(left, missing, 1.0).sqrt(), 0.0)
+
+
 def as_calibration(
     state: JointState, inliers: Tensor, apart: Tensor, positions: Tensor, cfg: JointConfig
 ) -> Calibration:
     """Make the calibration of a state.
 
     Its covariance adds what the filter does not estimate: the common scale of the lane widths; the deviation
-    of one unknown boundary; the difference from a frame that contradicts the state; and, if roll is not
-    observed, the second-order effect of its error on the height. If the boundaries at x₁ and x₂ stay where
-    they are seen, h'' = -2 (h - x₁ x₂ / h).
+    of one unknown boundary, and of all where too few are in view to show it; the difference from a frame that
+    contradicts the state; and, if roll is not observed, the second-order effect of its error on the height.
+    If the boundaries at x₁ and x₂ stay where they are seen, h'' = -2 (h - x₁ x₂ / h).
 
     Args:
         state: (B, ...).
@@ -128,7 +148,9 @@ def as_calibration(
     more = more + (cfg.lane_width_std / width * height).square()
     own = layout(cfg.num_boundaries).deviations
     variances = state.cov.diagonal(dim1=1, dim2=2)[:, own]
-    by_lanes = single_deviation(state.mean[:, own], variances, cfg)[:, None, None] * state.pose_sensitivity
+    single = single_deviation(state.mean[:, own], variances, cfg)
+    deviation = torch.maximum(single, unverified_deviation(state.pose_sensitivity, variances, cfg))
+    by_lanes = deviation[:, None, None] * state.pose_sensitivity
     only_height = constant(_ONLY_HEIGHT, like=cov)
     added = torch.cat([by_lanes, apart.unsqueeze(-1)], dim=-1)
     cov = torch.baddbmm(cov, added, added.mT) + (only_height * more.unsqueeze(-1)).diag_embed()
