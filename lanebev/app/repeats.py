@@ -17,6 +17,7 @@ _STRIDE = 8  # px, of the pixels that are compared
 _NEAR = 2  # frames before and after, among which the largest change is that of the drive
 _MOVING = 1.0  # grey levels of 255 on average, of a change that counts
 _REPEATED = 0.2  # of the largest change near by; compression alone changes a repeated image by up to 0.1
+_FROZEN = 0.05  # grey levels on average, of a change that no camera's noise leaves
 _MANY, _FEW = 0.1, 4  # of the frames, and in number: those at a cut or a stop
 
 
@@ -59,7 +60,14 @@ class RepeatedFrames:
         """Return what to say of the drive; empty if few frames are repeated."""
         changes = self._changes.all()
         count = int(repeated(changes).sum()) if len(changes) else 0
-        if count <= max(_FEW, _MANY * len(changes)):
+        many = max(_FEW, _MANY * len(changes))
+        frozen = int((changes < _FROZEN).sum())
+        if count <= many < frozen:
+            return (
+                f"{frozen} of {len(changes)} frames show the image of the one before: is the video frozen?"
+                " standard deviations become too small in them, since their errors are the same"
+            )
+        if count <= many:
             return ""
         return (
             f"{count} of {len(changes)} frames repeat the one before: the motion stops in them and is larger"

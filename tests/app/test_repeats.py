@@ -39,6 +39,15 @@ def test_repeated_frames_are_counted(tmp_path, pattern, count):
     assert _drive(pattern, tmp_path).remark() == said  # kept on disk
 
 
+def test_a_frozen_video_is_said_and_a_standing_car_is_not():
+    assert (
+        _drive("abc" + 9 * "d", noise=0.0)
+        .remark()
+        .startswith("8 of 12 frames show the image of the one before: is")
+    )
+    assert _drive("abc" + 9 * "d", noise=0.5).remark() == ""
+
+
 @pytest.mark.parametrize(
     ("changes", "count"),
     [
