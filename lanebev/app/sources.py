@@ -100,8 +100,9 @@ def camera_of(config: RunConfig, source: FrameSource) -> Camera:
 
 
 def first_image(source: FrameSource) -> NDArray[np.uint8] | None:
-    """Return the first frame's image, (H, W, 3); None of a stream, and of a frame that does not decode."""
-    return None if source.is_live else next(iter(source)).image
+    """Return the first frame's image, (H, W, 3); None of a stream, or if there is none that decodes."""
+    frame = None if source.is_live else next(iter(source), None)
+    return None if frame is None else frame.image
 
 
 def observed_frames(source: FrameSource, observer: Observer) -> Generator[tuple[Frame, Observation]]:

@@ -17,9 +17,10 @@ import pytest
 from lanebev import Camera
 from lanebev.app.config import RunConfig
 from lanebev.app.options import parse_grid
-from lanebev.app.sources import make_source, source_of_run
+from lanebev.app.sources import first_image, make_source, source_of_run
 from lanebev.app.summary import setting_words
 from lanebev.cli import main
+from lanebev.io.frames import Selection
 from lanebev.io.images import write_png
 from lanebev.io.live import open_live
 from lanebev.io.results import read_extrinsics
@@ -160,6 +161,12 @@ def test_settings_that_take_nothing(data, tmp_path, capsys, arguments, word):
     fixed = ("run", data / "drive.mp4", "--camera", data / "camera.yaml", "--out", tmp_path / "out")
     _fails(capsys, *fixed, *arguments, word=word)
     assert not (tmp_path / "out").exists()
+
+
+def test_the_first_image_of_a_source(data):
+    source = open_source(str(data / "drive.mp4"))
+    assert first_image(source).shape[:2] == source.image_size
+    assert first_image(replace(source, selection=Selection(start=1e3))) is None
 
 
 def test_a_grid_by_its_text():
