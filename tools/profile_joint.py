@@ -3,11 +3,13 @@
     python -m tools.profile_joint --rows 256 --segments 408
 
 Prints for each function of the package the time of the operations that it calls itself, ms, the smallest of
-several runs for each operation, and their number. Views count as operations. One thread.
+several runs for each operation; the bytes that they read and write, MB; and their number. Views count as
+operations, without bytes. At last the bandwidth of the memory, in the caches and beyond them. One thread.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections import Counter
@@ -20,6 +22,7 @@ import torch
 from jsonargparse import auto_cli
 from jsonargparse.typing import PositiveInt
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 import lanebev
 from tools.bench_speed.calibration import calibrators
@@ -28,11 +31,11 @@ _PACKAGE = str(Path(lanebev.__file__).parent)
 
 
 class Recorder(TorchDispatchMode):
-    """Record of every operation the function that called it and its processor time, ns."""
+    """Record of every operation the function that called it, its processor time, ns, and its bytes."""
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self.calls: list[tuple[str, int]] = []
+        self.calls: list[tuple[str, int, int]] = []
 
     def __torch_dispatch__(
         self, func: Callable[..., Any], types: Any, args: Any = (), kwargs: Any = None
@@ -40,8 +43,16 @@ class Recorder(TorchDispatchMode):
         begin = time.thread_time_ns()
         result = func(*args, **(kwargs or {}))
         spent = time.thread_time_ns() - begin
-        self.calls.append((_caller(), spent))
+        moved = 0 if getattr(func, "is_view", False) else _bytes((args, kwargs, result))
+        self.calls.append((_caller(), spent, moved))
         return result
+
+
+def _bytes(values: Any) -> int:
+    """Count the bytes of all tensors in a tree, those that are repeated by broadcasting once."""
+    tensors = [leaf for leaf in tree_leaves(values) if isinstance(leaf, torch.Tensor)]
+    sizes = ([n for n, stride in zip(t.shape, t.stride(), strict=True) if stride] for t in tensors)
+    return sum(math.prod(size) * t.element_size() for size, t in zip(sizes, tensors, strict=True))
 
 
 def _caller() -> str:
@@ -55,8 +66,8 @@ def _caller() -> str:
     return "other"
 
 
-def profile(rows: int, segments: int, runs: int) -> dict[str, tuple[float, int]]:
-    """Measure a frame: time in ms and number of operations by function, the longest first."""
+def profile(rows: int, segments: int, runs: int) -> dict[str, tuple[float, float, int]]:
+    """Measure a frame: time in ms, MB and number of operations by function, the longest first."""
     call = calibrators(rows, segments // 6)["joint"]
     call()
     recorded = []
@@ -65,12 +76,26 @@ def profile(rows: int, segments: int, runs: int) -> dict[str, tuple[float, int]]
             call()
         recorded.append(recorder.calls)
     spent: Counter[str] = Counter()
+    moved: Counter[str] = Counter()
     number: Counter[str] = Counter()
     for same in zip(*recorded, strict=True):
-        function = same[0][0]
-        spent[function] += min(each for _, each in same)
+        function, _, size = same[0]
+        spent[function] += min(each for _, each, _ in same)
+        moved[function] += size
         number[function] += 1
-    return {function: (1e-6 * total, number[function]) for function, total in spent.most_common()}
+    return {name: (1e-6 * total, 1e-6 * moved[name], number[name]) for name, total in spent.most_common()}
+
+
+def bandwidth(megabytes: int) -> float:
+    """Measure GB/s read and written by the multiplication of two tensors of so many MB."""
+    one = torch.rand(megabytes * 125_000, dtype=torch.float64)
+    result = torch.empty_like(one)
+    times = []
+    for _ in range(10):
+        begin = time.thread_time_ns()
+        torch.mul(one, one, out=result)
+        times.append(time.thread_time_ns() - begin)
+    return 2e6 * megabytes / min(times)
 
 
 def main(rows: PositiveInt = 256, segments: PositiveInt = 408, runs: PositiveInt = 10) -> None:
@@ -83,9 +108,11 @@ def main(rows: PositiveInt = 256, segments: PositiveInt = 408, runs: PositiveInt
     """
     torch.set_num_threads(1)
     found = profile(rows, segments, runs)
-    total = (sum(ms for ms, _ in found.values()), sum(number for _, number in found.values()))
-    for function, (ms, number) in {"all": total, **found}.items():
-        print(f"{ms:8.2f} ms {number:5d} operations  {function}")
+    times, sizes, numbers = zip(*found.values(), strict=True)
+    for function, (ms, moved, number) in {"all": (sum(times), sum(sizes), sum(numbers)), **found}.items():
+        print(f"{ms:8.2f} ms {moved:8.1f} MB {number:5d} operations  {function}")
+    for size in (1, 64):
+        print(f"{bandwidth(size):8.0f} GB/s of tensors of {size} MB")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,8 @@ from tools import profile_joint
 
 def test_operations_are_counted_for_the_function_that_calls_them(capsys):
     profile_joint.main(rows=1, segments=12, runs=1)
-    first, *rest = (line.split() for line in capsys.readouterr().out.splitlines())
+    first, *rest, cache, memory = (line.split() for line in capsys.readouterr().out.splitlines())
     assert first[-1] == "all"
-    assert int(first[2]) == sum(int(line[2]) for line in rest) > 1000
+    assert int(first[4]) == sum(int(line[4]) for line in rest) > 1000
     assert {"update._normal_equations", "measurement.look"} < {line[-1] for line in rest}
+    assert cache[1] == memory[1] == "GB/s"
