@@ -431,7 +431,7 @@ def test_a_run_on_rectified_images(tmp_path):
     camera = _message(width=128, height=72, K=(np.array(K) / 10).tolist(), P=(np.array(P) / 10).tolist())
     camera["K"][8] = camera["P"][10] = 1.0
     (tmp_path / "0.lines.txt").write_text("")
-    paths = {"source": "0.png", "camera": "c.yaml", "lanes": "0.lines.txt", "out": "out"}
+    paths = {"source": "[0].png", "camera": "c.yaml", "lanes": "0.lines.txt", "out": "out"}
     _write(tmp_path / "c.yaml", camera)
     report = run(RunConfig(**{key: str(tmp_path / name) for key, name in paths.items()}, rectified=True))
     assert report.facts["camera"].endswith("pinhole, f = 70.0 / 70.0 px")
