@@ -135,6 +135,11 @@ def _unequal(t: float, moment: Moment) -> Moment:
     return replace(moment, places=PLACES + torch.tensor([0.1, 0.0, 0.25, -0.25, 0.0, -0.1]).double())
 
 
+def _two_then_more(t: float, moment: Moment) -> Moment:
+    """Show two unequal lanes for 2 s, then their neighbours too."""
+    return _only((2, 3, 4) if t < 1.99 else (1, 2, 3, 4, 5), _unequal(t, moment))
+
+
 def _nothing(first: float, last: float) -> Callable[[float, Moment], Moment]:
     def change(t: float, moment: Moment) -> Moment:
         gone = first <= t < last
@@ -209,6 +214,7 @@ GENERATED: dict[str, Generated] = {
     "two-unequal-lanes": Generated(
         "unequal lanes", _drive(lambda t, m: _only((2, 3, 4), replace(_unequal(t, m), tag="")))
     ),
+    "two-lanes-then-four": Generated("unequal lanes", _drive(_two_then_more)),
     "gap-2-s": Generated("gap", _drive(_nothing(1.0, 3.0))),
     "gap-6-s": Generated("gap", _drive(_nothing(1.5, 7.5), fps=12.0)),
     "clock-irregular": Generated("clock", _scenario("bad clock")),

@@ -16,11 +16,12 @@ from lanebev.batch import flag, replace_rows, select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.evidence import CALL
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, layout
-from lanebev.estimation.joint.measurement import HEIGHT, NUM_STRAIGHT, ROLL, boundary_residuals
-from lanebev.estimation.joint.observations import Observations
+from lanebev.estimation.joint.measurement import HEIGHT, NUM_STRAIGHT, OFFSET, ROLL, boundary_residuals
+from lanebev.estimation.joint.observations import Observations, by_ends, per_end
 from lanebev.estimation.joint.robust import log_likelihood, scaled_variance, squared_distance
 from lanebev.estimation.joint.single_frame import SingleFrameFit, fit_observations
 from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit
+from lanebev.estimation.joint.update import membership
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.linalg import inverse_spd
 from lanebev.types import Status
@@ -99,6 +100,7 @@ def compare_with_frame(
     total = seen.weight.sum(-1).clamp(min=1e-6)
     usable = fit.valid & ((fit.inliers * seen.weight).sum(-1) / total >= cfg.enter_share)
     begun = state_of_fit(fit, state, cfg)
+    begun = begun._replace(pose_sensitivity=sensitivity_of_fit(fit, places, seen, cfg.num_boundaries))
     contrary = usable & is_contrary(state, begun, fit, places, seen, cfg)
     count = torch.where(usable, (state.contrary + 1) * contrary, state.contrary)
     fresh = usable & (wanted | (count >= cfg.contrary_frames))
@@ -165,6 +167,20 @@ def is_contrary(
     )
     penalty = 0.5 * cfg.num_boundaries * seen.weight.sum(-1).clamp(min=1.0).log()
     return (chi2 > _FAR) & (by_fit + penalty > by_state)
+
+
+def sensitivity_of_fit(fit: SingleFrameFit, places: Tensor, seen: Observations, num: int) -> Tensor:
+    """Compute the change (B, 4, L) of a fit's pose per metre of deviation of a boundary.
+
+    Source: M of (J26). It is 0 where the fit does not determine the pose, since the prior's covariance
+    contains more there.
+    """
+    residuals = boundary_residuals(fit.params(), places, seen)
+    precision = residuals.valid * fit.inliers * seen.weight / scaled_variance(seen.sigma, fit.scale)
+    by_own = per_end(precision) * residuals.jacobian[:, OFFSET]  # a deviation moves as the offset does
+    by_segment = by_ends((fit.covariance[:, :NUM_POSE] @ residuals.jacobian) * by_own.unsqueeze(1)).sum(-2)
+    changed = by_segment @ membership(seen.boundary, num, like=by_own).mT
+    return torch.where(fit.observed.all(-1)[:, None, None], changed, 0.0)
 
 
 def state_of_fit(fit: SingleFrameFit, before: JointState, cfg: JointConfig) -> JointState:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple
@@ -94,6 +95,8 @@ class JointConfig:
         if self.iterations < 1 or self.start_iterations < 1:
             got = min(self.iterations, self.start_iterations)
             raise ValueError(f"iterations: expected at least 1, got {got}")
+        if not (math.isfinite(self.lane_deviation_std) and self.lane_deviation_std >= 0):
+            raise ValueError(f"lane_deviation_std: expected at least 0 m, got {self.lane_deviation_std}")
         bend = (self.prior.curvature_std, self.prior.curvature_rate_std)
         if not all(0 < sharp < wide for sharp, wide in zip(self.straight, bend, strict=True)):
             raise ValueError(

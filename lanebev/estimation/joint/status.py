@@ -19,7 +19,8 @@ from lanebev.types import Calibration, Extrinsics, Status
 
 _ONLY_HEIGHT = (0.0, 0.0, 0.0, 1.0)
 _FITTED = 3  # boundaries that a pose of equal lanes always fits: by offset, roll and height
-_IN_VIEW = 0.002  # rad/m or m/m: change of roll or height by a boundary's deviation from which it counts
+_IN_VIEW = 0.015  # rad/m or m/m: change of roll or height by a boundary's deviation from which it counts
+_GONE = 0.001  # likewise, below which it is not in view
 _DOUBTFUL = 0.6  # m out of place, below which a single boundary may stand for several
 
 
@@ -67,11 +68,15 @@ def update_track_status(
         Reason.HEIGHT_UNSEEN: blind[:, HEIGHT],
     }
     known = supported & ~blind.any(-1)
+    changed = (updated.reasons & int(Reason.LANE_CHANGE)) != 0
+    sensitivity = remembered_sensitivity(
+        updated.pose_sensitivity, predicted.pose_sensitivity, torch.where(changed, torch.inf, step), cfg
+    )
     after = predicted._replace(
         mean=select_rows(supported, updated.mean, predicted.mean),
         cov=select_rows(supported, updated.cov, predicted.cov),
         motion_scale=select_rows(supported, updated.motion_scale, predicted.motion_scale),
-        pose_sensitivity=select_rows(known, updated.pose_sensitivity, predicted.pose_sensitivity),
+        pose_sensitivity=select_rows(known, sensitivity, predicted.pose_sensitivity),
         evidence=select_rows(supported, updated.evidence, torch.zeros_like(updated.evidence)),
         early=torch.zeros_like(unseen),
         unseen=unseen,
@@ -80,6 +85,23 @@ def update_track_status(
         reasons=flags(conditions) | torch.where(supported, updated.reasons, 0),
     )
     return after, supported
+
+
+def remembered_sensitivity(now: Tensor, before: Tensor, step: Tensor, cfg: JointConfig) -> Tensor:
+    """Blend the pose's change per metre of deviation of each boundary, M of (J26), over the last frames.
+
+    A boundary counts fully after some frames in view. One that has gone has shown where it is, and its share
+    decays as deviations do. So the covariance changes gradually when boundaries come and go.
+
+    Args:
+        now: (B, 4, L) by this frame.
+        before: (B, 4, L).
+        step: (B,) s since then; inf where the boundaries' numbers have changed.
+        cfg: the numbers.
+    """
+    gone = now[:, ROLL:].abs().amax(1, keepdim=True) < _GONE
+    memory = torch.where(gone, cfg.motion.deviation_memory, cfg.evidence_time)
+    return now + (-step[:, None, None] / memory).exp() * (before - now)
 
 
 def single_deviation(deviations: Tensor, variances: Tensor, cfg: JointConfig) -> Tensor:
