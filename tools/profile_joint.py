@@ -98,7 +98,7 @@ def bandwidth(megabytes: int) -> float:
     return 2e6 * megabytes / min(times)
 
 
-def main(rows: PositiveInt = 256, segments: PositiveInt = 408, runs: PositiveInt = 10) -> None:
+def print_profile(rows: PositiveInt = 256, segments: PositiveInt = 408, runs: PositiveInt = 10) -> None:
     """Print a frame's time by function.
 
     Args:
@@ -115,5 +115,10 @@ def main(rows: PositiveInt = 256, segments: PositiveInt = 408, runs: PositiveInt
         print(f"{bandwidth(size):8.0f} GB/s of tensors of {size} MB")
 
 
+def main() -> None:
+    """Run from the command line."""
+    auto_cli(print_profile)
+
+
 if __name__ == "__main__":
-    auto_cli(main)
+    main()
