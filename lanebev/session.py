@@ -130,8 +130,9 @@ class Session:
         self.camera, self.grid, self.colours, self.device = camera, grid, colours, usable_device(device)
         self.polyline_sigma = polyline_sigma
         self._model = model
-        own = JointCalibrator() if model is None else deepcopy(model.calibrator).cpu()
-        self._parts: tuple[Any, ...] = (calibrator or own, camera, float(lane_width), float(focal_std))
+        if calibrator is None:
+            calibrator = JointCalibrator() if model is None else _calibrator_of(model)
+        self._parts: tuple[Any, ...] = (calibrator, camera, float(lane_width), float(focal_std))
         for remark in camera_remarks(camera):
             logger.warning(remark)
         self.reset()
@@ -261,6 +262,19 @@ class Session:
             if words and not self._doubt:  # once, as long as it lasts
                 logger.warning(words)
             self._doubt, self._drawn = words, []
+
+
+def _calibrator_of(model: LaneBEV) -> Calibrator[Any]:
+    """Return a copy of a model's calibrator on the CPU.
+
+    Raises:
+        TypeError: the model has another module in its place.
+    """
+    own = model.calibrator
+    if not isinstance(own, Calibrator):
+        got = type(own).__qualname__
+        raise TypeError(f"model: expected one with a lanebev.Calibrator, got {got}; give one as calibrator=")
+    return deepcopy(own).cpu()
 
 
 def _check_type(name: str, value: object, expected: type) -> None:

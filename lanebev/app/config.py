@@ -215,7 +215,7 @@ class RunConfig:
         for name, (value, count, least) in sizes.items():
             if value is None:
                 continue
-            whole = len(value) == count and all(isinstance(each, int) for each in value)
+            whole = len(value) == count and all(type(each) is int for each in value)
             if not (whole and all(each >= low for each, low in zip(value, least, strict=True))):
                 names = ("top", "left", "height", "width")[-count:]
                 raise ValueError(f"{name}: expected whole px of an image, ({', '.join(names)}), got {value}")

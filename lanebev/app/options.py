@@ -66,7 +66,9 @@ def check_grid(grid: Sequence[float]) -> tuple[float, float, float, float, float
 
 
 def check_types(settings: object) -> None:
-    """Raise unless the values of settings have the types of their fields; paths become texts, lists tuples.
+    """Raise unless the values of settings have the types of their fields.
+
+    Paths become texts, lists tuples, and numbers, of NumPy too, those of Python.
 
     Raises:
         TypeError: another type; the message names the setting.
@@ -77,12 +79,26 @@ def check_types(settings: object) -> None:
             continue
         if isinstance(value, os.PathLike):
             value = os.fspath(value)
-        kind = "tuple" if kind.startswith("tuple[") else kind
+        kind, _, rest = kind.partition("[")
         known, words = _TYPES[kind]
         if not isinstance(value, known) or (isinstance(value, bool) and kind != "bool"):
             name = each.name.replace("_", " ")
             raise TypeError(f"{name}: expected {words}, got {value!r}")
-        object.__setattr__(settings, each.name, tuple(value) if isinstance(value, list) else value)
+        if isinstance(value, tuple | list):
+            part = re.split(r"\W", rest)[0]
+            value = tuple(_python_number(one, part) for one in value)
+        object.__setattr__(settings, each.name, _python_number(value, kind))
+
+
+def _python_number(value: object, kind: str) -> object:
+    """Return a number as Python's "int" or "float", and a value that is no such number as it is."""
+    if isinstance(value, bool):
+        return value
+    if kind == "int" and isinstance(value, Integral):
+        return int(value)
+    if kind == "float" and isinstance(value, Real):
+        return float(value)
+    return value
 
 
 def option(

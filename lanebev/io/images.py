@@ -68,8 +68,9 @@ def stated_size(path: str | Path) -> tuple[int, int] | None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with Image.open(path) as image:
-                width, height = image.size
-                return (width, height) if _orientation(image) in _LYING else (height, width)
+                width, height = image.size  # of a TIFF already upright
+                lying = image.format != "TIFF" and _orientation(image) in _LYING
+                return (width, height) if lying else (height, width)
     except _UNREADABLE:
         return None
 

@@ -46,7 +46,7 @@ __all__ = [
     "write_png",
 ]
 
-_LOOKED_AT = 20  # images, for the most frequent size
+_LOOKED_AT = 20  # images, for the most frequent size and one that has it
 _DARK = 24  # of 255; 12 bits in 16 give 15 at most
 _SAME_RATE = 0.05  # relative, by which two frame rates may differ and be the same
 _SAME_VIDEO = 2  # factor, by which a video's frames may come faster or slower than its mean rate
@@ -125,13 +125,17 @@ def _image_source(source: str, paths: Sequence[str], fps: Fraction | None) -> Fr
 def _typical_image(paths: Sequence[str]) -> NDArray[np.uint8]:
     """Return the first whole image whose size is the most frequent one of the first images.
 
+    Where none of these is whole, it is the first whole image of any size.
+
     Raises:
         ValueError: none decodes; the error is that of the first.
     """
     sizes = Counter(filter(None, map(stated_size, paths[:_LOOKED_AT])))
     usual = sizes.most_common(1)[0][0] if sizes else None
     found, problem = None, ""
-    for path in paths:
+    for number, path in enumerate(paths):
+        if found is not None and number >= _LOOKED_AT:
+            break
         try:
             image = read_image(path)
         except ValueError as error:

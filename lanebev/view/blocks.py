@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from lanebev.view.lens import Lens
-from lanebev.view.one_thread import ONE_THREAD
 from lanebev.view.projection import Cells, CellSums, image_coordinates, outside_image
+from lanebev.view.thread_limits import ONE_THREAD
 from lanebev.view.tiles import Interpolant, interpolant
 
 BLOCK = 1 << 17  # cells: a dozen float32 planes of so many fit a cache of a few MB

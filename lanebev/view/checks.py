@@ -15,7 +15,7 @@ _SAME_SHAPE = 1.25  # factor between height over width of a map and of the image
 
 
 def check_image(image: Tensor, name: str = "image") -> None:
-    """Raise TypeError or ValueError unless this is a (B, C, h, w) map of floating point."""
+    """Raise TypeError or ValueError unless this is a (B, C, h, w) map of floating point, h and w above 0."""
     check_tensor(name, image)
     if image.ndim != 4:
         remedy = {3: "; add a batch axis, x[None]", 5: "; flatten clips (B, T) into one batch axis"}
@@ -23,12 +23,16 @@ def check_image(image: Tensor, name: str = "image") -> None:
         raise ValueError(f"{name}: expected (B, C, h, w), got {got}")
     if not image.is_floating_point():
         raise ValueError(f"{name}: expected floating point, got {image.dtype}")
+    if not torch.compiler.is_compiling() and 0 in image.shape[-2:]:
+        raise ValueError(f"{name}: expected (B, C, h, w) with h and w of 1 or more, got {tuple(image.shape)}")
 
 
 def check_size(size: object) -> None:
-    """Raise TypeError unless this is a pair, (height, width)."""
+    """Raise TypeError unless this is a pair, (height, width), and ValueError unless both are above 0."""
     if not (isinstance(size, Sequence) and len(size) == 2):
         raise TypeError(f"image_size: expected (height, width) in px, got {size!r}")
+    if not torch.compiler.is_compiling() and min(size) <= 0:
+        raise ValueError(f"image_size: expected (height, width) of 1 px or more, got {size!r}")
 
 
 def check_covers(image: Tensor, size: tuple[int, int]) -> None:

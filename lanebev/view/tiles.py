@@ -22,8 +22,8 @@ from torch import Tensor
 
 from lanebev.geometry.precision import autocast_off
 from lanebev.view.lens import Lens
-from lanebev.view.one_thread import ONE_THREAD, small_products
 from lanebev.view.projection import CellSums, image_coordinates
+from lanebev.view.thread_limits import ONE_THREAD, small_products
 
 _NODES = 12  # of a tile, along its rows and along its columns
 _LEAST_ROWS = 3 * _NODES  # of a tile

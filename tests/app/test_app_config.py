@@ -55,6 +55,21 @@ def test_paths_may_be_paths_and_numbers_of_numpy(tmp_path):
     assert ExportConfig(Path("c.yaml")).camera == "c.yaml"
 
 
+def test_numbers_of_numpy_are_kept_as_those_of_python():
+    lanes = {"source": "a", "camera": "c.yaml", "lanes": "l.json"}
+    given = RunConfig(
+        **lanes, fps=np.float32(30), every=np.int64(2), lanes_size=(np.int64(720), 1280),
+        grid=tuple(np.float32([3, 30, -5, 5, 0.25])),
+    )  # fmt: skip
+    of_python = RunConfig(
+        **lanes, fps=30.0, every=2, lanes_size=(720, 1280), grid=(3.0, 30.0, -5.0, 5.0, 0.25)
+    )
+    assert repr(given) == repr(of_python)
+    assert given.frame_rate == 30
+    whole = RunConfig("a", "c.yaml", fps=30)
+    assert repr(whole.fps) == "30.0"
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -80,6 +95,7 @@ def test_settings_of_other_types_are_named(settings, message):
         ({"lanes_crop": (0, 0, -1, 5)}, r"lanes crop: expected whole px .*\(top, left, height, width\), got"),
         ({"lanes_crop": (0, 0, 240)}, r"got \(0, 0, 240\)"),
         ({"lanes_crop": (0.5, 0, 240, 320)}, r"got \(0\.5, 0, 240, 320\)"),
+        ({"lanes_size": (True, 640)}, r"got \(True, 640\)"),
         ({"lanes_size": (0, 640)}, r"lanes size: expected whole px of an image, \(height, width\), got \(0,"),
         ({"formats": ("csv",)}, "formats: expected some of parquet, .*, got 'csv'"),
         ({"grid": (3, 60, -10)}, r"grid: expected the numbers \(near, far, left, right, resolution\), got"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lanebev.io import video
 from lanebev.io.images import is_damaged_jpeg, read_image, stated_size
 from lanebev.io.live import open_live
 from lanebev.io.video import open_source
@@ -77,11 +78,25 @@ def test_the_size_of_most_images_counts(tmp_path):
     assert [frame.image is None for frame in source] == [True, True, False, True, False]
 
 
-def test_the_size_that_a_header_states_is_that_of_the_upright_image(tmp_path):
-    turned = Image.Exif()
-    turned[0x0112] = 6
-    Image.new("RGB", (32, 24)).save(tmp_path / "a.jpg", exif=turned)
-    assert stated_size(tmp_path / "a.jpg") == read_image(tmp_path / "a.jpg").shape[:2] == (32, 24)
+def test_a_whole_image_of_the_usual_size_is_not_searched_beyond_the_first(tmp_path, monkeypatch):
+    for number in range(30):
+        (tmp_path / f"{number:02d}.jpg").write_bytes(_jpeg((16, 8)) if number == 3 else _jpeg()[:-60])
+    read = []
+    monkeypatch.setattr(video, "read_image", lambda path: read.append(path) or read_image(path))
+    assert open_source(str(tmp_path)).image_size == (8, 16)
+    assert len(read) == 20
+
+
+@pytest.mark.parametrize("kind", ["jpg", "tif", "png", "webp"])
+@pytest.mark.parametrize(("orientation", "size"), [(3, (24, 32)), (6, (32, 24))])
+def test_the_size_that_a_header_states_is_that_of_the_upright_image(tmp_path, kind, orientation, size):
+    turned, path = Image.Exif(), tmp_path / f"a.{kind}"
+    turned[0x0112] = orientation
+    Image.new("RGB", (32, 24)).save(path, exif=turned)
+    assert stated_size(path) == read_image(path).shape[:2] == size
+
+
+def test_a_missing_image_states_no_size(tmp_path):
     assert stated_size(tmp_path / "none.jpg") is None
 
 

@@ -255,6 +255,18 @@ def test_a_session_uses_the_calibrator_of_its_model():
     assert Session(CAMERA, model=model, calibrator=own).tracker.calibrator is own
 
 
+def test_a_model_without_a_calibrator_of_lanebev_needs_another():
+    class Own(torch.nn.Module):
+        def __deepcopy__(self, memo):
+            raise AssertionError("copied in vain")
+
+    model = LaneBEV.from_pretrained(calibrator=Own())
+    with pytest.raises(TypeError, match=r"model: expected one with a lanebev.Calibrator, got .*Own; give"):
+        Session(CAMERA, model=model)
+    own = JointCalibrator()
+    assert Session(CAMERA, model=model, calibrator=own).tracker.calibrator is own
+
+
 def test_every_reason_has_words():
     assert set(REASON_WORDS) == {reason for reason in Reason if reason}
     assert describe_reasons(Reason.NONE) == []

@@ -12,9 +12,9 @@ import torch
 from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics
 from lanebev.view.blocks import blocks
 from lanebev.view.cells import cells_and_lens
-from lanebev.view.one_thread import small_products
 from lanebev.view.projection import image_coordinates, normalised_intrinsics, outside_image
 from lanebev.view.sampling import MapSize, sampling_maps
+from lanebev.view.thread_limits import small_products
 from lanebev.view.tiles import (
     column_tiles,
     equal_edges,

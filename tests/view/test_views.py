@@ -102,6 +102,10 @@ def test_arguments_of_several_maps_are_checked():
     for views in (warp, CanonicalView(K[0], (180, 320), extrinsics)):
         with pytest.raises(ValueError, match=r"\(height, width\), got \(320, 180\) with a map .* swapped"):
             views(torch.rand(1, 2, 23, 40), K, extrinsics, image_size=(320, 180))
+        with pytest.raises(ValueError, match=r"image_size: expected .* of 1 px or more, got \(0, 320\)"):
+            views(torch.rand(1, 2, 23, 40), K, extrinsics, image_size=(0, 320))
+        with pytest.raises(ValueError, match=r"image: .* with h and w of 1 or more, got \(1, 2, 0, 40\)"):
+            views(torch.rand(1, 2, 0, 40), K, extrinsics)
     with pytest.raises(ValueError, match="image: expected maps of 1 images, got 2"):
         warp([ramp(), ramp(batch=2)], K, extrinsics, image_size=(180, 320))
     with pytest.raises(ValueError, match="image: expected one map at least, got none"):
