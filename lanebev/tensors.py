@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache, wraps
+from threading import Lock
 from typing import Any, ParamSpec, TypeVar, cast
 
 import torch
@@ -12,6 +13,9 @@ from torch import Tensor
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+_lock = Lock()
+_before: list[int] = []  # numbers of threads before the blocks of one_thread under way; the first one counts
 
 
 def map_tensors(function: Callable[[Tensor], Tensor], value: T) -> T:
@@ -29,13 +33,20 @@ def one_thread() -> Iterator[None]:
 
     For many operations on small tensors: several threads save little, and where other processes compute as
     well, each operation waits for the thread that comes last (``python -m tools.render_cost --threads 2``).
+
+    PyTorch's number of threads is each Python thread's own, and also the one with which later Python threads
+    begin. So where blocks of several overlap, all leave with the number that was there before the first. A
+    Python thread that first computes during another one's block, outside a block of its own, keeps 1.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    with _lock:
+        _before.append(torch.get_num_threads())
+        torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        with _lock:
+            torch.set_num_threads(_before[0])
+            _before.pop()
 
 
 def usable_device(device: torch.device | str | int) -> torch.device:

@@ -41,7 +41,8 @@ from train.export import checkout_commit, export, trained_segmenter
 
 START = 25.0  # s, imports and the first batch
 EXPORT = 6.0  # s, reading a checkpoint and writing weights
-RECALL = 25.0  # s at most
+RECALL = 25.0  # s, after which no further batch begins
+BATCH = 5.0  # s, kept for the first batch of the recall, whose time is not known before
 SMOKE = 120.0  # s at most, before the given time begins
 GRACE = 20.0  # s, a training may take to end by itself
 SHARES = (1 / 3, 2 / 3)
@@ -233,15 +234,17 @@ def time_parts(out: Path, seconds: float) -> None:
         print("gpu_run: train.smoke took too long and is ended", flush=True)
 
 
-def held_out_recall(weights: Path, views: int, deadline: float) -> list[dict[str, Any]]:
-    """Evaluate weights on held-out views, on the GPU if there is one, until a time of ``time.monotonic``.
+def held_out_recall(weights: Path, views: int, until: float) -> list[dict[str, Any]]:
+    """Evaluate weights on held-out views, on the GPU if there is one, within RECALL.
 
-    It runs in this process, which has loaded all it needs already. What goes wrong is printed.
+    It ends before ``until``, a time of ``time.monotonic``, if no batch takes longer than BATCH. It runs in
+    this process, which has loaded all it needs already. What goes wrong is printed.
     """
     cuda = torch.cuda.is_available()
     try:
         segmenter = trained_segmenter(weights)[0].to("cuda" if cuda else "cpu")
         each, batch = -(-views // len(OWN_KINDS)), 64 if cuda else 8
+        deadline = min(time.monotonic() + RECALL, until - BATCH)
         return records(evaluate(segmenter, each, list(OWN_KINDS), HELD_OUT_SEED, batch, deadline))
     except (ValueError, RuntimeError) as error:  # the weights are there without it
         print(f"gpu_run: recall: {error}", flush=True)
@@ -291,7 +294,7 @@ def main() -> None:
     if not there:
         raise ValueError(f"{work}: expected a checkpoint, got none; see {args.out / 'fit.log'}")
     until = end - EXPORT
-    figures = {"recall": held_out_recall(weights, args.views, until - RECALL / 5)}
+    figures = {"recall": held_out_recall(weights, args.views, until)}
     figures["noise"] = noise[0].result(until - time.monotonic()) if noise else []
     (args.out / "figures.json").write_text(json.dumps(figures, indent=1))
     save(training, weights, pose_scale(figures["noise"]), {**record, "metrics": figures["recall"]})

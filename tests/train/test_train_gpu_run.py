@@ -6,6 +6,7 @@ import math
 import sys
 
 import pytest
+import torch
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from train import gpu_run
@@ -119,6 +120,17 @@ def test_recall_is_measured_on_all_kinds_within_the_time_and_breaks_nothing(tmp_
     monkeypatch.undo()
     assert held_out_recall(tmp_path / "none.safetensors", 1, math.inf) == []
     assert "none.safetensors" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("until", "deadline"), [(1000.0, 125.0), (120.0, 115.0)])
+def test_recall_takes_its_time_at_most(tmp_path, monkeypatch, until, deadline):
+    clock, given = Clock(), []
+    clock.now = 100.0
+    monkeypatch.setattr(gpu_run, "time", clock)
+    monkeypatch.setattr(gpu_run, "trained_segmenter", lambda _: (torch.nn.Identity(),))
+    monkeypatch.setattr(gpu_run, "evaluate", lambda *arguments: given.append(arguments[-1]) or {})
+    held_out_recall(tmp_path, 8, until)
+    assert given == [deadline]
 
 
 def test_timing_the_parts_ends_in_time_and_the_run_goes_on(tmp_path, capsys):
