@@ -484,10 +484,14 @@ def test_deviations_that_three_boundaries_cannot_show_count_until_a_fourth_is_se
     sensitivity[:, ROLL, 1:4] = torch.tensor([-0.05, 0.1, -0.05], dtype=DOUBLE)
     sensitivity[1, HEIGHT, 4], sensitivity[2, HEIGHT, 4] = 0.015 / 4, 0.03
     none = torch.zeros(3, 6, dtype=DOUBLE)
-    found = unverified_deviation(sensitivity, none, JointConfig(lane_deviation_std=0.1))
+    found = unverified_deviation(sensitivity, none, none, JointConfig(lane_deviation_std=0.1))
     torch.testing.assert_close(found, torch.tensor([0.1, 0.1 * math.sqrt(0.75), 0.0], dtype=DOUBLE))
+    apart = none.clone()
+    apart[:, 4] = -0.9  # bounds no lane
+    alone = unverified_deviation(sensitivity, apart, none, JointConfig(lane_deviation_std=0.1))
+    torch.testing.assert_close(alone, torch.full_like(alone, 0.1))
     held = torch.full((3, 6), 0.02**2 / 3, dtype=DOUBLE)  # half of their sum is 0.02²
-    left = unverified_deviation(sensitivity, held, JointConfig(lane_deviation_std=0.1))
+    left = unverified_deviation(sensitivity, none, held, JointConfig(lane_deviation_std=0.1))
     assert left[0] == pytest.approx(math.sqrt(0.1**2 - 0.02**2))
 
 
@@ -537,7 +541,7 @@ def test_two_lanes_are_trusted_some_frames_after_a_third_is_seen():
     none = torch.zeros(1, 6, dtype=DOUBLE)
     seen, left = three, []
     for _ in range(5):
-        left.append(float(unverified_deviation(seen, none, cfg)))
+        left.append(float(unverified_deviation(seen, none, none, cfg)))
         seen = remembered_sensitivity(four, seen, step, cfg)
     assert left[0] == pytest.approx(0.05)
     assert 0.03 < left[1] < 0.05

@@ -125,18 +125,22 @@ def single_deviation(deviations: Tensor, variances: Tensor, cfg: JointConfig) ->
     return torch.where(alone, torch.where(alone, missing, 1.0).sqrt(), 0.0)
 
 
-def unverified_deviation(sensitivity: Tensor, variances: Tensor, cfg: JointConfig) -> Tensor:
+def unverified_deviation(
+    sensitivity: Tensor, deviations: Tensor, variances: Tensor, cfg: JointConfig
+) -> Tensor:
     """Compute how far (B,) m every boundary may deviate where too few are in view to show that any does.
 
     Source: (J26). Three boundaries fit a pose of equal lanes, however unequal the lanes are; a fourth shows
-    whether they are. As in :func:`single_deviation`, what the filter has in its own variances is subtracted.
+    whether they are, unless it is so far from its place that it bounds no lane. As in
+    :func:`single_deviation`, what the filter has in its own variances is subtracted.
 
     Args:
         sensitivity: (B, 4, L) change of the pose per metre of deviation of a boundary; 0 if not in view.
+        deviations: (B, L) m.
         variances: (B, L) m², of the deviations by the filter.
         cfg: the numbers.
     """
-    in_view = (sensitivity[:, ROLL:].abs().amax(1) / _IN_VIEW).clamp(max=1.0)
+    in_view = (sensitivity[:, ROLL:].abs().amax(1) / _IN_VIEW).clamp(max=1.0) * (deviations.abs() < _DOUBTFUL)
     further = (in_view.sum(-1) - _FITTED).clamp(0.0, 1.0)
     missing = cfg.lane_deviation_std**2 * (1 - further) - 0.5 * variances.sum(-1)
     left = missing > 0
@@ -171,7 +175,9 @@ def as_calibration(
     own = layout(cfg.num_boundaries).deviations
     variances = state.cov.diagonal(dim1=1, dim2=2)[:, own]
     single = single_deviation(state.mean[:, own], variances, cfg)
-    deviation = torch.maximum(single, unverified_deviation(state.pose_sensitivity, variances, cfg))
+    deviation = torch.maximum(
+        single, unverified_deviation(state.pose_sensitivity, state.mean[:, own], variances, cfg)
+    )
     by_lanes = deviation[:, None, None] * state.pose_sensitivity
     only_height = constant(_ONLY_HEIGHT, like=cov)
     added = torch.cat([by_lanes, apart.unsqueeze(-1)], dim=-1)
