@@ -532,7 +532,7 @@ def test_the_covariance_changes_gradually_when_boundaries_come_and_go():
     assert (sigma[60:] < 0.05).all()
 
 
-def test_two_lanes_are_trusted_some_frames_after_a_third_is_seen():
+def test_equal_lanes_are_trusted_some_time_after_a_fourth_boundary_is_seen():
     four = torch.zeros(1, 4, 6, dtype=DOUBLE)
     four[:, ROLL, 1:5] = torch.tensor([-0.05, 0.1, -0.05, 0.03], dtype=DOUBLE)
     three = four.clone()
@@ -540,12 +540,14 @@ def test_two_lanes_are_trusted_some_frames_after_a_third_is_seen():
     cfg, step = JointConfig(), torch.full((1,), 1 / 30, dtype=DOUBLE)
     none = torch.zeros(1, 6, dtype=DOUBLE)
     seen, left = three, []
-    for _ in range(5):
+    for _ in range(25):
         left.append(float(unverified_deviation(seen, none, none, cfg)))
         seen = remembered_sensitivity(four, seen, step, cfg)
     assert left[0] == pytest.approx(0.05)
     assert 0.03 < left[1] < 0.05
-    assert left[4] == 0.0
+    assert left[8] > 0.02
+    assert left[24] == 0.0
+    torch.testing.assert_close(remembered_sensitivity(four, 0 * four, step, cfg), four)
     gone = remembered_sensitivity(three, four, step, cfg)
     assert gone[0, ROLL, 4] == pytest.approx(0.03 * math.exp(-1 / 600))
     changed = remembered_sensitivity(three, four, torch.full_like(step, torch.inf), cfg)

@@ -90,18 +90,21 @@ def update_track_status(
 def remembered_sensitivity(now: Tensor, before: Tensor, step: Tensor, cfg: JointConfig) -> Tensor:
     """Blend the pose's change per metre of deviation of each boundary, M of (J26), over the last frames.
 
-    A boundary counts fully after some frames in view. One that has gone has shown where it is, and its share
-    decays as deviations do. So the covariance changes gradually when boundaries come and go.
+    A boundary counts fully after about a second in view. One that has gone has shown where it is, and its
+    share decays as deviations do. So the covariance changes gradually when boundaries come and go.
 
     Args:
         now: (B, 4, L) by this frame.
-        before: (B, 4, L).
+        before: (B, 4, L); 0 where no frame has determined the pose yet.
         step: (B,) s since then; inf where the boundaries' numbers have changed.
         cfg: the numbers.
     """
     gone = now[:, ROLL:].abs().amax(1, keepdim=True) < _GONE
-    memory = torch.where(gone, cfg.motion.deviation_memory, cfg.evidence_time)
-    return now + (-step[:, None, None] / memory).exp() * (before - now)
+    memory = torch.where(gone, cfg.motion.deviation_memory, cfg.motion.unequal_memory)
+    fade = torch.where(
+        (before != 0).any(-1).any(-1)[:, None, None], (-step[:, None, None] / memory).exp(), 0.0
+    )
+    return now + fade * (before - now)
 
 
 def single_deviation(deviations: Tensor, variances: Tensor, cfg: JointConfig) -> Tensor:
