@@ -123,9 +123,8 @@ def single_deviation(deviations: Tensor, variances: Tensor, cfg: JointConfig) ->
     """
     size = cfg.open_deviation
     worst = deviations.abs().amax(-1)
-    missing = worst.clamp(max=size).square() - 0.5 * variances.sum(-1)
-    alone = (worst > EQUAL * size) & (worst < _DOUBTFUL) & (missing > 0)
-    return torch.where(alone, torch.where(alone, missing, 1.0).sqrt(), 0.0)
+    alone = (worst > EQUAL * size) & (worst < _DOUBTFUL)
+    return _beyond_filter(torch.where(alone, worst.clamp(max=size).square(), 0.0), variances)
 
 
 def unverified_deviation(
@@ -145,7 +144,12 @@ def unverified_deviation(
     """
     in_view = (sensitivity[:, ROLL:].abs().amax(1) / _IN_VIEW).clamp(max=1.0) * (deviations.abs() < _DOUBTFUL)
     further = (in_view.sum(-1) - _FITTED).clamp(0.0, 1.0)
-    missing = cfg.lane_deviation_std**2 * (1 - further) - 0.5 * variances.sum(-1)
+    return _beyond_filter(cfg.lane_deviation_std**2 * (1 - further), variances)
+
+
+def _beyond_filter(expected: Tensor, variances: Tensor) -> Tensor:
+    """Return the root (B,) of a variance less half of the sum of the filter's own (B, L), at least 0."""
+    missing = expected - 0.5 * variances.sum(-1)
     left = missing > 0
     return torch.where(left, torch.where(left, missing, 1.0).sqrt(), 0.0)
 
