@@ -87,8 +87,8 @@ class RunConfig:
     )
     lanes: str | None = option(
         None,
-        "lanes of another detector: JSON of TuSimple, CurveLanes or OpenLane, .lines.txt of CULane, or a "
-        "folder of them",
+        "lanes of another detector: JSON of TuSimple, CurveLanes, OpenLane, LLAMAS or BDD100K, .lines.txt of "
+        "CULane, or a folder of them",
         "FILE",
     )
     stills: bool = option(False, "treat every image as independent, not as a frame of a drive")

@@ -105,7 +105,8 @@ def field(fields: Any, key: str, kind: type) -> Any:
     if not isinstance(fields, dict) or not isinstance(fields.get(key), kind):
         got = type(fields.get(key)).__name__ if isinstance(fields, dict) and key in fields else "none"
         raise ValueError(
-            f"{key}: expected a {kind.__name__}, got {got}; formats: TuSimple, CULane, CurveLanes, OpenLane"
+            f"{key}: expected a {kind.__name__}, got {got}; formats: TuSimple, CULane, CurveLanes, OpenLane, "
+            "LLAMAS, BDD100K"
         )
     return fields[key]
 

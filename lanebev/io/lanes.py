@@ -6,6 +6,7 @@ that names file and line.
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path, PurePath
@@ -13,21 +14,27 @@ from pathlib import Path, PurePath
 import numpy as np
 from numpy.typing import NDArray
 
+from lanebev.io.bdd100k import read_bdd100k
 from lanebev.io.culane import read_culane
 from lanebev.io.curvelanes import read_curvelanes
 from lanebev.io.image_names import in_natural_order
 from lanebev.io.images import IMAGE_SUFFIXES
-from lanebev.io.lane_parsing import FrameLines, json_object, lane_text
+from lanebev.io.lane_parsing import FrameLines, json_values, lane_text
+from lanebev.io.llamas import read_llamas
 from lanebev.io.openlane import read_openlane
 from lanebev.io.tusimple import read_tusimple, tusimple_line
+
+_OF_LLAMAS = re.compile(r"_(color|gray)_rect$")  # ends the names of LLAMAS' images, not of its labels
 
 __all__ = [
     "FrameLines",
     "lane_files",
     "match_frames",
+    "read_bdd100k",
     "read_culane",
     "read_curvelanes",
     "read_lanes",
+    "read_llamas",
     "read_openlane",
     "read_tusimple",
     "tusimple_line",
@@ -35,7 +42,7 @@ __all__ = [
 
 
 def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) -> list[FrameLines]:
-    """Read a TuSimple, CULane, CurveLanes or OpenLane file, or a folder of the latter three.
+    """Read a file of TuSimple, CULane, CurveLanes, OpenLane, LLAMAS or BDD100K, or a folder of such files.
 
     Args:
         path: path of the file or folder.
@@ -53,11 +60,15 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
     if path.name.endswith(".txt"):
         return [read_culane(path)]
     text = lane_text(path)
-    start = next((line for line in text.split("\n") if line.strip()), "")
-    if _has_key("Lines", start, text):
+    if _has_key("Lines", path, text):
         return [read_curvelanes(path)]
-    openlane = _has_key("lane_lines", start, text)
-    return [read_openlane(path, intrinsics)] if openlane else read_tusimple(path)
+    if _has_key("lane_lines", path, text):
+        return [read_openlane(path, intrinsics)]
+    if _has_key("image_name", path, text):
+        return [read_llamas(path)]
+    if any(_has_key(key, path, text) for key in ("labels", "frames")):
+        return read_bdd100k(path)
+    return read_tusimple(path)
 
 
 def lane_files(path: str | Path) -> list[Path]:
@@ -134,11 +145,15 @@ def _parts(name: str) -> tuple[str, ...]:
     path = PurePath(name.replace("\\", "/"))
     if path.suffix.lower() in IMAGE_SUFFIXES:  # what follows the last dot may be part of the name
         path = path.with_suffix("")
-    return tuple(part for part in path.parts if part not in ("/", "."))
+    parts = [part for part in path.parts if part not in ("/", ".")]
+    return (*parts[:-1], *(_OF_LLAMAS.sub("", part) for part in parts[-1:]))
 
 
-def _has_key(key: str, first_line: str, text: str) -> bool:
+def _has_key(key: str, path: Path, text: str) -> bool:
+    """Tell whether the first object of a JSON text has the key; of one that breaks off, its first line."""
+    if f'"{key}"' not in text:
+        return False
     try:
-        return f'"{key}"' in text and key in json_object(text)
-    except ValueError:
-        return f'"{key}"' in first_line
+        return key in next((value for _, value in json_values(path, text)), {})
+    except (ValueError, TypeError):
+        return f'"{key}"' in text.lstrip().split("\n", 1)[0]

@@ -90,7 +90,7 @@ def _longest_of_doubles(
     for i, before in zip(order, [None, *order], strict=False):
         if before is None or abs(place[i] - place[before]) > least:
             kept.append(i)
-        elif len(lines[i]) > len(lines[kept[-1]]):
+        elif np.ptp(lines[i][:, 1]) > np.ptp(lines[kept[-1]][:, 1]):
             kept[-1] = i
     return kept
 

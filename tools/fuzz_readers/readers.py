@@ -26,6 +26,15 @@ from lanebev.io.video import open_source
 from lanebev.weights import load_segmenter, read_metadata
 
 _CURVELANES = b'{"Lines": [[{"x": "5.0", "y": "590"}, {"x": 7, "y": 580}]]}'
+_LLAMAS = (
+    b'{"image_name": "1", "lanes": [{"lane_id": "l0", "markers": [{"pixel_start": {"x": "5", "y": "590"}, '
+    b'"pixel_end": {"x": 7, "y": 580}}]}]}'
+)
+_BDD100K = [
+    b'[{"name": "1.jpg", "labels": [{"category": "lane", "attributes": {"laneDirection": "parallel"}, '
+    b'"poly2d": [{"vertices": [[5, 590], [7, 580.5], [9, 560], [10, 540]], "types": "LCCC"}]}]}]',
+    b'{"name": "1", "frames": [{"objects": [{"category": "lane/x", "poly2d": [[5, 590, "L"], [7, 8]]}]}]}',
+]
 
 
 class Reader(NamedTuple):
@@ -61,7 +70,7 @@ def readers() -> dict[str, Reader]:
             ],
         ),
         "lanes.json": Reader(read_lanes, ".json", _tusimple(), 30),
-        "openlane.json": Reader(read_lanes, ".json", [*_openlane(), _CURVELANES], 20),
+        "openlane.json": Reader(read_lanes, ".json", [*_openlane(), _CURVELANES, _LLAMAS, *_BDD100K], 20),
         "culane": Reader(
             read_lanes, ".lines.txt", [b"10 590 12.5 580 15 570 17 560\n500.25 590 510 580 520 570\n"], 20
         ),
