@@ -38,6 +38,8 @@ def read_text(path: Path, errors: str = "strict") -> str:
         text = data.decode(_BYTE_ORDER_MARKS.get(mark, "utf-8"), errors)
         if errors == "replace" and text.count("\ufffd") > _MOST_FOREIGN * len(text):
             raise ValueError("not a text file")
+        if "\0" in text:
+            raise ValueError("not a text file, or one in UTF-16 without a byte order mark; save it as UTF-8")
         return text
     except UnicodeDecodeError as error:
         raise ValueError("not a text file") from error

@@ -8,7 +8,7 @@ from typing import Any
 
 from lanebev.camera.parameters import CameraParameters, centre_offset
 from lanebev.camera.parsing import numbers, whole_number
-from lanebev.numbers import finite_numbers
+from lanebev.numbers import finite_numbers, shown
 
 _KITTI = re.compile(r"^[ \t]*P(?:_rect_)?\d+[ \t]*:", re.MULTILINE | re.ASCII)
 _COLMAP = re.compile(r"^[ \t]*\d+[ \t]+([A-Z_]+)[ \t]+(\d{1,6})[ \t]+(\d{1,6})[ \t]+(.+)$", re.MULTILINE)
@@ -46,7 +46,10 @@ def kitti(text: str, image_size: tuple[int, int] | None) -> CameraParameters:
     names = [f"P_rect_{i:02d}" for i in (2, 3, 0, 1)] + [f"P{i}" for i in (2, 3, 0, 1)]
     name = next((n for n in names if n in entries), None)
     if name is None:
-        raise ValueError("expected a KITTI projection matrix (P_rect_02 or P2), got none of them")
+        raise ValueError(
+            "expected P_rect_02 or P2 of KITTI, or keys such as fx: 1150, got "
+            f"{shown(next(iter(text.split()), ''))}"
+        )
     projection = finite_numbers(name, entries[name].split(), 12)
     known = next((s for f, s in _KITTI_SIZES.items() if abs(f - projection[0]) < 1e-3), None)
     if (size_name := name.replace("P", "S", 1)) in entries:

@@ -78,8 +78,7 @@ def _camera(content: Any, image_size: tuple[int, int] | None, rectified: bool) -
     if slam or "model_type" in content:
         camera = checked(slam(content) if slam else camodocal(content))
         return without_lens(camera) if rectified else camera
-    camera, restated = opencv_or_ros(content, rectified)
-    return checked(camera, restated)
+    return opencv_or_ros(content, rectified)
 
 
 def camera_from_fields(fields: Mapping[str, Any], rectified: bool = False) -> CameraParameters:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from lanebev.camera.parameters import CameraParameters, centre_offset
+from lanebev.camera.parameters import CameraParameters, centre_offset, checked
 from lanebev.camera.parsing import mapping, number, numbers, whole_number
 from lanebev.numbers import shown
 
@@ -48,19 +48,21 @@ _MODELS = {
 _IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
-def opencv_or_ros(fields: Mapping[str, Any], rectified: bool) -> tuple[CameraParameters, bool]:
+def opencv_or_ros(fields: Mapping[str, Any], rectified: bool) -> CameraParameters:
     """Read the keys of OpenCV's calibration programs, of ROS's ``camera_info``, or our short ones.
 
     ROS's ``roi`` (in pixels of the full resolution) and ``binning_x``, ``binning_y`` are applied, in this
     order: what is returned is the camera of the images, as ``image_geometry`` has it. Deviation: a binned
     pixel's centre is the centre of those it binds together, not their corner: (x + 0.5) / b − 0.5.
 
+    A file may state its matrix twice, in K and P, as our own writer does: then it is not a person's mistake.
+
     Args:
         fields: fields of the file.
         rectified: return the camera of rectified images: the projection matrix P without a lens.
 
-    Returns:
-        the camera, and whether the file states its matrix twice, in K and P, as our own writer does.
+    Raises:
+        ValueError: an unknown key, or a value that no real camera has.
     """
     short = not {"fx", "fy", "cx", "cy"}.isdisjoint(fields)
     unknown = sorted(set(fields) - (_SHORT_KEYS if short else _KNOWN_KEYS))
@@ -70,11 +72,11 @@ def opencv_or_ros(fields: Mapping[str, Any], rectified: bool) -> tuple[CameraPar
         words = f"unknown key {shown(unknown[0])}; expected {known}{case}, or those of OpenCV or ROS"
         raise ValueError(words)
     if short:
-        return _short(fields, rectified), False
+        return checked(_short(fields, rectified))
     size = (whole_number(fields, *_HEIGHT_KEYS), whole_number(fields, *_WIDTH_KEYS))
     if rectified:
         camera = CameraParameters(_projection(fields), [], "pinhole", size)
-        return _as_taken(camera, fields), _restates(fields)
+        return _as_taken(checked(camera, _restates(fields)), fields)
     matrix = numbers(fields, *_MATRIX_KEYS, count=9)
     distortion = numbers(fields, *_DISTORTION_KEYS)
     model = _model(fields)
@@ -82,7 +84,7 @@ def opencv_or_ros(fields: Mapping[str, Any], rectified: bool) -> tuple[CameraPar
         xi = numbers(fields, "xi", count=1) if not isinstance(fields["xi"], str) else [number(fields, "xi")]
         model, distortion = "omni", [*xi, *(distortion or [0.0] * 4)]
     camera = CameraParameters(matrix, distortion, model, size)
-    return _as_taken(camera, fields), _restates(fields)
+    return _as_taken(checked(camera, _restates(fields)), fields)
 
 
 def _short(fields: Mapping[str, Any], rectified: bool) -> CameraParameters:
@@ -135,7 +137,10 @@ def _model(fields: Mapping[str, Any]) -> str:
 
 
 def _as_taken(camera: CameraParameters, fields: Mapping[str, Any]) -> CameraParameters:
-    """Return the camera of the images, cropped to the region of interest and binned."""
+    """Return the camera of the images, cropped to the region of interest and binned.
+
+    The principal point may be outside of the region.
+    """
     roi = mapping("roi", fields.get("roi") or {})
     left, top, width, height = (
         whole_number(roi, key) if roi.get(key) is not None else 0
@@ -155,7 +160,8 @@ def _as_taken(camera: CameraParameters, fields: Mapping[str, Any]) -> CameraPara
         zero, fy / down, _binned(cy - top, down),
         *last,
     ]  # fmt: skip
-    return camera._replace(matrix=matrix, image_size=(height // down, width // across))
+    taken = camera._replace(matrix=matrix, image_size=(height // down, width // across))
+    return checked(taken, restated=True)
 
 
 def _check_full_resolution(camera: CameraParameters, binned_size: tuple[int, int]) -> None:

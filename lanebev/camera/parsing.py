@@ -20,6 +20,7 @@ from lanebev.numbers import finite_numbers, shown
 _LARGEST_YAML = 1_000_000  # characters; PyYAML reads some 100,000 a second
 _MOST_NUMBERS = 1_000  # of one matrix
 _TABS = re.compile(r"(?<=\S) *\t[ \t]*")  # between words; PyYAML takes none there, YAML and other readers do
+_NO_BREAK_SPACE = "\u00a0"  # of texts copied from web pages
 _ROS_INI = re.compile(r"^\[image\]\s*$", re.MULTILINE)
 _INI_KEYS = {
     "width": "image_width",
@@ -105,7 +106,7 @@ for _tag in ("int", "float", "bool", "timestamp"):
 def _parse_yaml(text: str) -> Any:
     if len(text) > _LARGEST_YAML:
         raise ValueError(f"expected a camera file, got {len(text)} characters of YAML")
-    lines = text.splitlines()
+    lines = text.replace(_NO_BREAK_SPACE, " ").splitlines()
     if lines and lines[0].startswith("%YAML"):  # OpenCV writes %YAML:1.0, which YAML does not allow
         lines[0] = ""
     try:

@@ -58,8 +58,8 @@ def kalibr(fields: Mapping[str, Any]) -> CameraParameters:
         first = min(chain, key=lambda key: int(key[3:10]))
         fields = mapping(first, fields[first])
     names = (
-        str(required(fields, ["camera_model"])).strip(),
-        str(fields.get("distortion_model") or "none").strip(),
+        str(required(fields, ["camera_model"])).strip().lower(),
+        str(fields.get("distortion_model") or "none").strip().lower(),
     )
     if names in _KALIBR_RADIAL:
         return _radial(fields, *_KALIBR_RADIAL[names])
@@ -144,5 +144,7 @@ def orb_slam(fields: Mapping[str, Any]) -> CameraParameters:
     fx, fy, cx, cy = (number(fields, of + key) for key in ("fx", "fy", "cx", "cy"))
     given = [of + key for key in names.split()]
     distortion = [number(fields, key) if fields.get(key) is not None else 0.0 for key in given]
+    if model == "pinhole" and fields.get(of + "k4") is not None and number(fields, of + "k4"):
+        raise ValueError(f"{of}k4: expected none of {kind}, got one; is Camera.type: KannalaBrandt8 missing?")
     size = (whole_number(fields, "Camera.height"), whole_number(fields, "Camera.width"))
     return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, model, size)

@@ -160,6 +160,15 @@ def test_ros_binning_and_region_of_interest_are_applied(tmp_path):
     _same(Camera.from_file(_write(tmp_path / "c.yaml", _message(binning_x=1, binning_y=1))), LENS)
 
 
+def test_a_region_of_interest_may_leave_out_the_principal_point(tmp_path):
+    for roi in ({"width": 600, "height": 700}, {"y_offset": 400}):
+        cut = Camera.from_file(_write(tmp_path / "c.yaml", _message(roi=roi)))
+        expected = LENS.cropped(roi.get("y_offset", 0), 0, roi.get("height", 320), roi.get("width", 1280))
+        _same(cut, expected)
+    with pytest.raises(ValueError, match="cx: expected a principal point inside the image, 0 to 1280"):
+        Camera.from_file(_write(tmp_path / "c.yaml", _message(K=[812.5, 0, 1300, 0, 810, 355, 0, 0, 1])))
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
@@ -173,7 +182,7 @@ def test_ros_binning_and_region_of_interest_are_applied(tmp_path):
         ({"roi": {"y_offset": -1}}, "roi: expected a part"),
         ({"roi": [1, 2]}, "roi: expected keys and values"),
         ({"distortion_model": "inverse_brown_conrady"}, "model: expected one of pinhole, plumb_bob"),
-        ({"K": [0.0] * 9}, "fx: expected 128 to 25600 px .* got 0"),
+        ({"K": [0.0] * 9}, "camera matrix: expected focal lengths, got zeros, by which ROS marks"),
     ],
 )
 def test_impossible_messages_are_one_clear_line(tmp_path, fields, message):

@@ -87,6 +87,11 @@ def test_ends_of_lines_tabs_between_words_and_foreign_letters(tmp_path, old, new
     assert changed.fingerprint() == plain.fingerprint()
 
 
+def test_spaces_of_web_pages(tmp_path):
+    copied = _read(tmp_path / "c.yaml", OST.replace(": ", ":\u00a0"))
+    assert copied.fingerprint() == _read(tmp_path / "c.yaml", OST).fingerprint()
+
+
 def test_rows_that_are_indented_by_tabs_are_one_clear_line(tmp_path):
     with pytest.raises(ValueError, match=r"expected YAML, got a tab at line 5; indent by spaces$"):
         _read(tmp_path / "c.yaml", OST.replace("\n  ", "\n\t"))
@@ -183,13 +188,44 @@ def test_colmaps_pixels_begin_at_their_corner(tmp_path, line, expected):  # colm
     _is(camera, 800, fy, 639.5, 359.5, 1280, 720, distortion, model)
 
 
+ORB_SLAM = """%YAML:1.0
+
+#--------------------------------------------------------------------------------------------
+Camera.type: "{0}"
+
+Camera{1}.fx: 458.654
+Camera{1}.fy: 457.296
+Camera{1}.cx: 367.215
+Camera{1}.cy: 248.375
+
+Camera{1}.k1: -0.28340811
+Camera{1}.k2: 0.07395907
+{2}
+Camera.width: 752
+Camera.height: 480
+Camera.fps: 20.0
+ORBextractor.nFeatures: 1200
+"""
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
         ("cameras.txt", "1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1\n", "expected one camera, got 2; keep"),
         ("cameras.txt", "1 FOV 1280 720 1 1 1 1 1\n", "model: expected one of SIMPLE_PINHOLE, .*, got FOV"),
         ("cameras.txt", "1 PINHOLE 1280 720 800 800 640\n", "PINHOLE: expected 4 numbers, got 3"),
-        ("calib_velo_to_cam.txt", "R: 7.5 1\nT: 1 2 3\n", "expected a KITTI projection matrix"),
+        ("calib_velo_to_cam.txt", "R: 7.5 1\nT: 1 2 3\n", "expected P_rect_02 or P2 .*, got 'R:'"),
+        ("k.txt", "1000 0 640\n0 1000 360\n", "of KITTI, or keys such as fx: 1150, got '1000'"),
+        (
+            "c.yaml",
+            "fx: 500\n".encode("utf-16-le").decode(),
+            "got: not a text file, or one in UTF-16 without a byte order mark; save it as UTF-8",
+        ),
+        (
+            "c.yaml",
+            ORB_SLAM.format("PinHole", "", "Camera.k3: 0.1\nCamera.k4: 0.2"),
+            "Camera.k4: expected none of PinHole, got one; is Camera.type: KannalaBrandt8 missing",
+        ),
         (
             "c.yaml",
             "{camera_model: pinhole, intrinsics: [800, 800, 640, 360], resolution: [1280, 720], "
@@ -272,26 +308,6 @@ def test_rectified_images_have_no_lens_of_colmaps(tmp_path):
         _read(tmp_path / "cameras.txt", "1 RADIAL 1280 720 800 640 360 -0.3 0.1\n", rectified=True)
     camera = _read(tmp_path / "cameras.txt", "1 SIMPLE_PINHOLE 1280 720 800 640 360\n", rectified=True)
     _is(camera, 800, 800, 639.5, 359.5, 1280, 720)
-
-
-ORB_SLAM = """%YAML:1.0
-
-#--------------------------------------------------------------------------------------------
-Camera.type: "{0}"
-
-Camera{1}.fx: 458.654
-Camera{1}.fy: 457.296
-Camera{1}.cx: 367.215
-Camera{1}.cy: 248.375
-
-Camera{1}.k1: -0.28340811
-Camera{1}.k2: 0.07395907
-{2}
-Camera.width: 752
-Camera.height: 480
-Camera.fps: 20.0
-ORBextractor.nFeatures: 1200
-"""
 
 
 @pytest.mark.parametrize("of", ["", "1"])
