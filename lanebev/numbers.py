@@ -16,6 +16,7 @@ _BYTE_ORDER_MARKS = {
     codecs.BOM_UTF16_LE: "utf-16",  # what PowerShell's > writes
     codecs.BOM_UTF16_BE: "utf-16",
 }
+_GZIP = b"\x1f\x8b"
 _MOST_FOREIGN = 0.3  # of a text's letters, in an encoding that is not known
 _REPR = reprlib.Repr()
 _REPR.maxlist = _REPR.maxdict = _REPR.maxtuple = 4
@@ -34,6 +35,8 @@ def read_text(path: Path, errors: str = "strict") -> str:
     """
     try:
         data = path.read_bytes()
+        if data.startswith(_GZIP):
+            raise ValueError("compressed by gzip; unpack it")
         mark = next((each for each in _BYTE_ORDER_MARKS if data.startswith(each)), b"")
         text = data.decode(_BYTE_ORDER_MARKS.get(mark, "utf-8"), errors)
         if errors == "replace" and text.count("\ufffd") > _MOST_FOREIGN * len(text):

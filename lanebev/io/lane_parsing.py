@@ -61,6 +61,8 @@ def json_object(text: str) -> dict[str, Any]:
     try:
         value = json.loads(text)
     except (ValueError, RecursionError) as error:
+        if getattr(error, "msg", "") == "Extra data":
+            raise ValueError("expected one JSON object, got more; write a file per image") from error
         raise ValueError(_NO_JSON) from error
     return as_object(value)
 
@@ -135,6 +137,14 @@ def columns(name: str, values: list[Any], count: int) -> NDArray[np.float64]:
 def checked_pixels(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the values if they can be pixels."""
     return within(name, "pixels", values)
+
+
+def without_zeros(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return x of a line's points, with NaN for 0 on several rows: no line runs along the images' edge.
+
+    Some detectors write 0 where they see no line, and others move what is outside the images to their edge.
+    """
+    return np.where((x == 0).sum() > 1, np.where(x == 0, np.nan, x), x)
 
 
 def within(name: str, unit: str, values: NDArray[np.float64]) -> NDArray[np.float64]:

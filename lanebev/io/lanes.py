@@ -57,9 +57,9 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
         if not frames:
             raise ValueError(f"lane folder {path}: expected .lines.txt or .json files, got none")
         return frames
-    if path.name.endswith(".txt"):
-        return [read_culane(path)]
     text = lane_text(path)
+    if path.name.endswith(".txt") and not text.lstrip("[ \r\n").startswith("{"):
+        return [read_culane(path)]
     if _has_key("Lines", path, text):
         return [read_curvelanes(path)]
     if _has_key("lane_lines", path, text):

@@ -51,8 +51,10 @@ def read_openlane(path: str | Path, intrinsics: NDArray[np.float64] | None = Non
         fields = json_object(lane_text(path))
         name = field(fields, "file_path", str)
         lines = []
-        for i, lane in enumerate(field(fields, "lane_lines", list)):
-            points = _openlane_points(f"lane_lines[{i}]", lane, fields, intrinsics)
+        lanes = field(fields, "lane_lines", list)
+        by_point = any(_is_list_of_points(lane) for lane in lanes)
+        for i, lane in enumerate(lanes):
+            points = _openlane_points(f"lane_lines[{i}]", lane, fields, intrinsics, by_point)
             if lane.get("category") not in _CURBS and np.isfinite(points).any():
                 lines.append(LaneLine(points))
     return FrameLines(name, lines)
@@ -90,16 +92,38 @@ def image_from_camera_points(points: Array, intrinsics: Array) -> Array:
     return pixels
 
 
+def _is_list_of_points(lane: Any) -> bool:
+    """Tell whether a line's ``xyz`` is P lists of three numbers, not three lists of P; 3 do not tell."""
+    xyz = lane.get("xyz") if isinstance(lane, dict) else None
+    return isinstance(xyz, list) and len(xyz) not in (0, 3) and _are_threes(xyz)
+
+
+def _are_threes(values: list[Any]) -> bool:
+    return all(isinstance(each, list) and len(each) == 3 for each in values)
+
+
 def _openlane_points(
-    name: str, lane: Any, fields: dict[str, Any], intrinsics: NDArray[np.float64] | None
+    name: str,
+    lane: Any,
+    fields: dict[str, Any],
+    intrinsics: NDArray[np.float64] | None,
+    by_point: bool,
 ) -> NDArray[np.float64]:
-    """Return the points (P, 2) px of a lane line, by its ``uv`` if it has any, else by its ``xyz``."""
+    """Return the points (P, 2) px of a lane line, by its ``uv`` if it has any, else by its ``xyz``.
+
+    Args:
+        name: of the line, for messages.
+        lane: the line.
+        fields: the file's content.
+        intrinsics: (3, 3) px, for a file without.
+        by_point: whether three lists of three numbers are three points, as other lines of the file tell.
+    """
     if not isinstance(lane, dict):
         raise ValueError(f"{name}: expected an object, got {shown(lane)}")
     if lane.get("uv") is not None or lane.get("xyz") is None:
         return checked_pixels(f"{name}.uv", columns(f"{name}.uv", field(lane, "uv", list), 2).T)
     xyz = field(lane, "xyz", list)
-    rows_of_three = len(xyz) != 3 and all(isinstance(point, list) and len(point) == 3 for point in xyz)
+    rows_of_three = _is_list_of_points(lane) or (by_point and _are_threes(xyz))
     by_axis = [list(axis) for axis in zip(*xyz, strict=True)] if rows_of_three and xyz else xyz
     points = within(f"{name}.xyz", "m", columns(f"{name}.xyz", by_axis or [[], [], []], 3).T)
     if (visibility := lane.get("visibility")) is not None:

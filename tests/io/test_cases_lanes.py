@@ -145,6 +145,17 @@ def test_3d_points_alone_are_projected_by_the_intrinsics(tmp_path, layout):
         read_lanes(path)
 
 
+def test_three_3d_points_are_laid_out_as_those_of_the_other_lines(tmp_path):
+    path = tmp_path / "1.json"
+    three, four = {"xyz": LABEL[:3].tolist()}, {"xyz": LABEL.tolist()}
+    path.write_text(json.dumps({"file_path": "1", "lane_lines": [three, four], "intrinsic": INTRINSICS}))
+    for line, points in zip(read_lanes(path)[0].lines, (PIXELS[:3], PIXELS), strict=True):
+        np.testing.assert_allclose(line.points, points, atol=1e-9)
+    by_axis = [{"xyz": LABEL[:3].T.tolist()}, {"xyz": LABEL.T.tolist()}]
+    path.write_text(json.dumps({"file_path": "1", "lane_lines": by_axis, "intrinsic": INTRINSICS}))
+    np.testing.assert_allclose(read_lanes(path)[0].lines[0].points, PIXELS[:3], atol=1e-9)
+
+
 def test_predictions_for_openlanes_benchmark_are_in_the_ground_frame(tmp_path):
     pitch, height = 0.05, 2.1  # camera nose down
     c, s = math.cos(pitch), math.sin(pitch)

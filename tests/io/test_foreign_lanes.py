@@ -1,5 +1,6 @@
 """Lane files as more detectors write them: lists, empty lanes, lines drawn twice, across the road or back."""
 
+import gzip
 import json
 
 import numpy as np
@@ -63,6 +64,33 @@ def test_an_empty_lane_is_none(tmp_path):
     )
     (line,) = read_lanes(tmp_path / "lanes.json")[0].lines
     np.testing.assert_array_equal(line.points[:, 0], [900, 910, 920])
+
+
+@pytest.mark.parametrize("name", ["1.json", "1.lines.txt"])
+def test_zeros_on_several_rows_are_points_that_are_not_there(tmp_path, name):
+    x, rows = [0, 0, 500, 0, 480, 470], [500, 510, 520, 530, 540, 550]
+    culane = " ".join(f"{a} {b}" for a, b in zip(x, rows, strict=True))
+    text = json.dumps(_entry(h_samples=rows, lanes=[x])) if name == "1.json" else culane
+    (tmp_path / name).write_text(text)
+    (line,) = read_lanes(tmp_path / name)[0].lines
+    np.testing.assert_array_equal(line.points[:, 0], [np.nan, np.nan, 500, np.nan, 480, 470])
+    (tmp_path / "2.json").write_text(json.dumps(_entry(lanes=[[0, 5, 9]])))
+    np.testing.assert_array_equal(read_lanes(tmp_path / "2.json")[0].lines[0].points[:, 0], [0, 5, 9])
+
+
+def test_json_by_the_name_of_a_text_file(tmp_path):
+    (tmp_path / "pred.txt").write_text("\n" + json.dumps([_entry(), _entry("2.jpg")]))
+    assert [frame.name for frame in read_lanes(tmp_path / "pred.txt")] == ["1.jpg", "2.jpg"]
+
+
+def test_openlanes_files_of_several_images_and_packed_files_are_one_clear_line(tmp_path):
+    path = tmp_path / "1.json"
+    path.write_text(2 * (json.dumps({"file_path": "1.jpg", "lane_lines": []}) + "\n"))
+    with pytest.raises(ValueError, match="expected one JSON object, got more; write a file per image"):
+        read_lanes(path)
+    path.write_bytes(gzip.compress(json.dumps(_entry()).encode()))
+    with pytest.raises(ValueError, match="a readable file, got: compressed by gzip; unpack it"):
+        read_lanes(path)
 
 
 def test_hidden_files_are_no_lanes(tmp_path):
