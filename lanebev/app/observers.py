@@ -23,6 +23,7 @@ from lanebev.pipeline import LaneBEV
 from lanebev.tensors import map_tensors
 
 _MOST_WORKERS = 4  # each holds a frame's feature maps in memory
+_HIGHEST = 4  # times its width, an image: the network resizes it to a fixed width, and would need many GB
 _WORKERS_SHARED = 2  # one frame of a drive is in the batch that is looked at, another waits for the next
 
 
@@ -129,11 +130,20 @@ class NetworkObserver:
     Args:
         network: segmenter and extractor, of one drive or shared with others in batches.
         camera: the lens.
+
+    Raises:
+        ValueError: images that are much higher than wide, as of no camera.
     """
 
     remark = ""
 
     def __init__(self, network: LaneBEV | SharedNetwork, camera: Camera) -> None:
+        height, width = camera.image_size
+        if height > _HIGHEST * width:
+            raise ValueError(
+                f"source: expected images at most {_HIGHEST} times as high as wide, got {width} x {height} "
+                "px; are they of a road?"
+            )
         self._shared = network if isinstance(network, SharedNetwork) else None
         self.model = network.model if isinstance(network, SharedNetwork) else network.eval()
         self.camera = camera

@@ -313,3 +313,10 @@ def test_a_stream_that_does_not_open(data, tmp_path, capsys):
 def test_a_stream_is_not_cut(capsys, data):
     arguments = ("run", "-", "--camera", data / "camera.yaml", "--start", "1")
     _fails(capsys, *arguments, word="expected no --start, --end")
+
+
+def test_images_much_higher_than_wide_are_refused(tmp_path, capsys):
+    write_png(tmp_path / "a.png", np.zeros((61, 15, 3), np.uint8))
+    arguments = ("run", tmp_path / "a.png", "--fov", 60, "--out", tmp_path / "out")
+    _fails(capsys, *arguments, word="at most 4 times as high as wide, got 15 x 61 px")
+    assert not (tmp_path / "out").exists()
