@@ -83,6 +83,8 @@ class LaneBEV(nn.Module):
         network_pixels: int | None = None,
     ) -> None:
         super().__init__()
+        if isinstance(frozen, str):
+            raise TypeError(f"frozen: expected a list of names, got {frozen!r}; write [{frozen!r}]")
         if unknown := set(frozen) - set(STAGES):
             raise ValueError(
                 f"frozen: expected some of {', '.join(STAGES)}, got {', '.join(sorted(unknown))}"

@@ -25,6 +25,7 @@ from lanebev.geometry.lens import (
     max_undistorted_radius,
     normalise_points,
 )
+from lanebev.numbers import check_number
 from lanebev.types import check_tensor
 
 
@@ -105,9 +106,14 @@ class Camera:
             dtype: dtype of the tensors.
 
         Raises:
+            TypeError: a focal length or a coordinate that is no number.
             ValueError: focal lengths that are not positive, an impossible image size, a number of
                 coefficients that the model does not have, or numbers that are not finite.
         """
+        numbers: dict[str, object] = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+        for name, value in numbers.items():
+            if not isinstance(value, Tensor):
+                check_number(name, value, "px as a number")
         intrinsics = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=dtype)
         return cls(intrinsics, torch.tensor(list(distortion), dtype=dtype), model, (height, width))
 
@@ -125,8 +131,10 @@ class Camera:
             dtype: dtype of the tensors.
 
         Raises:
+            TypeError: an angle that is no number.
             ValueError: an angle that is not between 10 and 179 degrees, or an impossible image size.
         """
+        check_number("fov", degrees, "degrees as a number")
         if not 10.0 <= degrees <= 179.0:  # NaN is not
             raise ValueError(
                 f"fov: expected a horizontal field of view of 10 to 179 degrees, got {degrees!r}"

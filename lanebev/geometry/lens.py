@@ -89,6 +89,8 @@ def check_points(points: Tensor, size: int = 2) -> None:
     check_tensor("points", points)
     if points.ndim < 2 or points.shape[-1] != size:
         raise ValueError(f"points: expected (..., N, {size}), got {tuple(points.shape)}")
+    if not points.is_floating_point():  # whole numbers would be cut to pixels
+        raise ValueError(f"points: expected floating point, got {points.dtype}")
 
 
 def normalise_points(points: Tensor, intrinsics: Tensor) -> Tensor:

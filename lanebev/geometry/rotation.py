@@ -52,13 +52,6 @@ def rotation_y(yaw: Tensor) -> Tensor:
     return _rotation([[c, zero, s], [zero, one, zero], [-s, zero, c]])
 
 
-def rotation_z(roll: Tensor) -> Tensor:
-    """Return R(ψ), (..., 3, 3): the first factor of Eq. (24)."""
-    s, c = roll.sin(), roll.cos()
-    zero, one = torch.zeros_like(s), torch.ones_like(s)
-    return _rotation([[c, s, zero], [-s, c, zero], [zero, zero, one]])
-
-
 @full_precision
 def cam_from_world(pitch: Tensor, yaw: Tensor) -> Tensor:
     """Compute the rotation from the lane-aligned frame without roll to the camera.

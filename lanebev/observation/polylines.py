@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from lanebev.camera.model import Camera, check_camera
+from lanebev.numbers import shown
 from lanebev.observation.boundary_order import boundary_indices
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.types import NUM_BOUNDARIES
@@ -99,10 +100,18 @@ def lines_from_polylines(
     num_boundaries: int = NUM_BOUNDARIES,
 ) -> list[LaneLine]:
     """Check one frame's polylines, see :meth:`lanebev.LaneSegments.from_polylines`."""
+    if not isinstance(polylines, (Mapping, Iterable)) or isinstance(polylines, str):
+        got = type(polylines).__qualname__
+        raise TypeError(f"polylines: expected a list of (P, 2) px, or a dict by boundary, got {got}")
+    if not sigma > 0:
+        raise ValueError(f"sigma: expected more than 0 px, got {sigma}")
     named = isinstance(polylines, Mapping)
     lines = []
     for key, given in polylines.items() if isinstance(polylines, Mapping) else enumerate(polylines):
-        points = np.array(given.tolist() if isinstance(given, Tensor) else given, dtype=np.float64)
+        try:
+            points = np.array(given.tolist() if isinstance(given, Tensor) else given, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"polylines[{key}]: expected (P, 2) px, got {shown(given)}") from error
         if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points[:, 1]).all():
             raise ValueError(f"polylines[{key}]: expected (P, 2) px with finite y, got shape {points.shape}")
         if named and not (isinstance(key, (int, np.integer)) and 0 <= key < num_boundaries):

@@ -114,7 +114,7 @@ def _describe(events: Mapping[str, tuple[float, int]], rows: Sequence[Extrinsics
             doing = "predicted" if name == "COASTING" else "lost"
             words.append(f"least certain while {doing}: σ of pitch {_value('pitch', score)}")
     words += [f"largest jump: {', '.join(leaps)}"] if leaps else []
-    words += [f"largest σ: {', '.join(stds)}"] if stds else []
+    words += [f"largest σ while tracking: {', '.join(stds)}"] if stds else []
     return "; ".join(words)
 
 

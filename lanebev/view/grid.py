@@ -12,6 +12,7 @@ from torch import Tensor
 from lanebev.geometry.lens import cam_from_image, check_intrinsics
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import road_from_cam
+from lanebev.numbers import check_number
 from lanebev.types import Extrinsics, check_extrinsics
 
 
@@ -33,6 +34,7 @@ class BEVGrid:
     resolution: float = 0.05
 
     def __post_init__(self) -> None:
+        check_number("resolution", self.resolution, "m as a number")
         if not (self.resolution > 0 and math.isfinite(self.resolution)):
             raise ValueError(f"resolution: expected > 0 m and finite, got {self.resolution}")
         for name, interval in (("x", self.x), ("z", self.z)):

@@ -180,7 +180,7 @@ class Interpolant(NamedTuple):
 
 
 def interpolant(cells: CellSums, lens: Lens | None, limit: float) -> Interpolant | None:
-    """Interpolate where cells are seen; None of a grid that has too few.
+    """Interpolate where cells are seen; None of a grid that has too few, and of an empty batch.
 
     Args:
         cells: float32, affine in row and column but for jumps: where a tile's corners are ahead of the camera
@@ -191,7 +191,7 @@ def interpolant(cells: CellSums, lens: Lens | None, limit: float) -> Interpolant
     batch, count, width = cells.shape
     rows = row_tiles(cells.edges or equal_edges(count))
     columns = column_tiles(width, _COLUMNS // 2 if lens else _COLUMNS)
-    if rows is None or columns is None:
+    if rows is None or columns is None or batch == 0:
         return None
     nodes = CellSums(
         cells.by_row.index_select(-1, torch.from_numpy(rows.nodes)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import overload
 
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 
 from lanebev.geometry.precision import common_dtype
 from lanebev.geometry.road_profile import check_vertical_curvature
+from lanebev.numbers import check_number
 from lanebev.types import Extrinsics
 from lanebev.view.cells import cells_and_lens, rows_in_sight
 from lanebev.view.checks import check_cameras, check_covers, check_image, check_size
@@ -163,9 +165,7 @@ def _map_sizes(
         check_image(each)
         if each.shape[0] != maps[0].shape[0]:
             raise ValueError(f"image: expected maps of {maps[0].shape[0]} images, got {each.shape[0]}")
-    steps = list(strides) if isinstance(strides, Sequence) else [strides] * len(maps)
-    if len(steps) != len(maps):
-        raise ValueError(f"strides: expected {len(maps)}, one for each map, got {len(steps)}")
+    steps = _checked_strides(strides, len(maps))
     if image_size is None:
         if len(maps) > 1 or steps[0] is not None:
             raise ValueError("image_size: expected (H, W) px of the image that maps belong to, got None")
@@ -175,3 +175,16 @@ def _map_sizes(
         check_covers(each, image_size)
     sizes = [MapSize(each.shape[-2], each.shape[-1], step) for each, step in zip(maps, steps, strict=True)]
     return sizes, image_size
+
+
+def _checked_strides(strides: float | Sequence[float] | None, count: int) -> list[float | None]:
+    """Return the stride of each of ``count`` maps, px, or None."""
+    steps: list[float | None] = list(strides) if isinstance(strides, Sequence) else [strides] * count
+    if len(steps) != count:
+        raise ValueError(f"strides: expected {count}, one for each map, got {len(steps)}")
+    for step in steps:
+        if step is not None:
+            check_number("strides", step, "px as numbers, or None")
+            if not 0 < step < math.inf:
+                raise ValueError(f"strides: expected more than 0 px, got {step}")
+    return steps

@@ -114,6 +114,7 @@ def test_padding_may_hold_anything():
         (lambda: lanebev.bev_from_image(NUMBERS, K, GRID), TypeError, "extrinsics.pitch: .* got float"),
         (lambda: lanebev.bev_from_image(K, POSE, GRID), TypeError, "extrinsics: expected lanebev.Extrinsics"),
         (lambda: lanebev.bev_from_image(POSE, K, (10, 10)), TypeError, "grid: expected lanebev.BEVGrid"),
+        (lambda: BEVGrid(resolution="1"), TypeError, "resolution: expected m as a number, got str"),
         (lambda: BEVGrid(x=10), TypeError, r"x: expected \(low, high\) in m, got 10"),
         (lambda: Extrinsics.unstack([0, 0, 0, 1.5]), TypeError, "values: expected a torch.Tensor, got list"),
         (
@@ -129,6 +130,37 @@ def test_padding_may_hold_anything():
             lambda: Camera.from_fov(60, 640, 360).undistort_points(np.ones((5, 2))),
             TypeError,
             "points: .* numpy",
+        ),
+        (
+            lambda: Camera.from_fov(60, 640, 360).undistort_points(torch.ones(5, 2).long()),
+            ValueError,
+            "points: expected floating point, got torch.int64",
+        ),
+        (lambda: Camera.from_fov("60", 640, 360), TypeError, "fov: expected degrees as a number, got str"),
+        (
+            lambda: Camera.from_parameters(500, None, 320, 180, 640, 360),
+            TypeError,
+            "fy: expected px as a number, got NoneType",
+        ),
+        (
+            lambda: LaneSegments.from_polylines(5, Camera.from_fov(60, 640, 360)),
+            TypeError,
+            r"polylines: expected a list of \(P, 2\) px, or a dict by boundary, got int",
+        ),
+        (
+            lambda: LaneSegments.from_polylines(["ab"], Camera.from_fov(60, 640, 360)),
+            ValueError,
+            r"polylines\[0\]: expected \(P, 2\) px, got 'ab'",
+        ),
+        (
+            lambda: LaneSegments.from_polylines([[[1, 2], [3]]], Camera.from_fov(60, 640, 360)),
+            ValueError,
+            r"polylines\[0\]: expected \(P, 2\) px, got \[\[1, 2\], \[3\]\]",
+        ),
+        (
+            lambda: LaneSegments.from_polylines([], Camera.from_fov(60, 640, 360), sigma=-1.0),
+            ValueError,
+            "sigma: expected more than 0 px, got -1.0",
         ),
         (
             lambda: Camera.from_fov(60, 640, 360).scaled(2),
@@ -160,6 +192,12 @@ def test_geometry(call, error, message):
             TypeError,
             r"image_size: expected \(height, width\) in px, got 96",
         ),
+        (
+            (IMAGE, K, POSE, None, "pinhole", (64, 96), 0),
+            ValueError,
+            "strides: expected more than 0 px, got 0",
+        ),
+        ((IMAGE, K, POSE, None, "pinhole", (64, 96), "8"), TypeError, "strides: .* as numbers, .* got str"),
     ],
 )
 def test_warp(arguments, error, message):
@@ -187,6 +225,11 @@ def model():
 def test_lanebev_images(model, image, error, message):
     with pytest.raises(error, match=message):
         model(image, K)
+
+
+def test_lanebev_frozen():
+    with pytest.raises(TypeError, match=r"frozen: expected a list of names, got 'segmenter'; write \['seg"):
+        lanebev.LaneBEV.from_pretrained(frozen="segmenter")
 
 
 def test_lanebev_cameras(model):

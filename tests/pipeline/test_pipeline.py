@@ -10,6 +10,7 @@ from lanebev import (
     HILLY_ROADS,
     BEVGrid,
     BEVWarp,
+    ImageFromBEV,
     JointCalibrator,
     LaneBEV,
     LaneSegmenter,
@@ -308,6 +309,14 @@ def test_an_empty_batch_goes_all_the_way(shape):
     assert out.bev.shape == (*shape, 3, *GRID.shape)
     assert out.calibration.covariance.shape == (*shape, 4, 4)
     assert state.status.shape == (0,)
+
+
+def test_views_of_an_empty_batch_on_large_grids():
+    grid, none = BEVGrid(resolution=0.2), Extrinsics.unstack(torch.zeros(0, 4))
+    bev, valid = BEVWarp(grid)(torch.zeros(0, 3, 36, 64), K.float().expand(0, 3, 3), none)
+    assert (bev.shape, valid.shape) == ((0, 3, *grid.shape), (0, 1, *grid.shape))
+    image, _ = ImageFromBEV(grid)(bev, K.float().expand(0, 3, 3), none, (360, 640))
+    assert image.shape == (0, 3, 360, 640)
 
 
 def test_a_model_of_half_precision_resizes_too():

@@ -161,7 +161,7 @@ def test_worst_moments_are_found():
     assert found[KNOCK].startswith("started in this frame; largest jump: pitch +3.")
     assert found[139] == "least certain while predicted: σ of pitch 1.00°"
     assert found[159] == "least certain while lost: σ of pitch 2.00°"
-    assert found[99].startswith("largest σ: roll 1.08")
+    assert found[99].startswith("largest σ while tracking: roll 1.08")
 
 
 def test_a_quiet_drive_has_no_jumps():

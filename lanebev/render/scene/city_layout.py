@@ -14,6 +14,7 @@ from lanebev.render.scene.layout import (
     WHITE,
     YELLOW,
     Layout,
+    dashes_of_lines,
 )
 from lanebev.render.scene.sampler import BatchSampler
 
@@ -69,11 +70,7 @@ def sample_city_layout(sampler: BatchSampler, base: Layout) -> tuple[Layout, Ten
     blocks = outer & sampler.chance(0.6, slots)
     dashes = torch.where(blocks[..., None], sampler.pick_from(BLOCKS, slots), dashes)
     dashes = dashes * sampler.uniform(0.9, 1.1, 1, 1)
-    solid = dashes[..., 1:].expand_as(dashes)
-    is_dashed, mixed = (kind == DASHED)[..., None], (kind == SOLID_DASHED)[..., None]
-    dash = torch.stack(
-        [torch.where(is_dashed | mixed, dashes, solid), torch.where(is_dashed, dashes, solid)], dim=2
-    )
+    dash = dashes_of_lines(kind, dashes)
     double = (kind == DOUBLE) | (kind == SOLID_DASHED)
     width = torch.where(sampler.chance(0.8), sampler.uniform(0.09, 0.15), sampler.uniform(0.12, 0.2))[:, None]
     width = torch.where(blocks & (kind == DASHED), sampler.uniform(0.15, 0.3, slots), width)

@@ -122,11 +122,7 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
     other = sampler.pick_from(DASHES, slots)
     dashes = torch.where(sampler.chance(0.1, slots)[..., None], other, dashes)
     dashes = dashes * sampler.uniform(0.9, 1.1, 1, 1)
-    solid = dashes[..., 1:].expand_as(dashes)
-    is_dashed, mixed = (kind == DASHED)[..., None], (kind == SOLID_DASHED)[..., None]
-    dash = torch.stack(
-        [torch.where(is_dashed | mixed, dashes, solid), torch.where(is_dashed, dashes, solid)], dim=2
-    )
+    dash = dashes_of_lines(kind, dashes)
     double = (kind == DOUBLE) | (kind == SOLID_DASHED)
 
     width = torch.where(sampler.chance(0.75), sampler.uniform(0.10, 0.16), sampler.uniform(0.14, 0.30))[
@@ -180,6 +176,19 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
         symbol_phase=sampler.uniform(0, 150),
         symbol_opacity=sampler.uniform(0.5, 1.0),
     )
+
+
+def dashes_of_lines(kind: Tensor, dashes: Tensor) -> Tensor:
+    """Return (length, period) of the left and the right stripe of each boundary, (B, K, 2, 2) m.
+
+    Args:
+        kind: (B, K) int64, of both stripes; of SOLID_DASHED the left one is dashed.
+        dashes: (B, K, 2) m, (length, period) where a stripe is dashed.
+    """
+    solid = dashes[..., 1:].expand_as(dashes)
+    right = (kind == DASHED)[..., None]
+    left = right | (kind == SOLID_DASHED)[..., None]
+    return torch.stack([torch.where(left, dashes, solid), torch.where(right, dashes, solid)], dim=2)
 
 
 def presence(layout: Layout, slot: Tensor, along: Tensor) -> Tensor:
