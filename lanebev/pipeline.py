@@ -151,7 +151,12 @@ class LaneBEV(nn.Module):
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
     ) -> Any:
-        """Return the calibrator's state before the first frame."""
+        """Return the calibrator's state before the first frame, of ``batch_size`` drives.
+
+        Raises:
+            TypeError: a batch size that is no whole number.
+            ValueError: a negative batch size, or another dtype than float32 and float64.
+        """
         initial_state: Any = self.calibrator.initial_state
         device = torch.device(device or "cpu")
         off = torch.is_autocast_enabled(device.type)  # asked, since torch.export cannot keep an empty context

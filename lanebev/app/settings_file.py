@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import fields
 from pathlib import Path
 
@@ -12,13 +13,20 @@ import yaml
 from lanebev.app.config import RunConfig
 from lanebev.numbers import read_text
 
+_NUMBERS: dict[object, str] = {float: "a number", int: "a whole number"}
 _FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """SafeLoader that leaves numbers and dates as texts."""
+    """SafeLoader that leaves numbers and dates as texts, and refuses a key given twice."""
 
     yaml_implicit_resolvers = {}  # noqa: RUF012 - so it is in the base class
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, object]:
+        keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        if twice := [key for key, count in keys.items() if count > 1]:
+            raise ValueError(f"the key {twice[0]!r} twice")
+        return super().construct_mapping(node, deep=deep)
 
 
 for _tag, _pattern, _begin in (
@@ -36,6 +44,7 @@ def load_plain_yaml(text: str) -> object:
 
     Raises:
         yaml.YAMLError: the text is none.
+        ValueError: a key is given twice.
     """
     loader = _PlainLoader(text)
     try:
@@ -76,6 +85,8 @@ def parsed_settings(given: Mapping[str, object]) -> dict[str, object]:
         name = str(key).replace("-", "_")
         if name not in known:
             raise ValueError(f"expected one of {', '.join(known)}, got {key!r}")
+        if name in values:
+            raise ValueError(f"{key}: expected it once, got it with - and with _")
         try:
             values[name] = _parsed(value, known[name].default, known[name].metadata["parse"])
         except ValueError as error:
@@ -94,4 +105,9 @@ def _parsed(value: object, default: object, parse: Callable[[str], object]) -> o
         return value
     if not isinstance(value, (str, int, float)):
         raise ValueError(f"expected a text or number, got {value!r}")
-    return parse(str(value))
+    try:
+        return parse(str(value))
+    except ValueError as error:
+        if parse in _NUMBERS:
+            raise ValueError(f"expected {_NUMBERS[parse]}, got {value!r}") from error
+        raise

@@ -227,7 +227,17 @@ class Camera:
         return replace(self, intrinsics=resize @ self.intrinsics, image_size=(image_size[0], image_size[1]))
 
     def cropped(self, top: int, left: int, height: int, width: int) -> Camera:
-        """Return the camera of ``image[top:top+height, left:left+width]``; may reach beyond the image."""
+        """Return the camera of ``image[top:top+height, left:left+width]``; may reach beyond the image.
+
+        Args:
+            top: first row, px; negative above the image.
+            left: first column, px; negative left of the image.
+            height: rows, px.
+            width: columns, px.
+
+        Raises:
+            ValueError: sides that are not whole and positive.
+        """
         shift = self.intrinsics.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
         return replace(self, intrinsics=self.intrinsics - shift, image_size=(height, width))
 

@@ -62,6 +62,10 @@ class Calibrator(nn.Module, Generic[StateT]):
             batch_size: B.
             dtype: dtype of the state and so of all results, float32 or float64.
             device: device of the state; None is the default device.
+
+        Raises:
+            TypeError: a batch size that is no whole number.
+            ValueError: a negative batch size, or another dtype.
         """
         raise NotImplementedError
 

@@ -7,6 +7,7 @@ that names file and line.
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path, PurePath
@@ -142,7 +143,7 @@ def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int
 
 
 def _parts(name: str) -> tuple[str, ...]:
-    path = PurePath(name.replace("\\", "/"))
+    path = PurePath(unicodedata.normalize("NFC", name).replace("\\", "/"))  # macOS takes letters apart
     if path.suffix.lower() in IMAGE_SUFFIXES:  # what follows the last dot may be part of the name
         path = path.with_suffix("")
     parts = [part for part in path.parts if part not in ("/", ".")]

@@ -130,6 +130,13 @@ class BEVWarp(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Compute where every cell is seen.
 
+        Args:
+            intrinsics: (B, 3, 3) px.
+            extrinsics: extrinsics, each (B,).
+            distortion: (B, D) of the lens, or None for an undistorted image.
+            model: "pinhole", "fisheye" or "omni", the lens of ``distortion``.
+            vertical_curvature: (B,) 1/m of the road, positive over a crest; None for a plane.
+
         Returns:
             (B, U·V, 2) px of the image as taken, and (B, U·V) bool, in front and not hidden by a crest; with
             P plane heights P·U·V.

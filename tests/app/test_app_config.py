@@ -111,7 +111,14 @@ def test_settings_are_checked_when_they_are_made(settings, message):
     ("text", "message"),
     [
         ("lane_widht: 3", "expected one of source, camera, .*, got 'lane_widht'"),
-        ("lane_width: wide", "lane_width: could not convert"),
+        ("lane_width: wide", "lane_width: expected a number, got 'wide'"),
+        ("lane_width: 3,5", "lane_width: expected a number, got '3,5'"),
+        ("every: 1.5", "every: expected a whole number, got '1.5'"),
+        (
+            "lane_width: 3.5\nlane_width: 3.6",
+            "expected a YAML file .*, got: the key 'lane_width' twice",
+        ),
+        ("lane_width: 3.5\nlane-width: 3.6", "lane-width: expected it once, got it with - and with _"),
         ("stills: 1", "stills: expected true or false, got '1'"),
         ("lane_width: true", "lane_width: expected a text or number, got True"),
         ("source: [1]", r"source: expected a text or number, got \['1'\]"),

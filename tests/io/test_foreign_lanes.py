@@ -10,7 +10,7 @@ from PIL import Image
 from lanebev import Camera
 from lanebev.app.config import RunConfig
 from lanebev.app.sources import make_source
-from lanebev.io.lanes import match_frames, read_lanes
+from lanebev.io.lanes import FrameLines, match_frames, read_lanes
 from lanebev.observation.boundary_order import boundary_indices
 from lanebev.observation.polylines import LaneLine, vertices_from_lines
 
@@ -76,6 +76,11 @@ def test_zeros_on_several_rows_are_points_that_are_not_there(tmp_path, name):
     np.testing.assert_array_equal(line.points[:, 0], [np.nan, np.nan, 500, np.nan, 480, 470])
     (tmp_path / "2.json").write_text(json.dumps(_entry(lanes=[[0, 5, 9]])))
     np.testing.assert_array_equal(read_lanes(tmp_path / "2.json")[0].lines[0].points[:, 0], [0, 5, 9])
+
+
+def test_letters_that_macos_takes_apart_are_the_same():
+    assert match_frames(["caf\u00e9/1.jpg"], [FrameLines("cafe\u0301/1.jpg", [])]) == [0]
+    assert match_frames(["cafe\u0301.jpg"], [FrameLines("caf\u00e9.jpg", [])]) == [0]
 
 
 def test_json_by_the_name_of_a_text_file(tmp_path):

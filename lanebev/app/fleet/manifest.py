@@ -125,7 +125,11 @@ def _rows(path: Path) -> list[Row]:
 
 def _csv_rows(text: str) -> list[Row]:
     rows = []
-    for row in csv.DictReader(io.StringIO(text, newline=""), strict=True):
+    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
+    columns = Counter(name.strip() for name in reader.fieldnames or ())
+    if twice := [name for name, count in columns.items() if count > 1]:
+        raise ValueError(f"the column {twice[0]!r} twice")
+    for row in reader:
         if None in row or None in row.values():
             raise ValueError(f"a row with another number of columns: {shown(row)}")
         filled = {str(key).strip(): value.strip() for key, value in row.items() if value.strip()}

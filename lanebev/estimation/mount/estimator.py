@@ -44,7 +44,10 @@ class MountEstimator(nn.Module):
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
     ) -> MountState:
-        """Return the state before the first frame: no blocks, UNCALIBRATED."""
+        """Return the state before the first frame: no blocks, UNCALIBRATED.
+
+        See :meth:`~lanebev.estimation.calibrator.Calibrator.initial_state` for arguments and errors.
+        """
         check_new_state(batch_size, dtype)
         zero = torch.zeros(batch_size, 4, dtype=dtype, device=device)
         blocks = torch.zeros(batch_size, self.config.num_blocks, 4, dtype=dtype, device=device)

@@ -45,7 +45,10 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
     ) -> TwoStageState:
-        """Return the state before the first frame: the initial pose with its uncertainty, UNINITIALISED."""
+        """Return the state before the first frame: the initial pose with its uncertainty, UNINITIALISED.
+
+        See :meth:`~lanebev.estimation.calibrator.Calibrator.initial_state` for arguments and errors.
+        """
         check_new_state(batch_size, dtype)
         cfg = self.config
         pose, pose_std = cfg.initial_pose, cfg.initial_pose_std

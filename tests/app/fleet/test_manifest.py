@@ -118,6 +118,7 @@ def test_a_path_that_leaves_the_folder_is_refused(write, tmp_path, key, text):
         ({"drive": []}, "expected drives and defaults, got 'drive'"),
         ("video", "expected a list of drives"),
         ("a: [", "not YAML"),
+        ("- {video: a.mp4, camera: c, video: b.mp4}", "the key 'video' twice"),
     ],
 )
 def test_a_bad_manifest_is_one_line(write, rows, words):
@@ -130,6 +131,12 @@ def test_a_csv_row_with_too_many_cells_is_refused(write):
     for row in ("a.mp4,c.yaml,x", "a.mp4"):
         with pytest.raises(ValueError, match="a row with another number of columns"):
             read_manifest(write(f"video,camera\n{row}\n", "manifest.csv"))
+
+
+def test_a_csv_column_that_is_there_twice_is_refused(tmp_path):
+    (tmp_path / "drives.csv").write_text("video,camera, video\na.mp4,c.yaml,b.mp4\n")
+    with pytest.raises(ValueError, match="expected YAML or CSV, got: the column 'video' twice"):
+        read_manifest(tmp_path / "drives.csv")
 
 
 def test_the_command_says_it_in_a_line_and_status_2(write, tmp_path, capsys):
