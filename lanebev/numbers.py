@@ -42,7 +42,9 @@ def read_text(path: Path, errors: str = "strict") -> str:
         if errors == "replace" and text.count("\ufffd") > _MOST_FOREIGN * len(text):
             raise ValueError("not a text file")
         if "\0" in text:
-            raise ValueError("not a text file, or one in UTF-16 without a byte order mark; save it as UTF-8")
+            wide = text.count("\0") > _MOST_FOREIGN * len(text)
+            of_utf16 = ", or one in UTF-16 without a byte order mark; save it as UTF-8" if wide else ""
+            raise ValueError(f"not a text file{of_utf16}")
         return text
     except UnicodeDecodeError as error:
         raise ValueError("not a text file") from error

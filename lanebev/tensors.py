@@ -67,7 +67,7 @@ def usable_device(device: torch.device | str | int) -> torch.device:
 def made_once(function: Callable[P, T]) -> Callable[P, T]:
     """Decorate a function of hashable arguments that makes tensors, to be called once for each of them.
 
-    A compiled or exported program makes its own. Nobody may change the tensors in place.
+    A compiled or exported program makes its own. The tensors must not be changed in place.
     """
 
     @lru_cache(maxsize=256)

@@ -179,8 +179,8 @@ def _smoothed(
     for number, smoothed in backward:
         state = states[number]
         given = torch.from_numpy(covariances.all()[number : number + 1].copy())
-        pose, nobody = Extrinsics.unstack(state.mean[:, POSE]), given.new_zeros(1, 0)
-        filtered = Calibration(pose, given, state.status, nobody)
+        pose, no_inliers = Extrinsics.unstack(state.mean[:, POSE]), given.new_zeros(1, 0)
+        filtered = Calibration(pose, given, state.status, no_inliers)
         scale = float(scales.all()[number, 0])
         calibration = tracker.given_out(smoothed_calibration(filtered, state, smoothed), scale)
         result.poses[number] = calibration.extrinsics.stack()[0].numpy()

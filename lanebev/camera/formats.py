@@ -101,7 +101,7 @@ def without_lens(camera: CameraParameters) -> CameraParameters:
     """Return the camera of rectified images, for a file that has no projection matrix of them.
 
     Raises:
-        ValueError: the lens distorts, so that nobody knows what rectified images are like.
+        ValueError: the lens distorts, so that the camera of rectified images is unknown.
     """
     if camera.model != "pinhole" or any(camera.distortion):
         raise ValueError("projection_matrix: expected P for rectified images, got none; add the entry")

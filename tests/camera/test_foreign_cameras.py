@@ -221,6 +221,7 @@ ORBextractor.nFeatures: 1200
             "fx: 500\n".encode("utf-16-le").decode(),
             "got: not a text file, or one in UTF-16 without a byte order mark; save it as UTF-8",
         ),
+        ("c.npz", "PK\x03\x04" + 20 * "K.npy\0", "got: not a text file$"),
         (
             "c.yaml",
             ORB_SLAM.format("PinHole", "", "Camera.k3: 0.1\nCamera.k4: 0.2"),
