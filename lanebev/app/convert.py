@@ -61,4 +61,4 @@ def convert(
     path = Path(run) / FORMATS[to].file if out is None else Path(out)
     with whole_file(path) as whole:
         write(whole, record, source)
-    return f"{path}: {len(record.rows)} frames"
+    return f"{path}: {len(record.rows)} frame{'s'[: len(record.rows) != 1]}"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.io.lane_parsing import FrameLines, Where, checked_pixels, lane_text, without_zeros
+from lanebev.io.lane_parsing import FrameLines, Where, checked_pixels, lane_text
 from lanebev.numbers import numbers_or_gaps
 from lanebev.observation.polylines import LaneLine
 
@@ -23,7 +23,7 @@ def read_culane(path: str | Path) -> FrameLines:
     """Read CULane's ``.lines.txt``, a line of ``x y x y ...`` per lane; the path without suffix names it.
 
     A point that is repeated right after itself counts once; x of ``nan``, -2 or -1 is a point that is not
-    there, and so is 0 on several rows. Where rows are left out, the line is not seen.
+    there. Where rows are left out, the line is not seen.
     """
     path = Path(path)
     lines = []
@@ -40,7 +40,6 @@ def read_culane(path: str | Path) -> FrameLines:
             if number == len(rows) and texts:
                 _check_last_row(points[:, 1], texts[-1])
             points[np.isin(points[:, 0], _NOT_THERE), 0] = np.nan
-            points[:, 0] = without_zeros(points[:, 0])
             if np.isfinite(points).all(-1).any():
                 lines.append(LaneLine(_with_gaps(checked_pixels("points", points))))
     return FrameLines(str(path).removesuffix(".txt").removesuffix(".lines"), lines)

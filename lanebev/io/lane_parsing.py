@@ -139,14 +139,6 @@ def checked_pixels(name: str, values: NDArray[np.float64]) -> NDArray[np.float64
     return within(name, "pixels", values)
 
 
-def without_zeros(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return x of a line's points, with NaN for 0 on several rows: no line runs along the images' edge.
-
-    Some detectors write 0 where they see no line, and others move what is outside the images to their edge.
-    """
-    return np.where((x == 0).sum() > 1, np.where(x == 0, np.nan, x), x)
-
-
 def within(name: str, unit: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the values if none is too large for this unit."""
     if (np.abs(values) > _FARTHEST).any():  # NaN is not

@@ -25,7 +25,6 @@ from lanebev.io.lane_parsing import (
     json_values,
     lane_text,
     number_array,
-    without_zeros,
 )
 from lanebev.numbers import finite_numbers, numbers_or_gaps, shown
 from lanebev.observation.boundary_vertices import BoundaryVertices
@@ -193,4 +192,4 @@ def _on_h_samples(name: str, values: Any, count: int) -> NDArray[np.float64]:
         raise ValueError(f"{name}: expected {count} numbers, one per h_sample, got {got}")
     x = checked_pixels(name, np.array(numbers_or_gaps(name, values)))
     x[x < 0] = np.nan  # -2 is "not there", as null and NaN are
-    return without_zeros(x)
+    return x

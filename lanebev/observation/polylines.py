@@ -27,6 +27,7 @@ VERTICES_PER_LINE = 60
 """At most; more do not make a frame's pose better, only slower."""
 
 _MOST_TURNS = 0.25  # of a line's steps: points with more turns are in no order
+_BESIDE_EDGE = 3.0  # px from an edge, where points of the same x were moved to it
 _GAP, _GAP_ROWS = 4.0, 30.0  # between vertices: times the usual distance, and px
 
 
@@ -70,7 +71,9 @@ def vertices_from_lines(
     """Convert one frame's lines to boundary vertices.
 
     Lines without a boundary index get one by :func:`boundary_indices`; those beyond the outermost boundary,
-    and those that cross fewer than two rows, are left out.
+    and those that cross fewer than two rows, are left out. So are several points of a line with the same x at
+    the left or the right edge of the image: some detectors move points to the edge that are outside of it,
+    or write 0 where they see no line.
 
     Args:
         lines: lines of one frame.
@@ -83,6 +86,7 @@ def vertices_from_lines(
     check_camera(camera)
     shape = (1, num_boundaries, VERTICES_PER_LINE)
     points, weight, sigma = np.zeros((*shape, 2)), np.zeros(shape), np.ones(shape)
+    lines = [_without_edges(line, camera.image_size[1]) for line in lines]
     for line, index in zip(lines, _indices(lines, camera, num_boundaries), strict=True):
         if index is not None and index < num_boundaries:
             found = _line_vertices(line, camera.image_size)
@@ -136,6 +140,17 @@ def rows_from_vertices(vertices: BoundaryVertices, image_size: tuple[int, int]) 
         if inside.sum() >= 2:
             own[inside] = on_rows[inside]
     return BoundaryRows(rows, x)
+
+
+def _without_edges(line: LaneLine, width: int) -> LaneLine:
+    """Return a polyline with NaN for several points of the same x at an edge of the image; vertices stay."""
+    x = line.points[:, 0]
+    at_edge = x[(x < _BESIDE_EDGE) | (x > width - 1 - _BESIDE_EDGE)]
+    values, counts = np.unique(at_edge, return_counts=True)
+    if line.weight is not None or (counts == 1).all():
+        return line
+    moved = np.isin(x, values[counts > 1])
+    return line._replace(points=np.column_stack([np.where(moved, np.nan, x), line.points[:, 1]]))
 
 
 def _indices(lines: Sequence[LaneLine], camera: Camera, num_boundaries: int) -> list[int | None]:

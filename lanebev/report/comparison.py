@@ -159,7 +159,7 @@ def render_comparison(first: RunFolder, second: RunFolder) -> str:
 def comparison_summary(first: RunFolder, second: RunFolder) -> str:
     """Return what to print: the frames in common, how each axis differs, the settings that do."""
     pairs = common_frames(first, second)
-    lines = [f"{len(pairs)} frames in common; {second.name} minus {first.name}:"]
+    lines = [f"{len(pairs)} frame{'s'[: len(pairs) != 1]} in common; {second.name} minus {first.name}:"]
     for each in differences(pairs):
         mean, rms, largest = each.words
         frame = pairs[each.at][0].frame

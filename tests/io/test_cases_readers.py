@@ -64,10 +64,21 @@ CAMERA_KEYS = (
     "K D P R roi width height distortion_model binning_x xi cam0 intrinsics camera_model resolution "
     "camera_intrinsic intrinsic model_type projection_parameters fx"
 )
-LANE_KEYS = "raw_file h_samples lanes boundary sigma seen pose_sigma_scale file_path lane_lines"
+LANE_KEYS = (
+    "raw_file h_samples lanes boundary sigma seen pose_sigma_scale file_path lane_lines "
+    "image_name name labels frames objects"
+)
 camera_keys, lane_keys = (st.sampled_from(keys.split()) for keys in (CAMERA_KEYS, LANE_KEYS))
 line_keys = st.sampled_from(["uv", "xyz", "visibility", "category"])
 lane_lines = st.dictionaries(line_keys, json_values, max_size=4)
+label_keys = st.sampled_from(
+    ["category", "attributes", "poly2d", "vertices", "types", "markers", "pixel_start"]
+)
+labels = st.recursive(
+    json_values | st.just("lane"),
+    lambda inner: st.lists(inner) | st.dictionaries(label_keys, inner),
+    max_leaves=20,
+)
 
 
 @thorough
@@ -80,6 +91,13 @@ def test_any_values_of_a_cameras_keys(tmp_path, fields):
 @given(fields=st.dictionaries(lane_keys, json_values | st.lists(lane_lines, max_size=3), max_size=6))
 def test_any_values_of_a_lane_files_keys(tmp_path, fields):
     assert fault(READERS["lanes.json"], _json(fields), tmp_path) == ""
+
+
+@thorough
+@given(label=st.dictionaries(label_keys, labels, max_size=4))
+def test_any_values_of_a_label(tmp_path, label):
+    for fields in ({"name": "1", "labels": [label]}, {"image_name": "1", "lanes": [label]}):
+        assert fault(READERS["lanes.json"], _json(fields), tmp_path) == ""
 
 
 @thorough

@@ -66,16 +66,32 @@ def test_an_empty_lane_is_none(tmp_path):
     np.testing.assert_array_equal(line.points[:, 0], [900, 910, 920])
 
 
-@pytest.mark.parametrize("name", ["1.json", "1.lines.txt"])
-def test_zeros_on_several_rows_are_points_that_are_not_there(tmp_path, name):
-    x, rows = [0, 0, 500, 0, 480, 470], [500, 510, 520, 530, 540, 550]
-    culane = " ".join(f"{a} {b}" for a, b in zip(x, rows, strict=True))
-    text = json.dumps(_entry(h_samples=rows, lanes=[x])) if name == "1.json" else culane
-    (tmp_path / name).write_text(text)
-    (line,) = read_lanes(tmp_path / name)[0].lines
-    np.testing.assert_array_equal(line.points[:, 0], [np.nan, np.nan, 500, np.nan, 480, 470])
-    (tmp_path / "2.json").write_text(json.dumps(_entry(lanes=[[0, 5, 9]])))
-    np.testing.assert_array_equal(read_lanes(tmp_path / "2.json")[0].lines[0].points[:, 0], [0, 5, 9])
+@pytest.mark.parametrize(("left", "right"), [(0.0, 1279.0), (-1.0, 1280.0), (1.5, 1277.5)])
+def test_points_that_were_moved_to_the_edge_are_missing(left, right):
+    outer = _fan(-5.4, 5.4)  # leave the image above its bottom
+    rows = np.array([600.0, 650.0, 700.0])
+    moved = [
+        np.concatenate([line, np.column_stack([np.full(3, edge), rows])])
+        for line, edge in zip(outer, (left, right), strict=True)
+    ]
+    lines = [moved[0], LEFT, RIGHT, moved[1]]
+    found, expected = (
+        vertices_from_lines([LaneLine(line) for line in each], CAMERA)
+        for each in (lines, [outer[0], LEFT, RIGHT, outer[1]])
+    )
+    np.testing.assert_array_equal(found.points, expected.points)
+    np.testing.assert_array_equal(found.weight, expected.weight)
+
+
+def test_zeros_where_a_detector_sees_no_line_are_missing():
+    with_zeros = LEFT.copy()
+    with_zeros[5:9, 0] = 0.0
+    with_gap = np.where(with_zeros == 0.0, np.nan, with_zeros)
+    found, expected = (
+        vertices_from_lines([LaneLine(line), LaneLine(RIGHT)], CAMERA) for line in (with_zeros, with_gap)
+    )
+    np.testing.assert_array_equal(found.points, expected.points)
+    np.testing.assert_array_equal(found.weight, expected.weight)
 
 
 def test_letters_that_macos_takes_apart_are_the_same():
