@@ -82,3 +82,22 @@ def test_gradients_back_to_logits_and_pixels_equal_finite_differences(calibrator
     for got, expected in zip(analytic[:, compared], numeric[:, compared], strict=True):
         scale = float(expected.abs().max())
         torch.testing.assert_close(got, expected, rtol=2e-3, atol=1e-4 * scale)
+
+
+@pytest.mark.parametrize("calibrator", [JointCalibrator(), TwoStageCalibrator()], ids=["joint", "two-stage"])
+@pytest.mark.parametrize("dtype", [torch.float32, DOUBLE], ids=str)
+def test_frames_without_gradients_may_come_before_frames_with_them(calibrator, dtype):
+    """Computed in inference mode, whose tensors no graph accepts, but returned as others."""
+    state, intrinsics = calibrator.initial_state(1, dtype=dtype), K[None].to(dtype)
+    _, expected = calibrator(lanes(seed=0), intrinsics, state, 1 / 30)
+    with torch.no_grad():
+        calibration, state = calibrator(lanes(seed=0), intrinsics, state, 1 / 30)
+    for one, other in zip(state, expected, strict=True):
+        assert not one.is_inference()
+        assert torch.equal(one, other)
+    assert not any(part.is_inference() for part in (*calibration.extrinsics, *calibration[1:]))
+    camera = intrinsics.clone().requires_grad_()
+    calibration, _ = calibrator(lanes(seed=1), camera, state, 1 / 30)
+    calibration.extrinsics.pitch.sum().backward()
+    assert camera.grad.isfinite().all()
+    assert camera.grad[0, 1, 2] != 0
