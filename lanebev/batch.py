@@ -105,12 +105,13 @@ def in_blocks(numbers: int, function: Callable[..., T], *operands: Any) -> T:
             row alone.
         operands: (B, ...) tensors, or NamedTuples of such.
     """
+    first = operands[0]
+    while isinstance(first, tuple):
+        first = first[0]
+    count = round(numbers * first.shape[0] / _BLOCK)
+    if torch.compiler.is_compiling() or count < 2 or first.device.type != "cpu":
+        return function(*operands)
     parts, structure = tree_flatten(operands)
-    if torch.compiler.is_compiling() or parts[0].device.type != "cpu":
-        return function(*operands)
-    count = round(numbers * parts[0].shape[0] / _BLOCK)
-    if count < 2:
-        return function(*operands)
     blocks = zip(*(part.chunk(count) for part in parts), strict=True)
     results = [tree_flatten(function(*tree_unflatten(list(block), structure))) for block in blocks]
     joined = [torch.cat(same) for same in zip(*(leaves for leaves, _ in results), strict=True)]

@@ -256,7 +256,7 @@ def update_state(
             residuals = residuals._replace(distance=distance, valid=valid)
         frame = frame_information(residuals, jacobian, scale, doubt, seen)
         alone, sensitivity = single_frame(frame.matrix)
-        estimated = estimated_entries(alone, place)
+        estimated = estimated_entries(alone, num)
         moved = observed_step(
             before, cov[:, place.observed, place.observed], at, frame, estimated[:, place.observed]
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lanebev.estimation.joint.layout import NUM_COMMON
 from lanebev.estimation.joint.measurement import OFFSET, Sight, every_segment, sampson_distances
@@ -67,11 +68,9 @@ def renumber(mean: Tensor, shift: Tensor, lane_width: Tensor, num_boundaries: in
         (B, D).
     """
     last = NUM_COMMON + num_boundaries
-    own = mean[:, NUM_COMMON:last]
-    none, direction = torch.zeros_like(own[:, :1]), shift.unsqueeze(-1)
-    right, left = torch.cat([own[:, 1:], none], -1), torch.cat([none, own[:, :-1]], -1)
-    own = torch.where(direction > 0, right, torch.where(direction < 0, left, own))
-    offset = mean[:, OFFSET : OFFSET + 1] + direction * lane_width.unsqueeze(-1)
+    number = constant(tuple(range(1, num_boundaries + 1)), like=mean, dtype=torch.int64)  # in the padded
+    own = pad(mean[:, NUM_COMMON:last], (1, 1)).gather(1, number + shift.long().unsqueeze(-1))
+    offset = mean[:, OFFSET : OFFSET + 1] + (shift * lane_width).unsqueeze(-1)
     return torch.cat(
         [mean[:, :OFFSET], offset, mean[:, OFFSET + 1 : NUM_COMMON], own, mean[:, last:]], dim=-1
     )

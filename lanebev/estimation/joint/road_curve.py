@@ -123,7 +123,7 @@ def curve_by_shape(z: Tensor, by_bend: Tensor, by_heading: Tensor, road: Clothoi
 
 def _past_knots(z: Tensor, road: Spline) -> Tensor:
     """Distances (B, 1 + NUM_STEPS, M) past the knots, in knot spacings, 0 before a knot."""
-    return torch.add(road.past, z.unsqueeze(1), alpha=1 / KNOT_SPACING).clamp(min=0.0)
+    return torch.add(road.past, z.unsqueeze(1), alpha=1 / KNOT_SPACING).clamp_(min=0.0)
 
 
 def _behind(past: Tensor) -> tuple[Tensor, Tensor]:

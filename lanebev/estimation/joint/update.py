@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, Layout
+from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, layout
 from lanebev.estimation.joint.measurement import NUM_STRAIGHT, OFFSET, ROLL, Residuals
 from lanebev.estimation.joint.observations import Observations, by_ends, per_end
 from lanebev.estimation.joint.robust import (
@@ -216,10 +217,18 @@ def single_frame(matrix: Tensor) -> tuple[Tensor, Tensor]:
     return cov.diagonal(dim1=1, dim2=2).sqrt(), sensitivity
 
 
-def estimated_entries(single_frame_std: Tensor, place: Layout) -> Tensor:
+def estimated_entries(single_frame_std: Tensor, num_boundaries: int) -> Tensor:
     """(B, D): 0 for roll, its derivatives and slow mean where a frame does not determine roll, else 1."""
-    others = constant(tuple(float(i not in place.chain(ROLL)) for i in range(place.size)), single_frame_std)
+    others = constant(_all_but_roll(num_boundaries), single_frame_std)
     return torch.where(single_frame_std[:, ROLL, None] > UNSEEN[ROLL], others, 1.0)
+
+
+@lru_cache(maxsize=16)
+def _all_but_roll(num_boundaries: int) -> tuple[float, ...]:
+    """0 for roll, its derivatives and slow mean, else 1: D numbers."""
+    place = layout(num_boundaries)
+    roll = place.chain(ROLL)
+    return tuple(float(entry not in roll) for entry in range(place.size))
 
 
 def boundary_deviation(mean: Tensor, frame: FrameInformation) -> Tensor:
@@ -266,7 +275,8 @@ def _predicted_variance(jacobian: Tensor, cov: Tensor, boundary: Tensor) -> Tens
 
     Correlations between deviations and the common entries are left out: they lower it.
     """
-    common = by_ends(torch.bmm(cov[:, :NUM_COMMON, :NUM_COMMON], jacobian) * jacobian).sum((1, 2))  # (B, N)
+    spread = torch.bmm(cov[:, :NUM_COMMON, :NUM_COMMON], jacobian).mul_(jacobian)  # another copy takes longer
+    common = by_ends(spread).sum((1, 2))  # (B, N)
     own = cov.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:].gather(1, boundary)  # (B, N)
     shift = squared_distance(by_ends(jacobian[:, OFFSET]))
     total: Tensor = torch.addcmul(common, own, shift)
