@@ -15,6 +15,7 @@ clock's: of one thread, and for a machine that others use too.
 - ``frame``: one frame of bytes through the lens, against ``cv2.remap`` with its maps at hand, and with its
   maps computed, as they must be when the pose is another in every frame.
 - ``extractor``: seven maps of 160 × 288.
+- ``compiled_step`` (if asked for): a frame of the joint calibrator by inductor, which compiles for minutes.
 - ``rows``, ``dense``, ``segments``, ``cells``: calibrators by rows of a batch, with 30 and with 408 segments
   each, and by segments, the warp by cells.
 """
@@ -39,7 +40,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     every = [*TABLES, *GROWTHS]
-    usual = [part for part in every if part != "compiled"]
+    usual = [part for part in every if not part.startswith("compiled")]
     parser.add_argument("--parts", nargs="+", choices=every, default=usual)
     parser.add_argument("--threads", type=PositiveInt, default=2)
     parser.add_argument("--cpu-time", action="store_true", help="processor time, with --threads 1")

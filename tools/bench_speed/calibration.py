@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -30,12 +29,12 @@ def extractors() -> Calls:
     }
 
 
-def calibrators(rows: int, per_boundary: int) -> Calls:
+def calibrators(rows: int, per_boundary: int) -> dict[str, partial[Any]]:
     """Make calls of one frame of each calibrator, sure of its start: see ``JointConfig.doubt_frames``."""
     one = lanes(per=per_boundary, noise=0.5)
     seen = LaneSegments(*(part.expand(rows, *part.shape[1:]) for part in one))
     intrinsics = INTRINSICS.expand(rows, 3, 3)
-    calls: dict[str, Callable[[], object]] = {}
+    calls = {}
     for name, calibrator in (("joint", JointCalibrator()), ("two-stage", TwoStageCalibrator())):
         state: Any = calibrator.initial_state(1, dtype=torch.float64)
         for _ in range(20):  # of one row, which the others equal
@@ -43,3 +42,10 @@ def calibrators(rows: int, per_boundary: int) -> Calls:
         state = map_tensors(lambda part: part.expand(rows, *part.shape[1:]).clone(), state)
         calls[name] = partial(calibrator, seen, intrinsics, state, 1 / 30)
     return calls
+
+
+def compiled() -> Calls:
+    """Make calls of one frame of the joint calibrator, as it is and compiled by inductor, of 408 segments."""
+    frame = calibrators(1, 68)["joint"]
+    step = torch.compile(frame.func, fullgraph=True)
+    return {"JointCalibrator": frame, "torch.compile": partial(step, *frame.args)}

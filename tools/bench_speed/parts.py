@@ -32,6 +32,7 @@ TABLES: dict[str, list[tuple[str, Callable[[], Calls]]]] = {
         ("compiled without a lens", lambda: views.compiled(None)),
         ("compiled with 5 coefficients", lambda: views.compiled(scene.BROWN)),
     ],
+    "compiled_step": [("a compiled frame of the joint calibrator", calibration.compiled)],
     "gradients": [
         ("one image and back", lambda: views.backwards(1, 3, 1)),
         ("8 images and back", lambda: views.backwards(8, 3, 1)),
