@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from lanebev.geometry.precision import autocast_off
+from lanebev.geometry.vanishing_point import vanishing_point
 from lanebev.render.frame import RenderedFrame
 from lanebev.render.raster.features import features_of
 from lanebev.render.raster.paint import paint_view, prepare
@@ -20,7 +21,6 @@ from lanebev.render.scene.varied import varied_extrinsics, varied_intrinsics
 from lanebev.render.scene.window import (
     WindowConfig,
     sample_window_scale,
-    vanishing_pixel,
     window_from_native,
 )
 from lanebev.render.scene.world import (
@@ -184,7 +184,8 @@ def _through_window(
 ) -> tuple[World, Lens]:
     """Look through windows: other intrinsics, and blur that is as much larger as the native pixels are."""
     scale = sample_window_scale(sampler, config)
-    horizon = vanishing_pixel(lens.intrinsics, lens.distortion, lens.model, lens.extrinsics)
+    pitch, yaw = lens.extrinsics[:2]
+    horizon = vanishing_point(pitch, yaw, lens.intrinsics, lens.distortion, lens.model)
     matrix = window_from_native(sampler, config, scale, size, horizon)
     zoom = scale.clamp(max=1.0) ** -sampler.uniform(0.0, 1.0)  # of native images with more, or as few, pixels
     sensor = world.sensor._replace(blur=world.sensor.blur * zoom)

@@ -7,10 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lanebev.geometry.lens import denormalise_points, distort_points
-from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.types import Extrinsics
 
 
 @dataclass(frozen=True)
@@ -79,11 +76,3 @@ def window_from_native(
     entries = [across, zero, shift_x, zero, down, shift_y, zero, zero, one]
     matrix: Tensor = torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
     return matrix
-
-
-def vanishing_pixel(intrinsics: Tensor, distortion: Tensor, model: str, extrinsics: Extrinsics) -> Tensor:
-    """Compute the vanishing point of the lanes below the camera, (B, 2) px as taken."""
-    direction = vanishing_dir_from_pitch_yaw(extrinsics.pitch, extrinsics.yaw)
-    ideal = denormalise_points((direction[:, :2] / direction[:, 2:])[:, None], intrinsics)
-    taken: Tensor = distort_points(ideal, intrinsics, distortion, model)[:, 0]
-    return taken
