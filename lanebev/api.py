@@ -15,6 +15,7 @@ from lanebev.geometry.road import (
     road_from_image_points,
 )
 from lanebev.io.state import load_state, save_state
+from lanebev.observation.far_view import FarView
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.observation.segments import LaneSegments
@@ -35,6 +36,7 @@ __all__ = [
     "Camera",
     "CanonicalView",
     "Extrinsics",
+    "FarView",
     "ImageFromBEV",
     "JointCalibrator",
     "JointConfig",

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Collection
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from lanebev.batch import select_rows
 from lanebev.clips import drive_starts, frame_intervals, stack_frames
+from lanebev.estimation.expected_view import expected_vanishing_point
 from lanebev.geometry.lens import check_intrinsics
 from lanebev.geometry.precision import autocast_off, common_dtype
-from lanebev.observation.boundary_vertices import BoundaryVertices
-from lanebev.observation.frames import check_images, resize_image, resized_size
+from lanebev.observation.boundary_detector import BoundaryDetector
+from lanebev.observation.far_view import FarView
+from lanebev.observation.frames import check_images
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segments import LaneSegments, segments_from_vertices
 from lanebev.types import Calibration, register_pytree
@@ -37,7 +39,7 @@ class LaneBEVOutput(NamedTuple):
         bev_from_image: (B, 3, 3) homography from undistorted pixels to BEV pixels of a plane road, which
             touches the road below the camera.
         segments: what the calibrator was given, in undistorted pixels of the image.
-        logits: (B, 1 + L, h, w) of the network.
+        logits: (B, 1 + L, h, w) of the network for the whole image.
     """
 
     bev: Tensor | None
@@ -48,7 +50,7 @@ class LaneBEVOutput(NamedTuple):
     logits: Tensor
 
 
-class LaneBEV(nn.Module):
+class LaneBEV(BoundaryDetector):
     """Image to bird's-eye view: segmenter, line extractor, calibrator, warp.
 
     Args:
@@ -66,6 +68,9 @@ class LaneBEV(nn.Module):
             (:class:`SegmenterConfig`), or 1 where it has none.
         frozen: names of STAGES without training and gradients: they stay in evaluation mode, and no graph of
             them is kept. With all but the warp frozen, the view is still differentiable in the image.
+        far_view: sizes of a view about the horizon that the network sees beside a smaller whole image. The
+            horizon is that of the state before the frame, or of the prior of a known mount. Rows where it is
+            not known (not TRACKING, or a sharp turn) have the whole image alone. None: all rows have.
 
     Raises:
         ValueError: segmenter and calibrator have different numbers of boundaries, or a stage does not exist.
@@ -81,8 +86,9 @@ class LaneBEV(nn.Module):
         pose_sigma_scale: float | None = None,
         frozen: Collection[str] = (),
         network_pixels: int | None = None,
+        far_view: FarView | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(segmenter, extractor, network_width, network_pixels, frozen, far_view)
         if isinstance(frozen, str):
             raise TypeError(f"frozen: expected a list of names, got {frozen!r}; write [{frozen!r}]")
         if unknown := set(frozen) - set(STAGES):
@@ -97,23 +103,11 @@ class LaneBEV(nn.Module):
             )
         if pose_sigma_scale is None:
             pose_sigma_scale = _configured(segmenter, "pose_sigma_scale", 1.0)
-        self.segmenter = segmenter
-        self.extractor = extractor
         self.calibrator = calibrator
         self.warp = warp or BEVWarp()
-        self.network_width = network_width
-        self.network_pixels = network_pixels
         self.pose_sigma_scale = pose_sigma_scale
-        self.frozen = frozenset(frozen)
         for stage in self.frozen:
             self.get_submodule(stage).requires_grad_(False).eval()
-
-    def train(self, mode: bool = True) -> Self:
-        """Set the mode of all stages but the frozen ones."""
-        super().train(mode)
-        for stage in self.frozen:
-            self.get_submodule(stage).eval()
-        return self
 
     @classmethod
     def from_pretrained(
@@ -123,6 +117,7 @@ class LaneBEV(nn.Module):
         calibrator: nn.Module | None = None,
         network_width: int | None = None,
         frozen: Collection[str] = (),
+        far_view: FarView | None = None,
     ) -> LaneBEV:
         """Make a model with the shipped weights, offline.
 
@@ -133,6 +128,7 @@ class LaneBEV(nn.Module):
             network_width: px; None is the width that the weights were trained for, and a larger one for wide
                 images, at which the input has about as many pixels as in training.
             frozen: see the class.
+            far_view: see the class.
 
         Raises:
             ValueError: a weights file that doesn't fit the network.
@@ -146,7 +142,10 @@ class LaneBEV(nn.Module):
         extractor = LineExtractor.for_network(segmenter.config)
         calibrator = calibrator or JointCalibrator(num_boundaries=segmenter.config.num_boundaries)
         view = BEVWarp(grid)
-        return cls(segmenter, extractor, calibrator, view, width, frozen=frozen, network_pixels=pixels)
+        return cls(
+            segmenter, extractor, calibrator, view, width,
+            frozen=frozen, network_pixels=pixels, far_view=far_view,
+        )  # fmt: skip
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
@@ -210,20 +209,16 @@ class LaneBEV(nn.Module):
             dtype = common_dtype(intrinsics) if state is None else state[0].dtype
             fresh = self.initial_state(batch, dtype, image.device)
             state = fresh if state is None else state
-        logits, segments = self.observe(
-            frames.flatten(0, 1),
-            intrinsics.repeat_interleave(steps, 0),
-            None if distortion is None else distortion.repeat_interleave(steps, 0),
-            model,
-        )
+        lens = (intrinsics, distortion, model)
+        look = self._look_ahead(frames, *lens) if self.far_view is None else self._look_in_turn(frames, *lens)
         intervals = frame_intervals(dt, batch, steps, intrinsics)
         outputs = []
         for step in range(steps):
-            now = LaneSegments(*(part.reshape(batch, steps, *part.shape[1:])[:, step] for part in segments))
             if begins is not None:
                 state = select_rows(begins[:, step], fresh, state)
             if truncation is not None and step % truncation == 0:
                 state = state.detach()
+            logits, now = look(step, state)
             with self._gradients("calibrator"):
                 calibration, state = self.calibrator(now, intrinsics, state, intervals[:, step], lane_width)
                 calibration = calibration.with_std_scaled(self.pose_sigma_scale)
@@ -235,12 +230,45 @@ class LaneBEV(nn.Module):
                         **self._road_shape(state),
                     )  # fmt: skip
             homography = bev_from_image(calibration.extrinsics, intrinsics, self.warp.grid)
-            logits_now = logits.reshape(batch, steps, *logits.shape[1:])[:, step]
-            outputs.append(LaneBEVOutput(view, valid, calibration, homography, now, logits_now))
+            outputs.append(LaneBEVOutput(view, valid, calibration, homography, now, logits))
         return (outputs[0] if image.ndim == 4 else stack_frames(outputs)), state
 
+    def _look_ahead(
+        self, frames: Tensor, intrinsics: Tensor, distortion: Tensor | None, model: str
+    ) -> Callable[[int, Any], tuple[Tensor, LaneSegments]]:
+        """Observe T frames (B, T, 3, H, W) as one batch; return what looks up those of a step."""
+        batch, steps = frames.shape[:2]
+        rows = intrinsics.repeat_interleave(steps, 0)
+        lens = None if distortion is None else distortion.repeat_interleave(steps, 0)
+        logits, segments = self.observe(frames.flatten(0, 1), rows, lens, model)
+
+        def of_step(part: Tensor, step: int) -> Tensor:
+            return part.reshape(batch, steps, *part.shape[1:])[:, step]
+
+        return lambda step, _: (
+            of_step(logits, step),
+            LaneSegments(*(of_step(part, step) for part in segments)),
+        )
+
+    def _look_in_turn(
+        self, frames: Tensor, intrinsics: Tensor, distortion: Tensor | None, model: str
+    ) -> Callable[[int, Any], tuple[Tensor, LaneSegments]]:
+        """Return what observes the frames of a step with the state before it, which places the far view."""
+        lens = (intrinsics, distortion, model)
+
+        def look(step: int, state: Any) -> tuple[Tensor, LaneSegments]:
+            point = expected_vanishing_point(self.calibrator, state, *lens)
+            return self.observe(frames[:, step], *lens, vanishing_point=point)
+
+        return look
+
     def observe(
-        self, image: Tensor, intrinsics: Tensor, distortion: Tensor | None = None, model: str = "pinhole"
+        self,
+        image: Tensor,
+        intrinsics: Tensor,
+        distortion: Tensor | None = None,
+        model: str = "pinhole",
+        vanishing_point: Tensor | None = None,
     ) -> tuple[Tensor, LaneSegments]:
         """Run network, line extraction and pairing only.
 
@@ -249,51 +277,19 @@ class LaneBEV(nn.Module):
             intrinsics: (B, 3, 3) px.
             distortion: (B, D) or None.
             model: "pinhole", "fisheye" or "omni".
+            vanishing_point: (B, 2) px of the image as taken, see :meth:`boundary_vertices`.
 
         Returns:
             logits (B, 1 + L, h, w) and segments in undistorted pixels of the image.
         """
-        logits, vertices = self.boundary_vertices(image)
+        logits, vertices = self.boundary_vertices(image, vanishing_point)
         with self._gradients("extractor"):
             return logits, segments_from_vertices(vertices, intrinsics, distortion, model)
-
-    def boundary_vertices(self, image: Tensor) -> tuple[Tensor, BoundaryVertices]:
-        """Run network and line extraction only.
-
-        Args:
-            image: (B, 3, H, W) as taken.
-
-        Returns:
-            logits (B, 1 + L, h, w) and vertices in pixels of the image as taken. A row whose image is not
-            finite counts as black and has none, so that it spoils neither other rows nor gradients.
-        """
-        size = self.network_size((image.shape[-2], image.shape[-1]))
-        resized = resize_image(
-            image, size
-        ).contiguous()  # a network rounds otherwise for another order in memory
-        finite = resized.isfinite().flatten(1).all(1)  # (B,)
-        with self._gradients("segmenter"):
-            logits = self.segmenter(torch.where(finite[:, None, None, None], resized, 0.0))
-        (height, width), (rows, columns) = image.shape[-2:], resized.shape[-2:]
-        with self._gradients("extractor"):
-            vertices = self.extractor.vertices(logits, (height, width), (rows, columns))
-        weight = torch.where(finite[:, None, None], vertices.weight, 0.0)
-        return logits, vertices._replace(weight=weight)
 
     def _road_shape(self, state: Any) -> dict[str, Tensor]:
         """Return the argument of the warp that describes a road that is not a plane, if there is one."""
         curvature = getattr(self.calibrator, "vertical_curvature", lambda _: None)(state)
         return {} if curvature is None else {"vertical_curvature": curvature}
-
-    def _gradients(self, stage: str) -> AbstractContextManager[object]:
-        """Return the context of a stage: without gradients if it is frozen."""
-        return torch.no_grad() if stage in self.frozen else nullcontext()
-
-    def network_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
-        """Return the (h, w) px to which images of (H, W) px are resized for the segmenter."""
-        if self.network_width is None:
-            return image_size
-        return resized_size(image_size, self.network_width, self.network_pixels)
 
 
 def _configured(part: nn.Module, name: str, default: Any = None) -> Any:

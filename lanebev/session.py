@@ -249,7 +249,8 @@ class Session:
         if self._model is None:
             self._model = LaneBEV.from_pretrained()
         model = self._model.eval().to(self.device)
-        _, vertices = model.boundary_vertices(network_image(image, self.device))
+        point = None if model.far_view is None else self.tracker.vanishing_point()
+        _, vertices = model.boundary_vertices(network_image(image, self.device), point)
         return map_tensors(Tensor.cpu, vertices), model.pose_sigma_scale
 
     def _look_at_size(self, lines: FrameLines) -> None:

@@ -18,3 +18,9 @@ def evaluation_parser(description: str | None) -> argparse.ArgumentParser:
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the data (../shared/data)")
     parser.add_argument("--weights", type=Path, help="other weights than the shipped")
     return parser
+
+
+def add_far_view(parser: argparse.ArgumentParser) -> None:
+    """Add the option of a far view to a parser."""
+    words = "the network also looks at far views about the horizon"
+    parser.add_argument("--far-view", action="store_true", help=words)

@@ -1,7 +1,7 @@
 """Evaluate real and third-party images, with all results beside their targets.
 
     python tools/evaluate_real.py [--data ../shared/data] [--json FILE] [--sheet FILE.png]
-        [--weights FILE] [--width PX] [--only PART] [--hilly]
+        [--weights FILE] [--width PX] [--only PART] [--hilly] [--far-view]
 
 Nothing of these images has been trained on.
 """
@@ -30,7 +30,7 @@ from lanebev.app.views import bird_view
 from lanebev.estimation.still import calibrate_still
 from lanebev.io.video import open_source
 from lanebev.report.overlay import Panel, draw_panels, joined
-from tools.arguments import evaluation_parser
+from tools.arguments import add_far_view, evaluation_parser
 from tools.real_figures import (
     Figure,
     carla_drive,
@@ -54,6 +54,7 @@ SHEET = tuple(range(0, 88, 8))  # and the last: a dozen
 @one_line_errors()
 def main() -> None:
     parser = evaluation_parser(__doc__)
+    add_far_view(parser)
     parser.add_argument("--json", type=Path, help="file for the results as JSON")
     parser.add_argument("--sheet", type=Path, help="write a PNG of a dozen TuSimple images, before and after")
     parser.add_argument("--width", type=PositiveInt, help="px of the network's input, instead of its own")
@@ -66,7 +67,8 @@ def main() -> None:
     calibrators = {name: make_calibrator(name) for name in ("two-stage", "joint")}
     if options.hilly:
         calibrators["joint"] = lanebev.JointCalibrator(lanebev.HILLY_ROADS)
-    model = lanebev.LaneBEV.from_pretrained(options.weights, network_width=options.width)
+    far_view = lanebev.FarView() if options.far_view else None
+    model = lanebev.LaneBEV.from_pretrained(options.weights, network_width=options.width, far_view=far_view)
     start = time.monotonic()
     figures = [figure for part in parts(options, model, calibrators) for figure in part]
     print_table(figures)

@@ -1,7 +1,8 @@
 """Figures on single images of streets, by day and by night, from pixels.
 
     python -m tools.evaluate_streets [--data ../shared/data] [--weights FILE] [--json FILE] [--sheets FOLDER]
-    python -m tools.evaluate_streets --rendered 24 [--width 576]
+        [--far-view]
+    python -m tools.evaluate_streets --rendered 24 [--width 576] [--far-view]
 
 ``kitti_road``: the road plane of the lidar is the truth of pitch and roll (0.1 to 0.2 degrees), yaw has none.
 ``kitti_road_with_prior``: the same with the median of these as a mount that is known.
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import lanebev
-from lanebev import BEVGrid, Calibration, Camera, JointCalibrator, LaneBEV, LaneSegments, Status
+from lanebev import BEVGrid, Calibration, Camera, FarView, JointCalibrator, LaneBEV, LaneSegments, Status
 from lanebev.estimation.joint.frame_prior import FramePrior, prior_of_mount
 from lanebev.estimation.tracker import Tracker
 from lanebev.geometry.rotation import road_from_cam
@@ -34,7 +35,7 @@ from lanebev.io.video import read_image
 from lanebev.observation.frames import check_frame, network_image
 from lanebev.render import render_views
 from lanebev.report.overlay import draw_panels
-from tools.arguments import evaluation_parser
+from tools.arguments import add_far_view, evaluation_parser
 from train.commands import one_line_errors
 
 KITTI_LANE_WIDTH = 3.5  # m
@@ -88,8 +89,12 @@ def calibrate_frame(
     model: LaneBEV, frame: Tensor, camera: Camera, lane_width: float, prior: FramePrior | None = None
 ) -> tuple[LaneSegments, Calibration]:
     """Calibrate one frame (1, 3, H, W) in [0, 1], as taken."""
-    _, vertices = model.boundary_vertices(frame)
     tracker = Tracker(JointCalibrator(prior=prior or FramePrior()), camera, lane_width)
+    if model.far_view is None:
+        _, vertices = model.boundary_vertices(frame)
+    else:
+        _, whole = model.whole_vertices(frame)
+        vertices = model.add_far_view(frame, whole, tracker.vanishing_point_of_still(whole))
     estimate = tracker.still(vertices, model.pose_sigma_scale)
     return estimate.segments, estimate.calibration
 
@@ -246,6 +251,7 @@ def save_sheet(
 def main() -> None:
     """Run the evaluation from the command line."""
     parser = evaluation_parser(__doc__)
+    add_far_view(parser)
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--sheets", type=Path, help="write contact sheets with the segments into this folder")
     parser.add_argument(
@@ -255,7 +261,8 @@ def main() -> None:
         "--rendered", type=PositiveInt, metavar="N", help="evaluate on N rendered views instead"
     )
     options = parser.parse_args()
-    model = LaneBEV.from_pretrained(options.weights, network_width=options.width).eval()
+    far_view = FarView() if options.far_view else None
+    model = LaneBEV.from_pretrained(options.weights, network_width=options.width, far_view=far_view).eval()
     if options.rendered:
         report({"rendered": rendered(model, options.rendered)}, options.json)
         return

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from lanebev import Camera, Extrinsics, LaneSegments, Status
-from lanebev.app.observers import NetworkObserver
+from lanebev import Camera, Extrinsics, JointCalibrator, LaneSegments, Status
+from lanebev.app.observers import FarViewObserver, NetworkObserver
 from lanebev.estimation.still import calibrate_still
+from lanebev.estimation.tracker import Tracker
 from lanebev.io.lanes import match_frames, read_lanes
 from lanebev.io.video import open_source
 from lanebev.observation.segments import camera_segments, segments_from_lines
@@ -135,8 +136,16 @@ def tusimple_pixels(data: Path, model: Any, calibrators: dict[str, Any]) -> Iter
 
 def still_segments(images: list[str], model: Any, camera: Camera) -> list[LaneSegments]:
     """Return what the network finds in each image, in double precision."""
-    observer = NetworkObserver(model, camera)
+    tracker = Tracker(JointCalibrator(), camera, TUSIMPLE_LANE_WIDTH)
+    observer = make_observer(model, tracker, camera, stills=True)
     return [camera_segments(observer(next(iter(open_source(image)))).vertices, camera) for image in images]
+
+
+def make_observer(model: Any, tracker: Tracker[Any], camera: Camera, stills: bool) -> NetworkObserver:
+    """Make what finds boundaries: with far views about the tracker's horizon if the model has such."""
+    if model.far_view is None:
+        return NetworkObserver(model, camera)
+    return FarViewObserver(model, tracker, camera, stills)
 
 
 def carla_truth(data: Path) -> dict[str, torch.Tensor]:
@@ -193,8 +202,9 @@ def udacity(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable[Fig
 def follow(
     source: str, camera: Camera, model: Any, calibrators: dict[str, Any], lane_width: float
 ) -> dict[str, Drive]:
-    """Run every calibrator on the same observations of a video."""
-    observer = NetworkObserver(model, camera)
+    """Run every calibrator on the same observations of a video; far views are about joint's horizon."""
+    tracker = Tracker(calibrators["joint"], camera, lane_width)
+    observer = make_observer(model, tracker, camera, stills=False)
     states = {
         name: calibrator.initial_state(1, dtype=torch.float64) for name, calibrator in calibrators.items()
     }
@@ -216,6 +226,7 @@ def follow(
             curvatures[name].append(calibrator.vertical_curvature(states[name]))
             status[name].append(calibration.status[0])
             lanes[name].append(select_inliers(segments, calibration.inliers))
+        tracker.state = states["joint"]
     return {
         name: Drive(
             torch.stack(poses[name]),

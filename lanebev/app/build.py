@@ -7,7 +7,7 @@ from fractions import Fraction
 from pathlib import Path
 
 from lanebev.app.config import RunConfig
-from lanebev.app.observers import LaneFileObserver, NetworkObserver, Observer
+from lanebev.app.observers import FarViewObserver, LaneFileObserver, NetworkObserver, Observer
 from lanebev.app.shared_network import SharedNetwork
 from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator, StateT
@@ -111,7 +111,11 @@ def make_network(weights: str | None, device: str) -> LaneBEV:
 
 
 def make_observer(
-    config: RunConfig, source: FrameSource, camera: Camera, network: SharedNetwork | None = None
+    config: RunConfig,
+    source: FrameSource,
+    camera: Camera,
+    network: SharedNetwork | None = None,
+    tracker: RunTracker | None = None,
 ) -> Observer:
     """Make what finds boundaries: by a lane file if one is given, else by the network.
 
@@ -120,6 +124,7 @@ def make_observer(
         source: the frames.
         camera: the lens.
         network: an already loaded network with the weights and device of the settings.
+        tracker: tracker of the same frames, on whose estimates a far view depends.
 
     Raises:
         ValueError: lanes that do not fit the source, or see :func:`make_network`.
@@ -131,7 +136,10 @@ def make_observer(
         return LaneFileObserver(entries, source, camera)
     if config.backend == "onnxruntime":
         return NetworkObserver(onnx_model(Path(config.exported), camera), camera)
-    return NetworkObserver(network or make_network(config.weights, config.device), camera)
+    loaded = network or make_network(config.weights, config.device)
+    if config.far_view and tracker is not None:
+        return FarViewObserver(loaded, tracker, camera, config.stills)
+    return NetworkObserver(loaded, camera)
 
 
 def input_files(config: RunConfig, source: FrameSource) -> list[str | Path]:

@@ -64,6 +64,7 @@ class RunConfig:
         topic: topic of the images in a bag with several.
         keep_all: drop no frame of a stream.
         smooth: estimate every pose from all frames of the drive, in two passes over the source.
+        far_view: the network also looks at a view about the horizon, see :class:`lanebev.FarView`.
         hilly: expect crests and dips everywhere on the road, instead of only where they are evident.
     """
 
@@ -164,6 +165,7 @@ class RunConfig:
     topic: str | None = option(None, "topic of the images in a bag with several", "NAME")
     keep_all: bool = option(False, "drop no frame of a stream: it waits, and its own times are used")
     smooth: bool = option(False, "estimate every pose from all frames of the drive, in two passes")
+    far_view: bool = option(False, "the network also looks at a far view about the horizon, at the same cost")
     hilly: bool = option(False, "expect crests and dips everywhere on the road (default: only where evident)")
 
     @property
@@ -222,9 +224,11 @@ class RunConfig:
         for name, value in (("lanes size", self.lanes_size), ("lanes crop", self.lanes_crop)):
             if value is not None and not self.lanes:
                 raise ValueError(f"{name}: expected --lanes with it, got none")
-        if self.lanes and self.weights:
+        given = next((name for name in ("weights", "far_view") if getattr(self, name)), None)
+        if self.lanes and given:
             raise ValueError(
-                "weights: expected the network's lanes, got --lanes as well; leave one of them out"
+                f"{given.replace('_', ' ')}: expected the network's lanes, got --lanes as well; leave one of "
+                "them out"
             )
 
     def _check_selection(self) -> None:
@@ -245,11 +249,12 @@ class RunConfig:
     def _check_backend(self) -> None:
         if self.backend not in BACKENDS:
             raise ValueError(f"backend: expected {' or '.join(BACKENDS)}, got {self.backend!r}")
-        given = next((name for name in ("mount", "hilly", "weights") if getattr(self, name)), None)
+        torch_only = ("mount", "hilly", "weights", "far_view")
+        given = next((name for name in torch_only if getattr(self, name)), None)
         if self.backend != "torch" and given:
             raise ValueError(
-                f"{given}: expected --backend torch with it, got {self.backend}; an exported calibrator and "
-                "network have their own"
+                f"{given.replace('_', ' ')}: expected --backend torch with it, got {self.backend}; an "
+                "exported calibrator and network have their own"
             )
 
     def _check_lens(self) -> None:

@@ -18,7 +18,7 @@ from lanebev.io.lanes import FrameLines, match_frames
 from lanebev.io.video import Frame, FrameSource
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.frames import check_frame, network_image
-from lanebev.observation.polylines import vertices_from_lines
+from lanebev.observation.polylines import VERTICES_PER_LINE, vertices_from_lines
 from lanebev.pipeline import LaneBEV
 from lanebev.tensors import map_tensors
 
@@ -44,7 +44,8 @@ class Observer(Protocol):
 
     Attributes:
         remark: what should be said of all frames together, else empty.
-        workers: calls at a time that make the best use of the machine.
+        workers: calls at a time that make the best use of the machine; 0 if each call needs the estimate of
+            the frame before.
     """
 
     remark: str
@@ -158,15 +159,61 @@ class NetworkObserver:
             return Observation(vertices_from_lines([], self.camera), self.model.pose_sigma_scale)
         image = network_image(check_frame(frame.image, self.camera.image_size), self.device)
         with torch.inference_mode():
-            if self._shared is not None:
-                vertices = self._shared.vertices(image)
-            else:
-                _, vertices = self.model.boundary_vertices(image)
+            vertices = self._vertices(image)
         return Observation(map_tensors(Tensor.cpu, vertices), self.model.pose_sigma_scale)
+
+    def _vertices(self, image: Tensor) -> BoundaryVertices:
+        """Return the vertices in an image (1, 3, H, W)."""
+        return (
+            self.model.boundary_vertices(image)[1] if self._shared is None else self._shared.vertices(image)
+        )
 
     def restored(self, found: FrameLines) -> Observation:
         """Return what the network saw by lanes.json, in its own layout: sums are the same to the bit."""
         vertices = vertices_from_lines(found.lines, self.camera)
-        most = 2 * self.model.extractor.config.segments
-        cut = [part[:, :, :most].float() for part in vertices[:3]]
+        cut = [part[:, :, : self._columns()].float() for part in vertices[:3]]
         return Observation(BoundaryVertices._make([*cut, vertices.boundary]), found.pose_sigma_scale)
+
+    def _columns(self) -> int:
+        """Return the number of vertices on a boundary, padding included."""
+        return 2 * self.model.extractor.config.segments
+
+
+class HorizonSource(Protocol):
+    """A tracker with any calibrator, which says where the lanes meet: (1, 2) px as taken, NaN if unknown."""
+
+    def vanishing_point(self) -> Tensor:
+        """Return the point expected in the next frame."""
+        ...
+
+    def vanishing_point_of_still(self, vertices: BoundaryVertices) -> Tensor:
+        """Return the point in a single image with these vertices."""
+        ...
+
+
+class FarViewObserver(NetworkObserver):
+    """Finds lanes in the whole images and in far views, which are about the horizon that a tracker expects.
+
+    Args:
+        network: segmenter and extractor; frames are not batched with those of other drives.
+        tracker: the tracker that is given what this observer sees, frame by frame.
+        stills: every image is on its own: the horizon is that of a first estimate from the whole image.
+    """
+
+    def __init__(
+        self, network: LaneBEV | SharedNetwork, tracker: HorizonSource, camera: Camera, stills: bool
+    ) -> None:
+        super().__init__(network, camera)
+        self.tracker, self.stills = tracker, stills
+        self.workers = self.workers if stills else 0
+
+    def _vertices(self, image: Tensor) -> BoundaryVertices:
+        _, whole = self.model.whole_vertices(image)
+        if self.stills:
+            point = self.tracker.vanishing_point_of_still(map_tensors(Tensor.cpu, whole))
+        else:
+            point = self.tracker.vanishing_point()
+        return self.model.add_far_view(image, whole, point)
+
+    def _columns(self) -> int:
+        return VERTICES_PER_LINE

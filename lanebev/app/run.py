@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 
 from lanebev.app.build import (
+    RunTracker,
     input_files,
     joint_config,
     make_grid,
@@ -84,9 +85,8 @@ def run(
     camera = camera_of(config, source)
     source = match_image_size(camera, source)
     logger.info("%s: %d frames of %d x %d", source.source, source.count, *reversed(camera.image_size))
-    observer = make_observer(config, source, camera, network)
-    tracker = make_tracker(config, camera)
-    problem = load_states(config, tracker, camera)
+    tracker, problem = resumed_tracker(config, camera)
+    observer = make_observer(config, source, camera, network, tracker)
     viewer = None if config.rerun is None else open_viewer(config.rerun, camera)
     with OutputFolder(config.out) as out, torch.inference_mode():
         if config.resume and problem:
@@ -99,7 +99,8 @@ def run(
         )
         smoothed, second = None, taken
         if config.smooth:
-            smoothed = first_pass(config, source, camera, taken, out, progress)
+            smoothed = first_pass(config, source, tracker, taken, out, progress)
+            tracker, _ = resumed_tracker(config, camera)
             second = observer_of_second_pass(out, observer, taken, source)
         recorder = Recorder(
             path=out.__truediv__,
@@ -161,6 +162,12 @@ def opened(config: RunConfig) -> tuple[RunConfig, FrameSource]:
     return (replace(config, stills=True) if is_still else config), source
 
 
+def resumed_tracker(config: RunConfig, camera: Camera) -> tuple[RunTracker, str | None]:
+    """Make the tracker with the states to continue from; also return what is wrong with these."""
+    tracker = make_tracker(config, camera)
+    return tracker, load_states(config, tracker, camera)
+
+
 def remarks(config: RunConfig, source: FrameSource, camera: Camera) -> list[str]:
     """Return what speaks against the camera, the field of view and the mount of the settings."""
     bars = "" if config.fov is None else bars_remark(first_image(source))
@@ -171,14 +178,12 @@ def remarks(config: RunConfig, source: FrameSource, camera: Camera) -> list[str]
 def first_pass(
     config: RunConfig,
     source: FrameSource,
-    camera: Camera,
+    tracker: RunTracker,
     observer: Observer,
     out: OutputFolder,
     progress: Progress | None,
 ) -> SmoothedPoses:
     """Process the whole drive once, and estimate every pose from all frames."""
-    tracker = make_tracker(config, camera)
-    load_states(config, tracker, camera)
     with closing(observed_frames(source, observer)) as frames:
         logger.info("first of two passes")
         shown = progress(frames, source.taken_count) if progress else frames

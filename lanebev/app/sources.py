@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.app.build import make_camera
-from lanebev.app.concurrency import map_ahead
+from lanebev.app.concurrency import map_ahead, prefetch
 from lanebev.app.config import RunConfig, rate_as_fraction
 from lanebev.app.observers import Observation, Observer
 from lanebev.camera.model import Camera
@@ -107,9 +107,11 @@ def first_image(source: FrameSource) -> NDArray[np.uint8] | None:
 
 def observed_frames(source: FrameSource, observer: Observer) -> Generator[tuple[Frame, Observation]]:
     """Yield each frame with what is seen in it; of a stream one after another, else several at a time."""
-    if not source.is_live:
-        return map_ahead(observer, source, observer.workers)
-    return ((frame, observer(frame)) for frame in source)
+    if source.is_live:
+        return ((frame, observer(frame)) for frame in source)
+    if observer.workers == 0:
+        return ((frame, observer(frame)) for frame in prefetch(source))
+    return map_ahead(observer, source, observer.workers)
 
 
 @contextlib.contextmanager

@@ -40,7 +40,8 @@ class Calibrator(nn.Module, Generic[StateT]):
     """Estimate the pose frame by frame, per row of a batch: state in, state out.
 
     A subclass sets the attributes and defines :meth:`initial_state`, :meth:`step` and, where it estimates
-    the road's curvature, :meth:`curvature` and :meth:`vertical_curvature`.
+    the road's curvature, :meth:`curvature` and :meth:`vertical_curvature`; for a far view also
+    :meth:`pitch_and_yaw`.
 
     Attributes:
         state_type: the class of the state.
@@ -171,6 +172,13 @@ class Calibrator(nn.Module, Generic[StateT]):
 
     def vertical_curvature(self, state: StateT) -> Tensor | None:
         """Return the road's vertical curvature, (B,) 1/m, positive over a crest, or None for a plane road."""
+        return None
+
+    def pitch_and_yaw(self, state: StateT) -> tuple[Tensor, Tensor] | None:
+        """Return pitch and yaw of a state, (B, 2) rad, and their variances (B, 2), or None.
+
+        Before the first frame they are those of the prior.
+        """
         return None
 
     def reasons(self, state: StateT) -> Tensor:

@@ -9,14 +9,16 @@ from torch import Tensor
 
 from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator, StateT
+from lanebev.estimation.expected_view import expected_vanishing_point
 from lanebev.estimation.mount import MountCalibration, MountEstimator, MountState
 from lanebev.estimation.reasons import Reason
 from lanebev.estimation.still import calibrate_still_with_state
 from lanebev.geometry.focal import focal_covariance
 from lanebev.geometry.road import lane_width_covariance
+from lanebev.geometry.vanishing_point import vanishing_point
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.segments import LaneSegments, camera_segments
-from lanebev.types import Calibration, Extrinsics
+from lanebev.types import Calibration, Extrinsics, Status
 
 
 class Estimate(NamedTuple):
@@ -109,6 +111,24 @@ class Tracker(Generic[StateT]):
         calibration = self.calibrator.scale_still(calibration, pose_sigma_scale)
         reasons = Reason(int(self.calibrator.reasons(state)[0]))
         return Estimate(segments, self.given_out(calibration, 1.0), reasons)
+
+    def vanishing_point(self) -> Tensor:
+        """Return where the lanes are expected to meet in the next image, (1, 2) px as taken, or NaN."""
+        return expected_vanishing_point(self.calibrator, self.state, *self._lens())
+
+    def vanishing_point_of_still(self, vertices: BoundaryVertices) -> Tensor:
+        """Return where the lanes meet in a single image, (1, 2) px as taken; NaN if it is not TRACKING.
+
+        Args:
+            vertices: vertices of batch size 1, in pixels of the image as taken.
+        """
+        calibration = self.still(vertices, 1.0).calibration
+        pitch, yaw, _, _ = calibration.extrinsics
+        point = vanishing_point(pitch, yaw, *self._lens())
+        return torch.where((calibration.status == int(Status.TRACKING)).unsqueeze(-1), point, torch.nan)
+
+    def _lens(self) -> tuple[Tensor, Tensor, str]:
+        return self.camera.intrinsics[None], self.camera.distortion[None], self.camera.model
 
     def _common_error(self, extrinsics: Extrinsics) -> Tensor:
         """Return the covariance (1, 4, 4) of the errors by focal length and lane width, constant in time.

@@ -30,10 +30,14 @@ def make_part(name: str, model: LaneBEV, camera: Camera) -> Part:
         camera: camera whose image size and lens model are fixed; its numbers stay inputs.
 
     Raises:
-        ValueError: another name.
+        ValueError: another name, or a model with a far view.
     """
     if name not in PARTS:
         raise ValueError(f"part: expected one of {', '.join(PARTS)}, got {name!r}")
+    if model.far_view is not None:
+        raise ValueError(
+            f"far view: expected a model without one for export, got {model.far_view}; set far_view to None"
+        )
     model = model.eval()
     if name == "segmenter":
         part = _segmenter_part(model, camera)

@@ -58,7 +58,7 @@ class LineExtractor(nn.Module):
 
     @full_precision
     def vertices(
-        self, logits: Tensor, image_size: tuple[int, int], network_size: tuple[int, int] | None = None
+        self, logits: Tensor, image_size: tuple[float, float], network_size: tuple[int, int] | None = None
     ) -> BoundaryVertices:
         """Extract vertices, which :func:`~lanebev.observation.segments.segments_from_vertices` pairs.
 
@@ -83,7 +83,7 @@ class LineExtractor(nn.Module):
 @full_precision
 def extract_vertices(
     probabilities: Tensor,
-    image_size: tuple[int, int],
+    image_size: tuple[float, float],
     config: LineConfig,
     network_size: tuple[int, int] | None = None,
 ) -> BoundaryVertices:

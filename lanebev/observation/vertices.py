@@ -138,7 +138,7 @@ def stretches(vertices: Vertices, config: LineConfig) -> tuple[Tensor, Tensor, T
     """
     count = (vertices.weight > 0).sum(-1, keepdim=True)  # (B, L, 1)
     bins, total = 2 * _half_of(count, config), count.clamp(min=1)
-    order, rank = _order_along(vertices.points.detach(), vertices.weight.detach())
+    order, rank = order_along(vertices.points.detach(), vertices.weight.detach())
     last_one = 2 * config.segments - 1
     stretch = (rank * bins).div(total, rounding_mode="floor").clamp(max=last_one)
     number = torch.arange(last_one + 2, device=rank.device)
@@ -188,7 +188,7 @@ def _half_of(count: Tensor, config: LineConfig) -> Tensor:
     return torch.where(count >= config.min_vertices, half, 0)
 
 
-def _order_along(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+def order_along(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Sort vertices along their boundary's main direction, unseen ones last; return them and the ranks.
 
     Args:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lanebev import Camera, LaneBEV, Session
+from lanebev import Camera, FarView, LaneBEV, Session
 from lanebev.app.build import make_calibrator
 from lanebev.app.config import RunConfig
 from lanebev.app.run import run
@@ -46,17 +46,24 @@ def _numbers(rows):
     return np.array([row[2:10] for row in rows])
 
 
-@pytest.mark.parametrize("calibrator", ["joint", "two-stage"])
-def test_one_road(drive, tmp_path, calibrator):
+@pytest.mark.parametrize(
+    ("calibrator", "far_view"), [("joint", None), ("two-stage", None), ("joint", FarView())]
+)
+def test_one_road(drive, tmp_path, calibrator, far_view):
     config = {"camera": str(drive / "camera.yaml"), "lane_width": LANE_WIDTH, "calibrator": calibrator}
+    with_lanes, config["far_view"] = dict(config), far_view is not None
     by_run = run(RunConfig(str(drive / "drive.mp4"), out=str(tmp_path / "run"), **config))
     lanes = str(tmp_path / "run" / "lanes.json")
-    by_lanes = run(RunConfig(str(drive / "drive.mp4"), out=str(tmp_path / "again"), lanes=lanes, **config))
+    by_lanes = run(
+        RunConfig(str(drive / "drive.mp4"), out=str(tmp_path / "again"), lanes=lanes, **with_lanes)
+    )
 
     camera = Camera.from_file(drive / "camera.yaml")
-    model = LaneBEV.from_pretrained(calibrator=make_calibrator(calibrator)).eval()
+    model = LaneBEV.from_pretrained(calibrator=make_calibrator(calibrator), far_view=far_view).eval()
     lens = (camera.distortion[None], camera.model)
-    session = Session(camera, calibrator=make_calibrator(calibrator), lane_width=LANE_WIDTH, colours="rgb")
+    session = Session(
+        camera, model=model, calibrator=make_calibrator(calibrator), lane_width=LANE_WIDTH, colours="rgb"
+    )
     state, rows, live = None, [], []
     for frame in open_source(str(drive / "drive.mp4")):
         result = session(frame.image, stamp=frame.time)

@@ -71,8 +71,8 @@ def tasks_of(drives: Sequence[Drive], out: str | Path, length: float | None = No
     Args:
         drives: drives of the manifest.
         out: folder of the fleet.
-        length: s of a part, None to cut nothing. Drives with lanes of their own need no network, and are not
-            cut.
+        length: s of a part, None to cut nothing. Drives with lanes of their own need no network, and those
+            with far views the estimate of the frame before; they are not cut.
     """
     tasks: dict[str, Task] = {}
     for drive in drives:
@@ -91,7 +91,8 @@ def tasks_of(drives: Sequence[Drive], out: str | Path, length: float | None = No
 
 
 def _is_to_be_cut(config: RunConfig) -> bool:
-    return config.lanes is None and not config.stills and Path(config.source).is_file()
+    whole = config.lanes is not None or config.stills or config.far_view
+    return not whole and Path(config.source).is_file()
 
 
 def _part_task(name: str, config: RunConfig, folder: Path, number: int, part: Part) -> Task:

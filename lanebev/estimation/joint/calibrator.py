@@ -187,6 +187,10 @@ class JointCalibrator(Calibrator[JointState]):
         """Return the road's vertical curvature κ of (J1), (B,) 1/m, positive over a crest."""
         return state.mean[:, VERTICAL]
 
+    def pitch_and_yaw(self, state: JointState) -> tuple[Tensor, Tensor]:
+        """Return pitch and yaw of a state, (B, 2) rad, and their variances (B, 2)."""
+        return state.mean[:, :2], state.cov[:, :2, :2].diagonal(dim1=-2, dim2=-1)
+
 
 def elapsed(dt: Tensor, state: JointState, cfg: JointConfig) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Compute the time to predict over; whether to skip the frame; how far ahead the state is; if guessed."""

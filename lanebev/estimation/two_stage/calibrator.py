@@ -108,6 +108,10 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
         state = select_rows(skip, skipped, after)
         return unused_frame(self._calibration(state, lane_width, one.inliers), skip), state
 
+    def pitch_and_yaw(self, state: TwoStageState) -> tuple[Tensor, Tensor]:
+        """Return pitch and yaw of a state, (B, 2) rad, and their variances (B, 2)."""
+        return state.direction_mean[:, :2], state.direction_cov[:, :2, :2].diagonal(dim1=-2, dim2=-1)
+
     def _calibration(self, state: TwoStageState, lane_width: Tensor, inliers: Tensor) -> Calibration:
         pose = torch.cat([state.direction_mean[:, :2], state.roll_height_mean[:, :2]], dim=-1)
         cov = torch.zeros(*pose.shape, 4, dtype=pose.dtype, device=pose.device)
