@@ -13,6 +13,8 @@ import torch
 from jsonargparse.typing import PositiveFloat, PositiveInt
 from torch.utils.data import DataLoader, IterableDataset
 
+from lanebev import FarView
+from lanebev.observation.far_view import view_sizes
 from lanebev.render import WindowConfig
 from train.budget import Stage, stage_at, used_share
 from train.data import Batch, Seed, run_position
@@ -49,6 +51,7 @@ class LiveBatches(IterableDataset[Batch]):
         first: number of the first batch.
         device: device of the rendering.
         rows: views whose pixels are computed at once.
+        far_share: probability that a block's views are far views, see :func:`far_stage`.
     """
 
     def __init__(
@@ -63,8 +66,10 @@ class LiveBatches(IterableDataset[Batch]):
         first: int,
         device: torch.device,
         rows: int,
+        far_share: float = 0.0,
     ) -> None:
         super().__init__()
+        self.far_share = far_share
         self.share, self.stages, self.repeats, self.together = share, stages, repeats, together
         self.view, self.window, self.seed, self.first = view, window, seed, first
         self.device, self.rows = device, rows
@@ -96,7 +101,9 @@ class LiveBatches(IterableDataset[Batch]):
         return Block(views, self._fresh(stage))
 
     def _stage(self, block: int) -> Stage:
-        return stage_at(self.stages, self.share(block * self.together))
+        stage = stage_at(self.stages, self.share(block * self.together))
+        is_far = np.random.default_rng((*self.seed, block, 2)).random() < self.far_share
+        return far_stage(stage) if is_far else stage
 
     def _fresh(self, stage: Stage) -> int:
         count: int = stage.batch_size // self.repeats
@@ -105,6 +112,16 @@ class LiveBatches(IterableDataset[Batch]):
     def _sample(self, block: int, stage: Stage) -> Scenes:
         seed = (*self.seed, block, 1)
         return sampled(self._fresh(stage) * self.together, stage.size, seed, self.window)
+
+
+def far_stage(stage: Stage) -> Stage:
+    """Return a stage with views of the size of :class:`~lanebev.FarView`, and as many pixels in a batch.
+
+    A far view is a wide and low window about the horizon.
+    """
+    (height, width), (rows, columns) = stage.size, view_sizes(FarView(), stage.size, stage.size).far
+    batch_size = max(1, round(stage.batch_size * height * width / (rows * columns)))
+    return Stage(stage.until, (rows, columns), batch_size)
 
 
 class ScenesAhead:
@@ -165,6 +182,7 @@ class LiveRoads(L.LightningDataModule):
         together: batches whose new views are rendered together.
         rows: views whose pixels are computed at once, for the memory's sake.
         window: how windows about the horizon are drawn; None for whole images.
+        far_share: probability that the views rendered together are far views; these need a ``window``.
         view: stride and stripes of the labels, and the probability of mirroring; the rest of it is not used.
         val_size: (height, width) of whole frames in validation.
         val_batch_size: frames per batch in validation.
@@ -180,6 +198,7 @@ class LiveRoads(L.LightningDataModule):
         together: PositiveInt = 4,
         rows: PositiveInt = 256,
         window: WindowConfig | None = None,
+        far_share: float = 0.0,
         view: ViewConfig | None = None,
         val_size: tuple[PositiveInt, PositiveInt] = (320, 576),
         val_batch_size: PositiveInt = 32,
@@ -189,12 +208,18 @@ class LiveRoads(L.LightningDataModule):
         super().__init__()
         if not stages:
             raise ValueError("stages: expected at least one, got none")
+        if not 0.0 <= far_share <= 1.0:
+            raise ValueError(f"far_share: expected a probability of 0 to 1, got {far_share}")
+        if far_share and window is None:
+            raise ValueError(
+                f"far_share: expected a window with it, got {far_share} without; give window: {{}}"
+            )
         self.stages = [
             Stage(stage.until, stage.size, max(repeats, round(batch_share * stage.batch_size)))
             for stage in stages
         ]
         self.repeats, self.together, self.rows = repeats, together, rows
-        self.window, self.view = window, view or ViewConfig()
+        self.window, self.view, self.far_share = window, view or ViewConfig(), far_share
         self.val_size, self.val_batch_size, self.val_batches = val_size, val_batch_size, val_batches
         self.seed = seed
         self.batches: LiveBatches | None = None  # of the training under way
@@ -215,6 +240,7 @@ class LiveRoads(L.LightningDataModule):
             first,
             trainer.strategy.root_device,
             self.rows,
+            self.far_share,
         )
         return DataLoader(self.batches, batch_size=None)
 

@@ -18,7 +18,7 @@ from lanebev.render import WindowConfig
 from train.__main__ import main
 from train.budget import Stage, rate_factor, stage_at, used_share
 from train.labels import ViewConfig
-from train.live import HeldOutBatches, LiveBatches, ScenesAhead
+from train.live import HeldOutBatches, LiveBatches, LiveRoads, ScenesAhead, far_stage
 from train.maps import separated
 from train.module import Segmentation
 from train.rendering import Views, drawn, labelled, mirrored, rendered
@@ -211,7 +211,7 @@ def test_gpu_config_trains_by_steps_and_an_interrupted_run_ends_as_one_in_a_piec
     )
     assert all(torch.equal(value, parts["state_dict"][name]) for name, value in whole["state_dict"].items())
     views = [each["callbacks"]["Throughput"]["views"] for each in (whole, parts)]
-    assert views == [2 + 2 * 4 + 1 + 2 * 2] * 2
+    assert views == [2 + 4 + 7 + 1 + 1 + 2] * 2  # the third and the fourth batch are of far views
     table = next((tmp_path / "whole").rglob("throughput.csv")).read_text().splitlines()
     assert table[0].startswith("step,used,views,views_per_s")
     assert len(table) > 3
@@ -237,3 +237,37 @@ def test_the_last_checkpoint_is_of_the_last_step(config):
     for each in callbacks:
         if each["class_path"].endswith("ModelCheckpoint"):
             assert each["init_args"]["save_last"] is True
+
+
+def test_a_share_of_the_blocks_are_far_views_with_as_many_pixels(instant):
+    """Which ones, the seed decides: a run that is resumed has the same."""
+    stages = [Stage(1.0, (96, 160), 4)]
+    arguments = (lambda _: 0.0, stages, 1, 2, ViewConfig(), WindowConfig(), (3, 0))
+    seen = list(itertools.islice(LiveBatches(*arguments, 0, CPU, 64, 0.4), 10))
+    sizes = [batch.image.shape[-2:] for batch in seen]
+    assert set(sizes) == {(96, 160), (32, 224)}
+    assert sizes[::2] == sizes[1::2], "expected one size for the batches of a block"
+    assert {len(batch.image) for batch in seen if batch.image.shape[-2] == 32} == {9}
+    later = next(iter(LiveBatches(*arguments, 7, CPU, 64, 0.4)))
+    assert torch.equal(later.image, seen[7].image)
+    without = itertools.islice(LiveBatches(*arguments, 0, CPU, 64, 0.0), 10)
+    assert {batch.image.shape[-2:] for batch in without} == {(96, 160)}
+
+
+@pytest.mark.slow
+def test_far_views_show_the_road_about_the_horizon():
+    far = far_stage(Stage(1.0, (192, 320), 1))
+    views = rendered(4, far.size, (8,), CPU, WindowConfig(scale=(0.7, 0.7), horizon=(0.1, 0.3)), 64)
+    assert views.image.shape == (4, 3, 64, 320)
+    inside = (views.points >= 0).all(-1) & (views.points[..., 1] < 64) & (views.points[..., 0] < 320)
+    assert (inside & views.painted).any(-1).sum() >= 8, "expected boundaries in view"
+    farthest = torch.where(views.painted & inside, views.points[..., 1], torch.inf).flatten(1).amin(1)
+    assert bool((farthest < 32).all()), "expected the road's end in the upper half"
+
+
+@pytest.mark.parametrize(
+    ("share", "window", "match"), [(1.5, WindowConfig(), "0 to 1, got 1.5"), (0.2, None, "window")]
+)
+def test_impossible_shares_of_far_views_are_refused(share, window, match):
+    with pytest.raises(ValueError, match=match):
+        LiveRoads(STAGES, window=window, far_share=share)
