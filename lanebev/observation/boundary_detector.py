@@ -26,6 +26,7 @@ from lanebev.observation.far_view import (
 from lanebev.observation.frames import resize_image, resized_size
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.polylines import VERTICES_PER_LINE
+from lanebev.types import check_tensor
 
 
 class BoundaryDetector(nn.Module):
@@ -50,6 +51,10 @@ class BoundaryDetector(nn.Module):
         far_view: FarView | None,
     ) -> None:
         super().__init__()
+        if not (far_view is None or isinstance(far_view, FarView)):
+            raise TypeError(
+                f"far_view: expected a lanebev.FarView or None, got {far_view!r}; write FarView()"
+            )
         self.segmenter = segmenter
         self.extractor = extractor
         self.network_width = network_width
@@ -122,9 +127,15 @@ class BoundaryDetector(nn.Module):
 
         Returns:
             (B, L, VERTICES_PER_LINE).
+
+        Raises:
+            TypeError: the vanishing point is not a tensor.
+            ValueError: it has another shape, or whole numbers.
         """
-        known = vanishing_point.isfinite().all(-1).to(image.device)
-        point = torch.where(known.unsqueeze(-1), vanishing_point.to(image.device), 0.0)
+        check_vanishing_point(vanishing_point, image.shape[0])
+        point = vanishing_point.to(image.device, torch.float32)
+        known = point.isfinite().all(-1)
+        point = torch.where(known.unsqueeze(-1), point, 0.0)
         found = with_columns(whole, VERTICES_PER_LINE)
         found = replace_rows(known, found, self._merged, image, whole, point)
         return replace_rows(~known, found, self._full, image)
@@ -171,6 +182,19 @@ class BoundaryDetector(nn.Module):
     def _gradients(self, stage: str) -> AbstractContextManager[object]:
         """Return the context of a stage: without gradients if it is frozen."""
         return torch.no_grad() if stage in self.frozen else nullcontext()
+
+
+def check_vanishing_point(point: Tensor, rows: int) -> None:
+    """Raise unless these are points (rows, 2) of floating point.
+
+    Raises:
+        TypeError: not a tensor.
+        ValueError: another shape, or whole numbers.
+    """
+    check_tensor("vanishing_point", point)
+    if point.shape != (rows, 2) or not point.is_floating_point():
+        got = f"{tuple(point.shape)} {point.dtype}"
+        raise ValueError(f"vanishing_point: expected ({rows}, 2) of floating point, px, got {got}")
 
 
 def _finite(image: Tensor) -> Tensor:

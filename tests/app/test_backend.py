@@ -100,9 +100,7 @@ def test_files_of_another_camera_or_calibrator_are_refused(folder, monkeypatch):
 def test_a_run_without_the_files_is_one_line(folder, capsys):
     words = ["run", "images", "--camera", "camera.yaml", "--backend", "onnxruntime", "--exported", "nowhere"]
     assert main([str(folder / word) if word in ("images", "camera.yaml") else word for word in words]) == 2
-    assert (
-        "segmenter.onnx: expected a file that lanebev export writes, there is none" in capsys.readouterr().err
-    )
+    assert "joint.onnx: expected a file that lanebev export writes, there is none" in capsys.readouterr().err
 
 
 def test_more_segments_than_exported_are_refused():

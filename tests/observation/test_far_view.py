@@ -213,6 +213,23 @@ def test_impossible_far_views_are_refused(values, match):
         FarView(**values)
 
 
+def test_wrong_arguments_are_refused_by_name():
+    detecting, ramp = detector()
+    image = ramp_images(2)
+    with pytest.raises(
+        ValueError, match=r"vanishing_point: expected \(2, 2\) of floating point, px, got \(2,\)"
+    ):
+        detecting.boundary_vertices(image, torch.zeros(2))
+    with pytest.raises(ValueError, match=r"vanishing_point: .* torch\.int64"):
+        detecting.boundary_vertices(image, torch.zeros(2, 2, dtype=torch.int64))
+    with pytest.raises(TypeError, match=r"vanishing_point: expected a torch\.Tensor"):
+        detecting.boundary_vertices(image, [640.0, 360.0])
+    with pytest.raises(
+        TypeError, match=r"far_view: expected a lanebev.FarView or None, got True; write FarView\(\)"
+    ):
+        BoundaryDetector(ramp, ramp, 576, None, (), True)
+
+
 def test_the_vanishing_point_of_known_angles():
     """Yaw to the left moves it to the right, pitch down moves it up."""
     intrinsics = torch.tensor([[[1000.0, 0, 640], [0, 1000, 360], [0, 0, 1]]]).double()
