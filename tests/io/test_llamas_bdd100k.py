@@ -119,6 +119,12 @@ def test_bdd100ks_curves(tmp_path, types):
     np.testing.assert_allclose(points[4], np.array([1, 3, 3, 1]) @ np.array(vertices) / 8)  # half-way
 
 
+def test_an_image_of_a_folder_may_have_other_labels_only(tmp_path):
+    _write(tmp_path / "1.json", {"name": "1", "frames": [{"objects": [CAR, FORMER]}]})
+    _write(tmp_path / "2.json", {"name": "2", "frames": [{"objects": [CAR]}]})
+    assert [len(frame.lines) for frame in read_lanes(tmp_path)] == [1, 0]
+
+
 def test_a_bezier_curve_with_controls_on_its_chord_is_the_chord():
     points = bezier_points(np.zeros(2), np.array([[1.0, 2.0], [2.0, 4.0], [3.0, 6.0]]))
     np.testing.assert_allclose(points, np.linspace(0, 1, 9)[1:, None] * [3.0, 6.0])
@@ -141,7 +147,6 @@ def test_bdd100ks_kerbs_and_what_crosses_the_road_are_left_out(tmp_path):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ([{"name": "1", "labels": [CAR]}], "expected labels of lanes, got 1 of other things"),
         ([{"name": "1", "labels": [_label("a")]}], "vertices: expected a list, got str"),
         ([{"name": "1", "labels": [_label([[1]])]}], "vertices: expected 2 numbers, got 1"),
         ([{"name": "1", "labels": [_label([[1, None]])]}], "vertices: expected finite numbers, got 1, None"),
