@@ -47,6 +47,7 @@ __all__ = [
 ]
 
 _LOOKED_AT = 20  # images, for the most frequent size and one that has it
+_HEIC = (".heic", ".heif")  # ffmpeg takes the tiles of such an image for videos
 _DARK = 24  # of 255; 12 bits in 16 give 15 at most
 _SAME_RATE = 0.05  # relative, by which two frame rates may differ and be the same
 _SAME_VIDEO = 2  # factor, by which a video's frames may come faster or slower than its mean rate
@@ -71,12 +72,16 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
         if not paths:
             raise ValueError(f"{source}: expected images in the folder, got none; {_folder_remedy(path)}")
         return _image_source(source, paths, fps)
+    if path.suffix.lower() in _HEIC:
+        raise ValueError(f"{source}: expected a video or an image, got HEIC; convert it to JPEG")
     if path.is_file():
         return _image_source(source, [source], fps) if is_image(path) else _video_source(source, fps)
     if glob.has_magic(source):
-        paths = in_natural_order(filter(is_image, glob.glob(_pattern(source), recursive=True)))
+        matches = glob.glob(_pattern(source), recursive=True)
+        paths = in_natural_order(filter(is_image, matches))
         if not paths:
-            raise ValueError(f"{source}: expected images that match, got none; quote the pattern")
+            remedy = _endings_remedy(map(Path, matches)) or "quote the pattern"
+            raise ValueError(f"{source}: expected images that match, got none; {remedy}")
         return _image_source(source, paths, fps)
     remedy = ""
     if re.search(r"%\d*d", source):
@@ -90,12 +95,16 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
 
 def _folder_remedy(folder: Path) -> str:
     """Return what to give instead of a folder without images."""
-    endings = sorted({each.suffix for each in folder.iterdir() if each.is_file() and each.name[0] != "."})
     below = f"for images in folders below it give a quoted glob such as '{folder}/**/*.jpg'"
-    if not endings:
-        return below
+    return "; ".join(filter(None, [_endings_remedy(folder.iterdir()), below]))
+
+
+def _endings_remedy(paths: Iterable[Path]) -> str:
+    """Return what to give instead of files that are no images; empty if there are none."""
+    endings = sorted({each.suffix for each in paths if each.is_file() and each.name[0] != "."})
     known = " ".join(IMAGE_SUFFIXES)
-    return f"its files end with {' '.join(endings[:5])}, images with {known}; give a video itself; {below}"
+    found = f"its files end with {' '.join(endings[:5])}, images with {known}; give a video itself"
+    return found if endings else ""
 
 
 def _pattern(source: str) -> str:

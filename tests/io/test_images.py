@@ -104,6 +104,9 @@ def test_a_missing_image_states_no_size(tmp_path):
     ("source", "word"),
     [
         ("drives", "its files end with .mp4, images with .jpg"),
+        ("drives/*.mp4", "expected images that match, got none; its files end with .mp4, images with"),
+        ("drives/*.png", "expected images that match, got none; quote the pattern"),
+        ("a.HEIC", "got HEIC; convert it to JPEG"),
         ("drives/%03d.jpg", "got nothing there; give the folder, or a quoted glob"),
         ("file:///drives/a.mp4", "got nothing there; give the path without file://"),
     ],
@@ -112,6 +115,7 @@ def test_what_is_no_source_says_what_to_give(tmp_path, monkeypatch, source, word
     monkeypatch.chdir(tmp_path)
     (tmp_path / "drives").mkdir()
     (tmp_path / "drives" / "a.mp4").touch()
+    (tmp_path / "a.HEIC").touch()
     with pytest.raises(ValueError, match=word):
         open_source(source)
 
