@@ -31,7 +31,7 @@ from lanebev.observation.frames import check_frame, network_image
 from lanebev.observation.polylines import LINE_SIGMA, lines_from_polylines, vertices_from_lines
 from lanebev.pipeline import LaneBEV
 from lanebev.tensors import map_tensors, usable_device
-from lanebev.types import Calibration, Extrinsics, Status
+from lanebev.types import Calibration, Extrinsics, Status, check_type
 from lanebev.view.frame import remap_frame
 from lanebev.view.grid import BEVGrid
 
@@ -113,9 +113,9 @@ class Session:
         device: torch.device | str = "cpu",
     ) -> None:
         check_camera(camera)
-        _check_type("model", model, LaneBEV)
-        _check_type("calibrator", calibrator, Calibrator)
-        _check_type("grid", grid, BEVGrid)
+        check_type("model", model, LaneBEV)
+        check_type("calibrator", calibrator, Calibrator)
+        check_type("grid", grid, BEVGrid)
         for name, value in (("lane_width", lane_width), ("focal_std", focal_std)):
             check_number(name, value)
         check_number("polyline_sigma", polyline_sigma)
@@ -276,13 +276,6 @@ def _calibrator_of(model: LaneBEV) -> Calibrator[Any]:
         got = type(own).__qualname__
         raise TypeError(f"model: expected one with a lanebev.Calibrator, got {got}; give one as calibrator=")
     return deepcopy(own).cpu()
-
-
-def _check_type(name: str, value: object, expected: type) -> None:
-    """Raise TypeError unless a value is None or of this type."""
-    if value is not None and not isinstance(value, expected):
-        kind = f"the class {value.__qualname__}" if isinstance(value, type) else type(value).__qualname__
-        raise TypeError(f"{name}: expected a lanebev.{expected.__qualname__} or None, got {kind}")
 
 
 def _as_bytes(image: Tensor) -> NDArray[np.uint8]:

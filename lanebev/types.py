@@ -50,6 +50,17 @@ def check_tensor(name: str, value: object) -> None:
         raise TypeError(f"{name}: expected a torch.Tensor, got {kind}; convert numbers with {remedy}")
 
 
+def check_type(name: str, value: object, expected: type) -> None:
+    """Raise unless an argument is None or of a class of lanebev.
+
+    Raises:
+        TypeError: naming the argument, the class and what came.
+    """
+    if value is not None and not isinstance(value, expected):
+        kind = f"the class {value.__qualname__}" if isinstance(value, type) else type(value).__qualname__
+        raise TypeError(f"{name}: expected a lanebev.{expected.__qualname__} or None, got {kind}")
+
+
 class Status(IntEnum):
     """Status of a row of a calibration. A new meaning is a new value."""
 

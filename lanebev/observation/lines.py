@@ -12,7 +12,7 @@ from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.observation.segments import LaneSegments, pair_vertices
 from lanebev.observation.vertices import LineConfig, representative_vertices
 from lanebev.tensors import constant
-from lanebev.types import check_tensor
+from lanebev.types import check_tensor, check_type
 
 NETWORK_CORRELATION = 10.0
 """``LineConfig.correlation`` of a network, px: how far along a line its errors are one error."""
@@ -30,6 +30,7 @@ class LineExtractor(nn.Module):
 
     def __init__(self, config: LineConfig | None = None) -> None:
         super().__init__()
+        check_type("config", config, LineConfig)
         self.config = config or LineConfig()
 
     @classmethod
@@ -77,6 +78,8 @@ class LineExtractor(nn.Module):
         check_tensor("logits", logits)
         if logits.ndim != 4 or logits.shape[1] < 2:
             raise ValueError(f"logits: expected (B, 1+L, h, w), got {tuple(logits.shape)}")
+        if not logits.is_floating_point():
+            raise ValueError(f"logits: expected floating point, got {logits.dtype}")
         return extract_vertices(logits.softmax(1)[:, 1:], image_size, self.config, network_size)
 
 

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lanebev.observation.resnet import ResNet18
-from lanebev.types import NUM_BOUNDARIES, check_tensor
+from lanebev.types import NUM_BOUNDARIES, check_tensor, check_type
 
 _LARGEST = 8.0  # of an image in [0, 1], whatever was done to its contrast; one in [0, 255] has more
 
@@ -57,6 +57,8 @@ class SegmenterConfig:
             raise ValueError(f"sigma_scale: expected more than 0, got {self.sigma_scale}")
         if not self.pose_sigma_scale > 0:
             raise ValueError(f"pose_sigma_scale: expected more than 0, got {self.pose_sigma_scale}")
+        if self.base_width < 1:
+            raise ValueError(f"base_width: expected at least 1, got {self.base_width}")
         if self.decoder_width < 4:
             raise ValueError(f"decoder_width: expected at least 4, got {self.decoder_width}")
 
@@ -74,6 +76,7 @@ class LaneSegmenter(nn.Module):
 
     def __init__(self, config: SegmenterConfig | None = None) -> None:
         super().__init__()
+        check_type("config", config, SegmenterConfig)
         self.config = config = config or SegmenterConfig()
         width = config.decoder_width
         self.trunk = ResNet18(config.base_width, config.trunk_stride)

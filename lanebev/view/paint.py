@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from lanebev.geometry.lens import invert_distortion
 from lanebev.geometry.precision import common_dtype, full_precision
 from lanebev.geometry.road import road_from_image_points
-from lanebev.types import Extrinsics
+from lanebev.types import Extrinsics, check_type
 from lanebev.view.checks import check_cameras, check_image, check_size
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.projection import CellSums, normalised_intrinsics
@@ -50,6 +50,7 @@ class ImageFromBEV(nn.Module):
 
     def __init__(self, grid: BEVGrid | None = None, plane_height: float = 0.0) -> None:
         super().__init__()
+        check_type("grid", grid, BEVGrid)
         self.grid = grid or BEVGrid()
         self.plane_height = plane_height
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from numbers import Real
 from typing import overload
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 from lanebev.geometry.precision import common_dtype
 from lanebev.geometry.road_profile import check_vertical_curvature
 from lanebev.numbers import check_number
-from lanebev.types import Extrinsics
+from lanebev.types import Extrinsics, check_type
 from lanebev.view.cells import cells_and_lens, rows_in_sight
 from lanebev.view.checks import check_cameras, check_covers, check_image, check_size
 from lanebev.view.grid import BEVGrid
@@ -35,6 +36,9 @@ class BEVWarp(nn.Module):
 
     def __init__(self, grid: BEVGrid | None = None, plane_heights: Sequence[float] | None = None) -> None:
         super().__init__()
+        check_type("grid", grid, BEVGrid)
+        if isinstance(plane_heights, (str, Real)):
+            raise TypeError(f"plane_heights: expected a list of heights in m, got {plane_heights!r}")
         self.grid = grid or BEVGrid()
         self.plane_heights = None if plane_heights is None else tuple(map(float, plane_heights))
         if self.plane_heights == ():

@@ -227,6 +227,31 @@ def test_lanebev_images(model, image, error, message):
         model(image, K)
 
 
+@pytest.mark.parametrize(
+    ("part", "name"),
+    [
+        (lanebev.LaneSegmenter, "config: expected a lanebev.SegmenterConfig"),
+        (lanebev.LineExtractor, "config: expected a lanebev.LineConfig"),
+        (lanebev.TwoStageCalibrator, "config: expected a lanebev.TwoStageConfig"),
+        (lanebev.MountEstimator, "config: expected a lanebev.MountConfig"),
+        (BEVWarp, "grid: expected a lanebev.BEVGrid"),
+        (lanebev.ImageFromBEV, "grid: expected a lanebev.BEVGrid"),
+    ],
+)
+def test_parts_take_a_config_or_none(part, name):
+    with pytest.raises(TypeError, match=f"{name} or None, got int"):
+        part(5)
+
+
+def test_plane_heights_and_widths():
+    with pytest.raises(TypeError, match=r"plane_heights: expected a list of heights in m, got 1.0"):
+        BEVWarp(GRID, 1.0)
+    with pytest.raises(ValueError, match="base_width: expected at least 1, got 0"):
+        lanebev.SegmenterConfig(base_width=0)
+    with pytest.raises(ValueError, match=r"logits: expected floating point, got torch.int64"):
+        lanebev.LineExtractor()(torch.zeros(1, 7, 16, 24).long(), (64, 96))
+
+
 def test_lanebev_frozen():
     with pytest.raises(TypeError, match=r"frozen: expected a list of names, got 'segmenter'; write \['seg"):
         lanebev.LaneBEV.from_pretrained(frozen="segmenter")

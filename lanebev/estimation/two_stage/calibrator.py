@@ -15,7 +15,7 @@ from lanebev.estimation.two_stage.roll_height import RollHeightStep, track_roll_
 from lanebev.estimation.two_stage.state import TwoStageConfig, TwoStageState
 from lanebev.geometry.road import segment_rays
 from lanebev.observation.segments import LaneSegments
-from lanebev.types import Calibration, Extrinsics, Status
+from lanebev.types import Calibration, Extrinsics, Status, check_type
 
 
 class TwoStageCalibrator(Calibrator[TwoStageState]):
@@ -33,6 +33,7 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
 
     def __init__(self, config: TwoStageConfig | None = None, **numbers: object) -> None:
         super().__init__()
+        check_type("config", config, TwoStageConfig)
         if config is not None and numbers:
             raise ValueError("config: expected either a TwoStageConfig or its keywords, got both")
         self.config = config or TwoStageConfig(**numbers)  # type: ignore[arg-type]
