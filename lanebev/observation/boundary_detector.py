@@ -9,7 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from lanebev.batch import replace_rows
+from lanebev.batch import replace_rows, select_rows
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.far_view import (
     FarView,
@@ -118,7 +118,8 @@ class BoundaryDetector(nn.Module):
         """Add the vertices of the far view to those of the smaller whole image.
 
         Each row has a far view of its own. Where the vanishing point is not known, the vertices are those of
-        the whole image at its full size, as without a far view.
+        the whole image at its full size, as without a far view. A compiled program computes both for all
+        rows.
 
         Args:
             image: (B, 3, H, W) as taken.
@@ -137,6 +138,9 @@ class BoundaryDetector(nn.Module):
         known = point.isfinite().all(-1)
         point = torch.where(known.unsqueeze(-1), point, 0.0)
         found = with_columns(whole, VERTICES_PER_LINE)
+        if torch.compiler.is_compiling():  # torch.cond cannot contain the network (torch 2.13)
+            both = self._merged(image, whole, point)
+            return select_rows(known, both, self._full(image))
         found = replace_rows(known, found, self._merged, image, whole, point)
         return replace_rows(~known, found, self._full, image)
 

@@ -122,6 +122,26 @@ def test_rows_without_a_horizon_have_the_whole_image_at_full_size():
     assert bool((found.weight[0, 0, 6:] == 0).all())
 
 
+class Quiet(Ramp):
+    """A ramp that remembers nothing, as a compiled program must."""
+
+    def forward(self, image):
+        return image
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_compiled_program_gives_each_row_the_same():
+    """It computes both ways for all rows, in one graph."""
+    torch.compiler.reset()
+    ramp = Quiet()
+    detecting = BoundaryDetector(ramp, ramp, 576, None, (), FarView())
+    compiled = torch.compile(detecting.boundary_vertices, backend="eager", fullgraph=True)
+    image, points = ramp_images(2).clone(), torch.tensor([[600.0, 250.0], [NOWHERE, NOWHERE]])
+    expected, found = (each(image, points)[1] for each in (detecting.boundary_vertices, compiled))
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other)
+
+
 def test_rows_of_a_batch_are_independent():
     detecting, _ = detector()
     image = ramp_images(4).clone()
