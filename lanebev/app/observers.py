@@ -195,7 +195,7 @@ class FarViewObserver(NetworkObserver):
     """Finds lanes in the whole images and in far views, which are about the horizon that a tracker expects.
 
     Args:
-        network: segmenter and extractor; frames are not batched with those of other drives.
+        network: segmenter and extractor, of one drive or shared with others in batches, but those of stills.
         tracker: the tracker that is given what this observer sees, frame by frame.
         stills: every image is on its own: the horizon is that of a first estimate from the whole image.
     """
@@ -208,12 +208,14 @@ class FarViewObserver(NetworkObserver):
         self.workers = self.workers if stills else 0
 
     def _vertices(self, image: Tensor) -> BoundaryVertices:
-        _, whole = self.model.whole_vertices(image)
         if self.stills:
+            _, whole = self.model.whole_vertices(image)
             point = self.tracker.vanishing_point_of_still(map_tensors(Tensor.cpu, whole))
-        else:
-            point = self.tracker.vanishing_point()
-        return self.model.add_far_view(image, whole, point)
+            return self.model.add_far_view(image, whole, point)
+        point = self.tracker.vanishing_point()
+        if self._shared is not None:
+            return self._shared.vertices(image, point)
+        return self.model.boundary_vertices(image, point)[1]
 
     def _columns(self) -> int:
         return VERTICES_PER_LINE

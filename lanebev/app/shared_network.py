@@ -16,10 +16,15 @@ from lanebev.tensors import map_tensors
 
 
 class _Request(NamedTuple):
-    """A waiting image (1, 3, H, W), and where its vertices go."""
+    """A waiting image (1, 3, H, W), its vanishing point or None, and where its vertices go."""
 
     image: Tensor
+    point: Tensor | None
     answer: Future[BoundaryVertices]
+
+    def is_like(self, other: _Request) -> bool:
+        """Return whether both may be in one batch."""
+        return self.image.shape == other.image.shape and (self.point is None) == (other.point is None)
 
 
 class SharedNetwork:
@@ -45,9 +50,14 @@ class SharedNetwork:
         self._waiting: list[_Request] = []
         self._changing, self._looking = threading.Lock(), threading.Lock()
 
-    def vertices(self, image: Tensor) -> BoundaryVertices:
-        """Return the vertices of an image (1, 3, H, W) in [0, 1], of batch size 1, on its device."""
-        own = _Request(image, Future())
+    def vertices(self, image: Tensor, vanishing_point: Tensor | None = None) -> BoundaryVertices:
+        """Return the vertices of an image, of batch size 1, on its device.
+
+        Args:
+            image: (1, 3, H, W) in [0, 1].
+            vanishing_point: (1, 2) px of a far view, see :meth:`lanebev.LaneBEV.boundary_vertices`.
+        """
+        own = _Request(image, vanishing_point, Future())
         with self._changing:
             self._waiting.append(own)
         with self._looking:
@@ -56,11 +66,9 @@ class SharedNetwork:
         return own.answer.result()
 
     def _taken(self, own: _Request) -> list[_Request]:
-        """Remove this frame, and as many others of its size as a batch holds, from the list."""
+        """Remove this frame, and as many others like it as a batch holds, from the list."""
         with self._changing:
-            alike = [
-                each for each in self._waiting if each is not own and each.image.shape == own.image.shape
-            ]
+            alike = [each for each in self._waiting if each is not own and each.is_like(own)]
             taken = [own, *alike[: self.most - 1]]
             self._waiting = [each for each in self._waiting if all(each is not one for one in taken)]
         return taken
@@ -69,7 +77,9 @@ class SharedNetwork:
     def _look(self, requests: list[_Request]) -> None:
         """Run the network on frames in one batch; if that fails, on each alone: only bad ones fail."""
         try:
-            _, found = self.model.boundary_vertices(torch.cat([each.image for each in requests]))
+            points = [each.point for each in requests if each.point is not None]
+            images = torch.cat([each.image for each in requests])
+            _, found = self.model.boundary_vertices(images, *([torch.cat(points)] if points else []))
         except Exception as error:
             if len(requests) == 1:
                 requests[0].answer.set_exception(error)

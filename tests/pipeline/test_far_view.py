@@ -1,6 +1,8 @@
 """LaneBEV, Session and a run with a far view: where it is, and when there is none."""
 
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -12,6 +14,7 @@ from lanebev.app.fleet.manifest import Drive as FleetDrive
 from lanebev.app.fleet.plan import tasks_of
 from lanebev.app.observers import FarViewObserver
 from lanebev.app.run import run
+from lanebev.app.shared_network import SharedNetwork
 from lanebev.estimation.expected_view import expected_vanishing_point
 from lanebev.estimation.joint.frame_prior import prior_of_mount
 from lanebev.estimation.tracker import Tracker
@@ -172,6 +175,27 @@ def test_the_far_view_of_a_still_is_about_the_horizon_of_its_whole_image(drive, 
     for one, other in zip(seen, expected, strict=True):
         torch.testing.assert_close(one, other)
     assert int(tracker.state.status) == Status.UNINITIALISED
+
+
+def test_far_views_of_several_drives_form_a_batch(drive, models):
+    """Frames with a far view and without one are in batches of their own."""
+    images, _ = drive
+    shared = SharedNetwork(models[0], most=4)
+    points = [torch.tensor([[x, 70.0]]) for x in (120.0, 160.0, 200.0)]
+    wanted = [*((images[:1], point) for point in points), (images[:1], None)]
+    with shared._looking, ThreadPoolExecutor(4) as pool, torch.inference_mode():
+        waiting = [pool.submit(shared.vertices, *each) for each in wanted]
+        while len(shared._waiting) < 4:
+            time.sleep(0.01)
+        shared._looking.release()
+        seen = [each.result() for each in waiting]
+        shared._looking.acquire()
+    assert (shared.batches, shared.frames) == (2, 4)
+    for (image, point), found in zip(wanted, seen, strict=True):
+        with torch.inference_mode():
+            _, alone = models[0].boundary_vertices(image, point)
+        for one, other in zip(found, alone, strict=True):
+            torch.testing.assert_close(one, other, atol=1e-3, rtol=1e-3)
 
 
 @pytest.mark.slow
