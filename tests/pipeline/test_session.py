@@ -183,6 +183,8 @@ def test_careless_arguments_are_named():
         session(np.zeros((360, 640, 3), np.uint16))
     with pytest.raises(ValueError, match=r"of one with alpha take frame\[\.\.\., :3\]"):
         session(np.zeros((360, 640, 4), np.uint8))
+    with pytest.raises(ValueError, match="channels go last, see np"):
+        session(np.zeros((3, 360, 640), np.uint8))
     with pytest.raises(ValueError, match="for a grey image repeat its channel"):
         session(np.zeros((360, 640), np.uint8))
     with pytest.raises(ValueError, match=r"frame: expected \(360, 640, 3\) uint8, the camera's size"):
