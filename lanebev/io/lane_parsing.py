@@ -27,11 +27,14 @@ class FrameLines(NamedTuple):
         name: name of the frame in the file.
         lines: lines as they were drawn.
         pose_sigma_scale: factor on the standard deviations of the pose estimated from them; 1 unless stated.
+        principal_point: (x, y) px of the camera by which all lines were projected from 3D points, perhaps to
+            places outside of the image; None for lines that were drawn in the image.
     """
 
     name: str
     lines: list[LaneLine]
     pose_sigma_scale: float = 1.0
+    principal_point: tuple[float, float] | None = None
 
 
 class Where:

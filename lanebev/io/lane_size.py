@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lanebev.io.lanes import FrameLines
 
 _OUTSIDE = 0.1  # share of points below or far beside the images, of which more are of another size
+_OFF_CENTRE = 0.2  # share of a side, more than a principal point is off the centre
 _BESIDE = 0.5  # image widths beside an image that lines are drawn on to
 _REACHED = 0.8  # of both sides, one of which a drive's lanes reach: they leave images at the bottom
 _REACHED_UNCROPPED = 0.85  # of the height, likewise, by lanes whose horizon is above _HIGHEST_HORIZON
@@ -33,17 +34,27 @@ def resized_lanes(
     """
     scale = np.array([image_size[1] / size[1], image_size[0] / size[0]])  # of x and y
     return [
-        frame._replace(
-            lines=[
-                line._replace(
-                    points=(line.points + 0.5) * scale - 0.5,
-                    sigma=None if line.sigma is None else line.sigma * scale[0],
-                )
-                for line in frame.lines
-            ]
+        _moved(
+            frame._replace(
+                lines=[
+                    line._replace(sigma=None if line.sigma is None else line.sigma * scale[0])
+                    for line in frame.lines
+                ]
+            ),
+            scale,
+            0.5 * scale - 0.5,
         )
         for frame in frames
     ]
+
+
+def _moved(frame: FrameLines, scale: NDArray[np.float64], shift: NDArray[np.float64]) -> FrameLines:
+    """Return a frame with all pixels p replaced by scale · p + shift, each (2,)."""
+    lines = [line._replace(points=scale * line.points + shift) for line in frame.lines]
+    if frame.principal_point is None:
+        return frame._replace(lines=lines)
+    x, y = (scale * np.array(frame.principal_point) + shift).tolist()
+    return frame._replace(lines=lines, principal_point=(x, y))
 
 
 def lanes_of_whole_images(
@@ -71,11 +82,7 @@ def lanes_of_whole_images(
             f"{height} at {left}, {top}"
         )
     resized = resized_lanes(frames, size or (height, width), (height, width))
-    corner = np.array([left, top])
-    return [
-        frame._replace(lines=[line._replace(points=line.points + corner) for line in frame.lines])
-        for frame in resized
-    ]
+    return [_moved(frame, np.ones(2), np.array([left, top], dtype=np.float64)) for frame in resized]
 
 
 class SizeDoubt(NamedTuple):
@@ -118,12 +125,22 @@ def size_doubt(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> Siz
         frames: frames of one drive.
         image_size: (height, width) px of its images.
     """
-    points = _all_points(frames)
+    height, width = image_size
+    size = "state their size with --lanes-size WIDTHxHEIGHT"
+    centres = [frame.principal_point for frame in frames if frame.principal_point is not None]
+    if centres:
+        x, y = np.median(centres, axis=0)
+        if max(abs(x / width - 0.5), abs(y / height - 0.5)) > _OFF_CENTRE:
+            return SizeDoubt(
+                f"expected 3D points of a camera for {width} x {height} px, got one whose principal point is "
+                f"{x:.0f}, {y:.0f}; of images of another size?",
+                size,
+                is_outside=True,
+            )
+    points = _all_points([frame for frame in frames if frame.principal_point is None])
     if not len(points):
         return None
-    height, width = image_size
     x, y = points.T
-    size = "state their size with --lanes-size WIDTHxHEIGHT"
     outside = (y >= height) | (x < -_BESIDE * width) | (x > (1 + _BESIDE) * width)
     if outside.mean() > _OUTSIDE:
         return SizeDoubt(

@@ -57,7 +57,11 @@ def read_openlane(path: str | Path, intrinsics: NDArray[np.float64] | None = Non
             points = _openlane_points(f"lane_lines[{i}]", lane, fields, intrinsics, by_point)
             if lane.get("category") not in _CURBS and np.isfinite(points).any():
                 lines.append(LaneLine(points))
-    return FrameLines(name, lines)
+        projected = bool(lines) and all(_is_3d(lane) for lane in lanes)
+        matrix = _camera_matrix(fields, intrinsics) if projected else None
+    return FrameLines(
+        name, lines, 1.0, None if matrix is None else (float(matrix[0, 2]), float(matrix[1, 2]))
+    )
 
 
 def camera_from_label_points(points: Array) -> Array:
@@ -98,6 +102,15 @@ def _is_list_of_points(lane: Any) -> bool:
     return isinstance(xyz, list) and len(xyz) not in (0, 3) and _are_threes(xyz)
 
 
+def _is_3d(lane: dict[str, Any]) -> bool:
+    """Tell whether a line has 3D points only."""
+    return lane.get("uv") is None and lane.get("xyz") is not None
+
+
+def _camera_matrix(fields: dict[str, Any], intrinsics: Array | None) -> Array | None:
+    return intrinsics if fields.get("intrinsic") is None else _square(fields, "intrinsic", 3)
+
+
 def _are_threes(values: list[Any]) -> bool:
     return all(isinstance(each, list) and len(each) == 3 for each in values)
 
@@ -120,7 +133,7 @@ def _openlane_points(
     """
     if not isinstance(lane, dict):
         raise ValueError(f"{name}: expected an object, got {shown(lane)}")
-    if lane.get("uv") is not None or lane.get("xyz") is None:
+    if not _is_3d(lane):
         return checked_pixels(f"{name}.uv", columns(f"{name}.uv", field(lane, "uv", list), 2).T)
     xyz = field(lane, "xyz", list)
     rows_of_three = _is_list_of_points(lane) or (by_point and _are_threes(xyz))
@@ -137,7 +150,7 @@ def _openlane_points(
         camera = camera_from_label_points(points)
         if len(camera) and not (camera[:, 2] > 0).any():
             raise ValueError(f"{name}.xyz: expected points before the camera (x forward, y left, z up)")
-    matrix = intrinsics if fields.get("intrinsic") is None else _square(fields, "intrinsic", 3)
+    matrix = _camera_matrix(fields, intrinsics)
     if matrix is None:
         raise ValueError(f"intrinsic: expected the camera matrix of {name}.xyz, got none")
     image = image_from_camera_points(camera, matrix)

@@ -156,6 +156,21 @@ def test_three_3d_points_are_laid_out_as_those_of_the_other_lines(tmp_path):
     np.testing.assert_allclose(read_lanes(path)[0].lines[0].points, PIXELS[:3], atol=1e-9)
 
 
+def test_3d_points_near_the_camera_may_lie_outside_of_the_images(tmp_path):
+    forward = [3.0, 5.0, 10.0, 20.0, 40.0, 80.0]  # the first two below the images, or beside them
+    lines = [{"xyz": [forward, [left] * 6, [-1.5] * 6]} for left in (5.4, 1.8, -1.8, -5.4)]
+    path = tmp_path / "1.json"
+    path.write_text(json.dumps({"file_path": "1", "lane_lines": lines, "intrinsic": INTRINSICS}))
+    frames = read_lanes(path)
+    assert frames[0].principal_point == (640.0, 360.0)
+    assert size_remark(frames, (720, 1280)) == ""
+    with pytest.raises(ValueError, match=r"principal point is 640, 360; of images of another size\? state"):
+        size_remark(frames, (480, 854))
+    half = lanes_of_whole_images(frames, (720, 1280), None, (360, 640))
+    assert half[0].principal_point == (319.75, 179.75)
+    assert size_remark(half, (360, 640)) == ""
+
+
 def test_predictions_for_openlanes_benchmark_are_in_the_ground_frame(tmp_path):
     pitch, height = 0.05, 2.1  # camera nose down
     c, s = math.cos(pitch), math.sin(pitch)
