@@ -18,7 +18,7 @@ from lanebev.io.lanes import FrameLines, match_frames
 from lanebev.io.video import Frame, FrameSource
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.frames import check_frame, network_image
-from lanebev.observation.polylines import VERTICES_PER_LINE, vertices_from_lines
+from lanebev.observation.polylines import VERTICES_PER_LINE, distorted_line, vertices_from_lines
 from lanebev.pipeline import LaneBEV
 from lanebev.tensors import map_tensors
 
@@ -72,7 +72,8 @@ class LaneFileObserver:
     workers = 1
 
     def __init__(self, entries: Sequence[FrameLines], source: FrameSource, camera: Camera) -> None:
-        self.entries, self.camera = entries, camera
+        self.entries = [_as_taken(entry, camera) for entry in entries]
+        self.camera = camera
         self.remark = size_remark(entries, camera.image_size)
         if not any(entry.lines for entry in entries):
             self.remark = "lanes: none of the entries has a line"
@@ -110,6 +111,13 @@ class LaneFileObserver:
         found = FrameLines(frame.name, []) if entry is None else self.entries[entry]
         lines = [] if frame.image is None else found.lines
         return Observation(vertices_from_lines(lines, self.camera), found.pose_sigma_scale)
+
+
+def _as_taken(entry: FrameLines, camera: Camera) -> FrameLines:
+    """Return an entry in pixels as taken: 3D points were projected without the lens's distortion."""
+    if entry.principal_point is None:
+        return entry
+    return entry._replace(lines=[distorted_line(line, camera) for line in entry.lines])
 
 
 def _check_order(names: Sequence[str], source: str) -> None:

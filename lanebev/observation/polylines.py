@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from lanebev.camera.model import Camera, check_camera
+from lanebev.geometry.lens import normalise_points
 from lanebev.numbers import shown
 from lanebev.observation.boundary_order import boundary_indices
 from lanebev.observation.boundary_vertices import BoundaryVertices
@@ -122,6 +123,16 @@ def lines_from_polylines(
             raise ValueError(f"polylines: expected boundaries 0 to {num_boundaries - 1}, got {key!r}")
         lines.append(LaneLine(points, key if named else None, np.full(len(points), float(sigma))))
     return lines
+
+
+def distorted_line(line: LaneLine, camera: Camera) -> LaneLine:
+    """Return a line of undistorted pixels in pixels as taken; NaN where the lens images nothing."""
+    if not camera.distortion.shape[-1]:
+        return line
+    points = torch.from_numpy(line.points).to(camera.intrinsics)
+    imaged = normalise_points(points, camera.intrinsics).norm(dim=-1, keepdim=True) < camera.max_radius
+    taken: NDArray[np.float64] = camera.distort_points(points).where(imaged, torch.nan).double().numpy()
+    return line._replace(points=taken)
 
 
 def rows_from_vertices(vertices: BoundaryVertices, image_size: tuple[int, int]) -> BoundaryRows:

@@ -12,11 +12,13 @@ from PIL import Image
 
 from lanebev import Camera
 from lanebev.app.config import RunConfig
+from lanebev.app.observers import LaneFileObserver
 from lanebev.app.run import run
 from lanebev.io.lane_order import check_boundary_order
 from lanebev.io.lane_size import lanes_of_whole_images, meeting_row, resized_lanes, size_remark
 from lanebev.io.lanes import FrameLines, read_culane, read_lanes, tusimple_line
 from lanebev.io.openlane import camera_from_ground_points
+from lanebev.io.video import open_source
 from lanebev.numbers import parse_crop, parse_size
 from lanebev.observation.polylines import LaneLine, vertices_from_lines
 
@@ -169,6 +171,21 @@ def test_3d_points_near_the_camera_may_lie_outside_of_the_images(tmp_path):
     half = lanes_of_whole_images(frames, (720, 1280), None, (360, 640))
     assert half[0].principal_point == (319.75, 179.75)
     assert size_remark(half, (360, 640)) == ""
+
+
+def test_3d_points_are_seen_through_the_lens_of_the_run(tmp_path):
+    lens = Camera.from_parameters(1000, 1000, 640, 360, 1280, 720, [-0.3, 0.02, 0.001, -0.002])
+    near = np.concatenate([[[1.8, 1.5, 0.5]], ROAD])  # the first is beyond what the lens images
+    xyz = (near[:, [2, 0, 1]] * [1, -1, -1]).T.tolist()
+    entries = read_lanes(_openlane(tmp_path / "1.json", {"xyz": xyz}), lens.intrinsics.numpy())
+    Image.new("RGB", (1280, 720)).save(tmp_path / "1.jpg")
+    observer = LaneFileObserver(entries, open_source(str(tmp_path / "1.jpg")), lens)
+    found = observer.entries[0].lines[0].points
+    expected, seen = lens.project(torch.from_numpy(near))
+    assert seen.tolist() == [False, True, True, True, True]
+    np.testing.assert_allclose(found[1:], expected[1:], atol=1e-9)
+    assert np.isnan(found[0]).all()
+    assert np.abs(found[1] - PIXELS[0]).max() > 2.0  # px
 
 
 def test_predictions_for_openlanes_benchmark_are_in_the_ground_frame(tmp_path):
