@@ -50,7 +50,7 @@ class FrameSource:
 
     @property
     def is_live(self) -> bool:
-        """Whether the frames come when they come, once, until it is stopped."""
+        """Whether frames arrive in real time and only once, until the source is stopped."""
         return False
 
     @property

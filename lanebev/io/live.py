@@ -71,7 +71,7 @@ class LiveSource(FrameSource):
 
     @property
     def is_live(self) -> bool:
-        """Whether the frames come when they come: yes."""
+        """Whether frames arrive in real time: yes."""
         return True
 
     def stop(self) -> None:

@@ -68,7 +68,7 @@ class Report:
 
     @property
     def after_title(self) -> str:
-        """What "after" is."""
+        """How the poses after calibration were estimated, in a word."""
         return "calibrated" if self.is_stills else "smoothed" if self.is_smoothed else "online"
 
 
