@@ -95,13 +95,13 @@ def constant(numbers: tuple[Any, ...], like: Tensor, dtype: torch.dtype | None =
         dtype: of the result.
     """
     kind = dtype or like.dtype
-    if torch.compiler.is_exporting():
+    if torch.compiler.is_compiling():
         return _computed_constant(numbers, kind, like.device)
     return _constant(numbers, kind, like.device)
 
 
 def _computed_constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Compute a constant: literals in a branch of ``torch.cond`` cannot be exported to ONNX (torch 2.13)."""
+    """Compute a constant: ONNX and inductor fail at literals in a branch of ``torch.cond`` (torch 2.13)."""
     shape: list[int] = []
     first: Any = numbers
     while isinstance(first, tuple):

@@ -14,7 +14,9 @@ from lanebev import (
     Status,
     TwoStageCalibrator,
 )
+from lanebev.batch import replace_rows
 from lanebev.estimation.mount import MountEstimator
+from lanebev.tensors import constant
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes, no_lanes, stack_rows
 from lanebev.types import Calibration, Extrinsics
@@ -112,3 +114,21 @@ def test_an_interval_that_varies_makes_no_graph_per_frame(calibrator):
     for frame in range(6):
         _, state = compiled(lanes(seed=frame), K[None], state, 0.033 + 1e-4 * frame)
     assert len(graphs) <= 2
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_rows_replaced_in_an_inductor_program_may_need_constants():
+    """Which inductor passes to a branch of ``torch.cond`` only if they are computed in it (torch 2.13)."""
+    torch.compiler.reset()
+
+    def added(values):
+        return values + constant(((1.0, 2.0, 4.0), (0.0, 5.0, 3.0)), like=values).sum(0)
+
+    def some(rows, values):
+        return replace_rows(rows, values, added, values)
+
+    compiled, values = torch.compile(some, fullgraph=True), torch.zeros(2, 3, dtype=torch.float64)
+    assert torch.equal(compiled(torch.tensor([False, False]), values), values)
+    expected = torch.tensor([[1.0, 7.0, 7.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    assert torch.equal(compiled(torch.tensor([True, False]), values), expected)
