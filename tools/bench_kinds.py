@@ -25,6 +25,7 @@ from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, with
 from lanebev.testing.moments import FPS, PLACES, Moment, moments
 from lanebev.testing.motions import Pose, fall, landing_time, moved, sinusoids
 from lanebev.testing.scenarios import SCENARIOS
+from lanebev.testing.streets import wandering
 from tools.replay.figures import as_track
 from tools.replay.kinds import EGO_LANE, FRAMES, Generated
 from tools.replay.recording import record, replay
@@ -249,6 +250,23 @@ def _unequal(seed: int, std: float) -> Generated:
     return _drawn(seed, lambda t, moment: replace(moment, places=PLACES + out))
 
 
+def _street(seed: int, std: float, speed: float) -> Generated:
+    """Drive along a street, three to five boundaries in view from 4 to 30 m, each of which wanders by itself.
+
+    The camera is mounted at up to some degrees of pitch and roll, and moves by 0.4°.
+    """
+    random = Random(seed)
+    visible = random.choice(((1, 2, 3), (2, 3, 4), (1, 2, 3, 4), (0, 1, 2, 3), (1, 2, 3, 4, 5)))
+    mount = (math.radians(random.gauss(0.0, 1.0)), 0.0, math.radians(random.gauss(0.0, 1.0)), 0.0)
+    aside = wandering(seed, std)
+
+    def change(t: float, moment: Moment) -> Moment:
+        there = replace(moment, near=4.0, far=30.0, visible=visible, pose=moved(moment.pose, mount))
+        return replace(there, wander=lambda z: aside(z + speed * t))
+
+    return _drawn(seed, change, largest_deg=0.4)
+
+
 def _two_lanes(seed: int, std: float) -> Generated:
     """Leave two lanes in view, which the same pose fits whether they are equal or not."""
     drive = _unequal(seed, std)
@@ -301,6 +319,11 @@ KINDS: dict[str, Callable[[int], Generated]] = {
     "two lanes in view": partial(_two_lanes, std=0.0),
     **{
         f"two lanes in view, unequal by {size} cm": partial(_two_lanes, std=size / 100) for size in (2, 5, 10)
+    },
+    **{
+        f"{kind}, boundaries wander by {size} cm": partial(_street, std=size / 100, speed=speed)
+        for kind, speed in (("street at 8 m/s", 8.0), ("standing in a street", 0.0))
+        for size in (5, 15)
     },
     **{f"{kind}, ego lane": partial(_ego_lane_of, kind) for kind in _ALL_LANES},
     **{

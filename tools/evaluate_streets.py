@@ -6,6 +6,7 @@
 
 ``kitti_road``: the road plane of the lidar is the truth of pitch and roll (0.1 to 0.2 degrees), yaw has none.
 ``kitti_road_with_prior``: the same with the median of these as a mount that is known.
+``kitti_road_standing``: each image as a drive of a second in which the car stands: the same frame 30 times.
 ``culane``: frames at night whose camera is not published; a field of view of 60 degrees is assumed, and only
 the number of calibrated frames counts. ``streets``: two images with a known pose. Nothing here is trained on.
 ``--rendered``: in place of these, rendered views of all kinds of road, as wide as KITTI's images.
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,6 +44,7 @@ KITTI_LANE_WIDTH = 3.5  # m
 ASSUMED_FOV = 60.0  # deg, of a camera that is not published
 SIGMAS = 3.0
 RENDERED_SEED, RENDERED_ROWS, RENDERED_SIZE = 621, 8, (375, 1242)  # views at once; px, as KITTI's images
+STANDING_FRAMES = 30  # of a drive in which the car stands
 MOUNT_STD = 0.001  # rad, of the median pose where it is given as a prior
 
 
@@ -163,14 +166,34 @@ def kitti_road_with_prior(model: LaneBEV, data: Path, sheets: Path | None) -> di
     return _kitti_road(model, data, None, prior_of_mount(pose, std))
 
 
+def kitti_road_standing(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
+    """Evaluate the last frame of drives in which the car stands, so that every frame is the same."""
+    answers, truth = [], []
+    for path, calib, camera in _kitti_images(data):
+        with torch.inference_mode():
+            image = check_frame(read_image(path), camera.image_size)
+            _, vertices = model.boundary_vertices(network_image(image, torch.device("cpu")))
+            tracker = Tracker(JointCalibrator(), camera, KITTI_LANE_WIDTH)
+            for _ in range(STANDING_FRAMES):
+                estimate = tracker.drive_frame(vertices, 1 / STANDING_FRAMES, model.pose_sigma_scale)
+        answers.append(as_answer(path.name, estimate.calibration))
+        truth.append(kitti_truth(calib))
+    return summarise(answers, torch.stack(truth))
+
+
+def _kitti_images(data: Path) -> Iterator[tuple[Path, Path, Camera]]:
+    """Yield every image, its calibration file and its camera."""
+    for path in sorted((data / "kitti_road" / "image_2").glob("*.png")):
+        calib = data / "kitti_road" / "calib" / f"{path.stem}.txt"
+        height, width = read_image(path).shape[:2]
+        yield path, calib, Camera.from_file(calib, image_size=(height, width))
+
+
 def _kitti_road(
     model: LaneBEV, data: Path, sheets: Path | None, prior: FramePrior | None
 ) -> dict[str, float]:
     answers, truth, pictures = [], [], []
-    for path in sorted((data / "kitti_road" / "image_2").glob("*.png")):
-        calib = data / "kitti_road" / "calib" / f"{path.stem}.txt"
-        height, width = read_image(path).shape[:2]
-        camera = Camera.from_file(calib, image_size=(height, width))
+    for path, calib, camera in _kitti_images(data):
         answer, picture = calibrate(model, path, camera, KITTI_LANE_WIDTH, prior)
         answers.append(answer)
         truth.append(kitti_truth(calib))
@@ -271,7 +294,7 @@ def main() -> None:
             raise ValueError(f"{options.data}: expected the folder {name}, got none; give --data")
     figures = {
         part.__name__: part(model, options.data, options.sheets)
-        for part in (kitti_road, kitti_road_with_prior, culane, streets)
+        for part in (kitti_road, kitti_road_with_prior, kitti_road_standing, culane, streets)
     }
     report(figures, options.json)
 

@@ -33,6 +33,7 @@ class Moment:
     offset: float = 0.0  # m, X of the ego lane's middle
     places: Tensor = field(default_factory=lambda: PLACES)  # (6,) m
     headings: Tensor = field(default_factory=lambda: torch.zeros(6, dtype=torch.float64))  # (6,) tangent
+    wander: Callable[[Tensor], Tensor] | None = None  # of Z (G,): boundaries beside their places (6, G) m
     curvature: Callable[[Tensor], Tensor] | None = None  # of Z ahead, 1/m
     profile: float = 0.0  # 1/m, vertical curvature of the road, positive over a crest
     visible: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
@@ -125,6 +126,8 @@ def road_curves(moment: Moment, num: int = 400) -> Tensor:
         x = torch.stack(points)
     else:
         x = (moment.places + moment.offset).unsqueeze(-1) + moment.headings.unsqueeze(-1) * z
+    if moment.wander is not None:
+        x = x + moment.wander(z)
     return torch.stack([x, z.expand_as(x)], dim=-1)
 
 

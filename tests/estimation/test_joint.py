@@ -34,7 +34,8 @@ from lanebev.estimation.joint.measurement import (
     look,
 )
 from lanebev.estimation.joint.observations import boundary_places, observe
-from lanebev.estimation.joint.restart import sensitivity_of_fit
+from lanebev.estimation.joint.output import beyond_filter, single_deviation, unverified_deviation
+from lanebev.estimation.joint.restart import scatter_of_fit
 from lanebev.estimation.joint.road import propagate_road_shape, straight_or_bend, turn_along
 from lanebev.estimation.joint.road_curve import (
     KNOT_SPACING,
@@ -43,9 +44,9 @@ from lanebev.estimation.joint.road_curve import (
     road_curve,
     road_shape,
 )
+from lanebev.estimation.joint.scatter import remembered_sensitivity
 from lanebev.estimation.joint.single_frame import fit_observations
 from lanebev.estimation.joint.state import JointConfig, state_from_fit
-from lanebev.estimation.joint.status import remembered_sensitivity, single_deviation, unverified_deviation
 from lanebev.estimation.joint.update import (
     frame_information,
     kalman_gain,
@@ -474,7 +475,7 @@ def test_one_boundary_out_of_place_counts_until_the_filter_holds_unequal_lanes()
     size = cfg.open_deviation
     out = torch.tensor([[-0.4, 0.0, 0.0, 0.013, 0.0, 0.0]] * 3 + [[0.011] + [0.0] * 5], dtype=DOUBLE)
     held = torch.tensor([0.0, 0.5 * size**2 / 6, 0.5 * size**2, 0.0], dtype=DOUBLE)
-    found = single_deviation(out, held.unsqueeze(-1).expand(-1, 6), cfg)
+    found = beyond_filter(single_deviation(out, cfg), held.unsqueeze(-1).expand(-1, 6)).sqrt()
     expected = torch.tensor([size, size * math.sqrt(0.75), 0.0, 0.0], dtype=DOUBLE)
     torch.testing.assert_close(found, expected)
 
@@ -483,16 +484,18 @@ def test_deviations_that_three_boundaries_cannot_show_count_until_a_fourth_is_se
     sensitivity = torch.zeros(3, 4, 6, dtype=DOUBLE)
     sensitivity[:, ROLL, 1:4] = torch.tensor([-0.05, 0.1, -0.05], dtype=DOUBLE)
     sensitivity[1, HEIGHT, 4], sensitivity[2, HEIGHT, 4] = 0.015 / 4, 0.03
-    none = torch.zeros(3, 6, dtype=DOUBLE)
-    found = unverified_deviation(sensitivity, none, none, JointConfig(lane_deviation_std=0.1))
+    none, straight = torch.zeros(3, 6, dtype=DOUBLE), torch.zeros(3, dtype=DOUBLE)
+    found = unverified_deviation(sensitivity, none, straight, JointConfig(lane_deviation_std=0.1)).sqrt()
     torch.testing.assert_close(found, torch.tensor([0.1, 0.1 * math.sqrt(0.75), 0.0], dtype=DOUBLE))
     apart = none.clone()
     apart[:, 4] = -0.9  # bounds no lane
-    alone = unverified_deviation(sensitivity, apart, none, JointConfig(lane_deviation_std=0.1))
+    alone = unverified_deviation(sensitivity, apart, straight, JointConfig(lane_deviation_std=0.1)).sqrt()
     torch.testing.assert_close(alone, torch.full_like(alone, 0.1))
     held = torch.full((3, 6), 0.02**2 / 3, dtype=DOUBLE)  # half of their sum is 0.02²
-    left = unverified_deviation(sensitivity, none, held, JointConfig(lane_deviation_std=0.1))
-    assert left[0] == pytest.approx(math.sqrt(0.1**2 - 0.02**2))
+    left = beyond_filter(
+        unverified_deviation(sensitivity, none, straight, JointConfig(lane_deviation_std=0.1)), held
+    )
+    assert left[0] == pytest.approx(0.1**2 - 0.02**2)
 
 
 @pytest.mark.parametrize("visible", [(1, 2, 3), (2, 3, 4)])
@@ -533,7 +536,7 @@ def test_the_covariance_changes_gradually_when_boundaries_come_and_go():
 
 
 def test_equal_lanes_are_trusted_some_time_after_a_fourth_boundary_is_seen():
-    four = torch.zeros(1, 4, 6, dtype=DOUBLE)
+    four = torch.zeros(1, 4, 12, dtype=DOUBLE)
     four[:, ROLL, 1:5] = torch.tensor([-0.05, 0.1, -0.05, 0.03], dtype=DOUBLE)
     three = four.clone()
     three[..., 4] = 0.0
@@ -541,7 +544,7 @@ def test_equal_lanes_are_trusted_some_time_after_a_fourth_boundary_is_seen():
     none = torch.zeros(1, 6, dtype=DOUBLE)
     seen, left = three, []
     for _ in range(25):
-        left.append(float(unverified_deviation(seen, none, none, cfg)))
+        left.append(float(unverified_deviation(seen[..., :6], none, none[:, 0], cfg).sqrt()))
         seen = remembered_sensitivity(four, seen, step, cfg)
     assert left[0] == pytest.approx(0.05)
     assert 0.03 < left[1] < 0.05
@@ -566,7 +569,7 @@ def test_the_sensitivity_of_a_start_is_that_of_its_fit():
         seen = observe(segments, CAMERA[None], 6)
         own = boundary_places(WIDTH, 6, seen.sigma).expand(1, -1).gather(1, seen.boundary)
         fit = fit_observations(seen, own, FramePrior())
-        return fit.extrinsics.stack(), sensitivity_of_fit(fit, own, seen, 6)
+        return fit.extrinsics.stack(), scatter_of_fit(fit, own, seen, JointConfig()).sensitivity
 
     (before, sensitivity), (after, _) = fitted(PLACES), fitted(moved)
     torch.testing.assert_close((after - before)[0], 0.001 * sensitivity[0, :, 3], rtol=0.05, atol=2e-6)

@@ -9,6 +9,7 @@ import torch
 from lanebev import JointCalibrator, LaneSegments, Status
 from lanebev.estimation.joint.averaging import distance, mixture_moments, window
 from lanebev.estimation.joint.readings import ReadingConfig, log_prior, log_prior_of_half, readings
+from lanebev.estimation.joint.single_frame import fit_single_frame
 from lanebev.estimation.still import calibrate_still
 from lanebev.testing.moments import CAMERA, Moment, observe
 from lanebev.testing.segments import INTRINSICS, POSE, lanes, no_lanes, stack_rows
@@ -74,9 +75,9 @@ def test_streets_are_within_three_sigma():
     assert begun.double().mean() > 0.9
     error = (found.extrinsics.stack() - truth)[begun].abs()
     assert (error <= 3 * sigmas(found)[begun]).double().mean() >= 0.95
-    best = calibrate_still(Best(), segments, CAMERA.expand(80, 3, 3), 3.5)  # as it was
+    best = fit_single_frame(segments, CAMERA.expand(80, 3, 3), 3.5)  # the likeliest reading, if it is right
     error = (best.extrinsics.stack() - truth)[begun].abs()
-    assert (error <= 3 * sigmas(best)[begun]).double().mean() < 0.7
+    assert (error <= 3 * sigmas(best)[begun, :4]).double().mean() < 0.7
 
 
 class Best(JointCalibrator):

@@ -10,8 +10,9 @@ import torch
 
 from lanebev.camera.model import Camera
 from lanebev.testing.moments import PLACES, Moment, moments, swing
-from lanebev.testing.motions import Motion, Pose, fall, landing_time, moved, sinusoids, suspension
+from lanebev.testing.motions import MOUNT, Motion, Pose, fall, landing_time, moved, sinusoids, suspension
 from lanebev.testing.scenarios import SCENARIOS
+from lanebev.testing.streets import wandering
 
 FRAMES = 120
 """Of every drive, so that all of them are rows of one batch."""
@@ -31,6 +32,7 @@ KINDS = (
     "lane change",
     "outliers",
     "unequal lanes",
+    "street",
     "gap",
     "clock",
     "remount",
@@ -140,6 +142,20 @@ def _two_then_more(t: float, moment: Moment) -> Moment:
     return _only((2, 3, 4) if t < 1.99 else (1, 2, 3, 4, 5), _unequal(t, moment))
 
 
+_WANDERING = wandering(7, 0.1)
+
+
+def _along_street(t: float, moment: Moment) -> Moment:
+    """Drive at 8 m/s along a street whose boundaries each wander by 10 cm; four of them are in view."""
+    there = replace(moment, near=4.0, far=30.0, visible=(1, 2, 3, 4))
+    return replace(there, wander=lambda z: _WANDERING(z + 8.0 * t))
+
+
+def _in_street(t: float, moment: Moment) -> Moment:
+    """Stand in the same street: nothing but the noise changes."""
+    return _along_street(0.0, replace(moment, pose=MOUNT, offset=-0.4))
+
+
 def _nothing(first: float, last: float) -> Callable[[float, Moment], Moment]:
     def change(t: float, moment: Moment) -> Moment:
         gone = first <= t < last
@@ -215,6 +231,8 @@ GENERATED: dict[str, Generated] = {
         "unequal lanes", _drive(lambda t, m: _only((2, 3, 4), replace(_unequal(t, m), tag="")))
     ),
     "two-lanes-then-four": Generated("unequal lanes", _drive(_two_then_more)),
+    "street": Generated("street", _drive(_along_street)),
+    "street-standing": Generated("street", _drive(_in_street)),
     "gap-2-s": Generated("gap", _drive(_nothing(1.0, 3.0))),
     "gap-6-s": Generated("gap", _drive(_nothing(1.5, 7.5), fps=12.0)),
     "clock-irregular": Generated("clock", _scenario("bad clock")),

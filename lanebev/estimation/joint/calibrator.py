@@ -30,6 +30,7 @@ from lanebev.estimation.joint.lane_change import best_shift, renumber
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, SHAPE, STEPS, layout
 from lanebev.estimation.joint.measurement import (
     CURVATURE,
+    NUM_STRAIGHT,
     VERTICAL,
     boundary_distances,
     boundary_residuals,
@@ -37,11 +38,14 @@ from lanebev.estimation.joint.measurement import (
     look,
 )
 from lanebev.estimation.joint.observations import Observations, boundary_places, observations
+from lanebev.estimation.joint.output import as_calibration
 from lanebev.estimation.joint.restart import restart
 from lanebev.estimation.joint.road import propagate_road_shape
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
+from lanebev.estimation.joint.robust import scaled_variance
+from lanebev.estimation.joint.scatter import averaged_moments, boundary_scatter
 from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit, unobserved_mask
-from lanebev.estimation.joint.status import as_calibration, update_track_status
+from lanebev.estimation.joint.status import update_track_status
 from lanebev.estimation.joint.tempering import temper_frame
 from lanebev.estimation.joint.update import (
     agreement,
@@ -53,13 +57,14 @@ from lanebev.estimation.joint.update import (
     observed_jacobian,
     observed_step,
     posterior_covariance,
-    single_frame,
+    single_frame_std,
+    wide_precision,
 )
 from lanebev.estimation.kalman import predict
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.observation.segments import LaneSegments
-from lanebev.types import Calibration, Extrinsics, Status
+from lanebev.types import Calibration, Extrinsics, Status, check_type
 
 _NO_BOUNDARY = 0.36  # m out of place, three sigmas of what lanes differ, from which a line bounds no lane
 
@@ -78,6 +83,7 @@ class JointCalibrator(Calibrator[JointState]):
 
     def __init__(self, config: JointConfig | None = None, **numbers: object) -> None:
         super().__init__()
+        check_type("config", config, JointConfig)
         if config is not None and numbers:
             raise ValueError("config: expected either a JointConfig or its keywords, got both")
         self.config = config or JointConfig(**numbers)  # type: ignore[arg-type]
@@ -101,7 +107,8 @@ class JointCalibrator(Calibrator[JointState]):
             cov=cov,
             phase=zero.clone(),
             evidence=mean.new_zeros(batch_size, NUM_POSE + NUM_COMMON - CURVATURE + cfg.num_boundaries),
-            pose_sensitivity=mean.new_zeros(batch_size, NUM_POSE, cfg.num_boundaries),
+            pose_sensitivity=mean.new_zeros(batch_size, NUM_POSE, 2 * cfg.num_boundaries),
+            scatter=mean.new_zeros(batch_size, 2, 3),
             motion_scale=mean.new_ones(batch_size, NUM_POSE),
             early=zero.clone(),
             unseen=zero,
@@ -259,7 +266,7 @@ def update_state(
             distance, valid = boundary_distances(params, places + own, seen, feet, predicted.phase)
             residuals = residuals._replace(distance=distance, valid=valid)
         frame = frame_information(residuals, jacobian, scale, doubt, seen)
-        alone, sensitivity = single_frame(frame.matrix)
+        alone = single_frame_std(frame.matrix)
         estimated = estimated_entries(alone, num)
         moved = observed_step(
             before, cov[:, place.observed, place.observed], at, frame, estimated[:, place.observed]
@@ -274,12 +281,22 @@ def update_state(
             noise = adaptive_process_noise(evidence, doubt, cfg)
             cov = cov + torch.nn.functional.pad(noise, (0, place.size - noise.shape[-1])).diag_embed()
         last, at, doubt, scale = at, moved.mean, moved.cov, frame.scale
+    weight = frame.trust * seen.weight / scaled_variance(seen.sigma, frame.scale)
+    scatter = boundary_scatter(
+        torch.cat([residuals.jacobian[:, :NUM_STRAIGHT], residuals.jacobian[:, VERTICAL:]], dim=1),
+        torch.cat([wide_precision(cov), cov[:, VERTICAL, VERTICAL, None].reciprocal()], dim=-1),
+        residuals,
+        weight,
+        member,
+        predicted.scatter,
+    )
     gain = kalman_gain(used, moved, frame, estimated)
     updated = predicted._replace(
         mean=torch.baddbmm(prior.unsqueeze(-1), gain, moved.pull.unsqueeze(-1)).squeeze(-1),
         cov=posterior_covariance(cov, frame.matrix, gain),
         evidence=evidence,
-        pose_sensitivity=sensitivity,
+        pose_sensitivity=scatter.sensitivity,
+        scatter=averaged_moments(scatter.moments, predicted.scatter, step, cfg.scatter_memory),
         motion_scale=motion_scale,
         reasons=flag(shift != 0, Reason.LANE_CHANGE),
     )

@@ -15,10 +15,12 @@ from torch import Tensor
 from lanebev.batch import flag, replace_rows, select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.evidence import CALL
+from lanebev.estimation.joint.frame_prior import student_weight
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, layout
-from lanebev.estimation.joint.measurement import HEIGHT, NUM_STRAIGHT, OFFSET, ROLL, boundary_residuals
-from lanebev.estimation.joint.observations import Observations, by_ends, per_end
+from lanebev.estimation.joint.measurement import HEIGHT, NUM_STRAIGHT, ROLL, boundary_residuals
+from lanebev.estimation.joint.observations import Observations
 from lanebev.estimation.joint.robust import log_likelihood, scaled_variance, squared_distance
+from lanebev.estimation.joint.scatter import Scatter, averaged_moments, boundary_scatter
 from lanebev.estimation.joint.single_frame import SingleFrameFit, fit_observations
 from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit
 from lanebev.estimation.joint.update import membership
@@ -100,7 +102,12 @@ def compare_with_frame(
     total = seen.weight.sum(-1).clamp(min=1e-6)
     usable = fit.valid & ((fit.inliers * seen.weight).sum(-1) / total >= cfg.enter_share)
     begun = state_of_fit(fit, state, cfg)
-    begun = begun._replace(pose_sensitivity=sensitivity_of_fit(fit, places, seen, cfg.num_boundaries))
+    scatter = scatter_of_fit(fit, places, seen, cfg)
+    usual_step = torch.full_like(total, cfg.assumed_dt)
+    begun = begun._replace(
+        pose_sensitivity=scatter.sensitivity,
+        scatter=averaged_moments(scatter.moments, begun.scatter, usual_step, cfg.scatter_memory),
+    )
     contrary = usable & is_contrary(state, begun, fit, places, seen, cfg)
     count = torch.where(usable, (state.contrary + 1) * contrary, state.contrary)
     fresh = usable & (wanted | (count >= cfg.contrary_frames))
@@ -169,18 +176,25 @@ def is_contrary(
     return (chi2 > _FAR) & (by_fit + penalty > by_state)
 
 
-def sensitivity_of_fit(fit: SingleFrameFit, places: Tensor, seen: Observations, num: int) -> Tensor:
-    """Compute the change (B, 4, L) of a fit's pose per metre of deviation of a boundary.
+def scatter_of_fit(fit: SingleFrameFit, places: Tensor, seen: Observations, cfg: JointConfig) -> Scatter:
+    """Estimate the scatter of the boundaries in a frame that was fitted by itself.
 
-    Source: M of (J26). It is 0 where the fit does not determine the pose, since the prior's covariance
-    contains more there.
+    The sensitivity is 0 where the fit does not determine the pose, since the prior's covariance contains more
+    there.
     """
-    residuals = boundary_residuals(fit.params(), places, seen)
-    precision = residuals.valid * fit.inliers * seen.weight / scaled_variance(seen.sigma, fit.scale)
-    by_own = per_end(precision) * residuals.jacobian[:, OFFSET]  # a deviation moves as the offset does
-    by_segment = by_ends((fit.covariance[:, :NUM_POSE] @ residuals.jacobian) * by_own.unsqueeze(1)).sum(-2)
-    changed = by_segment @ membership(seen.boundary, num, like=by_own).mT
-    return torch.where(fit.observed.all(-1)[:, None, None], changed, 0.0)
+    params, std = fit.params(), cfg.prior.std(places)
+    residuals = boundary_residuals(params, places, seen)
+    away = ((params - cfg.prior.mean(places)) / std).square()
+    found = boundary_scatter(
+        residuals.jacobian,
+        student_weight(away, cfg.prior.freedom) / std.square(),
+        residuals,
+        residuals.valid * fit.inliers * seen.weight / scaled_variance(seen.sigma, fit.scale),
+        membership(seen.boundary, cfg.num_boundaries, like=places),
+        places.new_zeros(places.shape[0], 2, 3),
+    )
+    determined = fit.observed.all(-1)[:, None, None]
+    return found._replace(sensitivity=torch.where(determined, found.sensitivity, 0.0))
 
 
 def state_of_fit(fit: SingleFrameFit, before: JointState, cfg: JointConfig) -> JointState:
@@ -193,6 +207,7 @@ def state_of_fit(fit: SingleFrameFit, before: JointState, cfg: JointConfig) -> J
         phase=zero,
         evidence=torch.zeros_like(before.evidence),
         pose_sensitivity=torch.zeros_like(before.pose_sensitivity),
+        scatter=torch.zeros_like(before.scatter),
         motion_scale=torch.ones_like(before.motion_scale),
         early=zero,
         unseen=zero,

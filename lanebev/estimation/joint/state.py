@@ -33,6 +33,8 @@ class JointConfig:
         iterations: Gauss-Newton steps per frame.
         start_iterations: Gauss-Newton steps for every start of a first frame.
         lane_width_std: sigma of the common scale of the lane widths, m; 0: the widths are exact.
+        scatter_memory: time constant, s, of the mean squares of the boundaries' own places and headings;
+            inf: they are taken for 0.
         lane_deviation_std: sigma of a boundary's deviation where too few are in view to tell whether lanes
             are equal, m; 0: lanes are equal.
         motion: motion model.
@@ -65,6 +67,7 @@ class JointConfig:
     iterations: int = 2
     start_iterations: int = 8
     lane_width_std: float = 0.0
+    scatter_memory: float = 1.0
     lane_deviation_std: float = 0.05
     motion: MotionConfig = field(default_factory=MotionConfig)
     prior: FramePrior = field(default_factory=FramePrior)
@@ -95,6 +98,8 @@ class JointConfig:
         if self.iterations < 1 or self.start_iterations < 1:
             got = min(self.iterations, self.start_iterations)
             raise ValueError(f"iterations: expected at least 1, got {got}")
+        if not self.scatter_memory > 0:
+            raise ValueError(f"scatter_memory: expected more than 0 s, got {self.scatter_memory}")
         if not (math.isfinite(self.lane_deviation_std) and self.lane_deviation_std >= 0):
             raise ValueError(f"lane_deviation_std: expected at least 0 m, got {self.lane_deviation_std}")
         bend = (self.prior.curvature_std, self.prior.curvature_rate_std)
@@ -119,8 +124,10 @@ class JointState(NamedTuple):
         cov: (B, D, D).
         phase: (B,) m, how far the first knot of the road's curvature lies behind the camera.
         evidence: (B, 11 + L) evidence against the motion, the accumulated scores of (J15).
-        pose_sensitivity: (B, 4, L) change of the pose per metre of deviation of a boundary, by the last frame
-            that determined the pose.
+        pose_sensitivity: (B, 4, 2 L) change of the pose by each boundary's own place (per m) and heading (per
+            rad), by the last frames that determined the pose.
+        scatter: (B, 2, 3) over the last frames, for the boundaries' own places (m²) and headings (rad²): sum
+            of squares, degrees of freedom, weight of the frames.
         motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, adapted to the drive.
         early: (B,) s by which the state is ahead of the last frame, which came out of order.
         unseen: (B,) s since the last usable frame.
@@ -137,6 +144,7 @@ class JointState(NamedTuple):
     phase: Tensor
     evidence: Tensor
     pose_sensitivity: Tensor
+    scatter: Tensor
     motion_scale: Tensor
     early: Tensor
     unseen: Tensor

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, layout
+from lanebev.estimation.joint.layout import NUM_COMMON, layout
 from lanebev.estimation.joint.measurement import NUM_STRAIGHT, OFFSET, ROLL, Residuals
 from lanebev.estimation.joint.observations import Observations, by_ends, per_end
 from lanebev.estimation.joint.robust import (
@@ -201,20 +201,19 @@ def posterior_covariance(cov: Tensor, matrix: Tensor, gain: Tensor) -> Tensor:
     return symmetrise(torch.baddbmm(cov, gain, less, alpha=-1))  # the terms of (J10), of which two are equal
 
 
-def single_frame(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute a frame's own standard deviations, on a straight road with a wide prior.
+def wide_precision(like: Tensor) -> Tensor:
+    """Return the precisions (B, 5) of the prior of pose and offset when a frame is judged alone."""
+    return constant(tuple(std**-2 for std in _WIDE_PRIOR), like=like).expand(like.shape[0], -1)
+
+
+def single_frame_std(matrix: Tensor) -> Tensor:
+    """Compute the standard deviations (B, 5) of pose and offset by a frame alone, on a straight road.
 
     Args:
         matrix: (B, O, O), its information.
-
-    Returns:
-        (B, 5) standard deviations of pose and offset, and (B, 4, L) change of the pose by a metre that a
-        boundary is out of place.
     """
-    prior = constant(tuple(sigma**-2 for sigma in _WIDE_PRIOR), like=matrix).diag()
-    cov = inverse_spd(matrix[:, :NUM_STRAIGHT, :NUM_STRAIGHT] + prior)
-    sensitivity = torch.bmm(cov[:, :NUM_POSE], matrix[:, :NUM_STRAIGHT, NUM_COMMON:])
-    return cov.diagonal(dim1=1, dim2=2).sqrt(), sensitivity
+    cov = inverse_spd(matrix[:, :NUM_STRAIGHT, :NUM_STRAIGHT] + wide_precision(matrix).diag_embed())
+    return cov.diagonal(dim1=1, dim2=2).sqrt()
 
 
 def estimated_entries(single_frame_std: Tensor, num_boundaries: int) -> Tensor:

@@ -1,0 +1,117 @@
+"""The calibration that is given out: the pose, and its covariance with what the filter does not estimate."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lanebev.estimation.joint.evidence import EQUAL
+from lanebev.estimation.joint.layout import POSE, layout
+from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL
+from lanebev.estimation.joint.scatter import scatter_variance
+from lanebev.estimation.joint.state import JointConfig, JointState
+from lanebev.estimation.reasons import Reason
+from lanebev.tensors import constant
+from lanebev.types import Calibration, Extrinsics
+
+_ONLY_HEIGHT = (0.0, 0.0, 0.0, 1.0)
+_FITTED = 3  # boundaries that a pose of equal lanes always fits: by offset, roll and height
+_IN_VIEW = 0.015  # rad/m or m/m: change of roll or height by a boundary's deviation from which it counts
+_WAY = 15.0  # m along which a boundary keeps a heading of its own
+_DOUBTFUL = 0.6  # m out of place, below which a single boundary may stand for several
+
+
+def single_deviation(deviations: Tensor, cfg: JointConfig) -> Tensor:
+    """Compute the variance (B,) m² of any boundary's place if exactly one deviates.
+
+    Source: (J26).
+
+    Args:
+        deviations: (B, L) m, by the filter.
+        cfg: the numbers.
+    """
+    size = cfg.open_deviation
+    worst = deviations.abs().amax(-1)
+    alone = (worst > EQUAL * size) & (worst < _DOUBTFUL)
+    return torch.where(alone, worst.clamp(max=size).square(), 0.0)
+
+
+def unverified_deviation(
+    sensitivity: Tensor, deviations: Tensor, of_headings: Tensor, cfg: JointConfig
+) -> Tensor:
+    """Compute the variance (B,) m² of every boundary's place where too few are in view to tell.
+
+    Source: (J26). Three boundaries fit a pose of equal lanes, however unequal the lanes are; a fourth shows
+    whether they are, unless it is so far from its place that it bounds no lane.
+
+    Args:
+        sensitivity: (B, 4, L) change of the pose per metre of deviation of a boundary; 0 if not in view.
+        deviations: (B, L) m, by the filter.
+        of_headings: (B,) rad², variance of a boundary's own heading. One that has such a heading gets out of
+            its place by as much as it differs over ``_WAY``.
+        cfg: the numbers.
+    """
+    in_view = (sensitivity[:, ROLL:].abs().amax(1) / _IN_VIEW).clamp(max=1.0) * (deviations.abs() < _DOUBTFUL)
+    further = (in_view.sum(-1) - _FITTED).clamp(0.0, 1.0)
+    askew = of_headings * _WAY**2 if cfg.lane_deviation_std else 0.0
+    return (cfg.lane_deviation_std**2 + askew) * (1 - further)
+
+
+def beyond_filter(expected: Tensor, variances: Tensor) -> Tensor:
+    """Compute the variance (B,) m² of the boundaries' places that the filter does not have in its covariance.
+
+    Source: (J26). Half of six independent deviations can be observed, so their variances by the filter sum to
+    three times that of one.
+
+    Args:
+        expected: (B,) m², of any boundary's place.
+        variances: (B, L) m², of the deviations by the filter.
+    """
+    return (expected - 0.5 * variances.sum(-1)).clamp(min=0.0)
+
+
+def covariance_by_boundaries(state: JointState, cfg: JointConfig) -> Tensor:
+    """Compute the covariance (B, 4, 4) of the pose by the boundaries' own places and headings.
+
+    Source: (J26) and (J29).
+    """
+    own = layout(cfg.num_boundaries).deviations
+    deviations, variances = state.mean[:, own], state.cov.diagonal(dim1=1, dim2=2)[:, own]
+    of_places, of_headings = scatter_variance(state.scatter).unbind(-1)
+    by_place = state.pose_sensitivity[..., : cfg.num_boundaries]
+    unverified = unverified_deviation(by_place, deviations, of_headings, cfg)
+    expected = single_deviation(deviations, cfg).maximum(unverified)
+    each = torch.stack([beyond_filter(expected, variances).maximum(of_places), of_headings], dim=-1)  # (B, 2)
+    each = each.repeat_interleave(cfg.num_boundaries, dim=-1).unsqueeze(1)  # (B, 1, 2 L)
+    return torch.bmm(each * state.pose_sensitivity, state.pose_sensitivity.mT)
+
+
+def as_calibration(
+    state: JointState, inliers: Tensor, apart: Tensor, positions: Tensor, cfg: JointConfig
+) -> Calibration:
+    """Make the calibration of a state.
+
+    Its covariance adds what the filter does not estimate: the common scale of the lane widths; places and
+    headings of the boundaries that differ from the model's; the difference from a frame that
+    contradicts the state; and, if roll is not observed, the second-order effect of its error on the height.
+    If the boundaries at x₁ and x₂ stay where they are seen, h'' = -2 (h - x₁ x₂ / h).
+
+    Args:
+        state: (B, ...).
+        inliers: (B, N).
+        apart: (B, 4), pose of a frame that contradicts the state, less the state's; else 0.
+        positions: (B, L) m, of the boundaries from the ego lane's middle.
+        cfg: the numbers.
+    """
+    cov = state.cov[:, POSE, POSE]
+    height, ego = state.mean[:, HEIGHT], cfg.num_boundaries // 2 - 1
+    left, right = (positions[:, ego : ego + 2] + state.mean[:, OFFSET, None]).unbind(-1)
+    bend = height - left * right / height.clamp(min=0.1)
+    roll_unseen = (state.reasons & int(Reason.ROLL_UNSEEN)) != 0
+    more = 3.0 * (bend * cov[:, ROLL, ROLL]).square() * roll_unseen
+    width = (positions[:, -1] - positions[:, 0]) / (cfg.num_boundaries - 1)
+    more = more + (cfg.lane_width_std / width * height).square()
+    only_height = constant(_ONLY_HEIGHT, like=cov)
+    cov = cov + covariance_by_boundaries(state, cfg) + apart.unsqueeze(-1) * apart.unsqueeze(-2)
+    cov = cov + (only_height * more.unsqueeze(-1)).diag_embed()
+    return Calibration(Extrinsics.unstack(state.mean[:, POSE]), cov, state.status, inliers)

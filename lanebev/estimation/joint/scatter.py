@@ -1,0 +1,137 @@
+"""Scatter of the boundaries about parallel lanes of equal width, and its effect on the pose.
+
+The pose is fitted to a road whose boundaries are parallel and whose lanes have the given widths. On a street,
+every boundary has a place and a heading of its own; where a detector's errors last along a boundary, it seems
+to. All vertices of the boundary share them, and so do consecutive frames: they do not average out as noise
+does. What the fit leaves of them in every frame tells their variances.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from lanebev.estimation.joint.layout import NUM_POSE
+from lanebev.estimation.joint.measurement import OFFSET, ROLL, Residuals
+from lanebev.estimation.joint.observations import per_end
+from lanebev.estimation.joint.state import JointConfig
+from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
+from lanebev.tensors import constant
+
+_LEAST_STD = (0.05, 0.003)  # m, rad: prior of a boundary's own place and heading where they are estimated
+_NOISE = 1.5  # factor on the variance of the estimates by noise, which is subtracted
+_FEW = 0.2  # degrees of freedom added where there are none
+_UNSURE = 2.0  # degrees of freedom by which variances from few of them are enlarged
+_GONE = 0.001  # rad/m or m/m: change of roll or height by a boundary's place below which it is not in view
+_NO_WEIGHT = 1e-9
+_ENOUGH = 0.5  # degrees of freedom from which a frame counts fully
+
+
+class Scatter(NamedTuple):
+    """What one frame tells of its boundaries' own places and headings.
+
+    Attributes:
+        sensitivity: (B, 4, 2 L), change of the pose by the boundaries' own places (per m), then by their
+            headings (per rad).
+        moments: (B, 2, 3), for places (m²) and headings (rad²): the sum of squares beyond those of noise, the
+            degrees of freedom that the fit leaves (at most 2 L - 5 together), and 1, the weight of the frame.
+    """
+
+    sensitivity: Tensor
+    moments: Tensor
+
+
+def boundary_scatter(
+    jacobian: Tensor,
+    precision: Tensor,
+    residuals: Residuals,
+    weight: Tensor,
+    member: Tensor,
+    moments: Tensor,
+) -> Scatter:
+    """Estimate each boundary's own place and heading in a frame, beside the parameters that all share.
+
+    Source: (J27), random effects of a linear mixed model, and moments for their variances (Henderson 1953).
+    A heading moves an end point as an offset of Z times the heading does.
+
+    Args:
+        jacobian: (B, P, M) of the distances by the common parameters, pose and offset first.
+        precision: (B, P), of their priors.
+        residuals: distances, and Z of the foot points.
+        weight: (B, N) px⁻², weight of each segment over its variance.
+        member: (B, L, N) of :func:`~lanebev.estimation.joint.update.membership`.
+        moments: (B, 2, 3) of the frames before; they decide the prior of the places and headings.
+    """
+    count, num = jacobian.shape[1], member.shape[1]
+    by_place = jacobian[:, OFFSET : OFFSET + 1] * per_end(member)
+    rows = torch.cat([jacobian, by_place, by_place * residuals.z.unsqueeze(1)], dim=1)  # (B, P + 2 L, M)
+    weighted = rows * per_end(weight).unsqueeze(1)
+    matrix, vector = weighted @ rows.mT, -(weighted @ residuals.distance.flatten(1).unsqueeze(-1))
+
+    factor = cholesky(matrix[:, :count, :count] + precision.diag_embed())
+    across = torch.cholesky_inverse(factor) @ matrix[:, :count, count:]  # (B, P, 2 L), change by what is own
+    known = solve_lower(factor, torch.cat([matrix[:, :count, count:], vector[:, :count]], dim=-1))
+    own_known = known[:, :, :-1].mT
+    left = matrix[:, count:, count:] - own_known @ known[:, :, :-1]
+    pull = vector[:, count:] - own_known @ known[:, :, -1:]
+
+    least = constant(tuple(std**2 for std in _LEAST_STD), like=matrix)
+    prior = scatter_variance(moments).maximum(least).repeat_interleave(num, dim=-1)  # (B, 2 L)
+    own_cov = inverse_spd(left + prior.reciprocal().diag_embed())
+    seen = own_cov @ left  # ŝ is this times the own places and headings, and noise
+    found = (own_cov @ pull).squeeze(-1)
+    by_noise = (seen @ own_cov).diagonal(dim1=1, dim2=2)
+    squares = (found.square() - _NOISE * by_noise).unflatten(-1, (2, num)).sum(-1)
+    freedom = seen.square().unflatten(1, (2, num)).unflatten(-1, (2, num)).sum((2, 4))  # (B, 2, 2)
+    each = torch.stack([squares, freedom.diagonal(dim1=1, dim2=2)], dim=-1)
+    return Scatter(across[:, :NUM_POSE], pad(each, (0, 1), value=1.0))
+
+
+def averaged_moments(now: Tensor, before: Tensor, step: Tensor, memory: float) -> Tensor:
+    """Average the moments (B, 2, 3) of scatter over the last frames, as far as a frame tells any.
+
+    Args:
+        now: of this frame.
+        before: so far; 0 if no frame has told any.
+        step: (B,) s since the last frame.
+        memory: s, time constant.
+    """
+    told = (now[..., 1].sum(-1) / _ENOUGH).clamp(max=1.0)
+    gain = told * (1 - (-step / memory).exp())
+    return before + gain[:, None, None] * (now - before)
+
+
+def scatter_variance(moments: Tensor) -> Tensor:
+    """Compute the variances (B, 2) of a boundary's own place (m²) and heading (rad²) from their moments.
+
+    Source: (J28). The fewer the degrees of freedom, the larger: one deviation may be small by chance.
+    """
+    squares, freedom, weight = moments.unbind(-1)
+    none = weight < _NO_WEIGHT
+    weight = torch.where(none, 1.0, weight)
+    freedom = freedom / weight + _FEW
+    return squares.clamp(min=0.0) / weight / freedom * (1 + _UNSURE / freedom)
+
+
+def remembered_sensitivity(now: Tensor, before: Tensor, step: Tensor, cfg: JointConfig) -> Tensor:
+    """Blend the pose's change by each boundary's own place and heading, M of (J26), over the last frames.
+
+    A boundary counts fully after about a second in view. One that has gone has shown where it is, and its
+    share decays as deviations do. So the covariance changes gradually when boundaries come and go.
+
+    Args:
+        now: (B, 4, 2 L) by this frame.
+        before: (B, 4, 2 L); 0 where no frame has determined the pose yet.
+        step: (B,) s since then; inf where the boundaries' numbers have changed.
+        cfg: the numbers.
+    """
+    num = now.shape[-1] // 2
+    gone = (now[:, ROLL:, :num].abs().amax(1, keepdim=True) < _GONE).repeat(1, 1, 2)
+    memory = torch.where(gone, cfg.motion.deviation_memory, cfg.motion.unequal_memory)
+    fade = torch.where(
+        (before != 0).any(-1).any(-1)[:, None, None], (-step[:, None, None] / memory).exp(), 0.0
+    )
+    return now + fade * (before - now)

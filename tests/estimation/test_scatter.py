@@ -1,0 +1,168 @@
+"""Scatter of the boundaries about parallel lanes of equal width, and its part in the covariance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+
+from lanebev import JointCalibrator, LaneSegments
+from lanebev.estimation.joint.measurement import NUM_STRAIGHT, PITCH, ROLL, boundary_residuals
+from lanebev.estimation.joint.observations import boundary_places, observe
+from lanebev.estimation.joint.output import unverified_deviation
+from lanebev.estimation.joint.restart import scatter_of_fit
+from lanebev.estimation.joint.scatter import averaged_moments, boundary_scatter, scatter_variance
+from lanebev.estimation.joint.single_frame import fit_observations
+from lanebev.estimation.joint.state import JointConfig
+from lanebev.estimation.joint.update import membership
+from lanebev.testing.moments import CAMERA, PLACES, WIDTH, moments
+from lanebev.testing.moments import observe as see
+from lanebev.testing.segments import stack_rows
+from lanebev.testing.streets import wandering
+
+DOUBLE = torch.float64
+ONE_FRAME = 1 / 30
+CONFIG = JointConfig()
+
+
+def scatter_of_frame(places, headings, sigma=1.0, seed=0):
+    """Fit the frame of one moment by itself and return its scatter."""
+    [moment] = moments(ONE_FRAME, lambda t, m: replace(m, places=places, headings=headings, far=40.0))
+    _, segments = next(iter(see([moment], 1, sigma, 20, seed, DOUBLE)))
+    segments = segments._replace(sigma=torch.ones_like(segments.sigma))
+    seen = observe(segments, CAMERA[None], 6)
+    own = boundary_places(WIDTH, 6, seen.sigma).expand(1, -1).gather(1, seen.boundary)
+    fit = fit_observations(seen, own, CONFIG.prior)
+    return fit.extrinsics.stack(), scatter_of_fit(fit, own, seen, CONFIG)
+
+
+@pytest.mark.parametrize(("place_std", "heading_std"), [(0.04, 0.003), (0.06, 0.003), (0.02, 0.006)])
+def test_the_variances_of_places_and_headings_are_found(place_std, heading_std):
+    """In the mean of 60 roads, if no boundary is taken for an outlier."""
+    draws = torch.randn(60, 2, 6, generator=torch.Generator().manual_seed(3), dtype=DOUBLE)
+    frames = []
+    for place, heading in draws / draws.std((0, 2), keepdim=True):
+        own = {"places": PLACES + place_std * place, "headings": heading_std * heading}
+        [moment] = moments(ONE_FRAME, lambda t, m, own=own: replace(m, far=40.0, **own))
+        frames.append(next(iter(see([moment], 1, 0.3, 20, 0, DOUBLE)))[1])
+    seen = observe(stack_rows(*frames), CAMERA.expand(60, 3, 3), 6)
+    params = torch.tensor([*moment.pose, moment.offset, 0.0, 0.0], dtype=DOUBLE).expand(60, -1)
+    places = boundary_places(WIDTH, 6, seen.sigma).expand(60, -1).gather(1, seen.boundary)
+    residuals = boundary_residuals(params, places, seen)
+    straight = residuals._replace(jacobian=residuals.jacobian[:, :NUM_STRAIGHT])
+    found = boundary_scatter(
+        straight.jacobian,
+        torch.ones(60, NUM_STRAIGHT, dtype=DOUBLE),
+        straight,
+        residuals.valid * seen.weight / seen.sigma.square(),
+        membership(seen.boundary, 6, seen.sigma),
+        torch.zeros(60, 2, 3, dtype=DOUBLE),
+    )
+    squares, freedom, weight = found.moments.mean(0).unbind(-1)
+    assert (squares / freedom).sqrt().tolist() == [
+        pytest.approx(place_std, rel=0.15, abs=0.008),
+        pytest.approx(heading_std, rel=0.15),
+    ]
+    assert 4.0 < freedom.sum() < 7.0  # 12 numbers, of which the pose and the offset take five
+    assert (weight == 1).all()
+
+
+@pytest.mark.parametrize("visible", [(0, 1, 2, 3, 4, 5), (1, 2, 3, 4), (1, 2, 3)])
+def test_parallel_boundaries_add_almost_nothing(visible):
+    """With noise of 1 px, after half a second."""
+    drive = moments(0.6, lambda t, m: replace(m, visible=visible))
+    calibrator = JointCalibrator(lane_deviation_std=0.0)
+    state = calibrator.initial_state(8, dtype=DOUBLE)
+    for moment, segments in see(drive, 8, 1.0, 20, 4, DOUBLE):
+        calibration, state = calibrator(segments, CAMERA.expand(8, 3, 3), state, moment.dt, WIDTH)
+    added = calibration.covariance.diagonal(dim1=1, dim2=2) / state.cov.diagonal(dim1=1, dim2=2)[:, :4]
+    assert (added.median(0).values < 1.15).all()
+    assert (added >= 1 - 1e-9).all()
+
+
+def test_the_sensitivity_to_a_heading_is_the_change_of_the_fit():
+    headings = torch.zeros(6, dtype=DOUBLE)
+    headings[3] = 1e-4
+    before, scatter = scatter_of_frame(PLACES, 0 * headings, 0.0)
+    after, _ = scatter_of_frame(PLACES, headings, 0.0)
+    expected = 1e-4 * scatter.sensitivity[0, :, 6 + 3]
+    torch.testing.assert_close((after - before)[0], expected, rtol=0.1, atol=2e-6)
+    assert expected[PITCH].abs() > 5e-6
+
+
+def test_frames_that_tell_nothing_leave_the_moments_and_the_first_that_tells_counts_fully():
+    now = torch.tensor([[[4e-4, 2.0, 1.0], [9e-6, 3.0, 1.0]]] * 2, dtype=DOUBLE)
+    now[1, :, :2] = 0.0  # two boundaries fit parallel lanes whatever they are
+    step = torch.full((2,), ONE_FRAME, dtype=DOUBLE)
+    first = averaged_moments(now, torch.zeros_like(now), step, 1.0)
+    torch.testing.assert_close(scatter_variance(first)[0], scatter_variance(now)[0])
+    assert (scatter_variance(first)[1] == 0).all()
+    again = averaged_moments(now, first, step, 1.0)
+    torch.testing.assert_close(scatter_variance(again)[0], scatter_variance(now)[0])
+    quiet = torch.tensor([[[0.0, 2.0, 1.0], [0.0, 3.0, 1.0]]], dtype=DOUBLE)
+    later = averaged_moments(quiet, now[:1], torch.ones(1, dtype=DOUBLE), 1.0)
+    torch.testing.assert_close(scatter_variance(later), math.exp(-1) * scatter_variance(now[:1]))
+
+
+def test_few_degrees_of_freedom_enlarge_the_variance():
+    few, many = (torch.tensor([[[1e-4 * n, n, 1.0]] * 2], dtype=DOUBLE) for n in (1.0, 100.0))
+    assert (scatter_variance(few) > 2 * scatter_variance(many)).all()
+    assert scatter_variance(many).tolist() == [pytest.approx([1e-4, 1e-4], rel=0.03)]
+
+
+def test_boundaries_that_are_askew_may_be_out_of_place_where_nothing_shows_it():
+    sensitivity = torch.zeros(2, 4, 6, dtype=DOUBLE)
+    sensitivity[:, ROLL, 1:4] = torch.tensor([-0.05, 0.1, -0.05], dtype=DOUBLE)
+    askew = torch.tensor([0.0, 0.01**2], dtype=DOUBLE)
+    found = unverified_deviation(sensitivity, torch.zeros(2, 6, dtype=DOUBLE), askew, CONFIG).sqrt()
+    expected = torch.tensor([0.05, math.hypot(0.05, 0.15)], dtype=DOUBLE)
+    torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize("speed", [0.0, 8.0])
+def test_the_covariance_contains_the_boundaries_of_a_street_that_wander(speed):
+    """From the first frame on, and while the car stands: the same frames again tell nothing new."""
+
+    def change(aside, t, moment):
+        there = replace(moment, near=4.0, far=30.0, visible=(0, 1, 2, 3, 4))
+        return replace(there, wander=lambda z: aside(z + speed * t))
+
+    nees, nees_of_filter = [], []
+    for seed in range(5):
+        drive = moments(0.5, partial(change, wandering(seed, 0.1)))
+        calibrator = JointCalibrator()
+        state = calibrator.initial_state(1, dtype=DOUBLE)
+        for moment, segments in see(drive, 1, 1.0, 20, seed, DOUBLE):
+            calibration, state = calibrator(segments, CAMERA[None], state, moment.dt, WIDTH)
+            error = calibration.extrinsics.stack() - torch.tensor(moment.pose, dtype=DOUBLE)
+            for covariance, found in ((calibration.covariance, nees), (state.cov[:, :4, :4], nees_of_filter)):
+                found.append((error @ torch.linalg.inv(covariance[0]) @ error.T).item() / 4)
+    assert 0.2 < sum(nees) / len(nees) < 3.0
+    assert sum(nees_of_filter) / len(nees_of_filter) > 30.0
+
+
+def test_skipped_and_unsupported_frames_keep_the_scatter_and_rows_are_independent():
+    aside = wandering(1, 0.1)
+    drive = moments(0.4, lambda t, m: replace(m, near=4.0, far=30.0, wander=lambda z: aside(z + 8.0 * t)))
+    calibrator = JointCalibrator()
+    state, alone = (calibrator.initial_state(rows, dtype=DOUBLE) for rows in (3, 1))
+    for moment, segments in see(drive, 3, 1.0, 20, 0, DOUBLE):
+        _, state = calibrator(segments, CAMERA.expand(3, 3, 3), state, moment.dt, WIDTH)
+        first = LaneSegments(*(part[:1] for part in segments))
+        _, alone = calibrator(first, CAMERA[None], alone, moment.dt, WIDTH)
+    assert (state.scatter[..., 0] > 0).all()
+    torch.testing.assert_close(state.scatter[:1], alone.scatter, rtol=1e-9, atol=0)
+    nothing = segments._replace(weight=torch.zeros_like(segments.weight))
+    _, unsupported = calibrator(nothing, CAMERA.expand(3, 3, 3), state, 1 / 30, WIDTH)
+    _, skipped = calibrator(segments, CAMERA.expand(3, 3, 3), state, 0.0, WIDTH)
+    for after in (unsupported, skipped):
+        assert (after.scatter == state.scatter).all()
+        assert (after.pose_sensitivity == state.pose_sensitivity).all()
+
+
+def test_a_time_constant_that_is_not_positive_is_refused():
+    with pytest.raises(ValueError, match="scatter_memory: expected more than 0 s, got nan"):
+        JointConfig(scatter_memory=math.nan)
