@@ -14,6 +14,8 @@ from torch import Tensor
 P = ParamSpec("P")
 T = TypeVar("T")
 
+_INLINED = 8  # numbers of a constant, at most, that inductor writes into its code
+
 _lock = Lock()
 _before: list[int] = []  # numbers of threads before the blocks of one_thread under way; the first one counts
 
@@ -95,13 +97,33 @@ def constant(numbers: tuple[Any, ...], like: Tensor, dtype: torch.dtype | None =
         dtype: of the result.
     """
     kind = dtype or like.dtype
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_exporting():
         return _computed_constant(numbers, kind, like.device)
+    if torch.compiler.is_compiling():
+        return _constant_of_pieces(numbers, kind, like.device)
     return _constant(numbers, kind, like.device)
 
 
 def _computed_constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Compute a constant: ONNX and inductor fail at literals in a branch of ``torch.cond`` (torch 2.13)."""
+    """Compute a constant: literals in a branch of ``torch.cond`` cannot be exported to ONNX (torch 2.13)."""
+    shape, flat = _flat(numbers)
+    each = {number: torch.full((1,), number, dtype=dtype, device=device) for number in set(flat)}
+    return torch.cat([each[number] for number in flat]).view(shape)
+
+
+def _constant_of_pieces(numbers: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Join a constant of pieces so short that inductor writes them into its code.
+
+    It does not find longer ones in a branch of ``torch.cond`` (torch 2.13).
+    """
+    shape, flat = _flat(numbers)
+    starts = range(0, len(flat), _INLINED)
+    pieces = [torch.tensor(flat[at : at + _INLINED], dtype=dtype, device=device) for at in starts]
+    return torch.cat(pieces).view(shape)
+
+
+def _flat(numbers: tuple[Any, ...]) -> tuple[list[int], list[Any]]:
+    """Return the shape of nested tuples, and their numbers in order."""
     shape: list[int] = []
     first: Any = numbers
     while isinstance(first, tuple):
@@ -110,8 +132,7 @@ def _computed_constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: tor
     flat = list(numbers)
     for _ in shape[1:]:
         flat = [number for row in flat for number in row]
-    each = {number: torch.full((1,), number, dtype=dtype, device=device) for number in set(flat)}
-    return torch.cat([each[number] for number in flat]).view(shape)
+    return shape, flat
 
 
 @made_once

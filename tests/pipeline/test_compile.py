@@ -119,7 +119,7 @@ def test_an_interval_that_varies_makes_no_graph_per_frame(calibrator):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_rows_replaced_in_an_inductor_program_may_need_constants():
-    """Which inductor passes to a branch of ``torch.cond`` only if they are computed in it (torch 2.13)."""
+    """Which inductor does not find in a branch of ``torch.cond`` if they are long (torch 2.13)."""
     torch.compiler.reset()
 
     def added(values):
