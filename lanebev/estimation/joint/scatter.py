@@ -19,7 +19,7 @@ from lanebev.estimation.joint.measurement import OFFSET, ROLL, Residuals
 from lanebev.estimation.joint.observations import per_end
 from lanebev.estimation.joint.state import JointConfig
 from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
-from lanebev.tensors import constant
+from lanebev.tensors import constant, identity
 
 _LEAST_STD = (0.05, 0.003)  # m, rad: prior of a boundary's own place and heading where they are estimated
 _NOISE = 1.5  # factor on the variance of the estimates by noise, which is subtracted
@@ -65,20 +65,26 @@ def boundary_scatter(
         member: (B, L, N) of :func:`~lanebev.estimation.joint.update.membership`.
         moments: (B, 2, 3) of the frames before; they decide the prior of the places and headings.
     """
-    count, num = jacobian.shape[1], member.shape[1]
-    by_place = jacobian[:, OFFSET : OFFSET + 1] * per_end(member)
-    rows = torch.cat([jacobian, by_place, by_place * residuals.z.unsqueeze(1)], dim=1)  # (B, P + 2 L, M)
-    weighted = rows * per_end(weight).unsqueeze(1)
-    matrix, vector = weighted @ rows.mT, -(weighted @ residuals.distance.flatten(1).unsqueeze(-1))
+    count, num, distance = jacobian.shape[1], member.shape[1], residuals.distance.flatten(1).unsqueeze(1)
+    by_place = jacobian[:, OFFSET : OFFSET + 1]
+    rows = torch.cat(
+        [jacobian, by_place, by_place * residuals.z.unsqueeze(1), distance], dim=1
+    )  # (B, P + 3, M)
+    weights = per_end(weight).unsqueeze(1)
+    shared = rows @ (jacobian * weights).mT  # (B, P + 3, P)
+    of_places = per_end(member) * (by_place * weights)  # (B, L, M), of each boundary's own end points
+    by_own = rows @ torch.cat([of_places, of_places * residuals.z.unsqueeze(1)], dim=1).mT  # (B, P + 3, 2 L)
 
-    factor = cholesky(matrix[:, :count, :count] + precision.diag_embed())
-    across = torch.cholesky_inverse(factor) @ matrix[:, :count, count:]  # (B, P, 2 L), change by what is own
-    known = solve_lower(factor, torch.cat([matrix[:, :count, count:], vector[:, :count]], dim=-1))
+    factor = cholesky(shared[:, :count] + precision.diag_embed())
+    across = torch.cholesky_inverse(factor) @ by_own[:, :count]  # (B, P, 2 L), change by what is own
+    known = solve_lower(factor, torch.cat([by_own[:, :count], -shared[:, -1:].mT], dim=-1))
     own_known = known[:, :, :-1].mT
-    left = matrix[:, count:, count:] - own_known @ known[:, :, :-1]
-    pull = vector[:, count:] - own_known @ known[:, :, -1:]
+    same = identity(num, rows.dtype, rows.device).repeat(2, 2)  # no end point is on two boundaries
+    own = by_own[:, count : count + 2].repeat_interleave(num, dim=1) * same  # (B, 2 L, 2 L)
+    left = own - own_known @ known[:, :, :-1]
+    pull = -by_own[:, -1:].mT - own_known @ known[:, :, -1:]
 
-    least = constant(tuple(std**2 for std in _LEAST_STD), like=matrix)
+    least = constant(tuple(std**2 for std in _LEAST_STD), like=left)
     prior = scatter_variance(moments).maximum(least).repeat_interleave(num, dim=-1)  # (B, 2 L)
     own_cov = inverse_spd(left + prior.reciprocal().diag_embed())
     seen = own_cov @ left  # ŝ is this times the own places and headings, and noise
