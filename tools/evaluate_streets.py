@@ -171,10 +171,12 @@ def kitti_road_standing(model: LaneBEV, data: Path, sheets: Path | None) -> dict
     answers, truth = [], []
     for path, calib, camera in _kitti_images(data):
         with torch.inference_mode():
-            image = check_frame(read_image(path), camera.image_size)
-            _, vertices = model.boundary_vertices(network_image(image, torch.device("cpu")))
+            image = network_image(check_frame(read_image(path), camera.image_size), torch.device("cpu"))
             tracker = Tracker(JointCalibrator(), camera, KITTI_LANE_WIDTH)
-            for _ in range(STANDING_FRAMES):
+            for number in range(STANDING_FRAMES):
+                if number == 0 or model.far_view is not None:  # else every frame is the same
+                    point = None if model.far_view is None else tracker.vanishing_point()
+                    _, vertices = model.boundary_vertices(image, point)
                 estimate = tracker.drive_frame(vertices, 1 / STANDING_FRAMES, model.pose_sigma_scale)
         answers.append(as_answer(path.name, estimate.calibration))
         truth.append(kitti_truth(calib))

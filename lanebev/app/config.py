@@ -165,7 +165,9 @@ class RunConfig:
     topic: str | None = option(None, "topic of the images in a bag with several", "NAME")
     keep_all: bool = option(False, "drop no frame of a stream: it waits, and its own times are used")
     smooth: bool = option(False, "estimate every pose from all frames of the drive, in two passes")
-    far_view: bool = option(False, "the network also looks at a far view about the horizon, at the same cost")
+    far_view: bool = option(
+        False, "also look at a far view about the horizon; frames are taken one at a time"
+    )
     hilly: bool = option(False, "expect crests and dips everywhere on the road (default: only where evident)")
 
     @property

@@ -6,6 +6,7 @@ from typing import Generic, Protocol, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.autograd import forward_ad
 
 from lanebev.estimation.checks import (
     as_batch,
@@ -101,7 +102,9 @@ class Calibrator(nn.Module, Generic[StateT]):
         check_segments(segments, intrinsics)
         given = check_state(state, self.state_type, intrinsics.shape[0])
         frame = (segments, intrinsics, state, dt, lane_width, given)
-        if torch.compiler.is_compiling() or torch.is_grad_enabled() or torch.is_inference_mode_enabled():
+        forward_mode = forward_ad._current_level >= 0  # tangents, which inference mode would drop
+        keeps_mode = forward_mode or torch.is_grad_enabled() or torch.is_inference_mode_enabled()
+        if torch.compiler.is_compiling() or keeps_mode:
             calibration, after = self._estimate(*frame)
         else:
             with torch.inference_mode():  # takes a fifth less time than torch.no_grad

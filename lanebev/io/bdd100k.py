@@ -68,7 +68,7 @@ def _frames(path: Path, value: dict[str, Any]) -> Iterator[tuple[str, list[Any]]
         name = frame.get("name", value.get("name", path.stem))
         if not isinstance(name, str) or not name:
             raise ValueError(f"name: expected the image's, got {shown(name)}")
-        yield name, as_list("labels", frame.get("labels", frame.get("objects")) or [])
+        yield name, as_list("labels", frame.get("labels") or frame.get("objects") or [])
 
 
 def _is_lane(label: dict[str, Any]) -> bool:

@@ -194,14 +194,16 @@ def test_a_stream_has_no_second_pass(data, tmp_path, capsys):
     assert "expected no --smooth with a stream, got it" in capsys.readouterr().err
 
 
-def test_kept_states_come_back_to_the_bit(tmp_path):
-    calibrator = JointCalibrator()
+@pytest.mark.parametrize(("num", "kilobytes"), [(6, 6.3), (2, 4.86)])
+def test_kept_states_come_back_to_the_bit(num, kilobytes, tmp_path):
+    """With two boundaries the sensitivity (1, 4, 4) is a square too, but not symmetric."""
+    calibrator = JointCalibrator(num_boundaries=num)
     kept, states = KeptStates(tmp_path / "states"), []
     for k in range(3):
         state = calibrator.initial_state(1, dtype=torch.float64)
-        states.append(
-            state._replace(mean=state.mean + k, phase=state.phase + 0.1 * k, reasons=state.reasons + k)
-        )
+        slope = torch.arange(8.0 * num, dtype=torch.float64).view(1, 4, 2 * num)
+        state = state._replace(pose_sensitivity=slope, mean=state.mean + k, reasons=state.reasons + k)
+        states.append(state._replace(phase=state.phase + 0.1 * k))
         kept.append(states[-1])
     assert len(kept) == 3
     torch.testing.assert_close(kept[1:], states[1:], rtol=0, atol=0)
@@ -210,7 +212,7 @@ def test_kept_states_come_back_to_the_bit(tmp_path):
         kept[3]
     size = (tmp_path / "states").stat().st_size / 3
     kept.close()
-    assert 5500 < size < 6500  # bytes a frame, as the documentation says
+    assert size == pytest.approx(1000 * kilobytes, rel=0.03)  # of six boundaries as the documentation says
 
 
 def test_smoothing_is_off_unless_asked_for():

@@ -101,3 +101,20 @@ def test_frames_without_gradients_may_come_before_frames_with_them(calibrator, d
     calibration.extrinsics.pitch.sum().backward()
     assert camera.grad.isfinite().all()
     assert camera.grad[0, 1, 2] != 0
+
+
+def test_forward_mode_derivatives_are_there_without_gradients():
+    calibrator = JointCalibrator()
+    state = calibrator.initial_state(1, dtype=DOUBLE)
+    _, state = calibrator(lanes(seed=0), K[None], state, 1 / 30)
+
+    def pitch(camera):
+        return calibrator(lanes(seed=1), camera, state, 1 / 30)[0].extrinsics.pitch
+
+    along = torch.zeros_like(K[None])
+    along[0, 1, 2] = 1.0
+    _, expected = torch.func.jvp(pitch, (K[None],), (along,))
+    with torch.no_grad():
+        _, found = torch.func.jvp(pitch, (K[None],), (along,))
+    torch.testing.assert_close(found, expected)
+    assert found.abs() > 1e-5

@@ -123,7 +123,9 @@ def scatter_variance(moments: Tensor) -> Tensor:
 
 
 def remembered_sensitivity(now: Tensor, before: Tensor, step: Tensor, cfg: JointConfig) -> Tensor:
-    """Blend the pose's change by each boundary's own place and heading, M of (J26), over the last frames.
+    """Blend the pose's change by each boundary's own place and heading over the last frames.
+
+    Source: M of (J26) and (J29).
 
     A boundary counts fully after about a second in view. One that has gone has shown where it is, and its
     share decays as deviations do. So the covariance changes gradually when boundaries come and go.
