@@ -92,8 +92,8 @@ def as_calibration(
     """Make the calibration of a state.
 
     Its covariance adds what the filter does not estimate: the common scale of the lane widths; places and
-    headings of the boundaries that differ from the model's; the difference from a frame that
-    contradicts the state; and, if roll is not observed, the second-order effect of its error on the height.
+    headings of the boundaries that differ from the model's; the difference from a frame that contradicts the
+    state; and, if roll is not observed, the second-order effect of its error on the height.
     If the boundaries at x₁ and x₂ stay where they are seen, h'' = -2 (h - x₁ x₂ / h).
 
     Args:

@@ -26,7 +26,7 @@ _NOISE = 1.5  # factor on the variance of the estimates by noise, which is subtr
 _FEW = 0.2  # degrees of freedom added where there are none
 _UNSURE = 2.0  # degrees of freedom by which variances from few of them are enlarged
 _GONE = 0.001  # rad/m or m/m: change of roll or height by a boundary's place below which it is not in view
-_NO_WEIGHT = 1e-9
+_LEAST_WEIGHT = 1e-9  # of the frames before; 0 before the first
 _ENOUGH = 0.5  # degrees of freedom from which a frame counts fully
 
 
@@ -67,9 +67,8 @@ def boundary_scatter(
     """
     count, num, distance = jacobian.shape[1], member.shape[1], residuals.distance.flatten(1).unsqueeze(1)
     by_place = jacobian[:, OFFSET : OFFSET + 1]
-    rows = torch.cat(
-        [jacobian, by_place, by_place * residuals.z.unsqueeze(1), distance], dim=1
-    )  # (B, P + 3, M)
+    by_heading = by_place * residuals.z.unsqueeze(1)
+    rows = torch.cat([jacobian, by_place, by_heading, distance], dim=1)  # (B, P + 3, M)
     weights = per_end(weight).unsqueeze(1)
     shared = rows @ (jacobian * weights).mT  # (B, P + 3, P)
     of_places = per_end(member) * (by_place * weights)  # (B, L, M), of each boundary's own end points
@@ -116,8 +115,7 @@ def scatter_variance(moments: Tensor) -> Tensor:
     Source: (J28). The fewer the degrees of freedom, the larger: one deviation may be small by chance.
     """
     squares, freedom, weight = moments.unbind(-1)
-    none = weight < _NO_WEIGHT
-    weight = torch.where(none, 1.0, weight)
+    weight = weight.clamp(min=_LEAST_WEIGHT)
     freedom = freedom / weight + _FEW
     return squares.clamp(min=0.0) / weight / freedom * (1 + _UNSURE / freedom)
 
