@@ -91,6 +91,18 @@ def test_every_page_is_in_the_navigation():
     assert listed == {page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")}
 
 
+def test_every_public_name_is_on_the_api_pages():
+    """In the table of the index, and in a module that a page documents."""
+    pages = {page.name: page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.md")}
+    documented = set(re.findall(r"^::: (\S+)", "\n".join(pages.values()), re.MULTILINE))
+    assert set(re.findall(r"`(\w+)`", pages["index.md"])) >= set(lanebev.__all__)
+    for name in lanebev.__all__:
+        thing = getattr(lanebev, name)
+        module = getattr(thing, "__module__", None) or thing.__name__
+        if name != "HILLY_ROADS":  # an instance of a class
+            assert documented & {module, f"{module}.{name}"}, name
+
+
 def test_the_version_is_one():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == lanebev.__version__

@@ -1,10 +1,12 @@
 """Every example runs, and is short."""
 
+import math
 import runpy
 import subprocess
 import sys
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,6 +15,7 @@ import torch
 from PIL import Image
 from torch import nn
 
+import lanebev
 from lanebev.export.part import Part
 from lanebev.export.write import write_onnx
 from lanebev.io.video import VideoWriter
@@ -101,6 +104,69 @@ def test_a_live_loop_ends_with_a_state(monkeypatch, tmp_path, capsys):
     assert said.count("+-") == 3
     assert "does not advance" not in said
     assert (tmp_path / "state.safetensors").is_file()
+
+
+class Message(SimpleNamespace):
+    """Stand-in for a ROS message: its fields are the keywords."""
+
+
+def ros_modules(messages, info, sent, said):
+    """Stand-ins for the ROS 2 packages, in which a node is given one CameraInfo and some images."""
+    node = Message(get_logger=lambda: Message(info=said.append))
+    node.create_subscription = lambda kind, topic, callback, depth: node.__dict__.update(receive=callback)
+    kinds = dict.fromkeys(("Quaternion", "Transform", "TransformStamped", "Vector3"), Message)
+    wait = {"wait_for_message": lambda kind, node, topic: (True, info)}
+    modules = {
+        "rclpy": {
+            "init": lambda: None,
+            "create_node": lambda name: node,
+            "spin": lambda node: [node.receive(message) for message in messages],
+        },
+        "rclpy.wait_for_message": wait,
+        "cv_bridge": {"CvBridge": lambda: Message(imgmsg_to_cv2=lambda message, code: message.data)},
+        "geometry_msgs.msg": kinds,
+        "sensor_msgs.msg": {"CameraInfo": Message, "Image": Message},
+        "std_msgs.msg": {"Header": Message},
+        "tf2_ros": {"TransformBroadcaster": lambda node: Message(sendTransform=sent.append)},
+    }
+    return {name: SimpleNamespace(**names) for name, names in modules.items()}
+
+
+def test_a_ros_node_publishes_the_pose(monkeypatch, tmp_path):
+    """Of a camera that looks straight ahead, at the height that the filter says, in every TRACKING frame."""
+    image = cv2.imread(str(GOLDEN / "frame.png"))
+    height, width = image.shape[:2]
+    header = [Message(stamp=Message(sec=7, nanosec=k * 50_000_000), frame_id="front") for k in range(3)]
+    info = Message(
+        width=width, height=height, distortion_model="plumb_bob", d=[0.0] * 5,
+        k=[300.0, 0, (width - 1) / 2, 0, 300.0, (height - 1) / 2, 0, 0, 1],
+    )  # fmt: skip
+    sent, said, results = [], [], []
+    called = lanebev.Session.__call__
+
+    def remembered(self, frame, stamp):
+        results.append((stamp, called(self, frame, stamp)))
+        return results[-1][1]
+
+    monkeypatch.setattr(lanebev.Session, "__call__", remembered)
+    images = [Message(header=each, data=image) for each in header]
+    for name, module in ros_modules(images, info, sent, said).items():
+        monkeypatch.setitem(sys.modules, name, module)
+    run_example("ros2_node.py", monkeypatch, tmp_path)
+    assert [stamp for stamp, _ in results] == pytest.approx([7.0, 7.05, 7.1])
+    tracked = [result for _, result in results if result.status == lanebev.Status.TRACKING]
+    assert len(said) == 3
+    assert len(sent) == len(tracked) > 0
+    for message, result in zip(sent, tracked, strict=True):
+        pose = message.transform
+        assert (message.header.frame_id, message.child_frame_id) == ("base_footprint", "front")
+        assert pose.translation.z == pytest.approx(float(result.extrinsics.height))
+        x, y, z, w = (getattr(pose.rotation, name) for name in "xyzw")
+        ahead = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))  # the camera's z axis
+        pitch, yaw = (float(angle) for angle in result.extrinsics[:2])
+        assert ahead[0] > 0.9  # forward
+        assert ahead[1] == pytest.approx(math.cos(pitch) * math.sin(yaw), abs=0.02)  # yaw > 0 is left
+        assert ahead[2] == pytest.approx(-math.sin(pitch), abs=0.02)  # pitch > 0 is down
 
 
 @pytest.mark.slow
