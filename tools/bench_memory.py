@@ -29,7 +29,7 @@ def main() -> None:
     for frame in range(frames):
         pose, reason = random.normal(size=3).tolist(), "" if frame % 700 else "ROLL_UNSEEN"
         numbers = [frame / FPS, *pose, 1.4, 0.1, 0.1, 0.1, 0.01]
-        rows.append(ExtrinsicsRow._make([frame, *numbers, "TRACKING", 30, "", reason]))
+        rows.append(ExtrinsicsRow._make([frame, *numbers, "TRACKING", 30, "", reason, 1e-5]))
         widths.append(np.full((2, NUM_BOUNDARIES - 1), 3.7))
         covariances.append(np.eye(4))
     kept, start = resident(), time.perf_counter()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import tempfile
 from array import array
 from collections.abc import Iterable, Sequence
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from lanebev.io.results import ExtrinsicsRow
 
-_NUMBERS = 9  # of a row, from time_s on
+_NUMBERS = 10  # of a row: nine from time_s on, and the vertical curvature
 
 
 class KeptRows(Sequence[ExtrinsicsRow]):
@@ -30,7 +31,9 @@ class KeptRows(Sequence[ExtrinsicsRow]):
 
     def append(self, row: ExtrinsicsRow) -> None:
         """Add the row of the next frame."""
-        self._numbers.extend(float(number) for number in row[1 : 1 + _NUMBERS])
+        curvature = row.vertical_curvature_per_m
+        self._numbers.extend(float(number) for number in row[1:10])
+        self._numbers.append(math.nan if curvature is None else curvature)
         self._counts.extend((row.frame, row.segments))
         self._codes.extend((self._code(row.status), self._code(row.reasons)))
         self._images.append(row.image)  # last: from now on it is there for other threads
@@ -50,8 +53,9 @@ class KeptRows(Sequence[ExtrinsicsRow]):
         at = range(len(self))[place]
         frame, segments = self._counts[2 * at : 2 * at + 2]
         status, reasons = (self._known[code] for code in self._codes[2 * at : 2 * at + 2])
-        numbers = self._numbers[_NUMBERS * at : _NUMBERS * (at + 1)]
-        return ExtrinsicsRow._make([frame, *numbers, status, segments, self._images[at], reasons])
+        *numbers, curvature = self._numbers[_NUMBERS * at : _NUMBERS * (at + 1)]
+        texts = (status, segments, self._images[at], reasons)
+        return ExtrinsicsRow._make([frame, *numbers, *texts, None if math.isnan(curvature) else curvature])
 
     def _code(self, text: str) -> int:
         if text not in self._texts:

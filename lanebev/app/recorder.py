@@ -35,7 +35,7 @@ from lanebev.report.page import Report, summary_facts, write_report
 from lanebev.report.run_folder import FIRST_NUMBER
 from lanebev.report.verdict import reason_words
 from lanebev.report.worst import EventScores
-from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics
+from lanebev.types import NUM_BOUNDARIES, Extrinsics
 from lanebev.view.grid import BEVGrid
 
 _BEFORE_RESOLUTION = 0.1  # m, of the view before: it is only shown small
@@ -52,14 +52,14 @@ class Recorded:
         name: for ``raw_file`` of lanes.json.
         seen: vertices of batch size 1.
         estimate: what they led to.
-        filtered: calibration from frames up to this one, where the estimate is smoothed.
+        filtered: estimate from frames up to this one, where ``estimate`` is smoothed.
     """
 
     frame: Frame
     name: str
     seen: Observation
     estimate: Estimate
-    filtered: Calibration | None = None
+    filtered: Estimate | None = None
 
 
 @dataclass(kw_only=True)
@@ -126,7 +126,7 @@ class Recorder:
         self._repeats.add(frame.image)
         if not len(self.rows):
             self._first_number = frame.source_number
-        self.rows.append(_row(done, done.estimate.calibration))
+        self.rows.append(_row(done, done.estimate))
         if self.smoothed and done.filtered is not None:
             self._filtered_rows.append(_row(done, done.filtered))
         self._background.submit(lambda: self._draw(done))
@@ -232,11 +232,12 @@ class Recorder:
         return measured.widths
 
 
-def _row(done: Recorded, calibration: Calibration) -> ExtrinsicsRow:
-    """Return the row of a frame with one of its calibrations."""
-    frame, estimate = done.frame, done.estimate
-    weight, reasons = estimate.segments.weight, estimate.reasons
-    return extrinsics_row(frame.number, frame.time, calibration, weight, frame.name, reasons)
+def _row(done: Recorded, estimate: Estimate) -> ExtrinsicsRow:
+    """Return the row of a frame with one of its estimates."""
+    frame, (segments, calibration, reasons, vertical) = done.frame, estimate
+    return extrinsics_row(
+        frame.number, frame.time, calibration, segments.weight, frame.name, reasons, vertical
+    )
 
 
 def _shortened(name: str, most: int = 38) -> str:

@@ -123,7 +123,7 @@ def run(
                     estimate = tracker.still(seen.vertices, seen.pose_sigma_scale)
                 else:
                     estimate = tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale)
-                filtered = estimate.calibration
+                filtered = estimate
                 if smoothed is not None:
                     estimate = smoothed.of(estimate, frame.number)
                 covariances.append(estimate.calibration.covariance[0].double().cpu().numpy())

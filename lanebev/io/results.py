@@ -7,12 +7,12 @@ import errno
 import math
 import os
 import shutil
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from enum import Flag
 from itertools import count
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -23,10 +23,16 @@ from lanebev.types import Calibration, Status
 
 CSV_COLUMNS = (
     "frame", "time_s", "pitch_deg", "yaw_deg", "roll_deg", "height_m", "pitch_std_deg", "yaw_std_deg",
-    "roll_std_deg", "height_std_m", "status", "segments", "image", "reasons",
+    "roll_std_deg", "height_std_m", "status", "segments", "image", "reasons", "vertical_curvature_per_m",
 )  # fmt: skip
 
-_COLUMN_TYPES = (int, *[float] * 9, str, int, str, str)
+
+def _number_or_none(text: str) -> float | None:
+    return float(text) if text else None
+
+
+_COLUMN_TYPES: tuple[Callable[[str], Any], ...] = (int, *[float] * 9, str, int, str, str, _number_or_none)
+_HEADERS = (CSV_COLUMNS, CSV_COLUMNS[:-1], CSV_COLUMNS[:-2])  # of this version and of earlier ones
 
 OUTPUT_NAMES = (
     "extrinsics.csv", "filtered.csv", "lanes.json", "bev.mp4", "bev.png", "overlay.mp4", "overlay.png",
@@ -38,7 +44,10 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # what a disk says that has n
 
 
 class ExtrinsicsRow(NamedTuple):
-    """One row of ``extrinsics.csv``, in its units and order; ``reasons`` are names joined by ``|``."""
+    """One row of ``extrinsics.csv``, in its units and order.
+
+    ``reasons`` are names joined by ``|``; ``vertical_curvature_per_m`` is None where it was not estimated.
+    """
 
     frame: int
     time_s: float
@@ -54,6 +63,7 @@ class ExtrinsicsRow(NamedTuple):
     segments: int
     image: str
     reasons: str = ""
+    vertical_curvature_per_m: float | None = None
 
 
 def extrinsics_row(
@@ -63,6 +73,7 @@ def extrinsics_row(
     weight: Tensor,
     image: str,
     reasons: Iterable[Flag] = (),
+    vertical_curvature: Tensor | None = None,
 ) -> ExtrinsicsRow:
     """Return the row of a frame.
 
@@ -73,6 +84,7 @@ def extrinsics_row(
         weight: (1, N) of the frame's segments; those above zero are counted.
         image: the file's path as found, empty for a video.
         reasons: flags such as those of :class:`lanebev.Reason` that hold in this frame.
+        vertical_curvature: (1,) 1/m of the road; None where the calibrator takes it as plane.
     """
     pitch, yaw, roll, height = calibration.extrinsics.stack()[0].tolist()
     variances = calibration.covariance[0].diagonal().clamp_min(0)
@@ -92,6 +104,7 @@ def extrinsics_row(
         segments=int((weight[0] > 0).sum()),
         image=image,
         reasons="|".join(str(reason.name) for reason in reasons),
+        vertical_curvature_per_m=None if vertical_curvature is None else float(vertical_curvature[0]),
     )
 
 
@@ -101,11 +114,14 @@ def write_extrinsics(path: str | Path, rows: Iterable[ExtrinsicsRow]) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(CSV_COLUMNS)
         for row in rows:
-            writer.writerow([f"{value:.6f}" if isinstance(value, float) else value for value in row])
+            *numbers, curvature = (f"{value:.6f}" if isinstance(value, float) else value for value in row)
+            if row.vertical_curvature_per_m is not None:
+                curvature = f"{row.vertical_curvature_per_m:.9f}"  # a radius of 100 km is 0.00001
+            writer.writerow([*numbers, curvature])
 
 
 def read_extrinsics(path: str | Path) -> list[ExtrinsicsRow]:
-    """Read what :func:`write_extrinsics` wrote; in a file without the last column no reasons are known.
+    """Read what :func:`write_extrinsics` wrote, now or in an earlier version without the last columns.
 
     Raises:
         ValueError: the file is missing, or its header or a row is not ours.
@@ -116,7 +132,7 @@ def read_extrinsics(path: str | Path) -> list[ExtrinsicsRow]:
     except (OSError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise ValueError(f"{path}: expected a readable extrinsics.csv, got: {reason}") from error
-    if tuple(header) not in (CSV_COLUMNS, CSV_COLUMNS[:-1]):
+    if tuple(header) not in _HEADERS:
         expected, got = ",".join(CSV_COLUMNS), shown(",".join(header))
         raise ValueError(f"{path}: expected the columns {expected}, got {got}")
     result = []

@@ -11,7 +11,13 @@ def _row(number):
     numbers = np.random.default_rng(number).normal(size=9).tolist()
     image = f"images/{number}.png" if number % 2 else ""
     return ExtrinsicsRow(
-        number + 10, *numbers, "TRACKING" if number else "LOST", number, image, "A|B"[:number]
+        number + 10,
+        *numbers,
+        "TRACKING" if number else "LOST",
+        number,
+        image,
+        "A|B"[:number],
+        1e-5 * number if number % 3 else None,
     )
 
 
@@ -32,7 +38,7 @@ def test_a_row_takes_little():
     for number in range(2000):
         kept.append(_row(5)._replace(frame=number))
     parts = (kept._numbers, kept._counts, kept._codes)
-    assert sum(part.itemsize * len(part) for part in parts) == 2000 * (9 * 8 + 2 * 8 + 2 * 8)
+    assert sum(part.itemsize * len(part) for part in parts) == 2000 * (10 * 8 + 2 * 8 + 2 * 8)
     assert len(kept._texts) == 2
 
 

@@ -18,13 +18,14 @@ from lanebev.io.results import (
 )
 
 
-def _row(frame=0, image="", reasons=Reason.NONE):
+def _row(frame=0, image="", reasons=Reason.NONE, curvature=-1.25e-5):
     pose = Extrinsics(*(torch.tensor([math.radians(v)]) for v in (1.0, -2.0, 3.0)), torch.tensor([1.5]))
     cov = torch.diag(torch.tensor([math.radians(0.1), math.radians(0.2), math.radians(0.3), 0.04]) ** 2)[None]
     status = torch.tensor([int(Status.TRACKING)])
     calibration = Calibration(pose, cov, status, torch.ones(1, 4))
     weight = torch.tensor([[1.0, 0.5, 0.0, 0.0]])
-    return extrinsics_row(frame, 0.04 * frame, calibration, weight, image, reasons)
+    vertical = None if curvature is None else torch.tensor([curvature])
+    return extrinsics_row(frame, 0.04 * frame, calibration, weight, image, reasons, vertical)
 
 
 def test_csv_is_as_promised(tmp_path):
@@ -32,28 +33,39 @@ def test_csv_is_as_promised(tmp_path):
     lines = (tmp_path / "e.csv").read_text().splitlines()
     assert lines[0] == (
         "frame,time_s,pitch_deg,yaw_deg,roll_deg,height_m,pitch_std_deg,yaw_std_deg,roll_std_deg,"
-        "height_std_m,status,segments,image,reasons"
+        "height_std_m,status,segments,image,reasons,vertical_curvature_per_m"
     )
     expected = (
-        "0,0.000000,1.000000,-2.000000,3.000000,1.500000,0.100000,0.200000,0.300000,0.040000,TRACKING,2,,"
+        "0,0.000000,1.000000,-2.000000,3.000000,1.500000,0.100000,0.200000,0.300000,0.040000,TRACKING,2,,,"
+        "-0.000012500"
     )
     assert lines[1] == expected
-    assert lines[2].endswith('TRACKING,2,"a,b.jpg",')
-    assert CSV_COLUMNS[-1] == "reasons"  # the 13 columns before it are promised
+    assert lines[2].endswith('TRACKING,2,"a,b.jpg",,-0.000012500')
+    assert CSV_COLUMNS[12] == "image"  # the 13 columns up to it are promised; further ones come after them
 
 
 def test_csv_tells_the_reasons_of_a_frame(tmp_path):
     row = _row(reasons=Reason.ROLL_UNSEEN | Reason.LANE_CHANGE)
     write_extrinsics(tmp_path / "e.csv", [row, _row(1)])
-    assert (tmp_path / "e.csv").read_text().splitlines()[1].endswith(",ROLL_UNSEEN|LANE_CHANGE")
+    assert (tmp_path / "e.csv").read_text().splitlines()[1].endswith(",ROLL_UNSEEN|LANE_CHANGE,-0.000012500")
     assert [row.reasons for row in read_extrinsics(tmp_path / "e.csv")] == ["ROLL_UNSEEN|LANE_CHANGE", ""]
 
 
-def test_csv_without_reasons_is_read(tmp_path):
+@pytest.mark.parametrize("missing", [1, 2])
+def test_csv_of_an_earlier_version_is_read(tmp_path, missing):
+    """Without the vertical curvature, and without the reasons too."""
     write_extrinsics(tmp_path / "e.csv", [_row(0)])
     lines = (tmp_path / "e.csv").read_text().splitlines()
-    (tmp_path / "old.csv").write_text("\n".join(line.rsplit(",", 1)[0] for line in lines))
-    assert read_extrinsics(tmp_path / "old.csv") == read_extrinsics(tmp_path / "e.csv")
+    (tmp_path / "old.csv").write_text("\n".join(line.rsplit(",", missing)[0] for line in lines))
+    (expected,) = read_extrinsics(tmp_path / "e.csv")
+    assert expected.vertical_curvature_per_m == -1.25e-5
+    assert read_extrinsics(tmp_path / "old.csv") == [expected._replace(vertical_curvature_per_m=None)]
+
+
+def test_csv_has_no_vertical_curvature_of_a_plane_road(tmp_path):
+    write_extrinsics(tmp_path / "e.csv", [_row(0, curvature=None)])
+    assert (tmp_path / "e.csv").read_text().splitlines()[1].endswith("TRACKING,2,,,")
+    assert read_extrinsics(tmp_path / "e.csv")[0].vertical_curvature_per_m is None
 
 
 def test_csv_keeps_a_file_name_that_is_no_text(tmp_path):
@@ -76,7 +88,7 @@ def test_csv_round_trip(tmp_path):
     [
         ("", "expected the columns"),
         ("a,b\n1,2\n", "expected the columns"),
-        ("0,1\n", "line 2: expected 14 values"),
+        ("0,1\n", "line 2: expected 15 values"),
     ],
 )
 def test_foreign_csv(tmp_path, text, message):

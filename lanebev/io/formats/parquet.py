@@ -37,6 +37,7 @@ def frame_table(record: RunRecord) -> Any:
             ("segments", pa.int64()),
             ("image", pa.string()),
             ("reasons", pa.list_(pa.string())),
+            ("vertical_curvature_per_m", pa.float64()),
             ("covariance", pa.list_(pa.float64(), 16)),
         ],
         metadata={"lanebev": __version__, "conventions": CONVENTIONS, "run": record.name}
