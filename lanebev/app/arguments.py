@@ -23,6 +23,26 @@ _DOCTOR_SETTINGS = (
 )  # fmt: skip
 
 
+RUN_GROUPS = {
+    "source": ("source", "fps", "start", "end", "every", "stills", "topic", "keep_all"),
+    "camera": ("camera", "fov", "focal_std", "rectified", "mount"),
+    "lanes": ("lane_width", "lane_width_std", "lanes", "lanes_size", "lanes_crop"),
+    "estimation": ("calibrator", "smooth", "hilly", "resume"),
+    "network": ("weights", "device", "far_view", "backend", "exported"),
+    "outputs": ("out", "formats", "no_video", "grid", "rerun"),
+}
+"""Groups of the options of ``run`` in its ``--help``: the fields of :class:`RunConfig`, each once."""
+
+_RUN_EXAMPLES = """\
+examples:
+  lanebev run drive.mp4 --camera camera.yaml --lane-width 3.7 --out out/drive
+  lanebev run drive.mp4 --fov 60 --out out/drive        only the field of view is known
+  lanebev run images/ --camera camera.yaml --lanes lanes.json   lanes of another detector
+
+Open report.html in the output folder first.
+"""
+
+
 class _Parser(argparse.ArgumentParser):
     """Reports an error in one line."""
 
@@ -44,7 +64,8 @@ def parser() -> argparse.ArgumentParser:
     names = f"{{{','.join(_COMMANDS)}}}"
     commands = top.add_subparsers(dest="command", required=True, metavar=names)
     for name, (words, add_arguments) in _COMMANDS.items():
-        command = commands.add_parser(name, help=words, allow_abbrev=False)
+        about = f"{words[0].upper()}{words[1:]}."
+        command = commands.add_parser(name, help=words, description=about, allow_abbrev=False)
         add_arguments(command)
         _add_verbose(command, argparse.SUPPRESS)
     return top
@@ -56,10 +77,18 @@ def _add_demo(demo: argparse.ArgumentParser) -> None:
 
 
 def _add_run(run: argparse.ArgumentParser) -> None:
-    for setting in fields(RunConfig):
-        _add_setting(run, setting)
+    settings = {setting.name: setting for setting in fields(RunConfig)}
+    for title, names in RUN_GROUPS.items():
+        group = run.add_argument_group(title)
+        for name in names:
+            _add_setting(group, settings[name])
+    run.usage = "%(prog)s SOURCE [--camera FILE | --fov DEG] [options]"
+    run.epilog, run.formatter_class = _RUN_EXAMPLES, argparse.RawDescriptionHelpFormatter
     run.add_argument(
-        "--config", type=_PATH, metavar="FILE", help="settings as YAML; options here override it"
+        "--config",
+        type=_PATH,
+        metavar="FILE",
+        help="settings as YAML, under the names of the options (lane-width: 3.5); options here override them",
     )
 
 
@@ -137,7 +166,7 @@ def _add_verbose(parser: argparse.ArgumentParser, default: bool | str) -> None:
     parser.add_argument("--verbose", action="store_true", default=default, help="log each step to stderr")
 
 
-def _add_setting(parser: argparse.ArgumentParser, setting: Field[object]) -> None:
+def _add_setting(parser: argparse._ActionsContainer, setting: Field[object]) -> None:
     """Add the option of a setting; if it is not given, the parsed options do not contain it."""
     about = setting.metadata
     words = about["help"].replace("%", "%%")

@@ -108,8 +108,8 @@ class RunConfig:
     )
     lanes_crop: tuple[int, int, int, int] | None = option(
         None,
-        "part of the source's images that --lanes was drawn on, such as 1280x480+0+240; --lanes-size is the "
-        "size to which it was then resized",
+        "part of the source's images that --lanes was drawn on, such as 1280x480+0+240; if that part was "
+        "then resized, --lanes-size is its size",
         "WxH+LEFT+TOP",
         parse_crop,
     )
@@ -133,7 +133,9 @@ class RunConfig:
         "M",
         float,
     )
-    mount: str | None = option(None, "calibration.yaml of an earlier run, whose pose is the prior", "FILE")
+    mount: str | None = option(
+        None, "calibration.yaml of an earlier run, whose pose is the prior of the first frame", "FILE"
+    )
     rectified: bool = option(False, "the images were rectified: use the projection matrix P")
     weights: str | None = option(None, "weights of the network instead of the shipped ones", "FILE")
     device: str = option("cpu", "device of the network: cpu, cuda, cuda:1, mps (default {})", "NAME")
@@ -164,11 +166,11 @@ class RunConfig:
     )
     topic: str | None = option(None, "topic of the images in a bag with several", "NAME")
     keep_all: bool = option(False, "drop no frame of a stream: it waits, and its own times are used")
-    smooth: bool = option(False, "estimate every pose from all frames of the drive, in two passes")
+    smooth: bool = option(False, "estimate every pose from all frames of the drive, later ones too")
     far_view: bool = option(
-        False, "also look at a far view about the horizon; frames are taken one at a time"
+        False, "also show the network the far road at a larger scale; frames are processed one at a time"
     )
-    hilly: bool = option(False, "expect crests and dips everywhere on the road (default: only where evident)")
+    hilly: bool = option(False, "expect crests and dips everywhere (default: at the start and where evident)")
 
     @property
     def relative_focal_std(self) -> float:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lanebev.app.arguments import RUN_GROUPS
 from lanebev.app.config import RunConfig
 from lanebev.app.export_config import ExportConfig
 from lanebev.app.settings_file import read_settings
@@ -186,6 +187,11 @@ def test_device_that_is_not_there_is_one_line(tmp_path, capsys):
         assert error.count("\n") == 1
         assert f"device: expected one that torch can use here, got {device}" in error
     assert not out.exists()
+
+
+def test_every_setting_of_a_run_is_in_one_group_of_its_help():
+    grouped = [name for names in RUN_GROUPS.values() for name in names]
+    assert sorted(grouped) == sorted(field.name for field in fields(RunConfig))
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["--version"]])
