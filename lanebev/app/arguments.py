@@ -84,12 +84,8 @@ def _add_run(run: argparse.ArgumentParser) -> None:
             _add_setting(group, settings[name])
     run.usage = "%(prog)s SOURCE [--camera FILE | --fov DEG] [options]"
     run.epilog, run.formatter_class = _RUN_EXAMPLES, argparse.RawDescriptionHelpFormatter
-    run.add_argument(
-        "--config",
-        type=_PATH,
-        metavar="FILE",
-        help="settings as YAML, under the names of the options (lane-width: 3.5); options here override them",
-    )
+    words = "settings as YAML, under the names of the options (lane-width: 3.5); options here override them"
+    run.add_argument("--config", type=_PATH, metavar="FILE", help=words)
 
 
 def _add_compare(compare: argparse.ArgumentParser) -> None:
