@@ -62,12 +62,22 @@ def check_type(name: str, value: object, expected: type) -> None:
 
 
 class Status(IntEnum):
-    """Status of a row of a calibration. A new meaning is a new value."""
+    """Status of a row of a calibration: whether lane boundaries of this frame were used.
 
-    UNINITIALISED = 0  # nothing has been seen yet: the extrinsics are the initial guess
-    TRACKING = 1  # this frame's observations were used
-    COASTING = 2  # nothing usable in this frame: predicted from earlier ones
-    LOST = 3  # too long without usable boundaries: the extrinsics are the last ones that could be trusted
+    Later versions may add values; these keep their meaning.
+
+    Attributes:
+        UNINITIALISED: no usable frame so far; the extrinsics are the prior.
+        TRACKING: lane boundaries of this frame were used.
+        COASTING: this frame has no usable boundaries; the pose is predicted from earlier frames.
+        LOST: no usable boundaries for too long, or frames contradict the estimate; the extrinsics are the
+            last ones that could be trusted.
+    """
+
+    UNINITIALISED = 0
+    TRACKING = 1
+    COASTING = 2
+    LOST = 3
 
 
 @register_pytree

@@ -6,18 +6,37 @@ from enum import IntFlag
 
 
 class Reason(IntFlag):
-    """Why a row is not, or not fully, tracked; several may hold at once. A new meaning is a new value."""
+    """Why a row is not, or not fully, tracked; several may hold at once.
+
+    Later versions may add values; these keep their meaning.
+
+    Attributes:
+        NONE: every axis was updated.
+        NO_SEGMENTS: no lane boundary was seen in this frame, or there was no image.
+        FEW_INLIERS: the boundaries seen do not fit the estimate.
+        TIME: the frame is not later than the one before and was not used, or its time is unknown and one was
+            assumed.
+        NO_START: not started yet: this frame does not determine pitch and yaw.
+        ROLL_UNSEEN: at most one lane was seen, or the frame was not used: roll is not updated and its
+            standard deviation grows.
+        HEIGHT_UNSEEN: no lane with both boundaries was seen, or the frame was not used: the same for the
+            height.
+        LANE_CHANGE: the boundary indices changed by one in this frame.
+        RESTARTED: estimation started with this frame.
+        DIRECTION_UNSEEN: at most one boundary was seen, or the frame was not used: pitch and yaw are not
+            updated.
+    """
 
     NONE = 0
-    NO_SEGMENTS = 1  # nothing was seen in this frame
-    FEW_INLIERS = 2  # what was seen does not fit the estimate
-    TIME = 4  # not later than the last frame, and not used; or the time unknown, and one assumed
-    NO_START = 8  # not started yet: this frame does not determine pitch and yaw
-    ROLL_UNSEEN = 16  # one lane or less, or the frame was not used: roll is as known before, its sigma grows
-    HEIGHT_UNSEEN = 32  # no lane, or the frame was not used: height is as known before, its sigma grows
-    LANE_CHANGE = 64  # the boundary indices moved by one in this frame
-    RESTARTED = 128  # started or restarted in this frame
-    DIRECTION_UNSEEN = 256  # one boundary or less, or not used: pitch and yaw are not updated
+    NO_SEGMENTS = 1
+    FEW_INLIERS = 2
+    TIME = 4
+    NO_START = 8
+    ROLL_UNSEEN = 16
+    HEIGHT_UNSEEN = 32
+    LANE_CHANGE = 64
+    RESTARTED = 128
+    DIRECTION_UNSEEN = 256
 
 
 REASON_WORDS = {

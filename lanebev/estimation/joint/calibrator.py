@@ -73,7 +73,9 @@ class JointCalibrator(Calibrator[JointState]):
     """Online calibration by one iterated filter, per row of a batch, state in and state out.
 
     Deviation from the paper: one stage instead of two, so that all axes use all information; perpendicular
-    pixel distances with propagated noise instead of normals; curved roads, lane changes, unequal lanes.
+    pixel distances with propagated noise instead of normals; curved roads, lane changes, unequal lanes. It is
+    called as :meth:`~lanebev.estimation.calibrator.Calibrator.forward` says: ``calibration, state =
+    calibrator(segments, intrinsics, state, dt, lane_width)``. docs/method/joint.md defines it.
 
     Args:
         config: the numbers, or keywords of :class:`JointConfig`.
@@ -173,7 +175,7 @@ class JointCalibrator(Calibrator[JointState]):
         return cast_floating(weighed, calibration.covariance.dtype)
 
     def scale_still(self, calibration: Calibration, factor: float) -> Calibration:
-        """Weaken what an image says by a factor on its standard deviations, but not what was known before."""
+        """Multiply the standard deviations of a single image's information by a factor, not the prior's."""
         given = calibration.covariance
         like = given.to(widest_dtype(given.device))
         pose = calibration.extrinsics.stack().to(like)

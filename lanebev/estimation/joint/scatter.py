@@ -1,9 +1,10 @@
 """Scatter of the boundaries about parallel lanes of equal width, and its effect on the pose.
 
 The pose is fitted to a road whose boundaries are parallel and whose lanes have the given widths. On a street,
-every boundary has a place and a heading of its own; where a detector's errors last along a boundary, it seems
-to. All vertices of the boundary share them, and so do consecutive frames: they do not average out as noise
-does. What the fit leaves of them in every frame tells their variances.
+every boundary has a lateral deviation (here: its own place) and a heading of its own. Errors of a detector
+that last along a boundary have the same effect. All vertices of the boundary share them, and so do
+consecutive frames, so they do not average out as noise does. Their variances are estimated from the residuals
+of every frame's fit.
 """
 
 from __future__ import annotations

@@ -12,25 +12,26 @@ class MountConfig:
     """Numbers of :class:`MountEstimator`; rad, m, s, in the order pitch, yaw, roll, height.
 
     Attributes:
-        block_time: s of accepted frames in a block.
+        block_time: time of accepted frames in a block, s.
         num_blocks: number of blocks kept.
         needed: number of blocks for a valid estimate.
         lower, upper: validity limits of the mount.
         margin: hysteresis of the limits.
-        largest_std: largest standard deviation of the fast pose, for a frame to be used on that axis.
-        block_std: prior standard deviation of blocks, which counts as ``prior_blocks`` blocks.
-        prior_blocks: see above.
+        largest_std: largest standard deviation of a frame's pose with which it is used on that axis.
+        block_std: prior standard deviation of blocks.
+        prior_blocks: number of blocks as which ``block_std`` counts.
         block_correlation: correlation of neighbouring blocks, due to slow motion.
         prior_pose, prior_std: mean and standard deviation of the prior.
         moved_least: smallest change that counts as a moved camera.
         moved_sigmas: number of a block's sigmas that the change must also exceed.
         moved_blocks: number of consecutive, agreeing blocks that must show the change.
         blend_steps: number of accepted frames over which the output changes from an old to a new estimate.
-        drift_std: std of the mount's random walk, per square root of an hour without a new block.
-        stale_time: s without a new block after which an axis is reported as stale.
-        min_speed: m/s.
-        max_yaw_rate: rad/s.
-        max_curvature: 1/m.
+        drift_std: standard deviation of the mount's random walk, per square root of an hour without a new
+            block.
+        stale_time: time without a new block after which an axis is reported as stale, s.
+        min_speed: speed of the vehicle below which a frame is not used, m/s.
+        max_yaw_rate: yaw rate of the vehicle above which a frame is not used, rad/s.
+        max_curvature: curvature of the road above which a frame is not used, 1/m.
     """
 
     block_time: float = 4.0

@@ -13,33 +13,61 @@ AXES = ("pitch", "yaw", "roll", "height")
 
 
 class MountStatus(IntEnum):
-    """Status of a mount estimate or of one axis. A new meaning is a new value."""
+    """Status of a mount estimate or of one axis.
 
-    UNCALIBRATED = 0  # not enough blocks yet
+    Later versions may add values; these keep their meaning.
+
+    Attributes:
+        UNCALIBRATED: not enough blocks yet.
+        CALIBRATED: enough blocks, and the estimate is within the limits of a usable mount.
+        INVALID: enough blocks, but the estimate is outside the limits: mount the camera again.
+        RECALIBRATING: estimation has started again, because the camera was moved or frames contradicted the
+            estimate.
+        PARTIAL: of the mount as a whole: some axes are calibrated, others are not yet.
+    """
+
+    UNCALIBRATED = 0
     CALIBRATED = 1
-    INVALID = 2  # enough blocks, but outside the limits: mount the camera again
-    RECALIBRATING = 3  # restarted: the camera was moved, or frames contradicted the estimate
-    PARTIAL = 4  # of the mount as a whole: some axes are calibrated, others are not yet
+    INVALID = 2
+    RECALIBRATING = 3
+    PARTIAL = 4
 
 
 class MountReason(IntFlag):
-    """Why an estimate is not (yet) valid, or this frame was not used; several may hold at once."""
+    """Why an estimate is not (yet) valid, or this frame was not used; several may hold at once.
+
+    Attributes:
+        NONE: the frame was used and the estimate is valid.
+        NOT_TRACKING: the frame's pose is not TRACKING.
+        UNSURE: the standard deviation of the frame's pose is too large (``MountConfig.largest_std``).
+        SLOW: the vehicle is slower than ``MountConfig.min_speed``.
+        TURNING: the yaw rate of the vehicle or the curvature of the road is too large.
+        FEW_BLOCKS: progress is below 100 %.
+        PITCH_LIMIT, YAW_LIMIT, ROLL_LIMIT, HEIGHT_LIMIT: the estimate is outside the limits of a usable
+            mount.
+        SUSPECT: the latest blocks or frames contradict the estimate.
+        MOVED: the camera was moved; estimation restarted in this frame.
+        TIME: dt is not positive or not finite.
+        WITHDRAWN: the estimate was dropped in this frame: it is older than a move of the camera, or was
+            contradicted.
+        STALE: no new block for a long time.
+    """
 
     NONE = 0
-    NOT_TRACKING = 1  # the fast calibration had no support in this frame
-    UNSURE = 2  # its sigma was too large
-    SLOW = 4  # the vehicle was too slow to follow the lane
-    TURNING = 8  # yaw rate or curvature too high
-    FEW_BLOCKS = 16  # progress below 100 %
+    NOT_TRACKING = 1
+    UNSURE = 2
+    SLOW = 4
+    TURNING = 8
+    FEW_BLOCKS = 16
     PITCH_LIMIT = 32
     YAW_LIMIT = 64
     ROLL_LIMIT = 128
     HEIGHT_LIMIT = 256
-    SUSPECT = 512  # the latest evidence contradicts the estimate
-    MOVED = 1024  # the camera was moved: estimation restarted in this frame
-    TIME = 2048  # dt not positive or not finite
-    WITHDRAWN = 4096  # dropped in this frame: it dates from before a move, or was contradicted
-    STALE = 8192  # no new block for a long time
+    SUSPECT = 512
+    MOVED = 1024
+    TIME = 2048
+    WITHDRAWN = 4096
+    STALE = 8192
 
 
 @register_pytree
@@ -48,7 +76,7 @@ class MountState(NamedTuple):
 
     Attributes:
         blocks: (B, K, 4) mean pose of each.
-        variances: (B, K, 4) mean variance of the fast pose in each.
+        variances: (B, K, 4) mean variance of the frames' poses in each.
         filled: (B, K, 4) 1 where there is a block.
         ages: (B, K, 4) s since the block was begun.
         pose_sum: (B, 4) of the current block, times seconds.

@@ -22,7 +22,9 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
     """Online calibration in the paper's two stages, per row of a batch, state in and state out.
 
     Source: Secs. III and IV. Assumes a straight flat road, parallel boundaries and equal known lane widths:
-    at R = 860 m its yaw is 1.3 deg off (paper.md D17).
+    at R = 860 m its yaw is 1.3 deg off (paper.md D17). It is called as
+    :meth:`~lanebev.estimation.calibrator.Calibrator.forward` says: ``calibration, state =
+    calibrator(segments, intrinsics, state, dt, lane_width)``.
 
     Args:
         config: the numbers, or keywords of :class:`TwoStageConfig`.

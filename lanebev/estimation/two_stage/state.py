@@ -16,25 +16,45 @@ class TwoStageConfig:
 
     The paper gives none of Q, W, N_loop or the search range (paper.md D13). W here admits ±1.5 deg and
     ±5 cm at 1 Hz.
+
+    Attributes:
+        num_boundaries: L.
+        num_hypotheses: largest number of vanishing point hypotheses, N_loop.
+        seed: seed of the hypotheses.
+        gate_sigmas: number of standard deviations up to which a segment is an inlier; 0 is the paper's fixed
+            gate of 0.7 deg.
+        angular_acceleration_density: spectral density of the acceleration of pitch, yaw and roll, rad²/s³.
+        height_acceleration_density: the same of the height, m²/s³.
+        initial_pose: pose before the first frame: pitch, yaw, roll (rad), height (m).
+        initial_pose_std: standard deviations of this pose.
+        initial_rate_std: standard deviations of its rates, per s.
+        min_segments: number of segments that must support a vanishing point.
+        min_inlier_share: fraction of the segments that must support it.
+        reacquire_after: time without support after which the search starts again, s.
+        reacquire_spread: standard deviation of the predicted direction above which it does too, rad.
+        lost_after: time without support after which the status is LOST, s.
+        assumed_dt: time between frames, s, where it is not finite.
+        lane_noise: standard deviation of each lane's width about the prior, m.
+        lane_width_std: standard deviation of the prior itself, m: a common scale of the height.
     """
 
     num_boundaries: int = NUM_BOUNDARIES
-    num_hypotheses: int = 300  # N_loop, at most
-    seed: int = 0  # of the hypotheses
-    gate_sigmas: float = 3.5  # 0 is the paper's fixed gate of 0.7 deg
-    angular_acceleration_density: float = 0.25  # rad² / s³, of pitch, yaw and roll
-    height_acceleration_density: float = 1.0  # m² / s³
+    num_hypotheses: int = 300
+    seed: int = 0
+    gate_sigmas: float = 3.5
+    angular_acceleration_density: float = 0.25
+    height_acceleration_density: float = 1.0
     initial_pose: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.5)
     initial_pose_std: tuple[float, float, float, float] = (0.1, 0.1, 0.05, 0.5)
-    initial_rate_std: tuple[float, float, float, float] = (0.2, 0.2, 0.2, 0.5)  # per second
-    min_segments: int = 4  # that must support a vanishing point
+    initial_rate_std: tuple[float, float, float, float] = (0.2, 0.2, 0.2, 0.5)
+    min_segments: int = 4
     min_inlier_share: float = 0.3
-    reacquire_after: float = 0.2  # s without support before the search starts over
-    reacquire_spread: float = 0.013  # rad, sigma of the predicted direction at which it does, too
-    lost_after: float = 1.5  # s without support
-    assumed_dt: float = 1 / 30  # s between frames where it is not finite
-    lane_noise: float = 0.0  # m, how far single lanes differ from the prior
-    lane_width_std: float = 0.0  # m, how far the prior itself may be off: a common scale of height
+    reacquire_after: float = 0.2
+    reacquire_spread: float = 0.013
+    lost_after: float = 1.5
+    assumed_dt: float = 1 / 30
+    lane_noise: float = 0.0
+    lane_width_std: float = 0.0
 
     def __post_init__(self) -> None:
         if self.num_boundaries < 2:
