@@ -32,6 +32,7 @@ _COLUMNS = 128  # of a tile; half as many of a lens
 _TOLERANCE = 4e-6  # of half the image, .004 px of 1920; what float32 rounds is a quarter of it
 _LOW = _NODES - 2  # the coefficients of this degree and higher tell what those of higher ones would add
 _SUMS = np.stack([np.ones(_NODES), np.arange(_NODES) >= _LOW], axis=1).astype(np.float32)
+LARGEST_WEIGHTS = 4.0  # the magnitudes of the weights of a cell sum up to less
 _OUTSIDE = 0.25  # share of the distance to the image by which a tile that is not in it may be off
 
 

@@ -16,6 +16,7 @@ from lanebev.view.projection import image_coordinates, normalised_intrinsics, ou
 from lanebev.view.sampling import MapSize, sampling_maps
 from lanebev.view.thread_limits import small_products
 from lanebev.view.tiles import (
+    LARGEST_WEIGHTS,
     column_tiles,
     equal_edges,
     interpolant,
@@ -191,6 +192,11 @@ def test_interpolation_reproduces_polynomials_and_finds_their_coefficients():
     np.testing.assert_allclose(weights.sum(1), 1, atol=1e-12)
     fourth = 8 * t**4 - 8 * t**2 + 1  # Chebyshev polynomial of degree 4
     np.testing.assert_allclose(coefficients @ fourth[nodes], [0, 0, 0, 0, 1, 0], atol=1e-12)
+
+
+def test_weights_of_a_cell_are_bounded():
+    sums = [np.abs(interpolation(size, tile_nodes(size, 12))[0]).sum(1).max() for size in range(36, 400)]
+    assert 2 < max(sums) < LARGEST_WEIGHTS
 
 
 def test_small_products_are_those_of_the_whole(monkeypatch):
