@@ -24,7 +24,7 @@ from lanebev.estimation.tracker import Tracker
 from lanebev.io.frame_clock import FrameClock
 from lanebev.io.lane_size import size_doubt
 from lanebev.io.lanes import FrameLines
-from lanebev.io.state import load_state, save_state
+from lanebev.io.state import lane_width_remark, load_state, save_state
 from lanebev.numbers import check_number
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.frames import check_frame, network_image
@@ -211,11 +211,11 @@ class Session:
         Raises:
             OSError: the file cannot be written.
         """
-        clock = self._clock.values()
-        save_state(path, {**self.tracker.states(), "camera": self.camera.fingerprint(), "clock": clock})
+        plain = {"camera": self.camera.fingerprint(), "lane_width": self.tracker.lane_width}
+        save_state(path, {**self.tracker.states(), **plain, "clock": self._clock.values()})
 
     def load(self, path: str | Path) -> None:
-        """Continue from a file that :meth:`save` wrote.
+        """Continue from a file that :meth:`save` wrote. A lane width that differs from it is a warning.
 
         Raises:
             ValueError: the file cannot be used, or is of another calibrator or camera; nothing is changed.
@@ -223,9 +223,11 @@ class Session:
         fresh: Tracker[Any] = Tracker(*self._parts)
         loaded = load_state(path, fresh.states())
         if loaded.problem is not None:
-            raise ValueError(loaded.problem)
+            raise ValueError(f"{loaded.problem}; leave out load to start anew")
         if loaded.metadata.get("camera") != self.camera.fingerprint():
             raise ValueError(f"{path}: expected the state of this camera, got another camera's")
+        if remark := lane_width_remark(loaded, fresh.lane_width):
+            logger.warning(remark)
         fresh.state, fresh.mount_state = loaded.states["calibrator"], loaded.states["mount"]
         self.tracker = fresh
         self._clock = FrameClock(**(loaded.metadata.get("clock") or {}))

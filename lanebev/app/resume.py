@@ -9,7 +9,7 @@ from lanebev.app.build import RunTracker, make_tracker
 from lanebev.app.config import CALIBRATORS, RunConfig
 from lanebev.camera.model import Camera
 from lanebev.io.results import OutputFolder
-from lanebev.io.state import load_state
+from lanebev.io.state import lane_width_remark, load_state
 
 STATE_FILE, CALIBRATION_FILE = "state.safetensors", "calibration.yaml"
 
@@ -47,6 +47,14 @@ def load_states(config: RunConfig, tracker: RunTracker, camera: Camera) -> str |
         )
     tracker.state, tracker.mount_state = loaded.states["calibrator"], loaded.states["mount"]
     return None
+
+
+def resume_remark(config: RunConfig) -> str:
+    """Return a remark on a state to resume that was saved with lanes of another width; else nothing."""
+    if config.resume is None:
+        return ""
+    remark = lane_width_remark(load_state(Path(config.resume) / STATE_FILE), config.taken_lane_width[0])
+    return f"resume: {remark}" if remark else ""
 
 
 def backup_state(resume: str, out: OutputFolder) -> str:

@@ -29,7 +29,7 @@ from lanebev.app.plausibility import bars_remark, mount_remark
 from lanebev.app.progress import Progress
 from lanebev.app.recorder import Recorded, Recorder
 from lanebev.app.recovery import facts_of, frame_name, observer_of_second_pass, recover_run
-from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states
+from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states, resume_remark
 from lanebev.app.shared_network import SharedNetwork
 from lanebev.app.smoothing import SmoothedPoses, smooth_frames
 from lanebev.app.sources import camera_of, ended_by_signals, first_image, make_source, observed_frames
@@ -136,7 +136,10 @@ def run(
                     viewer.add(RecordedFrame(recorder.rows[-1], pose, lines), frame.image)
         facts = run_facts(config, source, camera) | facts_of(taken)
         if tracker.mount is not None:
-            save_state(out / STATE_FILE, {**tracker.states(), "camera": camera.fingerprint()})
+            save_state(
+                out / STATE_FILE,
+                {**tracker.states(), "camera": camera.fingerprint(), "lane_width": tracker.lane_width},
+            )
             facts |= mount_facts(tracker.mount)
             write_calibration(out / CALIBRATION_FILE, camera, tracker.mount)
         logger.info("writing the report")
@@ -169,10 +172,10 @@ def resumed_tracker(config: RunConfig, camera: Camera) -> tuple[RunTracker, str 
 
 
 def remarks(config: RunConfig, source: FrameSource, camera: Camera) -> list[str]:
-    """Return what speaks against the camera, the field of view and the mount of the settings."""
+    """Return what speaks against the camera, the field of view, the mount and the state of the settings."""
     bars = "" if config.fov is None else bars_remark(first_image(source))
     mount = mount_remark(config.mount, camera)
-    return [*filter(None, (bars, mount)), *camera_remarks(camera, source.pixel_aspect)]
+    return [*filter(None, (resume_remark(config), bars, mount)), *camera_remarks(camera, source.pixel_aspect)]
 
 
 def first_pass(

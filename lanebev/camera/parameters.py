@@ -85,7 +85,8 @@ def _check_matrix(matrix: list[float], size: tuple[int, int], restated: bool) ->
                 "focal lengths are in pixels"
             )
     if abs(skew) > 0.1 * fx or zero != 0 or last != [0.0, 0.0, 1.0]:
-        raise ValueError("camera matrix: expected [fx s cx; 0 fy cy; 0 0 1], got other off-diagonal entries")
+        got = "its transpose" if last[:2] != [0.0, 0.0] == [cx, cy] else "other off-diagonal entries"
+        raise ValueError(f"camera matrix: expected [fx s cx; 0 fy cy; 0 0 1], got {got}")
     if restated:
         return
     if not 0.4 < fx / fy < 2.5:

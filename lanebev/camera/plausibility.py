@@ -12,6 +12,7 @@ from lanebev.camera.parameters import centre_offset
 _FIELD_OF_VIEW = (25.0, 130.0)  # degrees, horizontal, of cameras in cars with a pinhole model
 _IMPOSSIBLE_VIEW = 170.0  # degrees, of focal lengths in mm
 _RESCALED = (0.08, 0.02)  # sides: least offset of a principal point, most difference of that in x and y
+_OFF_CENTRE = (0.2, 0.4)  # sides, more than a principal point is off the middle in x and y; skies are cut off
 _MOST_TANGENTIAL = 0.025  # coefficient of a lens that is not doubted
 _WIDE = 95.0  # degrees, from which on lenses distort
 _MOST_EDGE_RATIO = 0.93  # of an edge's distance from the centre to an ideal lens's, of wide lenses
@@ -29,7 +30,7 @@ def camera_remarks(camera: Camera, pixel_aspect: Fraction = Fraction(1)) -> list
     """
     found = (
         lens_remark(camera),
-        resized_remark(camera),
+        resized_remark(camera) or off_centre_remark(camera),
         model_remark(camera),
         view_remark(camera),
         pixel_remark(camera, pixel_aspect),
@@ -72,6 +73,18 @@ def resized_remark(camera: Camera) -> str:
     other = f"{2 * matrix[2] + 1:.0f} x {2 * matrix[5] + 1:.0f}"
     return (
         f"{words} {other} px, not of {width} x {height}: was it calibrated at another size? see Camera.scaled"
+    )
+
+
+def off_centre_remark(camera: Camera) -> str:
+    """Return a remark on a principal point that is far from the middle of the images; else nothing."""
+    (height, width), x, y = camera.image_size, *camera.intrinsics[:2, 2].tolist()
+    across, down = _OFF_CENTRE
+    if abs(x / width - 0.5) <= across and abs(y / height - 0.5) <= down:
+        return ""
+    return (
+        f"the principal point {x:.0f}, {y:.0f} is far from the middle of the {width} x {height} px: is it in "
+        "pixels, and are the images whole?"
     )
 
 

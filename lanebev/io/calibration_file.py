@@ -23,6 +23,7 @@ ROAD_FROM_VEHICLE = ((0.0, -1.0, 0.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0))
 """Axes of the road (X right, Y down, Z along the lanes) from the vehicle's (x forward, y left, z up)."""
 
 _USED_BY_AXIS = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
+_ANGLES, _HEIGHTS = (-60.0, 60.0), (0.1, 20.0)  # degrees, m, of any camera that sees the road ahead
 
 
 def vehicle_from_camera(mount: Extrinsics) -> torch.Tensor:
@@ -117,7 +118,7 @@ def read_mount(path: str | Path) -> MountPrior:
     """Read the mount of a ``calibration.yaml`` that :func:`write_calibration` wrote.
 
     Raises:
-        ValueError: the file cannot be read, has no mount, or no calibrated axis.
+        ValueError: the file cannot be read, has no mount, no calibrated axis, or a pose that no camera has.
     """
     try:
         fields = parse(read_text(Path(path)))
@@ -136,9 +137,14 @@ def read_mount(path: str | Path) -> MountPrior:
             try:
                 (value,) = finite_numbers(key, [mount[key]], 1)
                 (sigma,) = finite_numbers(f"{name}_std_{unit}", [mount.get(f"{name}_std_{unit}")], 1)
+                low, high = _HEIGHTS if unit == "m" else _ANGLES
+                if not low <= value <= high:
+                    raise ValueError(f"{key}: expected {low:g} to {high:g}, got {value:g}")
+                if not sigma > 0:
+                    raise ValueError(f"{name}_std_{unit}: expected more than 0, got {sigma:g}")
             except ValueError as error:
                 raise ValueError(f"mount file {path}: {error}") from error
-            pose[axis], std[axis] = scale * value, scale * abs(sigma)
+            pose[axis], std[axis] = scale * value, scale * sigma
     if not std.isfinite().any():
         needs = mount.get("needs")
         why = needs[0] if isinstance(needs, list) and needs else None

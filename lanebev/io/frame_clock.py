@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -58,9 +59,15 @@ class FrameClock:
         dt = self.stamp - before
         if dt <= 0:
             return dt, [f"the time stamp does not advance: {dt:g} s after the frame before"]
-        self.steps = [*self.steps[-_LOOKED_AT + 1 :], dt]
-        if len(self.steps) == _LOOKED_AT and min(self.steps) > _LONG_DT:
-            remark = f"time stamps advance by {dt:g} a frame: expected seconds, got milli- or nanoseconds?"
+        was_odd, self.steps = _are_odd(self.steps), [*self.steps[-_LOOKED_AT + 1 :], dt]
+        if not _are_odd(self.steps):
+            return dt, []
+        remark = f"time stamps advance by {dt:g} a frame: expected seconds, got milli- or nanoseconds?"
+        if not was_odd:  # once, as long as it lasts
             logger.warning(remark)
-            return dt, [remark]
-        return dt, []
+        return dt, [remark]
+
+
+def _are_odd(steps: Sequence[float]) -> bool:
+    """Tell whether all of some time steps (s) are longer than those of a camera."""
+    return len(steps) == _LOOKED_AT and min(steps) > _LONG_DT

@@ -115,6 +115,24 @@ def load_state(
         return LoadedState({}, {}, f"{path}: {error}")
 
 
+def lane_width_remark(loaded: LoadedState, lane_width: float) -> str:
+    """Return a remark on a state that was saved with lanes of another width; else nothing.
+
+    Its heights, those of the mount too, are proportional to that width.
+
+    Args:
+        loaded: the state with its plain values, ``lane_width`` (m) among them.
+        lane_width: m, as it is now.
+    """
+    before = loaded.metadata.get("lane_width")
+    if before is None or math.isclose(before, lane_width):
+        return ""
+    return (
+        f"the state was saved with lanes {before:g} m wide, now they are {lane_width:g} m; on the same road "
+        "one of the widths is wrong, and so are the heights: then start without the state"
+    )
+
+
 class _RefusedError(Exception):
     """The reason why a file is not used."""
 
@@ -203,7 +221,7 @@ def _mismatch(name: str, kind: str, fields: Mapping[str, Tensor], like: Any) -> 
         return f"{name} is a {kind}, expected {type(like).__name__}"
     expected = _fields(like) or {}
     if set(fields) != set(expected):
-        return f"{name} has the fields {', '.join(sorted(fields))}, expected {', '.join(sorted(expected))}"
+        return f"expected a state of this version of lanebev, got one of another, whose {kind} differs"
     for field, tensor in expected.items():
         got = fields[field]
         if got.shape != tensor.shape or got.dtype != tensor.dtype:

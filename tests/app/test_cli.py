@@ -272,7 +272,7 @@ def test_one_image_is_a_still(data, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("calibrator", ["two-stage", "joint"])
-def test_resuming_gives_what_an_uninterrupted_run_gives(data, tmp_path, calibrator):
+def test_resuming_gives_what_an_uninterrupted_run_gives(data, tmp_path, calibrator, capsys):
     for part, numbers in (("whole", range(6)), ("first", range(3)), ("second", range(3, 6))):
         (tmp_path / part).mkdir()
         for i in numbers:
@@ -292,6 +292,8 @@ def test_resuming_gives_what_an_uninterrupted_run_gives(data, tmp_path, calibrat
     one, other = (
         load_state(tmp_path / f"out_{part}" / "state.safetensors").states for part in ("whole", "second")
     )
+    assert _run(data, "--calibrator", calibrator, "--lane-width", "3.5", *resume, out=out, **sources) == 0
+    assert "resume: the state was saved with lanes 3.7 m wide, now they are 3.5 m" in capsys.readouterr().out
     assert set(one) == {"calibrator", "mount"}
     for name in one:
         assert all(torch.equal(one[name][field], other[name][field]) for field in one[name])

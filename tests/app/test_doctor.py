@@ -119,6 +119,8 @@ def test_a_camera_that_was_calibrated_at_another_size():
     assert (
         "180, 320 is in the middle of images of 360 x 640 px, not of 640 x 360: are cx and cy, or" in remark
     )
+    (remark,) = camera_remarks(Camera.from_parameters(600, 600, 50, 50, 640, 360))  # percent of the sides
+    assert "principal point 50, 50 is far from the middle of the 640 x 360 px: is it in pixels" in remark
     (remark,) = camera_remarks(Camera.from_fov(10.0, 640, 360))
     assert "10 degrees of view across, where cameras on cars have 25 to 130: was it calibrated" in remark
     (remark,) = camera_remarks(Camera.from_parameters(4.2, 4.2, 319.5, 179.5, 640, 360))

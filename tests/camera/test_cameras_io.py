@@ -290,6 +290,9 @@ def test_a_mount_that_cannot_be_used_is_one_clear_line(tmp_path):
     for text, said in (
         ("fx: 3", "the key mount"),
         ("mount: {pitch_deg: a}", "pitch_deg"),
+        ("mount: {pitch_deg: 95, pitch_std_deg: 1}", "pitch_deg: expected -60 to 60, got 95"),
+        ("mount: {height_m: 140, height_std_m: 1}", "height_m: expected 0.1 to 20, got 140"),
+        ("mount: {height_m: 1.4, height_std_m: 0}", "height_std_m: expected more than 0, got 0"),
         ("a: [1", "readable"),
     ):
         path.write_text(text)

@@ -244,6 +244,11 @@ ORBextractor.nFeatures: 1200
             "expected a camera of 1920 x 1280 px, OpenLane's, got a",
         ),
         ("c.json", json.dumps({"intrinsic": {"fx": 1, "u0": 2}}), "intrinsic: expected rows, cols, dt, data"),
+        (
+            "c.json",
+            json.dumps({"K": np.array(MATRIX).T.tolist(), "D": [], "width": 800, "height": 450}),
+            r"camera matrix: expected \[fx s cx; 0 fy cy; 0 0 1\], got its transpose",
+        ),
     ],
 )
 def test_what_is_no_camera_is_one_clear_line(tmp_path, name, text, message):

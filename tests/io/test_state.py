@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -90,6 +92,14 @@ def test_another_calibrator_batch_or_precision_is_refused(tmp_path, states):
     assert "expected torch.float64" in load_state(tmp_path / "s", like=double).problem
     more = {**states, "mount": states["other"]}
     assert "expected other, mount" in load_state(tmp_path / "s", like=more).problem
+
+
+def test_a_state_of_another_version_is_one_short_line(tmp_path, states):
+    earlier = NamedTuple("JointState", [(name, torch.Tensor) for name in JointState._fields[:-1]])
+    save_state(tmp_path / "s", {"calibrator": earlier(*states["calibrator"][:-1])})
+    problem = load_state(tmp_path / "s", like={"calibrator": states["calibrator"]}).problem
+    words = "expected a state of this version of lanebev, got one of another, whose JointState differs"
+    assert problem == f"{tmp_path / 's'}: {words}"
 
 
 def test_failed_write_keeps_the_old_file(tmp_path, states):

@@ -91,11 +91,12 @@ def test_a_clock_that_was_set_back_does_not_end_a_session():
     assert result.reasons == []
 
 
-def test_milliseconds_are_noticed():
+def test_milliseconds_are_noticed(caplog):
     session = Session(CAMERA)
     said = [session(polylines=lines(), stamp=33.0 * k).reasons for k in range(8)]
     assert not any("expected seconds" in text for texts in said[:5] for text in texts)
     assert any("expected seconds, got milli- or nanoseconds?" in text for text in said[6])
+    assert len(caplog.records) == 1  # not in every frame
 
 
 @pytest.mark.parametrize(
@@ -138,8 +139,18 @@ def test_a_saved_session_goes_on_exactly(tmp_path):
     foreign = Session(Camera.from_parameters(500, 500, 319.5, 179.5, 640, 360))
     with pytest.raises(ValueError, match="expected the state of this camera"):
         foreign.load(tmp_path / "state.safetensors")
-    with pytest.raises(ValueError, match=r"none\.safetensors"):
+    with pytest.raises(ValueError, match=r"none\.safetensors: .*; leave out load to start anew"):
         other.load(tmp_path / "none.safetensors")
+
+
+def test_a_state_of_lanes_of_another_width_is_noticed(tmp_path, caplog):
+    one = Session(CAMERA, lane_width=3.7)
+    one(polylines=lines(), stamp=0.0)
+    one.save(tmp_path / "s")
+    Session(CAMERA, lane_width=3.7).load(tmp_path / "s")
+    assert caplog.records == []
+    Session(CAMERA, lane_width=3.5).load(tmp_path / "s")
+    assert "the state was saved with lanes 3.7 m wide, now they are 3.5 m" in caplog.text
 
 
 def test_pixels_are_seen_in_either_order_of_colours_and_warped():
