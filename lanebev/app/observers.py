@@ -13,6 +13,7 @@ from lanebev.app.shared_network import SharedNetwork
 from lanebev.camera.model import Camera
 from lanebev.io.image_names import in_natural_order
 from lanebev.io.lane_order import check_boundary_order
+from lanebev.io.lane_repeats import repeats_remark
 from lanebev.io.lane_size import size_remark
 from lanebev.io.lanes import FrameLines, match_frames
 from lanebev.io.video import Frame, FrameSource
@@ -89,7 +90,9 @@ class LaneFileObserver:
             self.matches: list[int | None] = list(range(len(entries)))
         else:
             self.matches = match_frames(source.paths, entries)
-            self.remark = "; ".join(filter(None, [self.remark, self._unmatched(source.taken_numbers)]))
+        in_order = [entries[match] for match in self.matches if match is not None]
+        unmatched = "" if source.is_video else self._unmatched(source.taken_numbers)
+        self.remark = "; ".join(filter(None, [self.remark, unmatched, repeats_remark(in_order)]))
 
     def _unmatched(self, taken: Sequence[int]) -> str:
         """Return how many of the images that are taken have no entry; empty if all have one."""

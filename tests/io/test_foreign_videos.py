@@ -315,6 +315,22 @@ def test_a_run_says_that_images_are_of_several_cameras(tmp_path):
     assert make_source(RunConfig(f"{tmp_path}/*_left.png", fov=60.0, fps=10)).problem == ""
 
 
+def test_lanes_that_a_slow_detector_repeats_are_noticed(tmp_path):
+    for number in range(6):
+        Image.fromarray(_picture()).save(tmp_path / f"{number}.png")
+    source, camera = open_source(str(tmp_path)), Camera.from_fov(60, *_picture().shape[1::-1])
+    line = np.array([[0.5, 0.5], [1.0, 1.0]]) * (np.array(_picture().shape[1::-1]) - 1.0)
+    remarks = {
+        every: LaneFileObserver(
+            [FrameLines(f"{i}.png", [LaneLine(line - i // every)]) for i in range(6)], source, camera
+        ).remark
+        for every in (1, 2, 3, 6)
+    }
+    assert remarks[1] == remarks[6] == ""  # all the same: nothing moves
+    assert remarks[2].startswith("lanes: 3 of 6 frames have the lines of the frame before")
+    assert remarks[3].startswith("lanes: 4 of 6 frames have the lines of the frame before")
+
+
 def test_images_without_lanes_are_counted(tmp_path):
     """As where names of lanes begin at 1 and those of images at 0."""
     for number in range(6):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import resource
 from dataclasses import replace
 
 import cv2
@@ -23,6 +24,7 @@ from lanebev.io.formats.ros_tf import static_transform
 from lanebev.io.images import write_png
 from lanebev.io.results import ExtrinsicsRow, write_extrinsics
 from lanebev.io.video import Frame
+from lanebev.io.whole_file import whole_file
 
 FRAMES = 5
 LENS = (-0.1, 0.02, 0.001, -0.002, 0.003)
@@ -311,6 +313,21 @@ def test_rerun_by_its_reader(tmp_path):
     strips = columns["/road/camera/boundaries", "LineStrips2D:strips"]
     assert np.allclose(strips[1][0], LINE + 1.5)
     assert len(columns["/road/camera/image", "EncodedImage:blob"]) == 4
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_full_disk_is_an_error_of_every_format(tmp_path, name):
+    path, before = tmp_path / FORMATS[name].file, resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, before[1]))
+    try:
+        with (
+            pytest.raises(ValueError, match=r"that can be written, got: .*File too large"),
+            whole_file(path) as whole,
+        ):
+            writer(name)(whole, RECORD, _images())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_viewer_is_shown_the_run_as_it_goes_on(tmp_path, monkeypatch, capsys):

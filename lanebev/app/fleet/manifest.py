@@ -19,7 +19,7 @@ from lanebev.app.settings_file import load_plain_yaml, parsed_settings
 from lanebev.numbers import read_text, shown
 
 UNKNOWN_DAY = "unknown"
-PATHS = ("source", "camera", "lanes", "weights", "mount", "resume")  # settings that are paths
+PATHS = ("source", "camera", "lanes", "weights", "mount", "resume", "exported")  # settings that are paths
 _OWN = ("name", "camera_id", "day", "time")
 _REFUSED = ("out", "source")
 _MOST_NAME = 150  # characters, of which names of files and folders are made

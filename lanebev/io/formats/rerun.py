@@ -19,6 +19,7 @@ from lanebev.io.video import Frame
 
 APPLICATION, VIEWER = "lanebev", "viewer"
 _QUALITY = 80  # of JPEG
+_FRAMES_HELD = 100  # in memory, at most
 _NUMBERS = ExtrinsicsRow._fields[2:10]
 
 
@@ -68,16 +69,20 @@ class RerunLog:
 
 
 def write(path: Path, record: RunRecord, images: Iterable[Frame] | None = None) -> None:
-    """Write the run as a recording (``.rrd``), with its images if there are any."""
+    """Write the run as a recording (``.rrd``), with its images if there are any.
+
+    Rerun's own file writer waits forever where the disk is full, so the bytes are written here.
+    """
     import rerun
 
-    with rerun.RecordingStream(APPLICATION) as stream:
-        stream.save(path)
+    with rerun.RecordingStream(APPLICATION) as stream, open(path, "wb") as file:
+        encoded = stream.binary_stream()
         log = RerunLog(stream, record.camera)
-        for frame, image in with_images(record, images):
+        for number, (frame, image) in enumerate(with_images(record, images), start=1):
             log.add(frame, image)
-        stream.flush()
-        stream.disconnect()
+            if number % _FRAMES_HELD == 0:
+                file.write(encoded.read() or b"")
+        file.write(encoded.read() or b"")
 
 
 def open_viewer(where: str, camera: Camera) -> RerunLog:

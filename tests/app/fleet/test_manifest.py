@@ -80,7 +80,7 @@ def test_yaml_with_defaults_says_the_same(write):
     assert read_manifest(write(listed)) == [first, second]
 
 
-@pytest.mark.parametrize("key", ["video", "camera", "lanes", "weights", "mount", "resume"])
+@pytest.mark.parametrize("key", ["video", "camera", "lanes", "weights", "mount", "resume", "exported"])
 @pytest.mark.parametrize("text", ["../x", "/etc/passwd", "a/../../x", "link/x"])
 def test_a_path_that_leaves_the_folder_is_refused(write, tmp_path, key, text):
     row = {"video": "a.mp4", "camera": "c.yaml", key: text}
