@@ -129,7 +129,7 @@ def _pair(distortion: Tensor, first: int, second: int) -> Tensor:
 
 
 def radial_scale(r2: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute what radial distortion multiplies a point at squared radius (B, N) with; its slope by it."""
+    """Compute the factor of radial distortion at squared radii (B, N), and its derivative by these."""
     count = distortion.shape[-1]
     k = distortion.unsqueeze(-2).unbind(-1)  # each (B, 1)
     scale, slope = 1 + r2 * (k[0] + r2 * k[1]), k[0] + 2 * r2 * k[1]
@@ -153,7 +153,7 @@ def kannala_brandt(plane: Tensor, distortion: Tensor) -> Tensor:
 
 
 def fisheye_distance(angle: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute the distance from the centre of what is seen at an angle (B, N) rad; its slope by the angle."""
+    """Compute the image radius of rays at angles (B, N) rad off the axis, and its derivative by the angle."""
     k1, k2, k3, k4 = distortion[..., None, :].unbind(-1)  # each (B, 1)
     t2 = angle * angle
     distance = angle * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))

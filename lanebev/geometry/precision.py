@@ -1,4 +1,4 @@
-"""Half precision is for features: a pixel's place among 1920 takes more than the 8 bits of bfloat16."""
+"""Keep geometry in single or double precision: bfloat16's 8 bits cannot represent a pixel among 1920."""
 
 from __future__ import annotations
 

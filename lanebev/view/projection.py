@@ -1,7 +1,8 @@
 """Project homogeneous coordinates of cells to the image, and find the cells that it does not show.
 
-Coordinates are planes (B, 2, R, V), never pairs. Sums that are zero inside the image tell what lies outside:
-comparisons and ``where`` take several times as long as arithmetic on a CPU.
+Coordinates are stored as planes (B, 2, R, V), x before y, not as pairs. Cells outside the image are marked by
+sums that are zero inside it, since comparisons and ``where`` take several times as long as arithmetic on a
+CPU.
 """
 
 from __future__ import annotations

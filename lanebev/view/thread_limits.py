@@ -1,4 +1,4 @@
-"""Sizes up to which one thread computes: threads that start for each short operation wait for each other."""
+"""Sizes of operations that one thread computes: divided, short operations take longer than undivided ones."""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
 """Interpolate where cells are seen: exact at a few cells of each tile, polynomials for the others.
 
 Perspective and lens are smooth functions of a cell's row and column: the polynomial through 12 × 12 cells of
-a tile is as exact as float32 itself. Whether it is, its Chebyshev coefficients tell; tiles in which they do
-not fall off are computed cell by cell. A lens that folds over is smooth too: it is continued beyond the fold,
-and which cells lie beyond tells a quadratic function of row and column.
+a tile is as exact as float32 itself. Its Chebyshev coefficients show whether it is: tiles in which they do
+not fall off are computed cell by cell. A lens model whose radial function has a maximum (a fold) is smooth
+too: it is continued beyond the fold, and the sign of a quadratic function of row and column marks the cells
+beyond it.
 
 Source: Trefethen, Approximation Theory and Approximation Practice, ch. 3 (coefficients from values), 8
 (they fall off geometrically and bound the error where a function is analytic).

@@ -2,18 +2,18 @@
 
 The equations (J1) to (J33) that this package cites are in docs/method/joint.md.
 
-Boundary k lies on the road at X_k(Z) = b(Z) + x_k (1 + b'(Z)² / 2), with x_k = offset + (its place in
-the ego lane's frame): parallel curves, to second order in their heading b'. The bend b is linear in the
+Boundary k lies on the road at X_k(Z) = b(Z) + x_k (1 + b'(Z)² / 2), with x_k = offset + (its position from
+the ego lane's middle): parallel curves, to second order in their heading b'. The bend b is linear in the
 shape parameters: c0 Z²/2 + c1 Z³/6 (third-order clothoid), or the double integral of a curvature that is
 linear between knots. The road is h + κ Z²/2 below the camera, κ its vertical curvature, positive over a
-crest; on a plane road a ray d = road_from_cam K⁻¹ p meets it at (X, Z) = h (d_x, d_z) / d_y. The boundary is
-seen where d is parallel to (X_k, h + κ Z²/2, Z), and
+crest; on a plane road the direction d = road_from_cam K⁻¹ (x, y, 1) of an end point meets it at (X, Z) = h
+(d_x, d_z) / d_y. The boundary is seen where d is parallel to (X_k, h + κ Z²/2, Z), and
 
     n = (h - κ Z²/2, Z X' - X, κ Z X - (h + κ Z²/2) X')
 
 is the normal of the plane through the camera and the boundary's tangent there. The perpendicular distance in
-pixels is that of the end point to this tangent, n·d / |∂(n·d)/∂p|: exact for straight boundaries, of second
-order in the distance for curved ones.
+pixels is that of the end point to this tangent, n·d / |∂(n·d)/∂(x, y)|: exact for straight boundaries, of
+second order in the distance for curved ones.
 """
 
 from __future__ import annotations
