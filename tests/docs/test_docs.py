@@ -1,5 +1,6 @@
 """README and docs say what is so: their Python runs, their commands parse, their links lead somewhere."""
 
+import importlib
 import re
 import shlex
 from pathlib import Path
@@ -79,6 +80,42 @@ def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
         path = target.split("#")[0]
         assert target.startswith("https://") or (page.parent / path).exists(), target
+
+
+def _resolves(name):
+    """Tell whether a dotted name is a module, or something in one."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:count]))
+        except ImportError:
+            continue
+        return all((found := getattr(found, part, None)) is not None for part in parts[count:])
+    return False
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_names_and_paths_exist(page):
+    text = page.read_text(encoding="utf-8")
+    for name in set(re.findall(r"`((?:lanebev|train|tools)(?:\.[A-Za-z_]\w*)+)[`(]", text)):
+        assert name.endswith(".py") or _resolves(name), name
+    for path in set(re.findall(r"`((?:lanebev|train|tools|tests|configs|docs|examples)/[\w/.-]+)`", text)):
+        assert (ROOT / path).exists(), path
+
+
+def test_functions_of_the_paper_exist():
+    """In the table of equations: dotted names, of the package they are named after, or of the one before."""
+    table = (ROOT / "docs" / "method" / "paper.md").read_text(encoding="utf-8").split("## Deviations")[0]
+    homes = (
+        "lanebev",
+        "lanebev.estimation",
+        "lanebev.estimation.two_stage",
+        "lanebev.estimation.two_stage.state",
+    )
+    names = re.findall(r"`([a-z_]+(?:\.\w+)+)`", table)
+    assert len(names) > 20
+    for name in names:
+        assert any(_resolves(f"{home}.{name}") for home in homes), name
 
 
 def test_the_readme_is_short():
