@@ -39,15 +39,15 @@ class JointConfig:
             are equal, m; 0: lanes are equal.
         motion: motion model.
         prior: prior of a start and range of its search.
-        open_pose: sigma of a jump of the pose if a frame contradicts the motion by ten sigmas, rad (and ten
-            times that in m for the height); proportional to the number of sigmas.
-        open_curvature, open_step: the same for the knots when a bend begins or ends, 1/m.
-        straight: sigmas of c0 and c1 of a straight road, 1/m and 1/m².
+        open_pose: standard deviation of the process noise that the evidence (J16) adds to the pose where it
+            is ten sigmas, rad (and ten times that in m for the height); proportional to the evidence.
+        open_curvature, open_step: the same for the curvature at the first knot and for its steps, 1/m.
+        straight: standard deviations of c0 and c1 of a straight road, 1/m and 1/m².
         bends: prior probability that a start is on a bend, with the curvatures of ``prior``.
-        open_vertical_curvature: the same for the vertical curvature when a crest or a dip begins or ends,
-            1/m.
-        open_deviation: sigma of a boundary's deviation on a road of unequal lanes, m; 0: lanes are equal.
-        evidence_time: time constant of the evidence, s.
+        open_vertical_curvature: as ``open_pose``, for the vertical curvature, 1/m.
+        open_deviation: standard deviation of a boundary's deviation on a road of unequal lanes, m, and the
+            most that the evidence adds to it; 0: lanes are equal.
+        evidence_time: time constant of the evidence (J15), s.
         motion_scale_rise: time, s, in which the variance of the pose's motion grows by a factor e if it is
             half of the right one.
         motion_scale_memory: time constant, s, of the decay to the variance of ``motion``.
