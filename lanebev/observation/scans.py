@@ -22,7 +22,7 @@ _FLOOR = 0.01  # probability of background noise, which counts as 0
 _LEAST_MASS = 1e-3  # px, what is divided by of an empty window
 _PEAK = 2  # half-width of the box whose largest sum is a scan's peak, label px
 _TINY = 1e-30  # times the number of cells it is less than any difference of two sums
-_FADE = 0.2  # of a stripe's mass, over which a scan's weight goes to zero below ``twice``
+_FADE = 0.2  # of a stripe's mass, over which a scan's weight goes to zero below ``max_mass``
 
 
 class Scans(NamedTuple):
@@ -71,13 +71,13 @@ def scan_vertices(probabilities: Tensor, config: LineConfig) -> Vertices:
     scans = make_scans(rows, columns, padding, probabilities.device)
     position, mass, spread = scan_moments(counted_probability(probabilities, padding), config.window, scans)
     whole = 2 * config.half_width  # px, mass of a stripe across the scan
-    absent, present, twice = (part * whole for part in (config.absent, config.present, config.twice))
-    step = _ramp(mass, absent, present)
+    least, full, most = (part * whole for part in (config.min_mass, config.full_mass, config.max_mass))
+    step = _ramp(mass, least, full)
     slope, scatter = local_line(position, step)
     cos2 = 1 / (1 + slope.square())  # of the angle between the line and the normal of the scan
     cos = cos2.sqrt()
     across = mass * cos
-    weight = _eroded(_ramp(across, absent, present) * _ramp(across, twice, twice - _FADE * whole))
+    weight = _eroded(_ramp(across, least, full) * _ramp(across, most, most - _FADE * whole))
     steep = _ramp(cos2, 0.4, 0.6)  # 1 below 39 degrees, 0 above 51
     reach = config.half_width / cos + 1.0  # of the stripe's band in its scan
     inside = (position >= reach) & (position + reach <= scans.last) & (steep > 0)

@@ -28,10 +28,10 @@ class LineConfig:
         half_width: half width of the stripes that the network learned, across the line, label px.
         segments: per boundary, S.
         window: half-width of the window about a scan's peak, label px.
-        absent, present: fractions of a stripe's mass up to which a scan has no boundary, and from which it
-            surely has one.
-        twice: fraction from which the scan crosses the boundary more than once, as where it turns back at the
-            horizon, and is not used; its weight decreases over 0.2 below that.
+        min_mass, full_mass: sums of a scan's probabilities, as fractions of a stripe's, up to which the scan
+            has weight 0 (no boundary), and from which it has weight 1.
+        max_mass: fraction from which the scan crosses the boundary more than once, as where it turns back at
+            the horizon, and is not used; its weight decreases over 0.2 below that.
         min_vertices: a boundary with fewer counts as not seen.
         sigma_floor: least standard deviation of a vertex, label px, by errors that correlate along the line.
         sigma_scale: factor on all standard deviations; 1 for exact maps.
@@ -45,9 +45,9 @@ class LineConfig:
     half_width: float = 1.125
     segments: int = 16
     window: int = 6
-    absent: float = 0.2
-    present: float = 0.6
-    twice: float = 1.4
+    min_mass: float = 0.2
+    full_mass: float = 0.6
+    max_mass: float = 1.4
     min_vertices: int = 8
     sigma_floor: float = 0.004
     sigma_scale: float = 1.0
@@ -65,10 +65,14 @@ class LineConfig:
             raise ValueError(f"correlation: expected 0 px or more, got {self.correlation}")
         if not 0 <= self.least_weight <= 1:
             raise ValueError(f"least_weight: expected 0 to 1, got {self.least_weight}")
-        if not 0 <= self.absent < self.present:
-            raise ValueError(f"present: expected more than absent ({self.absent}), got {self.present}")
-        if not self.present < self.twice:
-            raise ValueError(f"twice: expected more than present ({self.present}), got {self.twice}")
+        if not 0 <= self.min_mass < self.full_mass:
+            raise ValueError(
+                f"full_mass: expected more than min_mass ({self.min_mass}), got {self.full_mass}"
+            )
+        if not self.full_mass < self.max_mass:
+            raise ValueError(
+                f"max_mass: expected more than full_mass ({self.full_mass}), got {self.max_mass}"
+            )
 
 
 class Vertices(NamedTuple):

@@ -168,11 +168,11 @@ def test_readings_close_up_beyond_a_wrong_line():
     assert arrow.tolist() == [0, 0, 0, 0, -1, -1]
     left = ways.shift[closes & ways.wrong[:, 1]][0]
     assert left.tolist() == [1, 0, 0, 0, 0, 0]
-    assert not ways.wrong[: len(ReadingConfig().unequal)].any()
+    assert not ways.wrong[: len(ReadingConfig().deviation_std)].any()
 
 
 def test_priors_of_what_is_not_there():
-    cfg = ReadingConfig(no_boundary=0.2, another=0.5, share=(0.25,) * 4)
+    cfg = ReadingConfig(no_boundary_probability=0.2, another_probability=0.5, kind_probability=(0.25,) * 4)
     ways = readings(6, cfg, torch.zeros((), dtype=DOUBLE))
     there = torch.tensor([[False, False, True, True, True, True]])
     prior = log_prior(ways, there, cfg)[0]
@@ -185,9 +185,9 @@ def test_priors_of_what_is_not_there():
 @pytest.mark.parametrize(
     ("numbers", "message"),
     [
-        ({"unequal": (0.1,)}, "unequal, askew, profile, share: expected as many of each, got 1, 4, 4, 4"),
-        ({"anywhere": (0.0, 0.1)}, "expected positive numbers"),
-        ({"least": 0.0}, "least: expected more than 0 and at most 1, got 0"),
+        ({"deviation_std": (0.1,)}, "kind_probability: expected as many of each, got 1, 4, 4, 4"),
+        ({"no_boundary_std": (0.0, 0.1)}, "expected positive numbers"),
+        ({"least_weight": 0.0}, "least_weight: expected more than 0 and at most 1, got 0"),
     ],
 )
 def test_a_bad_config(numbers, message):

@@ -301,7 +301,7 @@ def test_export_equals_eager(fans):
         (lambda: LineExtractor()(torch.zeros(2, 7, 8), (16, 16)), "logits: expected"),
         (lambda: extract_segments(torch.zeros(7, 8), (16, 16), CONFIG), "probabilities: expected"),
         (lambda: LineConfig(segments=0), "segments: expected"),
-        (lambda: LineConfig(absent=0.7), "present: expected"),
+        (lambda: LineConfig(min_mass=0.7), "full_mass: expected"),
         (lambda: LineConfig(half_width=0.0), "half_width: expected more than 0"),
     ],
 )

@@ -130,7 +130,7 @@ def average_readings(
     at_level = replace(prior, roll_steps=1)
     starts = torch.cat([start.unsqueeze(1), linear_starts(seen, places, at_level)], dim=1)  # (B, S, 7)
     ways = readings(num, cfg, like)
-    kinds, count, tries = len(cfg.unequal), len(ways.kind), starts.shape[1]
+    kinds, count, tries = len(cfg.deviation_std), len(ways.kind), starts.shape[1]
     alike = Readings(*(part[:kinds] for part in ways))
 
     model = reading_model(seen, positions, alike, tries, prior)
@@ -149,9 +149,11 @@ def average_readings(
 
     pose, cov = params[:, _POSE].unflatten(0, (batch, count)), covariance[:, _POSE, _POSE]
     cov = cov.unflatten(0, (batch, count))
-    likely, doubted = (window(power * evidence + before, cfg.least) for power in (1.0, cfg.information))
-    mean, _ = mixture_moments(*_with_half(pose, cov, likely, prior, half, cfg.least))
-    centre, spread = mixture_moments(*_with_half(pose, cov, doubted, prior, half, cfg.least))
+    likely, doubted = (
+        window(power * evidence + before, cfg.least_weight) for power in (1.0, cfg.evidence_exponent)
+    )
+    mean, _ = mixture_moments(*_with_half(pose, cov, likely, prior, half, cfg.least_weight))
+    centre, spread = mixture_moments(*_with_half(pose, cov, doubted, prior, half, cfg.least_weight))
     level = prior.mean(like)[_ANGLES]
     farther = (start[:, _ANGLES] - level).abs() - (mean[:, _ANGLES] - level).abs()
     farther = (farther / prior.std(like)[_ANGLES]).amax(-1)

@@ -73,7 +73,7 @@ def reading_model(
     num, ego = positions.shape[-1], positions.shape[-1] // 2 - 1
     width = positions[:, ego + 1] - positions[:, ego]
     places = positions.unsqueeze(1) + ways.shift * width[:, None, None]  # (B, C, L)
-    own = [ways.place_std, ways.heading_std, ways.profile_std.unsqueeze(-1)]
+    own = [ways.deviation_std, ways.heading_std, ways.vertical_curvature_std.unsqueeze(-1)]
     std = torch.cat(own, dim=-1).expand(len(positions), -1, -1)
     many = Observations(*(part.repeat_interleave(places.shape[1] * repeats, dim=0) for part in seen))
     return Model(

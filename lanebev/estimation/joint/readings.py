@@ -21,40 +21,42 @@ class ReadingConfig:
     """Prior probabilities and standard deviations of the readings of a single image.
 
     Attributes:
-        unequal: standard deviation of a boundary's place, m, one for each kind of road, from a motorway to a
-            street whose lanes differ by half a metre.
-        askew: standard deviation of a boundary's heading against the road's, rad, for each kind of road.
-        profile: standard deviation of the road's vertical curvature, 1/m, for each kind of road.
-        share: prior probability of each kind of road.
-        no_boundary: probability that a line bounds no lane: a kerb, an arrow, a cycle path.
-        another: probability that the next line does not either.
-        anywhere: standard deviations of the place (m) and heading (rad) of such a line.
-        information: exponent of the evidence, below 1 since no reading is exactly right and a detector's
-            errors are correlated along a boundary.
-        least: weight, as a fraction of the best reading's, below which a reading is left out.
+        deviation_std: standard deviation of a boundary's deviation, m, one for each kind of road, from a
+            motorway to a street whose lanes differ by half a metre.
+        heading_std: standard deviation of a boundary's heading against the road's, rad, for each kind of
+            road.
+        vertical_curvature_std: standard deviation of the road's vertical curvature, 1/m, for each kind of
+            road.
+        kind_probability: prior probability of each kind of road.
+        no_boundary_probability: probability that a line bounds no lane: a kerb, an arrow, a cycle path.
+        another_probability: probability that the next line does not either.
+        no_boundary_std: standard deviations of the deviation (m) and heading (rad) of such a line.
+        evidence_exponent: exponent of the evidence, below 1 since no reading is exactly right and a
+            detector's errors are correlated along a boundary.
+        least_weight: weight, as a fraction of the best reading's, below which a reading is left out.
     """
 
-    unequal: tuple[float, ...] = (0.0005, 0.4, 0.1, 0.4)
-    askew: tuple[float, ...] = (0.00005, 0.001, 0.003, 0.012)
-    profile: tuple[float, ...] = (1e-8, 1e-4, 1e-4, 5e-4)
-    share: tuple[float, ...] = (0.2, 0.2, 0.2, 0.4)
-    no_boundary: float = 0.1
-    another: float = 0.5
-    anywhere: tuple[float, float] = (2.0, 0.1)
-    information: float = 0.5
-    least: float = 0.05
+    deviation_std: tuple[float, ...] = (0.0005, 0.4, 0.1, 0.4)
+    heading_std: tuple[float, ...] = (0.00005, 0.001, 0.003, 0.012)
+    vertical_curvature_std: tuple[float, ...] = (1e-8, 1e-4, 1e-4, 5e-4)
+    kind_probability: tuple[float, ...] = (0.2, 0.2, 0.2, 0.4)
+    no_boundary_probability: float = 0.1
+    another_probability: float = 0.5
+    no_boundary_std: tuple[float, float] = (2.0, 0.1)
+    evidence_exponent: float = 0.5
+    least_weight: float = 0.05
 
     def __post_init__(self) -> None:
-        counts = [len(part) for part in (self.unequal, self.askew, self.profile, self.share)]
+        kinds = (self.deviation_std, self.heading_std, self.vertical_curvature_std, self.kind_probability)
+        names = "deviation_std, heading_std, vertical_curvature_std, kind_probability"
+        counts = [len(part) for part in kinds]
         if len(set(counts)) > 1 or not counts[0]:
             got = ", ".join(map(str, counts))
-            raise ValueError(f"unequal, askew, profile, share: expected as many of each, got {got}")
-        sigmas = (*self.unequal, *self.askew, *self.profile, *self.share, *self.anywhere)
-        if not all(np.isfinite(sigma) and sigma > 0 for sigma in sigmas):
-            raise ValueError(
-                f"unequal, askew, profile, share, anywhere: expected positive numbers, got {sigmas}"
-            )
-        for name in ("no_boundary", "another", "information", "least"):
+            raise ValueError(f"{names}: expected as many of each, got {got}")
+        numbers = (*[number for part in kinds for number in part], *self.no_boundary_std)
+        if not all(np.isfinite(number) and number > 0 for number in numbers):
+            raise ValueError(f"{names}, no_boundary_std: expected positive numbers, got {numbers}")
+        for name in ("no_boundary_probability", "another_probability", "evidence_exponent", "least_weight"):
             value = getattr(self, name)
             if not 0.0 < value <= 1.0:
                 raise ValueError(f"{name}: expected more than 0 and at most 1, got {value}")
@@ -66,17 +68,17 @@ class Readings(NamedTuple):
     Attributes:
         wrong: (C, L) bool, of a line that bounds no lane.
         shift: (C, L) lanes by which a boundary's index is wrong therefore.
-        place_std: (C, L) m, of a boundary's deviation from its place.
+        deviation_std: (C, L) m, of a boundary's deviation.
         heading_std: (C, L) rad, of its heading against the road's.
-        profile_std: (C,) 1/m, of the road's vertical curvature.
+        vertical_curvature_std: (C,) 1/m, of the road's vertical curvature.
         kind: (C,) int64, index of the kind of road; the first readings are one of each, without wrong lines.
     """
 
     wrong: Tensor
     shift: Tensor
-    place_std: Tensor
+    deviation_std: Tensor
     heading_std: Tensor
-    profile_std: Tensor
+    vertical_curvature_std: Tensor
     kind: Tensor
 
 
@@ -89,18 +91,19 @@ def readings(num_boundaries: int, cfg: ReadingConfig, like: Tensor) -> Readings:
         like: gives dtype and device.
     """
     wrong, shift = _single_wrong_lines(num_boundaries)
-    kinds, faults = len(cfg.unequal), len(wrong)
+    kinds, faults = len(cfg.deviation_std), len(wrong)
     kind = [*range(kinds), *np.repeat([0, kinds - 1], faults)]
     none = [num_boundaries * [False]]
     is_wrong = torch.as_tensor(np.concatenate([none * kinds, wrong, wrong]), device=like.device)
     moved = np.concatenate([0 * np.array(none * kinds), shift, shift])
-    place, heading, profile = (like.new_tensor(part)[kind] for part in (cfg.unequal, cfg.askew, cfg.profile))
+    stds = (cfg.deviation_std, cfg.heading_std, cfg.vertical_curvature_std)
+    deviation, heading, vertical_curvature = (like.new_tensor(std)[kind] for std in stds)
     return Readings(
         wrong=is_wrong,
         shift=torch.as_tensor(moved).to(like),
-        place_std=torch.where(is_wrong, cfg.anywhere[0], place.unsqueeze(-1)),
-        heading_std=torch.where(is_wrong, cfg.anywhere[1], heading.unsqueeze(-1)),
-        profile_std=profile,
+        deviation_std=torch.where(is_wrong, cfg.no_boundary_std[0], deviation.unsqueeze(-1)),
+        heading_std=torch.where(is_wrong, cfg.no_boundary_std[1], heading.unsqueeze(-1)),
+        vertical_curvature_std=vertical_curvature,
         kind=torch.as_tensor(kind, device=like.device),
     )
 
@@ -129,9 +132,9 @@ def log_prior(ways: Readings, there: Tensor, cfg: ReadingConfig) -> Tensor:
     """
     any_wrong = ways.wrong.any(-1)
     seen = (ways.wrong & there.unsqueeze(1)).any(-1)  # (B, C)
-    of_wrong = torch.where(seen, np.log(cfg.no_boundary), -torch.inf)
-    of_lines = torch.where(any_wrong, of_wrong, np.log(1 - cfg.no_boundary)).to(ways.shift)
-    of_kinds: Tensor = ways.shift.new_tensor(cfg.share).log()
+    of_wrong = torch.where(seen, np.log(cfg.no_boundary_probability), -torch.inf)
+    of_lines = torch.where(any_wrong, of_wrong, np.log(1 - cfg.no_boundary_probability)).to(ways.shift)
+    of_kinds: Tensor = ways.shift.new_tensor(cfg.kind_probability).log()
     return of_lines + of_kinds[ways.kind]
 
 
@@ -145,5 +148,7 @@ def log_prior_of_half(there: Tensor, cfg: ReadingConfig) -> Tensor:
         cfg: the numbers.
     """
     more = (there.sum(-1) // 2 - 1).clamp(min=0)
-    odds: Tensor = np.log(cfg.no_boundary) + more.to(torch.float64) * np.log(cfg.another)
+    odds: Tensor = np.log(cfg.no_boundary_probability) + more.to(torch.float64) * np.log(
+        cfg.another_probability
+    )
     return odds
