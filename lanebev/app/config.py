@@ -255,10 +255,11 @@ class RunConfig:
             raise ValueError(f"backend: expected {' or '.join(BACKENDS)}, got {self.backend!r}")
         torch_only = ("mount", "hilly", "weights", "far_view")
         given = next((name for name in torch_only if getattr(self, name)), None)
+        given = given or ("device" if self.device != "cpu" else None)
         if self.backend != "torch" and given:
             raise ValueError(
                 f"{given.replace('_', ' ')}: expected --backend torch with it, got {self.backend}; an "
-                "exported calibrator and network have their own"
+                "exported calibrator and network have their own, and run on the CPU"
             )
 
     def _check_lens(self) -> None:

@@ -107,7 +107,9 @@ def _extractor_part(model: LaneBEV, camera: Camera) -> Part:
         logits = model.segmenter(torch.rand(ROWS, 3, *model.network_size(camera.image_size)))
     inputs = {"logits": logits.float(), **lens_inputs(camera)}
     names = ("vertex_points", "vertex_weight", "vertex_sigma", "vertex_boundary", *LaneSegments._fields)
-    return Part(_Extractor(model, camera), inputs, names)
+    return Part(
+        _Extractor(model, camera), inputs, names, {"boundary_segments": model.extractor.config.segments}
+    )
 
 
 class _Warp(nn.Module):

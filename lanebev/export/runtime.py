@@ -17,6 +17,7 @@ from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.export.write import METADATA, MISSING
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.segments import LaneSegments
+from lanebev.observation.vertices import LineConfig
 from lanebev.pipeline import LaneBEV
 from lanebev.types import Calibration, Extrinsics
 
@@ -85,6 +86,7 @@ class OnnxExtractor(nn.Module):
     def __init__(self, part: OnnxPart, camera: Camera) -> None:
         super().__init__()
         self.part, self.camera = part, camera
+        self.config = SimpleNamespace(segments=part.facts.get("boundary_segments", LineConfig().segments))
 
     def vertices(
         self, logits: Tensor, image_size: tuple[int, int], network_size: tuple[int, int]
@@ -145,6 +147,21 @@ class OnnxCalibrator(Calibrator[StateT]):
         )
         return calibration, type(state)(*(found[f"next_{name}"] for name in states))
 
+    def weigh_still(
+        self,
+        calibration: Calibration,
+        state: StateT,
+        segments: LaneSegments,
+        intrinsics: Tensor,
+        lane_width: float | Tensor,
+    ) -> Calibration:
+        """See :meth:`~lanebev.estimation.calibrator.Calibrator.weigh_still`."""
+        return self.calibrator.weigh_still(calibration, state, segments, intrinsics, lane_width)
+
+    def scale_still(self, calibration: Calibration, factor: float) -> Calibration:
+        """See :meth:`~lanebev.estimation.calibrator.Calibrator.scale_still`."""
+        return self.calibrator.scale_still(calibration, factor)
+
     def curvature(self, state: StateT) -> Tensor | None:
         """See :meth:`~lanebev.estimation.calibrator.Calibrator.curvature`."""
         return self.calibrator.curvature(state)
@@ -160,7 +177,7 @@ def onnx_model(folder: Path, camera: Camera) -> LaneBEV:
     Raises:
         ValueError: files that are missing, or for images or a lens of another kind than the camera's.
     """
-    segmenter, extractor = OnnxPart(folder / "segmenter.onnx"), OnnxPart(folder / "extractor.onnx")
+    segmenter, extractor = (_part(folder, name) for name in ("segmenter", "extractor"))
     expected = (list(camera.image_size), camera.model if camera.distortion.numel() else None)
     found = (extractor.facts["image_size"], extractor.facts["lens"])
     if found != expected:
@@ -182,12 +199,24 @@ def onnx_calibrator(folder: Path, name: str, calibrator: Calibrator[StateT]) -> 
     Raises:
         ValueError: a file that is missing, or of another calibrator.
     """
-    path = folder / f"{name}.onnx"
-    part = OnnxPart(path)
-    state = calibrator.initial_state(1)._asdict()
-    if part.facts["part"] != name or not {f"state_{each}" for each in state} <= set(part.inputs):
-        raise ValueError(f"{path}: expected the calibrator {name}, got {part.facts['part']}")
+    part, state = _part(folder, name), calibrator.initial_state(1)._asdict()
+    if not {f"state_{each}" for each in state} <= set(part.inputs):
+        raise ValueError(
+            f"{folder / name}.onnx: expected one of this version of lanebev, got another's; export it again"
+        )
     return OnnxCalibrator(part, calibrator)
+
+
+def _part(folder: Path, name: str) -> OnnxPart:
+    """Return the part of this name in a folder.
+
+    Raises:
+        ValueError: its file is missing, or of another part.
+    """
+    part = OnnxPart(folder / f"{name}.onnx")
+    if part.facts["part"] != name:
+        raise ValueError(f"{folder / name}.onnx: expected the {name}, got the {part.facts['part']}")
+    return part
 
 
 def _words(size: list[int], lens: str | None) -> str:

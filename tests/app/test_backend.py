@@ -53,11 +53,13 @@ def settings(folder, **changes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("calibrator", ["joint", "two-stage"])
-def test_the_rows_are_the_same(folder, calibrator, monkeypatch):
+@pytest.mark.parametrize(
+    "options", [{}, {"calibrator": "two-stage"}, {"stills": True}, {"smooth": True}], ids=str
+)
+def test_the_rows_are_the_same(folder, options, monkeypatch):
     monkeypatch.setattr(runtime, "OnnxPart", EagerPart)
     for backend in ("torch", "onnxruntime"):
-        run(settings(folder, calibrator=calibrator, backend=backend, out=str(folder / backend)))
+        run(settings(folder, backend=backend, out=str(folder / backend), **options))
     rows = (folder / "torch" / "extrinsics.csv").read_text()
     assert rows.count("TRACKING") == 2
     assert (folder / "onnxruntime" / "extrinsics.csv").read_text() == rows
@@ -93,8 +95,10 @@ def test_files_of_another_camera_or_calibrator_are_refused(folder, monkeypatch):
     ):
         runtime.onnx_model(folder, other)
     monkeypatch.setattr(runtime, "OnnxPart", lambda path: EagerPart(path.with_stem("joint")))
-    with pytest.raises(ValueError, match="expected the calibrator two-stage, got joint"):
+    with pytest.raises(ValueError, match=r"two-stage\.onnx: expected the two-stage, got the joint"):
         runtime.onnx_calibrator(folder, "two-stage", LaneBEV.from_pretrained().calibrator)
+    with pytest.raises(ValueError, match=r"segmenter\.onnx: expected the segmenter, got the joint"):
+        runtime.onnx_model(folder, other)
 
 
 def test_a_run_without_the_files_is_one_line(folder, capsys):
@@ -123,8 +127,9 @@ def test_settings_are_checked():
             ExportConfig(camera="c", int8=True, **other)
     with pytest.raises(ValueError, match="backend: expected torch or onnxruntime, got 'tvm'"):
         RunConfig(source="s", camera="c", backend="tvm")
-    with pytest.raises(ValueError, match="weights: expected --backend torch with it, got onnxruntime"):
-        RunConfig(source="s", camera="c", backend="onnxruntime", weights="w")
+    for name in ("weights", "device"):
+        with pytest.raises(ValueError, match=f"{name}: expected --backend torch with it, got onnxruntime"):
+            RunConfig(source="s", camera="c", backend="onnxruntime", **{name: "cuda"})
 
 
 @pytest.mark.slow
