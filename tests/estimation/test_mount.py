@@ -85,8 +85,10 @@ def test_gates_keep_frames_out(inputs, reason):
 def test_bad_time_and_numbers_change_nothing():
     mount = MountEstimator()
     _, state = run(mount, start(mount), 2.0)
-    bad_pose = fast((math.nan, 0.0, 0.0, 1.5))
-    for calibration, dt in ((fast(POSE), math.nan), (fast(POSE), 0.0), (fast(POSE), -1.0), (bad_pose, 0.1)):
+    bad_pose, bad_covariance = fast((math.nan, 0.0, 0.0, 1.5)), fast(POSE)
+    bad_covariance = bad_covariance._replace(covariance=-bad_covariance.covariance)
+    times = ((fast(POSE), math.nan), (fast(POSE), 0.0), (fast(POSE), -1.0))
+    for calibration, dt in (*times, (bad_pose, 0.1), (bad_covariance, 0.1)):
         out, after = mount(calibration, state, dt)
         assert out.reasons.item() & (MountReason.TIME | MountReason.UNSURE)
         for name in ("blocks", "pose_sum", "seconds"):

@@ -103,7 +103,7 @@ class MountEstimator(nn.Module):
         variance = calibration.covariance.diagonal(dim1=-2, dim2=-1).to(pose.dtype)
         step = as_batch(dt, pose)
         frame_why = self._frame_gates(calibration.status, pose, step, speed, yaw_rate, curvature)
-        known = pose.isfinite().all(-1, keepdim=True) & variance.isfinite()
+        known = pose.isfinite().all(-1, keepdim=True) & variance.isfinite() & (variance >= 0)
         sure = known & (variance < constant(cfg.largest_std, variance).square())
         why = frame_why.unsqueeze(-1) | flag(~sure, MountReason.UNSURE)  # (B, 4)
 
