@@ -13,6 +13,7 @@ _SUFFIXES = r"(?:\.[A-Za-z]\w*)*$"  # .jpg, .lines.txt
 _DECIMAL = re.compile(rf"(?<![\d.])(\d+)\.(\d+)(?={_SUFFIXES})", re.ASCII)
 _SECONDS = re.compile(rf"(?<!\d)(\d{{10}})(?:\.|[_-](?=\d{{9}}\b|\d{{6}}\b))(\d{{1,9}}){_SUFFIXES}", re.ASCII)
 _STAMP = re.compile(rf"(?<!\d)(\d{{13,19}}){_SUFFIXES}", re.ASCII)
+_DIGITS = re.compile(r"[0-9a-f]+", re.IGNORECASE)  # of numbers to the base 10 or 16
 _EPOCH = (1_000_000_000, 4_102_444_800)  # s: September 2001 to 2100
 _STEPS = (Fraction(1, 2000), Fraction(60))  # s between two frames of a drive
 _NANOSECONDS = (8, 9)  # digits: a float of seconds since 1970 has 7 at most, of seconds since a start 17
@@ -47,9 +48,13 @@ def in_natural_order(paths: Iterable[str]) -> list[str]:
 
     Names of decimal seconds as ``str`` writes them, without zeros at the end, are in the order of time; the
     names of all files tell whether they are: a fraction that ends with a zero, or has more digits than a
-    float, is a whole number (1.9 before 1.10; seconds and nanoseconds).
+    float, is a whole number (1.9 before 1.10; seconds and nanoseconds). Hexadecimal numbers of one length
+    (0009, 000a) are in the order of their texts.
     """
     paths = list(paths)
+    stems = [PurePath(path).stem for path in paths]
+    if len({len(stem) for stem in stems}) == 1 and all(map(_DIGITS.fullmatch, stems)):
+        return sorted(paths, key=lambda path: (natural_order(str(PurePath(path).parent)), path))
     decimal = _are_decimal([match[2] for match in map(_DECIMAL.search, paths) if match])
     return sorted(paths, key=lambda path: natural_order(path, decimal))
 

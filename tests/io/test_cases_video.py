@@ -184,6 +184,8 @@ def test_decimal_seconds_are_in_order_of_time():
         ["1700000000.99999999.jpg", "1700000000.149999999.jpg"],  # nanoseconds without leading zeros
         ["a/2/10.jpg", "a/10/2.jpg"],
         ["00810.MP4/1.jpg", "00810.MP4/10.jpg"],
+        ["0000.jpg", "0009.jpg", "000a.jpg", "000f.jpg", "0010.jpg"],  # hexadecimal
+        ["2/0009.JPG", "2/000A.JPG", "10/0000.JPG"],
     ],
 )
 def test_other_numbers_are_in_natural_order(names):
