@@ -1,4 +1,9 @@
-"""lanebev: estimate the pose of a camera above the road, frame by frame, from lane boundaries."""
+"""lanebev: estimate the pose of a camera above the road, frame by frame, from lane boundaries.
+
+Start with ``Session`` (live, frame by frame), ``LaneBEV`` (a layer, batched and differentiable),
+``JointCalibrator`` (segments of your own detector) or ``BEVWarp`` (a bird's-eye view with a known pose).
+Angles are in rad, lengths in m, times in s. ``lanebev --help`` is the command line.
+"""
 
 from __future__ import annotations
 

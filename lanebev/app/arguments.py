@@ -54,7 +54,8 @@ class _Parser(argparse.ArgumentParser):
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of ``lanebev``; the options of ``run`` are the fields of :class:`RunConfig`."""
-    top = _Parser(prog="lanebev", description=DESCRIPTION, allow_abbrev=False)
+    words = "Begin with: lanebev demo, or lanebev run VIDEO --camera FILE. Options: lanebev COMMAND --help."
+    top = _Parser(prog="lanebev", description=DESCRIPTION, epilog=words, allow_abbrev=False)
     top.add_argument("--version", action="version", version=f"lanebev {__version__}")
     top.add_argument(
         "--print-completion", choices=("bash", "zsh"), action=PrintCompletion, default=argparse.SUPPRESS,
