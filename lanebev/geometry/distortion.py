@@ -38,14 +38,13 @@ def lens_model(name: str) -> str:
     return known
 
 
-def check_lens(distortion: Tensor, model: str) -> None:
-    """Raise unless the lens model exists and has as many coefficients as (..., D) are given."""
+def check_lens(distortion: Tensor | None, model: str) -> None:
+    """Raise unless the lens model exists and has as many coefficients as (..., D) are given, None as 0."""
     lengths = DISTORTION_LENGTHS[lens_model(model)]
-    if distortion.shape[-1] not in lengths:
+    count = 0 if distortion is None else distortion.shape[-1]
+    if count not in lengths:
         expected = ", ".join(map(str, lengths))
-        raise ValueError(
-            f"distortion: expected {expected} coefficients for a {model} lens, got {distortion.shape[-1]}"
-        )
+        raise ValueError(f"distortion: expected {expected} coefficients for a {model} lens, got {count}")
 
 
 def distort_plane(plane: Tensor, distortion: Tensor, model: str) -> Tensor:

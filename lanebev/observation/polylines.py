@@ -117,12 +117,24 @@ def lines_from_polylines(
             points = np.array(given.tolist() if isinstance(given, Tensor) else given, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise ValueError(f"polylines[{key}]: expected (P, 2) px, got {shown(given)}") from error
-        if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points[:, 1]).all():
-            raise ValueError(f"polylines[{key}]: expected (P, 2) px with finite y, got shape {points.shape}")
+        if points.ndim != 2 or points.shape[1] != 2:
+            raise ValueError(f"polylines[{key}]: expected (P, 2) px, got shape {points.shape}")
+        points = _with_rows(points)
         if named and not (isinstance(key, (int, np.integer)) and 0 <= key < num_boundaries):
             raise ValueError(f"polylines: expected boundaries 0 to {num_boundaries - 1}, got {key!r}")
         lines.append(LaneLine(points, key if named else None, np.full(len(points), float(sigma))))
     return lines
+
+
+def _with_rows(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points (P, 2) with finite y; one without y, as at the end of a padded array, is missing."""
+    index = np.arange(len(points))
+    known = np.flatnonzero(np.isfinite(points[:, 1]))
+    if len(known) == len(points) or not len(known):
+        return points[known]
+    x = np.where(np.isfinite(points[:, 1]), points[:, 0], np.nan)
+    y = np.interp(index, known, points[known, 1])
+    return np.column_stack([x, y])[known[0] : known[-1] + 1]
 
 
 def distorted_line(line: LaneLine, camera: Camera) -> LaneLine:
@@ -177,7 +189,7 @@ def _line_vertices(line: LaneLine, image_size: tuple[int, int]) -> NDArray[np.fl
     if line.weight is not None:
         return np.column_stack([line.points, said, line.weight])
     rows = image_rows(image_size[0])
-    part = _one_way(line.points[:, 1])
+    part = _one_way(line.points)
     x = _on_rows(line.points[part], rows)
     sigma = _on_rows(np.column_stack([said, line.points[:, 1]])[part], rows)
     return np.column_stack([x, rows, sigma, np.ones(len(rows))])[_inside(x, image_size[1])]
@@ -193,19 +205,21 @@ def _spread(count: int, most: int) -> NDArray[np.int64]:
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
 
 
-def _one_way(y: NDArray[np.float64]) -> NDArray[np.int64]:
+def _one_way(points: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the points of the longest part of a line that goes only up or only down; all if it has no order.
 
-    Where a road turns away, its far end may come down again in the image: two points on a row.
+    Where a road turns away, its far end may come down again in the image: two points on a row. Missing points
+    are no part of the way, since some detectors write (0, 0) for them.
     """
-    there = np.flatnonzero(np.isfinite(y))
+    there, y = np.flatnonzero(np.isfinite(points).all(-1)), points[:, 1]
     signs = np.sign(np.diff(y[there]))
     moves = np.flatnonzero(signs)
     turns = moves[1:][np.diff(signs[moves]) != 0]
     if not 0 < len(turns) <= _MOST_TURNS * len(moves):
-        return there
-    parts = [there[first : last + 1] for first, last in pairwise([0, *turns.tolist(), len(there) - 1])]
-    return max(parts, key=lambda part: float(np.ptp(y[part])))
+        return np.flatnonzero(np.isfinite(y))
+    parts = [there[[first, last]] for first, last in pairwise([0, *turns.tolist(), len(there) - 1])]
+    first, last = max(parts, key=lambda ends: float(np.ptp(y[ends])))
+    return np.arange(first, last + 1)[np.isfinite(y[first : last + 1])]
 
 
 def _on_rows(points: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float64]:

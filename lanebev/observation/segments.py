@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from lanebev.camera.model import Camera
+from lanebev.geometry.distortion import check_lens
 from lanebev.geometry.precision import full_precision
 from lanebev.observation.boundary_vertices import BoundaryVertices, move_to_front, undistort_vertices
 from lanebev.observation.polylines import LINE_SIGMA, LaneLine, lines_from_polylines, vertices_from_lines
@@ -88,8 +89,8 @@ class LaneSegments(NamedTuple):
 
         Args:
             polylines: one for each boundary, (P, 2) px (x, y) of the image as taken, along the boundary in
-                either direction; x is NaN in a gap. A mapping from number to polyline if the detector knows
-                the numbers (0..L-1, left to right).
+                either direction; x, or x and y, are NaN in a gap. A mapping from number to polyline if the
+                detector knows the numbers (0..L-1, left to right).
             camera: the lens.
             sigma: px, standard deviation of a polyline across its line.
             num_boundaries: L.
@@ -128,7 +129,11 @@ def segments_from_vertices(
     Returns:
         segments with N = P·(V // 2), in the widest dtype of the arguments. A vertex that the lens cannot
         have imaged, and every vertex of a row whose lens is not usable, is left out.
+
+    Raises:
+        ValueError: a lens model that does not exist, or another number of coefficients than it has.
     """
+    check_lens(distortion, model)
     vertices = move_to_front(vertices)
     if distortion is not None and distortion.shape[-1] > 0:
         vertices = move_to_front(undistort_vertices(vertices, intrinsics, distortion, model))

@@ -54,9 +54,9 @@ def check_cameras(
     """Raise TypeError or ValueError unless there are ``batch`` cameras with poses, and lenses that exist."""
     check_intrinsics(intrinsics, batch)
     check_extrinsics(extrinsics, batch)
-    if distortion is None:
-        return
-    check_tensor("distortion", distortion)
-    if distortion.shape[:-1] != (batch,):
-        raise ValueError(f"distortion: expected ({batch}, D) like the points, got {tuple(distortion.shape)}")
+    if distortion is not None:
+        check_tensor("distortion", distortion)
+        if distortion.shape[:-1] != (batch,):
+            got = tuple(distortion.shape)
+            raise ValueError(f"distortion: expected ({batch}, D) like the points, got {got}")
     check_lens(distortion, model)

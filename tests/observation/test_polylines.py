@@ -95,11 +95,32 @@ def test_a_dense_polyline_says_no_more_than_one_on_rows():
     assert (one.weight > 0).sum() == 19  # of 39 rows from 330 to 710 the middle one is left out
 
 
+@pytest.mark.parametrize("missing", [(0, 0), (-1, -1), (-2, -2), (np.nan, np.nan), (np.inf, 5), (np.nan, 0)])
+def test_arrays_of_one_shape_are_padded_by_points_that_are_not_there(missing):
+    line = np.stack([np.linspace(640, 300, 20), np.linspace(330, 710, 20)], axis=-1)
+    expected = LaneSegments.from_polylines({2: line}, CAMERA)
+    for way in (line, line[::-1]):
+        for before, after in ((0, 3), (3, 0), (2, 2)):
+            padded = np.concatenate([np.tile(missing, (before, 1)), way, np.tile(missing, (after, 1))])
+            found = LaneSegments.from_polylines({2: padded}, CAMERA)
+            torch.testing.assert_close(found.endpoints, expected.endpoints)
+            torch.testing.assert_close(found.weight, expected.weight)
+
+
+def test_a_line_is_not_joined_across_points_without_coordinates():
+    line = np.stack([np.linspace(640, 300, 39), np.arange(330, 711, 10)], axis=-1)
+    gap, nowhere = line.copy(), line.copy()
+    gap[10:20, 0], nowhere[10:20] = np.nan, np.nan
+    one, other = (LaneSegments.from_polylines({2: each}, CAMERA) for each in (gap, nowhere))
+    torch.testing.assert_close(one.endpoints, other.endpoints)
+    assert (one.weight > 0).sum() == 14  # of 29 rows
+
+
 @pytest.mark.parametrize(
     ("polylines", "message"),
     [
-        ([np.zeros((4, 3))], r"polylines\[0\]: expected \(P, 2\) px with finite y, got shape \(4, 3\)"),
-        ([np.zeros((4, 2)), [[1.0, np.nan]]], r"polylines\[1\]: expected"),
+        ([np.zeros((4, 3))], r"polylines\[0\]: expected \(P, 2\) px, got shape \(4, 3\)"),
+        ([np.zeros((4, 2)), [["a", 3]]], r"polylines\[1\]: expected"),
         ({6: np.zeros((4, 2))}, "polylines: expected boundaries 0 to 5, got 6"),
         ({"2": np.zeros((4, 2))}, "polylines: expected boundaries 0 to 5, got '2'"),
     ],

@@ -266,6 +266,15 @@ def test_cameras_of_whole_numbers_are_named(calibrator):
         calibrator(lanes(), K[None].long(), calibrator.initial_state(1), 1 / 30)
 
 
+def test_a_lens_that_is_no_pinhole_needs_its_coefficients():
+    net, image, pose = model(), torch.zeros(1, 3, 72, 128), Extrinsics.from_values(0.0, 0.0, 0.0, 1.5)
+    for call in (net, lambda *given, **lens: net.warp(*given, pose, **lens)):
+        with pytest.raises(ValueError, match="distortion: expected 4 coefficients for a fisheye lens, got 0"):
+            call(image, INTRINSICS[None], model="fisheye")
+        with pytest.raises(ValueError, match="model: expected one of pinhole, fisheye, omni, got 'fish'"):
+            call(image, INTRINSICS[None], model="fish")
+
+
 def test_shapes_are_checked():
     with pytest.raises(ValueError, match=r"image: expected \(B, 3, H, W\)"):
         model()(torch.zeros(3, 72, 128), INTRINSICS[None], None)
