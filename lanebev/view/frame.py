@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from functools import lru_cache
 from typing import NamedTuple
@@ -70,7 +71,7 @@ def remap_frame(
         check_vertical_curvature(vertical_curvature, 1)
         curvature = vertical_curvature.cpu()
     cells = cell_sums(grid, (0.0,), image_from_cam, extrinsics, curvature).to(torch.float32)
-    source = _Source(frame, grid.shape[0] * grid.shape[1])
+    source = _Source(frame, grid.shape)
     bev = np.empty((*grid.shape, *frame.shape[2:]), np.uint8)
     valid = np.ones(grid.shape, np.bool_)
     for strip in _strips(cells, lens, camera.image_size):
@@ -111,6 +112,7 @@ def _strips(cells: CellSums, lens: Lens | None, size: tuple[int, int]) -> Iterat
     _, count, columns = cells.shape
     curves = interpolant(cells, lens, 1 - 1 / min(size))
     edges: tuple[int, ...] = (0, count)
+    memory = torch.from_numpy(_kept("points", (1, 2, max(1, BLOCK // columns), columns), np.float32))
     if curves is not None:
         curves, edges = curves._replace(values=_pixels(curves.values, size)), curves.rows.edges
     for tile, span in enumerate(itertools.pairwise(edges)):
@@ -119,7 +121,6 @@ def _strips(cells: CellSums, lens: Lens | None, size: tuple[int, int]) -> Iterat
         for rows in (slice(first, min(first + step, span[1])) for first in range(*span, step)):
             if curves is not None and smooth:
                 inner = slice(rows.start - span[0], rows.stop - span[0])
-                memory = torch.from_numpy(_kept("points", (1, 2, step, columns), np.float32))
                 points = curves.points(tile, inner, memory[:, :, : rows.stop - rows.start])
                 if curves.inside[tile]:
                     y = curves.values[0, 1, tile].numpy()
@@ -187,13 +188,14 @@ class _Source:
 
     Args:
         frame: (H, W, 3) or (H, W).
-        cells: number of cells to be sampled.
+        shape: (U, V) of its view.
     """
 
-    def __init__(self, frame: NDArray[np.uint8], cells: int) -> None:
+    def __init__(self, frame: NDArray[np.uint8], shape: tuple[int, int]) -> None:
         self._frame = frame
-        self._wide = frame.shape[2:] == (3,) and frame.size < 3 * _FEW_PIXELS * cells
+        self._wide = frame.shape[2:] == (3,) and frame.size < 3 * _FEW_PIXELS * math.prod(shape)
         self._pixels = _kept("wide", (*frame.shape[:2], 4), np.uint8) if self._wide else frame
+        self._memory = _kept("sampled", (max(BLOCK, shape[1]), *self._pixels.shape[2:]), np.uint8)
         self._ready = range(0)  # rows that have a fourth channel
 
     def prepare(self, first: int, last: int) -> None:
@@ -209,9 +211,7 @@ class _Source:
     ) -> None:
         """Sample at points (2, R, V) px, to (R, V, 3) or (R, V); zero where not seen, None where all are."""
         x, y = points
-        channels = self._pixels.shape[2:]
-        memory = _kept("sampled", (max(BLOCK, x.size), *channels), np.uint8)
-        sampled = memory[: x.size].reshape(*x.shape, *channels)
+        sampled = self._memory[: x.size].reshape(*x.shape, *self._pixels.shape[2:])
         cv2.remap(self._pixels, x, y, cv2.INTER_LINEAR, sampled)
         if seen is not None:
             sampled = cv2.copyTo(sampled, seen.view(np.uint8))

@@ -12,8 +12,8 @@ clock's: of one thread, and for a machine that others use too.
 - ``warp``: 1920 × 1020 px, three channels, or 64 channels at stride 8, to 1024 × 512 cells, against a bare
   ``grid_sample`` with its grid at hand and kornia's ``warp_perspective``; ``gradients``: and back;
   ``stages``: what is done before the resampling; ``compiled`` (if asked for): by inductor.
-- ``frame``: one frame of bytes through the lens, against ``cv2.remap`` with its maps at hand, and with its
-  maps computed, as they must be when the pose is another in every frame.
+- ``frame``: one frame of bytes, against ``cv2.remap`` with its maps at hand, in fixed point and in float32,
+  and with its maps computed, as they must be when the pose is another in every frame.
 - ``extractor``: seven maps of 160 × 288.
 - ``compiled_step`` (if asked for): a frame of the joint calibrator by inductor, which compiles for minutes.
 - ``rows``, ``dense``, ``segments``, ``cells``: calibrators by rows of a batch, with 30 and with 408 segments

@@ -39,8 +39,9 @@ TABLES: dict[str, list[tuple[str, Callable[[], Calls]]]] = {
         ("64 channels at stride 8 and back", lambda: views.backwards(1, 64, 8)),
     ],
     "frame": [
-        ("a frame of bytes", lambda: views.frames("pinhole")),
-        ("a fisheye's frame of bytes", lambda: views.frames("fisheye")),
+        ("a frame of bytes", lambda: views.frames(scene.BROWN)),
+        ("an undistorted frame of bytes", lambda: views.frames([])),
+        ("a fisheye's frame of bytes", lambda: views.frames(scene.FISHEYE, "fisheye")),
     ],
     "extractor": [("maps to segments", calibration.extractors)],
 }

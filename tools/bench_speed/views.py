@@ -120,23 +120,24 @@ def backwards(batch: int, channels: int, stride: int) -> Calls:
     }
 
 
-def frames(model: str) -> Calls:
-    """Make calls on one frame of bytes through a lens."""
-    taken = scene.camera(scene.FISHEYE if model == "fisheye" else scene.BROWN, model)
+def frames(distortion: list[float], model: str = "pinhole") -> Calls:
+    """Make calls on one frame of bytes through a lens, or without one."""
+    taken = scene.camera(distortion, model)
     frame = np.random.default_rng(0).integers(0, 255, (*scene.SIZE, 3), np.uint8)
     extrinsics = Extrinsics(*(value.double() for value in scene.poses(1)))
-    matrix, distortion = taken.intrinsics.numpy(), taken.distortion.numpy()
+    matrix, coefficients = taken.intrinsics.numpy(), taken.distortion.numpy()
     turn = (bev_from_image(extrinsics, taken.intrinsics[None], scene.GRID)[0] @ taken.intrinsics).numpy()
     rectify: Any = cv2.fisheye.initUndistortRectifyMap if model == "fisheye" else cv2.initUndistortRectifyMap
     shape = (scene.GRID.shape[1], scene.GRID.shape[0])
 
-    def maps() -> tuple[Any, Any]:
-        first, second = rectify(matrix, distortion, turn, np.eye(3), shape, cv2.CV_16SC2)
+    def maps(kind: int = cv2.CV_16SC2) -> tuple[Any, Any]:
+        first, second = rectify(matrix, coefficients, turn, np.eye(3), shape, kind)
         return first, second
 
-    ready = maps()
+    ready, exact = maps(), maps(cv2.CV_32FC1)
     return {
         "cv2.remap": lambda: cv2.remap(frame, *ready, cv2.INTER_LINEAR),
+        "cv2.remap, float32": lambda: cv2.remap(frame, *exact, cv2.INTER_LINEAR),
         "cv2 maps and remap": lambda: cv2.remap(frame, *maps(), cv2.INTER_LINEAR),
         "remap_frame": lambda: remap_frame(frame, taken, extrinsics, scene.GRID),
     }
