@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lanebev.tensors import one_thread
 from lanebev.view.lens import Lens
 from lanebev.view.projection import Cells, CellSums, image_coordinates, outside_image
 from lanebev.view.thread_limits import ONE_THREAD
@@ -17,6 +18,9 @@ from lanebev.view.tiles import Interpolant, interpolant
 BLOCK = 1 << 17  # cells: a dozen float32 planes of so many fit a cache of a few MB
 
 Memory = Callable[[int, int], Tensor]
+Project = Callable[[Tensor, Lens | None], tuple[Tensor, Tensor]]
+
+image_coordinates_by_one_thread: Project = one_thread()(image_coordinates)
 
 
 class Block(NamedTuple):
@@ -55,7 +59,9 @@ def blocks(cells: Cells, lens: Lens | None, limit: float, memory: Memory | None 
             for tile, span in enumerate(itertools.pairwise(curves.rows.edges)):
                 smooth = curves.smooth[:, tile]
                 if not smooth.any():
-                    yield from _exact_blocks(cells, lens, span, ONE_THREAD // 3, memory)
+                    yield from _exact_blocks(
+                        cells, lens, span, ONE_THREAD // 3, memory, image_coordinates_by_one_thread
+                    )
                 elif curves.inside[tile] or memory is None:
                     yield _tile_block(curves, cells, lens, tile, span, memory)
                 else:
@@ -75,12 +81,17 @@ def _may_choose(cells: CellSums) -> bool:
 
 
 def _exact_blocks(
-    cells: Cells, lens: Lens | None, rows: tuple[int, int], size: int, memory: Memory | None
+    cells: Cells,
+    lens: Lens | None,
+    rows: tuple[int, int],
+    size: int,
+    memory: Memory | None,
+    project: Project = image_coordinates,
 ) -> Iterator[Block]:
     """Yield rows from the first to below the second, cell by cell, in blocks of so many cells."""
     batch, _, columns = cells.shape
     for first, last in _spans(rows, size // max(1, batch * columns)):
-        points, hidden = image_coordinates(cells.rows(first, last), lens)
+        points, hidden = project(cells.rows(first, last), lens)
         if memory is not None:
             points = memory(first, last).copy_(points)
         yield Block(first, last, points, outside_image(points, hidden))
@@ -102,7 +113,7 @@ def _tile_block(
     outside = outside_image(points, curves.hidden(tile, inner))
     smooth = curves.smooth[:, tile]
     if not smooth.all():
-        exact, hidden = image_coordinates(cells.rows(*rows), lens)
+        exact, hidden = image_coordinates_by_one_thread(cells.rows(*rows), lens)
         whole = torch.from_numpy(smooth)[:, None, None]
         outside = torch.where(whole, outside, outside_image(exact, hidden))
         exact = torch.where(whole.unsqueeze(1), points, exact)

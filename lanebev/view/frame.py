@@ -17,12 +17,12 @@ from torch import Tensor
 from lanebev.camera.model import Camera
 from lanebev.geometry.road_profile import check_vertical_curvature
 from lanebev.types import Extrinsics
-from lanebev.view.blocks import BLOCK
+from lanebev.view.blocks import BLOCK, image_coordinates_by_one_thread
 from lanebev.view.cells import cell_sums, rows_in_sight
 from lanebev.view.grid import BEVGrid
 from lanebev.view.kept import KeptArrays
 from lanebev.view.lens import Lens, make_lens
-from lanebev.view.projection import CellSums, image_coordinates, normalised_intrinsics
+from lanebev.view.projection import CellSums, normalised_intrinsics
 from lanebev.view.thread_limits import ONE_THREAD
 from lanebev.view.tiles import LARGEST_WEIGHTS, interpolant
 
@@ -128,7 +128,7 @@ def _strips(cells: CellSums, lens: Lens | None, size: tuple[int, int]) -> Iterat
                     continue
                 hidden = curves.hidden(tile, inner)
             else:
-                points, hidden = image_coordinates(cells.rows(rows.start, rows.stop), lens)
+                points, hidden = image_coordinates_by_one_thread(cells.rows(rows.start, rows.stop), lens)
                 points = _pixels(points, size)
             at = points[0].numpy()
             seen = _clamp(at, size)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lanebev.geometry.precision import autocast_off
+from lanebev.tensors import one_thread
 from lanebev.view.lens import Lens
 from lanebev.view.projection import CellSums, image_coordinates
 from lanebev.view.thread_limits import ONE_THREAD, small_products
@@ -181,6 +182,7 @@ class Interpolant(NamedTuple):
         return excess.squeeze(1).clamp_(min=0.0).sign_()
 
 
+@one_thread()  # MKL's threads too, which start for the atan of some hundred numbers
 def interpolant(cells: CellSums, lens: Lens | None, limit: float) -> Interpolant | None:
     """Interpolate where cells are seen; None of a grid that has too few, and of an empty batch.
 

@@ -216,7 +216,7 @@ def test_small_products_are_those_of_the_whole(monkeypatch):
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="no list of threads and their times")
-@pytest.mark.parametrize("lens", [lens for lens in LENSES if lens != "fisheye"])  # atan starts MKL's threads
+@pytest.mark.parametrize("lens", LENSES)
 def test_one_thread_computes_where_to_sample(lens):
     """PyTorch's and BLAS's would wait for each other at every short operation."""
 
