@@ -23,6 +23,7 @@ from lanebev.estimation.reasons import Reason, describe_reasons
 from lanebev.estimation.tracker import Tracker
 from lanebev.io.frame_clock import FrameClock
 from lanebev.io.lane_size import size_doubt
+from lanebev.io.lane_widths import unequal_lanes_remark
 from lanebev.io.lanes import FrameLines
 from lanebev.io.state import lane_width_remark, load_state, save_state
 from lanebev.numbers import check_number
@@ -37,7 +38,7 @@ from lanebev.view.grid import BEVGrid
 
 logger = logging.getLogger(__name__)
 
-_LANES_LOOKED_AT = 20  # frames whose polylines are checked together for the size of their images
+_LANES_LOOKED_AT = 20  # frames whose polylines are checked together
 
 
 class SessionResult(NamedTuple):
@@ -246,7 +247,7 @@ class Session:
         """Return the frame's vertices and the scale of the pose's sigmas that their detector needs."""
         if polylines is not None or image is None:
             lines = lines_from_polylines([] if polylines is None else polylines, self.polyline_sigma)
-            self._look_at_size(FrameLines("", lines))
+            self._look_at_lanes(FrameLines("", lines))
             return vertices_from_lines(lines, self.camera), 1.0
         if self._model is None:
             self._model = LaneBEV.from_pretrained()
@@ -255,13 +256,14 @@ class Session:
         _, vertices = model.boundary_vertices(network_image(image, self.device), point)
         return map_tensors(Tensor.cpu, vertices), model.pose_sigma_scale
 
-    def _look_at_size(self, lines: FrameLines) -> None:
-        """Doubt polylines in pixels of other images, by all of some frames together."""
+    def _look_at_lanes(self, lines: FrameLines) -> None:
+        """Doubt polylines in pixels of other images, or of unequal lanes, by all of some frames together."""
         self._drawn += [lines] if lines.lines else []
         if len(self._drawn) == _LANES_LOOKED_AT:
             doubt = size_doubt(self._drawn, self.camera.image_size)
             remedy = "give pixels of the camera's images, or a camera by Camera.scaled or Camera.cropped"
             words = f"polylines: {doubt.words} {remedy}" if doubt else ""
+            words = words or unequal_lanes_remark(self._drawn, self.camera)
             if words and not self._doubt:  # once, as long as it lasts
                 logger.warning(words)
             self._doubt, self._drawn = words, []

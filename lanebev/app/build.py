@@ -133,7 +133,7 @@ def make_observer(
         entries = read_lanes(config.lanes, camera.intrinsics.double().numpy())
         if config.lanes_size is not None or config.lanes_crop is not None:
             entries = lanes_of_whole_images(entries, config.lanes_size, config.lanes_crop, camera.image_size)
-        return LaneFileObserver(entries, source, camera)
+        return LaneFileObserver(entries, source, camera, config.stills)
     if config.backend == "onnxruntime":
         return NetworkObserver(onnx_model(Path(config.exported), camera), camera)
     loaded = network or make_network(config.weights, config.device)

@@ -15,6 +15,7 @@ from lanebev.io.image_names import in_natural_order
 from lanebev.io.lane_order import check_boundary_order
 from lanebev.io.lane_repeats import repeats_remark
 from lanebev.io.lane_size import size_remark
+from lanebev.io.lane_widths import unequal_lanes_remark
 from lanebev.io.lanes import FrameLines, match_frames
 from lanebev.io.video import Frame, FrameSource
 from lanebev.observation.boundary_vertices import BoundaryVertices
@@ -65,6 +66,7 @@ class LaneFileObserver:
         source: the frames; images are matched by the longest common tail of their path, a video by order: an
             entry for each frame of it, or for each that is taken.
         camera: the lens.
+        stills: images are independent, not frames of a drive.
 
     Raises:
         ValueError: the entries do not fit the source.
@@ -72,7 +74,9 @@ class LaneFileObserver:
 
     workers = 1
 
-    def __init__(self, entries: Sequence[FrameLines], source: FrameSource, camera: Camera) -> None:
+    def __init__(
+        self, entries: Sequence[FrameLines], source: FrameSource, camera: Camera, stills: bool = False
+    ) -> None:
         self.entries = [_as_taken(entry, camera) for entry in entries]
         self.camera = camera
         self.remark = size_remark(entries, camera.image_size)
@@ -92,7 +96,8 @@ class LaneFileObserver:
             self.matches = match_frames(source.paths, entries)
         in_order = [entries[match] for match in self.matches if match is not None]
         unmatched = "" if source.is_video else self._unmatched(source.taken_numbers)
-        self.remark = "; ".join(filter(None, [self.remark, unmatched, repeats_remark(in_order)]))
+        of_drive = [] if stills else [repeats_remark(in_order), unequal_lanes_remark(in_order, camera)]
+        self.remark = "; ".join(filter(None, [self.remark, unmatched, *of_drive]))
 
     def _unmatched(self, taken: Sequence[int]) -> str:
         """Return how many of the images that are taken have no entry; empty if all have one."""

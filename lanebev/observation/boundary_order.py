@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from lanebev.types import NUM_BOUNDARIES
 
 _SAME_LINE, _NEXT_BUT_ONE = 0.4, 1.75  # gap between neighbours, in usual gaps
 _FARTHEST = 20.0  # lateral distance over camera height: beyond it a line crosses the road, as stop lines do
+_CENTRED = 0.17  # distance of the camera from the middle of a lane in which it drives, in the lane's widths
 _NARROWEST = 0.25  # lane width over camera height: below it two lines are one, or edges of one marking
 
 
@@ -25,8 +27,10 @@ def boundary_indices(
     sideways, and the lines are counted outwards in that order. Going down, a line runs to its own side of the
     camera, so its slope gives the side at any yaw. A neighbour much nearer than usual, or nearer than the
     narrowest lane, is the other edge of the same marking or the same line drawn twice, and gets None; one
-    twice as far as usual is the next but one. For the narrowest lane: on a plane, the slopes dx/dy of two
-    boundaries differ by their distance over the camera's height, for any pitch, yaw and focal length.
+    twice as far as usual is the next but one. Usual is the gap in whose middle the camera is, since cars
+    drive in the middle of a lane and not above the boundary of two; else the lower median. For the narrowest
+    lane: on a plane, the slopes dx/dy of two boundaries differ by their distance over the camera's height,
+    for any pitch, yaw and focal length.
 
     Args:
         lines: each (P, 2) px, undistorted; P = 0 and 1 get None.
@@ -48,8 +52,12 @@ def boundary_indices(
     usual = float(np.median(gaps)) if len(gaps) > 1 else 0.0
     kept = _longest_of_doubles(apart, crossing, _SAME_LINE * usual, lines)
     left = sum(slope[i] < 0 for i in kept)
-    usual = _usual_gap([crossing[b] - crossing[a] for a, b in pairwise(kept)])
-    steps = [2 if crossing[b] - crossing[a] > _NEXT_BUT_ONE * usual else 1 for a, b in pairwise(kept)]
+    lanes = [crossing[b] - crossing[a] for a, b in pairwise(kept)]
+    usual = _usual_gap(lanes)
+    if 0 < left < len(kept):
+        right_of, left_of = -slope[kept[left - 1]], slope[kept[left]]  # the camera, in camera heights
+        usual = lanes[left - 1] if abs(right_of - left_of) < 2 * _CENTRED * (right_of + left_of) else usual
+    steps = [2 if gap > _NEXT_BUT_ONE * usual else 1 for gap in lanes]
     position = np.concatenate([[0], np.cumsum(steps)]).astype(int)
     if left == 0:
         origin = position[0] - num_boundaries // 2
@@ -59,6 +67,25 @@ def boundary_indices(
         if 0 <= place < num_boundaries:
             result[i] = int(place)
     return result
+
+
+def width_ratio(lines: Sequence[NDArray[np.float64]], indices: Sequence[int | None]) -> float:
+    """Return the ratio of the widest lane to the narrowest one, as a camera without roll would see them.
+
+    Args:
+        lines: each (P, 2) px, undistorted.
+        indices: boundary of each, None for a line that is none.
+
+    Returns:
+        the ratio; NaN with fewer than three boundaries, or boundaries that cross.
+    """
+    found = sorted(
+        (index, _lower_half(line).slope)
+        for line, index in zip(lines, indices, strict=True)
+        if index is not None and len(line) > 1 and np.ptp(line[:, 1]) > 0
+    )
+    widths = [(slope - left) / (index - before) for (before, left), (index, slope) in pairwise(found)]
+    return max(widths) / min(widths) if len(widths) > 1 and min(widths) > 0 else math.nan
 
 
 class _Straight(NamedTuple):

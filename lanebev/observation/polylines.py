@@ -14,7 +14,7 @@ from torch import Tensor
 from lanebev.camera.model import Camera, check_camera
 from lanebev.geometry.lens import normalise_points
 from lanebev.numbers import shown
-from lanebev.observation.boundary_order import boundary_indices
+from lanebev.observation.boundary_order import boundary_indices, width_ratio
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.types import NUM_BOUNDARIES
 
@@ -97,6 +97,15 @@ def vertices_from_lines(
                 sigma[0, index, : len(kept)], weight[0, index, : len(kept)] = kept[:, 2:].T
     parts = map(torch.from_numpy, (points, weight, sigma))
     return BoundaryVertices._make([*parts, torch.arange(num_boundaries)[None]])
+
+
+def lane_width_ratio(
+    lines: Sequence[LaneLine], camera: Camera, num_boundaries: int = NUM_BOUNDARIES
+) -> float:
+    """Return the ratio of the widths of a frame's lanes, see :mod:`lanebev.observation.boundary_order`."""
+    lines = [_without_edges(line, camera.image_size[1]) for line in lines]
+    ideal = [_undistorted(line.points, camera) for line in lines]
+    return width_ratio(ideal, _indices(lines, camera, num_boundaries))
 
 
 def lines_from_polylines(

@@ -331,6 +331,26 @@ def test_lanes_that_a_slow_detector_repeats_are_noticed(tmp_path):
     assert remarks[3].startswith("lanes: 4 of 6 frames have the lines of the frame before")
 
 
+def test_lanes_of_different_widths_are_noticed(tmp_path):
+    Image.fromarray(_picture()).save(tmp_path / "0.png")
+    height, width = _picture().shape[:2]
+    camera, source = Camera.from_fov(60, width, height), open_source(str(tmp_path))
+    rows = np.linspace(0.5 * height, height - 1.0, 20)
+    entry = FrameLines(
+        "0.png",
+        [
+            LaneLine(np.stack([0.5 * width + 0.7 * place * (rows - 0.4 * height), rows], axis=-1))
+            for place in (-1.85, 1.85, 3.35)
+        ],
+    )
+    assert LaneFileObserver([entry], source, camera).remark.startswith(
+        "lanes: one lane is 2.5 times as wide as another, unless the camera is rolled; if a line"
+    )
+    assert LaneFileObserver([entry], source, camera, stills=True).remark == ""
+    equal = entry._replace(lines=entry.lines[:2])
+    assert LaneFileObserver([equal], source, camera).remark == ""
+
+
 def test_images_without_lanes_are_counted(tmp_path):
     """As where names of lanes begin at 1 and those of images at 0."""
     for number in range(6):

@@ -15,6 +15,7 @@ from lanebev.observation.polylines import (
     VERTICES_PER_LINE,
     LaneLine,
     image_rows,
+    lane_width_ratio,
     rows_from_vertices,
     vertices_from_lines,
 )
@@ -32,6 +33,23 @@ def _fan(offsets, vanishing=(640.0, 300.0), height=1.5, top=330.0, bottom=719.0)
         x = vanishing[0] + (rows - vanishing[1]) * offset / height
         lines.append(np.stack([x, rows], axis=-1)[(x >= 0) & (x <= 1279)])
     return lines
+
+
+@pytest.mark.parametrize(
+    ("offsets", "expected", "ratio"),
+    [
+        ((-1.85, 1.85, 3.35), [2, 3, 4], 3.7 / 1.5),  # a shoulder's line
+        ((-3.35, -1.85, 1.85, 3.35), [1, 2, 3, 4], 3.7 / 1.5),
+        ((-1.6, 2.1, 3.6), [2, 3, 4], 3.7 / 1.5),
+        ((-1.85, 5.55, 9.25), [2, 4, 5], 1.0),  # in a lane whose right boundary is not seen
+        ((-5.55, 1.85, 5.55), [2, 4, 5], 1.0),
+        ((-1.85, 1.85, 9.25), [2, 3, 5], 1.0),
+    ],
+)
+def test_the_lane_in_whose_middle_the_camera_is_is_one(offsets, expected, ratio):
+    lines = _fan(offsets)
+    assert boundary_indices(lines) == expected
+    assert lane_width_ratio([LaneLine(line) for line in lines], CAMERA) == pytest.approx(ratio)
 
 
 def test_boundary_index_counts_outwards_from_the_ego_lane():

@@ -125,6 +125,13 @@ def test_polylines_in_pixels_of_other_images_are_noticed(caplog, tmp_path, chang
         assert not any(text.startswith("polylines: ") for text in again)
 
 
+def test_polylines_of_different_lanes_are_noticed():
+    session = Session(CAMERA)
+    said = [session(polylines=lines(places=(-1.85, 1.85, 3.35)), stamp=k / 20).reasons for k in range(21)]
+    (remark,) = (text for text in said[-1] if text.startswith("lanes: "))
+    assert "one lane is 2.7 times as wide as another" in remark  # 2.5, and some roll
+
+
 def test_a_saved_session_goes_on_exactly(tmp_path):
     one, other = Session(CAMERA), Session(CAMERA)
     for k in range(6):
