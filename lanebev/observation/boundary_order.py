@@ -16,6 +16,7 @@ _SAME_LINE, _NEXT_BUT_ONE = 0.4, 1.75  # gap between neighbours, in usual gaps
 _FARTHEST = 20.0  # lateral distance over camera height: beyond it a line crosses the road, as stop lines do
 _CENTRED = 0.17  # distance of the camera from the middle of a lane in which it drives, in the lane's widths
 _NARROWEST = 0.25  # lane width over camera height: below it two lines are one, or edges of one marking
+_WIDEST = 4.2  # the same: above it there are two lanes between two lines, for cameras from 0.9 m on
 
 
 def boundary_indices(
@@ -28,9 +29,9 @@ def boundary_indices(
     camera, so its slope gives the side at any yaw. A neighbour much nearer than usual, or nearer than the
     narrowest lane, is the other edge of the same marking or the same line drawn twice, and gets None; one
     twice as far as usual is the next but one. Usual is the gap in whose middle the camera is, since cars
-    drive in the middle of a lane and not above the boundary of two; else the lower median. For the narrowest
-    lane: on a plane, the slopes dx/dy of two boundaries differ by their distance over the camera's height,
-    for any pitch, yaw and focal length.
+    drive in the middle of a lane and not above the boundary of two, unless it is too wide for one; else the
+    lower median. For the narrowest and the widest lane: on a plane, the slopes dx/dy of two boundaries differ
+    by their distance over the camera's height, for any pitch, yaw and focal length.
 
     Args:
         lines: each (P, 2) px, undistorted; P = 0 and 1 get None.
@@ -56,7 +57,9 @@ def boundary_indices(
     usual = _usual_gap(lanes)
     if 0 < left < len(kept):
         right_of, left_of = -slope[kept[left - 1]], slope[kept[left]]  # the camera, in camera heights
-        usual = lanes[left - 1] if abs(right_of - left_of) < 2 * _CENTRED * (right_of + left_of) else usual
+        width = right_of + left_of
+        is_one_lane = width < _WIDEST and abs(right_of - left_of) < 2 * _CENTRED * width
+        usual = lanes[left - 1] if is_one_lane else usual
     steps = [2 if gap > _NEXT_BUT_ONE * usual else 1 for gap in lanes]
     position = np.concatenate([[0], np.cumsum(steps)]).astype(int)
     if left == 0:

@@ -44,6 +44,7 @@ def _fan(offsets, vanishing=(640.0, 300.0), height=1.5, top=330.0, bottom=719.0)
         ((-1.85, 5.55, 9.25), [2, 4, 5], 1.0),  # in a lane whose right boundary is not seen
         ((-5.55, 1.85, 5.55), [2, 4, 5], 1.0),
         ((-1.85, 1.85, 9.25), [2, 3, 5], 1.0),
+        ((-3.7, 3.7, 7.4), [2, 4, 5], 1.0),  # above a boundary that is not seen
     ],
 )
 def test_the_lane_in_whose_middle_the_camera_is_is_one(offsets, expected, ratio):
