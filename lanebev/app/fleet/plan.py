@@ -105,7 +105,8 @@ def _part_task(name: str, config: RunConfig, folder: Path, number: int, part: Pa
 def settings_fingerprint(config: RunConfig) -> str:
     """Return all that decides a run's outputs, as text: settings, and sizes and times of the files named."""
     settings = {name: value for name, value in asdict(config).items() if name != "out"}
-    files = {name: size_and_time(Path(settings[name])) for name in PATHS if settings.get(name)}
+    read = [name for name in PATHS if name != "exported" or config.backend == "onnxruntime"]
+    files = {name: size_and_time(Path(settings[name])) for name in read if settings.get(name)}
     return json.dumps({"settings": settings, "files": files, "lanebev": __version__}, default=str)
 
 

@@ -7,12 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lanebev.app.config import RunConfig
+from lanebev.app.config import BACKENDS, RunConfig
 from lanebev.app.fleet.fleet import write_mounts
 from lanebev.app.fleet.manifest import Drive
 from lanebev.app.fleet.mounts import DriveMount, stretches
 from lanebev.app.fleet.page import CameraMounts, DriveVerdict, fleet_page
-from lanebev.app.fleet.plan import Outcome, earlier_outcome, failure_path, tasks_of, write_mark
+from lanebev.app.fleet.plan import (
+    Outcome,
+    earlier_outcome,
+    failure_path,
+    settings_fingerprint,
+    tasks_of,
+    write_mark,
+)
 
 HOSTILE = "<script>alert(1)<_script>\"'&é…"
 
@@ -68,6 +75,11 @@ def test_what_is_finished_is_known_until_something_changes(tmp_path):
     done = Outcome("one", frames=3, seconds=1.5)
     write_mark(task, done)
     assert earlier_outcome(task) == done
+    exported = replace(drive.config, exported=str(tmp_path / "exported"))
+    before = [settings_fingerprint(replace(exported, backend=name)) for name in BACKENDS]
+    (tmp_path / "exported").mkdir()
+    after = [settings_fingerprint(replace(exported, backend=name)) for name in BACKENDS]
+    assert [one == other for one, other in zip(before, after, strict=True)] == [True, False]
     narrow = replace(drive, config=replace(drive.config, lane_width=3.5))
     other = tasks_of([narrow], tmp_path / "out")["one"]
     assert earlier_outcome(other) is None
