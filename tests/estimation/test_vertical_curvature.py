@@ -10,7 +10,7 @@ import torch
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.dynamics import MotionConfig
-from lanebev.estimation.joint.evidence import vertical_curvature_prior_std
+from lanebev.estimation.joint.evidence import hill_variance
 from lanebev.estimation.joint.layout import NUM_COMMON
 from lanebev.estimation.joint.measurement import HEIGHT, VERTICAL, boundary_residuals, look
 from lanebev.estimation.joint.observations import boundary_places, observe
@@ -94,11 +94,35 @@ def test_the_vertical_curvature_of_a_start_is_correlated_with_the_error_that_it_
     torch.testing.assert_close(found, torch.tensor(expected, dtype=DOUBLE))
 
 
-def test_a_clear_vertical_curvature_is_its_own_prior():
-    cfg = JointConfig(motion=MotionConfig(vertical_curvature_std=3e-5))
-    curvature = torch.tensor([0.0, 2e-5, -5e-5], dtype=DOUBLE)
-    found = vertical_curvature_prior_std(curvature, torch.full((3,), 1e-10, dtype=DOUBLE), cfg)
-    torch.testing.assert_close(found, torch.tensor([3e-5, 3e-5, 5e-5], dtype=DOUBLE), rtol=1e-6, atol=0.0)
+def test_a_clear_vertical_curvature_is_its_own_prior_and_is_remembered():
+    cfg = JointConfig(motion=MotionConfig(hill_memory=20.0))
+    state = JointCalibrator(cfg).initial_state(3, DOUBLE)
+    mean, cov = state.mean.clone(), state.cov.clone()
+    mean[:, VERTICAL] = torch.tensor([0.0, 2e-5, -5e-5])
+    cov[:, VERTICAL, VERTICAL] = 1e-10
+    found = hill_variance(state._replace(mean=mean, cov=cov), torch.zeros(3, dtype=DOUBLE), cfg)
+    torch.testing.assert_close(found, torch.tensor([0.0, 0.0, 2.1e-9], dtype=DOUBLE), rtol=1e-6, atol=1e-18)
+    later = hill_variance(state._replace(hills=found), torch.full((3,), 20.0, dtype=DOUBLE), cfg)
+    torch.testing.assert_close(later, found / math.e, rtol=1e-6, atol=1e-18)
+
+
+def test_the_dip_behind_a_crest_is_expected():
+    """A crest and a dip of R = 8 km in 7 s: pitch's errors against its standard deviations."""
+
+    def change(t, moment):
+        return replace(moment, near=5.0, far=40.0, profile=1.2e-4 * math.sin(2 * math.pi * t / 7))
+
+    ratios = []
+    for memory in (20.0, 1e-3):
+        calibrator = JointCalibrator(motion=MotionConfig(hill_memory=memory))
+        state, squares = calibrator.initial_state(4, dtype=DOUBLE), []
+        for moment, segments in see(moments(8.0, change), 4, 1.0, 15, 3, DOUBLE):
+            found, state = calibrator(segments, CAMERA.expand(4, 3, 3), state, moment.dt, WIDTH)
+            error = found.extrinsics.pitch - moment.pose[0]
+            squares.append(error.square() / found.covariance[:, 0, 0])
+        ratios.append(float(torch.stack(squares[100:]).mean()))
+    assert ratios[0] < 1.5
+    assert ratios[1] > 1.5 * ratios[0]
 
 
 def test_a_crest_in_one_row_is_estimated_and_leaves_the_other_as_it_is():

@@ -23,8 +23,8 @@ from lanebev.estimation.joint.evidence import (
     adapt_motion_scale,
     adaptive_process_noise,
     deviation_prior_std,
+    hill_variance,
     normalized_score,
-    vertical_curvature_prior_std,
 )
 from lanebev.estimation.joint.lane_change import best_shift, renumber
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, SHAPE, STEPS, layout
@@ -112,6 +112,7 @@ class JointCalibrator(Calibrator[JointState]):
             pose_sensitivity=mean.new_zeros(batch_size, NUM_POSE, 2 * cfg.num_boundaries),
             scatter=mean.new_zeros(batch_size, 2, 3),
             motion_scale=mean.new_ones(batch_size, NUM_POSE),
+            hills=zero.clone(),
             early=zero.clone(),
             unseen=zero,
             misfit=zero.clone(),
@@ -215,7 +216,7 @@ def predict_state(state: JointState, dt: Tensor, cfg: JointConfig) -> JointState
     road, transition, noise = state_motion(state, dt, cfg)
     mean, cov = predict(state.mean, state.cov, transition, noise)
     mean = torch.cat([mean[:, :CURVATURE], road.shape, mean[:, SHAPE.stop :]], dim=-1)
-    return state._replace(mean=mean, cov=cov, phase=road.phase)
+    return state._replace(mean=mean, cov=cov, phase=road.phase, hills=hill_variance(state, dt, cfg))
 
 
 def state_motion(state: JointState, dt: Tensor, cfg: JointConfig) -> tuple[RoadMotion, Tensor, Tensor]:
@@ -226,7 +227,7 @@ def state_motion(state: JointState, dt: Tensor, cfg: JointConfig) -> tuple[RoadM
     unobserved = unobserved_mask(state.reasons)
     scale = torch.where(unobserved, scale.clamp(min=cfg.motion.unobserved_scale), scale)
     unequal = deviation_prior_std(state.mean[:, place.deviations], cfg)
-    vertical = vertical_curvature_prior_std(state.mean[:, VERTICAL], state.cov[:, VERTICAL, VERTICAL], cfg)
+    vertical = (cfg.motion.vertical_curvature_std**2 + hill_variance(state, dt, cfg)).sqrt()
     return road, *motion(dt, scale, unequal, vertical, road, place, cfg.motion)
 
 

@@ -44,6 +44,7 @@ class MotionConfig:
         vertical_curvature_std: 1/m, standard deviation of the road's vertical curvature where nothing says
             that it is curved.
         vertical_curvature_memory: s, time constant of the return to it.
+        hill_memory: s, time constant of the return to that standard deviation after a crest or a dip.
         curvature_walk: 1/m/√s, random walk of every knot.
         curvature_step: 1/m, sigma of a step that comes into view on a straight road.
         speed, speed_std: m/s, prior of the speed.
@@ -62,7 +63,8 @@ class MotionConfig:
     offset_density: float = 0.2
     offset_memory: float = 2.0
     vertical_curvature_std: float = 1e-6
-    vertical_curvature_memory: float = 5.0
+    vertical_curvature_memory: float = 10.0
+    hill_memory: float = 20.0
     curvature_walk: float = 2e-6
     curvature_step: float = 1e-4
     speed: float = 20.0

@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 
 from lanebev.estimation.joint.layout import DEVIATIONS, NUM_POSE, POSE, SHAPE
 from lanebev.estimation.joint.measurement import NUM_SHAPE, VERTICAL
-from lanebev.estimation.joint.state import JointConfig
+from lanebev.estimation.joint.state import JointConfig, JointState
 from lanebev.estimation.joint.update import FrameInformation, innovation_score
 from lanebev.tensors import constant
 
@@ -21,7 +21,7 @@ _FREE_POSE = (0.05, 0.05, 0.05, 0.3)  # rad, m: sigmas added where the pose is f
 _LARGEST_EXCESS = 4.0  # of a squared score; a larger one is a jump
 EQUAL = 0.1  # of the deviations of unequal lanes, up to which lanes are equal
 _RAISED = 0.01  # share of segments over the horizon, above which the others are too low
-_CURVED = 3.0  # sigmas of a vertical curvature from which the road is taken for a crest or a dip
+_CURVED = 2.0  # sigmas of a vertical curvature from which the road is taken for a crest or a dip
 _POSE_DECAY = 0.85  # factor per frame on the pose's evidence, since a detector's errors last over frames
 CALL = 5.0  # sigmas of evidence at which half of the noise is admitted
 
@@ -158,16 +158,17 @@ def deviation_prior_std(deviations: Tensor, cfg: JointConfig) -> Tensor:
     return torch.where(unequal, 2 * torch.where(unequal, excess, 1.0).sqrt(), 0.0).clamp(max=size)
 
 
-def vertical_curvature_prior_std(curvature: Tensor, variance: Tensor, cfg: JointConfig) -> Tensor:
-    """Compute the prior standard deviation (B,) 1/m of the vertical curvature from its estimate.
+def hill_variance(state: JointState, dt: Tensor, cfg: JointConfig) -> Tensor:
+    """Compute the variance (B,) 1/m² of the vertical curvature beyond that of a plane road.
 
-    Source: (J21). Otherwise the prior of a plane road would pull the estimate to 0 all along a crest.
+    Source: (J21). Otherwise the prior of a plane road would pull the estimate to 0 all along a crest, and the
+    dip behind it would come as a surprise.
 
     Args:
-        curvature: (B,) 1/m, estimate.
-        variance: (B,) 1/m², of it.
+        state: after the last frame.
+        dt: (B,) s since then.
         cfg: the numbers.
     """
+    curvature, variance = state.mean[:, VERTICAL], state.cov[:, VERTICAL, VERTICAL]
     excess = (curvature.square() - _CURVED**2 * variance).clamp(min=0.0)
-    std: Tensor = (cfg.motion.vertical_curvature_std**2 + excess).sqrt()
-    return std
+    return (state.hills * (-dt / cfg.motion.hill_memory).exp()).maximum(excess)

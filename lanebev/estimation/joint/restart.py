@@ -209,6 +209,7 @@ def state_of_fit(fit: SingleFrameFit, before: JointState, cfg: JointConfig) -> J
         pose_sensitivity=torch.zeros_like(before.pose_sensitivity),
         scatter=torch.zeros_like(before.scatter),
         motion_scale=torch.ones_like(before.motion_scale),
+        hills=zero,
         early=zero,
         unseen=zero,
         misfit=zero,

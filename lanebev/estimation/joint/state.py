@@ -129,6 +129,7 @@ class JointState(NamedTuple):
         scatter: (B, 2, 3) over the last frames, for the boundaries' own places (m²) and headings (rad²): sum
             of squares, degrees of freedom, weight of the frames.
         motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, adapted to the drive.
+        hills: (B,) 1/m², variance of the road's vertical curvature beyond that of a plane road, by the drive.
         early: (B,) s by which the state is ahead of the last frame, which came out of order.
         unseen: (B,) s since the last usable frame.
         misfit: (B,) s for which there were segments that did not fit.
@@ -146,6 +147,7 @@ class JointState(NamedTuple):
     pose_sensitivity: Tensor
     scatter: Tensor
     motion_scale: Tensor
+    hills: Tensor
     early: Tensor
     unseen: Tensor
     misfit: Tensor
