@@ -16,6 +16,7 @@ from lanebev.types import Calibration, Extrinsics
 
 _ONLY_HEIGHT = (0.0, 0.0, 0.0, 1.0)
 _FITTED = 3  # boundaries that a pose of equal lanes always fits: by offset, roll and height
+_BY_CHANCE = 0.004  # probability that a further boundary is in its place though lanes are unequal
 _IN_VIEW = 0.015  # rad/m or m/m: change of roll or height by a boundary's deviation from which it counts
 _WAY = 15.0  # m along which a boundary keeps a heading of its own
 _DOUBTFUL = 0.6  # m out of place, below which a single boundary may stand for several
@@ -52,9 +53,10 @@ def unverified_deviation(
         cfg: the numbers.
     """
     in_view = (sensitivity[:, ROLL:].abs().amax(1) / _IN_VIEW).clamp(max=1.0) * (deviations.abs() < _DOUBTFUL)
-    further = (in_view.sum(-1) - _FITTED).clamp(0.0, 1.0)
+    further = (in_view.sum(-1) - _FITTED).clamp(min=0.0)
     askew = of_headings * _WAY**2 if cfg.lane_deviation_std else 0.0
-    return (cfg.lane_deviation_std**2 + askew) * (1 - further)
+    share = (1 - further).maximum(_BY_CHANCE**further)
+    return (cfg.lane_deviation_std**2 + askew) * share
 
 
 def beyond_filter(expected: Tensor, variances: Tensor) -> Tensor:

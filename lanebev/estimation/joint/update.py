@@ -94,7 +94,7 @@ def frame_information(
         doubt: (B, O, O), covariance of the point of linearisation. A residual within it is not an outlier.
         seen: what was observed.
     """
-    unsure = _predicted_variance(jacobian[:, :NUM_COMMON], doubt, seen.boundary)
+    unsure = _predicted_variance(jacobian, doubt)
     squared = squared_distance(residuals.distance)
     gate = scaled_variance(seen.sigma, scale) + unsure
     trust = inlier_weights(squared, residuals.valid, gate, seen.focal)
@@ -269,14 +269,7 @@ def _normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tup
     return torch.cat([common, own], dim=-1), -against
 
 
-def _predicted_variance(jacobian: Tensor, cov: Tensor, boundary: Tensor) -> Tensor:
-    """(B, N) px², h P hᵀ of a segment's end points, their mean, for (B, 12, M) and (B, O, O).
-
-    Correlations between deviations and the common entries are left out: they lower it.
-    """
-    spread = torch.bmm(cov[:, :NUM_COMMON, :NUM_COMMON], jacobian).mul_(jacobian)  # another copy takes longer
-    common = by_ends(spread).sum((1, 2))  # (B, N)
-    own = cov.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:].gather(1, boundary)  # (B, N)
-    shift = squared_distance(by_ends(jacobian[:, OFFSET]))
-    total: Tensor = torch.addcmul(common, own, shift)
-    return 0.5 * total
+def _predicted_variance(jacobian: Tensor, cov: Tensor) -> Tensor:
+    """(B, N) px², h P hᵀ of a segment's end points, their mean, for (B, O, M) and (B, O, O)."""
+    spread = torch.bmm(cov, jacobian).mul_(jacobian)  # another copy takes longer
+    return 0.5 * by_ends(spread).sum((1, 2))
