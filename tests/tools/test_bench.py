@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 
+from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.testing.evaluation import Track, recovery, summarise
+from lanebev.testing.moments import WIDTH
 from tools.bench_calibration import main, smallest_eigenvalue, stream
 from tools.bench_kinds import ALLOWED, FIRST_SEED, measure
+from tools.bench_mixed import FIRST_SEED as FIRST_MIXED
+from tools.bench_mixed import draw, follow, row
 
 
 @pytest.mark.slow
@@ -73,3 +78,24 @@ def test_shocks_of_drives_on_which_nothing_was_chosen(kind):
     found = measure(kind, [FIRST_SEED + 500, FIRST_SEED + 501])
     assert max(found.back) <= ALLOWED
     assert found.within >= 0.97
+
+
+def test_drives_drawn_at_random_are_the_same_for_a_seed_and_change_lanes_without_a_jump():
+    seed = next(k for k in range(2000, 2050) if "lane change" in draw(k).difficulties)
+    drive, again = draw(seed), draw(seed)
+    assert [moment.pose for moment in drive.moments] == [moment.pose for moment in again.moments]
+    offsets = torch.tensor([moment.offset for moment in drive.moments]).diff().abs()
+    assert (offsets > WIDTH - 0.5).sum() == 1  # where the numbers of the boundaries change
+    assert ((offsets < 0.5) | (offsets > WIDTH - 0.5)).all()
+
+
+def test_a_drive_drawn_at_random_is_calibrated_and_its_row_has_the_shares():
+    drive = draw(FIRST_MIXED)
+    short = replace(drive, moments=drive.moments[: len(drive.moments) // 8])
+    errors = follow(short, FIRST_MIXED, JointCalibrator())
+    evaluated = [moment for moment in short.moments if not moment.tag]
+    assert 0 < len(errors.nees) <= len(evaluated)
+    assert (errors.within() > 0.9).all()
+    wrong = errors._replace(by_sigma=torch.tensor([[0.0, 2.9, 3.1, 9.0]]), nees=torch.tensor([2.0]))
+    assert row("one", [wrong]) == "| one | 1 | 2.00 | 100.0 100.0 0.0 0.0 |"
+    assert row("none", []) == "| none | 0 | – | – |"
