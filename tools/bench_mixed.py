@@ -264,7 +264,7 @@ def row(name: str, errors: Sequence[Errors]) -> str:
     return f"| {name} | {len(errors)} | {nees:.2f} | {' '.join(f'{100 * one:.1f}' for one in within)} |"
 
 
-def main(drives: PositiveInt = 60, first: int = FIRST_SEED) -> None:
+def print_mixed(drives: PositiveInt = 60, first: int = FIRST_SEED) -> None:
     """Measure the joint calibrator on drives drawn at random.
 
     Args:
@@ -285,5 +285,10 @@ def main(drives: PositiveInt = 60, first: int = FIRST_SEED) -> None:
         print(row(f"seed {seeds[k]}: {what}", found[k : k + 1]))
 
 
+def main() -> None:
+    """Run from the command line."""
+    auto_cli(print_mixed)
+
+
 if __name__ == "__main__":
-    auto_cli(main)
+    main()
