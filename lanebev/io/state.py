@@ -19,6 +19,7 @@ from torch import Tensor
 FORMAT = "lanebev-state"
 VERSION = 3
 _SEPARATOR = "."
+_SAME_WIDTH = 1e-4  # relative difference of equal lane widths: one may have been a float32
 
 
 class LoadedState(NamedTuple):
@@ -125,11 +126,11 @@ def lane_width_remark(loaded: LoadedState, lane_width: float) -> str:
         lane_width: m, as it is now.
     """
     before = loaded.metadata.get("lane_width")
-    if before is None or math.isclose(before, lane_width):
+    if before is None or math.isclose(before, lane_width, rel_tol=_SAME_WIDTH):
         return ""
     return (
-        f"the state was saved with lanes {before:g} m wide, now they are {lane_width:g} m; on the same road "
-        "one of the widths is wrong, and so are the heights: then start without the state"
+        f"the state was saved with lanes {before:g} m wide, now they are {lane_width:g} m; if the road is the "
+        "same, one of the widths is wrong, and so are the heights: start without the state"
     )
 
 

@@ -28,8 +28,7 @@ from lanebev.view.tiles import LARGEST_WEIGHTS, interpolant
 
 _kept = KeptArrays()
 
-
-_FEW_PIXELS = 8  # of a frame, for each cell: so many take as long to copy as a fourth channel saves
+_MOST_PIXELS = 8  # of a frame, for each cell: to copy more takes longer than a fourth channel saves
 
 
 @torch.inference_mode()
@@ -193,7 +192,7 @@ class _Source:
 
     def __init__(self, frame: NDArray[np.uint8], shape: tuple[int, int]) -> None:
         self._frame = frame
-        self._wide = frame.shape[2:] == (3,) and frame.size < 3 * _FEW_PIXELS * math.prod(shape)
+        self._wide = frame.shape[2:] == (3,) and frame.size < 3 * _MOST_PIXELS * math.prod(shape)
         self._pixels = _kept("wide", (*frame.shape[:2], 4), np.uint8) if self._wide else frame
         self._memory = _kept("sampled", (max(BLOCK, shape[1]), *self._pixels.shape[2:]), np.uint8)
         self._ready = range(0)  # rows that have a fourth channel

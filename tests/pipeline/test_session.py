@@ -154,7 +154,8 @@ def test_a_state_of_lanes_of_another_width_is_noticed(tmp_path, caplog):
     one = Session(CAMERA, lane_width=3.7)
     one(polylines=lines(), stamp=0.0)
     one.save(tmp_path / "s")
-    Session(CAMERA, lane_width=3.7).load(tmp_path / "s")
+    for same in (3.7, float(np.float32(3.7))):
+        Session(CAMERA, lane_width=same).load(tmp_path / "s")
     assert caplog.records == []
     Session(CAMERA, lane_width=3.5).load(tmp_path / "s")
     assert "the state was saved with lanes 3.7 m wide, now they are 3.5 m" in caplog.text
