@@ -3,6 +3,7 @@
 import rclpy
 from cv_bridge import CvBridge
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.wait_for_message import wait_for_message
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
@@ -22,15 +23,15 @@ def on_image(message):
         rotation = Quaternion(**dict(zip("xyzw", quaternion_xyzw(matrix), strict=True)))
         header = Header(stamp=stamp, frame_id="base_footprint")
         pose = Transform(translation=origin, rotation=rotation)
-        child = message.header.frame_id
-        broadcaster.sendTransform(TransformStamped(header=header, child_frame_id=child, transform=pose))
+        publish(TransformStamped(header=header, child_frame_id=message.header.frame_id, transform=pose))
 
 
 rclpy.init()
 node = rclpy.create_node("lane_calibration")
-_, info = wait_for_message(CameraInfo, node, "camera_info")
+newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # from any publisher
+_, info = wait_for_message(CameraInfo, node, "camera_info", qos_profile=newest)
 lens = {"distortion_model": info.distortion_model, "D": list(info.d), "K": list(info.k)}
 session = lanebev.Session(lanebev.Camera.from_fields({"width": info.width, "height": info.height, **lens}))
-bridge, broadcaster = CvBridge(), TransformBroadcaster(node)
-subscription = node.create_subscription(Image, "image", on_image, 1)
+bridge, publish = CvBridge(), TransformBroadcaster(node).sendTransform
+subscription = node.create_subscription(Image, "image", on_image, newest)
 rclpy.spin(node)

@@ -106,6 +106,9 @@ def test_a_live_loop_ends_with_a_state(monkeypatch, tmp_path, capsys):
     assert (tmp_path / "state.safetensors").is_file()
 
 
+BEST_EFFORT = {"depth": 1, "reliability": "best effort"}
+
+
 class Message(SimpleNamespace):
     """Stand-in for a ROS message: its fields are the keywords."""
 
@@ -113,16 +116,25 @@ class Message(SimpleNamespace):
 def ros_modules(messages, info, sent, said):
     """Stand-ins for the ROS 2 packages, in which a node is given one CameraInfo and some images."""
     node = Message(get_logger=lambda: Message(info=said.append))
-    node.create_subscription = lambda kind, topic, callback, depth: node.__dict__.update(receive=callback)
+
+    def create_subscription(kind, topic, callback, quality):
+        assert vars(quality) == BEST_EFFORT  # with it a node receives what any publisher sends
+        node.receive = callback
+
+    def wait_for_message(kind, node, topic, *, qos_profile):
+        assert vars(qos_profile) == BEST_EFFORT
+        return True, info
+
+    node.create_subscription = create_subscription
     kinds = dict.fromkeys(("Quaternion", "Transform", "TransformStamped", "Vector3"), Message)
-    wait = {"wait_for_message": lambda kind, node, topic: (True, info)}
     modules = {
         "rclpy": {
             "init": lambda: None,
             "create_node": lambda name: node,
             "spin": lambda node: [node.receive(message) for message in messages],
         },
-        "rclpy.wait_for_message": wait,
+        "rclpy.qos": {"QoSProfile": Message, "ReliabilityPolicy": Message(BEST_EFFORT="best effort")},
+        "rclpy.wait_for_message": {"wait_for_message": wait_for_message},
         "cv_bridge": {"CvBridge": lambda: Message(imgmsg_to_cv2=lambda message, code: message.data)},
         "geometry_msgs.msg": kinds,
         "sensor_msgs.msg": {"CameraInfo": Message, "Image": Message},
