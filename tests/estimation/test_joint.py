@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -640,6 +641,30 @@ def test_update_equals_a_plain_gauss_newton_on_all_data():
         assert ((change[row] - step) / std).abs().max() < 1e-6
         expected = torch.linalg.inv(rows.mT @ rows)
         assert ((cov[row] - expected) / std / std.unsqueeze(-1)).abs().max() < 1e-6
+
+
+def test_weights_allow_for_the_predicted_variance_of_the_end_points():
+    """(J6) with h P hᵀ of each end point, one at a time, on unequal lanes; with all correlations."""
+    uneven = moments(1.0, lambda t, m: replace(m, places=PLACES + torch.tensor([0.1, 0, -0.1, 0.1, 0, -0.1])))
+    frames, calibrator = list(see(uneven, 2, 1.0, 8, 0, DOUBLE)), JointCalibrator()
+    _, state = run(calibrator, frames)
+    seen = observe(frames[-1][1], cameras(2), 6)
+    own = state.mean[:, PLACE.deviations].gather(1, seen.boundary)
+    places = boundary_places(WIDTH, 6, seen.sigma).gather(1, seen.boundary) + own
+    at = boundary_residuals(state.mean[:, :NUM_COMMON], places, seen, state.phase)
+    full = observed_jacobian(at.jacobian, membership(seen.boundary, 6, like=own))
+    cov = state.cov[:, PLACE.observed, PLACE.observed]
+    trust = frame_information(at, full, torch.ones(2, dtype=DOUBLE), cov, seen).trust
+    count = seen.boundary.shape[1]
+    for row, segment in itertools.product(range(2), range(count)):
+        first, second = (full[row, :, end * count + segment] for end in (0, 1))
+        variance = float(
+            seen.sigma[row, segment] ** 2 + 0.5 * (first @ cov[row] @ first + second @ cov[row] @ second)
+        )
+        squared = float(at.distance[row, :, segment].square().sum())
+        inlier = math.exp(-0.5 * squared / variance) / (2 * math.pi * variance)
+        outlier = 0.3 / (0.2 * float(seen.focal[row])) ** 2
+        assert float(trust[row, segment]) == pytest.approx(inlier / (inlier + outlier), rel=1e-9)
 
 
 def test_considered_entries_keep_their_mean_and_variance():
