@@ -129,8 +129,8 @@ def lane_width_remark(loaded: LoadedState, lane_width: float) -> str:
     if before is None or math.isclose(before, lane_width, rel_tol=_SAME_WIDTH):
         return ""
     return (
-        f"the state was saved with lanes {before:g} m wide, now they are {lane_width:g} m; if the road is the "
-        "same, one of the widths is wrong, and so are the heights: start without the state"
+        f"the state was saved with lanes {before:g} m wide, now they are {lane_width:g} m; if the road is "
+        "the same, one of the widths is wrong, and so are the heights: start without the state"
     )
 
 
