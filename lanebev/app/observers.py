@@ -94,7 +94,7 @@ class LaneFileObserver:
             self.matches: list[int | None] = list(range(len(entries)))
         else:
             self.matches = match_frames(source.paths, entries)
-        in_order = [entries[match] for match in self.matches if match is not None]
+        in_order = [self.entries[match] for match in self.matches if match is not None]
         unmatched = "" if source.is_video else self._unmatched(source.taken_numbers)
         of_drive = [] if stills else [repeats_remark(in_order), unequal_lanes_remark(in_order, camera)]
         self.remark = "; ".join(filter(None, [self.remark, unmatched, *of_drive]))

@@ -349,6 +349,12 @@ def test_lanes_of_different_widths_are_noticed(tmp_path):
     assert LaneFileObserver([entry], source, camera, stills=True).remark == ""
     equal = entry._replace(lines=entry.lines[:2])
     assert LaneFileObserver([equal], source, camera).remark == ""
+    lens = Camera.from_parameters(
+        fx=0.55 * width, fy=0.55 * width, cx=0.5 * width, cy=0.5 * height, width=width, height=height,
+        distortion=(-0.3, 0.1, 0.0, 0.0, 0.0),
+    )  # fmt: skip
+    ideal = entry._replace(principal_point=(0.5 * width, 0.5 * height))  # 3D points, projected without it
+    assert LaneFileObserver([ideal], source, lens).remark.startswith("lanes: one lane is 2.5 times as wide")
 
 
 def test_images_without_lanes_are_counted(tmp_path):
