@@ -54,12 +54,8 @@ def boundary_indices(
     kept = _longest_of_doubles(apart, crossing, _SAME_LINE * usual, lines)
     left = sum(slope[i] < 0 for i in kept)
     lanes = [crossing[b] - crossing[a] for a, b in pairwise(kept)]
-    usual = _usual_gap(lanes)
-    if 0 < left < len(kept):
-        right_of, left_of = -slope[kept[left - 1]], slope[kept[left]]  # the camera, in camera heights
-        width = right_of + left_of
-        is_one_lane = width < _WIDEST and abs(right_of - left_of) < 2 * _CENTRED * width
-        usual = lanes[left - 1] if is_one_lane else usual
+    in_a_lane = 0 < left < len(kept) and _bound_one_lane(-slope[kept[left - 1]], slope[kept[left]])
+    usual = lanes[left - 1] if in_a_lane else _usual_gap(lanes)
     steps = [2 if gap > _NEXT_BUT_ONE * usual else 1 for gap in lanes]
     position = np.concatenate([[0], np.cumsum(steps)]).astype(int)
     if left == 0:
@@ -123,6 +119,12 @@ def _longest_of_doubles(
         elif np.ptp(lines[i][:, 1]) > np.ptp(lines[kept[-1]][:, 1]):
             kept[-1] = i
     return kept
+
+
+def _bound_one_lane(from_left: float, from_right: float) -> bool:
+    """Tell whether the lines to both sides bound one lane, by the camera's distances in camera heights."""
+    width = from_left + from_right
+    return width < _WIDEST and abs(from_left - from_right) < 2 * _CENTRED * width
 
 
 def _usual_gap(gaps: Sequence[float]) -> float:
