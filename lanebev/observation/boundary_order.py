@@ -68,23 +68,33 @@ def boundary_indices(
     return result
 
 
-def width_ratio(lines: Sequence[NDArray[np.float64]], indices: Sequence[int | None]) -> float:
-    """Return the ratio of the widest lane to the narrowest one, as a camera without roll would see them.
+def width_ratios(
+    lines: Sequence[NDArray[np.float64]], indices: Sequence[int | None], rolls: Sequence[float] = (0.0,)
+) -> NDArray[np.float64]:
+    """Return the ratio of the widest lane to the narrowest one, for every roll that the camera may have.
 
     Args:
         lines: each (P, 2) px, undistorted.
         indices: boundary of each, None for a line that is none.
+        rolls: (R,) rad, of the camera.
 
     Returns:
-        the ratio; NaN with fewer than three boundaries, or boundaries that cross.
+        (R,) ratios; NaN with fewer than three boundaries, or boundaries that cross.
     """
     found = sorted(
-        (index, _lower_half(line).slope)
+        (index, math.atan(_lower_half(line).slope))
         for line, index in zip(lines, indices, strict=True)
         if index is not None and len(line) > 1 and np.ptp(line[:, 1]) > 0
     )
-    widths = [(slope - left) / (index - before) for (before, left), (index, slope) in pairwise(found)]
-    return max(widths) / min(widths) if len(widths) > 1 and min(widths) > 0 else math.nan
+    if len(found) < 3:
+        return np.full(len(rolls), math.nan)
+    numbers, angles = np.array(found).T
+    turned = angles - np.array(rolls)[:, None]  # from straight down in an image without roll
+    widths = np.diff(np.tan(turned)) / np.diff(numbers)
+    possible = (np.abs(turned) < math.pi / 2).all(-1) & (widths > 0).all(-1)
+    widths = np.where(possible[:, None], widths, math.nan)
+    ratios: NDArray[np.float64] = widths.max(-1) / widths.min(-1)
+    return ratios
 
 
 class _Straight(NamedTuple):

@@ -14,7 +14,7 @@ from torch import Tensor
 from lanebev.camera.model import Camera, check_camera
 from lanebev.geometry.lens import normalise_points
 from lanebev.numbers import shown
-from lanebev.observation.boundary_order import boundary_indices, width_ratio
+from lanebev.observation.boundary_order import boundary_indices, width_ratios
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.types import NUM_BOUNDARIES
 
@@ -99,13 +99,19 @@ def vertices_from_lines(
     return BoundaryVertices._make([*parts, torch.arange(num_boundaries)[None]])
 
 
-def lane_width_ratio(
-    lines: Sequence[LaneLine], camera: Camera, num_boundaries: int = NUM_BOUNDARIES
-) -> float:
-    """Return the ratio of the widths of a frame's lanes, see :mod:`lanebev.observation.boundary_order`."""
+def lane_width_ratios(
+    lines: Sequence[LaneLine],
+    camera: Camera,
+    rolls: Sequence[float] = (0.0,),
+    num_boundaries: int = NUM_BOUNDARIES,
+) -> NDArray[np.float64]:
+    """Return the ratios (R,) of the widths of a frame's lanes for rolls (R,) rad of the camera.
+
+    See :func:`lanebev.observation.boundary_order.width_ratios`.
+    """
     lines = [_without_edges(line, camera.image_size[1]) for line in lines]
     ideal = [_undistorted(line.points, camera) for line in lines]
-    return width_ratio(ideal, _indices(lines, camera, num_boundaries))
+    return width_ratios(ideal, _indices(lines, camera, num_boundaries), rolls)
 
 
 def lines_from_polylines(

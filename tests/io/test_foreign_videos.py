@@ -18,6 +18,7 @@ from lanebev.app.sources import make_source
 from lanebev.io.frames import Selection
 from lanebev.io.image_names import drives_remark
 from lanebev.io.images import read_image
+from lanebev.io.lane_widths import unequal_lanes_remark
 from lanebev.io.lanes import FrameLines
 from lanebev.io.video import open_source
 from lanebev.observation.polylines import LaneLine
@@ -344,11 +345,14 @@ def test_lanes_of_different_widths_are_noticed(tmp_path):
         ],
     )
     assert LaneFileObserver([entry], source, camera).remark.startswith(
-        "lanes: one lane is 2.5 times as wide as another, unless the camera is rolled; if a line"
+        "lanes: one lane is 2.5 times as wide as another, unless the camera is rolled by more than 2 degrees;"
     )
     assert LaneFileObserver([entry], source, camera, stills=True).remark == ""
     equal = entry._replace(lines=entry.lines[:2])
     assert LaneFileObserver([equal], source, camera).remark == ""
+    slopes = np.tan(np.arctan(0.7 * 3.7 * np.arange(-2.5, 3.0)) + math.radians(2.0))  # the camera is rolled
+    rolled = [LaneLine(np.stack([0.5 * width + slope * (rows - 0.4 * height), rows], -1)) for slope in slopes]
+    assert unequal_lanes_remark([entry._replace(lines=rolled)], camera) == ""
     lens = Camera.from_parameters(
         fx=0.55 * width, fy=0.55 * width, cx=0.5 * width, cy=0.5 * height, width=width, height=height,
         distortion=(-0.3, 0.1, 0.0, 0.0, 0.0),

@@ -15,7 +15,7 @@ from lanebev.observation.polylines import (
     VERTICES_PER_LINE,
     LaneLine,
     image_rows,
-    lane_width_ratio,
+    lane_width_ratios,
     rows_from_vertices,
     vertices_from_lines,
 )
@@ -50,7 +50,23 @@ def _fan(offsets, vanishing=(640.0, 300.0), height=1.5, top=330.0, bottom=719.0)
 def test_the_lane_in_whose_middle_the_camera_is_is_one(offsets, expected, ratio):
     lines = _fan(offsets)
     assert boundary_indices(lines) == expected
-    assert lane_width_ratio([LaneLine(line) for line in lines], CAMERA) == pytest.approx(ratio)
+    assert lane_width_ratios([LaneLine(line) for line in lines], CAMERA) == pytest.approx([ratio])
+
+
+@pytest.mark.parametrize("roll", [-0.05, 0.02])
+def test_lanes_are_equal_for_the_roll_of_the_camera_only(roll):
+    """Of lines through one point, at the angles at which a camera with roll sees equal lanes."""
+    angles = np.arctan(np.array([-5.55, -1.85, 1.85, 5.55, 9.25]) / 1.5) + roll
+    lines = [LaneLine(line, k + 1) for k, line in enumerate(_fan(np.tan(angles), height=1.0, bottom=340.0))]
+    found = lane_width_ratios(lines, CAMERA, (0.0, roll, 1.5, -1.5))
+    assert found[1] == pytest.approx(1.0)
+    assert found[0] > 1.2
+    assert np.isnan(found[2:]).all()  # then lines would be above the horizon
+
+
+def test_a_frame_without_three_boundaries_has_no_ratio_of_widths():
+    assert np.isnan(lane_width_ratios([], CAMERA)).all()
+    assert np.isnan(lane_width_ratios([LaneLine(line) for line in _fan((-1.85, 1.85))], CAMERA)).all()
 
 
 def test_boundary_index_counts_outwards_from_the_ego_lane():
