@@ -28,10 +28,13 @@ def boundary_indices(
     sideways, and the lines are counted outwards in that order. Going down, a line runs to its own side of the
     camera, so its slope gives the side at any yaw. A neighbour much nearer than usual, or nearer than the
     narrowest lane, is the other edge of the same marking or the same line drawn twice, and gets None; one
-    twice as far as usual is the next but one. Usual is the gap in whose middle the camera is, since cars
-    drive in the middle of a lane and not above the boundary of two, unless it is too wide for one; else the
-    lower median. For the narrowest and the widest lane: on a plane, the slopes dx/dy of two boundaries differ
-    by their distance over the camera's height, for any pitch, yaw and focal length.
+    twice as far as usual is the next but one.
+
+    The usual gap is that of the lane in whose middle the camera is, unless it is too wide for one lane: cars
+    drive in the middle of a lane, not above a boundary. So a car above a boundary that is not seen is taken
+    to be in one wide lane. If the camera is in the middle of no lane, the usual gap is the lower median. For
+    the narrowest and the widest lane: on a plane, the slopes dx/dy of two boundaries differ by their distance
+    over the camera's height, for any pitch, yaw and focal length.
 
     Args:
         lines: each (P, 2) px, undistorted; P = 0 and 1 get None.

@@ -161,8 +161,8 @@ def deviation_prior_std(deviations: Tensor, cfg: JointConfig) -> Tensor:
 def hill_variance(state: JointState, dt: Tensor, cfg: JointConfig) -> Tensor:
     """Compute the variance (B,) 1/m² of the vertical curvature beyond that of a plane road.
 
-    Source: (J21). Otherwise the prior of a plane road would pull the estimate to 0 all along a crest, and the
-    dip behind it would come as a surprise.
+    Source: (J21). Otherwise the prior of a plane road would pull the estimate to 0 all along a crest, and
+    again in the dip behind it until there is evidence of it.
 
     Args:
         state: after the last frame.

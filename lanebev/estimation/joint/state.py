@@ -129,7 +129,8 @@ class JointState(NamedTuple):
         scatter: (B, 2, 3) over the last frames, for the boundaries' own places (m²) and headings (rad²): sum
             of squares, degrees of freedom, weight of the frames.
         motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, adapted to the drive.
-        hills: (B,) 1/m², variance of the road's vertical curvature beyond that of a plane road, by the drive.
+        hills: (B,) 1/m², variance of the road's vertical curvature beyond that of a plane road, by the crests
+            and dips so far (J21).
         early: (B,) s by which the state is ahead of the last frame, which came out of order.
         unseen: (B,) s since the last usable frame.
         misfit: (B,) s for which there were segments that did not fit.
