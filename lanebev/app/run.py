@@ -113,8 +113,8 @@ def run(
             videos=not config.no_video,
             smoothed=config.smooth,
         )
-        doubts = (source.problem, problem, observer.remark, *remarks(config, source, camera))
-        recorder.problems += filter(None, doubts)
+        doubts = (problem or resume_remark(config), observer.remark, *remarks(config, source, camera))
+        recorder.problems += filter(None, (source.problem, *doubts))
         covariances = KeptNumbers(4, 4, folder=out / ".")
         frames = observed_frames(source, second)
         with recorder, closing(frames), ended_by_signals(source):
@@ -172,10 +172,10 @@ def resumed_tracker(config: RunConfig, camera: Camera) -> tuple[RunTracker, str 
 
 
 def remarks(config: RunConfig, source: FrameSource, camera: Camera) -> list[str]:
-    """Return what speaks against the camera, the field of view, the mount and the state of the settings."""
+    """Return what speaks against the camera, the field of view and the mount of the settings."""
     bars = "" if config.fov is None else bars_remark(first_image(source))
     mount = mount_remark(config.mount, camera)
-    return [*filter(None, (resume_remark(config), bars, mount)), *camera_remarks(camera, source.pixel_aspect)]
+    return [*filter(None, (bars, mount)), *camera_remarks(camera, source.pixel_aspect)]
 
 
 def first_pass(
