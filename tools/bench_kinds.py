@@ -273,6 +273,16 @@ def _two_lanes(seed: int, std: float) -> Generated:
     return replace(drive, moments=lambda: [replace(one, visible=(1, 2, 3)) for one in drive.moments()])
 
 
+def _kerb(seed: int) -> Generated:
+    """Leave the ego lane in view; a second later a line joins it, 0.5 to 1.8 m from where a lane ends."""
+    random = Random(seed)
+    places = PLACES.clone()
+    places[4] += random.choice((-1, 1)) * random.uniform(0.5, 1.8)
+    return _drawn(
+        seed, lambda t, moment: replace(moment, places=places, visible=(2, 3) if t < 1 else (2, 3, 4))
+    )
+
+
 def mounted_roll(seed: int) -> float:
     """Draw the roll of a mount, rad, normal with the standard deviation of the estimator's prior.
 
@@ -320,6 +330,7 @@ KINDS: dict[str, Callable[[int], Generated]] = {
     **{
         f"two lanes in view, unequal by {size} cm": partial(_two_lanes, std=size / 100) for size in (2, 5, 10)
     },
+    "a kerb beside the ego lane": _kerb,
     **{
         f"{kind}, boundaries wander by {size} cm": partial(_street, std=size / 100, speed=speed)
         for kind, speed in (("street at 8 m/s", 8.0), ("standing in a street", 0.0))

@@ -487,17 +487,21 @@ def test_deviations_that_three_boundaries_cannot_show_count_less_with_each_furth
     sensitivity[:, ROLL, 1:4] = torch.tensor([-0.05, 0.1, -0.05], dtype=DOUBLE)
     sensitivity[1, HEIGHT, 4], sensitivity[2, HEIGHT, 4] = 0.015 / 4, 0.03
     none, straight = torch.zeros(3, 6, dtype=DOUBLE), torch.zeros(3, dtype=DOUBLE)
-    found = unverified_deviation(sensitivity, none, straight, JointConfig(lane_deviation_std=0.1)).sqrt()
+    found = unverified_deviation(
+        sensitivity, none, straight, straight, JointConfig(lane_deviation_std=0.1)
+    ).sqrt()
     torch.testing.assert_close(
         found, torch.tensor([0.1, 0.1 * math.sqrt(0.75), 0.1 * 0.004**0.5], dtype=DOUBLE)
     )
     apart = none.clone()
     apart[:, 4] = -0.9  # bounds no lane
-    alone = unverified_deviation(sensitivity, apart, straight, JointConfig(lane_deviation_std=0.1)).sqrt()
+    alone = unverified_deviation(
+        sensitivity, apart, straight, straight, JointConfig(lane_deviation_std=0.1)
+    ).sqrt()
     torch.testing.assert_close(alone, torch.full_like(alone, 0.1))
     held = torch.full((3, 6), 0.02**2 / 3, dtype=DOUBLE)  # half of their sum is 0.02²
     left = beyond_filter(
-        unverified_deviation(sensitivity, none, straight, JointConfig(lane_deviation_std=0.1)), held
+        unverified_deviation(sensitivity, none, straight, straight, JointConfig(lane_deviation_std=0.1)), held
     )
     assert left[0] == pytest.approx(0.1**2 - 0.02**2)
 
@@ -564,7 +568,7 @@ def test_equal_lanes_are_trusted_some_time_after_a_fourth_boundary_is_seen():
     none = torch.zeros(1, 6, dtype=DOUBLE)
     seen, left = three, []
     for _ in range(25):
-        left.append(float(unverified_deviation(seen[..., :6], none, none[:, 0], cfg).sqrt()))
+        left.append(float(unverified_deviation(seen[..., :6], none, none[:, 0], none[:, 0], cfg).sqrt()))
         seen = remembered_sensitivity(four, seen, step, cfg)
     assert left[0] == pytest.approx(0.05)
     assert 0.03 < left[1] < 0.05

@@ -12,7 +12,7 @@ import torch
 from lanebev import JointCalibrator, LaneSegments
 from lanebev.estimation.joint.measurement import NUM_STRAIGHT, PITCH, ROLL, boundary_residuals
 from lanebev.estimation.joint.observations import boundary_places, observe
-from lanebev.estimation.joint.output import unverified_deviation
+from lanebev.estimation.joint.output import odd_line_deviation, unverified_deviation
 from lanebev.estimation.joint.restart import scatter_of_fit
 from lanebev.estimation.joint.scatter import averaged_moments, boundary_scatter, scatter_variance
 from lanebev.estimation.joint.single_frame import fit_observations
@@ -117,9 +117,42 @@ def test_boundaries_that_are_askew_may_be_out_of_place_where_nothing_shows_it():
     sensitivity = torch.zeros(2, 4, 6, dtype=DOUBLE)
     sensitivity[:, ROLL, 1:4] = torch.tensor([-0.05, 0.1, -0.05], dtype=DOUBLE)
     askew = torch.tensor([0.0, 0.01**2], dtype=DOUBLE)
-    found = unverified_deviation(sensitivity, torch.zeros(2, 6, dtype=DOUBLE), askew, CONFIG).sqrt()
+    level = torch.zeros(2, dtype=DOUBLE)  # no roll: no line is odd
+    found = unverified_deviation(sensitivity, torch.zeros(2, 6, dtype=DOUBLE), askew, level, CONFIG).sqrt()
     expected = torch.tensor([0.05, math.hypot(0.05, 0.15)], dtype=DOUBLE)
     torch.testing.assert_close(found, expected)
+
+
+def test_the_variance_of_an_improbable_roll_is_that_of_the_mixture_with_an_odd_line():
+    """Against the mixture computed by quadrature: equal lanes and the camera's roll, or a line anywhere."""
+    by_outer, prior, freedom = 0.08, CONFIG.prior.roll_std, CONFIG.prior.freedom
+    by_place = by_outer * torch.tensor([[0.0, 0.0, 1.0, -2.0, 1.0, 0.0]], dtype=DOUBLE)
+    grid = torch.linspace(-400.0, 400.0, 4_000_001, dtype=DOUBLE)
+    shape = (1 + grid.square() / freedom) ** (-0.5 * (freedom + 1))
+    norm = torch.trapezoid(shape, grid) * prior
+    for roll in (0.01, 0.05, 0.15):
+        density = (1 + (roll / prior) ** 2 / freedom) ** (-0.5 * (freedom + 1)) / norm * by_outer  # per m
+        for misfit, share in ((False, 1 / 5), (True, 1 / 2)):
+            odd = share / 3.6
+            expected = odd / (odd + (1 - share) * density) * roll**2
+            found = odd_line_deviation(by_place, torch.tensor([roll]), torch.tensor([misfit]), CONFIG)
+            assert (found * by_place.square().sum()).item() == pytest.approx(expected.item(), rel=1e-3)
+    assert odd_line_deviation(0 * by_place, torch.tensor([0.1]), torch.tensor([True]), CONFIG).isfinite()
+
+
+def test_a_kerb_taken_for_a_boundary_beside_the_ego_lane_is_in_the_variance_of_roll_and_height():
+    """Three lines fit some roll of equal lanes; the kerb is a metre from where a lane would end."""
+    kerb = PLACES.clone()
+    kerb[4] -= 1.0
+    drive = moments(1.5, lambda t, m: replace(m, places=kerb, visible=(2, 3) if t < 0.5 else (2, 3, 4)))
+    calibrator = JointCalibrator()
+    state = calibrator.initial_state(1, dtype=DOUBLE)
+    for moment, segments in see(drive, 1, 1.0, 20, 0, DOUBLE):
+        calibration, state = calibrator(segments, CAMERA[None], state, moment.dt, WIDTH)
+    error = calibration.extrinsics.stack()[0] - torch.tensor(moment.pose, dtype=DOUBLE)
+    sigma = calibration.covariance[0].diagonal().sqrt()
+    assert math.degrees(error[ROLL].abs()) > 3.0
+    assert (error.abs() < 3 * sigma).all()
 
 
 @pytest.mark.parametrize("speed", [0.0, 8.0])

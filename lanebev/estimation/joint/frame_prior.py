@@ -117,3 +117,10 @@ def student_weight(squared: Tensor, freedom: float) -> Tensor:
 def student_log(squared: Tensor, freedom: float) -> Tensor:
     """Compute its log density, (…, P) to (…), the constant left out."""
     return -0.5 * (freedom + 1) * (squared / freedom).log1p().sum(-1)
+
+
+def student_density(away: Tensor, freedom: float) -> Tensor:
+    """Compute the density of Student's t distribution at so many of its scales from its centre."""
+    half = 0.5 * (freedom + 1)
+    scale = math.exp(math.lgamma(half) - math.lgamma(half - 0.5)) / math.sqrt(freedom * math.pi)
+    return scale * (1 + away.square() / freedom) ** -half

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.joint.evidence import EQUAL
+from lanebev.estimation.joint.frame_prior import student_density
 from lanebev.estimation.joint.layout import POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL
 from lanebev.estimation.joint.scatter import scatter_variance
@@ -17,6 +18,9 @@ from lanebev.types import Calibration, Extrinsics
 _ONLY_HEIGHT = (0.0, 0.0, 0.0, 1.0)
 _FITTED = 3  # boundaries that a pose of equal lanes always fits: by offset, roll and height
 _BY_CHANCE = 0.004  # probability that a further boundary is in its place though lanes are unequal
+_ODD, _ODD_OF_MORE = 0.25, 1.0  # odds that one of three lines bounds no lane; where further lines are none
+_ODD_WITHIN = 3.6  # m, range of such a line's place
+_THIRD = 6.0  # sum of squares of (1, -2, 1), in which proportion three boundaries change the roll
 _IN_VIEW = 0.015  # rad/m or m/m: change of roll or height by a boundary's deviation from which it counts
 _WAY = 15.0  # m along which a boundary keeps a heading of its own
 _DOUBTFUL = 0.6  # m out of place, below which a single boundary may stand for several
@@ -38,7 +42,7 @@ def single_deviation(deviations: Tensor, cfg: JointConfig) -> Tensor:
 
 
 def unverified_deviation(
-    sensitivity: Tensor, deviations: Tensor, of_headings: Tensor, cfg: JointConfig
+    sensitivity: Tensor, deviations: Tensor, of_headings: Tensor, roll: Tensor, cfg: JointConfig
 ) -> Tensor:
     """Compute the variance (B,) m² of every boundary's place where too few are in view to tell.
 
@@ -50,13 +54,40 @@ def unverified_deviation(
         deviations: (B, L) m, by the filter.
         of_headings: (B,) rad², variance of a boundary's own heading. One that has such a heading gets out of
             its place by as much as it differs over ``_WAY``.
+        roll: (B,) rad.
         cfg: the numbers.
     """
-    in_view = (sensitivity[:, ROLL:].abs().amax(1) / _IN_VIEW).clamp(max=1.0) * (deviations.abs() < _DOUBTFUL)
+    fits = deviations.abs() < _DOUBTFUL
+    in_view = (sensitivity[:, ROLL:].abs().amax(1) / _IN_VIEW).clamp(max=1.0) * fits
     further = (in_view.sum(-1) - _FITTED).clamp(min=0.0)
-    askew = of_headings * _WAY**2 if cfg.lane_deviation_std else 0.0
-    share = (1 - further).maximum(_BY_CHANCE**further)
-    return (cfg.lane_deviation_std**2 + askew) * share
+    of_three = (1 - further).clamp(min=0.0)
+    share = of_three.maximum(_BY_CHANCE**further)
+    if not cfg.lane_deviation_std:
+        return torch.zeros_like(share)
+    askew = of_headings * _WAY**2
+    odd = odd_line_deviation(sensitivity[:, ROLL], roll, ~fits.all(-1), cfg)
+    return (cfg.lane_deviation_std**2 + askew) * share + odd * of_three
+
+
+def odd_line_deviation(by_place: Tensor, roll: Tensor, misfit: Tensor, cfg: JointConfig) -> Tensor:
+    """Compute the variance (B,) m² of every boundary's place by the chance that one of three bounds no lane.
+
+    Source: (J26). Such a line, a kerb or the edge of a shoulder, is taken for a boundary by a wrong roll, and
+    the larger this roll is, the less probable is it that the camera has it. The result gives the roll the
+    variance p r², with p the probability that there is such a line and r the roll beyond its mean.
+
+    Args:
+        by_place: (B, L), change of the roll (rad) per metre of deviation of a boundary; 0 if not in view.
+        roll: (B,) rad.
+        misfit: (B,) bool, other lines are in view that are on no boundary.
+        cfg: the numbers.
+    """
+    total = by_place.square().sum(-1).clamp(min=_IN_VIEW**2)
+    beyond = roll - cfg.prior.roll
+    by_camera = student_density(beyond / cfg.prior.roll_std, cfg.prior.freedom) / cfg.prior.roll_std
+    density = by_camera * (total / _THIRD).sqrt()  # per m of the outer line's place
+    odds = torch.where(misfit, _ODD_OF_MORE, _ODD) / (_ODD_WITHIN * density)
+    return odds / (1 + odds) * beyond.square() / total
 
 
 def beyond_filter(expected: Tensor, variances: Tensor) -> Tensor:
@@ -81,7 +112,7 @@ def covariance_by_boundaries(state: JointState, cfg: JointConfig) -> Tensor:
     deviations, variances = state.mean[:, own], state.cov.diagonal(dim1=1, dim2=2)[:, own]
     of_places, of_headings = scatter_variance(state.scatter).unbind(-1)
     by_place = state.pose_sensitivity[..., : cfg.num_boundaries]
-    unverified = unverified_deviation(by_place, deviations, of_headings, cfg)
+    unverified = unverified_deviation(by_place, deviations, of_headings, state.mean[:, ROLL], cfg)
     expected = single_deviation(deviations, cfg).maximum(unverified)
     each = torch.stack([beyond_filter(expected, variances).maximum(of_places), of_headings], dim=-1)  # (B, 2)
     each = each.repeat_interleave(cfg.num_boundaries, dim=-1).unsqueeze(1)  # (B, 1, 2 L)

@@ -87,7 +87,7 @@ def boundary_scatter(
     least = constant(tuple(std**2 for std in _LEAST_STD), like=left)
     prior = scatter_variance(moments).maximum(least).repeat_interleave(num, dim=-1)  # (B, 2 L)
     own_cov = inverse_spd(left + prior.reciprocal().diag_embed())
-    seen = own_cov @ left  # ŝ is this times the own places and headings, and noise
+    seen = own_cov @ left  # ζ̂ is this times the own places and headings, and noise
     found = (own_cov @ pull).squeeze(-1)
     by_noise = (seen @ own_cov).diagonal(dim1=1, dim2=2)
     squares = (found.square() - _NOISE * by_noise).unflatten(-1, (2, num)).sum(-1)
