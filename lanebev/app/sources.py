@@ -21,7 +21,7 @@ from lanebev.app.observers import Observation, Observer
 from lanebev.camera.model import Camera
 from lanebev.io.bags import BagSource, open_bag_source
 from lanebev.io.frames import ALL, Frame, Selection
-from lanebev.io.image_names import drives_remark
+from lanebev.io.image_names import drives_remark, jump_remark
 from lanebev.io.live import LiveSource, open_live
 from lanebev.io.source_names import is_bag, is_live
 from lanebev.io.video import FrameSource, open_source
@@ -49,7 +49,7 @@ def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
     found = _opened(config.source, config.topic, config.frame_rate)
     remarks = [found.problem]
     if found.paths and not config.stills:
-        remarks.append(drives_remark(found.paths))
+        remarks.append(drives_remark(found.paths) or ("" if found.times else jump_remark(found.paths)))
         if found.count > 1 and not (found.times or config.frame_rate):
             rate = f"{float(found.fps):g} frames per second are assumed"
             remarks.append(f"their names state no times, {rate}; state --fps")

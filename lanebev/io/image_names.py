@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import PurePath
+from statistics import median_low
 
 _SUFFIXES = r"(?:\.[A-Za-z]\w*)*$"  # .jpg, .lines.txt
 _DECIMAL = re.compile(rf"(?<![\d.])(\d+)\.(\d+)(?={_SUFFIXES})", re.ASCII)
@@ -119,6 +120,30 @@ def drives_remark(paths: Sequence[str]) -> str:
             "taken for one drive; give a run each, or --stills"
         )
     return ""
+
+
+def jump_remark(paths: Sequence[str]) -> str:
+    """Return where the only number that differs in images' names jumps; else nothing.
+
+    It jumps where images are missing, and where a counter began again at 0: later images come first then.
+
+    Args:
+        paths: paths of the images, in order.
+    """
+    parts = [re.split(r"(\d+)", PurePath(path).stem, flags=re.ASCII) for path in paths]
+    columns = list(zip(*parts, strict=True)) if len(set(map(len, parts))) == 1 else []
+    varying = [column for column in columns if len(set(column)) > 1]
+    if len(varying) != 1 or not varying[0][0].isdigit():
+        return ""
+    steps = [int(after) - int(before) for before, after in pairwise(varying[0])]
+    place = next((index for index, step in enumerate(steps) if step > median_low(steps) > 0), None)
+    if place is None:
+        return ""
+    before, after = (PurePath(path).name for path in paths[place : place + 2])
+    return (
+        f"their numbers jump, as from {before} to {after}, which are taken for frames one after another; "
+        "give each part a run, or number them anew"
+    )
 
 
 def _are_decimal(fractions: Sequence[str]) -> bool:

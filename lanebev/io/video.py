@@ -77,7 +77,7 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
     if path.is_file():
         return _image_source(source, [source], fps) if is_image(path) else _video_source(source, fps)
     if glob.has_magic(source):
-        matches = glob.glob(_pattern(source), recursive=True)
+        matches = glob.glob(glob_pattern(source), recursive=True)
         paths = in_natural_order(filter(is_image, matches))
         if not paths:
             remedy = _endings_remedy(map(Path, matches)) or "quote the pattern"
@@ -107,8 +107,8 @@ def _endings_remedy(paths: Iterable[Path]) -> str:
     return found if endings else ""
 
 
-def _pattern(source: str) -> str:
-    """Return the glob, with brackets in the names of existing folders taken literally."""
+def glob_pattern(source: str) -> str:
+    """Return a source as a glob, with brackets in the names of existing folders taken literally."""
     folder = next((str(each) for each in Path(source).parents if each.is_dir()), ".")
     rest = source.removeprefix(folder)
     return glob.escape(folder) + rest if rest != source and glob.has_magic(rest) else source

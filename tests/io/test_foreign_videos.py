@@ -16,7 +16,7 @@ from lanebev.app.config import RunConfig
 from lanebev.app.observers import LaneFileObserver
 from lanebev.app.sources import make_source
 from lanebev.io.frames import Selection
-from lanebev.io.image_names import drives_remark
+from lanebev.io.image_names import drives_remark, in_natural_order, jump_remark
 from lanebev.io.images import read_image
 from lanebev.io.lane_widths import unequal_lanes_remark
 from lanebev.io.lanes import FrameLines
@@ -379,3 +379,24 @@ def test_images_without_lanes_are_counted(tmp_path):
     assert LaneFileObserver(entries[:3], part, camera).remark.endswith(
         "2 of 5 images have no entry, the first is number 4"
     )
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        (range(9990, 10010), "from IMG_0009.jpg to IMG_9990.jpg"),
+        ([*range(10), *range(15, 30)], "from IMG_0009.jpg to IMG_0015.jpg"),
+        (range(10), ""),
+        (range(0, 50, 5), ""),
+    ],
+)
+def test_a_counter_that_began_again_or_has_gaps_is_noticed(numbers, words):
+    names = in_natural_order(f"IMG_{number % 10_000:04d}.jpg" for number in numbers)
+    remark = jump_remark(names)
+    assert words in remark
+    assert bool(words) == bool(remark)
+
+
+def test_names_of_several_numbers_or_of_none_have_no_jumps():
+    assert jump_remark(["a/1_07.jpg", "a/2_09.jpg", "a/9_01.jpg"]) == ""
+    assert jump_remark(["a.jpg", "b.jpg"]) == jump_remark(["a/7.jpg"]) == ""

@@ -7,8 +7,8 @@ import io
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -206,13 +206,21 @@ def _time_and_day(row: Row) -> tuple[str, str]:
     return (date if time is None else time.isoformat()), date
 
 
-def _check_names(path: Path, drives: Iterable[Drive]) -> None:
+def _check_names(path: Path, drives: Sequence[Drive]) -> None:
     names = Counter(drive.name.casefold() for drive in drives)
     if twice := [drive.name for drive in drives if names[drive.name.casefold()] > 1]:
         raise ValueError(
             f"manifest {path}: expected names that tell the drives apart, got {shown(twice[0])} twice; "
             "give name"
         )
+    runs: dict[str, str] = {}
+    for drive in drives:
+        run = repr(replace(drive.config, source=os.path.realpath(drive.config.source)))
+        if (first := runs.setdefault(run, drive.name)) != drive.name:
+            raise ValueError(
+                f"manifest {path}: expected each drive once, since it would count twice in the mounts, got "
+                f"{shown(first)} and {shown(drive.name)} of the same video and settings; leave one out"
+            )
     files: dict[str, str] = {}
     for drive in drives:
         lens = drive.config.camera

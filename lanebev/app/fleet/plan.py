@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import glob
+import hashlib
 import json
 import math
 from collections.abc import Sequence
@@ -13,6 +15,7 @@ from lanebev.app.config import RunConfig
 from lanebev.app.fleet.cutting import Part, duration, parts_of
 from lanebev.app.fleet.manifest import PATHS, Drive
 from lanebev.app.recovery import size_and_time
+from lanebev.io.video import glob_pattern
 
 DRIVES, MARK, SEEN = "drives", "fleet.json", "seen.json"
 
@@ -106,8 +109,18 @@ def settings_fingerprint(config: RunConfig) -> str:
     """Return all that decides a run's outputs, as text: settings, and sizes and times of the files named."""
     settings = {name: value for name, value in asdict(config).items() if name != "out"}
     read = [name for name in PATHS if name != "exported" or config.backend == "onnxruntime"]
-    files = {name: size_and_time(Path(settings[name])) for name in read if settings.get(name)}
+    files = {name: _sizes_and_times(str(settings[name])) for name in read if settings.get(name)}
     return json.dumps({"settings": settings, "files": files, "lanebev": __version__}, default=str)
+
+
+def _sizes_and_times(path: str) -> list[object]:
+    """Return a file's size and time; of a folder or a glob also a digest of those of all its files."""
+    own: list[object] = list(size_and_time(Path(path)))
+    if Path(path).is_file():
+        return own
+    pattern = f"{glob.escape(path)}/**" if Path(path).is_dir() else glob_pattern(path)
+    files = [(each, *size_and_time(Path(each))) for each in sorted(glob.glob(pattern, recursive=True))]
+    return [*own, hashlib.sha256(json.dumps(files).encode()).hexdigest()]
 
 
 def earlier_outcome(task: Task) -> Outcome | None:

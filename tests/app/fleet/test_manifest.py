@@ -146,3 +146,17 @@ def test_the_command_says_it_in_a_line_and_status_2(write, tmp_path, capsys):
     assert said.count("\n") == 1
     assert "which leaves it" in said
     assert not (tmp_path / "out").exists()
+
+
+def test_one_drive_under_two_names_is_refused(write, tmp_path):
+    rows = [
+        {"video": "a.mp4", "camera": "c.yaml", "name": "one"},
+        {"video": "link.mp4", "camera": "c.yaml", "name": "two"},
+    ]
+    path = write(rows)
+    (path.parent / "a.mp4").write_text("video")
+    (path.parent / "link.mp4").symlink_to("a.mp4")
+    with pytest.raises(ValueError, match=r"each drive once.* got 'one' and 'two' of the same"):
+        read_manifest(path)
+    rows[1]["start"] = "60"
+    assert [drive.name for drive in read_manifest(write(rows))] == ["one", "two"]

@@ -94,3 +94,19 @@ def test_what_is_finished_is_known_until_something_changes(tmp_path):
     assert not failure_path(changed).exists()
     (folder / "fleet.json").write_text("{")
     assert earlier_outcome(changed) is None
+
+
+@pytest.mark.parametrize(
+    "settings", [{"source": "images"}, {"source": "images/*.jpg"}, {"lanes": "images"}], ids=str
+)
+def test_a_changed_file_of_a_folder_or_a_glob_is_noticed(tmp_path, settings):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "0.jpg").write_text("old")
+    paths = {name: str(tmp_path / path) for name, path in settings.items()}
+    config = replace(_drive(tmp_path, "one").config, **paths)
+    before = settings_fingerprint(config)
+    assert settings_fingerprint(config) == before
+    (tmp_path / "images" / "0.jpg").write_text("new and longer")
+    changed = settings_fingerprint(config)
+    (tmp_path / "images" / "1.jpg").write_text("another")
+    assert len({before, changed, settings_fingerprint(config)}) == 3
