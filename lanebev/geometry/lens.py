@@ -71,6 +71,11 @@ def check_intrinsics(intrinsics: Tensor, *rows: int) -> None:
         raise ValueError(f"intrinsics: expected {(*rows, 3, 3)}, got {tuple(intrinsics.shape)}")
     if not intrinsics.is_floating_point():
         raise ValueError(f"intrinsics: expected floating point, got {intrinsics.dtype}")
+    if intrinsics.element_size() < 4:  # bfloat16 rounds 554 px to 556
+        raise ValueError(
+            f"intrinsics: expected float32 or float64, got {intrinsics.dtype}, which rounds them by pixels; "
+            "leave them in float32"
+        )
 
 
 def usable_cameras(intrinsics: Tensor) -> Tensor:

@@ -278,3 +278,10 @@ def test_lanebev_cameras(model):
 def test_extrinsics_from_values(values, error, message):
     with pytest.raises(error, match=message):
         Extrinsics.from_values(*values)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_intrinsics_of_half_precision_are_refused(model, dtype):
+    """They would be off by up to 4 px, pitch and yaw by several standard deviations."""
+    with pytest.raises(ValueError, match="intrinsics: expected float32 or float64, got torch"):
+        model(torch.zeros(1, 3, 64, 64), torch.eye(3, dtype=dtype)[None])

@@ -16,6 +16,7 @@ import yaml
 
 from lanebev.app.config import RunConfig
 from lanebev.app.settings_file import load_plain_yaml, parsed_settings
+from lanebev.io.source_names import is_live
 from lanebev.numbers import read_text, shown
 
 UNKNOWN_DAY = "unknown"
@@ -146,12 +147,7 @@ def _drive(given: Row, base: Path, inside: Path) -> Drive:
     for name in _REFUSED:
         if name in row:
             raise ValueError(f"expected video, camera, {', '.join(_OWN)} or settings of a run, got {name}")
-    if "video" not in row:
-        remedy = "; columns are separated by commas" if any(set(";\t") & set(key) for key in row) else ""
-        raise ValueError(f"expected video, the drive's path, got only {', '.join(row)}{remedy}")
-    video = row["video"]
-    if not (isinstance(video, str) and video):
-        raise ValueError(f"video: expected a path, got {shown(video)}")
+    video = _video(row)
     settings = {("source" if key == "video" else key): value for key, value in row.items() if key not in _OWN}
     values = parsed_settings(settings)
     for key in PATHS:
@@ -171,6 +167,19 @@ def _drive(given: Row, base: Path, inside: Path) -> Drive:
                 f"with a dot, got {shown(text)}"
             )
     return Drive(name, lens, day, time, config)
+
+
+def _video(row: Row) -> str:
+    """Return the drive's path, which is that of no stream."""
+    if "video" not in row:
+        remedy = "; columns are separated by commas" if any(set(";\t") & set(key) for key in row) else ""
+        raise ValueError(f"expected video, the drive's path, got only {', '.join(row)}{remedy}")
+    video = row["video"]
+    if not (isinstance(video, str) and video):
+        raise ValueError(f"video: expected a path, got {shown(video)}")
+    if is_live(video):
+        raise ValueError(f"video: expected a file or a folder, got the stream {video}; use lanebev run")
+    return video
 
 
 def _is_name(text: str) -> bool:

@@ -160,3 +160,9 @@ def test_one_drive_under_two_names_is_refused(write, tmp_path):
         read_manifest(path)
     rows[1]["start"] = "60"
     assert [drive.name for drive in read_manifest(write(rows))] == ["one", "two"]
+
+
+@pytest.mark.parametrize("video", ["rtsp://camera/1", "/dev/video0", "-"])
+def test_a_stream_is_no_drive(write, video):
+    with pytest.raises(ValueError, match=r"drive 1: video: expected a file .*; use lanebev run"):
+        read_manifest(write([{"video": video, "camera": "c.yaml"}]))
