@@ -1,4 +1,4 @@
-"""Texts and numbers from files."""
+"""Texts and numbers from files, and numbers of settings."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import codecs
 import math
 import re
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import fields
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,28 @@ def check_number(name: str, value: object, expected: str = "a number") -> None:
     """
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name}: expected {expected}, got {type(value).__qualname__}")
+
+
+def check_settings(config: Any, positive: Collection[str] = (), infinite: Collection[str] = ()) -> None:
+    """Raise unless every number of a dataclass is finite and at least 0.
+
+    Args:
+        config: an instance; fields whose default is no number are not checked.
+        positive: names of those that must be more than 0.
+        infinite: names of those that may be infinite.
+
+    Raises:
+        TypeError: a field is no number.
+        ValueError: naming the field, what was expected and what came.
+    """
+    for name in (part.name for part in fields(config) if isinstance(part.default, Real)):
+        value = getattr(config, name)
+        check_number(name, value)
+        enough = value > 0 if name in positive else value >= 0
+        if not (enough and (value < math.inf or name in infinite)):
+            least = "more than 0" if name in positive else "at least 0"
+            finite = "" if name in infinite else "a finite number, "
+            raise ValueError(f"{name}: expected {finite}{least}, got {value}")
 
 
 def shown(value: Any, most: int = 60) -> str:

@@ -959,3 +959,28 @@ def test_speed_wanders_about_its_mean_as_far_as_it_says():
     transition, noise = motion(time, one, equal, equal, no_road(), PLACE, cfg)
     fade, more = transition[0, PLACE.speed, PLACE.speed], noise[0, PLACE.speed, PLACE.speed]
     assert float(more / (1 - fade**2)) == pytest.approx(cfg.speed_std**2, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("config", "name", "value", "expected"),
+    [
+        (MotionConfig, "hill_memory", 0.0, "more than 0, got 0.0"),
+        (MotionConfig, "offset_memory", math.inf, "a finite number, more than 0, got inf"),
+        (MotionConfig, "bandwidth", 0, "a finite number, more than 0, got 0"),
+        (MotionConfig, "angle_std", -0.1, "a finite number, at least 0, got -0.1"),
+        (MotionConfig, "speed", math.nan, "a finite number, at least 0, got nan"),
+        (JointConfig, "scatter_memory", math.nan, "more than 0, got nan"),
+        (JointConfig, "assumed_dt", 0.0, "a finite number, more than 0, got 0.0"),
+        (JointConfig, "lane_deviation_std", math.inf, "a finite number, at least 0, got inf"),
+    ],
+)
+def test_settings_that_are_no_such_numbers_are_refused(config, name, value, expected):
+    with pytest.raises(ValueError, match=f"^{name}: expected {expected}$"):
+        config(**{name: value})
+    with pytest.raises(TypeError, match=f"^{name}: expected a number, got str$"):
+        config(**{name: "1"})
+
+
+def test_times_may_be_endless_and_walks_zero():
+    MotionConfig(deviation_memory=math.inf, mean_angle_walk=0.0, curvature_walk=0)
+    JointConfig(scatter_memory=math.inf, lost_after=math.inf, open_pose=0.0)

@@ -194,8 +194,3 @@ def test_skipped_and_unsupported_frames_keep_the_scatter_and_rows_are_independen
     for after in (unsupported, skipped):
         assert (after.scatter == state.scatter).all()
         assert (after.pose_sensitivity == state.pose_sensitivity).all()
-
-
-def test_a_time_constant_that_is_not_positive_is_refused():
-    with pytest.raises(ValueError, match="scatter_memory: expected more than 0 s, got nan"):
-        JointConfig(scatter_memory=math.nan)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ from torch import Tensor
 
 from lanebev.estimation.joint.layout import NUM_POSE, SHAPE, Layout, layout
 from lanebev.estimation.joint.measurement import OFFSET, VERTICAL
+from lanebev.numbers import check_settings
 from lanebev.tensors import constant
 
 Rows = tuple[tuple[float, ...], ...]
@@ -73,6 +74,11 @@ class MotionConfig:
     deviation_memory: float = 20.0
     deviation_walk: float = 1e-4
     unequal_memory: float = 1.0
+
+    def __post_init__(self) -> None:
+        memories = [part.name for part in fields(self) if part.name.endswith("_memory")]
+        endless = [name for name in memories if name != "offset_memory"]
+        check_settings(self, positive=["bandwidth", *memories], infinite=endless)
 
 
 class LowPass(NamedTuple):

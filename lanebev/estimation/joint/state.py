@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple
@@ -18,6 +17,7 @@ from lanebev.estimation.joint.readings import ReadingConfig
 from lanebev.estimation.joint.road import straight_or_bend
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
 from lanebev.estimation.reasons import Reason
+from lanebev.numbers import check_settings
 from lanebev.tensors import constant
 from lanebev.types import NUM_BOUNDARIES, map_tensors, register_pytree
 
@@ -98,10 +98,8 @@ class JointConfig:
         if self.iterations < 1 or self.start_iterations < 1:
             got = min(self.iterations, self.start_iterations)
             raise ValueError(f"iterations: expected at least 1, got {got}")
-        if not self.scatter_memory > 0:
-            raise ValueError(f"scatter_memory: expected more than 0 s, got {self.scatter_memory}")
-        if not (math.isfinite(self.lane_deviation_std) and self.lane_deviation_std >= 0):
-            raise ValueError(f"lane_deviation_std: expected at least 0 m, got {self.lane_deviation_std}")
+        times = ("scatter_memory", "evidence_time", "motion_scale_rise", "motion_scale_memory", "assumed_dt")
+        check_settings(self, positive=times, infinite=(*times[:-1], "lost_after", "restart_after"))
         bend = (self.prior.curvature_std, self.prior.curvature_rate_std)
         if not all(0 < sharp < wide for sharp, wide in zip(self.straight, bend, strict=True)):
             raise ValueError(
