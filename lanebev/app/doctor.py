@@ -26,6 +26,7 @@ from lanebev.camera.plausibility import (
     view_remark,
 )
 from lanebev.io.frames import Selection
+from lanebev.io.source_names import without_login
 from lanebev.io.video import FrameSource
 from lanebev.types import Status
 
@@ -97,7 +98,7 @@ def doctor(config: RunConfig, progress: Progress | None = None) -> tuple[str, in
         "a run is possible, but check what is doubtful",
         "a run would refuse this camera or give wrong results",
     )[level]
-    return "\n".join([*lines, f"{config.source}: {verdict}"]), level
+    return "\n".join([*lines, f"{without_login(config.source)}: {verdict}"]), level
 
 
 def sample_frames(

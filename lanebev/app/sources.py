@@ -23,7 +23,7 @@ from lanebev.io.bags import BagSource, open_bag_source
 from lanebev.io.frames import ALL, Frame, Selection
 from lanebev.io.image_names import drives_remark, jump_remark
 from lanebev.io.live import LiveSource, open_live
-from lanebev.io.source_names import is_bag, is_live
+from lanebev.io.source_names import is_bag, is_live, without_login
 from lanebev.io.video import FrameSource, open_source
 from lanebev.report.run_folder import RunFolder
 
@@ -44,7 +44,8 @@ def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
         unfit = {"--lanes": config.lanes, "--stills": config.stills, "--smooth": config.smooth}
         for name, given in unfit.items():
             if given:
-                raise ValueError(f"source {config.source}: expected no {name} with a stream, got it")
+                shown = without_login(config.source)
+                raise ValueError(f"source {shown}: expected no {name} with a stream, got it")
         return open_live(config.source, config.frame_rate, config.keep_all, selection)
     found = _opened(config.source, config.topic, config.frame_rate)
     remarks = [found.problem]
@@ -52,7 +53,7 @@ def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
         remarks.append(drives_remark(found.paths) or ("" if found.times else jump_remark(found.paths)))
         if found.count > 1 and not (found.times or config.frame_rate):
             rate = f"{float(found.fps):g} frames per second are assumed"
-            remarks.append(f"their names state no times, {rate}; state --fps")
+            remarks.append(f"no times are read from their names, {rate}; state --fps")
     said = [each if each is found.problem else f"{config.source}: {each}" for each in remarks if each]
     found = replace(found, problem="; ".join(said))
     source = replace(found, selection=selection)

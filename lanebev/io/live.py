@@ -15,7 +15,7 @@ import av
 from lanebev.io.decoding import display_matrix, pixel_aspect, rgb
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import ALL, Frame, Selection
-from lanebev.io.source_names import PIPE
+from lanebev.io.source_names import PIPE, without_login
 
 _TIMEOUT = 10.0  # s without a frame, after which a stream has ended
 _POLL = 0.05  # s between checks whether to stop
@@ -184,8 +184,9 @@ def open_live(
         ValueError: there is no such device, nothing answers, or no frame comes.
     """
     if selection not in (None, ALL):
-        raise ValueError(f"source {source}: expected no --start, --end or --every with a stream, got one")
-    name = "standard input" if source == PIPE else source
+        shown = without_login(source)
+        raise ValueError(f"source {shown}: expected no --start, --end or --every with a stream, got one")
+    name = "standard input" if source == PIPE else without_login(source)
     try:
         container = _opened(source)
     except (av.error.FFmpegError, OSError) as error:
@@ -209,7 +210,7 @@ def open_live(
     thread = threading.Thread(target=_read, args=(container, slot, figures), name="stream", daemon=True)
     thread.start()
     live = LiveSource(
-        source, (), rate, 0, size, pixel_aspect=aspect, matrix=matrix,
+        without_login(source), (), rate, 0, size, pixel_aspect=aspect, matrix=matrix,
         slot=slot, keep_all=keep_all, figures=figures,
     )  # fmt: skip
     weakref.finalize(live, slot.stop)  # of a run that ended before its first frame
@@ -221,6 +222,8 @@ def _opened(source: str) -> av.container.InputContainer:
         return av.open("pipe:0", "r", metadata_errors="replace")
     if source.startswith("/dev/video"):
         return av.open(source, "r", format="v4l2")
+    scheme, separator, address = source.partition("://")
+    url = f"{scheme.lower()}{separator}{address}"
     return av.open(
-        source, "r", options=dict(_LOW_DELAY), timeout=(_TIMEOUT, _TIMEOUT), metadata_errors="replace"
+        url, "r", options=dict(_LOW_DELAY), timeout=(_TIMEOUT, _TIMEOUT), metadata_errors="replace"
     )

@@ -15,6 +15,13 @@ def is_live(source: str) -> bool:
     return source == PIPE or device or bool(found and scheme.lower() in SCHEMES)
 
 
+def without_login(source: str) -> str:
+    """Return an address without the user's name and password; they belong in no message and no report."""
+    scheme, found, rest = source.partition("://")
+    host, slash, path = rest.partition("/")
+    return f"{scheme}{found}{host.rpartition('@')[2]}{slash}{path}" if is_live(source) else source
+
+
 def is_bag(source: str) -> bool:
     """Return whether a source is an MCAP file, a ROS bag, or the folder of a ROS 2 bag."""
     path = Path(source)

@@ -30,6 +30,7 @@ from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import Frame
 from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
 from lanebev.io.images import IMAGE_SUFFIXES, image_size, is_image, read_image, stated_size, write_png
+from lanebev.io.source_names import SCHEMES
 from lanebev.io.video_writer import VideoWriter
 
 __all__ = [
@@ -83,14 +84,20 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
             remedy = _endings_remedy(map(Path, matches)) or "quote the pattern"
             raise ValueError(f"{source}: expected images that match, got none; {remedy}")
         return _image_source(source, paths, fps)
-    remedy = ""
-    if re.search(r"%\d*d", source):
-        remedy = "; give the folder, or a quoted glob with * for the number"
-    elif source.startswith("file:"):
-        remedy = "; give the path without file://"
     raise ValueError(
-        f"{source}: expected a video, an image, a folder or a glob of images, got nothing there{remedy}"
+        f"{source}: expected a video, an image, a folder or a glob of images, got nothing there"
+        f"{_address_remedy(source)}"
     )
+
+
+def _address_remedy(source: str) -> str:
+    if re.search(r"%\d*d", source):
+        return "; give the folder, or a quoted glob with * for the number"
+    if source.startswith("file:"):
+        return "; give the path without file://"
+    if re.fullmatch(r"\d", source):
+        return f"; a camera is given as /dev/video{source}"
+    return f"; streams are {', '.join(SCHEMES)}; download other addresses first" if "://" in source else ""
 
 
 def _folder_remedy(folder: Path) -> str:

@@ -9,6 +9,8 @@ import threading
 import time
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +26,7 @@ from lanebev.io.frames import Selection
 from lanebev.io.images import write_png
 from lanebev.io.live import open_live
 from lanebev.io.results import read_extrinsics
-from lanebev.io.source_names import is_live
+from lanebev.io.source_names import is_live, without_login
 from lanebev.io.video import VideoWriter, open_source
 from lanebev.report.comparison import common_frames
 from lanebev.report.run_folder import read_run
@@ -308,6 +310,27 @@ def test_a_stream_that_does_not_open(data, tmp_path, capsys):
     _fails(capsys, "run", "/dev/video99", *fixed, word="that opens, got: No such file")
     _fails(capsys, "run", "-", *fixed, "--stills", word="expected no --stills with a stream")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_login_is_in_no_message_and_no_report(tmp_path, capsys, data):
+    assert without_login("RTSP://user:a@b@cam.local:554/live?x=@") == "RTSP://cam.local:554/live?x=@"
+    assert without_login("https://cam/a@b.mp4") == "https://cam/a@b.mp4"
+    assert without_login("folder/a://user:b@c") == "folder/a://user:b@c"
+    assert without_login("-") == "-"
+    address = "HTTP://user:secret@127.0.0.1:9/none"
+    for more in ((), ("--stills",), ("--start", "1")):
+        assert main(["run", address, "--camera", f"{data}/camera.yaml", *more]) == 2
+        error = capsys.readouterr().err
+        assert "HTTP://127.0.0.1:9/none" in error
+        assert "secret" not in error
+    handler = partial(SimpleHTTPRequestHandler, directory=data)
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"HTTP://user:secret@127.0.0.1:{server.server_port}/drive.mp4"
+        live = open_live(address)
+        assert len(list(live)) > 0
+        server.shutdown()
+    assert live.source == f"HTTP://127.0.0.1:{server.server_port}/drive.mp4"
 
 
 def test_a_stream_is_not_cut(capsys, data):

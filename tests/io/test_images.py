@@ -109,6 +109,8 @@ def test_a_missing_image_states_no_size(tmp_path):
         ("a.HEIC", "got HEIC; convert it to JPEG"),
         ("drives/%03d.jpg", "got nothing there; give the folder, or a quoted glob"),
         ("file:///drives/a.mp4", "got nothing there; give the path without file://"),
+        ("0", "got nothing there; a camera is given as /dev/video0"),
+        ("s3://bucket/a.mp4", "got nothing there; streams are rtsp, .*; download other addresses first"),
     ],
 )
 def test_what_is_no_source_says_what_to_give(tmp_path, monkeypatch, source, word):
