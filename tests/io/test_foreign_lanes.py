@@ -228,7 +228,9 @@ def test_a_folder_whose_names_state_no_times_says_which_rate_is_assumed(tmp_path
     for number in range(3):
         Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / f"{number}.png")
     assumed = make_source(RunConfig(str(tmp_path), "c")).problem
-    assert assumed.endswith("state no times, 30 frames per second are assumed; state --fps")
+    assert assumed.endswith(
+        "no times are read from their names, 30 frames per second are assumed; state --fps"
+    )
     for settings in ({"fps": 10.0}, {"stills": True}):
         assert make_source(RunConfig(str(tmp_path), "c", **settings)).problem == ""
     assert make_source(RunConfig(str(tmp_path / "0.png"), "c")).problem == ""
