@@ -16,7 +16,7 @@ import yaml
 
 from lanebev.app.config import RunConfig
 from lanebev.app.settings_file import load_plain_yaml, parsed_settings
-from lanebev.io.source_names import is_live
+from lanebev.io.source_names import is_live, without_login
 from lanebev.numbers import read_text, shown
 
 UNKNOWN_DAY = "unknown"
@@ -178,7 +178,8 @@ def _video(row: Row) -> str:
     if not (isinstance(video, str) and video):
         raise ValueError(f"video: expected a path, got {shown(video)}")
     if is_live(video):
-        raise ValueError(f"video: expected a file or a folder, got the stream {video}; use lanebev run")
+        stream = without_login(video)
+        raise ValueError(f"video: expected a file or a folder, got the stream {stream}; use lanebev run")
     return video
 
 

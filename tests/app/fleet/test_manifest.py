@@ -162,7 +162,8 @@ def test_one_drive_under_two_names_is_refused(write, tmp_path):
     assert [drive.name for drive in read_manifest(write(rows))] == ["one", "two"]
 
 
-@pytest.mark.parametrize("video", ["rtsp://camera/1", "/dev/video0", "-"])
+@pytest.mark.parametrize("video", ["rtsp://user:secret@camera/1", "/dev/video0", "-"])
 def test_a_stream_is_no_drive(write, video):
-    with pytest.raises(ValueError, match=r"drive 1: video: expected a file .*; use lanebev run"):
+    with pytest.raises(ValueError, match=r"drive 1: video: expected a file .*; use lanebev run") as caught:
         read_manifest(write([{"video": video, "camera": "c.yaml"}]))
+    assert "secret" not in str(caught.value)
