@@ -10,6 +10,7 @@ import torch
 from lanebev.geometry.lens import distort_points
 from lanebev.render import Drive, RenderedFrame, render_views
 from lanebev.render.raster.effects import add_bonnet
+from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.glass import behind_glass, recorded
 from lanebev.render.raster.glyphs import GLYPH_LENGTH, glyph_coverage
 from lanebev.render.raster.night import lamp_light, low_beam
@@ -188,7 +189,8 @@ def test_a_kerbs_top_is_seen_farther_out_by_h_over_h_minus_its_height() -> None:
     across = torch.tensor([[2.9, 3.05, 3.3, 3.4, 5.7, 5.9]])
     fine = torch.full_like(across, 0.01)
     eye = (torch.tensor([0.0]), torch.tensor([1.5]))
-    colour, there = roadside(street, pavement, torch.full_like(across, 0.5), across, fine, fine, *eye)
+    ground = Ground(across, torch.full_like(across, 0.5), across, fine, fine)
+    colour, there = roadside(street, pavement, ground, *eye)
     dark = colour[0, 0] < 0.05
     assert dark[1:4].tolist() == [True, True, False]
     # 2.2 m of strips on the raised plane end at (3 + 2.2) · 1.5 / 1.35 = 5.78 m
@@ -237,7 +239,8 @@ def test_snow_covers_no_paint_that_is_labelled_and_all_that_is_not() -> None:
     along = torch.linspace(0, 300, 400).expand(batch, -1)
     across = layout.across[:, 1:2].expand_as(along)
     fine = torch.full_like(along, 0.05)
-    cover = snow_cover(winter, layout, pavement, along, across, fine, fine, torch.zeros_like(along))
+    ground = Ground(along, along, across, fine, fine)
+    cover = snow_cover(winter, layout, pavement, ground, torch.zeros_like(along))
     marked = presence(layout, torch.ones_like(along, dtype=torch.long), along) > 0
     exists = layout.exists[:, 1:2].expand_as(marked)
     assert (cover[marked & exists] == 0).all()

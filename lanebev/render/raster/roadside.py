@@ -7,6 +7,7 @@ from torch import Tensor
 
 from lanebev.render.raster.coverage import dash_coverage, stripe_coverage
 from lanebev.render.raster.edges import band, beyond
+from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.noise import CLOUD, GRAIN, hash01, sample_grain, sample_noise, smoothstep
 from lanebev.render.scene.pavement import Pavement
 from lanebev.render.scene.street import GREEN, KERB, PATH, WALK, Street
@@ -15,10 +16,7 @@ from lanebev.render.scene.street import GREEN, KERB, PATH, WALK, Street
 def roadside(
     street: Street,
     pavement: Pavement,
-    along: Tensor,
-    across: Tensor,
-    reach_along: Tensor,
-    reach_across: Tensor,
+    ground: Ground,
     eye_across: Tensor,
     eye_height: Tensor,
 ) -> tuple[Tensor, Tensor]:
@@ -30,16 +28,14 @@ def roadside(
     Args:
         street: what there is.
         pavement: its edges are the kerbs' feet; its surface covers junctions.
-        along: (B, N) m in the world.
-        across: (B, N) m in the layout's frame, on the road's plane.
-        reach_along: (B, N) m per pixel.
-        reach_across: (B, N) m per pixel.
+        ground: (B, N) points on the road's plane.
         eye_across: (B,) m, the camera's place.
         eye_height: (B,) m, the camera's height.
 
     Returns:
         (B, 3, N) linear reflectance and (B, N) coverage.
     """
+    _, along, across, reach_along, reach_across = ground
     colour, alpha = torch.zeros_like(across)[:, None].repeat(1, 3, 1), torch.zeros_like(across)
     grain = sample_grain(GRAIN, along / 7.0, across / 7.0) / (1 + reach_along / 0.06)
     tufts = sample_grain(GRAIN, along / 19.0, across / 17.0) / (1 + reach_along / 0.15)

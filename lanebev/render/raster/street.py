@@ -7,6 +7,7 @@ from torch import Tensor
 
 from lanebev.render.raster.coverage import dash_coverage, stripe_coverage
 from lanebev.render.raster.edges import band
+from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.glyphs import GLYPH_LENGTH, GLYPH_WIDTH, glyph_coverage
 from lanebev.render.raster.noise import GRAIN, hash01, sample_grain, smoothstep
 from lanebev.render.raster.roadside import junction_coverage
@@ -22,10 +23,7 @@ def street_paint(
     street: Street,
     layout: Layout,
     pavement: Pavement,
-    along: Tensor,
-    across: Tensor,
-    reach_along: Tensor,
-    reach_across: Tensor,
+    ground: Ground,
     blotch: Tensor,
 ) -> Tensor:
     """Compute the coverage of a pixel by paint that bounds no lane, (B, N).
@@ -34,21 +32,16 @@ def street_paint(
         street: what is painted.
         layout: the lanes.
         pavement: the carriageway's edges.
-        along: (B, N) m in the world.
-        across: (B, N) m in the layout's frame.
-        reach_along: (B, N) m per pixel.
-        reach_across: (B, N) m per pixel.
+        ground: (B, N) points.
         blotch: (B, N) slow noise: where the paint is worn.
     """
-    lane, inside, width, on_lane = lane_coordinates(layout, across)
-    reach = (reach_along, reach_across)
+    lane, inside, width, on_lane = lane_coordinates(layout, ground.across)
     marks = torch.maximum(
-        _glyphs(street, lane, along, inside, width, *reach),
-        _hatching(street, lane, along, inside, width, *reach),
+        _glyphs(street, ground, lane, inside, width), _hatching(street, ground, lane, inside, width)
     )
-    marks = torch.maximum(marks * on_lane, _across_the_road(street, layout, pavement, along, across, *reach))
-    marks = torch.maximum(marks, _bays(street, layout, pavement, along, across, *reach))
-    grain = sample_grain(GRAIN, along / 5.0, across / 2.5) / (1 + reach_along / 0.05)
+    marks = torch.maximum(marks * on_lane, _across_the_road(street, layout, pavement, ground))
+    marks = torch.maximum(marks, _bays(street, layout, pavement, ground))
+    grain = sample_grain(GRAIN, ground.along / 5.0, ground.across / 2.5) / (1 + ground.reach_along / 0.05)
     worn = smoothstep(-0.6, 0.5, blotch * 0.5 + grain * 0.45 + 0.95 - 1.4 * street.wear[:, None])
     return marks * worn * street.opacity[:, None]
 
@@ -63,15 +56,8 @@ def lane_coordinates(layout: Layout, across: Tensor) -> tuple[Tensor, Tensor, Te
     return lane, across - 0.5 * (low + high), high - low, on_lane
 
 
-def _glyphs(
-    street: Street,
-    lane: Tensor,
-    along: Tensor,
-    inside: Tensor,
-    width: Tensor,
-    reach_along: Tensor,
-    reach_across: Tensor,
-) -> Tensor:
+def _glyphs(street: Street, ground: Ground, lane: Tensor, inside: Tensor, width: Tensor) -> Tensor:
+    _, along, _, reach_along, reach_across = ground
     period, scale = street.glyph_period[:, None], street.glyph_scale[:, None]
     shifted = along + street.phase[:, None] + 3.0
     cell = (shifted / period).floor()
@@ -87,16 +73,9 @@ def _glyphs(
     return glyph_coverage(glyph, inside / wide, position / length, reach_across / wide, reach_along / length)
 
 
-def _hatching(
-    street: Street,
-    lane: Tensor,
-    along: Tensor,
-    inside: Tensor,
-    width: Tensor,
-    reach_along: Tensor,
-    reach_across: Tensor,
-) -> Tensor:
+def _hatching(street: Street, ground: Ground, lane: Tensor, inside: Tensor, width: Tensor) -> Tensor:
     """Draw oblique stripes or chevrons that fill a lane, or grow into it from its left boundary."""
+    _, along, _, reach_along, reach_across = ground
     chevron = street.hatch_chevron[:, None]
     slope = street.hatch_slope[:, None]
     oblique = along + slope * torch.where(chevron > 0, inside.abs(), inside)
@@ -117,16 +96,9 @@ def _hatching(
     return torch.maximum(stripe, rim) * here * street.hatch.gather(1, lane)
 
 
-def _across_the_road(
-    street: Street,
-    layout: Layout,
-    pavement: Pavement,
-    along: Tensor,
-    across: Tensor,
-    reach_along: Tensor,
-    reach_across: Tensor,
-) -> Tensor:
-    """Stop lines, crossings and grids at the junctions."""
+def _across_the_road(street: Street, layout: Layout, pavement: Pavement, ground: Ground) -> Tensor:
+    """Draw stop lines, crossings and grids at the junctions."""
+    _, along, across, reach_along, reach_across = ground
     there = (street.junction_length > 0)[:, None]
     period = street.junction_period[:, None]
     left = layout.across.gather(1, street.first[:, None])
@@ -159,16 +131,9 @@ def _across_the_road(
     return torch.maximum(torch.maximum(stop, walk) * there, grid)
 
 
-def _bays(
-    street: Street,
-    layout: Layout,
-    pavement: Pavement,
-    along: Tensor,
-    across: Tensor,
-    reach_along: Tensor,
-    reach_across: Tensor,
-) -> Tensor:
+def _bays(street: Street, layout: Layout, pavement: Pavement, ground: Ground) -> Tensor:
     """Draw lines across parking strips, the outer line of cycle strips, and bicycles on them."""
+    _, along, across, reach_along, reach_across = ground
     marks = torch.zeros_like(along)
     for side, low, high in strips_between(layout, pavement):
         kind = street.strip[:, side, None]

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from lanebev.render.raster.coverage import dash_coverage, stripe_coverage
 from lanebev.render.raster.edges import band, beyond
+from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.noise import GRAIN, hash01, sample_grain
 from lanebev.render.scene.layout import Layout
 from lanebev.render.scene.pavement import Pavement
@@ -15,10 +16,9 @@ from lanebev.render.scene.street import Street
 RAIL_GAUGE = 1.435  # m
 
 
-def tracks(
-    street: Street, along: Tensor, across: Tensor, reach_along: Tensor, reach_across: Tensor, albedo: Tensor
-) -> Tensor:
+def tracks(street: Street, ground: Ground, albedo: Tensor) -> Tensor:
     """Draw tram rails in their bed over a reflectance (B, 3, N)."""
+    _, along, across, reach_along, reach_across = ground
     aside = across - street.tram_across[:, None]
     on = street.tram[:, None]
     bed = (
@@ -55,19 +55,16 @@ def strips_between(layout: Layout, pavement: Pavement) -> list[tuple[int, Tensor
     return [(0, pavement.left[:, None], -0.15 + 0 * last), (1, last, pavement.right[:, None])]
 
 
-def ironwork(
-    street: Street, lane: Tensor, along: Tensor, inside: Tensor, reach_along: Tensor, reach_across: Tensor
-) -> Tensor:
+def ironwork(street: Street, ground: Ground, lane: Tensor, inside: Tensor) -> Tensor:
     """Compute the darkening by manhole covers and by sealed cuts about old trenches, (B, N) in [0, 1].
 
     Args:
         street: how many there are.
+        ground: (B, N) points.
         lane: (B, N) int64.
-        along: (B, N) m in the world.
         inside: (B, N) m right of the lane's middle.
-        reach_along: (B, N) m per pixel.
-        reach_across: (B, N) m per pixel.
     """
+    _, along, _, reach_along, reach_across = ground
     row = lane.to(along.dtype)
     cell = (along / 16.0).floor()
     middle = cell * 16.0 + 2 + 12 * hash01(cell, row, 21.0)

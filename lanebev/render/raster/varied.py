@@ -34,14 +34,10 @@ def add_roadside(scene: Scene, row: Tensor, ground: Ground, paved: Tensor, albed
     """
     beside = make_blocks(paved < 1, row=row, num_rows=len(scene.place.along))
     own = beside.row
-    along, across, reach_along, reach_across = (take(t, beside.place) for t in ground[1:])
     colours, share = roadside(
         select_rows(scene.world.street, own),
         select_rows(scene.world.pavement, own),
-        along,
-        across,
-        reach_along,
-        reach_across,
+        Ground(*(take(t, beside.place) for t in ground)),
         scene.place.across[own],
         scene.lens.extrinsics.height[own],
     )
@@ -104,14 +100,12 @@ def city_ground(
     Returns:
         albedo and painted of the street.
     """
-    here = (ground.along, ground.across, ground.reach_along, ground.reach_across)
     coloured = strips(street, layout, pavement, ground.across, ground.reach_across, albedo)
     albedo = albedo + (coloured - albedo) * (1 - painted)[:, None]
     lane, inside, _, on_lane = lane_coordinates(layout, ground.across)
-    reach = (ground.reach_along, ground.reach_across)
-    dark = ironwork(street, lane, ground.along, inside, *reach) * on_lane * (1 - painted)
-    albedo = tracks(street, *here, albedo * (1 - dark)[:, None])
-    marks = street_paint(street, layout, pavement, *here, blotch)
+    dark = ironwork(street, ground, lane, inside) * on_lane * (1 - painted)
+    albedo = tracks(street, ground, albedo * (1 - dark)[:, None])
+    marks = street_paint(street, layout, pavement, ground, blotch)
     albedo = albedo + (street.paint[..., None] - albedo) * marks[:, None]
     return albedo, torch.maximum(painted, marks)
 
@@ -120,7 +114,7 @@ def works_ground(
     works: Works, ground: Ground, albedo: Tensor, paved: Tensor, painted: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Put old lines on the ground of road works; for the arguments see :func:`city_ground`."""
-    old, scars = old_lines(works, ground.along, ground.across, ground.reach_along, ground.reach_across)
+    old, scars = old_lines(works, ground)
     old, scars = (part * paved * (1 - painted) for part in (old, scars))
     albedo = albedo * (1 - scars)[:, None]
     albedo = albedo + (works.colour[..., None] - albedo) * old[:, None]
@@ -138,17 +132,15 @@ def snow_ground(
     blotch: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Put snow on the ground; for the arguments see :func:`city_ground`."""
-    here = (ground.along, ground.across, ground.reach_along, ground.reach_across)
-    cover = snow_cover(winter, layout, pavement, *here, blotch)
+    cover = snow_cover(winter, layout, pavement, ground, blotch)
     field = winter.on[:, None] * winter.verge[:, None] * (1 - paved)
     cover = torch.maximum(cover * paved, field * (0.85 + 0.15 * blotch).clamp(0, 1))
     return albedo + (winter.colour[..., None] - albedo) * cover[:, None], painted * (1 - cover)
 
 
-def old_lines(
-    works: Works, along: Tensor, across: Tensor, reach_along: Tensor, reach_across: Tensor
-) -> tuple[Tensor, Tensor]:
+def old_lines(works: Works, ground: Ground) -> tuple[Tensor, Tensor]:
     """Compute the coverage by lines that are not valid, and the darkening by removed ones, (B, N) both."""
+    _, along, across, reach_along, reach_across = ground
     paint, scars = torch.zeros_like(along), torch.zeros_like(along)
     ahead = along + works.phase[:, None]
     for line in range(NUM_OLD):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.noise import CLOUD, GRAIN, SECOND, sample_grain, sample_noise, smoothstep
 from lanebev.render.raster.surface import count_below, nearest_slot
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout, presence
@@ -12,28 +13,17 @@ from lanebev.render.scene.pavement import Pavement
 from lanebev.render.scene.winter import Winter
 
 
-def snow_cover(
-    winter: Winter,
-    layout: Layout,
-    pavement: Pavement,
-    along: Tensor,
-    across: Tensor,
-    reach_along: Tensor,
-    reach_across: Tensor,
-    blotch: Tensor,
-) -> Tensor:
+def snow_cover(winter: Winter, layout: Layout, pavement: Pavement, ground: Ground, blotch: Tensor) -> Tensor:
     """Compute the share of a pixel under snow, (B, N); none where a boundary's paint is visible.
 
     Args:
         winter: the snow.
         layout: the boundaries.
         pavement: its edges.
-        along: (B, N) m in the world.
-        across: (B, N) m in the layout's frame.
-        reach_along: (B, N) m per pixel.
-        reach_across: (B, N) m per pixel.
+        ground: (B, N) points.
         blotch: (B, N) slow noise.
     """
+    _, along, across, reach_along, reach_across = ground
     torn = sample_noise(CLOUD, along / 47.0, across / 23.0)
     wave = winter.ragged[:, None] * (0.5 * blotch + 0.4 * torn)
     inward = torch.minimum(
