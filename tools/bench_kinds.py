@@ -21,7 +21,7 @@ from lanebev.estimation.joint.dynamics import MotionConfig
 from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.state import HILLY_ROADS
 from lanebev.estimation.joint.update import UNSEEN
-from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, within_sigmas
+from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, within_3_sigma
 from lanebev.testing.moments import FPS, PLACES, Moment, moments
 from lanebev.testing.motions import Pose, fall, landing_time, moved, sinusoids
 from lanebev.testing.scenarios import SCENARIOS
@@ -81,7 +81,7 @@ def measure(kind: str, seeds: Sequence[int], calibrator: JointCalibrator | None 
     )
     run = Track(error, variance, nees, status, bound, after.flatten() > 0)
     found = summarise(run)
-    windows = within_sigmas(run).unfold(0, round(FPS), 1).mean(-1)
+    windows = within_3_sigma(run).unfold(0, round(FPS), 1).mean(-1)
     easy = (torch.arange(len(shock)) >= WARM_UP) & ~run.hard
     return KindFigures(
         ratio=tuple(found["ratio_to_bound"]),

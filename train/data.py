@@ -55,8 +55,8 @@ class Frames(Protocol):
 class PoolFrames:
     """Frames of a pool in random order, a few shards at a time. Added shards come with the next round."""
 
-    def __init__(self, folder: str | Path, pattern: str = "*.npz", resident: int = 12) -> None:
-        self.folder, self.pattern, self.resident = Path(folder), pattern, resident
+    def __init__(self, folder: str | Path, resident: int = 12) -> None:
+        self.folder, self.resident = Path(folder), resident
 
     def paths(self) -> list[Path]:
         """Return the shards present now.
@@ -64,10 +64,10 @@ class PoolFrames:
         Raises:
             ValueError: there are none.
         """
-        paths = sorted(self.folder.glob(self.pattern))
+        paths = sorted(self.folder.glob("*.npz"))
         if not paths:
             raise ValueError(
-                f"{self.folder}: expected pool shards {self.pattern}, found none; "
+                f"{self.folder}: expected pool shards *.npz, found none; "
                 f"render some with: python -m train.pool {self.folder}"
             )
         return paths

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+_LEAST_MASS = 0.5  # of labels, below which a row does not count
+
 
 def boundary_cross_entropy(
     logits: Tensor, target: Tensor, weight: Tensor, class_weight: Tensor | None = None
@@ -25,7 +27,7 @@ def boundary_cross_entropy(
     return -((scaled * log_p).sum(1) * weight).sum() / weight.sum().clamp(min=1)
 
 
-def row_cross_entropy(logits: Tensor, target: Tensor, weight: Tensor, least: float = 0.5) -> Tensor:
+def row_cross_entropy(logits: Tensor, target: Tensor, weight: Tensor) -> Tensor:
     """Compute how far each boundary's share of a row's probability is from its crossing of the row.
 
     Each row of each boundary that is there counts the same, however thin its stripe: this says where, the
@@ -35,7 +37,6 @@ def row_cross_entropy(logits: Tensor, target: Tensor, weight: Tensor, least: flo
         logits: (B, 1+L, h, w).
         target: (B, 1+L, h, w).
         weight: (B, h, w).
-        least: label mass below which a row does not count.
 
     Returns:
         Mean Kullback-Leibler divergence over counting rows.
@@ -43,8 +44,8 @@ def row_cross_entropy(logits: Tensor, target: Tensor, weight: Tensor, least: flo
     log_p = (logits.log_softmax(1)[:, 1:] + (weight.unsqueeze(1) - 1) * 30).log_softmax(-1)  # over columns
     share = target[:, 1:] * weight.unsqueeze(1)
     mass = share.sum(-1, keepdim=True)
-    counts = (mass > least).squeeze(-1)
-    share = share / mass.clamp(min=least)
+    counts = (mass > _LEAST_MASS).squeeze(-1)
+    share = share / mass.clamp(min=_LEAST_MASS)
     divergence = (torch.special.xlogy(share, share) - share * log_p).sum(-1)
     mean: Tensor = (divergence * counts).sum() / counts.sum().clamp(min=1)
     return mean

@@ -17,10 +17,10 @@ from lanebev.io.lanes import FrameLines
 
 Points = npt.NDArray[np.float64]
 
+_LEAST_MASS = 0.5  # label px, below which a row has no boundary
 
-def row_recall(
-    probabilities: Tensor, target: Tensor, tolerance: float = 2.5, least: float = 0.5
-) -> tuple[Tensor, Tensor]:
+
+def row_recall(probabilities: Tensor, target: Tensor, tolerance: float = 2.5) -> tuple[Tensor, Tensor]:
     """Return the rows in which each boundary is found.
 
     A row where a boundary's stripe has its mass is found if at least half of that mass of probability lies
@@ -30,7 +30,6 @@ def row_recall(
         probabilities: (B, L, h, w).
         target: (B, L, h, w) in [0, 1].
         tolerance: label px.
-        least: mass, in label px, below which a row has no boundary.
 
     Returns:
         found, there: (B, L, h) bool.
@@ -39,15 +38,13 @@ def row_recall(
     mass = target.sum(-1)
     centre = (target * columns).sum(-1) / mass.clamp(min=1e-6)
     near = (columns - centre.unsqueeze(-1)).abs() <= tolerance
-    there = mass > least
+    there = mass > _LEAST_MASS
     return there & ((probabilities * near).sum(-1) >= 0.5 * (target * near).sum(-1)), there
 
 
-def point_recall(
-    probabilities: Tensor, target: Tensor, tolerance: float = 2.5, least: float = 0.5
-) -> tuple[Tensor, Tensor]:
+def point_recall(probabilities: Tensor, target: Tensor, tolerance: float = 2.5) -> tuple[Tensor, Tensor]:
     """Count the rows of :func:`row_recall`: found, there, (B, L) each."""
-    found, there = row_recall(probabilities, target, tolerance, least)
+    found, there = row_recall(probabilities, target, tolerance)
     return found.sum(-1).to(target.dtype), there.sum(-1).to(target.dtype)
 
 

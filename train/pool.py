@@ -26,6 +26,8 @@ from lanebev.render import RenderedFrame, render_views
 from train.commands import one_line_errors
 from train.labels import LabelledImage
 
+_QUALITY = 94  # of JPEG
+
 
 class Pose(NamedTuple):
     """True pose of the camera over the road. A shard has N.
@@ -111,10 +113,10 @@ def camera_poses(frames: list[RenderedFrame]) -> Pose:
     return Pose(*(torch.cat(field).float().numpy() for field in zip(*parts, strict=True)))
 
 
-def write_shard(path: Path, frames: list[RenderedFrame], quality: int = 94) -> None:
+def write_shard(path: Path, frames: list[RenderedFrame]) -> None:
     """Write rendered batches as one shard, whole or not at all."""
     samples = [sample for frame in frames for sample in labelled_images(frame)]
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    options = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
     jpegs = [cv2.imencode(".jpg", sample.image[..., ::-1], options)[1].ravel() for sample in samples]
     partial = path.with_suffix(".part")
     with partial.open("wb") as file:

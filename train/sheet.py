@@ -13,9 +13,10 @@ from lanebev.report.overlay import BOUNDARY_COLOURS
 from train.data import Batch
 
 _HIDDEN = (255.0, 255.0, 255.0)
+_OPACITY = 0.7
 
 
-def labelled_view(batch: Batch, opacity: float = 0.7) -> Tensor:
+def labelled_view(batch: Batch) -> Tensor:
     """Draw the labels of a batch into its images, hidden boundaries in white: (B, 3, H, W) uint8."""
     size = batch.image.shape[-2:]
     colours = torch.tensor(BOUNDARY_COLOURS, dtype=torch.float32, device=batch.image.device)
@@ -24,8 +25,8 @@ def labelled_view(batch: Batch, opacity: float = 0.7) -> Tensor:
     share = torch.cat([batch.target.float(), hidden], dim=1) / 255
     share = F.interpolate(share, size=size, mode="nearest")
     paint = torch.einsum("blhw,lc->bchw", share, colours)
-    covered = share.sum(1, keepdim=True).clamp(max=1) * opacity
-    return ((1 - covered) * batch.image.float() + opacity * paint).clamp(0, 255).byte()
+    covered = share.sum(1, keepdim=True).clamp(max=1) * _OPACITY
+    return ((1 - covered) * batch.image.float() + _OPACITY * paint).clamp(0, 255).byte()
 
 
 def save_sheet(images: Tensor, path: Path, columns: int = 4, width: int = 400) -> None:

@@ -14,6 +14,7 @@ import torch
 T = TypeVar("T")
 Result = TypeVar("Result")
 _END = object()
+_MOST_CALLS = 8  # that wait in a background thread
 
 
 def prefetch(items: Iterable[T], depth: int = 4) -> Iterator[T]:
@@ -81,8 +82,8 @@ def map_ahead(call: Callable[[T], Result], items: Iterable[T], workers: int) -> 
 class Background:
     """Runs calls one after another in a thread; ``with`` waits for them and raises their exceptions."""
 
-    def __init__(self, depth: int = 8) -> None:
-        self._calls: queue.Queue[Callable[[], object] | None] = queue.Queue(depth)
+    def __init__(self) -> None:
+        self._calls: queue.Queue[Callable[[], object] | None] = queue.Queue(_MOST_CALLS)
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="background", daemon=True)
 

@@ -29,13 +29,12 @@ _RENDERED_CRF = 16  # nearly as rendered
 ProgressOf = Callable[[str], Progress]
 
 
-def demo(out: str, progress: ProgressOf | None = None, frames: int = FRAMES) -> str:
+def demo(out: str, progress: ProgressOf | None = None) -> str:
     """Render a drive into ``out/drive``, run on it, and compare with the truth.
 
     Args:
         out: output folder; the drive itself goes to ``drive`` in it, see :func:`write_drive`.
         progress: makes a wrapper of frames from a label, see :func:`lanebev.app.run.run`.
-        frames: length of the drive.
 
     Returns:
         what to print.
@@ -43,7 +42,7 @@ def demo(out: str, progress: ProgressOf | None = None, frames: int = FRAMES) -> 
     Raises:
         ValueError: the folder cannot be written.
     """
-    drive = Drive(SEED, IMAGE_SIZE, frames, float(FPS))
+    drive = Drive(SEED, IMAGE_SIZE, FRAMES, float(FPS))
     folder = Path(out) / "drive"
     with OutputFolder(folder) as inside:
         truth, lane_width = write_drive(drive, inside.__truediv__, progress and progress("rendering"))

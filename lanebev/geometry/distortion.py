@@ -24,6 +24,7 @@ MODELS = ("pinhole", "fisheye", "omni")
 DISTORTION_LENGTHS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "omni": (5,)}
 _OTHER_NAMES = {"mei": "omni"}
 _REACH_STEPS = 2000  # of the search for the radius where a lens folds over
+_PINHOLE_REACH = 10.0  # the largest radius looked at
 
 
 def lens_model(name: str) -> str:
@@ -232,7 +233,7 @@ def transform_plane(plane: Tensor, homography: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(finite, mapped[..., :2], 0.0) / torch.where(finite, depth, 1.0), finite[..., 0]
 
 
-def max_undistorted_radius(distortion: Tensor, model: str = "pinhole", limit: float = 10.0) -> Tensor:
+def max_undistorted_radius(distortion: Tensor, model: str = "pinhole") -> Tensor:
     """Compute how far from the axis a lens still images points farther out.
 
     Beyond, its polynomial folds over and maps points that the camera can't see back into the image.
@@ -241,10 +242,10 @@ def max_undistorted_radius(distortion: Tensor, model: str = "pinhole", limit: fl
     Args:
         distortion: (B, D).
         model: "pinhole", "fisheye" or "omni".
-        limit: the largest radius looked at of a pinhole; 10 is 84 deg off the axis. Others' is 90 deg.
 
     Returns:
-        (B,) radius on the undistorted z = 1 plane.
+        (B,) radius on the undistorted z = 1 plane: at most 10 of a pinhole, which is 84 deg off the axis, and
+        90 deg of the others.
     """
     check_lens(distortion, model)
     steps, angle, radius, sine, cosine = (
@@ -256,7 +257,7 @@ def max_undistorted_radius(distortion: Tensor, model: str = "pinhole", limit: fl
         seen = sine / (cosine + distortion[..., :1])
         value = seen * radial_scale(seen * seen, distortion[..., 1:])[0]
     else:
-        radius = limit * steps
+        radius = _PINHOLE_REACH * steps
         value = radius * (radial_scale(radius * radius, distortion)[0] if distortion.shape[-1] else 1.0)
     grows = value.diff(dim=-1) > 0
     return torch.where(grows, radius[..., -1:], radius[..., :-1]).amin(-1)  # the first that doesn't

@@ -11,7 +11,7 @@ from torch import Tensor
 from lanebev.batch import masked_median
 from lanebev.geometry.precision import full_precision
 from lanebev.observation.boundary_vertices import BoundaryVertices, move_to_front
-from lanebev.observation.frames import resize_image, resized_size
+from lanebev.observation.frames import resized_size
 from lanebev.observation.polylines import VERTICES_PER_LINE
 from lanebev.observation.vertices import order_along, take
 
@@ -122,11 +122,6 @@ def crop_images(image: Tensor, corner: Tensor, size: tuple[int, int]) -> Tensor:
     columns = left + torch.arange(size[1], device=image.device)  # (B, w)
     across = image.gather(2, rows[:, None, :, None].expand(-1, image.shape[1], -1, image.shape[3]))
     return across.gather(3, columns[:, None, None, :].expand(-1, image.shape[1], size[0], -1))
-
-
-def far_image(image: Tensor, corner: Tensor, sizes: ViewSizes) -> Tensor:
-    """Return the far view's input for the network, (B, C, h, w), of images (B, C, H, W)."""
-    return crop_images(resize_image(image, sizes.resized), corner, sizes.far)
 
 
 @full_precision

@@ -100,10 +100,7 @@ def vertices_from_lines(
 
 
 def lane_width_ratios(
-    lines: Sequence[LaneLine],
-    camera: Camera,
-    rolls: Sequence[float] = (0.0,),
-    num_boundaries: int = NUM_BOUNDARIES,
+    lines: Sequence[LaneLine], camera: Camera, rolls: Sequence[float] = (0.0,)
 ) -> NDArray[np.float64]:
     """Return the ratios (R,) of the widths of a frame's lanes for rolls (R,) rad of the camera.
 
@@ -111,7 +108,7 @@ def lane_width_ratios(
     """
     lines = [_without_edges(line, camera.image_size[1]) for line in lines]
     ideal = [_undistorted(line.points, camera) for line in lines]
-    return width_ratios(ideal, _indices(lines, camera, num_boundaries), rolls)
+    return width_ratios(ideal, _indices(lines, camera, NUM_BOUNDARIES), rolls)
 
 
 def lines_from_polylines(

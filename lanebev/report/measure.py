@@ -17,6 +17,7 @@ _MIN_VERTICES = 4
 _MIN_ROWS = 50.0  # px of the image that a boundary must cross: on fewer, its vertices err alike
 _MIN_STRETCH = 5.0  # m of road that a boundary must cover
 _LEAST_SCALE = 1e-6  # of the residuals in sigmas
+_NEAR = 5.0  # m, nearest Z that counts
 _WIDTH_STD = 0.03  # m; a width with a larger standard deviation is left out
 
 
@@ -41,9 +42,7 @@ def measure_boundaries(
     segments: LaneSegments,
     intrinsics: Tensor,
     extrinsics: Extrinsics,
-    near: float = 5.0,
     far: float = 40.0,
-    num_boundaries: int = NUM_BOUNDARIES,
     vertical_curvature: Tensor | None = None,
 ) -> RoadBoundaries:
     """Measure a frame's boundaries in the bird's-eye view that these extrinsics give.
@@ -57,9 +56,7 @@ def measure_boundaries(
         segments: segments of batch size 1, end points in undistorted pixels.
         intrinsics: (1, 3, 3).
         extrinsics: each (1,).
-        near: m, nearest Z that counts.
-        far: m, farthest.
-        num_boundaries: L.
+        far: m, farthest Z that counts.
         vertical_curvature: (1,) 1/m of the road, or None for a plane.
     """
     points, valid = road_from_image_points(
@@ -68,22 +65,22 @@ def measure_boundaries(
     boundary = segments.boundary[0].repeat_interleave(2).numpy()
     seen = (valid[0] & (segments.weight[0] > 0).repeat_interleave(2)).numpy()
     x, z = points[0].double().numpy().T
-    seen &= np.isfinite(x) & np.isfinite(z) & (z >= near) & (z <= far)
+    seen &= np.isfinite(x) & np.isfinite(z) & (z >= _NEAR) & (z <= far)
     rows = segments.endpoints[0, ..., 1].flatten().double().numpy()
-    seen &= _long_enough(boundary, z, rows, seen, num_boundaries)
+    seen &= _long_enough(boundary, z, rows, seen)
     sigma = segments.sigma[0].repeat_interleave(2).double().numpy() / float(intrinsics[0, 0, 0]) * z  # m
-    nothing = RoadBoundaries(np.full(num_boundaries, np.nan), np.full(num_boundaries - 1, np.nan))
+    nothing = RoadBoundaries(np.full(NUM_BOUNDARIES, np.nan), np.full(NUM_BOUNDARIES - 1, np.nan))
     if not seen.any():
         return nothing
     for _ in range(3):
-        line, cov = _fit(x[seen], z[seen], sigma[seen], boundary[seen], num_boundaries)
-        offset, slope, bend = line[:num_boundaries], line[num_boundaries:-1], float(line[-1])
+        line, cov = _fit(x[seen], z[seen], sigma[seen], boundary[seen])
+        offset, slope, bend = line[:NUM_BOUNDARIES], line[NUM_BOUNDARIES:-1], float(line[-1])
         residual = (x - offset[boundary] - slope[boundary] * z - bend * z**2) / sigma
         scale = 1.4826 * np.median(np.abs(residual[seen])) + _LEAST_SCALE
         seen &= np.abs(residual) < 3 * scale
-    present = np.array([(seen & (boundary == k)).sum() >= _MIN_VERTICES for k in range(num_boundaries)])
-    direction = np.where(present, np.arctan(slope + 2 * bend * near), np.nan)
-    widths = np.full(num_boundaries - 1, np.nan)
+    present = np.array([(seen & (boundary == k)).sum() >= _MIN_VERTICES for k in range(NUM_BOUNDARIES)])
+    direction = np.where(present, np.arctan(slope + 2 * bend * _NEAR), np.nan)
+    widths = np.full(NUM_BOUNDARIES - 1, np.nan)
     for k in np.flatnonzero(present[:-1] & present[1:]):
         extents = [(z[seen & (boundary == i)].min(), z[seen & (boundary == i)].max()) for i in (k, k + 1)]
         start, end = max(e[0] for e in extents), min(e[1] for e in extents)
@@ -91,7 +88,7 @@ def measure_boundaries(
             middle = 0.5 * (start + end)
             heading = 0.5 * (slope[k] + slope[k + 1]) + 2 * bend * middle
             at = np.zeros(len(line))  # of the width, in the parameters
-            at[[k, k + 1, num_boundaries + k, num_boundaries + k + 1]] = -1.0, 1.0, -middle, middle
+            at[[k, k + 1, NUM_BOUNDARIES + k, NUM_BOUNDARIES + k + 1]] = -1.0, 1.0, -middle, middle
             if at @ cov @ at < _WIDTH_STD**2:
                 widths[k] = at @ line / np.hypot(1.0, heading)  # square to the lane
     return RoadBoundaries(direction, widths)
@@ -108,10 +105,9 @@ def _long_enough(
     z: NDArray[np.float64],
     rows: NDArray[np.float64],
     seen: NDArray[np.bool_],
-    num_boundaries: int,
 ) -> NDArray[np.bool_]:
-    enough = np.zeros(num_boundaries, dtype=bool)
-    for k in range(num_boundaries):
+    enough = np.zeros(NUM_BOUNDARIES, dtype=bool)
+    for k in range(NUM_BOUNDARIES):
         of = seen & (boundary == k)
         long = of.sum() >= _MIN_VERTICES and np.ptp(z[of]) >= _MIN_STRETCH
         enough[k] = long and np.ptp(rows[of]) >= _MIN_ROWS
@@ -124,10 +120,9 @@ def _fit(
     z: NDArray[np.float64],
     sigma: NDArray[np.float64],
     boundary: NDArray[np.int64],
-    num_boundaries: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Fit offsets (L,), slopes (L,) and the common bend by weighted least squares, with their covariance."""
-    member = np.eye(num_boundaries)[boundary]
+    member = np.eye(NUM_BOUNDARIES)[boundary]
     columns = np.concatenate([member, member * z[:, None], z[:, None] ** 2], axis=1) / sigma[:, None]
     inverse = np.linalg.pinv(columns)
     return inverse @ (x / sigma), inverse @ inverse.T

@@ -64,9 +64,9 @@ class MomentSampler:
         return sum(len(data) for pictures in self._kept.values() for data in pictures.values())
 
 
-def jpeg(picture: Picture, longest: int = _LONGEST) -> bytes:
-    """Return a picture as JPEG, scaled down to ``longest`` px if it is larger."""
-    scale = min(1.0, longest / max(picture.shape[:2]))
+def jpeg(picture: Picture) -> bytes:
+    """Return a picture as JPEG, scaled down to 800 px if it is larger."""
+    scale = min(1.0, _LONGEST / max(picture.shape[:2]))
     if scale < 1.0:
         size = [max(1, round(side * scale)) for side in picture.shape[1::-1]]
         method = cv2.INTER_AREA if scale < 0.5 else cv2.INTER_LINEAR  # which is several times as fast

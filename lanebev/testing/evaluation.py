@@ -47,8 +47,6 @@ def track(
     rows: int,
     sigma: float = 1.0,
     per_boundary: int = 30,
-    seed: int = 0,
-    dtype: torch.dtype = torch.float64,
 ) -> Track:
     """Run a calibrator over a drive.
 
@@ -58,13 +56,11 @@ def track(
         rows: R Monte Carlo runs.
         sigma: px, noise of an end point.
         per_boundary: segments of each boundary.
-        seed: seed of pairs and noise.
-        dtype: dtype of the calibrator.
     """
-    state = calibrator.initial_state(rows, dtype=dtype)
-    intrinsics = CAMERA.to(dtype).expand(rows, 3, 3)
+    state = calibrator.initial_state(rows, dtype=torch.float64)
+    intrinsics = CAMERA.double().expand(rows, 3, 3)
     found = []
-    for moment, segments in observe(drive, rows, sigma, per_boundary, seed, dtype):
+    for moment, segments in observe(drive, rows, sigma, per_boundary, seed=0, dtype=torch.float64):
         calibration, state = calibrator(segments, intrinsics, state, moment.dt, WIDTH)
         error = calibration.extrinsics.stack().double() - torch.tensor(moment.pose, dtype=torch.float64)
         cov = calibration.covariance.double()
@@ -108,7 +104,7 @@ def summarise(run: Track, usual: Tensor | None = None) -> dict[str, Any]:
         "rmse": (rms(run.errors[easy]) * UNITS).tolist(),
         "ratio_to_bound": (mean_of(run.errors.square(), known) / mean_of(run.bounds, known)).sqrt().tolist(),
         "nees_per_dof": float(run.nees[easy].mean() / 4),
-        "within_3_sigma": within_sigmas(run)[later].mean().item(),
+        "within_3_sigma": within_3_sigma(run)[later].mean().item(),
         "time_in_status": {s.name: float((run.status[later] == s).double().mean()) for s in Status},
     }
     if hard.any():
@@ -123,9 +119,9 @@ def summarise(run: Track, usual: Tensor | None = None) -> dict[str, Any]:
     return figures
 
 
-def within_sigmas(run: Track, sigmas: float = 3.0) -> Tensor:
-    """Compute the share (T,) of all rows' parameters whose error is at most so many of their sigmas."""
-    return (run.errors.square() <= sigmas**2 * run.variances).double().mean((1, 2))
+def within_3_sigma(run: Track) -> Tensor:
+    """Compute the share (T,) of all rows' parameters whose error is at most three of their sigmas."""
+    return (run.errors.square() <= 9 * run.variances).double().mean((1, 2))
 
 
 def recovery(run: Track, usual: Tensor, fps: float = FPS) -> float | None:

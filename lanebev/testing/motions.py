@@ -19,6 +19,7 @@ Motion = Callable[[float], Pose]
 MOUNT: Pose = (0.0, 0.0, 0.0, 1.5)
 
 _GRAVITY = 9.81  # m/s²
+_DROP = 1.2  # m, height of a fall
 
 
 def sinusoids(
@@ -26,10 +27,9 @@ def sinusoids(
     largest_deg: float = 1.5,
     largest_m: float = 0.05,
     highest_hz: float = 1.2,
-    terms: int = 3,
     mount: Pose = MOUNT,
 ) -> Motion:
-    """Draw a motion whose pitch, yaw, roll and height are sums of sinusoids about the mount.
+    """Draw a motion whose pitch, yaw, roll and height are sums of three sinusoids about the mount.
 
     Frequencies are uniform between 0.1 Hz and the highest, phases uniform, amplitudes uniform and scaled to
     add up to the largest.
@@ -39,13 +39,12 @@ def sinusoids(
         largest_deg: sum of the amplitudes of each angle.
         largest_m: sum of the amplitudes of height.
         highest_hz: see above.
-        terms: sinusoids of each.
         mount: pose about which it moves.
     """
     random = Random(seed)
 
     def one(largest: float) -> list[tuple[float, float, float]]:
-        sizes = [0.2 + random.random() for _ in range(terms)]
+        sizes = [0.2 + random.random() for _ in range(3)]
         return [
             (
                 largest * size / sum(sizes),
@@ -102,35 +101,34 @@ def damped(t: float, hz: float, damping: float = 0.2) -> float:
     return math.exp(-damping * rate * t) * math.sin(rate * math.sqrt(1 - damping**2) * t)
 
 
-def fall(t: float, drop_m: float = 1.2) -> Pose:
+def fall(t: float) -> Pose:
     """Compute the difference of a falling car's pose from its pose at rest.
 
-    It begins at rest ``drop_m`` above, 3° nose up and rolled by 2°, falls freely, 1.2 m in half a second,
+    It begins at rest 1.2 m above, 3° nose up and rolled by 2°, falls freely for half a second,
     turns level as it falls, and its suspension swings at 2.5 Hz: 12 cm, 2° in pitch and 1° in roll at most.
 
     Args:
         t: s since the beginning of the fall.
-        drop_m: height of the fall.
 
     Returns:
         differences of pitch, yaw, roll (rad) and height (m).
     """
-    landing = landing_time(drop_m)
+    landing = landing_time()
     if t < landing:
         left = 1 - t / landing
         return (
             -math.radians(3.0) * left,
             0.0,
             math.radians(2.0) * left,
-            drop_m - 0.5 * _GRAVITY * t * t,
+            _DROP - 0.5 * _GRAVITY * t * t,
         )
     swing = damped(t - landing, 2.5, 0.4)
     return math.radians(2.0) * swing, 0.0, -math.radians(1.0) * swing, -0.12 * swing
 
 
-def landing_time(drop_m: float = 1.2) -> float:
-    """Compute the time, s, of a free fall from rest."""
-    return math.sqrt(2 * drop_m / _GRAVITY)
+def landing_time() -> float:
+    """Compute the time, s, of the free fall."""
+    return math.sqrt(2 * _DROP / _GRAVITY)
 
 
 def moved(pose: Pose, by: Pose, share: float = 1.0) -> Pose:

@@ -10,7 +10,7 @@ from lanebev.estimation.joint.dynamics import MotionConfig
 from lanebev.estimation.joint.state import JointConfig
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.estimation.two_stage.state import TwoStageConfig
-from lanebev.testing.evaluation import Track, within_sigmas
+from lanebev.testing.evaluation import Track, within_3_sigma
 from lanebev.testing.motions import fall, landing_time, sinusoids
 from tools.replay.__main__ import main
 from tools.replay.check import (
@@ -175,11 +175,11 @@ def test_figures_of_a_straight_drive(straight):
     assert math.isnan(found.back)
 
 
-def test_within_sigmas_counts_every_parameter():
+def test_within_3_sigma_counts_every_parameter():
     error = torch.tensor([[[2.9, -2.9, 3.1, -3.1]], [[0.0, 0.0, 0.0, 4.0]]])
     one = torch.ones_like(error)
     run = Track(error, one, one[..., 0], one[..., 0].long(), one, torch.zeros(2, dtype=torch.bool))
-    assert within_sigmas(run).tolist() == [0.5, 0.75]
+    assert within_3_sigma(run).tolist() == [0.5, 0.75]
 
 
 def test_an_unknown_kind_is_one_line(capsys):
@@ -199,7 +199,7 @@ def test_random_motion_stays_within_what_it_says():
 
 
 def test_a_fall_is_continuous_and_comes_to_rest():
-    landing = landing_time(1.2)
+    landing = landing_time()
     assert landing == pytest.approx(0.495, abs=1e-3)
     assert fall(0.0)[3] == pytest.approx(1.2)
     assert fall(landing - 1e-9) == pytest.approx(fall(landing), abs=1e-6)

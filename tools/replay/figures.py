@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lanebev.observation.segments import LaneSegments
-from lanebev.testing.evaluation import UNITS, Track, frame_bound, recovery, rms, summarise, within_sigmas
+from lanebev.testing.evaluation import UNITS, Track, frame_bound, recovery, rms, summarise, within_3_sigma
 from tools.replay.recording import Recording, Replayed
 
 
@@ -39,7 +39,7 @@ def figures(recording: Recording, replayed: Replayed, row: int) -> Figures:
     run = as_track(recording, replayed, row)
     found = summarise(run)
     fps = 1 / float(recording.dt[recording.dt > 0].median())
-    share = within_sigmas(run)
+    share = within_3_sigma(run)
     window = min(max(round(fps), 1), len(share))
     return Figures(
         rmse=tuple(found["rmse"]),

@@ -16,21 +16,21 @@ from train.commands import one_line_errors
 from train.detector.experiment import experiment_of, experiment_parser, trained_arm
 from train.detector.frames import DriveFrames
 from train.detector.module import DetectorTraining
+from train.detector.predict import TOGETHER
 from train.detector.targets import detection_loss
 
 QUANTITIES = ("pitch", "yaw", "roll", "height")
 
 
-def pose_gradients(module: DetectorTraining, frames: DriveFrames, together: int = 8) -> Tensor:
+def pose_gradients(module: DetectorTraining, frames: DriveFrames) -> Tensor:
     """Compute the gradient (N, 4) of the loss on the poses of the online calibration.
 
     Args:
         module: in evaluation mode.
-        frames: N of them.
-        together: frames of a batch, of which the loss is the mean over boxes.
+        frames: N of them, in batches of 8, over whose boxes the loss is the mean.
     """
     gradients: list[Tensor] = []
-    for rows in torch.arange(len(frames)).split(together):
+    for rows in torch.arange(len(frames)).split(TOGETHER):
         batch = frames.__getitems__(rows.tolist())
         poses = batch.online.clone().requires_grad_()
         maps = module.detector(batch.image.float() / 255, batch.intrinsics, Extrinsics.unstack(poses))

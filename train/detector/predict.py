@@ -16,26 +16,24 @@ from train.detector.precision import Centres
 from train.detector.targets import decode_boxes
 
 LEAST_SCORE = 0.02
+TOGETHER = 8  # frames of a batch
 OFFSETS_DEG = (0.1, 0.25, 0.5, 1.0, 2.0)
 AXES = ("pitch", "roll", "yaw")
 _COLUMN = {"pitch": 0, "yaw": 1, "roll": 2}
 
 
 @torch.inference_mode()
-def find(
-    detector: VehicleDetector, frames: Frames, poses: Sequence[Tensor], together: int = 8
-) -> list[Centres]:
+def find(detector: VehicleDetector, frames: Frames, poses: Sequence[Tensor]) -> list[Centres]:
     """Find vehicles in all frames by each of several poses; image features are computed once.
 
     Args:
         detector: in evaluation mode.
         frames: N of them.
         poses: poses of each: (N, 4).
-        together: frames of a batch.
     """
     size, grid = (frames.image.shape[-2], frames.image.shape[-1]), detector.warp.grid
     found: list[list[tuple[Tensor, Tensor]]] = [[] for _ in poses]
-    for rows in torch.arange(len(frames.image)).split(together):
+    for rows in torch.arange(len(frames.image)).split(TOGETHER):
         features = detector.features(frames.image[rows].float() / 255)
         for pose, own in zip(poses, found, strict=True):
             extrinsics = Extrinsics.unstack(pose[rows])
@@ -56,9 +54,9 @@ def true_centres(frames: Frames) -> Centres:
     return centres(frames.boxes, frames.seen.float())
 
 
-def offset_poses(poses: Tensor, seed: int = 0) -> dict[tuple[str, float], Tensor]:
+def offset_poses(poses: Tensor) -> dict[tuple[str, float], Tensor]:
     """Turn poses (N, 4) about one axis at a time, each frame's by the same angle to a random side."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     side = 2.0 * torch.randint(2, (len(poses),), generator=generator) - 1
     turned = {}
     for axis in AXES:

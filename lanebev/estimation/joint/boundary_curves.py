@@ -50,7 +50,6 @@ def fit_boundaries(
     intrinsics: Tensor,
     extrinsics: Extrinsics,
     curvature: Tensor | None = None,
-    num_boundaries: int = NUM_BOUNDARIES,
     least_support: float = 2.0,
     vertical_curvature: Tensor | None = None,
 ) -> Boundaries:
@@ -64,7 +63,6 @@ def fit_boundaries(
         intrinsics: (B, 3, 3).
         extrinsics: each (B,), of this frame.
         curvature: (B, 2), c0 and c1, or None to fit them to all boundaries together.
-        num_boundaries: L.
         least_support: sum of the inlier segments' weights from which a boundary is present.
         vertical_curvature: (B,) 1/m of the road, or None for a plane.
 
@@ -74,7 +72,7 @@ def fit_boundaries(
     Raises:
         ValueError: shapes that do not fit.
     """
-    seen = observe(segments, intrinsics, num_boundaries)
+    seen = observe(segments, intrinsics, NUM_BOUNDARIES)
     if vertical_curvature is not None:
         check_vertical_curvature(vertical_curvature, intrinsics.shape[0])
     given = intrinsics.new_zeros(intrinsics.shape[0], 2) if curvature is None else curvature
@@ -90,7 +88,7 @@ def fit_boundaries(
     lateral = across - _bend(z, given)
     focal = seen.focal.unsqueeze(-1)
     boundary = per_end(seen.boundary)
-    member = torch.nn.functional.one_hot(boundary, num_boundaries).mT.to(z.dtype)  # (B, L, 2N)
+    member = torch.nn.functional.one_hot(boundary, NUM_BOUNDARIES).mT.to(z.dtype)  # (B, L, 2N)
     weight = per_end(seen.weight) * on_road
     member = member * weight.unsqueeze(1)
     sigma = per_end(seen.sigma)

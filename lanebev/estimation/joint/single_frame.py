@@ -31,6 +31,7 @@ from lanebev.geometry.precision import full_precision
 from lanebev.observation.segments import LaneSegments
 from lanebev.types import NUM_BOUNDARIES, Extrinsics, map_tensors
 
+_START_SEGMENTS = 96  # that are used to choose the start
 _OBSERVED = 0.2  # a parameter is observed if its sigma fell below this part of the prior's
 
 
@@ -73,7 +74,6 @@ def fit_single_frame(
     lane_width: float | Tensor = 3.7,
     prior: FramePrior | None = None,
     num_boundaries: int = NUM_BOUNDARIES,
-    start_segments: int = 96,
     iterations: int = 8,
 ) -> SingleFrameFit:
     """Compute the robust maximum a posteriori fit of one frame, for each row of the batch.
@@ -100,7 +100,6 @@ def fit_single_frame(
         lane_width: float, (B,) or (B, L-1) m.
         prior: means, sigmas and search range; default :class:`FramePrior`.
         num_boundaries: L, the ego lane being between L/2 - 1 and L/2.
-        start_segments: segments used to choose the start.
         iterations: Gauss-Newton steps of every start.
 
     Returns:
@@ -114,15 +113,15 @@ def fit_single_frame(
     segments, intrinsics, widths = mask_invalid_rows(segments, intrinsics, widths, num_boundaries)
     seen = observations(segments, intrinsics)
     places = boundary_places(widths, num_boundaries, intrinsics).gather(1, seen.boundary)  # (B, N)
-    return fit_observations(seen, places, prior or FramePrior(), start_segments, iterations)
+    return fit_observations(seen, places, prior or FramePrior(), iterations)
 
 
 def fit_observations(
-    seen: Observations, places: Tensor, prior: FramePrior, start_segments: int = 96, iterations: int = 8
+    seen: Observations, places: Tensor, prior: FramePrior, iterations: int = 8
 ) -> SingleFrameFit:
     """As :func:`fit_single_frame`, of segments made ready and places (B, N) of their boundaries, m."""
     fixed, fixed_places = map_tensors(Tensor.detach, seen), places.detach()
-    fewer, fewer_places = spread_subset(fixed, fixed_places, start_segments)
+    fewer, fewer_places = spread_subset(fixed, fixed_places, _START_SEGMENTS)
     starts = linear_starts(fewer, fewer_places, prior)  # (B, S, 7)
     params, scale = _best_start(starts, fewer, fewer_places, prior, iterations)
     params, scale, _ = refine(params, scale, fixed_places, fixed, prior, iterations=3)

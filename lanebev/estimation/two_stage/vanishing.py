@@ -196,7 +196,7 @@ def incidence_noise(rays: Tensor, vanishing_dir: Tensor, sigma: Tensor, intrinsi
 
 
 def vanishing_dir_least_squares(
-    normals: Tensor, noise: Tensor, weight: Tensor, prior_dir: Tensor, prior_std: float = 1.0
+    normals: Tensor, noise: Tensor, weight: Tensor, prior_dir: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Estimate the vanishing direction from great-circle normals, with its covariance.
 
@@ -208,8 +208,8 @@ def vanishing_dir_least_squares(
         normals: (B, N, 3), not normalised.
         noise: (B, N) variances of n·v at v_z = 1, > 0 where the weight is.
         weight: (B, N) in [0, 1].
-        prior_dir: (B, 3) with z > 0, what to return where nothing is observed.
-        prior_std: standard deviation of the prior, in units of x/z.
+        prior_dir: (B, 3) with z > 0, what to return where nothing is observed; the prior's standard deviation
+            is 1 in x/z and y/z.
 
     Returns:
         (B, 3) direction with z = 1, and (B, 2, 2) covariance of (x, y).
@@ -220,8 +220,8 @@ def vanishing_dir_least_squares(
     moments = scaled.mT @ normals  # (B, 3, 3) Σ n nᵀ / var
     prior = prior_dir[..., :2] / prior_dir[..., 2:]
     eye = torch.eye(2, dtype=normals.dtype, device=normals.device)
-    matrix = moments[..., :2, :2] + eye / prior_std**2
-    vector = prior / prior_std**2 - moments[..., :2, 2]
+    matrix = moments[..., :2, :2] + eye
+    vector = prior - moments[..., :2, 2]
     cov = inverse_spd(matrix)
     solution = (cov @ vector.unsqueeze(-1)).squeeze(-1)
     return torch.cat([solution, torch.ones_like(solution[..., :1])], dim=-1), cov
