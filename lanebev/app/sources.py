@@ -21,7 +21,7 @@ from lanebev.app.observers import Observation, Observer
 from lanebev.camera.model import Camera
 from lanebev.io.bags import BagSource, open_bag_source
 from lanebev.io.frames import ALL, Frame, Selection
-from lanebev.io.image_names import drives_remark, jump_remark
+from lanebev.io.image_names import drives_remark, jump_remark, untimed_remark
 from lanebev.io.live import LiveSource, open_live
 from lanebev.io.source_names import is_bag, is_live, without_login
 from lanebev.io.video import FrameSource, open_source
@@ -52,8 +52,8 @@ def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
     if found.paths and not config.stills:
         remarks.append(drives_remark(found.paths) or ("" if found.times else jump_remark(found.paths)))
         if found.count > 1 and not (found.times or config.frame_rate):
-            rate = f"{float(found.fps):g} frames per second are assumed"
-            remarks.append(f"no times are read from their names, {rate}; state --fps")
+            why, remedy = untimed_remark(found.paths)
+            remarks.append(f"{why}, {float(found.fps):g} frames per second are assumed; {remedy}")
     said = [each if each is found.problem else f"{config.source}: {each}" for each in remarks if each]
     found = replace(found, problem="; ".join(said))
     source = replace(found, selection=selection)

@@ -10,6 +10,8 @@ from itertools import pairwise
 from pathlib import PurePath
 from statistics import median_low
 
+from lanebev.io.name_clocks import are_decimal, read_clocks
+
 _SUFFIXES = r"(?:\.[A-Za-z]\w*)*$"  # .jpg, .lines.txt
 _DECIMAL = re.compile(rf"(?<![\d.])(\d+)\.(\d+)(?={_SUFFIXES})", re.ASCII)
 _SECONDS = re.compile(rf"(?<!\d)(\d{{10}})(?:\.|[_-](?=\d{{9}}\b|\d{{6}}\b))(\d{{1,9}}){_SUFFIXES}", re.ASCII)
@@ -17,7 +19,6 @@ _STAMP = re.compile(rf"(?<!\d)(\d{{13,19}}){_SUFFIXES}", re.ASCII)
 _DIGITS = re.compile(r"[0-9a-f]+", re.IGNORECASE)  # of numbers to the base 10 or 16
 _EPOCH = (1_000_000_000, 4_102_444_800)  # s: September 2001 to 2100
 _STEPS = (Fraction(1, 2000), Fraction(60))  # s between two frames of a drive
-_NANOSECONDS = (8, 9)  # digits: a float of seconds since 1970 has 7 at most, of seconds since a start 17
 
 _MOST_ALIKE = (
     0.5  # of the images, of which more with the same number or name are of several cameras or drives
@@ -50,46 +51,84 @@ def in_natural_order(paths: Iterable[str]) -> list[str]:
     Names of decimal seconds as ``str`` writes them, without zeros at the end, are in the order of time; the
     names of all files tell whether they are: a fraction that ends with a zero, or has more digits than a
     float, is a whole number (1.9 before 1.10; seconds and nanoseconds). Hexadecimal numbers of one length
-    (0009, 000a) are in the order of their texts.
+    (0009, 000a) are in the order of their texts. Names with times of day are in the order of these, also
+    over midnight and with the day before the month.
     """
     paths = list(paths)
     stems = [PurePath(path).stem for path in paths]
     if len({len(stem) for stem in stems}) == 1 and all(map(_DIGITS.fullmatch, stems)):
         return sorted(paths, key=lambda path: (natural_order(str(PurePath(path).parent)), path))
-    decimal = _are_decimal([match[2] for match in map(_DECIMAL.search, paths) if match])
-    return sorted(paths, key=lambda path: natural_order(path, decimal))
+    decimal = are_decimal([match[2] for match in map(_DECIMAL.search, paths) if match])
+    ordered = sorted(paths, key=lambda path: natural_order(path, decimal))
+    clocks = read_clocks(ordered)
+    if clocks is None:
+        return ordered
+    places = sorted(range(len(ordered)), key=lambda place: clocks.seconds[place])
+    return [ordered[place] for place in places]
 
 
 def times_from_names(paths: Sequence[str]) -> tuple[float, ...]:
     """Return the times of frames, s since the first, if their names state them without doubt; else nothing.
 
-    They do if each ends with a time since 1970 of one kind (seconds with a fraction, seconds and
-    nanoseconds, or a whole number of milli-, micro- or nanoseconds), and all of them rise in steps of half
-    a millisecond to a minute.
+    They do if each has a time of day with its date, or ends with a time since 1970 of one kind (seconds with
+    a fraction, seconds and nanoseconds, or a whole number of milli-, micro- or nanoseconds), and all of them
+    rise in steps of half a millisecond to a minute.
 
     Args:
         paths: paths of the images, in order.
     """
+    clocks = read_clocks(paths)
+    by_clock = clocks.seconds if clocks is not None and clocks.is_one_camera else ()
+    times = next(filter(_are_of_a_drive, (by_clock, _times_since_1970(paths))), ())
+    return tuple(float(time - times[0]) for time in times)
+
+
+def untimed_remark(paths: Sequence[str]) -> tuple[str, str]:
+    """Return why frames have no times from their names, and what to do.
+
+    Args:
+        paths: paths of the images, in order.
+    """
+    clocks = read_clocks(paths)
+    times = clocks.seconds if clocks else ()
+    if _are_of_a_drive(times):
+        words = "numbers beside the times in their names may be those of cameras"
+        return f"{words}, as from {_two_names(paths)}", "give the images of one as a quoted glob"
+    if times and len(set(times)) < len(times) and all(time.denominator == 1 for time in times):
+        inner = sum(times[0] < time < times[-1] for time in times)  # the first and the last second are cut
+        rate = inner / max(float(times[-1] - times[0] - 1), 1.0)
+        return f"the times in their names are whole seconds, with {rate:.3g} images in each", "state --fps"
+    return "no times are read from their names", "state --fps"
+
+
+def _two_names(paths: Sequence[str]) -> str:
+    """Return the names of the first two of some images."""
+    return " to ".join(PurePath(path).name for path in paths[:2])
+
+
+def _times_since_1970(paths: Sequence[str]) -> Sequence[Fraction]:
+    """Return the times since 1970 (s) at the ends of names; none if one has none or is of another kind."""
     names = [PurePath(path).name for path in paths]
     seconds = [_SECONDS.search(name) for name in names]
     stamps = [_STAMP.search(name) for name in names]
-    if len(names) > 1 and all(seconds):
+    if all(seconds):
         fractions = [match[2] for match in seconds if match]
-        whole = not _are_decimal(fractions)  # nanoseconds without zeros before them
+        whole = not are_decimal(fractions)  # nanoseconds without zeros before them
         times = [
             int(match[1]) + (Fraction(int(match[2]), 10**9 if whole else 10 ** len(match[2])))
             for match in seconds
             if match
         ]
-    elif len(names) > 1 and all(stamps) and len({len(match[1]) for match in stamps if match}) == 1:
+    elif all(stamps) and len({len(match[1]) for match in stamps if match}) == 1:
         times = [Fraction(int(match[1]), 10 ** (len(match[1]) - 10)) for match in stamps if match]
     else:
         return ()
-    steps = [b - a for a, b in pairwise(times)]
-    since_1970 = _EPOCH[0] <= times[0] and times[-1] < _EPOCH[1]
-    if not (since_1970 and all(_STEPS[0] <= step <= _STEPS[1] for step in steps)):
-        return ()
-    return tuple(float(time - times[0]) for time in times)
+    return times if all(_EPOCH[0] <= time < _EPOCH[1] for time in times) else ()
+
+
+def _are_of_a_drive(times: Sequence[Fraction]) -> bool:
+    """Tell whether times (s) are of several frames and rise as those of a drive."""
+    return len(times) > 1 and all(_STEPS[0] <= b - a <= _STEPS[1] for a, b in pairwise(times))
 
 
 def drives_remark(paths: Sequence[str]) -> str:
@@ -123,33 +162,34 @@ def drives_remark(paths: Sequence[str]) -> str:
 
 
 def jump_remark(paths: Sequence[str]) -> str:
-    """Return where the only number that differs in images' names jumps; else nothing.
+    """Return where the times in images' names, or the only number that differs in these, jump; else nothing.
 
-    It jumps where images are missing, and where a counter began again at 0: later images come first then.
+    A number jumps where images are missing, and where a counter began again at 0: later images come first.
 
     Args:
         paths: paths of the images, in order.
     """
+    clocks = read_clocks(paths)
+    times = clocks.seconds if clocks else _times_since_1970(paths)
+    if times:
+        jumps = [b - a > _STEPS[1] for a, b in pairwise(times)]
+        kind, remedy = "the times in their names jump", ""
+    else:
+        steps = _number_steps(paths)
+        jumps = [step > median_low(steps) > 0 for step in steps]
+        kind, remedy = "their numbers jump", ", or number them anew"
+    if True not in jumps:
+        return ""
+    place = _two_names(paths[jumps.index(True) :])
+    taken = "which are taken for frames one after another"
+    return f"{kind}, as from {place}, {taken}; give each part a run{remedy}"
+
+
+def _number_steps(paths: Sequence[str]) -> list[int]:
+    """Return the steps of the only number that differs in images' names; none if there is no such."""
     parts = [re.split(r"(\d+)", PurePath(path).stem, flags=re.ASCII) for path in paths]
     columns = list(zip(*parts, strict=True)) if len(set(map(len, parts))) == 1 else []
     varying = [column for column in columns if len(set(column)) > 1]
     if len(varying) != 1 or not varying[0][0].isdigit():
-        return ""
-    steps = [int(after) - int(before) for before, after in pairwise(varying[0])]
-    place = next((index for index, step in enumerate(steps) if step > median_low(steps) > 0), None)
-    if place is None:
-        return ""
-    before, after = (PurePath(path).name for path in paths[place : place + 2])
-    return (
-        f"their numbers jump, as from {before} to {after}, which are taken for frames one after another; "
-        "give each part a run, or number them anew"
-    )
-
-
-def _are_decimal(fractions: Sequence[str]) -> bool:
-    """Tell whether digits after a dot are fractions: of one length, or as in a float's shortest text."""
-    lengths = {len(digits) for digits in fractions}
-    if len(lengths) <= 1:
-        return True
-    shortest = all(digits == "0" or digits[-1] != "0" for digits in fractions)
-    return shortest and max(lengths) not in _NANOSECONDS
+        return []
+    return [int(after) - int(before) for before, after in pairwise(varying[0])]

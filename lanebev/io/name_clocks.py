@@ -1,0 +1,179 @@
+"""Dates and times of day in images' names, such as 2026-11-29_10-15-30.123.jpg."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import date
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import PurePath
+from statistics import median
+from typing import NamedTuple
+
+_DAY = 86_400  # s
+_DATES = (  # and which of their numbers may be year, month and day
+    (r"(?<!\d)(?P<a>20\d\d)[-_.]?(?P<b>\d\d)[-_.]?(?P<c>\d\d)", ("ymd",)),
+    (r"(?<!\d)(?P<a>20\d\d)[-_.](?P<b>\d\d?)[-_.](?P<c>\d\d?)", ("ymd",)),
+    (r"(?<!\d)(?P<a>\d\d)[-_.]?(?P<b>\d\d)[-_.]?(?P<c>20\d\d)", ("dmy", "mdy")),
+    (r"(?<!\d)(?P<a>\d\d?)[-_.](?P<b>\d\d?)[-_.](?P<c>20\d\d)", ("dmy", "mdy")),
+)
+_SHORT_DATE = r"(?<!\d)(?P<a>\d\d)(?P<b>\d\d)(?P<c>\d\d)[_-]"
+_BETWEEN = r"(?P<between>[T_ .@/-]{0,3}|[ _]at[ _])"  # date and time of day
+_CLOCK = r"(?P<hour>\d\d?)[-_.:h](?P<minute>\d\d?)[-_.:m](?P<second>\d\d?)"
+_DIGITS = r"(?P<hour>\d\d)(?P<minute>\d\d)(?P<second>\d\d)"
+_ALONE = r"(?<![^/])(?P<words>[^\d/]*)" + _CLOCK.replace(".", "")
+_FRACTION = r"(?:(?:[.,](?=\d{1,9}(?!\d))|(?P<loose>[-_]?)(?=(?:\d{3}|\d{6}|\d{9})(?!\d)))(?P<fraction>\d+))?"
+_END = r"(?!\d)(?:[ \u202f_-]?(?P<half>[AaPp])[Mm](?![A-Za-z]))?"
+_FORMS = (
+    *((day + _BETWEEN + clock + _FRACTION + _END, orders)
+      for day, orders in _DATES for clock in (_CLOCK, _DIGITS)),
+    (_SHORT_DATE + _DIGITS + r"(?P<fraction>\d{3})(?!\d)", ("ymd", "dmy")),
+    (_ALONE + _FRACTION + _END, ("",)),
+)  # fmt: skip
+_FASTEST = Fraction(1, 250)  # s between frames, of fractions that may be numbers of images
+
+
+class NameClocks(NamedTuple):
+    """Times of day in images' names.
+
+    Attributes:
+        seconds: s of any epoch, one for each image.
+        is_one_camera: whether nothing else in the names tells some images from others, as the number of a
+            camera would.
+    """
+
+    seconds: tuple[Fraction, ...]
+    is_one_camera: bool
+
+
+def read_clocks(paths: Sequence[str]) -> NameClocks | None:
+    """Return the times that images' names, and the folders above them, state as time of day.
+
+    A time has a date or at least a fraction of a second. Where day and month may be exchanged, they are read
+    so that the drive is the shorter one.
+
+    Args:
+        paths: paths of the images.
+
+    Returns:
+        None if a name has no time, if all have the same, or if they differ in other words.
+    """
+    texts = ["/".join(PurePath(path).parts[-2:]) for path in paths]
+    for form, orders in _FORMS:
+        matches = _last_matches(re.compile(form, re.ASCII), texts)
+        drives = [times for order in orders if matches and (times := _times(matches, order))]
+        if drives:
+            seconds = min(drives, key=lambda times: max(times) - min(times))
+            rests = [_rest(text, match) for text, match in zip(texts, matches, strict=True)]
+            if len({re.sub(r"\d+", "", "/".join(rest)) for rest in rests}) > 1 or len(set(seconds)) == 1:
+                return None
+            is_one = all(len(set(part)) in (1, len(part)) for part in zip(*rests, strict=True))
+            return NameClocks(tuple(seconds), is_one)
+    return None
+
+
+def are_decimal(fractions: Sequence[str]) -> bool:
+    """Tell whether digits after a dot are fractions: of one length, or as in a float's shortest text."""
+    lengths = {len(digits) for digits in fractions}
+    if len(lengths) <= 1:
+        return True
+    shortest = all(digits == "0" or digits[-1] != "0" for digits in fractions)
+    return shortest and max(lengths) not in (8, 9)  # ns: since 1970 a float has 7 at most, else 17
+
+
+def _last_matches(form: re.Pattern[str], texts: Sequence[str]) -> list[re.Match[str]]:
+    """Return the last match in each text, which must end in the file's name; none if one has none."""
+    found = []
+    for text in texts:
+        of_name = [match for match in form.finditer(text) if match.end() > text.rfind("/") + 1]
+        if not of_name:
+            return []
+        found.append(of_name[-1])
+    return found
+
+
+def _rest(text: str, match: re.Match[str]) -> tuple[str, str]:
+    """Return what a path has before and after its time, without the file's suffix."""
+    before = text[: match.start()] + (match.groupdict().get("words") or "")
+    return before, str(PurePath("_" + text[match.end() :]).with_suffix(""))
+
+
+def _times(matches: Sequence[re.Match[str]], order: str) -> list[Fraction] | None:
+    """Return the times (s), the numbers of a date in this order; None if one is no time, or in doubt."""
+    groups = [match.groupdict("") for match in matches]
+    days, clocks = [_day(each, order) for each in groups], [_time_of_day(each) for each in groups]
+    if None in days or None in clocks:
+        return None
+    whole = [_DAY * day + clock for day, clock in zip(days, clocks, strict=True)]  # type: ignore[operator]
+    fractions = _seconds_of_digits([each["fraction"] for each in groups])
+    if not any(each["fraction"] for each in groups):
+        return None if not order or _may_be_numbers(matches) else [Fraction(each) for each in whole]
+    times = [a + b for a, b in zip(whole, fractions, strict=True)]
+    may_count = all("loose" in match.re.groupindex and match["loose"] is not None for match in matches)
+    if may_count and _are_counts(times):
+        times = [Fraction(each) for each in whole]
+    return times if order else _over_midnight(times)
+
+
+def _day(groups: dict[str, str], order: str) -> int | None:
+    """Return the number of a date, 0 where none is expected; None if it is no date."""
+    if not order:
+        return 0
+    number = {kind: int(groups[name]) for kind, name in zip(order, "abc", strict=True)}
+    try:
+        return date(number["y"] % 100 + 2000, number["m"], number["d"]).toordinal()
+    except ValueError:
+        return None
+
+
+def _time_of_day(groups: dict[str, str]) -> int | None:
+    """Return a time of day, whole s; None if it is none."""
+    hour, minute, second = (int(groups[name]) for name in ("hour", "minute", "second"))
+    half = groups.get("half", "").lower()
+    if minute > 59 or second > 59 or hour > 23 or (half and not 1 <= hour <= 12):
+        return None
+    hour = hour % 12 + 12 * (half == "p") if half else hour
+    return 3600 * hour + 60 * minute + second
+
+
+def _seconds_of_digits(fractions: Sequence[str]) -> list[Fraction]:
+    """Return what digits after whole seconds are, s; no digits are 0.
+
+    They are decimal fractions, or whole milli-, micro- or nanoseconds without zeros before them.
+    """
+    given = [digits for digits in fractions if digits]
+    most = max(map(len, given), default=0)
+    unit = None if are_decimal(given) else next(10**power for power in (3, 6, 9) if most <= power)
+    return [Fraction(int(digits or 0), unit or 10 ** len(digits)) for digits in fractions]
+
+
+def _may_be_numbers(matches: Sequence[re.Match[str]]) -> bool:
+    """Tell whether times of day may be images' numbers: six digits after a date that all begin with 00."""
+    return all(
+        match["hour"] == "00" and match.end("hour") == match.start("minute") and "T" not in match["between"]
+        for match in matches
+    )
+
+
+def _are_counts(times: Sequence[Fraction]) -> bool:
+    """Tell whether digits after the seconds are numbers of images, of which some have the same second.
+
+    Those of a clock fall from a second to the next, and do not rise by less than 4 ms.
+    """
+    ordered = sorted(times)
+    parts = [time % 1 for time in ordered]
+    same = any(int(a) == int(b) for a, b in pairwise(ordered))
+    rising = all(a <= b for a, b in pairwise(parts))
+    steps = [b - a for a, b in pairwise(ordered)]
+    return same and (rising or median(steps) < _FASTEST)
+
+
+def _over_midnight(times: list[Fraction]) -> list[Fraction]:
+    """Return times of day (s) of which those after midnight are of the next day, by the longest gap."""
+    ordered = sorted(times)
+    gaps = [(b - a, b) for a, b in pairwise(ordered)]
+    longest, begin = max(gaps, default=(Fraction(0), Fraction(0)))
+    if longest <= _DAY - ordered[-1] + ordered[0]:
+        return times
+    return [time if time >= begin else time + _DAY for time in times]
