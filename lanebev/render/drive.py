@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from lanebev.camera.model import Camera
+from lanebev.render.camera_motion import BodyMotion, LanePath
+from lanebev.render.course import Course
 from lanebev.render.frame import RenderedFrame
-from lanebev.render.scene.alignment import Alignment, arc_nodes, build_alignment
 from lanebev.render.scene.camera import Lens
 from lanebev.render.scene.sampler import BatchSampler, concatenate_rows
 from lanebev.render.scene.traffic import NUM_VEHICLES
@@ -24,31 +25,6 @@ _SCENERY_PERIOD = 450.0  # m; bridges, signs and lamps come again
 _ONCOMING_PERIOD = 420.0  # m
 _COMING, _COMING_TOGETHER, _SLOWEST = -20.0, -28.0, -3.0  # m/s relative to the camera: who is faster comes
 _BEHIND = 40.0  # m behind the camera at which things move to the far end
-_LANE_CHANGE = 4.5  # s
-_DAMPING, _BUMP_RATE = 4.0, 9.0  # 1/s and rad/s of a suspension after a bump
-
-
-class SmoothNoise:
-    """A sum of sinusoids: a repeatable, band-limited signal at any time.
-
-    Args:
-        sampler: the randomness, one row.
-        amplitude: about the largest value.
-        low: Hz, lowest frequency.
-        high: Hz, highest frequency.
-    """
-
-    def __init__(
-        self, sampler: BatchSampler, amplitude: float, low: float, high: float, terms: int = 6
-    ) -> None:
-        self.rate = 2 * math.pi * low * (high / low) ** sampler.uniform(0, 1, terms)[0].double()
-        self.phase = sampler.uniform(0, 2 * math.pi, terms)[0].double()
-        weight = self.rate**-0.5
-        self.weight = amplitude * weight / weight.norm() / math.sqrt(2)
-
-    def __call__(self, time: float) -> float:
-        """Return the value at ``time`` s."""
-        return float((self.weight * (self.rate * time + self.phase).sin()).sum())
 
 
 class Drive:
@@ -73,6 +49,7 @@ class Drive:
     Attributes:
         times: (N,) s, float64.
         camera: the lens in use.
+        course: curvature and elevation of the road.
 
     Raises:
         ValueError: no frames, or a frame rate or speed that is not positive.
@@ -110,66 +87,14 @@ class Drive:
         self.world = self.world._replace(tunnel=endless(self.world.tunnel))
         self.start = float(sampler.uniform(0, 2000))
         duration = num_frames / fps
-        self._sample_course(sampler, duration, curves, hills)
-        self._sample_lanes(sampler, int(first_lane), duration, lane_changes)
-        self._sample_motion(sampler, duration, motion, mount)
+        self.course = Course(sampler, duration * speed, curves, hills)
+        street, layout = self.world.street, self.world.layout
+        self._path = LanePath(sampler, street, layout, int(first_lane), duration, lane_changes)
+        self._body = BodyMotion(sampler, duration, motion, mount)
         self.world = self._without_collisions(self.world)
 
     def __len__(self) -> int:
         return len(self.times)
-
-    def _sample_course(self, sampler: BatchSampler, duration: float, curves: float, hills: float) -> None:
-        count = int((duration * self.speed + 2600) / 90) + 3
-        value = sampler.uniform(-1, 1, count)[0].double() * sampler.chance(0.65, count)[0]
-        value[: 1 + int(sampler.uniform(1, 4))] = 0.0  # the first hundreds of metres are straight
-        self._curvature = value * curves / 300.0
-        self._wave = 2 * math.pi / sampler.uniform(250, 700, 3)[0].double()
-        self._wave_phase = sampler.uniform(0, 2 * math.pi, 3)[0].double()
-        self._wave_bend = hills * sampler.uniform(0, 1, 3)[0].double() / 9000.0
-
-    def curvature_at(self, arc: Tensor) -> Tensor:
-        """Return the road's curvature, 1/m, at arc lengths from the drive's start; linear between nodes."""
-        position = (arc / 90.0 + 1.0).clamp(0, len(self._curvature) - 1.001)
-        index = position.long()
-        low, high = self._curvature[index], self._curvature[index + 1]
-        return low + (high - low) * (position - index)
-
-    def _heading_at(self, arc: float) -> float:
-        nodes = torch.linspace(0, arc, max(2, int(arc / 5) + 2), dtype=torch.float64)
-        return float(torch.trapezoid(self.curvature_at(nodes), nodes))
-
-    def _elevation_about(self, arc: float, ahead: Tensor) -> Tensor:
-        """Return the elevation above the tangent at ``arc``, m, for distances ``ahead`` m."""
-        amplitude = self._wave_bend / self._wave**2
-        angle = self._wave * arc + self._wave_phase
-        there = (self._wave * (ahead[..., None] + arc) + self._wave_phase).sin()
-        tangent = angle.sin() + self._wave * angle.cos() * ahead[..., None]
-        return (amplitude * (there - tangent)).sum(-1)
-
-    def _sample_lanes(self, sampler: BatchSampler, first: int, duration: float, lane_changes: bool) -> None:
-        """Return lane changes as (start time, from lane, to lane)."""
-        street = self.world.street
-        lowest, lanes = int(street.first), int(street.own) or int(self.world.layout.exists.sum()) - 1
-        self._changes: list[tuple[float, int, int]] = []
-        self._first_lane = lane = min(first, lowest + max(lanes - 1, 0))
-        time = float(sampler.uniform(3.0, 7.0))
-        while lane_changes and lanes > 1 and time + _LANE_CHANGE < duration:
-            step = 1 if bool(sampler.chance(0.5)) else -1
-            target = lane + step if lowest <= lane + step < lowest + lanes else lane - step
-            self._changes.append((time, lane, target))
-            lane, time = target, time + float(sampler.uniform(7.0, 16.0))
-
-    def _lane_middle(self, lane: int) -> float:
-        return float(self.world.layout.across[0, lane : lane + 2].mean())
-
-    def _across(self, time: float) -> float:
-        """Return the lateral position at a time, m: the lane's middle, smooth lane changes, and wander."""
-        place = self._lane_middle(self._first_lane)
-        for start, old, new in self._changes:
-            u = min(max((time - start) / _LANE_CHANGE, 0.0), 1.0)
-            blend = u**3 * (10 - 15 * u + 6 * u * u)
-            place += blend * (self._lane_middle(new) - self._lane_middle(old))
-        return place + self._wander(time)
 
     def _ego_lane(self, across: float) -> int:
         layout = self.world.layout
@@ -177,38 +102,15 @@ class Drive:
         lane = int((layout.across[0] <= across).sum()) - 1
         return min(max(lane, 0), last)
 
-    def _sample_motion(
-        self, sampler: BatchSampler, duration: float, motion: float, mount: Extrinsics | None
-    ) -> None:
-        degree = math.pi / 180 * motion
-        self._wander = SmoothNoise(sampler, 0.25, 0.05, 0.25)
-        self._noises = (
-            SmoothNoise(sampler, 0.45 * degree, 0.15, 2.0),  # pitch
-            SmoothNoise(sampler, 0.15 * degree, 0.1, 0.8),  # yaw, beside that of the path
-            SmoothNoise(sampler, 0.35 * degree, 0.1, 1.5),  # roll
-            SmoothNoise(sampler, 0.015 * motion, 0.2, 2.0),  # height
-        )
-        bumps = max(1, int(duration / 6))
-        self._bump_times = sampler.uniform(1.0, max(duration, 1.5), bumps)[0].double()
-        self._bump_sizes = sampler.uniform(-1.0, 1.0, bumps)[0].double() * degree
-        if mount is None:
-            angles = sampler.normal(1.0, 3)[0].clamp(-2, 2) * torch.tensor([1.5, 1.0, 0.6]) * (math.pi / 180)
-            self._mount = [*angles.tolist(), float(sampler.uniform(1.25, 1.6))]
-        else:
-            self._mount = [float(value) for value in mount]
-
     def extrinsics_at(self, time: float) -> Extrinsics:
         """Return the true pose over the road at a time, each (1,)."""
         arc = self.speed * time
         h = 0.01
-        slip = (self._across(time + h) - self._across(time - h)) / (2 * h * self.speed)
-        since = (time - self._bump_times).clamp(min=0)
-        bump = self._bump_sizes * (-_DAMPING * since).exp() * (_BUMP_RATE * since).sin()
-        lean = 0.02 * float(self.curvature_at(torch.tensor(arc, dtype=torch.float64))) * self.speed**2 / 9.81
-        pitch, yaw, roll, height = (
-            m + noise(time) for m, noise in zip(self._mount, self._noises, strict=True)
-        )
-        values = (pitch + float(bump.sum()), yaw - math.atan(slip), roll + lean, height)
+        slip = (self._path.across(time + h) - self._path.across(time - h)) / (2 * h * self.speed)
+        curvature = float(self.course.curvature(torch.tensor(arc, dtype=torch.float64)))
+        lean = 0.02 * curvature * self.speed**2 / 9.81
+        pitch, yaw, roll, height = self._body.pose(time)
+        values = (pitch, yaw - math.atan(slip), roll + lean, height)
         return Extrinsics(*(torch.tensor([v], dtype=torch.float32) for v in values))
 
     def _without_collisions(self, world: World) -> World:
@@ -221,10 +123,8 @@ class Drive:
         speed[0, :NUM_VEHICLES] = torch.where(coming, _COMING_TOGETHER, own)
         valid = traffic.valid.clone()
         for time in torch.arange(0, float(self.times[-1]) + 0.5, 0.5).tolist():
-            across, along = (
-                self._across(time),
-                traffic.along[0, :NUM_VEHICLES] + speed[0, :NUM_VEHICLES] * time,
-            )
+            across = self._path.across(time)
+            along = traffic.along[0, :NUM_VEHICLES] + speed[0, :NUM_VEHICLES] * time
             beside = (traffic.across[0, :NUM_VEHICLES] - across).abs() < 2.6
             valid[0, :NUM_VEHICLES] &= ~(beside & (along < 16.0) & (along > -14.0))
         return world._replace(traffic=traffic._replace(speed=speed, valid=valid))
@@ -243,25 +143,20 @@ class Drive:
         bridge = torch.stack([shift, shift + torch.where(begin.isfinite(), end - begin, 0.0)], dim=1)
         return self.world._replace(traffic=traffic, bridge=bridge)
 
-    def alignment_at(self, arc: float) -> Alignment:
-        """Return the road's course from ``arc`` m after the start on."""
-        ahead = arc_nodes()
-        return build_alignment(self.curvature_at(ahead + arc)[None], self._elevation_about(arc, ahead)[None])
-
     def _scene_at(self, index: int) -> Scene:
         if not 0 <= index < len(self):
             raise IndexError(f"index: expected 0..{len(self) - 1}, got {index}")
         time = float(self.times[index])
-        arc, across = self.speed * time, self._across(time)
+        arc, across = self.speed * time, self._path.across(time)
         place = Place(
             along=torch.tensor([self.start + arc]),
             across=torch.tensor([across]),
             ego_lane=torch.tensor([self._ego_lane(across)]),
-            heading=torch.tensor([self._heading_at(arc)]),
+            heading=torch.tensor([self.course.heading(arc)]),
         )
         camera = self.camera
         lens = Lens(camera.intrinsics[None], camera.distortion[None], camera.model, self.extrinsics_at(time))
-        return scene_at(self._world_at(arc, time), place, self.alignment_at(arc), lens)
+        return scene_at(self._world_at(arc, time), place, self.course.alignment(arc), lens)
 
     def frame(self, index: int, *, device: torch.device | str | None = None) -> RenderedFrame:
         """Render one frame with its truth, B = 1; frames can be asked for in any order.

@@ -27,7 +27,7 @@ def elevations(path: Path, frames: int, fps: float) -> Tensor:
     drive = ShakingDrive(int(path.stem), image_size=(16, 32), num_frames=frames, fps=fps)
     arcs = [drive.speed * float(drive.times[index]) for index in range(WARM_UP, frames)]
     z = torch.tensor([AHEAD])
-    return torch.cat([elevation_at(drive.alignment_at(arc), z) for arc in arcs])
+    return torch.cat([elevation_at(drive.course.alignment(arc), z) for arc in arcs])
 
 
 def summary(elevation: Tensor, pitch_error: Tensor) -> list[list[float]]:

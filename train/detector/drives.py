@@ -24,7 +24,7 @@ from torch import Tensor
 from lanebev.estimation.joint.state import JointState
 from lanebev.pipeline import LaneBEV
 from lanebev.render import Drive
-from lanebev.render.drive import SmoothNoise
+from lanebev.render.camera_motion import SmoothNoise
 from lanebev.render.scene.sampler import BatchSampler
 from lanebev.types import Extrinsics
 from lanebev.view.grid import BEVGrid
