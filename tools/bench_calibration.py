@@ -5,7 +5,7 @@
 Prints and writes (bench.json, bench.md) the RMSE of every parameter, its ratio to the per-frame Cramér-Rao
 bound, NEES per degree of freedom, the time in each status and the time to recover. ``--stream N`` runs N
 frames of an endless drive and watches memory, covariance, drift, and float32 against float64. ``--kinds N``
-draws N drives of each kind of ``tools/bench_kinds.py``, motions and shocks at random.
+draws N drives of each kind of ``tools/random_drives.py``, motions and shocks at random.
 
 "Hard" frames are those a scenario names (nothing to see, a bump, a line crossed); they are counted on their
 own. The first half second is left out of every figure.

@@ -2,7 +2,7 @@
 
     python -m tools.bench_mixed [--drives 60] [--first SEED]
 
-The drives of ``tools/bench_kinds.py`` have one difficulty each; these have several at once, each with a
+The drives of ``tools/random_drives.py`` have one difficulty each; these have several at once, each with a
 probability of its own. Prints NEES per degree of freedom and the share of errors within 3 sigma, of all
 drives and of those with each difficulty, then the drives with the smallest shares. Frames that are not
 TRACKING, and half a second after a start and after a knock, are left out.

@@ -1,0 +1,226 @@
+"""Drives whose motions and shocks are drawn at random, of each kind one by its seed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from random import Random
+from statistics import NormalDist
+
+import torch
+
+from lanebev.estimation.joint.frame_prior import FramePrior
+from lanebev.testing.moments import FPS, PLACES, Moment, moments
+from lanebev.testing.motions import Pose, fall, landing_time, moved, sinusoids
+from lanebev.testing.scenarios import SCENARIOS
+from lanebev.testing.streets import wandering
+from tools.replay.kinds import EGO_LANE, FRAMES, Generated
+
+IN_CURVE = "motion up to 1.5°, 1.2 Hz, R 300 m"
+CREST = "crest or dip, R 5 to 20 km"
+HILLS = "crests and dips in turn"
+
+SHOCK = 1.5
+"""s, when a knock or a cut comes."""
+
+Change = Callable[[float, Moment], Moment]
+
+
+def _drawn(
+    seed: int, change: Change | None = None, largest_deg: float = 1.5, highest_hz: float = 1.2
+) -> Generated:
+    """Draw a drive whose pitch, yaw and roll are sums of three sinusoids."""
+    motion = sinusoids(seed, largest_deg, highest_hz=highest_hz)
+    return Generated("", lambda: moments(FRAMES / FPS, change, motion))
+
+
+def _curve(seed: int) -> Generated:
+    """Draw the same motion from the straight through a clothoid into R = 300 m and half out of it."""
+    change = SCENARIOS["curves R 300 m, 5-40 m"][1]
+    return Generated("", lambda: moments(FRAMES / FPS, change, sinusoids(seed), start=2.0))
+
+
+def difference(seed: int, degrees: float, metres: float) -> Pose:
+    """Draw a change of the pose of that size in every axis, the signs at random."""
+    random = Random(seed)
+    size = (math.radians(degrees),) * 3 + (metres,)
+    pitch, yaw, roll, height = (random.choice((-1.0, 1.0)) * value for value in size)
+    return pitch, yaw, roll, height
+
+
+def _drop(seed: int) -> Generated:
+    """Fall 1.2 m onto the wheels from the first frame on."""
+
+    def change(t: float, moment: Moment) -> Moment:
+        tag = "falling" if t < landing_time() else ""
+        return replace(moment, pose=moved(moment.pose, fall(t)), tag=tag)
+
+    return _drawn(seed, change)
+
+
+def _knock(seed: int) -> Generated:
+    """Knock the camera by 3° and 25 cm in 0.1 s, for good."""
+    by = difference(seed, 3.0, 0.25)
+
+    def change(t: float, moment: Moment) -> Moment:
+        share = min(max((t - SHOCK) / 0.1, 0.0), 1.0)
+        return replace(moment, pose=moved(moment.pose, by, share), tag="knock" if 0 < share < 1 else "")
+
+    return _drawn(seed, change)
+
+
+def _other_vehicle(seed: int, moment: Moment) -> Moment:
+    random = Random(seed)
+    pitch, yaw, roll, _ = difference(seed, random.uniform(1.0, 4.0), 0.0)
+    by = (pitch, yaw, roll, random.uniform(-0.3, 1.2))
+    return replace(moment, pose=moved(moment.pose, by), offset=moment.offset + random.uniform(-1.0, 1.0))
+
+
+def _cut(seed: int) -> Generated:
+    """Cut to another vehicle's camera, 1 to 4° and -0.3 to 1.2 m away, up to a metre beside."""
+
+    def change(t: float, moment: Moment) -> Moment:
+        if t < SHOCK:
+            return moment
+        return replace(_other_vehicle(seed, moment), tag="cut" if t < SHOCK + 0.5 / FPS else "")
+
+    return _drawn(seed, change)
+
+
+def _resumed(seed: int) -> Generated:
+    """Resume with the state of another vehicle's camera in a bend of R = 400 m."""
+
+    def bend(z: torch.Tensor) -> torch.Tensor:
+        return torch.full_like(z, 1 / 400)
+
+    def before(t: float, moment: Moment) -> Moment:
+        return replace(_other_vehicle(seed, moment), curvature=bend, far=40.0)
+
+    def change(t: float, moment: Moment) -> Moment:
+        return replace(moment, tag="resumed" if t == 0 else "")
+
+    return replace(_drawn(seed, change), resumed=lambda: moments(1.0, before))
+
+
+def _crest(seed: int) -> Generated:
+    """Drive over a crest or through a dip of R = 5 to 20 km, seen from 5 to 40 m."""
+    random = Random(seed)
+    vertical = random.choice((-1.0, 1.0)) / random.uniform(5e3, 20e3)
+    return _drawn(seed, lambda t, moment: replace(moment, near=5.0, far=40.0, profile=vertical))
+
+
+def _hills(seed: int) -> Generated:
+    """Drive over crests and through dips in turn, of R = 5 to 20 km at the sharpest, one in 3 to 8 s."""
+    random = Random(seed)
+    sharpest, duration = 1 / random.uniform(5e3, 20e3), random.uniform(3.0, 8.0)
+    first = random.uniform(0.0, 2 * math.pi)
+
+    def change(t: float, moment: Moment) -> Moment:
+        vertical = sharpest * math.sin(first + math.pi * t / duration)
+        return replace(moment, near=5.0, far=40.0, profile=vertical)
+
+    return _drawn(seed, change)
+
+
+def _unequal(seed: int, std: float) -> Generated:
+    """Put every boundary out of its place for good, independently, by a normal deviate."""
+    random = Random(seed)
+    out = torch.tensor([random.gauss(0.0, std) for _ in PLACES], dtype=PLACES.dtype)
+    return _drawn(seed, lambda t, moment: replace(moment, places=PLACES + out))
+
+
+def _street(seed: int, std: float, speed: float) -> Generated:
+    """Drive along a street, three to five boundaries in view from 4 to 30 m, each of which wanders by itself.
+
+    The camera is mounted at up to some degrees of pitch and roll, and moves by 0.4°.
+    """
+    random = Random(seed)
+    visible = random.choice(((1, 2, 3), (2, 3, 4), (1, 2, 3, 4), (0, 1, 2, 3), (1, 2, 3, 4, 5)))
+    mount = (math.radians(random.gauss(0.0, 1.0)), 0.0, math.radians(random.gauss(0.0, 1.0)), 0.0)
+    aside = wandering(seed, std)
+
+    def change(t: float, moment: Moment) -> Moment:
+        there = replace(moment, near=4.0, far=30.0, visible=visible, pose=moved(moment.pose, mount))
+        return replace(there, wander=lambda z: aside(z + speed * t))
+
+    return _drawn(seed, change, largest_deg=0.4)
+
+
+def _two_lanes(seed: int, std: float) -> Generated:
+    """Leave two lanes in view, which the same pose fits whether they are equal or not."""
+    drive = _unequal(seed, std)
+    return replace(drive, moments=lambda: [replace(one, visible=(1, 2, 3)) for one in drive.moments()])
+
+
+def _kerb(seed: int) -> Generated:
+    """Leave the ego lane in view; a second later a line joins it, 0.5 to 1.8 m from where a lane ends."""
+    random = Random(seed)
+    places = PLACES.clone()
+    places[4] += random.choice((-1, 1)) * random.uniform(0.5, 1.8)
+    return _drawn(
+        seed, lambda t, moment: replace(moment, places=places, visible=(2, 3) if t < 1 else (2, 3, 4))
+    )
+
+
+def mounted_roll(seed: int) -> float:
+    """Draw the roll of a mount, rad, normal with the standard deviation of the estimator's prior.
+
+    Seeds in a row give quantiles spread evenly (Weyl's sequence), so that a few are like many.
+    """
+    share = (seed * 0.6180339887498949) % 1.0
+    return NormalDist(0.0, FramePrior().roll_std).inv_cdf(min(max(share, 0.01), 0.99))
+
+
+def in_ego_lane(drive: Generated, roll: float = 0.0) -> Generated:
+    """Leave only the ego lane in view, of a camera that is mounted with a roll (rad), which is not seen."""
+
+    def only(moment: Moment) -> Moment:
+        return replace(moment, visible=EGO_LANE, pose=moved(moment.pose, (0.0, 0.0, roll, 0.0)))
+
+    return replace(drive, moments=lambda: [only(moment) for moment in drive.moments()])
+
+
+_ALL_LANES: dict[str, Callable[[int], Generated]] = {
+    "motion up to 1.5°, 1.2 Hz": _drawn,
+    "motion up to 2.5°, 1.5 Hz": partial(_drawn, largest_deg=2.5, highest_hz=1.5),
+    IN_CURVE: _curve,
+    "drop": _drop,
+    "knock": _knock,
+    "cut": _cut,
+    "resumed": _resumed,
+}
+
+
+def _ego_lane_of(kind: str, seed: int) -> Generated:
+    return in_ego_lane(_ALL_LANES[kind](seed))
+
+
+def _rolled_ego_lane_of(kind: str, seed: int) -> Generated:
+    return in_ego_lane(_ALL_LANES[kind](seed), mounted_roll(seed))
+
+
+KINDS: dict[str, Callable[[int], Generated]] = {
+    **_ALL_LANES,
+    CREST: _crest,
+    HILLS: _hills,
+    "lanes unequal by 2 cm": partial(_unequal, std=0.02),
+    "lanes unequal by 10 cm": partial(_unequal, std=0.1),
+    "two lanes in view": partial(_two_lanes, std=0.0),
+    **{
+        f"two lanes in view, unequal by {size} cm": partial(_two_lanes, std=size / 100) for size in (2, 5, 10)
+    },
+    "a kerb beside the ego lane": _kerb,
+    **{
+        f"{kind}, boundaries wander by {size} cm": partial(_street, std=size / 100, speed=speed)
+        for kind, speed in (("street at 8 m/s", 8.0), ("standing in a street", 0.0))
+        for size in (5, 15)
+    },
+    **{f"{kind}, ego lane": partial(_ego_lane_of, kind) for kind in _ALL_LANES},
+    **{
+        f"{kind}, ego lane, roll drawn": partial(_rolled_ego_lane_of, kind)
+        for kind in ("motion up to 1.5°, 1.2 Hz", IN_CURVE, "drop")
+    },
+}
+"""A drive of each kind by its seed."""
