@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
-from train import gpu_run
+from train import gpu_run, processes
 from train.evaluate_roads import OWN_KINDS
-from train.gpu_run import Measurement, Training, held_out_recall, pose_scale, time_parts, train_until
+from train.gpu_run import held_out_recall, pose_scale, time_parts, train_until
+from train.processes import Measurement, Training
 
 
 class Clock:
@@ -91,8 +92,8 @@ def test_a_run_that_does_not_end_is_ended(clock, tmp_path):
 
 def test_training_hears_its_process(tmp_path, monkeypatch, capsys):
     command = [sys.executable, "-c", "print('CUDA out of memory'); raise SystemExit(1)"]
-    popen = gpu_run.subprocess.Popen
-    monkeypatch.setattr(gpu_run.subprocess, "Popen", lambda _, **kwargs: popen(command, **kwargs))
+    popen = processes.subprocess.Popen
+    monkeypatch.setattr(processes.subprocess, "Popen", lambda _, **kwargs: popen(command, **kwargs))
     training = Training(tmp_path / "c.yaml", tmp_path, tmp_path / "fit.log", [])
     training.start(5)
     training._process.wait(30)
