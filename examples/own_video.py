@@ -1,4 +1,4 @@
-"""Calibrate on a video: the same as ``lanebev run drive.mp4 --camera camera.yaml --out out``."""
+"""Calibrate on a video: the same as ``lanebev run VIDEO --camera CAMERA --lane-width 3.7 --out OUT``."""
 
 import sys
 
