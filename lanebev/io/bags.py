@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from lanebev.io.bag_messages import IMAGE_TYPES, LENS_TYPES, Bag, Topic, open_bag
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import ALL, Frame
+from lanebev.io.images import is_damaged_jpeg
 
 _PLAIN = {  # encoding of ROS to channels, and to OpenCV's conversion to RGB
     "rgb8": (3, None),
@@ -35,6 +36,7 @@ _PLAIN = {  # encoding of ROS to channels, and to OpenCV's conversion to RGB
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
     "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
 }
+_JPEG = b"\xff\xd8"  # begins such an image
 _LENS_FIELDS = ("width", "height", "distortion_model", "D", "K", "R", "P", "binning_x", "binning_y")
 _REGION = ("x_offset", "y_offset", "height", "width")
 
@@ -128,8 +130,10 @@ def message_image(message: Any) -> NDArray[np.uint8]:
     data = np.frombuffer(bytes(message.data), np.uint8)
     if not hasattr(message, "encoding"):
         found = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-        if found is None:
-            raise ValueError(f"expected an image of format {message.format[:40]!r} that decodes, got another")
+        if found is None or (bytes(data[:2]) == _JPEG and is_damaged_jpeg(bytes(message.data))):
+            raise ValueError(
+                f"expected an image of format {message.format[:40]!r} that decodes, got another or half"
+            )
         return np.ascontiguousarray(found[..., ::-1])
     encoding, height, width, step = message.encoding, message.height, message.width, message.step
     if encoding not in _PLAIN:

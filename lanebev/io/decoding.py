@@ -32,10 +32,18 @@ def open_video(source: str) -> av.container.InputContainer:
         reason = error.strerror or "unknown format"
         words = f"video {source}: expected a video that opens, got: {reason}; is it a video, and whole?"
         raise ValueError(words) from error
+    for stream in container.streams.video:
+        tell_damaged_jpegs(stream)
     if not moving_pictures(container):
         container.close()
         raise ValueError(f"video {source}: expected a video stream, got none")
     return container
+
+
+def tell_damaged_jpegs(stream: av.VideoStream) -> None:
+    """Let a decoder of JPEG fail at damaged images, which it shows as grey or garbage without a word."""
+    if stream.codec_context is not None and stream.codec_context.name == "mjpeg":
+        stream.codec_context.options = {"err_detect": "explode"}
 
 
 def moving_pictures(container: av.container.InputContainer) -> list[av.VideoStream]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import select
 import threading
 import time
 import weakref
@@ -9,15 +11,18 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
+from io import FileIO
+from pathlib import Path
 
 import av
 
-from lanebev.io.decoding import display_matrix, pixel_aspect, rgb
+from lanebev.io.decoding import display_matrix, pixel_aspect, rgb, tell_damaged_jpegs
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import ALL, Frame, Selection
 from lanebev.io.source_names import PIPE, without_login
 
 _TIMEOUT = 10.0  # s without a frame, after which a stream has ended
+_FIRST_BYTES = 30.0  # s without anything from a pipe, after which it is no source
 _POLL = 0.05  # s between checks whether to stop
 _LOW_DELAY = {"flags": "low_delay", "rtsp_transport": "tcp"}
 
@@ -30,6 +35,7 @@ class LiveFigures:
         seen: number of frames that were passed on.
         dropped: number of frames that arrived during the processing of an earlier one and were replaced by
             a later one.
+        damaged: number of frames that arrived damaged and were left out.
         longest_wait: s from a frame's arrival until it was passed on.
         longest_delay: s from a frame's arrival until the next one was requested.
         end: why the stream ended, empty if it was stopped or ran out.
@@ -37,6 +43,7 @@ class LiveFigures:
 
     seen: int = 0
     dropped: int = 0
+    damaged: int = 0
     longest_wait: float = 0.0
     longest_delay: float = 0.0
     end: str = ""
@@ -44,8 +51,9 @@ class LiveFigures:
     def words(self) -> str:
         """Return the figures in a sentence."""
         ended = f"; it ended: {self.end}" if self.end else ""
+        lost = f"{self.dropped} dropped" + (f", {self.damaged} damaged and left out" if self.damaged else "")
         return (
-            f"{self.seen} frames used, {self.dropped} dropped, at most {self.longest_delay:.2f} s from a "
+            f"{self.seen} frames used, {lost}, at most {self.longest_delay:.2f} s from a "
             f"frame's arrival to its result, {self.longest_wait:.2f} s of them waiting{ended}"
         )
 
@@ -111,15 +119,32 @@ class LiveSource(FrameSource):
         return float(number / self.fps) if frame.time is None else frame.time
 
 
-def _read(container: av.container.InputContainer, slot: _Slot, figures: LiveFigures) -> None:
-    """Decode until the stream ends or is stopped; frames that do not decode are left out."""
+def _whole_frames(
+    container: av.container.InputContainer, stream: av.VideoStream, figures: LiveFigures
+) -> Iterator[av.VideoFrame]:
+    """Yield a stream's frames as they arrive; damaged ones are left out and counted."""
+    for packet in container.demux(stream):
+        try:
+            frames = packet.decode()
+        except av.error.InvalidDataError:
+            figures.damaged += 1
+            continue
+        for frame in frames:
+            figures.damaged += frame.is_corrupt
+            if not frame.is_corrupt:
+                yield frame
+
+
+def _read(
+    container: av.container.InputContainer,
+    frames: Iterator[av.VideoFrame],
+    slot: _Slot,
+    figures: LiveFigures,
+) -> None:
+    """Take frames until the stream ends or is stopped."""
     try:
-        for packet in container.demux(container.streams.video[0]):
-            try:
-                for frame in packet.decode():
-                    slot.put(frame)
-            except av.error.InvalidDataError:
-                continue
+        for frame in frames:
+            slot.put(frame)
             if slot.is_stopped:
                 break
     except (av.error.FFmpegError, OSError) as error:
@@ -187,6 +212,7 @@ def open_live(
         shown = without_login(source)
         raise ValueError(f"source {shown}: expected no --start, --end or --every with a stream, got one")
     name = "standard input" if source == PIPE else without_login(source)
+    figures = LiveFigures()
     try:
         container = _opened(source)
     except (av.error.FFmpegError, OSError) as error:
@@ -196,18 +222,22 @@ def open_live(
         if not container.streams.video:
             raise ValueError(f"stream {name}: expected a video stream, got none")
         stream = container.streams.video[0]
-        first = next(container.decode(stream))
+        tell_damaged_jpegs(stream)
+        frames = _whole_frames(container, stream, figures)
+        first = next(frames)
         matrix = display_matrix(first)
         size = rgb(first, matrix).shape[:2]
         aspect = pixel_aspect(stream, first, size)
     except (av.error.FFmpegError, StopIteration, OSError) as error:
         container.close()
-        raise ValueError(f"stream {name}: expected a frame, got none") from error
+        got = "damaged ones only" if figures.damaged else "none"
+        raise ValueError(f"stream {name}: expected a whole frame, got {got}") from error
     rate = Fraction(fps or stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
-    figures = LiveFigures()
     slot = _Slot(keep_all, figures)
     slot.put(first)
-    thread = threading.Thread(target=_read, args=(container, slot, figures), name="stream", daemon=True)
+    thread = threading.Thread(
+        target=_read, args=(container, frames, slot, figures), name="stream", daemon=True
+    )
     thread.start()
     live = LiveSource(
         without_login(source), (), rate, 0, size, pixel_aspect=aspect, matrix=matrix,
@@ -219,7 +249,10 @@ def open_live(
 
 def _opened(source: str) -> av.container.InputContainer:
     if source == PIPE:  # not by sys.stdin, whose lock a thread that still reads would hold at the end
-        return av.open("pipe:0", "r", metadata_errors="replace")
+        return _opened_pipe(open(0, "rb", buffering=0, closefd=False), "standard input")
+    if Path(source).is_fifo():  # at once, where opening it otherwise waits for one that writes
+        number = os.open(source, os.O_RDONLY | os.O_NONBLOCK)
+        return _opened_pipe(open(number, "rb", buffering=0), source)
     if source.startswith("/dev/video"):
         return av.open(source, "r", format="v4l2")
     scheme, separator, address = source.partition("://")
@@ -227,3 +260,21 @@ def _opened(source: str) -> av.container.InputContainer:
     return av.open(
         url, "r", options=dict(_LOW_DELAY), timeout=(_TIMEOUT, _TIMEOUT), metadata_errors="replace"
     )
+
+
+def _opened_pipe(pipe: FileIO, name: str) -> av.container.InputContainer:
+    """Open a pipe when something has come through it.
+
+    Raises:
+        ValueError: it is a terminal, or nothing came.
+    """
+    if pipe.isatty():
+        raise ValueError(f"stream {name}: expected a pipe, as from ffmpeg, got a terminal")
+    if hasattr(select, "poll"):  # not on Windows
+        waiting = select.poll()
+        waiting.register(pipe, select.POLLIN)
+        if not waiting.poll(1000 * _FIRST_BYTES):
+            pipe.close()
+            raise ValueError(f"stream {name}: expected frames, got nothing for {_FIRST_BYTES:g} s")
+        os.set_blocking(pipe.fileno(), True)
+    return av.open(pipe, "r", metadata_errors="replace")

@@ -1,6 +1,7 @@
 """Streams and the frames that are taken of a source, as a person uses them; only this machine is asked."""
 
 import gc
+import io
 import os
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from lanebev import Camera
 from lanebev.app.config import RunConfig
@@ -296,6 +298,58 @@ def test_a_pipe(data, tmp_path):
     assert done.returncode == 0, done.stderr
     rows = read_extrinsics(tmp_path / "out" / "extrinsics.csv")
     assert [row.time_s for row in rows] == pytest.approx(np.arange(10) / 10, abs=1e-3)  # the stream's own
+
+
+def _jpegs(cut):
+    """Eight JPEG files one after another, of which some are halves."""
+    noise = np.random.default_rng(0)
+    for number in range(8):
+        file = io.BytesIO()
+        Image.fromarray(noise.integers(0, 255, (*SIZE, 3), dtype=np.uint8)).save(file, "JPEG")
+        data = file.getvalue()
+        yield data[: len(data) // 2] if number in cut else data
+
+
+@pytest.mark.parametrize("cut", [(), (0,), (3,), (3, 4), (7,)])
+def test_half_a_jpeg_on_a_pipe_is_no_frame(tmp_path, cut):
+    os.mkfifo(tmp_path / "pipe")
+    writer = threading.Thread(target=(tmp_path / "pipe").write_bytes, args=(b"".join(_jpegs(cut)),))
+    writer.start()
+    source = open_live(str(tmp_path / "pipe"), keep_all=True)
+    assert len(list(source)) == 8 - len(cut)
+    writer.join()
+    assert (f" {len(cut)} damaged and left out," in source.figures.words()) == bool(cut)
+
+
+def test_a_pipe_without_a_writer_is_one_line(tmp_path, capsys, data, monkeypatch):
+    monkeypatch.setattr("lanebev.io.live._FIRST_BYTES", 0.3)
+    fixed = ("--camera", data / "camera.yaml", "--out", tmp_path / "out")
+    os.mkfifo(tmp_path / "pipe")
+    _fails(capsys, "run", tmp_path / "pipe", *fixed, word="pipe: expected frames, got nothing for 0.3 s")
+    with open(os.open(tmp_path / "pipe", os.O_RDWR), "wb", buffering=0) as silent:  # a writer that is silent
+        _fails(capsys, "run", tmp_path / "pipe", *fixed, word="pipe: expected frames, got nothing for 0.3 s")
+        monkeypatch.setattr("lanebev.io.live._FIRST_BYTES", 30.0)
+        silent.write(next(_jpegs((0,))))
+        closing = threading.Timer(0.5, silent.close)
+        closing.start()
+        _fails(capsys, "run", tmp_path / "pipe", *fixed, word="expected a whole frame, got damaged ones only")
+        closing.join()
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_terminal_is_no_pipe(data, tmp_path):
+    command = [sys.executable, "-m", "lanebev", "run", "-", "--camera", f"{data}/camera.yaml"]
+    leader, terminal = os.openpty()
+    try:
+        done = subprocess.run(
+            command, stdin=terminal, capture_output=True, text=True, timeout=120, check=False
+        )
+    finally:
+        os.close(leader)
+        os.close(terminal)
+    assert done.returncode == 2
+    assert done.stderr.endswith("stream standard input: expected a pipe, as from ffmpeg, got a terminal\n")
 
 
 def test_a_stream_that_does_not_open(data, tmp_path, capsys):

@@ -46,6 +46,11 @@ def _compressed(number):
     return TYPES["sensor_msgs/msg/CompressedImage"](_header(number), "png", data)
 
 
+def _jpeg():
+    noise = np.random.default_rng(0).integers(0, 255, (*SIZE, 3), dtype=np.uint8)
+    return cv2.imencode(".jpg", noise)[1].reshape(-1)
+
+
 def _raw(image, encoding, padding=0):
     rows = np.pad(image.reshape(image.shape[0], -1), ((0, 0), (0, padding)))
     shape = (image.shape[0], image.shape[1], encoding, 0, rows.shape[1])
@@ -253,11 +258,18 @@ def test_yuv_images():
         (replace(_raw(_picture(0), "rgb8"), data=np.zeros(9, np.uint8)), "got 9 bytes; is it cut"),
         (replace(_compressed(0), data=np.zeros(9, np.uint8)), "format 'png' that decodes"),
         (replace(_compressed(0), data=np.zeros(0, np.uint8)), "format 'png' that decodes"),
+        (replace(_compressed(0), data=_compressed(0).data[:100]), "format 'png' that decodes"),
+        (replace(_compressed(0), format="jpeg", data=_jpeg()[:-300]), "format 'jpeg' that decodes"),
     ],
 )
 def test_images_that_do_not_decode(message, word):
     with pytest.raises(ValueError, match=word):
         message_image(message)
+
+
+def test_a_whole_jpeg_decodes():
+    message = replace(_compressed(0), format="jpeg", data=_jpeg())
+    np.testing.assert_array_equal(message_image(message), cv2.imdecode(_jpeg(), 1)[..., ::-1])
 
 
 def _fails(capsys, *arguments, word):

@@ -1,6 +1,7 @@
 """Frames from videos, folders, globs and single images; H.264 out; work side by side."""
 
 import gc
+import io
 import struct
 import threading
 import time
@@ -234,6 +235,25 @@ def test_every_frame_of_a_damaged_video_has_its_row_and_time(tmp_path, spoilt, o
     assert numbers == [frame.number for frame in frames if frame.image is None]
     for frame in frames:
         assert frame.problem.startswith("expected a whole frame, got: ") == (frame.number in numbers)
+
+
+@pytest.mark.parametrize("suffix", ["avi", "mov", "mkv"])
+def test_half_a_jpeg_in_a_video_is_a_frame_without_image(tmp_path, suffix):
+    noise = np.random.default_rng(0)
+    with av.open(str(tmp_path / f"v.{suffix}"), "w") as container:
+        stream = container.add_stream("mjpeg", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
+        for number in range(6):
+            file = io.BytesIO()
+            Image.fromarray(noise.integers(0, 255, (48, 64, 3), dtype=np.uint8)).save(file, "JPEG")
+            data = file.getvalue()
+            packet = av.Packet(data[: len(data) // 2] if number in (0, 3) else data)
+            packet.pts = packet.dts = number
+            packet.time_base, packet.stream, packet.is_keyframe = Fraction(1, 10), stream, True
+            container.mux(packet)
+    frames = list(open_source(str(tmp_path / f"v.{suffix}")))
+    assert [frame.number for frame in frames if frame.image is None] == [0, 3]
+    np.testing.assert_allclose([frame.time for frame in frames], np.arange(6) / 10, atol=1e-3)
 
 
 def test_a_cut_video_says_so(tmp_path):
