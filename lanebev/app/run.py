@@ -102,17 +102,7 @@ def run(
             smoothed = first_pass(config, source, tracker, taken, out, progress)
             tracker, _ = resumed_tracker(config, camera)
             second = observer_of_second_pass(out, observer, taken, source)
-        recorder = Recorder(
-            path=out.__truediv__,
-            camera=camera,
-            fps=STILLS_FPS if config.stills else source.fps / config.every,
-            lane_width=config.taken_lane_width[0],
-            single=source.is_single,
-            stills=config.stills,
-            grid=make_grid(config),
-            videos=not config.no_video,
-            smoothed=config.smooth,
-        )
+        recorder = _recorder(config, source, camera, out)
         doubts = (problem or resume_remark(config), observer.remark, *remarks(config, source, camera))
         recorder.problems += filter(None, (source.problem, *doubts))
         covariances = KeptNumbers(4, 4, folder=out / ".")
@@ -120,12 +110,10 @@ def run(
         with recorder, closing(frames), ended_by_signals(source):
             for frame, seen in progress(frames, source.taken_count) if progress else frames:
                 if config.stills:
-                    estimate = tracker.still(seen.vertices, seen.pose_sigma_scale)
+                    filtered = tracker.still(seen.vertices, seen.pose_sigma_scale)
                 else:
-                    estimate = tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale)
-                filtered = estimate
-                if smoothed is not None:
-                    estimate = smoothed.of(estimate, frame.number)
+                    filtered = tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale)
+                estimate = filtered if smoothed is None else smoothed.of(filtered, frame.number)
                 covariances.append(estimate.calibration.covariance[0].double().cpu().numpy())
                 name = frame_name(frame, source)
                 recorder.add(
@@ -136,10 +124,8 @@ def run(
                     viewer.add(RecordedFrame(recorder.rows[-1], pose, lines), frame.image)
         facts = run_facts(config, source, camera) | facts_of(taken)
         if tracker.mount is not None:
-            save_state(
-                out / STATE_FILE,
-                {**tracker.states(), "camera": camera.fingerprint(), "lane_width": tracker.lane_width},
-            )
+            plain = {"camera": camera.fingerprint(), "lane_width": tracker.lane_width}
+            save_state(out / STATE_FILE, {**tracker.states(), **plain})
             facts |= mount_facts(tracker.mount)
             write_calibration(out / CALIBRATION_FILE, camera, tracker.mount)
         logger.info("writing the report")
@@ -169,6 +155,21 @@ def resumed_tracker(config: RunConfig, camera: Camera) -> tuple[RunTracker, str 
     """Make the tracker with the states to continue from; also return what is wrong with these."""
     tracker = make_tracker(config, camera)
     return tracker, load_states(config, tracker, camera)
+
+
+def _recorder(config: RunConfig, source: FrameSource, camera: Camera, out: OutputFolder) -> Recorder:
+    """Make what writes the rows, lanes and pictures of a run."""
+    return Recorder(
+        path=out.__truediv__,
+        camera=camera,
+        fps=STILLS_FPS if config.stills else source.fps / config.every,
+        lane_width=config.taken_lane_width[0],
+        single=source.is_single,
+        stills=config.stills,
+        grid=make_grid(config),
+        videos=not config.no_video,
+        smoothed=config.smooth,
+    )
 
 
 def remarks(config: RunConfig, source: FrameSource, camera: Camera) -> list[str]:

@@ -172,7 +172,7 @@ def _smoothed(
         pose, no_inliers = Extrinsics.unstack(state.mean[:, POSE]), given.new_zeros(1, 0)
         filtered = Calibration(pose, given, state.status, no_inliers)
         scale = float(scales.all()[number, 0])
-        calibration = tracker.given_out(smoothed_calibration(filtered, state, smoothed), scale)
+        calibration = tracker.with_output_covariance(smoothed_calibration(filtered, state, smoothed), scale)
         result.poses[number] = calibration.extrinsics.stack()[0].numpy()
         result.covariances[number] = calibration.covariance[0].numpy()
         result.vertical_curvatures[number] = float(smoothed.mean[0, VERTICAL])

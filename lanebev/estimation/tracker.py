@@ -83,7 +83,7 @@ class Tracker(Generic[StateT]):
         intrinsics = self.camera.intrinsics[None]
         calibration, self.state = self.calibrator(segments, intrinsics, self.state, dt, self.lane_width)
         self.unscaled_covariance = calibration.covariance
-        given_out = self.given_out(calibration, pose_sigma_scale)
+        output = self.with_output_covariance(calibration, pose_sigma_scale)
         calibration = calibration.with_std_scaled(pose_sigma_scale)
         mount, self.mount_state = self.mount_estimator(
             calibration,
@@ -94,7 +94,7 @@ class Tracker(Generic[StateT]):
         )
         self.mount = mount._replace(covariance=mount.covariance + self._common_error(mount.extrinsics))
         reasons = Reason(int(self.calibrator.reasons(self.state)[0]))
-        return Estimate(segments, given_out, reasons, self.calibrator.vertical_curvature(self.state))
+        return Estimate(segments, output, reasons, self.calibrator.vertical_curvature(self.state))
 
     def still(self, vertices: BoundaryVertices, pose_sigma_scale: float) -> Estimate:
         """Estimate the pose of a single image; the states do not change.
@@ -110,7 +110,7 @@ class Tracker(Generic[StateT]):
         )
         calibration = self.calibrator.scale_still(calibration, pose_sigma_scale)
         reasons = Reason(int(self.calibrator.reasons(state)[0]))
-        return Estimate(segments, self.given_out(calibration, 1.0), reasons)
+        return Estimate(segments, self.with_output_covariance(calibration, 1.0), reasons)
 
     def vanishing_point(self) -> Tensor:
         """Return where the lanes are expected to meet in the next image, (1, 2) px as taken, or NaN."""
@@ -140,8 +140,8 @@ class Tracker(Generic[StateT]):
             common = common + focal_covariance(extrinsics, self.camera.intrinsics[None], self.focal_std)
         return common
 
-    def given_out(self, calibration: Calibration, pose_sigma_scale: float) -> Calibration:
-        """Return a calibration with the output covariance.
+    def with_output_covariance(self, calibration: Calibration, pose_sigma_scale: float) -> Calibration:
+        """Return a calibration whose covariance has all errors in it: scaled, and with the common ones.
 
         Args:
             calibration: result of the calibrator.
