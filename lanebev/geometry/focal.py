@@ -8,7 +8,7 @@ from torch import Tensor
 from lanebev.geometry.lens import cam_from_image
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import road_from_cam
-from lanebev.types import Calibration, Extrinsics
+from lanebev.types import Extrinsics
 
 _HALF_WIDTH = 1.85  # m beside the camera at which a lane boundary is looked at; cancels to first order
 
@@ -41,7 +41,8 @@ def pose_by_log_focal(extrinsics: Extrinsics, intrinsics: Tensor) -> Tensor:
 def focal_covariance(extrinsics: Extrinsics, intrinsics: Tensor, focal_std: float | Tensor) -> Tensor:
     """Compute what an uncertain focal length contributes to the covariance of a pose, (B, 4, 4).
 
-    It is d dᵀ σ² with d from :func:`pose_by_log_focal`.
+    It is d dᵀ σ² with d from :func:`pose_by_log_focal`. The error is the same in all frames, so that a filter
+    does not average it out.
 
     Args:
         extrinsics: each (B,).
@@ -59,24 +60,6 @@ def focal_covariance(extrinsics: Extrinsics, intrinsics: Tensor, focal_std: floa
     change = slope * share.reshape(-1, 1)  # (B, 4)
     covariance: Tensor = change.unsqueeze(-1) * change.unsqueeze(-2)
     return covariance
-
-
-def with_focal_std(calibration: Calibration, intrinsics: Tensor, focal_std: float | Tensor) -> Calibration:
-    """Add to a calibration's covariance what an uncertain focal length contributes.
-
-    The error is the same in all frames, so that a filter does not average it out: the covariance grows by
-    :func:`focal_covariance`.
-
-    Args:
-        calibration: calibration of B rows.
-        intrinsics: (B, 3, 3) px.
-        focal_std: standard deviation of the focal length as a share of it, a float or (B,).
-
-    Raises:
-        ValueError: a negative or not finite standard deviation, given as a float.
-    """
-    more = focal_covariance(calibration.extrinsics, intrinsics, focal_std)
-    return calibration._replace(covariance=calibration.covariance + more)
 
 
 def _image_of_lanes(pose: Tensor, intrinsics: Tensor, log_focal: Tensor) -> Tensor:

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from lanebev import Calibration, Extrinsics, JointCalibrator, LaneSegments, Status, image_from_road_points
+from lanebev import Extrinsics, JointCalibrator, LaneSegments, image_from_road_points
 from lanebev.estimation.joint.measurement import boundary_residuals
 from lanebev.estimation.joint.observations import observe
-from lanebev.geometry.focal import pose_by_log_focal, with_focal_std
+from lanebev.geometry.focal import focal_covariance, pose_by_log_focal
 from lanebev.testing.moments import CAMERA, moments, swing
 from lanebev.testing.moments import observe as see
 from tools.focal_information import frame_information
@@ -58,19 +58,17 @@ def test_closed_form_at_zero_roll():
     assert level.abs().max() < 1e-12  # the horizon through the principal point stays there
 
 
-def test_covariance_grows_by_the_focal_lengths_share():
+def test_covariance_is_that_of_the_focal_lengths_share():
     pose = pose_of(0.05, 0.03, 0.02, 1.5)
-    covariance = torch.diag(torch.tensor([1e-6, 1e-6, 1e-6, 1e-4], dtype=torch.float64))[None]
-    status, inliers = torch.tensor([int(Status.TRACKING)]), torch.ones(1, 1)
-    before = Calibration(pose, covariance, status, inliers)
-    after = with_focal_std(before, INTRINSICS, 0.1)
+    covariance = focal_covariance(pose, INTRINSICS, 0.1)
     slope = pose_by_log_focal(pose, INTRINSICS)[0]
-    torch.testing.assert_close(after.covariance[0], covariance[0] + 0.01 * torch.outer(slope, slope))
-    assert torch.equal(with_focal_std(before, INTRINSICS, 0.0).covariance, covariance)
-    rows = with_focal_std(before, INTRINSICS, torch.tensor([0.1], dtype=torch.float64))
-    assert torch.equal(rows.covariance, after.covariance)
+    torch.testing.assert_close(covariance[0], 0.01 * torch.outer(slope, slope))
+    assert not focal_covariance(pose, INTRINSICS, 0.0).any()
+    assert torch.equal(
+        focal_covariance(pose, INTRINSICS, torch.tensor([0.1], dtype=torch.float64)), covariance
+    )
     with pytest.raises(ValueError, match="focal_std: expected a share of the focal length"):
-        with_focal_std(before, INTRINSICS, -0.1)
+        focal_covariance(pose, INTRINSICS, -0.1)
 
 
 def test_rows_are_independent():
@@ -124,4 +122,5 @@ def test_focal_lengths_drawn_from_their_sigma_leave_errors_as_large_as_the_covar
         return float((error * torch.linalg.solve(covariance, error)).sum(-1).mean()) / 4
 
     assert nees(calibration.covariance) > 20
-    assert 0.6 < nees(with_focal_std(calibration, assumed, 0.1).covariance) < 1.4
+    by_focal = focal_covariance(calibration.extrinsics, assumed, 0.1)
+    assert 0.6 < nees(calibration.covariance + by_focal) < 1.4
