@@ -18,7 +18,6 @@ def boundary_masks(
     size: tuple[int, int],
     half_width_px: float,
     *,
-    weight: Tensor | None = None,
     model: str = "pinhole",
 ) -> Tensor:
     """Return soft masks of the boundaries in the image as taken, drawn by :func:`draw_stripes`.
@@ -27,24 +26,20 @@ def boundary_masks(
         frame: B rendered images.
         size: (h, w) of the masks; the image is taken to be resized to it, pixel centres at integers.
         half_width_px: in pixels of the masks.
-        weight: (B, L, P) in [0, 1] for each point; by default ``frame.visible``.
         model: the frame's lens model.
 
     Returns:
         (B, L, h, w) in [0, 1].
 
     Raises:
-        ValueError: a half width that is not positive, or weights of the wrong shape.
+        ValueError: a half width that is not positive.
     """
     if not half_width_px > 0:
         raise ValueError(f"half_width_px: expected > 0, got {half_width_px}")
-    weight = frame.visible if weight is None else weight
-    if weight.shape != frame.painted.shape:
-        raise ValueError(f"weight: expected {tuple(frame.painted.shape)}, got {tuple(weight.shape)}")
     points = distort_points(frame.boundaries.flatten(1, 2), frame.intrinsics, frame.distortion, model)
     scale = points.new_tensor([size[1] / frame.image.shape[3], size[0] / frame.image.shape[2]])
-    points = ((points + 0.5) * scale - 0.5).unflatten(1, weight.shape[1:])
-    return draw_stripes(points, weight, size, half_width_px)
+    points = ((points + 0.5) * scale - 0.5).unflatten(1, frame.visible.shape[1:])
+    return draw_stripes(points, frame.visible, size, half_width_px)
 
 
 @torch.no_grad()

@@ -10,6 +10,7 @@ from lanebev.render.frame import RenderedFrame
 from lanebev.render.scene.alignment import Alignment, elevation_at, hidden_by_crest, local_from_road
 from lanebev.render.scene.camera import Lens
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout, labelled_slots, presence
+from lanebev.render.scene.objects import SceneObjects
 from lanebev.render.scene.traffic import NUM_ONCOMING, NUM_VEHICLES
 from lanebev.render.scene.world import Place, Scene
 from lanebev.tensors import constant
@@ -17,6 +18,7 @@ from lanebev.types import NUM_BOUNDARIES
 
 NUM_POINTS = 72
 FARTHEST = 150.0  # m
+_VEHICLES = slice(0, NUM_VEHICLES + NUM_ONCOMING)  # of the objects
 _SLACK = 0.3  # m; nearer to a boundary than this does not hide it
 
 
@@ -79,7 +81,6 @@ def frame_truth(image: Tensor, blocked: Tensor, scene: Scene, nearest: Tensor) -
         nearest: (B,) m, Z of the first boundary point.
     """
     layout, place, alignment, lens = scene.world.layout, scene.place, scene.alignment, scene.lens
-    objects = scene.objects
     size = (image.shape[2], image.shape[3])
     points, marked, hidden = boundary_points(layout, place, alignment, lens, nearest)
     ideal, taken, inside = project(points.flatten(1, 2), lens, size)
@@ -89,33 +90,7 @@ def frame_truth(image: Tensor, blocked: Tensor, scene: Scene, nearest: Tensor) -
     shape = marked.shape
     painted = marked * inside.reshape(shape)
     visible = painted * clear.reshape(shape) * ~hidden
-
-    slot = (
-        place.ego_lane[:, None]
-        + torch.arange(NUM_BOUNDARIES - 1, device=image.device)
-        - (NUM_BOUNDARIES // 2 - 1)
-    )
-    here = slot.clamp(0, MAX_BOUNDARIES - 2)
-    widths = layout.across.diff(dim=1).gather(1, here)
-    real = (slot == here) & layout.exists.gather(1, here + 1)
     middle = 0.5 * sum(layout.across.gather(1, (place.ego_lane + i)[:, None])[:, 0] for i in (0, 1))
-
-    vehicles = slice(0, NUM_VEHICLES + NUM_ONCOMING)
-    body = objects.shape[:, vehicles]
-    rear = torch.minimum(body[..., 0, 2], body[..., 1, 2])
-    front = torch.maximum(body[..., 0, 3], body[..., 1, 3])
-    heading = objects.heading[:, vehicles]
-    shift = 0.5 * (rear + front)  # from the vehicle's origin to the middle of its outline
-    boxes = torch.stack(
-        [
-            objects.x[:, vehicles] + shift * heading.sin(),
-            objects.z[:, vehicles] + shift * heading.cos(),
-            front - rear,
-            2 * body[..., :2].amax((-1, -2)),
-            heading,
-        ],
-        dim=-1,
-    )
     curvature = alignment.curvature[:, 0]
     change = (alignment.curvature[:, 1] - curvature) / (alignment.arc[:, 1] - alignment.arc[:, 0])
     return RenderedFrame(
@@ -126,9 +101,30 @@ def frame_truth(image: Tensor, blocked: Tensor, scene: Scene, nearest: Tensor) -
         extrinsics=lens.extrinsics,
         intrinsics=lens.intrinsics,
         distortion=lens.distortion,
-        lane_width=torch.where(real, widths, layout.lane_width[:, None]),
+        lane_width=lane_widths(layout, place.ego_lane),
         offset=place.across - middle,
         curvature=torch.stack([curvature, change], dim=1),
-        boxes=boxes,
-        box_valid=objects.valid[:, vehicles],
+        boxes=vehicle_boxes(scene.objects),
+        box_valid=scene.objects.valid[:, _VEHICLES],
     )
+
+
+def lane_widths(layout: Layout, ego_lane: Tensor) -> Tensor:
+    """Return the widths (B, L-1) m between labelled boundaries, beside the road the nominal one."""
+    slot = ego_lane[:, None] + torch.arange(NUM_BOUNDARIES - 1, device=ego_lane.device)
+    slot = slot - (NUM_BOUNDARIES // 2 - 1)
+    here = slot.clamp(0, MAX_BOUNDARIES - 2)
+    widths = layout.across.diff(dim=1).gather(1, here)
+    real = (slot == here) & layout.exists.gather(1, here + 1)
+    return torch.where(real, widths, layout.lane_width[:, None])
+
+
+def vehicle_boxes(objects: SceneObjects) -> Tensor:
+    """Return the outlines (B, V, 5) of vehicles, see :class:`~lanebev.render.frame.RenderedFrame`."""
+    body, heading = objects.shape[:, _VEHICLES], objects.heading[:, _VEHICLES]
+    rear = torch.minimum(body[..., 0, 2], body[..., 1, 2])
+    front = torch.maximum(body[..., 0, 3], body[..., 1, 3])
+    shift = 0.5 * (rear + front)  # from the vehicle's origin to the middle of its outline
+    x = objects.x[:, _VEHICLES] + shift * heading.sin()
+    z = objects.z[:, _VEHICLES] + shift * heading.cos()
+    return torch.stack([x, z, front - rear, 2 * body[..., :2].amax((-1, -2)), heading], dim=-1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -60,19 +60,20 @@ def take_image(
     image = expose(painted.radiance, sensor, painted.road_level, features.bloom)
     if ideal:
         return image
+
+    def change(mask: Tensor, effect: Callable[[Tensor, Tensor], Tensor]) -> None:
+        """Change the images of the rows in which a mask holds, by an effect of these images and rows."""
+        if bool(mask.any()):
+            rows = rows_with(mask)
+            image.index_copy_(0, rows, effect(image.index_select(0, rows), rows))
+
     raining = host.world.weather.wet > 0
-    if bool(raining.any()):
-        rows = rows_with(raining)
-        wet = scene.world.weather.wet.index_select(0, rows)
-        drawn = [g for g, wet_row in zip(generators, raining.tolist(), strict=True) if wet_row]
-        image.index_copy_(0, rows, rain(image.index_select(0, rows), wet, drawn))
+    drawn = [g for g, wet_row in zip(generators, raining.tolist(), strict=True) if wet_row]
+    change(raining, lambda part, rows: rain(part, scene.world.weather.wet.index_select(0, rows), drawn))
     windscreens = torch.tensor(faulty, dtype=torch.long).to(device, non_blocking=True)
     glass = select_rows(scene.world.glass, windscreens)
-    moved = host.world.glass.shake.any(1)
-    if bool(moved.any()):
-        rows = rows_with(moved)
-        shake = scene.world.glass.shake.index_select(0, rows)
-        image.index_copy_(0, rows, shaken(image.index_select(0, rows), shake))
+    moved, shake = host.world.glass.shake.any(1), scene.world.glass.shake
+    change(moved, lambda part, rows: shaken(part, shake.index_select(0, rows)))
     if faulty:
         image.index_copy_(0, windscreens, behind_glass(image.index_select(0, windscreens), glass))
     _blur(image, host.world.sensor.blur * (image.shape[3] / _REFERENCE_WIDTH))
@@ -83,10 +84,7 @@ def take_image(
         seen = painted.blocked.index_select(0, windscreens).masked_fill(shut, 0.0)
         painted.blocked.index_copy_(0, windscreens, seen)
     squeezed = host.world.sensor.jpeg > 0
-    if bool(squeezed.any()):
-        rows = rows_with(squeezed)
-        quality = sensor.jpeg.index_select(0, rows)
-        image.index_copy_(0, rows, compress(image.index_select(0, rows), quality))
+    change(squeezed, lambda part, rows: compress(part, sensor.jpeg.index_select(0, rows)))
     return image
 
 
