@@ -11,17 +11,12 @@ import torch
 
 from lanebev import batch
 from lanebev.estimation.joint.calibrator import JointCalibrator, predict_state
-from lanebev.estimation.joint.dynamics import (
-    MotionConfig,
-    RoadMotion,
-    motion,
-    pose_covariance,
-    pose_transition,
-)
+from lanebev.estimation.joint.dynamics import MotionConfig, RoadMotion, motion
 from lanebev.estimation.joint.evidence import CALL, adapt_motion_scale, deviation_prior_std
 from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.lane_change import renumber
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, SHAPE, STEPS, layout
+from lanebev.estimation.joint.low_pass import pose_covariance, pose_transition
 from lanebev.estimation.joint.measurement import (
     CURVATURE,
     HEIGHT,

@@ -1,32 +1,21 @@
-"""Dynamics of the joint filter's state, except the road (``road``).
-
-The pose moves about its slow mean as band-limited noise: white noise through a fourth-order Butterworth
-low-pass. A vehicle's body moves like this, smoothly from frame to frame and back to the mount's pose within a
-second.
-"""
+"""Dynamics of the joint filter's state, except the road (``road``); those of the pose are ``low_pass``."""
 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from lanebev.estimation.joint.layout import NUM_POSE, SHAPE, Layout, layout
+from lanebev.estimation.joint.low_pass import ORDER, pose_transition
 from lanebev.estimation.joint.measurement import OFFSET, VERTICAL
 from lanebev.numbers import check_settings
 from lanebev.tensors import constant
-
-Rows = tuple[tuple[float, ...], ...]
-
-_ORDER = 4  # of the low-pass: the pose and three derivatives
 
 
 @dataclass(frozen=True)
@@ -81,106 +70,6 @@ class MotionConfig:
         check_settings(self, positive=["bandwidth", *memories], infinite=endless)
 
 
-class LowPass(NamedTuple):
-    """A low-pass with cut-off 1 rad/s, driven by white noise, at unit variance of its output.
-
-    Attributes:
-        modes: (4, 16), the transition matrix of (x, ẋ, ẍ, x⃛) as a sum of 4 × 4 matrices, row by row, one for
-            each of exp(a₁t) cos(b₁t), exp(a₁t) sin(b₁t), exp(a₂t) cos(b₂t), exp(a₂t) sin(b₂t).
-        decays: (2,) a, 1/s.
-        turns: (2,) b, rad/s.
-        covariance: (4, 4), stationary.
-    """
-
-    modes: Rows
-    decays: tuple[float, ...]
-    turns: tuple[float, ...]
-    covariance: Rows
-
-
-def butterworth() -> LowPass:
-    """Return the fourth-order Butterworth low-pass.
-
-    Source: Butterworth 1930, poles exp(iπ (2k + 3) / 8); modal decomposition of the companion matrix; the
-    stationary covariance S solves A S + S Aᵀ + g gᵀ = 0 (Särkkä and Solin 2019, Sec. 6.5).
-    """
-    poles = np.exp(1j * np.pi * (2 * np.arange(1, _ORDER + 1) + _ORDER - 1) / (2 * _ORDER))
-    companion = np.eye(_ORDER, k=1)
-    companion[-1] = -np.poly(poles).real[:0:-1]
-    values, vectors = np.linalg.eig(companion)
-    inverse = np.linalg.inv(vectors)
-    upper = [k for k in range(_ORDER) if values[k].imag > 0]
-    each = [2 * np.outer(vectors[:, k], inverse[k]) for k in upper]
-    modes = np.stack([part.ravel() for matrix in each for part in (matrix.real, -matrix.imag)])
-    eye, drive = np.eye(_ORDER), np.zeros((_ORDER, _ORDER))
-    drive[-1, -1] = 1.0
-    lyapunov = np.kron(eye, companion) + np.kron(companion, eye)
-    covariance = np.linalg.solve(lyapunov, -drive.ravel()).reshape(_ORDER, _ORDER)
-    return LowPass(
-        _as_rows(modes),
-        tuple(values[upper].real.tolist()),
-        tuple(values[upper].imag.tolist()),
-        _as_rows(covariance / covariance[0, 0]),
-    )
-
-
-def _as_rows(matrix: NDArray[np.float64]) -> Rows:
-    return tuple(map(tuple, matrix.tolist()))
-
-
-_UNIT = butterworth()
-
-
-def pose_covariance(bandwidth: float, like: Tensor) -> Tensor:
-    """Return the stationary covariance (4, 4) of value and three derivatives, at unit variance of value."""
-    return constant(_covariance(bandwidth), like=like)
-
-
-def pose_variances(bandwidth: float) -> tuple[float, ...]:
-    """Return the diagonal of :func:`pose_covariance`."""
-    return tuple(row[k] for k, row in enumerate(_covariance(bandwidth)))
-
-
-@lru_cache(maxsize=16)
-def _covariance(bandwidth: float) -> Rows:
-    cutoff = 2 * math.pi * bandwidth
-    rows = enumerate(_UNIT.covariance)
-    return tuple(tuple(cutoff ** (i + k) * value for k, value in enumerate(row)) for i, row in rows)
-
-
-@lru_cache(maxsize=16)
-def _modes(bandwidth: float) -> tuple[Rows, tuple[float, ...], tuple[float, ...]]:
-    """The low-pass with this cut-off frequency (Hz): modes, those of cosines first; decays and turns, 1/s."""
-    cutoff = 2 * math.pi * bandwidth
-    powers = [cutoff ** (i - k) for i in range(_ORDER) for k in range(_ORDER)]
-    modes = tuple(
-        tuple(value * power for value, power in zip(_UNIT.modes[m], powers, strict=True))
-        for m in (0, 2, 1, 3)
-    )
-    return modes, tuple(cutoff * part for part in _UNIT.decays), tuple(cutoff * part for part in _UNIT.turns)
-
-
-def pose_transition(dt: Tensor, bandwidth: float) -> tuple[Tensor, Tensor]:
-    """Compute transition and process noise of one axis of the pose about its mean, at unit variance.
-
-    Source: (J11).
-
-    Args:
-        dt: (B,) s, >= 0.
-        bandwidth: Hz, cut-off frequency.
-
-    Returns:
-        (B, 4, 4) F of value and three derivatives, and (B, 4, 4) W = S - F S Fᵀ.
-    """
-    modes, decays, turns = (constant(part, like=dt) for part in _modes(bandwidth))
-    time = dt.unsqueeze(-1)
-    fade, angle = (time * decays).exp(), time * turns
-    mixed = torch.cat([fade * angle.cos(), fade * angle.sin()], dim=-1)  # (B, 4)
-    transition = (mixed @ modes).unflatten(-1, (_ORDER, _ORDER))
-    covariance = pose_covariance(bandwidth, dt)
-    return transition, covariance - transition @ covariance @ transition.mT
-
-
 class RoadMotion(NamedTuple):
     """How the road's shape moves over a step, see :func:`lanebev.estimation.joint.road.propagate_road_shape`.
 
@@ -223,37 +112,40 @@ def motion(
         (B, D, D) F and (B, D, D) W.
     """
     num = place.deviations.stop - place.deviations.start
-    swing, drive = pose_transition(dt, cfg.bandwidth)
-    to_mean = constant(((1,), (0,), (0,), (0,)), like=dt) - swing[:, :, :1]
-    chain = torch.cat([swing, to_mean], dim=-1).flatten(1)  # (B, 20)
-    slide, push = damped_velocity(dt, cfg.offset_memory)
+    pose_step, pose_noise = pose_transition(dt, cfg.bandwidth)
+    to_mean = constant(((1,), (0,), (0,), (0,)), like=dt) - pose_step[:, :, :1]
+    pose_step = torch.cat([pose_step, to_mean], dim=-1).flatten(1)  # (B, 20)
+    offset_step, offset_noise = damped_velocity(dt, cfg.offset_memory)
     memories = (cfg.speed_memory, cfg.vertical_curvature_memory, cfg.deviation_memory, cfg.unequal_memory)
     step, unequal, vertical = (part.unsqueeze(-1) for part in (dt, unequal, vertical))  # (B, 1)
-    fade, level, slow, fast = (-step / constant(memories, like=dt)).exp().chunk(4, dim=-1)
-    settle = torch.where(unequal > 0, fast, slow)
-    still = torch.ones_like(pose_scale)
+    decays = (-step / constant(memories, like=dt)).exp().chunk(4, dim=-1)
+    speed_decay, vertical_decay, of_equal_lanes, of_unequal_lanes = decays
+    deviation_decay = torch.where(unequal > 0, of_unequal_lanes, of_equal_lanes)
+    mean_step = torch.ones_like(pose_scale)
     moves = [
-        *[chain] * NUM_POSE,
-        still,
-        slide,
+        *[pose_step] * NUM_POSE,
+        mean_step,
+        offset_step,
         road.transition.flatten(1),
         road.by_speed,
-        fade,
-        settle.expand(-1, num),
-        level,
+        speed_decay,
+        deviation_decay.expand(-1, num),
+        vertical_decay,
     ]
     std = constant((*[cfg.angle_std] * 3, cfg.height_std), like=dt)
     walk = constant((*[cfg.mean_angle_walk**2] * 3, cfg.mean_height_walk**2), like=dt)
     variance = (pose_scale * std).square()
-    wander = cfg.deviation_walk**2 * step + unequal.square() * (1 - settle * settle)
+    deviation_noise = cfg.deviation_walk**2 * step + unequal.square() * (
+        1 - deviation_decay * deviation_decay
+    )
     noises = [
-        (variance.unsqueeze(-1) * drive.flatten(1).unsqueeze(1)).flatten(1),
+        (variance.unsqueeze(-1) * pose_noise.flatten(1).unsqueeze(1)).flatten(1),
         walk * step,
-        cfg.offset_density * push,
+        cfg.offset_density * offset_noise,
         road.noise + cfg.curvature_walk**2 * step,
         (2 * cfg.speed_std**2 / cfg.speed_memory) * step,
-        wander.expand(-1, num),
-        vertical.square() * (1 - level * level),
+        deviation_noise.expand(-1, num),
+        vertical.square() * (1 - vertical_decay * vertical_decay),
     ]
     values = torch.cat([*moves, *noises], dim=-1)
     index = constant(_places(num), like=values, dtype=torch.int64).expand(values.shape[0], -1)
@@ -277,11 +169,11 @@ def _places(num_boundaries: int) -> tuple[int, ...]:
     slide = (OFFSET, place.rates.start + OFFSET)
     shape = range(SHAPE.start, SHAPE.stop)
     speed = slice(place.speed, place.speed + 1)
-    moves = [block(chain[:_ORDER], chain) for chain in chains]
+    moves = [block(chain[:ORDER], chain) for chain in chains]
     moves += [diagonal(place.means), block(slide, slide), block(shape, shape), block(shape, [place.speed])]
     vertical = slice(VERTICAL, VERTICAL + 1)
     moves += [diagonal(speed), diagonal(place.deviations), diagonal(vertical)]
-    noises = [block(chain[:_ORDER], chain[:_ORDER]) for chain in chains]
+    noises = [block(chain[:ORDER], chain[:ORDER]) for chain in chains]
     noises += [diagonal(place.means), block(slide, slide), diagonal(SHAPE), diagonal(speed)]
     noises += [diagonal(place.deviations), diagonal(vertical)]
     return (*itertools.chain(*moves), *(place.size**2 + entry for entry in itertools.chain(*noises)))

@@ -9,9 +9,10 @@ from typing import NamedTuple
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lanebev.estimation.joint.dynamics import MotionConfig, pose_variances
+from lanebev.estimation.joint.dynamics import MotionConfig
 from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.layout import NUM_POSE, STEPS, layout
+from lanebev.estimation.joint.low_pass import pose_variances
 from lanebev.estimation.joint.measurement import CURVATURE, NUM_PARAMS, NUM_SHAPE, NUM_STRAIGHT, VERTICAL
 from lanebev.estimation.joint.readings import ReadingConfig
 from lanebev.estimation.joint.road import straight_or_bend
