@@ -15,14 +15,12 @@ from torch import Tensor
 
 from lanebev.camera.files import camera_from_fields, read_camera, write_camera
 from lanebev.camera.parameters import CameraParameters
+from lanebev.geometry.distortion import check_lens, lens_model, max_undistorted_radius
 from lanebev.geometry.lens import (
-    check_lens,
     check_points,
     denormalise_points,
     distort_points,
     invert_distortion,
-    lens_model,
-    max_undistorted_radius,
     normalise_points,
 )
 from lanebev.numbers import check_number

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import torch
 
-from lanebev.geometry.lens import DISTORTION_LENGTHS, invert_distortion
+from lanebev.geometry.distortion import DISTORTION_LENGTHS
+from lanebev.geometry.lens import invert_distortion
 
 _FOCAL_RANGE = (0.1, 20.0)  # times the longer image side: 160 deg fisheye to 3 deg telephoto
 _LONGEST_SIDE = 99_999  # px

@@ -9,38 +9,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.geometry.distortion import (
-    DISTORTION_LENGTHS,
-    MODELS,
-    check_lens,
-    distort_plane,
-    lens_model,
-    max_undistorted_radius,
-)
+from lanebev.geometry.distortion import check_lens, distort_plane, lens_model, max_undistorted_radius
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.undistortion import undistort_plane
 from lanebev.tensors import constant
 from lanebev.types import check_tensor
-
-__all__ = [
-    "DISTORTION_LENGTHS",
-    "MODELS",
-    "cam_from_image",
-    "check_intrinsics",
-    "check_lens",
-    "check_points",
-    "check_rows",
-    "denormalise_points",
-    "distort_points",
-    "invert_distortion",
-    "lens_model",
-    "max_undistorted_radius",
-    "normalise_points",
-    "placeholder_intrinsics",
-    "undistort_points",
-    "undistorted_sigma",
-    "usable_cameras",
-]
 
 _HARMLESS_FOCAL = 1000.0  # px
 

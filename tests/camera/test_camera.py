@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from lanebev import Camera
-from lanebev.geometry import lens
+from lanebev.geometry.distortion import max_undistorted_radius
 from lanebev.geometry.lens import (
     cam_from_image,
     distort_points,
+    normalise_points,
     undistort_points,
     undistorted_sigma,
 )
@@ -48,7 +49,7 @@ def test_brown_conrady_equals_opencv(count):
 
 def test_fisheye_equals_opencv():
     cam = camera(FISHEYE, "fisheye", 500.0)
-    plane = lens.normalise_points(pixels(), cam.intrinsics)
+    plane = normalise_points(pixels(), cam.intrinsics)
     expected = cv2.fisheye.distortPoints(plane.numpy()[None], cam.intrinsics.numpy(), np.array(FISHEYE))
     np.testing.assert_allclose(cam.distort_points(pixels()).numpy(), expected[0], atol=1e-8)
 
@@ -68,10 +69,10 @@ def test_fisheye_undistortion_has_a_gradient_at_the_centre():
     cam = camera(FISHEYE, "fisheye", 500.0)
     points = torch.tensor([[[650.0, 370.0], [100.0, 600.0]]], dtype=torch.float64, requires_grad=True)
     args = (cam.intrinsics[None], cam.distortion[None], "fisheye")
-    lens.undistort_points(points, *args).sum().backward()
+    undistort_points(points, *args).sum().backward()
     assert points.grad.isfinite().all()
     away = torch.tensor([[[700.0, 400.0], [100.0, 600.0]]], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda p: lens.undistort_points(p, *args), (away,))
+    assert torch.autograd.gradcheck(lambda p: undistort_points(p, *args), (away,))
 
 
 def test_rays_project_back():
@@ -96,13 +97,13 @@ def test_the_matrix_of_the_inverse_camera_has_skew():
 
 def test_points_beyond_the_fold_of_the_lens_are_not_seen():
     cam = camera(BROWN[5])
-    radius = float(lens.max_undistorted_radius(cam.distortion[None])[0])
+    radius = float(max_undistorted_radius(cam.distortion[None])[0])
     assert 0.8 < radius < 1.5
     folded = torch.tensor([[radius * 1.2, 0.0, 1.0]], dtype=torch.float64)
     _, inside = cam.project(folded)
     assert not inside.any()
     none = torch.zeros(1, 0, dtype=torch.float64)
-    assert float(lens.max_undistorted_radius(none)[0]) == pytest.approx(10.0)
+    assert float(max_undistorted_radius(none)[0]) == pytest.approx(10.0)
 
 
 def test_a_fisheye_sees_to_the_side():
