@@ -137,10 +137,8 @@ def _edge_ratio(camera: Camera) -> float:
 
     It is 0 if the lens has no ray there.
     """
-    edge, centre = (
-        camera.intrinsics.new_tensor([[0.0, float(camera.intrinsics[1, 2])]]),
-        camera.intrinsics[0, 2],
-    )
+    centre = camera.intrinsics[0, 2]
+    edge = camera.intrinsics.new_tensor([[0.0, float(camera.intrinsics[1, 2])]])
     ideal, valid = camera.undistort_points(edge)
     return float(centre / (centre - ideal[0, 0])) if bool(valid.all()) else 0.0
 

@@ -209,9 +209,8 @@ def order_along(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     along = x * angle.cos() + y * angle.sin()
     order = torch.where(weight > 0, along, math.inf).argsort(dim=-1)
     rank = torch.arange(order.shape[-1], device=order.device).expand_as(order)
-    return order, torch.zeros_like(order).scatter(
-        -1, order, rank
-    )  # ties: vertices that coincide, or are not seen
+    # ties: vertices that coincide, or are not seen
+    return order, torch.zeros_like(order).scatter(-1, order, rank)
 
 
 def take(points: Tensor, index: Tensor) -> Tensor:

@@ -92,7 +92,7 @@ def verdict(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> Verdict:
     whole = (states == AxisState.MEASURED).all(-1)
     share, complete = float(tracked.mean()), float(whole.mean())
     if not tracked.any():
-        why = _frequent([row for row in rows], _WHOLE_FRAME)
+        why = _frequent(rows, _WHOLE_FRAME)
         return Verdict("poor", f"Not calibrated: {why or 'no usable frame'}.", "", ())
     if stills:
         headline = f"{tracked.sum()} of {len(rows)} {_images(len(rows))} calibrated"

@@ -132,12 +132,14 @@ def fit_readings(params: Tensor, model: Model, steps: int) -> Fits:
         weighted = at.jacobian * per_end(weight).unsqueeze(1)
         away = ((params - mean) / std).square()
         of_prior = student_weight(away, prior.freedom) / std.square()
-        held = torch.cat([of_prior, model.std.square().reciprocal()], dim=-1)
-        information = weighted @ at.jacobian.mT + held.diag_embed()
+        prior_precision = torch.cat([of_prior, model.std.square().reciprocal()], dim=-1)
+        information = weighted @ at.jacobian.mT + prior_precision.diag_embed()
         if step == steps:
             break
         found = torch.cat([params, own], dim=-1)
-        gradient = (weighted @ at.distance.flatten(1).unsqueeze(-1)).squeeze(-1) + held * (found - at_prior)
+        gradient = (weighted @ at.distance.flatten(1).unsqueeze(-1)).squeeze(-1) + prior_precision * (
+            found - at_prior
+        )
         change = solve_spd(information, gradient.unsqueeze(-1)).squeeze(-1)
         too_far = (change[:, :NUM_PARAMS] / std).abs().amax(-1, keepdim=True)
         found = found - change / too_far.clamp(min=1.0)

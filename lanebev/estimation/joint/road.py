@@ -197,8 +197,7 @@ def _share_in_view(phase: Tensor, gone: Tensor, passed: Tensor) -> Tensor:
     The farthest step comes in over ``ENTRY`` metres and not when a knot is passed, so that rounding does not
     decide in which of two frames its noise is added.
     """
-    since = constant(_BEHIND, like=gone) - KNOT_SPACING * passed.unsqueeze(
-        -1
-    )  # m, less the way, since a step came into view
+    # m, less the way, since a step came into view
+    since = constant(_BEHIND, like=gone) - KNOT_SPACING * passed.unsqueeze(-1)
     after, before = gone.unsqueeze(-1) + since, phase.unsqueeze(-1) + since
     return (after.clamp(0.0, ENTRY) - before.clamp(0.0, ENTRY)) / ENTRY

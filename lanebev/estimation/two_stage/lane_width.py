@@ -269,8 +269,8 @@ def _gauss_newton_step(
     measured = measure_widths(boundaries, roll, height)
     there = measured.present.unsqueeze(-1)
     jacobian = torch.where(there, measured.jacobian, 0.0)
-    held = torch.stack([observable, torch.ones_like(observable)], dim=-1)  # roll only where it shows
-    jacobian = jacobian * held.unsqueeze(1)
+    observed = torch.stack([observable, torch.ones_like(observable)], dim=-1)  # roll only where it shows
+    jacobian = jacobian * observed.unsqueeze(1)
     error = width_residuals(measured.widths, lane_width, measured.present).unsqueeze(-1)
     eye = torch.eye(2, dtype=roll.dtype, device=roll.device)
     normal = jacobian.mT @ jacobian + 1e-9 * eye
