@@ -141,7 +141,7 @@ def trained_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
     training = {name: value for name, value in settings.items() if name != "network"}
     for name in ("init_from", "backbone"):
         if training.get(name) is not None:
-            training[name] = Path(training[name]).name  # its folder is nobody else's business
+            training[name] = Path(training[name]).name  # without its folder
     return segmenter.eval(), training
 
 

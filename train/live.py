@@ -230,17 +230,17 @@ class LiveRoads(L.LightningDataModule):
         rank, first = run_position(self)
         every = trainer.accumulate_grad_batches
         self.batches = LiveBatches(
-            lambda number: used_share(trainer, number // every),
-            self.stages,
-            self.repeats,
-            self.together,
-            self.view,
-            self.window,
-            (self.seed, rank),
-            first,
-            trainer.strategy.root_device,
-            self.rows,
-            self.far_share,
+            share=lambda number: used_share(trainer, number // every),
+            stages=self.stages,
+            repeats=self.repeats,
+            together=self.together,
+            view=self.view,
+            window=self.window,
+            seed=(self.seed, rank),
+            first=first,
+            device=trainer.strategy.root_device,
+            rows=self.rows,
+            far_share=self.far_share,
         )
         return DataLoader(self.batches, batch_size=None)
 

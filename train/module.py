@@ -117,9 +117,7 @@ class Segmentation(L.LightningModule):
         if self.photometric is not None:
             with torch.no_grad(), self._own_randomness(batch_idx):
                 image = self.photometric(image)
-        logits = self.segmenter(
-            image.contiguous(memory_format=self.layout)
-        ).float()  # sums need it under bf16
+        logits = self.segmenter(image.contiguous(memory_format=self.layout)).float()  # sums need it
         pixels = boundary_cross_entropy(logits, target, weight, self.class_weight)
         rows = row_cross_entropy(logits, target, weight)
         self.log_dict({"loss/pixels": pixels.detach(), "loss/rows": rows.detach()}, prog_bar=True)

@@ -158,7 +158,7 @@ def scan_moments(padded: Tensor, window: int, scans: Scans) -> tuple[Tensor, Ten
     step = offset.to(padded.dtype)
     values = _about(fixed, centre, offset, scans)
     first, _ = _mean(values, step)
-    centre = (centre + first).round().long().clamp(min=0).minimum(scans.last)  # of NaN anything may come
+    centre = (centre + first).round().long().clamp(min=0).minimum(scans.last)  # a NaN may become any number
     values = _about(padded, centre, offset, scans)
     mean, mass = _mean(values, step)
     variance = (values * (step - mean.unsqueeze(-2)).square()).sum(-2) / mass.clamp(min=_LEAST_MASS)

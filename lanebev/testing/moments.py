@@ -108,16 +108,10 @@ def road_curves(moment: Moment, num: int = 400) -> Tensor:
     z = 1 / inverse
     if moment.curvature is not None:
         fine = torch.linspace(0, moment.far * 1.1, 2000, dtype=torch.float64)
-        step = fine[1] - fine[0]
-        turned = torch.cumulative_trapezoid(moment.curvature(fine), dx=float(step))
-        turned = torch.cat([torch.zeros(1, dtype=torch.float64), turned])
+        step = float(fine[1] - fine[0])
+        turned = _integral(moment.curvature(fine), step)
         # along the arc: dX = sin(heading) ds, dZ = cos(heading) ds
-        side = torch.cat(
-            [torch.zeros(1, dtype=torch.float64), torch.cumulative_trapezoid(turned.sin(), dx=float(step))]
-        )
-        ahead = torch.cat(
-            [torch.zeros(1, dtype=torch.float64), torch.cumulative_trapezoid(turned.cos(), dx=float(step))]
-        )
+        side, ahead = _integral(turned.sin(), step), _integral(turned.cos(), step)
         points = []
         for place, own in zip(moment.places + moment.offset, moment.headings, strict=True):
             x = side + place * turned.cos() + own * ahead
@@ -129,6 +123,11 @@ def road_curves(moment: Moment, num: int = 400) -> Tensor:
     if moment.wander is not None:
         x = x + moment.wander(z)
     return torch.stack([x, z.expand_as(x)], dim=-1)
+
+
+def _integral(values: Tensor, step: float) -> Tensor:
+    """Integrate values (G,) by the trapezoidal rule from the first one on, (G,)."""
+    return torch.nn.functional.pad(torch.cumulative_trapezoid(values, dx=step), (1, 0))
 
 
 def on_flat_road(road: Tensor, height: float, profile: float) -> Tensor:

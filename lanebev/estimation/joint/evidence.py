@@ -15,7 +15,7 @@ from lanebev.estimation.joint.state import JointConfig, JointState
 from lanebev.estimation.joint.update import FrameInformation, innovation_score
 from lanebev.tensors import constant
 
-_SHARED = 0.2  # sigmas by which all end points of a boundary may be off alike
+_SHARED = 0.2  # standard deviation of the error that all end points of a boundary share, in their sigmas
 _KNOWN = 1e-3  # share of a prediction-free score's variance below which the prediction determines the entry
 _FREE_POSE = (0.05, 0.05, 0.05, 0.3)  # rad, m: sigmas added where the pose is free
 _LARGEST_EXCESS = 4.0  # of a squared score; a larger one is a jump

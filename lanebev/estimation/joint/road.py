@@ -22,7 +22,7 @@ from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS
 from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
 from lanebev.tensors import constant
 
-CLEAR_BEND = (10.0, 20.0)  # chi-square of the five steps of curvature between which they come to tell speed
+CLEAR_BEND = (10.0, 20.0)  # χ² of the five steps: below, they do not change the speed; above, fully
 ENTRY = KNOT_SPACING / 3  # m, way over which a step comes into view
 _BENT = 3.0  # sigmas of the curvature at the farthest knot from which the road is taken to bend there
 _BEND_STEP = 0.07  # of that curvature: standard deviation of the next step, in a bend
