@@ -207,26 +207,22 @@ class RunConfig:
             raise ValueError(f"fps: expected 0.01 to 10000 frames per second, got {self.fps:g}")
         self._check_calibrator()
         self._check_backend()
-        if self.smooth and (self.calibrator != "joint" or self.stills):
-            expected = "a drive" if self.stills else "--calibrator joint"
-            raise ValueError(
-                f"smooth: expected {expected} with it, got {'--stills' if self.stills else self.calibrator}"
-            )
+        if self.smooth and self.stills:
+            raise ValueError("smooth: expected a drive with it, got --stills")
         if self.stills and self.resume:
             raise ValueError("resume: expected a drive, got --stills; images on their own have no state")
         self._check_lanes()
 
     def _check_lanes(self) -> None:
-        sizes = {"lanes size": (self.lanes_size, 2, (1, 1)), "lanes crop": (self.lanes_crop, 4, (0, 0, 1, 1))}
-        for name, (value, count, least) in sizes.items():
+        sizes = {"lanes size": (self.lanes_size, (1, 1)), "lanes crop": (self.lanes_crop, (0, 0, 1, 1))}
+        for name, (value, least) in sizes.items():
             if value is None:
                 continue
-            whole = len(value) == count and all(type(each) is int for each in value)
+            whole = len(value) == len(least) and all(type(each) is int for each in value)
             if not (whole and all(each >= low for each, low in zip(value, least, strict=True))):
-                names = ("top", "left", "height", "width")[-count:]
-                raise ValueError(f"{name}: expected whole px of an image, ({', '.join(names)}), got {value}")
-        for name, value in (("lanes size", self.lanes_size), ("lanes crop", self.lanes_crop)):
-            if value is not None and not self.lanes:
+                sides = ", ".join(("top", "left", "height", "width")[-len(least) :])
+                raise ValueError(f"{name}: expected whole px of an image, ({sides}), got {value}")
+            if not self.lanes:
                 raise ValueError(f"{name}: expected --lanes with it, got none")
         given = next((name for name in ("weights", "far_view") if getattr(self, name)), None)
         if self.lanes and given:
@@ -246,7 +242,7 @@ class RunConfig:
     def _check_calibrator(self) -> None:
         if self.calibrator not in CALIBRATORS:
             raise ValueError(f"calibrator: expected {' or '.join(CALIBRATORS)}, got {self.calibrator!r}")
-        for name in ("mount", "hilly"):
+        for name in ("mount", "hilly", "smooth"):
             if getattr(self, name) and self.calibrator != "joint":
                 raise ValueError(f"{name}: expected --calibrator joint with it, got {self.calibrator}")
 
