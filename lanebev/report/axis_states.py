@@ -45,7 +45,7 @@ def estimates(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.float64]:
     return np.array([pose(row) for row in rows], dtype=np.float64).reshape(-1, 4)
 
 
-def deviations(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.float64]:
+def estimate_stds(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.float64]:
     """Return (F, 4) standard deviations of pitch, yaw, roll (deg) and height (m)."""
     return np.array([sigmas(row) for row in rows], dtype=np.float64).reshape(-1, 4)
 

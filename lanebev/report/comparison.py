@@ -12,7 +12,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AXES, AxisState, axis_states, deviations, estimates
+from lanebev.report.axis_states import AXES, AxisState, axis_states, estimate_stds, estimates
 from lanebev.report.figures import bokeh_script
 from lanebev.report.plots import plot_differences, plot_two
 from lanebev.report.run_folder import RunFolder
@@ -95,7 +95,7 @@ def differences(pairs: Sequence[Pair]) -> list[AxisDifference]:
 def difference_and_sigma(pairs: Sequence[Pair]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the change from first to second (F, 4) in deg and m, and its sigma if both err independently."""
     first, second = ([pair[i] for pair in pairs] for i in (0, 1))
-    return estimates(second) - estimates(first), np.hypot(deviations(first), deviations(second))
+    return estimates(second) - estimates(first), np.hypot(estimate_stds(first), estimate_stds(second))
 
 
 def differing(first: Mapping[str, str], second: Mapping[str, str]) -> dict[str, tuple[str, str]]:

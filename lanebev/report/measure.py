@@ -14,9 +14,7 @@ from lanebev.observation.segments import LaneSegments
 from lanebev.types import NUM_BOUNDARIES, Extrinsics
 
 _MIN_VERTICES = 4
-_MIN_ROWS = (
-    50.0  # px of the image that a boundary must cross: on fewer, the errors of its vertices are correlated
-)
+_MIN_ROWS = 50.0  # px of the image that a boundary must cross: on fewer, its errors are correlated
 _MIN_STRETCH = 5.0  # m of road that a boundary must cover
 _LEAST_SCALE = 1e-6  # of the residuals in sigmas
 _NEAR = 5.0  # m, nearest Z that counts

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration, MountStatus, describe_mount
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AXES, AxisState, axis_states, deviations, estimates
+from lanebev.report.axis_states import AXES, AxisState, axis_states, estimate_stds, estimates
 from lanebev.report.figures import bokeh_script
 from lanebev.report.lens_table import lens_table
 from lanebev.report.moments import Jpegs
@@ -124,7 +124,7 @@ def page_data(report: Report, places: Sequence[int], edges: NDArray[np.float64])
         "reason": [reasons.index(row.reasons) for row in rows],
         "reasons": [", ".join(reason_words([name for name in each.split("|") if name])) for each in reasons],
         "value": _plain(estimates(rows), 4),
-        "std": _plain(deviations(rows), 4),
+        "std": _plain(estimate_stds(rows), 4),
         "state": [[int(state) for state in axis_states(row)] for row in rows],
         "states": [STATE_WORDS[state] for state in AxisState],
         "kinds": [state.name.lower() for state in AxisState],
@@ -143,7 +143,7 @@ def page_data(report: Report, places: Sequence[int], edges: NDArray[np.float64])
 def pose_table(rows: Sequence[ExtrinsicsRow]) -> list[tuple[str, list[str]]]:
     """Return median, least, most and median sigma of each axis over the frames that measure it."""
     states = np.array([axis_states(row) for row in rows]).reshape(-1, 4)
-    value, std = estimates(rows), deviations(rows)
+    value, std = estimates(rows), estimate_stds(rows)
     table = []
     for axis, name in enumerate(AXES):
         seen = (states[:, axis] <= AxisState.UNCERTAIN) & np.isfinite(value[:, axis])

@@ -11,7 +11,7 @@ from bokeh.models import ColumnDataSource, HoverTool, Span
 from numpy.typing import NDArray
 
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AxisState, axis_states, deviations, estimates
+from lanebev.report.axis_states import AxisState, axis_states, estimate_stds, estimates
 from lanebev.report.figures import (
     INK,
     LEAST_RANGE,
@@ -43,7 +43,7 @@ def plot_estimates(
         stills: each image is on its own.
         truth: a row per frame where it is known.
     """
-    value, std = estimates(rows), deviations(rows)
+    value, std = estimates(rows), estimate_stds(rows)
     states = _states(rows)
     known = states != AxisState.UNKNOWN
     measured = states <= AxisState.UNCERTAIN
@@ -78,7 +78,7 @@ def plot_two(
     """
     names, colours = ("A", "B"), (_LINE, _SECOND)
     values = np.stack([estimates(first), estimates(second)])
-    stds = np.stack([deviations(first), deviations(second)])
+    stds = np.stack([estimate_stds(first), estimate_stds(second)])
     states = np.stack([_states(first), _states(second)])
     figures: list[Any] = []
     for axis, label in enumerate(_LABELS):

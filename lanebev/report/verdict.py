@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lanebev.estimation.reasons import REASON_WORDS, UNSEEN, WHOLE_FRAME, Reason, telling_reasons
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AXES, LARGEST_STD, AxisState, axis_states, deviations, reasons_of
+from lanebev.report.axis_states import AXES, LARGEST_STD, AxisState, axis_states, estimate_stds, reasons_of
 
 _WORDS = {str(reason.name): words for reason, words in REASON_WORDS.items()}
 _WHOLE_FRAME, _UNSEEN = ([str(reason.name) for reason in some] for some in (WHOLE_FRAME, UNSEEN))
@@ -254,7 +254,7 @@ def _unseen_why(rows: Sequence[ExtrinsicsRow]) -> str:
 
 def _precision(rows: Sequence[ExtrinsicsRow], states: NDArray[np.int64]) -> str:
     """Return the median of ±2σ over the frames that measure an axis."""
-    std = deviations(rows)
+    std = estimate_stds(rows)
     told = [
         f"{name} ±{_value(axis, 2 * float(np.median(std[states[:, axis] <= AxisState.UNCERTAIN, axis])))}"
         for axis, name in enumerate(AXES)
