@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntFlag
 from typing import Any, TypeVar, cast
 
@@ -36,17 +36,34 @@ def select_rows(rows: Tensor, yes: T, no: T) -> T:
 def may_skip(wanted: Tensor) -> bool:
     """Tell whether a costly step, such as a search, can be left out because no row wants its result.
 
-    Beside :func:`replace_rows` the one place where the maths asks the device. A compiled or exported program
-    cannot, and always searches.
+    Beside :func:`replace_rows` the one place where the maths asks the device. A compiled or exported program,
+    and ``torch.vmap``, cannot, and always search.
     """
-    return not torch.compiler.is_compiling() and not bool(wanted.any())
+    return not (torch.compiler.is_compiling() or mapped(wanted)) and not bool(wanted.any())
+
+
+def readable(value: Tensor) -> bool:
+    """Tell whether a check may read a tensor's numbers: now, and without waiting for a device."""
+    recorded = torch.compiler.is_compiling() or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
+    return value.device.type == "cpu" and not (recorded or mapped(value))
+
+
+def mapped(value: Tensor) -> bool:
+    """Tell whether ``torch.vmap`` stands over this tensor, which then has no numbers of its own."""
+    functorch = torch._C._functorch
+    while functorch.is_functorch_wrapped_tensor(value):
+        if functorch.is_batchedtensor(value):
+            return True
+        value = functorch.get_unwrapped(value)
+    return False
 
 
 def replace_rows(rows: Tensor, values: T, function: Callable[..., T], *operands: Any) -> T:
     """Replace some rows of ``values`` by a costly function's result, which is computed for these rows only.
 
     The device is asked how many rows there are. A compiled or exported program has both ways
-    (``torch.cond``): it computes the function for all rows where there is any, else not at all.
+    (``torch.cond``): it computes the function for all rows where there is any, else not at all. Under
+    ``torch.vmap`` it is computed for all rows.
 
     Args:
         rows: (B,) bool.
@@ -56,6 +73,8 @@ def replace_rows(rows: Tensor, values: T, function: Callable[..., T], *operands:
     """
     if torch.compiler.is_compiling():
         return _replace_rows_in_program(rows, values, function, operands)
+    if mapped(rows):
+        return select_rows(rows, function(*operands), values)
     index = rows.nonzero().squeeze(-1)
     if index.shape[0] == 0:
         return values
@@ -71,17 +90,29 @@ def _replace_rows_in_program(
     """Replace rows as :func:`replace_rows` does, by ``torch.cond``, of tensors none of which is a view."""
     parts, structure = tree_flatten((rows, values, operands))
     parts = [part.clone() for part in parts]
-    results = tree_flatten(values)[1]
+    leaves, results = tree_flatten(values)
+    kinds = [leaf.dtype for leaf in leaves]
 
     def anew(*parts: Tensor) -> tuple[Tensor, ...]:
         rows, values, operands = tree_unflatten(parts, structure)
-        return tuple(tree_flatten(select_rows(rows, function(*operands), values))[0])
+        return _differentiable(tree_flatten(select_rows(rows, function(*operands), values))[0])
 
     def kept(*parts: Tensor) -> tuple[Tensor, ...]:
-        return tuple(part.clone() for part in parts[1 : 1 + results.num_leaves])
+        return _differentiable([part.clone() for part in parts[1 : 1 + results.num_leaves]])
 
-    found: T = tree_unflatten(torch.cond(rows.any(), anew, kept, tuple(parts)), results)
+    chosen = torch.cond(rows.any(), anew, kept, tuple(parts))
+    found: T = tree_unflatten([part.to(kind) for part, kind in zip(chosen, kinds, strict=True)], results)
     return found
+
+
+def _differentiable(parts: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """Return numbers of floating point: ``torch.cond`` has no gradient beside whole ones (torch 2.13).
+
+    Those of a state are far below 2²⁴, up to which single precision holds them all.
+    """
+    if not torch.is_grad_enabled():
+        return tuple(parts)
+    return tuple(part if part.is_floating_point() else part.float() for part in parts)
 
 
 def _put_rows(index: Tensor, rows: T, values: T) -> T:

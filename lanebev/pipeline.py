@@ -17,7 +17,7 @@ from lanebev.geometry.lens import check_intrinsics
 from lanebev.geometry.precision import autocast_off, common_dtype
 from lanebev.observation.boundary_detector import BoundaryDetector
 from lanebev.observation.far_view import FarView
-from lanebev.observation.frames import check_images
+from lanebev.observation.frames import black_unless_finite, check_images
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segments import LaneSegments, segments_from_vertices
 from lanebev.types import Calibration, register_pytree
@@ -33,8 +33,8 @@ class LaneBEVOutput(NamedTuple):
 
     Attributes:
         bev: (B, 3, U, V), zero where not valid; None where it was not asked for. It follows the vertical
-            curvature of the road where the calibrator estimates one.
-        valid: (B, 1, U, V) bool; None likewise.
+            curvature of the road where the calibrator estimates one. An image that is not finite is black.
+        valid: (B, 1, U, V) bool, nowhere in an image that is not finite; None likewise.
         calibration: extrinsics, covariance, status, inliers.
         bev_from_image: (B, 3, 3) homography from undistorted pixels to BEV pixels of a plane road, which
             touches the road below the camera.
@@ -224,11 +224,13 @@ class LaneBEV(BoundaryDetector):
                 calibration = calibration.with_std_scaled(self.pose_sigma_scale)
             view, valid = None, None
             if bev:
+                image_now, finite = black_unless_finite(frames[:, step])
                 with self._gradients("warp"):
                     view, valid = self.warp(
-                        frames[:, step], intrinsics, calibration.extrinsics, distortion, model,
+                        image_now, intrinsics, calibration.extrinsics, distortion, model,
                         **self._road_shape(state),
                     )  # fmt: skip
+                valid = select_rows(finite, valid, torch.zeros_like(valid))
             homography = bev_from_image(calibration.extrinsics, intrinsics, self.warp.grid)
             outputs.append(LaneBEVOutput(view, valid, calibration, homography, now, logits))
         return (outputs[0] if image.ndim == 4 else stack_frames(outputs)), state

@@ -69,7 +69,8 @@ def usable_device(device: torch.device | str | int) -> torch.device:
 def made_once(function: Callable[P, T]) -> Callable[P, T]:
     """Decorate a function of hashable arguments that makes tensors, to be called once for each of them.
 
-    A compiled or exported program makes its own. The tensors must not be changed in place.
+    A compiled or exported program makes its own, and so does each call inside a context in which tensors are
+    of another kind, such as ``FakeTensorMode``. The tensors must not be changed in place.
     """
 
     @lru_cache(maxsize=256)
@@ -79,7 +80,7 @@ def made_once(function: Callable[P, T]) -> Callable[P, T]:
 
     @wraps(function)
     def once(*args: P.args, **kwargs: P.kwargs) -> T:
-        if torch.compiler.is_compiling():
+        if torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack():
             return function(*args, **kwargs)
         return cast("Callable[..., T]", kept)(*args, **kwargs)
 
@@ -143,4 +144,4 @@ def identity(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 @made_once
 def _constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    return torch.tensor(numbers, dtype=dtype).to(device)
+    return torch.tensor(numbers, dtype=dtype, device=device)

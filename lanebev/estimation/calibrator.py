@@ -87,7 +87,8 @@ class Calibrator(nn.Module, Generic[StateT]):
 
         Args:
             segments: N >= 0 segments per row; those of weight 0 or with non-finite numbers are ignored.
-            intrinsics: (B, 3, 3) px. If they or the widths are not finite and positive, the row is unused.
+            intrinsics: (B, 3, 3) px. If they or the widths are not finite and positive, the row is unused; so
+                it is on a GPU if they are transposed, which is an error on the CPU.
             state: state of the frame before, or ``initial_state(B)``.
             dt: s since that frame, float or (B,). A started row skips a frame that is not later (0 or
                 negative). If it is not finite, an interval is assumed.

@@ -122,7 +122,7 @@ def mask_invalid_rows(
 
     Args:
         segments: unchecked segments, see :func:`clean_segments`.
-        intrinsics: (B, 3, 3), unusable where not finite or without a positive focal length.
+        intrinsics: (B, 3, 3), unusable where not finite, transposed or without a positive focal length.
         lane_width: (B, M) m, unusable where one is not finite and positive.
         num_boundaries: L.
     """

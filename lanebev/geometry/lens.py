@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lanebev.batch import readable
 from lanebev.geometry.distortion import check_lens, distort_plane, lens_model, max_undistorted_radius
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.undistortion import undistort_plane
@@ -16,6 +17,7 @@ from lanebev.tensors import constant
 from lanebev.types import check_tensor
 
 _HARMLESS_FOCAL = 1000.0  # px
+_NO_PIXEL = 0.5  # px
 
 
 def check_rows(distortion: Tensor, points: Tensor) -> None:
@@ -35,6 +37,9 @@ def _check(points: Tensor, distortion: Tensor, model: str) -> None:
 def check_intrinsics(intrinsics: Tensor, *rows: int) -> None:
     """Raise unless these are (*rows, 3, 3) matrices of floating point.
 
+    On the CPU also if one is transposed; elsewhere reading numbers would wait for the device, see
+    :func:`usable_cameras`.
+
     Raises:
         TypeError: not a tensor.
         ValueError: saying what was expected and what came.
@@ -49,12 +54,23 @@ def check_intrinsics(intrinsics: Tensor, *rows: int) -> None:
             f"intrinsics: expected float32 or float64, got {intrinsics.dtype}, which rounds them by pixels; "
             "leave them in float32"
         )
+    if readable(intrinsics) and bool(intrinsics.detach()[..., 2, :2].any()):
+        upright = (intrinsics.mT[..., 2, :2] != 0).any(-1) | _last_row_is_small(intrinsics)
+        if not bool(upright.all()):
+            raise ValueError(
+                "intrinsics: expected [fx s cx; 0 fy cy; 0 0 1], got its transpose; give intrinsics.mT"
+            )
 
 
 def usable_cameras(intrinsics: Tensor) -> Tensor:
-    """Return (...,) bool of intrinsics (..., 3, 3): finite, and with positive focal lengths."""
-    finite = intrinsics.isfinite().all(-1).all(-1)
+    """Return (...,) bool of intrinsics (..., 3, 3): finite, with positive focal lengths, not transposed."""
+    finite = intrinsics.isfinite().all(-1).all(-1) & _last_row_is_small(intrinsics)
     return finite & (intrinsics[..., 0, 0] > 0) & (intrinsics[..., 1, 1] > 0)
+
+
+def _last_row_is_small(intrinsics: Tensor) -> Tensor:
+    """Return (...,) bool: not the principal point, px, is in the last row, nor NaN."""
+    return intrinsics[..., 2, :2].abs().amax(-1) < _NO_PIXEL
 
 
 def placeholder_intrinsics(like: Tensor) -> Tensor:

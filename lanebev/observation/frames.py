@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from lanebev.batch import readable
 from lanebev.geometry.precision import common_dtype
 from lanebev.types import check_tensor
 
@@ -80,6 +81,21 @@ def check_images(image: Tensor) -> None:
         raise ValueError(f"image: expected floating point in [0, 1], got {image.dtype}; divide bytes by 255")
     if 0 in image.shape[1:]:  # B may be 0
         raise ValueError(f"image: expected frames with pixels, got {tuple(image.shape)}")
+
+
+def black_unless_finite(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Replace images that are not finite, whose product with a zero gradient would be NaN.
+
+    Args:
+        image: (B, C, H, W).
+
+    Returns:
+        the images, black where a number is not finite, and (B,) bool, which are finite.
+    """
+    finite = image.detach().sum((1, 2, 3), dtype=common_dtype(image)).isfinite()
+    if readable(finite) and bool(finite.all()):
+        return image, finite
+    return torch.where(finite[:, None, None, None], image, 0.0), finite
 
 
 def network_image(frame: Tensor, device: torch.device) -> Tensor:

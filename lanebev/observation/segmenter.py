@@ -8,7 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from lanebev.batch import readable
 from lanebev.observation.resnet import ResNet18
+from lanebev.tensors import constant
 from lanebev.types import NUM_BOUNDARIES, check_tensor, check_type
 
 _LARGEST = 8.0  # of an image in [0, 1], whatever was done to its contrast; one in [0, 255] has more
@@ -91,10 +93,6 @@ class LaneSegmenter(nn.Module):
         self.shuffle = 4 // config.output_stride
         self.head = nn.Conv2d(32, (1 + config.num_boundaries) * self.shuffle**2, 1)
         nn.init.normal_(self.head.weight, std=0.01)
-        self.mean: Tensor
-        self.std: Tensor
-        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
-        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -122,9 +120,9 @@ class LaneSegmenter(nn.Module):
                 f"image: expected floating point in [0, 1], got {image.dtype}; divide bytes by 255"
             )
         _check_scale(image)
-        if image.dtype != self.mean.dtype:
-            image = image.to(self.mean.dtype)
-        stem, c2, c3, c4, c5 = self.trunk((image - self.mean) / self.std)
+        image = image.to(self.head.weight.dtype)
+        mean, std = (constant(each, like=image).view(3, 1, 1) for each in (IMAGENET_MEAN, IMAGENET_STD))
+        stem, c2, c3, c4, c5 = self.trunk((image - mean) / std)
         lateral2, lateral3, lateral4, lateral5 = self.lateral
         x = lateral5(c5) + self.position(_positions(c5))
         x = lateral4(c4) + upsample_aligned(x, c4.shape[-2:])
@@ -145,9 +143,9 @@ class LaneSegmenter(nn.Module):
 def _check_scale(image: Tensor) -> None:
     """Raise ValueError if a finite image is in [0, 255] instead of [0, 1], unless the check is slow.
 
-    Reading values on another device would wait for it, and a compiled program cannot read them.
+    Reading values on another device would wait for it; a compiled program or ``torch.vmap`` cannot read them.
     """
-    if torch.compiler.is_compiling() or image.device.type != "cpu" or not image.numel():
+    if not (image.numel() and readable(image)):
         return
     largest = float(image.detach().nan_to_num(0.0, 0.0, 0.0).amax())
     if largest > _LARGEST:

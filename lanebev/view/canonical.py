@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from lanebev.geometry.lens import cam_from_image, check_intrinsics
 from lanebev.geometry.precision import common_dtype, full_precision
 from lanebev.geometry.rotation import road_from_cam
+from lanebev.tensors import constant
 from lanebev.types import Extrinsics
 from lanebev.view.checks import check_cameras, check_covers, check_image, check_size
 from lanebev.view.lens import make_lens
@@ -55,9 +56,6 @@ class CanonicalView(nn.Module):
         keep_height: leave every camera at its own height: a rotation only.
     """
 
-    intrinsics: Tensor
-    pose: Tensor
-
     def __init__(
         self,
         intrinsics: Tensor,
@@ -75,8 +73,8 @@ class CanonicalView(nn.Module):
             raise ValueError(f"extrinsics.height: expected more than 0 m, got {float(pose[0, 3]):g}")
         self.image_size = (int(image_size[0]), int(image_size[1]))
         self.keep_height = keep_height
-        self.register_buffer("intrinsics", intrinsics.detach().clone(), persistent=False)
-        self.register_buffer("pose", pose.detach().clone(), persistent=False)
+        self._intrinsics = tuple(map(tuple, intrinsics.tolist()))  # no buffers: half() would round them
+        self._pose: tuple[float, ...] = tuple(pose[0].tolist())
 
     def forward(
         self,
@@ -128,10 +126,9 @@ class CanonicalView(nn.Module):
         matrix = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll).mT
         if image_from_cam is not None:
             matrix = image_from_cam @ matrix
-        pitch, yaw, roll, height = self.pose.to(matrix).unbind(-1)
-        road_from_pixel = road_from_cam(pitch, yaw, roll) @ cam_from_image(
-            self.intrinsics.to(matrix)
-        )  # (1, 3, 3)
+        pitch, yaw, roll, height = constant((self._pose,), like=matrix).unbind(-1)
+        cam_from_pixel = cam_from_image(constant(self._intrinsics, like=matrix))
+        road_from_pixel = road_from_cam(pitch, yaw, roll) @ cam_from_pixel  # (1, 3, 3)
         ratio = torch.ones_like(extrinsics.height) if self.keep_height else extrinsics.height / height
         rows, columns = (
             torch.arange(size, dtype=matrix.dtype, device=matrix.device) for size in self.image_size

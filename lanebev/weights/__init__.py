@@ -32,6 +32,8 @@ _FORMER_NAMES = {"noise_factor": "sigma_scale", "pose_factor": "pose_sigma_scale
 def load_segmenter(path: str | Path | None = None) -> LaneSegmenter:
     """Load a segmenter with its weights, ready for inference.
 
+    On the default device; on the CPU if that is "meta", since weights without numbers would be lost.
+
     Args:
         path: a file written by :func:`save_segmenter`; None is the shipped one.
 
@@ -42,7 +44,9 @@ def load_segmenter(path: str | Path | None = None) -> LaneSegmenter:
     metadata, tensors = _read(path)
     try:
         config = segmenter_config(json.loads(metadata["config"]))
-        segmenter = LaneSegmenter(config)
+        device = torch.get_default_device()
+        with torch.device("cpu" if device.type == "meta" else device):
+            segmenter = LaneSegmenter(config)
         segmenter.load_state_dict(tensors, strict=True)
         if not all(bool(value.isfinite().all()) for value in tensors.values()):
             raise ValueError("expected finite numbers, got others; was the training unstable?")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Self
+
 import torch
 from torch import Tensor
 
@@ -40,10 +43,21 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
             raise ValueError("config: expected either a TwoStageConfig or its keywords, got both")
         self.config = config or TwoStageConfig(**numbers)  # type: ignore[arg-type]
         self.num_boundaries = self.config.num_boundaries
-        generator = torch.Generator().manual_seed(self.config.seed)
         self.draws: Tensor
-        draws = torch.rand(self.config.num_hypotheses, 2, generator=generator, dtype=torch.float64)
-        self.register_buffer("draws", draws.float(), persistent=False)  # some devices have no float64
+        self.register_buffer("draws", self._drawn(torch.get_default_device()), persistent=False)
+
+    def _drawn(self, device: torch.device) -> Tensor:
+        """Draw the numbers (num_hypotheses, 2) in [0, 1), on the CPU if the device has no numbers."""
+        generator, count = torch.Generator().manual_seed(self.config.seed), self.config.num_hypotheses
+        draws = torch.rand(count, 2, generator=generator, dtype=torch.float64, device="cpu")
+        return draws.float().to("cpu" if device.type == "meta" else device)  # some devices have no float64
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Apply what moves or casts a module, and draw again what ``to_empty`` and ``half`` would lose."""
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        if not self.draws.is_meta:
+            self.draws = self._drawn(self.draws.device)
+        return self
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None

@@ -122,7 +122,8 @@ def predict_direction(state: TwoStageState, dt: Tensor, cfg: TwoStageConfig) -> 
 def is_supported(segments: LaneSegments, inliers: Tensor, cfg: TwoStageConfig) -> Tensor:
     """Tell which rows have enough segments that agree, on two boundaries at least, (B,) bool."""
     weight = segments.weight * inliers
-    member = torch.nn.functional.one_hot(segments.boundary, cfg.num_boundaries).to(weight.dtype)
+    every = torch.arange(cfg.num_boundaries, device=weight.device)
+    member = (segments.boundary.unsqueeze(-1) == every).to(weight.dtype)
     boundaries = ((weight.unsqueeze(1) @ member).squeeze(1) > 0).sum(-1)
     count = (weight > 0).sum(-1)
     share = weight.sum(-1) / segments.weight.sum(-1).clamp_min(1e-9)
