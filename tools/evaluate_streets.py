@@ -18,55 +18,32 @@ import csv
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
-import scipy.stats
 import torch
 from jsonargparse.typing import PositiveInt
 from numpy.typing import NDArray
 from torch import Tensor
 
 import lanebev
-from lanebev import BEVGrid, Calibration, Camera, FarView, JointCalibrator, LaneBEV, LaneSegments, Status
+from lanebev import Camera, FarView, JointCalibrator, LaneBEV
 from lanebev.estimation.joint.frame_prior import FramePrior, prior_of_mount
 from lanebev.estimation.tracker import Tracker
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.io.video import read_image
 from lanebev.observation.frames import check_frame, network_image
 from lanebev.render import render_views
-from lanebev.report.overlay import draw_panels
 from tools.arguments import add_far_view, evaluation_parser
+from tools.single_images import as_answer, calibrate, calibrate_frame, plane_angles, summarise
 from train.commands import one_line_errors
 
 KITTI_LANE_WIDTH = 3.5  # m
 ASSUMED_FOV = 60.0  # deg, of a camera that is not published
-SIGMAS = 3.0
 RENDERED_SEED, RENDERED_ROWS, RENDERED_SIZE = 621, 8, (375, 1242)  # views at once; px, as KITTI's images
+SHEET_COLUMNS, SHEET_WIDTH = 2, 900  # px of an image
 STANDING_FRAMES = 30  # of a drive in which the car stands
 MOUNT_STD = 0.001  # rad, of the median pose where it is given as a prior
-
-
-class Answer(NamedTuple):
-    """One image's estimate: angles of the road plane (pitch, roll) and their sigmas, deg; height, m."""
-
-    name: str
-    plane: Tensor
-    sigma: Tensor
-    height: float
-    height_sigma: float
-    tracking: bool
-
-
-def plane_angles(normal: Tensor) -> Tensor:
-    """Compute the pitch and roll (..., 2), rad, of a camera at zero yaw over a road plane.
-
-    Args:
-        normal: (..., 3) of the plane in camera axes, pointing down.
-    """
-    x, y, z = normal.unbind(-1)
-    return torch.stack([torch.atan2(z, y), torch.atan2(-x, torch.hypot(y, z))], dim=-1)
 
 
 def kitti_truth(path: Path) -> Tensor:
@@ -74,83 +51,6 @@ def kitti_truth(path: Path) -> Tensor:
     lines = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
     matrix = torch.tensor([float(value) for value in lines["Tr_cam_to_road"].split()]).double()
     return plane_angles(matrix.reshape(3, 4)[1, :3])
-
-
-def calibrate(
-    model: LaneBEV, path: Path, camera: Camera, lane_width: float, prior: FramePrior | None = None
-) -> tuple[Answer, NDArray[np.uint8]]:
-    """Calibrate one image, as ``lanebev run --stills`` does; also return it with what was seen drawn."""
-    image = read_image(path)
-    with torch.inference_mode():
-        frame = network_image(check_frame(image, camera.image_size), torch.device("cpu"))
-        segments, calibration = calibrate_frame(model, frame, camera, lane_width, prior)
-        picture = draw_panels(image, camera, segments, calibration, path.name, (), BEVGrid())[0]
-    return as_answer(path.name, calibration), picture
-
-
-def calibrate_frame(
-    model: LaneBEV, frame: Tensor, camera: Camera, lane_width: float, prior: FramePrior | None = None
-) -> tuple[LaneSegments, Calibration]:
-    """Calibrate one frame (1, 3, H, W) in [0, 1], as taken."""
-    tracker = Tracker(JointCalibrator(prior=prior or FramePrior()), camera, lane_width)
-    if model.far_view is None:
-        _, vertices = model.boundary_vertices(frame)
-    else:
-        _, whole = model.whole_vertices(frame)
-        vertices = model.add_far_view(frame, whole, tracker.vanishing_point_of_still(whole))
-    estimate = tracker.still(vertices, model.pose_sigma_scale)
-    return estimate.segments, estimate.calibration
-
-
-def as_answer(name: str, calibration: Calibration) -> Answer:
-    """Take angles and standard deviations from a calibration of batch size 1."""
-    pitch, yaw, roll, height = calibration.extrinsics
-    down = road_from_cam(pitch, yaw, roll)[0, 1]
-    sigma = calibration.covariance[0].diagonal().sqrt()
-    return Answer(
-        name,
-        plane_angles(down).rad2deg(),
-        sigma[[0, 2]].rad2deg(),
-        float(height[0]),
-        float(sigma[3]),
-        int(calibration.status[0]) == Status.TRACKING,
-    )
-
-
-def summarise(answers: list[Answer], truth: Tensor) -> dict[str, float]:
-    """Return median errors, how many were calibrated, and the share within three sigma (all images)."""
-    plane = torch.stack([answer.plane for answer in answers])
-    sigma = torch.stack([answer.sigma for answer in answers])
-    error = (plane - truth.rad2deg()).abs()
-    tracking = torch.tensor([answer.tracking for answer in answers])
-    inside = (error <= SIGMAS * sigma).double().mean(0)
-    middle = error.median(0).values
-    low, high = median_interval(error)
-    return {
-        "images": len(answers),
-        "tracking": int(tracking.sum()),
-        "pitch_median_deg": float(middle[0]),
-        "roll_median_deg": float(middle[1]),
-        "pitch_median_low_deg": float(low[0]),
-        "pitch_median_high_deg": float(high[0]),
-        "roll_median_low_deg": float(low[1]),
-        "roll_median_high_deg": float(high[1]),
-        "pitch_within_3_sigma": float(inside[0]),
-        "roll_within_3_sigma": float(inside[1]),
-        "pitch_worst_deg": float(error[:, 0].max()),
-        "roll_worst_deg": float(error[:, 1].max()),
-    }
-
-
-def median_interval(error: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute the 95 % interval of the medians (P,) of errors (N, P), were other images drawn.
-
-    Source: how many of N values lie below a median is binomial (David and Nagaraja 2003, Sec. 7.1).
-    """
-    count = len(error)
-    below = int(scipy.stats.binom.ppf(0.025, count, 0.5))
-    ordered = error.sort(0).values
-    return ordered[max(below - 1, 0)], ordered[min(count - below, count - 1)]
 
 
 def kitti_road(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
@@ -200,7 +100,7 @@ def _kitti_road(
         answers.append(answer)
         truth.append(kitti_truth(calib))
         pictures.append(picture)
-    save_sheet(sheets, "kitti_road", pictures, 2, 900)
+    save_sheet(sheets, "kitti_road", pictures)
     return summarise(answers, torch.stack(truth))
 
 
@@ -210,7 +110,7 @@ def culane(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
     height, width = read_image(paths[0]).shape[:2]
     camera = Camera.from_fov(ASSUMED_FOV, width, height)
     seen = [calibrate(model, path, camera, 3.7) for path in paths]
-    save_sheet(sheets, "culane", [picture for _, picture in seen], 2, 900)
+    save_sheet(sheets, "culane", [picture for _, picture in seen])
     return {"images": len(seen), "tracking": sum(answer.tracking for answer, _ in seen)}
 
 
@@ -233,7 +133,7 @@ def streets(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]
             tall = abs(answer.height - float(row["height_m"])) / answer.height_sigma
             for axis, value in (("pitch", pitch), ("roll", roll), ("height", tall)):
                 figures[f"{path.stem}_{axis}_error_in_sigma"] = value
-    save_sheet(sheets, "streets", pictures, 2, 900)
+    save_sheet(sheets, "streets", pictures)
     return figures
 
 
@@ -255,18 +155,16 @@ def rendered(model: LaneBEV, views: int) -> dict[str, float]:
     return summarise(answers, torch.cat(truth))
 
 
-def save_sheet(
-    folder: Path | None, name: str, pictures: list[NDArray[np.uint8]], columns: int, width: int
-) -> None:
+def save_sheet(folder: Path | None, name: str, pictures: list[NDArray[np.uint8]]) -> None:
     """Write a contact sheet as a JPEG, if a folder is given."""
     if folder is None or not pictures:
         return
     folder.mkdir(parents=True, exist_ok=True)
-    small = [cv2.resize(p, (width, round(width * p.shape[0] / p.shape[1]))) for p in pictures]
+    small = [cv2.resize(p, (SHEET_WIDTH, round(SHEET_WIDTH * p.shape[0] / p.shape[1]))) for p in pictures]
     tall = max(p.shape[0] for p in small)
     padded = [cv2.copyMakeBorder(p, 0, tall - p.shape[0], 0, 0, cv2.BORDER_CONSTANT) for p in small]
-    padded += [np.zeros_like(padded[0])] * (-len(padded) % columns)
-    rows = [np.hstack(padded[i : i + columns]) for i in range(0, len(padded), columns)]
+    padded += [np.zeros_like(padded[0])] * (-len(padded) % SHEET_COLUMNS)
+    rows = [np.hstack(padded[i : i + SHEET_COLUMNS]) for i in range(0, len(padded), SHEET_COLUMNS)]
     for page, start in enumerate(range(0, len(rows), 8)):
         sheet = cv2.cvtColor(np.vstack(rows[start : start + 8]), cv2.COLOR_RGB2BGR)
         cv2.imwrite(str(folder / f"{name}-{page}.jpg"), sheet)

@@ -9,7 +9,8 @@ from lanebev import JointCalibrator, LaneBEV, LaneSegmenter, LineExtractor
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.observation.segmenter import SegmenterConfig
 from tools import evaluate_streets
-from tools.evaluate_streets import Answer, kitti_truth, median_interval, plane_angles, summarise
+from tools.evaluate_streets import kitti_truth
+from tools.single_images import Answer, median_interval, plane_angles, summarise
 
 
 @pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (0.03, -0.05), (-0.1, 0.2)])
