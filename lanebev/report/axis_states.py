@@ -1,4 +1,4 @@
-"""State of pitch, yaw, roll and height in each frame: measured, uncertain, held, lost or unknown."""
+"""State of pitch, yaw, roll and height in each frame: measured, uncertain, undetermined, lost or unknown."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class AxisState(IntEnum):
 
     MEASURED = 0  # from this frame's lane boundaries
     UNCERTAIN = 1  # measured, but with a standard deviation above LARGEST_STD
-    HELD = 2  # not determined by this frame: predicted from earlier ones
+    UNDETERMINED = 2  # not determined by this frame: predicted from earlier ones
     LOST = 3  # too long without support
     UNKNOWN = 4  # nothing known yet
 
@@ -57,7 +57,7 @@ def reasons_of(row: ExtrinsicsRow) -> list[str]:
 
 def axis_states(row: ExtrinsicsRow) -> tuple[AxisState, AxisState, AxisState, AxisState]:
     """Return the state of pitch, yaw, roll and height in a frame, from its status, reasons and sigmas."""
-    whole = {"LOST": AxisState.LOST, "COASTING": AxisState.HELD, "TRACKING": AxisState.MEASURED}
+    whole = {"LOST": AxisState.LOST, "COASTING": AxisState.UNDETERMINED, "TRACKING": AxisState.MEASURED}
     state = whole.get(row.status, AxisState.UNKNOWN)
     if state != AxisState.MEASURED:
         return state, state, state, state
@@ -71,5 +71,5 @@ def axis_states(row: ExtrinsicsRow) -> tuple[AxisState, AxisState, AxisState, Ax
 
 def _tracked_state(unseen: bool, std: float, most: float) -> AxisState:
     if unseen:
-        return AxisState.HELD
+        return AxisState.UNDETERMINED
     return AxisState.MEASURED if std <= most else AxisState.UNCERTAIN

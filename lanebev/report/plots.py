@@ -26,7 +26,7 @@ from lanebev.report.figures import (
 from lanebev.report.overlay import BOUNDARY_COLOURS
 
 _LABELS = ("pitch (°)", "yaw (°)", "roll (°)", "height (m)")
-_LINE, _HELD, _TRUTH, _SECOND = "#1f6feb", "#7d8794", "#24292f", "#c2410c"
+_LINE, _UNDETERMINED, _TRUTH, _SECOND = "#1f6feb", "#7d8794", "#24292f", "#c2410c"
 
 
 def plot_estimates(
@@ -52,8 +52,8 @@ def plot_estimates(
     for axis, label in enumerate(_LABELS):
         shown = figures[0].x_range if figures else x_range(x)
         plot = new_figure(label, shown, value_limits(value[:, axis], std[:, axis], known[:, axis], axis))
-        held = known[:, axis] & ~measured[:, axis]
-        kinds = {_LINE: (measured[:, axis], "estimate ±2σ"), _HELD: (held, "not determined")}
+        undetermined = known[:, axis] & ~measured[:, axis]
+        kinds = {_LINE: (measured[:, axis], "estimate ±2σ"), _UNDETERMINED: (undetermined, "not determined")}
         _draw_estimate(plot, x, value[:, axis], std[:, axis], kinds, stills)
         if true is not None:
             plot.line(x, true[:, axis], color=_TRUTH, line_dash=[5, 3], line_width=1.2, legend_label="truth")
@@ -113,7 +113,9 @@ def plot_differences(
         plot = new_figure(f"Δ {label}", shown, (-1.2 * most, 1.2 * most), height=120)
         where = {"x": x[finite], "change": change[finite, axis], "two_sigma": 2 * sigma[finite, axis]}
         source = ColumnDataSource({key: single(column) for key, column in where.items()})
-        plot.varea(x[finite], -2 * sigma[finite, axis], 2 * sigma[finite, axis], color=_HELD, fill_alpha=0.2)
+        plot.varea(
+            x[finite], -2 * sigma[finite, axis], 2 * sigma[finite, axis], color=_UNDETERMINED, fill_alpha=0.2
+        )
         if not stills:
             plot.line("x", "change", source=source, color=INK, line_width=1.5)
         dots = plot.scatter("x", "change", source=source, color=INK, size=4, alpha=1.0 if stills else 0.0)

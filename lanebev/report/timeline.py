@@ -18,7 +18,7 @@ STATUSES = ("TRACKING", "COASTING", "LOST", "UNINITIALISED")  # the better first
 STATE_WORDS = {
     AxisState.MEASURED: "measured",
     AxisState.UNCERTAIN: "uncertain",
-    AxisState.HELD: "not determined",
+    AxisState.UNDETERMINED: "not determined",
     AxisState.LOST: "lost",
     AxisState.UNKNOWN: "not known yet",
 }

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import compress, groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,13 +125,14 @@ def drive_findings(rows: Sequence[ExtrinsicsRow]) -> list[Finding]:
             why = _frequent([row for row in rows[first : last + 1] if row.status == status], _WHOLE_FRAME)
             found.append(_finding("", words, first, last, times, why))
     states = np.array([axis_states(row) for row in rows])
-    held = states == AxisState.HELD
+    undetermined = states == AxisState.UNDETERMINED
     tracked = np.array([row.status == "TRACKING" for row in rows])
     parts: list[Finding] = []
     for axis, name in enumerate(AXES):
         most = f"σ above {_value(axis, LARGEST_STD[axis])}"
-        for first, last in intervals(held[:, axis] & tracked, times):
-            why = _unseen_why([row for row, is_held in _cut(rows, held[:, axis], first, last) if is_held])
+        for first, last in intervals(undetermined[:, axis] & tracked, times):
+            part = slice(first, last + 1)
+            why = _unseen_why(compress(rows[part], undetermined[part, axis]))
             parts.append(_finding(name, "not determined", first, last, times, why))
         for first, last in intervals(states[:, axis] == AxisState.UNCERTAIN, times):
             parts.append(_finding(name, "uncertain", first, last, times, most))
@@ -146,12 +147,10 @@ def image_findings(rows: Sequence[ExtrinsicsRow]) -> list[Finding]:
     lost = [row for row in rows if row.status != "TRACKING"]
     found = [*_in_images("", "no calibration", ~tracked, _frequent(lost, _WHOLE_FRAME))]
     for axis, name in enumerate(AXES):
-        held, uncertain = (
-            tracked & (states[:, axis] == AxisState.HELD),
-            states[:, axis] == AxisState.UNCERTAIN,
-        )
-        why = _unseen_why([row for row, is_held in zip(rows, held.tolist(), strict=True) if is_held])
-        found += _in_images(name, "not determined", held, why)
+        undetermined = tracked & (states[:, axis] == AxisState.UNDETERMINED)
+        uncertain = states[:, axis] == AxisState.UNCERTAIN
+        why = _unseen_why(compress(rows, undetermined))
+        found += _in_images(name, "not determined", undetermined, why)
         found += _in_images(name, "uncertain", uncertain, f"σ above {_value(axis, LARGEST_STD[axis])}")
     return found
 
@@ -218,12 +217,6 @@ def _end(times: NDArray[np.float64], last: int) -> float:
     return min(following, float(times[last]) + max(usual, 0.0))
 
 
-def _cut(
-    rows: Sequence[ExtrinsicsRow], at: NDArray[np.bool_], first: int, last: int
-) -> Iterator[tuple[ExtrinsicsRow, bool]]:
-    return zip(rows[first : last + 1], at[first : last + 1].tolist(), strict=True)
-
-
 def _joined_axes(parts: Sequence[Finding]) -> list[Finding]:
     """Join axes to which the same happens in the same frames."""
 
@@ -245,7 +238,7 @@ def _frequent(rows: Sequence[ExtrinsicsRow], among: Sequence[str], least: float 
     return ", ".join(_WORDS[name] for name in usual)
 
 
-def _unseen_why(rows: Sequence[ExtrinsicsRow]) -> str:
+def _unseen_why(rows: Iterable[ExtrinsicsRow]) -> str:
     """Return why an axis was not seen in most of the frames, in words."""
     named = [next((name for name in _UNSEEN if name in reasons_of(row)), None) for row in rows]
     counts = Counter(name for name in named if name)

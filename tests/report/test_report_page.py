@@ -204,9 +204,9 @@ def test_timeline_has_stretches_without_gaps():
     assert [stretch.kind for stretch in roll] == [
         "unknown",
         "measured",
-        "held",
+        "undetermined",
         "measured",
-        "held",
+        "undetermined",
         "lost",
         "measured",
     ]

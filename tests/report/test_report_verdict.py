@@ -117,8 +117,8 @@ def test_images_on_their_own_are_counted():
 def test_every_row_has_a_state_on_each_axis(status):
     states = axis_states(ROW._replace(status=status, reasons="ROLL_UNSEEN", height_std_m=0.3))
     expected = {
-        "TRACKING": (AxisState.MEASURED, AxisState.MEASURED, AxisState.HELD, AxisState.UNCERTAIN),
-        "COASTING": (AxisState.HELD,) * 4,
+        "TRACKING": (AxisState.MEASURED, AxisState.MEASURED, AxisState.UNDETERMINED, AxisState.UNCERTAIN),
+        "COASTING": (AxisState.UNDETERMINED,) * 4,
         "LOST": (AxisState.LOST,) * 4,
     }
     assert states == expected.get(status, (AxisState.UNKNOWN,) * 4)
