@@ -2,10 +2,11 @@
 
     python -m tools.bench_int8 [--views 64] [--drives 4] [--data ../shared/data]
 
-Both files compute by ONNX Runtime; the processor time is that of all its threads together. Recall, error and
-false boundaries are those of ``train.evaluate_roads``, the errors of the pose the medians over drives of
-``train.noise``, both on held-out rendered roads; with ``--data`` also the figures on TuSimple's images of
-``tools.real_figures``.
+Both files compute by ONNX Runtime; the processor time is that of all its threads together. Recall, error
+and false boundaries are those of ``train.evaluate_roads``. The pose is that of the joint calibrator: its
+errors and its NEES per degree of freedom, with the weights' ``pose_sigma_scale``, are the medians over drives
+of ``train.noise``. Both are on held-out rendered roads; with ``--data`` also the figures on TuSimple's images
+of ``tools.real_figures``.
 """
 
 from __future__ import annotations
@@ -93,8 +94,9 @@ def figures(network: Any, options: argparse.Namespace) -> dict[str, float]:
     seeds = range(81_000, 81_000 + options.drives)
     drives = [observe_drive([network], seed, options.frames, 20.0)[0] for seed in seeds]
     factor = network.config.sigma_scale
-    errors = compare(drives, (factor,))[factor].rmse.tolist()
-    found |= {f"drives: {axis}": value for axis, value in zip(AXES, errors, strict=True)}
+    summary = compare(drives, (factor,))[factor]
+    found |= {f"drives: {axis}": value for axis, value in zip(AXES, summary.rmse.tolist(), strict=True)}
+    found["drives: NEES"] = float(summary.nees) / network.config.pose_sigma_scale**2
     if options.data is not None:
         extractor = LineExtractor.for_network(network.config)
         model = LaneBEV(network, extractor, JointCalibrator(), network_width=network.config.image_size[1])

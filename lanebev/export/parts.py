@@ -30,13 +30,14 @@ def make_part(name: str, model: LaneBEV, camera: Camera) -> Part:
         camera: camera whose image size and lens model are fixed; its numbers stay inputs.
 
     Raises:
-        ValueError: another name, or a model with a far view.
+        ValueError: another name, or a segmenter or extractor alone of a model with a far view.
     """
     if name not in PARTS:
         raise ValueError(f"part: expected one of {', '.join(PARTS)}, got {name!r}")
-    if model.far_view is not None:
+    if model.far_view is not None and name in ("segmenter", "extractor"):
         raise ValueError(
-            f"far view: expected a model without one for export, got {model.far_view}; set far_view to None"
+            f"far view: expected the part step, which has all three inputs of the network, got {name}; "
+            "export the step, or a model without far view"
         )
     model = model.eval()
     if name == "segmenter":

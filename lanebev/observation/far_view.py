@@ -212,7 +212,7 @@ def x_on_rows(vertices: BoundaryVertices, rows: Tensor) -> tuple[Tensor, Tensor]
     y = torch.where(vertices.weight > 0, vertices.points[..., 1].detach(), torch.inf)
     y, order = y.sort(-1)
     x = vertices.points[..., 0].detach().gather(-1, order)
-    after = torch.searchsorted(y, rows.contiguous())
+    after = (y.unsqueeze(-2) < rows.unsqueeze(-1)).sum(-1)  # torch.searchsorted, which ONNX lacks
     count = (vertices.weight > 0).sum(-1, keepdim=True)
     there = (after > 0) & (after < count)
     after = after.clamp(1, y.shape[-1] - 1)

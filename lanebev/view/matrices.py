@@ -84,6 +84,8 @@ class LiftSplatInputs(NamedTuple):
         intrins: (B, 3, 3) px.
         post_rots: (B, 3, 3), the image's resizing, flipping and turning.
         post_trans: (B, 3) px, its shift.
+
+    All have the dtype of the pose, since heads multiply them.
     """
 
     rots: Tensor
@@ -106,6 +108,7 @@ def lift_splat_inputs(
     """
     check_intrinsics(intrinsics, *extrinsics.pitch.shape)
     pose = ego_from_camera(extrinsics, ego_from_road_matrix)
+    intrinsics = intrinsics.to(pose)
     eye = torch.eye(3, dtype=intrinsics.dtype, device=intrinsics.device).expand_as(intrinsics)
     transform = eye if image_transform is None else image_transform.to(intrinsics).expand_as(intrinsics)
     affine = torch.cat([transform[..., :2], eye[..., 2:]], dim=-1)

@@ -66,7 +66,8 @@ def test_the_rows_are_the_same(folder, options, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_run_by_a_segmenter_of_8_bits_finds_about_the_same_pose(folder, monkeypatch, caplog):
+@pytest.mark.parametrize("calibrator", ["joint", "two-stage"])
+def test_a_run_by_a_segmenter_of_8_bits_finds_about_the_same_pose(folder, monkeypatch, caplog, calibrator):
     monkeypatch.setattr("lanebev.app.export.rendered_views", lambda size: rendered_views(size, 2))
     part = {"part": "segmenter", "int8": True, "out": str(folder)}
     assert "segmenter.onnx" in export(ExportConfig(camera=str(folder / "camera.yaml"), **part))
@@ -78,7 +79,7 @@ def test_a_run_by_a_segmenter_of_8_bits_finds_about_the_same_pose(folder, monkey
     rows = {}
     for backend in ("torch", "onnxruntime"):
         out = folder / backend
-        run(settings(folder, calibrator="two-stage", backend=backend, out=str(out)))
+        run(settings(folder, calibrator=calibrator, backend=backend, out=str(out)))
         rows[backend] = list(csv.DictReader((out / "extrinsics.csv").open()))
     assert [row["status"] for row in rows["onnxruntime"]] == [row["status"] for row in rows["torch"]]
     for name in ("pitch", "yaw", "roll"):

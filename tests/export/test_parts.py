@@ -8,6 +8,7 @@ from lanebev import (
     BEVGrid,
     BEVWarp,
     Camera,
+    FarView,
     LaneBEV,
     LaneSegmenter,
     LineExtractor,
@@ -35,12 +36,12 @@ def camera(*distortion):
     return Camera(INTRINSICS, torch.tensor(distortion, dtype=torch.float64), "pinhole", SIZE)
 
 
-def model(network_width=None):
+def model(network_width=None, far_view=None):
     torch.manual_seed(0)
     config = SegmenterConfig(base_width=4, decoder_width=8)
     return LaneBEV(
         LaneSegmenter(config), LineExtractor.for_network(config), TwoStageCalibrator(num_hypotheses=20),
-        BEVWarp(GRID), network_width,
+        BEVWarp(GRID), network_width, far_view=far_view,
     )  # fmt: skip
 
 
@@ -160,6 +161,54 @@ def test_the_step_as_a_program_equals_eager_for_any_batch():
     with torch.no_grad():
         for found, expected in zip(program(*one), part.module(*one), strict=True):
             torch.testing.assert_close(found, expected)
+
+
+class _FarView(torch.nn.Module):
+    """Image and vanishing point to the vertices of both views."""
+
+    def __init__(self, model):
+        super().__init__()
+        self.model = model
+
+    def forward(self, image, point):
+        logits, vertices = self.model.boundary_vertices(image, point)
+        return logits, *vertices
+
+
+@pytest.mark.slow
+def test_a_far_view_equals_eager_where_it_is_known_and_where_it_is_not(tmp_path):
+    """Each row has a far view of its own place; in the last one the vanishing point is not known."""
+    made = model(96, far_view=FarView()).eval()
+    image = torch.rand(3, 3, *SIZE, generator=torch.Generator().manual_seed(3))
+    point = torch.tensor([[60.0, 20.0], [90.0, 30.0], [torch.nan, torch.nan]])
+    names = ("logits", "points", "weight", "sigma", "boundary")
+    other = onnx(Part(_FarView(made), {"image": image[:2], "point": point[:2]}, names), tmp_path)
+    with torch.no_grad():
+        expected = dict(zip(names, _FarView(made)(image, point), strict=True))
+        whole = made.boundary_vertices(image)[1]
+    equals(other({"image": image, "point": point}), expected, 1e-3)
+    seen, alone = (each.gt(0).sum((1, 2)) for each in (expected["weight"], whole.weight))
+    assert seen[2] == alone[2]
+    assert (seen[:2] > alone[:2]).all()
+
+
+@pytest.mark.slow
+def test_the_step_with_a_far_view_as_a_program_equals_eager():
+    """In the first row the state knows where the lanes meet, in the second one it does not."""
+    part = make_part("step", model(96, far_view=FarView()), camera())
+    inputs = {name: value.clone() for name, value in part.inputs.items()}
+    inputs["state_status"][0] = int(Status.TRACKING)
+    inputs["state_direction_cov"][0] *= 1e-6
+    plain = make_part("step", model(96), camera())
+    with torch.no_grad():
+        expected, without = (
+            dict(zip(each.outputs, each.module(*inputs.values()), strict=True)) for each in (part, plain)
+        )
+        found = dict(zip(part.outputs, export_program(part).module()(*inputs.values()), strict=True))
+    equals(found, expected, 1e-4)
+    counts = [each["weight"].gt(0).sum(1) for each in (expected, without)]
+    assert counts[0][0] != counts[1][0]
+    assert counts[0][1] == counts[1][1]
 
 
 def test_files_of_others_are_refused(tmp_path):

@@ -57,17 +57,17 @@ def test_figures_are_those_of_roads_and_drives(network, monkeypatch):
 
     def compare(drives, factors):
         assert (drives, factors) == ([81_000, 81_001], (1.0,))
-        return {1.0: SimpleNamespace(rmse=torch.tensor([0.1, 0.2, 0.3, 4.0]))}
+        return {1.0: SimpleNamespace(rmse=torch.tensor([0.1, 0.2, 0.3, 4.0]), nees=torch.tensor(2.0))}
 
     monkeypatch.setattr(bench_int8, "evaluate", evaluate)
     monkeypatch.setattr(bench_int8, "observe_drive", lambda networks, seed, frames, fps: [seed])
     monkeypatch.setattr(bench_int8, "compare", compare)
     found = bench_int8.figures(network, SimpleNamespace(views=5, drives=2, frames=9, data=None))
     assert asked == [3]  # of each of two kinds
-    assert len(found) == 2 * 3 + 4
+    assert len(found) == 2 * 3 + 4 + 1
     assert found["highway: recall"] == 0.9
     assert [value for name, value in found.items() if name.startswith("drives")] == pytest.approx(
-        [0.1, 0.2, 0.3, 4.0]
+        [0.1, 0.2, 0.3, 4.0, 2.0]
     )
 
 

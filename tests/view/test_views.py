@@ -263,6 +263,8 @@ def test_lifted_pixels_are_the_ego_points_that_they_show():
     lifted = torch.cat([frustum[..., :2] * frustum[..., 2:], frustum[..., 2:]], -1)
     combined = given.rots @ torch.linalg.inv(given.intrins)
     torch.testing.assert_close(lifted @ combined.mT + given.trans.unsqueeze(1), points.expand(2, 3, 3))
+    single = lift_splat_inputs(POSES, K.expand(2, 3, 3).float(), image_transform=crop.float())
+    assert {part.dtype for part in single} == {torch.float64}
     sensor = ego_from_camera(POSES)
     torch.testing.assert_close(sensor[:, :3, :3], given.rots)
     torch.testing.assert_close(sensor[:, :3, 3], torch.tensor([[0, 0, 1.7], [0, 0, 1.4]]).double())
