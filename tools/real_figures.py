@@ -208,10 +208,7 @@ def follow(
     states = {
         name: calibrator.initial_state(1, dtype=torch.float64) for name, calibrator in calibrators.items()
     }
-    poses: dict[str, list[torch.Tensor]] = {name: [] for name in calibrators}
-    curvatures: dict[str, list[torch.Tensor | None]] = {name: [] for name in calibrators}
-    status: dict[str, list[torch.Tensor]] = {name: [] for name in calibrators}
-    lanes: dict[str, list[LaneSegments]] = {name: [] for name in calibrators}
+    results: dict[str, list[Any]] = {name: [] for name in calibrators}
     times, seen = [], []
     for frame in open_source(source):
         segments = camera_segments(observer(frame).vertices, camera)
@@ -222,22 +219,17 @@ def follow(
                 calibration, states[name] = calibrator(
                     segments, camera.intrinsics[None], states[name], frame.dt, lane_width
                 )
-            poses[name].append(calibration.extrinsics.stack()[0])
-            curvatures[name].append(calibrator.vertical_curvature(states[name]))
-            status[name].append(calibration.status[0])
-            lanes[name].append(select_inliers(segments, calibration.inliers))
+            pose, inliers = calibration.extrinsics.stack()[0], select_inliers(segments, calibration.inliers)
+            vertical = calibrator.vertical_curvature(states[name])
+            results[name].append((pose, calibration.status[0], inliers, vertical))
         tracker.state = states["joint"]
-    return {
-        name: Drive(
-            torch.stack(poses[name]),
-            torch.stack(status[name]),
-            np.array(times),
-            seen,
-            lanes[name],
-            curvatures[name],
+    drives = {}
+    for name, frames in results.items():
+        poses, status, lanes, curvatures = map(list, zip(*frames, strict=True))
+        drives[name] = Drive(
+            torch.stack(poses), torch.stack(status), np.array(times), seen, lanes, curvatures
         )
-        for name in calibrators
-    }
+    return drives
 
 
 def _width_figures(part: str, name: str, drive: Drive, camera: Camera, targets: bool) -> Iterable[Figure]:
