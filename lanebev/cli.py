@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import itertools
 import logging
 import os
 import signal
@@ -20,10 +19,6 @@ from lanebev.app.progress import Item, Progress
 from lanebev.app.settings_file import read_settings
 
 
-class _Stopped(KeyboardInterrupt):
-    """Raised by a signal, whose number is the argument."""
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status.
 
@@ -36,17 +31,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.pop("verbose"):
         logging.basicConfig(format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
         logging.getLogger("lanebev").setLevel(logging.DEBUG)
+    received: list[int] = []
     try:
-        with _signals_unwind():
+        with _signals_unwind(received):
             done = _COMMANDS[command](options)
             report, status = (done, 0) if isinstance(done, str) else done
     except (ValueError, OSError) as error:
         print(f"lanebev {command}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt as stopped:
+    except KeyboardInterrupt:
         kept = "finished drives stay" if command == "fleet" else "nothing written"
         print(f"lanebev {command}: interrupted, {kept}", file=sys.stderr)
-        return 128 + int(stopped.args[0] if isinstance(stopped, _Stopped) else signal.SIGINT)
+        return 128 + (received[0] if received else signal.SIGINT)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # of signs that a terminal's encoding lacks
     try:
@@ -57,19 +53,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _signals_unwind() -> Iterator[None]:
-    """Raise :class:`_Stopped` on SIGINT, SIGTERM, SIGHUP; a second signal waits while outputs are undone."""
+def _signals_unwind(received: list[int]) -> Iterator[None]:
+    """Raise KeyboardInterrupt on SIGINT, SIGTERM, SIGHUP; a second signal waits while outputs are undone.
+
+    Args:
+        received: numbers of the signals are added to it, since Ray raises an exception of its own instead.
+    """
     known = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     before = {each: signal.getsignal(each) for each in known}
     usual = (signal.SIG_DFL, signal.default_int_handler)
     own = [each for each, handler in before.items() if handler in usual]  # not what nohup ignores
     if threading.current_thread() is not threading.main_thread():
         own = []  # Python lets no other thread set them
-    sent = itertools.count(1)
 
     def stop(number: int, _: object) -> None:
-        if next(sent) != 2:  # the first may have been swallowed, or what it undoes may hang
-            raise _Stopped(number)
+        received.append(number)
+        if len(received) != 2:  # the first may have been swallowed, or what it undoes may hang
+            raise KeyboardInterrupt
 
     for each in own:
         signal.signal(each, stop)

@@ -32,6 +32,7 @@ from lanebev.app.recovery import facts_of, frame_name, observer_of_second_pass, 
 from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states, resume_remark
 from lanebev.app.shared_network import SharedNetwork
 from lanebev.app.smoothing import SmoothedPoses, smooth_frames
+from lanebev.app.source_changes import changes_remark, files_of
 from lanebev.app.sources import camera_of, ended_by_signals, first_image, make_source, observed_frames
 from lanebev.app.summary import mount_facts, run_facts
 from lanebev.camera.model import Camera
@@ -81,6 +82,7 @@ def run(
     """
     check_installed(config.formats)
     config, source = opened(config)
+    files = files_of(source)
     check_inputs_stay(config.out, input_files(config, source))
     camera = camera_of(config, source)
     source = match_image_size(camera, source)
@@ -100,6 +102,7 @@ def run(
         smoothed, second = None, taken
         if config.smooth:
             smoothed = first_pass(config, source, tracker, taken, out, progress)
+            source = replace(source, most=len(smoothed.poses))
             tracker, _ = resumed_tracker(config, camera)
             second = observer_of_second_pass(out, observer, taken, source)
         recorder = _recorder(config, source, camera, out)
@@ -115,13 +118,19 @@ def run(
                     filtered = tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale)
                 estimate = filtered if smoothed is None else smoothed.of(filtered, frame.number)
                 covariances.append(estimate.calibration.covariance[0].double().cpu().numpy())
-                name = frame_name(frame, source)
                 recorder.add(
-                    Recorded(frame=frame, name=name, seen=seen, estimate=estimate, filtered=filtered)
+                    Recorded(
+                        frame=frame,
+                        name=frame_name(frame, source),
+                        seen=seen,
+                        estimate=estimate,
+                        filtered=filtered,
+                    )
                 )
                 if viewer is not None:
                     pose, lines = estimate.calibration.extrinsics, vertex_lines(seen.vertices)
                     viewer.add(RecordedFrame(recorder.rows[-1], pose, lines), frame.image)
+        recorder.problems += filter(None, [changes_remark(source, files)])
         facts = run_facts(config, source, camera) | facts_of(taken)
         if tracker.mount is not None:
             plain = {"camera": camera.fingerprint(), "lane_width": tracker.lane_width}
@@ -132,10 +141,18 @@ def run(
         report = recorder.finish(facts, Path(source.source).name, truth, tracker.mount)
         write_covariances(out / "covariance.csv", covariances.all())
         if config.formats:
-            record = replace(read_record(out / "."), name=report.title, rows=recorder.rows, camera=camera)
-            for name in config.formats:
-                writer(name)(out / FORMATS[name].file, record, None if source.is_live else source)
+            _write_formats(config, out, report, camera, source)
         return report
+
+
+def _write_formats(
+    config: RunConfig, out: OutputFolder, report: Report, camera: Camera, source: FrameSource
+) -> None:
+    """Write the results for other programs; formats with images take the frames of the run again."""
+    record = replace(read_record(out / "."), name=report.title, rows=report.rows, camera=camera)
+    images = None if source.is_live else replace(source, most=len(report.rows))
+    for name in config.formats:
+        writer(name)(out / FORMATS[name].file, record, images)
 
 
 def opened(config: RunConfig) -> tuple[RunConfig, FrameSource]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,7 @@ class FrameSource:
         has_times: whether a video says when its frames are shown; else they are evenly spaced.
         pixel_aspect: width of a pixel over its height, as a video states it; frames are not resized by it.
         selection: which of the frames are taken. ``fps`` and ``count`` are those of the whole source.
+        most: how many frames are yielded at most, so that a file that grows is the same twice; None for all.
         matrix: by which a video's frames are shown, see :func:`lanebev.io.decoding.display_matrix`.
     """
 
@@ -46,6 +48,7 @@ class FrameSource:
     has_times: bool = True
     pixel_aspect: Fraction = Fraction(1)
     selection: Selection = ALL
+    most: int | None = None
     matrix: tuple[int, ...] | None = None
 
     @property
@@ -76,7 +79,8 @@ class FrameSource:
 
     def __iter__(self) -> Iterator[Frame]:
         frames = self._video_frames() if self.is_video else self._image_frames()
-        return frames if self.selection == ALL else taken_frames(frames, self.selection)
+        taken = frames if self.selection == ALL else taken_frames(frames, self.selection)
+        return taken if self.most is None else islice(taken, self.most)
 
     def _image_frames(self) -> Iterator[Frame]:
         for index, path in enumerate(self.paths):

@@ -221,19 +221,34 @@ class OutputFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        is_there, failure = self._partial.is_dir(), error
         try:
             if error is None:
                 self._publish()
+        except OSError as unpublished:
+            failure = unpublished
         finally:
             shutil.rmtree(self._partial, ignore_errors=True)
             self._lock.release()
-            if error is not None:
+            if failure is not None:
                 self._remove_parents()
-        if isinstance(error, OSError) and error.errno in _FULL:
-            raise OutputFolderError(
-                f"output folder {self.folder}: expected room for the outputs, got: "
-                f"{os.strerror(error.errno)}; make room or give another with --out"
-            ) from error
+        if isinstance(failure, OSError) and (words := self._words(failure, is_there, error is None)):
+            raise OutputFolderError(f"output folder {self.folder}: {words}") from failure
+
+    def _words(self, failure: OSError, is_there: bool, is_ours: bool) -> str:
+        """Return what was expected of the folder and what was got; empty of an error elsewhere.
+
+        Args:
+            failure: what failed.
+            is_there: whether the temporary folder was there at the end.
+            is_ours: whether the outputs were moved into place then.
+        """
+        reason = failure.strerror
+        if failure.errno in _FULL:
+            return f"expected room for the outputs, got: {reason}; make room or give another with --out"
+        if isinstance(failure, FileNotFoundError) and not is_there:
+            return "expected it to stay until the outputs are written, got: deleted meanwhile; begin again"
+        return f"expected one that can be written, got: {reason}; give another with --out" if is_ours else ""
 
     def __truediv__(self, name: str) -> Path:
         """Return where to write the file of this name until the work is done."""

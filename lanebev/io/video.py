@@ -68,8 +68,7 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
     """
     path = Path(source)
     if path.is_dir():
-        there = (p for p in path.iterdir() if is_image(p) and p.name[0] != ".")  # macOS leaves ._ files
-        paths = in_natural_order(map(str, there))
+        paths = images_of(source)
         if not paths:
             raise ValueError(f"{source}: expected images in the folder, got none; {_folder_remedy(path)}")
         return _image_source(source, paths, fps)
@@ -78,9 +77,9 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
     if path.is_file():
         return _image_source(source, [source], fps) if is_image(path) else _video_source(source, fps)
     if glob.has_magic(source):
-        matches = glob.glob(glob_pattern(source), recursive=True)
-        paths = in_natural_order(filter(is_image, matches))
+        paths = images_of(source)
         if not paths:
+            matches = glob.glob(glob_pattern(source), recursive=True)
             remedy = _endings_remedy(map(Path, matches)) or "quote the pattern"
             raise ValueError(f"{source}: expected images that match, got none; {remedy}")
         return _image_source(source, paths, fps)
@@ -88,6 +87,17 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
         f"{source}: expected a video, an image, a folder or a glob of images, got nothing there"
         f"{_address_remedy(source)}"
     )
+
+
+def images_of(source: str) -> list[str]:
+    """Return the images in a folder, or that match a glob, in their order; none of other sources."""
+    path = Path(source)
+    if path.is_dir():
+        there = (p for p in path.iterdir() if is_image(p) and p.name[0] != ".")  # macOS leaves ._ files
+        return in_natural_order(map(str, there))
+    if path.is_file() or not glob.has_magic(source):
+        return []
+    return in_natural_order(filter(is_image, glob.glob(glob_pattern(source), recursive=True)))
 
 
 def _address_remedy(source: str) -> str:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import signal
+import threading
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -100,7 +103,8 @@ def outcomes(tasks: Sequence[Task], cluster: Cluster) -> Iterator[Outcome]:
                         waiting.append((follows,))
                     if told is not None:
                         if told.is_final:
-                            write_mark(drives[told.name], told)
+                            with contextlib.suppress(OSError):  # a full disk: the next call tries it again
+                                write_mark(drives[told.name], told)
                         yield told
     finally:
         ray.shutdown()
@@ -132,13 +136,14 @@ def _started(cluster: Cluster) -> ModuleType:
             "object_store_memory": _STORE,
         }
     try:
-        ray.init(
-            address=cluster.address or "local",
-            logging_level=logging.ERROR,
-            log_to_driver=False,
-            configure_logging=True,
-            **local,
-        )
+        with _signal_handlers_kept():
+            ray.init(
+                address=cluster.address or "local",
+                logging_level=logging.ERROR,
+                log_to_driver=False,
+                configure_logging=True,
+                **local,
+            )
     except (ConnectionError, ValueError, RuntimeError) as error:
         where = cluster.address or "this machine"
         raise ValueError(
@@ -146,3 +151,16 @@ def _started(cluster: Cluster) -> ModuleType:
         ) from error
     module: ModuleType = ray
     return module
+
+
+@contextlib.contextmanager
+def _signal_handlers_kept() -> Iterator[None]:
+    """Set the handlers of signals again afterwards: by Ray's own, SIGTERM aborts with a dump of the stack."""
+    names = ("SIGINT", "SIGTERM", "SIGHUP")
+    own = {number: signal.getsignal(number) for name in names if (number := getattr(signal, name, None))}
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():  # Python lets no other thread set them
+            for number, handler in own.items():
+                signal.signal(number, handler)

@@ -139,13 +139,21 @@ def is_done(task: Task) -> bool:
 
 
 def write_mark(task: Task, outcome: Outcome) -> None:
-    """Note what became of a task, for the next call."""
+    """Note what became of a task, for the next call.
+
+    Raises:
+        OSError: the disk is full.
+    """
     path = failure_path(task) if outcome.failure else Path(task.config.out) / MARK
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"fingerprint": task.fingerprint, **asdict(outcome)})
     half = path.with_name(f".{path.name}.part")
-    half.write_text(text, encoding="utf-8")
-    half.replace(path)
+    try:
+        half.write_text(text, encoding="utf-8")
+        half.replace(path)
+    except OSError:
+        half.unlink(missing_ok=True)
+        raise
     if not outcome.failure:
         failure_path(task).unlink(missing_ok=True)
 

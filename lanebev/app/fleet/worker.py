@@ -50,11 +50,11 @@ def _run_task(task: Task, network: SharedNetwork | None) -> Outcome:
             frames = observe_part(task.config, task.result, network)
         else:
             frames = len(run(task.config, network=network, parts=[part.result for part in task.parts]).rows)
+        before = sum(part.seconds for part in map(earlier_outcome, task.parts) if part is not None)
+        outcome = Outcome(task.name, frames=frames, seconds=before + time.perf_counter() - start)
+        write_mark(task, outcome)
     except Exception as error:  # whatever it is, it is this drive's only
         return _failed(task, error)
-    before = sum(part.seconds for part in map(earlier_outcome, task.parts) if part is not None)
-    outcome = Outcome(task.name, frames=frames, seconds=before + time.perf_counter() - start)
-    write_mark(task, outcome)
     for part in task.parts:
         shutil.rmtree(part.config.out, ignore_errors=True)
     return outcome

@@ -1,9 +1,14 @@
 """A fleet on Ray: a killed worker, a corrupt file, a second call; the same as single runs."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 
 import pytest
 
+from tests.app.test_robustness import write_drive
 from tools import fleet_check
 
 pytest.importorskip("ray", reason="Ray is not installed")
@@ -40,3 +45,37 @@ def test_a_fleet_equals_single_runs(tmp_path, capsys):
     assert "drive-01-drive</b>: video" in page
     assert 'href="drives/drive-00-drive/report.html"' in page
     assert (tmp_path / "fleet" / "drives" / "drive-00-drive" / "report.html").is_file()
+
+
+def _lines_of(path):
+    return path.read_text().count("\n") if path.is_file() else 0
+
+
+@pytest.mark.slow
+def test_a_fleet_that_is_stopped_says_so_and_continues(tmp_path):
+    write_drive(tmp_path, frames=3, name="short")
+    write_drive(tmp_path, frames=60, name="long")
+    (tmp_path / "drives.csv").write_text(
+        "video,camera,no_video,lanes\nshort.mp4,camera.yaml,true,short.json\nlong.mp4,camera.yaml,true,\n"
+    )
+    command = [sys.executable, "-m", "lanebev", "fleet", f"{tmp_path}/drives.csv", "--workers", "1"]
+    command += ["--out", f"{tmp_path}/fleet"]
+    log = tmp_path / "log"
+    with log.open("wb") as file:
+        begun = subprocess.Popen(command, stdout=file, stderr=file)
+    drives = tmp_path / "fleet" / "drives"
+    end = time.monotonic() + 120
+    while (
+        begun.poll() is None and time.monotonic() < end and _lines_of(drives / ".long.partial/lanes.json") < 5
+    ):
+        time.sleep(0.05)
+    begun.send_signal(signal.SIGTERM)
+    assert begun.wait(60) == 128 + signal.SIGTERM
+    assert log.read_text() == "lanebev fleet: interrupted, finished drives stay\n"
+    assert (drives / "short" / "fleet.json").is_file()
+    assert not (drives / "long").exists()
+    assert not (tmp_path / "fleet" / ".fleet").exists()
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("2 drives: 2 finished, 0 failed; 1 run now")
+    assert "detections of a run that was killed" in (drives / "long" / "report.html").read_text()

@@ -1,0 +1,42 @@
+"""Notice that the files of a source changed during a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lanebev.app.recovery import size_and_time
+from lanebev.io.video import FrameSource, images_of
+
+Files = dict[str, tuple[int, int]]
+"""Size and time of change of files, by path."""
+
+
+def files_of(source: FrameSource) -> Files:
+    """Return the files that are there now of a source; none of a stream."""
+    if source.is_live:
+        return {}
+    path = Path(source.source)
+    if path.is_dir() and source.is_video:  # of a bag
+        paths = [str(each) for each in path.iterdir() if each.name[0] != "."]
+    else:
+        paths = images_of(source.source) or [source.source]
+    return {each: size_and_time(Path(each)) for each in paths if Path(each).is_file()}
+
+
+def changes_remark(source: FrameSource, before: Files) -> str:
+    """Return how many files of a source came, went or were written again since then; nothing if none did.
+
+    Args:
+        source: the source.
+        before: result of :func:`files_of` when it was opened.
+    """
+    now = files_of(source)
+    counts = {
+        "new": len(now.keys() - before.keys()),
+        "deleted": len(before.keys() - now.keys()),
+        "written again": sum(before[path] != now[path] for path in before.keys() & now.keys()),
+    }
+    words = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+    if not words:
+        return ""
+    return f"{source.source}: files changed during the run: {words}; run again when it is complete"
