@@ -19,6 +19,7 @@ from lanebev.app.kept import KeptNumbers, KeptRows
 from lanebev.app.observers import Observation
 from lanebev.app.plausibility import drive_remark
 from lanebev.app.repeats import RepeatedFrames
+from lanebev.app.view_changes import ViewChanges
 from lanebev.app.views import ViewBefore, bird_view
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration
@@ -101,7 +102,7 @@ class Recorder:
         self._first_number: int | None = None
         self._widths = KeptNumbers(2, NUM_BOUNDARIES - 1, folder=self.path("."))
         self._moments, self._scores = MomentSampler(), EventScores()
-        self._repeats = RepeatedFrames(self.path("."))
+        self._repeats, self._views = RepeatedFrames(self.path(".")), ViewChanges()
 
     def __enter__(self) -> Recorder:
         self._stack = ExitStack()
@@ -124,6 +125,7 @@ class Recorder:
         if frame.problem:
             self._note(f"frame {frame.number}: {frame.problem}")
         self._repeats.add(frame.image)
+        self._views.add(frame.number, frame.image, frame.dt)
         if not len(self.rows):
             self._first_number = frame.source_number
         self.rows.append(_row(done, done.estimate))
@@ -156,7 +158,8 @@ class Recorder:
         if self.smoothed:
             write_extrinsics(self.path("filtered.csv"), self._filtered_rows)
         before, after = self._widths.all().transpose(1, 0, 2)
-        remarks = ("" if self.stills else self._repeats.remark(), drive_remark(self.rows))
+        of_drive = [] if self.stills else [self._views.remark(), self._repeats.remark()]
+        remarks = (*of_drive, drive_remark(self.rows))
         report = Report(
             title=title,
             rows=self.rows,
