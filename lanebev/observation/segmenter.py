@@ -14,6 +14,7 @@ from lanebev.tensors import constant
 from lanebev.types import NUM_BOUNDARIES, check_tensor, check_type
 
 _LARGEST = 8.0  # of an image in [0, 1], whatever was done to its contrast; one in [0, 255] has more
+_SMALLEST = -0.75  # likewise; one that was normalised by mean and standard deviation, or to [-1, 1], has less
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -110,7 +111,7 @@ class LaneSegmenter(nn.Module):
 
         Raises:
             TypeError: not a tensor.
-            ValueError: another shape, or whole numbers; on the CPU also values far beyond 1.
+            ValueError: another shape, or whole numbers; on the CPU also values far beyond 0 or 1.
         """
         check_tensor("image", image)
         if image.ndim != 4 or image.shape[1] != 3:
@@ -141,15 +142,18 @@ class LaneSegmenter(nn.Module):
 
 
 def _check_scale(image: Tensor) -> None:
-    """Raise ValueError if a finite image is in [0, 255] instead of [0, 1], unless the check is slow.
+    """Raise ValueError if a finite image is in [0, 255] or normalised instead of in [0, 1].
 
     Reading values on another device would wait for it; a compiled program or ``torch.vmap`` cannot read them.
     """
     if not (image.numel() and readable(image)):
         return
-    largest = float(image.detach().nan_to_num(0.0, 0.0, 0.0).amax())
+    smallest, largest = map(float, image.detach().nan_to_num(0.0, 0.0, 0.0).aminmax())
     if largest > _LARGEST:
         raise ValueError(f"image: expected values in [0, 1], got {largest:g}; divide bytes by 255")
+    if smallest < _SMALLEST:
+        remedy = "leave out the normalisation, which the network does itself"
+        raise ValueError(f"image: expected values in [0, 1], got {smallest:g}; {remedy}")
 
 
 class StripMessage(nn.Module):

@@ -217,6 +217,12 @@ def model():
     [
         (IMAGE.numpy(), TypeError, "image: expected a torch.Tensor, got numpy.ndarray"),
         (255 * IMAGE, ValueError, r"image: expected values in \[0, 1\], got 2\d\d.*; divide bytes by 255"),
+        (
+            (IMAGE - 0.45) / 0.225,
+            ValueError,
+            r"in \[0, 1\], got -[12]\..*; leave out the normalisation, which",
+        ),
+        (2 * IMAGE - 1, ValueError, r"in \[0, 1\], got -[01]\..*; leave out the normalisation, which"),
         ((255 * IMAGE).byte(), ValueError, r"image: expected floating point in \[0, 1\], got torch.uint8"),
         (IMAGE.movedim(1, -1), ValueError, r"image: expected \(B, 3, H, W\) or"),
         (IMAGE[0], ValueError, r"image: expected \(B, 3, H, W\) or"),
@@ -225,6 +231,10 @@ def model():
 def test_lanebev_images(model, image, error, message):
     with pytest.raises(error, match=message):
         model(image, K)
+
+
+def test_an_image_of_more_contrast_is_no_normalised_one(model):
+    assert model(0.5 + 1.8 * (IMAGE - 0.5), K)[0].logits.isfinite().all()
 
 
 @pytest.mark.parametrize(
