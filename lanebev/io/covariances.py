@@ -38,23 +38,26 @@ def read_covariances(path: str | Path) -> NDArray[np.float64]:
         (N, 4, 4).
 
     Raises:
-        ValueError: the file cannot be read, or its header or a row is not ours.
+        ValueError: the file cannot be read, its header or a row is not ours, or frames are out of order.
     """
     try:
-        with open(path, newline="", encoding="utf-8") as file:
-            header, *rows = list(csv.reader(file)) or [[]]
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            header, *rows = [row for row in csv.reader(file) if row] or [[]]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise ValueError(f"{path}: expected a readable covariance.csv, got: {reason}") from error
     if tuple(header) != COVARIANCE_COLUMNS:
         expected, got = ",".join(COVARIANCE_COLUMNS), shown(",".join(header))
         raise ValueError(f"{path}: expected the columns {expected}, got {got}")
-    result = np.zeros((len(rows), 4, 4))
+    result, before = np.zeros((len(rows), 4, 4)), 0.0
     for number, row in enumerate(rows):
         try:
-            values = finite_numbers("covariance", row, len(COVARIANCE_COLUMNS))[1:]
+            frame, *values = finite_numbers("covariance", row, len(COVARIANCE_COLUMNS))
+            if number and frame <= before:
+                raise ValueError(f"expected frames in order, got {frame:g} after {before:g}")
         except ValueError as error:
             raise ValueError(f"{path}, line {number + 2}: {error}") from error
+        before = frame
         for (i, j), value in zip(PAIRS, values, strict=True):
             result[number, i, j] = result[number, j, i] = value
     return result

@@ -7,7 +7,7 @@ import errno
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from enum import Flag
 from itertools import count
 from pathlib import Path
@@ -31,7 +31,11 @@ def _number_or_none(text: str) -> float | None:
     return float(text) if text else None
 
 
-_COLUMN_TYPES: tuple[Callable[[str], Any], ...] = (int, *[float] * 9, str, int, str, str, _number_or_none)
+def _status(text: str) -> str:
+    return Status[text].name
+
+
+_COLUMN_TYPES: tuple[Callable[[str], Any], ...] = (int, *[float] * 9, _status, int, str, str, _number_or_none)
 _HEADERS = (CSV_COLUMNS, CSV_COLUMNS[:-1], CSV_COLUMNS[:-2])  # of this version and of earlier ones
 
 OUTPUT_NAMES = (
@@ -124,27 +128,51 @@ def read_extrinsics(path: str | Path) -> list[ExtrinsicsRow]:
     """Read what :func:`write_extrinsics` wrote, now or in an earlier version without the last columns.
 
     Raises:
-        ValueError: the file is missing, or its header or a row is not ours.
+        ValueError: the file is missing, its header or a row is not ours, or its frames are not in order.
     """
     try:
-        with open(path, newline="", encoding="utf-8", errors="surrogateescape") as file:
-            header, *rows = list(csv.reader(file)) or [[]]
+        with open(path, newline="", encoding="utf-8-sig", errors="surrogateescape") as file:
+            reader = csv.reader(file)
+            header, *rows = [(reader.line_num, row) for row in reader if row] or [(1, [])]
     except (OSError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise ValueError(f"{path}: expected a readable extrinsics.csv, got: {reason}") from error
-    if tuple(header) not in _HEADERS:
-        expected, got = ",".join(CSV_COLUMNS), shown(",".join(header))
-        raise ValueError(f"{path}: expected the columns {expected}, got {got}")
-    result = []
-    for number, row in enumerate(rows, start=2):
+    if tuple(header[1]) not in _HEADERS:
+        expected, got = ",".join(CSV_COLUMNS), shown(",".join(header[1]))
+        raise ValueError(
+            f"{path}: expected the columns {expected}, got {got}; if another program saved it, take the "
+            "run's own file"
+        )
+    result: list[ExtrinsicsRow] = []
+    for number, row in rows:
         try:
-            typed = [kind(value) for kind, value in zip(_COLUMN_TYPES[: len(header)], row, strict=True)]
-            result.append(ExtrinsicsRow(*typed))
+            result.append(_read_row(row, len(header[1])))
         except ValueError as error:
+            raise ValueError(f"{path}, line {number}: {error}") from error
+        before, after = (each.frame for each in (result[-2:] if len(result) > 1 else (result[0], result[0])))
+        if len(result) > 1 and after <= before:
             raise ValueError(
-                f"{path}, line {number}: expected {len(header)} values, got {shown(','.join(row))}"
-            ) from error
+                f"{path}, line {number}: expected frames in order, got {after} after {before}; were the rows "
+                "sorted or copied?"
+            )
     return result
+
+
+def _read_row(texts: Sequence[str], count: int) -> ExtrinsicsRow:
+    """Return a row of ``extrinsics.csv`` with this number of columns.
+
+    Raises:
+        ValueError: it has another number, or a value is none of its column.
+    """
+    if len(texts) != count:
+        raise ValueError(f"expected {count} values, got {shown(','.join(texts))}; is the file cut?")
+    values = []
+    for name, kind, text in zip(CSV_COLUMNS, _COLUMN_TYPES, texts, strict=False):
+        try:
+            values.append(kind(text))
+        except (ValueError, KeyError) as error:
+            raise ValueError(f"{name}: expected a value as the run wrote it, got {shown(text)}") from error
+    return ExtrinsicsRow(*values)
 
 
 def check_inputs_stay(folder: str | Path, inputs: Iterable[str | Path]) -> None:

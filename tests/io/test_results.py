@@ -4,10 +4,12 @@ import math
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from lanebev import Calibration, Extrinsics, Reason, Status
+from lanebev.io.covariances import read_covariances, write_covariances
 from lanebev.io.results import (
     CSV_COLUMNS,
     OutputFolder,
@@ -16,6 +18,8 @@ from lanebev.io.results import (
     read_extrinsics,
     write_extrinsics,
 )
+
+ROW = "7,0.5,1.25,-0.5,0.25,1.3,0.1,0.2,0.3,0.02,TRACKING,9,,,0.000000000"
 
 
 def _row(frame=0, image="", reasons=Reason.NONE, curvature=-1.25e-5):
@@ -89,15 +93,49 @@ def test_csv_round_trip(tmp_path):
         ("", "expected the columns"),
         ("a,b\n1,2\n", "expected the columns"),
         ("0,1\n", "line 2: expected 15 values"),
+        (f"{ROW}\n\n{ROW.replace('7,', '6,', 1)}\n", "line 4: expected frames in order, got 6 after 7; were"),
+        (
+            f"{ROW}\n{ROW}\n",
+            "line 3: expected frames in order, got 7 after 7; were the rows sorted or copied",
+        ),
+        (ROW.replace("7,", "7.0,", 1), "line 2: frame: expected a value as the run wrote it, got '7.0'"),
+        (ROW.replace("0.5", "00:00:00.5"), "line 2: time_s: expected a value as the run wrote it"),
+        (ROW.replace("TRACKING", "tracking"), "line 2: status: expected a value as the run wrote it"),
+        (ROW[:40], "line 2: expected 15 values, got .*; is the file cut?"),
     ],
 )
 def test_foreign_csv(tmp_path, text, message):
-    header = ",".join(CSV_COLUMNS) + "\n" if "line 2" in message else ""
+    header = ",".join(CSV_COLUMNS) + "\n" if "line " in message else ""
     (tmp_path / "e.csv").write_text(header + text)
     with pytest.raises(ValueError, match=message):
         read_extrinsics(tmp_path / "e.csv")
     with pytest.raises(ValueError, match="No such file"):
         read_extrinsics(tmp_path / "none.csv")
+
+
+def test_csv_with_a_byte_order_mark_and_empty_lines_is_read(tmp_path):
+    text = ",".join(CSV_COLUMNS) + f"\r\n{ROW}\r\n\r\n"
+    (tmp_path / "e.csv").write_bytes(("\ufeff" + text).encode())
+    (row,) = read_extrinsics(tmp_path / "e.csv")
+    assert (row.frame, row.pitch_deg, row.status, row.vertical_curvature_per_m) == (7, 1.25, "TRACKING", 0.0)
+
+
+def test_csv_of_a_spreadsheet_says_whose_to_take(tmp_path):
+    for sign, code in ((";", "utf-8"), ("\t", "utf-8"), (",", "utf-16")):
+        (tmp_path / "e.csv").write_bytes((sign.join(CSV_COLUMNS) + "\n").encode(code))
+        with pytest.raises(ValueError, match="if another program saved it, take the run's own file") as error:
+            read_extrinsics(tmp_path / "e.csv")
+        assert "\n" not in str(error.value)
+
+
+def test_covariances_out_of_order_are_refused(tmp_path):
+    write_covariances(tmp_path / "c.csv", np.eye(4)[None] * np.arange(1.0, 4.0)[:, None, None])
+    header, *rows = (tmp_path / "c.csv").read_text().splitlines()
+    assert read_covariances(tmp_path / "c.csv")[:, 0, 0].tolist() == [1, 2, 3]
+    for order in ((2, 1, 0), (0, 0, 1)):
+        (tmp_path / "c.csv").write_text("\n".join([header, *(rows[place] for place in order)]))
+        with pytest.raises(ValueError, match=r"line [34]: expected frames in order, got"):
+            read_covariances(tmp_path / "c.csv")
 
 
 def test_folder_appears_whole(tmp_path):

@@ -128,9 +128,13 @@ def _csv_rows(text: str) -> list[Row]:
     rows = []
     reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
     columns = Counter(name.strip() for name in reader.fieldnames or ())
+    if len(columns) == 1 and (other := next((sign for sign in ";\t|" if sign in "".join(columns)), "")):
+        raise ValueError(f"columns separated by {other!r}; write commas, and points in numbers")
     if twice := [name for name, count in columns.items() if count > 1]:
         raise ValueError(f"the column {twice[0]!r} twice")
     for row in reader:
+        if not any(filter(None, row.values())):  # as a spreadsheet adds them
+            continue
         if None in row or None in row.values():
             raise ValueError(f"a row with another number of columns: {shown(row)}")
         filled = {str(key).strip(): value.strip() for key, value in row.items() if value.strip()}
@@ -172,8 +176,7 @@ def _drive(given: Row, base: Path, inside: Path) -> Drive:
 def _video(row: Row) -> str:
     """Return the drive's path, which is that of no stream."""
     if "video" not in row:
-        remedy = "; columns are separated by commas" if any(set(";\t") & set(key) for key in row) else ""
-        raise ValueError(f"expected video, the drive's path, got only {', '.join(row)}{remedy}")
+        raise ValueError(f"expected video, the drive's path, got only {', '.join(row)}")
     video = row["video"]
     if not (isinstance(video, str) and video):
         raise ValueError(f"video: expected a path, got {shown(video)}")

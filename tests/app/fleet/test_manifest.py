@@ -43,8 +43,17 @@ def test_a_row_a_drive(write, tmp_path):
 
 
 def test_a_table_with_semicolons_says_what_separates_columns(write):
-    with pytest.raises(ValueError, match="got only video;camera; columns are separated by commas"):
-        read_manifest(write("video;camera\na.mp4;c.yaml\n", "manifest.csv"))
+    for sign, width in ((";", "3.5"), (";", "3,5"), ("\t", "3,5")):
+        text = f"video,camera,lane_width\na.mp4,c.yaml,{width}\n"
+        rows = text.replace(",", sign).replace(f"3{sign}5", "3,5")
+        with pytest.raises(
+            ValueError, match=r"got: columns separated by .*; write commas, and points in num"
+        ):
+            read_manifest(write(rows, "manifest.csv"))
+
+
+def test_empty_rows_of_a_spreadsheet_are_passed_over(write):
+    assert len(read_manifest(write("video,camera\na.mp4,c.yaml\n,\n\n,\n", "manifest.csv"))) == 1
 
 
 def test_names_in_yaml_are_those_that_were_written(write):
