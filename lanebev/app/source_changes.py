@@ -20,7 +20,8 @@ def files_of(source: FrameSource) -> Files:
         paths = [str(each) for each in path.iterdir() if each.name[0] != "."]
     else:
         paths = images_of(source.source) or [source.source]
-    return {each: size_and_time(Path(each)) for each in paths if Path(each).is_file()}
+    found = {each: size_and_time(Path(each)) for each in paths}
+    return {each: facts for each, facts in found.items() if any(facts)}  # others are not there
 
 
 def changes_remark(source: FrameSource, before: Files) -> str:

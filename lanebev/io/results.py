@@ -18,6 +18,7 @@ from torch import Tensor
 
 from lanebev.io.folder_lock import LOCK_NAME, FolderLock
 from lanebev.io.formats.names import FORMATS
+from lanebev.io.late_signals import late_signals_ignored
 from lanebev.numbers import shown
 from lanebev.types import Calibration, Status
 
@@ -252,7 +253,10 @@ class OutputFolder:
         is_there, failure = self._partial.is_dir(), error
         try:
             if error is None:
-                self._publish()
+                with (
+                    late_signals_ignored()
+                ):  # else some outputs would be of this run, others of an earlier one
+                    self._publish()
         except OSError as unpublished:
             failure = unpublished
         finally:

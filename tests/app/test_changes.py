@@ -1,8 +1,11 @@
 """Files of the source, or the output folder, change during a run."""
 
 import errno
+import os
 import shutil
+import signal
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -132,6 +135,34 @@ def test_a_file_in_the_place_of_the_output_folder_is_one_line(tmp_path):
         out.__exit__(None, None, None)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     assert (tmp_path / "out").read_text() == "mine"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_outputs_are_moved_leaves_none_of_an_earlier_run(tmp_path, monkeypatch, number):
+    names = ["extrinsics.csv", "lanes.json", "report.html"]
+    replace_file, heard = Path.replace, []
+
+    def replace_and_send(path, target):
+        os.kill(os.getpid(), number)
+        return replace_file(path, target)
+
+    def write(text):
+        with OutputFolder(tmp_path / "out") as out:
+            for name in names:
+                (out / name).write_text(text)
+            if text == "new":
+                monkeypatch.setattr(Path, "replace", replace_and_send)
+
+    before = signal.signal(number, lambda *_: heard.append(number))
+    try:
+        write("old")
+        write("new")
+        assert not heard
+        os.kill(os.getpid(), number)
+        assert heard == [number]  # as before
+    finally:
+        signal.signal(number, before)
+    assert [(tmp_path / "out" / name).read_text() for name in names] == ["new"] * 3
 
 
 def test_a_drive_whose_mark_has_no_room_fails_alone_and_is_run_again(images, monkeypatch):
