@@ -11,14 +11,17 @@ import torch
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.dynamics import MotionConfig
 from lanebev.estimation.joint.evidence import hill_variance
+from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.layout import NUM_COMMON
-from lanebev.estimation.joint.measurement import HEIGHT, VERTICAL, boundary_residuals, look
+from lanebev.estimation.joint.measurement import HEIGHT, ROLL, VERTICAL, boundary_residuals, look
 from lanebev.estimation.joint.observations import boundary_places, observe
+from lanebev.estimation.joint.restart import with_roll_of_prior
 from lanebev.estimation.joint.single_frame import fit_single_frame
 from lanebev.estimation.joint.state import JointConfig, with_vertical_curvature
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.moments import CAMERA, FPS, WIDTH, Moment, moments
 from lanebev.testing.moments import observe as see
+from lanebev.types import Extrinsics
 
 torch.set_num_threads(1)
 DOUBLE = torch.float64
@@ -92,6 +95,52 @@ def test_the_vertical_curvature_of_a_start_is_correlated_with_the_error_that_it_
     found = with_vertical_curvature(cov, by, 0.5)[0]
     expected = [[2.0, 0, -0.5, -0.5], [0, 1, 0, 0], [-0.5, 0, 1.25, 0.25], [-0.5, 0, 0.25, 0.25]]
     torch.testing.assert_close(found, torch.tensor(expected, dtype=DOUBLE))
+
+
+def test_the_roll_of_a_start_on_one_lane_is_the_priors_however_precise_the_lines():
+    """Two lines have nothing to tell of roll, but with a noise of 0.1 px a crest would turn the fit far."""
+    drive = moments(1 / FPS, lambda t, m: replace(m, near=4.0, far=60.0, visible=(2, 3)))
+    (_, segments), *_ = see(drive, 8, 0.1, 20, 5, DOUBLE)
+    fit = fit_single_frame(segments, CAMERA.expand(8, 3, 3), WIDTH)
+    prior = JointConfig().prior
+    by_crest = prior.vertical_curvature_std * fit.by_vertical_curvature[:, ROLL]
+    assert (by_crest.abs() > 2 * prior.roll_std).any()
+    params, cov, by_vertical = with_roll_of_prior(fit, prior)
+    assert params[:, ROLL].tolist() == pytest.approx([prior.roll] * 8)
+    assert cov[:, ROLL, ROLL].sqrt().tolist() == pytest.approx([prior.roll_std] * 8)
+    torch.testing.assert_close(by_vertical[:, ROLL], torch.zeros(8, dtype=DOUBLE))
+    _, state = run(JointCalibrator(), [(drive[0], segments)])
+    assert (state.cov[:, ROLL, ROLL].sqrt() < 1.01 * prior.roll_std).all()
+
+
+def test_a_start_keeps_what_a_lane_tells_of_the_other_parameters_given_roll():
+    """Of the information, the prior replaces what is left about roll; a roll that the fit tells is kept."""
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(2, 7, 7, generator=generator, dtype=DOUBLE)
+    information = root @ root.mT + torch.eye(7, dtype=DOUBLE)
+    information[0] *= 1e4
+    params = 0.1 * torch.randn(2, 7, generator=generator, dtype=DOUBLE)
+    params[:, ROLL] = 0.1
+    ((_, segments),) = crest(0.0)
+    fit = fit_single_frame(segments, CAMERA.expand(2, 3, 3), WIDTH)._replace(
+        extrinsics=Extrinsics.unstack(params[:, :4]),
+        offset=params[:, 4],
+        curvature=params[:, 5:],
+        covariance=torch.linalg.inv(information),
+    )
+    prior = FramePrior(roll=0.02, roll_std=0.1)
+    moved, cov, _ = with_roll_of_prior(fit, prior)
+    torch.testing.assert_close(moved[0], params[0])
+    torch.testing.assert_close(cov[0], fit.covariance[0])
+    others = [k for k in range(7) if k != ROLL]
+    of_others, across = information[1][others][:, others], information[1][others, ROLL]
+    expected = information[1].clone()
+    expected[ROLL, ROLL] = prior.roll_std**-2 + across @ torch.linalg.solve(of_others, across)
+    torch.testing.assert_close(torch.linalg.inv(cov[1]), expected)
+    by_roll = -torch.linalg.solve(of_others, across)
+    torch.testing.assert_close(moved[1, others], params[1, others] + by_roll * (0.02 - params[1, ROLL]))
+    far = FramePrior(roll=0.02, roll_std=0.05)  # 1.6 sigmas away
+    torch.testing.assert_close(with_roll_of_prior(fit, far)[0], params)
 
 
 def test_a_clear_vertical_curvature_is_its_own_prior_and_is_remembered():

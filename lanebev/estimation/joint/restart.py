@@ -15,7 +15,7 @@ from torch import Tensor
 from lanebev.batch import flag, replace_rows, select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.evidence import CALL
-from lanebev.estimation.joint.frame_prior import student_weight
+from lanebev.estimation.joint.frame_prior import FramePrior, student_weight
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, NUM_STRAIGHT, ROLL, boundary_residuals
 from lanebev.estimation.joint.observations import Observations
@@ -30,6 +30,8 @@ from lanebev.types import Status
 
 _FAR = 25.7  # χ² of pose and offset, five degrees of freedom, exceeded by chance once in 10,000 frames
 _FEW = 0.5  # share of the segments that fit, below which the state is in doubt
+_UNTOLD = 0.5  # share of the prior's standard deviation of roll, above which a frame does not tell roll
+_USUAL = 1.5  # such deviations from the prior's mean, within which a roll that is not told may be noise
 
 
 class Compared(NamedTuple):
@@ -197,9 +199,28 @@ def scatter_of_fit(fit: SingleFrameFit, places: Tensor, seen: Observations, cfg:
     return found._replace(sensitivity=torch.where(determined, found.sensitivity, 0.0))
 
 
+def with_roll_of_prior(fit: SingleFrameFit, prior: FramePrior) -> tuple[Tensor, Tensor, Tensor]:
+    """Give the roll of a fit that tells next to nothing of it the prior's mean and variance.
+
+    The two lines of one lane do not tell roll. What a fit takes for it is noise that bends the lines, as a
+    vertical curvature of the road does, and where the lines are precise that is far from the prior. The other
+    parameters follow by their regression on the roll. A roll far from the prior's is kept.
+
+    Returns:
+        parameters (B, 7), covariance (B, 7, 7), and their change (B, 7) per 1/m of vertical curvature.
+    """
+    params, cov, by_vertical = fit.params(), fit.covariance, fit.by_vertical_curvature
+    variance, to_prior = cov[:, ROLL, ROLL, None], prior.roll - params[:, ROLL, None]
+    usual = to_prior.abs() < _USUAL * prior.roll_std
+    untold = usual & (variance > (_UNTOLD * prior.roll_std) ** 2)
+    by_roll = cov[:, ROLL] / variance * untold  # (B, 7), 1 in roll; 0 where the fit tells it
+    more = (prior.roll_std**2 - variance).unsqueeze(-1) * by_roll.unsqueeze(-1) * by_roll.unsqueeze(-2)
+    return params + to_prior * by_roll, cov + more, by_vertical - by_vertical[:, ROLL, None] * by_roll
+
+
 def state_of_fit(fit: SingleFrameFit, before: JointState, cfg: JointConfig) -> JointState:
     """Make a state of one frame's fit; nothing of the state before is kept."""
-    mean, cov = state_from_fit(fit.params(), fit.covariance, fit.by_vertical_curvature, cfg)
+    mean, cov = state_from_fit(*with_roll_of_prior(fit, cfg.prior), cfg)
     zero = torch.zeros_like(before.unseen)
     return JointState(
         mean=mean,
