@@ -176,7 +176,8 @@ def jump_remark(paths: Sequence[str]) -> str:
         kind, remedy = "the times in their names jump", ""
     else:
         steps = _number_steps(paths)
-        jumps = [step > median_low(steps) > 0 for step in steps]
+        usual = median_low(steps or [0])
+        jumps = [step > usual > 0 for step in steps]
         kind, remedy = "their numbers jump", ", or number them anew"
     if True not in jumps:
         return ""

@@ -15,6 +15,7 @@ from lanebev.app.build import make_camera
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import LaneFileObserver
 from lanebev.app.sources import make_source
+from lanebev.io import image_names
 from lanebev.io.frames import Selection
 from lanebev.io.image_names import drives_remark, in_natural_order, jump_remark
 from lanebev.io.images import read_image
@@ -395,6 +396,15 @@ def test_a_counter_that_began_again_or_has_gaps_is_noticed(numbers, words):
     remark = jump_remark(names)
     assert words in remark
     assert bool(words) == bool(remark)
+
+
+def test_jumps_are_looked_for_in_time_that_grows_with_the_number_of_images(monkeypatch):
+    """The median of all steps was calculated for each of them: minutes for 100,000 images."""
+    calls = []
+    original = image_names.median_low
+    monkeypatch.setattr(image_names, "median_low", lambda steps: calls.append(1) or original(steps))
+    assert jump_remark([f"{number:05d}.jpg" for number in range(1000)]) == ""
+    assert len(calls) == 1
 
 
 def test_names_of_several_numbers_or_of_none_have_no_jumps():
