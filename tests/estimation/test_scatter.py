@@ -138,6 +138,8 @@ def test_the_variance_of_an_improbable_roll_is_that_of_the_mixture_with_an_odd_l
             found = odd_line_deviation(by_place, torch.tensor([roll]), torch.tensor([misfit]), CONFIG)
             assert (found * by_place.square().sum()).item() == pytest.approx(expected.item(), rel=1e-3)
     assert odd_line_deviation(0 * by_place, torch.tensor([0.1]), torch.tensor([True]), CONFIG).isfinite()
+    every_line_bounds = JointConfig(odd_line=0.0)
+    assert odd_line_deviation(by_place, torch.tensor([0.1]), torch.tensor([True]), every_line_bounds) == 0
 
 
 def test_a_kerb_taken_for_a_boundary_beside_the_ego_lane_is_in_the_variance_of_roll_and_height():

@@ -32,6 +32,7 @@ from lanebev.estimation.joint.measurement import (
     CURVATURE,
     NUM_STRAIGHT,
     VERTICAL,
+    Residuals,
     boundary_distances,
     boundary_residuals,
     foot_points,
@@ -43,7 +44,7 @@ from lanebev.estimation.joint.restart import restart
 from lanebev.estimation.joint.road import propagate_road_shape
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
 from lanebev.estimation.joint.robust import scaled_variance
-from lanebev.estimation.joint.scatter import averaged_moments, boundary_scatter
+from lanebev.estimation.joint.scatter import Scatter, averaged_moments, boundary_scatter
 from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit, unobserved_mask
 from lanebev.estimation.joint.status import update_track_status
 from lanebev.estimation.joint.tempering import temper_frame
@@ -257,7 +258,7 @@ def update_state(
     prior, cov = renumber(predicted.mean, shift, width, num), predicted.cov
     places = positions.gather(1, seen.boundary)  # (B, N)
     member = membership(seen.boundary, num, like=places)
-    before, evidence = prior[:, place.observed], predicted.evidence
+    before = prior[:, place.observed]
     at, doubt = before, cov[:, place.observed, place.observed]
     for iteration in range(cfg.iterations):
         params, own = at[:, :NUM_COMMON], at[:, NUM_COMMON:].gather(1, seen.boundary)
@@ -276,23 +277,14 @@ def update_state(
         )
         used = cov
         if iteration == 0:
-            believed = 2.0 * torch.bmm(member, (frame.trust * seen.weight).unsqueeze(-1)).squeeze(-1)
-            score = normalized_score(doubt, frame, believed, seen.weight)
-            evidence = accumulate_evidence(evidence, score, step, cfg.evidence_time)
-            told = torch.where(estimated[:, POSE] > 0, score[:, POSE], 1.0)  # 1 changes nothing
-            motion_scale = adapt_motion_scale(predicted.motion_scale, told, step, cfg)
+            support = 2.0 * torch.bmm(member, (frame.trust * seen.weight).unsqueeze(-1)).squeeze(-1)
+            score = normalized_score(doubt, frame, support, seen.weight)
+            evidence, motion_scale = with_evidence(predicted, score, estimated[:, POSE] > 0, step, cfg)
             noise = adaptive_process_noise(evidence, doubt, cfg)
             cov = cov + torch.nn.functional.pad(noise, (0, place.size - noise.shape[-1])).diag_embed()
         last, at, doubt, scale = at, moved.mean, moved.cov, frame.scale
     weight = frame.trust * seen.weight / scaled_variance(seen.sigma, frame.scale)
-    scatter = boundary_scatter(
-        torch.cat([residuals.jacobian[:, :NUM_STRAIGHT], residuals.jacobian[:, VERTICAL:]], dim=1),
-        torch.cat([wide_precision(cov), cov[:, VERTICAL, VERTICAL, None].reciprocal()], dim=-1),
-        residuals,
-        weight,
-        member,
-        predicted.scatter,
-    )
+    scatter = scatter_of_frame(residuals, cov, weight, member, predicted.scatter)
     gain = kalman_gain(used, moved, frame, estimated)
     updated = predicted._replace(
         mean=torch.baddbmm(prior.unsqueeze(-1), gain, moved.pull.unsqueeze(-1)).squeeze(-1),
@@ -307,3 +299,41 @@ def update_state(
     apart = torch.maximum(at[:, NUM_COMMON:].abs(), boundary_deviation(last, frame).abs())
     lane = (apart < _NO_BOUNDARY).gather(1, seen.boundary)
     return updated, frame.trust, torch.where((seen.weight > 0) & lane, agreed, 0.0), alone
+
+
+def with_evidence(
+    predicted: JointState, score: Tensor, pose_told: Tensor, step: Tensor, cfg: JointConfig
+) -> tuple[Tensor, Tensor]:
+    """Add a frame's scores to the evidence against the motion, and adapt the scale of the motion to them.
+
+    Args:
+        predicted: state.
+        score: (B, 11 + L), of :func:`~lanebev.estimation.joint.evidence.normalized_score`.
+        pose_told: (B, 4) bool, what of the pose the frame determines; the scale of the rest decays.
+        step: (B,) s since the last frame.
+        cfg: the numbers.
+
+    Returns:
+        evidence (B, 11 + L) and scale (B, 4).
+    """
+    evidence = accumulate_evidence(predicted.evidence, score, step, cfg.evidence_time)
+    told = torch.where(pose_told, score[:, POSE], 1.0)  # 1 is the score that is expected
+    return evidence, adapt_motion_scale(predicted.motion_scale, told, step, cfg)
+
+
+def scatter_of_frame(
+    residuals: Residuals, cov: Tensor, weight: Tensor, member: Tensor, moments: Tensor
+) -> Scatter:
+    """Estimate the scatter of the boundaries beside pose, offset and vertical curvature.
+
+    Args:
+        residuals: of the frame, near the state.
+        cov: (B, D, D), of the state before the frame.
+        weight: (B, N) px⁻².
+        member: (B, L, N), boundary of each segment.
+        moments: (B, 2, 3) of the frames before.
+    """
+    jacobian = torch.cat([residuals.jacobian[:, :NUM_STRAIGHT], residuals.jacobian[:, VERTICAL:]], dim=1)
+    of_vertical = cov[:, VERTICAL, VERTICAL, None].reciprocal()
+    precision = torch.cat([wide_precision(cov), of_vertical], dim=-1)
+    return boundary_scatter(jacobian, precision, residuals, weight, member, moments)

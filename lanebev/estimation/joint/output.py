@@ -18,7 +18,7 @@ from lanebev.types import Calibration, Extrinsics
 _ONLY_HEIGHT = (0.0, 0.0, 0.0, 1.0)
 _FITTED = 3  # boundaries that a pose of equal lanes always fits: by offset, roll and height
 _BY_CHANCE = 0.004  # probability that a further boundary is in its place though lanes are unequal
-_ODD, _ODD_OF_MORE = 0.25, 1.0  # odds that one of three lines bounds no lane; where further lines are none
+_MORE = 4.0  # factor on the odds that a line bounds no lane, where further lines are on no boundary
 _ODD_WITHIN = 3.6  # m, range of such a line's place
 _THIRD = 6.0  # sum of squares of (1, -2, 1), in which proportion three boundaries change the roll
 _IN_VIEW = 0.015  # rad/m or m/m: change of roll or height by a boundary's deviation from which it counts
@@ -86,7 +86,7 @@ def odd_line_deviation(by_place: Tensor, roll: Tensor, misfit: Tensor, cfg: Join
     beyond = roll - cfg.prior.roll
     by_camera = student_density(beyond / cfg.prior.roll_std, cfg.prior.freedom) / cfg.prior.roll_std
     density = by_camera * (total / _THIRD).sqrt()  # per m of the outer line's place
-    odds = torch.where(misfit, _ODD_OF_MORE, _ODD) / (_ODD_WITHIN * density)
+    odds = cfg.odd_line * torch.where(misfit, _MORE, 1.0) / (_ODD_WITHIN * density)
     return odds / (1 + odds) * beyond.square() / total
 
 

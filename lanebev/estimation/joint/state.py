@@ -38,6 +38,7 @@ class JointConfig:
             inf: they are taken for 0.
         lane_deviation_std: sigma of a boundary's deviation where too few are in view to tell whether lanes
             are equal, m; 0: lanes are equal.
+        odd_line: prior odds that one of three lines in view bounds no lane; 0: each does.
         motion: motion model.
         prior: prior of a start and range of its search.
         open_pose: standard deviation of the process noise that the evidence (J16) adds to the pose where it
@@ -70,6 +71,7 @@ class JointConfig:
     lane_width_std: float = 0.0
     scatter_memory: float = 1.0
     lane_deviation_std: float = 0.05
+    odd_line: float = 0.25
     motion: MotionConfig = field(default_factory=MotionConfig)
     prior: FramePrior = field(default_factory=FramePrior)
     open_pose: float = 0.01
