@@ -13,6 +13,7 @@ from lanebev.camera.model import Camera
 from lanebev.export.parts import make_part
 from lanebev.export.quantize import quantize_segmenter, rendered_views
 from lanebev.export.write import write_onnx, write_program
+from lanebev.observation.far_view import FarView
 from lanebev.pipeline import LaneBEV
 
 SUFFIXES = {"onnx": ".onnx", "torch-export": ".pt2"}
@@ -30,7 +31,11 @@ def export(config: ExportConfig) -> str:
         ValueError: bad input, or the packages of ONNX are not there.
     """
     camera = Camera.from_file(config.camera)
-    model = LaneBEV.from_pretrained(config.weights, calibrator=make_calibrator(config.calibrator))
+    model = LaneBEV.from_pretrained(
+        config.weights,
+        calibrator=make_calibrator(config.calibrator),
+        far_view=FarView() if config.far_view else None,
+    )
     write, lines = {"onnx": write_onnx, "torch-export": write_program}[config.format], []
     out = Path(config.out)
     try:

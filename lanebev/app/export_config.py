@@ -23,6 +23,7 @@ class ExportConfig:
         calibrator: calibrator of the step, one of CALIBRATORS.
         weights: weights file of the network; None is the shipped one.
         int8: the segmenter's convolutions compute with 8-bit numbers; the other files stay in float.
+        far_view: the network of the step also looks at a view about the horizon; only the step has one.
     """
 
     camera: str = option("", "camera file, whose image size and lens model the export keeps", "FILE")
@@ -36,6 +37,9 @@ class ExportConfig:
     )
     weights: str | None = option(None, "weights of the network instead of the shipped ones", "FILE")
     int8: bool = option(False, "quantise the segmenter's convolutions to 8 bits, by rendered views")
+    far_view: bool = option(
+        False, "the step with a far view, see lanebev run --help; no other part is written"
+    )
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -44,7 +48,12 @@ class ExportConfig:
         if self.int8 and (self.format != "onnx" or "segmenter" not in self.parts):
             raise ValueError("int8: expected --format onnx and the part segmenter with it, got another")
 
+        if self.far_view and self.part not in (None, "step"):
+            raise ValueError(f"far_view: expected the part step, which alone has one, got {self.part}")
+
     @property
     def parts(self) -> tuple[str, ...]:
         """The parts to write."""
+        if self.far_view:
+            return ("step",)
         return (self.part,) if self.part else ("segmenter", "extractor", self.calibrator, "warp", "step")

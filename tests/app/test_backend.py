@@ -123,6 +123,9 @@ def test_settings_are_checked():
         ExportConfig()
     assert ExportConfig(camera="c", part="warp").parts == ("warp",)
     assert ExportConfig(camera="c", calibrator="two-stage").parts[2] == "two-stage"
+    assert ExportConfig(camera="c", far_view=True).parts == ("step",)
+    with pytest.raises(ValueError, match="far_view: expected the part step, which alone has one, got warp"):
+        ExportConfig(camera="c", part="warp", far_view=True)
     for other in ({"format": "torch-export"}, {"part": "warp"}):
         with pytest.raises(ValueError, match="int8: expected --format onnx and the part segmenter"):
             ExportConfig(camera="c", int8=True, **other)
