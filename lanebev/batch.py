@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
-from lanebev.tensors import constant, map_tensors
+from lanebev.tensors import constant, handled_by_mode, map_tensors
 
 T = TypeVar("T")
 FlagT = TypeVar("FlagT", bound=IntFlag)
@@ -37,15 +37,19 @@ def may_skip(wanted: Tensor) -> bool:
     """Tell whether a costly step, such as a search, can be left out because no row wants its result.
 
     Beside :func:`replace_rows` the one place where the maths asks the device. A compiled or exported program,
-    and ``torch.vmap``, cannot, and always search.
+    ``torch.vmap`` and ``FakeTensorMode`` cannot, and always search.
     """
-    return not (torch.compiler.is_compiling() or mapped(wanted)) and not bool(wanted.any())
+    return not (torch.compiler.is_compiling() or _is_without_numbers(wanted)) and not bool(wanted.any())
 
 
 def readable(value: Tensor) -> bool:
     """Tell whether a check may read a tensor's numbers: now, and without waiting for a device."""
     recorded = torch.compiler.is_compiling() or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
-    return value.device.type == "cpu" and not (recorded or mapped(value))
+    return value.device.type == "cpu" and not (recorded or _is_without_numbers(value))
+
+
+def _is_without_numbers(value: Tensor) -> bool:
+    return handled_by_mode() or mapped(value)
 
 
 def mapped(value: Tensor) -> bool:
@@ -63,7 +67,7 @@ def replace_rows(rows: Tensor, values: T, function: Callable[..., T], *operands:
 
     The device is asked how many rows there are. A compiled or exported program has both ways
     (``torch.cond``): it computes the function for all rows where there is any, else not at all. Under
-    ``torch.vmap`` it is computed for all rows.
+    ``torch.vmap`` and ``FakeTensorMode`` it is computed for all rows.
 
     Args:
         rows: (B,) bool.
@@ -73,7 +77,7 @@ def replace_rows(rows: Tensor, values: T, function: Callable[..., T], *operands:
     """
     if torch.compiler.is_compiling():
         return _replace_rows_in_program(rows, values, function, operands)
-    if mapped(rows):
+    if _is_without_numbers(rows):
         return select_rows(rows, function(*operands), values)
     index = rows.nonzero().squeeze(-1)
     if index.shape[0] == 0:

@@ -66,6 +66,14 @@ def usable_device(device: torch.device | str | int) -> torch.device:
     return found
 
 
+def handled_by_mode() -> bool:
+    """Tell whether a context handles every operation itself, as ``FakeTensorMode`` and ``make_fx`` do.
+
+    Tensors may then have no numbers of their own, or numbers that stand for all others.
+    """
+    return bool(torch._C._len_torch_dispatch_stack())
+
+
 def made_once(function: Callable[P, T]) -> Callable[P, T]:
     """Decorate a function of hashable arguments that makes tensors, to be called once for each of them.
 
@@ -80,7 +88,7 @@ def made_once(function: Callable[P, T]) -> Callable[P, T]:
 
     @wraps(function)
     def once(*args: P.args, **kwargs: P.kwargs) -> T:
-        if torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack():
+        if torch.compiler.is_compiling() or handled_by_mode():
             return function(*args, **kwargs)
         return cast("Callable[..., T]", kept)(*args, **kwargs)
 

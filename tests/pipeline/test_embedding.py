@@ -5,6 +5,7 @@ import copy
 import pytest
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from lanebev import (
     BEVGrid,
@@ -85,6 +86,40 @@ def test_constants_of_fake_tensors_are_not_kept():
     with FakeTensorMode():
         assert identity(11, torch.float64, torch.device("cpu")).shape == (11, 11)
     assert torch.equal(identity(11, torch.float64, torch.device("cpu")), torch.eye(11).double())
+
+
+@CALIBRATORS
+def test_shapes_are_found_without_computing(calibrator):
+    """By a tool that estimates memory; the model computes afterwards as before."""
+    made = model().eval()
+    made.calibrator = calibrator
+    image = torch.rand(2, 3, 64, 128, generator=torch.Generator().manual_seed(1))
+    expected, state = made(image, CAMERA.expand(2, 3, 3))
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        given = type(state)(*map(mode.from_tensor, state))
+        found, _ = made(mode.from_tensor(image), mode.from_tensor(CAMERA.expand(2, 3, 3)), given)
+    for one, other in zip(
+        (found.bev, *found.calibration[1:]), (expected.bev, *expected.calibration[1:]), strict=True
+    ):
+        assert (one.shape, one.dtype) == (other.shape, other.dtype)
+    again, _ = made(image, CAMERA.expand(2, 3, 3))
+    assert torch.equal(again.bev, expected.bev)
+
+
+@pytest.mark.parametrize("way", ["real", "fake", "symbolic"])
+def test_a_recorded_warp_equals_it_for_another_camera_and_pose(way):
+    warp = BEVWarp(BEVGrid(x=(-6.0, 6.0), z=(2.0, 30.0), resolution=0.5))
+
+    def view(image, camera, *pose):
+        return warp(image, camera, Extrinsics(*pose))
+
+    image = torch.rand(1, 3, 64, 128, generator=torch.Generator().manual_seed(1))
+    recorded = make_fx(view, tracing_mode=way)(image, CAMERA, *POSE)
+    other = (image.flip(-1), 1.5 * CAMERA, *Extrinsics.unstack(torch.tensor([[-0.03, 0.1, 0.05, 1.2]])))
+    expected, found = view(*other), recorded(*other)
+    assert not torch.equal(expected[1], view(image, CAMERA, *POSE)[1])
+    assert torch.equal(found[1], expected[1])
+    torch.testing.assert_close(found[0], expected[0], atol=1e-4, rtol=1e-4)
 
 
 @CALIBRATORS
