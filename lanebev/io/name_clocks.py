@@ -106,13 +106,13 @@ def _times(matches: Sequence[re.Match[str]], order: str) -> list[Fraction] | Non
     if None in days or None in clocks:
         return None
     whole = [_DAY * day + clock for day, clock in zip(days, clocks, strict=True)]  # type: ignore[operator]
+    if order and _may_be_numbers(matches):
+        return None
     fractions = _seconds_of_digits([each["fraction"] for each in groups])
-    if not any(each["fraction"] for each in groups):
-        return None if not order or _may_be_numbers(matches) else [Fraction(each) for each in whole]
     times = [a + b for a, b in zip(whole, fractions, strict=True)]
     may_count = all("loose" in match.re.groupindex and match["loose"] is not None for match in matches)
-    if may_count and _are_counts(times):
-        times = [Fraction(each) for each in whole]
+    if not any(each["fraction"] for each in groups) or (may_count and _are_counts(times)):
+        return [Fraction(each) for each in whole] if order else None
     return times if order else _over_midnight(times)
 
 
@@ -149,20 +149,28 @@ def _seconds_of_digits(fractions: Sequence[str]) -> list[Fraction]:
 
 
 def _may_be_numbers(matches: Sequence[re.Match[str]]) -> bool:
-    """Tell whether times of day may be images' numbers: six digits after a date that all begin with 00."""
+    """Tell whether digits after a date may be numbers of images: 6 that begin with 00, or 9 with 0000."""
     return all(
-        match["hour"] == "00" and match.end("hour") == match.start("minute") and "T" not in match["between"]
+        match["hour"] == "00"
+        and match.end("hour") == match.start("minute")
+        and "T" not in match.groupdict("").get("between", "")
+        and (
+            match["fraction"] is None
+            or (match["minute"] == "00" and match.string[match.end("second")] not in ".,")
+        )
         for match in matches
     )
 
 
 def _are_counts(times: Sequence[Fraction]) -> bool:
-    """Tell whether digits after the seconds are numbers of images, of which some have the same second.
+    """Tell whether digits after the seconds are numbers, as of images or cameras.
 
-    Those of a clock fall from a second to the next, and do not rise by less than 4 ms.
+    Those of a clock differ, fall from a second to the next, and do not rise by less than 4 ms.
     """
     ordered = sorted(times)
     parts = [time % 1 for time in ordered]
+    if len(set(parts)) == 1:
+        return True
     same = any(int(a) == int(b) for a, b in pairwise(ordered))
     rising = all(a <= b for a, b in pairwise(parts))
     steps = [b - a for a, b in pairwise(ordered)]

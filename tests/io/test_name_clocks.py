@@ -52,7 +52,7 @@ def test_times_of_day_are_those_of_the_frames_also_over_midnight(form, start):
 
 @given(
     st.sampled_from(FORMS),
-    st.datetimes(datetime(2001, 1, 1), datetime(2030, 1, 1)),
+    st.datetimes(datetime(2001, 1, 1), datetime(2030, 1, 1)).filter(lambda each: each.hour or each.minute),
     st.lists(st.integers(20, 400), min_size=40, max_size=80),
 )
 def test_any_drive_has_its_times(form, start, milliseconds):
@@ -86,6 +86,11 @@ def test_whole_seconds_of_one_frame_each_are_times(form):
         [f"2026-11-29_10-15-30.{20 * number:03d}_cam{number % 2}.jpg" for number in range(30)],
         [f"2026-13-29_10-15-{number:02d}.jpg" for number in range(30)],  # no month
         [f"01-02-{number:02d}.jpg" for number in range(30)],  # three numbers
+        [f"20261129_{number:09d}.jpg" for number in range(0, 3000, 10)],
+        [f"2011_09_26/{number:06d}_003.jpg" for number in range(50)],  # the number of the camera at the end
+        [f"{number:03d}/010203_{number:09d}.jpg" for number in range(0, 900, 10)],
+        [f"{scene}_{view}_2_{number:06d}.jpg" for scene in (0, 22) for view in (1, 2) for number in range(9)],
+        [f"tile_{x}_{y}_{z}_128.png" for x in (0, 22) for y in range(12) for z in range(40)],
         [f"aachen_000121_{number:06d}_leftImg8bit.png" for number in range(19)],
     ],
 )
