@@ -13,6 +13,7 @@ _MOVING = 1.0  # grey levels of 255 on average, of a change that counts
 _MORE_ALIKE, _LARGER = 0.6, 1.5  # of the change without turning the image, and times those near by
 _NEAR = 2  # frames before and after a cut
 _CUT, _LEAST_CUT = 2.5, 12.0  # times the changes near by, and grey levels on average
+_SAME_VIEW = 0.75  # least correlation of two images of one view, also when the exposure changes
 _LONGER = 1.5  # times the time step before, of frames between which others are missing
 _IN_TURN = 0.8  # of the change from the frame before, that from the last but one where cameras take turns
 _MOST = 0.8  # of the frames, of which this holds then
@@ -33,12 +34,14 @@ class _Change(NamedTuple):
         is_next: whether no time is missing between the two.
         size: change from the frame before.
         turned: how it is turned against the frame before, in words; empty if it is not.
+        is_same_view: whether it correlates with the frame before, or changes too little for a cut.
     """
 
     number: int
     is_next: bool
     size: float
     turned: str
+    is_same_view: bool
 
 
 class ViewChanges:
@@ -70,7 +73,9 @@ class ViewChanges:
             if len(self._before) == 2 and size > _MOVING:
                 self._compared += 1
                 self._in_turn += _difference(seen, self._before[0]) < _IN_TURN * size
-            self._changes.append(_Change(number, is_next, size, _turned(seen, self._before[-1], size)))
+            turned = _turned(seen, self._before[-1], size)
+            is_same_view = size <= _LEAST_CUT or _correlation(seen, self._before[-1]) > _SAME_VIEW
+            self._changes.append(_Change(number, is_next, size, turned, is_same_view))
             self._look()
         self._before.append(seen)
 
@@ -80,7 +85,7 @@ class ViewChanges:
             return
         change = self._changes[_NEAR]
         others = max(each.size for each in self._changes if each is not change)
-        is_cut = change.is_next and change.size > max(_CUT * others, _LEAST_CUT)
+        is_cut = change.is_next and change.size > _CUT * others and not change.is_same_view
         kind = change.turned if change.size > _LARGER * others else ""
         kind = kind or ("cut" if is_cut else "")
         if kind:
@@ -112,6 +117,19 @@ def _difference(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
         return 0.0
     difference = a - b
     return float(np.abs(difference - difference.mean()).mean())
+
+
+def _correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    """Return the correlation of two images' grey levels, 1 where one of them is uniform.
+
+    A change of brightness and contrast leaves it as it is.
+    """
+    if a.shape != b.shape:
+        return 1.0
+    greys = [image.mean(-1) for image in (a, b)]
+    first, second = (grey - grey.mean() for grey in greys)
+    scale = float(np.linalg.norm(first) * np.linalg.norm(second))
+    return float((first * second).sum()) / scale if scale > 0 else 1.0
 
 
 def _turned(image: NDArray[np.float32], before: NDArray[np.float32], size: float) -> str:

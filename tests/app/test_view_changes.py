@@ -34,15 +34,18 @@ def _remark(images, steps=None):
 DRIVE = [_view(number) for number in range(30)]
 
 
-def _lit(number):
-    return (DRIVE[number] * (0.6 if number >= 15 else 1.0)).astype(np.uint8)
+def _lit(gain):
+    """The drive with images that are darker or brighter from one frame to the next, clipped at white."""
+    return [*DRIVE[:15], *((image * gain).clip(0, 255).astype(np.uint8) for image in DRIVE[15:])]
 
 
 @pytest.mark.parametrize(
     ("images", "steps"),
     [
         (DRIVE, None),
-        ([_lit(number) for number in range(30)], None),  # darker from one frame to the next
+        (_lit(0.6), None),
+        (_lit(0.1), None),
+        (_lit(1.7), None),
         ([*DRIVE[:12], np.full_like(DRIVE[0], 255), *DRIVE[13:]], None),  # a flash of light
         ([*DRIVE[:12], None, None, *DRIVE[14:]], None),
         ([*DRIVE[:10], *map(_view, range(40, 60))], [*[0.1] * 10, 3.0, *[0.1] * 19]),  # a pause
