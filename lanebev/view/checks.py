@@ -9,9 +9,11 @@ from torch import Tensor
 
 from lanebev.geometry.distortion import check_lens
 from lanebev.geometry.lens import check_intrinsics
+from lanebev.tensors import constant
 from lanebev.types import Extrinsics, check_extrinsics, check_tensor
 
 _SAME_SHAPE = 1.25  # factor between height over width of a map and of the image that it covers, padded
+_BESIDE = -1e6  # px, place of every point in the image of a camera that cannot be used
 
 
 def check_image(image: Tensor, name: str = "image") -> None:
@@ -46,6 +48,19 @@ def check_covers(image: Tensor, size: tuple[int, int]) -> None:
             f"image_size: expected (height, width), got {size} with a map of {rows} x {columns} cells: are "
             "they swapped?"
         )
+
+
+def blind_unless_finite(intrinsics: Tensor, distortion: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Replace cameras (B, 3, 3), (B, D) in which a number is not finite by one whose image has nothing in it.
+
+    NaN would become the value and the gradient of every cell.
+    """
+    finite = intrinsics.isfinite().all(-1).all(-1)
+    if distortion is not None:
+        finite = finite & distortion.isfinite().all(-1)
+        distortion = torch.where(finite.unsqueeze(-1), distortion, 0.0)
+    blind = constant(((1.0, 0.0, _BESIDE), (0.0, 1.0, _BESIDE), (0.0, 0.0, 1.0)), like=intrinsics)
+    return torch.where(finite[:, None, None], intrinsics, blind), distortion
 
 
 def check_cameras(

@@ -12,6 +12,7 @@ from lanebev import (
     BEVWarp,
     CanonicalView,
     Extrinsics,
+    ImageFromBEV,
     JointCalibrator,
     LaneBEV,
     LaneSegmenter,
@@ -201,6 +202,32 @@ def test_a_view_of_an_image_that_is_not_finite_is_black_and_not_valid():
     assert out.bev[0].any()
     assert not out.valid[1].any()
     assert not out.bev[1].any()
+
+
+@pytest.mark.parametrize("curvature", [None, torch.full((2,), 1e-3)], ids=["plane", "crest"])
+@pytest.mark.parametrize("distortion", [None, torch.zeros(2, 5)], ids=["no lens", "lens"])
+@pytest.mark.parametrize("kind", [BEVWarp, CanonicalView, ImageFromBEV])
+def test_a_camera_with_nan_sees_nothing_and_leaves_gradients_finite(kind, distortion, curvature):
+    grid = BEVGrid(x=(-6.0, 6.0), z=(3.0, 30.0), resolution=0.5)
+    make = {CanonicalView: lambda: CanonicalView(CAMERA[0], (64, 128), POSE)}
+    view = make.get(kind, lambda: kind(grid))()
+    image = torch.rand(2, 3, *(grid.shape if kind is ImageFromBEV else (64, 128)))
+    cameras = CAMERA.repeat(2, 1, 1)
+    if distortion is None:
+        cameras[1] = torch.nan
+    else:
+        distortion = distortion.clone()
+        distortion[1, 0] = torch.nan
+    options = {} if kind is CanonicalView else {"vertical_curvature": curvature}
+    if kind is ImageFromBEV:
+        options["image_size"] = (64, 128)
+    pose = POSE.stack().repeat(2, 1).requires_grad_()
+    found, valid = view(image, cameras, Extrinsics.unstack(pose), distortion=distortion, **options)
+    assert valid.flatten(1).any(1).tolist() == [True, False]
+    assert found.flatten(1).ne(0).any(1).tolist() == [True, False]
+    (gradient,) = torch.autograd.grad((found.mean((1, 2, 3)) * torch.tensor([1.0, 0.0])).sum(), pose)
+    assert gradient.isfinite().all()
+    assert gradient.ne(0).any(1).tolist() == [True, False]
 
 
 @CALIBRATORS
