@@ -16,8 +16,8 @@ def files_of(source: FrameSource) -> Files:
     if source.is_live:
         return {}
     path = Path(source.source)
-    if path.is_dir() and source.is_video:  # of a bag
-        paths = [str(each) for each in path.iterdir() if each.name[0] != "."]
+    if path.is_dir() and source.is_video:  # a bag, in which the output folder may be
+        paths = [str(each) for each in path.iterdir() if each.name[0] != "." and each.is_file()]
     else:
         paths = images_of(source.source) or [source.source]
     found = {each: size_and_time(Path(each)) for each in paths}

@@ -68,7 +68,7 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
     """
     path = Path(source)
     if path.is_dir():
-        paths = images_of(source)
+        paths = in_natural_order(images_of(source))
         if not paths:
             raise ValueError(f"{source}: expected images in the folder, got none; {_folder_remedy(path)}")
         return _image_source(source, paths, fps)
@@ -77,7 +77,7 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
     if path.is_file():
         return _image_source(source, [source], fps) if is_image(path) else _video_source(source, fps)
     if glob.has_magic(source):
-        paths = images_of(source)
+        paths = in_natural_order(images_of(source))
         if not paths:
             matches = glob.glob(glob_pattern(source), recursive=True)
             remedy = _endings_remedy(map(Path, matches)) or "quote the pattern"
@@ -90,14 +90,13 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
 
 
 def images_of(source: str) -> list[str]:
-    """Return the images in a folder, or that match a glob, in their order; none of other sources."""
+    """Return the images in a folder, or that match a glob; none of other sources."""
     path = Path(source)
     if path.is_dir():
-        there = (p for p in path.iterdir() if is_image(p) and p.name[0] != ".")  # macOS leaves ._ files
-        return in_natural_order(map(str, there))
+        return [str(p) for p in path.iterdir() if is_image(p) and p.name[0] != "."]  # macOS leaves ._ files
     if path.is_file() or not glob.has_magic(source):
         return []
-    return in_natural_order(filter(is_image, glob.glob(glob_pattern(source), recursive=True)))
+    return list(filter(is_image, glob.glob(glob_pattern(source), recursive=True)))
 
 
 def _address_remedy(source: str) -> str:

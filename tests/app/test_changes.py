@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from lanebev.app.fleet import worker
 from lanebev.app.fleet.plan import Task, earlier_outcome, write_mark
 from lanebev.app.run import run
 from lanebev.app.source_changes import changes_remark, files_of
+from lanebev.io.frame_source import FrameSource
 from lanebev.io.results import OutputFolder, OutputFolderError
 from lanebev.io.video import open_source
 from tests.app.rtsp_server import transport_stream
@@ -91,6 +93,18 @@ def test_a_glob_that_grows_is_told(images):
     assert changes_remark(source, before) == ""
     _write(images / "images" / "new.png")
     assert "during the run: 1 new;" in changes_remark(source, before)
+
+
+def test_an_output_folder_in_a_bag_is_no_change(tmp_path):
+    bag = FrameSource(str(tmp_path), (), Fraction(10), 1, (HEIGHT, WIDTH))
+    (tmp_path / "0.mcap").touch()
+    (tmp_path / "out").mkdir()
+    before = files_of(bag)
+    (tmp_path / "out" / "report.html").touch()
+    (tmp_path / "other").mkdir()
+    assert changes_remark(bag, before) == ""
+    (tmp_path / "1.mcap").touch()
+    assert "during the run: 1 new;" in changes_remark(bag, before)
 
 
 @pytest.mark.parametrize("formats", [(), ("mcap",)])
