@@ -224,13 +224,15 @@ class LaneBEV(BoundaryDetector):
                 calibration = calibration.with_std_scaled(self.pose_sigma_scale)
             view, valid = None, None
             if bev:
-                image_now, finite = black_unless_finite(frames[:, step])
+                taken = frames[:, step]
+                usable, finite = black_unless_finite(taken)
                 with self._gradients("warp"):
                     view, valid = self.warp(
-                        image_now, intrinsics, calibration.extrinsics, distortion, model,
+                        usable, intrinsics, calibration.extrinsics, distortion, model,
                         **self._road_shape(state),
                     )  # fmt: skip
-                valid = select_rows(finite, valid, torch.zeros_like(valid))
+                if usable is not taken:
+                    valid = select_rows(finite, valid, torch.zeros_like(valid))
             homography = bev_from_image(calibration.extrinsics, intrinsics, self.warp.grid)
             outputs.append(LaneBEVOutput(view, valid, calibration, homography, now, logits))
         return (outputs[0] if image.ndim == 4 else stack_frames(outputs)), state

@@ -90,7 +90,8 @@ def black_unless_finite(image: Tensor) -> tuple[Tensor, Tensor]:
         image: (B, C, H, W).
 
     Returns:
-        the images, black where a number is not finite, and (B,) bool, which are finite.
+        the images, black where a number is not finite, or ``image`` itself if all are known to be finite; and
+        (B,) bool, which are finite.
     """
     finite = image.detach().sum((1, 2, 3), dtype=common_dtype(image)).isfinite()
     if readable(finite) and bool(finite.all()):
