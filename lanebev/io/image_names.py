@@ -20,9 +20,8 @@ _DIGITS = re.compile(r"[0-9a-f]+", re.IGNORECASE)  # of numbers to the base 10 o
 _EPOCH = (1_000_000_000, 4_102_444_800)  # s: September 2001 to 2100
 _STEPS = (Fraction(1, 2000), Fraction(60))  # s between two frames of a drive
 
-_MOST_ALIKE = (
-    0.5  # of the images, of which more with the same number or name are of several cameras or drives
-)
+# of the images, of which more with the same number or name are of several cameras or drives
+_MOST_ALIKE = 0.5
 
 Key = list[tuple[int, Fraction, str]]
 

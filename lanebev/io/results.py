@@ -253,9 +253,8 @@ class OutputFolder:
         is_there, failure = self._partial.is_dir(), error
         try:
             if error is None:
-                with (
-                    late_signals_ignored()
-                ):  # else some outputs would be of this run, others of an earlier one
+                # a signal would leave some outputs of this run beside others of an earlier one
+                with late_signals_ignored():
                     self._publish()
         except OSError as unpublished:
             failure = unpublished
