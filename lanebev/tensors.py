@@ -152,4 +152,4 @@ def identity(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 @made_once
 def _constant(numbers: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    return torch.tensor(numbers, dtype=dtype, device=device)
+    return torch.tensor(numbers, dtype=dtype, device="cpu").to(device)

@@ -4,7 +4,7 @@ from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -53,12 +53,14 @@ def test_times_of_day_are_those_of_the_frames_also_over_midnight(form, start):
 @given(
     st.sampled_from(FORMS),
     st.datetimes(datetime(2001, 1, 1), datetime(2030, 1, 1)).filter(lambda each: each.hour or each.minute),
-    st.lists(st.integers(20, 400), min_size=40, max_size=80),
+    st.lists(st.integers(20, 400), min_size=60, max_size=80),  # more than a second, as counters fill none
 )
 def test_any_drive_has_its_times(form, start, milliseconds):
     start = start.replace(microsecond=1000 * (start.microsecond // 1000))
     steps = np.array(milliseconds) / 1000
     names = _names(form, start, steps)
+    if form.endswith(",{ms}.jpg"):  # digits of which none ends in 0 are read as a decimal fraction's
+        assume(any(name.endswith("0.jpg") for name in names))
     order = np.random.default_rng(len(names)).permutation(len(names))
     assert in_natural_order(names[place] for place in order) == names
     np.testing.assert_allclose(times_from_names(names), np.cumsum([0.0, *steps]), atol=1e-6)

@@ -61,7 +61,7 @@ def run(tmp_path):
             there, lanes = [*there, STRAY[1]], [*lanes, line(8.0).tolist()]
         found = {"h_samples": image_rows(360).tolist(), "raw_file": f"{number:03d}.png"}
         entries.append(found | {"lanes": lanes, "boundary": there})
-        status = "HOLDING" if number == 8 else "TRACKING"
+        status = "COASTING" if number == 8 else "TRACKING"
         rows.append(ExtrinsicsRow(number, 0.1 * number, *POSE, 0.1, 0.1, 0.1, 0.01, status, 20, ""))
     write_extrinsics(result / "extrinsics.csv", rows)
     (result / "lanes.json").write_text("".join(json.dumps(entry) + "\n" for entry in entries))
