@@ -87,7 +87,7 @@ def main() -> None:
     parser.add_argument("--frames", type=PositiveInt, default=90, help="frames per drive")
     parser.add_argument("--fps", type=PositiveFloat, default=20.0)
     parser.add_argument("--seed", type=int, default=81_000)
-    parser.add_argument("--hilly", action="store_true", help="with the numbers for hilly roads")
+    parser.add_argument("--hilly", action="store_true", help="with the configuration for hilly roads")
     parser.add_argument("--jobs", type=PositiveInt, default=1, help="number of processes")
     args = parser.parse_args()
     one = partial(_observe_one, args.weights, args.frames, args.fps)

@@ -127,7 +127,7 @@ def smooth_frames(
         tracker: with the joint calibrator.
         out: for lanes.json and, meanwhile, the states.
         source: name of the frames' source.
-        config: numbers of the tracker's calibrator.
+        config: configuration of the tracker's calibrator.
     """
     path = out / _STATES
     states, intervals = KeptStates(path), KeptNumbers(1)
@@ -161,7 +161,7 @@ def _smoothed(
         covariances: covariances of the pose as the calibrator gave it.
         scales: factor on the standard deviations of the pose.
         tracker: tracker that gave the states.
-        config: numbers of its calibrator.
+        config: configuration of its calibrator.
     """
     steps, count = torch.from_numpy(intervals.all().copy()), len(states)
     result = SmoothedPoses(np.empty((count, 4)), np.empty((count, 4, 4)), np.empty(count))

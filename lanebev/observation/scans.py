@@ -64,7 +64,7 @@ def scan_vertices(probabilities: Tensor, config: LineConfig) -> Vertices:
 
     Args:
         probabilities: (B, L, h, w).
-        config: numbers of the extraction.
+        config: configuration of the extraction.
     """
     padding = max(config.window, _PEAK)
     rows, columns = probabilities.shape[-2:]

@@ -21,7 +21,7 @@ _UNSURE = 0.12  # px, sigma of a clean map's vertex above which it counts less, 
 
 @dataclass(frozen=True)
 class LineConfig:
-    """Numbers of the line extraction.
+    """Configuration of the line extraction.
 
     Attributes:
         stride: px of the network's input per label px.

@@ -12,7 +12,7 @@ import torch
 from lanebev import JointCalibrator, LaneSegments
 from lanebev.estimation.joint.measurement import NUM_STRAIGHT, PITCH, ROLL, boundary_residuals
 from lanebev.estimation.joint.observations import boundary_places, observe
-from lanebev.estimation.joint.output import odd_line_deviation, unverified_deviation
+from lanebev.estimation.joint.output import no_boundary_deviation, unverified_deviation
 from lanebev.estimation.joint.restart import scatter_of_fit
 from lanebev.estimation.joint.scatter import averaged_moments, boundary_scatter, scatter_variance
 from lanebev.estimation.joint.single_frame import fit_observations
@@ -123,7 +123,7 @@ def test_boundaries_that_are_askew_may_be_out_of_place_where_nothing_shows_it():
     torch.testing.assert_close(found, expected)
 
 
-def test_the_variance_of_an_improbable_roll_is_that_of_the_mixture_with_an_odd_line():
+def test_the_variance_of_an_improbable_roll_is_that_of_the_mixture_with_a_line_that_bounds_no_lane():
     """Against the mixture computed by quadrature: equal lanes and the camera's roll, or a line anywhere."""
     by_outer, prior, freedom = 0.08, CONFIG.prior.roll_std, CONFIG.prior.freedom
     by_place = by_outer * torch.tensor([[0.0, 0.0, 1.0, -2.0, 1.0, 0.0]], dtype=DOUBLE)
@@ -135,11 +135,11 @@ def test_the_variance_of_an_improbable_roll_is_that_of_the_mixture_with_an_odd_l
         for misfit, share in ((False, 1 / 5), (True, 1 / 2)):
             odd = share / 3.6
             expected = odd / (odd + (1 - share) * density) * roll**2
-            found = odd_line_deviation(by_place, torch.tensor([roll]), torch.tensor([misfit]), CONFIG)
+            found = no_boundary_deviation(by_place, torch.tensor([roll]), torch.tensor([misfit]), CONFIG)
             assert (found * by_place.square().sum()).item() == pytest.approx(expected.item(), rel=1e-3)
-    assert odd_line_deviation(0 * by_place, torch.tensor([0.1]), torch.tensor([True]), CONFIG).isfinite()
-    every_line_bounds = JointConfig(odd_line=0.0)
-    assert odd_line_deviation(by_place, torch.tensor([0.1]), torch.tensor([True]), every_line_bounds) == 0
+    assert no_boundary_deviation(0 * by_place, torch.tensor([0.1]), torch.tensor([True]), CONFIG).isfinite()
+    every_line_bounds = JointConfig(no_boundary_odds=0.0)
+    assert no_boundary_deviation(by_place, torch.tensor([0.1]), torch.tensor([True]), every_line_bounds) == 0
 
 
 def test_a_kerb_taken_for_a_boundary_beside_the_ego_lane_is_in_the_variance_of_roll_and_height():

@@ -81,7 +81,7 @@ def weigh_readings(
         segments: segments of the frame, usable.
         intrinsics: (B, 3, 3) px.
         lane_width: (B, L-1) m.
-        cfg: the numbers.
+        cfg: the configuration.
 
     Returns:
         the calibration; a segment is an inlier as far as its line bounds a lane.
@@ -123,7 +123,7 @@ def average_readings(
         prior: prior of the frame.
         straight: 1/m and 1/m², sigmas of c0 and c1 of a straight road.
         bends: how probable a bend is; its sigmas are those of ``prior``.
-        cfg: the numbers of the readings.
+        cfg: configuration of the readings.
     """
     (batch, num), like = positions.shape, positions
     seen, places = spread_subset(seen, positions.gather(1, seen.boundary), _SEGMENTS)

@@ -67,7 +67,7 @@ from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.observation.segments import LaneSegments
 from lanebev.types import Calibration, Extrinsics, Status, check_type
 
-_NO_BOUNDARY = 0.36  # m out of place, three sigmas of what lanes differ, from which a line bounds no lane
+_NO_BOUNDARY_DEVIATION = 0.36  # m, from which a line bounds no lane: three sigmas of `open_deviation`
 
 
 class JointCalibrator(Calibrator[JointState]):
@@ -79,7 +79,7 @@ class JointCalibrator(Calibrator[JointState]):
     calibrator(segments, intrinsics, state, dt, lane_width)``. docs/method/joint.md defines it.
 
     Args:
-        config: the numbers, or keywords of :class:`JointConfig`.
+        config: the configuration, or keywords of :class:`JointConfig`.
     """
 
     state_type = JointState
@@ -244,7 +244,7 @@ def update_state(
         positions: (B, L) m, of the boundaries from the ego lane's middle.
         seen: what was observed.
         step: (B,) s since the last frame.
-        cfg: the numbers.
+        cfg: the configuration.
 
     Returns:
         the state with the frame; weights of the segments (B, N); inliers (B, N); standard deviations (B, 5)
@@ -297,7 +297,7 @@ def update_state(
     )
     agreed = agreement(frame, jacobian, at - last, seen)
     apart = torch.maximum(at[:, NUM_COMMON:].abs(), boundary_deviation(last, frame).abs())
-    lane = (apart < _NO_BOUNDARY).gather(1, seen.boundary)
+    lane = (apart < _NO_BOUNDARY_DEVIATION).gather(1, seen.boundary)
     return updated, frame.trust, torch.where((seen.weight > 0) & lane, agreed, 0.0), alone
 
 
@@ -311,14 +311,14 @@ def with_evidence(
         score: (B, 11 + L), of :func:`~lanebev.estimation.joint.evidence.normalized_score`.
         pose_told: (B, 4) bool, what of the pose the frame determines; the scale of the rest decays.
         step: (B,) s since the last frame.
-        cfg: the numbers.
+        cfg: the configuration.
 
     Returns:
         evidence (B, 11 + L) and scale (B, 4).
     """
     evidence = accumulate_evidence(predicted.evidence, score, step, cfg.evidence_time)
-    told = torch.where(pose_told, score[:, POSE], 1.0)  # 1 is the score that is expected
-    return evidence, adapt_motion_scale(predicted.motion_scale, told, step, cfg)
+    scored = torch.where(pose_told, score[:, POSE], 1.0)  # 1 is the score that is expected
+    return evidence, adapt_motion_scale(predicted.motion_scale, scored, step, cfg)
 
 
 def scatter_of_frame(

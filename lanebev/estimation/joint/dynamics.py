@@ -20,7 +20,7 @@ from lanebev.tensors import constant
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """Numbers of the motion; angles in rad, lengths in m, times in s.
+    """Configuration of the motion model; angles in rad, lengths in m, times in s.
 
     Attributes:
         bandwidth: Hz, cut-off frequency of the pose's motion.
@@ -106,7 +106,7 @@ def motion(
         vertical: (B,) 1/m, standard deviation of the road's vertical curvature.
         road: how the shape moves.
         place: indices.
-        cfg: the numbers.
+        cfg: the configuration.
 
     Returns:
         (B, D, D) F and (B, D, D) W.

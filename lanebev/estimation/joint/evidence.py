@@ -15,13 +15,13 @@ from lanebev.estimation.joint.state import JointConfig, JointState
 from lanebev.estimation.joint.update import FrameInformation, innovation_score
 from lanebev.tensors import constant
 
-_SHARED = 0.2  # standard deviation of the error that all end points of a boundary share, in their sigmas
-_KNOWN = 1e-3  # share of a prediction-free score's variance below which the prediction determines the entry
+_COMMON_ERROR = 0.2  # sigmas: standard deviation of the error that all end points of a boundary share
+_LEAST_VARIANCE = 1e-3  # ratio of a score's variance to Λᵢᵢ below which the prediction fixes the entry
 _FREE_POSE = (0.05, 0.05, 0.05, 0.3)  # rad, m: sigmas added where the pose is free
 _LARGEST_EXCESS = 4.0  # of a squared score; a larger one is a jump
 EQUAL = 0.1  # of the deviations of unequal lanes, up to which lanes are equal
-_RAISED = 0.01  # share of segments over the horizon, above which the others are too low
-_CURVED = 2.0  # sigmas of a vertical curvature from which the road is taken for a crest or a dip
+_OVER_HORIZON = 0.01  # fraction of segments over the horizon, above which the others are too low
+_CURVED_SIGMAS = 2.0  # ratio of the vertical curvature to its sigma from which it is a crest or a dip
 _POSE_DECAY = 0.85  # factor per frame on the pose's evidence, since a detector's errors last over frames
 CALL = 5.0  # sigmas of evidence at which half of the noise is admitted
 
@@ -52,12 +52,12 @@ def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor, weight
             priors, torch.cat([frame.matrix, frame.matrix]), torch.cat([frame.vector, frame.vector])
         )
     )
-    known = variance > (_KNOWN * frame.matrix.diagonal(dim1=1, dim2=2)).clamp(min=0.0)
-    usual = count.square().sum(-1, keepdim=True) / count.sum(-1, keepdim=True).clamp(min=1.0)
-    alike = torch.cat([usual, count], dim=-1)  # of the vertical curvature, and of each boundary
-    inflation = pad(_SHARED**2 * alike, (cov.shape[-1] - alike.shape[-1], 0)) + 1
+    known = variance > (_LEAST_VARIANCE * frame.matrix.diagonal(dim1=1, dim2=2)).clamp(min=0.0)
+    mean_count = count.square().sum(-1, keepdim=True) / count.sum(-1, keepdim=True).clamp(min=1.0)
+    counts = torch.cat([mean_count, count], dim=-1)  # of the vertical curvature, and of each boundary
+    inflation = pad(_COMMON_ERROR**2 * counts, (cov.shape[-1] - counts.shape[-1], 0)) + 1
     normal = torch.where(known, score * torch.where(known, variance * inflation, 1.0).rsqrt(), 0.0)
-    raised = (weight * ~frame.residuals.valid).sum(-1) > _RAISED * weight.sum(-1)
+    raised = (weight * ~frame.residuals.valid).sum(-1) > _OVER_HORIZON * weight.sum(-1)
     crest = torch.where(raised, 0.0, normal[1, :, VERTICAL]).unsqueeze(-1)
     return torch.cat([normal[0, :, POSE], normal[1, :, SHAPE], crest, normal[1, :, DEVIATIONS]], dim=-1)
 
@@ -106,7 +106,7 @@ def adapt_motion_scale(before: Tensor, score: Tensor, dt: Tensor, cfg: JointConf
         before: (B, 4) >= 1, factor on the variance so far.
         score: (B, 4), normalised, of pitch, yaw, roll and height.
         dt: (B,) s.
-        cfg: the numbers.
+        cfg: the configuration.
     """
     gain = 1 - (-dt / cfg.motion_scale_rise).exp().unsqueeze(-1)
     excess = (score.square() - 1).clamp(max=_LARGEST_EXCESS)
@@ -127,7 +127,7 @@ def adaptive_process_noise(evidence: Tensor, cov: Tensor, cfg: JointConfig) -> T
     Args:
         evidence: (B, 5 + NUM_SHAPE + L).
         cov: (B, O, O), predicted.
-        cfg: the numbers.
+        cfg: the configuration.
     """
     parts = evidence.square().split([NUM_POSE, NUM_SHAPE, 1, cfg.num_boundaries], dim=-1)
     worst = [part.amax(-1, keepdim=True) for part in parts]
@@ -167,8 +167,8 @@ def hill_variance(state: JointState, dt: Tensor, cfg: JointConfig) -> Tensor:
     Args:
         state: after the last frame.
         dt: (B,) s since then.
-        cfg: the numbers.
+        cfg: the configuration.
     """
     curvature, variance = state.mean[:, VERTICAL], state.cov[:, VERTICAL, VERTICAL]
-    excess = (curvature.square() - _CURVED**2 * variance).clamp(min=0.0)
+    excess = (curvature.square() - _CURVED_SIGMAS**2 * variance).clamp(min=0.0)
     return (state.hills * (-dt / cfg.motion.hill_memory).exp()).maximum(excess)

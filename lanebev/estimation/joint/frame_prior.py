@@ -90,20 +90,20 @@ def prior_of_mount(pose: Sequence[float], std: Sequence[float]) -> FramePrior:
         pose: pitch, yaw, roll (rad) and height (m) of the mount.
         std: their standard deviations; infinite for unknown axes, whose prior is that without a mount.
     """
-    usual = FramePrior()
+    default = FramePrior()
     names = ("pitch", "yaw", "roll", "height")
     known = [name for name, sigma in zip(names, std, strict=True) if math.isfinite(sigma)]
     means = {name: value for name, value in zip(names, pose, strict=True) if name in known}
     wide = zip(names, std, _BODY_STD, strict=True)
     spread = {f"{name}_std": math.hypot(sigma, body) for name, sigma, body in wide if name in known}
     search = {
-        f"{name}_range": min(3.0 * spread[f"{name}_std"], getattr(usual, f"{name}_range"))
+        f"{name}_range": min(3.0 * spread[f"{name}_std"], getattr(default, f"{name}_range"))
         for name in ("pitch", "roll")
         if name in known
     }
     freedom = {"freedom": _MOUNT_FREEDOM} if known else {}
     changes: dict[str, Any] = {**means, **spread, **search, **freedom}
-    return replace(usual, **changes)
+    return replace(default, **changes)
 
 
 def student_weight(squared: Tensor, freedom: float) -> Tensor:

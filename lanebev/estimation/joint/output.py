@@ -16,95 +16,95 @@ from lanebev.tensors import constant
 from lanebev.types import Calibration, Extrinsics
 
 _ONLY_HEIGHT = (0.0, 0.0, 0.0, 1.0)
-_FITTED = 3  # boundaries that a pose of equal lanes always fits: by offset, roll and height
-_BY_CHANCE = 0.004  # probability that a further boundary is in its place though lanes are unequal
-_MORE = 4.0  # factor on the odds that a line bounds no lane, where further lines are on no boundary
-_ODD_WITHIN = 3.6  # m, range of such a line's place
-_THIRD = 6.0  # sum of squares of (1, -2, 1), in which proportion three boundaries change the roll
-_IN_VIEW = 0.015  # rad/m or m/m: change of roll or height by a boundary's deviation from which it counts
-_WAY = 15.0  # m along which a boundary keeps a heading of its own
-_DOUBTFUL = 0.6  # m out of place, below which a single boundary may stand for several
+_ALWAYS_FIT = 3  # number of boundaries that some pose over equal lanes always fits
+_CHANCE_FIT = 0.004  # probability that a further boundary fits though lanes are unequal
+_MISFIT_FACTOR = 4.0  # on the odds that a line bounds no lane, where other lines do not fit
+_NO_BOUNDARY_RANGE = 3.6  # m, over which the position of such a line is uniform
+_ROLL_PATTERN = 6.0  # sum of squares of (1, -2, 1), the proportion in which three boundaries change roll
+_LEAST_SENSITIVITY = 0.015  # rad/m or m/m of roll or height, from which a boundary counts as in view
+_HEADING_LENGTH = 15.0  # m along which a boundary keeps its own heading
+_LARGEST_DEVIATION = 0.6  # m; a line that deviates by more is on no boundary
 
 
 def single_deviation(deviations: Tensor, cfg: JointConfig) -> Tensor:
-    """Compute the variance (B,) m² of any boundary's place if exactly one deviates.
+    """Compute the variance (B,) m² of any boundary's deviation if exactly one deviates.
 
     Source: (J26).
 
     Args:
         deviations: (B, L) m, by the filter.
-        cfg: the numbers.
+        cfg: the configuration.
     """
     size = cfg.open_deviation
     worst = deviations.abs().amax(-1)
-    alone = (worst > EQUAL * size) & (worst < _DOUBTFUL)
+    alone = (worst > EQUAL * size) & (worst < _LARGEST_DEVIATION)
     return torch.where(alone, worst.clamp(max=size).square(), 0.0)
 
 
 def unverified_deviation(
     sensitivity: Tensor, deviations: Tensor, of_headings: Tensor, roll: Tensor, cfg: JointConfig
 ) -> Tensor:
-    """Compute the variance (B,) m² of every boundary's place where too few are in view to tell.
+    """Compute the variance (B,) m² of every boundary's deviation where too few are in view to tell.
 
     Source: (J26). Three boundaries fit a pose of equal lanes, however unequal the lanes are; a fourth shows
-    whether they are, unless it is so far from its place that it bounds no lane.
+    whether they are, unless it deviates so much that it bounds no lane.
 
     Args:
         sensitivity: (B, 4, L) change of the pose per metre of deviation of a boundary; 0 if not in view.
         deviations: (B, L) m, by the filter.
-        of_headings: (B,) rad², variance of a boundary's own heading. One that has such a heading gets out of
-            its place by as much as it differs over ``_WAY``.
+        of_headings: (B,) rad², variance of a boundary's own heading, which makes it deviate over
+            ``_HEADING_LENGTH``.
         roll: (B,) rad.
-        cfg: the numbers.
+        cfg: the configuration.
     """
-    fits = deviations.abs() < _DOUBTFUL
-    in_view = (sensitivity[:, ROLL:].abs().amax(1) / _IN_VIEW).clamp(max=1.0) * fits
-    further = (in_view.sum(-1) - _FITTED).clamp(min=0.0)
+    fits = deviations.abs() < _LARGEST_DEVIATION
+    in_view = (sensitivity[:, ROLL:].abs().amax(1) / _LEAST_SENSITIVITY).clamp(max=1.0) * fits
+    further = (in_view.sum(-1) - _ALWAYS_FIT).clamp(min=0.0)
     of_three = (1 - further).clamp(min=0.0)
-    share = of_three.maximum(_BY_CHANCE**further)
+    share = of_three.maximum(_CHANCE_FIT**further)
     if not cfg.lane_deviation_std:
         return torch.zeros_like(share)
-    askew = of_headings * _WAY**2
-    odd = odd_line_deviation(sensitivity[:, ROLL], roll, ~fits.all(-1), cfg)
-    return (cfg.lane_deviation_std**2 + askew) * share + odd * of_three
+    by_headings = of_headings * _HEADING_LENGTH**2
+    odd = no_boundary_deviation(sensitivity[:, ROLL], roll, ~fits.all(-1), cfg)
+    return (cfg.lane_deviation_std**2 + by_headings) * share + odd * of_three
 
 
-def odd_line_deviation(by_place: Tensor, roll: Tensor, misfit: Tensor, cfg: JointConfig) -> Tensor:
-    """Compute the variance (B,) m² of every boundary's place by the chance that one of three bounds no lane.
+def no_boundary_deviation(by_place: Tensor, roll: Tensor, misfit: Tensor, cfg: JointConfig) -> Tensor:
+    """Compute the variance (B,) m² of every boundary's deviation because one line of three may bound no lane.
 
-    Source: (J26). Such a line, a kerb or the edge of a shoulder, is taken for a boundary by a wrong roll, and
-    the larger this roll is, the less probable is it that the camera has it. The result gives the roll the
-    variance p r², with p the probability that there is such a line and r the roll beyond its mean.
+    Source: (J26). A kerb or the edge of a shoulder fits as a boundary if the roll is wrong. The larger that
+    roll is, the less probable is it for a camera. The result gives roll the variance p r², where p is the
+    probability that there is such a line and r the difference of the roll from the prior's mean.
 
     Args:
         by_place: (B, L), change of the roll (rad) per metre of deviation of a boundary; 0 if not in view.
         roll: (B,) rad.
         misfit: (B,) bool, other lines are in view that are on no boundary.
-        cfg: the numbers.
+        cfg: the configuration.
     """
-    total = by_place.square().sum(-1).clamp(min=_IN_VIEW**2)
+    total = by_place.square().sum(-1).clamp(min=_LEAST_SENSITIVITY**2)
     beyond = roll - cfg.prior.roll
     by_camera = student_density(beyond / cfg.prior.roll_std, cfg.prior.freedom) / cfg.prior.roll_std
-    density = by_camera * (total / _THIRD).sqrt()  # per m of the outer line's place
-    odds = cfg.odd_line * torch.where(misfit, _MORE, 1.0) / (_ODD_WITHIN * density)
+    density = by_camera * (total / _ROLL_PATTERN).sqrt()  # per m of the outer line's position
+    odds = cfg.no_boundary_odds * torch.where(misfit, _MISFIT_FACTOR, 1.0) / (_NO_BOUNDARY_RANGE * density)
     return odds / (1 + odds) * beyond.square() / total
 
 
 def beyond_filter(expected: Tensor, variances: Tensor) -> Tensor:
-    """Compute the variance (B,) m² of the boundaries' places that the filter does not have in its covariance.
+    """Compute the variance (B,) m² of the boundaries' deviations that the filter's covariance lacks.
 
     Source: (J26). Half of six independent deviations can be observed, so their variances by the filter sum to
     three times that of one.
 
     Args:
-        expected: (B,) m², of any boundary's place.
+        expected: (B,) m², of any boundary's deviation.
         variances: (B, L) m², of the deviations by the filter.
     """
     return (expected - 0.5 * variances.sum(-1)).clamp(min=0.0)
 
 
 def covariance_by_boundaries(state: JointState, cfg: JointConfig) -> Tensor:
-    """Compute the covariance (B, 4, 4) of the pose by the boundaries' own places and headings.
+    """Compute the covariance (B, 4, 4) of the pose by the boundaries' own deviations and headings.
 
     Source: (J26) and (J29).
     """
@@ -124,8 +124,8 @@ def as_calibration(
 ) -> Calibration:
     """Make the calibration of a state.
 
-    Its covariance adds what the filter does not estimate: the common scale of the lane widths; places and
-    headings of the boundaries that differ from the model's; the difference from a frame that contradicts the
+    Its covariance adds what the filter does not estimate: the common scale of the lane widths; the
+    boundaries' own deviations and headings; the difference from a frame that contradicts the
     state; and, if roll is not observed, the second-order effect of its error on the height.
     If the boundaries at x₁ and x₂ stay where they are seen, h'' = -2 (h - x₁ x₂ / h).
 
@@ -134,7 +134,7 @@ def as_calibration(
         inliers: (B, N).
         apart: (B, 4), pose of a frame that contradicts the state, less the state's; else 0.
         positions: (B, L) m, of the boundaries from the ego lane's middle.
-        cfg: the numbers.
+        cfg: the configuration.
     """
     cov = state.cov[:, POSE, POSE]
     height, ego = state.mean[:, HEIGHT], cfg.num_boundaries // 2 - 1

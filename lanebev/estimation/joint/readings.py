@@ -87,7 +87,7 @@ def readings(num_boundaries: int, cfg: ReadingConfig, like: Tensor) -> Readings:
 
     Args:
         num_boundaries: L.
-        cfg: the numbers.
+        cfg: the configuration.
         like: gives dtype and device.
     """
     wrong, shift = _single_wrong_lines(num_boundaries)
@@ -128,7 +128,7 @@ def log_prior(ways: Readings, there: Tensor, cfg: ReadingConfig) -> Tensor:
     Args:
         ways: C readings.
         there: (B, L) bool, lines that were seen.
-        cfg: the numbers.
+        cfg: the configuration.
     """
     any_wrong = ways.wrong.any(-1)
     seen = (ways.wrong & there.unsqueeze(1)).any(-1)  # (B, C)
@@ -145,7 +145,7 @@ def log_prior_of_half(there: Tensor, cfg: ReadingConfig) -> Tensor:
 
     Args:
         there: (B, L) bool, lines that were seen.
-        cfg: the numbers.
+        cfg: the configuration.
     """
     more = (there.sum(-1) // 2 - 1).clamp(min=0)
     odds: Tensor = np.log(cfg.no_boundary_probability) + more.to(torch.float64) * np.log(

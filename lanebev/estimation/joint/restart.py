@@ -28,10 +28,10 @@ from lanebev.estimation.reasons import Reason
 from lanebev.geometry.linalg import inverse_spd
 from lanebev.types import Status
 
-_FAR = 25.7  # χ² of pose and offset, five degrees of freedom, exceeded by chance once in 10,000 frames
-_FEW = 0.5  # share of the segments that fit, below which the state is in doubt
-_UNTOLD = 0.5  # share of the prior's standard deviation of roll, above which a frame does not tell roll
-_USUAL = 1.5  # such deviations from the prior's mean, within which a roll that is not told may be noise
+_CONTRADICTION = 25.7  # χ² with five degrees of freedom, exceeded by chance in one frame of 10,000
+_MISFIT_SHARE = 0.5  # fraction of segments that fit, below which the state is in doubt
+_UNDETERMINED_ROLL = 0.5  # of the prior's sigma of roll: sigma of a fit's roll from which it is undetermined
+_ROLL_NOISE = 1.5  # of the prior's sigma: distance from its mean within which such a roll may be noise
 
 
 class Compared(NamedTuple):
@@ -67,7 +67,7 @@ def restart(
         supported: (B,) bool, the frame supports the state.
         seen: what was observed.
         positions: (B, L) m, of the boundaries from the ego lane's middle.
-        cfg: the numbers.
+        cfg: the configuration.
     """
     total = seen.weight.sum(-1)
     share = (agreed * seen.weight).sum(-1) / total.clamp(min=1e-6)
@@ -97,7 +97,7 @@ def compare_with_frame(
         wanted: (B,) bool, to begin anew from any usable frame.
         seen: what was observed.
         positions: (B, L) m, of the boundaries from the ego lane's middle.
-        cfg: the numbers.
+        cfg: the configuration.
     """
     places = positions.gather(1, seen.boundary)
     fit = fit_observations(seen, places, cfg.prior, iterations=cfg.start_iterations)
@@ -105,10 +105,10 @@ def compare_with_frame(
     usable = fit.valid & ((fit.inliers * seen.weight).sum(-1) / total >= cfg.enter_share)
     begun = state_of_fit(fit, state, cfg)
     scatter = scatter_of_fit(fit, places, seen, cfg)
-    usual_step = torch.full_like(total, cfg.assumed_dt)
+    assumed_step = torch.full_like(total, cfg.assumed_dt)
     begun = begun._replace(
         pose_sensitivity=scatter.sensitivity,
-        scatter=averaged_moments(scatter.moments, begun.scatter, usual_step, cfg.scatter_memory),
+        scatter=averaged_moments(scatter.moments, begun.scatter, assumed_step, cfg.scatter_memory),
     )
     contrary = usable & is_contrary(state, begun, fit, places, seen, cfg)
     count = torch.where(usable, (state.contrary + 1) * contrary, state.contrary)
@@ -130,10 +130,12 @@ def remaining_doubt(state: JointState, share: Tensor, cfg: JointConfig) -> Tenso
     Args:
         state: after the frame.
         share: (B,), of the frame's segments that fit the state.
-        cfg: the numbers.
+        cfg: the configuration.
     """
     jumped = (state.evidence[:, :NUM_POSE].abs() > CALL).any(-1)
-    return torch.where(jumped | (share < _FEW), float(cfg.doubt_frames), (state.doubt - 1).clamp(min=0))
+    return torch.where(
+        jumped | (share < _MISFIT_SHARE), float(cfg.doubt_frames), (state.doubt - 1).clamp(min=0)
+    )
 
 
 def is_contrary(
@@ -158,7 +160,7 @@ def is_contrary(
         fit: fit of the frame.
         places: (B, N) m, of the segments' boundaries on equal lanes.
         seen: what was observed.
-        cfg: the numbers.
+        cfg: the configuration.
 
     Returns:
         (B,) bool.
@@ -175,7 +177,7 @@ def is_contrary(
         for at in (with_state, alone)
     )
     penalty = 0.5 * cfg.num_boundaries * seen.weight.sum(-1).clamp(min=1.0).log()
-    return (chi2 > _FAR) & (by_fit + penalty > by_state)
+    return (chi2 > _CONTRADICTION) & (by_fit + penalty > by_state)
 
 
 def scatter_of_fit(fit: SingleFrameFit, places: Tensor, seen: Observations, cfg: JointConfig) -> Scatter:
@@ -200,20 +202,20 @@ def scatter_of_fit(fit: SingleFrameFit, places: Tensor, seen: Observations, cfg:
 
 
 def with_roll_of_prior(fit: SingleFrameFit, prior: FramePrior) -> tuple[Tensor, Tensor, Tensor]:
-    """Give the roll of a fit that tells next to nothing of it the prior's mean and variance.
+    """Replace a roll that a fit hardly determines by the prior's mean and variance.
 
-    The two lines of one lane do not tell roll. What a fit takes for it is noise that bends the lines, as a
-    vertical curvature of the road does, and where the lines are precise that is far from the prior. The other
-    parameters follow by their regression on the roll. A roll far from the prior's is kept.
+    The two boundaries of one lane do not determine roll. The roll of such a fit is the effect of noise that
+    bends the lines, or of the road's vertical curvature, and precise lines can bring it far from the prior.
+    The other parameters follow by their regression on roll. A roll farther from the prior is kept.
 
     Returns:
         parameters (B, 7), covariance (B, 7, 7), and their change (B, 7) per 1/m of vertical curvature.
     """
     params, cov, by_vertical = fit.params(), fit.covariance, fit.by_vertical_curvature
     variance, to_prior = cov[:, ROLL, ROLL, None], prior.roll - params[:, ROLL, None]
-    usual = to_prior.abs() < _USUAL * prior.roll_std
-    untold = usual & (variance > (_UNTOLD * prior.roll_std) ** 2)
-    by_roll = cov[:, ROLL] / variance * untold  # (B, 7), 1 in roll; 0 where the fit tells it
+    near_prior = to_prior.abs() < _ROLL_NOISE * prior.roll_std
+    undetermined = near_prior & (variance > (_UNDETERMINED_ROLL * prior.roll_std) ** 2)
+    by_roll = cov[:, ROLL] / variance * undetermined  # (B, 7), 1 in roll; 0 where it is determined
     more = (prior.roll_std**2 - variance).unsqueeze(-1) * by_roll.unsqueeze(-1) * by_roll.unsqueeze(-2)
     return params + to_prior * by_roll, cov + more, by_vertical - by_vertical[:, ROLL, None] * by_roll
 

@@ -52,7 +52,7 @@ def propagate_road_shape(
         phase: (B,) m, how far the first knot lies behind the camera.
         dt: (B,) s.
         place: indices.
-        cfg: the numbers.
+        cfg: the configuration.
 
     Returns:
         shape and phase after it, with derivatives and noise.
@@ -84,7 +84,7 @@ def step_variance(shape: Tensor, shape_cov: Tensor, cfg: MotionConfig) -> Tensor
     Args:
         shape: (B, NUM_SHAPE).
         shape_cov: (B, NUM_SHAPE, NUM_SHAPE).
-        cfg: the numbers.
+        cfg: the configuration.
     """
     farthest, variance = shape.sum(-1), shape_cov.sum((1, 2))  # of the curvature at the last knot
     excess = (farthest.square() - _BENT**2 * variance).clamp(min=0.0)

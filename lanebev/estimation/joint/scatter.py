@@ -1,7 +1,7 @@
 """Scatter of the boundaries about parallel lanes of equal width, and its effect on the pose.
 
 The pose is fitted to a road whose boundaries are parallel and whose lanes have the given widths. On a street,
-every boundary has a lateral deviation (here: its own place) and a heading of its own. Errors of a detector
+every boundary has a lateral deviation and a heading of its own. Errors of a detector
 that last along a boundary have the same effect. All vertices of the boundary share them, and so do
 consecutive frames, so they do not average out as noise does. Their variances are estimated from the residuals
 of every frame's fit.
@@ -22,23 +22,23 @@ from lanebev.estimation.joint.state import JointConfig
 from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
 from lanebev.tensors import constant, identity
 
-_LEAST_STD = (0.05, 0.003)  # m, rad: prior of a boundary's own place and heading where they are estimated
-_NOISE = 1.5  # factor on the variance of the estimates by noise, which is subtracted
-_FEW = 0.2  # degrees of freedom added where there are none
-_UNSURE = 2.0  # degrees of freedom by which variances from few of them are enlarged
-_GONE = 0.001  # rad/m or m/m: change of roll or height by a boundary's place below which it is not in view
+_PRIOR_STD = (0.05, 0.003)  # m, rad: least prior sigmas of a boundary's own deviation and heading
+_NOISE_FACTOR = 1.5  # on the noise variance of the estimates, which is subtracted
+_ADDED_FREEDOM = 0.2  # degrees of freedom that are added, since there may be none
+_FEW_FREEDOM = 2.0  # degrees of freedom at which a variance is doubled, because it may be small by chance
+_LEAST_SENSITIVITY = 0.001  # rad/m or m/m of roll or height, below which a boundary is not in view
 _LEAST_WEIGHT = 1e-9  # of the frames before; 0 before the first
-_ENOUGH = 0.5  # degrees of freedom from which a frame counts fully
+_FULL_FREEDOM = 0.5  # degrees of freedom from which a frame counts fully
 
 
 class Scatter(NamedTuple):
-    """What one frame tells of its boundaries' own places and headings.
+    """What one frame tells of its boundaries' own deviations and headings.
 
     Attributes:
-        sensitivity: (B, 4, 2 L), change of the pose by the boundaries' own places (per m), then by their
+        sensitivity: (B, 4, 2 L), change of the pose by the boundaries' own deviations (per m), then by their
             headings (per rad).
-        moments: (B, 2, 3), for places (m²) and headings (rad²): the sum of squares beyond those of noise, the
-            degrees of freedom that the fit leaves (at most 2 L - 5 together), and 1, the weight of the frame.
+        moments: (B, 2, 3), for deviations (m²) and headings (rad²): the sum of squares minus that of noise,
+            the degrees of freedom that the fit leaves (at most 2 L - 5 together), and 1, the frame's weight.
     """
 
     sensitivity: Tensor
@@ -53,7 +53,7 @@ def boundary_scatter(
     member: Tensor,
     moments: Tensor,
 ) -> Scatter:
-    """Estimate each boundary's own place and heading in a frame, beside the parameters that all share.
+    """Estimate each boundary's own deviation and heading in a frame, beside the parameters that all share.
 
     Source: (J27), random effects of a linear mixed model, and moments for their variances (Henderson 1953).
     A heading moves an end point as an offset of Z times the heading does.
@@ -64,7 +64,7 @@ def boundary_scatter(
         residuals: distances, and Z of the foot points.
         weight: (B, N) px⁻², weight of each segment over its variance.
         member: (B, L, N) of :func:`~lanebev.estimation.joint.update.membership`.
-        moments: (B, 2, 3) of the frames before; they decide the prior of the places and headings.
+        moments: (B, 2, 3) of the frames before; they decide the prior of the deviations and headings.
     """
     count, num, distance = jacobian.shape[1], member.shape[1], residuals.distance.flatten(1).unsqueeze(1)
     by_place = jacobian[:, OFFSET : OFFSET + 1]
@@ -84,13 +84,13 @@ def boundary_scatter(
     left = own - own_known @ known[:, :, :-1]
     pull = -by_own[:, -1:].mT - own_known @ known[:, :, -1:]
 
-    least = constant(tuple(std**2 for std in _LEAST_STD), like=left)
+    least = constant(tuple(std**2 for std in _PRIOR_STD), like=left)
     prior = scatter_variance(moments).maximum(least).repeat_interleave(num, dim=-1)  # (B, 2 L)
     own_cov = inverse_spd(left + prior.reciprocal().diag_embed())
-    seen = own_cov @ left  # ζ̂ is this times the own places and headings, and noise
+    seen = own_cov @ left  # ζ̂ is this times the own deviations and headings, and noise
     found = (own_cov @ pull).squeeze(-1)
     by_noise = (seen @ own_cov).diagonal(dim1=1, dim2=2)
-    squares = (found.square() - _NOISE * by_noise).unflatten(-1, (2, num)).sum(-1)
+    squares = (found.square() - _NOISE_FACTOR * by_noise).unflatten(-1, (2, num)).sum(-1)
     freedom = seen.square().unflatten(1, (2, num)).unflatten(-1, (2, num)).sum((2, 4))  # (B, 2, 2)
     each = torch.stack([squares, freedom.diagonal(dim1=1, dim2=2)], dim=-1)
     return Scatter(across[:, :NUM_POSE], pad(each, (0, 1), value=1.0))
@@ -105,24 +105,24 @@ def averaged_moments(now: Tensor, before: Tensor, step: Tensor, memory: float) -
         step: (B,) s since the last frame.
         memory: s, time constant.
     """
-    told = (now[..., 1].sum(-1) / _ENOUGH).clamp(max=1.0)
+    told = (now[..., 1].sum(-1) / _FULL_FREEDOM).clamp(max=1.0)
     gain = told * (1 - (-step / memory).exp())
     return before + gain[:, None, None] * (now - before)
 
 
 def scatter_variance(moments: Tensor) -> Tensor:
-    """Compute the variances (B, 2) of a boundary's own place (m²) and heading (rad²) from their moments.
+    """Compute the variances (B, 2) of a boundary's own deviation (m²) and heading (rad²) from their moments.
 
     Source: (J28). The fewer the degrees of freedom, the larger: one deviation may be small by chance.
     """
     squares, freedom, weight = moments.unbind(-1)
     weight = weight.clamp(min=_LEAST_WEIGHT)
-    freedom = freedom / weight + _FEW
-    return squares.clamp(min=0.0) / weight / freedom * (1 + _UNSURE / freedom)
+    freedom = freedom / weight + _ADDED_FREEDOM
+    return squares.clamp(min=0.0) / weight / freedom * (1 + _FEW_FREEDOM / freedom)
 
 
 def remembered_sensitivity(now: Tensor, before: Tensor, step: Tensor, cfg: JointConfig) -> Tensor:
-    """Blend the pose's change by each boundary's own place and heading over the last frames.
+    """Blend the pose's change by each boundary's own deviation and heading over the last frames.
 
     Source: M of (J26) and (J29).
 
@@ -133,10 +133,10 @@ def remembered_sensitivity(now: Tensor, before: Tensor, step: Tensor, cfg: Joint
         now: (B, 4, 2 L) by this frame.
         before: (B, 4, 2 L); 0 where no frame has determined the pose yet.
         step: (B,) s since then; inf where the boundaries' numbers have changed.
-        cfg: the numbers.
+        cfg: the configuration.
     """
     num = now.shape[-1] // 2
-    gone = (now[:, ROLL:, :num].abs().amax(1, keepdim=True) < _GONE).repeat(1, 1, 2)
+    gone = (now[:, ROLL:, :num].abs().amax(1, keepdim=True) < _LEAST_SENSITIVITY).repeat(1, 1, 2)
     memory = torch.where(gone, cfg.motion.deviation_memory, cfg.motion.unequal_memory)
     fade = torch.where(
         (before != 0).any(-1).any(-1)[:, None, None], (-step[:, None, None] / memory).exp(), 0.0

@@ -135,8 +135,8 @@ def fit_observations(
     along = residuals.by_vertical_curvature * per_end(precision)
     by_vertical = covariance @ residuals.jacobian @ along.unsqueeze(-1)
     std = covariance.diagonal(dim1=-2, dim2=-1)[:, :OFFSET].sqrt()
-    usual = FramePrior().std(params)[:OFFSET]
-    observed = std < _OBSERVED * torch.maximum(prior.std(params)[:OFFSET], usual)
+    default = FramePrior().std(params)[:OFFSET]
+    observed = std < _OBSERVED * torch.maximum(prior.std(params)[:OFFSET], default)
     support = (trust * seen.weight).sum(-1)
     valid = (support >= 2.5) & observed[:, :2].all(-1) & params.isfinite().all(-1)
     return SingleFrameFit(

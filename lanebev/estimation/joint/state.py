@@ -27,18 +27,18 @@ _OFFSET_RATE_STD = 0.5  # m/s, of a start
 
 @dataclass(frozen=True)
 class JointConfig:
-    """Numbers of :class:`lanebev.JointCalibrator`; angles in rad, lengths in m, times in s.
+    """Configuration of :class:`lanebev.JointCalibrator`; angles in rad, lengths in m, times in s.
 
     Attributes:
         num_boundaries: L.
         iterations: Gauss-Newton steps per frame.
         start_iterations: Gauss-Newton steps for every start of a first frame.
         lane_width_std: sigma of the common scale of the lane widths, m; 0: the widths are exact.
-        scatter_memory: time constant, s, of the mean squares of the boundaries' own places and headings;
+        scatter_memory: time constant, s, of the mean squares of the boundaries' own deviations and headings;
             inf: they are taken for 0.
         lane_deviation_std: sigma of a boundary's deviation where too few are in view to tell whether lanes
             are equal, m; 0: lanes are equal.
-        odd_line: prior odds that one of three lines in view bounds no lane; 0: each does.
+        no_boundary_odds: prior odds that one of three lines in view bounds no lane; 0: each does.
         motion: motion model.
         prior: prior of a start and range of its search.
         open_pose: standard deviation of the process noise that the evidence (J16) adds to the pose where it
@@ -71,7 +71,7 @@ class JointConfig:
     lane_width_std: float = 0.0
     scatter_memory: float = 1.0
     lane_deviation_std: float = 0.05
-    odd_line: float = 0.25
+    no_boundary_odds: float = 0.25
     motion: MotionConfig = field(default_factory=MotionConfig)
     prior: FramePrior = field(default_factory=FramePrior)
     open_pose: float = 0.01
@@ -125,10 +125,10 @@ class JointState(NamedTuple):
         cov: (B, D, D).
         phase: (B,) m, how far the first knot of the road's curvature lies behind the camera.
         evidence: (B, 11 + L) evidence against the motion, the accumulated scores of (J15).
-        pose_sensitivity: (B, 4, 2 L) change of the pose by each boundary's own place (per m) and heading (per
-            rad), by the last frames that determined the pose.
-        scatter: (B, 2, 3) over the last frames, for the boundaries' own places (m²) and headings (rad²): sum
-            of squares, degrees of freedom, weight of the frames.
+        pose_sensitivity: (B, 4, 2 L) change of the pose by each boundary's own deviation (per m) and heading
+            (per rad), in the last frames that determined the pose.
+        scatter: (B, 2, 3) mean over the last frames, for the boundaries' own deviations (m²) and headings
+            (rad²): sum of squares, degrees of freedom, weight of the frames.
         motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, adapted to the drive.
         hills: (B,) 1/m², variance of the road's vertical curvature beyond that of a plane road, by the crests
             and dips so far (J21).
@@ -174,7 +174,7 @@ def state_from_fit(
         params: (B, 7), see ``NUM_PARAMS``.
         param_cov: (B, 7, 7).
         by_vertical: (B, 7), change of the fit per 1/m of vertical curvature.
-        cfg: the numbers.
+        cfg: the configuration.
 
     Returns:
         mean (B, D) and covariance (B, D, D).

@@ -36,7 +36,7 @@ def update_track_status(
         single_frame_std: (B, 5) of pose and offset by the frame alone.
         step: (B,) s since the last frame.
         seen: what was observed.
-        cfg: the numbers.
+        cfg: the configuration.
 
     Returns:
         the state after the frame, before any restart, and (B,) bool: it was supported.

@@ -1,4 +1,4 @@
-"""The numbers of the mount estimator."""
+"""Configuration of the mount estimator."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ PerAxis = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class MountConfig:
-    """Numbers of :class:`MountEstimator`; rad, m, s, in the order pitch, yaw, roll, height.
+    """Configuration of :class:`MountEstimator`; rad, m, s, in the order pitch, yaw, roll, height.
 
     Attributes:
         block_time: time of accepted frames in a block, s.

@@ -32,7 +32,7 @@ class MountEstimator(nn.Module):
     """Estimate the mount from the poses of frames, per row of a batch and axis by axis.
 
     Args:
-        config: the numbers, or keywords of :class:`MountConfig`.
+        config: the configuration, or keywords of :class:`MountConfig`.
     """
 
     def __init__(self, config: MountConfig | None = None, **numbers: object) -> None:

@@ -30,7 +30,7 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
     calibrator(segments, intrinsics, state, dt, lane_width)``.
 
     Args:
-        config: the numbers, or keywords of :class:`TwoStageConfig`.
+        config: the configuration, or keywords of :class:`TwoStageConfig`.
     """
 
     state_type = TwoStageState

@@ -63,7 +63,7 @@ def track_direction(
         state: state of the frame before.
         dt: (B,) s.
         draws: (N_loop, 2), see :func:`lanebev.estimation.two_stage.vanishing.segment_pairs`.
-        cfg: the numbers.
+        cfg: the configuration.
 
     Returns:
         the step; a row that is neither supported nor started keeps its prediction.

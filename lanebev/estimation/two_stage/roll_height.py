@@ -62,7 +62,7 @@ def track_roll_height(
         state: state of the frame before.
         dt: (B,) s.
         fresh: (B,) bool, stage 1 started over.
-        cfg: the numbers.
+        cfg: the configuration.
 
     Returns:
         the step.

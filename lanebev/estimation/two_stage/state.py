@@ -12,7 +12,7 @@ from lanebev.types import NUM_BOUNDARIES, map_tensors, register_pytree
 
 @dataclass(frozen=True)
 class TwoStageConfig:
-    """Numbers of :class:`lanebev.TwoStageCalibrator`; angles in rad, lengths in m, times in s.
+    """Configuration of :class:`lanebev.TwoStageCalibrator`; angles in rad, lengths in m, times in s.
 
     The paper gives none of Q, W, N_loop or the search range (paper.md D13). W here admits ±1.5 deg and
     ±5 cm at 1 Hz.
