@@ -20,7 +20,7 @@ from lanebev.app.observers import Observation
 from lanebev.app.plausibility import drive_remark
 from lanebev.app.repeats import RepeatedFrames
 from lanebev.app.view_changes import ViewChanges
-from lanebev.app.views import ViewBefore, bird_view
+from lanebev.app.views import FixedPose, bird_view
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration
 from lanebev.estimation.tracker import Estimate
@@ -95,8 +95,8 @@ class Recorder:
 
     def __post_init__(self) -> None:
         alone = self.single or self.stills
-        self.before_title = "uncalibrated" if alone else "first frame's pose kept"
-        self._before = ViewBefore(alone)
+        self.before_title = "level, at 1.5 m" if alone else "first frame's pose kept"
+        self._before = FixedPose(alone)
         self._coarse = replace(self.grid, resolution=max(self.grid.resolution, _BEFORE_RESOLUTION))
         self._filtered_rows = KeptRows()
         self._first_number: int | None = None
@@ -195,10 +195,10 @@ class Recorder:
         image = frame.image if frame.image is not None else np.zeros((*self.camera.image_size, 3), np.uint8)
         place = frame.name if self.single or self.stills else f"frame {frame.number}   {frame.time:.2f} s"
         bev = bird_view(self.grid, frame.image, self.camera, after, vertical)
-        views = [Panel("after", bev, after, vertical)]
+        views = {"after": Panel("estimated pose", bev, after, vertical)}
         if before is not None:
             coarse = bird_view(self._coarse, frame.image, self.camera, before)
-            views.insert(0, Panel("before", coarse, before))
+            views = {"before": Panel("fixed pose", coarse, before), **views}
         words = ", ".join(reason_words([str(reason.name) for reason in reasons]))
         panels = draw_panels(
             image,
@@ -206,11 +206,11 @@ class Recorder:
             segments,
             calibration,
             _shortened(place),
-            tuple(views),
+            tuple(views.values()),
             self.grid,
             words,
         )
-        names = ["image", *(view.title for view in views)]
+        names = ["image", *views]
         scores = self._scores(self.rows[frame.number])
         self._moments.add(frame.number, dict(zip(names, panels, strict=True)), scores)
         picture = joined(panels)

@@ -1,4 +1,4 @@
-"""Bird's-eye views of a run before and after calibration."""
+"""Bird's-eye views of a run, with a fixed pose and with the estimated one."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from lanebev.types import Calibration, Extrinsics, Status
 from lanebev.view.frame import remap_frame
 from lanebev.view.grid import BEVGrid
 
-_NOMINAL_HEIGHT = 1.5  # m, of the view before anything is known
+_NOMINAL_HEIGHT = 1.5  # m, of the fixed pose of single images
 
 
-class ViewBefore:
-    """Chooses the pose of the view before calibration: level for stills, in a drive the first tracked one.
+class FixedPose:
+    """The fixed pose of the view for comparison: level for stills, in a drive the first one that was tracked.
 
     Args:
         alone: single images, not frames of a drive.

@@ -1,4 +1,4 @@
-"""The overlay: a frame with its detections and estimate, and its bird's-eye view before and after."""
+"""The overlay: a frame with its detections and estimate, and its bird's-eye views."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from lanebev.geometry.road import horizon_line, road_from_image_points
 from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
 from lanebev.observation.segments import LaneSegments
 from lanebev.report.lettering import Colour, Picture, text_width, write_text
+from lanebev.report.measure import select_inliers
 from lanebev.types import Calibration, Extrinsics, Status
 from lanebev.view.grid import BEVGrid
 
@@ -64,7 +65,7 @@ def draw_panels(
         segments: segments of batch size 1, undistorted.
         calibration: calibration of batch size 1, on the CPU.
         headline: what frame this is.
-        views: e.g. before and after.
+        views: e.g. with a fixed and with the estimated pose. Outliers are drawn on the input only.
         grid: grid of the views.
         reasons: why the frame is not (fully) tracked, in words.
 
@@ -84,7 +85,8 @@ def draw_panels(
     _draw_banner(shown, headline, status.name, colour, _numbers(calibration))
     if reasons:
         _draw_note(shown, reasons)
-    return [shown, *(_bev_panel(view, grid, camera, segments) for view in views)]
+    used = select_inliers(segments, calibration.inliers)
+    return [shown, *(_bev_panel(view, grid, camera, used) for view in views)]
 
 
 def joined(panels: Sequence[Picture]) -> Picture:
@@ -100,7 +102,7 @@ def _numbers(calibration: Calibration) -> str:
         f"{name} {math.degrees(value):+.2f}° ±{math.degrees(2 * sigma):.2f}"
         for name, value, sigma in zip(("pitch", "yaw", "roll"), (pitch, yaw, roll), std, strict=False)
     )
-    return f"{angles}   height {height:.3f} m ±{2 * std[3]:.3f}"
+    return f"{angles}   height {height:.3f} m ±{2 * std[3]:.3f}   (±2σ)"
 
 
 def _draw_boundaries(

@@ -37,15 +37,15 @@ class Report:
     Attributes:
         title: the source's name.
         rows: rows of ``extrinsics.csv``.
-        before: (F, L-1) m, lane widths in the view with the pose before.
-        after: (F, L-1) m, with the online pose, or the smoothed one.
+        before: (F, L-1) m, lane widths in the view with the fixed pose.
+        after: (F, L-1) m, with the estimated pose.
         lane_width: m, assumed.
         facts: what ran, label to value.
         moments: pictures of some frames by place of their row: "image", "before" and "after" as JPEG.
         problems: frames that did not decode and the like, one line each.
         is_stills: each image on its own.
         is_smoothed: each pose from the whole drive.
-        before_title: what "before" is.
+        before_title: which pose the fixed one is.
         truth: a row per frame, of a rendered drive.
         camera: the lens.
         mount: mount estimate at the end, of batch size 1.
@@ -68,8 +68,10 @@ class Report:
 
     @property
     def after_title(self) -> str:
-        """How the poses after calibration were estimated, in a word."""
-        return "calibrated" if self.is_stills else "smoothed" if self.is_smoothed else "online"
+        """From which images each pose was estimated."""
+        if self.is_stills:
+            return "from each image alone"
+        return "from all frames (smoothed)" if self.is_smoothed else "from the frames up to each"
 
 
 def write_report(path: str | Path, report: Report) -> None:
@@ -141,7 +143,7 @@ def page_data(report: Report, places: Sequence[int], edges: NDArray[np.float64])
 
 
 def pose_table(rows: Sequence[ExtrinsicsRow]) -> list[tuple[str, list[str]]]:
-    """Return median, least, most and median sigma of each axis over the frames that measure it."""
+    """Return median, minimum, maximum and median sigma of each axis over the frames that measure it."""
     states = np.array([axis_states(row) for row in rows]).reshape(-1, 4)
     value, std = estimates(rows), estimate_stds(rows)
     table = []
@@ -179,7 +181,7 @@ def mount_table(mount: MountCalibration | None) -> list[dict[str, Any]]:
 
 
 def summary_facts(report: Report) -> dict[str, str]:
-    """Return the scatter of lane widths before and after, where lanes were seen."""
+    """Return the standard deviations of lane widths with the fixed and the estimated pose."""
     names = {report.before_title: report.before, "calibrated": report.after}
     return {
         f"standard deviation of lane widths, {name}": f"{100 * width_deviation(widths):.1f} cm"

@@ -1,4 +1,4 @@
-"""Interactive plots of a run: the four estimates with ±2 sigma, and lane widths before and after."""
+"""Interactive plots of a run: the four estimates with ±2 sigma, and lane widths with both poses."""
 
 from __future__ import annotations
 

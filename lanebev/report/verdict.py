@@ -253,7 +253,7 @@ def _precision(rows: Sequence[ExtrinsicsRow], states: NDArray[np.int64]) -> str:
         for axis, name in enumerate(AXES)
         if (states[:, axis] <= AxisState.UNCERTAIN).any()
     ]
-    return f"Typical accuracy (2σ): {', '.join(told)}." if told else ""
+    return f"Typical uncertainty (2σ): {', '.join(told)}." if told else ""
 
 
 def _value(axis: int, value: float) -> str:

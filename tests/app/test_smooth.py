@@ -119,7 +119,7 @@ def test_every_output_tells_the_smoothed_pose(runs):
     np.testing.assert_allclose(np.degrees(np.sqrt(covariances["pitch_pitch"])), sigmas, atol=2e-6)
     page = (runs / "smooth" / "report.html").read_text()
     assert "every pose is from the whole drive, later frames too" in page
-    assert "after: smoothed" in page
+    assert "estimated pose: from all frames (smoothed)" in page
     lines = [(runs / name / "lanes.json").read_text().splitlines() for name in ("plain", "smooth")]
     assert [json.loads(line)["seen"] for line in lines[0]] == [json.loads(line)["seen"] for line in lines[1]]
     assert lines[0][:-1] != lines[1][:-1]  # the curves are by the smoothed pose

@@ -104,6 +104,24 @@ def test_overlay_draws_what_is_believed(status, height, width):
     assert (image == 90).all()  # the input is not drawn on
 
 
+def test_outliers_are_grey_on_the_input_and_not_in_the_views():
+    segments, grid = _segments(), BEVGrid(resolution=0.2)
+    view = Panel("fixed pose", np.zeros((*grid.shape, 3), np.uint8), POSE)
+    image, calibration = np.full((720, 1280, 3), 90, np.uint8), _calibration(segments)
+    outliers = calibration._replace(inliers=torch.zeros_like(calibration.inliers))
+
+    def coloured(picture):
+        return (np.ptp(picture[60:].astype(int), axis=-1) > 60).sum()
+
+    pictures = [
+        draw_panels(image, CAMERA, segments, each, "f", (view,), grid) for each in (calibration, outliers)
+    ]
+    (fitting, used), (grey, left) = [[coloured(part) for part in panels] for panels in pictures]
+    assert fitting > 1000
+    assert used > 1000
+    assert grey == left == 0
+
+
 def test_overlay_tells_the_reasons():
     segments, grid = _segments(), BEVGrid(resolution=0.2)
     view = Panel("after", np.zeros((*grid.shape, 3), np.uint8), POSE)

@@ -27,7 +27,9 @@ def test_a_drive_without_trouble_is_calibrated():
     assert found.headline == "Calibrated for 100 % of the drive."
     assert found.grade == "good"
     assert found.findings == ()
-    assert found.precision == "Typical accuracy (2σ): pitch ±0.10°, yaw ±0.16°, roll ±0.20°, height ±0.8 cm."
+    assert (
+        found.precision == "Typical uncertainty (2σ): pitch ±0.10°, yaw ±0.16°, roll ±0.20°, height ±0.8 cm."
+    )
 
 
 def test_a_road_of_one_lane_is_told_in_seconds():
