@@ -12,6 +12,8 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
+from lanebev.pipes import await_bytes, open_pipe
+
 _BYTE_ORDER_MARKS = {
     codecs.BOM_UTF8: "utf-8-sig",
     codecs.BOM_UTF16_LE: "utf-16",  # what PowerShell's > writes
@@ -35,7 +37,7 @@ def read_text(path: Path, errors: str = "strict") -> str:
         ValueError: why the file can't be read, in a few words; the caller says which file.
     """
     try:
-        data = path.read_bytes()
+        data = _bytes_of_pipe(path) if path.is_fifo() else path.read_bytes()
         if data.startswith(_GZIP):
             raise ValueError("compressed by gzip; unpack it")
         mark = next((each for each in _BYTE_ORDER_MARKS if data.startswith(each)), b"")
@@ -51,6 +53,13 @@ def read_text(path: Path, errors: str = "strict") -> str:
         raise ValueError("not a text file") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
         raise ValueError(getattr(error, "strerror", None) or str(error)) from error
+
+
+def _bytes_of_pipe(path: Path) -> bytes:
+    """Return what comes through a pipe, such as the output of a command in the shell's ``<(command)``."""
+    with open_pipe(path) as pipe:
+        await_bytes(pipe)
+        return pipe.read()
 
 
 def check_number(name: str, value: object, expected: str = "a number") -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from lanebev.app.shared_network import SharedNetwork
 from lanebev.camera.model import Camera
 from lanebev.io.image_names import in_natural_order
-from lanebev.io.lane_order import check_boundary_order
+from lanebev.io.lane_order import check_boundary_order, left_out_remark
 from lanebev.io.lane_repeats import repeats_remark
 from lanebev.io.lane_size import size_remark
 from lanebev.io.lane_widths import unequal_lanes_remark
@@ -97,7 +97,8 @@ class LaneFileObserver:
         in_order = [self.entries[match] for match in self.matches if match is not None]
         unmatched = "" if source.is_video else self._unmatched(source.taken_numbers)
         of_drive = [] if stills else [repeats_remark(in_order), unequal_lanes_remark(in_order, camera)]
-        self.remark = "; ".join(filter(None, [self.remark, unmatched, *of_drive]))
+        remarks = (self.remark, unmatched, left_out_remark(in_order), *of_drive)
+        self.remark = "; ".join(filter(None, remarks))
 
     def _unmatched(self, taken: Sequence[int]) -> str:
         """Return how many of the images that are taken have no entry; empty if all have one."""

@@ -23,7 +23,7 @@ _STEPS = (Fraction(1, 2000), Fraction(60))  # s between two frames of a drive
 # of the images, of which more with the same number or name are of several cameras or drives
 _MOST_ALIKE = 0.5
 
-Key = list[tuple[int, Fraction, str]]
+Key = list[tuple[int, int | Fraction, str]]
 
 
 def natural_order(path: str, decimal: bool = False) -> Key:
@@ -39,7 +39,7 @@ def natural_order(path: str, decimal: bool = False) -> Key:
         before, after = path[: match.start()], path[match.end() :]
         return [*natural_order(before), (0, value, match[0]), *natural_order(after)]
     return [
-        (0, Fraction(int(part)), part) if part.isascii() and part.isdigit() else (1, Fraction(0), part)
+        (0, int(part), part) if part.isascii() and part.isdigit() else (1, 0, part)
         for part in re.split(r"([0-9]+)", path)
     ]
 
@@ -59,7 +59,7 @@ def in_natural_order(paths: Iterable[str]) -> list[str]:
         return sorted(paths, key=lambda path: (natural_order(str(PurePath(path).parent)), path))
     decimal = are_decimal([match[2] for match in map(_DECIMAL.search, paths) if match])
     ordered = sorted(paths, key=lambda path: natural_order(path, decimal))
-    clocks = read_clocks(ordered)
+    clocks = read_clocks(tuple(ordered))
     if clocks is None:
         return ordered
     places = sorted(range(len(ordered)), key=lambda place: clocks.seconds[place])
@@ -76,7 +76,7 @@ def times_from_names(paths: Sequence[str]) -> tuple[float, ...]:
     Args:
         paths: paths of the images, in order.
     """
-    clocks = read_clocks(paths)
+    clocks = read_clocks(tuple(paths))
     by_clock = clocks.seconds if clocks is not None and clocks.is_one_camera else ()
     times = next(filter(_are_of_a_drive, (by_clock, _times_since_1970(paths))), ())
     return tuple(float(time - times[0]) for time in times)
@@ -88,7 +88,7 @@ def untimed_remark(paths: Sequence[str]) -> tuple[str, str]:
     Args:
         paths: paths of the images, in order.
     """
-    clocks = read_clocks(paths)
+    clocks = read_clocks(tuple(paths))
     times = clocks.seconds if clocks else ()
     if _are_of_a_drive(times):
         words = "numbers beside the times in their names may be those of cameras"
@@ -168,7 +168,7 @@ def jump_remark(paths: Sequence[str]) -> str:
     Args:
         paths: paths of the images, in order.
     """
-    clocks = read_clocks(paths)
+    clocks = read_clocks(tuple(paths))
     times = clocks.seconds if clocks else _times_since_1970(paths)
     if times:
         jumps = [b - a > _STEPS[1] for a, b in pairwise(times)]

@@ -1,4 +1,4 @@
-"""Lanes whose boundary numbers run the wrong way."""
+"""Lanes whose boundary numbers run the wrong way or leave one out."""
 
 from __future__ import annotations
 
@@ -25,6 +25,22 @@ def check_boundary_order(frames: Sequence[FrameLines]) -> None:
             "lanes: expected boundary numbers that rise from left to right, got falling ones in "
             f"{len(rising) - sum(rising)} of {len(rising)} pairs of neighbours; number them in that order"
         )
+
+
+def left_out_remark(frames: Sequence[FrameLines]) -> str:
+    """Return which boundary number no frame has between two that some have; else nothing.
+
+    Numbers of classes may leave one out, and the lane between the two is taken for two lanes.
+    """
+    numbers = sorted({line.boundary for frame in frames for line in frame.lines if line.boundary is not None})
+    skipping = [(left, right) for left, right in pairwise(numbers) if right > left + 1]
+    if not skipping:
+        return ""
+    left, right = skipping[0]
+    return (
+        f"lanes: no frame has boundary {left + 1}, so that {left} and {right} are taken to have "
+        f"{right - left} lanes between them; if it is one, number its boundaries one after the other"
+    )
 
 
 def _rising(frame: FrameLines) -> list[bool]:

@@ -54,6 +54,8 @@ class Where:
 def lane_text(path: Path) -> str:
     """Return a lane file's text; a ValueError names the file."""
     try:
+        if path.is_fifo():  # which gives its text only once
+            raise ValueError("a pipe; write the lanes to a file")
         return read_text(path)
     except ValueError as error:
         raise ValueError(f"lane file {path}: expected a readable file, got: {error}") from error

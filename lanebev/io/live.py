@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import select
 import threading
 import time
 import weakref
@@ -20,9 +18,9 @@ from lanebev.io.decoding import display_matrix, pixel_aspect, rgb, tell_damaged_
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import ALL, Frame, Selection
 from lanebev.io.source_names import PIPE, without_login
+from lanebev.pipes import await_bytes, open_pipe
 
 _TIMEOUT = 10.0  # s without a frame, after which a stream has ended
-_FIRST_BYTES = 30.0  # s without anything from a pipe, after which it is no source
 _POLL = 0.05  # s between checks whether to stop
 _LOW_DELAY = {"flags": "low_delay", "rtsp_transport": "tcp"}
 
@@ -250,9 +248,8 @@ def open_live(
 def _opened(source: str) -> av.container.InputContainer:
     if source == PIPE:  # not by sys.stdin, whose lock a thread that still reads would hold at the end
         return _opened_pipe(open(0, "rb", buffering=0, closefd=False), "standard input")
-    if Path(source).is_fifo():  # at once, where opening it otherwise waits for one that writes
-        number = os.open(source, os.O_RDONLY | os.O_NONBLOCK)
-        return _opened_pipe(open(number, "rb", buffering=0), source)
+    if Path(source).is_fifo():
+        return _opened_pipe(open_pipe(source), source)
     if source.startswith("/dev/video"):
         return av.open(source, "r", format="v4l2")
     scheme, separator, address = source.partition("://")
@@ -270,11 +267,9 @@ def _opened_pipe(pipe: FileIO, name: str) -> av.container.InputContainer:
     """
     if pipe.isatty():
         raise ValueError(f"stream {name}: expected a pipe, as from ffmpeg, got a terminal")
-    if hasattr(select, "poll"):  # not on Windows
-        waiting = select.poll()
-        waiting.register(pipe, select.POLLIN)
-        if not waiting.poll(1000 * _FIRST_BYTES):
-            pipe.close()
-            raise ValueError(f"stream {name}: expected frames, got nothing for {_FIRST_BYTES:g} s")
-        os.set_blocking(pipe.fileno(), True)
+    try:
+        await_bytes(pipe)
+    except ValueError as error:
+        pipe.close()
+        raise ValueError(f"stream {name}: expected frames, got {error}") from error
     return av.open(pipe, "r", metadata_errors="replace")

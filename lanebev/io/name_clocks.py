@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from datetime import date
 from fractions import Fraction
+from functools import lru_cache
 from itertools import pairwise
+from os.path import splitext
 from pathlib import PurePath
 from statistics import median
 from typing import NamedTuple
@@ -47,7 +50,8 @@ class NameClocks(NamedTuple):
     is_one_camera: bool
 
 
-def read_clocks(paths: Sequence[str]) -> NameClocks | None:
+@lru_cache(maxsize=1)  # the steps of opening a folder ask for the same, in turn
+def read_clocks(paths: tuple[str, ...]) -> NameClocks | None:
     """Return the times that images' names, and the folders above them, state as time of day.
 
     A time has a date or at least a fraction of a second. Where day and month may be exchanged, they are read
@@ -96,7 +100,7 @@ def _last_matches(form: re.Pattern[str], texts: Sequence[str]) -> list[re.Match[
 def _rest(text: str, match: re.Match[str]) -> tuple[str, str]:
     """Return what a path has before and after its time, without the file's suffix."""
     before = text[: match.start()] + (match.groupdict().get("words") or "")
-    return before, str(PurePath("_" + text[match.end() :]).with_suffix(""))
+    return before, splitext("_" + text[match.end() :])[0]
 
 
 def _times(matches: Sequence[re.Match[str]], order: str) -> list[Fraction] | None:
@@ -108,8 +112,7 @@ def _times(matches: Sequence[re.Match[str]], order: str) -> list[Fraction] | Non
     whole = [_DAY * day + clock for day, clock in zip(days, clocks, strict=True)]  # type: ignore[operator]
     if order and _may_be_numbers(matches):
         return None
-    fractions = _seconds_of_digits([each["fraction"] for each in groups])
-    times = [a + b for a, b in zip(whole, fractions, strict=True)]
+    times = _with_fractions(whole, [each["fraction"] for each in groups])
     may_count = all("loose" in match.re.groupindex and match["loose"] is not None for match in matches)
     if not any(each["fraction"] for each in groups) or (may_count and _are_counts(times)):
         return [Fraction(each) for each in whole] if order else None
@@ -137,29 +140,54 @@ def _time_of_day(groups: dict[str, str]) -> int | None:
     return 3600 * hour + 60 * minute + second
 
 
-def _seconds_of_digits(fractions: Sequence[str]) -> list[Fraction]:
-    """Return what digits after whole seconds are, s; no digits are 0.
+def _with_fractions(whole: Sequence[int], fractions: Sequence[str]) -> list[Fraction]:
+    """Return whole seconds and the digits after them as times (s); no digits are 0.
 
-    They are decimal fractions, or whole milli-, micro- or nanoseconds without zeros before them.
+    Digits are decimal fractions, or whole milli-, micro- or nanoseconds without zeros before them. A zero at
+    the beginning or the end tells which; without one, the reading with the more even steps is taken.
     """
+
+    def read(unit: int | None) -> list[Fraction]:
+        return [
+            a + Fraction(int(b or 0), unit or 10 ** len(b)) for a, b in zip(whole, fractions, strict=True)
+        ]
+
     given = [digits for digits in fractions if digits]
-    most = max(map(len, given), default=0)
-    unit = None if are_decimal(given) else next(10**power for power in (3, 6, 9) if most <= power)
-    return [Fraction(int(digits or 0), unit or 10 ** len(digits)) for digits in fractions]
+    if len(set(map(len, given))) <= 1 or any(digits[0] == "0" != digits for digits in given):
+        return read(None)
+    unit = next(10**power for power in (3, 6, 9) if max(map(len, given)) <= power)
+    return min(read(None), read(unit), key=_unevenness) if are_decimal(given) else read(unit)
+
+
+def _unevenness(times: Sequence[Fraction]) -> float:
+    """Return the mean square of the steps between times over the square of their mean: 1 if all are equal.
+
+    A step counts as 1 s at most, so that gaps do not decide.
+    """
+    steps = [min(float(b - a), 1.0) for a, b in pairwise(sorted(times))]
+    return len(steps) * sum(step**2 for step in steps) / (sum(steps) ** 2 or math.inf)
 
 
 def _may_be_numbers(matches: Sequence[re.Match[str]]) -> bool:
-    """Tell whether digits after a date may be numbers of images: 6 that begin with 00, or 9 with 0000."""
-    return all(
-        match["hour"] == "00"
-        and match.end("hour") == match.start("minute")
-        and "T" not in match.groupdict("").get("between", "")
-        and (
-            match["fraction"] is None
-            or (match["minute"] == "00" and match.string[match.end("second")] not in ".,")
-        )
+    """Tell whether digits after a date may be numbers of images.
+
+    They may if they are 6 that begin with 00, or 9 with 0000; also 6 of one minute from its first second on,
+    such as 100000 to 100020.
+    """
+    if any(
+        match.end("hour") < match.start("minute") or "T" in match.groupdict("").get("between", "")
         for match in matches
-    )
+    ):
+        return False
+    minutes = {match["hour"] + match["minute"] for match in matches}
+    fractions = [match for match in matches if match["fraction"]]
+    if fractions:
+        return minutes == {"0000"} and all(
+            match.string[match.end("second")] not in ".," for match in fractions
+        )
+    seconds = {match["second"] for match in matches}
+    of_one_minute = len(minutes) == 1 and "00" in seconds and len(seconds) == len(matches)
+    return of_one_minute or all(minute.startswith("00") for minute in minutes)
 
 
 def _are_counts(times: Sequence[Fraction]) -> bool:

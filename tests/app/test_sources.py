@@ -23,6 +23,7 @@ from lanebev.app.config import RunConfig
 from lanebev.app.options import parse_grid
 from lanebev.app.sources import first_image, make_source, source_of_run
 from lanebev.app.summary import setting_words
+from lanebev.camera.files import read_camera
 from lanebev.cli import main
 from lanebev.io.frames import Selection
 from lanebev.io.images import write_png
@@ -322,19 +323,38 @@ def test_half_a_jpeg_on_a_pipe_is_no_frame(tmp_path, cut):
 
 
 def test_a_pipe_without_a_writer_is_one_line(tmp_path, capsys, data, monkeypatch):
-    monkeypatch.setattr("lanebev.io.live._FIRST_BYTES", 0.3)
+    monkeypatch.setattr("lanebev.pipes._LONGEST_WAIT", 0.3)
     fixed = ("--camera", data / "camera.yaml", "--out", tmp_path / "out")
     os.mkfifo(tmp_path / "pipe")
     _fails(capsys, "run", tmp_path / "pipe", *fixed, word="pipe: expected frames, got nothing for 0.3 s")
     with open(os.open(tmp_path / "pipe", os.O_RDWR), "wb", buffering=0) as silent:  # a writer that is silent
         _fails(capsys, "run", tmp_path / "pipe", *fixed, word="pipe: expected frames, got nothing for 0.3 s")
-        monkeypatch.setattr("lanebev.io.live._FIRST_BYTES", 30.0)
+        monkeypatch.setattr("lanebev.pipes._LONGEST_WAIT", 30.0)
         silent.write(next(_jpegs((0,))))
         closing = threading.Timer(0.5, silent.close)
         closing.start()
         _fails(capsys, "run", tmp_path / "pipe", *fixed, word="expected a whole frame, got damaged ones only")
         closing.join()
     assert not (tmp_path / "out").exists()
+
+
+def test_files_may_not_be_pipes_without_a_writer(tmp_path, capsys, data, monkeypatch):
+    monkeypatch.setattr("lanebev.pipes._LONGEST_WAIT", 0.3)
+    os.mkfifo(tmp_path / "pipe")
+    video, camera = data / "drive.mp4", data / "camera.yaml"
+    word = "camera file {}: expected a readable camera file, got: nothing for 0.3 s"
+    _fails(capsys, "run", video, "--camera", tmp_path / "pipe", word=word.format(tmp_path / "pipe"))
+    word = "got: a pipe; write the lanes to a file"
+    _fails(capsys, "run", video, "--camera", camera, "--lanes", tmp_path / "pipe", word=word)
+
+
+def test_a_camera_comes_through_a_pipe(tmp_path, data):
+    os.mkfifo(tmp_path / "pipe")
+    written = (data / "camera.yaml").read_bytes()
+    writer = threading.Thread(target=(tmp_path / "pipe").write_bytes, args=(written,))
+    writer.start()
+    assert read_camera(tmp_path / "pipe") == read_camera(data / "camera.yaml")
+    writer.join()
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from lanebev import Camera
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import LaneFileObserver
 from lanebev.app.run import run
-from lanebev.io.lane_order import check_boundary_order
+from lanebev.io.lane_order import check_boundary_order, left_out_remark
 from lanebev.io.lane_size import lanes_of_whole_images, meeting_row, resized_lanes, size_remark
 from lanebev.io.lanes import FrameLines, read_culane, read_lanes, tusimple_line
 from lanebev.io.openlane import camera_from_ground_points
@@ -265,11 +265,21 @@ def _moved(entries, right, down):
     ]
 
 
-def test_boundary_numbers_that_fall_from_left_to_right_are_refused():
-    def numbered(*numbers):
-        lines = [line._replace(boundary=n) for n, line in zip(numbers, _entries()[0].lines, strict=True)]
-        return FrameLines("0.png", lines)
+def numbered(*numbers):
+    lines = [line._replace(boundary=n) for n, line in zip(numbers, _entries()[0].lines, strict=True)]
+    return FrameLines("0.png", lines)
 
+
+def test_a_boundary_number_that_no_frame_has_is_noticed():
+    assert left_out_remark([numbered(1, 2, 4, 5), FrameLines("1.png", [])]) == (
+        "lanes: no frame has boundary 3, so that 2 and 4 are taken to have 2 lanes between them; if it is "
+        "one, number its boundaries one after the other"
+    )
+    for frames in ([], [numbered(None, None, None, None)], [numbered(1, 2, 4, 5), numbered(1, 2, 3, 4)]):
+        assert left_out_remark(frames) == ""
+
+
+def test_boundary_numbers_that_fall_from_left_to_right_are_refused():
     check_boundary_order([numbered(1, 2, 3, 4), numbered(0, 1, 2, 3), numbered(None, None, None, None)])
     check_boundary_order([numbered(1, 2, 3, 4), numbered(4, 3, 2, 1)])  # one frame's mistake
     check_boundary_order([])

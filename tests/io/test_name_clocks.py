@@ -4,12 +4,13 @@ from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
 from lanebev.app.config import RunConfig
 from lanebev.app.sources import make_source
+from lanebev.io import name_clocks
 from lanebev.io.image_names import in_natural_order, times_from_names
 from lanebev.io.video import open_source
 
@@ -59,11 +60,26 @@ def test_any_drive_has_its_times(form, start, milliseconds):
     start = start.replace(microsecond=1000 * (start.microsecond // 1000))
     steps = np.array(milliseconds) / 1000
     names = _names(form, start, steps)
-    if form.endswith(",{ms}.jpg"):  # digits of which none ends in 0 are read as a decimal fraction's
-        assume(any(name.endswith("0.jpg") for name in names))
     order = np.random.default_rng(len(names)).permutation(len(names))
     assert in_natural_order(names[place] for place in order) == names
     np.testing.assert_allclose(times_from_names(names), np.cumsum([0.0, *steps]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("digits", "times"),
+    [
+        (["3", "53", "103", "153", "203"], [0.003, 0.053, 0.103, 0.153, 0.203]),  # milliseconds
+        (["5", "105", "205", "305", "405", "505", "605"], [0.005 + number / 10 for number in range(7)]),
+        (["2499", "32499", "62499", "92499", "122499"], [0.002499 + 0.03 * number for number in range(5)]),
+        (["125", "25", "375", "5", "625", "75", "875"], [number / 8 for number in range(1, 8)]),  # Go's
+        (["05", "1", "15", "2"], [0.05, 0.1, 0.15, 0.2]),
+        (["6", "85"], [0.6, 0.85]),
+    ],
+)
+def test_digits_after_the_seconds_are_read_so_that_the_steps_are_even(digits, times):
+    names = [f"2026-11-29_10-15-30.{each}.jpg" for each in digits]
+    assert in_natural_order(names[::-1]) == names
+    np.testing.assert_allclose(times_from_names(names), np.subtract(times, times[0]), atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -90,6 +106,8 @@ def test_whole_seconds_of_one_frame_each_are_times(form):
         [f"01-02-{number:02d}.jpg" for number in range(30)],  # three numbers
         [f"20261129_{number:09d}.jpg" for number in range(0, 3000, 10)],
         [f"2011_09_26/{number:06d}_003.jpg" for number in range(50)],  # the number of the camera at the end
+        [f"2011-09-26/{number}.jpg" for number in range(100000, 100060)],  # not the first minute after ten
+        [f"20261129_{number}.jpg" for number in range(231500, 231560, 10)],
         [f"{number:03d}/010203_{number:09d}.jpg" for number in range(0, 900, 10)],
         [f"{scene}_{view}_2_{number:06d}.jpg" for scene in (0, 22) for view in (1, 2) for number in range(9)],
         [f"tile_{x}_{y}_{z}_128.png" for x in (0, 22) for y in range(12) for z in range(40)],
@@ -104,6 +122,15 @@ def test_numbers_that_may_be_others_are_no_times(names):
 def test_the_time_since_1970_counts_where_the_time_of_day_is_that_of_the_drive():
     names = [f"n015-2018-07-24-11-22-45+0800__CAM_FRONT__153240292{number}612460.jpg" for number in (7, 8, 9)]
     assert times_from_names(names) == (0, 1, 2)
+
+
+def test_names_are_searched_for_times_once(tmp_path, monkeypatch):
+    folder = _folder(tmp_path / "a", _names("%Y%m%d_%H%M%S.jpg", EVENINGS[0], [1, 1, 70, 1]))
+    searched = []
+    times = name_clocks._times
+    monkeypatch.setattr(name_clocks, "_times", lambda *given: searched.append(given) or times(*given))
+    assert "jump" in make_source(RunConfig(folder, "c")).problem
+    assert len(searched) == 1
 
 
 def _folder(path, names):

@@ -7,7 +7,7 @@ import logging
 import math
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
@@ -161,7 +161,14 @@ def _run(
         for outcome in progress(ended, len(to_do)) if progress else ended:
             logger.info("%s: %s", outcome.name, outcome.failure or f"{outcome.frames} frames")
             found[outcome.name] = outcome
-    return {task.name: found[task.name] for task in tasks}, len(to_do)
+    return {task.name: _kept(found[task.name], task) for task in tasks}, len(to_do)
+
+
+def _kept(outcome: Outcome, task: Task) -> Outcome:
+    """Return a task's outcome, a failure if its outputs are no longer there."""
+    if outcome.failure or task.result.is_file():
+        return outcome
+    return replace(outcome, failure="its outputs were deleted meanwhile; the same command runs it again")
 
 
 def _is_to_do(earlier: Outcome | None, again: bool) -> bool:

@@ -1,6 +1,7 @@
 """A fleet on Ray: a killed worker, a corrupt file, a second call; the same as single runs."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -8,6 +9,8 @@ import time
 
 import pytest
 
+from lanebev.app.fleet.fleet import fleet
+from lanebev.app.fleet.worker import run_tasks
 from tests.app.test_robustness import write_drive
 from tools import fleet_check
 
@@ -45,6 +48,32 @@ def test_a_fleet_equals_single_runs(tmp_path, capsys):
     assert "drive-01-drive</b>: video" in page
     assert 'href="drives/drive-00-drive/report.html"' in page
     assert (tmp_path / "fleet" / "drives" / "drive-00-drive" / "report.html").is_file()
+
+
+@pytest.mark.slow
+def test_a_folder_that_is_deleted_meanwhile_fails_the_drives_that_were_in_it(tmp_path, monkeypatch):
+    write_drive(tmp_path, frames=3, name="a")
+    write_drive(tmp_path, frames=3, name="b")
+    (tmp_path / "drives.csv").write_text(
+        "video,camera,no_video,lanes\na.mp4,camera.yaml,true,a.json\nb.mp4,camera.yaml,true,b.json\n"
+    )
+
+    def outcomes(tasks, _):
+        for task in tasks:
+            yield from run_tasks([task])
+            if task.name == "a":
+                shutil.rmtree(tmp_path / "out")
+
+    monkeypatch.setattr("lanebev.app.fleet.fleet.outcomes", outcomes)
+    result = fleet(str(tmp_path / "drives.csv"), str(tmp_path / "out"))
+    words = "its outputs were deleted meanwhile; the same command runs it again"
+    assert {name: outcome.failure for name, outcome in result.outcomes.items()} == {"a": words, "b": ""}
+    assert words in (tmp_path / "out" / "index.html").read_text()
+    assert len(parquet.dataset(tmp_path / "out" / "frames").to_table()) == 3
+    monkeypatch.setattr("lanebev.app.fleet.fleet.outcomes", lambda tasks, _: run_tasks(tasks))
+    assert fleet(str(tmp_path / "drives.csv"), str(tmp_path / "out")).text.startswith(
+        "2 drives: 2 finished, 0 failed; 1 run now"
+    )
 
 
 def _lines_of(path):
