@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
-from lanebev.tensors import constant, handled_by_mode, map_tensors
+from lanebev.tensors import constant, map_tensors
+from lanebev.torch_internals import handled_by_mode, is_batched_by_vmap
 
 T = TypeVar("T")
 FlagT = TypeVar("FlagT", bound=IntFlag)
@@ -49,17 +50,7 @@ def readable(value: Tensor) -> bool:
 
 
 def _is_without_numbers(value: Tensor) -> bool:
-    return handled_by_mode() or mapped(value)
-
-
-def mapped(value: Tensor) -> bool:
-    """Tell whether ``torch.vmap`` stands over this tensor, which then has no numbers of its own."""
-    functorch = torch._C._functorch
-    while functorch.is_functorch_wrapped_tensor(value):
-        if functorch.is_batchedtensor(value):
-            return True
-        value = functorch.get_unwrapped(value)
-    return False
+    return handled_by_mode() or is_batched_by_vmap(value)
 
 
 def replace_rows(rows: Tensor, values: T, function: Callable[..., T], *operands: Any) -> T:

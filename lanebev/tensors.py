@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache, wraps
-from threading import Lock
+from threading import Lock, local
 from typing import Any, ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor
+
+from lanebev.torch_internals import handled_by_mode
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -18,6 +20,7 @@ _INLINED = 8  # numbers of a constant, at most, that inductor writes into its co
 
 _lock = Lock()
 _before: list[int] = []  # numbers of threads before the blocks of one_thread under way; the first one counts
+_block = local()  # attribute `active` in a Python thread that is in such a block
 
 
 def map_tensors(function: Callable[[Tensor], Tensor], value: T) -> T:
@@ -38,14 +41,20 @@ def one_thread() -> Iterator[None]:
 
     PyTorch's number of threads is each Python thread's own, and also the one with which later Python threads
     begin. So where blocks of several overlap, all leave with the number that was there before the first. A
-    Python thread that first computes during another one's block, outside a block of its own, keeps 1.
+    Python thread that first computes during another one's block, outside a block of its own, keeps 1. A block
+    inside another one of the same Python thread changes nothing.
     """
+    if getattr(_block, "active", False):
+        yield
+        return
     with _lock:
         _before.append(torch.get_num_threads())
         torch.set_num_threads(1)
+    _block.active = True
     try:
         yield
     finally:
+        _block.active = False
         with _lock:
             torch.set_num_threads(_before[0])
             _before.pop()
@@ -64,14 +73,6 @@ def usable_device(device: torch.device | str | int) -> torch.device:
         reason = str(error).splitlines()[0]
         raise ValueError(f"device: expected one that torch can use here, got {device}: {reason}") from error
     return found
-
-
-def handled_by_mode() -> bool:
-    """Tell whether a context handles every operation itself, as ``FakeTensorMode`` and ``make_fx`` do.
-
-    Tensors may then have no numbers of their own, or numbers that stand for all others.
-    """
-    return bool(torch._C._len_torch_dispatch_stack())
 
 
 def made_once(function: Callable[P, T]) -> Callable[P, T]:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from enum import IntEnum
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
-from torch.utils import _pytree
 
 from lanebev.geometry.rotation import (
     camera_from_road_matrix,
@@ -18,18 +17,10 @@ from lanebev.geometry.rotation import (
 )
 from lanebev.numbers import check_number
 from lanebev.tensors import map_tensors as map_tensors  # noqa: PLC0414 - part of this module too
-
-TupleClass = TypeVar("TupleClass", bound=type)
+from lanebev.torch_internals import register_pytree as register_pytree  # noqa: PLC0414 - likewise
 
 NUM_BOUNDARIES = 6
 """Semantic lane boundaries by default: 0, 1, 2 left of the ego lane's middle, 3, 4, 5 right of it."""
-
-
-def register_pytree(cls: TupleClass) -> TupleClass:
-    """Register a NamedTuple of tensors, so that ``torch.export.save`` and ``torch.load`` accept it."""
-    _pytree._register_namedtuple(cls, serialized_type_name=f"lanebev.{cls.__name__}")
-    torch.serialization.add_safe_globals([cls])
-    return cls
 
 
 class TensorTuple(Protocol):

@@ -6,7 +6,6 @@ from typing import Generic, Protocol, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch.autograd import forward_ad
 
 from lanebev.estimation.checks import (
     as_batch,
@@ -18,6 +17,7 @@ from lanebev.estimation.checks import (
 )
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.observation.segments import LaneSegments
+from lanebev.torch_internals import is_in_forward_mode
 from lanebev.types import Calibration, TensorTuple, map_tensors
 
 
@@ -103,7 +103,8 @@ class Calibrator(nn.Module, Generic[StateT]):
         check_segments(segments, intrinsics)
         given = check_state(state, self.state_type, intrinsics.shape[0])
         frame = (segments, intrinsics, state, dt, lane_width, given)
-        if torch.compiler.is_compiling() or _needs_derivatives() or torch.is_inference_mode_enabled():
+        differentiable = torch.is_grad_enabled() or is_in_forward_mode()
+        if torch.compiler.is_compiling() or differentiable or torch.is_inference_mode_enabled():
             calibration, after = self._estimate(*frame)
         else:
             with torch.inference_mode():  # takes a fifth less time than torch.no_grad
@@ -186,8 +187,3 @@ class Calibrator(nn.Module, Generic[StateT]):
     def reasons(self, state: StateT) -> Tensor:
         """Return why rows are not (fully) tracked, (B,) int64 flags of :class:`lanebev.Reason`."""
         return state.reasons
-
-
-def _needs_derivatives() -> bool:
-    """Tell whether derivatives may be asked for, backwards or, as by ``torch.func.jvp``, forwards."""
-    return torch.is_grad_enabled() or forward_ad._current_level >= 0

@@ -33,3 +33,16 @@ def test_overlapping_blocks_leave_the_number_of_threads_as_it_was_before_the_fir
             assert pool.submit(torch.get_num_threads).result() == 2  # of threads that begin later
     finally:
         torch.set_num_threads(threads)
+
+
+def test_a_block_inside_another_one_leaves_one_thread_until_the_outer_one_ends() -> None:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with one_thread():
+            with one_thread():
+                assert torch.get_num_threads() == 1
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
