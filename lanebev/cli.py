@@ -61,8 +61,8 @@ def _signals_unwind(received: list[int]) -> Iterator[None]:
     """
     known = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     before = {each: signal.getsignal(each) for each in known}
-    usual = (signal.SIG_DFL, signal.default_int_handler)
-    own = [each for each, handler in before.items() if handler in usual]  # not what nohup ignores
+    default = (signal.SIG_DFL, signal.default_int_handler)
+    own = [each for each, handler in before.items() if handler in default]  # not what nohup ignores
     if threading.current_thread() is not threading.main_thread():
         own = []  # Python lets no other thread set them
 

@@ -55,7 +55,7 @@ def compare(
 ) -> dict[str, Any]:
     """Run all scenarios with all calibrators; return figures by scenario and calibrator."""
     results: dict[str, Any] = {}
-    usual: dict[str, Tensor] = {}
+    reference: dict[str, Tensor] = {}
     for scenario in scenarios:
         length, change = SCENARIOS[scenario]
         drive = moments(min(length, seconds or length), change)
@@ -63,10 +63,10 @@ def compare(
         for name in names:
             began = time.perf_counter()
             run = track(CALIBRATORS[name](), drive, rows if name != "textbook EKF" else min(rows, 4), sigma)
-            if name not in usual:
+            if name not in reference:
                 later = torch.arange(len(run.hard)) >= WARM_UP
-                usual[name] = rms(run.errors[later])
-            figures = summarise(run, usual[name])
+                reference[name] = rms(run.errors[later])
+            figures = summarise(run, reference[name])
             figures["seconds"] = time.perf_counter() - began
             results[scenario][name] = figures
             print(_line(scenario, name, figures), flush=True)

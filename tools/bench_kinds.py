@@ -18,10 +18,10 @@ from lanebev.estimation.joint.state import HILLY_ROADS
 from lanebev.estimation.joint.update import UNSEEN
 from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, within_3_sigma
 from lanebev.testing.moments import FPS
+from tools.known_road import KnownRoad
 from tools.random_drives import CREST, HILLS, IN_CURVE, KINDS
 from tools.replay.figures import as_track
 from tools.replay.recording import record, replay
-from tools.told_road import ToldRoad
 
 FIRST_SEED = 20_000
 ALLOWED = 15
@@ -99,7 +99,7 @@ def speed_given() -> JointCalibrator:
 def informed(kind: str) -> JointCalibrator:
     """Return the joint filter with the priors that the name of a row says are given."""
     if kind.endswith(_TOLD):
-        return ToldRoad(KINDS[IN_CURVE](FIRST_SEED).moments(), speed=30.0)
+        return KnownRoad(KINDS[IN_CURVE](FIRST_SEED).moments(), speed=30.0)
     if kind.endswith(_GIVEN):
         return speed_given()
     return JointCalibrator(HILLY_ROADS if kind.endswith(_HILLY) else None)

@@ -256,11 +256,11 @@ def follow(drive: Drive, seed: int, calibrator: JointCalibrator) -> Errors:
 
 def row(name: str, errors: Sequence[Errors]) -> str:
     """Write a row of the table. Every drive that was calibrated counts the same."""
-    told = [one for one in errors if len(one.nees)]
-    if not told:
+    judged = [one for one in errors if len(one.nees)]
+    if not judged:
         return f"| {name} | {len(errors)} | – | – |"
-    nees = torch.stack([one.nees.mean() for one in told]).mean()
-    within = torch.stack([one.within() for one in told]).mean(0)
+    nees = torch.stack([one.nees.mean() for one in judged]).mean()
+    within = torch.stack([one.within() for one in judged]).mean(0)
     return f"| {name} | {len(errors)} | {nees:.2f} | {' '.join(f'{100 * one:.1f}' for one in within)} |"
 
 

@@ -95,15 +95,15 @@ def split_half_yaw(segments: LaneSegments, intrinsics: Tensor, prior: FramePrior
         intrinsics: (B, 3, 3).
         prior: prior of the fits.
     """
-    yaws, told = [], []
+    yaws, valid = [], []
     for half in ((1, 3), (2, 4)):
         mine = torch.stack([segments.boundary == k for k in half]).any(0)
         part = segments._replace(weight=segments.weight * mine)
         fit = fit_single_frame(part, intrinsics, TUSIMPLE_LANE_WIDTH, prior)
         seen = [((segments.boundary == k) & (segments.weight > 0)).any(1) for k in half]
         yaws.append(fit.extrinsics.yaw)
-        told.append(fit.valid & fit.observed[:, 1] & seen[0] & seen[1])
-    return 0.5 * (yaws[0] - yaws[1]).abs()[told[0] & told[1]]
+        valid.append(fit.valid & fit.observed[:, 1] & seen[0] & seen[1])
+    return 0.5 * (yaws[0] - yaws[1]).abs()[valid[0] & valid[1]]
 
 
 @one_line_errors()

@@ -75,7 +75,7 @@ def make_tracker(config: RunConfig, camera: Camera) -> RunTracker:
 
 
 def joint_config(config: RunConfig) -> JointConfig:
-    """Return the numbers of the joint calibrator, with the prior and the roads of the settings.
+    """Return the joint calibrator's configuration, with the prior and the roads of the settings.
 
     Raises:
         ValueError: ``mount`` is no calibration of a mount.

@@ -26,46 +26,16 @@ def rate_as_fraction(fps: float | None) -> Fraction | None:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Settings of a run.
+    """Settings of a run. Every field is an option of ``lanebev run``; its help text says what it means.
 
-    Attributes:
-        source: video, folder, glob, image, camera, stream, or "-" for a pipe.
-        camera: camera file; empty with ``fov``.
-        out: output folder.
-        lane_width: m; None if unknown, then LANE_WIDTH.
-        lanes: lane file or folder of another detector; None runs the network.
-        stills: every image is independent, not a frame of a drive.
-        resume: output folder of an earlier run with the same calibrator, whose state is the first one.
-        calibrator: one of CALIBRATORS.
-        fps: frame rate of a folder, a glob or a raw stream, Hz; None takes it from names or stream, else 30.
-            A video states its own.
-        lanes_size: (height, width) px of the images that ``lanes`` was drawn on; None is the size of
-            ``lanes_crop``, or else of the source.
-        lanes_crop: (top, left, height, width) px of the part of the source's images that ``lanes`` was drawn
-            on; None is all of them.
-        fov: horizontal field of view (degrees) of an ideal camera, instead of a camera file.
-        focal_std: standard deviation of the focal length as a fraction of it; None is 0 with a camera file
-            and FOV_FOCAL_STD with ``fov``.
-        lane_width_std: standard deviation of ``lane_width``, m; the height's is proportional to it. None is 0
-            if ``lane_width`` is given and LANE_WIDTH_STD if not.
-        mount: ``calibration.yaml`` of an earlier run of this camera, whose pose is the prior.
-        rectified: the images were rectified; the camera is the projection matrix P of the camera file.
-        weights: weights file of the network; None is the shipped one.
-        device: device of the network, such as "cpu" or "cuda".
-        backend: library that computes network and calibrator, one of BACKENDS.
-        exported: output folder of ``lanebev export``, for the backend "onnxruntime".
-        formats: names of FORMATS in which to write the results as well.
-        start: time of the first frame taken, s in the source.
-        end: time before which the last frame taken is, s in the source; None is its end.
-        every: take every Nth frame of the source.
-        no_video: write no ``bev.mp4`` and ``overlay.mp4``.
-        grid: (near, far, left, right, resolution) of the bird's-eye view, m.
-        rerun: "viewer" to open a Rerun viewer that shows the run, or the address of an open one.
-        topic: topic of the images in a bag with several.
-        keep_all: drop no frame of a stream.
-        smooth: estimate every pose from all frames of the drive, in two passes over the source.
-        far_view: the network also looks at a view about the horizon, see :class:`lanebev.FarView`.
-        hilly: expect crests and dips everywhere on the road, instead of only where they are evident.
+    In Python, ``lanes_size`` is (height, width) px, ``lanes_crop`` (top, left, height, width) px and ``grid``
+    (near, far, left, right, resolution) m. None stands for the default that the help text names: see
+    :attr:`relative_focal_std` and :attr:`taken_lane_width`; ``lanes_size`` is then the size of
+    ``lanes_crop``, or else of the source.
+
+    Raises:
+        TypeError: a value of another type.
+        ValueError: a value out of range, or settings that exclude each other.
     """
 
     source: str = option(
@@ -93,7 +63,9 @@ class RunConfig:
         "FILE",
     )
     stills: bool = option(False, "treat every image as independent, not as a frame of a drive")
-    resume: str | None = option(None, "continue from the state that a run saved in this folder", "DIR")
+    resume: str | None = option(
+        None, "continue from the state that a run with the same calibrator saved in this folder", "DIR"
+    )
     calibrator: str = option(
         "joint", "calibrator; two-stage is the paper's method (default {})", choices=CALIBRATORS
     )

@@ -59,7 +59,7 @@ def write_drive(
     Args:
         drive: what to render.
         path: gives the path to write a name to.
-        progress: wraps the frame numbers, told how many there are.
+        progress: wraps the frame numbers, given their number.
 
     Returns:
         the truth, a row per frame, and the mean lane width (m).

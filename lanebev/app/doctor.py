@@ -35,7 +35,7 @@ _WORDS = ("ok", "doubt", "wrong")
 _SAMPLED = 40  # frames
 _SECONDS = 120.0  # of a source, from which they are taken
 _OFF_CENTRE = 0.1  # of the image's sides, between its centre and the principal point
-_GAP = 3.0  # times the usual interval
+_GAP = 3.0  # times the median interval
 _LEAST_VERTICES = 4  # of a boundary that is seen
 _SHARE_SEEN = 0.5  # of frames with two boundaries
 
@@ -181,11 +181,13 @@ def check_times(sample: Sample) -> Finding:
         words = f"frames: {sample.undecoded} of {len(sample.boundaries)} do not decode"
         return Finding(DOUBT, words)
     longest = max(sample.steps, default=1.0)
-    usual = float(np.median(sample.steps)) if sample.steps else 1.0
-    if longest > _GAP * usual:
-        return Finding(DOUBT, f"times: a gap of {longest / usual:.0f} times the usual interval")
-    if not 0.8 < usual < 1.25:
-        return Finding(DOUBT, f"times: the frame interval is {usual:.2f} times that of the stated frame rate")
+    median = float(np.median(sample.steps)) if sample.steps else 1.0
+    if longest > _GAP * median:
+        return Finding(DOUBT, f"times: a gap of {longest / median:.0f} times the median interval")
+    if not 0.8 < median < 1.25:
+        return Finding(
+            DOUBT, f"times: the frame interval is {median:.2f} times that of the stated frame rate"
+        )
     return Finding(OK, "times: frames are evenly spaced and decode")
 
 
@@ -199,14 +201,14 @@ def check_lanes(sample: Sample) -> Finding:
 
 
 def check_pose(sample: Sample) -> Finding:
-    """Check if the median pose of the frames is usual for a camera in a car.
+    """Check if the median pose of the frames is plausible for a camera in a car.
 
     A wrong focal length changes pitch and yaw, and hardly anything else: lanes alone do not show it, unless
-    the pose becomes unusual.
+    the pose becomes implausible.
     """
     if not sample.poses:
         return Finding(DOUBT, "pose: none, since lanes were not found well enough in any frame")
     pose = np.median(sample.poses, axis=0).tolist()
-    if odd := pose_remark(pose):
-        return Finding(DOUBT, odd)
+    if remark := pose_remark(pose):
+        return Finding(DOUBT, remark)
     return Finding(OK, f"pose: {', '.join(pose_words(pose))}; lanes do not determine the focal length")

@@ -13,21 +13,19 @@ FORMATS = ("onnx", "torch-export")
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """Settings of an export.
+    """Settings of an export. Every field is an option of ``lanebev export``, with its help text.
 
-    Attributes:
-        camera: camera file; the exported parts take images of its size and lens model.
-        part: one of PARTS; None exports all parts that a run by ONNX Runtime needs, and the step.
-        format: one of FORMATS.
-        out: output folder.
-        calibrator: calibrator of the step, one of CALIBRATORS.
-        weights: weights file of the network; None is the shipped one.
-        int8: the segmenter's convolutions compute with 8-bit numbers; the other files stay in float.
-        far_view: the network of the step also looks at a view about the horizon; only the step has one.
+    Raises:
+        TypeError: a value of another type.
+        ValueError: settings that exclude each other.
     """
 
     camera: str = option("", "camera file, whose image size and lens model the export keeps", "FILE")
-    part: str | None = option(None, "export this part only (default: all)", choices=PARTS)
+    part: str | None = option(
+        None,
+        "export this part only (default: the step, and all that a run by ONNX Runtime needs)",
+        choices=PARTS,
+    )
     format: str = option("onnx", "format of the files (default {})", choices=FORMATS)
     out: str = option("lanebev-export", "output folder (default {})", "DIR")
     calibrator: str = option(
@@ -47,7 +45,6 @@ class ExportConfig:
             raise ValueError("camera: expected --camera FILE, got none")
         if self.int8 and (self.format != "onnx" or "segmenter" not in self.parts):
             raise ValueError("int8: expected --format onnx and the part segmenter with it, got another")
-
         if self.far_view and self.part not in (None, "step"):
             raise ValueError(f"far_view: expected the part step, which alone has one, got {self.part}")
 

@@ -62,4 +62,4 @@ def observer_of_parts(paths: Sequence[Path], observer: Observer) -> Observer:
         observer: observer of frames that are in none of them.
     """
     entries = chain.from_iterable(map(whole_tusimple_lines, paths))
-    return RecoveredObserver(entries, cast(RestoringObserver, observer), number_in_source, told=False)
+    return RecoveredObserver(entries, cast(RestoringObserver, observer), number_in_source, is_reported=False)

@@ -45,18 +45,18 @@ def pose_words(pose: Sequence[float]) -> list[str]:
 
 def pose_remark(pose: Sequence[float]) -> str:
     """Return a remark on pitch, yaw, roll (degrees), height (m) unusual for a car's camera; else nothing."""
-    odd = [
+    unusual = [
         words
         for words, value, (low, high) in zip(pose_words(pose), pose, _POSE, strict=True)
         if not low <= value <= high
     ]
-    if not odd:
+    if not unusual:
         return ""
-    return f"pose: {', '.join(odd)} is unusual for a camera in a car: are camera and lane width right?"
+    return f"pose: {', '.join(unusual)} is unusual for a camera in a car: are camera and lane width right?"
 
 
 def drive_remark(rows: Iterable[ExtrinsicsRow]) -> str:
-    """Return a remark on the median pose of the frames that were tracked; empty if nothing is odd."""
+    """Return a remark on the median pose of the frames that were tracked; empty if it is plausible."""
     poses = [
         (row.pitch_deg, row.yaw_deg, row.roll_deg, row.height_m) for row in rows if row.status == "TRACKING"
     ]

@@ -44,11 +44,11 @@ class RecoveredObserver:
         entries: entries of lanes.json, from the first frame on.
         observer: observer of the other frames.
         name_of: gives the name of a frame's entry.
-        told: whether the report says so.
+        is_reported: whether the report says so.
 
     Attributes:
         frames: how many were taken.
-        told: see above.
+        is_reported: see above.
         remark: remark of the other observer.
         workers: likewise.
     """
@@ -58,9 +58,9 @@ class RecoveredObserver:
         entries: Iterator[FrameLines],
         observer: RestoringObserver,
         name_of: Callable[[Frame], str],
-        told: bool = True,
+        is_reported: bool = True,
     ) -> None:
-        self.told = told
+        self.is_reported = is_reported
         self._entries, self._observer, self._name_of = entries, observer, name_of
         self._ahead: dict[str, FrameLines] = {}  # read before their frames came: threads overtake each other
         self._lock = threading.Lock()
@@ -83,7 +83,7 @@ class RecoveredObserver:
 
 def facts_of(observer: Observer) -> dict[str, str]:
     """Return the number of reused detections, for the report."""
-    if not isinstance(observer, RecoveredObserver) or not (observer.told and observer.frames):
+    if not isinstance(observer, RecoveredObserver) or not (observer.is_reported and observer.frames):
         return {}
     return {"reused": f"detections of a run that was killed, in the first {observer.frames} frames"}
 

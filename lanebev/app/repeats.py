@@ -18,7 +18,7 @@ _NEAR = 2  # frames before and after, among which the largest change is that of 
 _MOVING = 1.0  # grey levels of 255 on average, of a change that counts
 _REPEATED = 0.2  # of the largest change near by; compression alone changes a repeated image by up to 0.1
 _FROZEN = 0.05  # grey levels on average, of a change that no camera's noise leaves
-_MANY, _FEW = 0.1, 4  # of the frames, and in number: those at a cut or a stop
+_MOST_SHARE, _MOST_COUNT = 0.1, 4  # of a drive's frames, and in number: more repeated ones are reported
 
 
 def repeated(changes: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -60,7 +60,7 @@ class RepeatedFrames:
         """Return what to say of the drive; empty if few frames are repeated."""
         changes = self._changes.all()
         count = int(repeated(changes).sum()) if len(changes) else 0
-        many = max(_FEW, _MANY * len(changes))
+        many = max(_MOST_COUNT, _MOST_SHARE * len(changes))
         frozen = int((changes < _FROZEN).sum())
         if count <= many < frozen:
             return (

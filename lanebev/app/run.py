@@ -68,7 +68,7 @@ def run(
 
     Args:
         config: what to run.
-        progress: wraps the frames, told how many there are.
+        progress: wraps the frames, given their number.
         truth: truth of a rendered drive, a row per frame, for the report.
         network: an already loaded network with the weights and device of the settings.
         parts: files of :func:`lanebev.app.part_observation.observe_part` for parts of the source, in order;

@@ -10,7 +10,7 @@ from torch import Tensor
 from lanebev.geometry.vanishing_point import vanishing_point
 from lanebev.types import Status
 
-_SURE = 0.005  # rad, standard deviation of an angle up to which it places a far view
+_LARGEST_STD = 0.005  # rad, standard deviation of an angle up to which it places a far view
 
 
 def expected_vanishing_point(
@@ -35,7 +35,7 @@ def expected_vanishing_point(
     found = getattr(calibrator, "pitch_and_yaw", lambda _: None)(state)
     if found is None:
         return intrinsics.new_full((len(intrinsics), 2), torch.nan)
-    (pitch, yaw), sure = found[0].unbind(-1), found[1] < _SURE**2
+    (pitch, yaw), sure = found[0].unbind(-1), found[1] < _LARGEST_STD**2
     known = (state.status == int(Status.TRACKING)) & sure.all(-1)
     known = known | ((state.status == int(Status.UNINITIALISED)) & sure[:, 0])
     lens = (intrinsics.to(pitch), None if distortion is None else distortion.to(pitch), model)

@@ -16,7 +16,7 @@ _NOT_THERE = (
     -2.0,
     -1.0,
 )  # x of points that detectors made for TuSimple do not see; else it is a pixel outside
-_GAP = 2.5  # times the usual distance of rows: from there on a line is not seen in between
+_GAP = 2.5  # times the median distance of rows: from there on a line is not seen in between
 
 
 def read_culane(path: str | Path) -> FrameLines:

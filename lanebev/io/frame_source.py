@@ -96,7 +96,7 @@ class FrameSource:
             yield Frame(index, time, dt, path, image, problem)
 
     def _video_frames(self) -> Iterator[Frame]:
-        damaged, told = False, False  # since the last key frame
+        damaged, reported = False, False  # since the last key frame
         with begun(self.source, self.selection.start) as video:
             first, before, tick = video.first, video.before, video.stream.time_base
             for index, (pts, frame) in enumerate(video.frames, start=video.number):
@@ -108,9 +108,12 @@ class FrameSource:
                 dt = float(1 / self.fps) if before is None else float(time - before)
                 image, problem = None, ""
                 if isinstance(frame, str) or frame.key_frame:
-                    damaged, told = isinstance(frame, str), False
-                elif damaged and not told:
-                    problem, told = "up to the next key frame, images may show a lost frame's damage", True
+                    damaged, reported = isinstance(frame, str), False
+                elif damaged and not reported:
+                    problem, reported = (
+                        "up to the next key frame, images may show a lost frame's damage",
+                        True,
+                    )
                 if self.selection.takes(index, float(time - first)):
                     try:
                         image = self._right_size(rgb(frame, self.matrix))

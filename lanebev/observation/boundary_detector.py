@@ -32,13 +32,7 @@ from lanebev.types import check_tensor
 class BoundaryDetector(nn.Module):
     """Finds lane boundaries in images; the first half of :class:`lanebev.LaneBEV`.
 
-    Args:
-        segmenter: see :class:`lanebev.LaneBEV`, as all arguments.
-        extractor: likewise.
-        network_width: likewise.
-        network_pixels: likewise.
-        frozen: likewise.
-        far_view: likewise.
+    Its arguments are those of the same names of :class:`lanebev.LaneBEV`.
     """
 
     def __init__(

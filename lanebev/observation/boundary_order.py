@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lanebev.types import NUM_BOUNDARIES
 
-_SAME_LINE, _NEXT_BUT_ONE = 0.4, 1.75  # gap between neighbours, in usual gaps
+_SAME_LINE, _NEXT_BUT_ONE = 0.4, 1.75  # gap between neighbours, in typical gaps
 _FARTHEST = 20.0  # lateral distance over camera height: beyond it a line crosses the road, as stop lines do
 _CENTRED = 0.17  # distance of the camera from the middle of a lane in which it drives, in the lane's widths
 _NARROWEST = 0.25  # lane width over camera height: below it two lines are one, or edges of one marking
@@ -26,15 +26,15 @@ def boundary_indices(
 
     The lower half of each line is extended to the bottom of the image, also if the line leaves the image
     sideways, and the lines are counted outwards in that order. Going down, a line runs to its own side of the
-    camera, so its slope gives the side at any yaw. A neighbour much nearer than usual, or nearer than the
-    narrowest lane, is the other edge of the same marking or the same line drawn twice, and gets None; one
-    twice as far as usual is the next but one.
+    camera, so its slope gives the side at any yaw. A neighbour much nearer than the typical gap, or nearer
+    than the narrowest lane, is the other edge of the same marking or the same line drawn twice, and gets
+    None; one at twice the typical gap is the next but one.
 
-    The usual gap is that of the lane in whose middle the camera is, unless it is too wide for one lane: cars
-    drive in the middle of a lane, not above a boundary. So a car above a boundary that is not seen is taken
-    to be in one wide lane. If the camera is in the middle of no lane, the usual gap is the lower median. For
-    the narrowest and the widest lane: on a plane, the slopes dx/dy of two boundaries differ by their distance
-    over the camera's height, for any pitch, yaw and focal length.
+    The typical gap is that of the lane in whose middle the camera is, unless it is too wide for one lane:
+    cars drive in the middle of a lane, not above a boundary. So a car above a boundary that is not seen is
+    taken to be in one wide lane. If the camera is in the middle of no lane, the typical gap is the lower
+    median. For the narrowest and the widest lane: on a plane, the slopes dx/dy of two boundaries differ by
+    their distance over the camera's height, for any pitch, yaw and focal length.
 
     Args:
         lines: each (P, 2) px, undistorted; P = 0 and 1 get None.
@@ -53,13 +53,13 @@ def boundary_indices(
     crossing = {i: straight[i].at(bottom) for i in slope}
     apart = _longest_of_doubles(sorted(slope, key=crossing.__getitem__), slope, _NARROWEST, lines)
     gaps = np.diff([crossing[i] for i in apart])
-    usual = float(np.median(gaps)) if len(gaps) > 1 else 0.0
-    kept = _longest_of_doubles(apart, crossing, _SAME_LINE * usual, lines)
+    typical = float(np.median(gaps)) if len(gaps) > 1 else 0.0
+    kept = _longest_of_doubles(apart, crossing, _SAME_LINE * typical, lines)
     left = sum(slope[i] < 0 for i in kept)
     lanes = [crossing[b] - crossing[a] for a, b in pairwise(kept)]
     in_a_lane = 0 < left < len(kept) and _bound_one_lane(-slope[kept[left - 1]], slope[kept[left]])
-    usual = lanes[left - 1] if in_a_lane else _usual_gap(lanes)
-    steps = [2 if gap > _NEXT_BUT_ONE * usual else 1 for gap in lanes]
+    typical = lanes[left - 1] if in_a_lane else _median_gap(lanes)
+    steps = [2 if gap > _NEXT_BUT_ONE * typical else 1 for gap in lanes]
     position = np.concatenate([[0], np.cumsum(steps)]).astype(int)
     if left == 0:
         origin = position[0] - num_boundaries // 2
@@ -140,5 +140,5 @@ def _bound_one_lane(from_left: float, from_right: float) -> bool:
     return width < _WIDEST and abs(from_left - from_right) < 2 * _CENTRED * width
 
 
-def _usual_gap(gaps: Sequence[float]) -> float:
+def _median_gap(gaps: Sequence[float]) -> float:
     return sorted(gaps)[(len(gaps) - 1) // 2] if gaps else 1.0

@@ -17,9 +17,9 @@ from lanebev.observation.vertices import order_along, take
 
 _STEP = 32  # px, of which the sides of a network's input are multiples
 _EDGE = 4  # px of the network's input, at the edge of a far view, where lines have no vertices
-_OTHER = 1.0  # camera heights, less than half a lane, between two views of a boundary that are of two lines
+_DIFFERENT_LINES = 1.0  # camera heights (less than half a lane) from which both views show different lines
 _LEAST_BELOW = 10.0  # px below the horizon, where a camera height is too few px to tell
-_FEW = 4  # vertices of a boundary in the far view, below which those of the whole image are kept
+_LEAST_VERTICES = 4  # vertices of a boundary in the far view, below which those of the whole image are kept
 
 
 @dataclass(frozen=True)
@@ -167,9 +167,9 @@ def merge_vertices(
     Returns:
         (B, L, VERTICES_PER_LINE), in order along each boundary; the last ones of more are left out.
     """
-    other = contradiction(whole, far, horizon) > _OTHER
+    other = contradiction(whole, far, horizon) > _DIFFERENT_LINES
     trusted = torch.where(other.unsqueeze(-1), 0.0, far.weight)
-    replaced = inside & ((trusted > 0).sum(-1, keepdim=True) >= _FEW)
+    replaced = inside & ((trusted > 0).sum(-1, keepdim=True) >= _LEAST_VERTICES)
     weight = torch.cat([torch.where(replaced, 0.0, whole.weight), trusted], dim=-1)
     points, sigma = torch.cat([whole.points, far.points], dim=2), torch.cat([whole.sigma, far.sigma], dim=2)
     order = order_along(points.detach(), weight.detach())[0]

@@ -29,7 +29,7 @@ VERTICES_PER_LINE = 60
 
 _MOST_TURNS = 0.25  # of a line's steps: points with more turns are in no order
 _BESIDE_EDGE = 3.0  # px from an edge, where points of the same x were moved to it
-_GAP, _GAP_ROWS = 4.0, 30.0  # between vertices: times the usual distance, and px
+_GAP, _GAP_ROWS = 4.0, 30.0  # between vertices: times the median distance, and px
 
 
 class LaneLine(NamedTuple):

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from lanebev.batch import masked_median
 
-_TOGETHER = 3.0  # px off a circle through two vertices, at and above which they are not averaged
-_SURE = 0.03  # px, sigma up to which the median vertex of a boundary is that of a clean map
-_UNSURE = 0.12  # px, sigma of a clean map's vertex above which it counts less, and at 3/2 of which not at all
+_CIRCLE_TOLERANCE = 3.0  # px; two vertices that are farther off a common circle are not averaged
+_CLEAN_SIGMA = 0.03  # px; up to this median sigma of a boundary's vertices the map is clean
+_LARGEST_SIGMA = 0.12  # px; on a clean map a vertex of larger sigma counts less, at 3/2 of it not at all
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
     """
     points, normal = vertices.points.mT, vertices.normal.mT  # (B, L, 2, V)
     stretch, middle, size = stretches(vertices, config)
-    together = (vertices.weight > 0) & _with_the_middle(points.detach(), normal.detach(), middle, size)
+    together = (vertices.weight > 0) & _averaged_with_middle(points.detach(), normal.detach(), middle, size)
     density = vertices.density * together
     share = density * vertices.weight
     alone = torch.stack([density, share, share * vertices.common_var, share.square() * vertices.own_var], -2)
@@ -117,7 +117,7 @@ def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
     moved = _sums((share * off_tangent).unsqueeze(-2) * normal, stretch, config)
     mean = mean - 0.5 * moved / safe.unsqueeze(-2)
     common_var, own_var = common / safe + config.sigma_floor**2, own / safe.square()
-    sure = mass / counted.clamp(min=1e-6) * _as_sure_as_most(common_var + own_var, counted > 0)
+    sure = mass / counted.clamp(min=1e-6) * _variance_weight(common_var + own_var, counted > 0)
     return Vertices(mean.mT, across.mT, sure, counted, common_var, own_var)
 
 
@@ -153,18 +153,18 @@ def stretches(vertices: Vertices, config: LineConfig) -> tuple[Tensor, Tensor, T
     return stretch, order.gather(-1, middles).gather(-1, stretch), sizes.gather(-1, stretch)
 
 
-def _as_sure_as_most(variance: Tensor, there: Tensor) -> Tensor:
+def _variance_weight(variance: Tensor, there: Tensor) -> Tensor:
     """Weigh vertices (B, L, 2S) by their variance and the median variance of their boundary.
 
     On a clear map a vertex has a large variance only where there is no line: at its end, at a notch, on a
     bend of a few px. On an unclear map many have; there the limit grows with the median variance.
     """
     typical = masked_median(variance, there).unsqueeze(-1)
-    limit = _UNSURE * (typical / _SURE**2).clamp(min=1.0)
+    limit = _LARGEST_SIGMA * (typical / _CLEAN_SIGMA**2).clamp(min=1.0)
     return (3.0 - 2.0 * variance.sqrt() / limit).clamp(0, 1)
 
 
-def _with_the_middle(points: Tensor, normal: Tensor, middle: Tensor, size: Tensor) -> Tensor:
+def _averaged_with_middle(points: Tensor, normal: Tensor, middle: Tensor, size: Tensor) -> Tensor:
     """Return which vertices may be averaged with the middle one of their stretch, (B, L, V).
 
     These are not those across a gap (farther away than so many scans reach, two for dropped scans), nor
@@ -182,7 +182,7 @@ def _with_the_middle(points: Tensor, normal: Tensor, middle: Tensor, size: Tenso
     facing = torch.where((normal * other).sum(-2, keepdim=True) < 0, -normal, normal)
     off = 0.5 * ((facing + other) * chord).sum(-2).abs()
     near = chord.square().sum(-2) < (1.5 * size + 2).square()
-    kept: Tensor = near & (off < _TOGETHER)
+    kept: Tensor = near & (off < _CIRCLE_TOLERANCE)
     return kept
 
 

@@ -24,9 +24,9 @@ _STATUS_WORDS = {
 _SEVERITY = ("no frames", *_STATUS_WORDS.values(), "not determined", "uncertain")
 _JOINED = 0.5  # s, largest gap between two intervals of the same kind that are joined
 _SHORTEST = 0.2  # s, shortest interval that is listed
-_GAP = 1.0  # s between two frames, and
-_GAP_STEPS = 5.0  # times the usual step, from which on frames are missing
-_TOLD = 8  # findings
+_GAP = 1.0  # s; a longer interval has missing frames,
+_GAP_STEPS = 5.0  # if it is also longer than so many median intervals
+_MOST_FINDINGS = 8  # findings
 
 
 @dataclass(frozen=True)
@@ -60,22 +60,22 @@ class Verdict:
         grade: "good", "fair" or "poor".
         headline: one sentence.
         precision: one sentence, empty if nothing was calibrated.
-        findings: what is amiss, the most severe first.
-        untold: further findings.
+        findings: problems, the most severe first.
+        omitted: number of further findings.
     """
 
     grade: str
     headline: str
     precision: str
     findings: tuple[Finding, ...]
-    untold: int = 0
+    omitted: int = 0
 
     @property
     def text(self) -> str:
         """All of it in one line."""
-        told = [describe(finding) for finding in self.findings]
-        more = [f"and {self.untold} more"] if self.untold else []
-        return "; ".join([self.headline.removesuffix("."), *told, *more])
+        words = [describe(finding) for finding in self.findings]
+        more = [f"and {self.omitted} more"] if self.omitted else []
+        return "; ".join([self.headline.removesuffix("."), *words, *more])
 
 
 def verdict(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> Verdict:
@@ -83,7 +83,7 @@ def verdict(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> Verdict:
 
     Args:
         rows: one per frame.
-        stills: each image is on its own, so there are no intervals of time.
+        stills: independent images, so there are no intervals of time.
     """
     if not rows:
         return Verdict("poor", "Not calibrated: there was no frame.", "", ())
@@ -103,7 +103,9 @@ def verdict(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> Verdict:
     headline += "." if complete == share else f", {part}."
     grade = "good" if complete >= 0.9 else "fair" if share >= 0.5 else "poor"
     found = image_findings(rows) if stills else drive_findings(rows)
-    return Verdict(grade, headline, _precision(rows, states), tuple(found[:_TOLD]), len(found[_TOLD:]))
+    return Verdict(
+        grade, headline, _precision(rows, states), tuple(found[:_MOST_FINDINGS]), len(found[_MOST_FINDINGS:])
+    )
 
 
 def describe(finding: Finding) -> str:
@@ -116,7 +118,7 @@ def describe(finding: Finding) -> str:
 
 
 def drive_findings(rows: Sequence[ExtrinsicsRow]) -> list[Finding]:
-    """Return what is amiss in a drive: intervals without frames, support or one of the axes."""
+    """Return the problems of a drive: intervals without frames, support or one of the axes."""
     times = np.array([row.time_s for row in rows])
     found = [*_missing_frames(times)]
     for status, words in _STATUS_WORDS.items():
@@ -141,7 +143,7 @@ def drive_findings(rows: Sequence[ExtrinsicsRow]) -> list[Finding]:
 
 
 def image_findings(rows: Sequence[ExtrinsicsRow]) -> list[Finding]:
-    """Return what is amiss in images, each on its own: in how many of them, and the first."""
+    """Return the problems of independent images: in how many of them, and the first."""
     states = np.array([axis_states(row) for row in rows])
     tracked = np.array([row.status == "TRACKING" for row in rows])
     lost = [row for row in rows if row.status != "TRACKING"]
@@ -211,10 +213,10 @@ def _finding(subject: str, what: str, first: int, last: int, times: NDArray[np.f
 
 
 def _end(times: NDArray[np.float64], last: int) -> float:
-    """Return the time of the next frame, s, or a usual step later."""
-    usual = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    """Return the time of the next frame, s, or a median step later."""
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     following = float(times[last + 1]) if last + 1 < len(times) else np.inf
-    return min(following, float(times[last]) + max(usual, 0.0))
+    return min(following, float(times[last]) + max(step, 0.0))
 
 
 def _joined_axes(parts: Sequence[Finding]) -> list[Finding]:
@@ -234,8 +236,8 @@ def _joined_axes(parts: Sequence[Finding]) -> list[Finding]:
 def _frequent(rows: Sequence[ExtrinsicsRow], among: Sequence[str], least: float = 0.2) -> str:
     """Return the reasons that hold in a fifth of the frames or more, in words."""
     counts = Counter(name for row in rows for name in reasons_of(row) if name in among)
-    usual = [name for name, count in counts.most_common() if count >= least * len(rows)]
-    return ", ".join(_WORDS[name] for name in usual)
+    frequent = [name for name, count in counts.most_common() if count >= least * len(rows)]
+    return ", ".join(_WORDS[name] for name in frequent)
 
 
 def _unseen_why(rows: Iterable[ExtrinsicsRow]) -> str:
@@ -248,12 +250,12 @@ def _unseen_why(rows: Iterable[ExtrinsicsRow]) -> str:
 def _precision(rows: Sequence[ExtrinsicsRow], states: NDArray[np.int64]) -> str:
     """Return the median of ±2σ over the frames that measure an axis."""
     std = estimate_stds(rows)
-    told = [
+    parts = [
         f"{name} ±{_value(axis, 2 * float(np.median(std[states[:, axis] <= AxisState.UNCERTAIN, axis])))}"
         for axis, name in enumerate(AXES)
         if (states[:, axis] <= AxisState.UNCERTAIN).any()
     ]
-    return f"Typical uncertainty (2σ): {', '.join(told)}." if told else ""
+    return f"Typical uncertainty (2σ): {', '.join(parts)}." if parts else ""
 
 
 def _value(axis: int, value: float) -> str:

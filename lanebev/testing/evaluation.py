@@ -95,8 +95,8 @@ def _double(part: Tensor) -> Tensor:
     return part.double() if part.is_floating_point() else part
 
 
-def summarise(run: Track, usual: Tensor | None = None) -> dict[str, Any]:
-    """Return the figures of one track; ``usual`` (4,) is the RMSE on the straight road, for the recovery."""
+def summarise(run: Track, reference: Tensor | None = None) -> dict[str, Any]:
+    """Return a track's figures; ``reference`` (4,) is the RMSE on a straight road, for the recovery."""
     later = torch.arange(len(run.hard)) >= WARM_UP
     easy, hard = later & ~run.hard, later & run.hard
     known = run.bounds.isfinite() & easy[:, None, None]
@@ -114,8 +114,8 @@ def summarise(run: Track, usual: Tensor | None = None) -> dict[str, Any]:
             "largest_sigma": (run.variances[hard].amax((0, 1)).sqrt() * UNITS).tolist(),
             "nees_per_dof": float(run.nees[hard].mean() / 4),
         }
-        if usual is not None:
-            figures["recovery_s"] = recovery(run, usual)
+        if reference is not None:
+            figures["recovery_s"] = recovery(run, reference)
     return figures
 
 
@@ -124,17 +124,17 @@ def within_3_sigma(run: Track) -> Tensor:
     return (run.errors.square() <= 9 * run.variances).double().mean((1, 2))
 
 
-def recovery(run: Track, usual: Tensor, fps: float = FPS) -> float | None:
-    """Compute the longest time, s, from the end of hard frames until all errors are below twice the usual.
+def recovery(run: Track, reference: Tensor, fps: float = FPS) -> float | None:
+    """Compute the longest time, s, from the end of hard frames until all errors are below twice a reference.
 
     None if it never comes back before the next hard frames or the end.
 
     Args:
         run: run of a drive with hard frames.
-        usual: (4,) or (T, 4) rad and m.
+        reference: (4,) or (T, 4) rad and m.
         fps: frame rate of the drive.
     """
-    fine = (run.errors.square().mean(1).sqrt() <= 2 * usual).all(-1)  # (T,)
+    fine = (run.errors.square().mean(1).sqrt() <= 2 * reference).all(-1)  # (T,)
     ends = [k + 1 for k in range(len(fine) - 1) if run.hard[k] and not run.hard[k + 1]]
     longest = 0.0
     for end in ends:

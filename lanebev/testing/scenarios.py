@@ -1,4 +1,4 @@
-"""Drives that break the paper's assumptions one at a time, as changes to the moments of a usual drive."""
+"""Drives that break the paper's assumptions one at a time, as changes of the standard drive."""
 
 from __future__ import annotations
 
@@ -141,4 +141,4 @@ SCENARIOS: dict[str, tuple[float, Callable[[float, Moment], Moment] | None]] = {
     "bad clock": (6.0, _clock),
     "far start": (4.0, _far_start),
 }
-"""Name: seconds, and the change to the usual drive."""
+"""Name: seconds, and the change to the standard drive."""

@@ -21,7 +21,7 @@ from lanebev.view.projection import Cells
 _kept = KeptArrays()
 
 _PUSH = 4.0  # half widths of a map by which what lies outside is moved away from it
-_FEW = 8  # channels of which a copy costs less than to sample one image with one thread
+_FEW_CHANNELS = 8  # channels of which a copy costs less than to sample one image with one thread
 
 
 class MapSize(NamedTuple):
@@ -181,7 +181,7 @@ def _strips(features: Tensor, at: Tensor) -> int:
     ``grid_sample`` divides its work on a CPU by images: of one image, one thread does all. A copy puts the
     strips together, and gradients of the image would be computed once for each.
     """
-    one = features.shape[0] == 1 and features.shape[1] <= _FEW and features.device.type == "cpu"
+    one = features.shape[0] == 1 and features.shape[1] <= _FEW_CHANNELS and features.device.type == "cpu"
     return math.gcd(at.shape[2], torch.get_num_threads()) if one and _may_overwrite() else 1
 
 

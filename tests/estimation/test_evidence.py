@@ -15,7 +15,7 @@ from lanebev.estimation.joint.road import step_variance
 from lanebev.testing.evaluation import track
 from lanebev.testing.moments import FPS, Moment, moments
 from tools.bench_kinds import measure
-from tools.told_road import ToldRoad, shape_of
+from tools.known_road import KnownRoad, shape_of
 
 torch.set_num_threads(1)
 DOUBLE = torch.float64
@@ -108,6 +108,6 @@ def test_the_shape_that_a_filter_is_told_is_that_of_the_road():
 
 def test_a_filter_that_is_told_the_road_begins_again_with_every_drive():
     drive = moments(3 / FPS, lambda _, moment: replace(moment, curvature=lambda s: 1e-4 * s))
-    told = ToldRoad(drive, speed=30.0)
+    told = KnownRoad(drive, speed=30.0)
     first, second = (track(told, drive, rows=1) for _ in range(2))
     assert torch.equal(first.errors, second.errors)

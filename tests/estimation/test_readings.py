@@ -201,6 +201,7 @@ def test_gradients_flow():
     found = still(LaneSegments(ends, *segments[1:]))
     found.extrinsics.stack().sum().backward()
     assert ends.grad.isfinite().all()
+    assert ends.grad.abs().max() > 0
 
 
 def test_distance_is_in_sigmas():

@@ -92,7 +92,7 @@ def test_flicker_is_one_interval_and_single_frames_are_left_out():
 def test_many_findings_are_counted():
     changes = [(i, i + 0.3, {"status": "LOST"}) for i in np.arange(1, 20, 1.0)]
     found = verdict(drive(20.0, changes=changes))
-    assert (len(found.findings), found.untold) == (8, 11)
+    assert (len(found.findings), found.omitted) == (8, 11)
     assert found.text.endswith("; and 11 more")
 
 

@@ -153,7 +153,7 @@ def test_stopwatch_forgets_what_was_read():
     watch = Stopwatch(CPU)
     with watch.time("a"):
         pass
-    assert watch.read()["a"] >= 0
+    assert watch.read().keys() == {"a"}
     assert watch.read() == {}
 
 

@@ -40,8 +40,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     every = [*TABLES, *GROWTHS]
-    usual = [part for part in every if not part.startswith("compiled")]
-    parser.add_argument("--parts", nargs="+", choices=every, default=usual)
+    default = [part for part in every if not part.startswith("compiled")]
+    parser.add_argument("--parts", nargs="+", choices=every, default=default)
     parser.add_argument("--threads", type=PositiveInt, default=2)
     parser.add_argument("--cpu-time", action="store_true", help="processor time, with --threads 1")
     parser.add_argument("--seconds", type=PositiveFloat, default=5.0, help="per alternative (%(default)s)")

@@ -98,20 +98,20 @@ def outcomes(tasks: Sequence[Task], cluster: Cluster) -> Iterator[Outcome]:
                     if outcome.failure and not is_last and failures[task.name] <= cluster.retries:
                         waiting.append((task,))
                         continue
-                    follows, told = schedule.ended(task, outcome)
+                    follows, final = schedule.ended(task, outcome)
                     if follows is not None:
                         waiting.append((follows,))
-                    if told is not None:
-                        if told.is_final:
+                    if final is not None:
+                        if final.is_final:
                             with contextlib.suppress(OSError):  # a full disk: the next call tries it again
-                                write_mark(drives[told.name], told)
-                        yield told
+                                write_mark(drives[final.name], final)
+                        yield final
     finally:
         ray.shutdown()
 
 
 def _found(ray: ModuleType, reference: object, group: Sequence[Task]) -> tuple[Sequence[Outcome], bool]:
-    """Return what became of a group, and whether Ray has tried all it was told to."""
+    """Return what became of a group, and whether Ray has used all its retries."""
     try:
         found: Sequence[Outcome] = ray.get(reference)
     except ray.exceptions.RayError as error:  # its worker died again and again

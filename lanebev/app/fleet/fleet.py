@@ -34,7 +34,7 @@ from lanebev.io.whole_file import whole_file
 from lanebev.report.verdict import verdict
 
 logger = logging.getLogger(__name__)
-_TOLD = 10  # failures that are printed
+_MOST_FAILURES = 10  # failures that are printed
 
 
 class FleetResult(NamedTuple):
@@ -70,7 +70,7 @@ def fleet(
         again: try once more what failed in an earlier call.
         part_minutes: length of the parts of longer videos that the network looks at side by side; None cuts
             nothing.
-        progress: wraps the drives that end, told how many are to be run.
+        progress: wraps the drives that end, given the number that are to be run.
 
     Raises:
         ValueError: bad manifest, a library that is not installed, or another call at work in this folder.
@@ -199,7 +199,7 @@ def _axes(end: str, values: NDArray[np.float64]) -> dict[str, float | None]:
 def _summary(found: dict[str, Outcome], ran: int, out: str) -> str:
     failed = [outcome for outcome in found.values() if outcome.failure]
     lines = [f"{len(found)} drives: {len(found) - len(failed)} finished, {len(failed)} failed; {ran} run now"]
-    lines += [f"failed: {outcome.name}: {outcome.failure}" for outcome in failed[:_TOLD]]
-    if len(failed) > _TOLD:
-        lines.append(f"and {len(failed) - _TOLD} more, see the page")
+    lines += [f"failed: {outcome.name}: {outcome.failure}" for outcome in failed[:_MOST_FAILURES]]
+    if len(failed) > _MOST_FAILURES:
+        lines.append(f"and {len(failed) - _MOST_FAILURES} more, see the page")
     return "\n".join([*lines, f"{out}: index.html, mounts.json, {FRAMES}/, drives/"])

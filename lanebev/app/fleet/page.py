@@ -90,7 +90,7 @@ def fleet_page(
             (drive, quote(f"{DRIVES}/{drive.name}/report.html"), verdicts[drive.name], outcomes[drive.name])
             for drive in poor[:_MOST_DRIVES]
         ],
-        untold=max(0, len(poor) - _MOST_DRIVES),
+        omitted=max(0, len(poor) - _MOST_DRIVES),
         counts={
             grade: sum(each.grade == grade for each in verdicts.values())
             for grade in ("good", "fair", "poor")

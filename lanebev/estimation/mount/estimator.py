@@ -284,11 +284,11 @@ class MountEstimator(nn.Module):
 def _answer(
     pose: Tensor, variance: Tensor, status: Tensor, progress: Tensor, why: Tensor
 ) -> MountCalibration:
-    """Summarise the axes: calibrated if all are, otherwise the gravest status of any."""
+    """Summarise the axes: calibrated if all are, otherwise the most severe status of any."""
     calibrated = status == int(MountStatus.CALIBRATED)
     whole = torch.where(calibrated.any(-1), int(MountStatus.PARTIAL), int(MountStatus.UNCALIBRATED))
-    for grave in (MountStatus.RECALIBRATING, MountStatus.INVALID):
-        whole = torch.where((status == int(grave)).any(-1), int(grave), whole)
+    for severe in (MountStatus.RECALIBRATING, MountStatus.INVALID):
+        whole = torch.where((status == int(severe)).any(-1), int(severe), whole)
     whole = torch.where(calibrated.all(-1), int(MountStatus.CALIBRATED), whole)
     reasons = why[:, 0] | why[:, 1] | why[:, 2] | why[:, 3]
     return MountCalibration(

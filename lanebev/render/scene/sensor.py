@@ -57,8 +57,8 @@ class Sensor(NamedTuple):
 
 def sample_sensor(sampler: BatchSampler, weather: Weather, bright: Tensor) -> Sensor:
     """Sample a random camera; ``bright`` (B,) bool overexposes."""
-    usual = torch.where(sampler.chance(0.8), sampler.uniform(0.055, 0.22), sampler.uniform(0.2, 0.34))
-    exposure = torch.where(bright, sampler.uniform(0.3, 0.75), usual)
+    others = torch.where(sampler.chance(0.8), sampler.uniform(0.055, 0.22), sampler.uniform(0.2, 0.34))
+    exposure = torch.where(bright, sampler.uniform(0.3, 0.75), others)
     dark = (weather.kind == NIGHT) | (weather.kind == DUSK)
     exposure = torch.where(dark, sampler.uniform(0.03, 0.2), exposure)
     noisy = torch.where(weather.kind == NIGHT, 2.5, 1.0)

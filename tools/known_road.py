@@ -1,4 +1,4 @@
-"""The joint filter when it is told the shape of the road: what remains to be estimated is the pose."""
+"""The joint filter when the shape of the road is known: what remains to be estimated is the pose."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _STEP = 0.01  # m along the road
 _KNOWN = 1e-9  # 1/m, standard deviation of the shape
 
 
-class ToldRoad(JointCalibrator):
+class KnownRoad(JointCalibrator):
     """The joint filter whose state is given the true shape of the road before every frame.
 
     It counts the frames since ``initial_state``, so the rows of a batch must drive over the same road at the
