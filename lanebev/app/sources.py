@@ -27,6 +27,8 @@ from lanebev.io.source_names import is_bag, is_live, without_login
 from lanebev.io.video import FrameSource, open_source
 from lanebev.report.run_folder import RunFolder
 
+_LONG_STEP = 5  # s between frames, in which a pose has nothing to do with the one before
+
 
 def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
     """Open the source, with the frames that the settings take.
@@ -49,6 +51,11 @@ def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
         return open_live(config.source, config.frame_rate, config.keep_all, selection)
     found = _opened(config.source, config.topic, config.frame_rate)
     remarks = [found.problem]
+    step = config.every / found.fps
+    if found.count > 1 and step > _LONG_STEP and not config.stills:
+        remarks.append(
+            f"its frames are {float(step):.3g} s apart; is the frame rate right? if so, use --stills"
+        )
     if found.paths and not config.stills:
         remarks.append(drives_remark(found.paths) or ("" if found.times else jump_remark(found.paths)))
         if found.count > 1 and not (found.times or config.frame_rate):

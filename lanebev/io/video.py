@@ -19,7 +19,6 @@ from lanebev.io.decoding import (
     decoded,
     display_matrix,
     has_times,
-    moving_pictures,
     open_video,
     packets,
     pixel_aspect,
@@ -31,6 +30,7 @@ from lanebev.io.frames import Frame
 from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
 from lanebev.io.images import IMAGE_SUFFIXES, image_size, is_image, read_image, stated_size, write_png
 from lanebev.io.source_names import SCHEMES
+from lanebev.io.video_remarks import restart_remark, stream_remarks
 from lanebev.io.video_writer import VideoWriter
 
 __all__ = [
@@ -194,14 +194,16 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
         matrix = display_matrix(frame)
         size = rgb(frame, matrix).shape[:2]
         aspect = pixel_aspect(stream, frame, size)
-        problems = _remarks(container, frame, size)
+        problems = stream_remarks(container, frame, size)
     with open_video(source) as container:  # the header's count includes frames that an edit list cuts
         stream = video_stream(container)
         begin, tick = stream.start_time or 0, stream.time_base or 1 / fps
         end, edited = Fraction(0), False
         shown = [pts for pts in lost if first is not None and pts < first]
         telling = stream.codec_context.name not in _HIDING
+        keys: list[int] = []
         for packet in packets(container, stream):
+            keys += [packet.pts] if packet.is_keyframe and packet.pts is not None else []
             telling = telling and (packet.pts is not None or not packet.size)
             if packet.pts is not None:
                 edited = edited or packet.is_discard
@@ -211,6 +213,9 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
                 end = max(end, packet.pts - begin + max(packet.duration or 0, 1 / fps / tick))
         declared, got = _declared_duration(stream, begin * tick), float(end * tick)
     count = len(shown)
+    if restart := restart_remark(keys):
+        problems.append(restart)
+        telling = False
     if not telling:
         with open_video(source) as container:
             count = sum(1 for _ in decoded(container, video_stream(container)))
@@ -251,20 +256,6 @@ def _times_since_first(shown: Sequence[int], tick: Fraction, fps: Fraction) -> t
         time = pts * tick
         times.append(time if not times or time > times[-1] else times[-1] + 1 / fps)
     return tuple(float(time - times[0]) for time in times)
-
-
-def _remarks(
-    container: av.container.InputContainer, frame: av.VideoFrame, size: tuple[int, int]
-) -> list[str]:
-    """Return what to say of a video by its streams and its first frame."""
-    remarks = []
-    if others := len(moving_pictures(container)) - 1:
-        remarks.append(f"it has {others} more video streams; that of {size[1]} x {size[0]} px is used")
-    if frame.interlaced_frame:
-        remarks.append(
-            "its frames are interlaced, each of two moments; deinterlace it, as by ffmpeg -vf bwdif"
-        )
-    return remarks
 
 
 def _rate_of_times(times: Sequence[int], tick: Fraction, stated: Fraction) -> Fraction:

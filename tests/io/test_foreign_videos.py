@@ -1,6 +1,7 @@
 """Videos, images and folders as more recorders leave them, each after a public report."""
 
 import math
+import struct
 from dataclasses import replace
 from fractions import Fraction
 
@@ -188,6 +189,84 @@ def test_interlaced_frames_are_said(tmp_path):
         stream.options = {"flags": "+ildct+ilme"}
         _write(container, stream, range(4))
     assert "its frames are interlaced, each of two moments; deinterlace it" in open_source(str(path)).problem
+
+
+def test_frames_of_two_cameras_are_said(tmp_path):
+    path = tmp_path / "v.mkv"
+    with av.open(str(path), "w") as container:
+        stream = _stream(container)
+        stream.metadata["stereo_mode"] = "left_right"
+        _write(container, stream, range(4))
+    assert "its header says that frames have the images of two cameras" in open_source(str(path)).problem
+
+
+def test_videos_of_360_degrees_are_said(tmp_path):
+    """Google's box for spherical videos, as cameras and YouTube's injector write it into the track."""
+    path = tmp_path / "v.mp4"
+    with av.open(str(path), "w") as container:
+        _write(container, _stream(container), range(4))
+    words = b"<GSpherical:Spherical>true<GSpherical:Stitched>true<GSpherical:StitchingSoftware>"
+    words += b"<GSpherical:ProjectionType>equirectangular"
+    box = bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + words
+    box = struct.pack(">I4s", len(box) + 8, b"uuid") + box
+    data = path.read_bytes()
+    for kind in (b"moov", b"trak"):  # at the end of the file, so that no other place changes
+        place = data.index(kind) - 4
+        size = int.from_bytes(data[place : place + 4], "big")
+        data = data[:place] + struct.pack(">I", size + len(box)) + data[place + 4 :]
+    path.write_bytes(data[: place + size] + box + data[place + size :])
+    assert "its header says 360 degrees; cut out a pinhole view" in open_source(str(path)).problem
+
+
+def _joined(path, parts):
+    """Write videos that begin at some times (0.1 s), one byte by byte behind the other."""
+    data = b""
+    for times in parts:
+        with av.open(str(path), "w") as container:
+            _write(container, _stream(container), times)
+        data += path.read_bytes()
+    path.write_bytes(data)
+    return open_source(str(path))
+
+
+def test_an_appended_video_is_said(tmp_path):  # which players pass over
+    source = _joined(tmp_path / "v.mp4", [range(4), range(4)])
+    assert source.problem.endswith(
+        "v.mp4: another video is appended to it, of which nothing is read; join them by ffmpeg -f concat"
+    )
+    assert _joined(tmp_path / "w.mp4", [range(4)]).problem == ""
+
+
+@pytest.mark.parametrize("parts", [[range(20), range(20)], [range(90, 110), range(20)]])
+def test_times_that_begin_again_are_said(tmp_path, parts):
+    source = _joined(tmp_path / "v.ts", parts)
+    assert source.problem.endswith(
+        "v.ts: its times begin again, as of files joined byte by byte; is it one drive?"
+    )
+    frames = list(source)
+    assert source.count == len(frames) >= 40
+    assert all(frame.dt == pytest.approx(0.1) for frame in frames)
+    assert _joined(tmp_path / "w.ts", [range(20), range(20, 40)]).problem == ""
+
+
+def test_links_that_lead_nowhere_are_lost_frames(tmp_path):
+    folder = _folder(tmp_path / "a", "1.png", "2.png", "3.png")
+    (folder / "2.png").unlink()
+    (folder / "2.png").symlink_to(tmp_path / "away.png")
+    problems = [frame.problem for frame in open_source(str(folder))]
+    assert problems == [
+        "",
+        f"image {folder}/2.png: expected a whole image, got: no such file or directory",
+        "",
+    ]
+
+
+@pytest.mark.parametrize(("settings", "is_slow"), [({"fps": 1 / 30}, True), ({"fps": 0.5}, False),
+                                                   ({"fps": 1 / 30, "stills": True}, False)])  # fmt: skip
+def test_frames_that_are_half_a_minute_apart_are_said(tmp_path, settings, is_slow):
+    folder = str(_folder(tmp_path / "a", "1.png", "2.png"))
+    words = f"{folder}: its frames are 30 s apart; is the frame rate right? if so, use --stills"
+    assert make_source(RunConfig(folder, "c", **settings)).problem == (words if is_slow else "")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,72 @@
+"""What is odd about a video as a whole: its streams, its frames' layout, its times, what is appended."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import av
+
+from lanebev.io.decoding import moving_pictures
+
+_ROUND = range(4)  # AVSphericalProjection: equirectangular, cube maps, half of one
+_OF_TWO_CAMERAS = range(1, 8)  # AVStereo3DType: side by side, one above the other, in turn, ...
+
+
+def stream_remarks(
+    container: av.container.InputContainer, frame: av.VideoFrame, size: tuple[int, int]
+) -> list[str]:
+    """Return what to say of a video by its streams and its first frame.
+
+    Args:
+        container: the video.
+        frame: its first whole frame.
+        size: (height, width) px of the frame as shown.
+    """
+    remarks = []
+    if others := len(moving_pictures(container)) - 1:
+        remarks.append(f"it has {others} more video streams; that of {size[1]} x {size[0]} px is used")
+    if frame.interlaced_frame:
+        remarks.append(
+            "its frames are interlaced, each of two moments; deinterlace it, as by ffmpeg -vf bwdif"
+        )
+    # the first field of the side data's C structures is the kind
+    kinds = {data.type.name: int.from_bytes(bytes(data)[:4], sys.byteorder) for data in frame.side_data}
+    if kinds.get("SPHERICAL") in _ROUND:
+        remarks.append("its header says 360 degrees; cut out a pinhole view, as by ffmpeg -vf v360")
+    if kinds.get("STEREO3D") in _OF_TWO_CAMERAS:
+        remarks.append("its header says that frames have the images of two cameras; crop them to one")
+    if "mp4" in container.format.name and _has_appended(Path(container.name)):
+        remarks.append(
+            "another video is appended to it, of which nothing is read; join them by ffmpeg -f concat"
+        )
+    return remarks
+
+
+def restart_remark(times: Sequence[int]) -> str:
+    """Return a remark on times of key frames, in the order of the file, that do not rise; else nothing."""
+    falls = any(after <= before for before, after in pairwise(times))
+    return "its times begin again, as of files joined byte by byte; is it one drive?" if falls else ""
+
+
+def _has_appended(path: Path) -> bool:
+    """Tell whether another MP4 file was appended to one; players show nothing of it."""
+    kinds = list(_boxes(path))
+    return kinds.count(b"moov") > 1 and b"moof" not in kinds
+
+
+def _boxes(path: Path) -> Iterator[bytes]:
+    """Yield the kinds of an MP4 file's boxes.
+
+    Source: ISO/IEC 14496-12, 4.2. A size of 0 is up to the end of the file; of 1, 8 bytes have it.
+    """
+    place, end = 0, path.stat().st_size
+    with open(path, "rb") as file:
+        while place + 16 <= end:
+            file.seek(place)
+            size, kind, long = struct.unpack(">I4sQ", file.read(16))
+            yield kind
+            place += max(long if size == 1 else size or end, 8)
