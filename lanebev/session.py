@@ -50,7 +50,7 @@ class SessionResult(NamedTuple):
         extrinsics: pitch, yaw, roll (rad) and height (m), each (1,).
         std: their standard deviations, each (1,), in the same units.
         status: status of the pose.
-        reasons: why the pose is not, or not fully, determined, or the input is doubtful, in words.
+        reasons: why the pose is not, or not fully, determined, and what is doubtful in the input, in words.
         mount: the current mount estimate.
         mount_needs: what the mount estimate still needs, a sentence for each axis.
         calibration: pose, covariance, status and inliers as the calibrator gives them.
@@ -93,7 +93,7 @@ class Session:
         polyline_sigma: standard deviation of given polylines across their lines, px.
         device: device of the network; the filter runs on the CPU.
 
-    What speaks against the camera, as ``lanebev doctor`` says it, is logged as a warning.
+    Implausible numbers of the camera, as ``lanebev doctor`` finds them, are logged as a warning.
 
     Raises:
         TypeError: an argument of another type.

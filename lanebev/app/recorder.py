@@ -95,7 +95,7 @@ class Recorder:
 
     def __post_init__(self) -> None:
         alone = self.single or self.stills
-        self.before_title = "level, at 1.5 m" if alone else "first frame's pose kept"
+        self.before_title = "level at 1.5 m" if alone else "first frame's"
         self._before = FixedPose(alone)
         self._coarse = replace(self.grid, resolution=max(self.grid.resolution, _BEFORE_RESOLUTION))
         self._filtered_rows = KeptRows()

@@ -49,10 +49,10 @@ def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[st
 def lane_width_words(config: RunConfig) -> str:
     """Return the lane width used, and the effect of its standard deviation on the height, in words."""
     width, std = config.taken_lane_width
-    words = f"{width:.4g} m"
+    words = f"{width:.4g} m" if config.lane_width is not None else f"assumed to be {width:.4g} m"
     if std:
-        words += f" with a standard deviation of {std:.2g} m, so {std / width:.1%} of the height"
-    return words if config.lane_width is not None else f"assumed, {words}; give the road's by --lane-width"
+        words += f", with a standard deviation of {std:.2g} m, which is {std / width:.1%} of the height"
+    return words if config.lane_width is not None else f"{words}; if you know it, give --lane-width"
 
 
 def smoothing_facts(config: RunConfig) -> dict[str, str]:

@@ -61,7 +61,7 @@ class Report:
     problems: Sequence[str] = field(default_factory=list)
     is_stills: bool = False
     is_smoothed: bool = False
-    before_title: str = "first frame's pose kept"
+    before_title: str = "first frame's"
     truth: Sequence[ExtrinsicsRow] | None = None
     camera: Camera | None = None
     mount: MountCalibration | None = None
@@ -182,7 +182,7 @@ def mount_table(mount: MountCalibration | None) -> list[dict[str, Any]]:
 
 def summary_facts(report: Report) -> dict[str, str]:
     """Return the standard deviations of lane widths with the fixed and the estimated pose."""
-    names = {report.before_title: report.before, "calibrated": report.after}
+    names = {f"fixed pose ({report.before_title})": report.before, "estimated poses": report.after}
     return {
         f"standard deviation of lane widths, {name}": f"{100 * width_deviation(widths):.1f} cm"
         for name, widths in names.items()
@@ -211,7 +211,8 @@ def _width_sentence(report: Report) -> str:
     before, after = width_deviation(report.before), width_deviation(report.after)
     if not math.isfinite(after):
         return ""
-    compared = f"; {report.before_title}: {100 * before:.1f} cm" if math.isfinite(before) else ""
+    fixed = f"; with the fixed pose ({report.before_title}): {100 * before:.1f} cm"
+    compared = fixed if math.isfinite(before) else ""
     return f"Standard deviation of lane widths in the bird's-eye view: {100 * after:.1f} cm{compared}."
 
 
