@@ -52,7 +52,7 @@ def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
     found = _opened(config.source, config.topic, config.frame_rate)
     remarks = [found.problem]
     step = config.every / found.fps
-    if found.count > 1 and step > _LONG_STEP and not config.stills:
+    if (found.paths or found.times) and found.count > 1 and step > _LONG_STEP and not config.stills:
         remarks.append(
             f"its frames are {float(step):.3g} s apart; is the frame rate right? if so, use --stills"
         )

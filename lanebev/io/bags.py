@@ -76,10 +76,13 @@ class BagSource(FrameSource):
         try:
             with open_bag(Path(self.source)) as bag:
                 for number, (logged, message) in enumerate(bag.messages(self.topic)):
-                    time = _later(_stamp(message, logged), before, interval)
+                    stamp = _stamp(message, logged)
+                    time = _later(stamp, before, interval)
                     first = time if first is None else first
                     dt = interval if before is None else time - before
                     image, problem = None, ""
+                    if before is not None and stamp <= before:
+                        problem = f"expected a stamp later than the frame before, got {stamp - before:.3g} s"
                     if self.selection.takes(number, time - first):
                         try:
                             image = self._right_size(message_image(message))

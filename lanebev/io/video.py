@@ -30,7 +30,7 @@ from lanebev.io.frames import Frame
 from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
 from lanebev.io.images import IMAGE_SUFFIXES, image_size, is_image, read_image, stated_size, write_png
 from lanebev.io.source_names import SCHEMES
-from lanebev.io.video_remarks import restart_remark, stream_remarks
+from lanebev.io.video_remarks import LONGEST_STEP, gap_remark, restart_remark, stream_remarks
 from lanebev.io.video_writer import VideoWriter
 
 __all__ = [
@@ -219,6 +219,7 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
     if not telling:
         with open_video(source) as container:
             count = sum(1 for _ in decoded(container, video_stream(container)))
+    problems += filter(None, [gap_remark(shown, tick)])
     if timed and (rate := _rate_of_times(shown, tick, own)) != own:
         problems.append(f"it states {float(own):.4g} frames per second, they come at {float(rate):.4g}")
         fps = own = rate
@@ -259,8 +260,12 @@ def _times_since_first(shown: Sequence[int], tick: Fraction, fps: Fraction) -> t
 
 
 def _rate_of_times(times: Sequence[int], tick: Fraction, stated: Fraction) -> Fraction:
-    """Return the stated frame rate, or that of the times (ticks) where it is near neither mean nor median."""
+    """Return the stated frame rate, or that of the times (ticks) where it is near neither mean nor median.
+
+    Pauses of the recording tell nothing of it.
+    """
     steps = np.diff(np.unique(times))
+    steps = steps[steps * float(tick) <= LONGEST_STEP]
     if not len(steps):
         return stated
     median_rate, mean_rate = (1 / Fraction(float(of(steps))) / tick for of in (np.median, np.mean))

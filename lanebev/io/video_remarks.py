@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import sys
 from collections.abc import Iterator, Sequence
+from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import av
 
 from lanebev.io.decoding import moving_pictures
 
+LONGEST_STEP = 60  # s between two frames of a drive
 _ROUND = range(4)  # AVSphericalProjection: equirectangular, cube maps, half of one
 _OF_TWO_CAMERAS = range(1, 8)  # AVStereo3DType: side by side, one above the other, in turn, ...
 
@@ -50,6 +52,12 @@ def restart_remark(times: Sequence[int]) -> str:
     """Return a remark on times of key frames, in the order of the file, that do not rise; else nothing."""
     falls = any(after <= before for before, after in pairwise(times))
     return "its times begin again, as of files joined byte by byte; is it one drive?" if falls else ""
+
+
+def gap_remark(times: Sequence[int], tick: Fraction) -> str:
+    """Return a remark on times (ticks) of frames between which a minute or more is missing; else nothing."""
+    longest = max((after - before for before, after in pairwise(sorted(times))), default=0) * tick
+    return f"its times jump by {float(longest):.0f} s; is it one drive?" if longest > LONGEST_STEP else ""
 
 
 def _has_appended(path: Path) -> bool:

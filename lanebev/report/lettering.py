@@ -34,7 +34,7 @@ def write_text(
         bold: the bold font.
         anchor: anchor of the text, as Pillow names it: "la" is the left end of its ascender line.
     """
-    mask, (left, top) = _letters(text, size, bold, anchor)
+    mask, (left, top) = _letters(_printable(text), size, bold, anchor)
     x, y = round(place[0]) + left, round(place[1]) + top
     rows, columns = slice(max(y, 0), y + mask.shape[0]), slice(max(x, 0), x + mask.shape[1])
     under = picture[rows, columns]
@@ -44,7 +44,12 @@ def write_text(
 
 def text_width(text: str, size: int, bold: bool = False) -> float:
     """Return the width of a line of text, px."""
-    return _font(size, bold).getlength(text)
+    return _font(size, bold).getlength(_printable(text))
+
+
+def _printable(text: str) -> str:
+    """Return a text with a sign for what no font has, such as bytes of a file's name that are no letters."""
+    return "".join(letter if letter.isprintable() else "\ufffd" for letter in text)
 
 
 @lru_cache(maxsize=64)

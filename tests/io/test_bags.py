@@ -145,6 +145,19 @@ def _ros1_bag(path):
     return path
 
 
+def test_stamps_that_do_not_rise_are_said(tmp_path):  # usb_cam#259
+    name = "sensor_msgs/msg/CompressedImage"
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection("/image", name, typestore=STORE)
+        for place, number in enumerate((0, 1, 3, 2, 4)):
+            message = STORE.serialize_cdr(_compressed(number), name)
+            writer.write(connection, round(1e9 * (START + 0.1 * place)), message)
+    frames = list(make_source(RunConfig(str(tmp_path / "bag"), "")))
+    assert all(frame.image is not None and frame.dt > 0 for frame in frames)
+    problems = ["", "", "", "expected a stamp later than the frame before, got -0.1 s"]
+    assert [frame.problem for frame in frames[:4]] == problems
+
+
 def test_the_number_of_frames_that_are_taken_is_exact_where_times_vary(tmp_path, monkeypatch):
     name = "sensor_msgs/msg/CompressedImage"
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:

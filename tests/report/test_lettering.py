@@ -20,6 +20,14 @@ def test_text_is_what_pillow_draws(anchor):
     assert np.ptp(picture, axis=(0, 1)).min() > 100  # it is there
 
 
+@pytest.mark.parametrize("name", ["\udcff.png", "a\nb", "\x00", ""])
+def test_any_name_can_be_written(name):
+    picture = np.zeros((30, 90, 3), np.uint8)
+    write_text(picture, (5, 5), name, (255, 255, 255), 18)
+    assert picture.any() == bool(name)
+    assert (text_width(name, 18) > 0) == bool(name)
+
+
 def test_text_is_cut_at_the_border():
     picture = np.zeros((30, 40, 3), np.uint8)
     for place in ((-8, 5), (30, 5), (5, -8), (5, 24), (300, 5), (5, 300), (-300, 5), (5, -300)):
