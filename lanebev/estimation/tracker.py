@@ -109,7 +109,7 @@ class Tracker(Generic[StateT]):
             self.calibrator, segments, intrinsics, self.lane_width
         )
         calibration = self.calibrator.scale_still(calibration, pose_sigma_scale)
-        reasons = Reason(int(self.calibrator.reasons(state)[0]))
+        reasons = Reason(int(self.calibrator.reasons(state)[0])) & ~Reason.RESTARTED  # as every image does
         return Estimate(segments, self.with_output_covariance(calibration, 1.0), reasons)
 
     def vanishing_point(self) -> Tensor:

@@ -11,6 +11,7 @@ from lanebev.app.build import make_camera, make_tracker
 from lanebev.app.config import FOV_FOCAL_STD, RunConfig
 from lanebev.app.observers import NetworkObserver
 from lanebev.estimation.joint.frame_prior import FramePrior, prior_of_mount
+from lanebev.estimation.reasons import Reason
 from lanebev.geometry.road import lane_width_covariance
 from lanebev.io.video import Frame
 from lanebev.observation.polylines import LaneLine, vertices_from_lines
@@ -67,6 +68,7 @@ def test_stills_have_the_sigmas_of_the_settings_too():
     for settings in ({}, {"focal_std": 0.1}, {"lane_width_std": 0.37}):
         tracker = make_tracker(RunConfig("a", "b", lane_width=3.7, **settings), camera)
         still = tracker.still(vertices_from_lines(lines(camera), camera), 1.0)
+        assert still.reasons == Reason.NONE
         found.append(still.calibration.covariance[0].diagonal())
     known, by_focal, by_width = found
     assert float(by_focal[0] - known[0]) == pytest.approx((0.1 * POSE[0]) ** 2, rel=0.05)

@@ -117,21 +117,20 @@ def offset_curve(true: list[dict[str, Any]], axis: str, distance: float) -> list
 
 
 def plot_offsets(true: list[dict[str, Any]], path: Path) -> None:
-    """Draw AP over the angle, an axis a panel, mean and seeds' range."""
+    """Draw AP over the angle (evenly spaced, not to scale), an axis a panel, mean and seeds' range."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 3), layout="constrained")
     angles = [0.0, *OFFSETS_DEG]
+    places = range(len(angles))
     for axes, axis in zip(figure.subplots(1, len(AXES), sharey=True), AXES, strict=True):
         for distance in DISTANCES:
             curve = np.array(offset_curve(true, axis, distance))
-            axes.plot(angles, curve.mean(1), marker="o", ms=3, label=f"AP at {distance:g} m")
-            axes.fill_between(angles, curve.min(1), curve.max(1), alpha=0.2, lw=0)
-        axes.set(title=f"{axis} off", xlabel="degrees", ylim=(0, None))
-        axes.set_xscale("symlog", linthresh=0.1)
-        axes.set_xticks(angles, [f"{angle:g}" for angle in angles])
-        axes.minorticks_off()
-    figure.axes[0].legend(fontsize=8)
+            axes.plot(places, curve.mean(1), marker="o", ms=3, label=f"AP at {distance:g} m")
+            axes.fill_between(places, curve.min(1), curve.max(1), alpha=0.2, lw=0)
+        axes.set(xlabel=f"error of {axis} (°)", ylim=(0, None))
+        axes.set_xticks(places, [f"{angle:g}" for angle in angles])
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right center")
     figure.axes[0].set_ylabel("average precision")
     figure.savefig(path)
 
