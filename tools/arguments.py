@@ -22,5 +22,5 @@ def evaluation_parser(description: str | None) -> argparse.ArgumentParser:
 
 def add_far_view(parser: argparse.ArgumentParser) -> None:
     """Add the option of a far view to a parser."""
-    words = "the network also looks at far views about the horizon"
+    words = "the network also processes far views about the horizon"
     parser.add_argument("--far-view", action="store_true", help=words)

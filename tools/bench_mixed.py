@@ -238,7 +238,7 @@ def follow(drive: Drive, seed: int, calibrator: JointCalibrator) -> Errors:
     Args:
         drive: the drive.
         seed: of the noise.
-        calibrator: with any numbers.
+        calibrator: joint calibrator of any configuration.
     """
     state = calibrator.initial_state(1, dtype=torch.float64)
     by_sigma, nees = [torch.zeros(0, 4, dtype=torch.float64)], [torch.zeros(0, dtype=torch.float64)]

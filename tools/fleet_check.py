@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--kills", type=int, default=2, help="workers to kill (%(default)s)")
     parser.add_argument("--workers", type=int, default=4)
     parser.add_argument("--batch", type=int, default=1, help="drives a worker takes at a time (%(default)s)")
-    words = "cut drives that the network looks at into parts of so many seconds"
+    words = "cut drives, for the network, into parts of so many seconds"
     parser.add_argument("--part-seconds", type=float, help=words)
     parser.add_argument("--no-timing", action="store_true", help="do not time one worker and --workers")
     parser.add_argument("--folder", type=Path, help="folder in which all files are kept")
@@ -141,7 +141,7 @@ def busy_workers(ancestor: int) -> Iterator[int]:
 
 
 def compare(manifest: Path, out: Path, singles: Path) -> tuple[int, list[float]]:
-    """Run on each drive by itself; how many have the fleet's very outputs, and the seconds of each run."""
+    """Run on each drive by itself; how many have exactly the fleet's outputs, and the seconds of each run."""
     equal, seconds = 0, []
     for drive in read_manifest(manifest):
         start = time.perf_counter()

@@ -1,6 +1,6 @@
 """Plan the time and storage of many hours of video: python -m tools.fleet_plan [--hours 100000].
 
-Measures, with one thread, what a frame costs where it is decoded and looked at by the network, and where
+Measures, with one thread, what a frame costs where it is decoded and processed by the network, and where
 poses are estimated from what was seen, views drawn and outputs written, and the bytes of each output. From
 these follow cores, hours and disk, for the frame rates of the plan; nothing is taken from elsewhere. Frames
 are rendered ones, of a road with traffic, or those of ``--video``.

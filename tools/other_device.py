@@ -1,4 +1,4 @@
-"""A device that is none: tensors that say they are elsewhere, on a machine that has only a CPU.
+"""A simulated device: tensors that claim to be elsewhere, on a machine that has only a CPU.
 
 Every operation is carried out on the CPU, but tensors of "elsewhere" and those of the CPU must not meet, as
 on a real accelerator; what waits for the device, and what is launched on it, is counted.
@@ -127,7 +127,7 @@ def _own_bytes(tensor: Tensor) -> int:
 
 @contextmanager
 def other_device() -> Iterator[OtherDevice]:
-    """Enter a context in which generators and autocast know nothing of a device that is none."""
+    """Enter a context in which generators and autocast do not know the simulated device."""
 
     def of_cpu(device: Any = None) -> torch.Generator:
         return torch._C.Generator()

@@ -12,7 +12,7 @@ looks at it in a process of its own until it is interrupted. Passed is what has
 - resident memory of its own, without that of mapped files, that grows by 10 % at most after the first half
   minute.
 
-Prints the figures, what is amiss, and at the end all of it as a line of JSON.
+Prints the figures, problems, and at the end all of it as a line of JSON.
 """
 
 from __future__ import annotations

@@ -78,7 +78,7 @@ class CalibratorErrors(NamedTuple):
 def run_calibrator(
     seen: DriveObservations, factor: float, config: JointConfig | None = None
 ) -> CalibratorErrors:
-    """Run the online calibrator with these numbers on a drive, all sigmas times ``factor``."""
+    """Run the online calibrator with this configuration on a drive, all sigmas times ``factor``."""
     calibrator = JointCalibrator(config)
     state = calibrator.initial_state(1, dtype=torch.float64)
     found = []

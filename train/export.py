@@ -85,8 +85,8 @@ def add_to_bias(segmenter: LaneSegmenter, bias: Tensor) -> None:
 def widen(narrow: dict[str, Tensor], wide: dict[str, Tensor], noise: float = 0.02) -> dict[str, Tensor]:
     """Return weights of a network whose trunk has twice the channels and which computes the same.
 
-    Source: Chen et al. 2016, Net2Net: every channel twice, incoming weights halved. A little noise tells the
-    twins apart.
+    Source: Chen et al. 2016, Net2Net: every channel twice, incoming weights halved. A little noise makes
+    the two copies differ.
 
     Args:
         narrow: state of the narrow network.

@@ -53,7 +53,7 @@ def train_until(
     deadline: float,
     snapshot: Callable[[int], None],
 ) -> None:
-    """Train to the deadline (of ``time.monotonic``), with snapshots 1 and 2 on the way, whatever breaks."""
+    """Train to the deadline (of ``time.monotonic``), with snapshots 1 and 2, also after failures."""
     begin = time.monotonic()
     budget = deadline - begin - START
     training.start(budget)
@@ -85,7 +85,7 @@ def train_until(
 
 
 def save(training: Training, path: Path, changes: dict[str, Any], record: dict[str, Any]) -> bool:
-    """Export the newest checkpoint, and return whether there was one. What goes wrong is printed."""
+    """Export the newest checkpoint, and return whether there was one. Errors are printed."""
     newest = training.checkpoint()
     if newest is None:
         print(f"gpu_run: no checkpoint for {path.name} yet", flush=True)
@@ -122,7 +122,7 @@ def _commit() -> str:
 
 
 def time_parts(out: Path, seconds: float) -> None:
-    """Run ``train.smoke``, for so long at most. What goes wrong is printed."""
+    """Run ``train.smoke``, for so long at most. Errors are printed."""
     try:
         subprocess.run([sys.executable, "-m", "train.smoke", "--out", str(out)], timeout=seconds, check=False)
     except subprocess.TimeoutExpired:
@@ -133,7 +133,7 @@ def held_out_recall(weights: Path, views: int, until: float) -> list[dict[str, A
     """Evaluate weights on held-out views, on the GPU if there is one, within RECALL.
 
     It ends before ``until``, a time of ``time.monotonic``, if no batch takes longer than BATCH. It runs in
-    this process, which has loaded all it needs already. What goes wrong is printed.
+    this process, which has loaded all it needs already. Errors are printed.
     """
     cuda = torch.cuda.is_available()
     try:

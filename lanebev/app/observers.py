@@ -26,7 +26,7 @@ from lanebev.tensors import map_tensors
 
 _MOST_WORKERS = 4  # each holds a frame's feature maps in memory
 _HIGHEST = 4  # times its width, an image: the network resizes it to a fixed width, and would need many GB
-_WORKERS_SHARED = 2  # one frame of a drive is in the batch that is looked at, another waits for the next
+_WORKERS_SHARED = 2  # one frame of a drive is in the batch under way, another waits for the next
 
 
 class Observation(NamedTuple):

@@ -1,4 +1,4 @@
-"""What speaks against a pose, a mount or the images of a run."""
+"""Remarks on an implausible pose, mount or image of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames that show the image before them again, as of videos that were brought to a higher frame rate.
+"""Frames that show the image before them again, as in videos that were converted to a higher frame rate.
 
 Their errors are those of the frame before. The motion stops in them and is twice as large in the next frame.
 """

@@ -63,8 +63,8 @@ def run(
 ) -> Report:
     """Run on all frames and write the output folder, all of it or nothing.
 
-    Frames are decoded in one thread, looked at in others, and drawn and encoded in one more. What a run of
-    the same settings into the same folder had seen when it was killed is taken up.
+    Frames are decoded in one thread, processed by the network in others, and drawn and encoded in one more.
+    The detections of a run with the same settings into the same folder that was killed are reused.
 
     Args:
         config: what to run.
@@ -190,7 +190,7 @@ def _recorder(config: RunConfig, source: FrameSource, camera: Camera, out: Outpu
 
 
 def remarks(config: RunConfig, source: FrameSource, camera: Camera) -> list[str]:
-    """Return what speaks against the camera, the field of view and the mount of the settings."""
+    """Return remarks on an implausible camera, field of view or mount of the settings."""
     bars = "" if config.fov is None else bars_remark(first_image(source))
     mount = mount_remark(config.mount, camera)
     return [*filter(None, (bars, mount)), *camera_remarks(camera, source.pixel_aspect)]

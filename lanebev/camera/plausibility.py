@@ -1,4 +1,4 @@
-"""What speaks against a camera: values that are unusual for cameras in cars."""
+"""Remarks on an implausible camera: values that are unusual for cameras in cars."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PLUMB_BOB = (-0.15, 0.02)  # most of k1, and of |k3| and |k4|, that are like pl
 
 
 def camera_remarks(camera: Camera, pixel_aspect: Fraction = Fraction(1)) -> list[str]:
-    """Return what speaks against a camera: its lens, or a wrong size of images, model or focal length.
+    """Return remarks on an implausible lens, or a wrong size of images, model or focal length.
 
     Args:
         camera: of the settings.
@@ -144,7 +144,7 @@ def _edge_ratio(camera: Camera) -> float:
 
 
 def view_remark(camera: Camera) -> str:
-    """Return a remark on a focal length that gives an odd field of view; else nothing."""
+    """Return a remark on a focal length that gives an implausible field of view; else nothing."""
     angle, (low, high) = field_of_view(camera), _FIELD_OF_VIEW
     if low <= angle <= high or angle == 180.0 or camera.model != "pinhole":  # 180: see share_without_rays
         return ""

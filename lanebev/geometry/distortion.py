@@ -24,7 +24,7 @@ MODELS = ("pinhole", "fisheye", "omni")
 DISTORTION_LENGTHS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "omni": (5,)}
 _OTHER_NAMES = {"mei": "omni"}
 _REACH_STEPS = 2000  # of the search for the radius where a lens folds over
-_PINHOLE_REACH = 10.0  # the largest radius looked at
+_PINHOLE_REACH = 10.0  # the largest radius that is searched
 
 
 def lens_model(name: str) -> str:

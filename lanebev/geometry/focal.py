@@ -10,7 +10,7 @@ from lanebev.geometry.precision import full_precision
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.types import Extrinsics
 
-_HALF_WIDTH = 1.85  # m beside the camera at which a lane boundary is looked at; cancels to first order
+_HALF_WIDTH = 1.85  # m beside the camera at which a lane boundary is evaluated; cancels to first order
 
 
 @full_precision

@@ -53,7 +53,7 @@ def great_circle_normals(rays: Tensor) -> Tensor:
     """Compute the normals of the planes through the camera and each segment, not normalised.
 
     Source: Eq. (3), n = (K⁻¹ p₁) × (K⁻¹ p₂). Left unnormalised because |n| grows with the segment's
-    length, and with it the segment's say (paper.md D9).
+    length, and with it the segment's weight (paper.md D9).
 
     Args:
         rays: (..., N, 2, 3), see :func:`segment_rays`.

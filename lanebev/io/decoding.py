@@ -41,7 +41,7 @@ def open_video(source: str) -> av.container.InputContainer:
 
 
 def tell_damaged_jpegs(stream: av.VideoStream) -> None:
-    """Let a decoder of JPEG fail at damaged images, which it shows as grey or garbage without a word."""
+    """Let a decoder of JPEG fail at damaged images, which it silently shows as grey or garbage."""
     if stream.codec_context is not None and stream.codec_context.name == "mjpeg":
         stream.codec_context.options = {"err_detect": "explode"}
 
@@ -178,7 +178,7 @@ def displayed(image: NDArray[np.uint8], matrix: Sequence[int]) -> NDArray[np.uin
 
     Args:
         image: (H, W, 3).
-        matrix: nine numbers, row by row; other angles than right ones are brought to the nearest.
+        matrix: nine numbers, row by row; other angles are rounded to right ones.
 
     Returns:
         (H, W, 3) or (W, H, 3).

@@ -131,7 +131,7 @@ def _are_of_a_drive(times: Sequence[Fraction]) -> bool:
 
 
 def drives_remark(paths: Sequence[str]) -> str:
-    """Return what speaks for images of several cameras or drives, where one is expected; else nothing.
+    """Return a remark if images seem to be of several cameras or drives; else an empty text.
 
     Files of the same numbers in one folder are those of several cameras, or images and masks. Files of the
     same names in several folders are those of several drives.

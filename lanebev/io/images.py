@@ -83,7 +83,7 @@ def write_png(path: str | Path, image: NDArray[np.uint8]) -> None:
 
 
 def is_damaged_jpeg(data: bytes) -> bool:
-    """Return whether ffmpeg finds damage in a JPEG file, which Pillow shows as garbage without a word.
+    """Return whether ffmpeg finds damage in a JPEG file, which Pillow silently shows as garbage.
 
     Damage that happens to be valid code stays unnoticed.
     """

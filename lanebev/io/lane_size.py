@@ -86,7 +86,7 @@ def lanes_of_whole_images(
 
 
 class SizeDoubt(NamedTuple):
-    """What speaks for lanes in pixels of other images.
+    """A doubt: lanes seem to be in pixels of other images.
 
     Attributes:
         words: what was found, and a question.
@@ -100,7 +100,7 @@ class SizeDoubt(NamedTuple):
 
 
 def size_remark(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> str:
-    """Return what speaks for lanes in pixels of smaller or cropped images; empty if nothing does.
+    """Return a remark if lanes seem to be in pixels of smaller or cropped images; else an empty text.
 
     Args:
         frames: frames of one drive.
@@ -119,7 +119,7 @@ def size_remark(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> st
 
 
 def size_doubt(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> SizeDoubt | None:
-    """Return what speaks for lanes in pixels of larger, smaller or cropped images; None if nothing does.
+    """Return a doubt if lanes seem to be in pixels of larger, smaller or cropped images; else None.
 
     Args:
         frames: frames of one drive.

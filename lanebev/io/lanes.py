@@ -85,9 +85,9 @@ def lane_files(path: str | Path) -> list[Path]:
 def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int | None]:  # noqa: C901 - the rules of one decision
     """Find the lane entry of each image: the one whose path has the longest common end with its path.
 
-    An entry of the image's very name is its own. Else whole path components are compared from the end, the
-    last without an image's suffix. An entry goes to the image that shares most with it, so an image without
-    an entry of its own gets None rather than a stranger's.
+    An entry with exactly the image's name is its own. Else whole path components are compared from the end,
+    the last without an image's suffix. An entry goes to the image that shares most with it, so an image
+    without an entry of its own gets None rather than another image's.
 
     Args:
         names: paths of the images.
@@ -105,7 +105,7 @@ def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int
         for start in range(len(parts)):
             by_tail[parts[start:]].append(i)
     exact = {frame.name: i for i, frame in enumerate(frames)}
-    exact = exact if len(exact) == len(frames) else {}  # a name given twice is nobody's own
+    exact = exact if len(exact) == len(frames) else {}  # names are not unique
     matches: list[tuple[int, int] | None] = []  # (length of the common tail, entry)
     for name in names:
         parts = _parts(name)

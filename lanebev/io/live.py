@@ -1,4 +1,4 @@
-"""Cameras and streams: frames as they come, the newest first where not all can be looked at."""
+"""Cameras and streams: frames as they come, the newest first where not all can be processed."""
 
 from __future__ import annotations
 

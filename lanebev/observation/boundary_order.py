@@ -78,7 +78,7 @@ def width_ratios(
 
     Args:
         lines: each (P, 2) px, undistorted.
-        indices: boundary of each, None for a line that is none.
+        indices: boundary of each, None for a line that is no boundary.
         rolls: (R,) rad, of the camera.
 
     Returns:

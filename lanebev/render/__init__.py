@@ -1,4 +1,4 @@
-"""The rendered road: scenes, their images and what is true of them.
+"""The rendered road: scenes, their images and their ground truth.
 
 Scenes are sampled on the CPU, the same on every machine; whole batches of them are rendered on any device.
 """

@@ -1,4 +1,4 @@
-"""What one rendered image comes with: the exact truth."""
+"""A rendered image and its exact ground truth."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lanebev.types import Extrinsics
 
 
 class RenderedFrame(NamedTuple):
-    """A batch of rendered images and everything that is true of them.
+    """A batch of rendered images and their ground truth.
 
     Lengths in metres, angles in radians. Over a crest the road frame, and with it the extrinsics, is the
     tangent plane of the road below the camera; the points stay exact.

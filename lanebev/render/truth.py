@@ -1,4 +1,4 @@
-"""What is exactly true of a rendered image: boundaries in pixels, lanes, boxes."""
+"""Ground truth of a rendered image: boundaries in pixels, lanes, boxes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A table of all numbers of a lens."""
+"""A table of all parameters of a lens."""
 
 from __future__ import annotations
 

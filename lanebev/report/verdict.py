@@ -220,7 +220,7 @@ def _end(times: NDArray[np.float64], last: int) -> float:
 
 
 def _joined_axes(parts: Sequence[Finding]) -> list[Finding]:
-    """Join axes to which the same happens in the same frames."""
+    """Join the findings of axes with the same problem in the same frames."""
 
     def same(one: Finding) -> tuple[str, int, int, str]:
         return one.what, one.first, one.last, one.why if one.what == "not determined" else ""

@@ -31,7 +31,7 @@ class BEVWarp(nn.Module):
     Args:
         grid: the road's rectangle; default :class:`BEVGrid`.
         plane_heights: m above the road, of P planes parallel to it that are sampled instead of the road, as
-            heads that look at volumes want them.
+            heads that sample volumes need them.
     """
 
     def __init__(self, grid: BEVGrid | None = None, plane_heights: Sequence[float] | None = None) -> None:

@@ -20,7 +20,7 @@ REFERENCES = Path(__file__).resolve().parents[2] / "tests" / "replay" / "referen
 TOLERANCE = 1e-3
 """Sigmas by which a number may differ. Rounding, as other processors and versions of torch do it, stays far
 below: it is some 1e-12 px of an end point, and end points moved by a million times that change no number by
-as much as 3e-4 sigmas. A change of an estimator that stays below it changes nobody's pose."""
+as much as 3e-4 sigmas. A change of an estimator that stays below it is no change of the pose."""
 
 _DRIVES: dict[str, Generated | Rendered] = {**GENERATED, **RENDERED}
 

@@ -109,7 +109,7 @@ class ShockedDrive(Drive):
 
 
 def see(rendered: Rendered) -> dict[str, Any]:
-    """Render a drive and let the shipped network look at it: what the drive's file holds."""
+    """Render a drive and run the shipped network on it: the content of the drive's file."""
     drive = ShockedDrive(rendered.seed, SIZE, FRAMES, FPS, kind=rendered.world)
     drive.shock = rendered.shock
     model = LaneBEV.from_pretrained()

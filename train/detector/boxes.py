@@ -8,7 +8,7 @@ from torch import Tensor
 from lanebev.view.grid import BEVGrid
 
 BEARINGS = 33
-"""Directions in which a box is looked at, evenly over what it covers."""
+"""Directions in which a box is sampled, evenly over the angle that it covers."""
 
 
 def box_corners(boxes: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ class Experiment:
         lane_rate: the lane network's largest.
         width: channels of the image features.
         bev_width: channels of the bird's-eye features.
-        top: px of the image above which nothing is looked at.
+        top: px of the image above which nothing is used.
         grid: grid of the bird's-eye view.
         network_width: px of the lane network's input, as the drives were rendered with.
         fps: frames a second of the drives.

@@ -1,4 +1,4 @@
-"""What the loss tells of the pose: ``python -m train.detector.gradient --config configs/detector.yaml``.
+"""Gradient of the loss on the pose: ``python -m train.detector.gradient --config configs/detector.yaml``.
 
 Prints how the gradient of the loss on pitch, yaw, roll and height of arm "online" agrees with their errors on
 the test drives: only a gradient that has the sign of the error can lower it.

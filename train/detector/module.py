@@ -49,7 +49,7 @@ class DetectorTraining(L.LightningModule):
         grid: grid of the bird's-eye view.
         width: channels of the image features.
         bev_width: channels of the bird's-eye features.
-        top: px of the image above which nothing is looked at.
+        top: px of the image above which nothing is used.
         learning_rate: the detector's largest, see :func:`one_cycle`.
         lane_rate: the lane network's largest, of a cycle of its own over the ``tuned_steps``.
         steps: number of steps of the training.

@@ -28,7 +28,7 @@ class VehicleDetector(nn.Module):
         grid: grid of the bird's-eye view.
         width: channels of the image features.
         bev_width: channels of the bird's-eye features.
-        top: px of the image above which nothing is looked at.
+        top: px of the image above which nothing is used.
     """
 
     def __init__(self, grid: BEVGrid, width: int = 32, bev_width: int = 48, top: int = 96) -> None:

@@ -68,7 +68,7 @@ def fleet(
         cluster: cluster to run on.
         root: folder that paths must not leave; None is the manifest's.
         again: try once more what failed in an earlier call.
-        part_minutes: length of the parts of longer videos that the network looks at side by side; None cuts
+        part_minutes: length of the parts of longer videos that the network processes in parallel; None cuts
             nothing.
         progress: wraps the drives that end, given the number that are to be run.
 

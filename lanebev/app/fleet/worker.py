@@ -23,7 +23,7 @@ from lanebev.pipeline import LaneBEV
 def run_tasks(tasks: Sequence[Task]) -> list[Outcome]:
     """Run on drives at the same time, and note which are done.
 
-    Their frames are looked at in batches, by a network that stays loaded for later calls in this process.
+    The network processes their frames in batches, and stays loaded for later calls in this process.
     A drive that fails has an outcome that says why, and disturbs no other.
 
     Args:

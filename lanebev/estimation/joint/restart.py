@@ -35,7 +35,7 @@ _ROLL_NOISE = 1.5  # of the prior's sigma: distance from its mean within which s
 
 
 class Compared(NamedTuple):
-    """A state, compared with what its last frame says by itself.
+    """A state after its comparison with a fit of the last frame alone.
 
     Attributes:
         state: after the frame, or begun from it.
@@ -56,7 +56,7 @@ def restart(
     positions: Tensor,
     cfg: JointConfig,
 ) -> Compared:
-    """Start rows from this frame alone if it determines the pose, and if no state, or a worse one, is there.
+    """Start rows from this frame alone if it determines the pose and there is no state, or a worse one.
 
     A state that a second frame contradicts is COASTING until enough of them did. Only rows without a state,
     or with one in doubt, are compared with the frame.
@@ -89,12 +89,12 @@ def compare_with_frame(
     positions: Tensor,
     cfg: JointConfig,
 ) -> Compared:
-    """Fit the frame by itself and compare the state with it, or begin it anew.
+    """Fit the frame alone, and compare the state with the fit or start from it.
 
     Args:
         state: after the frame.
         agreed: (B, N), inliers.
-        wanted: (B,) bool, to begin anew from any usable frame.
+        wanted: (B,) bool, rows that start from any usable frame.
         seen: what was observed.
         positions: (B, L) m, of the boundaries from the ego lane's middle.
         cfg: the configuration.
@@ -125,7 +125,7 @@ def compare_with_frame(
 
 
 def remaining_doubt(state: JointState, share: Tensor, cfg: JointConfig) -> Tensor:
-    """Compute in how many more frames (B,) the frame is compared: some after a jump or a misfit.
+    """Compute the number (B,) of frames, this one too, that are compared after a jump or a misfit.
 
     Args:
         state: after the frame.
@@ -146,7 +146,7 @@ def is_contrary(
     seen: Observations,
     cfg: JointConfig,
 ) -> Tensor:
-    """Tell whether a frame contradicts the state: its own fit differs, and is no less likely.
+    """Tell whether a frame contradicts the state: its own fit differs significantly, and is not less likely.
 
     Source: (J19).
 

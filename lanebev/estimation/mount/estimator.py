@@ -137,7 +137,7 @@ class MountEstimator(nn.Module):
         state = state._replace(status=status, reasons=why)
 
         shown = state.blend * state.former + (1 - state.blend) * mean
-        var = var + (shown - mean).square()  # a blended estimate is wrong by what is not yet handed over
+        var = var + (shown - mean).square()  # the part of the change that is not yet blended in
         progress = 100 * (count / cfg.needed).clamp(max=1.0)
         return _answer(shown, var, status, progress, why), state
 
@@ -150,7 +150,7 @@ class MountEstimator(nn.Module):
         yaw_rate: Tensor | None,
         curvature: Tensor | None,
     ) -> Tensor:
-        """Return the flags (B,) of what speaks against using this frame on any axis."""
+        """Return the reasons (B,), as flags, not to use this frame on any axis."""
         cfg = self.config
         why = flag(status != int(Status.TRACKING), MountReason.NOT_TRACKING)
         why = why | flag(~(step.isfinite() & (step > 0)), MountReason.TIME)

@@ -1,4 +1,4 @@
-"""What is anywhere in a batch of scenes, read on the host: what is in none of them costs nothing."""
+"""Features that any scene of a batch has, read on the host, so that absent ones cost nothing."""
 
 from __future__ import annotations
 

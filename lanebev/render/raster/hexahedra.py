@@ -42,7 +42,7 @@ def hexahedra(objects: SceneObjects, lens: Lens, size: tuple[int, int]) -> Hexah
     height = lens.extrinsics.height
     normal, distance = face_planes(objects, height)
     real = (objects.shape[..., 7] > objects.shape[..., 6])[..., None]
-    distance = distance.where(real, -1.0)  # nobody is inside nothing
+    distance = distance.where(real, -1.0)  # an object that is not real contains no point
     return Hexahedra(bounding_boxes(objects, lens, height, size), normal, distance)
 
 

@@ -1,6 +1,6 @@
 """Objects on the road in the image, far to near.
 
-What an object may cover is looked at in tiles of 8 x 8 pixels: one ray to the pixel inside, four along the
+What an object may cover is tested in tiles of 8 x 8 pixels: one ray to the pixel inside, four along the
 outlines.
 """
 

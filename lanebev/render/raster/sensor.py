@@ -20,7 +20,7 @@ from lanebev.render.scene.sensor import Sensor
 from lanebev.render.scene.world import Scene
 
 _REFERENCE_WIDTH = 640  # px, at which the blur is stated
-_SHARP = 0.2  # px of blur that nobody sees
+_SHARP = 0.2  # px of blur that is not visible
 
 
 def take_image(

@@ -21,7 +21,7 @@ from lanebev.render.scene.weather import Light
 from lanebev.render.scene.world import Scene
 
 BRIDGE_UNDERSIDE = 6.2  # m, of all bridges as far as their shadows go
-_PIECE = 64  # pixels that are looked at together for a vehicle's shadow
+_PIECE = 64  # pixels that are tested together for a vehicle's shadow
 
 
 def shadows(

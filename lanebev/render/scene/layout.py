@@ -36,7 +36,7 @@ class Layout(NamedTuple):
     Attributes:
         across: m, place of each boundary; the first is at 0. Slots beyond the last lie far away.
         exists: bool.
-        marked: bool; an unmarked boundary is an edge nobody painted.
+        marked: bool; an unmarked boundary is an edge without paint.
         lane_width: (B,) m, nominal.
         stripe_width: m.
         separation: m between the centres of a double's two stripes; 0 for a single one.

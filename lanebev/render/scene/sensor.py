@@ -15,7 +15,7 @@ class Sensor(NamedTuple):
     """What the camera does to the light, each (B,) unless said otherwise.
 
     Attributes:
-        exposure: linear level that the road's mean is brought to.
+        exposure: linear level that the road's mean gets.
         tint: (B, 3) white balance.
         contrast: slope at middle grey.
         saturation: factor.
