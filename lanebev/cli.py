@@ -39,6 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"lanebev {command}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    except MemoryError:
+        print(f"lanebev {command}: error: expected enough memory, got too little", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         kept = "finished drives stay" if command == "fleet" else "nothing written"
         print(f"lanebev {command}: interrupted, {kept}", file=sys.stderr)

@@ -19,6 +19,7 @@ _BYTE_ORDER_MARKS = {
     codecs.BOM_UTF16_LE: "utf-16",  # what PowerShell's > writes
     codecs.BOM_UTF16_BE: "utf-16",
 }
+_BEGINNING = 65_536  # bytes of a file that tell whether it is a text
 _GZIP = b"\x1f\x8b"
 _MOST_FOREIGN = 0.3  # of a text's letters, in an encoding that is not known
 _REPR = reprlib.Repr()
@@ -37,7 +38,7 @@ def read_text(path: Path, errors: str = "strict") -> str:
         ValueError: why the file can't be read, in a few words; the caller says which file.
     """
     try:
-        data = _bytes_of_pipe(path) if path.is_fifo() else path.read_bytes()
+        data = _bytes_of_pipe(path) if path.is_fifo() else _bytes_of_file(path)
         if data.startswith(_GZIP):
             raise ValueError("compressed by gzip; unpack it")
         mark = next((each for each in _BYTE_ORDER_MARKS if data.startswith(each)), b"")
@@ -53,6 +54,14 @@ def read_text(path: Path, errors: str = "strict") -> str:
         raise ValueError("not a text file") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
         raise ValueError(getattr(error, "strerror", None) or str(error)) from error
+
+
+def _bytes_of_file(path: Path) -> bytes:
+    """Return a file's content; of one that is no text, such as a video, the beginning only."""
+    with open(path, "rb") as file:
+        begin = file.read(_BEGINNING)
+        is_text = b"\0" not in begin or begin.startswith(tuple(_BYTE_ORDER_MARKS))
+        return begin + file.read() if is_text else begin
 
 
 def _bytes_of_pipe(path: Path) -> bytes:

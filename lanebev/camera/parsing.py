@@ -151,15 +151,17 @@ def _xml_value(element: ET.Element) -> Any:
 
 
 def required(fields: Mapping[str, Any], keys: Sequence[str]) -> Any:
-    """Return the value of the first of these spellings of a key that is there.
+    """Return the value of the one of these spellings of a key that is there.
 
     Raises:
-        ValueError: none of them is.
+        ValueError: none of them is, or two with different values.
     """
-    for key in keys:
-        if fields.get(key) is not None:
-            return fields[key]
-    raise ValueError(f"{keys[0]}: expected a value, got none; add the entry")
+    given = [key for key in keys if fields.get(key) is not None]
+    if not given:
+        raise ValueError(f"{keys[0]}: expected a value, got none; add the entry")
+    if any(fields[key] != fields[given[0]] for key in given):
+        raise ValueError(f"expected one of {' and '.join(given)}, got both, which differ; keep the right one")
+    return fields[given[0]]
 
 
 def number(fields: Mapping[str, Any], *keys: str) -> float:

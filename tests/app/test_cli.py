@@ -628,3 +628,11 @@ def test_weights_are_there_after_one_import():
 def test_config_checks_itself():
     with pytest.raises(ValueError, match="calibrator: expected joint or two-stage"):
         RunConfig("a", "b", "c", calibrator="x")
+
+
+def test_too_little_memory_is_one_line(capsys, monkeypatch):
+    def compare(**_):
+        raise MemoryError
+
+    monkeypatch.setattr("lanebev.app.compare.compare", compare)
+    _fails(capsys, ["compare", "a", "b"], "lanebev compare: error: expected enough memory, got too little")

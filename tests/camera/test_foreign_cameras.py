@@ -362,6 +362,26 @@ def test_a_fisheye_may_have_zeros_after_its_coefficients(tmp_path):
         _read(tmp_path / "c.yaml", MESSAGE % "[0.1, 0.01, 0, 0, 0.2]")
 
 
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ("K: [700, 0, 32, 0, 700, 24, 0, 0, 1]", "camera_matrix and K"),
+        ("D: [0.3, 0, 0, 0, 0]", "distortion_coefficients and D"),
+        ("width: 128", "image_width and width"),
+    ],
+)
+def test_two_values_of_one_quantity_are_refused(tmp_path, more, words):
+    Camera.from_parameters(60, 60, 31.5, 23.5, 64, 48, (-0.1, 0.0, 0.0, 0.0, 0.0)).to_file(
+        tmp_path / "c.yaml"
+    )
+    with open(tmp_path / "c.yaml", "a") as file:
+        file.write(f"{more}\n")
+    with pytest.raises(
+        ValueError, match=f"expected one of {words}, got both, which differ; keep the right one"
+    ):
+        Camera.from_file(tmp_path / "c.yaml")
+
+
 def test_what_python_dumps(tmp_path):
     fields = {"K": (500.0, 0, 320.0, 0, 500.0, 240.0, 0, 0, 1), "D": (), "width": 640, "height": 480}
     _is(_read(tmp_path / "c.yaml", yaml.dump(fields)), 500, 500, 320, 240, 640, 480)

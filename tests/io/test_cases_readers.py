@@ -1,6 +1,7 @@
 """Every reader of files: any bytes are a value or one ValueError of one line, and soon."""
 
 import json
+import os
 import random
 import struct
 
@@ -173,3 +174,12 @@ def test_folders_and_what_is_not_there_are_one_line(tmp_path, read):
             read(path)
         assert str(error.value)
     assert load_state(tmp_path / "none").problem.endswith("there is no such file")
+
+
+@pytest.mark.parametrize("read", [Camera.from_file, read_lanes, read_mount])
+def test_of_a_long_video_given_as_a_text_only_the_beginning_is_read(tmp_path, read):
+    path = tmp_path / "drive.mp4"
+    path.write_bytes(b"\0\0\0 ftypisom")
+    os.truncate(path, 2**40)  # bytes; no disk has them
+    with pytest.raises(ValueError, match="not a text file"):
+        read(path)
