@@ -1,6 +1,6 @@
 """README and docs say what is so: their Python runs, their commands parse, their links lead somewhere."""
 
-import importlib
+import importlib.util
 import re
 import shlex
 from pathlib import Path
@@ -154,3 +154,14 @@ def test_equations_that_the_joint_calibrator_cites_are_on_its_page():
     cited = {int(number) for number in re.findall(r"\(J(\d+)\)", code)}
     assert cited <= set(numbered)
     assert len(cited) > 15
+
+
+def test_sphinx_roles_of_docstrings_are_shown_as_code():
+    specification = importlib.util.spec_from_file_location("roles", ROOT / "docs" / "roles.py")
+    roles = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(roles)
+    page = "see :func:<code>~lanebev.road.horizon_line</code> and :meth:<code>forward</code>"
+    assert roles.on_page_content(page, page=None) == (
+        'see <autoref identifier="lanebev.road.horizon_line" optional><code>horizon_line</code></autoref>'
+        ' and <autoref identifier="forward" optional><code>forward</code></autoref>'
+    )
