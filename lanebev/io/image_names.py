@@ -10,14 +10,14 @@ from itertools import pairwise
 from pathlib import PurePath
 from statistics import median_low
 
-from lanebev.io.name_clocks import are_decimal, read_clocks
+from lanebev.io.name_clocks import are_decimal, read_clocks, with_fractions
 
 _SUFFIXES = r"(?:\.[A-Za-z]\w*)*$"  # .jpg, .lines.txt
 _DECIMAL = re.compile(rf"(?<![\d.])(\d+)\.(\d+)(?={_SUFFIXES})", re.ASCII)
 _SECONDS = re.compile(rf"(?<!\d)(\d{{10}})(?:\.|[_-](?=\d{{9}}\b|\d{{6}}\b))(\d{{1,9}}){_SUFFIXES}", re.ASCII)
 _STAMP = re.compile(rf"(?<!\d)(\d{{13,19}}){_SUFFIXES}", re.ASCII)
 _DIGITS = re.compile(r"[0-9a-f]+", re.IGNORECASE)  # of numbers to the base 10 or 16
-_EPOCH = (1_000_000_000, 4_102_444_800)  # s: September 2001 to 2100
+_EPOCH = (315_964_800, 2_208_988_800)  # s: 1980, when the time of GPS begins, to 2040
 _STEPS = (Fraction(1, 2000), Fraction(60))  # s between two frames of a drive
 
 # of the images, of which more with the same number or name are of several cameras or drives
@@ -111,18 +111,30 @@ def _times_since_1970(paths: Sequence[str]) -> Sequence[Fraction]:
     seconds = [_SECONDS.search(name) for name in names]
     stamps = [_STAMP.search(name) for name in names]
     if all(seconds):
-        fractions = [match[2] for match in seconds if match]
-        whole = not are_decimal(fractions)  # nanoseconds without zeros before them
-        times = [
-            int(match[1]) + (Fraction(int(match[2]), 10**9 if whole else 10 ** len(match[2])))
-            for match in seconds
-            if match
-        ]
-    elif all(stamps) and len({len(match[1]) for match in stamps if match}) == 1:
-        times = [Fraction(int(match[1]), 10 ** (len(match[1]) - 10)) for match in stamps if match]
-    else:
-        return ()
-    return times if all(_EPOCH[0] <= time < _EPOCH[1] for time in times) else ()
+        whole = [int(match[1]) for match in seconds if match]
+        times = with_fractions(whole, [match[2] for match in seconds if match])
+        return times if _are_of_our_days(times) else ()
+    if all(stamps) and len({len(match[1]) for match in stamps if match}) == 1:
+        return _times_of_stamps([match[1] for match in stamps if match])
+    return ()
+
+
+def _times_of_stamps(stamps: Sequence[str]) -> Sequence[Fraction]:
+    """Return times (s) by whole numbers of one length; none if they are of other days than ours.
+
+    They are 10 digits of seconds and those of a fraction. If that gives no such time they are nanoseconds
+    since 1980, as in Argoverse. Of 18 digits with a fraction, as in OpenLane, the last two are zeros.
+    """
+    digits = len(stamps[0]) - 10
+    is_whole = digits != 8 or all(stamp.endswith("00") for stamp in stamps)
+    units = (10**digits, 10**9) if is_whole else (10**9,)
+    readings = ([Fraction(int(stamp), unit) for stamp in stamps] for unit in units)
+    return next(filter(_are_of_our_days, readings), ())
+
+
+def _are_of_our_days(times: Sequence[Fraction]) -> bool:
+    """Tell whether all times (s since 1970) are from 1980 to 2040."""
+    return all(_EPOCH[0] <= time < _EPOCH[1] for time in times)
 
 
 def _are_of_a_drive(times: Sequence[Fraction]) -> bool:

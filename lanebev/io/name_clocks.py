@@ -86,6 +86,25 @@ def are_decimal(fractions: Sequence[str]) -> bool:
     return shortest and max(lengths) not in (8, 9)  # ns: since 1970 a float has 7 at most, else 17
 
 
+def with_fractions(whole: Sequence[int], fractions: Sequence[str]) -> list[Fraction]:
+    """Return whole seconds and the digits after them as times (s); no digits are 0.
+
+    Digits are decimal fractions, or whole milli-, micro- or nanoseconds without zeros before them. A zero at
+    the beginning or the end tells which; without one, the reading with the more even steps is taken.
+    """
+
+    def read(unit: int | None) -> list[Fraction]:
+        return [
+            a + Fraction(int(b or 0), unit or 10 ** len(b)) for a, b in zip(whole, fractions, strict=True)
+        ]
+
+    given = [digits for digits in fractions if digits]
+    if len(set(map(len, given))) <= 1 or any(digits[0] == "0" != digits for digits in given):
+        return read(None)
+    unit = next(10**power for power in (3, 6, 9) if max(map(len, given)) <= power)
+    return min(read(None), read(unit), key=_unevenness) if are_decimal(given) else read(unit)
+
+
 def _last_matches(form: re.Pattern[str], texts: Sequence[str]) -> list[re.Match[str]]:
     """Return the last match in each text, which must end in the file's name; none if one has none."""
     found = []
@@ -112,7 +131,7 @@ def _times(matches: Sequence[re.Match[str]], order: str) -> list[Fraction] | Non
     whole = [_DAY * day + clock for day, clock in zip(days, clocks, strict=True)]  # type: ignore[operator]
     if order and _may_be_numbers(matches):
         return None
-    times = _with_fractions(whole, [each["fraction"] for each in groups])
+    times = with_fractions(whole, [each["fraction"] for each in groups])
     may_count = all("loose" in match.re.groupindex and match["loose"] is not None for match in matches)
     if not any(each["fraction"] for each in groups) or (may_count and _are_counts(times)):
         return [Fraction(each) for each in whole] if order else None
@@ -138,25 +157,6 @@ def _time_of_day(groups: dict[str, str]) -> int | None:
         return None
     hour = hour % 12 + 12 * (half == "p") if half else hour
     return 3600 * hour + 60 * minute + second
-
-
-def _with_fractions(whole: Sequence[int], fractions: Sequence[str]) -> list[Fraction]:
-    """Return whole seconds and the digits after them as times (s); no digits are 0.
-
-    Digits are decimal fractions, or whole milli-, micro- or nanoseconds without zeros before them. A zero at
-    the beginning or the end tells which; without one, the reading with the more even steps is taken.
-    """
-
-    def read(unit: int | None) -> list[Fraction]:
-        return [
-            a + Fraction(int(b or 0), unit or 10 ** len(b)) for a, b in zip(whole, fractions, strict=True)
-        ]
-
-    given = [digits for digits in fractions if digits]
-    if len(set(map(len, given))) <= 1 or any(digits[0] == "0" != digits for digits in given):
-        return read(None)
-    unit = next(10**power for power in (3, 6, 9) if max(map(len, given)) <= power)
-    return min(read(None), read(unit), key=_unevenness) if are_decimal(given) else read(unit)
 
 
 def _unevenness(times: Sequence[Fraction]) -> float:

@@ -133,6 +133,24 @@ def test_names_are_searched_for_times_once(tmp_path, monkeypatch):
     assert len(searched) == 1
 
 
+@pytest.mark.parametrize(
+    ("names", "times"),
+    [
+        (["315975689237425436", "315975689387425438", "315975689537425437"], [0, 0.15, 0.3]),  # Argoverse 2
+        (["ring_front_center_315966070546666304", "ring_front_center_315966070579999304"], [0, 0.033333]),
+        (["150723473694744600", "150723473704737600"], [0, 0.09993]),  # OpenLane
+        (["15616458249936530", "15616458250936530"], [0, 0.1]),  # DDAD
+        (["1241893239199111666", "1241893239399111666"], [0, 0.2]),  # Lyft
+        (["133760000000333333", "133760000000666666"], []),  # 0.1 µs since 1601
+        (["415975689237425436", "415975689387425438"], [0, 0.15]),
+        (["1700000000.910", "1700000000.960", "1700000001.10", "1700000001.60"], [0, 0.05, 0.1, 0.15]),  # ms
+        (["1700000000.966700", "1700000001.33", "1700000001.33360"], [0, 0.033333, 0.06666]),  # µs, "%ld.%ld"
+    ],
+)
+def test_whole_numbers_of_time_are_as_data_sets_write_them(names, times):
+    np.testing.assert_allclose(times_from_names([f"{name}.jpg" for name in names]), times, atol=1e-6)
+
+
 def _folder(path, names):
     path.mkdir()
     for name in names:
