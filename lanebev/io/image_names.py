@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import PurePath
 from statistics import median_low
 
-from lanebev.io.name_clocks import are_decimal, read_clocks, with_fractions
+from lanebev.io.name_clocks import FASTEST, are_decimal, read_clocks, with_fractions
 
 _SUFFIXES = r"(?:\.[A-Za-z]\w*)*$"  # .jpg, .lines.txt
 _DECIMAL = re.compile(rf"(?<![\d.])(\d+)\.(\d+)(?={_SUFFIXES})", re.ASCII)
@@ -71,7 +71,7 @@ def times_from_names(paths: Sequence[str]) -> tuple[float, ...]:
 
     They do if each has a time of day with its date, or ends with a time since 1970 of one kind (seconds with
     a fraction, seconds and nanoseconds, or a whole number of milli-, micro- or nanoseconds), and all of them
-    rise in steps of half a millisecond to a minute.
+    rise in steps of half a millisecond to a minute, with a median of at least 4 ms.
 
     Args:
         paths: paths of the images, in order.
@@ -139,7 +139,8 @@ def _are_of_our_days(times: Sequence[Fraction]) -> bool:
 
 def _are_of_a_drive(times: Sequence[Fraction]) -> bool:
     """Tell whether times (s) are of several frames and rise as those of a drive."""
-    return len(times) > 1 and all(_STEPS[0] <= b - a <= _STEPS[1] for a, b in pairwise(times))
+    steps = [b - a for a, b in pairwise(times)]
+    return bool(steps) and _STEPS[0] <= min(steps) <= max(steps) <= _STEPS[1] and median_low(steps) >= FASTEST
 
 
 def drives_remark(paths: Sequence[str]) -> str:

@@ -26,7 +26,9 @@ _BETWEEN = r"(?P<between>[T_ .@/-]{0,3}|[ _]at[ _])"  # date and time of day
 _CLOCK = r"(?P<hour>\d\d?)[-_.:h](?P<minute>\d\d?)[-_.:m](?P<second>\d\d?)"
 _DIGITS = r"(?P<hour>\d\d)(?P<minute>\d\d)(?P<second>\d\d)"
 _ALONE = r"(?<![^/])(?P<words>[^\d/]*)" + _CLOCK.replace(".", "")
-_FRACTION = r"(?:(?:[.,](?=\d{1,9}(?!\d))|(?P<loose>[-_]?)(?=(?:\d{3}|\d{6}|\d{9})(?!\d)))(?P<fraction>\d+))?"
+_FRACTION = (
+    r"(?:(?:[.,s](?=\d{1,9}(?!\d))|(?P<loose>[-_]?)(?=(?:\d{3}|\d{6}|\d{9})(?!\d)))(?P<fraction>\d+))?"
+)
 _END = r"(?!\d)(?:[ \u202f_-]?(?P<half>[AaPp])[Mm](?![A-Za-z]))?"
 _FORMS = (
     *((day + _BETWEEN + clock + _FRACTION + _END, orders)
@@ -34,7 +36,7 @@ _FORMS = (
     (_SHORT_DATE + _DIGITS + r"(?P<fraction>\d{3})(?!\d)", ("ymd", "dmy")),
     (_ALONE + _FRACTION + _END, ("",)),
 )  # fmt: skip
-_FASTEST = Fraction(1, 250)  # s between frames, of fractions that may be numbers of images
+FASTEST = Fraction(1, 250)  # s between frames, of fractions that may be numbers of images
 
 
 class NameClocks(NamedTuple):
@@ -133,7 +135,8 @@ def _times(matches: Sequence[re.Match[str]], order: str) -> list[Fraction] | Non
         return None
     times = with_fractions(whole, [each["fraction"] for each in groups])
     may_count = all("loose" in match.re.groupindex and match["loose"] is not None for match in matches)
-    if not any(each["fraction"] for each in groups) or (may_count and _are_counts(times)):
+    are_counts = _begin_again(times) or (may_count and _are_counts(times))
+    if are_counts or not any(each["fraction"] for each in groups):
         return [Fraction(each) for each in whole] if order else None
     return times if order else _over_midnight(times)
 
@@ -190,6 +193,13 @@ def _may_be_numbers(matches: Sequence[re.Match[str]]) -> bool:
     return of_one_minute or all(minute.startswith("00") for minute in minutes)
 
 
+def _begin_again(times: Sequence[Fraction]) -> bool:
+    """Tell whether digits after the seconds begin again in each before they fill it, as numbers do."""
+    seconds = {int(time) for time in times}
+    rate = len(times) / len(seconds)
+    return len(seconds) > 2 and max(time % 1 for time in times) < 1 - 2 / rate
+
+
 def _are_counts(times: Sequence[Fraction]) -> bool:
     """Tell whether digits after the seconds are numbers, as of images or cameras.
 
@@ -202,7 +212,7 @@ def _are_counts(times: Sequence[Fraction]) -> bool:
     same = any(int(a) == int(b) for a, b in pairwise(ordered))
     rising = all(a <= b for a, b in pairwise(parts))
     steps = [b - a for a, b in pairwise(ordered)]
-    return same and (rising or median(steps) < _FASTEST)
+    return same and (rising or median(steps) < FASTEST)
 
 
 def _over_midnight(times: list[Fraction]) -> list[Fraction]:

@@ -29,6 +29,7 @@ FORMS = [
     "%Y-%m-%d/%H-%M-%S.{ms:03d}.jpg",
     "{i:05d}_%Y.%m.%d-%H.%M.%S.{ms:03d}_front.jpg",
     "{i}_%d%m%Y-%H%M%S,{ms}.jpg",  # milliseconds without zeros before them
+    "vlcsnap-%Y-%m-%d-%Hh%Mm%Ss{ms:03d}.png",
     "Screenshot %Y-%m-%d at %I.%M.%S.{ms:03d} %p.png",
 ]
 EVENINGS = [datetime(2026, 11, 30, 23, 59, 58, 800_000), datetime(2024, 2, 28, 23, 59, 59, 10_000)]
@@ -101,6 +102,10 @@ def test_whole_seconds_of_one_frame_each_are_times(form):
         [f"20261129_1015{number // 30:02d}_{number:03d}.jpg" for number in range(200)],
         [f"20261129_1015{number // 30:02d}_{number % 30:03d}.jpg" for number in range(200)],
         [f"2026-11-29_10-15-30_{number:04d}.jpg" for number in range(30)],
+        [f"20261129_1015{number // 30:02d}.{number % 30:02d}.jpg" for number in range(200)],
+        [f"20261129_101530.{number:03d}.jpg" for number in range(1, 140)],
+        [f"1700000000.{number}.jpg" for number in range(1, 30)],
+        [f"2026{number:09d}.jpg" for number in range(20)],
         [f"2026-11-29_10-15-30.{20 * number:03d}_cam{number % 2}.jpg" for number in range(30)],
         [f"2026-13-29_10-15-{number:02d}.jpg" for number in range(30)],  # no month
         [f"01-02-{number:02d}.jpg" for number in range(30)],  # three numbers
