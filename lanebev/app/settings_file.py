@@ -65,6 +65,8 @@ def read_settings(path: str | Path) -> dict[str, object]:
     except (ValueError, yaml.YAMLError) as error:
         reason = "not YAML" if isinstance(error, yaml.YAMLError) else error
         raise ValueError(f"config {path}: expected a YAML file of settings, got: {reason}") from error
+    if given is None:
+        raise ValueError(f"config {path}: expected a YAML file of settings, got none; is it empty?")
     if not isinstance(given, dict):
         raise ValueError(f"config {path}: expected a YAML file of settings, got {type(given).__name__}")
     try:

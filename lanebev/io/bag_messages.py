@@ -36,11 +36,9 @@ class Bag(Protocol):
 
     Attributes:
         topics: topics of images and lenses.
-        duration: s, of all of it.
     """
 
     topics: list[Topic]
-    duration: float
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Return a topic's messages in the order of their times (ns)."""
@@ -100,7 +98,6 @@ class _RosBag:
         known = {*IMAGE_TYPES, *LENS_TYPES}
         connections = [each for each in reader.connections if each.msgtype in known]
         self.topics = _joined(Topic(each.topic, each.msgtype, each.msgcount) for each in connections)
-        self.duration = 1e-9 * reader.duration
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         connections = [each for each in self._reader.connections if each.topic == topic]
@@ -121,7 +118,6 @@ class _Mcap:
         if summary is None or summary.statistics is None:
             raise ValueError("no summary at its end")
         figures = summary.statistics
-        self.duration = 1e-9 * (figures.message_end_time - figures.message_start_time)
         topics = []
         for number, channel in summary.channels.items():
             schema = summary.schemas.get(channel.schema_id)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
+from itertools import islice, pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import cv2
@@ -36,6 +38,7 @@ _PLAIN = {  # encoding of ROS to channels, and to OpenCV's conversion to RGB
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
     "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
 }
+_LOOKED_AT = 50  # frames, for their rate
 _JPEG = b"\xff\xd8"  # begins such an image
 _LENS_FIELDS = ("width", "height", "distortion_model", "D", "K", "R", "P", "binning_x", "binning_y")
 _REGION = ("x_offset", "y_offset", "height", "width")
@@ -61,6 +64,11 @@ class BagSource(FrameSource):
         times = self._times()
         return [number for number, time in enumerate(times) if self.selection.takes(number, time)]
 
+    def rate_of_times(self) -> Fraction:
+        """Return the frame rate by the median step between the first frames; the nominal one of a single."""
+        steps = [after - before for before, after in pairwise(islice(self._times(), _LOOKED_AT))]
+        return Fraction(1 / median(steps)).limit_denominator(1000) if steps else self.fps
+
     def _times(self) -> Iterator[float]:
         """Yield the times of the frames, s since the first, up to where the bag cannot be read."""
         first = before = None
@@ -82,7 +90,7 @@ class BagSource(FrameSource):
                     dt = interval if before is None else time - before
                     image, problem = None, ""
                     if before is not None and stamp <= before:
-                        problem = f"expected a stamp later than the frame before, got {stamp - before:.3g} s"
+                        problem = f"expected a stamp later than the frame before, got {stamp - before:.4g} s"
                     if self.selection.takes(number, time - first):
                         try:
                             image = self._right_size(message_image(message))
@@ -102,7 +110,7 @@ def open_bag_source(source: str, topic: str | None = None, fps: Fraction | None 
     Args:
         source: an MCAP file, a ROS bag, or the folder of a ROS 2 bag.
         topic: topic of the images; None for the only one with images.
-        fps: nominal frame rate, None for the mean of the images' times.
+        fps: nominal frame rate, None for that of the images' times.
 
     Raises:
         ValueError: the bag cannot be read, has no such topic or more than one, or its image does not decode.
@@ -115,10 +123,9 @@ def open_bag_source(source: str, topic: str | None = None, fps: Fraction | None 
             break
         if size is None:
             raise ValueError(f"bag {source}: expected images on {chosen.name}, got none")
-        rate = (chosen.size - 1) / bag.duration if bag.duration > 0 and chosen.size > 1 else 0.0
-        own = Fraction(rate).limit_denominator(1000) or DEFAULT_FPS
         lens = _lens(bag, chosen.name)
-    return BagSource(source, (), fps or own, chosen.size, size, topic=chosen.name, lens=lens)
+    found = BagSource(source, (), fps or DEFAULT_FPS, chosen.size, size, topic=chosen.name, lens=lens)
+    return found if fps else replace(found, fps=found.rate_of_times())
 
 
 def message_image(message: Any) -> NDArray[np.uint8]:

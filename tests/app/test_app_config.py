@@ -125,6 +125,7 @@ def test_settings_are_checked_when_they_are_made(settings, message):
         ("source: [1]", r"source: expected a text or number, got \['1'\]"),
         ("lanes_size: 3", "lanes_size: .*expected WIDTHxHEIGHT"),
         ("- 1", "expected a YAML file of settings, got list"),
+        ("# lane_width: 3.5", "expected a YAML file of settings, got none; is it empty"),
         ("{", "expected a YAML file of settings, got: not YAML"),
     ],
 )

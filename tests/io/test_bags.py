@@ -145,6 +145,21 @@ def _ros1_bag(path):
     return path
 
 
+def test_other_topics_that_last_longer_change_no_frame_rate(tmp_path):
+    name, info = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        images = writer.add_connection("/image", name, typestore=STORE)
+        lenses = writer.add_connection("/rear/camera_info", info, typestore=STORE)
+        for number in range(COUNT):
+            message = STORE.serialize_cdr(_compressed(number), name)
+            writer.write(images, round(1e9 * (START + 0.1 * number)), message)
+        for seconds in (0, 600):
+            writer.write(lenses, round(1e9 * (START + seconds)), STORE.serialize_cdr(_info(), info))
+    source = open_bag_source(str(tmp_path / "bag"))
+    assert float(source.fps) == pytest.approx(10, rel=0.01)
+    assert [frame.dt for frame in source] == pytest.approx([0.1] * COUNT, rel=0.05)
+
+
 def test_stamps_that_do_not_rise_are_said(tmp_path):  # usb_cam#259
     name = "sensor_msgs/msg/CompressedImage"
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
