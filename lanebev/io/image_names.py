@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from itertools import pairwise
+from os.path import basename, split, splitext
 from pathlib import PurePath
 from statistics import median_low
 
@@ -54,7 +55,7 @@ def in_natural_order(paths: Iterable[str]) -> list[str]:
     over midnight and with the day before the month.
     """
     paths = list(paths)
-    stems = [PurePath(path).stem for path in paths]
+    stems = [splitext(basename(path))[0] for path in paths]
     if len({len(stem) for stem in stems}) == 1 and all(map(_DIGITS.fullmatch, stems)):
         return sorted(paths, key=lambda path: (natural_order(str(PurePath(path).parent)), path))
     decimal = are_decimal([match[2] for match in map(_DECIMAL.search, paths) if match])
@@ -152,11 +153,11 @@ def drives_remark(paths: Sequence[str]) -> str:
     Args:
         paths: paths of the images.
     """
-    numbers: dict[tuple[PurePath, tuple[str, ...]], list[str]] = defaultdict(list)
-    folders: dict[str, list[PurePath]] = defaultdict(list)
-    for path in map(PurePath, paths):
-        numbers[path.parent, tuple(re.findall(r"\d+", path.stem))].append(path.name)
-        folders[path.name].append(path.parent)
+    numbers: dict[tuple[str, tuple[str, ...]], list[str]] = defaultdict(list)
+    folders: dict[str, list[str]] = defaultdict(list)
+    for folder, name in map(split, paths):
+        numbers[folder, tuple(re.findall(r"\d+", splitext(name)[0]))].append(name)
+        folders[name].append(folder or ".")
     alike = [names for (_, found), names in numbers.items() if found and len(names) > 1]
     if alike and sum(map(len, alike)) > _MOST_ALIKE * len(paths):
         return (
