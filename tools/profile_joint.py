@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from jsonargparse import auto_cli
 from jsonargparse.typing import PositiveInt
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves
 
 import lanebev
@@ -30,27 +30,44 @@ from tools.bench_speed.calibration import calibrators
 _PACKAGE = str(Path(lanebev.__file__).parent)
 
 
-class Recorder(TorchDispatchMode):
-    """Record of every operation the function that called it, its processor time, ns, and its bytes."""
+class Recorder(TorchFunctionMode):
+    """Record of every operation the function that called it, its processor time, ns, and its bytes.
+
+    No mode of dispatch: under such a mode the package computes what it skips otherwise (``replace_rows``).
+    """
 
     def __init__(self) -> None:
-        super().__init__()  # type: ignore[no-untyped-call]
+        super().__init__()
         self.calls: list[tuple[str, int, int]] = []
 
-    def __torch_dispatch__(
+    def __torch_function__(
         self, func: Callable[..., Any], types: Any, args: Any = (), kwargs: Any = None
     ) -> Any:
         begin = time.thread_time_ns()
         result = func(*args, **(kwargs or {}))
         spent = time.thread_time_ns() - begin
-        moved = 0 if getattr(func, "is_view", False) else _bytes((args, kwargs, result))
-        self.calls.append((_caller(), spent, moved))
+        if _tensors(result):
+            moved = 0 if _is_view(func, args, result) else _bytes((args, kwargs, result))
+            self.calls.append((_caller(), spent, moved))
         return result
+
+
+def _tensors(values: Any) -> list[torch.Tensor]:
+    """List all tensors in a tree."""
+    return [leaf for leaf in tree_leaves(values) if isinstance(leaf, torch.Tensor)]
+
+
+def _is_view(func: Callable[..., Any], args: Any, result: Any) -> bool:
+    """Tell whether a result is memory of an argument that the function did not write."""
+    name = func.__name__
+    writes = name.endswith("_") and not name.endswith("__")
+    given = {tensor.untyped_storage().data_ptr() for tensor in _tensors(args)}
+    return not writes and _tensors(result)[0].untyped_storage().data_ptr() in given
 
 
 def _bytes(values: Any) -> int:
     """Count the bytes of all tensors in a tree, those that are repeated by broadcasting once."""
-    tensors = [leaf for leaf in tree_leaves(values) if isinstance(leaf, torch.Tensor)]
+    tensors = _tensors(values)
     sizes = ([n for n, stride in zip(t.shape, t.stride(), strict=True) if stride] for t in tensors)
     return sum(math.prod(size) * t.element_size() for size, t in zip(sizes, tensors, strict=True))
 
