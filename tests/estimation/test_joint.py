@@ -47,7 +47,6 @@ from lanebev.estimation.joint.update import (
     frame_information,
     kalman_gain,
     membership,
-    observed_jacobian,
     observed_step,
     posterior_covariance,
 )
@@ -322,7 +321,8 @@ def test_the_curve_is_the_sum_of_its_basis_and_the_integral_of_its_curvature(pha
     road = road_shape(shape, behind)
     curve = road_curve(z, road)
     tilt = torch.linspace(-3.0, 3.0, 9001, dtype=DOUBLE).expand(2, -1)
-    total = (shape.unsqueeze(1) @ curve_by_shape(z, 2 + tilt, tilt, road)).squeeze(1)
+    rows = torch.cat(curve_by_shape(z, 2 + tilt, tilt, road), dim=1)
+    total = (shape.unsqueeze(1) @ rows).squeeze(1)
     torch.testing.assert_close(total, (2 + tilt) * curve.bend + tilt * curve.heading)
     heading = torch.cumulative_trapezoid(curve.curvature, dx=0.01)
     torch.testing.assert_close(curve.heading[:, 1:], heading, rtol=1e-5, atol=1e-9)
@@ -617,8 +617,7 @@ def test_update_equals_a_plain_gauss_newton_on_all_data():
     places = places + state.mean[:, PLACE.deviations].gather(1, seen.boundary)
     at = boundary_residuals(state.mean[:, :NUM_COMMON], places, seen, state.phase)
     scale, doubt = torch.ones(2, dtype=DOUBLE), state.cov[:, PLACE.observed, PLACE.observed]
-    full = observed_jacobian(at.jacobian, membership(seen.boundary, 6, like=doubt))
-    frame = frame_information(at, full, scale, doubt, seen)
+    frame = frame_information(at, scale, doubt, seen, membership(seen.boundary, 6, like=doubt))
     estimated, mean = torch.ones_like(state.mean), state.mean[:, PLACE.observed]
     moved = observed_step(mean, doubt, mean, frame, estimated[:, PLACE.observed])
     gain = kalman_gain(state.cov, moved, frame, estimated)
@@ -651,9 +650,10 @@ def test_weights_allow_for_the_predicted_variance_of_the_end_points():
     own = state.mean[:, PLACE.deviations].gather(1, seen.boundary)
     places = boundary_places(WIDTH, 6, seen.sigma).gather(1, seen.boundary) + own
     at = boundary_residuals(state.mean[:, :NUM_COMMON], places, seen, state.phase)
-    full = observed_jacobian(at.jacobian, membership(seen.boundary, 6, like=own))
+    member = membership(seen.boundary, 6, like=own)
+    full = torch.cat([at.jacobian, member * at.jacobian[:, OFFSET, None]], dim=1)
     cov = state.cov[:, PLACE.observed, PLACE.observed]
-    trust = frame_information(at, full, torch.ones(2, dtype=DOUBLE), cov, seen).trust
+    trust = frame_information(at, torch.ones(2, dtype=DOUBLE), cov, seen, member).trust
     count = seen.boundary.shape[1]
     for row, segment in itertools.product(range(2), range(count)):
         first, second = (full[row, :, end * count + segment] for end in (0, 1))

@@ -14,10 +14,15 @@ from lanebev.estimation.joint.measurement import NUM_STRAIGHT, PITCH, ROLL, boun
 from lanebev.estimation.joint.observations import boundary_places, observe
 from lanebev.estimation.joint.output import no_boundary_deviation, unverified_deviation
 from lanebev.estimation.joint.restart import scatter_of_fit
-from lanebev.estimation.joint.scatter import averaged_moments, boundary_scatter, scatter_variance
+from lanebev.estimation.joint.scatter import (
+    averaged_moments,
+    boundary_scatter,
+    scatter_variance,
+    with_headings,
+)
 from lanebev.estimation.joint.single_frame import fit_observations
 from lanebev.estimation.joint.state import JointConfig
-from lanebev.estimation.joint.update import membership
+from lanebev.estimation.joint.update import information, membership
 from lanebev.testing.moments import CAMERA, PLACES, WIDTH, moments
 from lanebev.testing.moments import observe as see
 from lanebev.testing.segments import stack_rows
@@ -53,14 +58,11 @@ def test_the_variances_of_places_and_headings_are_found(place_std, heading_std):
     places = boundary_places(WIDTH, 6, seen.sigma).expand(60, -1).gather(1, seen.boundary)
     residuals = boundary_residuals(params, places, seen)
     straight = residuals._replace(jacobian=residuals.jacobian[:, :NUM_STRAIGHT])
-    found = boundary_scatter(
-        straight.jacobian,
-        torch.ones(60, NUM_STRAIGHT, dtype=DOUBLE),
-        straight,
-        residuals.valid * seen.weight / seen.sigma.square(),
-        membership(seen.boundary, 6, seen.sigma),
-        torch.zeros(60, 2, 3, dtype=DOUBLE),
-    )
+    weight = residuals.valid * seen.weight / seen.sigma.square()
+    member = membership(seen.boundary, 6, seen.sigma)
+    told = with_headings(*information(straight, weight, member), straight, weight, member)
+    precision = torch.ones(60, NUM_STRAIGHT, dtype=DOUBLE)
+    found = boundary_scatter(*told, precision, torch.zeros(60, 2, 3, dtype=DOUBLE))
     squares, freedom, weight = found.moments.mean(0).unbind(-1)
     assert (squares / freedom).sqrt().tolist() == [
         pytest.approx(place_std, rel=0.15, abs=0.008),

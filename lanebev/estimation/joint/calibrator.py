@@ -32,30 +32,28 @@ from lanebev.estimation.joint.measurement import (
     CURVATURE,
     NUM_STRAIGHT,
     VERTICAL,
-    Residuals,
     boundary_distances,
     boundary_residuals,
     foot_points,
     look,
 )
-from lanebev.estimation.joint.observations import Observations, boundary_places, observations
+from lanebev.estimation.joint.observations import Observations, boundary_places, observations, per_end
 from lanebev.estimation.joint.output import as_calibration
 from lanebev.estimation.joint.restart import restart
 from lanebev.estimation.joint.road import propagate_road_shape
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
-from lanebev.estimation.joint.robust import scaled_variance
-from lanebev.estimation.joint.scatter import Scatter, averaged_moments, boundary_scatter
+from lanebev.estimation.joint.scatter import Scatter, averaged_moments, boundary_scatter, with_headings
 from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit, unobserved_mask
 from lanebev.estimation.joint.status import update_track_status
 from lanebev.estimation.joint.tempering import temper_frame
 from lanebev.estimation.joint.update import (
+    FrameInformation,
     agreement,
     boundary_deviation,
     estimated_entries,
     frame_information,
     kalman_gain,
     membership,
-    observed_jacobian,
     observed_step,
     posterior_covariance,
     single_frame_std,
@@ -65,6 +63,7 @@ from lanebev.estimation.kalman import predict
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.observation.segments import LaneSegments
+from lanebev.tensors import constant
 from lanebev.types import Calibration, Extrinsics, Status, check_type
 
 _NO_BOUNDARY_DEVIATION = 0.36  # m, from which a line bounds no lane: three sigmas of `open_deviation`
@@ -145,7 +144,7 @@ class JointCalibrator(Calibrator[JointState]):
         step, skip, early, guessed = elapsed(dt, state, cfg)
 
         predicted = predict_state(state, step, cfg)
-        numbers = 6 * place.size**2 + place.observed.stop * seen.pixels.shape[-1]  # above all the Jacobian
+        numbers = 6 * place.size**2 + NUM_COMMON * seen.pixels.shape[-1]  # above all the Jacobian
         updated, trust, agreed, alone = in_blocks(
             numbers, partial(update_state, cfg=cfg), predicted, positions, seen, step
         )
@@ -265,11 +264,10 @@ def update_state(
         if iteration == 0:
             feet = foot_points(params, places + own, seen, sight)
             residuals = boundary_residuals(params, places + own, seen, predicted.phase, feet, sight)
-            jacobian = observed_jacobian(residuals.jacobian, member)
         else:  # the Jacobian stays
             distance, valid = boundary_distances(params, places + own, seen, feet, predicted.phase)
             residuals = residuals._replace(distance=distance, valid=valid)
-        frame = frame_information(residuals, jacobian, scale, doubt, seen)
+        frame = frame_information(residuals, scale, doubt, seen, member)
         alone = single_frame_std(frame.matrix)
         estimated = estimated_entries(alone, num)
         moved = observed_step(
@@ -277,14 +275,13 @@ def update_state(
         )
         used = cov
         if iteration == 0:
-            support = 2.0 * torch.bmm(member, (frame.trust * seen.weight).unsqueeze(-1)).squeeze(-1)
+            support = torch.bmm(member, per_end(frame.trust * seen.weight).unsqueeze(-1)).squeeze(-1)
             score = normalized_score(doubt, frame, support, seen.weight)
             evidence, motion_scale = with_evidence(predicted, score, estimated[:, POSE] > 0, step, cfg)
             noise = adaptive_process_noise(evidence, doubt, cfg)
             cov = cov + torch.nn.functional.pad(noise, (0, place.size - noise.shape[-1])).diag_embed()
         last, at, doubt, scale = at, moved.mean, moved.cov, frame.scale
-    weight = frame.trust * seen.weight / scaled_variance(seen.sigma, frame.scale)
-    scatter = scatter_of_frame(residuals, cov, weight, member, predicted.scatter)
+    scatter = scatter_of_frame(frame, cov, member, predicted.scatter)
     gain = kalman_gain(used, moved, frame, estimated)
     updated = predicted._replace(
         mean=torch.baddbmm(prior.unsqueeze(-1), gain, moved.pull.unsqueeze(-1)).squeeze(-1),
@@ -295,7 +292,7 @@ def update_state(
         motion_scale=motion_scale,
         reasons=flag(shift != 0, Reason.LANE_CHANGE),
     )
-    agreed = agreement(frame, jacobian, at - last, seen)
+    agreed = agreement(frame, at - last, seen)
     apart = torch.maximum(at[:, NUM_COMMON:].abs(), boundary_deviation(last, frame).abs())
     lane = (apart < _NO_BOUNDARY_DEVIATION).gather(1, seen.boundary)
     return updated, frame.trust, torch.where((seen.weight > 0) & lane, agreed, 0.0), alone
@@ -321,19 +318,18 @@ def with_evidence(
     return evidence, adapt_motion_scale(predicted.motion_scale, scored, step, cfg)
 
 
-def scatter_of_frame(
-    residuals: Residuals, cov: Tensor, weight: Tensor, member: Tensor, moments: Tensor
-) -> Scatter:
+def scatter_of_frame(frame: FrameInformation, cov: Tensor, member: Tensor, moments: Tensor) -> Scatter:
     """Estimate the scatter of the boundaries beside pose, offset and vertical curvature.
 
     Args:
-        residuals: of the frame, near the state.
+        frame: its information, near the state.
         cov: (B, D, D), of the state before the frame.
-        weight: (B, N) px⁻².
-        member: (B, L, N), boundary of each segment.
+        member: (B, L, M), boundary of each end point.
         moments: (B, 2, 3) of the frames before.
     """
-    jacobian = torch.cat([residuals.jacobian[:, :NUM_STRAIGHT], residuals.jacobian[:, VERTICAL:]], dim=1)
+    matrix, vector = with_headings(frame.matrix, frame.vector, frame.residuals, frame.weight, member)
+    kept = constant((*range(NUM_STRAIGHT), *range(VERTICAL, vector.shape[-1])), matrix, torch.int64)
+    matrix, vector = matrix.index_select(1, kept).index_select(2, kept), vector.index_select(1, kept)
     of_vertical = cov[:, VERTICAL, VERTICAL, None].reciprocal()
     precision = torch.cat([wide_precision(cov), of_vertical], dim=-1)
-    return boundary_scatter(jacobian, precision, residuals, weight, member, moments)
+    return boundary_scatter(matrix, vector, precision, moments)

@@ -27,9 +27,8 @@ from torch.nn.functional import pad
 from lanebev.estimation.joint.observations import Observations, by_ends, per_end
 from lanebev.estimation.joint.road_curve import (
     NUM_STEPS,
-    Clothoid,
+    Road,
     RoadCurve,
-    Spline,
     curve_by_shape,
     road_curve,
     road_shape,
@@ -75,7 +74,7 @@ class Sight(NamedTuple):
     z: Tensor
     valid: Tensor
     profile: Profile
-    road: Clothoid | Spline
+    road: Road
     curve: RoadCurve
 
 
@@ -169,7 +168,7 @@ def boundary_residuals(
     by_shape = curve_by_shape(z, up, up * x_k * curve.heading, sight.road)
     by_vertical = (0.5 * z * z * by_height).unsqueeze(1)  # the road is lower by Z²/2 per unit of it
     jacobian = torch.cat(
-        [by_angles, torch.stack([by_height, by_offset], dim=1), by_shape, by_vertical], dim=1
+        [by_angles, by_height.unsqueeze(1), by_offset.unsqueeze(1), *by_shape, by_vertical], dim=1
     )
     given = jacobian[:, :-1] if phase is None else jacobian
     return Residuals(_of_valid(distance, sight.valid), given, jacobian[:, -1], z, sight.valid)
@@ -242,7 +241,8 @@ def _of_valid(distance: Tensor, valid: Tensor) -> Tensor:
 
 def _per_pixel(line: Tensor) -> Tensor:
     """1 / |∂(n·d)/∂p| (…, M) px, for the lines l (…, 3, M) in which planes n appear, l·(x, y, 1) = n·d."""
-    return line[..., :2, :].square().sum(-2).rsqrt()
+    across, down, _ = line.unbind(-2)
+    return torch.addcmul(across * across, down, down).rsqrt()
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
@@ -255,7 +255,7 @@ def _lateral(params: Tensor, places: Tensor) -> Tensor:
     return per_end(places + params[:, OFFSET : OFFSET + 1])
 
 
-def _road(params: Tensor, phase: Tensor | None) -> Clothoid | Spline:
+def _road(params: Tensor, phase: Tensor | None) -> Road:
     """The middle line of the road: a clothoid, or with a phase a spline."""
     return road_shape(params[:, NUM_STRAIGHT : None if phase is None else VERTICAL], phase)
 

@@ -20,10 +20,10 @@ from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, NUM_STRAIGHT, ROLL, boundary_residuals
 from lanebev.estimation.joint.observations import Observations
 from lanebev.estimation.joint.robust import log_likelihood, scaled_variance, squared_distance
-from lanebev.estimation.joint.scatter import Scatter, averaged_moments, boundary_scatter
+from lanebev.estimation.joint.scatter import Scatter, averaged_moments, boundary_scatter, with_headings
 from lanebev.estimation.joint.single_frame import SingleFrameFit, fit_observations
 from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit
-from lanebev.estimation.joint.update import membership
+from lanebev.estimation.joint.update import information, membership
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.linalg import inverse_spd
 from lanebev.types import Status
@@ -189,14 +189,11 @@ def scatter_of_fit(fit: SingleFrameFit, places: Tensor, seen: Observations, cfg:
     params, std = fit.params(), cfg.prior.std(places)
     residuals = boundary_residuals(params, places, seen)
     away = ((params - cfg.prior.mean(places)) / std).square()
-    found = boundary_scatter(
-        residuals.jacobian,
-        student_weight(away, cfg.prior.freedom) / std.square(),
-        residuals,
-        residuals.valid * fit.inliers * seen.weight / scaled_variance(seen.sigma, fit.scale),
-        membership(seen.boundary, cfg.num_boundaries, like=places),
-        places.new_zeros(places.shape[0], 2, 3),
-    )
+    weight = residuals.valid * fit.inliers * seen.weight / scaled_variance(seen.sigma, fit.scale)
+    member = membership(seen.boundary, cfg.num_boundaries, like=places)
+    told = with_headings(*information(residuals, weight, member), residuals, weight, member)
+    precision = student_weight(away, cfg.prior.freedom) / std.square()
+    found = boundary_scatter(*told, precision, places.new_zeros(places.shape[0], 2, 3))
     determined = fit.observed.all(-1)[:, None, None]
     return found._replace(sensitivity=torch.where(determined, found.sensitivity, 0.0))
 

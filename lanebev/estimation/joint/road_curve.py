@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lanebev.tensors import constant
 
@@ -18,31 +19,25 @@ _KNOTS = tuple(map(float, range(1 + NUM_STEPS)))  # knot spacings, from the firs
 _BEGIN_AND_END = tuple(
     tuple(float(k == j) - (k == j + 1) for k in range(1 + NUM_STEPS)) for j in range(NUM_STEPS)
 )
+_POWERS = ((3.0,), (2.0,), (1.0,), (0.0,))  # of the way past a knot, in the coefficients of a piece
+_BY_RAMP = tuple(  # the coefficients by a ramp from each knot on; the first is not ahead, see road_shape
+    (factor * first, *[factor] * NUM_STEPS)
+    for factor, first in ((_CUBE, 0.0), (_SQUARE, 0.0), (1.0, 1.0), (1 / KNOT_SPACING, 1.0))
+)
+_BY_CURVATURE = ((0.0,), (0.0,), (1.0,), (0.0,))
 
 
-class Clothoid(NamedTuple):
-    """Coefficients of a clothoid, each (B, 1): the curvature at Z = 0, 1/m, and its rate, 1/m²."""
-
-    curvature: Tensor
-    rate: Tensor
-
-
-class Spline(NamedTuple):
-    """Coefficients of a curvature that is linear between knots.
+class Road(NamedTuple):
+    """The middle line of the road, a polynomial of the third degree between knots.
 
     Attributes:
-        first: (B, 1) 1/m, curvature at the first knot.
-        past: (B, 1 + NUM_STEPS, 1), how far the camera is past each knot, in knot spacings.
-        changes: (B, 1, 1 + NUM_STEPS) 1/m, by which the slope per knot spacing changes at each knot.
-        turned: (B, 1), heading at the camera because of the step that began behind it.
-        moved: (B, 1) m, bend, likewise.
+        pieces: (B, 4, K), the coefficients a (m), b, c (1/m) and m (1/m²) from each knot on: the bend is
+            a + b Z + c Z²/2 + m Z³/6. A clothoid is one piece, a = b = 0, c and m the curvature and its rate.
+        past: (B, 1 + NUM_STEPS, 1), how far the camera is past each knot, in knot spacings; a clothoid: None.
     """
 
-    first: Tensor
-    past: Tensor
-    changes: Tensor
-    turned: Tensor
-    moved: Tensor
+    pieces: Tensor
+    past: Tensor | None
 
 
 class RoadCurve(NamedTuple):
@@ -59,8 +54,11 @@ class RoadCurve(NamedTuple):
     curvature: Tensor
 
 
-def road_shape(shape: Tensor, phase: Tensor | None) -> Clothoid | Spline:
+def road_shape(shape: Tensor, phase: Tensor | None) -> Road:
     """Compute the coefficients of the road's middle line.
+
+    Source: (J3), in which the knots that are passed count. Bend and heading are 0 at the camera, so the first
+    knot, which is not ahead, changes only the curvature and its rate.
 
     Args:
         shape: (B, 2), c0 and c1 of a clothoid; with a phase (B, 1 + NUM_STEPS), curvature at the first knot
@@ -68,62 +66,59 @@ def road_shape(shape: Tensor, phase: Tensor | None) -> Clothoid | Spline:
         phase: (B,) m, how far the first knot lies behind the camera, or None.
     """
     if phase is None:
-        return Clothoid(shape[:, :1], shape[:, 1:])
-    steps, past = shape[:, 1:], phase.unsqueeze(-1) / KNOT_SPACING
-    heading, bend = _behind(past)
-    return Spline(
-        first=shape[:, :1],
-        past=(past - constant(_KNOTS, like=past)).unsqueeze(-1),
-        changes=(steps @ constant(_BEGIN_AND_END, like=steps)).unsqueeze(1),
-        turned=heading * steps[:, :1],
-        moved=bend * steps[:, :1],
-    )
+        return Road(pad(shape, (2, 0)).unsqueeze(-1), None)
+    past = phase.unsqueeze(-1) / KNOT_SPACING - constant(_KNOTS, like=phase)  # (B, K)
+    changes = shape[:, 1:] @ constant(_BEGIN_AND_END, like=shape)  # (B, K), of the slope at every knot
+    ramps = past.unsqueeze(1).pow(constant(_POWERS, like=past)) * constant(_BY_RAMP, like=past)
+    first = shape[:, :1, None] * constant(_BY_CURVATURE, like=shape)
+    pieces = torch.add((ramps * changes.unsqueeze(1)).cumsum(-1), first)
+    return Road(pieces, past.unsqueeze(-1))
 
 
-def road_curve(z: Tensor, road: Clothoid | Spline) -> RoadCurve:
+def road_curve(z: Tensor, road: Road) -> RoadCurve:
     """Compute bend, heading and curvature of the road's middle line at z (B, M) m, bend and heading 0 at 0.
 
     Source: (J3).
     """
-    if isinstance(road, Clothoid):
-        c0, c1 = road
-        return RoadCurve(z * z * (c0 / 2 + c1 * z / 6), z * (c0 + c1 * z / 2), c0 + c1 * z)
-    past = _past_knots(z, road)
-    square, turning = past * past, road.first * z
-    bend = torch.addcmul(-road.moved, z, torch.sub(0.5 * turning, road.turned))
+    a, b, c, m = _pieces_at(z, road).unbind(1)
+    ramp = m * z
     return RoadCurve(
-        bend=torch.baddbmm(bend.unsqueeze(1), road.changes, square * past, alpha=_CUBE).squeeze(1),
-        heading=torch.baddbmm(
-            (turning - road.turned).unsqueeze(1), road.changes, square, alpha=_SQUARE
-        ).squeeze(1),
-        curvature=torch.baddbmm(road.first.unsqueeze(1), road.changes, past).squeeze(1),
+        bend=torch.addcmul(a, z, torch.addcmul(b, z, torch.add(c, ramp, alpha=1 / 3), value=0.5)),
+        heading=torch.addcmul(b, z, torch.add(c, ramp, alpha=0.5)),
+        curvature=c + ramp,
     )
 
 
-def curve_by_shape(z: Tensor, by_bend: Tensor, by_heading: Tensor, road: Clothoid | Spline) -> Tensor:
-    """Compute the derivative of a function of bend and heading by every shape parameter, (B, K, M).
+def _pieces_at(z: Tensor, road: Road) -> Tensor:
+    """Coefficients (B, 4, M) of the piece of the road in which z (B, M) m lies; (B, 4, 1) of a clothoid."""
+    if road.past is None:
+        return road.pieces
+    passed = torch.add(road.past[:, 0], z, alpha=1 / KNOT_SPACING).long().clamp(0, NUM_STEPS)
+    return road.pieces.gather(2, passed.unsqueeze(1).expand(-1, 4, -1))
+
+
+def curve_by_shape(z: Tensor, by_bend: Tensor, by_heading: Tensor, road: Road) -> tuple[Tensor, ...]:
+    """Compute the derivative of a function of bend and heading by the shape parameters.
 
     Args:
         z: (B, M) m.
         by_bend: (B, M), its derivative by the bend.
         by_heading: (B, M), likewise.
         road: whose knots count.
+
+    Returns:
+        the rows (B, ..., M) of the K parameters in order, one or several a tensor.
     """
     first = z * torch.addcmul(by_heading, by_bend, z, value=0.5)
-    if isinstance(road, Clothoid):
-        return torch.stack([first, 0.5 * z * z * (by_bend * z / 3 + by_heading)], 1)
-    past = _past_knots(z, road)
+    if road.past is None:
+        return first.unsqueeze(1), (0.5 * z * z * (by_bend * z / 3 + by_heading)).unsqueeze(1)
+    past = torch.add(road.past, z.unsqueeze(1), alpha=1 / KNOT_SPACING).clamp_(min=0.0)
     of_square, of_cube = (_SQUARE * by_heading).unsqueeze(1), (_CUBE * by_bend).unsqueeze(1)
-    ramps = past * past * torch.addcmul(of_square, of_cube, past)
+    ramps = torch.addcmul(of_square, of_cube, past).mul_(past * past)
     steps = ramps[:, :-1] - ramps[:, 1:]  # a step rises from 0 at its knot to 1 at the next
     heading, bend = _behind(road.past[:, 0])
     head = steps[:, 0] - torch.addcmul(by_bend * bend, heading, torch.addcmul(by_heading, by_bend, z))
-    return torch.cat([torch.stack([first, head], 1), steps[:, 1:]], 1)
-
-
-def _past_knots(z: Tensor, road: Spline) -> Tensor:
-    """Distances (B, 1 + NUM_STEPS, M) past the knots, in knot spacings, 0 before a knot."""
-    return torch.add(road.past, z.unsqueeze(1), alpha=1 / KNOT_SPACING).clamp_(min=0.0)
+    return first.unsqueeze(1), head.unsqueeze(1), steps[:, 1:]
 
 
 def _behind(past: Tensor) -> tuple[Tensor, Tensor]:

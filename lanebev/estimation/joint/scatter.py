@@ -20,7 +20,7 @@ from lanebev.estimation.joint.measurement import OFFSET, ROLL, Residuals
 from lanebev.estimation.joint.observations import per_end
 from lanebev.estimation.joint.state import JointConfig
 from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
-from lanebev.tensors import constant, identity
+from lanebev.tensors import constant
 
 _PRIOR_STD = (0.05, 0.003)  # m, rad: least prior sigmas of a boundary's own deviation and heading
 _NOISE_FACTOR = 1.5  # on the noise variance of the estimates, which is subtracted
@@ -45,44 +45,55 @@ class Scatter(NamedTuple):
     moments: Tensor
 
 
-def boundary_scatter(
-    jacobian: Tensor,
-    precision: Tensor,
-    residuals: Residuals,
-    weight: Tensor,
-    member: Tensor,
-    moments: Tensor,
-) -> Scatter:
-    """Estimate each boundary's own deviation and heading in a frame, beside the parameters that all share.
+def with_headings(
+    matrix: Tensor, vector: Tensor, residuals: Residuals, weight: Tensor, member: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Extend a frame's information (J8) by the headings of the boundaries.
 
-    Source: (J27), random effects of a linear mixed model, and moments for their variances (Henderson 1953).
     A heading moves an end point as an offset of Z times the heading does.
 
     Args:
-        jacobian: (B, P, M) of the distances by the common parameters, pose and offset first.
-        precision: (B, P), of their priors.
-        residuals: distances, and Z of the foot points.
-        weight: (B, N) px⁻², weight of each segment over its variance.
-        member: (B, L, N) of :func:`~lanebev.estimation.joint.update.membership`.
+        matrix: (B, P + L, P + L) of :func:`~lanebev.estimation.joint.update.information`.
+        vector: (B, P + L), likewise.
+        residuals: distances, their Jacobian (B, P, M), and Z of the foot points.
+        weight: (B, N) px⁻², of each segment over its variance.
+        member: (B, L, M) of :func:`~lanebev.estimation.joint.update.membership`.
+
+    Returns:
+        (B, P + 2 L, P + 2 L) and (B, P + 2 L).
+    """
+    jacobian, distance = residuals.jacobian, residuals.distance.flatten(1)
+    by_heading = jacobian[:, OFFSET] * residuals.z  # (B, M)
+    own = member * (per_end(weight) * by_heading).unsqueeze(1)  # (B, L, M)
+    shared = torch.bmm(own, jacobian.mT)  # (B, L, P)
+    alone, against = torch.bmm(own, torch.stack([by_heading, distance], dim=-1)).unbind(-1)
+    across = torch.cat([shared, shared[:, :, OFFSET].diag_embed()], dim=-1)  # (B, L, P + L)
+    upper = torch.cat([matrix, across.mT], dim=-1)
+    lower = torch.cat([across, alone.diag_embed()], dim=-1)
+    return torch.cat([upper, lower], dim=1), torch.cat([vector, -against], dim=-1)
+
+
+def boundary_scatter(matrix: Tensor, vector: Tensor, precision: Tensor, moments: Tensor) -> Scatter:
+    """Estimate each boundary's own deviation and heading in a frame, beside the parameters that all share.
+
+    Source: (J27), random effects of a linear mixed model, and moments for their variances (Henderson 1953).
+
+    Args:
+        matrix: (B, P + 2 L, P + 2 L), information of :func:`with_headings`: on the parameters, pose and
+            offset first, on the deviations and on the headings.
+        vector: (B, P + 2 L), likewise.
+        precision: (B, P), of the priors of the parameters.
         moments: (B, 2, 3) of the frames before; they decide the prior of the deviations and headings.
     """
-    count, num, distance = jacobian.shape[1], member.shape[1], residuals.distance.flatten(1).unsqueeze(1)
-    by_place = jacobian[:, OFFSET : OFFSET + 1]
-    by_heading = by_place * residuals.z.unsqueeze(1)
-    rows = torch.cat([jacobian, by_place, by_heading, distance], dim=1)  # (B, P + 3, M)
-    weights = per_end(weight).unsqueeze(1)
-    shared = rows @ (jacobian * weights).mT  # (B, P + 3, P)
-    of_places = per_end(member) * (by_place * weights)  # (B, L, M), of each boundary's own end points
-    by_own = rows @ torch.cat([of_places, of_places * residuals.z.unsqueeze(1)], dim=1).mT  # (B, P + 3, 2 L)
-
-    factor = cholesky(shared[:, :count] + precision.diag_embed())
-    across = torch.cholesky_inverse(factor) @ by_own[:, :count]  # (B, P, 2 L), change by what is own
-    known = solve_lower(factor, torch.cat([by_own[:, :count], -shared[:, -1:].mT], dim=-1))
+    count = precision.shape[-1]
+    num = (vector.shape[-1] - count) // 2
+    by_own = matrix[:, :count, count:]  # (B, P, 2 L)
+    factor = cholesky(matrix[:, :count, :count] + precision.diag_embed())
+    across = torch.cholesky_inverse(factor) @ by_own  # change by what is own
+    known = solve_lower(factor, torch.cat([by_own, vector[:, :count, None]], dim=-1))
     own_known = known[:, :, :-1].mT
-    same = identity(num, rows.dtype, rows.device).repeat(2, 2)  # no end point is on two boundaries
-    own = by_own[:, count : count + 2].repeat_interleave(num, dim=1) * same  # (B, 2 L, 2 L)
-    left = own - own_known @ known[:, :, :-1]
-    pull = -by_own[:, -1:].mT - own_known @ known[:, :, -1:]
+    left = matrix[:, count:, count:] - own_known @ known[:, :, :-1]  # (B, 2 L, 2 L)
+    pull = vector[:, count:, None] - own_known @ known[:, :, -1:]
 
     least = constant(tuple(std**2 for std in _PRIOR_STD), like=left)
     prior = scatter_variance(moments).maximum(least).repeat_interleave(num, dim=-1)  # (B, 2 L)

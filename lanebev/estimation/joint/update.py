@@ -27,6 +27,7 @@ UNSEEN = (0.01, 0.01, 0.01, 0.3)
 
 _WIDE_PRIOR = (0.3, 0.3, 0.3, 1.0, 2.0)  # rad, m: prior of pose and offset when a frame is judged alone
 _FIXED = 1e-4  # factor on roll's prior sigma where roll is not estimated: known, but not singular
+_OFFSET_ALONE = tuple(float(entry == OFFSET) for entry in range(NUM_COMMON))
 _NO_INFORMATION = 1e-3  # 1/m², information about a boundary's place below which there is none
 
 
@@ -37,6 +38,7 @@ class FrameInformation(NamedTuple):
         matrix: (B, O, O), Λ = Hᵀ Q⁻¹ H.
         vector: (B, O), Hᵀ Q⁻¹ y at the point of linearisation.
         trust: (B, N) in [0, 1], weights of the segments.
+        weight: (B, N) px⁻², of every end point in these sums: the diagonal of Q⁻¹.
         scale: (B,) >= 1, of the noise.
         residuals: at the point of linearisation.
     """
@@ -44,6 +46,7 @@ class FrameInformation(NamedTuple):
     matrix: Tensor
     vector: Tensor
     trust: Tensor
+    weight: Tensor
     scale: Tensor
     residuals: Residuals
 
@@ -63,45 +66,52 @@ class Step(NamedTuple):
 
 
 def membership(boundary: Tensor, num_boundaries: int, like: Tensor) -> Tensor:
-    """Tell which segments are on which boundary, (B, L, N) of 1 and 0, for boundaries (B, N)."""
+    """Tell which end points are on which boundary, (B, L, M) of 1 and 0, by those of the segments (B, N)."""
     numbers = torch.arange(num_boundaries, device=boundary.device).unsqueeze(-1)
-    return (boundary.unsqueeze(1) == numbers).to(like.dtype)
-
-
-def observed_jacobian(jacobian: Tensor, member: Tensor) -> Tensor:
-    """Extend a Jacobian by the deviations, each of which moves its own end points as the offset does.
-
-    Args:
-        jacobian: (B, 12, M) of the distances by the common entries.
-        member: (B, L, N) of :func:`membership`.
-
-    Returns:
-        (B, O, M).
-    """
-    own = member.unsqueeze(2) * by_ends(jacobian[:, OFFSET : OFFSET + 1])  # (B, L, 2, N)
-    return torch.cat([jacobian, own.flatten(2)], dim=1)
+    return per_end((boundary.unsqueeze(1) == numbers).to(like.dtype))
 
 
 def frame_information(
-    residuals: Residuals, jacobian: Tensor, scale: Tensor, doubt: Tensor, seen: Observations
+    residuals: Residuals, scale: Tensor, doubt: Tensor, seen: Observations, member: Tensor
 ) -> FrameInformation:
     """Weigh a frame's linearised measurements and sum them up.
 
     Args:
         residuals: at the point of linearisation.
-        jacobian: (B, O, M) of :func:`observed_jacobian`.
         scale: (B,) noise scale so far; it is lowered.
         doubt: (B, O, O), covariance of the point of linearisation. A residual within it is not an outlier.
         seen: what was observed.
+        member: (B, L, M) of :func:`membership`.
     """
-    unsure = _predicted_variance(jacobian, doubt)
+    unsure = _predicted_variance(residuals.jacobian, doubt, seen.boundary)
     squared = squared_distance(residuals.distance)
     gate = scaled_variance(seen.sigma, scale) + unsure
     trust = inlier_weights(squared, residuals.valid, gate, seen.focal)
     used = trust * seen.weight
     scale = anneal_scale(scale, noise_scale(squared, seen.sigma, used))
     weight = used / scaled_variance(seen.sigma, scale)
-    return FrameInformation(*_normal_equations(jacobian, residuals.distance, weight), trust, scale, residuals)
+    return FrameInformation(*information(residuals, weight, member), trust, weight, scale, residuals)
+
+
+def information(residuals: Residuals, weight: Tensor, member: Tensor) -> tuple[Tensor, Tensor]:
+    """Sum up Λ (B, O, O) and Hᵀ Q⁻¹ y (B, O) of the common entries and the deviations.
+
+    Source: (J8). A deviation moves the end points of its own boundary, as the offset does. No end point is on
+    two boundaries, so that the block of the deviations is diagonal.
+
+    Args:
+        residuals: with the Jacobian (B, P, M) by the common entries.
+        weight: (B, N) px⁻², the diagonal of Q⁻¹.
+        member: (B, L, M) of :func:`membership`.
+    """
+    jacobian, distance = residuals.jacobian, residuals.distance.flatten(1).unsqueeze(-1)
+    weighted = jacobian * per_end(weight).unsqueeze(1)  # (B, P, M)
+    own = member * weighted[:, OFFSET : OFFSET + 1]  # (B, L, M)
+    shared = torch.bmm(own, jacobian.mT)  # (B, L, P)
+    common = torch.cat([torch.bmm(weighted, jacobian.mT), shared], dim=1)
+    deviations = torch.cat([shared.mT, shared[:, :, OFFSET].diag_embed()], dim=1)
+    against = torch.cat([torch.bmm(weighted, distance), torch.bmm(own, distance)], dim=1)
+    return torch.cat([common, deviations], dim=-1), -against.squeeze(-1)
 
 
 def observed_step(
@@ -238,38 +248,39 @@ def boundary_deviation(mean: Tensor, frame: FrameInformation) -> Tensor:
     return torch.where(known > _NO_INFORMATION, moved, 0.0)
 
 
-def agreement(frame: FrameInformation, jacobian: Tensor, moved: Tensor, seen: Observations) -> Tensor:
+def agreement(frame: FrameInformation, moved: Tensor, seen: Observations) -> Tensor:
     """Compute each segment's inlier probability (B, N) by its own noise, at a state near the linearisation.
 
     The update's weights allow for the uncertainty of the prediction; these do not.
 
     Args:
         frame: linearised nearby.
-        jacobian: (B, O, M) of :func:`observed_jacobian`.
         moved: (B, O), the state less that at which the frame was linearised.
         seen: what was observed.
     """
-    change = torch.bmm(moved.unsqueeze(1), jacobian).view_as(frame.residuals.distance)
+    jacobian = frame.residuals.jacobian
+    common, own = moved[:, :NUM_COMMON], moved[:, NUM_COMMON:].gather(1, seen.boundary)
+    change = by_ends(torch.bmm(common.unsqueeze(1), jacobian).squeeze(1))  # (B, 2, N)
+    change = torch.addcmul(change, by_ends(jacobian[:, OFFSET]), own.unsqueeze(1))
     squared = squared_distance(frame.residuals.distance + change)
     variance = scaled_variance(seen.sigma, frame.scale)
     return inlier_weights(squared, frame.residuals.valid, variance, seen.focal)
 
 
-def _normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Λ (B, O, O) and Hᵀ Q⁻¹ y (B, O), for (B, O, M), (B, 2, N) and (B, N).
+def _predicted_variance(jacobian: Tensor, cov: Tensor, boundary: Tensor) -> Tensor:
+    """Compute h P hᵀ of a segment's end points, their mean, (B, N) px².
 
-    Source: (J8). No end point has two deviations, and its own moves it as the offset does: their block of Λ
-    is diagonal, and the offset's row holds it.
+    A row h has the derivatives g by the common entries and, by the deviation of its boundary k, that by the
+    offset, g_o. So h P hᵀ is g P gᵀ + g_o (2 P_k g + P_kk g_o), with P_k the row of the deviation.
+
+    Args:
+        jacobian: (B, 12, M).
+        cov: (B, O, O), P.
+        boundary: (B, N), k.
     """
-    weight = per_end(weight)  # (B, M)
-    common = torch.bmm(jacobian, (jacobian[:, :NUM_COMMON] * weight.unsqueeze(1)).mT)  # (B, O, 12)
-    shared = common[:, NUM_COMMON:]
-    own = torch.cat([shared.mT, shared[:, :, OFFSET].diag_embed()], dim=1)
-    against = torch.bmm((weight * distance.flatten(1)).unsqueeze(1), jacobian.mT).squeeze(1)
-    return torch.cat([common, own], dim=-1), -against
-
-
-def _predicted_variance(jacobian: Tensor, cov: Tensor) -> Tensor:
-    """(B, N) px², h P hᵀ of a segment's end points, their mean, for (B, O, M) and (B, O, O)."""
-    spread = torch.bmm(cov, jacobian).mul_(jacobian)  # another copy takes longer
-    return 0.5 * by_ends(spread).sum((1, 2))
+    common, by_own = cov[:, :NUM_COMMON, :NUM_COMMON], cov[:, NUM_COMMON:, :NUM_COMMON]
+    own = cov.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:, None] * constant(_OFFSET_ALONE, like=cov)
+    spread = torch.bmm(common, jacobian).mul_(jacobian).sum(1)  # another copy takes longer
+    more = torch.bmm(torch.add(own, by_own, alpha=2.0), jacobian)  # (B, L, M)
+    more = more.gather(1, per_end(boundary).unsqueeze(1)).squeeze(1)
+    return by_ends(torch.addcmul(spread, more, jacobian[:, OFFSET])).mean(1)
