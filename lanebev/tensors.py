@@ -75,6 +75,12 @@ def usable_device(device: torch.device | str | int) -> torch.device:
     return found
 
 
+def device_of_numbers() -> torch.device:
+    """Return the default device, or the CPU where that is meta, whose tensors have no numbers."""
+    device = torch.get_default_device()
+    return torch.device("cpu") if device.type == "meta" else device
+
+
 def made_once(function: Callable[P, T]) -> Callable[P, T]:
     """Decorate a function of hashable arguments that makes tensors, to be called once for each of them.
 

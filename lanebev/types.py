@@ -41,6 +41,18 @@ def check_tensor(name: str, value: object) -> None:
         raise TypeError(f"{name}: expected a torch.Tensor, got {kind}; convert numbers with {remedy}")
 
 
+def check_numbers_known(name: str, value: Tensor) -> None:
+    """Raise unless a tensor, which is read now, has memory with numbers.
+
+    Raises:
+        ValueError: it is on the device meta.
+    """
+    if value.is_meta:
+        raise ValueError(
+            f"{name}: expected numbers, got a tensor on the device meta, which has none: make it on the CPU"
+        )
+
+
 def check_type(name: str, value: object, expected: type) -> None:
     """Raise unless an argument is None or of a class of lanebev.
 

@@ -24,7 +24,8 @@ from lanebev.geometry.lens import (
     normalise_points,
 )
 from lanebev.numbers import check_number
-from lanebev.types import check_tensor
+from lanebev.tensors import device_of_numbers
+from lanebev.types import check_numbers_known, check_tensor
 
 
 def check_camera(value: object) -> None:
@@ -59,6 +60,8 @@ class Camera:
     def __post_init__(self) -> None:
         check_tensor("intrinsics", self.intrinsics)
         check_tensor("distortion", self.distortion)
+        check_numbers_known("intrinsics", self.intrinsics)
+        check_numbers_known("distortion", self.distortion)
         if self.intrinsics.shape != (3, 3):
             raise ValueError(f"intrinsics: expected (3, 3), got {tuple(self.intrinsics.shape)}")
         if self.distortion.ndim != 1:
@@ -112,8 +115,10 @@ class Camera:
         for name, value in numbers.items():
             if not isinstance(value, Tensor):
                 check_number(name, value, "px as a number")
-        intrinsics = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=dtype)
-        return cls(intrinsics, torch.tensor(list(distortion), dtype=dtype), model, (height, width))
+        rows, device = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], device_of_numbers()
+        intrinsics = torch.tensor(rows, dtype=dtype, device=device)
+        coefficients = torch.tensor(list(distortion), dtype=dtype, device=device)
+        return cls(intrinsics, coefficients, model, (height, width))
 
     @classmethod
     def from_fov(cls, degrees: float, width: int, height: int, dtype: torch.dtype = torch.float64) -> Camera:
@@ -176,8 +181,8 @@ class Camera:
     @classmethod
     def _of(cls, read: CameraParameters) -> Camera:
         return cls(
-            torch.tensor(read.matrix, dtype=torch.float64).reshape(3, 3),
-            torch.tensor(read.distortion, dtype=torch.float64),
+            torch.tensor(read.matrix, dtype=torch.float64, device=device_of_numbers()).reshape(3, 3),
+            torch.tensor(read.distortion, dtype=torch.float64, device=device_of_numbers()),
             read.model,
             read.image_size,
         )

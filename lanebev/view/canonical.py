@@ -11,7 +11,7 @@ from lanebev.geometry.lens import cam_from_image, check_intrinsics
 from lanebev.geometry.precision import common_dtype, full_precision
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.tensors import constant
-from lanebev.types import Extrinsics
+from lanebev.types import Extrinsics, check_numbers_known
 from lanebev.view.checks import blind_unless_finite, check_cameras, check_covers, check_image, check_size
 from lanebev.view.lens import make_lens
 from lanebev.view.projection import CellSums, normalised_intrinsics
@@ -67,6 +67,8 @@ class CanonicalView(nn.Module):
         check_intrinsics(intrinsics)
         check_size(image_size)
         pose = extrinsics.stack().reshape(-1, 4)
+        check_numbers_known("intrinsics", intrinsics)
+        check_numbers_known("extrinsics", pose)
         if len(pose) != 1:
             raise ValueError(f"extrinsics: expected those of one virtual camera, got {len(pose)}")
         if not keep_height and not float(pose[0, 3]) > 0:

@@ -14,7 +14,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lanebev.geometry.precision import full_precision
-from lanebev.tensors import constant
 from lanebev.view.lens import Lens, image_planes
 
 LEAST_DEPTH = 1e-3  # in front of the camera; m for cells of the road
@@ -65,15 +64,18 @@ class CellSums(NamedTuple):
 def normalised_intrinsics(intrinsics: Tensor, image_size: tuple[int, int]) -> Tensor:
     """Convert intrinsics to coordinates in which the image, with the edges of its outer pixels, is [-1, 1].
 
-    This is the convention of ``grid_sample(align_corners=False)``: the same for maps of every size.
+    This is the convention of ``grid_sample(align_corners=False)``: the same for maps of every size. The size
+    may be symbolic, as in a program for images of any size, so it is in no constant.
 
     Args:
         intrinsics: (B, 3, 3) px.
         image_size: (H, W) px.
     """
     height, width = image_size
-    rows = ((2 / width, 0.0, 1 / width - 1), (0.0, 2 / height, 1 / height - 1), (0.0, 0.0, 1.0))
-    return constant(rows, like=intrinsics) @ intrinsics
+    x, y, last = intrinsics.unbind(-2)
+    across = torch.add(x * (2 / width), last, alpha=1 / width - 1)
+    down = torch.add(y * (2 / height), last, alpha=1 / height - 1)
+    return torch.stack([across, down, last], dim=-2)
 
 
 def image_coordinates(cells: Tensor, lens: Lens | None, continued: bool = False) -> tuple[Tensor, Tensor]:

@@ -18,6 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
+from lanebev.tensors import device_of_numbers
 
 SHIPPED = Path(__file__).with_name("lane_segmenter.safetensors")
 _FORMAT = "lanebev.LaneSegmenter/1"
@@ -44,8 +45,7 @@ def load_segmenter(path: str | Path | None = None) -> LaneSegmenter:
     metadata, tensors = _read(path)
     try:
         config = segmenter_config(json.loads(metadata["config"]))
-        device = torch.get_default_device()
-        with torch.device("cpu" if device.type == "meta" else device):
+        with device_of_numbers():
             segmenter = LaneSegmenter(config)
         segmenter.load_state_dict(tensors, strict=True)
         if not all(bool(value.isfinite().all()) for value in tensors.values()):

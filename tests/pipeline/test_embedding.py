@@ -10,6 +10,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from lanebev import (
     BEVGrid,
     BEVWarp,
+    Camera,
     CanonicalView,
     Extrinsics,
     ImageFromBEV,
@@ -70,6 +71,41 @@ def test_shipped_weights_are_not_lost_under_the_device_meta():
         loaded = load_segmenter()
     for one, other in zip(loaded.parameters(), load_segmenter().parameters(), strict=True):
         assert torch.equal(one, other)
+
+
+def test_a_camera_keeps_its_numbers_under_the_device_meta():
+    numbers = {"fx": 500.0, "fy": 510.0, "cx": 319.5, "cy": 179.5, "width": 640, "height": 360}
+    with torch.device("meta"):
+        camera = Camera.from_parameters(**numbers, distortion=(-0.1, 0.01, 0.0, 0.0))
+        view = CanonicalView(camera.intrinsics, camera.image_size, POSE)
+    expected = CanonicalView(Camera.from_parameters(**numbers).intrinsics, (360, 640), POSE)
+    image = torch.rand(1, 2, 360, 640, generator=torch.Generator().manual_seed(0))
+    assert camera.distortion.tolist() == [-0.1, 0.01, 0.0, 0.0]
+    for one, other in zip(*(each(image, CAMERA, POSE) for each in (view, expected)), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_a_pose_without_numbers_is_named():
+    pose = Extrinsics(*(part.to("meta") for part in POSE))
+    with pytest.raises(ValueError, match="extrinsics: expected numbers, got a tensor on the device meta"):
+        CanonicalView(CAMERA[0], (360, 640), pose)
+    with pytest.raises(ValueError, match="intrinsics: expected numbers, got a tensor on the device meta"):
+        Camera(CAMERA[0].to("meta"), torch.zeros(0), "pinhole", (360, 640))
+
+
+@pytest.mark.parametrize("kind", ["bev", "canonical"])
+def test_a_view_is_exported_for_images_of_any_size(kind):
+    grid = BEVGrid(x=(-6.0, 6.0), z=(6.0, 30.0), resolution=0.5)
+    view = BEVWarp(grid) if kind == "bev" else CanonicalView(CAMERA[0], (64, 128), POSE)
+    height, width = (torch.export.Dim(name, min=16, max=2000) for name in ("height", "width"))
+    images = [
+        torch.rand(1, 2, *size, generator=torch.Generator().manual_seed(0)) for size in ((64, 128), (90, 100))
+    ]
+    sizes = ({2: height, 3: width}, None, Extrinsics(*[None] * 4))
+    program = torch.export.export(view, (images[0], CAMERA, POSE), dynamic_shapes=sizes).module()
+    for image in images:
+        for found, expected in zip(program(image, CAMERA, POSE), view(image, CAMERA, POSE), strict=True):
+            torch.testing.assert_close(found, expected)
 
 
 def test_a_module_of_half_precision_keeps_the_numbers_of_cameras_and_draws():
