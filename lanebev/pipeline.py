@@ -183,7 +183,8 @@ class LaneBEV(BoundaryDetector):
             state: state after the frame before; its dtype is the calibration's. None starts a drive in the
                 dtype of the intrinsics, at least float32.
             dt: s since the frame before: float, (B,) or, with T frames, (B, T).
-            lane_width: m: float, (B,) or (B, L-1).
+            lane_width: m: float, (B,) or (B, L-1). It counts as exact, also the default; for an uncertain
+                width add :func:`~lanebev.geometry.road.lane_width_covariance` to the pose's covariance.
             distortion: (B, D) of the lens, or None.
             model: "pinhole", "fisheye" or "omni".
             reset: (B,) or, with T frames, (B, T) bool: in these rows the frame is the first of another drive

@@ -18,6 +18,7 @@ from lanebev.camera.model import Camera, check_camera
 from lanebev.camera.plausibility import camera_remarks
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.lane_width_prior import check_lane_width_prior, lane_width_prior
 from lanebev.estimation.mount import MountCalibration, describe_mount
 from lanebev.estimation.reasons import Reason, describe_reasons
 from lanebev.estimation.tracker import Tracker
@@ -86,7 +87,11 @@ class Session:
         model: network and calibrator; None is :meth:`LaneBEV.from_pretrained`, loaded with the first frame.
         calibrator: used instead of the model's; None is the model's, without a model a
             :class:`lanebev.JointCalibrator`.
-        lane_width: m.
+        lane_width: m, exact unless ``lane_width_std`` is given; the height is proportional to it. None is an
+            unknown one: 3.7 m with a standard deviation of 0.2 m, as in ``lanebev run``.
+        lane_width_std: standard deviation of the lane width, m; those of the height and of the mount's height
+            contain its effect. None is 0 with a ``lane_width`` or a ``lane_width_std`` in the calibrator's
+            configuration, otherwise 0.2 m.
         grid: grid of the bird's-eye view; None for no view.
         colours: order of a frame's channels: "bgr" as OpenCV reads them, or "rgb".
         focal_std: standard deviation of the focal length as a fraction of it; the pose's contain its effect.
@@ -106,7 +111,8 @@ class Session:
         *,
         model: LaneBEV | None = None,
         calibrator: Calibrator[Any] | None = None,
-        lane_width: float = 3.7,
+        lane_width: float | None = None,
+        lane_width_std: float | None = None,
         grid: BEVGrid | None = None,
         colours: Literal["bgr", "rgb"] = "bgr",
         focal_std: float = 0.0,
@@ -117,13 +123,13 @@ class Session:
         check_type("model", model, LaneBEV)
         check_type("calibrator", calibrator, Calibrator)
         check_type("grid", grid, BEVGrid)
-        for name, value in (("lane_width", lane_width), ("focal_std", focal_std)):
-            check_number(name, value)
+        for name, value in (("lane_width", lane_width), ("lane_width_std", lane_width_std)):
+            if value is not None:
+                check_number(name, value)
+        check_number("focal_std", focal_std)
         check_number("polyline_sigma", polyline_sigma)
         if colours not in ("bgr", "rgb"):
             raise ValueError(f"colours: expected 'bgr' or 'rgb', got {colours!r}")
-        if not (math.isfinite(lane_width) and 1.0 < lane_width < 10.0):
-            raise ValueError(f"lane_width: expected 1 to 10 m, got {lane_width}")
         if not 0.0 <= focal_std < 1.0:
             raise ValueError(f"focal_std: expected a fraction of the focal length, 0 to 1, got {focal_std}")
         if not (math.isfinite(polyline_sigma) and polyline_sigma > 0):
@@ -133,7 +139,11 @@ class Session:
         self._model = model
         if calibrator is None:
             calibrator = JointCalibrator() if model is None else _calibrator_of(model)
-        self._parts: tuple[Any, ...] = (calibrator, camera, float(lane_width), float(focal_std))
+        if lane_width_std is None and calibrator.lane_width_std:
+            lane_width_std = 0.0  # the calibrator's covariance contains it already
+        width, width_std = lane_width_prior(lane_width, lane_width_std)
+        check_lane_width_prior(width, width_std, ("lane_width", "lane_width_std"))
+        self._parts: tuple[Any, ...] = (calibrator, camera, width, float(focal_std), width_std)
         for remark in camera_remarks(camera):
             logger.warning(remark)
         self.reset()

@@ -7,6 +7,12 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from lanebev.app.options import check_grid, check_types, option, parse_grid
+from lanebev.estimation.lane_width_prior import (
+    LANE_WIDTH,
+    LANE_WIDTH_STD,
+    check_lane_width_prior,
+    lane_width_prior,
+)
 from lanebev.io.formats.names import FORMATS, check_formats, parse_formats
 from lanebev.io.source_names import is_bag
 from lanebev.numbers import parse_crop, parse_size
@@ -15,8 +21,6 @@ CALIBRATORS = ("joint", "two-stage")
 BACKENDS = ("torch", "onnxruntime")
 FOV_FOCAL_STD = 0.2
 """Standard deviation of a guessed focal length as a fraction of it: 60 degrees of view may be 40 or 90."""
-LANE_WIDTH, LANE_WIDTH_STD = 3.7, 0.2
-"""Mean and standard deviation (m) of an unknown lane width: most main roads have lanes of 3.25 to 3.75 m."""
 
 
 def rate_as_fraction(fps: float | None) -> Fraction | None:
@@ -154,8 +158,7 @@ class RunConfig:
     @property
     def taken_lane_width(self) -> tuple[float, float]:
         """Lane width and its standard deviation, m, with the defaults applied."""
-        mean, std = (LANE_WIDTH, LANE_WIDTH_STD) if self.lane_width is None else (self.lane_width, 0.0)
-        return mean, std if self.lane_width_std is None else self.lane_width_std
+        return lane_width_prior(self.lane_width, self.lane_width_std)
 
     @property
     def frame_rate(self) -> Fraction | None:
@@ -170,11 +173,7 @@ class RunConfig:
             raise ValueError("source: expected a path, got none")
         self._check_lens()
         self._check_selection()
-        width, width_std = self.taken_lane_width
-        if not 0.0 <= width_std <= 2.0:
-            raise ValueError(f"lane width std: expected 0 to 2 m, got {width_std:g}")
-        if not (math.isfinite(width) and 1.0 < width < 10.0):
-            raise ValueError(f"lane width: expected 1 to 10 m, got {width:g}")
+        check_lane_width_prior(*self.taken_lane_width, ("lane width", "lane width std"))
         if self.fps is not None and not (math.isfinite(self.fps) and 0.01 <= self.fps <= 10_000):
             raise ValueError(f"fps: expected 0.01 to 10000 frames per second, got {self.fps:g}")
         self._check_calibrator()

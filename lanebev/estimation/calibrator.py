@@ -49,11 +49,13 @@ class Calibrator(nn.Module, Generic[StateT]):
         num_boundaries: L.
         still_passes: updates that a single image needs, see
             :func:`~lanebev.estimation.still.calibrate_still`: 1 for a calibrator that starts by a search.
+        lane_width_std: standard deviation of the lane width, m, whose effect its covariance contains.
     """
 
     state_type: type[StateT]
     num_boundaries: int
     still_passes: int = 1
+    lane_width_std: float = 0.0
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
@@ -92,7 +94,8 @@ class Calibrator(nn.Module, Generic[StateT]):
             state: state of the frame before, or ``initial_state(B)``.
             dt: s since that frame, float or (B,). A started row skips a frame that is not later (0 or
                 negative). If it is not finite, an interval is assumed.
-            lane_width: m, float, (B,) or (B, L-1) per lane.
+            lane_width: m, float, (B,) or (B, L-1) per lane. It counts as exact, also the default, except for
+                the ``lane_width_std`` of the configuration: 0 unless given.
 
         Returns:
             calibration of this frame, which shares no memory with the inputs, and the state after it.

@@ -27,7 +27,7 @@ def calibrate_still(
         calibrator: any.
         segments: B images.
         intrinsics: (B, 3, 3) px.
-        lane_width: m, float, (B,) or (B, L-1).
+        lane_width: m, float, (B,) or (B, L-1); exact, except for the calibrator's ``lane_width_std``.
 
     Returns:
         the calibration of each image.

@@ -115,7 +115,7 @@ class OnnxCalibrator(Calibrator[StateT]):
         super().__init__()
         self.part, self.calibrator = part, calibrator
         self.state_type, self.num_boundaries = calibrator.state_type, calibrator.num_boundaries
-        self.still_passes = calibrator.still_passes
+        self.still_passes, self.lane_width_std = calibrator.still_passes, calibrator.lane_width_std
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None

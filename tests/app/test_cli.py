@@ -23,9 +23,10 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from lanebev import Camera, Extrinsics, JointCalibrator, image_from_road_points
-from lanebev.app.config import LANE_WIDTH, LANE_WIDTH_STD, RunConfig
+from lanebev.app.config import RunConfig
 from lanebev.app.summary import untracked_words
 from lanebev.cli import main
+from lanebev.estimation.lane_width_prior import LANE_WIDTH, LANE_WIDTH_STD
 from lanebev.estimation.mount import MountReason
 from lanebev.io.results import CSV_COLUMNS, ExtrinsicsRow, write_extrinsics
 from lanebev.io.state import load_state

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lanebev import Camera, Extrinsics, LaneBEV, Status, image_from_road_points
+from lanebev import Camera, Extrinsics, LaneBEV, Session, Status, image_from_road_points
 from lanebev.app.build import make_camera, make_tracker
 from lanebev.app.config import FOV_FOCAL_STD, RunConfig
 from lanebev.app.observers import NetworkObserver
@@ -89,6 +89,28 @@ def test_a_lane_width_that_nobody_stated_is_unsure():
     assert stated < 1
     assert wrongly_sure > 3
     assert 1 < unsure < 3
+
+
+@pytest.mark.parametrize(
+    "widths",
+    [
+        {},
+        {"lane_width": 3.5},
+        {"lane_width_std": 0.1},
+        {"lane_width": 3.5, "lane_width_std": 0.1},
+        {"lane_width": None, "lane_width_std": 0},
+    ],
+)
+def test_a_session_is_as_sure_of_the_lane_width_as_a_run(widths):
+    camera = Camera.from_fov(60.0, 1280, 720)
+    drawn = lines(camera)
+    tracker, by_run = tracked(RunConfig("a", "b", **widths), camera, drawn)
+    session = Session(camera, **widths)
+    for k in range(3):
+        live = session(polylines=[line.points for line in drawn], stamp=k / 30)
+    assert by_run.extrinsics.height.item() == pytest.approx(live.extrinsics.height.item(), abs=1e-9)
+    torch.testing.assert_close(live.calibration.covariance, by_run.covariance, atol=1e-12, rtol=1e-6)
+    torch.testing.assert_close(live.mount.covariance, tracker.mount.covariance, atol=1e-12, rtol=1e-6)
 
 
 def test_lane_width_is_a_share_of_height_alone():

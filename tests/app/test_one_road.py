@@ -83,6 +83,20 @@ def test_one_road(drive, tmp_path, calibrator, far_view):
 
 
 @pytest.mark.parametrize("calibrator", ["joint", "two-stage"])
+def test_one_road_with_a_lane_width_that_nobody_stated(drive, tmp_path, calibrator):
+    source, camera = str(drive / "drive.mp4"), str(drive / "camera.yaml")
+    by_run = run(RunConfig(source, camera, str(tmp_path / "run"), calibrator=calibrator)).rows
+    session = Session(Camera.from_file(camera), calibrator=make_calibrator(calibrator), colours="rgb")
+    live = []
+    for frame in open_source(source):
+        result = session(frame.image, stamp=frame.time)
+        weight = torch.ones(1, 11)
+        live.append(extrinsics_row(frame.number, frame.time, result.calibration, weight, ""))
+    np.testing.assert_allclose(_numbers(live), _numbers(by_run), atol=1e-6, rtol=0)
+    assert all(row.height_std_m > 0.2 / 3.7 * row.height_m for row in live)
+
+
+@pytest.mark.parametrize("calibrator", ["joint", "two-stage"])
 def test_one_road_of_a_still(drive, tmp_path, calibrator):
     """The calls of docs/tutorials/embed.md give what a run on one image gives."""
     frame = next(iter(open_source(str(drive / "drive.mp4"))))

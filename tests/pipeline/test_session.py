@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -44,7 +45,7 @@ def numbers(result):
 
 
 def test_polylines_give_the_pose_the_sigmas_and_the_mount():
-    session = Session(CAMERA)
+    session = Session(CAMERA, lane_width=3.7)
     for k in range(20):
         result = session(polylines=lines(), stamp=100.0 + k / 20)
     assert result.status == Status.TRACKING
@@ -181,6 +182,52 @@ def test_an_unsure_focal_length_widens_the_pose():
     assert grown == pytest.approx(0.1 * math.sin(POSE[0]), rel=0.05)
 
 
+@pytest.mark.parametrize(
+    ("settings", "added"),
+    [
+        ({}, 0.2 / 3.7),
+        ({"lane_width": 3.7, "lane_width_std": 0.1}, 0.1 / 3.7),
+        ({"lane_width_std": 0.0}, 0.0),
+        ({"lane_width": None, "calibrator": JointCalibrator()}, 0.2 / 3.7),
+        ({"lane_width": None, "calibrator": TwoStageCalibrator()}, 0.2 / 3.7),
+    ],
+)
+def test_height_is_as_unsure_as_the_lane_width(settings, added):
+    """A width that is given is exact; one that is not has a standard deviation of 0.2 m."""
+    calibrator = deepcopy(settings.get("calibrator"))
+    sessions = Session(CAMERA, calibrator=calibrator, lane_width=3.7), Session(CAMERA, **settings)
+    for k in range(5):
+        exact, unsure = (each(polylines=lines(), stamp=k / 10) for each in sessions)
+    assert torch.equal(exact.extrinsics.stack(), unsure.extrinsics.stack())
+    for pair in ((exact, unsure), (exact.mount, unsure.mount)):
+        covariances = [getattr(each, "calibration", each).covariance for each in pair]
+        more = torch.zeros(1, 4, 4, dtype=torch.float64)
+        more[0, 3, 3] = (added * float(pair[1].extrinsics.height)) ** 2
+        torch.testing.assert_close(covariances[1], covariances[0] + more, atol=1e-12, rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [JointCalibrator, TwoStageCalibrator])
+def test_a_lane_width_std_of_the_calibrator_counts_once(kind):
+    known = Session(CAMERA, calibrator=kind(), lane_width=3.7)
+    own = Session(CAMERA, calibrator=kind(lane_width_std=0.2))
+    for k in range(5):
+        exact, unsure = (each(polylines=lines(), stamp=k / 10).calibration for each in (known, own))
+    grown = (unsure.covariance - exact.covariance)[0, 3, 3].sqrt()
+    assert float(grown) == pytest.approx(0.2 / 3.7 * float(exact.extrinsics.height), rel=1e-3)
+
+
+def test_a_height_by_a_lane_width_that_nobody_stated_is_within_three_sigma():
+    """Lanes of 3.25 m, of which nobody tells."""
+    drawn = lines(places=(-4.875, -1.625, 1.625, 4.875))
+    errors = []
+    for settings in ({}, {"lane_width": 3.7}):
+        session = Session(CAMERA, **settings)
+        for k in range(5):
+            result = session(polylines=drawn, stamp=k / 10)
+        errors.append(float((result.extrinsics.height - POSE[3]) / result.std.height))
+    assert 1 < errors[0] < 3 < errors[1]
+
+
 def test_polylines_are_as_sure_as_they_are_said_to_be():
     """At the start, where nothing else is known, the pose is as unsure as the lines."""
     stds = [Session(CAMERA, polyline_sigma=s)(polylines=lines(), stamp=0.0).std.pitch.item() for s in (1, 2)]
@@ -224,6 +271,8 @@ def test_careless_arguments_are_named():
         session(stamp=math.nan)
     with pytest.raises(ValueError, match="lane_width: expected 1 to 10 m"):
         Session(CAMERA, lane_width=370)
+    with pytest.raises(ValueError, match="lane_width_std: expected 0 to 2 m, got -"):
+        Session(CAMERA, lane_width_std=-0.1)
     with pytest.raises(ValueError, match="colours: expected 'bgr' or 'rgb'"):
         Session(CAMERA, colours="gray")
 
@@ -234,6 +283,9 @@ def test_careless_arguments_are_named():
         ({"model": "weights"}, TypeError, "model: expected a lanebev.LaneBEV or None, got str"),
         ({"calibrator": JointCalibrator}, TypeError, "Calibrator or None, got the class JointCalibrator"),
         ({"lane_width": "3.7"}, TypeError, "lane_width: expected a number, got str"),
+        ({"lane_width_std": True}, TypeError, "lane_width_std: expected a number, got bool"),
+        ({"lane_width": math.nan}, ValueError, "lane_width: expected 1 to 10 m, got nan"),
+        ({"lane_width_std": math.nan}, ValueError, "lane_width_std: expected 0 to 2 m, got nan"),
         ({"focal_std": -0.1}, ValueError, "focal_std: expected a fraction of the focal length, 0 to 1, got"),
         ({"focal_std": 5}, ValueError, "0 to 1, got 5"),
         ({"device": "gpu"}, ValueError, "device: expected one that torch can use here, got gpu: "),

@@ -90,6 +90,7 @@ class JointCalibrator(Calibrator[JointState]):
             raise ValueError("config: expected either a JointConfig or its keywords, got both")
         self.config = config or JointConfig(**numbers)  # type: ignore[arg-type]
         self.num_boundaries = self.config.num_boundaries
+        self.lane_width_std = self.config.lane_width_std
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None

@@ -84,8 +84,9 @@ def fit_single_frame(
 
     Only the likeliest reading is fitted, and ``covariance`` assumes that it is right:
 
-    * lanes have the width ``lane_width``. Height is proportional to it. If two lanes differ by half a metre,
-      roll is wrong by up to some degrees, many times its sigma;
+    * lanes have exactly the width ``lane_width``, also the default. Height is proportional to it; for an
+      uncertain width add :func:`~lanebev.geometry.road.lane_width_covariance` to ``covariance``. If two lanes
+      differ by half a metre, roll is wrong by up to some degrees, many times its sigma;
     * every boundary bounds a lane and has the given index. What fits no lane is an outlier, but a kerb or an
       arrow in the place of a boundary is not recognised;
     * roll is observed with two lanes or more, height with one, pitch and yaw with two boundaries. The rest is

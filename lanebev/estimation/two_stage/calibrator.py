@@ -43,6 +43,7 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
             raise ValueError("config: expected either a TwoStageConfig or its keywords, got both")
         self.config = config or TwoStageConfig(**numbers)  # type: ignore[arg-type]
         self.num_boundaries = self.config.num_boundaries
+        self.lane_width_std = self.config.lane_width_std
         self.draws: Tensor
         self.register_buffer("draws", self._drawn(torch.get_default_device()), persistent=False)
 
