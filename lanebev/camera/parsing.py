@@ -10,7 +10,7 @@ import json
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import yaml
@@ -151,22 +151,40 @@ def _xml_value(element: ET.Element) -> Any:
 
 
 def required(fields: Mapping[str, Any], keys: Sequence[str]) -> Any:
-    """Return the value of the one of these spellings of a key that is there.
+    """Return the value of the first of these spellings of a key that is there.
 
     Raises:
-        ValueError: none of them is, or two with different values.
+        ValueError: none of them is.
     """
+    return fields[_given(fields, keys)[0]]
+
+
+def _given(fields: Mapping[str, Any], keys: Sequence[str]) -> list[str]:
+    """Return which of these spellings of a key are there, at least one."""
     given = [key for key in keys if fields.get(key) is not None]
     if not given:
         raise ValueError(f"{keys[0]}: expected a value, got none; add the entry")
-    if any(fields[key] != fields[given[0]] for key in given):
+    return given
+
+
+def _read_once(
+    fields: Mapping[str, Any], keys: Sequence[str], read: Callable[[Any], list[float]]
+) -> list[float]:
+    """Return the numbers that ``read`` finds in the value of a key; in another spelling they are the same.
+
+    Raises:
+        ValueError: no spelling of the key is there, or two with different numbers.
+    """
+    given = _given(fields, keys)
+    first, *others = (read(fields[key]) for key in given)
+    if any(other != first for other in others):
         raise ValueError(f"expected one of {' and '.join(given)}, got both, which differ; keep the right one")
-    return fields[given[0]]
+    return first
 
 
 def number(fields: Mapping[str, Any], *keys: str) -> float:
     """Return the finite number of a key."""
-    return finite_numbers(keys[0], [required(fields, keys)], 1)[0]
+    return _read_once(fields, keys, lambda value: finite_numbers(keys[0], [value], 1))[0]
 
 
 def whole_number(fields: Mapping[str, Any], *keys: str) -> int:
@@ -179,7 +197,10 @@ def whole_number(fields: Mapping[str, Any], *keys: str) -> int:
 
 def numbers(fields: Mapping[str, Any], *keys: str, count: int | None = None) -> list[float]:
     """Return the entries of ``{rows, cols, data}`` or of a (nested) list, row by row."""
-    name, value = keys[0], required(fields, keys)
+    return _read_once(fields, keys, lambda value: _numbers(keys[0], value, count))
+
+
+def _numbers(name: str, value: Any, count: int | None) -> list[float]:
     if isinstance(value, Mapping):
         return finite_numbers(name, *_opencv_data(name, value, count))
     entries = list(itertools.islice(_entries(_sequence(name, value)), _MOST_NUMBERS + 1))

@@ -382,6 +382,23 @@ def test_two_values_of_one_quantity_are_refused(tmp_path, more, words):
         Camera.from_file(tmp_path / "c.yaml")
 
 
+@pytest.mark.parametrize(
+    "more",
+    [
+        "K: [60.0, 0, 31.5, 0, 60, 23.50, 0, 0, 1]",
+        "K: [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]",
+        "D: [-1e-1, 0, 0, 0, 0]",
+        "width: 64.0",
+    ],
+)
+def test_one_value_written_in_two_ways_is_taken(tmp_path, more):
+    camera = Camera.from_parameters(60, 60, 31.5, 23.5, 64, 48, (-0.1, 0.0, 0.0, 0.0, 0.0))
+    camera.to_file(tmp_path / "c.yaml")
+    with open(tmp_path / "c.yaml", "a") as file:
+        file.write(f"{more}\n")
+    assert torch.equal(Camera.from_file(tmp_path / "c.yaml").intrinsics, camera.intrinsics)
+
+
 def test_what_python_dumps(tmp_path):
     fields = {"K": (500.0, 0, 320.0, 0, 500.0, 240.0, 0, 0, 1), "D": (), "width": 640, "height": 480}
     _is(_read(tmp_path / "c.yaml", yaml.dump(fields)), 500, 500, 320, 240, 640, 480)
