@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import glob
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -201,11 +202,13 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
         end, edited = Fraction(0), False
         shown = [pts for pts in lost if first is not None and pts < first]
         telling = stream.codec_context.name not in _HIDING
-        keys: list[int] = []
+        keys: list[tuple[int, float]] = []
+        latest = -math.inf
         for packet in packets(container, stream):
-            keys += [packet.pts] if packet.is_keyframe and packet.pts is not None else []
             telling = telling and (packet.pts is not None or not packet.size)
             if packet.pts is not None:
+                keys += [(packet.pts, latest)] if packet.is_keyframe else []
+                latest = max(latest, packet.pts)
                 edited = edited or packet.is_discard
                 # what precedes the first frame is not shown: it lacks a key frame
                 if not packet.is_discard and (first is None or packet.pts >= first):

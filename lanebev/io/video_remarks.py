@@ -48,10 +48,16 @@ def stream_remarks(
     return remarks
 
 
-def restart_remark(times: Sequence[int]) -> str:
-    """Return a remark on times of key frames, in the order of the file, that do not rise; else nothing."""
-    falls = any(after <= before for before, after in pairwise(times))
-    return "its times begin again, as of files joined byte by byte; is it one drive?" if falls else ""
+def restart_remark(keys: Sequence[tuple[int, float]]) -> str:
+    """Return a remark on times of key frames that fall or begin again in the file; else nothing.
+
+    Equal times of frames one after another are no such case: very fast videos round them to the same tick.
+
+    Args:
+        keys: time of each key frame, and the latest one of all frames before it in the file, both in ticks.
+    """
+    begins_again = any(time <= before and time < latest for (before, _), (time, latest) in pairwise(keys))
+    return "its times begin again, as of files joined byte by byte; is it one drive?" if begins_again else ""
 
 
 def gap_remark(times: Sequence[int], tick: Fraction) -> str:

@@ -250,6 +250,21 @@ def test_times_that_begin_again_are_said(tmp_path, parts):
     assert _joined(tmp_path / "w.ts", [range(20), range(20, 40)]).problem == ""
 
 
+def test_times_rounded_to_the_same_tick_do_not_begin_again(tmp_path):  # Matroska's are whole ms
+    path = tmp_path / "v.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mjpeg", rate=2000)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
+        for pts in range(20):
+            frame = av.VideoFrame(64, 48, "yuvj420p")
+            frame.pts, frame.time_base = pts, Fraction(1, 2000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    source = open_source(str(path))
+    assert "begin again" not in source.problem
+    assert len(source.times) == source.count == 20
+
+
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])
 def test_a_gap_of_hours_is_said_and_changes_no_frame_rate(tmp_path, suffix):
     path = tmp_path / f"v.{suffix}"
