@@ -48,8 +48,9 @@ def text_width(text: str, size: int, bold: bool = False) -> float:
 
 
 def _printable(text: str) -> str:
-    """Return a text with a sign for what no font has, such as bytes of a file's name that are no letters."""
-    return "".join(letter if letter.isprintable() else "\ufffd" for letter in text)
+    """Return a text with plain spaces, and a sign for what no font has, such as bytes that are no letters."""
+    spaced = (" " if letter.isspace() else letter for letter in text)
+    return "".join(letter if letter.isprintable() else "\ufffd" for letter in spaced)
 
 
 @lru_cache(maxsize=64)

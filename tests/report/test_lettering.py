@@ -28,6 +28,14 @@ def test_any_name_can_be_written(name):
     assert (text_width(name, 18) > 0) == bool(name)
 
 
+@pytest.mark.parametrize("space", ["\u202f", "\xa0", "\n"])  # the first one is in names of macOS
+def test_any_space_is_written_as_a_space(space):
+    pictures = np.zeros((2, 30, 90, 3), np.uint8)
+    for picture, name in zip(pictures, (f"1{space}AM", "1 AM"), strict=True):
+        write_text(picture, (5, 5), name, (255, 255, 255), 18)
+    np.testing.assert_array_equal(*pictures)
+
+
 def test_text_is_cut_at_the_border():
     picture = np.zeros((30, 40, 3), np.uint8)
     for place in ((-8, 5), (30, 5), (5, -8), (5, 24), (300, 5), (5, 300), (-300, 5), (5, -300)):
