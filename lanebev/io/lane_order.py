@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from lanebev.io.lane_parsing import FrameLines
 
+_LEAST_FRAMES = 10  # with lanes, among which each boundary is seen in one
+
 
 def check_boundary_order(frames: Sequence[FrameLines]) -> None:
     """Raise if the boundary numbers fall from left to right in most pairs of neighbours.
@@ -30,8 +32,11 @@ def check_boundary_order(frames: Sequence[FrameLines]) -> None:
 def left_out_remark(frames: Sequence[FrameLines]) -> str:
     """Return which boundary number no frame has between two that some have; else nothing.
 
-    Numbers of classes may leave one out, and the lane between the two is taken for two lanes.
+    Numbers of classes may leave one out, and the lane between the two is taken for two lanes. In a few frames
+    a boundary may just not be seen.
     """
+    if sum(bool(frame.lines) for frame in frames) < _LEAST_FRAMES:
+        return ""
     numbers = sorted({line.boundary for frame in frames for line in frame.lines if line.boundary is not None})
     skipping = [(left, right) for left, right in pairwise(numbers) if right > left + 1]
     if not skipping:

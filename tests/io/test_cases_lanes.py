@@ -271,12 +271,18 @@ def numbered(*numbers):
 
 
 def test_a_boundary_number_that_no_frame_has_is_noticed():
-    assert left_out_remark([numbered(1, 2, 4, 5), FrameLines("1.png", [])]) == (
+    skipping = [numbered(1, 2, 4, 5)] * 10
+    assert left_out_remark([*skipping, FrameLines("1.png", [])]) == (
         "lanes: no frame has boundary 3, so that 2 and 4 are taken to have 2 lanes between them; if it is "
         "one, number its boundaries one after the other"
     )
-    for frames in ([], [numbered(None, None, None, None)], [numbered(1, 2, 4, 5), numbered(1, 2, 3, 4)]):
+    unnumbered = [numbered(None, None, None, None)] * 10
+    for frames in ([], unnumbered, [*skipping, numbered(1, 2, 3, 4)]):
         assert left_out_remark(frames) == ""
+
+
+def test_a_boundary_may_be_hidden_in_a_few_images():
+    assert left_out_remark([numbered(1, 2, 4, 5)] * 9 + [FrameLines("1.png", [])] * 9) == ""
 
 
 def test_boundary_numbers_that_fall_from_left_to_right_are_refused():
