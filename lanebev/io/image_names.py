@@ -114,14 +114,14 @@ def _times_since_1970(paths: Sequence[str]) -> Sequence[Fraction]:
     if all(seconds):
         whole = [int(match[1]) for match in seconds if match]
         times = with_fractions(whole, [match[2] for match in seconds if match])
-        return times if _are_of_our_days(times) else ()
+        return times if _are_plausible(times) else ()
     if all(stamps) and len({len(match[1]) for match in stamps if match}) == 1:
         return _times_of_stamps([match[1] for match in stamps if match])
     return ()
 
 
 def _times_of_stamps(stamps: Sequence[str]) -> Sequence[Fraction]:
-    """Return times (s) by whole numbers of one length; none if they are of other days than ours.
+    """Return times (s) by whole numbers of one length; none if one is not from 1980 to 2040.
 
     They are 10 digits of seconds and those of a fraction. If that gives no such time they are nanoseconds
     since 1980, as in Argoverse. Of 18 digits with a fraction, as in OpenLane, the last two are zeros.
@@ -130,11 +130,11 @@ def _times_of_stamps(stamps: Sequence[str]) -> Sequence[Fraction]:
     is_whole = digits != 8 or all(stamp.endswith("00") for stamp in stamps)
     units = (10**digits, 10**9) if is_whole else (10**9,)
     readings = ([Fraction(int(stamp), unit) for stamp in stamps] for unit in units)
-    return next(filter(_are_of_our_days, readings), ())
+    return next(filter(_are_plausible, readings), ())
 
 
-def _are_of_our_days(times: Sequence[Fraction]) -> bool:
-    """Tell whether all times (s since 1970) are from 1980 to 2040."""
+def _are_plausible(times: Sequence[Fraction]) -> bool:
+    """Tell whether all times (s since 1970) are from 1980 to 2040, as those of drives are."""
     return all(_EPOCH[0] <= time < _EPOCH[1] for time in times)
 
 

@@ -24,8 +24,9 @@ _UNREADABLE = (  # what Pillow raises of files that are cut or none
 def is_image(path: str | Path) -> bool:
     """Return whether there is a file with an image's suffix, or a link to one that is not there."""
     path = Path(path)
-    is_there = path.is_file() or (path.is_symlink() and not path.exists())
-    return is_there and path.suffix.lower() in IMAGE_SUFFIXES
+    if path.suffix.lower() not in IMAGE_SUFFIXES:
+        return False
+    return path.is_file() or (path.is_symlink() and not path.exists())
 
 
 def read_image(path: str | Path) -> NDArray[np.uint8]:

@@ -265,7 +265,7 @@ def _times_since_first(shown: Sequence[int], tick: Fraction, fps: Fraction) -> t
 def _rate_of_times(times: Sequence[int], tick: Fraction, stated: Fraction) -> Fraction:
     """Return the stated frame rate, or that of the times (ticks) where it is near neither mean nor median.
 
-    Pauses of the recording tell nothing of it.
+    Steps longer than ``LONGEST_STEP``, which are pauses of the recording, do not count.
     """
     steps = np.diff(np.unique(times))
     steps = steps[steps * float(tick) <= LONGEST_STEP]

@@ -1,4 +1,4 @@
-"""What is odd about a video as a whole: its streams, its frames' layout, its times, what is appended."""
+"""Remarks on a whole video: its streams, the layout of its frames, its times, and a video appended to it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import av
 from lanebev.io.decoding import moving_pictures
 
 LONGEST_STEP = 60  # s between two frames of a drive
-_ROUND = range(4)  # AVSphericalProjection: equirectangular, cube maps, half of one
+_SPHERICAL = range(4)  # AVSphericalProjection: equirectangular, cube maps, half of one
 _OF_TWO_CAMERAS = range(1, 8)  # AVStereo3DType: side by side, one above the other, in turn, ...
 
 
@@ -37,7 +37,7 @@ def stream_remarks(
         )
     # the first field of the side data's C structures is the kind
     kinds = {data.type.name: int.from_bytes(bytes(data)[:4], sys.byteorder) for data in frame.side_data}
-    if kinds.get("SPHERICAL") in _ROUND:
+    if kinds.get("SPHERICAL") in _SPHERICAL:
         remarks.append("its header says 360 degrees; cut out a pinhole view, as by ffmpeg -vf v360")
     if kinds.get("STEREO3D") in _OF_TWO_CAMERAS:
         remarks.append("its header says that frames have the images of two cameras; crop them to one")
