@@ -18,6 +18,7 @@ from lanebev.estimation.joint.scatter import (
     averaged_moments,
     boundary_scatter,
     scatter_variance,
+    start_variance,
     with_headings,
 )
 from lanebev.estimation.joint.single_frame import fit_observations
@@ -76,7 +77,7 @@ def test_the_variances_of_places_and_headings_are_found(place_std, heading_std):
 def test_parallel_boundaries_add_almost_nothing(visible):
     """With noise of 1 px, after half a second."""
     drive = moments(0.6, lambda t, m: replace(m, visible=visible))
-    calibrator = JointCalibrator(lane_deviation_std=0.0)
+    calibrator = JointCalibrator(lane_deviation_std=0.0, start_heading_std=0.0)
     state = calibrator.initial_state(8, dtype=DOUBLE)
     for moment, segments in see(drive, 8, 1.0, 20, 4, DOUBLE):
         calibration, state = calibrator(segments, CAMERA.expand(8, 3, 3), state, moment.dt, WIDTH)
@@ -113,6 +114,32 @@ def test_few_degrees_of_freedom_enlarge_the_variance():
     few, many = (torch.tensor([[[1e-4 * n, n, 1.0]] * 2], dtype=DOUBLE) for n in (1.0, 100.0))
     assert (scatter_variance(few) > 2 * scatter_variance(many)).all()
     assert scatter_variance(many).tolist() == [pytest.approx([1e-4, 1e-4], rel=0.03)]
+
+
+def test_the_variance_of_a_start_decreases_with_time_and_with_degrees_of_freedom():
+    """By e in two seconds, and by e² for each degree of freedom, of deviations and headings together."""
+    now = torch.tensor([[[0.0, 0.0, 1.0]] * 2, [[0.0, 0.25, 1.0]] * 2, [[0.0, 1.0, 1.0]] * 2], dtype=DOUBLE)
+    two_seconds = torch.full((3,), 2.0, dtype=DOUBLE)
+    later = averaged_moments(now, torch.zeros_like(now), two_seconds, 1.0)
+    expected = torch.tensor([0.0, math.exp(-1 - 1), math.exp(-1 - 4)], dtype=DOUBLE)
+    torch.testing.assert_close(start_variance(later, 0.003) / 0.003**2, expected)  # the first: no frame yet
+
+
+@pytest.mark.parametrize(
+    ("visible", "least", "most"), [((0, 1, 2, 3, 4, 5), 1.0, 1.05), ((1, 2, 3), 1.25, 1.5)]
+)
+def test_a_start_with_few_boundaries_claims_less_and_one_with_all_as_much(visible, least, most):
+    """Standard deviation of the pitch with what a start assumes, over that without."""
+    [moment] = moments(ONE_FRAME, lambda t, m: replace(m, visible=visible))
+    stds = []
+    for config in (JointConfig(), JointConfig(start_heading_std=0.0)):
+        calibrator = JointCalibrator(config)
+        state = calibrator.initial_state(4, dtype=DOUBLE)
+        _, segments = next(iter(see([moment], 4, 1.0, 20, 7, DOUBLE)))
+        calibration, _ = calibrator(segments, CAMERA.expand(4, 3, 3), state, ONE_FRAME, WIDTH)
+        stds.append(calibration.covariance[:, PITCH, PITCH].sqrt())
+    ratio = stds[0] / stds[1]
+    assert ((ratio >= least) & (ratio <= most)).all()
 
 
 def test_boundaries_that_are_askew_may_be_out_of_place_where_nothing_shows_it():

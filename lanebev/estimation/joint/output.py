@@ -9,7 +9,7 @@ from lanebev.estimation.joint.evidence import EQUAL
 from lanebev.estimation.joint.frame_prior import student_density
 from lanebev.estimation.joint.layout import POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL
-from lanebev.estimation.joint.scatter import scatter_variance
+from lanebev.estimation.joint.scatter import scatter_variance, start_variance
 from lanebev.estimation.joint.state import JointConfig, JointState
 from lanebev.estimation.reasons import Reason
 from lanebev.tensors import constant
@@ -114,7 +114,9 @@ def covariance_by_boundaries(state: JointState, cfg: JointConfig) -> Tensor:
     by_place = state.pose_sensitivity[..., : cfg.num_boundaries]
     unverified = unverified_deviation(by_place, deviations, of_headings, state.mean[:, ROLL], cfg)
     expected = single_deviation(deviations, cfg).maximum(unverified)
-    each = torch.stack([beyond_filter(expected, variances).maximum(of_places), of_headings], dim=-1)  # (B, 2)
+    of_places = of_places.maximum(beyond_filter(expected, variances))
+    of_headings = of_headings + start_variance(state.scatter, cfg.start_heading_std)
+    each = torch.stack([of_places, of_headings], dim=-1)  # (B, 2)
     each = each.repeat_interleave(cfg.num_boundaries, dim=-1).unsqueeze(1)  # (B, 1, 2 L)
     return torch.bmm(each * state.pose_sensitivity, state.pose_sensitivity.mT)
 

@@ -27,6 +27,7 @@ _NOISE_FACTOR = 1.5  # on the noise variance of the estimates, which is subtract
 _ADDED_FREEDOM = 0.2  # degrees of freedom that are added, since there may be none
 _FEW_FREEDOM = 2.0  # degrees of freedom at which a variance is doubled, because it may be small by chance
 _LEAST_SENSITIVITY = 0.001  # rad/m or m/m of roll or height, below which a boundary is not in view
+_BY_FREEDOM = 2.0  # decrease of the log of a start's variance by each degree of freedom of a frame
 _LEAST_WEIGHT = 1e-9  # of the frames before; 0 before the first
 _FULL_FREEDOM = 0.5  # degrees of freedom from which a frame counts fully
 
@@ -130,6 +131,24 @@ def scatter_variance(moments: Tensor) -> Tensor:
     weight = weight.clamp(min=_LEAST_WEIGHT)
     freedom = freedom / weight + _ADDED_FREEDOM
     return squares.clamp(min=0.0) / weight / freedom * (1 + _FEW_FREEDOM / freedom)
+
+
+def start_variance(moments: Tensor, heading_std: float) -> Tensor:
+    """Compute the variance (B,) rad² of a boundary's own heading that is left from the start.
+
+    Source: (J28), of a start. The first frames of a street may fit parallel boundaries by chance, and the
+    frames after them show the same boundaries. The variance decreases with the degrees of freedom of a frame
+    and with the time for which frames have had any; it is 0 before.
+
+    Args:
+        moments: (B, 2, 3), averaged.
+        heading_std: rad, at a start whose frame has no degrees of freedom.
+    """
+    freedom, weight = moments[..., 1].sum(-1), moments[:, 0, 2]
+    of_frame = freedom / weight.clamp(min=_LEAST_WEIGHT)
+    by_time = (1 - weight).clamp(min=_LEAST_WEIGHT).sqrt()  # falls by e in two time constants
+    left = by_time * (-_BY_FREEDOM * of_frame).exp()
+    return heading_std**2 * torch.where(weight > 0, left, 0.0)
 
 
 def remembered_sensitivity(now: Tensor, before: Tensor, step: Tensor, cfg: JointConfig) -> Tensor:

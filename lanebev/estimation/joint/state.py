@@ -36,6 +36,8 @@ class JointConfig:
         lane_width_std: sigma of the common scale of the lane widths, m; 0: the widths are exact.
         scatter_memory: time constant, s, of the mean squares of the boundaries' own deviations and headings;
             inf: they are taken for 0.
+        start_heading_std: standard deviation of a boundary's own heading at a start, rad, unless frames show
+            that boundaries are parallel; its variance decays over twice ``scatter_memory``.
         lane_deviation_std: sigma of a boundary's deviation where too few are in view to tell whether lanes
             are equal, m; 0: lanes are equal.
         no_boundary_odds: prior odds that one of three lines in view bounds no lane; 0: each does.
@@ -70,6 +72,7 @@ class JointConfig:
     start_iterations: int = 8
     lane_width_std: float = 0.0
     scatter_memory: float = 1.0
+    start_heading_std: float = 0.003
     lane_deviation_std: float = 0.05
     no_boundary_odds: float = 0.25
     motion: MotionConfig = field(default_factory=MotionConfig)
