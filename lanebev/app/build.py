@@ -9,6 +9,7 @@ from pathlib import Path
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import FarViewObserver, LaneFileObserver, NetworkObserver, Observer
 from lanebev.app.shared_network import SharedNetwork
+from lanebev.camera.choice import camera_file
 from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator, StateT
 from lanebev.estimation.joint.calibrator import JointCalibrator
@@ -146,7 +147,8 @@ def input_files(config: RunConfig, source: FrameSource) -> list[str | Path]:
     """Return the files that a run reads and does not mean to replace."""
     lanes = [] if config.lanes is None else lane_files(config.lanes)
     weights = [] if config.weights is None else [config.weights]
-    files = [path for path in (config.camera, config.mount) if path]
+    files: list[str | Path] = [camera_file(config.camera)] if config.camera else []
+    files += [config.mount] if config.mount else []
     return [*(source.paths or [source.source]), *files, *lanes, *weights]
 
 

@@ -50,7 +50,8 @@ class RunConfig:
     )
     camera: str = option(
         "",
-        "camera file of OpenCV, ROS, Kalibr, EuRoC, KITTI or nuScenes, or YAML with fx fy cx cy width height",
+        "camera file of OpenCV, ROS, Kalibr, EuRoC, KITTI or nuScenes, or YAML with fx fy cx cy width height "
+        "(FILE#NAME: one of several cameras)",
         "FILE",
     )
     out: str = option("lanebev-out", "output folder (default {})", "DIR")

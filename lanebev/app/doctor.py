@@ -86,6 +86,8 @@ def doctor(config: RunConfig, progress: Progress | None = None) -> tuple[str, in
     source = make_source(config)
     camera = camera_of(config, source)
     findings = [check_size(camera, source.image_size)]
+    if camera.remark:
+        findings.append(Finding(DOUBT, f"file: {camera.remark}"))
     if findings[0].level != WRONG:
         findings += [check_field_of_view(camera), check_centre(camera), check_lens(camera)]
         findings.append(check_pixels(camera, source.pixel_aspect))

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
+from lanebev.camera.choice import Readers
 from lanebev.camera.parameters import CameraParameters, centre_offset
 from lanebev.camera.parsing import numbers, whole_number
 from lanebev.numbers import finite_numbers, shown
 
 _KITTI = re.compile(r"^[ \t]*P(?:_rect_)?\d+[ \t]*:", re.MULTILINE | re.ASCII)
-_COLMAP = re.compile(r"^[ \t]*\d+[ \t]+([A-Z_]+)[ \t]+(\d{1,6})[ \t]+(\d{1,6})[ \t]+(.+)$", re.MULTILINE)
+_COLMAP = re.compile(r"^[ \t]*(\d+)[ \t]+([A-Z_]+)[ \t]+(\d{1,6})[ \t]+(\d{1,6})[ \t]+(.+)$", re.MULTILINE)
 _COLMAP_MODELS = {  # names of their parameters
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fx fy cx cy",
@@ -19,6 +21,8 @@ _COLMAP_MODELS = {  # names of their parameters
     "RADIAL": "f cx cy k1 k2",
     "OPENCV": "fx fy cx cy k1 k2 p1 p2",
     "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
     "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
 }
 _KITTI_SIZES = {  # focal length of the rectified cameras of each recording day -> (height, width)
@@ -39,17 +43,25 @@ def is_kitti(text: str) -> bool:
     return _KITTI.search(text) is not None
 
 
-def kitti(text: str, image_size: tuple[int, int] | None) -> CameraParameters:
-    """Read KITTI's ``calib.txt`` or ``calib_cam_to_cam.txt``: the left colour camera's rectified images."""
+def kitti_cameras(text: str, image_size: tuple[int, int] | None) -> Readers:
+    """Return what reads the rectified cameras of KITTI's ``calib.txt`` or ``calib_cam_to_cam.txt``.
+
+    The left colour camera is the usual one.
+    """
     lines = (line.split(":", 1) for line in text.splitlines() if ":" in line)
     entries = {name.strip(): values for name, values in lines}
     names = [f"P_rect_{i:02d}" for i in (2, 3, 0, 1)] + [f"P{i}" for i in (2, 3, 0, 1)]
-    name = next((n for n in names if n in entries), None)
-    if name is None:
+    found = {name: partial(_kitti, entries, name, image_size) for name in names if name in entries}
+    if not found:
         raise ValueError(
             "expected P_rect_02 or P2 of KITTI, or keys such as fx: 1150, got "
             f"{shown(next(iter(text.split()), ''))}"
         )
+    return found
+
+
+def _kitti(entries: Mapping[str, str], name: str, image_size: tuple[int, int] | None) -> CameraParameters:
+    """Read the entry of a rectified camera."""
     projection = finite_numbers(name, entries[name].split(), 12)
     known = next((s for f, s in _KITTI_SIZES.items() if abs(f - projection[0]) < 1e-3), None)
     if (size_name := name.replace("P", "S", 1)) in entries:
@@ -76,15 +88,16 @@ def is_colmap(text: str) -> bool:
     return _COLMAP.search(text) is not None
 
 
-def colmap(text: str) -> CameraParameters:
-    """Read COLMAP's ``cameras.txt`` of one camera.
+def colmap_cameras(text: str) -> Readers:
+    """Return what reads the cameras of COLMAP's ``cameras.txt``, by their numbers."""
+    return {number: partial(_colmap, *values) for number, *values in _COLMAP.findall(text)}
+
+
+def _colmap(name: str, width: str, height: str, values: str) -> CameraParameters:
+    """Read a camera's line.
 
     Source: COLMAP, sensor/models.h; the centre of its first pixel is at (0.5, 0.5).
     """
-    found = _COLMAP.findall(text)
-    if len(found) != 1:
-        raise ValueError(f"expected one camera, got {len(found)}; keep the line of yours")
-    name, width, height, values = found[0]
     if name not in _COLMAP_MODELS:
         raise ValueError(f"model: expected one of {', '.join(_COLMAP_MODELS)}, got {name}")
     names = _COLMAP_MODELS[name].split()
@@ -97,26 +110,29 @@ def colmap(text: str) -> CameraParameters:
     return CameraParameters(matrix, distortion, model, (int(height), int(width)))
 
 
-def nuscenes(records: Sequence[Any], image_size: tuple[int, int] | None) -> CameraParameters:
-    """Read records of nuScenes' table ``calibrated_sensor``, of one camera; its images are undistorted.
+def nuscenes_cameras(records: Sequence[Any], image_size: tuple[int, int] | None) -> Readers:
+    """Return what reads the cameras of nuScenes' table ``calibrated_sensor``.
+
+    Their names are their tokens, or their places in the table if these do not tell them apart.
+    """
+    cameras = [each for each in records if isinstance(each, Mapping) and each.get("camera_intrinsic")]
+    if not cameras:
+        raise ValueError("camera_intrinsic: expected that of a camera, got none")
+    names = [str(each.get("token")) for each in cameras]
+    names = names if len(set(names)) == len(names) else [str(place) for place in range(len(names))]
+    return {name: partial(_nuscenes, each, image_size) for name, each in zip(names, cameras, strict=True)}
+
+
+def _nuscenes(record: Mapping[str, Any], image_size: tuple[int, int] | None) -> CameraParameters:
+    """Read a record of nuScenes' table ``calibrated_sensor``; its images are undistorted.
 
     The table has no size of images: nuScenes' are all of one. Other programs write such tables for images of
     other sizes, some with ``width`` and ``height``. Images of another size are those of the record if its
     principal point is less than half as far from their centre as from that of nuScenes' images, in shares of
     the sides; else they were resized.
     """
-    matrices = [
-        numbers(record, "camera_intrinsic", count=9)
-        for record in records
-        if isinstance(record, Mapping) and record.get("camera_intrinsic")
-    ]
-    if not matrices or any(matrix != matrices[0] for matrix in matrices):
-        raise ValueError(
-            f"camera_intrinsic: expected one camera's, got {len(matrices)}; keep the record of your camera, "
-            "by its token"
-        )
-    record = next(each for each in records if isinstance(each, Mapping) and each.get("camera_intrinsic"))
-    return _of_size(matrices[0], record, image_size, _NUSCENES_SIZE, "nuScenes'")
+    matrix = numbers(record, "camera_intrinsic", count=9)
+    return _of_size(matrix, record, image_size, _NUSCENES_SIZE, "nuScenes'")
 
 
 def openlane(fields: Mapping[str, Any], image_size: tuple[int, int] | None) -> CameraParameters:

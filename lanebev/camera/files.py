@@ -11,11 +11,19 @@ from typing import Any
 
 import yaml
 
-from lanebev.camera.datasets import colmap, is_colmap, is_kitti, kitti, nuscenes, openlane
+from lanebev.camera.choice import chosen, split_name
+from lanebev.camera.datasets import (
+    colmap_cameras,
+    is_colmap,
+    is_kitti,
+    kitti_cameras,
+    nuscenes_cameras,
+    openlane,
+)
 from lanebev.camera.formats import opencv_or_ros, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
 from lanebev.camera.parsing import parse
-from lanebev.camera.slam import camodocal, is_kalibr, is_orb_slam, kalibr, orb_slam
+from lanebev.camera.slam import camodocal, is_kalibr, is_orb_slam, kalibr_cameras, orb_slam_cameras
 from lanebev.numbers import read_text, shown
 
 
@@ -28,56 +36,64 @@ def read_camera(
     - ROS ``camera_info`` (YAML or INI, or a message as ``rostopic``, ``ros2 topic`` and Foxglove print it),
       its ``roi`` and ``binning_x``, ``binning_y`` applied;
     - our short YAML: fx, fy, cx, cy, width, height, distortion, model;
-    - Kalibr's camchain (the first camera), EuRoC's ``sensor.yaml``, CamOdoCal's YAML (VINS, KITTI-360), the
+    - Kalibr's camchain, EuRoC's ``sensor.yaml``, CamOdoCal's YAML (VINS, KITTI-360), the
       settings of ORB-SLAM;
-    - KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt``: the left colour camera's rectified images
-      (``P_rect_02``, ``P2``), else the lowest number there is;
-    - nuScenes' ``calibrated_sensor`` (the record of one camera) and OpenLane's labels, both JSON;
-    - COLMAP's ``cameras.txt`` of one camera.
+    - KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt``: rectified images (``P_rect_02``, ``P2``);
+    - nuScenes' ``calibrated_sensor`` and OpenLane's labels, both JSON;
+    - COLMAP's ``cameras.txt``.
+
+    Of a file with several cameras the first is taken, of KITTI's the left colour camera. If others differ
+    from it, that is remarked on, or refused with nuScenes' and COLMAP's.
 
     KITTI's object and odometry files, nuScenes and OpenLane do not hold the image's size: it is then
     ``image_size``, or the data set's.
 
     Args:
-        path: the file.
+        path: the file; the name of one of its cameras may follow after ``#``.
         image_size: (height, width) px of the images, for a file without a size. Not used otherwise.
         rectified: the images were rectified: take the projection matrix P, and no lens.
 
     Raises:
         ValueError: the file is missing, cut, holds an unknown key, or a missing or absurd value.
     """
-    path = Path(path)
+    path, name = split_name(path)
     try:
         text = read_text(path, "replace")  # of comments and names in other encodings nothing is needed
     except ValueError as error:
         raise ValueError(f"camera file {path}: expected a readable camera file, got: {error}") from error
     try:
         if is_colmap(text):
-            camera = checked(colmap(text))
-            return without_lens(camera) if rectified else camera
-        if is_kitti(text) or (path.suffix.lower() == ".txt" and "width" not in text):
-            return checked(kitti(text, image_size))
-        return _camera(parse(text), image_size, rectified)
+            camera = checked(chosen(colmap_cameras(text), name, has_usual=False))
+        elif is_kitti(text) or (path.suffix.lower() == ".txt" and "width" not in text):
+            camera = checked(chosen(kitti_cameras(text, image_size), name, has_usual=True))
+        else:
+            camera = _camera(parse(text), image_size, rectified, name)
+        return without_lens(camera) if rectified else camera
     except ValueError as error:
         raise ValueError(f"camera file {path}: {' '.join(str(error).split())}") from error
 
 
-def _camera(content: Any, image_size: tuple[int, int] | None, rectified: bool) -> CameraParameters:
+def _camera(
+    content: Any, image_size: tuple[int, int] | None, rectified: bool, name: str | None
+) -> CameraParameters:
     """Return the camera of a file's content, whose format its keys tell."""
-    if isinstance(content, list):
-        return checked(nuscenes(content, image_size))
+    if isinstance(content, list) or (isinstance(content, dict) and "camera_intrinsic" in content):
+        records = content if isinstance(content, list) else [content]
+        return checked(chosen(nuscenes_cameras(records, image_size), name, has_usual=False))
     if isinstance(content, str):
         raise ValueError(f"expected keys with a colon and a space, such as fx: 1150, got {shown(content)}")
     if not isinstance(content, dict) or not content:
         raise ValueError("expected keys such as fx, fy, cx, cy, width, height, got none; is the file empty?")
-    if "camera_intrinsic" in content:
-        return checked(nuscenes([content], image_size))
+    if is_kalibr(content):
+        return checked(chosen(kalibr_cameras(content), name, has_usual=True))
+    if is_orb_slam(content):
+        return checked(chosen(orb_slam_cameras(content), name, has_usual=True))
+    if name is not None:
+        raise ValueError(f"expected no name after # for a file of one camera, got {shown(name)}")
     if "intrinsic" in content:
         return checked(openlane(content, image_size))
-    slam = kalibr if is_kalibr(content) else orb_slam if is_orb_slam(content) else None
-    if slam or "model_type" in content:
-        camera = checked(slam(content) if slam else camodocal(content))
-        return without_lens(camera) if rectified else camera
+    if "model_type" in content:
+        return checked(camodocal(content))
     return opencv_or_ros(content, rectified)
 
 
@@ -87,7 +103,7 @@ def camera_from_fields(fields: Mapping[str, Any], rectified: bool = False) -> Ca
     Raises:
         ValueError: an unknown field, or a missing or absurd value.
     """
-    return _camera(dict(fields), None, rectified)
+    return _camera(dict(fields), None, rectified, None)
 
 
 def camera_info(camera: CameraParameters, name: str = "camera") -> dict[str, Any]:

@@ -80,9 +80,9 @@ def opencv_or_ros(fields: Mapping[str, Any], rectified: bool) -> CameraParameter
     matrix = numbers(fields, *_MATRIX_KEYS, count=9)
     distortion = numbers(fields, *_DISTORTION_KEYS)
     model = _model(fields)
-    if "xi" in fields and fields["xi"] is not None:
+    if fields.get("xi") is not None:
         xi = numbers(fields, "xi", count=1) if not isinstance(fields["xi"], str) else [number(fields, "xi")]
-        model, distortion = "omni", [*xi, *(distortion or [0.0] * 4)]
+        distortion = [*xi, *(distortion or [0.0] * 4)]
     camera = CameraParameters(matrix, distortion, model, size)
     return _as_taken(checked(camera, _restates(fields)), fields)
 
@@ -126,14 +126,22 @@ def _restates(fields: Mapping[str, Any]) -> bool:
 
 
 def _model(fields: Mapping[str, Any]) -> str:
-    fisheye = str(fields.get("fisheye_model", "0")).strip().lower() in ("1", "true")  # true since OpenCV 5
-    default = "fisheye" if fisheye else "pinhole"
-    name = next((str(fields[key]).strip() for key in _MODEL_KEYS if fields.get(key) is not None), "")
-    name = name.lower()
-    if name not in _MODELS:
+    """Return the lens model; beside another one, "pinhole" states the projection only, as in Kalibr.
+
+    Raises:
+        ValueError: a model is not known, or two that differ are stated.
+    """
+    names = [str(fields[key]).strip().lower() for key in _MODEL_KEYS if fields.get(key) is not None]
+    if unknown := [name for name in names if name not in _MODELS]:
         known = ", ".join(each for each in _MODELS if each)
-        raise ValueError(f"model: expected one of {known}, got {shown(name)}")
-    return _MODELS[name] or default
+        raise ValueError(f"model: expected one of {known}, got {shown(unknown[0])}")
+    is_fisheye = str(fields.get("fisheye_model")).strip().lower() in ("1", "true")  # true since OpenCV 5
+    stated = {name: _MODELS[name] for name in names if name not in ("", "pinhole")}
+    stated |= {"fisheye_model": "fisheye"} if is_fisheye else {}
+    stated |= {"xi of an omni": "omni"} if fields.get("xi") is not None else {}
+    if len(set(stated.values())) > 1:
+        raise ValueError(f"model: expected one, got {' and '.join(stated)}; keep the right one")
+    return next(iter(stated.values()), "pinhole")
 
 
 def _as_taken(camera: CameraParameters, fields: Mapping[str, Any]) -> CameraParameters:

@@ -50,12 +50,15 @@ class Camera:
             (Kannala and Brandt 2006, D = 4) or "omni" (Mei and Rives 2007, D = 5: ξ k1 k2 p1 p2), which may
             be given as "mei".
         image_size: (height, width) px.
+        remark: what is to be said of the file that it is from, such as which of its cameras it is; else
+            empty.
     """
 
     intrinsics: Tensor
     distortion: Tensor
     model: str
     image_size: tuple[int, int]
+    remark: str = ""
 
     def __post_init__(self) -> None:
         check_tensor("intrinsics", self.intrinsics)
@@ -156,7 +159,7 @@ class Camera:
         :func:`lanebev.camera.files.read_camera` says what each of them is.
 
         Args:
-            path: the file.
+            path: the file; one of several cameras is named after it, as ``camchain.yaml#cam1``.
             image_size: (height, width) px of the images, for a file without a size. Not used otherwise.
             rectified: the images were rectified: take the projection matrix P, and no lens.
 
@@ -185,6 +188,7 @@ class Camera:
             torch.tensor(read.distortion, dtype=torch.float64, device=device_of_numbers()),
             read.model,
             read.image_size,
+            read.remark,
         )
 
     def parameters(self) -> CameraParameters:

@@ -23,12 +23,14 @@ class CameraParameters(NamedTuple):
         distortion: coefficients in OpenCV's order, see :mod:`lanebev.geometry.distortion`.
         model: "pinhole", "fisheye" or "omni".
         image_size: (height, width) px.
+        remark: what is to be said of the file that it is from; else empty.
     """
 
     matrix: list[float]
     distortion: list[float]
     model: str
     image_size: tuple[int, int]
+    remark: str = ""
 
 
 def centre_offset(matrix: Sequence[float], image_size: tuple[int, int]) -> float:

@@ -172,12 +172,14 @@ def _read_once(
 ) -> list[float]:
     """Return the numbers that ``read`` finds in the value of a key; in another spelling they are the same.
 
+    Zeros at the end do not make a difference, as of coefficients.
+
     Raises:
         ValueError: no spelling of the key is there, or two with different numbers.
     """
     given = _given(fields, keys)
     first, *others = (read(fields[key]) for key in given)
-    if any(other != first for other in others):
+    if any(a != b for other in others for a, b in itertools.zip_longest(first, other, fillvalue=0.0)):
         raise ValueError(f"expected one of {' and '.join(given)}, got both, which differ; keep the right one")
     return first
 

@@ -22,13 +22,14 @@ _PLUMB_BOB = (-0.15, 0.02)  # most of k1, and of |k3| and |k4|, that are like pl
 
 
 def camera_remarks(camera: Camera, pixel_aspect: Fraction = Fraction(1)) -> list[str]:
-    """Return remarks on an implausible lens, or a wrong size of images, model or focal length.
+    """Return remarks on the file, an implausible lens, or a wrong size of images, model or focal length.
 
     Args:
         camera: of the settings.
         pixel_aspect: width of a pixel over its height, as the video states it; 1 if it does not.
     """
     found = (
+        camera.remark,
         lens_remark(camera),
         resized_remark(camera) or off_centre_remark(camera),
         model_remark(camera),

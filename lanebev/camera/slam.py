@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from lanebev.camera.approximation import (
@@ -14,6 +15,7 @@ from lanebev.camera.approximation import (
     fov_model,
     kannala_brandt_like,
 )
+from lanebev.camera.choice import Readers
 from lanebev.camera.parameters import CameraParameters
 from lanebev.camera.parsing import mapping, number, numbers, required, whole_number
 from lanebev.numbers import shown
@@ -45,18 +47,23 @@ def is_kalibr(fields: Mapping[str, Any]) -> bool:
     return "intrinsics" in fields or any(re.fullmatch(r"cam\d+", key, re.ASCII) for key in fields)
 
 
-def kalibr(fields: Mapping[str, Any]) -> CameraParameters:
-    """Read Kalibr's camchain, its first camera, or EuRoC's ``sensor.yaml``.
+def kalibr_cameras(fields: Mapping[str, Any]) -> Readers:
+    """Return what reads the cameras of Kalibr's camchain, or the one of EuRoC's ``sensor.yaml``."""
+    chain = [key for key in fields if re.fullmatch(r"cam\d+", key, re.ASCII)]
+    if not chain:
+        return {"": partial(_kalibr, fields)}
+    in_order = sorted(chain, key=lambda key: int(key[3:10]))
+    return {key: lambda key=key: _kalibr(mapping(key, fields[key])) for key in in_order}  # type: ignore[misc]
+
+
+def _kalibr(fields: Mapping[str, Any]) -> CameraParameters:
+    """Read one camera.
 
     A double sphere (``ds``), extended unified (``eucm``) or FOV camera becomes the nearest Kannala-Brandt
     one, see :func:`~lanebev.camera.approximation.kannala_brandt_like`.
 
     Source: Kalibr, wiki, "Supported models" and "Yaml formats".
     """
-    chain = [key for key in fields if re.fullmatch(r"cam\d+", key, re.ASCII)]
-    if chain:
-        first = min(chain, key=lambda key: int(key[3:10]))
-        fields = mapping(first, fields[first])
     names = (
         str(required(fields, ["camera_model"])).strip().lower(),
         str(fields.get("distortion_model") or "none").strip().lower(),
@@ -134,9 +141,16 @@ def is_orb_slam(fields: Mapping[str, Any]) -> bool:
     return "Camera.fx" in fields or "Camera1.fx" in fields
 
 
-def orb_slam(fields: Mapping[str, Any]) -> CameraParameters:
-    """Read the settings of ORB-SLAM 2 or 3: the camera, the left one of two."""
-    of = "Camera1." if "Camera1.fx" in fields else "Camera."
+def orb_slam_cameras(fields: Mapping[str, Any]) -> Readers:
+    """Return what reads the camera in the settings of ORB-SLAM 2 or 3, or the left and the right one."""
+    names = [name for name in ("Camera1", "Camera2") if f"{name}.fx" in fields]
+    return {name: partial(_orb_slam, fields, f"{name}.") for name in names} or {
+        "": partial(_orb_slam, fields, "Camera.")
+    }
+
+
+def _orb_slam(fields: Mapping[str, Any], of: str) -> CameraParameters:
+    """Read the camera whose keys begin with ``of``."""
     kind = str(fields.get("Camera.type") or "PinHole").strip()
     if kind.lower() not in _ORB_SLAM_MODELS:
         raise ValueError(f"Camera.type: expected PinHole, Rectified or KannalaBrandt8, got {shown(kind)}")

@@ -57,8 +57,9 @@ def lane_text(path: Path) -> str:
         if path.is_fifo():  # which gives its text only once
             raise ValueError("a pipe; write the lanes to a file")
         return read_text(path)
-    except ValueError as error:
-        raise ValueError(f"lane file {path}: expected a readable file, got: {error}") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ValueError(f"lane file {path}: expected a readable file, got: {reason}") from error
 
 
 def json_object(text: str) -> dict[str, Any]:

@@ -353,7 +353,7 @@ def test_nuscenes_and_openlane_json(tmp_path):
             Camera.from_file(path, image_size=(height // 2, width // 2))
     other = [[1200.0, 0.0, 800.0], *matrix[1:]]
     path.write_text(json.dumps([{**record, "camera_intrinsic": each} for each in (matrix, other)]))
-    with pytest.raises(ValueError, match="camera_intrinsic: expected one camera's, got 2; keep the record"):
+    with pytest.raises(ValueError, match=r"expected one camera, got 2: 0, 1; choose one as FILE#0$"):
         Camera.from_file(path)
     path.write_text(
         json.dumps({"intrinsic": [[2059, 0, 935.1], [0, 2059, 635], [0, 0, 1]], "lane_lines": []})
@@ -364,7 +364,7 @@ def test_nuscenes_and_openlane_json(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("c.json", "[]", "camera_intrinsic: expected one camera's, got 0"),
+        ("c.json", "[]", "camera_intrinsic: expected that of a camera, got none"),
         ("c.json", '{"a": 1, "a": 2}', "expected each key once, got 'a' twice"),
         ("c.json", '{"image_width": 1280, "image_height"', "syntax error at line 1; is the file cut"),
         (

@@ -179,6 +179,8 @@ def test_kittis_files_by_any_name(tmp_path, name, text):
             "OPENCV_FISHEYE 1280 720 800 801 640 360 .1 .01 0 0",
             ([0.1, 0.01, 0, 0], "fisheye", 801),
         ),
+        ("SIMPLE_RADIAL_FISHEYE 1280 720 800 640 360 .1", ([0.1, 0, 0, 0], "fisheye", 800)),
+        ("RADIAL_FISHEYE 1280 720 800 640 360 .1 .01", ([0.1, 0.01, 0, 0], "fisheye", 800)),
     ],
 )
 def test_colmaps_pixels_begin_at_their_corner(tmp_path, line, expected):  # colmap#2587
@@ -211,7 +213,11 @@ ORBextractor.nFeatures: 1200
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("cameras.txt", "1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1\n", "expected one camera, got 2; keep"),
+        (
+            "cameras.txt",
+            "1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 2 2 1 1\n",
+            "one camera, got 2: 1, 2;",
+        ),
         ("cameras.txt", "1 FOV 1280 720 1 1 1 1 1\n", "model: expected one of SIMPLE_PINHOLE, .*, got FOV"),
         ("cameras.txt", "1 PINHOLE 1280 720 800 800 640\n", "PINHOLE: expected 4 numbers, got 3"),
         ("calib_velo_to_cam.txt", "R: 7.5 1\nT: 1 2 3\n", "expected P_rect_02 or P2 .*, got 'R:'"),

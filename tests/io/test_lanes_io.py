@@ -251,3 +251,9 @@ def test_real_culane_and_openlane_folders(tmp_path):
     cut.write_text(cut.read_text()[:-7])
     with pytest.raises(ValueError, match="is the file cut"):
         read_lanes(cut)
+
+
+def test_a_file_that_the_system_does_not_open_is_named(tmp_path):
+    path = tmp_path / ("l" * 300)  # as a folder without permission, but for the superuser too
+    with pytest.raises(ValueError, match=r"lane file .*: expected a readable .*: File name too long$"):
+        read_tusimple(path)

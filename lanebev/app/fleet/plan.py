@@ -15,6 +15,7 @@ from lanebev.app.config import RunConfig
 from lanebev.app.fleet.cutting import Part, duration, parts_of
 from lanebev.app.fleet.manifest import PATHS, Drive
 from lanebev.app.recovery import size_and_time
+from lanebev.camera.choice import camera_file
 from lanebev.io.video import glob_pattern
 
 DRIVES, MARK, SEEN = "drives", "fleet.json", "seen.json"
@@ -109,7 +110,8 @@ def settings_fingerprint(config: RunConfig) -> str:
     """Return all that decides a run's outputs, as text: settings, and sizes and times of the files named."""
     settings = {name: value for name, value in asdict(config).items() if name != "out"}
     read = [name for name in PATHS if name != "exported" or config.backend == "onnxruntime"]
-    files = {name: _sizes_and_times(str(settings[name])) for name in read if settings.get(name)}
+    paths = settings | {"camera": config.camera and camera_file(config.camera)}
+    files = {name: _sizes_and_times(str(paths[name])) for name in read if paths.get(name)}
     return json.dumps({"settings": settings, "files": files, "lanebev": __version__}, default=str)
 
 

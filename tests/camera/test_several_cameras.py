@@ -1,0 +1,158 @@
+"""Files with several cameras: which one is taken, that it is said, and how another is chosen."""
+
+import json
+
+import pytest
+
+from lanebev import Camera
+from lanebev.app.config import RunConfig
+from lanebev.app.fleet.plan import settings_fingerprint
+from lanebev.camera.choice import camera_file
+from lanebev.camera.plausibility import camera_remarks
+
+P = "{0} 0 640 0 0 {0} 360 0 0 0 1 0"
+
+
+def _kalibr(*focals):
+    lens = "{camera_model: pinhole, distortion_model: radtan, distortion_coeffs: [-0.1, 0, 0, 0], "
+    lens += "intrinsics: [%s, %s, 640, 360], resolution: [1280, 720]}"
+    return "".join(f"cam{i}: {lens % (focal, focal)}\n" for i, focal in enumerate(focals))
+
+
+def _kitti(*focals):
+    return "".join(f"P{i}: {P.format(focal)}\n" for i, focal in enumerate(focals))
+
+
+def _raw_kitti(*focals):
+    entry = "P_rect_{0:02d}: {1}\nS_rect_{0:02d}: 1280 720\n"
+    return "".join(entry.format(i, P.format(focal)) for i, focal in enumerate(focals))
+
+
+def _orb_slam(*focals):
+    sizes = "Camera.width: 1280\nCamera.height: 720\n"
+    numbers = "Camera{0}.fx: {1}\nCamera{0}.fy: {1}\nCamera{0}.cx: 640\nCamera{0}.cy: 360\n"
+    return sizes + "".join(numbers.format(i, focal) for i, focal in enumerate(focals, start=1))
+
+
+def _colmap(*focals):
+    return "".join(f"{i} PINHOLE 1280 720 {focal} {focal} 640.5 360.5\n" for i, focal in enumerate(focals, 1))
+
+
+def _nuscenes(*focals):
+    matrices = [[[focal, 0, 640], [0, focal, 360], [0, 0, 1]] for focal in focals]
+    size = {"width": 1280, "height": 720}
+    tokens = ("a1", "b2", "c3")
+    lidar = {"token": "d4", "camera_intrinsic": []}
+    cameras = [{"token": t, "camera_intrinsic": m, **size} for t, m in zip(tokens, matrices, strict=False)]
+    return json.dumps([lidar, *cameras])
+
+
+USUAL = [  # with the names of three cameras, the usual one first
+    (_kalibr, ("cam0", "cam1", "cam2"), (0, 1, 2)),
+    (_kitti, ("P2", "P0", "P1"), (2, 0, 1)),
+    (_raw_kitti, ("P_rect_02", "P_rect_00", "P_rect_01"), (2, 0, 1)),
+    (_orb_slam, ("Camera1", "Camera2"), (0, 1)),
+]
+UNUSUAL = [
+    (_colmap, ("1", "2", "3"), (0, 1, 2)),
+    (_nuscenes, ("a1", "b2", "c3"), (0, 1, 2)),
+]
+FOCALS = (800, 900, 1000)
+
+
+def _write(tmp_path, text):
+    path = tmp_path / "cameras.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(("write", "names", "places"), [*USUAL, *UNUSUAL])
+def test_a_camera_is_chosen_by_its_name(tmp_path, write, names, places):
+    path = _write(tmp_path, write(*FOCALS[: len(names)]))
+    for name, place in zip(names, places, strict=True):
+        camera = Camera.from_file(f"{path}#{name}", image_size=(720, 1280))
+        assert camera.intrinsics[0].tolist() == [FOCALS[place], 0, 640]
+        assert camera.remark == ""
+    with pytest.raises(ValueError, match=f"expected one of .*{names[1]}.* after #, got 'front'$"):
+        Camera.from_file(f"{path}#front", image_size=(720, 1280))
+
+
+@pytest.mark.parametrize(("write", "names", "places"), USUAL)
+def test_the_usual_camera_is_taken_and_said(tmp_path, write, names, places):
+    path = _write(tmp_path, write(*FOCALS[: len(names)]))
+    camera = Camera.from_file(path, image_size=(720, 1280))
+    assert camera.intrinsics[0, 0] == FOCALS[places[0]]
+    words = f"of which {names[0]} is taken; choose another as FILE#{names[1]}"
+    assert [remark for remark in camera_remarks(camera.scaled((360, 640))) if words in remark]
+    same = Camera.from_file(_write(tmp_path, write(*[800] * len(names))), image_size=(720, 1280))
+    assert same.remark == ""  # KITTI's four have the same numbers
+
+
+@pytest.mark.parametrize(("write", "names", "places"), UNUSUAL)
+def test_of_cameras_in_no_order_one_must_be_chosen(tmp_path, write, names, places):
+    path = _write(tmp_path, write(*FOCALS))
+    with pytest.raises(ValueError, match=f"expected one camera, got 3: .*; choose one as FILE#{names[0]}$"):
+        Camera.from_file(path)
+    assert Camera.from_file(_write(tmp_path, write(800, 800, 800))).intrinsics[0, 0] == 800
+
+
+def test_a_broken_camera_beside_the_one_that_is_taken_is_another(tmp_path):
+    text = _kalibr(800, 900).replace("[900", "[x")
+    assert "cam0 is taken" in Camera.from_file(_write(tmp_path, text)).remark
+    with pytest.raises(ValueError, match="intrinsics: expected finite numbers"):
+        Camera.from_file(f"{_write(tmp_path, text)}#cam1")
+
+
+def test_a_file_of_one_camera_has_no_names(tmp_path):
+    path = tmp_path / "lens#1.yaml"  # its own name has the sign
+    path.write_text("{fx: 800, fy: 800, cx: 640, cy: 360, width: 1280, height: 720}")
+    assert Camera.from_file(path).intrinsics[0, 0] == 800
+    with pytest.raises(ValueError, match=r"lens#1\.yaml: expected no name after # for .* got 'cam0'$"):
+        Camera.from_file(f"{path}#cam0")
+
+
+def test_the_file_is_an_input_whatever_camera_of_it_is_taken(tmp_path):
+    path = _write(tmp_path, _kalibr(*FOCALS))
+    assert camera_file(f"{path}#cam1") == path
+    config = RunConfig(source="drive.mp4", camera=f"{path}#cam1")
+    before = settings_fingerprint(config)
+    path.write_text(_kalibr(*FOCALS[:2]))
+    assert settings_fingerprint(config) != before
+
+
+def _opencv(extra, distortion="[0.1, 0.01, 0.001, 0.002]"):
+    return (
+        "image_width: 1280\nimage_height: 720\ncamera_matrix: [800, 0, 640, 0, 800, 360, 0, 0, 1]\n"
+        f"distortion_coefficients: {distortion}\n{extra}\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        ("distortion_model: plumb_bob\ncamera_model: fisheye", "plumb_bob and fisheye"),
+        ("distortion_model: rational_polynomial\nfisheye_model: 1", "rational_polynomial and fisheye_model"),
+        ("distortion_model: equidistant\nxi: 1.2", "equidistant and xi of an omni"),
+    ],
+)
+def test_models_that_contradict_each_other_are_refused(tmp_path, extra, words):
+    with pytest.raises(ValueError, match=f"model: expected one, got {words}; keep the right one$"):
+        Camera.from_file(_write(tmp_path, _opencv(extra)))
+
+
+def test_a_pinhole_may_have_the_distortion_of_a_fisheye_as_kalibr_has_it(tmp_path):
+    text = _opencv("distortion_model: equidistant\ncamera_model: pinhole")
+    assert Camera.from_file(_write(tmp_path, text)).model == "fisheye"
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "expected"),
+    [
+        ("[]", "[0, 0, 0, 0, 0]", []),
+        ("[0, 0, 0, 0]", "[]", []),
+        ("[-0.1, 0.01, 0, 0, 0]", "[-0.1, 0.01, 0, 0]", [-0.1, 0.01, 0, 0, 0]),
+    ],
+)
+def test_coefficients_that_differ_in_zeros_at_their_end_are_the_same(tmp_path, one, other, expected):
+    camera = Camera.from_file(_write(tmp_path, _opencv(f"D: {other}", one)))
+    assert camera.distortion.tolist() == expected
