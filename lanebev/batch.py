@@ -157,6 +157,11 @@ def flag(condition: Tensor, reason: IntFlag) -> Tensor:
     return condition.to(torch.int64) * int(reason)
 
 
+def has_flag(bits: Tensor, reason: IntFlag) -> Tensor:
+    """Return where a reason's bit is set, bool."""
+    return (bits & int(reason)) != 0
+
+
 def masked_median(values: Tensor, mask: Tensor) -> Tensor:
     """Compute the lower median over the last dimension of the finite entries in the mask, or 0."""
     mask = mask & values.isfinite()

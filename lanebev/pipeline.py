@@ -20,7 +20,8 @@ from lanebev.observation.far_view import FarView
 from lanebev.observation.frames import black_unless_finite, check_images
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segments import LaneSegments, segments_from_vertices
-from lanebev.types import Calibration, register_pytree
+from lanebev.torch_internals import register_pytree
+from lanebev.types import Calibration
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
 

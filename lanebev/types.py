@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from enum import IntEnum
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -16,8 +16,9 @@ from lanebev.geometry.rotation import (
     rotation_vector,
 )
 from lanebev.numbers import check_number
-from lanebev.tensors import map_tensors as map_tensors  # noqa: PLC0414 - part of this module too
-from lanebev.torch_internals import register_pytree as register_pytree  # noqa: PLC0414 - likewise
+from lanebev.torch_internals import register_pytree
+
+ConfigT = TypeVar("ConfigT")
 
 NUM_BOUNDARIES = 6
 """Semantic lane boundaries by default: 0, 1, 2 left of the ego lane's middle, 3, 4, 5 right of it."""
@@ -62,6 +63,19 @@ def check_type(name: str, value: object, expected: type) -> None:
     if value is not None and not isinstance(value, expected):
         kind = f"the class {value.__qualname__}" if isinstance(value, type) else type(value).__qualname__
         raise TypeError(f"{name}: expected a lanebev.{expected.__qualname__} or None, got {kind}")
+
+
+def config_of(kind: type[ConfigT], config: ConfigT | None, settings: Mapping[str, object]) -> ConfigT:
+    """Return a configuration that is given as one, or by settings of it.
+
+    Raises:
+        TypeError: it is of another class.
+        ValueError: both are given.
+    """
+    check_type("config", config, kind)
+    if config is not None and settings:
+        raise ValueError(f"config: expected either a {kind.__name__} or its keywords, got both")
+    return config or kind(**settings)
 
 
 class Status(IntEnum):

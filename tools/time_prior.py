@@ -18,10 +18,11 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.camera.model import Camera
-from lanebev.estimation.joint.calibrator import JointCalibrator, predict_state
+from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.layout import NUM_COMMON, SHAPE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, VERTICAL
 from lanebev.estimation.joint.observations import boundary_places
+from lanebev.estimation.joint.prediction import predict_state
 from lanebev.estimation.joint.road_curve import road_curve, road_shape
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason
@@ -114,7 +115,7 @@ class PriorCalibrator(JointCalibrator):
         """Add the prior to the logits (1, 1 + L, h, w) of the frame that comes next."""
         if not any(self.prior) or self.last is None or int(self.last.status[0]) != Status.TRACKING:
             return logits
-        predicted = predict_state(self.last, self.dt, self.config)
+        predicted, *_ = predict_state(self.last, self.dt, self.config)
         if (predicted.mean[0, OFFSET] + self.places).abs().min() < _CROSSING:
             return logits
         z = 1 / torch.linspace(1 / 3.0, 1 / _FARTHEST, 64, dtype=self.places.dtype)

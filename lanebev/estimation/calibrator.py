@@ -17,8 +17,9 @@ from lanebev.estimation.checks import (
 )
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.observation.segments import LaneSegments
+from lanebev.tensors import map_tensors
 from lanebev.torch_internals import is_in_forward_mode
-from lanebev.types import Calibration, TensorTuple, map_tensors
+from lanebev.types import Calibration, TensorTuple
 
 
 class CalibratorState(TensorTuple, Protocol):

@@ -15,7 +15,7 @@ from lanebev.geometry.lens import (
     usable_cameras,
 )
 from lanebev.observation.vertices import take
-from lanebev.types import register_pytree
+from lanebev.torch_internals import register_pytree
 
 
 @register_pytree

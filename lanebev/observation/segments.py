@@ -15,7 +15,8 @@ from lanebev.geometry.precision import full_precision
 from lanebev.observation.boundary_vertices import BoundaryVertices, move_to_front, undistort_vertices
 from lanebev.observation.polylines import LINE_SIGMA, LaneLine, lines_from_polylines, vertices_from_lines
 from lanebev.observation.vertices import take
-from lanebev.types import NUM_BOUNDARIES, check_tensor, register_pytree
+from lanebev.torch_internals import register_pytree
+from lanebev.types import NUM_BOUNDARIES, check_tensor
 
 
 @register_pytree

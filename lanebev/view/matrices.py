@@ -22,7 +22,8 @@ import torch
 from torch import Tensor
 
 from lanebev.geometry.lens import check_intrinsics
-from lanebev.types import Extrinsics, register_pytree
+from lanebev.torch_internals import register_pytree
+from lanebev.types import Extrinsics
 
 
 def ego_from_road(dtype: torch.dtype = torch.float32, device: torch.device | str | None = None) -> Tensor:

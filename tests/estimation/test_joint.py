@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lanebev import batch
-from lanebev.estimation.joint.calibrator import JointCalibrator, predict_state
+from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.dynamics import MotionConfig, RoadMotion, motion
 from lanebev.estimation.joint.evidence import CALL, adapt_motion_scale, deviation_prior_std
 from lanebev.estimation.joint.frame_prior import FramePrior
@@ -31,6 +31,7 @@ from lanebev.estimation.joint.measurement import (
 )
 from lanebev.estimation.joint.observations import boundary_places, observe
 from lanebev.estimation.joint.output import beyond_filter, single_deviation, unverified_deviation
+from lanebev.estimation.joint.prediction import predict_state
 from lanebev.estimation.joint.restart import scatter_of_fit
 from lanebev.estimation.joint.road import propagate_road_shape, straight_or_bend, turn_along
 from lanebev.estimation.joint.road_curve import (
@@ -600,7 +601,7 @@ def test_minutes_of_nothing_keep_the_covariance_positive_and_bounded():
     unseen = Reason.ROLL_UNSEEN | Reason.HEIGHT_UNSEEN | Reason.DIRECTION_UNSEEN
     state = state._replace(reasons=torch.full_like(state.reasons, int(unseen)))
     for _ in range(300):
-        state = predict_state(state, torch.ones(1, dtype=DOUBLE), calibrator.config)
+        state = predict_state(state, torch.ones(1, dtype=DOUBLE), calibrator.config).state
     cov = state.cov
     size = cov.diagonal(dim1=1, dim2=2).rsqrt()
     assert torch.linalg.eigvalsh(size.unsqueeze(-1) * cov * size.unsqueeze(-2)).min() > 0
@@ -673,7 +674,7 @@ def test_considered_entries_keep_their_mean_and_variance():
     _, state = run(calibrator, frames[:6])
     segments = frames[6][1]
     ego = (segments.boundary == 2) | (segments.boundary == 3)
-    predicted = predict_state(state, torch.full((2,), 1 / FPS, dtype=DOUBLE), calibrator.config)
+    predicted, *_ = predict_state(state, torch.full((2,), 1 / FPS, dtype=DOUBLE), calibrator.config)
     _, after = calibrator(segments._replace(weight=segments.weight * ego), cameras(2), state, 1 / FPS, WIDTH)
     for entry in PLACE.chain(ROLL):
         torch.testing.assert_close(after.mean[:, entry], predicted.mean[:, entry])

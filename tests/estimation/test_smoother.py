@@ -8,15 +8,16 @@ import pytest
 import torch
 
 from lanebev.estimation import kalman
-from lanebev.estimation.joint.calibrator import JointCalibrator, predict_state
+from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.layout import POSE, layout
 from lanebev.estimation.joint.measurement import OFFSET, ROLL
+from lanebev.estimation.joint.prediction import predict_state
 from lanebev.estimation.joint.smoother import link_states, smooth_drive, smooth_states
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.precision import cast_floating
+from lanebev.tensors import map_tensors
 from lanebev.testing.evaluation import frame_bound, rms
 from lanebev.testing.moments import CAMERA, FPS, WIDTH, moments, observe
-from lanebev.types import map_tensors
 
 torch.set_num_threads(1)
 DOUBLE = torch.float64
@@ -189,7 +190,7 @@ def test_the_filters_prediction_is_repeated_to_rounding(plain):
     _, _, states, intervals, config = plain
     before, after, dt = states[20], states[21], intervals[21]
     link = link_states(before, after, dt, config)
-    predicted = predict_state(before, dt, config)
+    predicted, *_ = predict_state(before, dt, config)
     torch.testing.assert_close(link.predicted, predicted.mean, rtol=0, atol=0)
     cov = link.transition @ before.cov @ link.transition.mT + link.noise
     assert ((cov - predicted.cov).diagonal(dim1=1, dim2=2) > -1e-12).all()

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from lanebev.batch import has_flag
 from lanebev.estimation.mount import MountCalibration, MountEstimator, MountReason, MountState
 from lanebev.types import Calibration, Extrinsics, Status
 
@@ -76,7 +77,7 @@ def drive_mounts(states: Sequence[tuple[str, str, MountState]]) -> list[DriveMou
         mount: MountCalibration | None = None
         for calibration, seconds in block_calibrations(state, estimator.config.block_time):
             so_far, running = estimator(calibration, running, seconds)
-            moved |= (so_far.axis_reasons[0] & int(MountReason.MOVED)) != 0
+            moved |= has_flag(so_far.axis_reasons[0], MountReason.MOVED)
             mount, alone = estimator(calibration, alone, seconds)
         found.append(DriveMount(name, time, *_pose_and_std(mount), moved.numpy()))
     return found

@@ -140,6 +140,11 @@ def adaptive_process_noise(evidence: Tensor, cov: Tensor, cfg: JointConfig) -> T
     return torch.cat([pose * jump, bend * change, crest * cfg.open_vertical_curvature**2, freed], dim=-1)
 
 
+def with_process_noise(cov: Tensor, variances: Tensor) -> Tensor:
+    """Add variances (B, O) of the observed entries to a covariance (B, D, D)."""
+    return cov + pad(variances, (0, cov.shape[-1] - variances.shape[-1])).diag_embed()
+
+
 def deviation_prior_std(deviations: Tensor, cfg: JointConfig) -> Tensor:
     """Compute the prior standard deviation (B,) m of deviations from the second largest; 0 for equal lanes.
 

@@ -96,6 +96,12 @@ def boundary_places(lane_width: float | Tensor, num_boundaries: int, like: Tenso
     return widths @ constant(_places_by_widths(num_boundaries), like=widths)
 
 
+def ego_lane_width(positions: Tensor) -> Tensor:
+    """Return the width (B,) m of the ego lane, by the positions (B, L) m of the boundaries."""
+    ego = positions.shape[-1] // 2 - 1
+    return positions[:, ego + 1] - positions[:, ego]
+
+
 @lru_cache(maxsize=16)
 def _places_by_widths(num_boundaries: int) -> tuple[tuple[float, ...], ...]:
     """X of each boundary from the middle of the ego lane by the width of each lane: (L-1) × L."""

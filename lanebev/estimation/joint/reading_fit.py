@@ -17,7 +17,7 @@ from lanebev.estimation.joint.measurement import (
     foot_points,
     look,
 )
-from lanebev.estimation.joint.observations import Observations, by_ends, per_end
+from lanebev.estimation.joint.observations import Observations, by_ends, ego_lane_width, per_end
 from lanebev.estimation.joint.readings import Readings
 from lanebev.estimation.joint.robust import (
     anneal_scale,
@@ -70,15 +70,13 @@ def reading_model(
     seen: Observations, positions: Tensor, ways: Readings, repeats: int, prior: FramePrior
 ) -> Model:
     """Make the rows of C readings and of as many repeats of each, for B frames."""
-    num, ego = positions.shape[-1], positions.shape[-1] // 2 - 1
-    width = positions[:, ego + 1] - positions[:, ego]
-    places = positions.unsqueeze(1) + ways.shift * width[:, None, None]  # (B, C, L)
+    places = positions.unsqueeze(1) + ways.shift * ego_lane_width(positions)[:, None, None]  # (B, C, L)
     own = [ways.deviation_std, ways.heading_std, ways.vertical_curvature_std.unsqueeze(-1)]
     std = torch.cat(own, dim=-1).expand(len(positions), -1, -1)
     many = Observations(*(part.repeat_interleave(places.shape[1] * repeats, dim=0) for part in seen))
     return Model(
         seen=many,
-        member=one_hot(per_end(many.boundary), num).to(positions),
+        member=one_hot(per_end(many.boundary), positions.shape[-1]).to(positions),
         places=places.repeat_interleave(repeats, dim=1).flatten(0, 1),
         std=std.repeat_interleave(repeats, dim=1).flatten(0, 1),
         prior=prior,

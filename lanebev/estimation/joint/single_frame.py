@@ -29,7 +29,8 @@ from lanebev.estimation.joint.start_search import LAST_SCALE, linear_starts, spr
 from lanebev.geometry.linalg import inverse_spd, solve_spd
 from lanebev.geometry.precision import full_precision
 from lanebev.observation.segments import LaneSegments
-from lanebev.types import NUM_BOUNDARIES, Extrinsics, map_tensors
+from lanebev.tensors import map_tensors
+from lanebev.types import NUM_BOUNDARIES, Extrinsics
 
 _START_SEGMENTS = 96  # that are used to choose the start
 _OBSERVED = 0.2  # a parameter is observed if its sigma fell below this part of the prior's

@@ -11,11 +11,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lanebev.batch import has_flag
 from lanebev.estimation import kalman
-from lanebev.estimation.joint.calibrator import elapsed, predict_state, state_motion
-from lanebev.estimation.joint.evidence import adaptive_process_noise
+from lanebev.estimation.joint.evidence import adaptive_process_noise, with_process_noise
 from lanebev.estimation.joint.layout import POSE, layout
 from lanebev.estimation.joint.measurement import OFFSET, ROLL
+from lanebev.estimation.joint.prediction import elapsed, predict_state
 from lanebev.estimation.joint.state import JointConfig, JointState
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
@@ -55,16 +56,15 @@ def link_states(before: JointState, after: JointState, dt: Tensor, cfg: JointCon
     """
     place = layout(cfg.num_boundaries)
     step, skip, _, _ = elapsed(dt, before, cfg)
-    _, transition, noise = state_motion(before, step, cfg)
-    predicted = predict_state(before, step, cfg)
+    predicted, transition, noise = predict_state(before, step, cfg)
     evidence = torch.where(skip.unsqueeze(-1), 0.0, after.evidence)
     raised = adaptive_process_noise(evidence, predicted.cov[:, place.observed, place.observed], cfg)
-    noise = noise + torch.nn.functional.pad(raised, (0, place.size - raised.shape[-1])).diag_embed()
     known = (skip.unsqueeze(-1) | ~other_quantities(after, cfg)).unsqueeze(-2)  # (B, 1, D)
-    roll_alone = has(after, Reason.ROLL_UNSEEN) & (after.unseen == 0)
+    roll_alone = has_flag(after.reasons, Reason.ROLL_UNSEEN) & (after.unseen == 0)
     is_roll = torch.tensor([k in place.chain(ROLL) for k in range(place.size)], device=dt.device)
     same = is_roll.unsqueeze(-1) == is_roll  # (D, D)
-    return Link(predicted.mean, transition, noise, known & (same | ~roll_alone[:, None, None]))
+    linked = known & (same | ~roll_alone[:, None, None])
+    return Link(predicted.mean, transition, with_process_noise(noise, raised), linked)
 
 
 def other_quantities(after: JointState, cfg: JointConfig) -> Tensor:
@@ -72,13 +72,8 @@ def other_quantities(after: JointState, cfg: JointConfig) -> Tensor:
     place = layout(cfg.num_boundaries)
     numbered = (OFFSET, *range(place.size)[place.deviations])
     of_numbers = torch.tensor([k in numbered for k in range(place.size)], device=after.mean.device)
-    begun = has(after, Reason.RESTARTED) | (after.status == int(Status.UNINITIALISED))
-    return begun.unsqueeze(-1) | (has(after, Reason.LANE_CHANGE).unsqueeze(-1) & of_numbers)
-
-
-def has(state: JointState, reason: Reason) -> Tensor:
-    """Tell whether a reason holds, (B,) bool."""
-    return (state.reasons & int(reason)) != 0
+    begun = has_flag(after.reasons, Reason.RESTARTED) | (after.status == int(Status.UNINITIALISED))
+    return begun.unsqueeze(-1) | (has_flag(after.reasons, Reason.LANE_CHANGE).unsqueeze(-1) & of_numbers)
 
 
 def smooth_states(

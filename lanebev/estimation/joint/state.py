@@ -19,8 +19,9 @@ from lanebev.estimation.joint.road import straight_or_bend
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
 from lanebev.estimation.reasons import Reason
 from lanebev.numbers import check_settings
-from lanebev.tensors import constant
-from lanebev.types import NUM_BOUNDARIES, map_tensors, register_pytree
+from lanebev.tensors import constant, map_tensors
+from lanebev.torch_internals import register_pytree
+from lanebev.types import NUM_BOUNDARIES
 
 _OFFSET_RATE_STD = 0.5  # m/s, of a start
 

@@ -17,7 +17,7 @@ from lanebev.estimation.mount.blocks import add_frame, block_index, newest_age, 
 from lanebev.estimation.mount.config import MountConfig
 from lanebev.estimation.mount.results import MountCalibration, MountReason, MountState, MountStatus
 from lanebev.tensors import constant
-from lanebev.types import Calibration, Extrinsics, Status, check_calibration, check_type
+from lanebev.types import Calibration, Extrinsics, Status, check_calibration, config_of
 
 _LIMIT_REASONS = (
     MountReason.PITCH_LIMIT,
@@ -37,10 +37,7 @@ class MountEstimator(nn.Module):
 
     def __init__(self, config: MountConfig | None = None, **numbers: object) -> None:
         super().__init__()
-        check_type("config", config, MountConfig)
-        if config is not None and numbers:
-            raise ValueError("config: expected either a MountConfig or its keywords, got both")
-        self.config = config or MountConfig(**numbers)  # type: ignore[arg-type]
+        self.config = config_of(MountConfig, config, numbers)
 
     def initial_state(
         self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from lanebev.types import Extrinsics, register_pytree
+from lanebev.torch_internals import register_pytree
+from lanebev.types import Extrinsics
 
 AXES = ("pitch", "yaw", "roll", "height")
 

@@ -18,7 +18,7 @@ from lanebev.estimation.two_stage.roll_height import RollHeightStep, track_roll_
 from lanebev.estimation.two_stage.state import TwoStageConfig, TwoStageState
 from lanebev.geometry.road import segment_rays
 from lanebev.observation.segments import LaneSegments
-from lanebev.types import Calibration, Extrinsics, Status, check_type
+from lanebev.types import Calibration, Extrinsics, Status, config_of
 
 
 class TwoStageCalibrator(Calibrator[TwoStageState]):
@@ -38,10 +38,7 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
 
     def __init__(self, config: TwoStageConfig | None = None, **numbers: object) -> None:
         super().__init__()
-        check_type("config", config, TwoStageConfig)
-        if config is not None and numbers:
-            raise ValueError("config: expected either a TwoStageConfig or its keywords, got both")
-        self.config = config or TwoStageConfig(**numbers)  # type: ignore[arg-type]
+        self.config = config_of(TwoStageConfig, config, numbers)
         self.num_boundaries = self.config.num_boundaries
         self.lane_width_std = self.config.lane_width_std
         self.draws: Tensor

@@ -7,7 +7,9 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from lanebev.types import NUM_BOUNDARIES, map_tensors, register_pytree
+from lanebev.tensors import map_tensors
+from lanebev.torch_internals import register_pytree
+from lanebev.types import NUM_BOUNDARIES
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,196 @@
+"""Iterated update of a predicted state by one frame."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lanebev.batch import flag
+from lanebev.estimation.joint.evidence import (
+    accumulate_evidence,
+    adapt_motion_scale,
+    adaptive_process_noise,
+    normalized_score,
+    with_process_noise,
+)
+from lanebev.estimation.joint.lane_change import best_shift, renumber
+from lanebev.estimation.joint.layout import NUM_COMMON, POSE, layout
+from lanebev.estimation.joint.measurement import (
+    NUM_STRAIGHT,
+    VERTICAL,
+    Residuals,
+    boundary_distances,
+    boundary_residuals,
+    foot_points,
+    look,
+)
+from lanebev.estimation.joint.observations import Observations, ego_lane_width, per_end
+from lanebev.estimation.joint.scatter import Scatter, averaged_moments, boundary_scatter, with_headings
+from lanebev.estimation.joint.state import JointConfig, JointState
+from lanebev.estimation.joint.update import (
+    FrameInformation,
+    Step,
+    agreement,
+    boundary_deviation,
+    estimated_entries,
+    frame_information,
+    kalman_gain,
+    membership,
+    observed_step,
+    posterior_covariance,
+    single_frame_std,
+    wide_precision,
+)
+from lanebev.estimation.reasons import Reason
+from lanebev.tensors import constant
+
+_NO_BOUNDARY_DEVIATION = 0.36  # m, from which a line bounds no lane: three sigmas of `open_deviation`
+
+
+class FrameUpdate(NamedTuple):
+    """A state after the update by a frame.
+
+    Attributes:
+        state: with the frame.
+        trust: (B, N) in [0, 1], weights of the segments.
+        inliers: (B, N) in [0, 1].
+        single_frame_std: (B, 5) rad and m, of pose and offset by this frame alone.
+    """
+
+    state: JointState
+    trust: Tensor
+    inliers: Tensor
+    single_frame_std: Tensor
+
+
+class Iteration(NamedTuple):
+    """One iteration of an update.
+
+    Attributes:
+        at: (B, O), point of linearisation.
+        frame: information of the frame there.
+        single_frame_std: (B, 5) rad and m, of pose and offset by the frame alone.
+        estimated: (B, D), 0 for entries that are considered only, else 1.
+        step: what follows.
+    """
+
+    at: Tensor
+    frame: FrameInformation
+    single_frame_std: Tensor
+    estimated: Tensor
+    step: Step
+
+
+def update_state(
+    predicted: JointState, positions: Tensor, seen: Observations, step: Tensor, cfg: JointConfig
+) -> FrameUpdate:
+    """Update a prediction by a frame: lane change, iterated robust update, adaptive process noise.
+
+    After the first iteration, evidence against the motion raises the process noise for the others.
+
+    Args:
+        predicted: state.
+        positions: (B, L) m, of the boundaries from the ego lane's middle.
+        seen: what was observed.
+        step: (B,) s since the last frame.
+        cfg: the configuration.
+    """
+    place, num, width = layout(cfg.num_boundaries), cfg.num_boundaries, ego_lane_width(positions)
+    sight = look(predicted.mean[:, :NUM_COMMON], seen, predicted.phase)
+    shift, scale = best_shift(predicted.mean, positions, seen, sight, width)
+    mean = renumber(predicted.mean, shift, width, num)
+    prior, places = mean[:, place.observed], positions.gather(1, seen.boundary)  # (B, O), (B, N)
+    member = membership(seen.boundary, num, like=places)
+
+    def iterate(at: Tensor, doubt: Tensor, residuals: Residuals, scale: Tensor, cov: Tensor) -> Iteration:
+        frame = frame_information(residuals, scale, doubt, seen, member)
+        alone = single_frame_std(frame.matrix)
+        estimated = estimated_entries(alone, num)
+        observed = cov[:, place.observed, place.observed]
+        moved = observed_step(prior, observed, at, frame, estimated[:, place.observed])
+        return Iteration(at, frame, alone, estimated, moved)
+
+    used = cov = predicted.cov
+    doubt, on_road = cov[:, place.observed, place.observed], lateral_places(prior, places, seen)
+    feet = foot_points(prior[:, :NUM_COMMON], on_road, seen, sight)
+    residuals = boundary_residuals(prior[:, :NUM_COMMON], on_road, seen, predicted.phase, feet, sight)
+    last = iterate(prior, doubt, residuals, scale, cov)
+    support = torch.bmm(member, per_end(last.frame.trust * seen.weight).unsqueeze(-1)).squeeze(-1)
+    score = normalized_score(doubt, last.frame, support, seen.weight)
+    evidence, motion_scale = with_evidence(predicted, score, last.estimated[:, POSE] > 0, step, cfg)
+    cov = with_process_noise(cov, adaptive_process_noise(evidence, doubt, cfg))
+    for _ in range(cfg.iterations - 1):
+        at, used = last.step.mean, cov
+        on_road = lateral_places(at, places, seen)
+        distance, valid = boundary_distances(at[:, :NUM_COMMON], on_road, seen, feet, predicted.phase)
+        residuals = residuals._replace(distance=distance, valid=valid)  # the Jacobian stays
+        last = iterate(at, last.step.cov, residuals, last.frame.scale, cov)
+
+    scatter = scatter_of_frame(last.frame, cov, member, predicted.scatter)
+    gain = kalman_gain(used, last.step, last.frame, last.estimated)
+    updated = predicted._replace(
+        mean=torch.baddbmm(mean.unsqueeze(-1), gain, last.step.pull.unsqueeze(-1)).squeeze(-1),
+        cov=posterior_covariance(cov, last.frame.matrix, gain),
+        evidence=evidence,
+        pose_sensitivity=scatter.sensitivity,
+        scatter=averaged_moments(scatter.moments, predicted.scatter, step, cfg.scatter_memory),
+        motion_scale=motion_scale,
+        reasons=flag(shift != 0, Reason.LANE_CHANGE),
+    )
+    return FrameUpdate(updated, last.frame.trust, inliers_of_lanes(last, seen), last.single_frame_std)
+
+
+def lateral_places(at: Tensor, places: Tensor, seen: Observations) -> Tensor:
+    """Add the boundaries' deviations at (B, O) to the segments' places (B, N) m."""
+    return places + at[:, NUM_COMMON:].gather(1, seen.boundary)
+
+
+def inliers_of_lanes(last: Iteration, seen: Observations) -> Tensor:
+    """Compute each segment's inlier probability (B, N), 0 on a line that deviates too much to bound a lane.
+
+    It deviates so either in the state or by this frame alone.
+    """
+    after = last.step.mean
+    agreed = agreement(last.frame, after - last.at, seen)
+    apart = torch.maximum(after[:, NUM_COMMON:].abs(), boundary_deviation(last.at, last.frame).abs())
+    lane = (apart < _NO_BOUNDARY_DEVIATION).gather(1, seen.boundary)
+    return torch.where((seen.weight > 0) & lane, agreed, 0.0)
+
+
+def with_evidence(
+    predicted: JointState, score: Tensor, pose_told: Tensor, step: Tensor, cfg: JointConfig
+) -> tuple[Tensor, Tensor]:
+    """Add a frame's scores to the evidence against the motion, and adapt the scale of the motion to them.
+
+    Args:
+        predicted: state.
+        score: (B, 11 + L), of :func:`~lanebev.estimation.joint.evidence.normalized_score`.
+        pose_told: (B, 4) bool, what of the pose the frame determines; the scale of the rest decays.
+        step: (B,) s since the last frame.
+        cfg: the configuration.
+
+    Returns:
+        evidence (B, 11 + L) and scale (B, 4).
+    """
+    evidence = accumulate_evidence(predicted.evidence, score, step, cfg.evidence_time)
+    scored = torch.where(pose_told, score[:, POSE], 1.0)  # 1 is the score that is expected
+    return evidence, adapt_motion_scale(predicted.motion_scale, scored, step, cfg)
+
+
+def scatter_of_frame(frame: FrameInformation, cov: Tensor, member: Tensor, moments: Tensor) -> Scatter:
+    """Estimate the scatter of the boundaries beside pose, offset and vertical curvature.
+
+    Args:
+        frame: its information, near the state.
+        cov: (B, D, D), of the state before the frame.
+        member: (B, L, M), boundary of each end point.
+        moments: (B, 2, 3) of the frames before.
+    """
+    matrix, vector = with_headings(frame.matrix, frame.vector, frame.residuals, frame.weight, member)
+    kept = constant((*range(NUM_STRAIGHT), *range(VERTICAL, vector.shape[-1])), matrix, torch.int64)
+    matrix, vector = matrix.index_select(1, kept).index_select(2, kept), vector.index_select(1, kept)
+    of_vertical = cov[:, VERTICAL, VERTICAL, None].reciprocal()
+    precision = torch.cat([wide_precision(cov), of_vertical], dim=-1)
+    return boundary_scatter(matrix, vector, precision, moments)
