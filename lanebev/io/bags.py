@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lanebev.io.bag_clock import BagClock
 from lanebev.io.bag_messages import IMAGE_TYPES, LENS_TYPES, Bag, Topic, open_bag
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import ALL, Frame
@@ -61,36 +62,33 @@ class BagSource(FrameSource):
         """Numbers of the frames that are taken, by their times if not all are."""
         if self.selection == ALL:
             return list(range(self.count))
-        times = self._times()
+        times = self.frame_times()
         return [number for number, time in enumerate(times) if self.selection.takes(number, time)]
 
-    def rate_of_times(self) -> Fraction:
-        """Return the frame rate by the median step between the first frames; the nominal one of a single."""
-        steps = [after - before for before, after in pairwise(islice(self._times(), _LOOKED_AT))]
-        return Fraction(1 / median(steps)).limit_denominator(1000) if steps else self.fps
+    def frame_times(self, clock: BagClock | None = None) -> Iterator[float]:
+        """Yield the times of the frames, s since the first, up to where the bag cannot be read.
 
-    def _times(self) -> Iterator[float]:
-        """Yield the times of the frames, s since the first, up to where the bag cannot be read."""
-        first = before = None
+        Args:
+            clock: what gives them; None for a new one.
+        """
+        first, clock = None, clock or BagClock(float(1 / self.fps))
         with contextlib.suppress(ValueError), open_bag(Path(self.source)) as bag:
             for logged, message in bag.messages(self.topic):
-                before = _later(_stamp(message, logged), before, float(1 / self.fps))
-                first = before if first is None else first
-                yield before - first
+                time, _ = clock.time(_stamp(message), 1e-9 * logged)
+                first = time if first is None else first
+                yield time - first
 
     def _video_frames(self) -> Iterator[Frame]:
         first = before = None
         number, interval = 0, float(1 / self.fps)
+        clock = BagClock(interval)
         try:
             with open_bag(Path(self.source)) as bag:
                 for number, (logged, message) in enumerate(bag.messages(self.topic)):
-                    stamp = _stamp(message, logged)
-                    time = _later(stamp, before, interval)
+                    time, problem = clock.time(_stamp(message), 1e-9 * logged)
                     first = time if first is None else first
                     dt = interval if before is None else time - before
-                    image, problem = None, ""
-                    if before is not None and stamp <= before:
-                        problem = f"expected a stamp later than the frame before, got {stamp - before:.4g} s"
+                    image = None
                     if self.selection.takes(number, time - first):
                         try:
                             image = self._right_size(message_image(message))
@@ -125,7 +123,11 @@ def open_bag_source(source: str, topic: str | None = None, fps: Fraction | None 
             raise ValueError(f"bag {source}: expected images on {chosen.name}, got none")
         lens = _lens(bag, chosen.name)
     found = BagSource(source, (), fps or DEFAULT_FPS, chosen.size, size, topic=chosen.name, lens=lens)
-    return found if fps else replace(found, fps=found.rate_of_times())
+    clock = BagClock(float(1 / found.fps))
+    steps = [after - before for before, after in pairwise(islice(found.frame_times(clock), _LOOKED_AT))]
+    words = f"bag {source}: {clock.unstamped} of its first images have no stamps; they follow as recorded"
+    rate = fps or (Fraction(1 / median(steps)).limit_denominator(1000) if steps else found.fps)
+    return replace(found, fps=rate, problem=words if clock.unstamped else "")
 
 
 def message_image(message: Any) -> NDArray[np.uint8]:
@@ -209,17 +211,12 @@ def _image_topic(source: str, topics: Sequence[Topic], wanted: str | None) -> To
     return next(iter(found.values())) if wanted is None else found[wanted]
 
 
-def _later(time: float, before: float | None, interval: float) -> float:
-    """Return a frame's time (s), or an interval after the frame before if it is not later than that."""
-    return time if before is None or time > before else before + interval
-
-
-def _stamp(message: Any, logged: int) -> float:
-    """Return a message's own time (s), or that of its recording where it has none."""
+def _stamp(message: Any) -> float | None:
+    """Return a message's own time (s); None if it is zero."""
     stamp = message.header.stamp if hasattr(message, "header") else message.timestamp
     seconds = getattr(stamp, "sec", None)
     if seconds is None:
         seconds, fraction = stamp.seconds, stamp.nanos
     else:
         fraction = stamp.nanosec
-    return float(seconds + 1e-9 * fraction) if seconds or fraction else 1e-9 * logged
+    return float(seconds + 1e-9 * fraction) if seconds or fraction else None

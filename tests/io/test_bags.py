@@ -16,6 +16,7 @@ from lanebev import Camera
 from lanebev.app.config import RunConfig
 from lanebev.app.sources import camera_of, make_source
 from lanebev.cli import main
+from lanebev.io.bag_clock import BagClock
 from lanebev.io.bags import BagSource, message_image, open_bag_source
 from lanebev.io.formats.mcap import write
 from lanebev.io.formats.record import RunRecord
@@ -173,6 +174,43 @@ def test_stamps_that_do_not_rise_are_said(tmp_path):  # usb_cam#259
     assert [frame.problem for frame in frames[:4]] == problems
 
 
+@pytest.mark.parametrize(
+    ("stamps", "logged", "times", "problems"),
+    [
+        ([7.0] * 4, [0, 0.1, 0.2, 0.4], [0, 0.1, 0.2, 0.4], {1: "got 0 s"}),
+        ([7.0] * 3, [5, 5, 5], [0, 0.5, 1], {1: "got 0 s"}),
+        ([None] * 3, [5, 5.1, 5.3], [0, 0.1, 0.3], {}),
+        # simulated time, of which some messages have none (gazebo_ros_pkgs#548)
+        ([12.3, None, 12.5, 12.6], [900, 900.1, 900.3, 900.4], [0, 0.1, 0.2, 0.3], {}),
+        ([None, 12.4, 12.6], [900, 900.1, 900.3], [0, 0.1, 0.3], {}),
+        # a bag that is played again
+        ([10, 10.1, 5, 5.1, 5.3], [90, 90.1, 90.2, 90.3, 90.5], [0, 0.1, 0.2, 0.3, 0.5], {2: "got -5.1 s"}),
+        ([1, 1.2, 1.1, 1.4], [9, 9.1, 9.2, 9.3], [0, 0.2, 0.3, 0.4], {2: "got -0.1 s"}),
+    ],
+)
+def test_times_rise_whatever_the_stamps(stamps, logged, times, problems):
+    clock = BagClock(0.5)
+    found = [clock.time(stamp, record) for stamp, record in zip(stamps, logged, strict=True)]
+    assert [time - found[0][0] for time, _ in found] == pytest.approx(times)
+    assert {
+        place: words[-len(problems.get(place, "")) :] for place, (_, words) in enumerate(found) if words
+    } == problems
+
+
+def test_images_without_stamps_are_said(tmp_path):  # zed-ros-wrapper#969
+    name = "sensor_msgs/msg/CompressedImage"
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection("/image", name, typestore=STORE)
+        for number in range(COUNT):
+            header = replace(_header(0), stamp=TYPES["builtin_interfaces/msg/Time"](0, 0))
+            message = STORE.serialize_cdr(replace(_compressed(number), header=header), name)
+            writer.write(connection, round(1e9 * (START + 0.2 * number)), message)
+    source = open_bag_source(str(tmp_path / "bag"))
+    assert source.problem.endswith(f"{COUNT} of its first images have no stamps; they follow as recorded")
+    assert [frame.time for frame in source] == pytest.approx(0.2 * np.arange(COUNT))
+    assert float(source.fps) == pytest.approx(5)
+
+
 def test_the_number_of_frames_that_are_taken_is_exact_where_times_vary(tmp_path, monkeypatch):
     name = "sensor_msgs/msg/CompressedImage"
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
@@ -185,7 +223,7 @@ def test_the_number_of_frames_that_are_taken_is_exact_where_times_vary(tmp_path,
     assert [frame.source_number for frame in source] == source.taken_numbers == [2, 3, 4]
     assert make_source(replace(config, start=0.3, end=0.75)).taken_count == 1
     with monkeypatch.context() as patch:  # the bag is read once
-        patch.setattr(BagSource, "_times", lambda self: pytest.fail("it was read again"))
+        patch.setattr(BagSource, "frame_times", lambda self: pytest.fail("it was read again"))
         assert (source.taken_count, source.taken_numbers) == (3, [2, 3, 4])
     with pytest.raises(ValueError, match="expected some of the 6 frames to be taken, got none"):
         make_source(replace(config, start=0.3, end=0.65))
