@@ -31,7 +31,7 @@ from lanebev.io.frames import Frame
 from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
 from lanebev.io.images import IMAGE_SUFFIXES, image_size, is_image, read_image, stated_size, write_png
 from lanebev.io.source_names import SCHEMES
-from lanebev.io.video_remarks import LONGEST_STEP, gap_remark, restart_remark, stream_remarks
+from lanebev.io.video_remarks import LONGEST_STEP, appended_remark, gap_remark, restart_remark, stream_remarks
 from lanebev.io.video_writer import VideoWriter
 
 __all__ = [
@@ -199,13 +199,14 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
     with open_video(source) as container:  # the header's count includes frames that an edit list cuts
         stream = video_stream(container)
         begin, tick = stream.start_time or 0, stream.time_base or 1 / fps
-        end, edited = Fraction(0), False
+        end, edited, read = Fraction(0), False, 0
         shown = [pts for pts in lost if first is not None and pts < first]
         telling = stream.codec_context.name not in _HIDING
         keys: list[tuple[int, float]] = []
         latest = -math.inf
         for packet in packets(container, stream):
             telling = telling and (packet.pts is not None or not packet.size)
+            read = max(read, (packet.pos or 0) + packet.size)
             if packet.pts is not None:
                 keys += [(packet.pts, latest)] if packet.is_keyframe else []
                 latest = max(latest, packet.pts)
@@ -215,6 +216,7 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
                     shown.append(packet.pts)
                 end = max(end, packet.pts - begin + max(packet.duration or 0, 1 / fps / tick))
         declared, got = _declared_duration(stream, begin * tick), float(end * tick)
+        problems += filter(None, [appended_remark(container, read)])
     count = len(shown)
     if restart := restart_remark(keys):
         problems.append(restart)

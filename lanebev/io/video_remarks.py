@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from itertools import pairwise
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
 import av
@@ -14,6 +15,7 @@ import av
 from lanebev.io.decoding import moving_pictures
 
 LONGEST_STEP = 60  # s between two frames of a drive
+_HEAD = 8  # bytes, which tell what kind of file it is
 _SPHERICAL = range(4)  # AVSphericalProjection: equirectangular, cube maps, half of one
 _OF_TWO_CAMERAS = range(1, 8)  # AVStereo3DType: side by side, one above the other, in turn, ...
 
@@ -41,11 +43,20 @@ def stream_remarks(
         remarks.append("its header says 360 degrees; cut out a pinhole view, as by ffmpeg -vf v360")
     if kinds.get("STEREO3D") in _OF_TWO_CAMERAS:
         remarks.append("its header says that frames have the images of two cameras; crop them to one")
-    if "mp4" in container.format.name and _has_appended(Path(container.name)):
-        remarks.append(
-            "another video is appended to it, of which nothing is read; join them by ffmpeg -f concat"
-        )
     return remarks
+
+
+def appended_remark(container: av.container.InputContainer, end: int) -> str:
+    """Return a remark if another file of the same kind follows what is read of a video; else nothing.
+
+    Args:
+        container: the video.
+        end: place in the file after its last packet.
+    """
+    path = Path(container.name)
+    if not (_has_appended(path) if "mp4" in container.format.name else _begins_again(path, end)):
+        return ""
+    return "another video is appended to it, of which nothing is read; join them by ffmpeg -f concat"
 
 
 def restart_remark(keys: Sequence[tuple[int, float]]) -> str:
@@ -64,6 +75,14 @@ def gap_remark(times: Sequence[int], tick: Fraction) -> str:
     """Return a remark on times (ticks) of frames between which a minute or more is missing; else nothing."""
     longest = max((after - before for before, after in pairwise(sorted(times))), default=0) * tick
     return f"its times jump by {float(longest):.0f} s; is it one drive?" if longest > LONGEST_STEP else ""
+
+
+def _begins_again(path: Path, end: int) -> bool:
+    """Tell whether the first bytes of a file come again after a place."""
+    if not end < path.stat().st_size:
+        return False
+    with open(path, "rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        return data.find(data[:_HEAD], end) >= 0
 
 
 def _has_appended(path: Path) -> bool:

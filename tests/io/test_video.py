@@ -150,6 +150,16 @@ def test_video_round_trip(tmp_path):
             assert frame.image[10, 10, 2] > 200
 
 
+@pytest.mark.parametrize("pause", [3599.0, 30 * 3600.0])
+def test_of_a_long_pause_an_hour_is_written(tmp_path, pause):
+    with VideoWriter(tmp_path / "v.mp4", Fraction(10)) as writer:
+        for time in (0, 0.1, 0.1 + pause, 0.2 + pause):
+            writer.write(np.zeros((16, 16, 3), np.uint8), time)
+    shown = min(pause, 3600.1)  # MP4 cannot have 7 hours between two frames
+    expected = [0, 0.1, 0.1 + shown, 0.2 + shown]
+    assert list(open_source(str(tmp_path / "v.mp4")).times) == pytest.approx(expected)
+
+
 def test_writer_makes_what_browsers_play(tmp_path):
     path = _video(tmp_path / "v.mp4", height=47, width=63)
     with av.open(str(path)) as container:
