@@ -14,11 +14,11 @@ import torch
 from jsonargparse.typing import PositiveInt
 from torch import Tensor
 
-from lanebev.geometry.lens import distort_points
 from lanebev.observation.lines import extract_segments
 from lanebev.observation.vertices import LineConfig
 from lanebev.render import RenderedFrame, boundary_masks, render_views
 from train.commands import one_line_errors
+from train.maps import boundaries_as_taken
 
 
 class ExtractionError(NamedTuple):
@@ -49,10 +49,10 @@ def extraction_error(frame: RenderedFrame, size: tuple[int, int], config: LineCo
     """
     masks = boundary_masks(frame, size, config.half_width).double()
     segments = extract_segments(masks, size, config, size)._asdict()
-    batch, boundaries, count, _ = frame.boundaries.shape
-    points = distort_points(frame.boundaries.flatten(1, 2), frame.intrinsics, frame.distortion).double()
+    batch, boundaries = frame.boundaries.shape[:2]
+    points = boundaries_as_taken(frame).double()
     scale = points.new_tensor([size[1] / frame.image.shape[3], size[0] / frame.image.shape[2]])
-    truth = ((points + 0.5) * scale - 0.5).view(batch, boundaries, count, 2)
+    truth = (points + 0.5) * scale - 0.5
     # the masks are taken for the image: one network pixel per cell, so stride is 1
     ends = segments["endpoints"].view(batch, boundaries, -1, 2)
     seen = segments["weight"].view(batch, boundaries, -1, 1).expand(-1, -1, -1, 2).flatten(2) > 0

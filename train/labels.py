@@ -8,6 +8,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
 Float = npt.NDArray[np.float32]
 Byte = npt.NDArray[np.uint8]
@@ -84,19 +86,25 @@ def _runs(line: Float, mask: Bool) -> list[npt.NDArray[np.int32]]:
     return [fixed[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
 
 
-def separated(points: Float, exists: Bool, gap: float) -> Bool:
-    """Return where a boundary is at least ``gap`` px from the next one at the same distance ahead, (L, P).
+def separated(points: Tensor, exists: Tensor, gap: float) -> Tensor:
+    """Return where a boundary is at least ``gap`` px from the next one of the same distance ahead.
 
     Towards the horizon the boundaries run together; what cannot be told apart is not worth learning.
+
+    Args:
+        points: (..., L, P, 2) px.
+        exists: (..., L, P) bool.
+        gap: px.
+
+    Returns:
+        (..., L, P) bool.
     """
-    order = np.where(exists, points[..., 0], np.nan)
-    with np.errstate(invalid="ignore"):
-        apart = np.hypot(*np.moveaxis(np.diff(points, axis=0), -1, 0)) >= gap  # (L - 1, P)
-    apart |= np.isnan(np.diff(order, axis=0))
-    free = np.ones(exists.shape, bool)
-    free[1:] &= apart
-    free[:-1] &= apart
-    return exists & free
+    apart = points.diff(dim=-3).norm(dim=-1) >= gap  # (..., L - 1, P)
+    apart = apart | ~(exists[..., 1:, :] & exists[..., :-1, :])
+    free = exists.clone()
+    free[..., 1:, :] &= apart
+    free[..., :-1, :] &= apart
+    return free
 
 
 @dataclass(frozen=True)
@@ -177,7 +185,8 @@ def _view(
     )
     stride = config.output_stride
     points = (sample.points @ matrix[:2, :2].T + matrix[:2, 2]).astype(np.float32) / np.float32(stride)
-    exists = separated(points, sample.painted & np.isfinite(points).all(-1), config.gap)
+    there = torch.from_numpy(sample.painted & np.isfinite(points).all(-1))
+    exists = separated(torch.from_numpy(points), there, config.gap).numpy()
     label_size = (-(-height // stride), -(-width // stride))
     target = draw_boundaries(points, exists & sample.visible, label_size, config.half_width)
     hidden = draw_boundaries(points, exists & ~sample.visible, label_size, 2 * config.half_width)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lanebev.geometry.lens import distort_points
 from lanebev.render import RenderedFrame, draw_stripes
-from train.labels import ViewConfig
+from train.labels import ViewConfig, separated
 
 
 class LabelMaps(NamedTuple):
@@ -21,27 +21,6 @@ class LabelMaps(NamedTuple):
 
     target: Tensor
     weight: Tensor
-
-
-def separated(points: Tensor, exists: Tensor, gap: float) -> Tensor:
-    """Return where a boundary is at least ``gap`` px from the next one of the same distance ahead.
-
-    The same as :func:`train.labels.separated`, for a batch.
-
-    Args:
-        points: (..., L, P, 2) px.
-        exists: (..., L, P) bool.
-        gap: px.
-
-    Returns:
-        (..., L, P) bool.
-    """
-    apart = points.diff(dim=-3).norm(dim=-1) >= gap  # (..., L - 1, P)
-    apart = apart | ~(exists[..., 1:, :] & exists[..., :-1, :])
-    free = exists.clone()
-    free[..., 1:, :] &= apart
-    free[..., :-1, :] &= apart
-    return free
 
 
 def label_maps(
@@ -67,8 +46,8 @@ def label_maps(
     return LabelMaps(target / target.sum(1, keepdim=True).clamp(min=1), weight)
 
 
-def boundaries_as_taken(frame: RenderedFrame, model: str = "pinhole") -> Tensor:
+def boundaries_as_taken(frame: RenderedFrame) -> Tensor:
     """Return a rendered batch's boundary points as the lens shows them, (B, L, P, 2) px."""
     flat = frame.boundaries.flatten(1, 2)
-    taken = distort_points(flat, frame.intrinsics, frame.distortion, model)
+    taken = distort_points(flat, frame.intrinsics, frame.distortion)
     return taken.reshape(frame.boundaries.shape)

@@ -7,26 +7,22 @@ costs about as much as training on a view, and several views can be drawn from e
 from __future__ import annotations
 
 import argparse
-import os
 import time
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
 from jsonargparse.typing import PositiveInt
 
-from lanebev.geometry.lens import denormalise_points, distort_points
-from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
+from lanebev.geometry.vanishing_point import vanishing_point
 from lanebev.render import RenderedFrame, render_views
+from train.archives import as_bytes, decode_jpeg, encode_jpegs, read_arrays, write_arrays
 from train.commands import one_line_errors
 from train.labels import LabelledImage
-
-_QUALITY = 94  # of JPEG
+from train.maps import boundaries_as_taken
 
 
 class Pose(NamedTuple):
@@ -71,12 +67,8 @@ class Shard(NamedTuple):
 
     def frame(self, index: int) -> LabelledImage:
         """Decode one frame."""
-        start = 0 if index == 0 else int(self.ends[index - 1])
-        image = cv2.imdecode(self.jpeg[start : int(self.ends[index])], cv2.IMREAD_COLOR_RGB)
-        if image is None:
-            raise ValueError(f"frame {index} of a shard: expected a JPEG image, it does not decode")
         return LabelledImage(
-            image,
+            decode_jpeg(self.jpeg, self.ends, index),
             self.points[index],
             self.painted[index],
             self.visible[index],
@@ -90,16 +82,12 @@ class Shard(NamedTuple):
 
 def labelled_images(frame: RenderedFrame) -> Iterator[LabelledImage]:
     """Return the rows of a rendered batch, with boundaries as the lens shows them."""
-    batch, boundaries, count, _ = frame.boundaries.shape
-    points = distort_points(frame.boundaries.flatten(1, 2), frame.intrinsics, frame.distortion)
-    points = points.unflatten(1, (boundaries, count))
-    direction = vanishing_dir_from_pitch_yaw(frame.extrinsics.pitch, frame.extrinsics.yaw)
-    vanishing = denormalise_points((direction[:, :2] / direction[:, 2:])[:, None], frame.intrinsics)
-    vanishing = distort_points(vanishing, frame.intrinsics, frame.distortion)[:, 0]
-    images = (frame.image * 255).round().clamp(0, 255).byte().permute(0, 2, 3, 1)
-    for row in range(batch):
+    pitch, yaw, _, _ = frame.extrinsics
+    vanishing = vanishing_point(pitch, yaw, frame.intrinsics, frame.distortion)
+    points, images = boundaries_as_taken(frame), as_bytes(frame.image)
+    for row, image in enumerate(images):
         yield LabelledImage(
-            images[row].contiguous().numpy(),
+            image,
             points[row].float().numpy(),
             (frame.painted[row] > 0.5).numpy(),
             (frame.visible[row] > 0.5).numpy(),
@@ -116,21 +104,10 @@ def camera_poses(frames: list[RenderedFrame]) -> Pose:
 def write_shard(path: Path, frames: list[RenderedFrame]) -> None:
     """Write rendered batches as one shard, whole or not at all."""
     samples = [sample for frame in frames for sample in labelled_images(frame)]
-    options = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
-    jpegs = [cv2.imencode(".jpg", sample.image[..., ::-1], options)[1].ravel() for sample in samples]
-    partial = path.with_suffix(".part")
-    with partial.open("wb") as file:
-        np.savez(
-            file,
-            jpeg=np.concatenate(jpegs),
-            ends=np.cumsum([len(jpeg) for jpeg in jpegs]),
-            points=np.stack([sample.points for sample in samples]),
-            painted=np.stack([sample.painted for sample in samples]),
-            visible=np.stack([sample.visible for sample in samples]),
-            vanishing_point=np.stack([sample.vanishing_point for sample in samples]),
-            **camera_poses(frames)._asdict(),
-        )
-    os.replace(partial, path)
+    jpeg, ends = encode_jpegs(sample.image for sample in samples)
+    own = ("points", "painted", "visible", "vanishing_point")
+    fields = {name: np.stack([getattr(sample, name) for sample in samples]) for name in own}
+    write_arrays(path, {"jpeg": jpeg, "ends": ends, **fields, **camera_poses(frames)._asdict()})
 
 
 def read_shard(path: Path) -> Shard:
@@ -139,9 +116,10 @@ def read_shard(path: Path) -> Shard:
     Raises:
         ValueError: not a shard.
     """
-    own, poses = Shard._fields[:-1], Pose._fields
-    jpeg, ends, points, painted, visible, vanishing_point, *pose = _read_fields(path, (*own, *poses))
-    return Shard(jpeg, ends, points, painted, visible, vanishing_point, Pose(*pose))
+    own = Shard._fields[:-1]
+    arrays = read_arrays(path, (*own, *Pose._fields), "a pool shard")
+    jpeg, ends, points, painted, visible, vanishing = arrays[: len(own)]
+    return Shard(jpeg, ends, points, painted, visible, vanishing, Pose(*arrays[len(own) :]))
 
 
 def shard_size(path: Path) -> int:
@@ -150,15 +128,7 @@ def shard_size(path: Path) -> int:
     Raises:
         ValueError: not a shard.
     """
-    return len(_read_fields(path, ("ends",))[0])
-
-
-def _read_fields(path: Path, names: tuple[str, ...]) -> list[npt.NDArray[Any]]:
-    try:
-        with np.load(path) as file:
-            return [file[name] for name in names]
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: expected a pool shard with {', '.join(names)}: {error}") from error
+    return len(read_arrays(path, ("ends",), "a pool shard")[0])
 
 
 @one_line_errors()

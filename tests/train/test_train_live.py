@@ -17,9 +17,8 @@ import train.live
 from lanebev.render import WindowConfig
 from train.__main__ import main
 from train.budget import Stage, rate_factor, stage_at, used_share
-from train.labels import ViewConfig
+from train.labels import ViewConfig, separated
 from train.live import HeldOutBatches, LiveBatches, LiveRoads, ScenesAhead, far_stage
-from train.maps import separated
 from train.module import Segmentation
 from train.rendering import Views, drawn, labelled, mirrored, rendered
 from train.stopwatch import Stopwatch

@@ -78,11 +78,11 @@ def test_stripes_share_where_they_overlap():
 
 
 def test_boundaries_that_cannot_be_told_apart_are_left_out():
-    points = np.stack([[[0, 10], [9, 0]], [[10, 10], [10, 0]], [[20, 10], [11, 0]]]).astype(np.float32)
-    keep = separated(points, np.ones((3, 2), bool), gap=2.0)
-    np.testing.assert_array_equal(keep, [[True, False], [True, False], [True, False]])
-    alone = separated(points, np.array([[1, 1], [0, 0], [0, 0]], bool), gap=2.0)
-    np.testing.assert_array_equal(alone, [[True, True], [False, False], [False, False]])
+    points = torch.tensor([[[0, 10], [9, 0]], [[10, 10], [10, 0]], [[20, 10], [11, 0]]]).double()
+    keep = separated(points, torch.ones(3, 2).bool(), gap=2.0)
+    assert keep.tolist() == [[True, False], [True, False], [True, False]]
+    alone = separated(points, torch.tensor([[1, 1], [0, 0], [0, 0]]).bool(), gap=2.0)
+    assert alone.tolist() == [[True, True], [False, False], [False, False]]
 
 
 def bright_line(slot=1):

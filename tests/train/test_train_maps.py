@@ -8,8 +8,7 @@ import torch
 
 from lanebev.render import draw_stripes, render_views
 from train.labels import ViewConfig, full_view
-from train.labels import separated as separated_by_numpy
-from train.maps import boundaries_as_taken, label_maps, separated
+from train.maps import boundaries_as_taken, label_maps
 from train.pool import labelled_images
 
 VIEW = ViewConfig()
@@ -69,17 +68,6 @@ def test_points_that_are_no_numbers_or_far_away_draw_nothing():
 def test_long_pieces_have_no_holes():
     stripe = draw_stripes(torch.tensor([[-30.0, 16.0], [80.0, 16.0]]), torch.ones(2), (32, 32), 1.0)
     torch.testing.assert_close(stripe[16], torch.ones(32))
-
-
-def test_boundaries_that_cannot_be_told_apart_are_left_out_as_by_numpy():
-    generator = np.random.default_rng(2)
-    points = generator.uniform(0, 8, (6, 40, 2)).astype(np.float32)
-    exists = generator.random((6, 40)) < 0.7
-    expected = separated_by_numpy(points, exists, 2.0)
-    found = separated(torch.from_numpy(points), torch.from_numpy(exists), 2.0)
-    np.testing.assert_array_equal(found.numpy(), expected)
-    assert expected.any()
-    assert (expected != exists).any()
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

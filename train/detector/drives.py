@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import time
-import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from jsonargparse.typing import PositiveInt
@@ -28,6 +25,7 @@ from lanebev.render.camera_motion import SmoothNoise
 from lanebev.render.scene.sampler import BatchSampler
 from lanebev.types import Extrinsics
 from lanebev.view.grid import BEVGrid
+from train.archives import as_bytes, decode_jpeg, encode_jpegs, read_arrays, write_arrays
 from train.commands import one_line_errors
 from train.detector.boxes import in_grid, visible_share
 
@@ -94,9 +92,7 @@ class DriveRecord(NamedTuple):
 
     def images(self) -> NDArray[np.uint8]:
         """Decode, (N, H, W, 3)."""
-        parts = np.split(self.jpeg, self.ends[:-1])
-        decoded: list[Any] = [cv2.imdecode(part, cv2.IMREAD_COLOR_RGB) for part in parts]
-        return np.stack(decoded)
+        return np.stack([decode_jpeg(self.jpeg, self.ends, index) for index in range(len(self.ends))])
 
 
 def render_drive(seed: int, frames: int, size: tuple[int, int], fps: float, lanes: LaneBEV) -> DriveRecord:
@@ -111,7 +107,7 @@ def render_drive(seed: int, frames: int, size: tuple[int, int], fps: float, lane
     """
     drive = ShakingDrive(seed, image_size=size, num_frames=frames, fps=fps)
     taken = [drive.frame(index) for index in range(frames)]
-    jpegs = [_jpeg(frame.image[0]) for frame in taken]
+    jpeg, ends = encode_jpegs(as_bytes(frame.image[0]) for frame in taken)
     truth = [
         torch.cat(part)
         for part in zip(
@@ -121,8 +117,8 @@ def render_drive(seed: int, frames: int, size: tuple[int, int], fps: float, lane
     boxes, valid, extrinsics, lane_width = truth
     share = visible_share(boxes, valid, image_bearings(taken[0].intrinsics, extrinsics[:, 1], size[1]))
     record = DriveRecord(
-        jpeg=np.concatenate(jpegs),
-        ends=np.cumsum([len(jpeg) for jpeg in jpegs]),
+        jpeg=jpeg,
+        ends=ends,
         boxes=boxes.numpy(),
         seen=(share >= VISIBLE).numpy(),
         extrinsics=extrinsics.numpy(),
@@ -172,12 +168,9 @@ def has_vehicles(seed: int, frames: int, fps: float) -> bool:
 
 def write_drive(path: Path, record: DriveRecord) -> None:
     """Write a drive, whole or not at all."""
-    partial = path.with_suffix(".part")
     arrays = record._asdict()
-    state = arrays.pop("state")._asdict()
-    with partial.open("wb") as file:
-        np.savez(file, **arrays, **{f"state_{name}": part.numpy() for name, part in state.items()})
-    os.replace(partial, path)
+    state = {f"state_{name}": part.numpy() for name, part in arrays.pop("state")._asdict().items()}
+    write_arrays(path, {**arrays, **state})
 
 
 def read_drive(path: Path) -> DriveRecord:
@@ -186,23 +179,11 @@ def read_drive(path: Path) -> DriveRecord:
     Raises:
         ValueError: not a drive.
     """
-    own = DriveRecord._fields[:-1]
-    try:
-        with np.load(path) as file:
-            arrays = {name: file[name] for name in own}
-            state = JointState(*(torch.from_numpy(file[f"state_{name}"]) for name in JointState._fields))
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(
-            f"{path}: expected a drive that train.detector.drives wrote, got: {error}"
-        ) from error
-    return DriveRecord(**arrays, state=state)
-
-
-def _jpeg(image: Tensor) -> NDArray[np.uint8]:
-    """Encode (3, H, W) in [0, 1] as JPEG."""
-    pixels = (image * 255).round().clamp(0, 255).byte().permute(1, 2, 0).numpy()
-    coded: NDArray[np.uint8] = cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 94])[1]
-    return coded.ravel()
+    own, state = DriveRecord._fields[:-1], JointState._fields
+    names = (*own, *(f"state_{name}" for name in state))
+    arrays = read_arrays(path, names, "a drive that train.detector.drives wrote")
+    parts = dict(zip(own, arrays, strict=False))
+    return DriveRecord(**parts, state=JointState(*map(torch.from_numpy, arrays[len(own) :])))
 
 
 @one_line_errors()
