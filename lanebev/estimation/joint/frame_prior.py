@@ -77,6 +77,20 @@ class FramePrior:
         shape = (self.curvature_std, self.curvature_rate_std)
         return constant((*angles, self.height_std, self.offset_std, *shape), like=like)
 
+    def precision(self, params: Tensor) -> Tensor:
+        """Compute the precisions (..., P) of the prior, weighted as Student's t at the first P parameters."""
+        std = self.std(params)[: params.shape[-1]]
+        return student_weight(self._squared(params), self.freedom) / std.square()
+
+    def log_density(self, params: Tensor) -> Tensor:
+        """Compute the log density (...) of parameters (..., P), the constant left out."""
+        return student_log(self._squared(params), self.freedom)
+
+    def _squared(self, params: Tensor) -> Tensor:
+        """Squared normalised distances (..., P) of parameters from their means."""
+        count = params.shape[-1]
+        return ((params - self.mean(params)[:count]) / self.std(params)[:count]).square()
+
 
 def prior_of_mount(pose: Sequence[float], std: Sequence[float]) -> FramePrior:
     """Make the prior of a frame from the camera's mount.

@@ -49,6 +49,7 @@ NUM_SHAPE = 1 + NUM_STEPS
 VERTICAL = NUM_STRAIGHT + NUM_SHAPE
 """Index of the vertical curvature (1/m), the last parameter of a road whose bend is a spline."""
 
+LEAST_HEIGHT = 0.2  # m, of the camera in a fit of one frame
 FOOT_RANGE = 0.02  # of the focal length; a foot point farther off is an outlier's, perhaps above the horizon
 
 
@@ -214,6 +215,18 @@ def foot_points(params: Tensor, places: Tensor, seen: Observations, sight: Sight
     step = distance.clamp(-reach, reach) * per_pixel
     points = torch.addcmul(sight.pixels[:, :2], step.unsqueeze(1), line[:, :2], value=-1)
     return pad(points, (0, 0, 0, 1), value=1.0)
+
+
+def normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute Jᵀ W J and Jᵀ W r, (B, P, P) and (B, P), from (B, P, 2N), (B, 2, N) and a weight (B, N)."""
+    weighted = jacobian * per_end(weight).unsqueeze(1)
+    return weighted @ jacobian.mT, (weighted @ distance.flatten(1).unsqueeze(-1)).squeeze(-1)
+
+
+def above_road(params: Tensor) -> Tensor:
+    """Limit the height of a frame's parameters (B, 7) to ``LEAST_HEIGHT`` and more."""
+    height = params[:, HEIGHT : HEIGHT + 1].clamp(min=LEAST_HEIGHT)
+    return torch.cat([params[:, :HEIGHT], height, params[:, HEIGHT + 1 :]], dim=-1)
 
 
 def sampson_distances(params: Tensor, places: Tensor, sight: Sight) -> Tensor:

@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 from lanebev.estimation.checks import as_lane_width, check_segments, mask_invalid_rows
 from lanebev.geometry.lens import cam_from_image
 from lanebev.observation.segments import LaneSegments
-from lanebev.tensors import constant
+from lanebev.tensors import constant, map_tensors
 
 
 class Observations(NamedTuple):
@@ -33,6 +33,10 @@ class Observations(NamedTuple):
     sigma: Tensor
     focal: Tensor
     cam_from_image: Tensor
+
+    def repeated(self, count: int) -> Observations:
+        """Return each row ``count`` times, one after the other."""
+        return map_tensors(lambda part: part.repeat_interleave(count, dim=0), self)
 
 
 def observe(segments: LaneSegments, intrinsics: Tensor, num_boundaries: int) -> Observations:

@@ -6,24 +6,23 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import one_hot, softplus
+from torch.nn.functional import one_hot
 
-from lanebev.estimation.joint.frame_prior import FramePrior, student_log, student_weight
+from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.measurement import (
-    HEIGHT,
     NUM_PARAMS,
     OFFSET,
+    above_road,
     boundary_residuals,
     foot_points,
     look,
+    normal_equations,
 )
 from lanebev.estimation.joint.observations import Observations, by_ends, ego_lane_width, per_end
 from lanebev.estimation.joint.readings import Readings
 from lanebev.estimation.joint.robust import (
-    anneal_scale,
-    inlier_log_odds,
-    inlier_weights,
-    noise_scale,
+    log_likelihood,
+    reweigh,
     scaled_variance,
     squared_distance,
     start_scale,
@@ -73,7 +72,7 @@ def reading_model(
     places = positions.unsqueeze(1) + ways.shift * ego_lane_width(positions)[:, None, None]  # (B, C, L)
     own = [ways.deviation_std, ways.heading_std, ways.vertical_curvature_std.unsqueeze(-1)]
     std = torch.cat(own, dim=-1).expand(len(positions), -1, -1)
-    many = Observations(*(part.repeat_interleave(places.shape[1] * repeats, dim=0) for part in seen))
+    many = seen.repeated(places.shape[1] * repeats)
     return Model(
         seen=many,
         member=one_hot(per_end(many.boundary), positions.shape[-1]).to(positions),
@@ -109,54 +108,54 @@ def _own_lines(params: Tensor, model: Model) -> Tensor:
     at = _linearise(params, none, model)
     jacobian = at.jacobian[:, NUM_PARAMS:]
     weight = at.valid * model.seen.weight / model.seen.sigma.square()
-    weighted = jacobian * per_end(weight).unsqueeze(1)
-    information = weighted @ jacobian.mT + model.std.square().reciprocal().diag_embed()
-    return -solve_spd(information, weighted @ at.distance.flatten(1).unsqueeze(-1)).squeeze(-1)
+    information, gradient = normal_equations(jacobian, at.distance, weight)
+    information = information + model.std.square().reciprocal().diag_embed()
+    return -solve_spd(information, gradient.unsqueeze(-1)).squeeze(-1)
 
 
 def fit_readings(params: Tensor, model: Model, steps: int) -> Fits:
     """Compute the robust maximum a posteriori fit of every row, with its evidence."""
     seen, prior = model.seen, model.prior
-    mean, std = prior.mean(params), prior.std(params)
-    at_prior = torch.cat([mean.expand_as(params), torch.zeros_like(model.std)], dim=-1)
+    std = prior.std(params)
     own = _own_lines(params, model)
     at = _linearise(params, own, model)
     scale = start_scale(at.distance, seen.sigma, seen.weight * at.valid)
-    for step in range(steps + 1):
-        squared, variance = squared_distance(at.distance), scaled_variance(seen.sigma, scale)
-        trust = inlier_weights(squared, at.valid, variance, seen.focal) * seen.weight
-        scale = anneal_scale(scale, noise_scale(squared, seen.sigma, trust))
-        weight = at.valid * trust / scaled_variance(seen.sigma, scale)
-        weighted = at.jacobian * per_end(weight).unsqueeze(1)
-        away = ((params - mean) / std).square()
-        of_prior = student_weight(away, prior.freedom) / std.square()
-        prior_precision = torch.cat([of_prior, model.std.square().reciprocal()], dim=-1)
-        information = weighted @ at.jacobian.mT + prior_precision.diag_embed()
-        if step == steps:
-            break
-        found = torch.cat([params, own], dim=-1)
-        gradient = (weighted @ at.distance.flatten(1).unsqueeze(-1)).squeeze(-1) + prior_precision * (
-            found - at_prior
-        )
+    for _ in range(steps):
+        information, gradient, scale = _posterior_equations(params, own, at, scale, model)
         change = solve_spd(information, gradient.unsqueeze(-1)).squeeze(-1)
         too_far = (change[:, :NUM_PARAMS] / std).abs().amax(-1, keepdim=True)
-        found = found - change / too_far.clamp(min=1.0)
-        params, own = found[:, :NUM_PARAMS], found[:, NUM_PARAMS:]
-        height = params[:, HEIGHT : HEIGHT + 1].clamp(min=0.2)
-        params = torch.cat([params[:, :HEIGHT], height, params[:, HEIGHT + 1 :]], dim=-1)
+        found = torch.cat([params, own], dim=-1) - change / too_far.clamp(min=1.0)
+        params, own = above_road(found[:, :NUM_PARAMS]), found[:, NUM_PARAMS:]
         at = _linearise(params, own, model)
+    information, _, scale = _posterior_equations(params, own, at, scale, model)
     squared, variance = squared_distance(at.distance), scaled_variance(seen.sigma, scale)
-    odds = inlier_log_odds(squared, variance, seen.focal)
-    likelihood = (seen.weight * torch.where(at.valid, softplus(odds), 0.0)).sum(-1)
+    likelihood = log_likelihood(squared, at.valid, seen.weight, variance, seen.focal)
     of_lines = -0.5 * (own / model.std).square().sum(-1) - model.std.log().sum(-1)
-    evidence = likelihood + student_log(away, prior.freedom) + of_lines - _half_log_det(information)
+    evidence = likelihood + prior.log_density(params) + of_lines - _half_log_det(information)
     good = evidence.isfinite() & params.isfinite().all(-1)
     return Fits(
-        params=torch.where(good.unsqueeze(-1), params, mean),
+        params=torch.where(good.unsqueeze(-1), params, prior.mean(params)),
         own=own,
         covariance=inverse_spd(information)[:, :NUM_PARAMS, :NUM_PARAMS],
         evidence=torch.where(good, evidence, -1e30),
     )
+
+
+def _posterior_equations(
+    params: Tensor, own: Tensor, at: Linear, scale: Tensor, model: Model
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute the reweighted information and gradient of parameters and lines, priors included.
+
+    Returns:
+        (R, 7 + 2 L + 1, 7 + 2 L + 1), (R, 7 + 2 L + 1), and (R,) noise scale.
+    """
+    seen, prior = model.seen, model.prior
+    trust, scale = reweigh(squared_distance(at.distance), at.valid, seen, scale)
+    weight = at.valid * trust * seen.weight / scaled_variance(seen.sigma, scale)
+    information, gradient = normal_equations(at.jacobian, at.distance, weight)
+    precision = torch.cat([prior.precision(params), model.std.square().reciprocal()], dim=-1)
+    away = torch.cat([params - prior.mean(params), own], dim=-1)
+    return information + precision.diag_embed(), gradient + precision * away, scale
 
 
 def _half_log_det(matrix: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 from lanebev.batch import flag, replace_rows, select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.evidence import CALL
-from lanebev.estimation.joint.frame_prior import FramePrior, student_weight
+from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, NUM_STRAIGHT, ROLL, boundary_residuals
 from lanebev.estimation.joint.observations import Observations
@@ -186,14 +186,13 @@ def scatter_of_fit(fit: SingleFrameFit, places: Tensor, seen: Observations, cfg:
     The sensitivity is 0 where the fit does not determine the pose, since the prior's covariance contains more
     there.
     """
-    params, std = fit.params(), cfg.prior.std(places)
+    params = fit.params()
     residuals = boundary_residuals(params, places, seen)
-    away = ((params - cfg.prior.mean(places)) / std).square()
     weight = residuals.valid * fit.inliers * seen.weight / scaled_variance(seen.sigma, fit.scale)
     member = membership(seen.boundary, cfg.num_boundaries, like=places)
     told = with_headings(*information(residuals, weight, member), residuals, weight, member)
-    precision = student_weight(away, cfg.prior.freedom) / std.square()
-    found = boundary_scatter(*told, precision, places.new_zeros(places.shape[0], 2, 3))
+    no_moments = places.new_zeros(places.shape[0], 2, 3)
+    found = boundary_scatter(*told, cfg.prior.precision(params), no_moments)
     determined = fit.observed.all(-1)[:, None, None]
     return found._replace(sensitivity=torch.where(determined, found.sensitivity, 0.0))
 

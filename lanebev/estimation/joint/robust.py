@@ -11,6 +11,8 @@ import math
 import torch
 from torch import Tensor
 
+from lanebev.estimation.joint.observations import Observations
+
 OUTLIER_RANGE = 0.2  # of the focal length: gross outliers spread over some 200 px at f = 1000 px
 OUTLIER_ODDS = 0.3  # prior odds of a gross outlier
 SCALE_PRIOR = 20.0  # number of segments as which the prior for the given sigmas counts
@@ -76,6 +78,27 @@ def noise_scale(squared: Tensor, sigma: Tensor, weight: Tensor) -> Tensor:
 def anneal_scale(scale: Tensor, fitted: Tensor) -> Tensor:
     """Lower the noise scale (B,) to the fitted one, by a factor of 2 at most; never raise it."""
     return torch.minimum(torch.maximum(fitted, 0.5 * scale), scale)
+
+
+def reweigh(
+    squared: Tensor, valid: Tensor, seen: Observations, scale: Tensor, blur: float | Tensor = 0.0
+) -> tuple[Tensor, Tensor]:
+    """Weigh the segments of a frame, and lower the noise scale to that of its inliers.
+
+    Source: (J6) and (J7).
+
+    Args:
+        squared: (B, N) px², see :func:`inlier_log_odds`.
+        valid: (B, N) bool.
+        seen: what was observed.
+        scale: (B,), noise scale so far.
+        blur: (B, N) px² or a number, variance that no end point owes to its noise.
+
+    Returns:
+        (B, N) probability of an inlier, and (B,) noise scale.
+    """
+    trust = inlier_weights(squared, valid, scaled_variance(seen.sigma, scale) + blur, seen.focal)
+    return trust, anneal_scale(scale, noise_scale(squared, seen.sigma, trust * seen.weight))
 
 
 def start_scale(distance: Tensor, sigma: Tensor, weight: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from lanebev.estimation.joint.frame_prior import FramePrior, student_weight
+from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.geometry.linalg import inverse_spd
 
 
@@ -23,10 +23,8 @@ def temper_frame(pose: Tensor, covariance: Tensor, prior: FramePrior, factor: fl
     Returns:
         pose and covariance; those given at a factor of 1, the prior's at a large one.
     """
-    size = pose.shape[-1]
-    mean, std = prior.mean(pose)[:size], prior.std(pose)[:size]
-    apart = pose - mean
-    known = (student_weight((apart / std).square(), prior.freedom) / std.square()).diag_embed()
+    mean = prior.mean(pose)[: pose.shape[-1]]
+    apart, known = pose - mean, prior.precision(pose).diag_embed()
     share = factor**-2
     information = inverse_spd(covariance)
     weakened = inverse_spd(share * information + (1 - share) * known)
