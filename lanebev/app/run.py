@@ -32,7 +32,7 @@ from lanebev.app.recovery import facts_of, frame_name, observer_of_second_pass, 
 from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states, resume_remark
 from lanebev.app.shared_network import SharedNetwork
 from lanebev.app.smoothing import SmoothedPoses, smooth_frames
-from lanebev.app.source_changes import changes_remark, files_of
+from lanebev.app.source_changes import files_of, source_remarks
 from lanebev.app.sources import camera_of, ended_by_signals, first_image, make_source, observed_frames
 from lanebev.app.summary import mount_facts, run_facts
 from lanebev.camera.model import Camera
@@ -130,7 +130,7 @@ def run(
                 if viewer is not None:
                     pose, lines = estimate.calibration.extrinsics, vertex_lines(seen.vertices)
                     viewer.add(RecordedFrame(recorder.rows[-1], pose, lines), frame.image)
-        recorder.problems += filter(None, [changes_remark(source, files)])
+        recorder.problems += source_remarks(source, files, len(recorder.rows))
         facts = run_facts(config, source, camera) | facts_of(taken)
         if tracker.mount is not None:
             plain = {"camera": camera.fingerprint(), "lane_width": tracker.lane_width}

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from lanebev.app.recovery import size_and_time
-from lanebev.io.video import FrameSource, images_of
+from lanebev.io.image_files import images_of
+from lanebev.io.video import FrameSource
 
 Files = dict[str, tuple[int, int]]
 """Size and time of change of files, by path."""
@@ -41,3 +42,16 @@ def changes_remark(source: FrameSource, before: Files) -> str:
     if not words:
         return ""
     return f"{source.source}: files changed during the run: {words}; run again when it is complete"
+
+
+def count_remark(source: FrameSource, got: int) -> str:
+    """Return a remark if another number of frames came than a video's packets say; else nothing."""
+    expected = got if source.is_live else source.taken_count
+    if got == min(expected, source.most or expected):
+        return ""
+    return f"{source.source}: expected {expected} frames by its packets, got {got}; is it damaged?"
+
+
+def source_remarks(source: FrameSource, before: Files, got: int) -> list[str]:
+    """Return remarks on files that changed during a run, and on the number of frames that it got."""
+    return [*filter(None, (changes_remark(source, before), count_remark(source, got)))]

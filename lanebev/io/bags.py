@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.io.bag_clock import BagClock
 from lanebev.io.bag_messages import IMAGE_TYPES, LENS_TYPES, Bag, Topic, open_bag
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import ALL, Frame
 from lanebev.io.images import is_damaged_jpeg
+from lanebev.io.rising_clock import RisingClock
 
 _PLAIN = {  # encoding of ROS to channels, and to OpenCV's conversion to RGB
     "rgb8": (3, None),
@@ -65,13 +65,13 @@ class BagSource(FrameSource):
         times = self.frame_times()
         return [number for number, time in enumerate(times) if self.selection.takes(number, time)]
 
-    def frame_times(self, clock: BagClock | None = None) -> Iterator[float]:
+    def frame_times(self, clock: RisingClock[float] | None = None) -> Iterator[float]:
         """Yield the times of the frames, s since the first, up to where the bag cannot be read.
 
         Args:
             clock: what gives them; None for a new one.
         """
-        first, clock = None, clock or BagClock(float(1 / self.fps))
+        first, clock = None, clock or RisingClock(float(1 / self.fps))
         with contextlib.suppress(ValueError), open_bag(Path(self.source)) as bag:
             for logged, message in bag.messages(self.topic):
                 time, _ = clock.time(_stamp(message), 1e-9 * logged)
@@ -81,7 +81,7 @@ class BagSource(FrameSource):
     def _video_frames(self) -> Iterator[Frame]:
         first = before = None
         number, interval = 0, float(1 / self.fps)
-        clock = BagClock(interval)
+        clock = RisingClock(interval)
         try:
             with open_bag(Path(self.source)) as bag:
                 for number, (logged, message) in enumerate(bag.messages(self.topic)):
@@ -123,7 +123,7 @@ def open_bag_source(source: str, topic: str | None = None, fps: Fraction | None 
             raise ValueError(f"bag {source}: expected images on {chosen.name}, got none")
         lens = _lens(bag, chosen.name)
     found = BagSource(source, (), fps or DEFAULT_FPS, chosen.size, size, topic=chosen.name, lens=lens)
-    clock = BagClock(float(1 / found.fps))
+    clock = RisingClock(float(1 / found.fps))
     steps = [after - before for before, after in pairwise(islice(found.frame_times(clock), _LOOKED_AT))]
     words = f"bag {source}: {clock.unstamped} of its first images have no stamps; they follow as recorded"
     rate = fps or (Fraction(1 / median(steps)).limit_denominator(1000) if steps else found.fps)

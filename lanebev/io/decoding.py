@@ -12,6 +12,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+_DRAWN_TEXTS = ("tty", "bin", "xbin", "adf", "idf")  # formats of which ffmpeg draws the letters
 _NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS: raw streams, whose times ffmpeg makes up
 _MARKED = "one that the decoder marks as damaged"
 _EARLY = "one before the first key frame"
@@ -32,6 +33,11 @@ def open_video(source: str) -> av.container.InputContainer:
         reason = error.strerror or "unknown format"
         words = f"video {source}: expected a video that opens, got: {reason}; is it a video, and whole?"
         raise ValueError(words) from error
+    if container.format.name in _DRAWN_TEXTS:
+        container.close()
+        raise ValueError(
+            f"{source}: expected a video, got a text; images are given as a folder or as a quoted glob"
+        )
     for stream in container.streams.video:
         tell_damaged_jpegs(stream)
     if not moving_pictures(container):
@@ -59,8 +65,8 @@ def video_stream(container: av.container.InputContainer) -> av.VideoStream:
 
 
 def has_times(container: av.container.InputContainer) -> bool:
-    """Return whether the container says when its frames are shown; raw streams do not."""
-    return not int(container.format.flags) & _NO_TIMES
+    """Return whether the container says when its frames are shown; raw streams and piped images do not."""
+    return not (int(container.format.flags) & _NO_TIMES or container.format.name.endswith("_pipe"))
 
 
 def packets(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[av.Packet]:

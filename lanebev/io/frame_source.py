@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lanebev.io.decoding import rgb
 from lanebev.io.frames import ALL, Frame, Selection, taken_frames
 from lanebev.io.images import read_image
+from lanebev.io.rising_clock import RisingClock
 from lanebev.io.seeking import begun
 
 DEFAULT_FPS = Fraction(30)
@@ -99,11 +100,10 @@ class FrameSource:
         damaged, reported = False, False  # since the last key frame
         with begun(self.source, self.selection.start) as video:
             first, before, tick = video.first, video.before, video.stream.time_base
+            clock = RisingClock(1 / self.fps, before)
             for index, (pts, frame) in enumerate(video.frames, start=video.number):
                 timed = pts is not None and self.has_times
-                time = pts * tick if timed else (first or 0) + index / self.fps
-                if before is not None and time <= before:  # AVI has no times of display
-                    time = before + 1 / self.fps
+                time, _ = clock.time(pts * tick if timed else None, index / self.fps)
                 first = time if first is None else first
                 dt = float(1 / self.fps) if before is None else float(time - before)
                 image, problem = None, ""

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import av
 
-from lanebev.io.decoding import display_matrix, pixel_aspect, rgb, tell_damaged_jpegs
+from lanebev.io.decoding import display_matrix, has_times, pixel_aspect, rgb, tell_damaged_jpegs
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import ALL, Frame, Selection
+from lanebev.io.rising_clock import RisingClock
 from lanebev.io.source_names import PIPE, without_login
 from lanebev.pipes import await_bytes, open_pipe
 
@@ -87,11 +88,12 @@ class LiveSource(FrameSource):
     def __iter__(self) -> Iterator[Frame]:
         slot = self._own_slot()
         start = before = None
+        clock = RisingClock(float(1 / self.fps))
         try:
             while (item := slot.take()) is not None:
                 arrival, frame = item
                 self.figures.longest_wait = max(self.figures.longest_wait, time.monotonic() - arrival)
-                now = self._stated(frame, self.figures.seen) if self.keep_all else arrival
+                now = float(clock.time(*self._stated(frame))[0]) if self.keep_all else arrival
                 start = now if start is None else start
                 dt = float(1 / self.fps) if before is None else now - before
                 image, problem = None, ""
@@ -112,9 +114,9 @@ class LiveSource(FrameSource):
             raise RuntimeError("a live source is made by open_live")
         return self.slot
 
-    def _stated(self, frame: av.VideoFrame, number: int) -> float:
-        """Return the time (s) of a frame by the stream, or by its number if the stream states none."""
-        return float(number / self.fps) if frame.time is None else frame.time
+    def _stated(self, frame: av.VideoFrame) -> tuple[float | None, float]:
+        """Return the time (s) of the next frame by the stream, None if it states none, and by its number."""
+        return frame.time if self.has_times else None, float(self.figures.seen / self.fps)
 
 
 def _whole_frames(
@@ -231,6 +233,9 @@ def open_live(
         got = "damaged ones only" if figures.damaged else "none"
         raise ValueError(f"stream {name}: expected a whole frame, got {got}") from error
     rate = Fraction(fps or stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
+    timed, problem = has_times(container), ""
+    if keep_all and not timed and fps is None:
+        problem = f"stream {name}: it has no times, and is taken for {float(rate):g} frames per second"
     slot = _Slot(keep_all, figures)
     slot.put(first)
     thread = threading.Thread(
@@ -238,7 +243,7 @@ def open_live(
     )
     thread.start()
     live = LiveSource(
-        without_login(source), (), rate, 0, size, pixel_aspect=aspect, matrix=matrix,
+        without_login(source), (), rate, 0, size, problem, (), timed, pixel_aspect=aspect, matrix=matrix,
         slot=slot, keep_all=keep_all, figures=figures,
     )  # fmt: skip
     weakref.finalize(live, slot.stop)  # of a run that ended before its first frame

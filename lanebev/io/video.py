@@ -28,6 +28,14 @@ from lanebev.io.decoding import (
 )
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import Frame
+from lanebev.io.image_files import (
+    HEIC,
+    endings_remedy,
+    folder_remedy,
+    glob_pattern,
+    images_of,
+    left_out_remark,
+)
 from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
 from lanebev.io.images import IMAGE_SUFFIXES, image_size, is_image, read_image, stated_size, write_png
 from lanebev.io.source_names import SCHEMES
@@ -49,7 +57,6 @@ __all__ = [
 ]
 
 _LOOKED_AT = 20  # images, for the most frequent size and one that has it
-_HEIC = (".heic", ".heif")  # ffmpeg takes the tiles of such an image for videos
 _DARK = 24  # of 255; 12 bits in 16 give 15 at most
 _SAME_RATE = 0.05  # relative, by which two frame rates may differ and be the same
 _SAME_VIDEO = 2  # factor, by which a video's frames may come faster or slower than its mean rate
@@ -71,9 +78,9 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
     if path.is_dir():
         paths = in_natural_order(images_of(source))
         if not paths:
-            raise ValueError(f"{source}: expected images in the folder, got none; {_folder_remedy(path)}")
-        return _image_source(source, paths, fps)
-    if path.suffix.lower() in _HEIC:
+            raise ValueError(f"{source}: expected images in the folder, got none; {folder_remedy(path)}")
+        return _image_source(source, paths, fps, left_out_remark(path))
+    if path.suffix.lower() in HEIC:
         raise ValueError(f"{source}: expected a video or an image, got HEIC; convert it to JPEG")
     if path.is_file():
         return _image_source(source, [source], fps) if is_image(path) else _video_source(source, fps)
@@ -81,23 +88,13 @@ def open_source(source: str, fps: Fraction | None = None) -> FrameSource:
         paths = in_natural_order(images_of(source))
         if not paths:
             matches = glob.glob(glob_pattern(source), recursive=True)
-            remedy = _endings_remedy(map(Path, matches)) or "quote the pattern"
+            remedy = endings_remedy(map(Path, matches)) or "quote the pattern"
             raise ValueError(f"{source}: expected images that match, got none; {remedy}")
         return _image_source(source, paths, fps)
     raise ValueError(
         f"{source}: expected a video, an image, a folder or a glob of images, got nothing there"
         f"{_address_remedy(source)}"
     )
-
-
-def images_of(source: str) -> list[str]:
-    """Return the images in a folder, or that match a glob; none of other sources."""
-    path = Path(source)
-    if path.is_dir():
-        return [str(p) for p in path.iterdir() if is_image(p) and p.name[0] != "."]  # macOS leaves ._ files
-    if path.is_file() or not glob.has_magic(source):
-        return []
-    return list(filter(is_image, glob.glob(glob_pattern(source), recursive=True)))
 
 
 def _address_remedy(source: str) -> str:
@@ -110,31 +107,10 @@ def _address_remedy(source: str) -> str:
     return f"; streams are {', '.join(SCHEMES)}; download other addresses first" if "://" in source else ""
 
 
-def _folder_remedy(folder: Path) -> str:
-    """Return what to give instead of a folder without images."""
-    below = f"for images in folders below it give a quoted glob such as '{folder}/**/*.jpg'"
-    return "; ".join(filter(None, [_endings_remedy(folder.iterdir()), below]))
-
-
-def _endings_remedy(paths: Iterable[Path]) -> str:
-    """Return what to give instead of files that are no images; empty if there are none."""
-    endings = sorted({each.suffix for each in paths if each.is_file() and each.name[0] != "."})
-    known = " ".join(IMAGE_SUFFIXES)
-    found = f"its files end with {' '.join(endings[:5])}, images with {known}; give a video itself"
-    return found if endings else ""
-
-
-def glob_pattern(source: str) -> str:
-    """Return a source as a glob, with brackets in the names of existing folders taken literally."""
-    folder = next((str(each) for each in Path(source).parents if each.is_dir()), ".")
-    rest = source.removeprefix(folder)
-    return glob.escape(folder) + rest if rest != source and glob.has_magic(rest) else source
-
-
-def _image_source(source: str, paths: Sequence[str], fps: Fraction | None) -> FrameSource:
+def _image_source(source: str, paths: Sequence[str], fps: Fraction | None, left_out: str = "") -> FrameSource:
     image = _typical_image(paths)
     size, times = image.shape[:2], times_from_names(paths)
-    remarks = [_dark_remark(image)]
+    remarks = [left_out, _dark_remark(image)]
     rate = fps or DEFAULT_FPS
     if times:
         own = 1 / Fraction(median(np.diff(times).tolist())).limit_denominator(1_000_000)
@@ -203,13 +179,14 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
         shown = [pts for pts in lost if first is not None and pts < first]
         telling = stream.codec_context.name not in _HIDING
         keys: list[tuple[int, float]] = []
-        latest = -math.inf
+        latest, early, most_early = -math.inf, 0, 0
         for packet in packets(container, stream):
             telling = telling and (packet.pts is not None or not packet.size)
             read = max(read, (packet.pos or 0) + packet.size)
             if packet.pts is not None:
                 keys += [(packet.pts, latest)] if packet.is_keyframe else []
-                latest = max(latest, packet.pts)
+                early = early + 1 if packet.pts < latest else 0
+                latest, most_early = max(latest, packet.pts), max(most_early, early)
                 edited = edited or packet.is_discard
                 # what precedes the first frame is not shown: it lacks a key frame
                 if not packet.is_discard and (first is None or packet.pts >= first):
@@ -218,7 +195,7 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
         declared, got = _declared_duration(stream, begin * tick), float(end * tick)
         problems += filter(None, [appended_remark(container, read)])
     count = len(shown)
-    if restart := restart_remark(keys):
+    if restart := restart_remark(keys, most_early):
         problems.append(restart)
         telling = False
     if not telling:

@@ -13,6 +13,7 @@ from pathlib import Path
 import av
 
 from lanebev.io.decoding import moving_pictures
+from lanebev.io.rising_clock import REORDERED
 
 LONGEST_STEP = 60  # s between two frames of a drive
 _HEAD = 8  # bytes, which tell what kind of file it is
@@ -59,16 +60,19 @@ def appended_remark(container: av.container.InputContainer, end: int) -> str:
     return "another video is appended to it, of which nothing is read; join them by ffmpeg -f concat"
 
 
-def restart_remark(keys: Sequence[tuple[int, float]]) -> str:
-    """Return a remark on times of key frames that fall or begin again in the file; else nothing.
+def restart_remark(keys: Sequence[tuple[int, float]], early: int) -> str:
+    """Return a remark on times that fall or begin again in the file; else nothing.
 
     Equal times of frames one after another are no such case: very fast videos round them to the same tick.
 
     Args:
         keys: time of each key frame, and the latest one of all frames before it in the file, both in ticks.
+        early: most frames one after another in the file that are all earlier than one before them.
     """
     begins_again = any(time <= before and time < latest for (before, _), (time, latest) in pairwise(keys))
-    return "its times begin again, as of files joined byte by byte; is it one drive?" if begins_again else ""
+    if not begins_again and early <= REORDERED:
+        return ""
+    return "its times begin again, as of files joined byte by byte; is it one drive?"
 
 
 def gap_remark(times: Sequence[int], tick: Fraction) -> str:

@@ -322,6 +322,17 @@ def test_half_a_jpeg_on_a_pipe_is_no_frame(tmp_path, cut):
     assert (f" {len(cut)} damaged and left out," in source.figures.words()) == bool(cut)
 
 
+@pytest.mark.parametrize(("fps", "interval"), [(Fraction(10), 0.1), (None, 0.04)])
+def test_frames_without_times_on_a_pipe_have_the_stated_rate(tmp_path, fps, interval):
+    os.mkfifo(tmp_path / "pipe")
+    writer = threading.Thread(target=(tmp_path / "pipe").write_bytes, args=(b"".join(_jpegs(())),))
+    writer.start()
+    source = open_live(str(tmp_path / "pipe"), fps, keep_all=True)
+    assert [frame.dt for frame in source] == pytest.approx([interval] * 8)
+    writer.join()
+    assert source.problem.endswith("" if fps else "has no times, and is taken for 25 frames per second")
+
+
 def test_a_pipe_without_a_writer_is_one_line(tmp_path, capsys, data, monkeypatch):
     monkeypatch.setattr("lanebev.pipes._LONGEST_WAIT", 0.3)
     fixed = ("--camera", data / "camera.yaml", "--out", tmp_path / "out")

@@ -6,6 +6,7 @@ import pytest
 
 from lanebev import Camera
 from lanebev.app.config import RunConfig
+from lanebev.app.fleet.manifest import read_manifest
 from lanebev.app.fleet.plan import settings_fingerprint
 from lanebev.camera.choice import camera_file
 from lanebev.camera.plausibility import camera_remarks
@@ -118,6 +119,14 @@ def test_the_file_is_an_input_whatever_camera_of_it_is_taken(tmp_path):
     before = settings_fingerprint(config)
     path.write_text(_kalibr(*FOCALS[:2]))
     assert settings_fingerprint(config) != before
+
+
+def test_drives_of_several_cameras_of_a_file_are_not_those_of_one(tmp_path):
+    _write(tmp_path, _kalibr(*FOCALS))
+    drives = "video,camera\na.mp4,cameras.yaml#cam0\nb.mp4,cameras.yaml#cam1\n"
+    (tmp_path / "drives.csv").write_text(drives)
+    manifest = read_manifest(tmp_path / "drives.csv")
+    assert [drive.camera_id for drive in manifest] == ["cameras-cam0", "cameras-cam1"]
 
 
 def _opencv(extra, distortion="[0.1, 0.01, 0.001, 0.002]"):

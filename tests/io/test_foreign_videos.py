@@ -251,6 +251,12 @@ def test_times_that_begin_again_are_said(tmp_path, parts):
     assert _joined(tmp_path / "w.ts", [range(20), range(20, 40)]).problem == ""
 
 
+def test_after_times_that_begin_again_the_steps_between_them_count(tmp_path):
+    frames = list(_joined(tmp_path / "v.ts", [range(20), range(0, 42, 2)]))  # at first a tenth, as before
+    assert [frame.dt for frame in frames[-4:]] == pytest.approx([0.2] * 4)
+    assert all(frame.dt > 0 for frame in frames)
+
+
 def test_times_rounded_to_the_same_tick_do_not_begin_again(tmp_path):  # Matroska's are whole ms
     path = tmp_path / "v.mkv"
     with av.open(str(path), "w") as container:

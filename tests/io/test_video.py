@@ -337,6 +337,26 @@ def test_cut_video(tmp_path):
         open_source(str(path))
 
 
+def test_images_and_videos_that_are_left_out_of_a_folder_are_said(tmp_path):
+    for name in ("1.png", "2.png"):
+        Image.new("RGB", (64, 48), "grey").save(tmp_path / name)
+    for name in ("1.json", "bev.mp4", "._3.HEIC"):
+        (tmp_path / name).touch()
+    assert open_source(str(tmp_path)).problem == ""
+    for name in ("3.HEIC", "drive.MP4"):
+        (tmp_path / name).touch()
+    source = open_source(str(tmp_path))
+    assert source.count == 2
+    assert "2 pictures or videos beside the images are left out, such as 3.HEIC;" in source.problem
+    assert open_source(f"{tmp_path}/*.png").problem == ""
+
+
+def test_a_list_of_images_is_no_video(tmp_path):  # of which ffmpeg draws the letters
+    (tmp_path / "train.txt").write_text("".join(f"images/{i:04d}.jpg\n" for i in range(100)))
+    with pytest.raises(ValueError, match=r"train\.txt: expected a video, got a text; images are given"):
+        open_source(str(tmp_path / "train.txt"))
+
+
 def test_folder_without_images_suggests_a_glob(tmp_path):
     _folder(tmp_path, ["a/1.png"])
     with pytest.raises(ValueError, match=r"quoted glob such as '.*/\*\*/\*\.jpg'"):

@@ -16,6 +16,7 @@ import yaml
 
 from lanebev.app.config import RunConfig
 from lanebev.app.settings_file import load_plain_yaml, parsed_settings
+from lanebev.camera.choice import split_name
 from lanebev.io.source_names import is_live, without_login
 from lanebev.numbers import read_text, shown
 
@@ -198,7 +199,10 @@ def _default_name(video: str) -> str:
 
 
 def _default_camera(config: RunConfig) -> str:
-    return Path(config.camera).stem if config.camera else f"fov-{config.fov:g}"
+    if not config.camera:
+        return f"fov-{config.fov:g}"
+    file, name = split_name(config.camera)
+    return "-".join(filter(None, [file.stem, name]))
 
 
 def _time_and_day(row: Row) -> tuple[str, str]:
