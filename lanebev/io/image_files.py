@@ -25,7 +25,19 @@ def images_of(source: str) -> list[str]:
         return [str(p) for p in path.iterdir() if is_image(p) and p.name[0] != "."]  # macOS leaves ._ files
     if path.is_file() or not glob.has_magic(source):
         return []
-    return list(filter(is_image, glob.glob(glob_pattern(source), recursive=True)))
+    return list(filter(is_image, _each_once(glob.glob(glob_pattern(source), recursive=True))))
+
+
+def _each_once(paths: Iterable[str]) -> list[str]:
+    """Return each file once, by its shortest path: links of folders lead to it by others."""
+    folders: dict[str, str] = {}
+    found: dict[tuple[str, str], str] = {}
+    for path in sorted(paths, key=len):
+        folder, name = os.path.split(path)
+        if folder not in folders:
+            folders[folder] = os.path.realpath(folder)
+        found.setdefault((folders[folder], name), path)
+    return list(found.values())
 
 
 def glob_pattern(source: str) -> str:

@@ -351,6 +351,17 @@ def test_images_and_videos_that_are_left_out_of_a_folder_are_said(tmp_path):
     assert open_source(f"{tmp_path}/*.png").problem == ""
 
 
+def test_links_of_folders_lead_to_no_image_twice(tmp_path):
+    (tmp_path / "a").mkdir()
+    for name in ("1.png", "2.png"):
+        Image.new("RGB", (64, 48), "grey").save(tmp_path / "a" / name)
+    (tmp_path / "a" / "loop").symlink_to(".")
+    (tmp_path / "latest").symlink_to("a")
+    (tmp_path / "a" / "3.png").symlink_to("2.png")  # a frame that was repeated
+    names = [f"{tmp_path}/a/{i}.png" for i in (1, 2, 3)]
+    assert open_source(f"{tmp_path}/**/*.png").paths == tuple(names)
+
+
 def test_a_list_of_images_is_no_video(tmp_path):  # of which ffmpeg draws the letters
     (tmp_path / "train.txt").write_text("".join(f"images/{i:04d}.jpg\n" for i in range(100)))
     with pytest.raises(ValueError, match=r"train\.txt: expected a video, got a text; images are given"):
