@@ -90,7 +90,14 @@ def is_colmap(text: str) -> bool:
 
 def colmap_cameras(text: str) -> Readers:
     """Return what reads the cameras of COLMAP's ``cameras.txt``, by their numbers."""
-    return {number: partial(_colmap, *values) for number, *values in _COLMAP.findall(text)}
+    found = _COLMAP.findall(text)
+    names = _telling([number for number, *_ in found])
+    return {name: partial(_colmap, *values) for name, (_, *values) in zip(names, found, strict=True)}
+
+
+def _telling(names: list[str]) -> list[str]:
+    """Return the names of a file's cameras, or their places if these do not tell them apart."""
+    return names if len(set(names)) == len(names) else [str(place) for place in range(len(names))]
 
 
 def _colmap(name: str, width: str, height: str, values: str) -> CameraParameters:
@@ -118,8 +125,7 @@ def nuscenes_cameras(records: Sequence[Any], image_size: tuple[int, int] | None)
     cameras = [each for each in records if isinstance(each, Mapping) and each.get("camera_intrinsic")]
     if not cameras:
         raise ValueError("camera_intrinsic: expected that of a camera, got none")
-    names = [str(each.get("token")) for each in cameras]
-    names = names if len(set(names)) == len(names) else [str(place) for place in range(len(names))]
+    names = _telling([str(each.get("token")) for each in cameras])
     return {name: partial(_nuscenes, each, image_size) for name, each in zip(names, cameras, strict=True)}
 
 

@@ -5,7 +5,8 @@ Reading is strict: an unknown key, a missing, non-finite or absurd value is a ``
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from lanebev.camera.datasets import (
 )
 from lanebev.camera.formats import opencv_or_ros, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
-from lanebev.camera.parsing import parse
+from lanebev.camera.parsing import parse_documents
 from lanebev.camera.slam import camodocal, is_kalibr, is_orb_slam, kalibr_cameras, orb_slam_cameras
 from lanebev.numbers import read_text, shown
 
@@ -67,10 +68,23 @@ def read_camera(
         elif is_kitti(text) or (path.suffix.lower() == ".txt" and "width" not in text):
             camera = checked(chosen(kitti_cameras(text, image_size), name, has_usual=True))
         else:
-            camera = _camera(parse(text), image_size, rectified, name)
+            camera = _camera_of(parse_documents(text), image_size, rectified, name)
         return without_lens(camera) if rectified else camera
     except ValueError as error:
         raise ValueError(f"camera file {path}: {' '.join(str(error).split())}") from error
+
+
+def _camera_of(
+    documents: Sequence[Any], image_size: tuple[int, int] | None, rectified: bool, name: str | None
+) -> CameraParameters:
+    """Return the camera of a file's documents, such as messages that were printed one after another."""
+    if len(documents) == 1:
+        return _camera(documents[0], image_size, rectified, name)
+    readers = {
+        str(number): partial(_camera, document, image_size, rectified, None)
+        for number, document in enumerate(documents, start=1)
+    }
+    return chosen(readers, name, has_usual=True)
 
 
 def _camera(

@@ -33,25 +33,34 @@ _INI_KEYS = {
 
 
 def parse(text: str) -> Any:
+    """Return what the first document of a camera file says, see :func:`parse_documents`."""
+    return parse_documents(text)[0]
+
+
+def parse_documents(text: str) -> list[Any]:
     """Return what a camera file says: dicts by key, lists, texts, and None for nothing.
+
+    Returns:
+        the first document, and the second one of a YAML file that has more.
 
     Raises:
         ValueError: the syntax is none of YAML, JSON, XML and ROS's INI, or a key is given twice.
     """
     if _ROS_INI.search(text):
-        return _parse_ini(text)
+        return [_parse_ini(text)]
     start = text.lstrip()[:1]
     if start == "<":
-        return _parse_xml(text)
+        return [_parse_xml(text)]
     if start in ("{", "["):
         try:
-            return json.loads(
+            fields = json.loads(
                 text,
                 object_pairs_hook=_once,
                 parse_int=str,
                 parse_float=str,
                 parse_constant=str,
             )
+            return [fields]
         except (json.JSONDecodeError, RecursionError):
             pass  # YAML has braces too, and says where it breaks off
     return _parse_yaml(text)
@@ -103,22 +112,29 @@ for _tag in ("int", "float", "bool", "timestamp"):
     _TextLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _construct_text)
 
 
-def _parse_yaml(text: str) -> Any:
+def _parse_yaml(text: str) -> list[Any]:
+    """Return the first two documents that say something; of a second one that breaks off nothing is said."""
     if len(text) > _LARGEST_YAML:
         raise ValueError(f"expected a camera file, got {len(text)} characters of YAML")
     lines = text.replace(_NO_BREAK_SPACE, " ").splitlines()
     if lines and lines[0].startswith("%YAML"):  # OpenCV writes %YAML:1.0, which YAML does not allow
         lines[0] = ""
+    found: list[Any] = []
     try:
         documents = yaml.load_all(_TABS.sub(" ", "\n".join(lines)), Loader=_TextLoader)
-        return next((each for each in documents if each is not None), None)  # ros2 topic echo ends with ---
+        found.extend(itertools.islice((each for each in documents if each is not None), 2))
+        return found or [None]  # ros2 topic echo ends with ---
     except (yaml.YAMLError, RecursionError) as error:
+        if found and "document start" not in str(getattr(error, "problem", "")):
+            return found
         mark = getattr(error, "problem_mark", None)
         where = f" at line {mark.line + 1}" if mark else ""
         if isinstance(error, yaml.constructor.ConstructorError) and "!" in text:
             raise ValueError(f"expected numbers, texts and lists, got another object{where}") from error
         if "\\t" in str(getattr(error, "problem", "")):
             raise ValueError(f"expected YAML, got a tab{where}; indent by spaces") from error
+        if found:
+            raise ValueError(f"expected all keys in the braces, got more after them{where}") from error
         raise ValueError(f"expected YAML, got a syntax error{where}; is the file cut?") from error
 
 

@@ -129,6 +129,33 @@ def test_drives_of_several_cameras_of_a_file_are_not_those_of_one(tmp_path):
     assert [drive.camera_id for drive in manifest] == ["cameras-cam0", "cameras-cam1"]
 
 
+MESSAGE = (
+    "width: 1280\nheight: 720\nk: [{0}, 0, 640, 0, {0}, 360, 0, 0, 1]\nd: []\nheader: {{stamp: {1}}}\n---\n"
+)
+
+
+def test_messages_of_one_camera_that_were_printed_one_after_another(tmp_path):
+    text = "".join(MESSAGE.format(800, stamp) for stamp in range(3))
+    for cut in (text, text[:-20], text[: len(text) // 2 - 30]):
+        camera = Camera.from_file(_write(tmp_path, cut))
+        assert (float(camera.intrinsics[0, 0]), camera.remark) == (800, "")
+
+
+def test_messages_of_two_cameras_that_were_printed_one_after_another(tmp_path):
+    path = _write(tmp_path, MESSAGE.format(800, 1) + MESSAGE.format(900, 2))
+    camera = Camera.from_file(path)
+    assert camera.intrinsics[0, 0] == 800
+    assert camera.remark == "the file has the cameras 1, 2, of which 1 is taken; choose another as FILE#2"
+    assert Camera.from_file(f"{path}#2").intrinsics[0, 0] == 900
+
+
+@pytest.mark.parametrize("more", ["distortion: [-0.3, 0.1, 0, 0, 0]", "model: fisheye", "{fx: 900}"])
+def test_keys_after_the_braces_are_not_left_out(tmp_path, more):
+    text = f"{{fx: 800, fy: 800, cx: 640, cy: 360, width: 1280, height: 720}}\n{more}\n"
+    with pytest.raises(ValueError, match=r"expected all keys in the braces, got more after them at line 2$"):
+        Camera.from_file(_write(tmp_path, text))
+
+
 def _opencv(extra, distortion="[0.1, 0.01, 0.001, 0.002]"):
     return (
         "image_width: 1280\nimage_height: 720\ncamera_matrix: [800, 0, 640, 0, 800, 360, 0, 0, 1]\n"
