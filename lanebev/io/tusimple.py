@@ -112,7 +112,7 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
     if "h_samples" in fields:
         rows = finite_numbers("h_samples", field(fields, "h_samples", list))
     else:
-        rows = _benchmark_rows(field(fields, "lanes", list))
+        rows = _benchmark_rows(fields)
     if not (all(a < b for a, b in pairwise(rows)) or all(a > b for a, b in pairwise(rows))):
         raise ValueError("h_samples: expected rising rows, or falling ones, got others")
     checked_pixels("h_samples", np.array(rows))
@@ -173,9 +173,15 @@ def _seen_lines(fields: dict[str, Any]) -> list[LaneLine]:
     return lines
 
 
-def _benchmark_rows(lanes: list[Any]) -> list[float]:
+def _benchmark_rows(fields: dict[str, Any]) -> list[float]:
     """Return the rows of a prediction without ``h_samples``, by their number, as in TuSimple's benchmark."""
+    lanes = field(fields, "lanes", list)
     count = len(lanes[0]) if lanes and isinstance(lanes[0], list) else 0
+    for name, values in fields.items():  # y_samples, say
+        if count > len(lanes) and name != "lanes" and isinstance(values, list) and len(values) == count:
+            raise ValueError(
+                f"h_samples: expected this key, got {shown(name)} with as many numbers; rename it"
+            )
     if lanes and count not in _TUSIMPLE_ROWS:
         known = " or ".join(map(str, _TUSIMPLE_ROWS))
         raise ValueError(
