@@ -12,8 +12,9 @@ from lanebev.camera.model import Camera
 from lanebev.render.camera_motion import BodyMotion, LanePath
 from lanebev.render.course import Course
 from lanebev.render.frame import RenderedFrame
+from lanebev.render.rows import concatenate_rows
 from lanebev.render.scene.camera import Lens
-from lanebev.render.scene.sampler import BatchSampler, concatenate_rows
+from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.traffic import NUM_VEHICLES
 from lanebev.render.scene.tunnel import endless
 from lanebev.render.scene.weather import CLEAR

@@ -14,9 +14,10 @@ from lanebev.render.frame import RenderedFrame
 from lanebev.render.raster.features import features_of
 from lanebev.render.raster.paint import paint_view, prepare
 from lanebev.render.raster.sensor import take_image
+from lanebev.render.rows import send, take_rows
 from lanebev.render.scene.alignment import build_alignment
 from lanebev.render.scene.camera import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
-from lanebev.render.scene.sampler import BatchSampler, select_rows, send
+from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.varied import varied_extrinsics, varied_intrinsics
 from lanebev.render.scene.window import (
     WindowConfig,
@@ -69,11 +70,11 @@ def render_scenes(
         parts = []
         for start in range(0, len(host.place.along), rows):
             cut = slice(start, start + rows)
-            own = select_rows(host, cut)
-            part = own if scene is host else select_rows(scene, cut)
+            own = take_rows(host, cut)
+            part = own if scene is host else take_rows(scene, cut)
             features = features_of(own)
             generators = [torch.Generator(where).manual_seed(seed) for seed in seeds[cut]]
-            painted = paint_view(part, select_rows(prepared, cut), size, features)
+            painted = paint_view(part, take_rows(prepared, cut), size, features)
             image = take_image(painted, part, own, features, generators, ideal_sensor)
             parts.append((image, painted.blocked, painted.nearest))
         image, blocked, nearest = (torch.cat(pieces) for pieces in zip(*parts, strict=True))

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from lanebev.render import Drive, RenderedFrame, WindowConfig, render_views, views
 from lanebev.render.raster.blocks import make_blocks, multiply_rows
+from lanebev.render.rows import row_of, send, take_rows, tensors_of
 from lanebev.render.scene.kinds import KINDS
-from lanebev.render.scene.sampler import row_of, select_rows, send, tensors_of
 from lanebev.render.scene.world import Scene
 from lanebev.render.views import render_scenes, sample_scene
 from tools.other_device import ELSEWHERE, Elsewhere, other_device
@@ -110,7 +110,7 @@ def test_frames_of_a_drive_are_those_asked_for_one_by_one() -> None:
 @pytest.mark.parametrize("rows", [torch.tensor([2, 0, 0]), torch.tensor([1])])
 def test_selected_rows_are_those_of_every_tensor(rows: Tensor) -> None:
     scene = scene_of(3, 6)
-    for one, other in zip(tensors_of(select_rows(scene, rows)), tensors_of(scene), strict=True):
+    for one, other in zip(tensors_of(take_rows(scene, rows)), tensors_of(scene), strict=True):
         assert torch.equal(one, other[rows])
         assert one.dtype == other.dtype
 

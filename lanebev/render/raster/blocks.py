@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from lanebev.render.raster.select import count_where, indices_where
-from lanebev.render.scene.sampler import select_rows
+from lanebev.render.rows import take_rows
 from lanebev.tensors import map_tensors
 
 BLOCK = 1024  # pixels
@@ -122,5 +122,5 @@ def multiply_rows(
         values.mul_(factor(parameters, *planes))
         return
     parts = (map_tensors(lambda tensor: tensor.index_select(0, index), plane) for plane in planes)
-    changed = values.index_select(0, index) * factor(select_rows(parameters, index), *parts)
+    changed = values.index_select(0, index) * factor(take_rows(parameters, index), *parts)
     values.index_copy_(0, index, changed)

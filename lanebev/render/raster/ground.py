@@ -18,7 +18,7 @@ from lanebev.render.raster.surface import LanePlace, pavement_albedo, place_in_l
 from lanebev.render.raster.symbols import symbols
 from lanebev.render.raster.varied import add_roadside, add_street, snow_ground, works_ground
 from lanebev.render.raster.verge import verge_albedo
-from lanebev.render.scene.sampler import select_rows
+from lanebev.render.rows import take_rows
 from lanebev.render.scene.world import Scene
 
 STUD_ALBEDO = 0.62
@@ -50,7 +50,7 @@ def ground_radiance(
     if features.night:
         smear = (world.lights.on * world.lights.smear)[row, None]
         ground = ground._replace(reach_along=torch.hypot(ground.reach_along, smear))
-    pavement, light = scene.world.pavement, select_rows(scene.light, row)
+    pavement, light = scene.world.pavement, take_rows(scene.light, row)
     blotch = blotches(ground.along, ground.across)
     left, right = pavement.left[row, None], pavement.right[row, None]
     inside = torch.minimum(ground.across - left, right - ground.across)
@@ -105,7 +105,7 @@ def _add_headlights(
             beam = beam * scene.light.headlight[row, None]
             light = under + beam[:, None] * colour(beam, 1.0, 0.95, 0.85)
         else:
-            lamps, beam = night_irradiance(select_rows(scene.world.lights, row), own_x, z, along, across)
+            lamps, beam = night_irradiance(take_rows(scene.world.lights, row), own_x, z, along, across)
             light = under + lamps + beam * retro[:, None]
         lit.index_copy_(0, index, light)
 
@@ -123,8 +123,8 @@ def _albedo(
         Ground(*(take(t, road.place) for t in ground)),
         take_channels(blotch[:3].flatten(1), road.place),
     )
-    layout = select_rows(scene.world.layout, road.row)
-    pavement = select_rows(scene.world.pavement, road.row)
+    layout = take_rows(scene.world.layout, road.row)
+    pavement = take_rows(scene.world.pavement, road.row)
     lanes = place_in_lanes(layout, part.across)
     bare = pavement_albedo(road, pavement, layout, part, lanes, stain, features)
     put(albedo, road.place, bare.transpose(0, 1))
@@ -133,7 +133,7 @@ def _albedo(
     beside = make_blocks(paved < 1, row=row, num_rows=batch)
     part = Ground(*(take(t, beside.place) for t in ground))
     verge = verge_albedo(
-        select_rows(scene.world.surroundings, beside.row), part, take(blotch[0], beside.place)
+        take_rows(scene.world.surroundings, beside.row), part, take(blotch[0], beside.place)
     ).transpose(0, 1)
     share = take(paved, beside.place)
     inner = take_channels(albedo, beside.place)
@@ -167,10 +167,10 @@ def _add_kinds(
             add_roadside(scene, row, part, road, channels)
             add_street(scene, row, part, road, channels, paint_on, blotch)
         elif name == "works":
-            base, paint_on = works_ground(select_rows(scene.world.works, row), part, base, road, paint_on)
+            base, paint_on = works_ground(take_rows(scene.world.works, row), part, base, road, paint_on)
         else:
-            layout, pavement = select_rows(scene.world.layout, row), select_rows(scene.world.pavement, row)
-            winter = select_rows(scene.world.winter, row)
+            layout, pavement = take_rows(scene.world.layout, row), take_rows(scene.world.pavement, row)
+            winter = take_rows(scene.world.winter, row)
             base, paint_on = snow_ground(winter, layout, pavement, part, base, road, paint_on, blotch)
         own.index_copy_(1, index, base.transpose(0, 1))
         painted[0].index_copy_(0, index, paint_on)
@@ -189,15 +189,15 @@ def _add_paint(
 ) -> None:
     """Paint markings on the road; changes albedo (3, M) and coverage by paint and by studs (2, M)."""
     layout = scene.world.layout
-    near = near_marking(select_rows(layout, row), road, lanes.slot)
+    near = near_marking(take_rows(layout, row), road, lanes.slot)
     if features.symbols:
-        covered = symbols(select_rows(layout, row), road, lanes.lane)
+        covered = symbols(take_rows(layout, row), road, lanes.lane)
         near |= covered > 0
     marked = make_blocks(near, row=row, num_rows=len(layout.across))
     part = Ground(*(take(t, marked.place) for t in road))
     slot, where = take(lanes.slot, marked.place), take(place, marked.place)
     grazing = part.z / scene.lens.extrinsics.height[marked.row, None]
-    own = select_rows(layout, marked.row)
+    own = take_rows(layout, marked.row)
     paint_on, studs_on, tone = paint(own, part, slot, grazing, take(stain, marked.place), features)
     studs_on = studs_on * (1 - paint_on)
     if features.symbols:
@@ -218,7 +218,7 @@ def _gloss(
     features: Features,
 ) -> Tensor:
     """Compute the mirrored sun and, on wet roads, the mirrored sky, (T, 3, N)."""
-    light, wet = select_rows(scene.light, row), scene.world.pavement.wet[row, None]
+    light, wet = take_rows(scene.light, row), scene.world.pavement.wet[row, None]
     norm = (1 + ray_x.square() + ray_y.square()).rsqrt()
     sun_right, sun_up, sun_ahead = light.sun.unsqueeze(-1).unbind(1)
     sun = (ray_x * sun_right + ray_y * sun_up + sun_ahead) * norm

@@ -24,10 +24,10 @@ from lanebev.render.raster.object_shading import object_radiance
 from lanebev.render.raster.rays import View
 from lanebev.render.raster.select import as_float, choose, indices_where, put, take, take_channels
 from lanebev.render.raster.tiles import TILE, TILE_PIXELS
+from lanebev.render.rows import take_rows
 from lanebev.render.scene.objects import SceneObjects
-from lanebev.render.scene.sampler import map_tensors, select_rows
 from lanebev.render.scene.world import Scene
-from lanebev.tensors import constant
+from lanebev.tensors import constant, map_tensors
 
 _SUBPIXELS = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))  # rotated grid
 _OVERLAP = 0.6  # m that something may be nearer than an object and still be hidden by it
@@ -77,11 +77,11 @@ def add_objects(scene: Scene, view: View, solids: Hexahedra, canvas: Canvas) -> 
         return
     hits = _unhidden(canvas, _hits(scene, view, solids, canvas, tiles))
     row = hits.owner // scene.objects.x.shape[1]
-    objects = select_rows(_flat(scene.objects), hits.owner)
+    objects = take_rows(_flat(scene.objects), hits.owner)
     ray_x, ray_y = take(view.ray_x, hits.pixel), take(view.ray_y, hits.pixel)
     up = scene.lens.extrinsics.height[row] - ray_y * hits.depth - objects.ground
     lit = object_radiance(
-        objects, select_rows(scene.light, row), hits.depth, hits.face % 6, hits.face >= 6, ray_x, up
+        objects, take_rows(scene.light, row), hits.depth, hits.face % 6, hits.face >= 6, ray_x, up
     )
     clear = torch.exp(-hits.depth / scene.world.weather.visibility[row])[:, None]
     haze = scene.world.surroundings.skyline[row]

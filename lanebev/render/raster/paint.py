@@ -20,8 +20,8 @@ from lanebev.render.raster.select import as_float, put, take, take_channels
 from lanebev.render.raster.sky import sky_along
 from lanebev.render.raster.tunnel import add_ceiling
 from lanebev.render.raster.walls import add_walls
+from lanebev.render.rows import take_rows
 from lanebev.render.scene.alignment import ground_hit, lowest_slopes
-from lanebev.render.scene.sampler import select_rows
 from lanebev.render.scene.world import Scene
 
 _METERED = 40.0  # m of road by which the exposure is set
@@ -106,7 +106,7 @@ def _add_ground(
     scene: Scene, view: View, canvas: Canvas, below: Blocks, features: Features
 ) -> tuple[Ground, Tensor]:
     """Paint the ground; returns where it is and its radiance (T, 3, S) before the air's."""
-    alignment, place = select_rows(scene.alignment, below.row), select_rows(scene.place, below.row)
+    alignment, place = take_rows(scene.alignment, below.row), take_rows(scene.place, below.row)
     ray_x, ray_y = take(view.ray_x, below.place), take(view.ray_y, below.place)
     z, slope = ground_hit(alignment, scene.lens.extrinsics.height[below.row], ray_y)
     steps = take_channels(view.steps.flatten(1), below.place)
@@ -124,8 +124,8 @@ def _add_tunnels(scene: Scene, view: View, radiance: Tensor, blocked: Tensor, ro
     if not rows:
         return
     index = torch.tensor(rows).to(radiance.device, non_blocking=True)
-    tunnel, lens = select_rows(scene.world.tunnel, index), select_rows(scene.lens, index)
-    place, alignment = select_rows(scene.place, index), select_rows(scene.alignment, index)
+    tunnel, lens = take_rows(scene.world.tunnel, index), take_rows(scene.lens, index)
+    place, alignment = take_rows(scene.place, index), take_rows(scene.alignment, index)
     own = view._replace(ray_x=view.ray_x.index_select(0, index), ray_y=view.ray_y.index_select(0, index))
     under, hidden = radiance.index_select(0, index), blocked.index_select(0, index)
     radiance.index_copy_(0, index, add_ceiling(under, hidden, tunnel, place, alignment, lens, own))
@@ -136,9 +136,9 @@ def _add_lights(scene: Scene, view: View, radiance: Tensor, blocked: Tensor, row
     if not rows:
         return
     index = torch.tensor(rows).to(radiance.device, non_blocking=True)
-    lights, lens = select_rows(scene.world.lights, index), select_rows(scene.lens, index)
-    place, alignment = select_rows(scene.place, index), select_rows(scene.alignment, index)
-    shining = sprites(lights, place, alignment, lens, select_rows(scene.objects, index))
+    lights, lens = take_rows(scene.world.lights, index), take_rows(scene.lens, index)
+    place, alignment = take_rows(scene.place, index), take_rows(scene.alignment, index)
+    shining = sprites(lights, place, alignment, lens, take_rows(scene.objects, index))
     own = view._replace(ray_x=view.ray_x.index_select(0, index), ray_y=view.ray_y.index_select(0, index))
     under, hidden = radiance.index_select(0, index), blocked.index_select(0, index)
     radiance.index_copy_(0, index, add_lights(under, hidden, lights, shining, lens, own))

@@ -15,7 +15,7 @@ from lanebev.render.raster.glass import behind_glass, frame_cover, recorded, sha
 from lanebev.render.raster.jpeg import compress
 from lanebev.render.raster.paint import Painted
 from lanebev.render.raster.randomness import normal_rows
-from lanebev.render.scene.sampler import select_rows
+from lanebev.render.rows import take_rows
 from lanebev.render.scene.sensor import Sensor
 from lanebev.render.scene.world import Scene
 
@@ -52,7 +52,7 @@ def take_image(
     bonnet = host.world.sensor.bonnet
     if bool((bonnet > 0).any()):
         rows = rows_with(bonnet > 0)
-        own, light = select_rows(sensor, rows), select_rows(scene.light, rows)
+        own, light = take_rows(sensor, rows), take_rows(scene.light, rows)
         open_air = (1 - 0.95 * scene.world.tunnel.on)[:, None]
         sky = (scene.world.surroundings.skyline * open_air).index_select(0, rows)
         tallest = float((bonnet + 0.5 * host.world.sensor.bonnet_tilt.abs()).amax())
@@ -71,7 +71,7 @@ def take_image(
     drawn = [g for g, wet_row in zip(generators, raining.tolist(), strict=True) if wet_row]
     change(raining, lambda part, rows: rain(part, scene.world.weather.wet.index_select(0, rows), drawn))
     windscreens = torch.tensor(faulty, dtype=torch.long).to(device, non_blocking=True)
-    glass = select_rows(scene.world.glass, windscreens)
+    glass = take_rows(scene.world.glass, windscreens)
     moved, shake = host.world.glass.shake.any(1), scene.world.glass.shake
     change(moved, lambda part, rows: shaken(part, shake.index_select(0, rows)))
     if faulty:

@@ -13,9 +13,9 @@ from lanebev.render.raster.features import SHORTEST_SHADOW, STEEPEST, Features, 
 from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.noise import CLOUD, sample_line, sample_noise, smoothstep
 from lanebev.render.raster.select import as_float, choose, indices_where, take
+from lanebev.render.rows import take_rows
 from lanebev.render.scene.objects import TRUCK, SceneObjects
 from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.sampler import select_rows
 from lanebev.render.scene.surroundings import FENCE, HEDGE, RAIL, TREES, Surroundings
 from lanebev.render.scene.weather import Light
 from lanebev.render.scene.world import Scene
@@ -37,14 +37,14 @@ def shadows(
         features: what any of the scenes has.
     """
     row, world = below.row, scene.world
-    light = select_rows(scene.light, row)
+    light = take_rows(scene.light, row)
     sunlit, open_sky = _vehicle_shadows(scene.light, row, x, ground, scene.objects)
-    seen = _Shaders(world.bridge[row], light, world.shade[row], select_rows(world.pavement, row))
+    seen = _Shaders(world.bridge[row], light, world.shade[row], take_rows(world.pavement, row))
     multiply_rows(sunlit, below, features.bridge, _bridge_shadow, seen, ground)
     multiply_rows(open_sky, below, features.bridge, _bridge_cover, seen, ground)
     if features.sun:
         multiply_rows(sunlit, below, features.crowns, _crown_shadow, seen, ground)
-        around = select_rows(world.surroundings, row)
+        around = take_rows(world.surroundings, row)
         walls = _Walls(around, shadow_lengths(around, light))
         for wall, rows in enumerate(features.shading):
             multiply_rows(sunlit, below, rows, partial(_wall_shadow, wall), walls, ground)

@@ -9,7 +9,7 @@ from lanebev.render.raster.colour import colour
 from lanebev.render.raster.features import Features
 from lanebev.render.raster.noise import CLOUD, sample_line, sample_noise, smoothstep
 from lanebev.render.raster.select import as_float, choose
-from lanebev.render.scene.sampler import select_rows
+from lanebev.render.rows import take_rows
 from lanebev.render.scene.surroundings import Surroundings
 from lanebev.render.scene.world import Scene
 
@@ -24,13 +24,13 @@ def sky_along(scene: Scene, row: Tensor, ray_x: Tensor, rise: Tensor, features: 
         rise: (T, N) up per metre forward.
         features: what any of the scenes has.
     """
-    light = select_rows(scene.light, row)
+    light = take_rows(scene.light, row)
     level = (1 + ray_x * ray_x).rsqrt()
     norm = (1 + ray_x * ray_x + rise * rise).rsqrt()
     sun_right, sun_up, sun_ahead = light.sun.unsqueeze(-1).unbind(1)
     sun = (ray_x * sun_right + rise * sun_up + sun_ahead) * norm
     sun = choose(light.direct.amax(1, keepdim=True) > 0.3, sun, -2.0)
-    around = select_rows(scene.world.surroundings, row)
+    around = take_rows(scene.world.surroundings, row)
     azimuth = ray_x.atan() + scene.place.heading[row, None]
     return sky_radiance(around, azimuth, rise * level, sun, features)
 

@@ -13,9 +13,9 @@ from lanebev.render.raster.select import put, take, take_channels
 from lanebev.render.raster.street import lane_coordinates, street_paint
 from lanebev.render.raster.street_surface import ironwork, strips, tracks
 from lanebev.render.raster.winter import snow_cover
+from lanebev.render.rows import take_rows
 from lanebev.render.scene.layout import Layout
 from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.sampler import select_rows
 from lanebev.render.scene.street import Street
 from lanebev.render.scene.winter import Winter
 from lanebev.render.scene.works import NUM_OLD, Works
@@ -35,8 +35,8 @@ def add_roadside(scene: Scene, row: Tensor, ground: Ground, paved: Tensor, albed
     beside = make_blocks(paved < 1, row=row, num_rows=len(scene.place.along))
     own = beside.row
     colours, share = roadside(
-        select_rows(scene.world.street, own),
-        select_rows(scene.world.pavement, own),
+        take_rows(scene.world.street, own),
+        take_rows(scene.world.pavement, own),
         Ground(*(take(t, beside.place) for t in ground)),
         scene.place.across[own],
         scene.lens.extrinsics.height[own],
@@ -65,9 +65,9 @@ def add_street(
     world, place = scene.world, road.place
     planes = albedo.view(3, -1)
     base, covered = city_ground(
-        select_rows(world.street, road.row),
-        select_rows(world.layout, road.row),
-        select_rows(world.pavement, road.row),
+        take_rows(world.street, road.row),
+        take_rows(world.layout, road.row),
+        take_rows(world.pavement, road.row),
         Ground(*(take(t, place) for t in ground)),
         take_channels(planes, place).transpose(0, 1),
         take(painted, place),

@@ -18,8 +18,8 @@ from lanebev.render.raster.rays import View
 from lanebev.render.raster.select import as_float, choose, put, take, take_channels
 from lanebev.render.raster.tiles import tile_corners, tile_pixels
 from lanebev.render.raster.wall_texture import wall_texture
+from lanebev.render.rows import concatenate_rows, take_rows
 from lanebev.render.scene.alignment import elevation_at, wall_hit, wall_table
-from lanebev.render.scene.sampler import concatenate_rows, select_rows
 from lanebev.render.scene.surroundings import FENCE, HEDGE, HOUSES, NUM_WALLS, TREES, Wall, walls_of
 from lanebev.render.scene.world import Scene
 
@@ -94,7 +94,7 @@ def add_walls(scene: Scene, view: View, canvas: Canvas, across: Tensor, features
     blocks, hits = _hits(scene, view, canvas, across, row, walls)
     if not len(blocks):
         return
-    own = WallRows(row[blocks.row], kind[blocks.row], select_rows(walls, blocks.row))
+    own = WallRows(row[blocks.row], kind[blocks.row], take_rows(walls, blocks.row))
     colours = _textures(own.wall, blocks, hits, looks)
     lit = _radiance(scene, own, hits, colours.albedo, features)
     if features.night:
@@ -114,15 +114,15 @@ def _hits(
     tall = walls.height * 1.5
     mask = _candidates(scene, view, canvas, across, row, walls.across, place_across, tall - height)
     tiles = make_blocks(mask, _TILES)
-    alignment = select_rows(scene.alignment, row)
+    alignment = take_rows(scene.alignment, row)
     table = wall_table(alignment, place_across)
 
     own = tiles.row
     pixel = tile_pixels(tiles.place - own[:, None] * mask.shape[1], view.size).flatten(1)
     pixel = pixel + (row * across.shape[1])[own, None]
     ray_x, ray_y = take(view.ray_x, pixel), take(view.ray_y, pixel)
-    z, arc = wall_hit(select_rows(table, own), ray_x)
-    up = height[own, None] - ray_y * z - elevation_at(select_rows(alignment, own), z)
+    z, arc = wall_hit(take_rows(table, own), ray_x)
+    up = height[own, None] - ray_y * z - elevation_at(take_rows(alignment, own), z)
     keep = (z < _FARTHEST) & (up > -0.3) & (up < tall[own, None])
     keep &= z < take(canvas.depth, pixel) + _OVERLAP
     kept = make_blocks(keep, _BLOCK, row=own, num_rows=len(row))
@@ -164,7 +164,7 @@ def _textures(walls: Wall, blocks: Blocks, hits: WallHits, looks: list[tuple[int
     """Compute colours of points on walls, sorted by their looks (kind, style), one look at a time."""
     parts = []
     for look, part in _parts(blocks, looks):
-        own = select_rows(walls, part)
+        own = take_rows(walls, part)
         parts.append(
             WallColours(*wall_texture(own, *look, hits.along[part], hits.up[part], hits.footprint[part]))
         )
@@ -182,7 +182,7 @@ def _parts(blocks: Blocks, looks: list[tuple[int, int]]) -> Iterator[tuple[tuple
 
 def _radiance(scene: Scene, own: WallRows, hits: WallHits, albedo: Tensor, features: Features) -> Tensor:
     """Compute the linear radiance (T, 3, N) of points on walls as seen through the air."""
-    light, row, kind = select_rows(scene.light, own.row), own.row, own.kind
+    light, row, kind = take_rows(scene.light, own.row), own.row, own.kind
     right, up, ahead = light.sun.unbind(1)
     facing = (-(own.wall.across - scene.place.across[row]).sign() * right).clamp(min=0)
     away = (-ahead).clamp(min=0)  # sun from behind lights what the camera sees
@@ -206,7 +206,7 @@ def _add_windows(
             row = own.row[part]
             on = as_float(scene.world.lights.on[row] > 0)[:, None]
             clear = on * torch.exp(-hits.z[part] / scene.world.weather.visibility[row, None])
-            wall = select_rows(own.wall, part)
+            wall = take_rows(own.wall, part)
             windows = lit_windows(wall, hits.along[part], hits.up[part], hits.footprint[part])
             lit[part] += windows * clear[:, None]
 

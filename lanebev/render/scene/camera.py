@@ -65,7 +65,7 @@ class Lens(NamedTuple):
 def sample_intrinsics(sampler: BatchSampler, size: tuple[int, int]) -> Tensor:
     """Sample intrinsics (B, 3, 3): field of view 40 to 90 degrees, principal point near the centre."""
     height, width = size
-    view = torch.where(sampler.chance(0.6), sampler.uniform(44, 68), sampler.uniform(40, 90)).deg2rad()
+    view = sampler.either(0.6, (44, 68), (40, 90)).deg2rad()
     focal = 0.5 * width / (0.5 * view).tan()
     matrix = torch.zeros(sampler.batch_size, 3, 3)
     matrix[:, 0, 0] = focal
@@ -104,5 +104,5 @@ def sample_extrinsics(sampler: BatchSampler) -> Extrinsics:
     pitch = mixed(2.0, 6.0, 10.0, 0.08)
     yaw = mixed(1.5, 6.0, 12.0, 0.10)
     roll = mixed(1.0, 4.0, 22.0, 0.08)
-    height = torch.where(sampler.chance(0.65), sampler.uniform(1.15, 1.75), sampler.uniform(1.0, 2.3))
+    height = sampler.either(0.65, (1.15, 1.75), (1.0, 2.3))
     return Extrinsics(pitch, yaw, roll, height)

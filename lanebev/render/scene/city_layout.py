@@ -72,14 +72,12 @@ def sample_city_layout(sampler: BatchSampler, base: Layout) -> tuple[Layout, Ten
     dashes = dashes * sampler.uniform(0.9, 1.1, 1, 1)
     dash = dashes_of_lines(kind, dashes)
     double = (kind == DOUBLE) | (kind == SOLID_DASHED)
-    width = torch.where(sampler.chance(0.8), sampler.uniform(0.09, 0.15), sampler.uniform(0.12, 0.2))[:, None]
+    width = sampler.either(0.8, (0.09, 0.15), (0.12, 0.2))[:, None]
     width = torch.where(blocks & (kind == DASHED), sampler.uniform(0.15, 0.3, slots), width)
     yellow = (middle & sampler.chance(0.3, 1)) | (outer & sampler.chance(0.05, slots))
     white, gold = dash.new_tensor(WHITE), dash.new_tensor(YELLOW)
     colour = torch.where(yellow[..., None], gold, white) * sampler.uniform(0.85, 1.1, 1, 1)
-    opacity = torch.where(sampler.chance(0.7), sampler.uniform(0.75, 1.0), sampler.uniform(0.35, 0.85))[
-        :, None
-    ]
+    opacity = sampler.either(0.7, (0.75, 1.0), (0.35, 0.85))[:, None]
     opacity = (opacity * sampler.uniform(0.8, 1.15, slots)).clamp(0.3, 1.0)
     layout = base._replace(
         across=across,

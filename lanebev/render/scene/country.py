@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.kinds import choose
+from lanebev.batch import select_rows
 from lanebev.render.scene.layout import DASHED, MAX_BOUNDARIES, NONE, SOLID, Layout
 from lanebev.render.scene.pavement import Pavement
 from lanebev.render.scene.sampler import BatchSampler
@@ -58,7 +58,7 @@ def country_layout(
         symbol=torch.zeros_like(layout.symbol),
     )
     lane = (sampler.chance(0.85) & (lanes == 2)).long()
-    return choose(country, narrow, layout), torch.where(country, lane, ego_lane)
+    return select_rows(country, narrow, layout), torch.where(country, lane, ego_lane)
 
 
 def country_pavement(sampler: BatchSampler, country: Tensor, layout: Layout, pavement: Pavement) -> Pavement:
@@ -74,12 +74,12 @@ def country_pavement(sampler: BatchSampler, country: Tensor, layout: Layout, pav
         shoulder=base * sampler.uniform(0.8, 1.2, 1),
         gutter_width=torch.zeros_like(pavement.gutter_width),
         crack=sampler.uniform(0.0, 0.7),
-        patch=torch.where(sampler.chance(0.6), sampler.uniform(0.05, 0.35), 0.0),
+        patch=sampler.sometimes(0.6, 0.05, 0.35),
         tracks=sampler.uniform(-0.25, 0.3),
         mottle=sampler.uniform(0.03, 0.14),
         deck_length=torch.zeros_like(pavement.deck_length),
     )
-    return choose(country, old, pavement)
+    return select_rows(country, old, pavement)
 
 
 def country_surroundings(
@@ -110,4 +110,4 @@ def country_surroundings(
         wall_colour=colour * sampler.uniform(0.7, 1.3, NUM_WALLS, 1),
         opposite=torch.full_like(around.opposite, -math.inf),
     )
-    return choose(country, fields, around)
+    return select_rows(country, fields, around)

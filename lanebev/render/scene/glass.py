@@ -70,7 +70,7 @@ def sample_glass(sampler: BatchSampler, camera: Tensor, night: Tensor) -> Glass:
     here = camera.float()
 
     def some(probability: float, low: float, high: float) -> Tensor:
-        return here * torch.where(sampler.chance(probability), sampler.uniform(low, high), 0.0)
+        return here * sampler.sometimes(probability, low, high)
 
     amount = torch.where(night, sampler.uniform(0.0, 1.0) ** 2, 0.35 * sampler.uniform(0.0, 1.0) ** 3)
     amount = amount * torch.maximum(here, night.float()) * sampler.chance(0.6)
@@ -100,12 +100,10 @@ def sample_glass(sampler: BatchSampler, camera: Tensor, night: Tensor) -> Glass:
         sticker_colour=sampler.uniform(0.0, 1.0, 3) ** 2,
         stamp=some(0.4, 0.6, 1.0),
         text=sample_text(sampler, STAMP_LENGTH),
-        stamp_place=torch.stack(
-            [torch.where(sampler.chance(0.5), sampler.uniform(0.0, 0.06), sampler.uniform(0.1, 0.7)), top], 1
-        ),
+        stamp_place=torch.stack([sampler.either(0.5, (0.0, 0.06), (0.1, 0.7)), top], 1),
         stamp_height=high,
         stamp_colour=warm,
-        stamp_outline=torch.where(sampler.chance(0.5), sampler.uniform(0.4, 1.0), 0.0),
+        stamp_outline=sampler.sometimes(0.5, 0.4, 1.0),
         chroma=some(0.4, 0.4, 1.0),
         chroma_block=sampler.uniform(4.0, 24.0),
         block=some(0.2, 0.1, 0.45),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, TypeVar
 
-import torch
 from torch import Tensor
 
 from lanebev.render.scene.sampler import BatchSampler
@@ -65,14 +64,3 @@ def sample_kinds(sampler: BatchSampler, kind: str) -> Kinds:
         works=varied & ~country & sampler.chance(0.13),
         camera=varied & sampler.chance(0.5),
     )
-
-
-def choose(mask: Tensor, first: T, second: T) -> T:
-    """Select rows of ``first`` where the mask (B,) holds, else of ``second``: NamedTuples of tensors."""
-    parts = []
-    for one, other in zip(first, second, strict=True):
-        if isinstance(one, tuple):
-            parts.append(choose(mask, one, other))
-        else:
-            parts.append(torch.where(mask.reshape(-1, *[1] * (one.dim() - 1)), one, other))
-    return type(first)(*parts)

@@ -96,7 +96,7 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
         sampler.pick([0, 0, 0, 0.2, 1, 2, 2, 1, 0.5]),
     )
     count = torch.where(dotted, many, few_or_many)  # boundaries
-    lane_width = torch.where(sampler.chance(0.6), sampler.uniform(3.4, 3.8), sampler.uniform(2.7, 4.0))
+    lane_width = sampler.either(0.6, (3.4, 3.8), (2.7, 4.0))
     uneven = torch.where(sampler.chance(0.45), 0.09, 0.0)[:, None] * sampler.normal(1.0, slots - 1).clamp(
         -2, 2
     )
@@ -125,17 +125,13 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
     dash = dashes_of_lines(kind, dashes)
     double = (kind == DOUBLE) | (kind == SOLID_DASHED)
 
-    width = torch.where(sampler.chance(0.75), sampler.uniform(0.10, 0.16), sampler.uniform(0.14, 0.30))[
-        :, None
-    ]
+    width = sampler.either(0.75, (0.10, 0.16), (0.14, 0.30))[:, None]
     width = width * torch.where(outer, sampler.uniform(1.0, 1.35, 1), torch.ones(1))
     width = torch.where(faint[:, None], sampler.uniform(0.09, 0.14, 1), width)
     yellow = ((index == 0) & sampler.chance(0.6, 1)) | sampler.chance(0.03, slots)
     colour = torch.where(yellow[..., None], torch.tensor(YELLOW), torch.tensor(WHITE))
     colour = colour * sampler.uniform(0.85, 1.1, 1, 1) + sampler.normal(0.015, 1, 3)
-    opacity = torch.where(sampler.chance(0.55), sampler.uniform(0.75, 1.0), sampler.uniform(0.4, 0.85))[
-        :, None
-    ]
+    opacity = sampler.either(0.55, (0.75, 1.0), (0.4, 0.85))[:, None]
     opacity = (opacity * sampler.uniform(0.75, 1.15, slots)).clamp(0.3, 1.0)
     opacity = torch.where(faint[:, None], sampler.uniform(0.4, 0.9, 1), opacity)
 
@@ -157,17 +153,13 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
         + torch.where(sampler.chance(0.2, 1), sampler.uniform(0, 20, slots), 0.0),
         colour=colour.clamp(0.02, 0.95).expand(-1, slots, -1).contiguous(),
         opacity=torch.where(stud | (kind == NONE), 0.0, opacity),
-        wear=torch.where(sampler.chance(0.5), sampler.uniform(0.0, 0.3), sampler.uniform(0.2, 0.65))[
-            :, None
-        ].repeat(1, slots),
+        wear=sampler.either(0.5, (0.0, 0.3), (0.2, 0.65))[:, None].repeat(1, slots),
         stud_period=stud_period.contiguous(),
         stud_group=stud_group.expand(-1, slots).contiguous(),
         missing_period=sampler.uniform(150, 500, slots),
         missing_length=torch.where(missing, sampler.uniform(15, 90, slots), 0.0),
         missing_phase=sampler.uniform(-60, 40, slots),
-        ghost=torch.where(sampler.chance(0.1, 1), sampler.uniform(0.1, 0.45, 1), 0.0)
-        .expand(-1, slots)
-        .contiguous(),
+        ghost=sampler.sometimes(0.1, 0.1, 0.45, 1).expand(-1, slots).contiguous(),
         ghost_shift=sampler.uniform(-0.5, 0.5, slots),
         symbol=torch.where(
             sampler.chance(0.15, 1) & sampler.chance(0.6, slots), sampler.pick([0, 3, 1, 2, 1], slots), 0

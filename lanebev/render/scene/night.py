@@ -90,24 +90,21 @@ def sample_lights(sampler: BatchSampler, night: Tensor, left: Tensor, right: Ten
     lit = sampler.chance(0.65)
     one = sampler.chance(0.5)
     sides = torch.stack([one | (sampler.chance(0.35)), ~one | sampler.chance(0.1)], dim=1)
-    power = torch.where(sampler.chance(0.5), sampler.uniform(0.03, 0.3), sampler.uniform(0.2, 1.4))
+    power = sampler.either(0.5, (0.03, 0.3), (0.2, 1.4))
     hue = sampler.pick_from(LAMP_COLOURS)
     white = sampler.uniform(0, 1, 1)
     beam_colour = torch.cat([1.0 + 0 * white, 0.78 + 0.2 * white, 0.5 + 0.5 * white], dim=1)
-    town = torch.where(sampler.chance(0.75), sampler.uniform(0.1, 1.0), 0.0)[:, None]
-    wet = torch.where(sampler.chance(0.3), sampler.uniform(0.2, 1.0), 0.0)
+    town = sampler.sometimes(0.75, 0.1, 1.0)[:, None]
+    wet = sampler.sometimes(0.3, 0.2, 1.0)
     rare = sampler.uniform(0, 1, NUM_SPOTS) < 0.6 * town
     neon = sampler.chance(0.12, NUM_SPOTS)
     across = torch.stack([left, right], 1) + sampler.uniform(0.3, 3.0, 2) * left.new_tensor([-1.0, 1.0])
-    across = across + torch.where(
-        sampler.chance(0.4, 1), sampler.uniform(0.5, 2.5, 1), 0.0
-    ) * left.new_tensor([1.0, -1.0])
+    across = across + sampler.sometimes(0.4, 0.5, 2.5, 1) * left.new_tensor([1.0, -1.0])
     return Lights(
         on=on,
-        dark=on * torch.where(sampler.chance(0.75), sampler.uniform(0.01, 0.35), sampler.uniform(0.2, 1.5)),
-        spill=(on * torch.where(sampler.chance(0.2), sampler.uniform(0.0, 0.05), 0.0))[:, None]
-        * sampler.pick_from(SPOT_COLOURS),
-        beam=on * torch.where(sampler.chance(0.9), sampler.uniform(0.5, 1.6), 0.05),
+        dark=on * sampler.either(0.75, (0.01, 0.35), (0.2, 1.5)),
+        spill=(on * sampler.sometimes(0.2, 0.0, 0.05))[:, None] * sampler.pick_from(SPOT_COLOURS),
+        beam=on * sampler.sometimes(0.9, 0.5, 1.6, otherwise=0.05),
         beam_colour=beam_colour,
         beam_reach=sampler.uniform(8, 24),
         beam_fall=sampler.uniform(1.8, 3.5),
@@ -129,14 +126,14 @@ def sample_lights(sampler: BatchSampler, night: Tensor, left: Tensor, right: Ten
             neon, sampler.uniform(0.004, 0.012, NUM_SPOTS), sampler.uniform(0.0008, 0.0035, NUM_SPOTS)
         ),
         spot_colour=sampler.pick_from(SPOT_COLOURS, NUM_SPOTS),
-        halo=on * torch.where(sampler.chance(0.75), sampler.uniform(0.0, 0.12), sampler.uniform(0.05, 0.6)),
+        halo=on * sampler.either(0.75, (0.0, 0.12), (0.05, 0.6)),
         halo_size=sampler.uniform(0.008, 0.04),
         streak=torch.stack(
-            [torch.where(sampler.chance(0.35), sampler.uniform(0.1, 0.8), 0.0), sampler.uniform(0.6, 2.5)],
+            [sampler.sometimes(0.35, 0.1, 0.8), sampler.uniform(0.6, 2.5)],
             dim=1,
         ),
         mirror=on * wet,
-        smear=on * torch.where(sampler.chance(0.7), sampler.uniform(0.0, 0.8), sampler.uniform(0.5, 2.0)),
+        smear=on * sampler.either(0.7, (0.0, 0.8), (0.5, 2.0)),
     )
 
 

@@ -57,7 +57,7 @@ class Sensor(NamedTuple):
 
 def sample_sensor(sampler: BatchSampler, weather: Weather, bright: Tensor) -> Sensor:
     """Sample a random camera; ``bright`` (B,) bool overexposes."""
-    others = torch.where(sampler.chance(0.8), sampler.uniform(0.055, 0.22), sampler.uniform(0.2, 0.34))
+    others = sampler.either(0.8, (0.055, 0.22), (0.2, 0.34))
     exposure = torch.where(bright, sampler.uniform(0.3, 0.75), others)
     dark = (weather.kind == NIGHT) | (weather.kind == DUSK)
     exposure = torch.where(dark, sampler.uniform(0.03, 0.2), exposure)
@@ -68,14 +68,14 @@ def sample_sensor(sampler: BatchSampler, weather: Weather, bright: Tensor) -> Se
         contrast=sampler.uniform(0.9, 1.5),
         saturation=torch.where(sampler.chance(0.05), 0.0, sampler.uniform(0.6, 1.6)),
         black=sampler.uniform(-0.02, 0.04),
-        blur=torch.where(sampler.chance(0.8), sampler.uniform(0.2, 0.8), sampler.uniform(0.8, 2.0)),
+        blur=sampler.either(0.8, (0.2, 0.8), (0.8, 2.0)),
         read_noise=sampler.uniform(0.001, 0.012) * noisy,
         shot_noise=sampler.uniform(0.002, 0.022) * noisy,
-        vignette=torch.where(sampler.chance(0.5), sampler.uniform(0.0, 0.4), 0.0),
-        glare=torch.where(sampler.chance(0.3), sampler.uniform(0.0, 0.2), 0.0),
-        bloom=torch.where(sampler.chance(0.6), sampler.uniform(0.0, 0.35), 0.0),
-        jpeg=torch.where(sampler.chance(0.7), sampler.uniform(35, 95), 0.0),
-        bonnet=torch.where(sampler.chance(0.3), sampler.uniform(0.02, 0.14), 0.0),
+        vignette=sampler.sometimes(0.5, 0.0, 0.4),
+        glare=sampler.sometimes(0.3, 0.0, 0.2),
+        bloom=sampler.sometimes(0.6, 0.0, 0.35),
+        jpeg=sampler.sometimes(0.7, 35, 95),
+        bonnet=sampler.sometimes(0.3, 0.02, 0.14),
         bonnet_colour=sampler.uniform(0.01, 0.25, 1) * (1 + sampler.normal(0.2, 3)).clamp(0.4, 1.6),
         bonnet_bow=sampler.uniform(0.0, 0.12),
         bonnet_tilt=torch.zeros_like(exposure),

@@ -132,7 +132,7 @@ def sample_street(
     walk = sampler.uniform(0.07, 0.38, 2, 1) * (1 + sampler.normal(0.04, 2, 3))
     green = sampler.pick_from(GREENS, 2) * sampler.uniform(0.7, 1.4, 2, 1)
     walks, paths, greens = sampler.chance(0.75, 2), sampler.chance(0.3, 2), sampler.chance(0.4, 2)
-    kerb = torch.where(sampler.chance(0.9, 2), sampler.uniform(0.1, 0.32, 2), 0.0)
+    kerb = sampler.sometimes(0.9, 0.1, 0.32, 2)
     strips = torch.stack(
         [
             kerb,
@@ -165,22 +165,20 @@ def sample_street(
         strip_opacity=torch.where(
             (strip == CYCLING) & sampler.chance(0.45, 2), sampler.uniform(0.4, 1.0, 2), 0.0
         ),
-        bay=torch.where(sampler.chance(0.75, 2), sampler.uniform(5.0, 7.0, 2), sampler.uniform(2.3, 2.8, 2)),
-        kerb_height=torch.where(
-            sampler.chance(0.8, 2), sampler.uniform(0.05, 0.18, 2), sampler.uniform(0.0, 0.05, 2)
-        ),
+        bay=sampler.either(0.75, (5.0, 7.0), (2.3, 2.8), 2),
+        kerb_height=sampler.either(0.8, (0.05, 0.18), (0.0, 0.05), 2),
         kerb_shade=sampler.uniform(0.35, 1.2, 2),
-        kerb_blocks=torch.where(sampler.chance(0.08), sampler.uniform(0.5, 1.5), 0.0),
+        kerb_blocks=sampler.sometimes(0.08, 0.5, 1.5),
         strips=strips,
         colours=torch.stack([stone, green, path.expand(-1, -1, 3), walk], dim=2),
-        slab=torch.where(sampler.chance(0.5), sampler.uniform(0.3, 1.2), 0.0),
-        path_line=torch.where(sampler.chance(0.5, 2), sampler.uniform(0.5, 1.0, 2), 0.0),
+        slab=sampler.sometimes(0.5, 0.3, 1.2),
+        path_line=sampler.sometimes(0.5, 0.5, 1.0, 2),
         junction_period=sampler.uniform(90, 320),
         junction_length=torch.where(junction, sampler.uniform(7, 25), 0.0),
         phase=sampler.uniform(-70, 15),
-        stop_width=torch.where(sampler.chance(0.6), sampler.uniform(0.25, 0.6), 0.0),
+        stop_width=sampler.sometimes(0.6, 0.25, 0.6),
         crossing=sampler.pick([0.45, 0.25, 0.3]),
-        box=torch.where(sampler.chance(0.12), sampler.uniform(0.5, 1.0), 0.0),
+        box=sampler.sometimes(0.12, 0.5, 1.0),
         glyph=glyph,
         glyph_period=sampler.uniform(14, 60),
         glyph_scale=sampler.uniform(0.7, 1.3),
@@ -191,17 +189,17 @@ def sample_street(
         hatch_chevron=sampler.chance(0.3).float(),
         hatch_length=sampler.uniform(25, 120),
         hatch_every=sampler.uniform(120, 300),
-        hatch_taper=torch.where(sampler.chance(0.5), sampler.uniform(0.03, 0.12), 0.0),
+        hatch_taper=sampler.sometimes(0.5, 0.03, 0.12),
         tram=torch.where(track, sampler.uniform(0.5, 1.0), 0.0),
         tram_across=torch.where(sampler.chance(0.65), 0.5 * (low + high), low - sampler.uniform(2.0, 4.5)),
-        tram_bed=torch.where(sampler.chance(0.6), sampler.uniform(0.4, 1.0), 0.0),
+        tram_bed=sampler.sometimes(0.6, 0.4, 1.0),
         tram_colour=torch.where(
             sampler.chance(0.3, 1), sampler.pick_from(GREENS), sampler.uniform(0.06, 0.3, 1).expand(-1, 3)
         ),
-        tram_ballast=torch.where(sampler.chance(0.4), sampler.uniform(0.4, 1.2), 0.0),
-        manholes=torch.where(sampler.chance(0.6), sampler.uniform(0.05, 0.4), 0.0),
-        cuts=torch.where(sampler.chance(0.45), sampler.uniform(0.1, 0.6), 0.0),
-        weeds=torch.where(sampler.chance(0.5), sampler.uniform(0.2, 1.0), 0.0),
+        tram_ballast=sampler.sometimes(0.4, 0.4, 1.2),
+        manholes=sampler.sometimes(0.6, 0.05, 0.4),
+        cuts=sampler.sometimes(0.45, 0.1, 0.6),
+        weeds=sampler.sometimes(0.5, 0.2, 1.0),
         paint=layout.colour.new_tensor(WHITE) * sampler.uniform(0.8, 1.1, 1),
         opacity=sampler.uniform(0.55, 1.0),
         wear=layout.wear[:, 0],

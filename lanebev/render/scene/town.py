@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.kinds import choose
+from lanebev.batch import select_rows
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
 from lanebev.render.scene.pavement import Pavement
 from lanebev.render.scene.sampler import BatchSampler
@@ -33,7 +33,7 @@ def street_edges(
     sampler: BatchSampler, city: Tensor, street: Street, layout: Layout, pavement: Pavement
 ) -> Pavement:
     """Sample kerbs near the outer boundaries or beyond a parking or cycling strip, where city (B,) holds."""
-    plain = torch.where(sampler.chance(0.7, 2), sampler.uniform(0.05, 0.5, 2), sampler.uniform(0.3, 1.5, 2))
+    plain = sampler.either(0.7, (0.05, 0.5), (0.3, 1.5), 2)
     gap = torch.where(street.strip == CYCLING, sampler.uniform(1.1, 2.2, 2), plain)
     bay = torch.where(street.bay > 4.0, sampler.uniform(1.9, 2.6, 2), sampler.uniform(4.3, 5.2, 2))
     gap = torch.where(street.strip == PARKING, bay, gap)
@@ -46,10 +46,10 @@ def street_edges(
         ),
         patch=torch.where(sampler.chance(0.5), sampler.uniform(0.05, 0.3), pavement.patch),
         tar=torch.where(sampler.chance(0.4), sampler.uniform(0.3, 0.9), pavement.tar),
-        gutter_width=torch.where(sampler.chance(0.5, 2), sampler.uniform(0.1, 0.4, 2), 0.0),
+        gutter_width=sampler.sometimes(0.5, 0.1, 0.4, 2),
         gutter=sampler.uniform(0.5, 1.8, 2),
     )
-    return choose(city, edged, pavement)
+    return select_rows(city, edged, pavement)
 
 
 def kerb_boundaries(city: Tensor, street: Street, layout: Layout, pavement: Pavement) -> Layout:
@@ -111,7 +111,7 @@ def street_surroundings(
         opposite=opposite,
         hill_height=around.hill_height.clamp(max=0.03),
     )
-    return choose(city, town, around)
+    return select_rows(city, town, around)
 
 
 def city_traffic(

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.kinds import choose
+from lanebev.batch import select_rows
 from lanebev.render.scene.pavement import Pavement
 from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.surroundings import CONCRETE, NOTHING, NUM_WALLS, Surroundings
@@ -56,7 +56,7 @@ def sample_tunnel(sampler: BatchSampler, tunnel: Tensor, pavement: Pavement) -> 
     return Tunnel(
         on=tunnel.float(),
         ceiling=sampler.uniform(4.8, 7.5),
-        exit=torch.where(sampler.chance(0.5), sampler.uniform(60, 500), 1e5),
+        exit=sampler.sometimes(0.5, 60, 500, otherwise=1e5),
         tone=sampler.uniform(0.04, 0.4, 1) * (1 + sampler.normal(0.05, 3)),
         level=sampler.uniform(0.02, 0.25, 1) * hue,
         lamp=sampler.uniform(0.3, 4.0),
@@ -90,7 +90,7 @@ def tunnel_surroundings(
         verge=pavement.base[:, None].expand(-1, 2, -1),
         opposite=torch.full_like(around.opposite, -math.inf),
     )
-    return choose(tunnel, walled, around)
+    return select_rows(tunnel, walled, around)
 
 
 def tunnel_traffic(tunnel: Tensor, traffic: Traffic) -> Traffic:

@@ -14,7 +14,7 @@ from lanebev.types import Extrinsics
 
 def varied_weather(sampler: BatchSampler, kinds: Kinds, weather: Weather) -> Weather:
     """Change the weather of nights (at times a wet road), of snow (dull days) and of tunnels (clear air)."""
-    wet = torch.where(sampler.chance(0.3), sampler.uniform(0.1, 1.0), 0.0)
+    wet = sampler.sometimes(0.3, 0.1, 1.0)
     night = kinds.night
     dull = kinds.snow & sampler.chance(0.7)
     visibility = torch.where(kinds.tunnel, 1e4, weather.visibility)

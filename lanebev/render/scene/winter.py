@@ -37,16 +37,16 @@ class Winter(NamedTuple):
 
 def sample_winter(sampler: BatchSampler, snow: Tensor) -> Winter:
     """Sample random snow where snow (B,) bool holds."""
-    level = torch.where(sampler.chance(0.6), sampler.uniform(0.45, 0.85), sampler.uniform(0.18, 0.45))
+    level = sampler.either(0.6, (0.45, 0.85), (0.18, 0.45))
     blue = sampler.uniform(-0.02, 0.06)
     return Winter(
         on=snow.float(),
         colour=level[:, None] * torch.stack([1 - blue, 1 + 0 * blue, 1 + blue], 1),
-        verge=torch.where(sampler.chance(0.85), sampler.uniform(0.6, 1.0), 0.1),
+        verge=sampler.sometimes(0.85, 0.6, 1.0, otherwise=0.1),
         edge=sampler.uniform(-0.5, 1.6, 2),
         ragged=sampler.uniform(0.05, 0.5),
         line=sampler.uniform(0.15, 0.7),
-        film=torch.where(sampler.chance(0.6), sampler.uniform(0.1, 0.8), 0.0),
+        film=sampler.sometimes(0.6, 0.1, 0.8),
         track=sampler.uniform(0.25, 0.55),
     )
 

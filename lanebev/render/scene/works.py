@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.kinds import choose
+from lanebev.batch import select_rows
 from lanebev.render.scene.layout import DASHED, MAX_BOUNDARIES, NONE, SOLID, WHITE, Layout
 from lanebev.render.scene.objects import POLE
 from lanebev.render.scene.sampler import BatchSampler
@@ -85,12 +85,11 @@ def sample_works(sampler: BatchSampler, works: Tensor, layout: Layout) -> tuple[
         drift=torch.where(sampler.chance(0.4, 1), sampler.normal(0.012, 1), 0.0).expand(-1, NUM_OLD),
         dash=dash,
         width=sampler.uniform(0.10, 0.2, 1).expand(-1, NUM_OLD),
-        scar=works[:, None]
-        * torch.where(sampler.chance(0.3, 1), sampler.uniform(0.2, 0.7, 1), 0.0).expand(-1, NUM_OLD),
+        scar=works[:, None] * sampler.sometimes(0.3, 0.2, 0.7, 1).expand(-1, NUM_OLD),
         colour=layout.colour.new_tensor(WHITE) * sampler.uniform(0.75, 1.05, 1),
         phase=sampler.uniform(0, 40),
     )
-    return choose(works, yellow, layout), left
+    return select_rows(works, yellow, layout), left
 
 
 def works_traffic(
@@ -123,5 +122,5 @@ def works_traffic(
         valid=sampler.chance(0.75, 1).expand(-1, count),
     )
     rest = Traffic(*(t[:, :-count] for t in traffic))
-    tail = choose(works, mine, Traffic(*(t[:, -count:] for t in traffic)))
+    tail = select_rows(works, mine, Traffic(*(t[:, -count:] for t in traffic)))
     return Traffic(*(torch.cat(pair, 1) for pair in zip(rest, tail, strict=True)))

@@ -8,12 +8,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lanebev.batch import select_rows
 from lanebev.render.scene.alignment import Alignment, arc_nodes
 from lanebev.render.scene.camera import Lens
 from lanebev.render.scene.city_layout import sample_city_layout
 from lanebev.render.scene.country import country_layout, country_pavement, country_surroundings
 from lanebev.render.scene.glass import Glass, sample_glass
-from lanebev.render.scene.kinds import Kinds, choose, sample_kinds
+from lanebev.render.scene.kinds import Kinds, sample_kinds
 from lanebev.render.scene.layout import Layout, sample_layout
 from lanebev.render.scene.night import Lights, night_light, sample_lights
 from lanebev.render.scene.objects import SceneObjects
@@ -168,7 +169,7 @@ def sample_world(sampler: BatchSampler, kind: str = "any") -> tuple[World, Tenso
     surroundings = tunnel_surroundings(more, kinds.tunnel, tunnel, pavement, surroundings)
     lights = sample_lights(more, kinds.night, pavement.left, pavement.right)
     surroundings = _tinted(surroundings, weather, lights)
-    begin = torch.where(sampler.chance(0.25), sampler.uniform(-6, 140), math.inf)
+    begin = sampler.sometimes(0.25, -6, 140, otherwise=math.inf)
     begin = torch.where((kinds.city & more.chance(0.75)) | kinds.country | kinds.tunnel, math.inf, begin)
     extent = sampler.uniform(6, 30)
     bridge = torch.stack([begin, begin + extent], dim=1)
@@ -179,7 +180,7 @@ def sample_world(sampler: BatchSampler, kind: str = "any") -> tuple[World, Tenso
     traffic = works_traffic(more, kinds.works, layout, traffic, NUM_PARKED)
     traffic = tunnel_traffic(kinds.tunnel, traffic)
     sensor = varied_camera(more, kinds, sample_sensor(sampler, weather, bright))
-    shade = torch.where(sampler.chance(0.22), sampler.uniform(0.3, 1.0), 0.0)
+    shade = sampler.sometimes(0.22, 0.3, 1.0)
     shade = torch.where(kinds.city & more.chance(0.25), more.uniform(0.4, 1.0), shade)
     glass = sample_glass(more, kinds.camera, kinds.night)
     world = World(
@@ -214,9 +215,9 @@ def _with_street(
         missing_phase=street.phase[:, None].expand_as(city.across),
     )
     return (
-        choose(kinds.city, city, layout),
+        select_rows(kinds.city, city, layout),
         torch.where(kinds.city, lane, ego_lane),
-        choose(kinds.city, street, no_street(sampler)),
+        select_rows(kinds.city, street, no_street(sampler)),
     )
 
 

@@ -1,0 +1,87 @@
+"""Rows of nested NamedTuples of tensors (B, ...)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from lanebev.tensors import map_tensors
+
+T = TypeVar("T", bound=tuple[Any, ...])
+
+
+def tensors_of(values: tuple[Any, ...]) -> list[Tensor]:
+    """Return all tensors of a nested NamedTuple, in order."""
+    found: list[Tensor] = []
+    for value in values:
+        if isinstance(value, tuple):
+            found += tensors_of(value)
+        elif isinstance(value, Tensor):
+            found.append(value)
+    return found
+
+
+def _first_of(values: tuple[Any, ...]) -> Tensor:
+    """Return the first tensor of a nested NamedTuple that begins with one."""
+    first = values[0]
+    return first if isinstance(first, Tensor) else _first_of(first)
+
+
+def through_tables(function: Callable[[Tensor], Tensor], values: T) -> T:
+    """Apply a function of rows to a (nested) NamedTuple of (B, ...) tensors, all of one dtype at once.
+
+    Hundreds of small tensors so take a handful of operations: they become one table (B, F) for each dtype,
+    and the results are views of what the function makes of these.
+    """
+    leaves = tensors_of(values)
+    tables: dict[torch.dtype, Iterator[Tensor]] = {}
+    for dtype in {leaf.dtype for leaf in leaves}:
+        own = [leaf.flatten(1) if leaf.ndim > 1 else leaf[:, None] for leaf in leaves if leaf.dtype == dtype]
+        table = function(torch.cat(own, dim=1))
+        tables[dtype] = iter(table.split([part.shape[1] for part in own], dim=1))
+    return map_tensors(
+        lambda leaf: (
+            next(tables[leaf.dtype]).unflatten(1, leaf.shape[1:])
+            if leaf.ndim > 1
+            else next(tables[leaf.dtype])[:, 0]
+        ),
+        values,
+    )
+
+
+def take_rows(values: T, rows: Tensor | slice) -> T:
+    """Select rows of a (nested) NamedTuple of (B, ...) tensors by an index tensor (R,) or a slice."""
+    if isinstance(rows, slice):
+        return map_tensors(lambda tensor: tensor[rows], values)
+    if _first_of(values).shape[0] == 1:  # a batch of one row has no other: views
+        count = rows.shape[0]
+        return map_tensors(lambda tensor: tensor.expand(count, *[-1] * (tensor.ndim - 1)), values)
+    return through_tables(lambda table: table.index_select(0, rows), values)
+
+
+def send(values: T, device: torch.device) -> T:
+    """Send a (nested) NamedTuple of (B, ...) tensors to a device, without waiting for it."""
+    if device.type == "cpu":
+        return values
+    return through_tables(lambda table: table.to(device, non_blocking=True), values)
+
+
+def row_of(values: T, index: int) -> T:
+    """Return row ``index`` of a (nested) NamedTuple of (B, ...) tensors, with the batch dimension."""
+    return take_rows(values, slice(index, index + 1))
+
+
+def concatenate_rows(parts: Sequence[T]) -> T:
+    """Concatenate (nested) NamedTuples of (B, ...) tensors along the batch; all else is the first's."""
+    joined = [
+        concatenate_rows(group)
+        if isinstance(group[0], tuple)
+        else torch.cat(group)
+        if isinstance(group[0], Tensor)
+        else group[0]
+        for group in zip(*parts, strict=True)
+    ]
+    return type(parts[0])(*joined)
