@@ -24,6 +24,7 @@ from lanebev.app.views import FixedPose, bird_view
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration
 from lanebev.estimation.tracker import Estimate
+from lanebev.io.covariances import write_covariances
 from lanebev.io.lanes import tusimple_line
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video import Frame, VideoWriter, write_png
@@ -65,7 +66,7 @@ class Recorded:
 
 @dataclass(kw_only=True)
 class Recorder:
-    """Writes lanes.json and the pictures in a thread, and at the end extrinsics.csv and the report.
+    """Writes lanes.json and the pictures in a thread, and at the end the tables and the report.
 
     Attributes:
         path: gives the path to write an output's name to.
@@ -99,6 +100,7 @@ class Recorder:
         self._before = FixedPose(alone)
         self._coarse = replace(self.grid, resolution=max(self.grid.resolution, _BEFORE_RESOLUTION))
         self._filtered_rows = KeptRows()
+        self._covariances = KeptNumbers(4, 4, folder=self.path("."))
         self._first_number: int | None = None
         self._widths = KeptNumbers(2, NUM_BOUNDARIES - 1, folder=self.path("."))
         self._moments, self._scores = MomentSampler(), EventScores()
@@ -129,6 +131,7 @@ class Recorder:
         if not len(self.rows):
             self._first_number = frame.source_number
         self.rows.append(_row(done, done.estimate))
+        self._covariances.append(done.estimate.calibration.covariance[0].double().cpu().numpy())
         if self.smoothed and done.filtered is not None:
             self._filtered_rows.append(_row(done, done.filtered))
         self._background.submit(lambda: self._draw(done))
@@ -146,7 +149,7 @@ class Recorder:
         truth: Sequence[ExtrinsicsRow] | None = None,
         mount: MountCalibration | None = None,
     ) -> Report:
-        """Write extrinsics.csv, filtered.csv and the report, after the last frame and outside of ``with``.
+        """Write the tables and the report, after the last frame and outside of ``with``.
 
         Args:
             facts: what ran, for the report.
@@ -179,6 +182,7 @@ class Recorder:
         began = {} if self._first_number is None else {FIRST_NUMBER: str(self._first_number)}
         report.facts = {**facts, **began, **summary_facts(report)}
         write_report(self.path("report.html"), report)
+        write_covariances(self.path("covariance.csv"), self._covariances.all())
         return report
 
     @torch.inference_mode()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from fractions import Fraction
@@ -22,8 +22,7 @@ from lanebev.app.build import (
 )
 from lanebev.app.config import RunConfig
 from lanebev.app.convert import writer
-from lanebev.app.kept import KeptNumbers
-from lanebev.app.observers import Observer
+from lanebev.app.observers import Observation, Observer
 from lanebev.app.part_observation import observer_of_parts
 from lanebev.app.plausibility import bars_remark, mount_remark
 from lanebev.app.progress import Progress
@@ -38,14 +37,13 @@ from lanebev.app.summary import mount_facts, run_facts
 from lanebev.camera.model import Camera
 from lanebev.camera.plausibility import camera_remarks
 from lanebev.io.calibration_file import write_calibration
-from lanebev.io.covariances import write_covariances
 from lanebev.io.formats.folder import read_record
 from lanebev.io.formats.names import FORMATS, check_installed
 from lanebev.io.formats.record import RecordedFrame, vertex_lines
 from lanebev.io.formats.rerun import open_viewer
 from lanebev.io.results import ExtrinsicsRow, OutputFolder, check_inputs_stay
 from lanebev.io.state import save_state
-from lanebev.io.video import FrameSource
+from lanebev.io.video import Frame, FrameSource
 from lanebev.report.page import Report
 
 STILLS_FPS = Fraction(2)  # of the videos that show images one after another
@@ -108,41 +106,55 @@ def run(
         recorder = _recorder(config, source, camera, out)
         doubts = (problem or resume_remark(config), observer.remark, *remarks(config, source, camera))
         recorder.problems += filter(None, (source.problem, *doubts))
-        covariances = KeptNumbers(4, 4, folder=out / ".")
         frames = observed_frames(source, second)
         with recorder, closing(frames), ended_by_signals(source):
-            for frame, seen in progress(frames, source.taken_count) if progress else frames:
-                if config.stills:
-                    filtered = tracker.still(seen.vertices, seen.pose_sigma_scale)
-                else:
-                    filtered = tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale)
-                estimate = filtered if smoothed is None else smoothed.of(filtered, frame.number)
-                covariances.append(estimate.calibration.covariance[0].double().cpu().numpy())
-                recorder.add(
-                    Recorded(
-                        frame=frame,
-                        name=frame_name(frame, source),
-                        seen=seen,
-                        estimate=estimate,
-                        filtered=filtered,
-                    )
-                )
+            for done in results(shown(frames, source, progress), config, source, tracker, smoothed):
+                recorder.add(done)
                 if viewer is not None:
-                    pose, lines = estimate.calibration.extrinsics, vertex_lines(seen.vertices)
-                    viewer.add(RecordedFrame(recorder.rows[-1], pose, lines), frame.image)
+                    pose, lines = done.estimate.calibration.extrinsics, vertex_lines(done.seen.vertices)
+                    viewer.add(RecordedFrame(recorder.rows[-1], pose, lines), done.frame.image)
         recorder.problems += source_remarks(source, files, len(recorder.rows))
-        facts = run_facts(config, source, camera) | facts_of(taken)
-        if tracker.mount is not None:
-            plain = {"camera": camera.fingerprint(), "lane_width": tracker.lane_width}
-            save_state(out / STATE_FILE, {**tracker.states(), **plain})
-            facts |= mount_facts(tracker.mount)
-            write_calibration(out / CALIBRATION_FILE, camera, tracker.mount)
+        facts = run_facts(config, source, camera) | facts_of(taken) | _save_tracker(tracker, camera, out)
         logger.info("writing the report")
         report = recorder.finish(facts, Path(source.source).name, truth, tracker.mount)
-        write_covariances(out / "covariance.csv", covariances.all())
         if config.formats:
             _write_formats(config, out, report, camera, source)
         return report
+
+
+def results(
+    frames: Iterator[tuple[Frame, Observation]],
+    config: RunConfig,
+    source: FrameSource,
+    tracker: RunTracker,
+    smoothed: SmoothedPoses | None,
+) -> Iterator[Recorded]:
+    """Estimate frame by frame, with the smoothed poses where there are any."""
+    for frame, seen in frames:
+        if config.stills:
+            filtered = tracker.still(seen.vertices, seen.pose_sigma_scale)
+        else:
+            filtered = tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale)
+        estimate = filtered if smoothed is None else smoothed.of(filtered, frame.number)
+        name = frame_name(frame, source)
+        yield Recorded(frame=frame, name=name, seen=seen, estimate=estimate, filtered=filtered)
+
+
+def shown(
+    frames: Iterator[tuple[Frame, Observation]], source: FrameSource, progress: Progress | None
+) -> Iterator[tuple[Frame, Observation]]:
+    """Return the frames with their progress, if it is to be shown."""
+    return progress(frames, source.taken_count) if progress else frames
+
+
+def _save_tracker(tracker: RunTracker, camera: Camera, out: OutputFolder) -> dict[str, str]:
+    """Write the state and the mount after a drive, and return the mount's facts; nothing after stills."""
+    if tracker.mount is None:
+        return {}
+    plain = {"camera": camera.fingerprint(), "lane_width": tracker.lane_width}
+    save_state(out / STATE_FILE, {**tracker.states(), **plain})
+    write_calibration(out / CALIBRATION_FILE, camera, tracker.mount)
+    return mount_facts(tracker.mount)
 
 
 def _write_formats(
@@ -207,5 +219,4 @@ def first_pass(
     """Process the whole drive once, and estimate every pose from all frames."""
     with closing(observed_frames(source, observer)) as frames:
         logger.info("first of two passes")
-        shown = progress(frames, source.taken_count) if progress else frames
-        return smooth_frames(shown, tracker, out, source, joint_config(config))
+        return smooth_frames(shown(frames, source, progress), tracker, out, source, joint_config(config))

@@ -14,7 +14,7 @@ from lanebev.types import Calibration, Status, TensorTuple, check_tensor
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
 _MIN_SIGMA = 1e-3  # px; nothing is known better
-_MIN_SEGMENTS = 2  # that the estimators' reductions and pairs ask for; the rest is padding
+LEAST_SEGMENTS = 2  # that the estimators' reductions and pairs ask for; the rest is padding
 _HARMLESS_WIDTH = 3.7  # m
 LANE_WIDTHS = (1.0, 10.0)  # m, that a lane may have
 
@@ -136,9 +136,9 @@ def mask_invalid_rows(
     )
 
 
-def padded(segments: LaneSegments) -> LaneSegments:
-    """Pad with segments of weight zero to the number that the estimators need."""
-    missing = _MIN_SEGMENTS - segments.weight.shape[1]
+def padded(segments: LaneSegments, least: int = LEAST_SEGMENTS) -> LaneSegments:
+    """Pad with segments of weight zero to ``least`` of them, by default the number that estimators need."""
+    missing = least - segments.weight.shape[1]
     if missing <= 0:
         return segments
     return LaneSegments(

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator, StateT
+from lanebev.estimation.checks import padded
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.export.write import METADATA, MISSING
 from lanebev.observation.boundary_vertices import BoundaryVertices
@@ -127,11 +128,15 @@ class OnnxCalibrator(Calibrator[StateT]):
         self, segments: LaneSegments, intrinsics: Tensor, state: StateT, dt: Tensor, lane_width: Tensor
     ) -> tuple[Calibration, StateT]:
         """See :meth:`~lanebev.estimation.calibrator.Calibrator.step`."""
-        rows, count = segments.weight.shape
+        (rows, count), most = segments.weight.shape, self.part.facts["segments"]
+        if count > most:
+            raise ValueError(
+                f"segments: expected {most} at most, as the calibrator was exported for, got {count}"
+            )
         states = {f"state_{name}": value for name, value in state._asdict().items()}
         found = self.part(
             {
-                **_padded(segments, self.part.facts["segments"])._asdict(),
+                **padded(segments, most)._asdict(),
                 "intrinsics": intrinsics,
                 "dt": dt,
                 "lane_width": lane_width,
@@ -221,20 +226,3 @@ def _part(folder: Path, name: str) -> OnnxPart:
 
 def _words(size: list[int], lens: str | None) -> str:
     return f"{size[1]} x {size[0]} px {lens or 'without lens'}"
-
-
-def _padded(segments: LaneSegments, count: int) -> LaneSegments:
-    """Return segments with others of weight zero behind them, ``count`` together.
-
-    Raises:
-        ValueError: there are more.
-    """
-    missing = count - segments.weight.shape[1]
-    if missing < 0:
-        raise ValueError(
-            f"segments: expected {count} at most, as the calibrator was exported for, got "
-            f"{segments.weight.shape[1]}"
-        )
-    return LaneSegments(
-        *(torch.cat([part, part.new_zeros(part.shape[0], missing, *part.shape[2:])], 1) for part in segments)
-    )

@@ -69,6 +69,11 @@ def axis_states(row: ExtrinsicsRow) -> tuple[AxisState, AxisState, AxisState, Ax
     return pitch, yaw, roll, height
 
 
+def all_axis_states(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.int64]:
+    """Return (F, 4) states of pitch, yaw, roll and height."""
+    return np.array([axis_states(row) for row in rows], dtype=np.int64).reshape(-1, 4)
+
+
 def _tracked_state(unseen: bool, std: float, most: float) -> AxisState:
     if unseen:
         return AxisState.UNDETERMINED

@@ -12,7 +12,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AXES, AxisState, axis_states, estimate_stds, estimates
+from lanebev.report.axis_states import AXES, AxisState, all_axis_states, estimate_stds, estimates
 from lanebev.report.figures import bokeh_script
 from lanebev.report.plots import plot_differences, plot_two
 from lanebev.report.run_folder import RunFolder
@@ -184,7 +184,7 @@ def _names(
 
 
 def _measured(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.bool_]:
-    measured: NDArray[np.bool_] = np.array([axis_states(row) for row in rows]) <= AxisState.UNCERTAIN
+    measured: NDArray[np.bool_] = all_axis_states(rows) <= AxisState.UNCERTAIN
     return measured
 
 

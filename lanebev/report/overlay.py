@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lanebev.camera.model import Camera
 from lanebev.geometry.road import horizon_line, road_from_image_points
-from lanebev.geometry.rotation import vanishing_dir_from_pitch_yaw
+from lanebev.geometry.vanishing_point import vanishing_point
 from lanebev.observation.segments import LaneSegments
 from lanebev.report.lettering import Colour, Picture, text_width, write_text
 from lanebev.report.measure import select_inliers
@@ -147,9 +147,8 @@ def _draw_horizon(shown: Picture, camera: Camera, extrinsics: Extrinsics, scale:
 
 
 def _draw_vanishing_point(shown: Picture, camera: Camera, extrinsics: Extrinsics, scale: float) -> None:
-    ray = vanishing_dir_from_pitch_yaw(extrinsics.pitch, extrinsics.yaw)[0].to(camera.intrinsics)
-    pixel = camera.intrinsics @ ray
-    point = _to_image(camera, (pixel[:2] / pixel[2])[None]) * scale
+    lens = (camera.intrinsics[None], camera.distortion[None], camera.model)
+    point = vanishing_point(extrinsics.pitch, extrinsics.yaw, *lens) * scale
     if torch.isfinite(point).all():
         place = _fixed(point)
         centre = tuple(place[0].tolist())

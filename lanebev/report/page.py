@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration, MountStatus, describe_mount
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AXES, AxisState, axis_states, estimate_stds, estimates
+from lanebev.report.axis_states import AXES, AxisState, all_axis_states, axis_states, estimate_stds, estimates
 from lanebev.report.figures import bokeh_script
 from lanebev.report.lens_table import lens_table
 from lanebev.report.moments import Jpegs
@@ -144,7 +144,7 @@ def page_data(report: Report, places: Sequence[int], edges: NDArray[np.float64])
 
 def pose_table(rows: Sequence[ExtrinsicsRow]) -> list[tuple[str, list[str]]]:
     """Return median, minimum, maximum and median sigma of each axis over the frames that measure it."""
-    states = np.array([axis_states(row) for row in rows]).reshape(-1, 4)
+    states = all_axis_states(rows)
     value, std = estimates(rows), estimate_stds(rows)
     table = []
     for axis, name in enumerate(AXES):

@@ -11,7 +11,7 @@ from bokeh.models import ColumnDataSource, HoverTool, Span
 from numpy.typing import NDArray
 
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AxisState, axis_states, estimate_stds, estimates
+from lanebev.report.axis_states import AxisState, all_axis_states, estimate_stds, estimates
 from lanebev.report.figures import (
     INK,
     LEAST_RANGE,
@@ -44,7 +44,7 @@ def plot_estimates(
         truth: a row per frame where it is known.
     """
     value, std = estimates(rows), estimate_stds(rows)
-    states = _states(rows)
+    states = all_axis_states(rows)
     known = states != AxisState.UNKNOWN
     measured = states <= AxisState.UNCERTAIN
     true = None if truth is None else estimates(truth)
@@ -79,7 +79,7 @@ def plot_two(
     names, colours = ("A", "B"), (_LINE, _SECOND)
     values = np.stack([estimates(first), estimates(second)])
     stds = np.stack([estimate_stds(first), estimate_stds(second)])
-    states = np.stack([_states(first), _states(second)])
+    states = np.stack([all_axis_states(first), all_axis_states(second)])
     figures: list[Any] = []
     for axis, label in enumerate(_LABELS):
         shown = figures[0].x_range if figures else x_range(x)
@@ -226,11 +226,6 @@ def _draw_estimate(
                             **label)  # fmt: skip
         tooltips = [("at", "@x{0.00}"), ("value", "@value{0.000} ± @two_sigma{0.000}")]
         plot.add_tools(HoverTool(renderers=[dots], tooltips=tooltips, mode="vline"))
-
-
-def _states(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.int64]:
-    """Return (F, 4) states of pitch, yaw, roll and height."""
-    return np.array([axis_states(row) for row in rows], dtype=np.int64).reshape(-1, 4)
 
 
 def _dark(colour: tuple[int, int, int]) -> tuple[int, int, int]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AXES, AxisState, axis_states, reasons_of
+from lanebev.report.axis_states import AXES, AxisState, all_axis_states, reasons_of
 from lanebev.report.verdict import reason_words
 
 STATUSES = ("TRACKING", "COASTING", "LOST", "UNINITIALISED")  # the better first
@@ -56,7 +56,7 @@ def strips(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> list[Strip]:
         return []
     edges = places_on_axis(rows, stills)
     status = np.array([STATUSES.index(row.status) if row.status in STATUSES else 3 for row in rows])
-    states = np.array([axis_states(row) for row in rows])
+    states = all_axis_states(rows)
     found = [_strip("status", status, [name.lower() for name in STATUSES], edges, rows)]
     kinds = [state.name.lower() for state in AxisState]
     return found + [_strip(name, states[:, i], kinds, edges, rows) for i, name in enumerate(AXES)]

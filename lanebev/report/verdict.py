@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from lanebev.estimation.reasons import REASON_WORDS, UNSEEN, WHOLE_FRAME, Reason, telling_reasons
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AXES, LARGEST_STD, AxisState, axis_states, estimate_stds, reasons_of
+from lanebev.report.axis_states import (
+    AXES,
+    LARGEST_STD,
+    AxisState,
+    all_axis_states,
+    estimate_stds,
+    reasons_of,
+)
 
 _WORDS = {str(reason.name): words for reason, words in REASON_WORDS.items()}
 _WHOLE_FRAME, _UNSEEN = ([str(reason.name) for reason in some] for some in (WHOLE_FRAME, UNSEEN))
@@ -88,7 +95,7 @@ def verdict(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> Verdict:
     if not rows:
         return Verdict("poor", "Not calibrated: there was no frame.", "", ())
     tracked = np.array([row.status == "TRACKING" for row in rows])
-    states = np.array([axis_states(row) for row in rows])
+    states = all_axis_states(rows)
     whole = (states == AxisState.MEASURED).all(-1)
     share, complete = float(tracked.mean()), float(whole.mean())
     if not tracked.any():
@@ -126,7 +133,7 @@ def drive_findings(rows: Sequence[ExtrinsicsRow]) -> list[Finding]:
         for first, last in intervals(at, times):
             why = _frequent([row for row in rows[first : last + 1] if row.status == status], _WHOLE_FRAME)
             found.append(_finding("", words, first, last, times, why))
-    states = np.array([axis_states(row) for row in rows])
+    states = all_axis_states(rows)
     undetermined = states == AxisState.UNDETERMINED
     tracked = np.array([row.status == "TRACKING" for row in rows])
     parts: list[Finding] = []
@@ -144,7 +151,7 @@ def drive_findings(rows: Sequence[ExtrinsicsRow]) -> list[Finding]:
 
 def image_findings(rows: Sequence[ExtrinsicsRow]) -> list[Finding]:
     """Return the problems of independent images: in how many of them, and the first."""
-    states = np.array([axis_states(row) for row in rows])
+    states = all_axis_states(rows)
     tracked = np.array([row.status == "TRACKING" for row in rows])
     lost = [row for row in rows if row.status != "TRACKING"]
     found = [*_in_images("", "no calibration", ~tracked, _frequent(lost, _WHOLE_FRAME))]

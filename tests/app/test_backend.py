@@ -2,17 +2,19 @@
 
 import csv
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from PIL import Image
 
-from lanebev import Camera, LaneBEV
+from lanebev import Camera, JointCalibrator, LaneBEV
 from lanebev.app.config import RunConfig
 from lanebev.app.export import export
 from lanebev.app.export_config import ExportConfig
 from lanebev.app.run import run
 from lanebev.cli import main
+from lanebev.estimation.checks import padded
 from lanebev.export import parts, runtime
 from lanebev.export.names import PARTS
 from lanebev.export.quantize import rendered_views
@@ -110,11 +112,13 @@ def test_a_run_without_the_files_is_one_line(folder, capsys):
 
 def test_more_segments_than_exported_are_refused():
     segments = parts.LaneSegments(*(torch.zeros(1, 5, *shape) for shape in ((2, 2), (), (), ())))
+    calibrator = runtime.OnnxCalibrator(SimpleNamespace(facts={"segments": 4}), JointCalibrator())
+    frame = (segments, torch.eye(3)[None], calibrator.initial_state(1), torch.ones(1), torch.ones(1, 5))
     with pytest.raises(
         ValueError, match="segments: expected 4 at most, as the calibrator was exported for, got 5"
     ):
-        runtime._padded(segments, 4)
-    assert runtime._padded(segments, 7).endpoints.shape == (1, 7, 2, 2)
+        calibrator.step(*frame)
+    assert padded(segments, 7).endpoints.shape == (1, 7, 2, 2)
 
 
 def test_settings_are_checked():
