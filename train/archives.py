@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import zipfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lanebev.io.whole_file import whole_file
+
 _QUALITY = 94  # of JPEG
 
 
 def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     """Write arrays by name, whole or not at all."""
-    partial = path.with_suffix(".part")
-    with partial.open("wb") as file:
+    with whole_file(path) as whole, whole.open("wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]  # its option has another type
-    os.replace(partial, path)
 
 
 def read_arrays(path: Path, names: Sequence[str], kind: str) -> list[NDArray[Any]]:

@@ -32,6 +32,7 @@ from typing import Any
 import torch
 from jsonargparse.typing import PositiveFloat, PositiveInt
 
+from lanebev.io.whole_file import whole_file
 from train.commands import one_line_errors
 from train.evaluate_roads import HELD_OUT_SEED, OWN_KINDS, evaluate, records
 from train.export import checkout_commit, export, trained_segmenter
@@ -91,9 +92,8 @@ def save(training: Training, path: Path, changes: dict[str, Any], record: dict[s
         print(f"gpu_run: no checkpoint for {path.name} yet", flush=True)
         return False
     try:
-        partial = path.with_suffix(".part")
-        export(newest, partial, changes, **record)
-        os.replace(partial, path)
+        with whole_file(path) as whole:
+            export(newest, whole, changes, **record)
     except (ValueError, OSError, RuntimeError) as error:  # a run goes on without it
         print(f"gpu_run: {path.name}: {error}", flush=True)
         return False

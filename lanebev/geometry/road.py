@@ -217,7 +217,8 @@ def _road_from_cam(extrinsics: Extrinsics) -> Tensor:
 def lane_width_covariance(height: Tensor, relative_std: float | Tensor) -> Tensor:
     """Compute what an uncertain lane width contributes to the covariance of a pose, (B, 4, 4).
 
-    From lane boundaries the height is known in lane widths only: a share of the width is that of the height.
+    Source: (J25) of docs/method/joint.md. From lane boundaries the height is known in lane widths only: a
+    share of the width is that of the height.
 
     Args:
         height: (B,) m.

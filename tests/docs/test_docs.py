@@ -156,6 +156,19 @@ def test_equations_that_the_joint_calibrator_cites_are_on_its_page():
     assert len(cited) > 15
 
 
+def test_every_equation_of_the_joint_calibrator_has_a_function():
+    """In the table of steps: dotted names, of the joint calibrator's package or of one above it."""
+    page = (ROOT / "docs" / "method" / "joint.md").read_text(encoding="utf-8")
+    table = page.split("| step |")[1].split("\n\n")[0]
+    equations = [int(number) for number in re.findall(r"\bJ(\d+)\b", table)]
+    assert sorted(equations) == [int(number) for number in re.findall(r"\\tag\{J(\d+)\}", page)]
+    names = re.findall(r"`([a-z_]+(?:\.\w+)+)`", table)
+    assert len(names) > len(equations)
+    for name in names:
+        homes = ("lanebev", "lanebev.estimation", "lanebev.estimation.joint")
+        assert any(_resolves(f"{home}.{name}") for home in homes), name
+
+
 def test_sphinx_roles_of_docstrings_are_shown_as_code():
     specification = importlib.util.spec_from_file_location("roles", ROOT / "docs" / "roles.py")
     roles = importlib.util.module_from_spec(specification)

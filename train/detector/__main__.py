@@ -8,7 +8,6 @@ are one JSON file each in the folder ``out``; ``python -m train.detector.table``
 from __future__ import annotations
 
 import json
-import os
 import time
 from dataclasses import asdict
 from typing import Any
@@ -17,6 +16,7 @@ import lightning as L
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.utils.data import DataLoader
 
+from lanebev.io.whole_file import whole_file
 from train.commands import one_line_errors
 from train.detector.experiment import (
     Experiment,
@@ -114,9 +114,8 @@ def run(experiment: Experiment) -> None:
             result = {"seed": seed, **tested(experiment, module, test)}
             result |= {"train_frames": len(train), "seconds": round(time.perf_counter() - begun)}
             result["settings"] = {name: str(value) for name, value in asdict(experiment).items()}
-            partial = path.with_suffix(".part")
-            partial.write_text(json.dumps(result, indent=1))
-            os.replace(partial, path)
+            with whole_file(path) as whole:
+                whole.write_text(json.dumps(result, indent=1))
             ap = result["scores"][0]["precision"]
             print(f"{arm} seed {seed}: AP {ap}, {result['seconds']} s", flush=True)
 

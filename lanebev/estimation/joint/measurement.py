@@ -154,7 +154,7 @@ def boundary_residuals(
     foot, profile = torch.bmm(sight.road_from_image, feet), sight.profile
     z, x_k = meet_road(foot, profile), _lateral(params, places)
     curve = road_curve(z, sight.road)
-    normal, slope = _tangent_plane(z, x_k, profile, curve)
+    normal, slope = tangent_plane(z, x_k, profile, curve)
     line = torch.bmm(sight.road_from_image.mT, normal)
     per_pixel = _per_pixel(line)
     distance = (line * sight.pixels).sum(1) * per_pixel
@@ -188,7 +188,7 @@ def boundary_distances(
     valid = before_farthest(torch.bmm(road_from_image, seen.pixels), profile)
     z = meet_road(torch.bmm(road_from_image, feet), profile)
     curve = road_curve(z, _road(params, phase))
-    normal, _ = _tangent_plane(z, _lateral(params, places), profile, curve)
+    normal, _ = tangent_plane(z, _lateral(params, places), profile, curve)
     line = torch.bmm(road_from_image.mT, normal)
     return _of_valid((line * seen.pixels).sum(1) * _per_pixel(line), valid), valid
 
@@ -207,7 +207,7 @@ def foot_points(params: Tensor, places: Tensor, seen: Observations, sight: Sight
     Returns:
         (B, 3, M) px, (x, y, 1).
     """
-    normal, _ = _tangent_plane(sight.z, _lateral(params, places), sight.profile, sight.curve)
+    normal, _ = tangent_plane(sight.z, _lateral(params, places), sight.profile, sight.curve)
     line = torch.bmm(sight.road_from_image.mT, normal)
     per_pixel = _per_pixel(line)
     reach = (FOOT_RANGE * seen.focal).unsqueeze(-1)
@@ -242,7 +242,7 @@ def sampson_distances(params: Tensor, places: Tensor, sight: Sight) -> Tensor:
     Returns:
         (H, B, 2, N) px, zero where not valid.
     """
-    normal, _ = _tangent_plane(sight.z, _lateral(params, places), sight.profile, sight.curve)
+    normal, _ = tangent_plane(sight.z, _lateral(params, places), sight.profile, sight.curve)
     line = sight.road_from_image.mT @ normal
     return _of_valid((line * sight.pixels).sum(-2) * _per_pixel(line), sight.valid)
 
@@ -279,7 +279,7 @@ def _profile(params: Tensor, phase: Tensor | None) -> Profile:
     return road_profile(height, torch.zeros_like(height) if phase is None else params[:, VERTICAL:])
 
 
-def _tangent_plane(z: Tensor, x_k: Tensor, profile: Profile, curve: RoadCurve) -> tuple[Tensor, Tensor]:
+def tangent_plane(z: Tensor, x_k: Tensor, profile: Profile, curve: RoadCurve) -> tuple[Tensor, Tensor]:
     """Normal n (…, B, 3, M) of the plane through the camera and a boundary's tangent, and its slope X'(Z).
 
     Source: (J2) and (J4).

@@ -82,8 +82,10 @@ def reading_model(
     )
 
 
-def _linearise(params: Tensor, own: Tensor, model: Model) -> Linear:
+def linearise(params: Tensor, own: Tensor, model: Model) -> Linear:
     """Linearise the distances by parameters, deviations, headings and the road's profile.
+
+    Source: (J23).
 
     A boundary at heading η is at x_k + η Z: to first order its end points move as the offset moves them, η Z.
     A road that falls by κ Z² / 2 is as far below the camera as if the height were greater by that. Z is that
@@ -105,7 +107,7 @@ def _linearise(params: Tensor, own: Tensor, model: Model) -> Linear:
 def _own_lines(params: Tensor, model: Model) -> Tensor:
     """Fit all but the parameters, (R, 2 L + 1), all segments believed: no line begins as an outlier."""
     none = torch.zeros_like(model.std)
-    at = _linearise(params, none, model)
+    at = linearise(params, none, model)
     jacobian = at.jacobian[:, NUM_PARAMS:]
     weight = at.valid * model.seen.weight / model.seen.sigma.square()
     information, gradient = normal_equations(jacobian, at.distance, weight)
@@ -118,7 +120,7 @@ def fit_readings(params: Tensor, model: Model, steps: int) -> Fits:
     seen, prior = model.seen, model.prior
     std = prior.std(params)
     own = _own_lines(params, model)
-    at = _linearise(params, own, model)
+    at = linearise(params, own, model)
     scale = start_scale(at.distance, seen.sigma, seen.weight * at.valid)
     for _ in range(steps):
         information, gradient, scale = _posterior_equations(params, own, at, scale, model)
@@ -126,7 +128,7 @@ def fit_readings(params: Tensor, model: Model, steps: int) -> Fits:
         too_far = (change[:, :NUM_PARAMS] / std).abs().amax(-1, keepdim=True)
         found = torch.cat([params, own], dim=-1) - change / too_far.clamp(min=1.0)
         params, own = above_road(found[:, :NUM_PARAMS]), found[:, NUM_PARAMS:]
-        at = _linearise(params, own, model)
+        at = linearise(params, own, model)
     information, _, scale = _posterior_equations(params, own, at, scale, model)
     squared, variance = squared_distance(at.distance), scaled_variance(seen.sigma, scale)
     likelihood = log_likelihood(squared, at.valid, seen.weight, variance, seen.focal)
