@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 import signal
 import threading
 from collections.abc import Generator, Iterator
@@ -27,6 +28,7 @@ from lanebev.io.source_names import is_bag, is_live, without_login
 from lanebev.io.video import FrameSource, open_source
 from lanebev.report.run_folder import RunFolder
 
+_RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")  # in topics of ROS's image_proc, which P is of
 _LONG_STEP = 5  # s between frames, in which a pose has nothing to do with the one before
 
 
@@ -101,7 +103,7 @@ def camera_of(config: RunConfig, source: FrameSource) -> Camera:
             f"beside {source.topic}"
         )
     try:
-        rectified = config.rectified or "image_rect" in source.topic  # by ROS's image_proc, which P is of
+        rectified = config.rectified or bool(_RECTIFIED.search(source.topic))
         return Camera.from_fields(source.lens, rectified)
     except ValueError as error:
         raise ValueError(f"camera of bag {source.source}: {error}; give --camera FILE") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -185,12 +186,21 @@ def lens_fields(message: Any) -> dict[str, Any]:
 
 
 def _lens(bag: Bag, images: str) -> dict[str, Any] | None:
-    """Return the lens of the topic nearest to the images, or of a bag's only camera; None without one."""
+    """Return the lens of the topic nearest to the images, or of a bag's only camera; None without one.
+
+    Of several as near, such as ``camera_info`` and ``camera_info_raw``, it is that with the most words of the
+    images' topic and the fewest others.
+    """
     cameras = sum(each.kind in IMAGE_TYPES and each.size > 0 for each in bag.topics)
     topics = [each.name for each in bag.topics if each.kind in LENS_TYPES and each.size]
     folders = {name: name.rpartition("/")[0] + "/" for name in topics}
     beside = [name for name in topics if images.startswith(folders[name])]
-    nearest = [max(beside, key=lambda name: len(folders[name]))] if beside else []
+    words = {name: set(re.split("[/_]", name)) for name in (*beside, images)}
+
+    def fit(name: str) -> tuple[int, int, int]:
+        return len(folders[name]), len(words[name] & words[images]), -len(words[name] - words[images])
+
+    nearest = sorted(beside, key=fit)[-1:]
     for name in nearest or (topics if len(topics) == cameras == 1 else []):
         for _, message in bag.messages(name):
             try:

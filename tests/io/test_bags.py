@@ -59,7 +59,8 @@ def _raw(image, encoding, padding=0):
 
 
 def _info():
-    lens = (CAMERA.distortion.numpy(), CAMERA.intrinsics.flatten().numpy(), np.eye(3).reshape(-1))
+    matrix = CAMERA.intrinsics.flatten().numpy().copy()
+    lens = (CAMERA.distortion.numpy(), matrix, np.eye(3).reshape(-1))
     projection = torch.cat([CAMERA.intrinsics, torch.zeros(3, 1)], dim=1).flatten().numpy()
     region = TYPES["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     return TYPES["sensor_msgs/msg/CameraInfo"](
@@ -109,12 +110,35 @@ def test_frames_and_lens_of_a_ros_2_bag(bags, kind):
 
 
 @pytest.mark.parametrize(
-    ("topic", "rectified"), [("/cam/image_rect/compressed", True), ("/cam/image_raw", False)]
+    ("topic", "rectified"),
+    [
+        ("/cam/image_rect/compressed", True),
+        ("/cam/image_rect_color", True),
+        ("/cam/rectified/image", True),
+        ("/cam/image_raw", False),
+        ("/cam/direct/image", False),
+    ],
 )
 def test_images_that_ros_rectified_have_no_lens(tmp_path, topic, rectified):
     source = make_source(RunConfig(str(_bag(tmp_path / "bag", topics=(topic,))), ""))
     camera = camera_of(RunConfig(source.source, ""), source)
     assert camera.distortion.tolist() == ([] if rectified else CAMERA.distortion.tolist())
+
+
+@pytest.mark.parametrize(
+    ("topic", "more", "names"),
+    [
+        ("/cam/image_rect_color", 0, ("/cam/camera_info", "/cam/camera_info_raw")),  # zed-ros-wrapper#427
+        ("/cam/image_raw_color", 1, ("/cam/camera_info", "/cam/camera_info_raw")),
+        ("/image_left/compressed", 0, ("/camera_info_left", "/camera_info_right")),
+        ("/image_right/compressed", 1, ("/camera_info_left", "/camera_info_right")),
+    ],
+)
+@pytest.mark.parametrize("order", [1, -1])
+def test_images_have_the_lens_of_the_most_like_name(tmp_path, topic, more, names, order):
+    names = names[::order]
+    source = make_source(RunConfig(str(_bag(tmp_path / "bag", topics=(topic,), lenses=names)), ""))
+    assert source.lens["K"][0] == CAMERA.intrinsics[0, 0] + (more if order == 1 else 1 - more)
 
 
 def _ros1_header(store, number):
