@@ -86,8 +86,8 @@ def doctor(config: RunConfig, progress: Progress | None = None) -> tuple[str, in
     source = make_source(config)
     camera = camera_of(config, source)
     findings = [check_size(camera, source.image_size)]
-    if camera.remark:
-        findings.append(Finding(DOUBT, f"file: {camera.remark}"))
+    findings += [Finding(DOUBT, f"camera: {camera.remark}")] if camera.remark else []
+    findings += [Finding(DOUBT, f"source: {source.problem}")] if source.problem else []
     if findings[0].level != WRONG:
         findings += [check_field_of_view(camera), check_centre(camera), check_lens(camera)]
         findings.append(check_pixels(camera, source.pixel_aspect))

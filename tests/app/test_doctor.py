@@ -194,6 +194,21 @@ def test_status_is_that_of_the_worst(data, capsys):
     assert capsys.readouterr().err.count("\n") == 1
 
 
+def test_what_a_run_says_of_the_source_and_the_camera_file(data, tmp_path, capsys):
+    (tmp_path / "joined.mp4").write_bytes(2 * (data / "drive.mp4").read_bytes())
+    lens = "{camera_model: pinhole, intrinsics: [%d, %d, 320, 180], resolution: [640, 360]}"
+    (tmp_path / "chain.yaml").write_text(f"cam0: {lens % (500, 500)}\ncam1: {lens % (600, 600)}\n")
+    assert main(["doctor", f"{tmp_path}/joined.mp4", "--camera", f"{tmp_path}/chain.yaml"]) == 1
+    out = capsys.readouterr().out
+    assert "doubt  camera: the file has the cameras cam0, cam1, of which cam0 is taken; choose another" in out
+    assert "doubt  source: video " in out
+    assert "another video is appended to it" in out
+    main(["doctor", f"{data}/drive.mp4", "--camera", f"{tmp_path}/chain.yaml#cam1"])
+    out = capsys.readouterr().out
+    assert "focal length: 600 px" in out
+    assert "of which" not in out
+
+
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
 def test_completion(shell, capsys):
     with pytest.raises(SystemExit) as stopped:
