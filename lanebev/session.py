@@ -91,7 +91,7 @@ class Session:
             unknown one: 3.7 m with a standard deviation of 0.2 m, as in ``lanebev run``.
         lane_width_std: standard deviation of the lane width, m; those of the height and of the mount's height
             contain its effect. None is 0 with a ``lane_width`` or a ``lane_width_std`` in the calibrator's
-            configuration, otherwise 0.2 m.
+            configuration, otherwise 0.2 m. Only one of the two may be above 0.
         grid: grid of the bird's-eye view; None for no view.
         colours: order of a frame's channels: "bgr" as OpenCV reads them, or "rgb".
         focal_std: standard deviation of the focal length as a fraction of it; the pose's contain its effect.
@@ -143,6 +143,11 @@ class Session:
             lane_width_std = 0.0  # the calibrator's covariance contains it already
         width, width_std = lane_width_prior(lane_width, lane_width_std)
         check_lane_width_prior(width, width_std, ("lane_width", "lane_width_std"))
+        if width_std and calibrator.lane_width_std:
+            raise ValueError(
+                f"lane_width_std: expected it once, got {width_std:g} m beside the calibrator's "
+                f"{calibrator.lane_width_std:g} m; leave one out"
+            )
         self._parts: tuple[Any, ...] = (calibrator, camera, width, float(focal_std), width_std)
         for remark in camera_remarks(camera):
             logger.warning(remark)

@@ -68,6 +68,10 @@ def check_state(state: TensorTuple, kind: type[TensorTuple], rows: int) -> Tenso
     first, like = next(iter(parts.items()))
     if like.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"state.{first}: expected float32 or float64, got {like.dtype}")
+    for name in ("status", "reasons"):
+        if name in parts and parts[name].dtype != torch.int64:
+            got = parts[name].dtype
+            raise ValueError(f"state.{name}: expected int64, got {got}; cast only what is floating point")
     return like
 
 

@@ -31,8 +31,11 @@ def lens_model(name: str) -> str:
     """Return the model's name in :data:`MODELS`: ``mei`` is ``omni``.
 
     Raises:
+        TypeError: not one name, which all rows of a batch share.
         ValueError: there is no such model.
     """
+    if not isinstance(name, str):
+        raise TypeError(f"model: expected one name for all rows, got {name!r}; call once for each lens model")
     known = _OTHER_NAMES.get(name, name)
     if known not in MODELS:
         raise ValueError(f"model: expected one of {', '.join(MODELS)}, got {name!r}")

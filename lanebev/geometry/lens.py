@@ -55,7 +55,7 @@ def check_intrinsics(intrinsics: Tensor, *rows: int) -> None:
             "leave them in float32"
         )
     if readable(intrinsics) and bool(intrinsics.detach()[..., 2, :2].any()):
-        upright = (intrinsics.mT[..., 2, :2] != 0).any(-1) | _last_row_is_small(intrinsics)
+        upright = (intrinsics.mT[..., 2, :2] != 0).any(-1) | last_row_is_small(intrinsics)
         if not bool(upright.all()):
             raise ValueError(
                 "intrinsics: expected [fx s cx; 0 fy cy; 0 0 1], got its transpose; give intrinsics.mT"
@@ -64,11 +64,11 @@ def check_intrinsics(intrinsics: Tensor, *rows: int) -> None:
 
 def usable_cameras(intrinsics: Tensor) -> Tensor:
     """Return (...,) bool of intrinsics (..., 3, 3): finite, with positive focal lengths, not transposed."""
-    finite = intrinsics.isfinite().all(-1).all(-1) & _last_row_is_small(intrinsics)
+    finite = intrinsics.isfinite().all(-1).all(-1) & last_row_is_small(intrinsics)
     return finite & (intrinsics[..., 0, 0] > 0) & (intrinsics[..., 1, 1] > 0)
 
 
-def _last_row_is_small(intrinsics: Tensor) -> Tensor:
+def last_row_is_small(intrinsics: Tensor) -> Tensor:
     """Return (...,) bool: not the principal point, px, is in the last row, nor NaN."""
     return intrinsics[..., 2, :2].abs().amax(-1) < _NO_PIXEL
 
@@ -98,19 +98,20 @@ def normalise_points(points: Tensor, intrinsics: Tensor) -> Tensor:
         (..., N, 2) (x/z, y/z).
     """
     check_points(points)
-    fx, fy = intrinsics[..., None, 0, 0], intrinsics[..., None, 1, 1]
-    skew, cx, cy = intrinsics[..., None, 0, 1], intrinsics[..., None, 0, 2], intrinsics[..., None, 1, 2]
-    y = (points[..., 1] - cy) / fy
-    return torch.stack([(points[..., 0] - cx - skew * y) / fx, y], dim=-1)
+    return _moved(points, cam_from_image(intrinsics))
 
 
 def denormalise_points(points: Tensor, intrinsics: Tensor) -> Tensor:
     """Convert points of the z = 1 plane to undistorted pixels, the inverse of :func:`normalise_points`."""
     check_points(points)
-    fx, fy = intrinsics[..., None, 0, 0], intrinsics[..., None, 1, 1]
-    skew, cx, cy = intrinsics[..., None, 0, 1], intrinsics[..., None, 0, 2], intrinsics[..., None, 1, 2]
+    return _moved(points, intrinsics)
+
+
+def _moved(points: Tensor, matrix: Tensor) -> Tensor:
+    """Move points (..., N, 2) by affine matrices (..., 3, 3)."""
+    (xx, xy, cx), (yx, yy, cy) = (row.unbind(-1) for row in matrix[..., None, :2, :].unbind(-2))
     x, y = points.unbind(-1)
-    return torch.stack([fx * x + skew * y + cx, fy * y + cy], dim=-1)
+    return torch.stack([xx * x + xy * y + cx, yx * x + yy * y + cy], dim=-1)
 
 
 def cam_from_image(intrinsics: Tensor) -> Tensor:
@@ -119,17 +120,16 @@ def cam_from_image(intrinsics: Tensor) -> Tensor:
     In closed form: a row whose camera can't be used is not finite, where a solver would raise for all.
 
     Args:
-        intrinsics: (..., 3, 3), with skew.
+        intrinsics: (..., 3, 3), with skew, or of an image that was turned or mirrored.
 
     Returns:
         (..., 3, 3).
     """
-    fx, fy, skew = intrinsics[..., 0, 0], intrinsics[..., 1, 1], intrinsics[..., 0, 1]
-    cx, cy = intrinsics[..., 0, 2], intrinsics[..., 1, 2]
+    (fx, skew, cx), (turn, fy, cy), _ = (row.unbind(-1) for row in intrinsics.unbind(-2))
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    along = -skew / (fx * fy)
-    per_x, per_y = fx.reciprocal(), fy.reciprocal()
-    entries = [per_x, along, -cx * per_x - along * cy, zero, per_y, -cy * per_y, zero, zero, one]
+    area = fx * fy - skew * turn  # the determinant
+    xx, xy, yx, yy = fy / area, -skew / area, -turn / area, fx / area
+    entries = [xx, xy, -cx * xx - cy * xy, yx, yy, -cx * yx - cy * yy, zero, zero, one]
     inverse: Tensor = torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
     return inverse
 

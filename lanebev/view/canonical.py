@@ -12,7 +12,7 @@ from lanebev.geometry.precision import common_dtype, full_precision
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.tensors import constant
 from lanebev.types import Extrinsics, check_numbers_known
-from lanebev.view.checks import blind_unless_finite, check_cameras, check_covers, check_image, check_size
+from lanebev.view.checks import blind_unless_usable, check_cameras, check_covers, check_image, check_size
 from lanebev.view.lens import make_lens
 from lanebev.view.projection import CellSums, normalised_intrinsics
 from lanebev.view.sampling import MapSize, resampled
@@ -109,7 +109,7 @@ class CanonicalView(nn.Module):
         check_size(size)
         check_covers(image, size)
         check_cameras(image.shape[0], intrinsics, extrinsics, distortion, model)
-        intrinsics, distortion = blind_unless_finite(intrinsics, distortion)
+        intrinsics, distortion = blind_unless_usable(intrinsics, distortion)
         dtype, image_from_cam = common_dtype(image), normalised_intrinsics(intrinsics, size)
         lens = None
         if distortion is not None and distortion.shape[-1] > 0:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lanebev.geometry.distortion import check_lens
-from lanebev.geometry.lens import check_intrinsics
+from lanebev.geometry.lens import check_intrinsics, last_row_is_small
 from lanebev.tensors import constant
 from lanebev.types import Extrinsics, check_extrinsics, check_tensor
 
@@ -50,17 +50,18 @@ def check_covers(image: Tensor, size: tuple[int, int]) -> None:
         )
 
 
-def blind_unless_finite(intrinsics: Tensor, distortion: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Replace cameras (B, 3, 3), (B, D) in which a number is not finite by one whose image has nothing in it.
+def blind_unless_usable(intrinsics: Tensor, distortion: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Replace cameras (B, 3, 3), (B, D) that cannot be used by one whose image has nothing in it.
 
-    NaN would become the value and the gradient of every cell.
+    NaN would become the value and the gradient of every cell. Transposed intrinsics would show another place;
+    :func:`check_cameras` does not notice them on a GPU or in a compiled program.
     """
-    finite = intrinsics.isfinite().all(-1).all(-1)
+    usable = intrinsics.isfinite().all(-1).all(-1) & last_row_is_small(intrinsics)
     if distortion is not None:
-        finite = finite & distortion.isfinite().all(-1)
-        distortion = torch.where(finite.unsqueeze(-1), distortion, 0.0)
+        usable = usable & distortion.isfinite().all(-1)
+        distortion = torch.where(usable.unsqueeze(-1), distortion, 0.0)
     blind = constant(((1.0, 0.0, _BESIDE), (0.0, 1.0, _BESIDE), (0.0, 0.0, 1.0)), like=intrinsics)
-    return torch.where(finite[:, None, None], intrinsics, blind), distortion
+    return torch.where(usable[:, None, None], intrinsics, blind), distortion
 
 
 def check_cameras(

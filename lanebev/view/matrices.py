@@ -37,7 +37,8 @@ def ego_from_camera(extrinsics: Extrinsics, ego_from_road_matrix: Tensor | None 
 
     Args:
         extrinsics: each (B,).
-        ego_from_road_matrix: (4, 4) or (B, 4, 4), rigid; None is :func:`ego_from_road`.
+        ego_from_road_matrix: (4, 4) or (B, 4, 4); None is :func:`ego_from_road`. Where the ego frame is
+            turned, scaled or mirrored to augment the data, ``augmentation @ ego_from_road()``.
 
     Returns:
         (B, 4, 4).
@@ -56,7 +57,7 @@ def image_from_ego(
     Args:
         extrinsics: each (B,).
         intrinsics: (B, 3, 3) px of the undistorted image.
-        ego_from_road_matrix: (4, 4) or (B, 4, 4), rigid; None is :func:`ego_from_road`.
+        ego_from_road_matrix: (4, 4) or (B, 4, 4), as of :func:`ego_from_camera`.
         image_transform: (3, 3) or (B, 3, 3), pixels of that image to pixels of the resized, cropped or
             flipped one that the network is given.
 
@@ -68,7 +69,7 @@ def image_from_ego(
     """
     check_intrinsics(intrinsics, *extrinsics.pitch.shape)
     camera_from_road = extrinsics.camera_from_road()
-    road_from_ego = _inverse_rigid(_ego_from_road(extrinsics, ego_from_road_matrix))
+    road_from_ego = torch.linalg.inv(_ego_from_road(extrinsics, ego_from_road_matrix))
     image = intrinsics if image_transform is None else image_transform.to(intrinsics) @ intrinsics
     upper = image.to(camera_from_road) @ (camera_from_road @ road_from_ego)[..., :3, :]
     last = torch.zeros_like(upper[..., :1, :])
@@ -121,10 +122,3 @@ def lift_splat_inputs(
 def _ego_from_road(extrinsics: Extrinsics, matrix: Tensor | None) -> Tensor:
     pitch = extrinsics.pitch
     return ego_from_road(pitch.dtype, pitch.device) if matrix is None else matrix.to(pitch)
-
-
-def _inverse_rigid(matrix: Tensor) -> Tensor:
-    """Invert rigid transforms (..., 4, 4)."""
-    rotation = matrix[..., :3, :3].mT
-    shift = -(rotation @ matrix[..., :3, 3:])
-    return torch.cat([torch.cat([rotation, shift], dim=-1), matrix[..., 3:, :]], dim=-2)

@@ -11,7 +11,7 @@ from lanebev.geometry.lens import invert_distortion
 from lanebev.geometry.precision import common_dtype, full_precision
 from lanebev.geometry.road import road_from_image_points
 from lanebev.types import Extrinsics, check_type
-from lanebev.view.checks import blind_unless_finite, check_cameras, check_image, check_size
+from lanebev.view.checks import blind_unless_usable, check_cameras, check_image, check_size
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.projection import CellSums, normalised_intrinsics
 from lanebev.view.sampling import MapSize, resampled
@@ -85,7 +85,7 @@ class ImageFromBEV(nn.Module):
         check_image(bev, "bev")
         check_size(image_size)
         check_cameras(bev.shape[0], intrinsics, extrinsics, distortion, model)
-        intrinsics, distortion = blind_unless_finite(intrinsics, distortion)
+        intrinsics, distortion = blind_unless_usable(intrinsics, distortion)
         size, dtype = self.grid.shape, common_dtype(bev)
         cells: CellSums | PixelCells
         if vertical_curvature is not None:

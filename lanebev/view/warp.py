@@ -15,7 +15,7 @@ from lanebev.geometry.road_profile import check_vertical_curvature
 from lanebev.numbers import check_number
 from lanebev.types import Extrinsics, check_type
 from lanebev.view.cells import cells_and_lens, rows_in_sight
-from lanebev.view.checks import blind_unless_finite, check_cameras, check_covers, check_image, check_size
+from lanebev.view.checks import blind_unless_usable, check_cameras, check_covers, check_image, check_size
 from lanebev.view.grid import BEVGrid
 from lanebev.view.projection import image_coordinates, normalised_intrinsics
 from lanebev.view.sampling import MapSize, resampled
@@ -110,7 +110,7 @@ class BEVWarp(nn.Module):
         maps = [image] if isinstance(image, Tensor) or not isinstance(image, Sequence) else list(image)
         sizes, size = _map_sizes(maps, strides, image_size)
         check_cameras(maps[0].shape[0], intrinsics, extrinsics, distortion, model)
-        intrinsics, distortion = blind_unless_finite(intrinsics, distortion)
+        intrinsics, distortion = blind_unless_usable(intrinsics, distortion)
         if vertical_curvature is not None:
             check_vertical_curvature(vertical_curvature, maps[0].shape[0])
         heights = self.plane_heights or (0.0,)

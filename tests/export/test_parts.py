@@ -3,11 +3,14 @@
 import pytest
 import torch
 from onnx import load as load_onnx
+from onnxruntime import InferenceSession
 
 from lanebev import (
     BEVGrid,
     BEVWarp,
     Camera,
+    CanonicalView,
+    Extrinsics,
     FarView,
     LaneBEV,
     LaneSegmenter,
@@ -17,6 +20,7 @@ from lanebev import (
     TwoStageCalibrator,
 )
 from lanebev.batch import replace_rows
+from lanebev.export.operators import translations
 from lanebev.export.part import Part
 from lanebev.export.parts import make_part
 from lanebev.export.quantize import quantize_segmenter
@@ -72,6 +76,46 @@ def test_a_part_equals_eager_for_any_batch(name, distortion, tolerance, tmp_path
         with torch.no_grad():
             expected = dict(zip(part.outputs, part.module(*inputs.values()), strict=True))
         equals(other(inputs), expected, tolerance)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("kind", ["bev", "canonical"])
+def test_a_view_of_your_own_is_exported_for_images_of_any_size(kind, tmp_path):
+    """By torch.onnx.export, as somebody does it whose network has the view as a layer."""
+
+    class Layer(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            virtual = Extrinsics.from_values(0.0, 0.0, 0.0, 1.4)
+            self.view = BEVWarp(GRID) if kind == "bev" else CanonicalView(INTRINSICS, SIZE, virtual)
+
+        def forward(self, image, intrinsics, pose, distortion):
+            return self.view(image, intrinsics, Extrinsics.unstack(pose), distortion)
+
+    def arguments(rows, height, width):
+        numbers = torch.Generator().manual_seed(rows)
+        pose = torch.tensor([0.02, 0.01, -0.01, 1.5]) + 0.01 * torch.randn(rows, 4, generator=numbers)
+        lens = torch.tensor([-0.1, 0.01, 0.0, 0.0, 0.0]).repeat(rows, 1)
+        image = torch.rand(rows, 3, height, width, generator=numbers)
+        return image, INTRINSICS.float().repeat(rows, 1, 1), pose, lens
+
+    rows, *size = (
+        torch.export.Dim(name, min=1 if name == "rows" else 16) for name in ("rows", "height", "width")
+    )
+    torch.onnx.export(
+        Layer(), arguments(2, *SIZE), tmp_path / "view.onnx", dynamo=True, verbose=False,
+        input_names=["image", "intrinsics", "pose", "distortion"],
+        dynamic_shapes=({0: rows, 2: size[0], 3: size[1]}, {0: rows}, {0: rows}, {0: rows}),
+        custom_translation_table=translations(),
+    )  # fmt: skip
+    session = InferenceSession(tmp_path / "view.onnx")
+    for shape in ((2, *SIZE), (1, 50, 131), (3, 200, 90)):
+        given = arguments(*shape)
+        names = [each.name for each in session.get_inputs()]
+        found = session.run(None, {name: part.numpy() for name, part in zip(names, given, strict=True)})
+        for value, expected in zip(found, Layer()(*given), strict=True):
+            torch.testing.assert_close(torch.from_numpy(value), expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.slow

@@ -188,6 +188,11 @@ def test_geometry(call, error, message):
         ),
         ((IMAGE, K, POSE, [0.1, 0, 0, 0]), TypeError, "distortion: expected a torch.Tensor, got list"),
         (
+            (IMAGE, K, POSE, None, ["omni"]),
+            TypeError,
+            r"model: expected one name .*, got \['omni'\]; call once",
+        ),
+        (
             (IMAGE, K, POSE, None, "pinhole", 96),
             TypeError,
             r"image_size: expected \(height, width\) in px, got 96",

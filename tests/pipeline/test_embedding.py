@@ -1,11 +1,13 @@
 """LaneBEV inside somebody else's module: built without memory, cast, mapped, padded, compiled."""
 
 import copy
+import math
 
 import pytest
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.proxy_tensor import make_fx
+from torch.utils.data import default_collate
 
 from lanebev import (
     BEVGrid,
@@ -21,6 +23,8 @@ from lanebev import (
     SegmenterConfig,
     Status,
     TwoStageCalibrator,
+    bev_from_image,
+    road_from_image_points,
 )
 from lanebev.batch import replace_rows
 from lanebev.tensors import identity
@@ -281,6 +285,77 @@ def test_transposed_intrinsics_are_named_or_not_used(calibrator, monkeypatch):
     monkeypatch.setattr("lanebev.geometry.lens.readable", lambda _: False)  # as on a GPU
     found, _ = calibrator(segments, cameras, state, 1 / 30)
     assert found.status.tolist() == [Status.TRACKING, Status.UNINITIALISED]
+    both, poses = torch.cat([CAMERA, CAMERA.mT]), Extrinsics.unstack(POSE.stack().repeat(2, 1))
+    _, valid = BEVWarp()(torch.rand(2, 3, 64, 128), both, poses)
+    assert valid.flatten(1).any(1).tolist() == [True, False]
+
+
+@CALIBRATORS
+def test_a_turned_image_with_its_camera_shows_the_same(calibrator):
+    """Turned by 5 degrees, enlarged by 1.2 and shifted, as augmentation does it: A @ K is its camera."""
+    cos, sin = 1.2 * math.cos(math.radians(5)), 1.2 * math.sin(math.radians(5))
+    turn = torch.tensor([[cos, -sin, 30.0], [sin, cos, -20.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    upright = lanes(seed=3)
+    turned = upright._replace(endpoints=upright.endpoints @ turn[:2, :2].mT + turn[:2, 2])
+    poses = []
+    for segments, camera in ((upright, K), (turned, turn @ K)):
+        state = calibrator.initial_state(1, dtype=torch.float64)
+        found, _ = calibrator(segments, camera[None], state, 1 / 30)
+        assert found.status.tolist() == [Status.TRACKING]
+        poses.append(found.extrinsics)
+    torch.testing.assert_close(poses[1].stack(), poses[0].stack(), rtol=0.0, atol=1e-4)
+    grid = BEVGrid(resolution=0.5)
+    plane = bev_from_image(poses[0], K[None], grid)
+    torch.testing.assert_close(bev_from_image(poses[0], (turn @ K)[None], grid) @ turn, plane)
+    points = torch.tensor([[[300.0, 250.0], [410.0, 260.0]]], dtype=torch.float64)
+    there, _ = road_from_image_points(points, K[None], poses[0])
+    moved, _ = road_from_image_points(points @ turn[:2, :2].mT + turn[:2, 2], (turn @ K)[None], poses[0])
+    torch.testing.assert_close(moved, there)
+
+
+@CALIBRATORS
+def test_a_mirrored_image_shows_a_mirrored_road(calibrator):
+    """With the camera mirrored too, yaw and roll have the opposite sign, and so has X in the view."""
+    width, segments = 1280, lanes(seed=3)
+    mirror = torch.tensor([-1.0, 1.0], dtype=torch.float64)
+    shift = torch.tensor([width - 1.0, 0.0], dtype=torch.float64)
+    flipped = segments._replace(endpoints=segments.endpoints * mirror + shift, boundary=5 - segments.boundary)
+    camera = K.clone()
+    camera[0, 2] = width - 1 - camera[0, 2]
+    one, _ = calibrator(segments, K[None], calibrator.initial_state(1, dtype=torch.float64), 1 / 30)
+    other, _ = calibrator(flipped, camera[None], calibrator.initial_state(1, dtype=torch.float64), 1 / 30)
+    signs = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(other.extrinsics.stack(), one.extrinsics.stack() * signs, rtol=0.0, atol=1e-4)
+
+    image = torch.rand(1, 3, 720, width, dtype=torch.float64)
+    lens = [0.1, -0.05, 0.002, -0.003, 0.01, 0.02, 0.01, 0.003, 0.004, -0.002, 0.003, 0.001, 0.02, -0.03]
+    lens = torch.tensor([lens], dtype=torch.float64)
+    changed = lens.clone()
+    changed[:, [3, 8, 9, 13]] *= -1  # p2, s1, s2, τy
+    half = 0.25  # m, of a cell: cells lie symmetrically about X = 0
+    warp = BEVWarp(BEVGrid(x=(-8 + half, 8 + half), z=(4.0, 40.0), resolution=2 * half))
+    view, valid = warp(image, K[None], one.extrinsics, lens)
+    pose = Extrinsics.unstack(one.extrinsics.stack() * signs)
+    mirrored, seen = warp(image.flip(-1), camera[None], pose, changed)
+    assert torch.equal(seen.flip(-1), valid)
+    torch.testing.assert_close(mirrored.flip(-1), view)
+
+
+@CALIBRATORS
+def test_states_that_were_stacked_or_cast_as_a_whole_are_named(calibrator):
+    state = calibrator.initial_state(1, dtype=torch.float64)
+    stacked = default_collate([state, state])
+    segments = stack_rows(lanes(seed=0), lanes(seed=1))
+    with pytest.raises(
+        ValueError, match=r"state: expected \(2, D\), got \(2, 1, \d+\); join states by torch"
+    ):
+        calibrator(segments, K.expand(2, 3, 3), stacked, 1 / 30)
+    cast = type(state)(*(part.double() for part in state))
+    with pytest.raises(ValueError, match=r"state.status: expected int64, got torch.float64; cast only what"):
+        calibrator(lanes(seed=0), K[None], cast, 1 / 30)
+    joined = type(state)(*map(torch.cat, zip(state, state, strict=True)))
+    found, _ = calibrator(segments, K.expand(2, 3, 3), joined, 1 / 30)
+    assert found.status.tolist() == [Status.TRACKING] * 2
 
 
 def test_cameras_that_cannot_be_used_are_not_taken_for_transposed_ones():

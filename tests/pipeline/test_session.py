@@ -273,6 +273,8 @@ def test_careless_arguments_are_named():
         Session(CAMERA, lane_width=370)
     with pytest.raises(ValueError, match="lane_width_std: expected 0 to 2 m, got -"):
         Session(CAMERA, lane_width_std=-0.1)
+    with pytest.raises(ValueError, match=r"lane_width_std: expected it once, got 0.2 m beside the c.* 0.1 m"):
+        Session(CAMERA, lane_width_std=0.2, calibrator=JointCalibrator(lane_width_std=0.1))
     with pytest.raises(ValueError, match="colours: expected 'bgr' or 'rgb'"):
         Session(CAMERA, colours="gray")
 

@@ -250,6 +250,22 @@ def test_ego_points_project_as_heads_do_it():
     torch.testing.assert_close(resized[..., :2], found[..., :2] / 2)
 
 
+@pytest.mark.parametrize("scale", [(1.05, 1.05, 1.05), (1.0, -1.0, 1.0), (-1.1, 1.1, 1.1)])
+def test_an_augmented_ego_frame_projects_to_the_same_pixels(scale):
+    """As BEVDet augments it: turned, scaled and mirrored, points and matrix alike."""
+    turn = torch.eye(4).double()
+    turn[:2, :2] = torch.tensor([[0.8, -0.6], [0.6, 0.8]])
+    augmentation = torch.diag(torch.tensor([*scale, 1.0])).double() @ turn
+    points = torch.tensor([[10.0, 2.0, 0.0, 1.0], [20.0, -3.0, 1.2, 1.0]]).double()
+    cameras = K.expand(2, 3, 3)
+    found = (
+        points
+        @ augmentation.mT
+        @ image_from_ego(POSES, cameras, augmentation @ ego_from_road(torch.float64)).mT
+    )
+    torch.testing.assert_close(found, points @ image_from_ego(POSES, cameras).mT)
+
+
 def test_lifted_pixels_are_the_ego_points_that_they_show():
     """get_geometry of Lift-Splat-Shoot, written out."""
     points = torch.tensor([[10.0, 2.0, 0.0], [20.0, -3.0, 1.2], [7.0, 0.5, 0.3]]).double()
