@@ -21,7 +21,7 @@ from lanebev.observation.frames import black_unless_finite, check_images
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segments import LaneSegments, segments_from_vertices
 from lanebev.torch_internals import register_pytree
-from lanebev.types import Calibration
+from lanebev.types import Calibration, Extrinsics
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
 
@@ -226,18 +226,28 @@ class LaneBEV(BoundaryDetector):
                 calibration = calibration.with_std_scaled(self.pose_sigma_scale)
             view, valid = None, None
             if bev:
-                taken = frames[:, step]
-                usable, finite = black_unless_finite(taken)
-                with self._gradients("warp"):
-                    view, valid = self.warp(
-                        usable, intrinsics, calibration.extrinsics, distortion, model,
-                        **self._road_shape(state),
-                    )  # fmt: skip
-                if usable is not taken:
-                    valid = select_rows(finite, valid, torch.zeros_like(valid))
+                view, valid = self._view(frames[:, step], *lens, calibration.extrinsics, state)
             homography = bev_from_image(calibration.extrinsics, intrinsics, self.warp.grid)
             outputs.append(LaneBEVOutput(view, valid, calibration, homography, now, logits))
         return (outputs[0] if image.ndim == 4 else stack_frames(outputs)), state
+
+    def _view(
+        self,
+        image: Tensor,
+        intrinsics: Tensor,
+        distortion: Tensor | None,
+        model: str,
+        extrinsics: Extrinsics,
+        state: Any,
+    ) -> tuple[Tensor, Tensor]:
+        """Resample images (B, 3, H, W), which count as black if they are not finite."""
+        usable, finite = black_unless_finite(image)
+        with self._gradients("warp"):
+            road = self._road_shape(state)
+            view, valid = self.warp(usable, intrinsics, extrinsics, distortion, model, **road)
+        if usable is not image:
+            valid = select_rows(finite, valid, torch.zeros_like(valid))
+        return view, valid
 
     def _look_ahead(
         self, frames: Tensor, intrinsics: Tensor, distortion: Tensor | None, model: str

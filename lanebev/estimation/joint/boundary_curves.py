@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import masked_median
-from lanebev.estimation.joint.observations import observe, per_end
+from lanebev.estimation.joint.observations import Observations, observe, per_end
 from lanebev.geometry.road import image_from_road_points
 from lanebev.geometry.road_profile import (
     check_vertical_curvature,
@@ -76,20 +76,10 @@ def fit_boundaries(
     if vertical_curvature is not None:
         check_vertical_curvature(vertical_curvature, intrinsics.shape[0])
     given = intrinsics.new_zeros(intrinsics.shape[0], 2) if curvature is None else curvature
-    rotation = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)
-    directions = rotation @ seen.cam_from_image @ seen.pixels
-    height = extrinsics.height.unsqueeze(-1)
-    curved = torch.zeros_like(height) if vertical_curvature is None else vertical_curvature.unsqueeze(-1)
-    profile = road_profile(height, curved)
-    on_road, z = meets_before_farthest(directions, profile), meet_road(directions, profile)
-    x, _, ahead = directions.unbind(1)  # each (B, 2N)
-    scale = z / torch.where(on_road, ahead, 1.0)  # of a direction to its point on the road
-    across = scale * x  # (B, 2N) m
+    z, across, scale, weight = _ends_on_road(seen, extrinsics, vertical_curvature)
     lateral = across - _bend(z, given)
-    focal = seen.focal.unsqueeze(-1)
-    boundary = per_end(seen.boundary)
-    member = torch.nn.functional.one_hot(boundary, NUM_BOUNDARIES).mT.to(z.dtype)  # (B, L, 2N)
-    weight = per_end(seen.weight) * on_road
+    height, focal = extrinsics.height.unsqueeze(-1), seen.focal.unsqueeze(-1)
+    member = torch.nn.functional.one_hot(per_end(seen.boundary), NUM_BOUNDARIES).mT.to(z.dtype)  # (B, L, 2N)
     member = member * weight.unsqueeze(1)
     sigma = per_end(seen.sigma)
 
@@ -106,17 +96,30 @@ def fit_boundaries(
             lateral = across - _bend(z, given)
         offset, heading = _fit_line(z, lateral, precision)
     present = 0.5 * (member * trust).sum(-1) >= least_support
-    reached = (member > 0) & (trust > 0.25)
+    extent = torch.where(present.unsqueeze(-1), _extent(z, (member > 0) & (trust > 0.25)), 0.0)
+    return Boundaries(offset, heading, extent, present, given)
+
+
+def _ends_on_road(
+    seen: Observations, extrinsics: Extrinsics, vertical_curvature: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Project end points to the road: Z and X in m, the scale of their directions, weights, (B, 2N) each."""
+    rotation = road_from_cam(extrinsics.pitch, extrinsics.yaw, extrinsics.roll)
+    directions = rotation @ seen.cam_from_image @ seen.pixels
+    height = extrinsics.height.unsqueeze(-1)
+    curved = torch.zeros_like(height) if vertical_curvature is None else vertical_curvature.unsqueeze(-1)
+    profile = road_profile(height, curved)
+    on_road, z = meets_before_farthest(directions, profile), meet_road(directions, profile)
+    x, _, ahead = directions.unbind(1)
+    scale = z / torch.where(on_road, ahead, 1.0)
+    return z, scale * x, scale, per_end(seen.weight) * on_road
+
+
+def _extent(z: Tensor, reached: Tensor) -> Tensor:
+    """Return the nearest and farthest z (B, 2N) that each boundary reaches (B, L, 2N), (B, L, 2) m."""
     near = z.unsqueeze(1).masked_fill(~reached, torch.inf).amin(-1)
     far = z.unsqueeze(1).masked_fill(~reached, -torch.inf).amax(-1)
-    extent = torch.where(present.unsqueeze(-1), torch.stack([near, far], dim=-1), 0.0)
-    return Boundaries(
-        offset=offset,
-        heading=heading,
-        extent=extent,
-        present=present,
-        curvature=given,
-    )
+    return torch.stack([near, far], dim=-1)
 
 
 def boundary_polylines(

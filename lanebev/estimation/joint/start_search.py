@@ -49,10 +49,7 @@ def linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Tens
     Returns:
         (B, S, 7), S the number of rolls.
     """
-    like = places
-    pitch = prior.pitch + prior.pitch_range * _spread(prior.pitch_steps, like)
-    roll = prior.roll + prior.roll_range * _spread(prior.roll_steps, like)
-    pitch, roll = (grid.flatten() for grid in torch.meshgrid(pitch, roll, indexing="ij"))  # (H,)
+    pitch, roll = _grid(prior, places)
     angles = torch.stack([pitch, torch.zeros_like(pitch), roll], dim=-1)
     axes, _ = road_from_cam_and_roll(angles)  # (H, 3, 3) rows right, down, forward
     rays = torch.bmm(seen.cam_from_image, seen.pixels)
@@ -64,10 +61,7 @@ def linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Tens
     weight = per_end(seen.weight).unsqueeze(1) * valid
     regressors = torch.stack([below, place * below, ahead, bend], dim=-1)  # (B, H, M, 4)
 
-    mean = constant((0.0, 1.0 / prior.height, 0.0, 0.0), like=like)
-    slack = prior.height_std / prior.height / prior.height
-    lateral, bent = prior.offset_std / prior.height, prior.curvature_std * prior.height
-    std = constant((lateral, slack, prior.yaw_std, bent), like=like)
+    mean, std = _linear_prior(prior, places)
     precision = (std / 0.02).square().reciprocal()
     solution = mean.expand(*right.shape[:2], 4)
     for scale in _ANNEALING:
@@ -86,9 +80,25 @@ def linear_starts(seen: Observations, places: Tensor, prior: FramePrior) -> Tens
     total = cost.sum(-1) - of_prior - student_log(away.square(), prior.freedom)
 
     best = total.view(-1, prior.pitch_steps, prior.roll_steps).argmin(1)  # (B, S)
-    hypothesis = best * prior.roll_steps + torch.arange(prior.roll_steps, device=like.device)
+    hypothesis = best * prior.roll_steps + torch.arange(prior.roll_steps, device=places.device)
     chosen = solution.gather(1, hypothesis.unsqueeze(-1).expand(-1, -1, 4))  # (B, S, 4)
     return _params_from_linear(chosen, axes[hypothesis])
+
+
+def _grid(prior: FramePrior, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return pitch and roll of the hypotheses, (H,) rad each, roll running first."""
+    pitch = prior.pitch + prior.pitch_range * _spread(prior.pitch_steps, like)
+    roll = prior.roll + prior.roll_range * _spread(prior.roll_steps, like)
+    pitch, roll = (grid.flatten() for grid in torch.meshgrid(pitch, roll, indexing="ij"))
+    return pitch, roll
+
+
+def _linear_prior(prior: FramePrior, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and standard deviation of the linear solution, (4,) each."""
+    mean = constant((0.0, 1.0 / prior.height, 0.0, 0.0), like=like)
+    slack = prior.height_std / prior.height / prior.height
+    lateral, bent = prior.offset_std / prior.height, prior.curvature_std * prior.height
+    return mean, constant((lateral, slack, prior.yaw_std, bent), like=like)
 
 
 def _params_from_linear(solution: Tensor, axes: Tensor) -> Tensor:

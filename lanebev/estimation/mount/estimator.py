@@ -112,25 +112,15 @@ class MountEstimator(nn.Module):
         shown_before, *_ = self._estimate(state)
         state, moved = self._close_blocks(state)
         state, withdrawn = self._withdraw(state, moved)
-        again = moved | withdrawn
         faded = (state.blend - 1 / cfg.blend_steps).clamp(min=0.0)
         state = state._replace(
-            former=torch.where(again, shown_before, state.former),
-            blend=torch.where(again, 1.0, torch.where(used, faded, state.blend)),
+            former=torch.where(moved | withdrawn, shown_before, state.former),
+            blend=torch.where(moved | withdrawn, 1.0, torch.where(used, faded, state.blend)),
         )
 
         mean, var, count = self._estimate(state)
-        limits, outside = self._limits(mean, state.status == int(MountStatus.INVALID))
-        enough = count >= cfg.needed
-        again = again | (state.status == int(MountStatus.RECALIBRATING))
-        waiting = torch.where(again, int(MountStatus.RECALIBRATING), int(MountStatus.UNCALIBRATED))
-        valid = torch.where(outside, int(MountStatus.INVALID), int(MountStatus.CALIBRATED))
-        status = torch.where(enough, valid, waiting)
-        suspect = (state.suspect > 0) | (state.contradicted > 0)
-        why = why | flag(~enough, MountReason.FEW_BLOCKS) | torch.where(enough, limits, 0)
-        why = why | flag(suspect, MountReason.SUSPECT) | flag(moved, MountReason.MOVED)
-        why = why | flag(withdrawn, MountReason.WITHDRAWN)
-        why = why | flag(newest_age(state) > cfg.stale_time, MountReason.STALE)
+        status, of_axes = self._judge(state, mean, count, moved, withdrawn)
+        why = why | of_axes
         state = state._replace(status=status, reasons=why)
 
         shown = state.blend * state.former + (1 - state.blend) * mean
@@ -267,6 +257,21 @@ class MountEstimator(nn.Module):
             torch.where(some > 1e-3, torch.minimum(variance, prior_var), prior_var),
             some,
         )
+
+    def _judge(
+        self, state: MountState, mean: Tensor, count: Tensor, moved: Tensor, withdrawn: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the status of every axis, and the flags of the reasons for it, (B, 4) int64 each."""
+        limits, outside = self._limits(mean, state.status == int(MountStatus.INVALID))
+        enough = count >= self.config.needed
+        again = moved | withdrawn | (state.status == int(MountStatus.RECALIBRATING))
+        waiting = torch.where(again, int(MountStatus.RECALIBRATING), int(MountStatus.UNCALIBRATED))
+        valid = torch.where(outside, int(MountStatus.INVALID), int(MountStatus.CALIBRATED))
+        why = flag(~enough, MountReason.FEW_BLOCKS) | torch.where(enough, limits, 0)
+        why = why | flag((state.suspect > 0) | (state.contradicted > 0), MountReason.SUSPECT)
+        why = why | flag(moved, MountReason.MOVED) | flag(withdrawn, MountReason.WITHDRAWN)
+        why = why | flag(newest_age(state) > self.config.stale_time, MountReason.STALE)
+        return torch.where(enough, valid, waiting), why
 
     def _limits(self, mean: Tensor, invalid: Tensor) -> tuple[Tensor, Tensor]:
         """Return flags and bools (B, 4) of limits that are broken; the margin keeps them from flickering."""
