@@ -101,7 +101,7 @@ def _camera(
     if is_kalibr(content):
         return checked(chosen(kalibr_cameras(content), name, has_usual=True))
     if is_orb_slam(content):
-        return checked(chosen(orb_slam_cameras(content), name, has_usual=True))
+        return checked(chosen(orb_slam_cameras(content, rectified), name, has_usual=True))
     if name is not None:
         raise ValueError(f"expected no name after # for a file of one camera, got {shown(name)}")
     if "intrinsic" in content:

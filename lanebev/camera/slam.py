@@ -141,12 +141,26 @@ def is_orb_slam(fields: Mapping[str, Any]) -> bool:
     return "Camera.fx" in fields or "Camera1.fx" in fields
 
 
-def orb_slam_cameras(fields: Mapping[str, Any]) -> Readers:
-    """Return what reads the camera in the settings of ORB-SLAM 2 or 3, or the left and the right one."""
-    names = [name for name in ("Camera1", "Camera2") if f"{name}.fx" in fields]
-    return {name: partial(_orb_slam, fields, f"{name}.") for name in names} or {
-        "": partial(_orb_slam, fields, "Camera.")
-    }
+def orb_slam_cameras(fields: Mapping[str, Any], rectified: bool) -> Readers:
+    """Return what reads the camera in the settings of ORB-SLAM 2 or 3, or the left and the right one.
+
+    ORB-SLAM 2's ``Camera`` is that of rectified images, where ``LEFT`` and ``RIGHT`` are those as taken.
+    """
+    pair = [name for name in ("Camera1", "Camera2") if f"{name}.fx" in fields]
+    if pair:
+        return {name: partial(_orb_slam, fields, f"{name}.") for name in pair}
+    taken = {name: partial(_as_taken, fields, name) for name in ("LEFT", "RIGHT") if f"{name}.K" in fields}
+    if not taken:
+        return {"": partial(_orb_slam, fields, "Camera.")}
+    both: Readers = {"Camera": partial(_orb_slam, fields, "Camera.")}
+    return {**both, **taken} if rectified else {**taken, **both}
+
+
+def _as_taken(fields: Mapping[str, Any], name: str) -> CameraParameters:
+    """Read a camera of ORB-SLAM 2's stereo settings."""
+    matrix, distortion = numbers(fields, f"{name}.K", count=9), numbers(fields, f"{name}.D")
+    size = (whole_number(fields, f"{name}.height"), whole_number(fields, f"{name}.width"))
+    return CameraParameters(matrix, distortion, "pinhole", size)
 
 
 def _orb_slam(fields: Mapping[str, Any], of: str) -> CameraParameters:

@@ -89,6 +89,36 @@ def test_the_usual_camera_is_taken_and_said(tmp_path, write, names, places):
     assert same.remark == ""  # KITTI's four have the same numbers
 
 
+STEREO = """%YAML:1.0
+Camera.fx: 435.2
+Camera.fy: 435.2
+Camera.cx: 367.4
+Camera.cy: 252.2
+Camera.k1: 0.0
+Camera.k2: 0.0
+Camera.width: 752
+Camera.height: 480
+LEFT.height: 480
+LEFT.width: 752
+LEFT.D: !!opencv-matrix {rows: 1, cols: 5, dt: d, data: [-0.283, 0.074, 0.0002, 1.8e-05, 0.0]}
+LEFT.K: !!opencv-matrix {rows: 3, cols: 3, dt: d, data: [458.7, 0, 367.2, 0, 457.3, 248.4, 0, 0, 1]}
+RIGHT.height: 480
+RIGHT.width: 752
+RIGHT.D: !!opencv-matrix {rows: 1, cols: 5, dt: d, data: [-0.284, 0.075, -0.0001, -3.6e-05, 0.0]}
+RIGHT.K: !!opencv-matrix {rows: 3, cols: 3, dt: d, data: [457.6, 0, 380.0, 0, 456.1, 255.2, 0, 0, 1]}
+"""
+
+
+def test_orb_slams_stereo_settings_have_the_camera_of_rectified_images_too(tmp_path):
+    path = _write(tmp_path, STEREO)
+    taken = Camera.from_file(path)
+    assert (float(taken.intrinsics[0, 0]), float(taken.distortion[0])) == (458.7, -0.283)
+    assert "the cameras LEFT, RIGHT, Camera, of which LEFT is taken" in taken.remark
+    rectified = Camera.from_file(path, rectified=True)
+    assert (float(rectified.intrinsics[0, 0]), len(rectified.distortion)) == (435.2, 0)
+    assert Camera.from_file(f"{path}#RIGHT").intrinsics[0, 2] == 380
+
+
 @pytest.mark.parametrize(("write", "names", "places"), UNUSUAL)
 def test_of_cameras_in_no_order_one_must_be_chosen(tmp_path, write, names, places):
     path = _write(tmp_path, write(*FOCALS))
