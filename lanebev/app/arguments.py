@@ -43,12 +43,19 @@ Open report.html in the output folder first.
 """
 
 
+_LONGEST = 300  # characters of an error, in which a glob without quotes has all its files
+
+
 class _Parser(argparse.ArgumentParser):
     """Reports an error in one line."""
 
     def error(self, message: str) -> NoReturn:
+        remedy = ""
         if message.startswith("unrecognized arguments: ") and " -" not in message:
-            message += "; a glob needs quotes"
+            remedy = "; a glob needs quotes"
+        if len(message) > _LONGEST:
+            message = f"{message[:_LONGEST]} …"
+        message += remedy
         self.exit(2, f"{self.prog}: error: {message}; see {self.prog} --help\n")
 
 

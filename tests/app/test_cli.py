@@ -461,6 +461,7 @@ def test_bad_input_is_one_line_and_status_2(data, tmp_path, capsys):
     _fails(capsys, [], "demo", "run", "--help")
     _fails(capsys, [*good, "--lane-widht", "3"], "unrecognized arguments: --lane-widht")
     _fails(capsys, [*good, "b.jpg", "c.jpg"], "unrecognized arguments: b.jpg c.jpg; a glob needs quotes")
+    _fails(capsys, [*good, *[f"{i:05d}.jpg" for i in range(3000)]], " …; a glob needs quotes; see lan")
     _fails(capsys, [*good, "--lane-width", "wide"], "invalid float value: 'wide'")
     _fails(capsys, [*good, "--lane-width", "37"], "lane width: expected 1 to 10 m, got 37")
     _fails(capsys, [*good, "--fps", "0"], "fps: expected")
