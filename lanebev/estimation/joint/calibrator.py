@@ -98,8 +98,8 @@ class JointCalibrator(Calibrator[JointState]):
         After a late frame the next dt counts from it. Inliers fit the road; a boundary that deviates too much
         to bound a lane, such as the foot of a barrier, has 0, whether for long or in this frame only.
         """
-        cfg, place = self.config, layout(self.config.num_boundaries)
-        if state.mean.shape[-1] != place.size:
+        cfg, indices = self.config, layout(self.config.num_boundaries)
+        if state.mean.shape[-1] != indices.size:
             got = state.mean.shape[-1] - layout(0).size
             raise ValueError(f"state: expected one of {cfg.num_boundaries} boundaries, got one of {got}")
         seen = observations(segments, intrinsics)
@@ -107,7 +107,7 @@ class JointCalibrator(Calibrator[JointState]):
         time = elapsed(dt, state, cfg)
 
         predicted = predict_state(state, time.step, cfg).state
-        numbers = 6 * place.size**2 + NUM_COMMON * seen.pixels.shape[-1]  # above all the Jacobian
+        numbers = 6 * indices.size**2 + NUM_COMMON * seen.pixels.shape[-1]  # above all the Jacobian
         updated, trust, inliers, alone = in_blocks(
             numbers, partial(update_state, cfg=cfg), predicted, positions, seen, time.step
         )

@@ -94,7 +94,7 @@ def motion(
     unequal: Tensor,
     vertical: Tensor,
     road: RoadMotion,
-    place: Layout,
+    indices: Layout,
     cfg: MotionConfig,
 ) -> tuple[Tensor, Tensor]:
     """Compute transition and process noise of the whole state.
@@ -105,13 +105,13 @@ def motion(
         unequal: (B,) m, standard deviation of the deviations on a road of unequal lanes; 0 on equal lanes.
         vertical: (B,) 1/m, standard deviation of the road's vertical curvature.
         road: how the shape moves.
-        place: indices.
+        indices: of the state vector.
         cfg: the configuration.
 
     Returns:
         (B, D, D) F and (B, D, D) W.
     """
-    num = place.deviations.stop - place.deviations.start
+    num = indices.deviations.stop - indices.deviations.start
     pose_step, pose_noise = pose_transition(dt, cfg.bandwidth)
     to_mean = constant(((1,), (0,), (0,), (0,)), like=dt) - pose_step[:, :, :1]
     pose_step = torch.cat([pose_step, to_mean], dim=-1).flatten(1)  # (B, 20)
@@ -149,34 +149,39 @@ def motion(
     ]
     values = torch.cat([*moves, *noises], dim=-1)
     index = constant(_places(num), like=values, dtype=torch.int64).expand(values.shape[0], -1)
-    flat = values.new_zeros(values.shape[0], 2 * place.size**2).scatter(1, index, values)
-    transition, noise = flat.unflatten(1, (2, place.size, place.size)).unbind(1)
+    flat = values.new_zeros(values.shape[0], 2 * indices.size**2).scatter(1, index, values)
+    transition, noise = flat.unflatten(1, (2, indices.size, indices.size)).unbind(1)
     return transition, noise
 
 
 @lru_cache(maxsize=16)
 def _places(num_boundaries: int) -> tuple[int, ...]:
     """Flat indices, in the order of :func:`motion`, of the entries of F and, after it, W."""
-    place = layout(num_boundaries)
+    indices = layout(num_boundaries)
 
     def block(rows: Sequence[int], columns: Sequence[int]) -> list[int]:
-        return [place.size * row + column for row in rows for column in columns]
+        return [indices.size * row + column for row in rows for column in columns]
 
     def diagonal(entries: slice) -> list[int]:
-        return [(place.size + 1) * entry for entry in range(entries.start, entries.stop)]
+        return [(indices.size + 1) * entry for entry in range(entries.start, entries.stop)]
 
-    chains = [place.chain(axis) for axis in range(NUM_POSE)]
-    slide = (OFFSET, place.rates.start + OFFSET)
+    chains = [indices.chain(axis) for axis in range(NUM_POSE)]
+    lateral = (OFFSET, indices.rates.start + OFFSET)
     shape = range(SHAPE.start, SHAPE.stop)
-    speed = slice(place.speed, place.speed + 1)
+    speed = slice(indices.speed, indices.speed + 1)
     moves = [block(chain[:ORDER], chain) for chain in chains]
-    moves += [diagonal(place.means), block(slide, slide), block(shape, shape), block(shape, [place.speed])]
+    moves += [
+        diagonal(indices.means),
+        block(lateral, lateral),
+        block(shape, shape),
+        block(shape, [indices.speed]),
+    ]
     vertical = slice(VERTICAL, VERTICAL + 1)
-    moves += [diagonal(speed), diagonal(place.deviations), diagonal(vertical)]
+    moves += [diagonal(speed), diagonal(indices.deviations), diagonal(vertical)]
     noises = [block(chain[:ORDER], chain[:ORDER]) for chain in chains]
-    noises += [diagonal(place.means), block(slide, slide), diagonal(SHAPE), diagonal(speed)]
-    noises += [diagonal(place.deviations), diagonal(vertical)]
-    return (*itertools.chain(*moves), *(place.size**2 + entry for entry in itertools.chain(*noises)))
+    noises += [diagonal(indices.means), block(lateral, lateral), diagonal(SHAPE), diagonal(speed)]
+    noises += [diagonal(indices.deviations), diagonal(vertical)]
+    return (*itertools.chain(*moves), *(indices.size**2 + entry for entry in itertools.chain(*noises)))
 
 
 def damped_velocity(dt: Tensor, memory: float) -> tuple[Tensor, Tensor]:

@@ -97,30 +97,30 @@ def update_state(
         step: (B,) s since the last frame.
         cfg: the configuration.
     """
-    place, num, width = layout(cfg.num_boundaries), cfg.num_boundaries, ego_lane_width(positions)
+    indices, num, width = layout(cfg.num_boundaries), cfg.num_boundaries, ego_lane_width(positions)
     sight = look(predicted.mean[:, :NUM_COMMON], seen, predicted.phase)
     shift, scale = best_shift(predicted.mean, positions, seen, sight, width)
     mean = renumber(predicted.mean, shift, width, num)
-    prior, places = mean[:, place.observed], positions.gather(1, seen.boundary)  # (B, O), (B, N)
+    prior, places = mean[:, indices.observed], positions.gather(1, seen.boundary)  # (B, O), (B, N)
     member = membership(seen.boundary, num, like=places)
 
-    def iterate(at: Tensor, doubt: Tensor, residuals: Residuals, scale: Tensor, cov: Tensor) -> Iteration:
-        frame = frame_information(residuals, scale, doubt, seen, member)
+    def iterate(at: Tensor, at_cov: Tensor, residuals: Residuals, scale: Tensor, cov: Tensor) -> Iteration:
+        frame = frame_information(residuals, scale, at_cov, seen, member)
         alone = single_frame_std(frame.matrix)
         estimated = estimated_entries(alone, num)
-        observed = cov[:, place.observed, place.observed]
-        moved = observed_step(prior, observed, at, frame, estimated[:, place.observed])
+        observed = cov[:, indices.observed, indices.observed]
+        moved = observed_step(prior, observed, at, frame, estimated[:, indices.observed])
         return Iteration(at, frame, alone, estimated, moved)
 
     used = cov = predicted.cov
-    doubt, on_road = cov[:, place.observed, place.observed], lateral_places(prior, places, seen)
+    at_cov, on_road = cov[:, indices.observed, indices.observed], lateral_places(prior, places, seen)
     feet = foot_points(prior[:, :NUM_COMMON], on_road, seen, sight)
     residuals = boundary_residuals(prior[:, :NUM_COMMON], on_road, seen, predicted.phase, feet, sight)
-    last = iterate(prior, doubt, residuals, scale, cov)
+    last = iterate(prior, at_cov, residuals, scale, cov)
     support = torch.bmm(member, per_end(last.frame.trust * seen.weight).unsqueeze(-1)).squeeze(-1)
-    score = normalized_score(doubt, last.frame, support, seen.weight)
+    score = normalized_score(at_cov, last.frame, support, seen.weight)
     evidence, motion_scale = with_evidence(predicted, score, last.estimated[:, POSE] > 0, step, cfg)
-    cov = with_process_noise(cov, adaptive_process_noise(evidence, doubt, cfg))
+    cov = with_process_noise(cov, adaptive_process_noise(evidence, at_cov, cfg))
     for _ in range(cfg.iterations - 1):
         at, used = last.step.mean, cov
         on_road = lateral_places(at, places, seen)
@@ -160,14 +160,14 @@ def inliers_of_lanes(last: Iteration, seen: Observations) -> Tensor:
 
 
 def with_evidence(
-    predicted: JointState, score: Tensor, pose_told: Tensor, step: Tensor, cfg: JointConfig
+    predicted: JointState, score: Tensor, pose_determined: Tensor, step: Tensor, cfg: JointConfig
 ) -> tuple[Tensor, Tensor]:
     """Add a frame's scores to the evidence against the motion, and adapt the scale of the motion to them.
 
     Args:
         predicted: state.
         score: (B, 11 + L), of :func:`~lanebev.estimation.joint.evidence.normalized_score`.
-        pose_told: (B, 4) bool, what of the pose the frame determines; the scale of the rest decays.
+        pose_determined: (B, 4) bool, what of the pose the frame determines; the scale of the rest decays.
         step: (B,) s since the last frame.
         cfg: the configuration.
 
@@ -175,7 +175,7 @@ def with_evidence(
         evidence (B, 11 + L) and scale (B, 4).
     """
     evidence = accumulate_evidence(predicted.evidence, score, step, cfg.evidence_time)
-    scored = torch.where(pose_told, score[:, POSE], 1.0)  # 1 is the score that is expected
+    scored = torch.where(pose_determined, score[:, POSE], 1.0)  # 1 is the score that is expected
     return evidence, adapt_motion_scale(predicted.motion_scale, scored, step, cfg)
 
 

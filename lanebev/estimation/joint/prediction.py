@@ -61,14 +61,14 @@ def predict_state(state: JointState, dt: Tensor, cfg: JointConfig) -> Prediction
 
     Source: (J11), (J12), (J20), (J21).
     """
-    place, hills = layout(cfg.num_boundaries), hill_variance(state, dt, cfg)
-    road = propagate_road_shape(state.mean, state.cov[:, SHAPE, SHAPE], state.phase, dt, place, cfg.motion)
+    indices, hills = layout(cfg.num_boundaries), hill_variance(state, dt, cfg)
+    road = propagate_road_shape(state.mean, state.cov[:, SHAPE, SHAPE], state.phase, dt, indices, cfg.motion)
     scale = state.motion_scale.sqrt()
     unobserved = unobserved_mask(state.reasons)
     scale = torch.where(unobserved, scale.clamp(min=cfg.motion.unobserved_scale), scale)
-    unequal = deviation_prior_std(state.mean[:, place.deviations], cfg)
+    unequal = deviation_prior_std(state.mean[:, indices.deviations], cfg)
     vertical = (cfg.motion.vertical_curvature_std**2 + hills).sqrt()
-    transition, noise = motion(dt, scale, unequal, vertical, road, place, cfg.motion)
+    transition, noise = motion(dt, scale, unequal, vertical, road, indices, cfg.motion)
     mean, cov = predict(state.mean, state.cov, transition, noise)
     mean = torch.cat([mean[:, :CURVATURE], road.shape, mean[:, SHAPE.stop :]], dim=-1)
     predicted = state._replace(mean=mean, cov=cov, phase=road.phase, hills=hills)

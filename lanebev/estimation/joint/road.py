@@ -40,7 +40,7 @@ _PASSED = (  # row 0 takes up the steps up to the last knot passed, the others a
 
 
 def propagate_road_shape(
-    mean: Tensor, shape_cov: Tensor, phase: Tensor, dt: Tensor, place: Layout, cfg: MotionConfig
+    mean: Tensor, shape_cov: Tensor, phase: Tensor, dt: Tensor, indices: Layout, cfg: MotionConfig
 ) -> RoadMotion:
     """Predict the shape of the road as the camera passes knots and new steps come into view.
 
@@ -51,13 +51,13 @@ def propagate_road_shape(
         shape_cov: (B, NUM_SHAPE, NUM_SHAPE) of its shape.
         phase: (B,) m, how far the first knot lies behind the camera.
         dt: (B,) s.
-        place: indices.
+        indices: of the state vector.
         cfg: the configuration.
 
     Returns:
         shape and phase after it, with derivatives and noise.
     """
-    way = dt * (cfg.speed + mean[:, place.speed]).clamp(min=0.0)
+    way = dt * (cfg.speed + mean[:, indices.speed]).clamp(min=0.0)
     gone = phase + way
     passed = (gone / KNOT_SPACING).floor()  # (B,) knots
     shape = turn_along(mean[:, SHAPE], phase, way)

@@ -54,14 +54,14 @@ def link_states(before: JointState, after: JointState, dt: Tensor, cfg: JointCon
         dt: (B,) s between them, as the calibrator was given it.
         cfg: the calibrator's.
     """
-    place = layout(cfg.num_boundaries)
+    indices = layout(cfg.num_boundaries)
     step, skip, _, _ = elapsed(dt, before, cfg)
     predicted, transition, noise = predict_state(before, step, cfg)
     evidence = torch.where(skip.unsqueeze(-1), 0.0, after.evidence)
-    raised = adaptive_process_noise(evidence, predicted.cov[:, place.observed, place.observed], cfg)
+    raised = adaptive_process_noise(evidence, predicted.cov[:, indices.observed, indices.observed], cfg)
     known = (skip.unsqueeze(-1) | ~other_quantities(after, cfg)).unsqueeze(-2)  # (B, 1, D)
     roll_alone = has_flag(after.reasons, Reason.ROLL_UNSEEN) & (after.unseen == 0)
-    is_roll = torch.tensor([k in place.chain(ROLL) for k in range(place.size)], device=dt.device)
+    is_roll = torch.tensor([k in indices.chain(ROLL) for k in range(indices.size)], device=dt.device)
     same = is_roll.unsqueeze(-1) == is_roll  # (D, D)
     linked = known & (same | ~roll_alone[:, None, None])
     return Link(predicted.mean, transition, with_process_noise(noise, raised), linked)
@@ -69,9 +69,9 @@ def link_states(before: JointState, after: JointState, dt: Tensor, cfg: JointCon
 
 def other_quantities(after: JointState, cfg: JointConfig) -> Tensor:
     """Tell which entries (B, D) of a state are not the same quantity as in the state of the frame before."""
-    place = layout(cfg.num_boundaries)
-    numbered = (OFFSET, *range(place.size)[place.deviations])
-    of_numbers = torch.tensor([k in numbered for k in range(place.size)], device=after.mean.device)
+    indices = layout(cfg.num_boundaries)
+    numbered = (OFFSET, *range(indices.size)[indices.deviations])
+    of_numbers = torch.tensor([k in numbered for k in range(indices.size)], device=after.mean.device)
     begun = has_flag(after.reasons, Reason.RESTARTED) | (after.status == int(Status.UNINITIALISED))
     return begun.unsqueeze(-1) | (has_flag(after.reasons, Reason.LANE_CHANGE).unsqueeze(-1) & of_numbers)
 

@@ -215,12 +215,12 @@ def _by_parameters(num_boundaries: int) -> tuple[tuple[float, ...], ...]:
 
     The slow mean begins at the pose.
     """
-    place = layout(num_boundaries)
+    indices = layout(num_boundaries)
     factors = {(k, k): 1.0 for k in (*range(NUM_STRAIGHT), CURVATURE)}
     factors |= {(step, CURVATURE + 1): KNOT_SPACING for step in range(STEPS.start, STEPS.stop)}
     factors |= {(VERTICAL, NUM_PARAMS): 1.0}
-    factors |= {(place.means.start + axis, axis): 1.0 for axis in range(NUM_POSE)}
-    return tuple(tuple(factors.get((k, p), 0.0) for p in range(NUM_PARAMS + 1)) for k in range(place.size))
+    factors |= {(indices.means.start + axis, axis): 1.0 for axis in range(NUM_POSE)}
+    return tuple(tuple(factors.get((k, p), 0.0) for p in range(NUM_PARAMS + 1)) for k in range(indices.size))
 
 
 @lru_cache(maxsize=16)
