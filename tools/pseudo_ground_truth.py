@@ -59,7 +59,7 @@ def pseudo_ground_truth(
     Returns:
         the optimum, per row.
     """
-    ends, boundary, weight, sigma = segments
+    ends, _, weight, sigma = segments
     batch = ends.shape[0]
     rays = segment_rays(ends, intrinsics)
     normals = great_circle_normals(rays)
@@ -69,7 +69,7 @@ def pseudo_ground_truth(
         noise = incidence_noise(rays, direction, sigma, intrinsics)
         direction, _ = vanishing_dir_least_squares(normals, noise, weight, forward)
     pitch, yaw = pitch_yaw_from_vanishing_dir(direction)
-    angles = boundary_angles(rays, boundary, weight, sigma, intrinsics, pitch, yaw, NUM_BOUNDARIES)
+    angles = boundary_angles(segments, rays, intrinsics, pitch, yaw, NUM_BOUNDARIES)
     prior = ends.new_full((batch, NUM_BOUNDARIES - 1), lane_width)
     roll, height = initial_roll_height(angles, prior, torch.zeros_like(pitch), num_iterations=20)
     lanes = (angles.present[:, 1:] & angles.present[:, :-1]).sum(-1)

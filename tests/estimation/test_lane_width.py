@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from lanebev import Extrinsics
+from lanebev import Extrinsics, LaneSegments
 from lanebev.estimation.two_stage import lane_width as lw
 from lanebev.geometry.road import segment_rays
 from lanebev.geometry.rotation import cam_from_world
@@ -35,7 +35,8 @@ def angles_of(ends, pose, sigma=1.0, boundary=None):
     rays = segment_rays(ends, intrinsics)
     boundary = torch.arange(n).expand(rows, n) if boundary is None else boundary
     weight = torch.ones(rows, n, dtype=torch.float64)
-    return lw.boundary_angles(rays, boundary, weight, sigma * weight, intrinsics, pose.pitch, pose.yaw, 4)
+    segments = LaneSegments(ends, boundary, weight, sigma * weight)
+    return lw.boundary_angles(segments, rays, intrinsics, pose.pitch, pose.yaw, 4)
 
 
 @pytest.mark.parametrize(

@@ -104,16 +104,9 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
         stale = known & (state.unseen + dt > self.config.lost_after)
         state = state._replace(status=torch.where(stale, int(Status.LOST), state.status))
         one = track_direction(segments, rays, intrinsics, state, dt, self.draws, self.config)
-        boundaries = boundary_angles(
-            rays,
-            segments.boundary,
-            segments.weight * one.inliers,
-            segments.sigma,
-            intrinsics,
-            one.mean[:, 0],
-            one.mean[:, 1],
-            self.config.num_boundaries,
-        )
+        inliers = segments._replace(weight=segments.weight * one.inliers)
+        pitch, yaw = one.mean[:, 0], one.mean[:, 1]
+        boundaries = boundary_angles(inliers, rays, intrinsics, pitch, yaw, self.num_boundaries)
         two = track_roll_height(boundaries, lane_width, one.cov[:, :2, :2], state, dt, one.fresh, self.config)
         unseen = torch.where(one.seen, 0.0, state.unseen + dt)
         status = _status(state.status, one.seen, unseen, self.config.lost_after)

@@ -88,7 +88,7 @@ def track_direction(
     spread = cov[:, :2, :2].diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()
     start = ~tracking | (state.unseen + dt > cfg.reacquire_after) | (spread > cfg.reacquire_spread)
     wanted = start & there.any(-1)
-    started = start_direction(segments, rays, normals, intrinsics, mean, wanted, draws, cfg)
+    started = start_direction(segments, rays, intrinsics, mean, wanted, draws, cfg)
     fresh = start & started.seen
     seen = torch.where(start, fresh, supported)
     inliers = torch.where(fresh.unsqueeze(-1), started.inliers, inliers * supported.unsqueeze(-1))
@@ -133,7 +133,6 @@ def is_supported(segments: LaneSegments, inliers: Tensor, cfg: TwoStageConfig) -
 def start_direction(
     segments: LaneSegments,
     rays: Tensor,
-    normals: Tensor,
     intrinsics: Tensor,
     mean: Tensor,
     wanted: Tensor,
@@ -151,7 +150,7 @@ def start_direction(
     _, agree = ransac_vanishing_point(
         segments.endpoints, segments.weight, segments.sigma, draws.to(mean.dtype), cfg.gate_sigmas
     )
-    inliers = agree.to(mean.dtype)
+    inliers, normals = agree.to(mean.dtype), great_circle_normals(rays)
     weight = segments.weight * inliers
     vanishing = mean.new_tensor([0.0, 0.0, 1.0]).expand(mean.shape[0], 3)
     for _ in range(3):  # the noise depends on where the vanishing point is

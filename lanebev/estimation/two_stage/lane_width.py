@@ -11,6 +11,7 @@ from torch import Tensor
 from lanebev.batch import masked_median
 from lanebev.geometry.linalg import solve_spd
 from lanebev.geometry.rotation import cam_from_world
+from lanebev.observation.segments import LaneSegments
 
 _MIN_RADIUS = 1e-3  # a ray closer than 0.06 deg to the vanishing direction has no information
 _MIN_COSINE = 0.02  # 1.1 deg: a boundary plane closer to the road's own has no foot on it
@@ -98,10 +99,8 @@ def width_energy(residuals: Tensor) -> Tensor:
 
 
 def boundary_angles(
+    segments: LaneSegments,
     rays: Tensor,
-    boundary: Tensor,
-    weight: Tensor,
-    sigma: Tensor,
     intrinsics: Tensor,
     pitch: Tensor,
     yaw: Tensor,
@@ -115,11 +114,9 @@ def boundary_angles(
     boundary's median by more than 4 sigma and a degree are left out.
 
     Args:
+        segments: (B, N).
         rays: (B, N, 2, 3) of both end points.
-        boundary: (B, N) int64.
-        weight: (B, N) in [0, 1].
-        sigma: (B, N) px.
-        intrinsics: (B, 3, 3).
+        intrinsics: (B, 3, 3) px.
         pitch: (B,) rad.
         yaw: (B,) rad.
         num_boundaries: L.
@@ -127,13 +124,11 @@ def boundary_angles(
     Returns:
         angles with noise, Jacobian and presence.
     """
+    _, boundary, weight, sigma = segments
     world = rays @ cam_from_world(pitch, yaw).unsqueeze(1)  # (B, N, 2, 3)
     far = (world[..., :2].square().sum(-1) > _MIN_RADIUS**2).all(-1) & (weight > 0)  # (B, N)
     world = torch.where(far[..., None, None], world, world.new_tensor([0.0, 1.0, 1.0]))
-    x, y, z = world.unbind(-1)
-    radius = x * x + y * y
-    pull = radius.sum(-1)  # (B, N), how strongly a segment's ends fix the angle
-    angle = (radius * line_angles(world)).sum(-1) / pull
+    angle, by_pose, pull = _segment_angles(world, yaw)
     focal = 0.5 * (intrinsics[:, 0, 0] + intrinsics[:, 1, 1]).unsqueeze(-1)
     variance = (sigma / focal).square() / pull
     index = torch.arange(num_boundaries, device=boundary.device)[:, None]
@@ -145,14 +140,31 @@ def boundary_angles(
     total = precision.sum(-1)
     present = total > 0
     share = precision / torch.where(present, total, 1.0).unsqueeze(-1)
+    angles = (share @ angle.unsqueeze(-1)).squeeze(-1)
+    return BoundaryAngles(angles, 1.0 / torch.where(present, total, 1.0), share @ by_pose, present)
 
-    # How the angle changes as the camera pitches and yaws: d(R_WC r) is -(cosφ, 0, sinφ) × and -(0, 1, 0) ×.
+
+def _segment_angles(world: Tensor, yaw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute the angle of each segment's plane, its derivative by pitch and yaw, and its information.
+
+    The information is how strongly the ends of a segment fix the angle: that of unit noise of a ray.
+
+    Args:
+        world: (B, N, 2, 3), rays to the end points in the lane-aligned frame.
+        yaw: (B,) rad.
+
+    Returns:
+        (B, N) rad, (B, N, 2), (B, N).
+    """
+    x, y, z = world.unbind(-1)
+    radius = x * x + y * y
+    pull = radius.sum(-1)
+    angle = (radius * line_angles(world)).sum(-1) / pull
+    # As the camera pitches and yaws, d(R_WC r) is -(cosφ, 0, sinφ) × and -(0, 1, 0) ×.
     sy, cy = yaw.sin()[:, None, None], yaw.cos()[:, None, None]
     by_pitch = (x * (cy * z - sy * x) - sy * y * y).sum(-1) / pull
     by_yaw = (z * y).sum(-1) / pull
-    by_pose = torch.stack([by_pitch, by_yaw], dim=-1)  # (B, N, 2)
-    angles = (share @ angle.unsqueeze(-1)).squeeze(-1)
-    return BoundaryAngles(angles, 1.0 / torch.where(present, total, 1.0), share @ by_pose, present)
+    return angle, torch.stack([by_pitch, by_yaw], dim=-1), pull
 
 
 class WidthMeasurement(NamedTuple):
