@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import os
+import re
 import struct
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _DRAWN_TEXTS = ("tty", "bin", "xbin", "adf", "idf")  # formats of which ffmpeg draws the letters
+_MOVING = 0.5  # of the longest stream's duration, the least of another that is no picture beside it
 _NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS: raw streams, whose times ffmpeg makes up
 _MARKED = "one that the decoder marks as damaged"
 _EARLY = "one before the first key frame"
@@ -53,10 +55,28 @@ def tell_damaged_jpegs(stream: av.VideoStream) -> None:
 
 
 def moving_pictures(container: av.container.InputContainer) -> list[av.VideoStream]:
-    """Return the video streams that can be decoded and are no cover or thumbnail."""
+    """Return the video streams that can be decoded and are no cover or thumbnail.
+
+    Such are marked, or declare a much shorter duration than another stream.
+    """
     still = av.stream.Disposition.attached_pic
     known = (stream for stream in container.streams.video if stream.codec_context is not None)
-    return [stream for stream in known if not stream.disposition & still]
+    durations = {stream: declared_duration(stream) for stream in known if not stream.disposition & still}
+    least = _MOVING * max(durations.values(), default=0.0)
+    return [stream for stream, duration in durations.items() if duration == 0 or duration >= least]
+
+
+def declared_duration(stream: av.VideoStream) -> float:
+    """Return a stream's duration in the header, s; 0 if there is none.
+
+    Matroska has its end, in a tag, beside which ffmpeg may give the duration of the whole file.
+    """
+    match = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", stream.metadata.get("DURATION", ""))
+    if match is None:
+        return float((stream.duration or 0) * (stream.time_base or 0))
+    hours, minutes, seconds = map(float, match.groups())
+    begin = (stream.start_time or 0) * (stream.time_base or 0)
+    return 3600 * hours + 60 * minutes + seconds - float(begin)
 
 
 def video_stream(container: av.container.InputContainer) -> av.VideoStream:

@@ -14,7 +14,15 @@ from pathlib import Path
 
 import av
 
-from lanebev.io.decoding import display_matrix, has_times, pixel_aspect, rgb, tell_damaged_jpegs
+from lanebev.io.decoding import (
+    display_matrix,
+    has_times,
+    moving_pictures,
+    pixel_aspect,
+    rgb,
+    tell_damaged_jpegs,
+    video_stream,
+)
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import ALL, Frame, Selection
 from lanebev.io.rising_clock import RisingClock
@@ -219,9 +227,9 @@ def open_live(
         reason = error.strerror or str(error)
         raise ValueError(f"stream {name}: expected one that opens, got: {reason}") from error
     try:
-        if not container.streams.video:
+        if not moving_pictures(container):
             raise ValueError(f"stream {name}: expected a video stream, got none")
-        stream = container.streams.video[0]
+        stream = video_stream(container)
         tell_damaged_jpegs(stream)
         frames = _whole_frames(container, stream, figures)
         first = next(frames)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.io.decoding import (
+    declared_duration,
     decoded,
     display_matrix,
     has_times,
@@ -192,7 +193,7 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
                 if not packet.is_discard and (first is None or packet.pts >= first):
                     shown.append(packet.pts)
                 end = max(end, packet.pts - begin + max(packet.duration or 0, 1 / fps / tick))
-        declared, got = _declared_duration(stream, begin * tick), float(end * tick)
+        declared, got = declared_duration(stream), float(end * tick)
         problems += filter(None, [appended_remark(container, read)])
     count = len(shown)
     if restart := restart_remark(keys, most_early):
@@ -253,14 +254,3 @@ def _rate_of_times(times: Sequence[int], tick: Fraction, stated: Fraction) -> Fr
     median_rate, mean_rate = (1 / Fraction(float(of(steps))) / tick for of in (np.median, np.mean))
     near = any(1 / _SAME_VIDEO < rate / stated < _SAME_VIDEO for rate in (median_rate, mean_rate))
     return stated if near else median_rate.limit_denominator(1000)
-
-
-def _declared_duration(stream: av.VideoStream, begin: Fraction) -> float:
-    """Return the stream's duration in the header, s; 0 if there is none. Matroska has its end, in a tag."""
-    if stream.duration is not None and stream.time_base is not None:
-        return float(stream.duration * stream.time_base)
-    match = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", stream.metadata.get("DURATION", ""))
-    if match is None:
-        return 0.0
-    hours, minutes, seconds = map(float, match.groups())
-    return 3600 * hours + 60 * minutes + seconds - float(begin)

@@ -74,6 +74,20 @@ def test_of_several_streams_the_largest_is_used_and_said(tmp_path, first):  # ph
     assert len(list(source)) == source.count == 12
 
 
+@pytest.mark.parametrize("suffix", ["mkv", "mp4", "ts"])
+@pytest.mark.parametrize("first", [True, False])
+def test_a_picture_beside_a_video_is_passed_over_if_it_is_larger(tmp_path, suffix, first):  # LAVFilters#430
+    path = tmp_path / f"v.{suffix}"
+    with av.open(str(path), "w") as container:
+        sizes = [(96, 128), SIZE] if first else [SIZE, (96, 128)]
+        streams = {size: _stream(container, size) for size in sizes}
+        for size in sizes:
+            _write(container, streams[size], range(12 if size == SIZE else 1))
+    source = open_source(str(path))
+    assert (source.image_size, source.count, source.problem) == (SIZE, 12, "")
+    assert _levels(source) == list(range(12))
+
+
 def test_a_video_of_covers_only_is_none(tmp_path):
     path = tmp_path / "v.mp4"
     with av.open(str(path), "w") as container:
