@@ -91,10 +91,8 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
         faint: (B,) bool, thin worn paint of little contrast.
     """
     slots = MAX_BOUNDARIES
-    few_or_many, many = (
-        sampler.pick([0, 0, 1, 2, 3, 3, 3, 0.6, 0.6]),
-        sampler.pick([0, 0, 0, 0.2, 1, 2, 2, 1, 0.5]),
-    )
+    few_or_many = sampler.pick([0, 0, 1, 2, 3, 3, 3, 0.6, 0.6])
+    many = sampler.pick([0, 0, 0, 0.2, 1, 2, 2, 1, 0.5])
     count = torch.where(dotted, many, few_or_many)  # boundaries
     lane_width = sampler.either(0.6, (3.4, 3.8), (2.7, 4.0))
     uneven = torch.where(sampler.chance(0.45), 0.09, 0.0)[:, None] * sampler.normal(1.0, slots - 1).clamp(
@@ -108,32 +106,14 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
 
     last = (count - 1)[:, None]
     outer = (index == 0) | (index == last)
-    edge = sampler.pick([0.09, 0.66, 0.06, 0.12, 0.03, 0.04], slots)
-    divider = torch.where(
-        dotted[:, None],
-        sampler.pick([0.0, 0.01, 0.30, 0.02, 0.67, 0.0], 1),
-        sampler.pick([0.0, 0.05, 0.83, 0.03, 0.05, 0.04], 1),
-    )
-    odd_one = sampler.pick([0.0, 0.3, 0.25, 0.2, 0.2, 0.05], slots)
-    divider = torch.where(sampler.chance(0.12, slots), odd_one, divider)
-    kind = torch.where(outer, edge, divider)
-
+    kind = _kinds_of_lines(sampler, dotted, outer)
     dashes = sampler.pick_from(DASHES, 1).expand(-1, slots, -1).clone()
     other = sampler.pick_from(DASHES, slots)
     dashes = torch.where(sampler.chance(0.1, slots)[..., None], other, dashes)
     dashes = dashes * sampler.uniform(0.9, 1.1, 1, 1)
     dash = dashes_of_lines(kind, dashes)
     double = (kind == DOUBLE) | (kind == SOLID_DASHED)
-
-    width = sampler.either(0.75, (0.10, 0.16), (0.14, 0.30))[:, None]
-    width = width * torch.where(outer, sampler.uniform(1.0, 1.35, 1), torch.ones(1))
-    width = torch.where(faint[:, None], sampler.uniform(0.09, 0.14, 1), width)
-    yellow = ((index == 0) & sampler.chance(0.6, 1)) | sampler.chance(0.03, slots)
-    colour = torch.where(yellow[..., None], torch.tensor(YELLOW), torch.tensor(WHITE))
-    colour = colour * sampler.uniform(0.85, 1.1, 1, 1) + sampler.normal(0.015, 1, 3)
-    opacity = sampler.either(0.55, (0.75, 1.0), (0.4, 0.85))[:, None]
-    opacity = (opacity * sampler.uniform(0.75, 1.15, slots)).clamp(0.3, 1.0)
-    opacity = torch.where(faint[:, None], sampler.uniform(0.4, 0.9, 1), opacity)
+    width, colour, opacity = _paint(sampler, faint, outer)
 
     stud = kind == STUDS
     reflectors = sampler.chance(0.35, 1) & (sampler.chance(0.8, slots)) & (kind != NONE)
@@ -168,6 +148,35 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
         symbol_phase=sampler.uniform(0, 150),
         symbol_opacity=sampler.uniform(0.5, 1.0),
     )
+
+
+def _kinds_of_lines(sampler: BatchSampler, dotted: Tensor, outer: Tensor) -> Tensor:
+    """Sample the kind of line, NONE to SOLID_DASHED, of edges (outer) and dividers, (B, K) int64."""
+    slots = MAX_BOUNDARIES
+    edge = sampler.pick([0.09, 0.66, 0.06, 0.12, 0.03, 0.04], slots)
+    divider = torch.where(
+        dotted[:, None],
+        sampler.pick([0.0, 0.01, 0.30, 0.02, 0.67, 0.0], 1),
+        sampler.pick([0.0, 0.05, 0.83, 0.03, 0.05, 0.04], 1),
+    )
+    odd_one = sampler.pick([0.0, 0.3, 0.25, 0.2, 0.2, 0.05], slots)
+    divider = torch.where(sampler.chance(0.12, slots), odd_one, divider)
+    return torch.where(outer, edge, divider)
+
+
+def _paint(sampler: BatchSampler, faint: Tensor, outer: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Sample width (B, K) m, colour (B, K, 3) and opacity (B, K) of the lines."""
+    slots = MAX_BOUNDARIES
+    width = sampler.either(0.75, (0.10, 0.16), (0.14, 0.30))[:, None]
+    width = width * torch.where(outer, sampler.uniform(1.0, 1.35, 1), torch.ones(1))
+    width = torch.where(faint[:, None], sampler.uniform(0.09, 0.14, 1), width)
+    first = torch.arange(slots) == 0
+    yellow = (first & sampler.chance(0.6, 1)) | sampler.chance(0.03, slots)
+    colour = torch.where(yellow[..., None], torch.tensor(YELLOW), torch.tensor(WHITE))
+    colour = colour * sampler.uniform(0.85, 1.1, 1, 1) + sampler.normal(0.015, 1, 3)
+    opacity = sampler.either(0.55, (0.75, 1.0), (0.4, 0.85))[:, None]
+    opacity = (opacity * sampler.uniform(0.75, 1.15, slots)).clamp(0.3, 1.0)
+    return width, colour, torch.where(faint[:, None], sampler.uniform(0.4, 0.9, 1), opacity)
 
 
 def dashes_of_lines(kind: Tensor, dashes: Tensor) -> Tensor:

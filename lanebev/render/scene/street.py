@@ -121,34 +121,13 @@ def sample_street(
         first: (B,) int64, the own direction's first lane.
         own: (B,) int64, its number of lanes.
     """
-    slots = MAX_BOUNDARIES
-    index = torch.arange(slots, device=own.device)
+    index = torch.arange(MAX_BOUNDARIES, device=own.device)
     strip = sampler.pick([0.5, 0.27, 0.23], 2)
     tints = sampler.pick_from(
         [(0.22, 0.06, 0.045), (0.17, 0.05, 0.05), (0.05, 0.14, 0.07), (0.04, 0.09, 0.2)], 2
     )
-    stone = sampler.uniform(0.1, 0.45, 2, 1) * (1 + sampler.normal(0.03, 2, 3))
-    path = torch.where(sampler.chance(0.5, 2)[..., None], tints, sampler.uniform(0.06, 0.25, 2, 1))
-    walk = sampler.uniform(0.07, 0.38, 2, 1) * (1 + sampler.normal(0.04, 2, 3))
-    green = sampler.pick_from(GREENS, 2) * sampler.uniform(0.7, 1.4, 2, 1)
-    walks, paths, greens = sampler.chance(0.75, 2), sampler.chance(0.3, 2), sampler.chance(0.4, 2)
-    kerb = sampler.sometimes(0.9, 0.1, 0.32, 2)
-    strips = torch.stack(
-        [
-            kerb,
-            torch.where(greens, sampler.uniform(0.3, 3.5, 2), 0.0),
-            torch.where(paths, sampler.uniform(1.0, 2.2, 2), 0.0),
-            torch.where(walks, sampler.uniform(0.9, 4.5, 2), 0.0),
-        ],
-        dim=2,
-    )
-    signed = sampler.chance(0.55, 1)
-    lane_in = (index >= ego_lane[:, None] - 3) & (index < layout.exists.sum(1, keepdim=True) - 1)
-    glyph = sampler.pick([1.0] * len(ARROWS), slots)
-    other = sampler.pick_from([float(g) for g in (*WORDS, BICYCLE, CROSS)], slots).long()
-    glyph = torch.where(sampler.chance(0.15, slots), other, glyph)
-    glyph = torch.where(signed & lane_in & sampler.chance(0.75, slots), glyph, -1)
-
+    strips, colours = _strips_beside(sampler, tints)
+    glyph = _glyphs(sampler, layout, ego_lane)
     beside = ego_lane[:, None] + torch.where(sampler.chance(0.65), -1, 1)[:, None]
     lanes = layout.exists.sum(1, keepdim=True) - 1
     hatched = (index == beside) & (beside >= 0) & (beside < lanes) & sampler.chance(0.3, 1)
@@ -170,7 +149,7 @@ def sample_street(
         kerb_shade=sampler.uniform(0.35, 1.2, 2),
         kerb_blocks=sampler.sometimes(0.08, 0.5, 1.5),
         strips=strips,
-        colours=torch.stack([stone, green, path.expand(-1, -1, 3), walk], dim=2),
+        colours=colours,
         slab=sampler.sometimes(0.5, 0.3, 1.2),
         path_line=sampler.sometimes(0.5, 0.5, 1.0, 2),
         junction_period=sampler.uniform(90, 320),
@@ -204,6 +183,39 @@ def sample_street(
         opacity=sampler.uniform(0.55, 1.0),
         wear=layout.wear[:, 0],
     )
+
+
+def _strips_beside(sampler: BatchSampler, tints: Tensor) -> tuple[Tensor, Tensor]:
+    """Sample widths (B, 2, 4) m and colours (B, 2, 4, 3) of kerb, green, path and pavement on both sides.
+
+    Args:
+        sampler: the randomness.
+        tints: (B, 2, 3), colours of painted paths.
+    """
+    stone = sampler.uniform(0.1, 0.45, 2, 1) * (1 + sampler.normal(0.03, 2, 3))
+    path = torch.where(sampler.chance(0.5, 2)[..., None], tints, sampler.uniform(0.06, 0.25, 2, 1))
+    walk = sampler.uniform(0.07, 0.38, 2, 1) * (1 + sampler.normal(0.04, 2, 3))
+    green = sampler.pick_from(GREENS, 2) * sampler.uniform(0.7, 1.4, 2, 1)
+    walks, paths, greens = sampler.chance(0.75, 2), sampler.chance(0.3, 2), sampler.chance(0.4, 2)
+    widths = [
+        sampler.sometimes(0.9, 0.1, 0.32, 2),
+        torch.where(greens, sampler.uniform(0.3, 3.5, 2), 0.0),
+        torch.where(paths, sampler.uniform(1.0, 2.2, 2), 0.0),
+        torch.where(walks, sampler.uniform(0.9, 4.5, 2), 0.0),
+    ]
+    return torch.stack(widths, dim=2), torch.stack([stone, green, path, walk], dim=2)
+
+
+def _glyphs(sampler: BatchSampler, layout: Layout, ego_lane: Tensor) -> Tensor:
+    """Sample the arrow, word or sign in the lane right of each boundary, (B, K) int64; -1 is none."""
+    slots = MAX_BOUNDARIES
+    index = torch.arange(slots, device=ego_lane.device)
+    signed = sampler.chance(0.55, 1)
+    lane_in = (index >= ego_lane[:, None] - 3) & (index < layout.exists.sum(1, keepdim=True) - 1)
+    glyph = sampler.pick([1.0] * len(ARROWS), slots)
+    other = sampler.pick_from([float(g) for g in (*WORDS, BICYCLE, CROSS)], slots).long()
+    glyph = torch.where(sampler.chance(0.15, slots), other, glyph)
+    return torch.where(signed & lane_in & sampler.chance(0.75, slots), glyph, -1)
 
 
 def no_street(sampler: BatchSampler) -> Street:
