@@ -20,6 +20,7 @@ from lanebev.numbers import finite_numbers, shown
 _LARGEST_YAML = 1_000_000  # characters; PyYAML reads some 100,000 a second
 _MOST_NUMBERS = 1_000  # of one matrix
 _TABS = re.compile(r"(?<=\S) *\t[ \t]*")  # between words; PyYAML takes none there, YAML and other readers do
+_NO_SPACE = re.compile(r"^\w{1,40}:[\w.]{1,20}", re.MULTILINE)  # which OpenCV reads, and YAML does not know
 _NO_BREAK_SPACE = "\u00a0"  # of texts copied from web pages
 _ROS_INI = re.compile(r"^\[image\]\s*$", re.MULTILINE)
 _INI_KEYS = {
@@ -133,6 +134,8 @@ def _parse_yaml(text: str) -> list[Any]:
             raise ValueError(f"expected numbers, texts and lists, got another object{where}") from error
         if "\\t" in str(getattr(error, "problem", "")):
             raise ValueError(f"expected YAML, got a tab{where}; indent by spaces") from error
+        if without_space := _NO_SPACE.search(text):
+            raise ValueError(f"expected a space after each colon, got {without_space[0]}") from error
         if found:
             raise ValueError(f"expected all keys in the braces, got more after them{where}") from error
         raise ValueError(f"expected YAML, got a syntax error{where}; is the file cut?") from error

@@ -227,6 +227,11 @@ ORBextractor.nFeatures: 1200
             "fx: 500\n".encode("utf-16-le").decode(),
             "got: not a text file, or one in UTF-16 without a byte order mark; save it as UTF-8",
         ),
+        (  # ORB_SLAM2#583
+            "c.yaml",
+            "%YAML:1.0\n---\nimage_width:1280\nimage_height:720\ncamera_matrix: !!opencv-matrix\n rows: 3\n",
+            "expected a space after each colon, got image_width:1280$",
+        ),
         ("c.npz", "PK\x03\x04" + 20 * "K.npy\0", "got: not a text file$"),
         (
             "c.yaml",
