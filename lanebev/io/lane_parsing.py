@@ -17,6 +17,8 @@ from lanebev.observation.polylines import LaneLine
 _FARTHEST = 1e6  # px or m, of any coordinate
 _DECODER = json.JSONDecoder()
 _NO_VALUE = re.compile(r"[\s,]*")  # between JSON values
+_SHOWN = 30  # characters of what is no JSON
+_FORMATS = "formats: TuSimple, CULane, CurveLanes, OpenLane, LLAMAS, BDD100K"
 _NO_JSON = "expected JSON, got a line that breaks off or is none; is the file cut?"
 
 
@@ -95,7 +97,9 @@ def json_values(path: str | Path, text: str) -> Iterator[tuple[int, Any]]:
             try:
                 value, end = _DECODER.raw_decode(text, place)
             except (ValueError, RecursionError) as error:
-                raise ValueError(_NO_JSON) from error
+                got = shown(text[place : place + _SHOWN].split("\n", maxsplit=1)[0])
+                words = _NO_JSON if text[place] in "{[" else f"expected JSON, got {got}; {_FORMATS}"
+                raise ValueError(words) from error
         listed = isinstance(value, list) and all(isinstance(each, dict) for each in value)
         yield from ((line, each) for each in (value if listed else [value]))
         before, place = place, _begin(text, end)
@@ -112,10 +116,7 @@ def field(fields: Any, key: str, kind: type) -> Any:
     """Return the value of a key, if it is of this kind; else it is a ValueError."""
     if not isinstance(fields, dict) or not isinstance(fields.get(key), kind):
         got = type(fields.get(key)).__name__ if isinstance(fields, dict) and key in fields else "none"
-        raise ValueError(
-            f"{key}: expected a {kind.__name__}, got {got}; formats: TuSimple, CULane, CurveLanes, OpenLane, "
-            "LLAMAS, BDD100K"
-        )
+        raise ValueError(f"{key}: expected a {kind.__name__}, got {got}; {_FORMATS}")
     return fields[key]
 
 

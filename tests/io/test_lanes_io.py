@@ -53,6 +53,10 @@ def test_predictions_for_tusimples_benchmark_leave_the_rows_out(tmp_path, count,
         ("", "line 1"),
         ('{"raw_file": "a', "line 2: expected JSON, got a line that breaks off"),
         ("[1, 2]", "line 2: expected a JSON object, got list"),
+        (
+            "image,lane,x,y\n1.jpg,0,5,3",
+            "line 2: expected JSON, got 'image,lane,x,y'; formats: Tu",
+        ),
         (json.dumps({"raw_file": "b", "lanes": [[1, 2]]}), "line 2: h_samples: expected a list, got none"),
         (  # TuSimple's 56 rows were taken (resa#23)
             json.dumps({"raw_file": "b", "lanes": [[9] * 56], "y_samples": [*range(200, 480, 5)]}),
