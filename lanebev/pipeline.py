@@ -21,7 +21,7 @@ from lanebev.observation.frames import black_unless_finite, check_images
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segments import LaneSegments, segments_from_vertices
 from lanebev.torch_internals import register_pytree
-from lanebev.types import Calibration, Extrinsics
+from lanebev.types import Calibration, Extrinsics, check_tensor
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
 
@@ -180,7 +180,7 @@ class LaneBEV(BoundaryDetector):
 
         Args:
             image: (B, 3, H, W) or (B, T, 3, H, W), RGB in [0, 1], as taken.
-            intrinsics: (B, 3, 3) px.
+            intrinsics: (B, 3, 3) px, or (B, T, 3, 3) where they change from frame to frame.
             state: state after the frame before; its dtype is the calibration's. None starts a drive in the
                 dtype of the intrinsics, at least float32.
             dt: s since the frame before: float, (B,) or, with T frames, (B, T).
@@ -201,7 +201,7 @@ class LaneBEV(BoundaryDetector):
             ValueError: shapes that don't fit, or an image of whole numbers.
         """
         check_images(image)
-        check_intrinsics(intrinsics, image.shape[0])
+        cameras = _frame_cameras(intrinsics, image)
         if truncation is not None and truncation < 1:
             raise ValueError(f"truncation: expected 1 frame or more, or None, got {truncation}")
         frames = image if image.ndim == 5 else image.unsqueeze(1)
@@ -211,8 +211,8 @@ class LaneBEV(BoundaryDetector):
             dtype = common_dtype(intrinsics) if state is None else state[0].dtype
             fresh = self.initial_state(batch, dtype, image.device)
             state = fresh if state is None else state
-        lens = (intrinsics, distortion, model)
-        look = self._look_ahead(frames, *lens) if self.far_view is None else self._look_in_turn(frames, *lens)
+        observed = self._look_ahead if self.far_view is None else self._look_in_turn
+        look = observed(frames, cameras, distortion, model)
         intervals = frame_intervals(dt, batch, steps, intrinsics)
         outputs = []
         for step in range(steps):
@@ -221,13 +221,15 @@ class LaneBEV(BoundaryDetector):
             if truncation is not None and step % truncation == 0:
                 state = state.detach()
             logits, now = look(step, state)
+            camera = cameras[:, step]
             with self._gradients("calibrator"):
-                calibration, state = self.calibrator(now, intrinsics, state, intervals[:, step], lane_width)
+                calibration, state = self.calibrator(now, camera, state, intervals[:, step], lane_width)
                 calibration = calibration.with_std_scaled(self.pose_sigma_scale)
             view, valid = None, None
             if bev:
-                view, valid = self._view(frames[:, step], *lens, calibration.extrinsics, state)
-            homography = bev_from_image(calibration.extrinsics, intrinsics, self.warp.grid)
+                pose = calibration.extrinsics
+                view, valid = self._view(frames[:, step], camera, distortion, model, pose, state)
+            homography = bev_from_image(calibration.extrinsics, camera, self.warp.grid)
             outputs.append(LaneBEVOutput(view, valid, calibration, homography, now, logits))
         return (outputs[0] if image.ndim == 4 else stack_frames(outputs)), state
 
@@ -250,13 +252,12 @@ class LaneBEV(BoundaryDetector):
         return view, valid
 
     def _look_ahead(
-        self, frames: Tensor, intrinsics: Tensor, distortion: Tensor | None, model: str
+        self, frames: Tensor, cameras: Tensor, distortion: Tensor | None, model: str
     ) -> Callable[[int, Any], tuple[Tensor, LaneSegments]]:
         """Observe T frames (B, T, 3, H, W) as one batch; return what looks up those of a step."""
         batch, steps = frames.shape[:2]
-        rows = intrinsics.repeat_interleave(steps, 0)
         lens = None if distortion is None else distortion.repeat_interleave(steps, 0)
-        logits, segments = self.observe(frames.flatten(0, 1), rows, lens, model)
+        logits, segments = self.observe(frames.flatten(0, 1), cameras.flatten(0, 1), lens, model)
 
         def of_step(part: Tensor, step: int) -> Tensor:
             return part.reshape(batch, steps, *part.shape[1:])[:, step]
@@ -267,12 +268,12 @@ class LaneBEV(BoundaryDetector):
         )
 
     def _look_in_turn(
-        self, frames: Tensor, intrinsics: Tensor, distortion: Tensor | None, model: str
+        self, frames: Tensor, cameras: Tensor, distortion: Tensor | None, model: str
     ) -> Callable[[int, Any], tuple[Tensor, LaneSegments]]:
         """Return what observes the frames of a step with the state before it, which places the far view."""
-        lens = (intrinsics, distortion, model)
 
         def look(step: int, state: Any) -> tuple[Tensor, LaneSegments]:
+            lens = (cameras[:, step], distortion, model)
             point = expected_vanishing_point(self.calibrator, state, *lens)
             return self.observe(frames[:, step], *lens, vanishing_point=point)
 
@@ -311,3 +312,21 @@ class LaneBEV(BoundaryDetector):
 def _configured(part: nn.Module, name: str, default: Any = None) -> Any:
     """Return a setting of a module's ``config``, if it has one."""
     return getattr(getattr(part, "config", None), name, default)
+
+
+def _frame_cameras(intrinsics: Tensor, image: Tensor) -> Tensor:
+    """Return the intrinsics of every frame, (B, T, 3, 3) px.
+
+    Args:
+        intrinsics: (B, 3, 3), those of all frames, or (B, T, 3, 3).
+        image: (B, 3, H, W), which is one frame, or (B, T, 3, H, W).
+
+    Raises:
+        TypeError: not a tensor.
+        ValueError: another shape, or see :func:`~lanebev.geometry.lens.check_intrinsics`.
+    """
+    check_tensor("intrinsics", intrinsics)
+    each = image.ndim == 5 and intrinsics.ndim == 4
+    check_intrinsics(intrinsics, *image.shape[: 2 if each else 1])
+    steps = image.shape[1] if image.ndim == 5 else 1
+    return intrinsics if each else intrinsics.unsqueeze(1).expand(-1, steps, -1, -1)

@@ -96,6 +96,33 @@ def test_one_frame():
     assert state.status.tolist() == [Status.TRACKING] * 2
 
 
+def test_each_frame_of_a_clip_may_have_its_own_camera():
+    """As where every frame is cropped in another way: equal to frame by frame."""
+    layer, clip = model(), images(2, 3)
+    zooms = torch.tensor([[1.0, 1.1, 0.9], [1.2, 1.0, 1.0]], dtype=torch.float64)
+    cameras = INTRINSICS.repeat(2, 3, 1, 1)
+    cameras[..., 0, 0] *= zooms
+    cameras[..., 1, 1] *= zooms
+    together, after = layer(clip, cameras, dt=0.05)
+    state = None
+    for step in range(3):
+        alone, state = layer(clip[:, step], cameras[:, step], state, dt=0.05)
+        torch.testing.assert_close(together.bev[:, step], alone.bev, rtol=0, atol=0)
+        torch.testing.assert_close(together.bev_from_image[:, step], alone.bev_from_image, rtol=0, atol=0)
+        torch.testing.assert_close(
+            together.calibration.covariance[:, step], alone.calibration.covariance, rtol=0, atol=0
+        )
+    assert all(torch.equal(*pair) for pair in zip(after, state, strict=True))
+    same, _ = layer(clip, INTRINSICS.repeat(2, 1, 1), dt=0.05)
+    expected, _ = layer(clip, INTRINSICS.repeat(2, 3, 1, 1), dt=0.05)
+    assert torch.equal(same.bev, expected.bev)
+    assert not torch.equal(same.bev, together.bev)
+    with pytest.raises(ValueError, match=r"intrinsics: expected \(2, 3, 3, 3\), got \(2, 2, 3, 3\)"):
+        layer(clip, cameras[:, :2])
+    with pytest.raises(ValueError, match=r"intrinsics: expected \(2, 3, 3\), got \(2, 3, 3, 3\)"):
+        layer(clip[:, 0], cameras)
+
+
 def test_the_view_follows_the_roads_vertical_curvature():
     """It is the warp's own with what the calibrator says of the road, in every row."""
     layer = model()
