@@ -45,9 +45,11 @@ def check_frame(frame: NDArray[np.uint8] | Tensor, image_size: tuple[int, int]) 
             "PIL with np.asarray; lanes go to polylines="
         )
     if frame.shape not in ((3, height, width), (1, 3, height, width)):
+        is_array = tuple(frame.shape) == (height, width, 3)
+        remedy = "channels go first, see torch.movedim(frame, -1, 0)" if is_array else "see Camera.scaled"
         raise ValueError(
             f"frame: expected a tensor (3, {height}, {width}), the camera's size, got {tuple(frame.shape)}; "
-            "see Camera.scaled"
+            f"{remedy}"
         )
     if frame.dtype != torch.uint8 and not frame.is_floating_point():
         raise ValueError(f"frame: expected uint8 or floating point in [0, 1], got {frame.dtype}")

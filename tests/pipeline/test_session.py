@@ -251,6 +251,8 @@ def test_careless_arguments_are_named():
         session(np.zeros((360, 640, 4), np.uint8))
     with pytest.raises(ValueError, match="channels go last, see np"):
         session(np.zeros((3, 360, 640), np.uint8))
+    with pytest.raises(ValueError, match=r"got \(360, 640, 3\); channels go first, see torch"):
+        session(torch.zeros(360, 640, 3, dtype=torch.uint8))
     with pytest.raises(ValueError, match="for a grey image repeat its channel"):
         session(np.zeros((360, 640), np.uint8))
     with pytest.raises(ValueError, match=r"frame: expected \(360, 640, 3\) uint8, the camera's size"):
