@@ -9,7 +9,7 @@ from typing import Any
 
 from lanebev.camera.choice import Readers
 from lanebev.camera.parameters import CameraParameters, centre_offset
-from lanebev.camera.parsing import numbers, whole_number
+from lanebev.camera.parsing import numbers, once, whole_number
 from lanebev.numbers import finite_numbers, shown
 
 _KITTI = re.compile(r"^[ \t]*P(?:_rect_)?\d+[ \t]*:", re.MULTILINE | re.ASCII)
@@ -49,7 +49,7 @@ def kitti_cameras(text: str, image_size: tuple[int, int] | None) -> Readers:
     The left colour camera is the usual one.
     """
     lines = (line.split(":", 1) for line in text.splitlines() if ":" in line)
-    entries = {name.strip(): values for name, values in lines}
+    entries = once((name.strip(), values) for name, values in lines if name.strip()[:1] in ("P", "S"))
     names = [f"P_rect_{i:02d}" for i in (2, 3, 0, 1)] + [f"P{i}" for i in (2, 3, 0, 1)]
     found = {name: partial(_kitti, entries, name, image_size) for name in names if name in entries}
     if not found:

@@ -56,7 +56,7 @@ def parse_documents(text: str) -> list[Any]:
         try:
             fields = json.loads(
                 text,
-                object_pairs_hook=_once,
+                object_pairs_hook=once,
                 parse_int=str,
                 parse_float=str,
                 parse_constant=str,
@@ -67,7 +67,7 @@ def parse_documents(text: str) -> list[Any]:
     return _parse_yaml(text)
 
 
-def _once(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+def once(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     """Return the pairs as a dict; a repeated key is an error."""
     fields: dict[str, Any] = {}
     for key, value in pairs:
@@ -87,7 +87,7 @@ class _TextLoader(yaml.SafeLoader):
             raise ValueError(f"expected keys and values at line {node.start_mark.line + 1}, got others")
         if not all(isinstance(key, yaml.ScalarNode) for key, _ in node.value):
             raise ValueError("expected plain keys, got a list or a mapping for one")
-        _once((key.value, None) for key, _ in node.value)
+        once((key.value, None) for key, _ in node.value)
         return {key.value: self.construct_object(value, deep=deep) for key, value in node.value}
 
 
@@ -150,7 +150,7 @@ def _parse_ini(text: str) -> dict[str, Any]:
             entries.append((_INI_KEYS.get(words, words), []))
         elif entries and not words.startswith("["):
             entries[-1][1].extend(words.split())
-    return {key: values[0] if len(values) == 1 else values for key, values in _once(entries).items()}
+    return {key: values[0] if len(values) == 1 else values for key, values in once(entries).items()}
 
 
 def _parse_xml(text: str) -> dict[str, Any]:
@@ -159,14 +159,14 @@ def _parse_xml(text: str) -> dict[str, Any]:
     except ET.ParseError as error:
         line = error.position[0]
         raise ValueError(f"expected XML, got a syntax error at line {line}; is the file cut?") from error
-    return _once((child.tag, _xml_value(child)) for child in root)
+    return once((child.tag, _xml_value(child)) for child in root)
 
 
 def _xml_value(element: ET.Element) -> Any:
     """Return a matrix's fields, or a text."""
     if not len(element):
         return element.text
-    return _once((field.tag, (field.text or "").strip()) for field in element)
+    return once((field.tag, (field.text or "").strip()) for field in element)
 
 
 def required(fields: Mapping[str, Any], keys: Sequence[str]) -> Any:
