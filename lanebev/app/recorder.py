@@ -42,6 +42,7 @@ from lanebev.view.grid import BEVGrid
 
 _BEFORE_RESOLUTION = 0.1  # m, of the view before: it is only shown small
 _CRF = 23  # of the videos
+_LONGEST_NAME = 38  # characters of an image's name in its overlay
 _MOST_PROBLEMS = 1000  # of frames, that are listed
 
 
@@ -247,5 +248,5 @@ def _row(done: Recorded, estimate: Estimate) -> ExtrinsicsRow:
     )
 
 
-def _shortened(name: str, most: int = 38) -> str:
-    return name if len(name) <= most else "…" + name[-most + 1 :]
+def _shortened(name: str) -> str:
+    return name if len(name) <= _LONGEST_NAME else "…" + name[1 - _LONGEST_NAME :]

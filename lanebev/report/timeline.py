@@ -23,6 +23,7 @@ STATE_WORDS = {
     AxisState.UNKNOWN: "not known yet",
 }
 _MOST = 600  # stretches of a strip
+_MOST_FRAMES = 2000
 
 
 class Stretch(NamedTuple):
@@ -62,10 +63,10 @@ def strips(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> list[Strip]:
     return found + [_strip(name, states[:, i], kinds, edges, rows) for i, name in enumerate(AXES)]
 
 
-def shown_frames(rows: Sequence[ExtrinsicsRow], always: Sequence[int], most: int = 2000) -> list[int]:
-    """Return places of frames: ``most`` evenly spaced ones, changes of status, and ``always``."""
-    every = max(1, -(-len(rows) // most))
-    changes = [i for i in range(1, len(rows)) if rows[i].status != rows[i - 1].status][:most]
+def shown_frames(rows: Sequence[ExtrinsicsRow], always: Sequence[int]) -> list[int]:
+    """Return places of frames: 2000 evenly spaced ones, changes of status, and ``always``."""
+    every = max(1, -(-len(rows) // _MOST_FRAMES))
+    changes = [i for i in range(1, len(rows)) if rows[i].status != rows[i - 1].status][:_MOST_FRAMES]
     return sorted({*range(0, len(rows), every), *changes, *always})
 
 

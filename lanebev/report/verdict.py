@@ -240,10 +240,10 @@ def _joined_axes(parts: Sequence[Finding]) -> list[Finding]:
     return found
 
 
-def _frequent(rows: Sequence[ExtrinsicsRow], among: Sequence[str], least: float = 0.2) -> str:
+def _frequent(rows: Sequence[ExtrinsicsRow], among: Sequence[str]) -> str:
     """Return the reasons that hold in a fifth of the frames or more, in words."""
     counts = Counter(name for row in rows for name in reasons_of(row) if name in among)
-    frequent = [name for name, count in counts.most_common() if count >= least * len(rows)]
+    frequent = [name for name, count in counts.most_common() if count >= 0.2 * len(rows)]
     return ", ".join(_WORDS[name] for name in frequent)
 
 

@@ -234,14 +234,14 @@ def test_wrong_shapes_are_one_clear_line():
 def test_boundaries_of_unequal_lanes_and_their_polylines():
     truth = random_params(3, 20, (2, 2, 2), 1e-3)
     segments = drive_frames(truth, 0.3, 21)
-    pose, curvature = Extrinsics.unstack(truth[:, :4]), truth[:, 5:]
+    pose = Extrinsics.unstack(truth[:, :4])
     segments.weight[:, segments.boundary[0] == 5] = 0.0
     widened = truth.clone()
     widened[:, 4] += 0.4  # boundary 4 stands 40 cm farther right
     other = drive_frames(widened, 0.3, 21)
     is_4 = segments.boundary[0] == 4
     segments.endpoints[:, is_4] = other.endpoints[:, is_4]
-    found = fit_boundaries(segments, cameras(3), pose, curvature)
+    found = fit_boundaries(segments, cameras(3), pose)
     expected = boundary_places(3.7, 6, truth) + truth[:, 4:5]
     expected[:, 4] += 0.4
     assert found.present.tolist() == [[True] * 5 + [False]] * 3
@@ -297,15 +297,14 @@ def test_a_still_of_a_bend_says_how_sure_it_is():
     assert nees < 2
 
 
-def test_curvature_common_to_all_boundaries_is_fitted_where_it_is_not_given():
+def test_curvature_is_common_to_all_boundaries():
     truth = random_params(8, 22, (2, 2, 2), 1e-3)
     segments = drive_frames(truth, 0.1, 23)
     pose = Extrinsics.unstack(truth[:, :4])
-    given = fit_boundaries(segments, cameras(8), pose, truth[:, 5:])
     found = fit_boundaries(segments, cameras(8), pose)
     assert truth[:, 5].abs().max() > 5e-4
     assert (found.curvature[:, 0] - truth[:, 5]).abs().max() < 5e-5
-    assert (found.offset - given.offset).abs().max() < 0.02
+    assert (found.offset - boundary_places(3.7, 6, truth) - truth[:, 4:5]).abs().max() < 0.02
     alone = fit_boundaries(
         LaneSegments(*(part[3:4] for part in segments)), cameras(1), Extrinsics.unstack(truth[3:4, :4])
     )

@@ -49,11 +49,10 @@ def fit_boundaries(
     segments: LaneSegments,
     intrinsics: Tensor,
     extrinsics: Extrinsics,
-    curvature: Tensor | None = None,
     least_support: float = 2.0,
     vertical_curvature: Tensor | None = None,
 ) -> Boundaries:
-    """Fit each boundary's offset and heading by robust least squares on perpendicular pixel distances.
+    """Fit each boundary's offset and heading and their curvature by robust least squares on pixel distances.
 
     Real lanes are neither equally wide nor parallel: the boundaries have only pose and curvature in common.
     The start is the median offset of a boundary's end points.
@@ -62,7 +61,6 @@ def fit_boundaries(
         segments: (B, N) line segments.
         intrinsics: (B, 3, 3).
         extrinsics: each (B,), of this frame.
-        curvature: (B, 2), c0 and c1, or None to fit them to all boundaries together.
         least_support: sum of the inlier segments' weights from which a boundary is present.
         vertical_curvature: (B,) 1/m of the road, or None for a plane.
 
@@ -75,29 +73,26 @@ def fit_boundaries(
     seen = observe(segments, intrinsics, NUM_BOUNDARIES)
     if vertical_curvature is not None:
         check_vertical_curvature(vertical_curvature, intrinsics.shape[0])
-    given = intrinsics.new_zeros(intrinsics.shape[0], 2) if curvature is None else curvature
     z, across, scale, weight = _ends_on_road(seen, extrinsics, vertical_curvature)
-    lateral = across - _bend(z, given)
     height, focal = extrinsics.height.unsqueeze(-1), seen.focal.unsqueeze(-1)
     member = torch.nn.functional.one_hot(per_end(seen.boundary), NUM_BOUNDARIES).mT.to(z.dtype)  # (B, L, 2N)
     member = member * weight.unsqueeze(1)
     sigma = per_end(seen.sigma)
 
-    offset = masked_median(lateral.unsqueeze(1).expand_as(member), member > 0)  # (B, L)
-    heading = torch.zeros_like(offset)
+    offset = masked_median(across.unsqueeze(1).expand_as(member), member > 0)  # (B, L)
+    heading, lateral = torch.zeros_like(offset), across
     for _ in range(_REWEIGHTINGS):
         residual = lateral.unsqueeze(1) - offset.unsqueeze(-1) - heading.unsqueeze(-1) * z.unsqueeze(1)
         per_metre = _pixels_per_metre(offset, scale, height, focal)  # (B, L, 2N)
         far_off = residual * per_metre / (_TOLERANCE * focal.unsqueeze(-1))
         trust = (1 + far_off.square()).square().reciprocal()
         precision = member * trust * (per_metre / sigma.unsqueeze(1)).square()  # 1/m²
-        if curvature is None:
-            given = _fit_curvature(z, across, precision)
-            lateral = across - _bend(z, given)
+        curvature = _fit_curvature(z, across, precision)
+        lateral = across - _bend(z, curvature)
         offset, heading = _fit_line(z, lateral, precision)
     present = 0.5 * (member * trust).sum(-1) >= least_support
     extent = torch.where(present.unsqueeze(-1), _extent(z, (member > 0) & (trust > 0.25)), 0.0)
-    return Boundaries(offset, heading, extent, present, given)
+    return Boundaries(offset, heading, extent, present, curvature)
 
 
 def _ends_on_road(

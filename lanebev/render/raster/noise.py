@@ -39,8 +39,9 @@ def _shaped(spectrum: Tensor, generator: torch.Generator) -> Tensor:
     return field / field.std()
 
 
-def _cracks(warp: Tensor, generator: torch.Generator, cells: int = 9) -> Tensor:
+def _cracks(warp: Tensor, generator: torch.Generator) -> Tensor:
     """Draw the edges of the cells of a jittered periodic grid, bent by a noise."""
+    cells = 9
     axis = torch.arange(TILE) / TILE * cells
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     y, x = y + 0.12 * warp, x + 0.12 * warp.roll(200, 1)
