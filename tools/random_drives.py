@@ -193,8 +193,15 @@ _ALL_LANES: dict[str, Callable[[int], Generated]] = {
 }
 
 
+_STREETS: dict[str, Callable[[int], Generated]] = {
+    f"{kind}, boundaries wander by {size} cm": partial(_street, std=size / 100, speed=speed)
+    for kind, speed in (("street at 8 m/s", 8.0), ("standing in a street", 0.0))
+    for size in (5, 15)
+}
+
+
 def _ego_lane_of(kind: str, seed: int) -> Generated:
-    return in_ego_lane(_ALL_LANES[kind](seed))
+    return in_ego_lane((_ALL_LANES | _STREETS)[kind](seed))
 
 
 def _rolled_ego_lane_of(kind: str, seed: int) -> Generated:
@@ -212,12 +219,8 @@ KINDS: dict[str, Callable[[int], Generated]] = {
         f"two lanes in view, unequal by {size} cm": partial(_two_lanes, std=size / 100) for size in (2, 5, 10)
     },
     "a kerb beside the ego lane": _kerb,
-    **{
-        f"{kind}, boundaries wander by {size} cm": partial(_street, std=size / 100, speed=speed)
-        for kind, speed in (("street at 8 m/s", 8.0), ("standing in a street", 0.0))
-        for size in (5, 15)
-    },
-    **{f"{kind}, ego lane": partial(_ego_lane_of, kind) for kind in _ALL_LANES},
+    **_STREETS,
+    **{f"{kind}, ego lane": partial(_ego_lane_of, kind) for kind in _ALL_LANES | _STREETS},
     **{
         f"{kind}, ego lane, roll drawn": partial(_rolled_ego_lane_of, kind)
         for kind in ("motion up to 1.5°, 1.2 Hz", IN_CURVE, "drop")

@@ -12,11 +12,12 @@ import torch
 from lanebev import JointCalibrator, LaneSegments
 from lanebev.estimation.joint.measurement import NUM_STRAIGHT, PITCH, ROLL, boundary_residuals
 from lanebev.estimation.joint.observations import boundary_places, observe
-from lanebev.estimation.joint.output import no_boundary_deviation, unverified_deviation
+from lanebev.estimation.joint.output import heading_variance, no_boundary_deviation, unverified_deviation
 from lanebev.estimation.joint.restart import scatter_of_fit
 from lanebev.estimation.joint.scatter import (
     averaged_moments,
     boundary_scatter,
+    determined_sensitivity,
     scatter_variance,
     start_variance,
     with_headings,
@@ -184,6 +185,67 @@ def test_a_kerb_taken_for_a_boundary_beside_the_ego_lane_is_in_the_variance_of_r
     sigma = calibration.covariance[0].diagonal().sqrt()
     assert math.degrees(error[ROLL].abs()) > 3.0
     assert (error.abs() < 3 * sigma).all()
+
+
+def follow(drive, visible, seed=0):
+    """The calibration and state after a drive of which only these boundaries are in view."""
+    calibrator = JointCalibrator()
+    state = calibrator.initial_state(1, dtype=DOUBLE)
+    for moment, segments in see([replace(one, visible=visible) for one in drive], 1, 1.0, 20, seed, DOUBLE):
+        calibration, state = calibrator(segments, CAMERA[None], state, moment.dt, WIDTH)
+    return calibration, state, torch.tensor(moment.pose, dtype=DOUBLE)
+
+
+def test_two_boundaries_determine_how_headings_change_the_other_parameters():
+    determined = torch.tensor([[True] * 4, [True, True, False, True], [True, False, False, True]])
+    found = determined_sensitivity(determined, 2)
+    assert found[0].all()
+    assert not found[2].any()
+    columns = [False, False, True, True]  # deviations, headings
+    assert found[1].tolist() == [columns, columns, [False] * 4, columns]
+
+
+def test_headings_of_the_ego_lane_s_boundaries_turn_pitch_and_yaw():
+    """Lines that meet at a depth of w / Δη have a vanishing point lower by h Δη / w."""
+    _, state, pose = follow(moments(0.5), (2, 3))
+    by_headings = state.pose_sensitivity[0, :2, 6:]
+    ratio = pose[3] / WIDTH
+    assert by_headings[0, 2:4].abs().tolist() == [pytest.approx(ratio.item(), rel=0.05)] * 2
+    assert by_headings[0, 2:4].sum().abs() < 0.05 * ratio  # equal headings are no pitch
+    assert by_headings[1, 2:4].abs().sum().item() == pytest.approx(1.0, rel=0.15)
+    assert (by_headings[:, [0, 1, 4, 5]] == 0).all()
+
+
+def test_a_vertical_curvature_that_two_boundaries_show_may_be_their_own_curvatures():
+    """Their scatter is noise; that of six boundaries tells their headings, and a hill nothing of them."""
+    _, of_two, pose = follow(moments(0.2), (2, 3))
+    _, of_six, _ = follow(moments(0.2), (0, 1, 2, 3, 4, 5))
+    width, scatter = torch.tensor([WIDTH], dtype=DOUBLE), torch.tensor([0.002**2], dtype=DOUBLE)
+    for curvature in (0.0, 1e-4):
+        expected = 25.0 * curvature * WIDTH / 2 / pose[3].item()
+        hills = torch.tensor([curvature**2], dtype=DOUBLE)
+        found = heading_variance(of_two._replace(hills=hills), scatter, width, CONFIG).sqrt()
+        assert found.item() == pytest.approx(expected, rel=0.02)
+        found = heading_variance(of_six._replace(hills=hills), scatter, width, CONFIG).sqrt()
+        assert found.item() == pytest.approx(0.002, rel=0.02)
+
+
+def test_the_ego_lane_of_a_street_is_less_sure_than_that_of_parallel_boundaries():
+    """Squares of the error of pitch in standard deviations; the boundaries of the streets wander by 5 cm."""
+    squares, of_filter, added = [], [], []
+    for seed in range(8):
+        aside = wandering(seed, 0.05)
+        street = moments(
+            1.0, lambda t, m, aside=aside: replace(m, near=4.0, far=30.0, wander=lambda z: aside(z + 8.0 * t))
+        )
+        calibration, state, pose = follow(street, (2, 3), seed)
+        error = (calibration.extrinsics.stack()[0] - pose)[PITCH]
+        squares.append((error.square() / calibration.covariance[0, PITCH, PITCH]).item())
+        of_filter.append((error.square() / state.cov[0, PITCH, PITCH]).item())
+        parallel, state, _ = follow(moments(1.0, lambda t, m: replace(m, near=4.0, far=30.0)), (2, 3), seed)
+        added.append((parallel.covariance[0, PITCH, PITCH] / state.cov[0, PITCH, PITCH]).item())
+    assert sum(squares) < 0.5 * sum(of_filter)
+    assert sorted(added)[6] < 1.1  # one may show a vertical curvature by chance
 
 
 @pytest.mark.parametrize("speed", [0.0, 8.0])

@@ -23,6 +23,8 @@ _NO_BOUNDARY_RANGE = 3.6  # m, over which the position of such a line is uniform
 _ROLL_PATTERN = 6.0  # sum of squares of (1, -2, 1), the proportion in which three boundaries change roll
 _LEAST_SENSITIVITY = 0.015  # rad/m or m/m of roll or height, from which a boundary counts as in view
 _HEADING_LENGTH = 15.0  # m along which a boundary keeps its own heading
+_HEADING_BY_CURVATURE = 25.0  # m, ratio of the standard deviations of headings and curvatures: waves of 160 m
+_LEAST_HEIGHT = 0.1  # m, as a divisor
 _LARGEST_DEVIATION = 0.6  # m; a line that deviates by more is on no boundary
 
 
@@ -103,10 +105,35 @@ def beyond_filter(expected: Tensor, variances: Tensor) -> Tensor:
     return (expected - 0.5 * variances.sum(-1)).clamp(min=0.0)
 
 
-def covariance_by_boundaries(state: JointState, cfg: JointConfig) -> Tensor:
+def heading_variance(state: JointState, of_scatter: Tensor, width: Tensor, cfg: JointConfig) -> Tensor:
+    """Compute the variance (B,) rad² of a boundary's own heading.
+
+    Source: (J28), with that of a start and of two boundaries. Two lines fit parallel boundaries however they
+    converge, but not if each has a curvature of its own. The filter then finds a vertical curvature κ, since
+    it curves the image of a boundary at the lateral position X as a curvature of κ X / h does.
+
+    Args:
+        state: (B, ...). Where a frame does not determine the roll, two boundaries are in view.
+        of_scatter: (B,) rad², by the scatter of the boundaries; noise if never more than two were in view.
+        width: (B,) m, between the two.
+        cfg: the configuration.
+    """
+    own_curvature = state.hills * (0.5 * width / state.mean[:, HEIGHT].clamp(min=_LEAST_HEIGHT)).square()
+    of_two = torch.where((state.reasons & int(Reason.ROLL_UNSEEN)) != 0, own_curvature, 0.0)
+    more_than_two = (state.pose_sensitivity[:, ROLL] != 0).any(-1)  # in some frame
+    of_more = of_scatter + start_variance(state.scatter, cfg.start_heading_std)
+    return of_two * _HEADING_BY_CURVATURE**2 + torch.where(more_than_two, of_more, 0.0)
+
+
+def covariance_by_boundaries(state: JointState, width: Tensor, cfg: JointConfig) -> Tensor:
     """Compute the covariance (B, 4, 4) of the pose by the boundaries' own deviations and headings.
 
     Source: (J26) and (J29).
+
+    Args:
+        state: (B, ...).
+        width: (B,) m, of the ego lane.
+        cfg: the configuration.
     """
     own = layout(cfg.num_boundaries).deviations
     deviations, variances = state.mean[:, own], state.cov.diagonal(dim1=1, dim2=2)[:, own]
@@ -115,7 +142,7 @@ def covariance_by_boundaries(state: JointState, cfg: JointConfig) -> Tensor:
     unverified = unverified_deviation(by_place, deviations, of_headings, state.mean[:, ROLL], cfg)
     expected = single_deviation(deviations, cfg).maximum(unverified)
     of_places = of_places.maximum(beyond_filter(expected, variances))
-    of_headings = of_headings + start_variance(state.scatter, cfg.start_heading_std)
+    of_headings = heading_variance(state, of_headings, width, cfg)
     each = torch.stack([of_places, of_headings], dim=-1)  # (B, 2)
     each = each.repeat_interleave(cfg.num_boundaries, dim=-1).unsqueeze(1)  # (B, 1, 2 L)
     return torch.bmm(each * state.pose_sensitivity, state.pose_sensitivity.mT)
@@ -141,12 +168,12 @@ def as_calibration(
     cov = state.cov[:, POSE, POSE]
     height, ego = state.mean[:, HEIGHT], cfg.num_boundaries // 2 - 1
     left, right = (positions[:, ego : ego + 2] + state.mean[:, OFFSET, None]).unbind(-1)
-    bend = height - left * right / height.clamp(min=0.1)
+    bend = height - left * right / height.clamp(min=_LEAST_HEIGHT)
     roll_unseen = (state.reasons & int(Reason.ROLL_UNSEEN)) != 0
     more = 3.0 * (bend * cov[:, ROLL, ROLL]).square() * roll_unseen
     width = (positions[:, -1] - positions[:, 0]) / (cfg.num_boundaries - 1)
     more = more + (cfg.lane_width_std / width * height).square()
     only_height = constant(_ONLY_HEIGHT, like=cov)
-    cov = cov + covariance_by_boundaries(state, cfg) + apart.unsqueeze(-1) * apart.unsqueeze(-2)
+    cov = cov + covariance_by_boundaries(state, right - left, cfg) + apart.unsqueeze(-1) * apart.unsqueeze(-2)
     cov = cov + (only_height * more.unsqueeze(-1)).diag_embed()
     return Calibration(Extrinsics.unstack(state.mean[:, POSE]), cov, state.status, inliers)

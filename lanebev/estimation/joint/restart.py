@@ -20,7 +20,13 @@ from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, NUM_STRAIGHT, ROLL, boundary_residuals
 from lanebev.estimation.joint.observations import Observations
 from lanebev.estimation.joint.robust import log_likelihood, scaled_variance, squared_distance
-from lanebev.estimation.joint.scatter import Scatter, averaged_moments, boundary_scatter, with_headings
+from lanebev.estimation.joint.scatter import (
+    Scatter,
+    averaged_moments,
+    boundary_scatter,
+    determined_sensitivity,
+    with_headings,
+)
 from lanebev.estimation.joint.single_frame import SingleFrameFit, fit_observations
 from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit
 from lanebev.estimation.joint.update import information, membership
@@ -183,7 +189,7 @@ def is_contrary(
 def scatter_of_fit(fit: SingleFrameFit, places: Tensor, seen: Observations, cfg: JointConfig) -> Scatter:
     """Estimate the scatter of the boundaries in a frame that was fitted by itself.
 
-    The sensitivity is 0 where the fit does not determine the pose, since the prior's covariance contains more
+    The sensitivity is 0 where the fit does not determine it, since the prior's covariance contains more
     there.
     """
     params = fit.params()
@@ -193,7 +199,7 @@ def scatter_of_fit(fit: SingleFrameFit, places: Tensor, seen: Observations, cfg:
     told = with_headings(*information(residuals, weight, member), residuals, weight, member)
     no_moments = places.new_zeros(places.shape[0], 2, 3)
     found = boundary_scatter(*told, cfg.prior.precision(params), no_moments)
-    determined = fit.observed.all(-1)[:, None, None]
+    determined = determined_sensitivity(fit.observed, cfg.num_boundaries)
     return found._replace(sensitivity=torch.where(determined, found.sensitivity, 0.0))
 
 

@@ -30,6 +30,8 @@ _LEAST_SENSITIVITY = 0.001  # rad/m or m/m of roll or height, below which a boun
 _BY_FREEDOM = 2.0  # decrease of the log of a start's variance by each degree of freedom of a frame
 _LEAST_WEIGHT = 1e-9  # of the frames before; 0 before the first
 _FULL_FREEDOM = 0.5  # degrees of freedom from which a frame counts fully
+_IS_ROLL = tuple(axis == ROLL for axis in range(NUM_POSE))
+_BY_HEADINGS = (False, True)  # columns of M: by deviations, by headings
 
 
 class Scatter(NamedTuple):
@@ -151,6 +153,22 @@ def start_variance(moments: Tensor, heading_std: float) -> Tensor:
     return heading_std**2 * torch.where(weight > 0, left, 0.0)
 
 
+def determined_sensitivity(determined: Tensor, num_boundaries: int) -> Tensor:
+    """Tell which entries of the sensitivity M a frame determines, (B, 4, 2 L) bool.
+
+    All if it determines the whole pose. If it determines all but the roll, as with two boundaries in view,
+    those of the other parameters and the headings.
+
+    Args:
+        determined: (B, 4) bool, what of the pose the frame determines.
+        num_boundaries: L.
+    """
+    is_roll = constant(_IS_ROLL, like=determined)
+    all_but_roll = (determined | is_roll).all(-1)[:, None, None]
+    by_headings = constant(_BY_HEADINGS, like=determined).repeat_interleave(num_boundaries)  # (2 L,)
+    return determined.all(-1)[:, None, None] | (all_but_roll & by_headings & ~is_roll.unsqueeze(-1))
+
+
 def remembered_sensitivity(now: Tensor, before: Tensor, step: Tensor, cfg: JointConfig) -> Tensor:
     """Blend the pose's change by each boundary's own deviation and heading over the last frames.
 
@@ -161,14 +179,13 @@ def remembered_sensitivity(now: Tensor, before: Tensor, step: Tensor, cfg: Joint
 
     Args:
         now: (B, 4, 2 L) by this frame.
-        before: (B, 4, 2 L); 0 where no frame has determined the pose yet.
+        before: (B, 4, 2 L); its row of the roll is 0 where no frame has determined the whole pose yet.
         step: (B,) s since then; inf where the boundaries' numbers have changed.
         cfg: the configuration.
     """
     num = now.shape[-1] // 2
     gone = (now[:, ROLL:, :num].abs().amax(1, keepdim=True) < _LEAST_SENSITIVITY).repeat(1, 1, 2)
     memory = torch.where(gone, cfg.motion.deviation_memory, cfg.motion.unequal_memory)
-    fade = torch.where(
-        (before != 0).any(-1).any(-1)[:, None, None], (-step[:, None, None] / memory).exp(), 0.0
-    )
+    begun = (before[:, ROLL] != 0).any(-1)[:, None, None]
+    fade = torch.where(begun, (-step[:, None, None] / memory).exp(), 0.0)
     return now + fade * (before - now)

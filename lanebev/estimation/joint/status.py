@@ -10,7 +10,7 @@ from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.layout import POSE
 from lanebev.estimation.joint.measurement import HEIGHT, ROLL
 from lanebev.estimation.joint.observations import Observations
-from lanebev.estimation.joint.scatter import remembered_sensitivity
+from lanebev.estimation.joint.scatter import determined_sensitivity, remembered_sensitivity
 from lanebev.estimation.joint.state import JointConfig, JointState
 from lanebev.estimation.joint.update import UNSEEN
 from lanebev.estimation.reasons import Reason
@@ -62,17 +62,17 @@ def update_track_status(
         Reason.ROLL_UNSEEN: blind[:, ROLL],
         Reason.HEIGHT_UNSEEN: blind[:, HEIGHT],
     }
-    known = supported & ~blind.any(-1)
     changed = (updated.reasons & int(Reason.LANE_CHANGE)) != 0
     sensitivity = remembered_sensitivity(
         updated.pose_sensitivity, predicted.pose_sensitivity, torch.where(changed, torch.inf, step), cfg
     )
+    determined = determined_sensitivity(~blind, cfg.num_boundaries)
     after = predicted._replace(
         mean=select_rows(supported, updated.mean, predicted.mean),
         cov=select_rows(supported, updated.cov, predicted.cov),
         motion_scale=select_rows(supported, updated.motion_scale, predicted.motion_scale),
         scatter=select_rows(supported, updated.scatter, predicted.scatter),
-        pose_sensitivity=select_rows(known, sensitivity, predicted.pose_sensitivity),
+        pose_sensitivity=torch.where(determined, sensitivity, predicted.pose_sensitivity),
         evidence=select_rows(supported, updated.evidence, torch.zeros_like(updated.evidence)),
         early=torch.zeros_like(unseen),
         unseen=unseen,
