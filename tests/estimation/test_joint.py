@@ -815,6 +815,7 @@ def test_straight_road_does_not_tell_the_speed():
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # 200 s of tracing on an idle core
 def test_exports_saves_takes_any_batch_and_equals_eager(tmp_path):
     frames = drive(4)
     calibrator = JointCalibrator(iterations=1, start_iterations=1)  # a smaller graph, traced faster

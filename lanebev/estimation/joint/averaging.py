@@ -178,7 +178,7 @@ def window(log_weight: Tensor, least: float) -> Tensor:
 def mixture_moments(mean: Tensor, cov: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Compute mean (B, P) and covariance (B, P, P) of a mixture of C Gaussians.
 
-    Source: the law of total covariance: the mean of the covariances and the covariance of the means.
+    Source: (J24), the law of total covariance: the mean of the covariances and the covariance of the means.
 
     Args:
         mean: (B, C, P).

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lanebev.batch import has_flag
 from lanebev.estimation.joint.evidence import EQUAL
 from lanebev.estimation.joint.frame_prior import student_density
 from lanebev.estimation.joint.layout import POSE, layout
@@ -12,6 +13,7 @@ from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL
 from lanebev.estimation.joint.scatter import scatter_variance, start_variance
 from lanebev.estimation.joint.state import JointConfig, JointState
 from lanebev.estimation.reasons import Reason
+from lanebev.geometry.road import lane_width_covariance
 from lanebev.tensors import constant
 from lanebev.types import Calibration, Extrinsics
 
@@ -119,7 +121,7 @@ def heading_variance(state: JointState, of_scatter: Tensor, width: Tensor, cfg: 
         cfg: the configuration.
     """
     own_curvature = state.hills * (0.5 * width / state.mean[:, HEIGHT].clamp(min=_LEAST_HEIGHT)).square()
-    of_two = torch.where((state.reasons & int(Reason.ROLL_UNSEEN)) != 0, own_curvature, 0.0)
+    of_two = torch.where(has_flag(state.reasons, Reason.ROLL_UNSEEN), own_curvature, 0.0)
     more_than_two = (state.pose_sensitivity[:, ROLL] != 0).any(-1)  # in some frame
     of_more = of_scatter + start_variance(state.scatter, cfg.start_heading_std)
     return of_two * _HEADING_BY_CURVATURE**2 + torch.where(more_than_two, of_more, 0.0)
@@ -148,15 +150,29 @@ def covariance_by_boundaries(state: JointState, width: Tensor, cfg: JointConfig)
     return torch.bmm(each * state.pose_sensitivity, state.pose_sensitivity.mT)
 
 
+def height_variance_by_roll(height: Tensor, left: Tensor, right: Tensor, roll_variance: Tensor) -> Tensor:
+    """Compute the variance (B,) m² of the height by the second-order effect of an error of the roll.
+
+    Source: (J30). The ego lane's boundaries stay where they are seen.
+
+    Args:
+        height: (B,) m.
+        left: (B,) m, lateral position of the left boundary of the ego lane.
+        right: (B,) m, of the right one.
+        roll_variance: (B,) rad².
+    """
+    second = -2.0 * (height - left * right / height.clamp(min=_LEAST_HEIGHT))
+    return 0.75 * (second * roll_variance).square()
+
+
 def as_calibration(
     state: JointState, inliers: Tensor, apart: Tensor, positions: Tensor, cfg: JointConfig
 ) -> Calibration:
     """Make the calibration of a state.
 
-    Its covariance adds what the filter does not estimate: the common scale of the lane widths; the
-    boundaries' own deviations and headings; the difference from a frame that contradicts the
-    state; and, if roll is not observed, the second-order effect of its error on the height.
-    If the boundaries at x₁ and x₂ stay where they are seen, h'' = -2 (h - x₁ x₂ / h).
+    Its covariance adds what the filter does not estimate: the common scale of the lane widths (J25); the
+    boundaries' own deviations and headings (J29); the difference from a frame that contradicts the
+    state; and, if roll is not observed, the second-order effect of its error on the height (J30).
 
     Args:
         state: (B, ...).
@@ -168,12 +184,11 @@ def as_calibration(
     cov = state.cov[:, POSE, POSE]
     height, ego = state.mean[:, HEIGHT], cfg.num_boundaries // 2 - 1
     left, right = (positions[:, ego : ego + 2] + state.mean[:, OFFSET, None]).unbind(-1)
-    bend = height - left * right / height.clamp(min=_LEAST_HEIGHT)
-    roll_unseen = (state.reasons & int(Reason.ROLL_UNSEEN)) != 0
-    more = 3.0 * (bend * cov[:, ROLL, ROLL]).square() * roll_unseen
     width = (positions[:, -1] - positions[:, 0]) / (cfg.num_boundaries - 1)
-    more = more + (cfg.lane_width_std / width * height).square()
+    by_roll = height_variance_by_roll(height, left, right, cov[:, ROLL, ROLL])
+    by_roll = torch.where(has_flag(state.reasons, Reason.ROLL_UNSEEN), by_roll, 0.0)
     only_height = constant(_ONLY_HEIGHT, like=cov)
     cov = cov + covariance_by_boundaries(state, right - left, cfg) + apart.unsqueeze(-1) * apart.unsqueeze(-2)
-    cov = cov + (only_height * more.unsqueeze(-1)).diag_embed()
+    cov = cov + lane_width_covariance(height, cfg.lane_width_std / width)
+    cov = cov + (only_height * by_roll.unsqueeze(-1)).diag_embed()
     return Calibration(Extrinsics.unstack(state.mean[:, POSE]), cov, state.status, inliers)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lanebev.batch import flags, select_rows
+from lanebev.batch import flags, has_flag, select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.layout import POSE
 from lanebev.estimation.joint.measurement import HEIGHT, ROLL
@@ -62,7 +62,7 @@ def update_track_status(
         Reason.ROLL_UNSEEN: blind[:, ROLL],
         Reason.HEIGHT_UNSEEN: blind[:, HEIGHT],
     }
-    changed = (updated.reasons & int(Reason.LANE_CHANGE)) != 0
+    changed = has_flag(updated.reasons, Reason.LANE_CHANGE)
     sensitivity = remembered_sensitivity(
         updated.pose_sensitivity, predicted.pose_sensitivity, torch.where(changed, torch.inf, step), cfg
     )

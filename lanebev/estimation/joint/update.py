@@ -12,9 +12,8 @@ from lanebev.estimation.joint.layout import NUM_COMMON, layout
 from lanebev.estimation.joint.measurement import NUM_STRAIGHT, OFFSET, ROLL, Residuals
 from lanebev.estimation.joint.observations import Observations, by_ends, per_end
 from lanebev.estimation.joint.robust import (
-    anneal_scale,
     inlier_weights,
-    noise_scale,
+    reweigh,
     scaled_variance,
     squared_distance,
 )
@@ -84,12 +83,8 @@ def frame_information(
         member: (B, L, M) of :func:`membership`.
     """
     unsure = _predicted_variance(residuals.jacobian, doubt, seen.boundary)
-    squared = squared_distance(residuals.distance)
-    gate = scaled_variance(seen.sigma, scale) + unsure
-    trust = inlier_weights(squared, residuals.valid, gate, seen.focal)
-    used = trust * seen.weight
-    scale = anneal_scale(scale, noise_scale(squared, seen.sigma, used))
-    weight = used / scaled_variance(seen.sigma, scale)
+    trust, scale = reweigh(squared_distance(residuals.distance), residuals.valid, seen, scale, unsure)
+    weight = trust * seen.weight / scaled_variance(seen.sigma, scale)
     return FrameInformation(*information(residuals, weight, member), trust, weight, scale, residuals)
 
 
@@ -195,9 +190,7 @@ def innovation_score(cov: Tensor, matrix: Tensor, vector: Tensor) -> tuple[Tenso
 def posterior_covariance(cov: Tensor, matrix: Tensor, gain: Tensor) -> Tensor:
     """Compute the covariance after an update whose gain may have rows of zero.
 
-    Source: (J10).
-
-    Source: the Joseph form, (I - K H) P (I - K H)ᵀ + K Q Kᵀ, with K H = G Λ and K Q Kᵀ = G Λ Gᵀ.
+    Source: (J10), the Joseph form, (I - K H) P (I - K H)ᵀ + K Q Kᵀ, with K H = G Λ and K Q Kᵀ = G Λ Gᵀ.
 
     Args:
         cov: (B, D, D) of the prediction.
