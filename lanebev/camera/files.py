@@ -5,7 +5,7 @@ Reading is strict: an unknown key, a missing, non-finite or absurd value is a ``
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -77,14 +77,25 @@ def read_camera(
 def _camera_of(
     documents: Sequence[Any], image_size: tuple[int, int] | None, rectified: bool, name: str | None
 ) -> CameraParameters:
-    """Return the camera of a file's documents, such as messages that were printed one after another."""
-    if len(documents) == 1:
-        return _camera(documents[0], image_size, rectified, name)
+    """Return the camera of a file's documents, such as messages that were printed one after another.
+
+    A second document that is no camera, such as a message that breaks off, does not count.
+    """
     readers = {
         str(number): partial(_camera, document, image_size, rectified, None)
         for number, document in enumerate(documents, start=1)
     }
+    if len(documents) == 1 or not _is_camera(readers["2"]):
+        return _camera(documents[0], image_size, rectified, name)
     return chosen(readers, name, has_usual=True)
+
+
+def _is_camera(read: Callable[[], CameraParameters]) -> bool:
+    try:
+        read()
+    except ValueError:
+        return False
+    return True
 
 
 def _camera(
@@ -117,7 +128,8 @@ def camera_from_fields(fields: Mapping[str, Any], rectified: bool = False) -> Ca
     Raises:
         ValueError: an unknown field, or a missing or absurd value.
     """
-    return _camera(dict(fields), None, rectified, None)
+    camera = _camera(dict(fields), None, rectified, None)
+    return without_lens(camera) if rectified else camera
 
 
 def camera_info(camera: CameraParameters, name: str = "camera") -> dict[str, Any]:

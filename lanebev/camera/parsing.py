@@ -114,7 +114,7 @@ for _tag in ("int", "float", "bool", "timestamp"):
 
 
 def _parse_yaml(text: str) -> list[Any]:
-    """Return the first two documents that say something; of a second one that breaks off nothing is said."""
+    """Return the first two documents that say something; of a second one with errors nothing is said."""
     if len(text) > _LARGEST_YAML:
         raise ValueError(f"expected a camera file, got {len(text)} characters of YAML")
     lines = text.replace(_NO_BREAK_SPACE, " ").splitlines()
@@ -125,9 +125,11 @@ def _parse_yaml(text: str) -> list[Any]:
         documents = yaml.load_all(_TABS.sub(" ", "\n".join(lines)), Loader=_TextLoader)
         found.extend(itertools.islice((each for each in documents if each is not None), 2))
         return found or [None]  # ros2 topic echo ends with ---
-    except (yaml.YAMLError, RecursionError) as error:
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
         if found and "document start" not in str(getattr(error, "problem", "")):
             return found
+        if isinstance(error, ValueError):
+            raise
         mark = getattr(error, "problem_mark", None)
         where = f" at line {mark.line + 1}" if mark else ""
         if isinstance(error, yaml.constructor.ConstructorError) and "!" in text:
@@ -137,7 +139,10 @@ def _parse_yaml(text: str) -> list[Any]:
         if without_space := _NO_SPACE.search(text):
             raise ValueError(f"expected a space after each colon, got {without_space[0]}") from error
         if found:
-            raise ValueError(f"expected all keys in the braces, got more after them{where}") from error
+            together = (
+                "in the braces" if text.lstrip()[:1] in ("{", "[") else "in one block, equally indented"
+            )
+            raise ValueError(f"expected all keys {together}, got more after them{where}") from error
         raise ValueError(f"expected YAML, got a syntax error{where}; is the file cut?") from error
 
 

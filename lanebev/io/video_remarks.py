@@ -17,6 +17,7 @@ from lanebev.io.rising_clock import REORDERED
 
 LONGEST_STEP = 60  # s between two frames of a drive
 _HEAD = 8  # bytes, which tell what kind of file it is
+_HEAD_AGAIN = ("mpegts", "mxf")  # formats in which these bytes come again in one file
 _SPHERICAL = range(4)  # AVSphericalProjection: equirectangular, cube maps, half of one
 _OF_TWO_CAMERAS = range(1, 8)  # AVStereo3DType: side by side, one above the other, in turn, ...
 
@@ -54,8 +55,8 @@ def appended_remark(container: av.container.InputContainer, end: int) -> str:
         container: the video.
         end: place in the file after its last packet.
     """
-    path = Path(container.name)
-    if not (_has_appended(path) if "mp4" in container.format.name else _begins_again(path, end)):
+    path, kind = Path(container.name), container.format.name
+    if kind in _HEAD_AGAIN or not (_has_appended(path) if "mp4" in kind else _begins_again(path, end)):
         return ""
     return "another video is appended to it, of which nothing is read; join them by ffmpeg -f concat"
 

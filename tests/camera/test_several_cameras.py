@@ -127,6 +127,14 @@ def test_of_cameras_in_no_order_one_must_be_chosen(tmp_path, write, names, place
     assert Camera.from_file(_write(tmp_path, write(800, 800, 800))).intrinsics[0, 0] == 800
 
 
+def test_fields_of_a_lens_have_no_camera_of_rectified_images():
+    lens = {"camera_model": "pinhole", "distortion_model": "radtan", "distortion_coeffs": [-0.1, 0, 0, 0]}
+    fields = {**lens, "intrinsics": [800, 800, 640, 360], "resolution": [1280, 720]}
+    assert Camera.from_fields(fields).distortion[0] == -0.1
+    with pytest.raises(ValueError, match="projection_matrix: expected P for rectified images, got none"):
+        Camera.from_fields(fields, rectified=True)
+
+
 def test_a_broken_camera_beside_the_one_that_is_taken_is_another(tmp_path):
     text = _kalibr(800, 900).replace("[900", "[x")
     assert "cam0 is taken" in Camera.from_file(_write(tmp_path, text)).remark
@@ -177,6 +185,24 @@ def test_messages_of_two_cameras_that_were_printed_one_after_another(tmp_path):
     assert camera.intrinsics[0, 0] == 800
     assert camera.remark == "the file has the cameras 1, 2, of which 1 is taken; choose another as FILE#2"
     assert Camera.from_file(f"{path}#2").intrinsics[0, 0] == 900
+
+
+@pytest.mark.parametrize(
+    "more", [MESSAGE.format(900, 2)[:60], "a: 1\na: 2", "? [1]\n: 2", "note: it is rectified"]
+)
+def test_a_second_document_that_is_no_camera_does_not_count(tmp_path, more):
+    camera = Camera.from_file(_write(tmp_path, f"{MESSAGE.format(800, 1)}{more}\n"))
+    assert (float(camera.intrinsics[0, 0]), camera.remark) == (800, "")
+    with pytest.raises(ValueError, match=r"expected no name after # for a file of one camera, got '2'$"):
+        Camera.from_file(f"{_write(tmp_path, f'{MESSAGE.format(800, 1)}{more}')}#2")
+
+
+def test_keys_that_are_indented_in_several_ways_are_named(tmp_path):
+    text = "  fx: 800\nfy: 800\ncx: 640\ncy: 360\nwidth: 1280\nheight: 720\n"
+    with pytest.raises(
+        ValueError, match=r"expected all keys in one block, equally indented, got more .* line 2$"
+    ):
+        Camera.from_file(_write(tmp_path, text))
 
 
 @pytest.mark.parametrize("more", ["distortion: [-0.3, 0.1, 0, 0, 0]", "model: fisheye", "{fx: 900}"])

@@ -253,6 +253,23 @@ def test_an_appended_video_is_said(tmp_path, suffix):  # which players pass over
     assert words not in _joined(tmp_path / f"w.{suffix}", [range(4)]).problem
 
 
+@pytest.mark.parametrize(("suffix", "codec"), [("ts", "libx264"), ("mxf", "mpeg2video")])
+def test_a_video_that_ends_before_its_sound_has_none_appended(tmp_path, suffix, codec):
+    path = tmp_path / f"v.{suffix}"
+    with av.open(str(path), "w") as container:
+        stream = _stream(container, codec=codec, rate=25)
+        sound = container.add_stream("pcm_s16le" if suffix == "mxf" else "mp2", rate=48000)
+        sound.layout = "mono" if suffix == "mxf" else "stereo"
+        _write(container, stream, range(12), Fraction(1, 25))
+        samples = np.zeros((1, 1920 * sound.layout.nb_channels), np.int16)
+        for _ in range(12 if suffix == "mxf" else 250):
+            frame = av.AudioFrame.from_ndarray(samples, format="s16", layout=sound.layout.name)
+            frame.rate = 48000
+            container.mux(sound.encode(frame))
+        container.mux(sound.encode())
+    assert open_source(str(path)).problem == ""
+
+
 @pytest.mark.parametrize("parts", [[range(20), range(20)], [range(90, 110), range(20)]])
 def test_times_that_begin_again_are_said(tmp_path, parts):
     source = _joined(tmp_path / "v.ts", parts)
