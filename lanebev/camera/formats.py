@@ -128,15 +128,17 @@ def _restates(fields: Mapping[str, Any]) -> bool:
 def _model(fields: Mapping[str, Any]) -> str:
     """Return the lens model; beside another one, "pinhole" states the projection only, as in Kalibr.
 
+    Of the keys after the first, names that are no lens model are ignored: they may be a product's.
+
     Raises:
-        ValueError: a model is not known, or two that differ are stated.
+        ValueError: the first model is not known, or two that differ are stated.
     """
     names = [str(fields[key]).strip().lower() for key in _MODEL_KEYS if fields.get(key) is not None]
-    if unknown := [name for name in names if name not in _MODELS]:
+    if names and names[0] not in _MODELS:
         known = ", ".join(each for each in _MODELS if each)
-        raise ValueError(f"model: expected one of {known}, got {shown(unknown[0])}")
+        raise ValueError(f"model: expected one of {known}, got {shown(names[0])}")
     is_fisheye = str(fields.get("fisheye_model")).strip().lower() in ("1", "true")  # true since OpenCV 5
-    stated = {name: _MODELS[name] for name in names if name not in ("", "pinhole")}
+    stated = {name: _MODELS[name] for name in names if name in _MODELS and name not in ("", "pinhole")}
     stated |= {"fisheye_model": "fisheye"} if is_fisheye else {}
     stated |= {"xi of an omni": "omni"} if fields.get("xi") is not None else {}
     if len(set(stated.values())) > 1:

@@ -17,7 +17,7 @@ from lanebev.estimation.checks import (
 )
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.observation.segments import LaneSegments
-from lanebev.tensors import map_tensors, one_thread
+from lanebev.tensors import map_tensors
 from lanebev.torch_internals import is_in_forward_mode
 from lanebev.types import Calibration, TensorTuple
 
@@ -86,8 +86,7 @@ class Calibrator(nn.Module, Generic[StateT]):
 
         Everything is computed in double precision without autocast: with one precisely seen lane, information
         matrices have a condition number beyond 1e7, so in single precision they are not positive definite.
-        Only on a device without double precision (MPS) is single precision used. On the CPU one thread
-        computes, see docs/benchmarks/speed.md.
+        Only on a device without double precision (MPS) is single precision used.
 
         Args:
             segments: N >= 0 segments per row; those of weight 0 or with non-finite numbers are ignored.
@@ -112,13 +111,10 @@ class Calibrator(nn.Module, Generic[StateT]):
             raise ValueError(f"state: expected {rows}, got {tuple(given.shape)}; join states by torch.cat")
         frame = (segments, intrinsics, state, dt, lane_width, given)
         differentiable = torch.is_grad_enabled() or is_in_forward_mode()
-        if torch.compiler.is_compiling():
+        if torch.compiler.is_compiling() or differentiable or torch.is_inference_mode_enabled():
             calibration, after = self._estimate(*frame)
-        elif differentiable or torch.is_inference_mode_enabled():
-            with one_thread():
-                calibration, after = self._estimate(*frame)
         else:
-            with one_thread(), torch.inference_mode():  # takes a fifth less time than torch.no_grad
+            with torch.inference_mode():  # takes a fifth less time than torch.no_grad
                 calibration, after = self._estimate(*frame)
             after = map_tensors(torch.clone, after)  # which a graph may use later
         return map_tensors(torch.clone, calibration), after

@@ -472,7 +472,8 @@ def test_one_boundary_out_of_place_counts_until_the_filter_holds_unequal_lanes()
     size = cfg.open_deviation
     out = torch.tensor([[-0.4, 0.0, 0.0, 0.013, 0.0, 0.0]] * 3 + [[0.011] + [0.0] * 5], dtype=DOUBLE)
     held = torch.tensor([0.0, 0.5 * size**2 / 6, 0.5 * size**2, 0.0], dtype=DOUBLE)
-    found = beyond_filter(single_deviation(out, cfg), held.unsqueeze(-1).expand(-1, 6)).sqrt()
+    single = single_deviation(out, cfg).unsqueeze(-1)
+    found = beyond_filter(single, held.unsqueeze(-1).expand(-1, 6)).sqrt().squeeze(-1)
     expected = torch.tensor([size, size * math.sqrt(0.75), 0.0, 0.0], dtype=DOUBLE)
     torch.testing.assert_close(found, expected)
 
@@ -486,9 +487,8 @@ def test_deviations_that_three_boundaries_cannot_show_count_less_with_each_furth
     found = unverified_deviation(
         sensitivity, none, straight, straight, JointConfig(lane_deviation_std=0.1)
     ).sqrt()
-    torch.testing.assert_close(
-        found, torch.tensor([0.1, 0.1 * math.sqrt(0.75), 0.1 * 0.004**0.5], dtype=DOUBLE)
-    )
+    expected = torch.tensor([0.1, 0.1 * math.sqrt(0.75), 0.1 * 0.004**0.5], dtype=DOUBLE)
+    torch.testing.assert_close(found, expected.unsqueeze(-1).expand(-1, 6))
     apart = none.clone()
     apart[:, 4] = -0.9  # bounds no lane
     alone = unverified_deviation(
@@ -499,7 +499,7 @@ def test_deviations_that_three_boundaries_cannot_show_count_less_with_each_furth
     left = beyond_filter(
         unverified_deviation(sensitivity, none, straight, straight, JointConfig(lane_deviation_std=0.1)), held
     )
-    assert left[0] == pytest.approx(0.1**2 - 0.02**2)
+    assert left[0].tolist() == [pytest.approx(0.1**2 - 0.02**2)] * 6
 
 
 def test_outliers_beside_unequal_lanes_are_no_bend():
@@ -564,7 +564,8 @@ def test_equal_lanes_are_trusted_some_time_after_a_fourth_boundary_is_seen():
     none = torch.zeros(1, 6, dtype=DOUBLE)
     seen, left = three, []
     for _ in range(25):
-        left.append(float(unverified_deviation(seen[..., :6], none, none[:, 0], none[:, 0], cfg).sqrt()))
+        found = unverified_deviation(seen[..., :6], none, none[:, 0], none[:, 0], cfg)
+        left.append(float(found[0, 0].sqrt()))
         seen = remembered_sensitivity(four, seen, step, cfg)
     assert left[0] == pytest.approx(0.05)
     assert 0.03 < left[1] < 0.05

@@ -7,9 +7,7 @@ from threading import Event
 
 import torch
 
-from lanebev import JointCalibrator
 from lanebev.tensors import one_thread
-from lanebev.testing.segments import INTRINSICS, lanes
 
 
 def test_overlapping_blocks_leave_the_number_of_threads_as_it_was_before_the_first() -> None:
@@ -48,24 +46,3 @@ def test_a_block_inside_another_one_leaves_one_thread_until_the_outer_one_ends()
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
-
-
-def test_a_calibrator_computes_on_one_thread_and_leaves_the_number_as_it_was() -> None:
-    seen = []
-
-    class Watched(JointCalibrator):
-        def step(self, *arguments):  # type: ignore[no-untyped-def]
-            seen.append(torch.get_num_threads())
-            return super().step(*arguments)
-
-    calibrator = Watched()
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        for mode in (torch.enable_grad, torch.no_grad, torch.inference_mode):
-            with mode():
-                calibrator(lanes(), INTRINSICS[None], calibrator.initial_state(1), 1 / 30)
-            assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(threads)
-    assert seen == [1, 1, 1]

@@ -21,6 +21,7 @@ _ONLY_HEIGHT = (0.0, 0.0, 0.0, 1.0)
 _ALWAYS_FIT = 3  # number of boundaries that some pose over equal lanes always fits
 _CHANCE_FIT = 0.004  # probability that a further boundary fits though lanes are unequal
 _MISFIT_FACTOR = 4.0  # on the odds that a line bounds no lane, where other lines do not fit
+_EGO_LANE_SHARE = 0.2  # of the variance of other boundaries, for those of the ego lane, as such a line
 _NO_BOUNDARY_RANGE = 3.6  # m, over which the position of such a line is uniform
 _ROLL_PATTERN = 6.0  # sum of squares of (1, -2, 1), the proportion in which three boundaries change roll
 _LEAST_SENSITIVITY = 0.015  # rad/m or m/m of roll or height, from which a boundary counts as in view
@@ -48,7 +49,7 @@ def single_deviation(deviations: Tensor, cfg: JointConfig) -> Tensor:
 def unverified_deviation(
     sensitivity: Tensor, deviations: Tensor, of_headings: Tensor, roll: Tensor, cfg: JointConfig
 ) -> Tensor:
-    """Compute the variance (B,) m² of every boundary's deviation where too few are in view to tell.
+    """Compute the variance (B, L) m² of each boundary's deviation where too few are in view to tell.
 
     Source: (J26). Three boundaries fit a pose of equal lanes, however unequal the lanes are; a fourth shows
     whether they are, unless it deviates so much that it bounds no lane.
@@ -67,18 +68,20 @@ def unverified_deviation(
     of_three = (1 - further).clamp(min=0.0)
     share = of_three.maximum(_CHANCE_FIT**further)
     if not cfg.lane_deviation_std:
-        return torch.zeros_like(share)
+        return torch.zeros_like(deviations)
     by_headings = of_headings * _HEADING_LENGTH**2
     odd = no_boundary_deviation(sensitivity[:, ROLL], roll, ~fits.all(-1), cfg)
-    return (cfg.lane_deviation_std**2 + by_headings) * share + odd * of_three
+    of_any = (cfg.lane_deviation_std**2 + by_headings) * share
+    return of_any.unsqueeze(-1) + odd * of_three.unsqueeze(-1)
 
 
 def no_boundary_deviation(by_place: Tensor, roll: Tensor, misfit: Tensor, cfg: JointConfig) -> Tensor:
-    """Compute the variance (B,) m² of every boundary's deviation because one line of three may bound no lane.
+    """Compute the variance (B, L) m² of the deviations because one line of three may bound no lane.
 
     Source: (J26). A kerb or the edge of a shoulder fits as a boundary if the roll is wrong. The larger that
     roll is, the less probable is it for a camera. The result gives roll the variance p r², where p is the
-    probability that there is such a line and r the difference of the roll from the prior's mean.
+    probability that there is such a line and r the difference of the roll from the prior's mean. It is less
+    probably one of the ego lane's boundaries.
 
     Args:
         by_place: (B, L), change of the roll (rad) per metre of deviation of a boundary; 0 if not in view.
@@ -91,20 +94,25 @@ def no_boundary_deviation(by_place: Tensor, roll: Tensor, misfit: Tensor, cfg: J
     by_camera = student_density(beyond / cfg.prior.roll_std, cfg.prior.freedom) / cfg.prior.roll_std
     density = by_camera * (total / _ROLL_PATTERN).sqrt()  # per m of the outer line's position
     odds = cfg.no_boundary_odds * torch.where(misfit, _MISFIT_FACTOR, 1.0) / (_NO_BOUNDARY_RANGE * density)
-    return odds / (1 + odds) * beyond.square() / total
+    of_roll = odds / (1 + odds) * beyond.square()
+    ego = by_place.shape[-1] // 2 - 1
+    share = torch.ones_like(by_place)
+    share[:, ego : ego + 2] = _EGO_LANE_SHARE
+    by_share = (share * by_place.square()).sum(-1).clamp(min=_EGO_LANE_SHARE * _LEAST_SENSITIVITY**2)
+    return share * (of_roll / by_share).unsqueeze(-1)
 
 
 def beyond_filter(expected: Tensor, variances: Tensor) -> Tensor:
-    """Compute the variance (B,) m² of the boundaries' deviations that the filter's covariance lacks.
+    """Compute the variance (B, L) m² of the boundaries' deviations that the filter's covariance lacks.
 
     Source: (J26). Half of six independent deviations can be observed, so their variances by the filter sum to
     three times that of one.
 
     Args:
-        expected: (B,) m², of any boundary's deviation.
+        expected: (B, L) m², of each boundary's deviation.
         variances: (B, L) m², of the deviations by the filter.
     """
-    return (expected - 0.5 * variances.sum(-1)).clamp(min=0.0)
+    return (expected - 0.5 * variances.sum(-1, keepdim=True)).clamp(min=0.0)
 
 
 def heading_variance(state: JointState, of_scatter: Tensor, width: Tensor, cfg: JointConfig) -> Tensor:
@@ -142,11 +150,10 @@ def covariance_by_boundaries(state: JointState, width: Tensor, cfg: JointConfig)
     of_places, of_headings = scatter_variance(state.scatter).unbind(-1)
     by_place = state.pose_sensitivity[..., : cfg.num_boundaries]
     unverified = unverified_deviation(by_place, deviations, of_headings, state.mean[:, ROLL], cfg)
-    expected = single_deviation(deviations, cfg).maximum(unverified)
-    of_places = of_places.maximum(beyond_filter(expected, variances))
-    of_headings = heading_variance(state, of_headings, width, cfg)
-    each = torch.stack([of_places, of_headings], dim=-1)  # (B, 2)
-    each = each.repeat_interleave(cfg.num_boundaries, dim=-1).unsqueeze(1)  # (B, 1, 2 L)
+    expected = single_deviation(deviations, cfg).unsqueeze(-1).maximum(unverified)
+    of_places = of_places.unsqueeze(-1).maximum(beyond_filter(expected, variances))  # (B, L)
+    of_headings = heading_variance(state, of_headings, width, cfg).unsqueeze(-1).expand_as(of_places)
+    each = torch.cat([of_places, of_headings], dim=-1).unsqueeze(1)  # (B, 1, 2 L)
     return torch.bmm(each * state.pose_sensitivity, state.pose_sensitivity.mT)
 
 
