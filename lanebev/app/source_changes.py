@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lanebev.app.recovery import size_and_time
+from lanebev.io.frames import ALL
 from lanebev.io.image_files import images_of
 from lanebev.io.video import FrameSource
 
@@ -45,8 +46,12 @@ def changes_remark(source: FrameSource, before: Files) -> str:
 
 
 def count_remark(source: FrameSource, got: int) -> str:
-    """Return a remark if another number of frames came than a video's packets say; else nothing."""
-    expected = got if source.is_live else source.taken_count
+    """Return a remark if another number of frames came than a video's packets say; else nothing.
+
+    Which frames of a video with unknown times are taken is an estimate, and nothing is said of it.
+    """
+    unknown = source.is_video and source.has_times and not source.times and source.selection != ALL
+    expected = got if source.is_live or unknown else source.taken_count
     if got == min(expected, source.most or expected):
         return ""
     return f"{source.source}: expected {expected} frames by its packets, got {got}; is it damaged?"

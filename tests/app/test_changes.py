@@ -16,8 +16,9 @@ from lanebev.app.config import RunConfig
 from lanebev.app.fleet import worker
 from lanebev.app.fleet.plan import Task, earlier_outcome, write_mark
 from lanebev.app.run import run
-from lanebev.app.source_changes import changes_remark, files_of
+from lanebev.app.source_changes import changes_remark, count_remark, files_of
 from lanebev.io.frame_source import FrameSource
+from lanebev.io.frames import Selection
 from lanebev.io.results import OutputFolder, OutputFolderError
 from lanebev.io.video import open_source
 from tests.app.rtsp_server import transport_stream
@@ -216,3 +217,16 @@ def test_a_mark_without_room_leaves_nothing_half_written(tmp_path, monkeypatch):
         "extrinsics.csv",
         "fleet.json",
     ]
+
+
+def test_a_video_that_yields_another_number_of_frames_is_remarked_on_unless_the_number_is_an_estimate():
+    whole = FrameSource("drive.mp4", (), Fraction(25), 21, (720, 1280))
+    assert count_remark(whole, 21) == ""
+    assert "expected 21 frames by its packets, got 20" in count_remark(whole, 20)
+    part = replace(whole, selection=Selection(end=0.4))  # its times are not known, so neither are the frames
+    assert count_remark(part, 9) == ""
+    timed = replace(part, times=tuple(index / 25 for index in range(21)))
+    assert count_remark(timed, 10) == ""
+    assert "expected 10 frames" in count_remark(timed, 9)
+    spaced = replace(part, has_times=False)
+    assert "expected 10 frames" in count_remark(spaced, 9)
