@@ -14,13 +14,20 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.checks import as_lane_width, check_segments, mask_invalid_rows
-from lanebev.estimation.joint.frame_prior import FramePrior
-from lanebev.estimation.joint.measurement import OFFSET, above_road, boundary_residuals, normal_equations
+from lanebev.estimation.joint.frame_prior import FramePrior, student_log, student_weight
+from lanebev.estimation.joint.measurement import (
+    HEIGHT,
+    NUM_PARAMS,
+    OFFSET,
+    boundary_residuals,
+    normal_equations,
+)
 from lanebev.estimation.joint.observations import Observations, boundary_places, observations, per_end
 from lanebev.estimation.joint.robust import (
+    anneal_scale,
     inlier_weights,
     log_likelihood,
-    reweigh,
+    noise_scale,
     scaled_variance,
     squared_distance,
 )
@@ -177,21 +184,30 @@ def refine(
     Returns:
         params (B, 7), scale (B,), and the information matrix (B, 7, 7) at the last step.
     """
-    mean, largest_step = prior.mean(params), prior.std(params)
-    blur = torch.zeros_like(seen.focal) if blur is None else blur
-    information = prior.precision(params).diag_embed()  # overwritten unless iterations == 0
+    mean, precision = prior.mean(params), prior.std(params).square().reciprocal()
+    largest_step = prior.std(params)
+    focal = seen.focal
+    blur = torch.zeros_like(focal) if blur is None else blur
+    information = precision.diag().expand(*params.shape, NUM_PARAMS)  # overwritten unless iterations == 0
     for _ in range(iterations):
         residuals = boundary_residuals(params, places, seen)
-        added = blur.square().unsqueeze(-1)
-        trust, scale = reweigh(squared_distance(residuals.distance), residuals.valid, seen, scale, added)
-        weight = residuals.valid * trust * seen.weight / (scaled_variance(seen.sigma, scale) + added)
+        blurred = scaled_variance(seen.sigma, scale) + blur.square().unsqueeze(-1)
+        squared = squared_distance(residuals.distance)
+        trust = inlier_weights(squared, residuals.valid, blurred, focal) * seen.weight
+        fitted = noise_scale(squared, seen.sigma, trust)
+        scale = anneal_scale(scale, fitted)
+        by_noise = trust / (scaled_variance(seen.sigma, scale) + blur.square().unsqueeze(-1))
         blur = 0.5 * blur
-        information, gradient = normal_equations(residuals.jacobian, residuals.distance, weight)
-        precision = prior.precision(params)
-        information = information + precision.diag_embed()
-        gradient = gradient + precision * (params - mean)
+        information, gradient = normal_equations(
+            residuals.jacobian, residuals.distance, by_noise * residuals.valid
+        )
+        held = precision * student_weight((params - mean).square() * precision, prior.freedom)
+        information = information + held.diag_embed()
+        gradient = gradient + held * (params - mean)
         step = solve_spd(information, gradient.unsqueeze(-1)).squeeze(-1)
-        params = above_road(params - torch.maximum(torch.minimum(step, largest_step), -largest_step))
+        params = params - torch.maximum(torch.minimum(step, largest_step), -largest_step)
+        height = params[:, HEIGHT : HEIGHT + 1].clamp(min=0.2)
+        params = torch.cat([params[:, :HEIGHT], height, params[:, HEIGHT + 1 :]], dim=-1)
     return params, scale, information
 
 
@@ -200,7 +216,8 @@ def _best_start(
 ) -> tuple[Tensor, Tensor]:
     """Refine (B, S, 7) starts and keep the likeliest: (B, 7), and its noise scale (B,)."""
     batch, count, _ = starts.shape
-    many, many_places = seen.repeated(count), places.repeat_interleave(count, dim=0)
+    many = Observations(*(tensor.repeat_interleave(count, dim=0) for tensor in seen))
+    many_places = places.repeat_interleave(count, dim=0)
     focal = many.focal
     sigma = (many.sigma * many.weight).sum(-1) / many.weight.sum(-1).clamp(min=1e-3)
     scale = (LAST_SCALE * focal / sigma.clamp(min=1e-3)).clamp(min=1.0)
@@ -210,7 +227,8 @@ def _best_start(
     squared = squared_distance(residuals.distance)
     variance = scaled_variance(many.sigma, scale)
     score = log_likelihood(squared, residuals.valid, many.weight, variance, focal)
-    score = score + prior.log_density(params)
+    away = (params - prior.mean(params)) / prior.std(params)
+    score = score + student_log(away.square(), prior.freedom)
     score = torch.where(params.isfinite().all(-1), score, -torch.inf)
     best = score.view(batch, count).argmax(-1) + count * torch.arange(batch, device=score.device)
     return params[best], scale[best]
