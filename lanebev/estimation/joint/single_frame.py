@@ -189,6 +189,8 @@ def refine(
     focal = seen.focal
     blur = torch.zeros_like(focal) if blur is None else blur
     information = precision.diag().expand(*params.shape, NUM_PARAMS)  # overwritten unless iterations == 0
+    # In one function: with those of the readings (reweigh, above_road, FramePrior.precision) the joint
+    # calibrator could not be compiled (torch 2.13).
     for _ in range(iterations):
         residuals = boundary_residuals(params, places, seen)
         blurred = scaled_variance(seen.sigma, scale) + blur.square().unsqueeze(-1)
