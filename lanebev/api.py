@@ -3,7 +3,7 @@
 from lanebev import weights
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.state import HILLY_ROADS, JointConfig
+from lanebev.estimation.joint.config import HILLY_ROADS, JointConfig
 from lanebev.estimation.mount import MountCalibration, MountConfig, MountEstimator, MountReason, MountStatus
 from lanebev.estimation.reasons import Reason
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator

@@ -30,7 +30,7 @@ from jsonargparse.typing import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.state import HILLY_ROADS
+from lanebev.estimation.joint.config import HILLY_ROADS
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.evaluation import NAMES, UNITS, WARM_UP, rms, summarise, track

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.config import HILLY_ROADS
 from lanebev.estimation.joint.dynamics import MotionConfig
-from lanebev.estimation.joint.state import HILLY_ROADS
 from lanebev.estimation.joint.update import UNSEEN
 from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, within_3_sigma
 from lanebev.testing.moments import FPS

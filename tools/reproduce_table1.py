@@ -22,8 +22,8 @@ from jsonargparse.typing import PositiveInt
 
 import lanebev
 from lanebev.estimation.calibrator import Calibrator
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.smoother import smooth_drive
-from lanebev.estimation.joint.state import JointConfig
 from lanebev.estimation.kalman import symmetrise
 from lanebev.testing.experiment import Experiment, frames
 from lanebev.types import Status

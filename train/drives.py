@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.state import JointConfig
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.observation.segments import LaneSegments

@@ -22,7 +22,7 @@ import torch
 from jsonargparse.typing import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from lanebev.estimation.joint.state import HILLY_ROADS, JointConfig
+from lanebev.estimation.joint.config import HILLY_ROADS, JointConfig
 from train.commands import one_line_errors
 from train.drives import DriveObservations, observe_drive, run_calibrator
 from train.evaluate_poses import AXES

@@ -13,8 +13,9 @@ from lanebev.camera.choice import camera_file
 from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator, StateT
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.config import HILLY_ROADS, JointConfig
 from lanebev.estimation.joint.frame_prior import prior_of_mount
-from lanebev.estimation.joint.state import HILLY_ROADS, JointConfig, JointState
+from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.tracker import Tracker
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.estimation.two_stage.state import TwoStageState

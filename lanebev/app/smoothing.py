@@ -16,10 +16,11 @@ from lanebev.app.build import RunTracker
 from lanebev.app.kept import KeptNumbers
 from lanebev.app.observers import Observation
 from lanebev.app.recovery import LANES_FILE, frame_name
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.layout import POSE
 from lanebev.estimation.joint.measurement import VERTICAL
 from lanebev.estimation.joint.smoother import smooth_states, smoothed_calibration
-from lanebev.estimation.joint.state import JointConfig, JointState
+from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.tracker import Estimate
 from lanebev.io.lanes import tusimple_line
 from lanebev.io.results import OutputFolder

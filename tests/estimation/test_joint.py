@@ -11,6 +11,7 @@ import torch
 
 from lanebev import batch
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.dynamics import MotionConfig, RoadMotion, motion
 from lanebev.estimation.joint.evidence import CALL, adapt_motion_scale, deviation_prior_std
 from lanebev.estimation.joint.frame_prior import FramePrior
@@ -33,7 +34,7 @@ from lanebev.estimation.joint.observations import boundary_places, observe
 from lanebev.estimation.joint.output import beyond_filter, single_deviation, unverified_deviation
 from lanebev.estimation.joint.prediction import predict_state
 from lanebev.estimation.joint.restart import scatter_of_fit
-from lanebev.estimation.joint.road import propagate_road_shape, straight_or_bend, turn_along
+from lanebev.estimation.joint.road import propagate_road_shape, turn_along
 from lanebev.estimation.joint.road_curve import (
     KNOT_SPACING,
     NUM_STEPS,
@@ -43,7 +44,7 @@ from lanebev.estimation.joint.road_curve import (
 )
 from lanebev.estimation.joint.scatter import remembered_sensitivity
 from lanebev.estimation.joint.single_frame import fit_observations
-from lanebev.estimation.joint.state import JointConfig, state_from_fit
+from lanebev.estimation.joint.start import state_from_fit, straight_or_bend
 from lanebev.estimation.joint.update import (
     frame_information,
     kalman_gain,

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from lanebev import JointCalibrator, LaneSegments
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.measurement import NUM_STRAIGHT, PITCH, ROLL, boundary_residuals
 from lanebev.estimation.joint.observations import boundary_places, observe
 from lanebev.estimation.joint.output import heading_variance, no_boundary_deviation, unverified_deviation
@@ -23,7 +24,6 @@ from lanebev.estimation.joint.scatter import (
     with_headings,
 )
 from lanebev.estimation.joint.single_frame import fit_observations
-from lanebev.estimation.joint.state import JointConfig
 from lanebev.estimation.joint.update import information, membership
 from lanebev.testing.moments import CAMERA, PLACES, WIDTH, moments
 from lanebev.testing.moments import observe as see

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.dynamics import MotionConfig
 from lanebev.estimation.joint.evidence import hill_variance
 from lanebev.estimation.joint.frame_prior import FramePrior
@@ -17,7 +18,7 @@ from lanebev.estimation.joint.measurement import HEIGHT, ROLL, VERTICAL, boundar
 from lanebev.estimation.joint.observations import boundary_places, observe
 from lanebev.estimation.joint.restart import with_roll_of_prior
 from lanebev.estimation.joint.single_frame import fit_single_frame
-from lanebev.estimation.joint.state import JointConfig, with_vertical_curvature
+from lanebev.estimation.joint.start import with_vertical_curvature
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.moments import CAMERA, FPS, WIDTH, Moment, moments
 from lanebev.testing.moments import observe as see

@@ -17,6 +17,7 @@ from torch.nn.functional import one_hot, softplus
 
 from lanebev.batch import select_rows
 from lanebev.estimation.checks import is_running
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.frame_prior import FramePrior, student_log
 from lanebev.estimation.joint.layout import STEPS
 from lanebev.estimation.joint.measurement import (
@@ -28,16 +29,14 @@ from lanebev.estimation.joint.measurement import (
 from lanebev.estimation.joint.observations import Observations, boundary_places, observations
 from lanebev.estimation.joint.reading_fit import fit_readings, reading_model
 from lanebev.estimation.joint.readings import (
-    ReadingConfig,
     Readings,
     log_prior,
     log_prior_of_half,
     readings,
 )
-from lanebev.estimation.joint.road import straight_log_odds, straight_or_bend
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
+from lanebev.estimation.joint.start import straight_log_odds, straight_or_bend
 from lanebev.estimation.joint.start_search import linear_starts, spread_subset
-from lanebev.estimation.joint.state import JointConfig
 from lanebev.geometry.linalg import solve_spd
 from lanebev.geometry.road import lane_width_covariance
 from lanebev.observation.segments import LaneSegments
@@ -89,7 +88,7 @@ def weigh_readings(
     seen = observations(segments, intrinsics)
     positions = boundary_places(lane_width, cfg.num_boundaries, mean)
     start = torch.cat([mean[:, : OFFSET + 2], mean[:, STEPS.start, None] / KNOT_SPACING], dim=-1)
-    found = average_readings(start, seen, positions, cfg.prior, cfg.straight, cfg.bends, cfg.readings)
+    found = average_readings(start, seen, positions, cfg)
     scale = lane_width_covariance(found.mean[:, HEIGHT], cfg.lane_width_std / lane_width.mean(-1))
     begun = is_running(calibration.status)
     pose = calibration.extrinsics.stack()
@@ -101,15 +100,7 @@ def weigh_readings(
     )
 
 
-def average_readings(
-    start: Tensor,
-    seen: Observations,
-    positions: Tensor,
-    prior: FramePrior,
-    straight: tuple[float, float],
-    bends: float,
-    cfg: ReadingConfig,
-) -> AveragedPose:
+def average_readings(start: Tensor, seen: Observations, positions: Tensor, cfg: JointConfig) -> AveragedPose:
     """Average a frame's pose over all readings.
 
     The mean uses the evidence itself. If the pose of ``start`` is within ``_KEEP`` sigmas of the mean, and no
@@ -120,48 +111,74 @@ def average_readings(
         start: (B, 7) parameters near the likeliest reading.
         seen: what was observed.
         positions: (B, L) m, of the boundaries from the ego lane's middle, by the lane widths.
-        prior: prior of the frame.
-        straight: 1/m and 1/m², sigmas of c0 and c1 of a straight road.
-        bends: how probable a bend is; its sigmas are those of ``prior``.
-        cfg: configuration of the readings.
+        cfg: the configuration.
     """
-    (batch, num), like = positions.shape, positions
+    num, prior, least = cfg.num_boundaries, cfg.prior, cfg.readings.least_weight
     seen, places = spread_subset(seen, positions.gather(1, seen.boundary), _SEGMENTS)
-    at_level = replace(prior, roll_steps=1)
-    starts = torch.cat([start.unsqueeze(1), linear_starts(seen, places, at_level)], dim=1)  # (B, S, 7)
-    ways = readings(num, cfg, like)
-    kinds, count, tries = len(cfg.deviation_std), len(ways.kind), starts.shape[1]
-    alike = Readings(*(part[:kinds] for part in ways))
+    ways = readings(num, cfg.readings, positions)
+    pose, cov, evidence = fit_all_readings(start, seen, places, positions, ways, cfg)
+    in_view = ((seen.weight > 0).unsqueeze(-1) & one_hot(seen.boundary, num).bool()).any(1)  # (B, L)
+    before, half = log_prior(ways, in_view, cfg.readings), log_prior_of_half(in_view, cfg.readings)
+    likely, tempered = (
+        window(power * evidence + before, least) for power in (1.0, cfg.readings.evidence_exponent)
+    )
+    mean, _ = mixture_moments(*_with_half(pose, cov, likely, prior, half, least))
+    centre, spread = mixture_moments(*_with_half(pose, cov, tempered, prior, half, least))
+    keep = _agrees_with_average(start, mean, centre, spread, prior)
+    mean = select_rows(keep, start[:, _POSE], mean)
+    apart = centre - mean
+    wrong = likely @ ways.wrong.to(positions)
+    return AveragedPose(mean, spread + apart.unsqueeze(-1) * apart.unsqueeze(-2), 1 - wrong)
 
-    model = reading_model(seen, positions, alike, tries, prior)
+
+def fit_all_readings(
+    start: Tensor, seen: Observations, places: Tensor, positions: Tensor, ways: Readings, cfg: JointConfig
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Fit every reading, from the likeliest start on its kind of road.
+
+    Args:
+        start: (B, 7) parameters near the likeliest reading.
+        seen: what was observed.
+        places: (B, N) m, of the segments' boundaries.
+        positions: (B, L) m, of the boundaries from the ego lane's middle.
+        ways: C readings, the first of which are one of each kind of road.
+        cfg: the configuration.
+
+    Returns:
+        pose (B, C, 4), its covariance (B, C, 4, 4), and log evidence (B, C), each on a straight or bent road.
+    """
+    batch, kinds, prior = len(positions), len(cfg.readings.deviation_std), cfg.prior
+    starts = linear_starts(seen, places, replace(prior, roll_steps=1))
+    starts = torch.cat([start.unsqueeze(1), starts], dim=1)  # (B, S, 7)
+    tries = starts.shape[1]
+    model = reading_model(seen, positions, Readings(*(part[:kinds] for part in ways)), tries, prior)
     begun = fit_readings(starts.repeat(1, kinds, 1).flatten(0, 1), model, _START_STEPS)
     likeliest = begun.evidence.view(-1, tries).argmax(-1)
-    best = likeliest + tries * torch.arange(batch * kinds, device=like.device)
+    best = likeliest + tries * torch.arange(batch * kinds, device=likeliest.device)
     begin = begun.params[best].view(batch, kinds, -1)[:, ways.kind].flatten(0, 1)
     fits = fit_readings(begin, reading_model(seen, positions, ways, 1, prior), _STEPS)
 
-    bend = prior.std(like)[OFFSET + 1 :]
-    shape = (fits.params, fits.covariance, like.new_tensor(straight), bend, bends)
-    params, covariance = straight_or_bend(*shape)
-    evidence = (fits.evidence + softplus(straight_log_odds(*shape))).view(batch, count)
-    there = ((seen.weight > 0).unsqueeze(-1) & one_hot(seen.boundary, num).bool()).any(1)  # (B, L)
-    before, half = log_prior(ways, there, cfg), log_prior_of_half(there, cfg)
+    straight, bend = positions.new_tensor(cfg.straight), prior.std(positions)[OFFSET + 1 :]
+    roads = (fits.params, fits.covariance, straight, bend, cfg.bends)
+    params, covariance = straight_or_bend(*roads)
+    evidence = fits.evidence + softplus(straight_log_odds(*roads))
+    found = (params[:, _POSE], covariance[:, _POSE, _POSE], evidence)
+    pose, cov, evidence = (part.unflatten(0, (batch, len(ways.kind))) for part in found)
+    return pose, cov, evidence
 
-    pose, cov = params[:, _POSE].unflatten(0, (batch, count)), covariance[:, _POSE, _POSE]
-    cov = cov.unflatten(0, (batch, count))
-    likely, doubted = (
-        window(power * evidence + before, cfg.least_weight) for power in (1.0, cfg.evidence_exponent)
-    )
-    mean, _ = mixture_moments(*_with_half(pose, cov, likely, prior, half, cfg.least_weight))
-    centre, spread = mixture_moments(*_with_half(pose, cov, doubted, prior, half, cfg.least_weight))
-    level = prior.mean(like)[_ANGLES]
+
+def _agrees_with_average(
+    start: Tensor, mean: Tensor, centre: Tensor, spread: Tensor, prior: FramePrior
+) -> Tensor:
+    """Tell where the pose of the likeliest reading (B, 7) is as good as the average, (B,) bool.
+
+    It is near the average by the tempered evidence, whose mean and covariance are ``centre`` and ``spread``,
+    and its pitch and roll are not farther from the prior than those of ``mean`` are.
+    """
+    level = prior.mean(mean)[_ANGLES]
     farther = (start[:, _ANGLES] - level).abs() - (mean[:, _ANGLES] - level).abs()
-    farther = (farther / prior.std(like)[_ANGLES]).amax(-1)
-    keep = (distance(start[:, _POSE] - centre, spread) < _KEEP) & (farther < _FARTHER)
-    mean = select_rows(keep, start[:, _POSE], mean)
-    apart = centre - mean
-    wrong = likely @ ways.wrong.to(like)
-    return AveragedPose(mean, spread + apart.unsqueeze(-1) * apart.unsqueeze(-2), 1 - wrong)
+    farther = (farther / prior.std(mean)[_ANGLES]).amax(-1)
+    return (distance(start[:, _POSE] - centre, spread) < _KEEP) & (farther < _FARTHER)
 
 
 def window(log_weight: Tensor, least: float) -> Tensor:

@@ -17,15 +17,17 @@ from lanebev.estimation.checks import (
     unused_frame,
 )
 from lanebev.estimation.joint.averaging import weigh_readings
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.iterated_update import update_state
-from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, STEPS, layout
+from lanebev.estimation.joint.layout import NUM_COMMON, STEPS, layout
 from lanebev.estimation.joint.measurement import CURVATURE, VERTICAL
 from lanebev.estimation.joint.observations import boundary_places, observations
 from lanebev.estimation.joint.output import as_calibration
 from lanebev.estimation.joint.prediction import elapsed, predict_state
 from lanebev.estimation.joint.restart import restart
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
-from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit
+from lanebev.estimation.joint.start import new_state, state_from_fit
+from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.joint.status import update_track_status
 from lanebev.estimation.joint.tempering import temper_frame
 from lanebev.estimation.reasons import Reason
@@ -66,24 +68,7 @@ class JointCalibrator(Calibrator[JointState]):
             spread = cfg.prior.std(like).square().diag().repeat(batch_size, 1, 1)
             mean, cov = state_from_fit(params, spread, torch.zeros_like(params), cfg)
         none = torch.zeros(batch_size, dtype=torch.int64, device=device)
-        zero = torch.zeros(batch_size, dtype=dtype, device=device)
-        return JointState(
-            mean=mean,
-            cov=cov,
-            phase=zero.clone(),
-            evidence=mean.new_zeros(batch_size, NUM_POSE + NUM_COMMON - CURVATURE + cfg.num_boundaries),
-            pose_sensitivity=mean.new_zeros(batch_size, NUM_POSE, 2 * cfg.num_boundaries),
-            scatter=mean.new_zeros(batch_size, 2, 3),
-            motion_scale=mean.new_ones(batch_size, NUM_POSE),
-            hills=zero.clone(),
-            early=zero.clone(),
-            unseen=zero,
-            misfit=zero.clone(),
-            doubt=zero.clone(),
-            contrary=zero.clone(),
-            status=none + int(Status.UNINITIALISED),
-            reasons=none + int(Reason.NO_START),
-        )
+        return new_state(mean, cov, Status.UNINITIALISED, none + int(Reason.NO_START))
 
     def step(
         self,
@@ -106,13 +91,11 @@ class JointCalibrator(Calibrator[JointState]):
         positions = boundary_places(lane_width, cfg.num_boundaries, dt)  # (B, L)
         time = elapsed(dt, state, cfg)
 
-        predicted = predict_state(state, time.step, cfg).state
+        predicted = predict_state(state, time.dt, cfg).state
         numbers = 6 * indices.size**2 + NUM_COMMON * seen.pixels.shape[-1]  # above all the Jacobian
-        updated, trust, inliers, alone = in_blocks(
-            numbers, partial(update_state, cfg=cfg), predicted, positions, seen, time.step
-        )
-        after, supported = update_track_status(predicted, updated, trust, alone, time.step, seen, cfg)
-        after, inliers, apart = restart(after, inliers, supported, seen, positions, cfg)
+        update = in_blocks(numbers, partial(update_state, cfg=cfg), predicted, positions, seen, time.dt)
+        after, supported = update_track_status(predicted, update, time.dt, seen, cfg)
+        after, inliers, apart = restart(after, update.inliers, supported, seen, positions, cfg)
         after = after._replace(reasons=after.reasons | flag(time.guessed, Reason.TIME))
 
         skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=time.early)

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.layout import DEVIATIONS, NUM_POSE, POSE, SHAPE
 from lanebev.estimation.joint.measurement import NUM_SHAPE, VERTICAL
-from lanebev.estimation.joint.state import JointConfig, JointState
+from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.joint.update import FrameInformation, innovation_score
 from lanebev.tensors import constant
 

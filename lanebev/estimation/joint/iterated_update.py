@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import flag
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.evidence import (
     accumulate_evidence,
     adapt_motion_scale,
@@ -28,7 +29,7 @@ from lanebev.estimation.joint.measurement import (
 )
 from lanebev.estimation.joint.observations import Observations, ego_lane_width, per_end
 from lanebev.estimation.joint.scatter import Scatter, averaged_moments, boundary_scatter, with_headings
-from lanebev.estimation.joint.state import JointConfig, JointState
+from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.joint.update import (
     FrameInformation,
     Step,
@@ -84,7 +85,7 @@ class Iteration(NamedTuple):
 
 
 def update_state(
-    predicted: JointState, positions: Tensor, seen: Observations, step: Tensor, cfg: JointConfig
+    predicted: JointState, positions: Tensor, seen: Observations, dt: Tensor, cfg: JointConfig
 ) -> FrameUpdate:
     """Update a prediction by a frame: lane change, iterated robust update, adaptive process noise.
 
@@ -94,7 +95,7 @@ def update_state(
         predicted: state.
         positions: (B, L) m, of the boundaries from the ego lane's middle.
         seen: what was observed.
-        step: (B,) s since the last frame.
+        dt: (B,) s since the last frame.
         cfg: the configuration.
     """
     indices, num, width = layout(cfg.num_boundaries), cfg.num_boundaries, ego_lane_width(positions)
@@ -119,7 +120,7 @@ def update_state(
     last = iterate(prior, at_cov, residuals, scale, cov)
     support = torch.bmm(member, per_end(last.frame.trust * seen.weight).unsqueeze(-1)).squeeze(-1)
     score = normalized_score(at_cov, last.frame, support, seen.weight)
-    evidence, motion_scale = with_evidence(predicted, score, last.estimated[:, POSE] > 0, step, cfg)
+    evidence, motion_scale = with_evidence(predicted, score, last.estimated[:, POSE] > 0, dt, cfg)
     cov = with_process_noise(cov, adaptive_process_noise(evidence, at_cov, cfg))
     for _ in range(cfg.iterations - 1):
         at, used = last.step.mean, cov
@@ -135,7 +136,7 @@ def update_state(
         cov=posterior_covariance(cov, last.frame.matrix, gain),
         evidence=evidence,
         pose_sensitivity=scatter.sensitivity,
-        scatter=averaged_moments(scatter.moments, predicted.scatter, step, cfg.scatter_memory),
+        scatter=averaged_moments(scatter.moments, predicted.scatter, dt, cfg.scatter_memory),
         motion_scale=motion_scale,
         reasons=flag(shift != 0, Reason.LANE_CHANGE),
     )
@@ -160,7 +161,7 @@ def inliers_of_lanes(last: Iteration, seen: Observations) -> Tensor:
 
 
 def with_evidence(
-    predicted: JointState, score: Tensor, pose_determined: Tensor, step: Tensor, cfg: JointConfig
+    predicted: JointState, score: Tensor, pose_determined: Tensor, dt: Tensor, cfg: JointConfig
 ) -> tuple[Tensor, Tensor]:
     """Add a frame's scores to the evidence against the motion, and adapt the scale of the motion to them.
 
@@ -168,15 +169,15 @@ def with_evidence(
         predicted: state.
         score: (B, 11 + L), of :func:`~lanebev.estimation.joint.evidence.normalized_score`.
         pose_determined: (B, 4) bool, what of the pose the frame determines; the scale of the rest decays.
-        step: (B,) s since the last frame.
+        dt: (B,) s since the last frame.
         cfg: the configuration.
 
     Returns:
         evidence (B, 11 + L) and scale (B, 4).
     """
-    evidence = accumulate_evidence(predicted.evidence, score, step, cfg.evidence_time)
+    evidence = accumulate_evidence(predicted.evidence, score, dt, cfg.evidence_time)
     scored = torch.where(pose_determined, score[:, POSE], 1.0)  # 1 is the score that is expected
-    return evidence, adapt_motion_scale(predicted.motion_scale, scored, step, cfg)
+    return evidence, adapt_motion_scale(predicted.motion_scale, scored, dt, cfg)
 
 
 def scatter_of_frame(frame: FrameInformation, cov: Tensor, member: Tensor, moments: Tensor) -> Scatter:

@@ -6,12 +6,13 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import has_flag
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.evidence import EQUAL
 from lanebev.estimation.joint.frame_prior import student_density
 from lanebev.estimation.joint.layout import POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL
 from lanebev.estimation.joint.scatter import scatter_variance, start_variance
-from lanebev.estimation.joint.state import JointConfig, JointState
+from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.road import lane_width_covariance
 from lanebev.tensors import constant

@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.checks import is_running
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.dynamics import motion
 from lanebev.estimation.joint.evidence import deviation_prior_std, hill_variance
 from lanebev.estimation.joint.layout import SHAPE, layout
 from lanebev.estimation.joint.measurement import CURVATURE
 from lanebev.estimation.joint.road import propagate_road_shape
-from lanebev.estimation.joint.state import JointConfig, JointState, unobserved_mask
+from lanebev.estimation.joint.state import JointState, unobserved_mask
 from lanebev.estimation.kalman import predict
 
 
@@ -21,13 +22,13 @@ class Interval(NamedTuple):
     """Time from a state to a frame, (B,) each.
 
     Attributes:
-        step: s to predict over.
+        dt: s to predict over.
         skip: bool, the frame is not later than the state, and is not used.
         early: s by which the state is ahead of a skipped frame, else 0.
         guessed: bool, the time was not usable, and ``JointConfig.assumed_dt`` was taken.
     """
 
-    step: Tensor
+    dt: Tensor
     skip: Tensor
     early: Tensor
     guessed: Tensor

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lanebev.batch import flag, replace_rows, select_rows
 from lanebev.estimation.checks import is_running
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.evidence import CALL
 from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, layout
@@ -28,7 +29,8 @@ from lanebev.estimation.joint.scatter import (
     with_headings,
 )
 from lanebev.estimation.joint.single_frame import SingleFrameFit, fit_observations
-from lanebev.estimation.joint.state import JointConfig, JointState, state_from_fit
+from lanebev.estimation.joint.start import new_state, state_from_fit
+from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.joint.update import information, membership
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.linalg import inverse_spd
@@ -223,25 +225,11 @@ def with_roll_of_prior(fit: SingleFrameFit, prior: FramePrior) -> tuple[Tensor, 
 
 
 def state_of_fit(fit: SingleFrameFit, before: JointState, cfg: JointConfig) -> JointState:
-    """Make a state of one frame's fit; nothing of the state before is kept."""
+    """Make a state of one frame's fit; of the state before only the frames in doubt are kept."""
     mean, cov = state_from_fit(*with_roll_of_prior(fit, cfg.prior), cfg)
-    zero = torch.zeros_like(before.unseen)
-    return JointState(
-        mean=mean,
-        cov=cov,
-        phase=zero,
-        evidence=torch.zeros_like(before.evidence),
-        pose_sensitivity=torch.zeros_like(before.pose_sensitivity),
-        scatter=torch.zeros_like(before.scatter),
-        motion_scale=torch.ones_like(before.motion_scale),
-        hills=zero,
-        early=zero,
-        unseen=zero,
-        misfit=zero,
-        doubt=before.doubt,
-        contrary=zero,
-        status=torch.full_like(before.status, int(Status.TRACKING)),
-        reasons=int(Reason.RESTARTED)
+    reasons = (
+        int(Reason.RESTARTED)
         | flag(~fit.observed[:, ROLL], Reason.ROLL_UNSEEN)
-        | flag(~fit.observed[:, HEIGHT], Reason.HEIGHT_UNSEEN),
+        | flag(~fit.observed[:, HEIGHT], Reason.HEIGHT_UNSEEN)
     )
+    return new_state(mean, cov, Status.TRACKING, reasons)._replace(doubt=before.doubt)

@@ -14,12 +14,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lanebev.estimation import kalman
 from lanebev.estimation.joint.dynamics import MotionConfig, RoadMotion
 from lanebev.estimation.joint.layout import SHAPE, Layout
-from lanebev.estimation.joint.measurement import CURVATURE
 from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS
-from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
+from lanebev.geometry.linalg import cholesky, solve_lower
 from lanebev.tensors import constant
 
 CLEAR_BEND = (10.0, 20.0)  # χ² of the five steps: below, they do not change the speed; above, fully
@@ -126,52 +124,6 @@ def turn_along(shape: Tensor, phase: Tensor, way: Tensor) -> Tensor:
     after = heading - here * torch.minimum(way.unsqueeze(-1), (places - behind).clamp(min=0.0))
     bend = bend * (heading.cos() / after.cos().clamp(min=0.6)) ** 3
     return torch.cat([bend[:, :1], bend.diff(dim=-1)], dim=-1)
-
-
-def straight_or_bend(
-    params: Tensor, cov: Tensor, straight: Tensor, bend: Tensor, share: float
-) -> tuple[Tensor, Tensor]:
-    """Average one frame's fit over two models of the road, straight and bent, weighted by their evidence.
-
-    Source: (J18).
-
-    A distant bend and a yaw have nearly the same effect. Choosing the likelier model would be wrong by many
-    standard deviations if the other holds, so the difference of the two fits enters the covariance. Source:
-    Bayesian model averaging (Hoeting et al. 1999) of two Gaussians, moments matched. The straight road is a
-    measurement of c0 = c1 = 0 whose noise turns the one prior into the other.
-
-    Args:
-        params: (B, 7) fitted to a frame as a bend, in the order of ``NUM_PARAMS``.
-        cov: (B, 7, 7).
-        straight: (2,) 1/m and 1/m², sigmas of c0 and c1 of a straight road.
-        bend: (2,), those of a bend, larger, which the fit had for a prior.
-        share: prior probability of bends.
-
-    Returns:
-        mean (B, 7) and covariance (B, 7, 7).
-    """
-    noise = 1 / (straight.square().reciprocal() - bend.square().reciprocal())
-    curvature, gain = params[:, CURVATURE:], cov[:, :, CURVATURE:]
-    inverse = inverse_spd(cov[:, CURVATURE:, CURVATURE:] + noise.diag())
-    solved = inverse @ curvature.unsqueeze(-1)  # (B, 2, 1)
-    odds = straight_log_odds(params, cov, straight, bend, share)
-    is_straight = odds.sigmoid()[:, None, None]
-    pull = gain @ solved  # (B, 7, 1), from the bend to the straight road
-    known = gain @ inverse @ gain.mT
-    spread = is_straight * (1 - is_straight) * (pull @ pull.mT)
-    return params - (is_straight * pull).squeeze(-1), kalman.symmetrise(cov - is_straight * known + spread)
-
-
-def straight_log_odds(params: Tensor, cov: Tensor, straight: Tensor, bend: Tensor, share: float) -> Tensor:
-    """Compute the log odds (B,) of a straight road against a bend, see :func:`straight_or_bend`."""
-    noise = 1 / (straight.square().reciprocal() - bend.square().reciprocal())
-    curvature = params[:, CURVATURE:]
-    predicted = cov[:, CURVATURE:, CURVATURE:] + noise.diag()
-    chi2 = (curvature.unsqueeze(1) @ inverse_spd(predicted) @ curvature.unsqueeze(-1)).flatten()
-    sharper = 0.5 * (bend.square() + noise).log().sum()
-    sharper = sharper - cholesky(predicted).diagonal(dim1=1, dim2=2).log().sum(-1)
-    odds: Tensor = math.log((1 - share) / share) + sharper - 0.5 * chi2
-    return odds
 
 
 def _change_per_metre(shape: Tensor, cov: Tensor) -> Tensor:

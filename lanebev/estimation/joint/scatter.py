@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.layout import NUM_POSE
 from lanebev.estimation.joint.measurement import OFFSET, ROLL, Residuals
 from lanebev.estimation.joint.observations import per_end
-from lanebev.estimation.joint.state import JointConfig
 from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
 from lanebev.tensors import constant
 
@@ -110,17 +110,17 @@ def boundary_scatter(matrix: Tensor, vector: Tensor, precision: Tensor, moments:
     return Scatter(across[:, :NUM_POSE], pad(each, (0, 1), value=1.0))
 
 
-def averaged_moments(now: Tensor, before: Tensor, step: Tensor, memory: float) -> Tensor:
+def averaged_moments(now: Tensor, before: Tensor, dt: Tensor, memory: float) -> Tensor:
     """Average the moments (B, 2, 3) of scatter over the last frames, as far as a frame tells any.
 
     Args:
         now: of this frame.
         before: so far; 0 if no frame has told any.
-        step: (B,) s since the last frame.
+        dt: (B,) s since the last frame.
         memory: s, time constant.
     """
     told = (now[..., 1].sum(-1) / _FULL_FREEDOM).clamp(max=1.0)
-    gain = told * (1 - (-step / memory).exp())
+    gain = told * (1 - (-dt / memory).exp())
     return before + gain[:, None, None] * (now - before)
 
 
@@ -169,7 +169,7 @@ def determined_sensitivity(determined: Tensor, num_boundaries: int) -> Tensor:
     return determined.all(-1)[:, None, None] | (all_but_roll & by_headings & ~is_roll.unsqueeze(-1))
 
 
-def remembered_sensitivity(now: Tensor, before: Tensor, step: Tensor, cfg: JointConfig) -> Tensor:
+def remembered_sensitivity(now: Tensor, before: Tensor, dt: Tensor, cfg: JointConfig) -> Tensor:
     """Blend the pose's change by each boundary's own deviation and heading over the last frames.
 
     Source: M of (J26) and (J29).
@@ -180,12 +180,12 @@ def remembered_sensitivity(now: Tensor, before: Tensor, step: Tensor, cfg: Joint
     Args:
         now: (B, 4, 2 L) by this frame.
         before: (B, 4, 2 L); its row of the roll is 0 where no frame has determined the whole pose yet.
-        step: (B,) s since then; inf where the boundaries' numbers have changed.
+        dt: (B,) s since then; inf where the boundaries' numbers have changed.
         cfg: the configuration.
     """
     num = now.shape[-1] // 2
     gone = (now[:, ROLL:, :num].abs().amax(1, keepdim=True) < _LEAST_SENSITIVITY).repeat(1, 1, 2)
     memory = torch.where(gone, cfg.motion.deviation_memory, cfg.motion.unequal_memory)
     begun = (before[:, ROLL] != 0).any(-1)[:, None, None]
-    fade = torch.where(begun, (-step[:, None, None] / memory).exp(), 0.0)
+    fade = torch.where(begun, (-dt[:, None, None] / memory).exp(), 0.0)
     return now + fade * (before - now)

@@ -13,11 +13,12 @@ from torch import Tensor
 
 from lanebev.batch import has_flag
 from lanebev.estimation import kalman
+from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.evidence import adaptive_process_noise, with_process_noise
 from lanebev.estimation.joint.layout import POSE, layout
 from lanebev.estimation.joint.measurement import OFFSET, ROLL
 from lanebev.estimation.joint.prediction import elapsed, predict_state
-from lanebev.estimation.joint.state import JointConfig, JointState
+from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.types import Calibration, Extrinsics, Status
@@ -55,8 +56,8 @@ def link_states(before: JointState, after: JointState, dt: Tensor, cfg: JointCon
         cfg: the calibrator's.
     """
     indices = layout(cfg.num_boundaries)
-    step, skip, _, _ = elapsed(dt, before, cfg)
-    predicted, transition, noise = predict_state(before, step, cfg)
+    due, skip, _, _ = elapsed(dt, before, cfg)
+    predicted, transition, noise = predict_state(before, due, cfg)
     evidence = torch.where(skip.unsqueeze(-1), 0.0, after.evidence)
     raised = adaptive_process_noise(evidence, predicted.cov[:, indices.observed, indices.observed], cfg)
     known = (skip.unsqueeze(-1) | ~other_quantities(after, cfg)).unsqueeze(-2)  # (B, 1, D)

@@ -71,19 +71,19 @@ def membership(boundary: Tensor, num_boundaries: int, like: Tensor) -> Tensor:
 
 
 def frame_information(
-    residuals: Residuals, scale: Tensor, doubt: Tensor, seen: Observations, member: Tensor
+    residuals: Residuals, scale: Tensor, at_cov: Tensor, seen: Observations, member: Tensor
 ) -> FrameInformation:
     """Weigh a frame's linearised measurements and sum them up.
 
     Args:
         residuals: at the point of linearisation.
         scale: (B,) noise scale so far; it is lowered.
-        doubt: (B, O, O), covariance of the point of linearisation. A residual within it is not an outlier.
+        at_cov: (B, O, O), covariance of the point of linearisation. A residual within it is not an outlier.
         seen: what was observed.
         member: (B, L, M) of :func:`membership`.
     """
-    unsure = _predicted_variance(residuals.jacobian, doubt, seen.boundary)
-    trust, scale = reweigh(squared_distance(residuals.distance), residuals.valid, seen, scale, unsure)
+    by_state = _predicted_variance(residuals.jacobian, at_cov, seen.boundary)
+    trust, scale = reweigh(squared_distance(residuals.distance), residuals.valid, seen, scale, by_state)
     weight = trust * seen.weight / scaled_variance(seen.sigma, scale)
     return FrameInformation(*information(residuals, weight, member), trust, weight, scale, residuals)
 

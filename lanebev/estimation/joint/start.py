@@ -1,0 +1,178 @@
+"""How a state of the joint filter starts: from the prior, or from one frame's fit."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from lanebev.estimation import kalman
+from lanebev.estimation.joint.config import JointConfig
+from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, STEPS, layout
+from lanebev.estimation.joint.low_pass import pose_variances
+from lanebev.estimation.joint.measurement import CURVATURE, NUM_PARAMS, NUM_SHAPE, NUM_STRAIGHT, VERTICAL
+from lanebev.estimation.joint.road_curve import KNOT_SPACING
+from lanebev.estimation.joint.state import JointState
+from lanebev.geometry.linalg import cholesky, inverse_spd
+from lanebev.tensors import constant
+from lanebev.types import Status
+
+_OFFSET_RATE_STD = 0.5  # m/s, of a start
+
+
+def new_state(mean: Tensor, cov: Tensor, status: Status, reasons: Tensor) -> JointState:
+    """Make a state from its mean and covariance; it remembers no frame.
+
+    Args:
+        mean: (B, D).
+        cov: (B, D, D).
+        status: of all rows.
+        reasons: (B,) int64 flags.
+    """
+    batch, num = mean.shape[0], mean.shape[-1] - layout(0).size
+
+    def zero(*shape: int) -> Tensor:
+        return mean.new_zeros(batch, *shape)
+
+    return JointState(
+        mean=mean,
+        cov=cov,
+        phase=zero(),
+        evidence=zero(NUM_POSE + NUM_COMMON - CURVATURE + num),
+        pose_sensitivity=zero(NUM_POSE, 2 * num),
+        scatter=zero(2, 3),
+        motion_scale=mean.new_ones(batch, NUM_POSE),
+        hills=zero(),
+        early=zero(),
+        unseen=zero(),
+        misfit=zero(),
+        doubt=zero(),
+        contrary=zero(),
+        status=torch.full_like(reasons, int(status)),
+        reasons=reasons,
+    )
+
+
+def state_from_fit(
+    params: Tensor, param_cov: Tensor, by_vertical: Tensor, cfg: JointConfig
+) -> tuple[Tensor, Tensor]:
+    """Start a state from one frame's fit.
+
+    The fit takes the road as plane: see :func:`with_vertical_curvature`.
+
+    Args:
+        params: (B, 7), see ``NUM_PARAMS``.
+        param_cov: (B, 7, 7).
+        by_vertical: (B, 7), change of the fit per 1/m of vertical curvature.
+        cfg: the configuration.
+
+    Returns:
+        mean (B, D) and covariance (B, D, D).
+    """
+    straight, bend = constant(cfg.straight, like=params), cfg.prior.std(params)[CURVATURE:]
+    params, param_cov = straight_or_bend(params, param_cov, straight, bend, cfg.bends)
+    params = pad(params, (0, 1))  # the vertical curvature's mean is 0
+    param_cov = with_vertical_curvature(param_cov, by_vertical, cfg.prior.vertical_curvature_std)
+    copies = constant(_by_parameters(cfg.num_boundaries), like=params)
+    own = constant(_start_variances(cfg.num_boundaries, cfg.motion), like=params)
+    return params @ copies.mT, copies @ param_cov @ copies.mT + own.diag()
+
+
+def straight_or_bend(
+    params: Tensor, cov: Tensor, straight: Tensor, bend: Tensor, share: float
+) -> tuple[Tensor, Tensor]:
+    """Average one frame's fit over two models of the road, straight and bent, weighted by their evidence.
+
+    Source: (J18).
+
+    A distant bend and a yaw have nearly the same effect. Choosing the likelier model would be wrong by many
+    standard deviations if the other holds, so the difference of the two fits enters the covariance. Source:
+    Bayesian model averaging (Hoeting et al. 1999) of two Gaussians, moments matched. The straight road is a
+    measurement of c0 = c1 = 0 whose noise turns the one prior into the other.
+
+    Args:
+        params: (B, 7) fitted to a frame as a bend, in the order of ``NUM_PARAMS``.
+        cov: (B, 7, 7).
+        straight: (2,) 1/m and 1/m², sigmas of c0 and c1 of a straight road.
+        bend: (2,), those of a bend, larger, which the fit had for a prior.
+        share: prior probability of bends.
+
+    Returns:
+        mean (B, 7) and covariance (B, 7, 7).
+    """
+    noise = 1 / (straight.square().reciprocal() - bend.square().reciprocal())
+    curvature, gain = params[:, CURVATURE:], cov[:, :, CURVATURE:]
+    inverse = inverse_spd(cov[:, CURVATURE:, CURVATURE:] + noise.diag())
+    solved = inverse @ curvature.unsqueeze(-1)  # (B, 2, 1)
+    odds = straight_log_odds(params, cov, straight, bend, share)
+    is_straight = odds.sigmoid()[:, None, None]
+    pull = gain @ solved  # (B, 7, 1), from the bend to the straight road
+    known = gain @ inverse @ gain.mT
+    spread = is_straight * (1 - is_straight) * (pull @ pull.mT)
+    return params - (is_straight * pull).squeeze(-1), kalman.symmetrise(cov - is_straight * known + spread)
+
+
+def straight_log_odds(params: Tensor, cov: Tensor, straight: Tensor, bend: Tensor, share: float) -> Tensor:
+    """Compute the log odds (B,) of a straight road against a bend, see :func:`straight_or_bend`."""
+    noise = 1 / (straight.square().reciprocal() - bend.square().reciprocal())
+    curvature = params[:, CURVATURE:]
+    predicted = cov[:, CURVATURE:, CURVATURE:] + noise.diag()
+    chi2 = (curvature.unsqueeze(1) @ inverse_spd(predicted) @ curvature.unsqueeze(-1)).flatten()
+    sharper = 0.5 * (bend.square() + noise).log().sum()
+    sharper = sharper - cholesky(predicted).diagonal(dim1=1, dim2=2).log().sum(-1)
+    odds: Tensor = math.log((1 - share) / share) + sharper - 0.5 * chi2
+    return odds
+
+
+def with_vertical_curvature(cov: Tensor, by_vertical: Tensor, std: float) -> Tensor:
+    """Add the road's vertical curvature κ to the covariance of a fit that takes it as 0.
+
+    Source: (J22). The fit is off by g κ and the estimate 0 of κ by -κ, so both errors are correlated.
+
+    Args:
+        cov: (B, P, P) of the fit.
+        by_vertical: (B, P), g, change of the fit per 1/m.
+        std: 1/m, prior standard deviation of κ.
+
+    Returns:
+        (B, P + 1, P + 1), κ last.
+    """
+    error = std * pad(by_vertical, (0, 1), value=-1.0).unsqueeze(-1)
+    return pad(cov, (0, 1, 0, 1)) + error @ error.mT
+
+
+@lru_cache(maxsize=16)
+def _by_parameters(num_boundaries: int) -> tuple[tuple[float, ...], ...]:
+    """The state's entries by parameters and vertical curvature of one frame, D × 8.
+
+    The slow mean begins at the pose.
+    """
+    indices = layout(num_boundaries)
+    factors = {(k, k): 1.0 for k in (*range(NUM_STRAIGHT), CURVATURE)}
+    factors |= {(step, CURVATURE + 1): KNOT_SPACING for step in range(STEPS.start, STEPS.stop)}
+    factors |= {(VERTICAL, NUM_PARAMS): 1.0}
+    factors |= {(indices.means.start + axis, axis): 1.0 for axis in range(NUM_POSE)}
+    return tuple(tuple(factors.get((k, p), 0.0) for p in range(NUM_PARAMS + 1)) for k in range(indices.size))
+
+
+@lru_cache(maxsize=16)
+def _start_variances(num_boundaries: int, motion: MotionConfig) -> tuple[float, ...]:
+    """Variances (D,) of a start beside those of the frame's fit."""
+    swing = (*[motion.angle_std**2] * 3, motion.height_std**2)
+    _, rate, acceleration, jerk = pose_variances(motion.bandwidth)
+    return (
+        *[0.0] * NUM_STRAIGHT,
+        *[motion.curvature_step**2] * NUM_SHAPE,
+        0.0,
+        *[motion.deviation_walk**2] * num_boundaries,
+        *(rate * variance for variance in swing),
+        _OFFSET_RATE_STD**2,
+        *(acceleration * variance for variance in swing),
+        *(jerk * variance for variance in swing),
+        *swing,
+        motion.speed_std**2,
+    )
