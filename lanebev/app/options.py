@@ -23,14 +23,14 @@ _MOST_CELLS = 4096  # pixels a side of the bird's-eye view, which H.264 encodes
 
 
 def parse_path(text: str) -> str:
-    """Return a path unchanged.
+    """Return a path, with the home folder in place of ~, which shells leave in quotes and after =.
 
     Raises:
         ValueError: the path is empty.
     """
     if not text:
         raise ValueError("expected a path, got an empty string")
-    return text
+    return os.path.expanduser(text)
 
 
 def parse_grid(text: str) -> tuple[float, float, float, float, float]:

@@ -67,3 +67,8 @@ def _differs(read: Callable[[], CameraParameters], camera: CameraParameters) -> 
 def _listed(readers: Readers) -> str:
     names = [name if name.isprintable() else shown(name) for name in readers]
     return ", ".join([*names[:_MOST_NAMES], *(["..."] if len(names) > _MOST_NAMES else [])])
+
+
+def telling_names(names: list[str]) -> list[str]:
+    """Return the names of a file's cameras, or their places if these do not tell them apart."""
+    return names if len(set(names)) == len(names) else [str(place) for place in range(len(names))]

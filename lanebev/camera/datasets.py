@@ -1,15 +1,14 @@
-"""Camera files of data sets that state no image size (KITTI, nuScenes, OpenLane), and of COLMAP."""
+"""Camera files of KITTI and of COLMAP."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
-from lanebev.camera.choice import Readers
-from lanebev.camera.parameters import CameraParameters, centre_offset
-from lanebev.camera.parsing import numbers, once, whole_number
+from lanebev.camera.choice import Readers, telling_names
+from lanebev.camera.parameters import OFF_CENTRE, CameraParameters, centre_offset, size_of_images
+from lanebev.camera.parsing import once
 from lanebev.numbers import finite_numbers, shown
 
 _KITTI = re.compile(r"^[ \t]*P(?:_rect_)?\d+[ \t]*:", re.MULTILINE | re.ASCII)
@@ -33,9 +32,6 @@ _KITTI_SIZES = {  # focal length of the rectified cameras of each recording day 
     718.856: (376, 1241),
 }
 _KITTI_SPREAD = 8  # px, more than rectified images of one camera differ by
-_NUSCENES_SIZE = (900, 1600)
-_OPENLANE_SIZE = (1280, 1920)
-_OFF_CENTRE = 0.2  # shares of the sides, more than any data set's principal point is off the centre
 
 
 def is_kitti(text: str) -> bool:
@@ -68,14 +64,14 @@ def _kitti(entries: Mapping[str, str], name: str, image_size: tuple[int, int] | 
         width, height = finite_numbers(size_name, entries[size_name].split(), 2)
         size: tuple[int, int] | None = (round(height), round(width))
     else:
-        size = _size("KITTI's of this focal length", image_size, known, _KITTI_SPREAD)
+        size = size_of_images("KITTI's of this focal length", image_size, known, _KITTI_SPREAD)
     if size is None:
         raise ValueError(
             "expected the image size, got none, and the focal length is none of KITTI's; "
             "add a line 'S_rect_02: WIDTH HEIGHT' with P_rect_02, or use the short YAML"
         )
     matrix = projection[0:3] + projection[4:7] + projection[8:11]
-    if size_name not in entries and centre_offset(matrix, size) > _OFF_CENTRE:
+    if size_name not in entries and centre_offset(matrix, size) > OFF_CENTRE:
         raise ValueError(
             f"{name}: expected a camera of the images' {size[1]} x {size[0]} px, got a principal point of "
             f"{matrix[2]:g}, {matrix[5]:g}; give the images as they came, or add 'S_rect_02: WIDTH HEIGHT'"
@@ -91,13 +87,8 @@ def is_colmap(text: str) -> bool:
 def colmap_cameras(text: str) -> Readers:
     """Return what reads the cameras of COLMAP's ``cameras.txt``, by their numbers."""
     found = _COLMAP.findall(text)
-    names = _telling([number for number, *_ in found])
+    names = telling_names([number for number, *_ in found])
     return {name: partial(_colmap, *values) for name, (_, *values) in zip(names, found, strict=True)}
-
-
-def _telling(names: list[str]) -> list[str]:
-    """Return the names of a file's cameras, or their places if these do not tell them apart."""
-    return names if len(set(names)) == len(names) else [str(place) for place in range(len(names))]
 
 
 def _colmap(name: str, width: str, height: str, values: str) -> CameraParameters:
@@ -115,75 +106,3 @@ def _colmap(name: str, width: str, height: str, values: str) -> CameraParameters
     distortion = [given.get(key, 0.0) for key in order.split()]
     matrix = [fx, 0.0, given["cx"] - 0.5, 0.0, fy, given["cy"] - 0.5, 0.0, 0.0, 1.0]
     return CameraParameters(matrix, distortion, model, (int(height), int(width)))
-
-
-def nuscenes_cameras(records: Sequence[Any], image_size: tuple[int, int] | None) -> Readers:
-    """Return what reads the cameras of nuScenes' table ``calibrated_sensor``.
-
-    Their names are their tokens, or their places in the table if these do not tell them apart.
-    """
-    cameras = [each for each in records if isinstance(each, Mapping) and each.get("camera_intrinsic")]
-    if not cameras:
-        raise ValueError("camera_intrinsic: expected that of a camera, got none")
-    names = _telling([str(each.get("token")) for each in cameras])
-    return {name: partial(_nuscenes, each, image_size) for name, each in zip(names, cameras, strict=True)}
-
-
-def _nuscenes(record: Mapping[str, Any], image_size: tuple[int, int] | None) -> CameraParameters:
-    """Read a record of nuScenes' table ``calibrated_sensor``; its images are undistorted.
-
-    The table has no size of images: nuScenes' are all of one. Other programs write such tables for images of
-    other sizes, some with ``width`` and ``height``. Images of another size are those of the record if its
-    principal point is less than half as far from their centre as from that of nuScenes' images, in shares of
-    the sides; else they were resized.
-    """
-    matrix = numbers(record, "camera_intrinsic", count=9)
-    return _of_size(matrix, record, image_size, _NUSCENES_SIZE, "nuScenes'")
-
-
-def openlane(fields: Mapping[str, Any], image_size: tuple[int, int] | None) -> CameraParameters:
-    """Read the ``intrinsic`` of an OpenLane label or prediction."""
-    matrix = numbers(fields, "intrinsic", count=9)
-    return _of_size(matrix, fields, image_size, _OPENLANE_SIZE, "OpenLane's")
-
-
-def _of_size(
-    matrix: list[float],
-    record: Mapping[str, Any],
-    image_size: tuple[int, int] | None,
-    known: tuple[int, int],
-    whose: str,
-) -> CameraParameters:
-    """Return the camera of a data set's record: of the size that it states, the data set's, or the images'.
-
-    Raises:
-        ValueError: it states none, and the principal point is in the middle of neither.
-    """
-    if record.get("width") is not None and record.get("height") is not None:
-        stated = (whole_number(record, "height"), whole_number(record, "width"))
-        return CameraParameters(matrix, [], "pinhole", stated)
-    offset = centre_offset(matrix, known)
-    if image_size is not None and 2 * centre_offset(matrix, image_size) < offset:
-        return CameraParameters(matrix, [], "pinhole", image_size)
-    if image_size is None and offset > _OFF_CENTRE:
-        raise ValueError(
-            f"expected a camera of {known[1]} x {known[0]} px, {whose}, got a principal point of "
-            f"{matrix[2]:g}, {matrix[5]:g}; add width and height beside it"
-        )
-    return CameraParameters(matrix, [], "pinhole", _size(whose, image_size, known) or known)
-
-
-def _size(
-    whose: str, image_size: tuple[int, int] | None, known: tuple[int, int] | None, spread: int = 0
-) -> tuple[int, int] | None:
-    """Return the images' size, else the data set's.
-
-    Raises:
-        ValueError: they differ: the images were resized.
-    """
-    if image_size and known and max(abs(image_size[0] - known[0]), abs(image_size[1] - known[1])) > spread:
-        raise ValueError(
-            f"expected images of about {known[1]} x {known[0]} px, {whose}, got "
-            f"{image_size[1]} x {image_size[0]}; give them as they came, or the short YAML for the resized"
-        )
-    return image_size or known

@@ -18,12 +18,11 @@ from lanebev.camera.datasets import (
     is_colmap,
     is_kitti,
     kitti_cameras,
-    nuscenes_cameras,
-    openlane,
 )
 from lanebev.camera.formats import opencv_or_ros, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
 from lanebev.camera.parsing import parse_documents
+from lanebev.camera.records import record_cameras
 from lanebev.camera.slam import camodocal, is_kalibr, is_orb_slam, kalibr_cameras, orb_slam_cameras
 from lanebev.numbers import read_text, shown
 
@@ -40,13 +39,13 @@ def read_camera(
     - Kalibr's camchain, EuRoC's ``sensor.yaml``, CamOdoCal's YAML (VINS, KITTI-360), the
       settings of ORB-SLAM;
     - KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt``: rectified images (``P_rect_02``, ``P2``);
-    - nuScenes' ``calibrated_sensor`` and OpenLane's labels, both JSON;
+    - JSON of data sets, see :mod:`lanebev.camera.records`;
     - COLMAP's ``cameras.txt``.
 
     Of a file with several cameras the first is taken, of KITTI's the left colour camera. If others differ
-    from it, that is remarked on, or refused with nuScenes' and COLMAP's.
+    from it, that is remarked on, or refused with COLMAP's and those of data sets in JSON.
 
-    KITTI's object and odometry files, nuScenes and OpenLane do not hold the image's size: it is then
+    KITTI's object and odometry files and some data sets' JSON do not hold the image's size: it is then
     ``image_size``, or the data set's.
 
     Args:
@@ -102,21 +101,20 @@ def _camera(
     content: Any, image_size: tuple[int, int] | None, rectified: bool, name: str | None
 ) -> CameraParameters:
     """Return the camera of a file's content, whose format its keys tell."""
-    if isinstance(content, list) or (isinstance(content, dict) and "camera_intrinsic" in content):
-        records = content if isinstance(content, list) else [content]
-        return checked(chosen(nuscenes_cameras(records, image_size), name, has_usual=False))
     if isinstance(content, str):
         raise ValueError(f"expected keys with a colon and a space, such as fx: 1150, got {shown(content)}")
-    if not isinstance(content, dict) or not content:
+    if not isinstance(content, dict | list) or content == {}:
         raise ValueError("expected keys such as fx, fy, cx, cy, width, height, got none; is the file empty?")
+    if cameras := record_cameras(content, image_size, rectified):
+        return checked(chosen(cameras, name, has_usual=False))
+    if isinstance(content, list):
+        raise ValueError("camera_intrinsic: expected that of a camera, got none")
     if is_kalibr(content):
         return checked(chosen(kalibr_cameras(content), name, has_usual=True))
     if is_orb_slam(content):
         return checked(chosen(orb_slam_cameras(content, rectified), name, has_usual=True))
     if name is not None:
         raise ValueError(f"expected no name after # for a file of one camera, got {shown(name)}")
-    if "intrinsic" in content:
-        return checked(openlane(content, image_size))
     if "model_type" in content:
         return checked(camodocal(content))
     return opencv_or_ros(content, rectified)

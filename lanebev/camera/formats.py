@@ -79,7 +79,7 @@ def opencv_or_ros(fields: Mapping[str, Any], rectified: bool) -> CameraParameter
         return _as_taken(checked(camera, _restates(fields)), fields)
     matrix = numbers(fields, *_MATRIX_KEYS, count=9)
     distortion = numbers(fields, *_DISTORTION_KEYS)
-    model = _model(fields)
+    model = stated_model(fields)
     if fields.get("xi") is not None:
         xi = numbers(fields, "xi", count=1) if not isinstance(fields["xi"], str) else [number(fields, "xi")]
         distortion = [*xi, *(distortion or [0.0] * 4)]
@@ -92,7 +92,7 @@ def _short(fields: Mapping[str, Any], rectified: bool) -> CameraParameters:
     fx, fy, cx, cy = (number(fields, key) for key in ("fx", "fy", "cx", "cy"))
     distortion = [] if fields.get("distortion") is None else numbers(fields, "distortion")
     camera = CameraParameters(
-        [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, _model(fields), (height, width)
+        [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, stated_model(fields), (height, width)
     )
     return without_lens(camera) if rectified else camera
 
@@ -125,10 +125,14 @@ def _restates(fields: Mapping[str, Any]) -> bool:
         return False
 
 
-def _model(fields: Mapping[str, Any]) -> str:
+def stated_model(fields: Mapping[str, Any], usual: str = "pinhole") -> str:
     """Return the lens model; beside another one, "pinhole" states the projection only, as in Kalibr.
 
     Of the keys after the first, names that are no lens model are ignored: they may be a product's.
+
+    Args:
+        fields: fields of the file.
+        usual: the model where none is stated.
 
     Raises:
         ValueError: the first model is not known, or two that differ are stated.
@@ -143,7 +147,7 @@ def _model(fields: Mapping[str, Any]) -> str:
     stated |= {"xi of an omni": "omni"} if fields.get("xi") is not None else {}
     if len(set(stated.values())) > 1:
         raise ValueError(f"model: expected one, got {' and '.join(stated)}; keep the right one")
-    return next(iter(stated.values()), "pinhole")
+    return next(iter(stated.values()), usual)
 
 
 def _as_taken(camera: CameraParameters, fields: Mapping[str, Any]) -> CameraParameters:

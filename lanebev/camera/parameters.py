@@ -11,6 +11,9 @@ from lanebev.geometry.distortion import DISTORTION_LENGTHS
 from lanebev.geometry.lens import invert_distortion
 
 _FOCAL_RANGE = (0.1, 20.0)  # times the longer image side: 160 deg fisheye to 3 deg telephoto
+OFF_CENTRE = 0.2
+"""Shares of the sides, more than any data set's principal point is off the centre."""
+
 _LONGEST_SIDE = 99_999  # px
 _LARGEST_XI = 100.0  # of the unified model; 1 is a parabolic mirror, fisheyes have 1 to 4
 
@@ -42,6 +45,22 @@ def centre_offset(matrix: Sequence[float], image_size: tuple[int, int]) -> float
     """
     (height, width), x, y = image_size, matrix[2], matrix[5]
     return max(abs(x / max(width, 1) - 0.5), abs(y / max(height, 1) - 0.5))
+
+
+def size_of_images(
+    whose: str, image_size: tuple[int, int] | None, known: tuple[int, int] | None, spread: int = 0
+) -> tuple[int, int] | None:
+    """Return the images' size, else the data set's.
+
+    Raises:
+        ValueError: they differ: the images were resized.
+    """
+    if image_size and known and max(abs(image_size[0] - known[0]), abs(image_size[1] - known[1])) > spread:
+        raise ValueError(
+            f"expected images of about {known[1]} x {known[0]} px, {whose}, got "
+            f"{image_size[1]} x {image_size[0]}; give them as they came, or the short YAML for the resized"
+        )
+    return image_size or known
 
 
 def checked(camera: CameraParameters, restated: bool = False) -> CameraParameters:

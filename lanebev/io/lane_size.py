@@ -154,6 +154,13 @@ def size_doubt(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> Siz
             "all points lie between 0 and 1; are they shares of the sides instead of pixels?",
             "multiply them by the sides",
         )
+    horizon = meeting_row(frames)
+    if horizon > y.max():
+        return SizeDoubt(
+            f"they meet at row {horizon:.0f}, below all of their points; are rows counted from below, or in "
+            "another order than the points?",
+            "count them from the image's first row",
+        )
     low = y.max() < _REACHED * height and x.max() < _REACHED * width
     if low or y.max() < _REACHED_DOWN * height:
         return SizeDoubt(
@@ -161,7 +168,6 @@ def size_doubt(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> Siz
             "of smaller images?",
             size,
         )
-    horizon = meeting_row(frames)
     if y.max() < _REACHED_UNCROPPED * height and horizon < _HIGHEST_HORIZON * height:
         rest = height - math.ceil(y.max())
         return SizeDoubt(

@@ -37,6 +37,13 @@ def test_settings_of_a_file_are_those_of_the_command_line(tmp_path):
     )
 
 
+def test_the_home_folder_may_be_written_as_in_a_shell(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    given = read_settings(_file(tmp_path, "source: ~/a/*.jpg\nout: ~/b\ncamera: a~/~.yaml\n"))
+    assert given == {"source": f"{tmp_path}/a/*.jpg", "out": f"{tmp_path}/b", "camera": "a~/~.yaml"}
+    assert vars(parser().parse_args(["demo", "--out=~/run"]))["out"] == f"{tmp_path}/run"
+
+
 def test_numbers_of_a_file_are_decimal_and_names_stay_as_they_are(tmp_path):
     """YAML 1.1 would read 8 s, 61 s and a flag."""
     text = "source: No\ncamera: 017\nstart: 010\nend: 12e1\nresume: 1:01\nno-video: yes\n"

@@ -255,7 +255,7 @@ ORBextractor.nFeatures: 1200
             json.dumps({"intrinsic": MATRIX}),
             "expected a camera of 1920 x 1280 px, OpenLane's, got a",
         ),
-        ("c.json", json.dumps({"intrinsic": {"fx": 1, "u0": 2}}), "intrinsic: expected rows, cols, dt, data"),
+        ("c.json", json.dumps({"intrinsic": {"fx": 1, "u0": 2}}), "fy: expected a value, got none"),
         (
             "c.json",
             json.dumps({"K": np.array(MATRIX).T.tolist(), "D": [], "width": 800, "height": 450}),

@@ -300,6 +300,14 @@ def test_lines_meet_at_the_horizon():
     assert math.isnan(meeting_row([FrameLines("0.png", parallel), FrameLines("1.png", parallel[:1])]))
 
 
+def test_rows_counted_from_below_are_noticed():
+    (frame,) = _entries()
+    flipped = [line._replace(points=line.points * [1, -1] + [0, 719]) for line in frame.lines]
+    assert f"they meet at row {719 - HORIZON:.0f}, below all of their points; are rows" in size_remark(
+        [frame._replace(lines=flipped)], (720, 1280)
+    )
+
+
 @pytest.mark.parametrize("top", [110, 180, 240, 280])
 def test_lanes_of_images_whose_top_was_cut_off_are_noticed(top):
     remark = size_remark(_moved(_entries(), 0, -top), (720, 1280))

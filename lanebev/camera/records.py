@@ -1,0 +1,125 @@
+"""Cameras of data sets in JSON: nuScenes, nuImages, OpenLane, Cityscapes, ONCE, A2D2, ZOD and DAIR-V2X.
+
+Each is a record with the camera matrix under a name of the data set's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+from lanebev.camera.choice import Readers, telling_names
+from lanebev.camera.formats import stated_model
+from lanebev.camera.parameters import OFF_CENTRE, CameraParameters, centre_offset, size_of_images
+from lanebev.camera.parsing import mapping, number, numbers, whole_number
+
+Record = Mapping[str, Any]
+
+
+class _Layout(NamedTuple):
+    """How a data set writes its cameras down.
+
+    Attributes:
+        whose: its name, for messages.
+        matrix: key of the camera matrix.
+        images: (height, width) px of its images, for records without a size.
+        sides: key of width and height in one list, px; else they have keys of their own.
+        model: its lens model, where the record names none.
+        rectified: key of the camera matrix of rectified images.
+    """
+
+    whose: str
+    matrix: str
+    images: tuple[int, int] = (0, 0)
+    sides: str = ""
+    model: str = "pinhole"
+    rectified: str = ""
+
+
+_LAYOUTS = (
+    _Layout("nuScenes'", "camera_intrinsic", (900, 1600)),
+    _Layout("OpenLane's", "intrinsic", (1280, 1920)),
+    _Layout("ONCE's", "cam_intrinsic", (1020, 1920)),
+    _Layout("A2D2's", "CamMatrixOriginal", sides="Resolution", rectified="CamMatrix"),
+    _Layout("ZOD's", "intrinsics", sides="image_dimensions", model="fisheye"),
+    _Layout("DAIR-V2X's", "cam_K", (1080, 1920)),
+)
+_CITYSCAPES = _Layout("Cityscapes'", "intrinsic", (1024, 2048))  # fx, fy, u0, v0 instead of the matrix
+_LENS_KEYS = (  # of nuImages, of several data sets, and of programs that write such records
+    "camera_distortion", "distortion", "Distortion", "cam_D", "D", "dist", "dist_coeff", "dist_coeffs",
+    "distortion_coeffs", "distortion_coefficients",
+)  # fmt: skip
+_PLACES = ("calib", "cameras")  # keys below which ONCE and A2D2 have their cameras
+
+
+def record_cameras(content: Any, image_size: tuple[int, int] | None, rectified: bool) -> Readers:
+    """Return what reads the cameras of a data set's JSON; nothing if there is none.
+
+    Their names are those of the file, nuScenes' tokens, or their places if these do not tell them apart.
+    """
+    if isinstance(content, list):
+        records = [each for each in content if isinstance(each, Mapping) and each.get("camera_intrinsic")]
+        named = dict(zip(telling_names([str(each.get("token")) for each in records]), records, strict=True))
+    elif _layout(content) and not _layout(content).sides:  # type: ignore[union-attr]
+        named = {"": content}
+    else:
+        places = [content, *(content[key] for key in _PLACES if isinstance(content.get(key), Mapping))]
+        named = {key: each for place in places for key, each in place.items() if _layout(each)}
+    return {name: partial(_read, record, image_size, rectified) for name, record in named.items()}
+
+
+def _layout(record: Any) -> _Layout | None:
+    """Return the layout of a record; None if it is no camera's."""
+    if not isinstance(record, Mapping):
+        return None
+    if isinstance(record.get("intrinsic"), Mapping):
+        return _CITYSCAPES
+    fits = (each for each in _LAYOUTS if record.get(each.matrix) and (not each.sides or each.sides in record))
+    return next(fits, None)
+
+
+def _read(record: Record, image_size: tuple[int, int] | None, rectified: bool) -> CameraParameters:
+    """Read a record; the lens beside the matrix counts, under any of its names."""
+    layout = _layout(record) or _LAYOUTS[0]
+    if rectified and layout.rectified:
+        matrix = numbers(record, layout.rectified, count=9)
+        return CameraParameters(matrix, [], "pinhole", _size(matrix, record, image_size, layout))
+    if layout is _CITYSCAPES:
+        intrinsic = mapping("intrinsic", record["intrinsic"])
+        fx, fy, cx, cy = (number(intrinsic, key) for key in ("fx", "fy", "u0", "v0"))
+        matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    else:
+        matrix = numbers(record, layout.matrix, count=9)
+    has_lens = any(record.get(key) is not None for key in _LENS_KEYS)
+    distortion = numbers(record, *_LENS_KEYS) if has_lens else []
+    model = "fisheye" if record.get("Lens") == "Fisheye" else stated_model(record, layout.model)
+    return CameraParameters(matrix, distortion, model, _size(matrix, record, image_size, layout))
+
+
+def _size(
+    matrix: list[float], record: Record, image_size: tuple[int, int] | None, layout: _Layout
+) -> tuple[int, int]:
+    """Return the size (height, width) that a record states; else the data set's, or that of the images.
+
+    Other programs write such records for images of other sizes. Images of another size are those of the
+    record if its principal point is less than half as far from their centre as from that of the data set's
+    images, in shares of the sides; else they were resized.
+
+    Raises:
+        ValueError: it states none, and the principal point is in the middle of neither.
+    """
+    if layout.sides:
+        width, height = numbers(record, layout.sides, count=2)
+        return round(height), round(width)
+    if record.get("width") is not None and record.get("height") is not None:
+        return whole_number(record, "height"), whole_number(record, "width")
+    offset = centre_offset(matrix, layout.images)
+    if image_size is not None and 2 * centre_offset(matrix, image_size) < offset:
+        return image_size
+    if image_size is None and offset > OFF_CENTRE:
+        raise ValueError(
+            f"expected a camera of {layout.images[1]} x {layout.images[0]} px, {layout.whose}, got a "
+            f"principal point of {matrix[2]:g}, {matrix[5]:g}; add width and height beside it"
+        )
+    return size_of_images(layout.whose, image_size, layout.images) or layout.images
