@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from lanebev.camera.choice import chosen, split_name
@@ -26,13 +27,16 @@ from lanebev.camera.records import record_cameras
 from lanebev.camera.slam import camodocal, is_kalibr, is_orb_slam, kalibr_cameras, orb_slam_cameras
 from lanebev.numbers import read_text, shown
 
+_VIEWS = ("ret", "rvecs", "tvecs", "objpoints", "imgpoints")  # of a calibration, beside the camera
+
 
 def read_camera(
     path: str | Path, image_size: tuple[int, int] | None = None, rectified: bool = False
 ) -> CameraParameters:
     """Read a camera file of any of these kinds, told apart by what is in it.
 
-    - OpenCV's FileStorage (YAML, XML, JSON) by its calibration programs' keys;
+    - OpenCV's FileStorage (YAML, XML, JSON) by its calibration programs' keys, and ``mtx`` and ``dist`` of
+      its Python tutorial, also in NumPy's ``.npz``;
     - ROS ``camera_info`` (YAML or INI, or a message as ``rostopic``, ``ros2 topic`` and Foxglove print it),
       its ``roi`` and ``binning_x``, ``binning_y`` applied;
     - our short YAML: fx, fy, cx, cy, width, height, distortion, model;
@@ -46,7 +50,8 @@ def read_camera(
     from it, that is remarked on, or refused with COLMAP's and those of data sets in JSON.
 
     KITTI's object and odometry files and some data sets' JSON do not hold the image's size: it is then
-    ``image_size``, or the data set's.
+    ``image_size``, or the data set's. Other files without it are taken for ``image_size`` with a remark, if
+    the principal point is near the centre.
 
     Args:
         path: the file; the name of one of its cameras may follow after ``#``.
@@ -58,7 +63,9 @@ def read_camera(
     """
     path, name = split_name(path)
     try:
-        text = read_text(path, "replace")  # of comments and names in other encodings nothing is needed
+        arrays = _arrays(path) if path.suffix.lower() == ".npz" else None
+        # of comments and names in other encodings nothing is needed
+        text = read_text(path, "replace") if arrays is None else ""
     except ValueError as error:
         raise ValueError(f"camera file {path}: expected a readable camera file, got: {error}") from error
     try:
@@ -67,10 +74,21 @@ def read_camera(
         elif is_kitti(text) or (path.suffix.lower() == ".txt" and "width" not in text):
             camera = checked(chosen(kitti_cameras(text, image_size), name, has_usual=True))
         else:
-            camera = _camera_of(parse_documents(text), image_size, rectified, name)
+            documents = parse_documents(text) if arrays is None else [arrays]
+            camera = _camera_of(documents, image_size, rectified, name)
         return without_lens(camera) if rectified else camera
     except ValueError as error:
         raise ValueError(f"camera file {path}: {' '.join(str(error).split())}") from error
+
+
+def _arrays(path: Path) -> dict[str, Any]:
+    """Return the arrays of NumPy's ``savez``, but for those of the views of a calibration."""
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name].tolist() for name in arrays.files if name not in _VIEWS}
+    except Exception as error:  # what damaged bytes make of zipfile and NumPy
+        reason = " ".join(str(error).split())[:100] or type(error).__name__
+        raise ValueError(f"no arrays of numbers as by numpy.savez: {reason}") from error
 
 
 def _camera_of(
@@ -117,7 +135,7 @@ def _camera(
         raise ValueError(f"expected no name after # for a file of one camera, got {shown(name)}")
     if "model_type" in content:
         return checked(camodocal(content))
-    return opencv_or_ros(content, rectified)
+    return opencv_or_ros(content, rectified, image_size)
 
 
 def camera_from_fields(fields: Mapping[str, Any], rectified: bool = False) -> CameraParameters:

@@ -1,4 +1,4 @@
-"""Camera files of OpenCV, ROS and our short YAML."""
+"""Camera files of OpenCV, of its Python tutorial, of ROS, and our short YAML."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from lanebev.camera.parsing import mapping, number, numbers, whole_number
 from lanebev.numbers import shown
 
 _SHORT_KEYS = {"fx", "fy", "cx", "cy", "width", "height", "distortion", "model"}
-_MATRIX_KEYS = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "k")
-_DISTORTION_KEYS = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "D", "d")
+_MATRIX_KEYS = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "k", "mtx")
+DISTORTION_KEYS = (
+    "distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "D", "d", "dist", "dist_coeff",
+    "dist_coeffs",
+)  # fmt: skip
 _PROJECTION_KEYS = ("projection_matrix", "P", "p")
 _ROTATION_KEYS = ("rectification_matrix", "R", "r")
 _WIDTH_KEYS = ("image_width", "image_Width", "width")
@@ -26,12 +29,12 @@ _IGNORED_KEYS = {
     "calibration_time", "nframes", "nFrames", "nr_of_frames", "nrOfFrames", "board_width", "board_height",
     "board_size", "square_size", "marker_size", "aspectRatio", "fix_aspect_ratio", "flags", "flagValue",
     "fisheye_model", "avg_reprojection_error", "per_view_reprojection_errors", "extrinsic_parameters",
-    "image_points", "grid_points",
+    "image_points", "grid_points", "ret", "rvecs", "tvecs",
     # our own calibration.yaml
     "mount", "vehicle_from_camera", "quaternion_xyzw",
 }  # fmt: skip
 _KNOWN_KEYS = {
-    *_MATRIX_KEYS, *_DISTORTION_KEYS, *_PROJECTION_KEYS, *_ROTATION_KEYS, *_WIDTH_KEYS, *_HEIGHT_KEYS,
+    *_MATRIX_KEYS, *DISTORTION_KEYS, *_PROJECTION_KEYS, *_ROTATION_KEYS, *_WIDTH_KEYS, *_HEIGHT_KEYS,
     *_MODEL_KEYS, *_IGNORED_KEYS, "binning_x", "binning_y", "roi", "xi",
 }  # fmt: skip
 _MODELS = {
@@ -45,10 +48,13 @@ _MODELS = {
     "omni": "omni",
     "mei": "omni",
 }
+_OFF_CENTRE = 0.1  # shares of the sides, more than which a file without a size is of other images
 _IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
-def opencv_or_ros(fields: Mapping[str, Any], rectified: bool) -> CameraParameters:
+def opencv_or_ros(
+    fields: Mapping[str, Any], rectified: bool, image_size: tuple[int, int] | None = None
+) -> CameraParameters:
     """Read the keys of OpenCV's calibration programs, of ROS's ``camera_info``, or our short ones.
 
     ROS's ``roi`` (in pixels of the full resolution) and ``binning_x``, ``binning_y`` are applied, in this
@@ -60,6 +66,7 @@ def opencv_or_ros(fields: Mapping[str, Any], rectified: bool) -> CameraParameter
     Args:
         fields: fields of the file.
         rectified: return the camera of rectified images: the projection matrix P without a lens.
+        image_size: (height, width) px of the images, for a file without a size.
 
     Raises:
         ValueError: an unknown key, or a value that no real camera has.
@@ -71,6 +78,8 @@ def opencv_or_ros(fields: Mapping[str, Any], rectified: bool) -> CameraParameter
         case = ", in small letters" if unknown[0].lower() in _SHORT_KEYS else ""
         words = f"unknown key {shown(unknown[0])}; expected {known}{case}, or those of OpenCV or ROS"
         raise ValueError(words)
+    if image_size and not any(fields.get(key) is not None for key in (*_WIDTH_KEYS, *_HEIGHT_KEYS)):
+        return _of_images(fields, rectified, image_size)
     if short:
         return checked(_short(fields, rectified))
     size = (whole_number(fields, *_HEIGHT_KEYS), whole_number(fields, *_WIDTH_KEYS))
@@ -78,13 +87,30 @@ def opencv_or_ros(fields: Mapping[str, Any], rectified: bool) -> CameraParameter
         camera = CameraParameters(_projection(fields), [], "pinhole", size)
         return _as_taken(checked(camera, _restates(fields)), fields)
     matrix = numbers(fields, *_MATRIX_KEYS, count=9)
-    distortion = numbers(fields, *_DISTORTION_KEYS)
+    distortion = numbers(fields, *DISTORTION_KEYS)
     model = stated_model(fields)
     if fields.get("xi") is not None:
         xi = numbers(fields, "xi", count=1) if not isinstance(fields["xi"], str) else [number(fields, "xi")]
         distortion = [*xi, *(distortion or [0.0] * 4)]
     camera = CameraParameters(matrix, distortion, model, size)
     return _as_taken(checked(camera, _restates(fields)), fields)
+
+
+def _of_images(fields: Mapping[str, Any], rectified: bool, image_size: tuple[int, int]) -> CameraParameters:
+    """Read a file that states no size as one for these images, with a remark.
+
+    Raises:
+        ValueError: its principal point is not near their centre, so that it may be of others.
+    """
+    height, width = image_size
+    camera = opencv_or_ros({**fields, "width": width, "height": height}, rectified)
+    if centre_offset(camera.matrix, image_size) > _OFF_CENTRE:
+        raise ValueError(
+            f"width and height: expected those of the images that it was calibrated with, got none, and the "
+            f"principal point {camera.matrix[2]:g}, {camera.matrix[5]:g} is not in the middle of "
+            f"{width} x {height} px; add them"
+        )
+    return camera._replace(remark=f"the file states no size of images; {width} x {height} px are taken")
 
 
 def _short(fields: Mapping[str, Any], rectified: bool) -> CameraParameters:

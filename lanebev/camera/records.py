@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from lanebev.camera.choice import Readers, telling_names
-from lanebev.camera.formats import stated_model
+from lanebev.camera.formats import DISTORTION_KEYS, stated_model
 from lanebev.camera.parameters import OFF_CENTRE, CameraParameters, centre_offset, size_of_images
 from lanebev.camera.parsing import mapping, number, numbers, whole_number
 
@@ -46,10 +46,7 @@ _LAYOUTS = (
     _Layout("DAIR-V2X's", "cam_K", (1080, 1920)),
 )
 _CITYSCAPES = _Layout("Cityscapes'", "intrinsic", (1024, 2048))  # fx, fy, u0, v0 instead of the matrix
-_LENS_KEYS = (  # of nuImages, of several data sets, and of programs that write such records
-    "camera_distortion", "distortion", "Distortion", "cam_D", "D", "dist", "dist_coeff", "dist_coeffs",
-    "distortion_coeffs", "distortion_coefficients",
-)  # fmt: skip
+_LENS_KEYS = (*DISTORTION_KEYS, "camera_distortion", "distortion", "Distortion", "cam_D", "distortion_coeffs")
 _PLACES = ("calib", "cameras")  # keys below which ONCE and A2D2 have their cameras
 
 

@@ -44,7 +44,9 @@ _ORB_SLAM_MODELS = {  # Camera.type -> model and coefficients
 
 def is_kalibr(fields: Mapping[str, Any]) -> bool:
     """Tell whether the keys are those of Kalibr's camera chain, or of one camera as in EuRoC."""
-    return "intrinsics" in fields or any(re.fullmatch(r"cam\d+", key, re.ASCII) for key in fields)
+    return {"intrinsics", "camera_model"} <= fields.keys() or any(
+        re.fullmatch(r"cam\d+", key, re.ASCII) for key in fields
+    )
 
 
 def kalibr_cameras(fields: Mapping[str, Any]) -> Readers:

@@ -1,9 +1,11 @@
-"""Cameras of data sets in JSON: nuImages, Cityscapes, ONCE, A2D2, ZOD, DAIR-V2X and others like OpenLane's."""
+"""Cameras of data sets in JSON: nuImages, Cityscapes, ONCE, A2D2, ZOD, DAIR-V2X; OpenCV's Python tutorial."""
 
 import json
 
+import numpy as np
 import pytest
 import torch
+import yaml
 
 from lanebev import Camera
 
@@ -33,7 +35,7 @@ ZOD_FRONT = {
     "distortion": KANNALA_BRANDT,
     "undistortion": [9, 9, 9, 9],
 }
-DAIR = {"cam_K": sum(_matrix(2183, 940, 567), []), "cam_D": LENS, "width": 1920, "height": 1080}
+DAIR = {"cam_K": [2183, 0, 940, 0, 2185, 567, 0, 0, 1], "cam_D": LENS, "width": 1920, "height": 1080}
 LIKE_OPENLANE = {"intrinsic": _matrix(1000, 960, 540), "width": 1920, "height": 1080}
 
 
@@ -96,3 +98,27 @@ def test_rectified_images_of_a_lens_without_such_a_matrix_are_refused(tmp_path):
     (tmp_path / "c.json").write_text(json.dumps([NUIMAGES]))
     with pytest.raises(ValueError, match="expected P for rectified images, got none"):
         Camera.from_file(tmp_path / "c.json", rectified=True)
+
+
+@pytest.mark.parametrize(("matrix", "distortion"), [("mtx", "dist"), ("camera_matrix", "dist_coeff")])
+def test_results_of_opencvs_python_tutorial_are_read_for_images_of_a_given_size(tmp_path, matrix, distortion):
+    views = [np.zeros(2), np.zeros(3)]  # of two images, which an array has as objects
+    content = {matrix: _matrix(900, 630, 370), distortion: [LENS]}
+    np.savez(tmp_path / "c.npz", **content, rvecs=np.array(views, dtype=object))
+    (tmp_path / "c.json").write_text(json.dumps({**content, "rvecs": []}))
+    (tmp_path / "c.yaml").write_text(yaml.safe_dump(content))
+    expected = Camera.from_parameters(900, 902, 630, 370, 1280, 720, LENS)
+    for name in ("c.npz", "c.json", "c.yaml"):
+        camera = Camera.from_file(tmp_path / name, image_size=(720, 1280))
+        assert torch.equal(camera.intrinsics, expected.intrinsics)
+        assert torch.equal(camera.distortion, expected.distortion)
+        assert camera.remark == "the file states no size of images; 1280 x 720 px are taken"
+        with pytest.raises(ValueError, match="image_height: expected a value, got none; add the entry"):
+            Camera.from_file(tmp_path / name)
+        with pytest.raises(
+            ValueError, match="got none, and the principal point 630, 370 is not in the middle"
+        ):
+            Camera.from_file(tmp_path / name, image_size=(1080, 1920))
+    np.savez(tmp_path / "c.npz", **content, width=1280, height=720)
+    camera = Camera.from_file(tmp_path / "c.npz", image_size=(1080, 1920))
+    assert (camera.image_size, camera.remark) == ((720, 1280), "")
