@@ -13,8 +13,23 @@ IMAGE_TYPES = (
     "sensor_msgs/msg/Image",
     "foxglove.CompressedImage",
     "foxglove.RawImage",
+    "foxglove_msgs/msg/CompressedImage",
+    "foxglove_msgs/msg/RawImage",
 )
-LENS_TYPES = ("sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration")
+LENS_TYPES = (
+    "sensor_msgs/msg/CameraInfo",
+    "foxglove.CameraCalibration",
+    "foxglove_msgs/msg/CameraCalibration",
+)
+VIDEO_TYPES = (
+    "foxglove.CompressedVideo",
+    "foxglove_msgs/msg/CompressedVideo",
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
+)
+"""Types of messages with packets of a video, which are not read."""
+
+_ROS = (("cdr", "ros2msg"), ("ros1", "ros1msg"))  # encodings of messages and of their types
+_KNOWN = {*IMAGE_TYPES, *LENS_TYPES, *VIDEO_TYPES}
 
 
 class Topic(NamedTuple):
@@ -35,7 +50,7 @@ class Bag(Protocol):
     """A bag that is open.
 
     Attributes:
-        topics: topics of images and lenses.
+        topics: topics of images, lenses and videos.
     """
 
     topics: list[Topic]
@@ -58,6 +73,11 @@ def open_bag(path: Path) -> Iterator[Bag]:
                 f"bag {path}: expected the library {module}, got none; install it with "
                 "pip install 'lanebev[formats]'"
             )
+    if path.suffix.lower() == ".db3" or (path.is_dir() and not (path / "metadata.yaml").is_file()):
+        raise ValueError(
+            f"bag {path}: expected the folder of a ROS 2 bag with its metadata.yaml, got none; give the "
+            "folder of the .db3 file, after ros2 bag reindex if it has none"
+        )
     try:
         if path.suffix.lower() == ".mcap":
             with open(path, "rb") as file:
@@ -95,8 +115,7 @@ class _RosBag:
 
     def __init__(self, reader: Any) -> None:
         self._reader = reader
-        known = {*IMAGE_TYPES, *LENS_TYPES}
-        connections = [each for each in reader.connections if each.msgtype in known]
+        connections = [each for each in reader.connections if each.msgtype in _KNOWN]
         self.topics = _joined(Topic(each.topic, each.msgtype, each.msgcount) for each in connections)
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
@@ -106,13 +125,13 @@ class _RosBag:
 
 
 class _Mcap:
-    """An MCAP file by mcap: messages of ROS 2 (CDR) by rosbags' types, of Foxglove by protobuf."""
+    """An MCAP file by mcap: messages of ROS by rosbags' types, of Foxglove by protobuf."""
 
     def __init__(self, file: Any) -> None:
         from mcap.reader import make_reader
         from mcap_protobuf.decoder import DecoderFactory
 
-        factories = [DecoderFactory(), _CdrFactory()]
+        factories = [DecoderFactory(), _RosFactory()]
         self._reader = make_reader(file, validate_crcs=True, decoder_factories=factories)
         summary = self._reader.get_summary()
         if summary is None or summary.statistics is None:
@@ -121,9 +140,9 @@ class _Mcap:
         topics = []
         for number, channel in summary.channels.items():
             schema = summary.schemas.get(channel.schema_id)
-            if schema is not None and schema.name in {*IMAGE_TYPES, *LENS_TYPES}:
+            if schema is not None and (kind := _ros_2_name(schema.name)) in _KNOWN:
                 count = figures.channel_message_counts.get(number, 0)
-                topics.append(Topic(channel.topic, schema.name, count))
+                topics.append(Topic(channel.topic, kind, count))
         self.topics = _joined(topics)
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
@@ -131,15 +150,21 @@ class _Mcap:
             yield message.log_time, decoded
 
 
-class _CdrFactory:
-    """Gives mcap's reader what decodes messages of ROS 2, as its ``DecoderFactory`` does."""
+def _ros_2_name(name: str) -> str:
+    """Return the name of a type of messages as in ROS 2, where ROS 1 has ``sensor_msgs/Image``."""
+    return name if name.count("/") != 1 else name.replace("/", "/msg/")
+
+
+class _RosFactory:
+    """Gives mcap's reader what decodes messages of ROS 1 and 2, as its ``DecoderFactory`` does."""
 
     def decoder_for(self, message_encoding: str, schema: Any) -> Any:
         """Return what decodes the messages of a schema; None for those of others."""
-        if message_encoding != "cdr" or schema is None or schema.encoding != "ros2msg":
+        if schema is None or (message_encoding, schema.encoding) not in _ROS:
             return None
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-        store = get_typestore(Stores.EMPTY)
-        store.register(get_types_from_msg(schema.data.decode(), schema.name))
-        return lambda data: store.deserialize_cdr(data, schema.name)
+        store, name = get_typestore(Stores.EMPTY), _ros_2_name(schema.name)
+        store.register(get_types_from_msg(schema.data.decode(), name))
+        decode = store.deserialize_cdr if message_encoding == "cdr" else store.deserialize_ros1
+        return lambda data: decode(data, name)

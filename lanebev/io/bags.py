@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.io.bag_messages import IMAGE_TYPES, LENS_TYPES, Bag, Topic, open_bag
+from lanebev.io.bag_messages import IMAGE_TYPES, LENS_TYPES, VIDEO_TYPES, Bag, Topic, open_bag
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import ALL, Frame
 from lanebev.io.images import is_damaged_jpeg
@@ -216,7 +216,9 @@ def _image_topic(source: str, topics: Sequence[Topic], wanted: str | None) -> To
     if wanted is not None and wanted not in found:
         raise ValueError(f"bag {source}: expected images on {wanted}, got them on: {names}")
     if wanted is None and len(found) != 1:
-        remedy = "; choose one with --topic" if found else ""
+        videos = ", ".join(each.name for each in topics if each.kind in VIDEO_TYPES and each.size)
+        packets = f"; make a video file of {videos}, whose packets are not read" if videos else ""
+        remedy = "; choose one with --topic" if found else packets
         raise ValueError(f"bag {source}: expected one topic of images, got: {names}{remedy}")
     return next(iter(found.values())) if wanted is None else found[wanted]
 

@@ -23,6 +23,8 @@ def without_login(source: str) -> str:
 
 
 def is_bag(source: str) -> bool:
-    """Return whether a source is an MCAP file, a ROS bag, or the folder of a ROS 2 bag."""
+    """Return whether a source is an MCAP file, a ROS bag, or the folder of a ROS 2 bag or a file of it."""
     path = Path(source)
-    return path.suffix.lower() in (".mcap", ".bag") or (path / "metadata.yaml").is_file()
+    if path.suffix.lower() in (".mcap", ".bag", ".db3") or (path / "metadata.yaml").is_file():
+        return True
+    return path.is_dir() and any(path.glob("*.db3"))

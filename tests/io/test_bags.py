@@ -8,9 +8,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lanebev import Camera
 from lanebev.app.config import RunConfig
@@ -415,3 +416,67 @@ def test_any_bytes_are_one_line(bags, tmp_path_factory, data):
     assert problem.startswith("bag ")
     assert "\n" not in problem
     assert len(frames) <= COUNT + 1
+
+
+def _mcap(path, name, kinds, messages):
+    """Write an MCAP file with messages (bytes) of one type, whose encodings are ``kinds``."""
+    with open(path, "wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        schema = writer.register_schema(name, kinds[1], kinds[2].encode())
+        channel = writer.register_channel("/cam/images", kinds[0], schema)
+        for number, data in enumerate(messages):
+            time = round(1e9 * (START + 0.1 * number))
+            writer.add_message(channel, time, data, time)
+        writer.finish()
+    return str(path)
+
+
+def test_messages_of_ros_1_in_an_mcap_file(tmp_path):  # as mcap convert drive.bag writes them
+    store, name = get_typestore(Stores.ROS1_NOETIC), "sensor_msgs/msg/CompressedImage"
+    header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
+    messages = []
+    for number in range(COUNT):
+        made = _compressed(number)
+        time = stamp(made.header.stamp.sec, made.header.stamp.nanosec)
+        message = store.types[name](header(number, time, "camera"), "png", made.data)
+        messages.append(bytes(store.serialize_ros1(message, name)))
+    definition = store.generate_msgdef(name, ros_version=1)[0]
+    path = _mcap(
+        tmp_path / "a.mcap", "sensor_msgs/CompressedImage", ("ros1", "ros1msg", definition), messages
+    )
+    frames = list(open_bag_source(path))
+    assert [frame.image[0, 0, 0] for frame in frames] == [20 * number for number in range(COUNT)]
+    assert [frame.time for frame in frames] == pytest.approx(np.arange(COUNT) / 10, abs=1e-6)
+
+
+def test_foxgloves_messages_in_ros_2(tmp_path):
+    name = "foxglove_msgs/msg/CompressedImage"
+    fields = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(fields, name))
+    with Writer(tmp_path / "bag", version=9) as writer:
+        connection = writer.add_connection("/cam", name, typestore=store)
+        for number in range(COUNT):
+            made = _compressed(number)
+            message = store.types[name](made.header.stamp, "camera", made.data, "png")
+            writer.write(connection, round(1e9 * START) + number, store.serialize_cdr(message, name))
+    frames = list(open_bag_source(str(tmp_path / "bag")))
+    assert [frame.image[0, 0, 0] for frame in frames] == [20 * number for number in range(COUNT)]
+    assert [frame.time for frame in frames] == pytest.approx(np.arange(COUNT) / 10, abs=1e-6)
+
+
+def test_packets_of_a_video_are_named(tmp_path):
+    path = _mcap(tmp_path / "a.mcap", "foxglove.CompressedVideo", ("protobuf", "protobuf", ""), [b"x"])
+    with pytest.raises(ValueError, match="got: none; make a video file of /cam/images, whose packets are"):
+        open_bag_source(path)
+
+
+def test_a_file_of_a_ros_2_bag_and_a_folder_without_metadata_say_what_to_give(bags, tmp_path):
+    file = next(bags["folder"].glob("*.db3"))
+    (tmp_path / "a.db3").write_bytes(file.read_bytes())
+    for source in (file, tmp_path):
+        with pytest.raises(
+            ValueError, match=r"with its metadata.yaml, got none; give the folder of the .db3"
+        ):
+            make_source(RunConfig(str(source), ""))
