@@ -164,10 +164,11 @@ def match_image_size(camera: Camera, source: FrameSource) -> FrameSource:
     if any(image_size(path) == camera.image_size for path in source.paths[:_LOOKED_AT]):
         return replace(source, image_size=camera.image_size)
     (height, width), (rows, columns) = camera.image_size, source.image_size
-    turned = (
-        "; was it calibrated before the images were turned?" if (height, width) == (columns, rows) else ""
-    )
+    words = {
+        (columns, rows): "; was it calibrated before the images were turned?",
+        (rows, columns / 2): "; are the images of two cameras side by side? cut out one",
+    }
     raise ValueError(
         f"camera: expected one for the source's {columns} x {rows} px, got one for {width} x {height}; "
-        f"give the calibration of these images or resize them{turned}"
+        f"give the calibration of these images or resize them{words.get((height, width), '')}"
     )

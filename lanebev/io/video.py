@@ -39,6 +39,7 @@ from lanebev.io.image_files import (
 )
 from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
 from lanebev.io.images import IMAGE_SUFFIXES, image_size, is_image, read_image, stated_size, write_png
+from lanebev.io.side_by_side import halves_remark
 from lanebev.io.source_names import SCHEMES
 from lanebev.io.video_remarks import LONGEST_STEP, appended_remark, gap_remark, restart_remark, stream_remarks
 from lanebev.io.video_writer import VideoWriter
@@ -111,7 +112,7 @@ def _address_remedy(source: str) -> str:
 def _image_source(source: str, paths: Sequence[str], fps: Fraction | None, left_out: str = "") -> FrameSource:
     image = _typical_image(paths)
     size, times = image.shape[:2], times_from_names(paths)
-    remarks = [left_out, _dark_remark(image)]
+    remarks = [left_out, _dark_remark(image), halves_remark(image)]
     rate = fps or DEFAULT_FPS
     if times:
         own = 1 / Fraction(median(np.diff(times).tolist())).limit_denominator(1_000_000)
@@ -170,9 +171,10 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
         fps = own if timed else stated or own
         lost, first, frame = _first_whole(source, decoded(container, stream))
         matrix = display_matrix(frame)
-        size = rgb(frame, matrix).shape[:2]
+        image = rgb(frame, matrix)
+        size = image.shape[:2]
         aspect = pixel_aspect(stream, frame, size)
-        problems = stream_remarks(container, frame, size)
+        problems = list(filter(None, stream_remarks(container, frame, image)))
     with open_video(source) as container:  # the header's count includes frames that an edit list cuts
         stream = video_stream(container)
         begin, tick = stream.start_time or 0, stream.time_base or 1 / fps

@@ -11,9 +11,12 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
 import av
+import numpy as np
+from numpy.typing import NDArray
 
 from lanebev.io.decoding import moving_pictures
 from lanebev.io.rising_clock import REORDERED
+from lanebev.io.side_by_side import halves_remark
 
 LONGEST_STEP = 60  # s between two frames of a drive
 _HEAD = 8  # bytes, which tell what kind of file it is
@@ -23,16 +26,16 @@ _OF_TWO_CAMERAS = range(1, 8)  # AVStereo3DType: side by side, one above the oth
 
 
 def stream_remarks(
-    container: av.container.InputContainer, frame: av.VideoFrame, size: tuple[int, int]
+    container: av.container.InputContainer, frame: av.VideoFrame, image: NDArray[np.uint8]
 ) -> list[str]:
     """Return what to say of a video by its streams and its first frame.
 
     Args:
         container: the video.
         frame: its first whole frame.
-        size: (height, width) px of the frame as shown.
+        image: the frame as shown, (H, W, 3).
     """
-    remarks = []
+    remarks, size = [], image.shape[:2]
     if others := len(moving_pictures(container)) - 1:
         remarks.append(f"it has {others} more video streams; that of {size[1]} x {size[0]} px is used")
     if frame.interlaced_frame:
@@ -45,7 +48,7 @@ def stream_remarks(
         remarks.append("its header says 360 degrees; cut out a pinhole view, as by ffmpeg -vf v360")
     if kinds.get("STEREO3D") in _OF_TWO_CAMERAS:
         remarks.append("its header says that frames have the images of two cameras; crop them to one")
-    return remarks
+    return [*remarks, halves_remark(image)]
 
 
 def appended_remark(container: av.container.InputContainer, end: int) -> str:
