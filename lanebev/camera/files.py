@@ -23,10 +23,12 @@ from lanebev.camera.datasets import (
 from lanebev.camera.formats import opencv_or_ros, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
 from lanebev.camera.parsing import parse_documents
+from lanebev.camera.programs import gyroflow, matlab
 from lanebev.camera.records import record_cameras
 from lanebev.camera.slam import camodocal, is_kalibr, is_orb_slam, kalibr_cameras, orb_slam_cameras
 from lanebev.numbers import read_text, shown
 
+_BY_KEY = {"RadialDistortion": matlab, "fisheye_params": gyroflow, "model_type": camodocal}
 _VIEWS = ("ret", "rvecs", "tvecs", "objpoints", "imgpoints")  # of a calibration, beside the camera
 
 
@@ -43,6 +45,7 @@ def read_camera(
     - Kalibr's camchain, EuRoC's ``sensor.yaml``, CamOdoCal's YAML (VINS, KITTI-360), the
       settings of ORB-SLAM;
     - KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt``: rectified images (``P_rect_02``, ``P2``);
+    - JSON of MATLAB and of Gyroflow, see :mod:`lanebev.camera.programs`;
     - JSON of data sets, see :mod:`lanebev.camera.records`;
     - COLMAP's ``cameras.txt``.
 
@@ -133,8 +136,9 @@ def _camera(
         return checked(chosen(orb_slam_cameras(content, rectified), name, has_usual=True))
     if name is not None:
         raise ValueError(f"expected no name after # for a file of one camera, got {shown(name)}")
-    if "model_type" in content:
-        return checked(camodocal(content))
+    for key, read in _BY_KEY.items():
+        if key in content:
+            return checked(read(content))
     return opencv_or_ros(content, rectified, image_size)
 
 
