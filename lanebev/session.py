@@ -123,31 +123,15 @@ class Session:
         check_type("model", model, LaneBEV)
         check_type("calibrator", calibrator, Calibrator)
         check_type("grid", grid, BEVGrid)
-        for name, value in (("lane_width", lane_width), ("lane_width_std", lane_width_std)):
-            if value is not None:
-                check_number(name, value)
-        check_number("focal_std", focal_std)
-        check_number("polyline_sigma", polyline_sigma)
         if colours not in ("bgr", "rgb"):
             raise ValueError(f"colours: expected 'bgr' or 'rgb', got {colours!r}")
-        if not 0.0 <= focal_std < 1.0:
-            raise ValueError(f"focal_std: expected a fraction of the focal length, 0 to 1, got {focal_std}")
-        if not (math.isfinite(polyline_sigma) and polyline_sigma > 0):
-            raise ValueError(f"polyline_sigma: expected more than 0 px, got {polyline_sigma}")
+        _check_numbers(lane_width, lane_width_std, focal_std, polyline_sigma)
         self.camera, self.grid, self.colours, self.device = camera, grid, colours, usable_device(device)
         self.polyline_sigma = polyline_sigma
         self._model = model
         if calibrator is None:
             calibrator = JointCalibrator() if model is None else _calibrator_of(model)
-        if lane_width_std is None and calibrator.lane_width_std:
-            lane_width_std = 0.0  # the calibrator's covariance contains it already
-        width, width_std = lane_width_prior(lane_width, lane_width_std)
-        check_lane_width_prior(width, width_std, ("lane_width", "lane_width_std"))
-        if width_std and calibrator.lane_width_std:
-            raise ValueError(
-                f"lane_width_std: expected it once, got {width_std:g} m beside the calibrator's "
-                f"{calibrator.lane_width_std:g} m; leave one out"
-            )
+        width, width_std = _lane_width_of(calibrator, lane_width, lane_width_std)
         self._parts: tuple[Any, ...] = (calibrator, camera, width, float(focal_std), width_std)
         for remark in camera_remarks(camera):
             logger.warning(remark)
@@ -282,6 +266,41 @@ class Session:
             if words and not self._doubt:  # once, as long as it lasts
                 logger.warning(words)
             self._doubt, self._drawn = words, []
+
+
+def _check_numbers(
+    lane_width: float | None, lane_width_std: float | None, focal_std: float, polyline_sigma: float
+) -> None:
+    """Raise TypeError or ValueError unless these are numbers, and the last two in their ranges."""
+    for name, value in (("lane_width", lane_width), ("lane_width_std", lane_width_std)):
+        if value is not None:
+            check_number(name, value)
+    check_number("focal_std", focal_std)
+    check_number("polyline_sigma", polyline_sigma)
+    if not 0.0 <= focal_std < 1.0:
+        raise ValueError(f"focal_std: expected a fraction of the focal length, 0 to 1, got {focal_std}")
+    if not (math.isfinite(polyline_sigma) and polyline_sigma > 0):
+        raise ValueError(f"polyline_sigma: expected more than 0 px, got {polyline_sigma}")
+
+
+def _lane_width_of(
+    calibrator: Calibrator[Any], lane_width: float | None, lane_width_std: float | None
+) -> tuple[float, float]:
+    """Return the lane width and its standard deviation, m, as the session must add its effect.
+
+    Raises:
+        ValueError: out of range, or a standard deviation beside the calibrator's own.
+    """
+    if lane_width_std is None and calibrator.lane_width_std:
+        lane_width_std = 0.0  # the calibrator's covariance contains it already
+    width, width_std = lane_width_prior(lane_width, lane_width_std)
+    check_lane_width_prior(width, width_std, ("lane_width", "lane_width_std"))
+    if width_std and calibrator.lane_width_std:
+        raise ValueError(
+            f"lane_width_std: expected it once, got {width_std:g} m beside the calibrator's "
+            f"{calibrator.lane_width_std:g} m; leave one out"
+        )
+    return width, width_std
 
 
 def _calibrator_of(model: LaneBEV) -> Calibrator[Any]:

@@ -12,7 +12,6 @@ from types import TracebackType
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from lanebev.app.concurrency import Background
 from lanebev.app.kept import KeptNumbers, KeptRows
@@ -28,7 +27,6 @@ from lanebev.io.covariances import write_covariances
 from lanebev.io.lanes import tusimple_line
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video import Frame, VideoWriter, write_png
-from lanebev.observation.segments import LaneSegments
 from lanebev.report.lane_curves import lane_curves
 from lanebev.report.measure import measure_boundaries, select_inliers
 from lanebev.report.moments import MomentSampler
@@ -188,56 +186,60 @@ class Recorder:
 
     @torch.inference_mode()
     def _draw(self, done: Recorded) -> None:
-        frame, (segments, calibration, reasons, vertical) = done.frame, done.estimate
+        """Write a frame's lanes and pictures, and keep what the report shows of it."""
+        segments, calibration, _, vertical = done.estimate
         curves = lane_curves(segments, calibration, self.camera, vertical)
-        line = tusimple_line(done.name, *curves, *done.seen)
-        self._lanes.write(line + "\n")
-        before, after = self._before(calibration), calibration.extrinsics
+        self._lanes.write(tusimple_line(done.name, *curves, *done.seen) + "\n")
+        before = self._before(calibration)
+        self._widths.append(self._lane_widths(done.estimate, before))
+        views = self._bird_views(done, before)
+        panels = self._panels(done, tuple(views.values()))
+        names = ["image", *views]
+        number = done.frame.number
+        self._moments.add(number, dict(zip(names, panels, strict=True)), self._scores(self.rows[number]))
+        self._write_pictures(done.frame, views["after"].bev, joined(panels))
+
+    def _lane_widths(self, estimate: Estimate, before: Extrinsics | None) -> NDArray[np.float64]:
+        """Measure the lanes' widths (2, L-1) in the views with the fixed and with the estimated pose."""
+        segments, calibration, _, vertical = estimate
         intrinsics = self.camera.intrinsics[None].to(segments.endpoints)
         lanes = select_inliers(segments, calibration.inliers)
-        widths = [self._measure(lanes, intrinsics, *road) for road in ((before, None), (after, vertical))]
-        self._widths.append(np.stack(widths))
+        after = measure_boundaries(
+            lanes, intrinsics, calibration.extrinsics, vertical_curvature=vertical
+        ).widths
+        if before is None:
+            return np.stack([np.full_like(after, np.nan), after])
+        return np.stack([measure_boundaries(lanes, intrinsics, before).widths, after])
+
+    def _bird_views(self, done: Recorded, before: Extrinsics | None) -> dict[str, Panel]:
+        """Make the views with the fixed pose, if it is known, and with the estimated one."""
+        image, vertical = done.frame.image, done.estimate.vertical_curvature
+        pose = done.estimate.calibration.extrinsics
+        bev = bird_view(self.grid, image, self.camera, pose, vertical)
+        after = Panel("estimated pose", bev, pose, vertical)
+        if before is None:
+            return {"after": after}
+        coarse = bird_view(self._coarse, image, self.camera, before)
+        return {"before": Panel("fixed pose", coarse, before), "after": after}
+
+    def _panels(self, done: Recorded, views: tuple[Panel, ...]) -> list[NDArray[np.uint8]]:
+        """Draw the input, with the estimate and the reasons in words, and the views."""
+        frame, (segments, calibration, reasons, _) = done.frame, done.estimate
         image = frame.image if frame.image is not None else np.zeros((*self.camera.image_size, 3), np.uint8)
         place = frame.name if self.single or self.stills else f"frame {frame.number}   {frame.time:.2f} s"
-        bev = bird_view(self.grid, frame.image, self.camera, after, vertical)
-        views = {"after": Panel("estimated pose", bev, after, vertical)}
-        if before is not None:
-            coarse = bird_view(self._coarse, frame.image, self.camera, before)
-            views = {"before": Panel("fixed pose", coarse, before), **views}
         words = ", ".join(reason_words([str(reason.name) for reason in reasons]))
-        panels = draw_panels(
-            image,
-            self.camera,
-            segments,
-            calibration,
-            _shortened(place),
-            tuple(views.values()),
-            self.grid,
-            words,
-        )
-        names = ["image", *views]
-        scores = self._scores(self.rows[frame.number])
-        self._moments.add(frame.number, dict(zip(names, panels, strict=True)), scores)
-        picture = joined(panels)
+        headline = _shortened(place)
+        return draw_panels(image, self.camera, segments, calibration, headline, views, self.grid, words)
+
+    def _write_pictures(self, frame: Frame, bev: NDArray[np.uint8], overlay: NDArray[np.uint8]) -> None:
+        """Write the pictures of one image, or the next frames of the videos."""
         if self.single:
             write_png(self.path("bev.png"), bev)
-            write_png(self.path("overlay.png"), picture)
+            write_png(self.path("overlay.png"), overlay)
         elif self.videos:
             shown = None if self.stills else frame.time
             self._bev.write(bev, shown)
-            self._overlay.write(picture, shown)
-
-    def _measure(
-        self,
-        segments: LaneSegments,
-        intrinsics: Tensor,
-        pose: Extrinsics | None,
-        vertical_curvature: Tensor | None,
-    ) -> NDArray[np.float64]:
-        if pose is None:
-            return np.full(NUM_BOUNDARIES - 1, np.nan)
-        measured = measure_boundaries(segments, intrinsics, pose, vertical_curvature=vertical_curvature)
-        return measured.widths
+            self._overlay.write(overlay, shown)
 
 
 def _row(done: Recorded, estimate: Estimate) -> ExtrinsicsRow:

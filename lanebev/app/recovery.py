@@ -112,17 +112,17 @@ def recover_run(
 
 
 def observer_of_second_pass(
-    out: OutputFolder, observer: Observer, taken: Observer, source: FrameSource
+    out: OutputFolder, observer: Observer, reusing: Observer, source: FrameSource
 ) -> Observer:
     """Return an observer for a second pass, which reuses the detections in lanes.json of the first one.
 
     Args:
         out: output folder with the first pass's lanes.json, which is moved.
         observer: observer of the frames.
-        taken: result of :func:`recover_run` for it.
+        reusing: result of :func:`recover_run` for it.
         source: the frames.
     """
-    if not isinstance(taken, RecoveredObserver):
+    if not isinstance(reusing, RecoveredObserver):
         return observer
     (out / LANES_FILE).replace(out / _SEEN)
     return _named(whole_tusimple_lines(out / _SEEN), observer, source)

@@ -92,29 +92,29 @@ def run(
         if config.resume and problem:
             problem += backup_state(config.resume, out)
         progress = None if source.is_live else progress
-        taken = (
+        reusing = (
             observer_of_parts(parts, observer)
             if parts
             else recover_run(out, config, source, camera, observer)
         )
-        smoothed, second = None, taken
+        last_observer, smoothed = reusing, None
         if config.smooth:
-            smoothed = first_pass(config, source, tracker, taken, out, progress)
+            smoothed = first_pass(config, source, tracker, reusing, out, progress)
             source = replace(source, most=len(smoothed.poses))
             tracker, _ = resumed_tracker(config, camera)
-            second = observer_of_second_pass(out, observer, taken, source)
+            last_observer = observer_of_second_pass(out, observer, reusing, source)
         recorder = _recorder(config, source, camera, out)
-        doubts = (problem or resume_remark(config), observer.remark, *remarks(config, source, camera))
-        recorder.problems += filter(None, (source.problem, *doubts))
-        frames = observed_frames(source, second)
+        of_state = problem or resume_remark(config)
+        said = (source.problem, of_state, observer.remark, *remarks(config, source, camera))
+        recorder.problems += filter(None, said)
+        frames = observed_frames(source, last_observer)
         with recorder, closing(frames), ended_by_signals(source):
             for done in results(shown(frames, source, progress), config, source, tracker, smoothed):
                 recorder.add(done)
                 if viewer is not None:
-                    pose, lines = done.estimate.calibration.extrinsics, vertex_lines(done.seen.vertices)
-                    viewer.add(RecordedFrame(recorder.rows[-1], pose, lines), done.frame.image)
+                    viewer.add(_viewer_frame(recorder.rows[-1], done), done.frame.image)
         recorder.problems += source_remarks(source, files, len(recorder.rows))
-        facts = run_facts(config, source, camera) | facts_of(taken) | _save_tracker(tracker, camera, out)
+        facts = run_facts(config, source, camera) | facts_of(reusing) | _save_tracker(tracker, camera, out)
         logger.info("writing the report")
         report = recorder.finish(facts, Path(source.source).name, truth, tracker.mount)
         if config.formats:
@@ -145,6 +145,11 @@ def shown(
 ) -> Iterator[tuple[Frame, Observation]]:
     """Return the frames with their progress, if it is to be shown."""
     return progress(frames, source.taken_count) if progress else frames
+
+
+def _viewer_frame(row: ExtrinsicsRow, done: Recorded) -> RecordedFrame:
+    """Return what the viewer shows of a frame."""
+    return RecordedFrame(row, done.estimate.calibration.extrinsics, vertex_lines(done.seen.vertices))
 
 
 def _save_tracker(tracker: RunTracker, camera: Camera, out: OutputFolder) -> dict[str, str]:

@@ -69,11 +69,6 @@ def send(values: T, device: torch.device) -> T:
     return through_tables(lambda table: table.to(device, non_blocking=True), values)
 
 
-def row_of(values: T, index: int) -> T:
-    """Return row ``index`` of a (nested) NamedTuple of (B, ...) tensors, with the batch dimension."""
-    return take_rows(values, slice(index, index + 1))
-
-
 def concatenate_rows(parts: Sequence[T]) -> T:
     """Concatenate (nested) NamedTuples of (B, ...) tensors along the batch; all else is the first's."""
     joined = [

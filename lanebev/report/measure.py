@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from lanebev.types import NUM_BOUNDARIES, Extrinsics
 _MIN_VERTICES = 4
 _MIN_ROWS = 50.0  # px of the image that a boundary must cross: on fewer, its errors are correlated
 _MIN_STRETCH = 5.0  # m of road that a boundary must cover
+_REWEIGHTINGS = 3
 _LEAST_SCALE = 1e-6  # of the residuals in sigmas
 _NEAR = 5.0  # m, nearest Z that counts
 _WIDTH_STD = 0.03  # m; a width with a larger standard deviation is left out
@@ -69,29 +71,52 @@ def measure_boundaries(
     rows = segments.endpoints[0, ..., 1].flatten().double().numpy()
     seen &= _long_enough(boundary, z, rows, seen)
     sigma = segments.sigma[0].repeat_interleave(2).double().numpy() / float(intrinsics[0, 0, 0]) * z  # m
-    nothing = RoadBoundaries(np.full(NUM_BOUNDARIES, np.nan), np.full(NUM_BOUNDARIES - 1, np.nan))
     if not seen.any():
-        return nothing
-    for _ in range(3):
+        return RoadBoundaries(np.full(NUM_BOUNDARIES, np.nan), np.full(NUM_BOUNDARIES - 1, np.nan))
+    for _ in range(_REWEIGHTINGS):
         line, cov = _fit(x[seen], z[seen], sigma[seen], boundary[seen])
         offset, slope, bend = line[:NUM_BOUNDARIES], line[NUM_BOUNDARIES:-1], float(line[-1])
         residual = (x - offset[boundary] - slope[boundary] * z - bend * z**2) / sigma
         scale = 1.4826 * np.median(np.abs(residual[seen])) + _LEAST_SCALE
         seen &= np.abs(residual) < 3 * scale
-    present = np.array([(seen & (boundary == k)).sum() >= _MIN_VERTICES for k in range(NUM_BOUNDARIES)])
-    direction = np.where(present, np.arctan(slope + 2 * bend * _NEAR), np.nan)
-    widths = np.full(NUM_BOUNDARIES - 1, np.nan)
-    for k in np.flatnonzero(present[:-1] & present[1:]):
-        extents = [(z[seen & (boundary == i)].min(), z[seen & (boundary == i)].max()) for i in (k, k + 1)]
-        start, end = max(e[0] for e in extents), min(e[1] for e in extents)
-        if end > start:
-            middle = 0.5 * (start + end)
-            heading = 0.5 * (slope[k] + slope[k + 1]) + 2 * bend * middle
-            at = np.zeros(len(line))  # of the width, in the parameters
-            at[[k, k + 1, NUM_BOUNDARIES + k, NUM_BOUNDARIES + k + 1]] = -1.0, 1.0, -middle, middle
-            if at @ cov @ at < _WIDTH_STD**2:
-                widths[k] = at @ line / np.hypot(1.0, heading)  # square to the lane
-    return RoadBoundaries(direction, widths)
+    of_each = [z[seen & (boundary == k)] for k in range(NUM_BOUNDARIES)]
+    direction = np.where(
+        [len(each) >= _MIN_VERTICES for each in of_each], np.arctan(slope + 2 * bend * _NEAR), np.nan
+    )
+    widths = [_width(k, of_each[k], of_each[k + 1], line, cov) for k in range(NUM_BOUNDARIES - 1)]
+    return RoadBoundaries(direction, np.array(widths))
+
+
+def _width(
+    left: int,
+    z_left: NDArray[np.float64],
+    z_right: NDArray[np.float64],
+    line: NDArray[np.float64],
+    cov: NDArray[np.float64],
+) -> float:
+    """Compute the width of a lane in the middle of the stretch that both of its boundaries cover.
+
+    Args:
+        left: index of its left boundary.
+        z_left: m, distances of that boundary's vertices.
+        z_right: m, of the right one's.
+        line: (2 L + 1,) parameters of :func:`_fit`.
+        cov: (2 L + 1, 2 L + 1), their covariance.
+
+    Returns:
+        m, square to the lane; NaN where there is no such stretch or the width is not sure enough.
+    """
+    if min(len(z_left), len(z_right)) < _MIN_VERTICES:
+        return math.nan
+    start, end = max(z_left.min(), z_right.min()), min(z_left.max(), z_right.max())
+    middle = 0.5 * (start + end)
+    both = [left, left + 1, NUM_BOUNDARIES + left, NUM_BOUNDARIES + left + 1]
+    by_line = np.zeros(len(line))  # derivative of the width
+    by_line[both] = -1.0, 1.0, -middle, middle
+    if end <= start or by_line @ cov @ by_line >= _WIDTH_STD**2:
+        return math.nan
+    heading = 0.5 * (line[both[2]] + line[both[3]]) + 2 * line[-1] * middle
+    return float(by_line @ line / np.hypot(1.0, heading))
 
 
 def spread(values: NDArray[np.float64]) -> float:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lanebev.render import Drive, RenderedFrame, WindowConfig, render_views, views
 from lanebev.render.raster.blocks import make_blocks, multiply_rows
-from lanebev.render.rows import row_of, send, take_rows, tensors_of
+from lanebev.render.rows import send, take_rows, tensors_of
 from lanebev.render.scene.kinds import KINDS
 from lanebev.render.scene.world import Scene
 from lanebev.render.views import render_scenes, sample_scene
@@ -54,9 +54,9 @@ def test_a_row_is_the_same_in_a_batch_of_any_size(kind: str) -> None:
     """Blocks have one row each, so others change nothing but the rounding of vector instructions' ends."""
     scene, seeds = scene_of(3, 2, kind), [1, 2, 3]
     together = render_scenes(scene, SIZE, seeds, rows=3)
-    alone = [render_scenes(row_of(scene, b), SIZE, seeds[b : b + 1]) for b in range(3)]
+    alone = [render_scenes(take_rows(scene, slice(b, b + 1)), SIZE, seeds[b : b + 1]) for b in range(3)]
     for b in range(3):
-        assert_same(row_of(together, b), alone[b], share=2e-3)
+        assert_same(take_rows(together, slice(b, b + 1)), alone[b], share=2e-3)
 
 
 @pytest.mark.slow
@@ -103,7 +103,9 @@ def test_frames_of_a_drive_are_those_asked_for_one_by_one() -> None:
     drive = Drive(5, SIZE, num_frames=8, kind="any")
     frames = drive.frames([6, 1, 3])
     for row, index in enumerate((6, 1, 3)):
-        for one, other in zip(tensors_of(row_of(frames, row)), tensors_of(drive.frame(index)), strict=True):
+        for one, other in zip(
+            tensors_of(take_rows(frames, slice(row, row + 1))), tensors_of(drive.frame(index)), strict=True
+        ):
             assert torch.equal(one, other)
 
 

@@ -42,12 +42,10 @@ class FleetResult(NamedTuple):
 
     Attributes:
         outcomes: by name of the drive, in the manifest's order.
-        ran: how many drives were run in this call.
         text: what to print.
     """
 
     outcomes: dict[str, Outcome]
-    ran: int
     text: str
 
 
@@ -106,7 +104,7 @@ def fleet(
     finally:
         shutil.rmtree(lock.folder, ignore_errors=True)
         lock.release()
-    return FleetResult(found, ran, _summary(found, ran, out))
+    return FleetResult(found, _summary(found, ran, out))
 
 
 def in_order(drives: Sequence[Drive]) -> list[Drive]:
