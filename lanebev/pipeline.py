@@ -211,8 +211,8 @@ class LaneBEV(BoundaryDetector):
             dtype = common_dtype(intrinsics) if state is None else state[0].dtype
             fresh = self.initial_state(batch, dtype, image.device)
             state = fresh if state is None else state
-        observed = self._look_ahead if self.far_view is None else self._look_in_turn
-        look = observed(frames, cameras, distortion, model)
+        observer = self._observe_together if self.far_view is None else self._observe_in_turn
+        observed = observer(frames, cameras, distortion, model)
         intervals = frame_intervals(dt, batch, steps, intrinsics)
         outputs = []
         for step in range(steps):
@@ -220,17 +220,17 @@ class LaneBEV(BoundaryDetector):
                 state = select_rows(begins[:, step], fresh, state)
             if truncation is not None and step % truncation == 0:
                 state = state.detach()
-            logits, now = look(step, state)
+            logits, segments = observed(step, state)
             camera = cameras[:, step]
             with self._gradients("calibrator"):
-                calibration, state = self.calibrator(now, camera, state, intervals[:, step], lane_width)
+                calibration, state = self.calibrator(segments, camera, state, intervals[:, step], lane_width)
                 calibration = calibration.with_std_scaled(self.pose_sigma_scale)
             view, valid = None, None
             if bev:
                 pose = calibration.extrinsics
                 view, valid = self._view(frames[:, step], camera, distortion, model, pose, state)
             homography = bev_from_image(calibration.extrinsics, camera, self.warp.grid)
-            outputs.append(LaneBEVOutput(view, valid, calibration, homography, now, logits))
+            outputs.append(LaneBEVOutput(view, valid, calibration, homography, segments, logits))
         return (outputs[0] if image.ndim == 4 else stack_frames(outputs)), state
 
     def _view(
@@ -251,7 +251,7 @@ class LaneBEV(BoundaryDetector):
             valid = select_rows(finite, valid, torch.zeros_like(valid))
         return view, valid
 
-    def _look_ahead(
+    def _observe_together(
         self, frames: Tensor, cameras: Tensor, distortion: Tensor | None, model: str
     ) -> Callable[[int, Any], tuple[Tensor, LaneSegments]]:
         """Observe T frames (B, T, 3, H, W) as one batch; return what looks up those of a step."""
@@ -267,7 +267,7 @@ class LaneBEV(BoundaryDetector):
             LaneSegments(*(of_step(part, step) for part in segments)),
         )
 
-    def _look_in_turn(
+    def _observe_in_turn(
         self, frames: Tensor, cameras: Tensor, distortion: Tensor | None, model: str
     ) -> Callable[[int, Any], tuple[Tensor, LaneSegments]]:
         """Return what observes the frames of a step with the state before it, which places the far view."""

@@ -1,0 +1,214 @@
+"""What unequal lanes and single deviating boundaries do to pose and covariance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.config import JointConfig
+from lanebev.estimation.joint.evidence import CALL, deviation_prior_std
+from lanebev.estimation.joint.frame_prior import FramePrior
+from lanebev.estimation.joint.layout import NUM_POSE
+from lanebev.estimation.joint.measurement import (
+    HEIGHT,
+    NUM_SHAPE,
+    OFFSET,
+    ROLL,
+)
+from lanebev.estimation.joint.observations import boundary_places, observe
+from lanebev.estimation.joint.output import beyond_filter, single_deviation, unverified_deviation
+from lanebev.estimation.joint.restart import scatter_of_fit
+from lanebev.estimation.joint.scatter import remembered_sensitivity
+from lanebev.estimation.joint.single_frame import fit_observations
+from lanebev.estimation.reasons import Reason
+from lanebev.testing.moments import CAMERA, PLACES, WIDTH, moments
+from lanebev.testing.moments import observe as see
+from tests.estimation.joint_drives import DOUBLE, drive, nothing, run
+
+torch.set_num_threads(1)
+
+
+def test_doubt_about_lanes_outlasts_frames_that_show_nothing():
+    """A boundary 0.1 m out of place puts height in doubt, and an empty or skipped frame leaves it there."""
+    places = PLACES + 0.1 * (torch.arange(6) == 5)
+    frames = list(see(moments(0.8, lambda t, m: replace(m, places=places)), 2, 1.0, 30, 0, DOUBLE))
+    calibrator = JointCalibrator()
+    before, state = run(calibrator, frames)
+    assert (before.covariance[:, 3, 3].sqrt() > 0.005).all()
+    again, _ = run(calibrator, frames[-1:], state, dt=0.0)
+    assert torch.equal(again.covariance, before.covariance)
+    empty = [(frames[-1][0], nothing(frames[-1][1]))]
+    after, _ = run(calibrator, empty, state)
+    variances = (out.covariance.diagonal(dim1=1, dim2=2) for out in (after, before))
+    assert torch.div(*variances).min() > 0.99
+
+
+def test_prior_of_unequal_lanes_makes_roll_honest():
+    """Places fitted by offset, height and roll (1, x, x²): what is left gives the prior of the error."""
+    places = (torch.arange(6, dtype=DOUBLE) - 2.5) * 3.7
+    by_pose = torch.stack([torch.ones_like(places), places, places.square()], dim=-1)
+    out = 0.04 * torch.randn(20_000, 6, generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
+    error = out @ torch.linalg.pinv(by_pose).mT
+    left = out - error @ by_pose.mT
+    size = deviation_prior_std(left, JointConfig())
+    spread = torch.linalg.inv(by_pose.mT @ by_pose)[2, 2].sqrt() * size
+    opened = size > 0.02  # m; below, lanes count as nearly equal
+    chi2 = (error[opened, 2] / spread[opened]).square()
+    assert opened.double().mean() > 0.8
+    assert 0.6 < chi2.mean() < 1.3
+    assert (chi2 < 9).double().mean() > 0.97
+
+
+def test_one_boundary_out_of_place_counts_until_the_filter_holds_unequal_lanes():
+    """Half of six deviations are seen, so that those of unequal lanes keep half of their variance."""
+    cfg = JointConfig()
+    size = cfg.open_deviation
+    out = torch.tensor([[-0.4, 0.0, 0.0, 0.013, 0.0, 0.0]] * 3 + [[0.011] + [0.0] * 5], dtype=DOUBLE)
+    held = torch.tensor([0.0, 0.5 * size**2 / 6, 0.5 * size**2, 0.0], dtype=DOUBLE)
+    single = single_deviation(out, cfg).unsqueeze(-1)
+    found = beyond_filter(single, held.unsqueeze(-1).expand(-1, 6)).sqrt().squeeze(-1)
+    expected = torch.tensor([size, size * math.sqrt(0.75), 0.0, 0.0], dtype=DOUBLE)
+    torch.testing.assert_close(found, expected)
+
+
+def test_deviations_that_three_boundaries_cannot_show_count_less_with_each_further_one():
+    """Where lanes are unequal, one further boundary is in its place by chance with a probability of 0.4 %."""
+    sensitivity = torch.zeros(3, 4, 6, dtype=DOUBLE)
+    sensitivity[:, ROLL, 1:4] = torch.tensor([-0.05, 0.1, -0.05], dtype=DOUBLE)
+    sensitivity[1, HEIGHT, 4], sensitivity[2, HEIGHT, 4] = 0.015 / 4, 0.03
+    none, straight = torch.zeros(3, 6, dtype=DOUBLE), torch.zeros(3, dtype=DOUBLE)
+    found = unverified_deviation(
+        sensitivity, none, straight, straight, JointConfig(lane_deviation_std=0.1)
+    ).sqrt()
+    expected = torch.tensor([0.1, 0.1 * math.sqrt(0.75), 0.1 * 0.004**0.5], dtype=DOUBLE)
+    torch.testing.assert_close(found, expected.unsqueeze(-1).expand(-1, 6))
+    apart = none.clone()
+    apart[:, 4] = -0.9  # bounds no lane
+    alone = unverified_deviation(
+        sensitivity, apart, straight, straight, JointConfig(lane_deviation_std=0.1)
+    ).sqrt()
+    torch.testing.assert_close(alone, torch.full_like(alone, 0.1))
+    held = torch.full((3, 6), 0.02**2 / 3, dtype=DOUBLE)  # half of their sum is 0.02²
+    left = beyond_filter(
+        unverified_deviation(sensitivity, none, straight, straight, JointConfig(lane_deviation_std=0.1)), held
+    )
+    assert left[0].tolist() == [pytest.approx(0.1**2 - 0.02**2)] * 6
+
+
+def test_outliers_beside_unequal_lanes_are_no_bend():
+    """Deviations are uncertain only together with the pose: end points beside their boundary are outliers."""
+    out = torch.tensor([0.066, 0.027, 0.006, 0.062, -0.045, -0.017], dtype=DOUBLE)
+    drive = moments(4.0, lambda t, m: replace(m, near=6.0, far=73.0, outliers=0.25, places=PLACES + out))
+    calibrator = JointCalibrator()
+    state, yaw = calibrator.initial_state(8, dtype=DOUBLE), []
+    for k, (moment, segments) in enumerate(see(drive, 8, 0.7, 30, 1, DOUBLE)):
+        calibration, state = calibrator(segments, CAMERA.expand(8, 3, 3), state, moment.dt, WIDTH)
+        if k >= 30:
+            assert (state.evidence[:, NUM_POSE : NUM_POSE + NUM_SHAPE].abs() < CALL).all()
+            yaw.append(
+                (calibration.extrinsics.yaw - moment.pose[1]).square() / calibration.covariance[:, 1, 1]
+            )
+    assert (torch.stack(yaw) < 9).double().mean() > 0.98
+
+
+@pytest.mark.parametrize("visible", [(1, 2, 3), (2, 3, 4)])
+def test_two_lanes_that_differ_are_within_the_standard_deviations(visible):
+    """Nothing shows that a lane is 10 cm wider than the other: roll and height are wrong, and may be."""
+    places = PLACES.clone()
+    places[visible[0]] += 0.05
+    places[visible[2]] += 0.05
+    drive = moments(0.5, lambda t, m: replace(m, visible=visible, places=places))
+    calibrator = JointCalibrator()
+    state = calibrator.initial_state(2, dtype=DOUBLE)
+    for moment, segments in see(drive, 2, 1.0, 20, 0, DOUBLE):  # from the first frame on
+        calibration, state = calibrator(segments, CAMERA.expand(2, 3, 3), state, moment.dt, WIDTH)
+        error = calibration.extrinsics.stack() - torch.tensor(moment.pose, dtype=DOUBLE)
+        sigma = calibration.covariance.diagonal(dim1=1, dim2=2).sqrt()
+        assert (error.abs() < 4 * sigma).all()
+    assert (error[:, ROLL].abs() > math.radians(0.2)).all()
+    assert (sigma[:, ROLL] < math.radians(1.0)).all()
+    assert (sigma[:, :2] < math.radians(0.1)).all()  # pitch and yaw do not depend on it
+
+
+def test_the_covariance_changes_gradually_when_boundaries_come_and_go():
+    """All six for a second, the middle three for a second, then four."""
+
+    def change(t, moment):
+        visible = (0, 1, 2, 3, 4, 5) if t < 0.99 else (1, 2, 3) if t < 1.99 else (1, 2, 3, 4)
+        return replace(moment, visible=visible)
+
+    calibrator = JointCalibrator()
+    state, sigmas = calibrator.initial_state(1, dtype=DOUBLE), []
+    for moment, segments in see(moments(2.5, change), 1, 1.0, 20, 0, DOUBLE):
+        calibration, state = calibrator(segments, CAMERA.expand(1, 3, 3), state, moment.dt, WIDTH)
+        sigmas.append(calibration.covariance[0, ROLL, ROLL].sqrt().rad2deg())
+    sigma = torch.stack(sigmas)
+    assert sigma[29] < 0.02
+    assert (sigma[30:60] < 0.05).all()  # the six have shown that lanes are equal
+    assert (sigma[60:] < 0.05).all()
+
+
+def test_equal_lanes_are_trusted_some_time_after_a_fourth_boundary_is_seen():
+    four = torch.zeros(1, 4, 12, dtype=DOUBLE)
+    four[:, ROLL, 1:5] = torch.tensor([-0.05, 0.1, -0.05, 0.03], dtype=DOUBLE)
+    three = four.clone()
+    three[..., 4] = 0.0
+    cfg, step = JointConfig(), torch.full((1,), 1 / 30, dtype=DOUBLE)
+    none = torch.zeros(1, 6, dtype=DOUBLE)
+    seen, left = three, []
+    for _ in range(25):
+        found = unverified_deviation(seen[..., :6], none, none[:, 0], none[:, 0], cfg)
+        left.append(float(found[0, 0].sqrt()))
+        seen = remembered_sensitivity(four, seen, step, cfg)
+    assert left[0] == pytest.approx(0.05)
+    assert 0.03 < left[1] < 0.05
+    assert left[8] > 0.02
+    assert left[24] == pytest.approx(0.05 * math.sqrt(0.004))
+    torch.testing.assert_close(remembered_sensitivity(four, 0 * four, step, cfg), four)
+    gone = remembered_sensitivity(three, four, step, cfg)
+    assert gone[0, ROLL, 4] == pytest.approx(0.03 * math.exp(-1 / 600))
+    changed = remembered_sensitivity(three, four, torch.full_like(step, torch.inf), cfg)
+    torch.testing.assert_close(changed, three)
+
+
+def test_the_sensitivity_of_a_start_is_that_of_its_fit():
+    """Put a boundary out of place by 1 mm: the fit changes by as much as its sensitivity says."""
+    moved = PLACES.clone()
+    moved[3] += 0.001
+
+    def fitted(places):
+        drive = moments(1 / 30, lambda t, m: replace(m, places=places))
+        _, segments = next(iter(see(drive, 1, 0.0, 20, 0, DOUBLE)))
+        segments = segments._replace(sigma=torch.ones_like(segments.sigma))
+        seen = observe(segments, CAMERA[None], 6)
+        own = boundary_places(WIDTH, 6, seen.sigma).expand(1, -1).gather(1, seen.boundary)
+        fit = fit_observations(seen, own, FramePrior())
+        return fit.extrinsics.stack(), scatter_of_fit(fit, own, seen, JointConfig()).sensitivity
+
+    (before, sensitivity), (after, _) = fitted(PLACES), fitted(moved)
+    torch.testing.assert_close((after - before)[0], 0.001 * sensitivity[0, :, 3], rtol=0.05, atol=2e-6)
+
+
+def test_height_doubts_roll_that_is_held_as_the_lane_seen_bends_it():
+    """By the second derivative of the height at which a lane seen as it is has its width."""
+    frames = drive(10)
+    ego = torch.tensor([2, 3])
+    frames = [(moment, s._replace(weight=s.weight * torch.isin(s.boundary, ego))) for moment, s in frames]
+    out, state = run(JointCalibrator(), frames)
+    assert (state.reasons & Reason.ROLL_UNSEEN).all()
+    height, middle = state.mean[0, HEIGHT], state.mean[0, OFFSET]
+    left, right = middle - WIDTH / 2, middle + WIDTH / 2
+
+    def height_at(roll):
+        tangents = [(-(x / height).atan() - roll).tan() for x in (left, right)]
+        return WIDTH / (tangents[0] - tangents[1])
+
+    roll = torch.zeros((), dtype=DOUBLE)
+    bend = torch.func.grad(torch.func.grad(height_at))(roll)
+    more = 3 * (0.5 * bend * state.cov[0, ROLL, ROLL]).square()
+    added = out.covariance[0, 3, 3] - state.cov[0, HEIGHT, HEIGHT]
+    torch.testing.assert_close(added, more, rtol=1e-6, atol=0)
