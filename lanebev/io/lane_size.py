@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lanebev.io.lanes import FrameLines
 
+_STATE_SIZE = "state their size with --lanes-size WIDTHxHEIGHT"
 _OUTSIDE = 0.1  # share of points below or far beside the images, of which more are of another size
 _OFF_CENTRE = 0.2  # share of a side, more than a principal point is off the centre
 _BESIDE = 0.5  # image widths beside an image that lines are drawn on to
@@ -125,18 +126,29 @@ def size_doubt(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> Siz
         frames: frames of one drive.
         image_size: (height, width) px of its images.
     """
+    return _doubt_of_camera(frames, image_size) or _doubt_of_points(frames, image_size)
+
+
+def _doubt_of_camera(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> SizeDoubt | None:
+    """Return a doubt if 3D points are of a camera whose principal point is far from the images' middle."""
     height, width = image_size
-    size = "state their size with --lanes-size WIDTHxHEIGHT"
     centres = [frame.principal_point for frame in frames if frame.principal_point is not None]
-    if centres:
-        x, y = np.median(centres, axis=0)
-        if max(abs(x / width - 0.5), abs(y / height - 0.5)) > _OFF_CENTRE:
-            return SizeDoubt(
-                f"expected 3D points of a camera for {width} x {height} px, got one whose principal point is "
-                f"{x:.0f}, {y:.0f}; of images of another size?",
-                size,
-                is_outside=True,
-            )
+    if not centres:
+        return None
+    x, y = np.median(centres, axis=0)
+    if max(abs(x / width - 0.5), abs(y / height - 0.5)) <= _OFF_CENTRE:
+        return None
+    return SizeDoubt(
+        f"expected 3D points of a camera for {width} x {height} px, got one whose principal point is "
+        f"{x:.0f}, {y:.0f}; of images of another size?",
+        _STATE_SIZE,
+        is_outside=True,
+    )
+
+
+def _doubt_of_points(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> SizeDoubt | None:
+    """Return a doubt if points in pixels lie outside the images, or leave a large part of them empty."""
+    height, width = image_size
     points = _all_points([frame for frame in frames if frame.principal_point is None])
     if not len(points):
         return None
@@ -146,7 +158,7 @@ def size_doubt(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> Siz
         return SizeDoubt(
             f"expected points in images of {width} x {height} px, got {outside.mean():.0%} outside of them, "
             f"the farthest at {x.max():.0f}, {y.max():.0f}; of images of another size?",
-            size,
+            _STATE_SIZE,
             is_outside=True,
         )
     if points.min() >= 0 and points.max() <= 1:
@@ -166,17 +178,16 @@ def size_doubt(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> Siz
         return SizeDoubt(
             f"none of them reaches beyond {x.max():.0f}, {y.max():.0f} in images of {width} x {height} px; "
             "of smaller images?",
-            size,
+            _STATE_SIZE,
         )
-    if y.max() < _REACHED_UNCROPPED * height and horizon < _HIGHEST_HORIZON * height:
-        rest = height - math.ceil(y.max())
-        return SizeDoubt(
-            f"none of them reaches below row {y.max():.0f} of {height}, and they meet at row {horizon:.0f}; "
-            "of images whose top was cut off?",
-            "state the part with --lanes-crop WIDTHxHEIGHT+LEFT+TOP, "
-            f"such as {width}x{height - rest}+0+{rest}",
-        )
-    return None
+    if y.max() >= _REACHED_UNCROPPED * height or not horizon < _HIGHEST_HORIZON * height:
+        return None
+    rest = height - math.ceil(y.max())
+    return SizeDoubt(
+        f"none of them reaches below row {y.max():.0f} of {height}, and they meet at row {horizon:.0f}; "
+        "of images whose top was cut off?",
+        f"state the part with --lanes-crop WIDTHxHEIGHT+LEFT+TOP, such as {width}x{height - rest}+0+{rest}",
+    )
 
 
 def meeting_row(frames: Sequence[FrameLines]) -> float:

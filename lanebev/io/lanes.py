@@ -11,6 +11,7 @@ import unicodedata
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path, PurePath
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +83,14 @@ def lane_files(path: str | Path) -> list[Path]:
     return [Path(file) for file in in_natural_order(map(str, seen))]  # macOS leaves ._ files
 
 
-def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int | None]:  # noqa: C901 - the rules of one decision
+class _Match(NamedTuple):
+    """The entry of an image, and how many parts of the paths they have in common."""
+
+    entry: int
+    length: int
+
+
+def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int | None]:
     """Find the lane entry of each image: the one whose path has the longest common end with its path.
 
     An entry with exactly the image's name is its own. Else whole path components are compared from the end,
@@ -99,35 +107,13 @@ def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int
     Raises:
         ValueError: no image matches, or two entries (or two images) match equally well.
     """
-    by_tail: dict[tuple[str, ...], list[int]] = defaultdict(list)
-    for i, frame in enumerate(frames):
-        parts = _parts(frame.name)
-        for start in range(len(parts)):
-            by_tail[parts[start:]].append(i)
-    exact = {frame.name: i for i, frame in enumerate(frames)}
-    exact = exact if len(exact) == len(frames) else {}  # names are not unique
-    matches: list[tuple[int, int] | None] = []  # (length of the common tail, entry)
-    for name in names:
-        parts = _parts(name)
-        if name in exact:
-            matches.append((len(parts) + 1, exact[name]))
-            continue
-        tail = next((parts[k:] for k in range(len(parts)) if parts[k:] in by_tail), None)
-        matches.append(None if tail is None else (len(tail), by_tail[tail][0]))
-        if tail is not None and len(by_tail[tail]) > 1:
-            first, second = (frames[i].name for i in by_tail[tail][:2])
-            raise ValueError(
-                f"image {name}: expected one lane entry, got {first!r} and {second!r}, which fit equally "
-                "well; give images by a path that tells them apart"
-            )
-    owners: dict[int, list[int]] = defaultdict(list)
-    for image, match in enumerate(matches):
-        if match is not None:
-            owners[match[1]].append(image)
     result: list[int | None] = [None] * len(names)
-    for entry, images in owners.items():
-        longest = max(matches[image][0] for image in images)  # type: ignore[index]
-        best = [image for image in images if matches[image][0] == longest]  # type: ignore[index]
+    images_of: dict[int, dict[int, int]] = defaultdict(dict)  # by entry: the lengths by image
+    for image, match in enumerate(_best_entries(names, frames)):
+        if match is not None:
+            images_of[match.entry][image] = match.length
+    for entry, lengths in images_of.items():
+        best = [image for image, length in lengths.items() if length == max(lengths.values())]
         if len(best) > 1:
             raise ValueError(
                 f"lane entry {frames[entry].name!r}: expected one image, got {names[best[0]]} and "
@@ -140,6 +126,36 @@ def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int
             f"the file's first is {frames[0].name!r}"
         )
     return result
+
+
+def _best_entries(names: Sequence[str], frames: Sequence[FrameLines]) -> list[_Match | None]:
+    """Return for each image the entry that shares the longest end of the path with it.
+
+    Raises:
+        ValueError: two entries match an image equally well.
+    """
+    by_tail: dict[tuple[str, ...], list[int]] = defaultdict(list)
+    for entry, frame in enumerate(frames):
+        parts = _parts(frame.name)
+        for start in range(len(parts)):
+            by_tail[parts[start:]].append(entry)
+    exact = {frame.name: entry for entry, frame in enumerate(frames)}
+    exact = exact if len(exact) == len(frames) else {}  # names are not unique
+    matches: list[_Match | None] = []
+    for name in names:
+        parts = _parts(name)
+        if name in exact:
+            matches.append(_Match(exact[name], len(parts) + 1))
+            continue
+        tail = next((parts[k:] for k in range(len(parts)) if parts[k:] in by_tail), None)
+        matches.append(None if tail is None else _Match(by_tail[tail][0], len(tail)))
+        if tail is not None and len(by_tail[tail]) > 1:
+            first, second = (frames[entry].name for entry in by_tail[tail][:2])
+            raise ValueError(
+                f"image {name}: expected one lane entry, got {first!r} and {second!r}, which fit equally "
+                "well; give images by a path that tells them apart"
+            )
+    return matches
 
 
 def _parts(name: str) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple
 
 import av
 import numpy as np
@@ -163,7 +164,30 @@ def _dark_remark(image: NDArray[np.uint8]) -> str:
     )
 
 
+class _Survey(NamedTuple):
+    """What the packets of a video say.
+
+    Attributes:
+        shown: times, ticks, of the frames that are shown, in the order of their packets.
+        tick: s, unit of the times.
+        end: s since the video's begin, at which its last frame ends.
+        declared: s, as the header says it.
+        is_edited: whether an edit list leaves out frames.
+        is_complete: whether the packets tell which frames are shown.
+        problems: what is to be said of them.
+    """
+
+    shown: list[int]
+    tick: Fraction
+    end: float
+    declared: float
+    is_edited: bool
+    is_complete: bool
+    problems: list[str]
+
+
 def _video_source(source: str, stated: Fraction | None) -> FrameSource:
+    """Open a video as a source: a first frame says what it shows, its packets how many there are and when."""
     with open_video(source) as container:
         stream = video_stream(container)
         timed = has_times(container)
@@ -174,49 +198,81 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
         image = rgb(frame, matrix)
         size = image.shape[:2]
         aspect = pixel_aspect(stream, frame, size)
-        problems = list(filter(None, stream_remarks(container, frame, image)))
-    with open_video(source) as container:  # the header's count includes frames that an edit list cuts
+        problems = [*filter(None, stream_remarks(container, frame, image))]
+    found = _survey(source, lost, first, fps)
+    count = len(found.shown)
+    if not found.is_complete:
+        with open_video(source) as container:
+            count = sum(1 for _ in decoded(container, video_stream(container)))
+    problems += found.problems
+    if timed and (rate := _rate_of_times(found.shown, found.tick, own)) != own:
+        problems.append(f"it states {float(own):.4g} frames per second, they come at {float(rate):.4g}")
+        fps = own = rate
+    problems += filter(None, [_length_remark(found, fps) if timed else "", _rate_remark(timed, own, stated)])
+    problem = f"video {source}: {'; '.join(problems)}" if problems else ""
+    times = _times_since_first(found.shown, found.tick, fps) if timed and found.is_complete else ()
+    return FrameSource(source, (), fps, count, size, problem, times, timed, aspect, matrix=matrix)
+
+
+def _survey(source: str, lost: Sequence[int], first: int | None, fps: Fraction) -> _Survey:
+    """Read the packets of a video; the header's count includes frames that an edit list cuts.
+
+    Args:
+        source: path of the video.
+        lost: times, ticks, of frames before the first whole one.
+        first: time, ticks, of the first whole frame; what precedes it is not shown: it lacks a key frame.
+        fps: frame rate, for the last frame's duration where no packet states one.
+    """
+    with open_video(source) as container:
         stream = video_stream(container)
         begin, tick = stream.start_time or 0, stream.time_base or 1 / fps
-        end, edited, read = Fraction(0), False, 0
+        end, is_edited, read = Fraction(0), False, 0
         shown = [pts for pts in lost if first is not None and pts < first]
-        telling = stream.codec_context.name not in _HIDING
+        is_complete = stream.codec_context.name not in _HIDING
         keys: list[tuple[int, float]] = []
         latest, early, most_early = -math.inf, 0, 0
         for packet in packets(container, stream):
-            telling = telling and (packet.pts is not None or not packet.size)
+            is_complete = is_complete and (packet.pts is not None or not packet.size)
             read = max(read, (packet.pos or 0) + packet.size)
             if packet.pts is not None:
                 keys += [(packet.pts, latest)] if packet.is_keyframe else []
                 early = early + 1 if packet.pts < latest else 0
                 latest, most_early = max(latest, packet.pts), max(most_early, early)
-                edited = edited or packet.is_discard
-                # what precedes the first frame is not shown: it lacks a key frame
+                is_edited = is_edited or packet.is_discard
                 if not packet.is_discard and (first is None or packet.pts >= first):
                     shown.append(packet.pts)
                 end = max(end, packet.pts - begin + max(packet.duration or 0, 1 / fps / tick))
-        declared, got = declared_duration(stream), float(end * tick)
-        problems += filter(None, [appended_remark(container, read)])
-    count = len(shown)
-    if restart := restart_remark(keys, most_early):
-        problems.append(restart)
-        telling = False
-    if not telling:
-        with open_video(source) as container:
-            count = sum(1 for _ in decoded(container, video_stream(container)))
-    problems += filter(None, [gap_remark(shown, tick)])
-    if timed and (rate := _rate_of_times(shown, tick, own)) != own:
-        problems.append(f"it states {float(own):.4g} frames per second, they come at {float(rate):.4g}")
-        fps = own = rate
-    if timed and declared - got > (1.5 if edited else 0.5) / fps:  # an edit list may begin within a frame
-        problems.append(f"expected {declared:.2f} s as it declares, got {got:.2f} s; is it cut?")
-    if not timed and stated is None:
-        problems.append(f"it has no times, and is taken for {float(fps):g} frames per second; state --fps")
-    if timed and stated is not None and abs(own / stated - 1) > _SAME_RATE:
-        problems.append(f"its own {float(own):.4g} frames per second are used, not --fps {float(stated):g}")
-    problem = f"video {source}: {'; '.join(problems)}" if problems else ""
-    times = _times_since_first(shown, tick, fps) if timed and telling else ()
-    return FrameSource(source, (), fps, count, size, problem, times, timed, aspect, matrix=matrix)
+        declared, appended = declared_duration(stream), appended_remark(container, read)
+    restart = restart_remark(keys, most_early)
+    problems = [*filter(None, (appended, restart, gap_remark(shown, tick)))]
+    return _Survey(shown, tick, float(end * tick), declared, is_edited, is_complete and not restart, problems)
+
+
+def _length_remark(found: _Survey, fps: Fraction) -> str:
+    """Return a remark on a video that is shorter than it declares; else nothing."""
+    spare = (1.5 if found.is_edited else 0.5) / fps  # an edit list may begin within a frame
+    if found.declared - found.end <= spare:
+        return ""
+    return f"expected {found.declared:.2f} s as it declares, got {found.end:.2f} s; is it cut?"
+
+
+def _rate_remark(timed: bool, own: Fraction, stated: Fraction | None) -> str:
+    """Return a remark on a frame rate that is assumed, or given and not used; else nothing.
+
+    Args:
+        timed: whether the video says when its frames are shown.
+        own: its frame rate.
+        stated: the frame rate that the user gave.
+    """
+    if not timed:
+        return (
+            ""
+            if stated
+            else f"it has no times, and is taken for {float(own):g} frames per second; state --fps"
+        )
+    if stated is None or abs(own / stated - 1) <= _SAME_RATE:
+        return ""
+    return f"its own {float(own):.4g} frames per second are used, not --fps {float(stated):g}"
 
 
 def _first_whole(
