@@ -71,6 +71,7 @@ class Iteration(NamedTuple):
 
     Attributes:
         at: (B, O), point of linearisation.
+        prior_cov: (B, D, D), of the prediction, with the process noise so far.
         frame: information of the frame there.
         single_frame_std: (B, 5) rad and m, of pose and offset by the frame alone.
         estimated: (B, D), 0 for entries that are considered only, else 1.
@@ -78,6 +79,7 @@ class Iteration(NamedTuple):
     """
 
     at: Tensor
+    prior_cov: Tensor
     frame: FrameInformation
     single_frame_std: Tensor
     estimated: Tensor
@@ -111,10 +113,10 @@ def update_state(
         estimated = estimated_entries(alone, num)
         observed = cov[:, indices.observed, indices.observed]
         moved = observed_step(prior, observed, at, frame, estimated[:, indices.observed])
-        return Iteration(at, frame, alone, estimated, moved)
+        return Iteration(at, cov, frame, alone, estimated, moved)
 
-    used = cov = predicted.cov
-    at_cov, on_road = cov[:, indices.observed, indices.observed], lateral_places(prior, places, seen)
+    cov, on_road = predicted.cov, lateral_places(prior, places, seen)
+    at_cov = cov[:, indices.observed, indices.observed]
     feet = foot_points(prior[:, :NUM_COMMON], on_road, seen, sight)
     residuals = boundary_residuals(prior[:, :NUM_COMMON], on_road, seen, predicted.phase, feet, sight)
     last = iterate(prior, at_cov, residuals, scale, cov)
@@ -123,14 +125,14 @@ def update_state(
     evidence, motion_scale = with_evidence(predicted, score, last.estimated[:, POSE] > 0, dt, cfg)
     cov = with_process_noise(cov, adaptive_process_noise(evidence, at_cov, cfg))
     for _ in range(cfg.iterations - 1):
-        at, used = last.step.mean, cov
+        at = last.step.mean
         on_road = lateral_places(at, places, seen)
         distance, valid = boundary_distances(at[:, :NUM_COMMON], on_road, seen, feet, predicted.phase)
         residuals = residuals._replace(distance=distance, valid=valid)  # the Jacobian stays
         last = iterate(at, last.step.cov, residuals, last.frame.scale, cov)
 
     scatter = scatter_of_frame(last.frame, cov, member, predicted.scatter)
-    gain = kalman_gain(used, last.step, last.frame, last.estimated)
+    gain = kalman_gain(last.prior_cov, last.step, last.frame, last.estimated)
     updated = predicted._replace(
         mean=torch.baddbmm(mean.unsqueeze(-1), gain, last.step.pull.unsqueeze(-1)).squeeze(-1),
         cov=posterior_covariance(cov, last.frame.matrix, gain),

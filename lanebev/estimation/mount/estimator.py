@@ -98,14 +98,14 @@ class MountEstimator(nn.Module):
         pose = calibration.extrinsics.stack()
         pose = pose.to(check_state(state, MountState, pose.shape[0]).dtype)
         variance = calibration.covariance.diagonal(dim1=-2, dim2=-1).to(pose.dtype)
-        step = as_batch(dt, pose)
-        frame_why = self._frame_gates(calibration.status, pose, step, speed, yaw_rate, curvature)
+        interval = as_batch(dt, pose)
+        frame_why = self._frame_gates(calibration.status, pose, interval, speed, yaw_rate, curvature)
         known = pose.isfinite().all(-1, keepdim=True) & variance.isfinite() & (variance >= 0)
         sure = known & (variance < constant(cfg.largest_std, variance).square())
         why = frame_why.unsqueeze(-1) | flag(~sure, MountReason.UNSURE)  # (B, 4)
 
         used = why == 0
-        elapsed = torch.where(step.isfinite() & (step > 0), step, 0.0).unsqueeze(-1)  # (B, 1)
+        elapsed = torch.where(interval.isfinite() & (interval > 0), interval, 0.0).unsqueeze(-1)  # (B, 1)
         state = add_frame(state, used, pose, variance, elapsed, cfg.block_time)
         doubtful = (frame_why == 0).unsqueeze(-1) & known & ~sure
         state = self._weigh_doubtful(state, doubtful, used, pose, variance, elapsed)
@@ -132,7 +132,7 @@ class MountEstimator(nn.Module):
         self,
         status: Tensor,
         pose: Tensor,
-        step: Tensor,
+        interval: Tensor,
         speed: Tensor | None,
         yaw_rate: Tensor | None,
         curvature: Tensor | None,
@@ -140,7 +140,7 @@ class MountEstimator(nn.Module):
         """Return the reasons (B,), as flags, not to use this frame on any axis."""
         cfg = self.config
         why = flag(status != int(Status.TRACKING), MountReason.NOT_TRACKING)
-        why = why | flag(~(step.isfinite() & (step > 0)), MountReason.TIME)
+        why = why | flag(~(interval.isfinite() & (interval > 0)), MountReason.TIME)
         if speed is not None:
             why = why | flag(~(as_batch(speed, pose, "speed") >= cfg.min_speed), MountReason.SLOW)
         turns = (("yaw_rate", yaw_rate, cfg.max_yaw_rate), ("curvature", curvature, cfg.max_curvature))
