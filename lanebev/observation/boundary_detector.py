@@ -91,7 +91,7 @@ class BoundaryDetector(nn.Module):
         """
         size = (image.shape[-2], image.shape[-1])
         if vanishing_point is None:
-            return self._whole(image, self.network_size(size))
+            return self._detect_whole(image, self.network_size(size))
         logits, whole = self.whole_vertices(image)
         return logits, self.add_far_view(image, whole, vanishing_point)
 
@@ -104,7 +104,7 @@ class BoundaryDetector(nn.Module):
         Returns:
             as :meth:`boundary_vertices`.
         """
-        return self._whole(image, self.view_sizes((image.shape[-2], image.shape[-1])).whole)
+        return self._detect_whole(image, self.view_sizes((image.shape[-2], image.shape[-1])).whole)
 
     def add_far_view(
         self, image: Tensor, whole: BoundaryVertices, vanishing_point: Tensor
@@ -133,33 +133,33 @@ class BoundaryDetector(nn.Module):
         point = torch.where(known.unsqueeze(-1), point, 0.0)
         found = with_columns(whole, VERTICES_PER_LINE)
         if torch.compiler.is_compiling():  # torch.cond cannot contain the network (torch 2.13)
-            both = self._merged(image, whole, point)
-            return select_rows(known, both, self._full(image))
-        found = replace_rows(known, found, self._merged, image, whole, point)
-        return replace_rows(~known, found, self._full, image)
+            both = self._with_far_view(image, whole, point)
+            return select_rows(known, both, self._without_far_view(image))
+        found = replace_rows(known, found, self._with_far_view, image, whole, point)
+        return replace_rows(~known, found, self._without_far_view, image)
 
-    def _merged(self, image: Tensor, whole: BoundaryVertices, point: Tensor) -> BoundaryVertices:
+    def _with_far_view(self, image: Tensor, whole: BoundaryVertices, point: Tensor) -> BoundaryVertices:
         """Return the vertices of both views; all rows know their vanishing points."""
         size = (image.shape[-2], image.shape[-1])
         sizes = self.view_sizes(size)
         resized = resize_image(image, sizes.resized)
         corner = place_crop(point, sizes, size, (self.far_view or FarView()).above)
         view = crop_images(resized, corner, sizes.far)
-        _, seen = self._look(view, _finite(resized), covered_size(sizes, size))
+        _, seen = self._detect(view, _finite(resized), covered_size(sizes, size))
         far = far_vertices(seen, corner, sizes, size)
         inside = inside_far_view(whole.points, corner, sizes, size)
         return merge_vertices(whole, far, inside, point[:, 1].to(whole.points))
 
-    def _full(self, image: Tensor) -> BoundaryVertices:
-        found = self._whole(image, self.network_size((image.shape[-2], image.shape[-1])))[1]
+    def _without_far_view(self, image: Tensor) -> BoundaryVertices:
+        found = self._detect_whole(image, self.network_size((image.shape[-2], image.shape[-1])))[1]
         return with_columns(found, VERTICES_PER_LINE)
 
-    def _whole(self, image: Tensor, size: tuple[int, int]) -> tuple[Tensor, BoundaryVertices]:
+    def _detect_whole(self, image: Tensor, size: tuple[int, int]) -> tuple[Tensor, BoundaryVertices]:
         """Look at whole images, resized to (h, w) px."""
         resized = resize_image(image, size)
-        return self._look(resized, _finite(resized), (image.shape[-2], image.shape[-1]))
+        return self._detect(resized, _finite(resized), (image.shape[-2], image.shape[-1]))
 
-    def _look(
+    def _detect(
         self, view: Tensor, finite: Tensor, covered: tuple[float, float]
     ) -> tuple[Tensor, BoundaryVertices]:
         """Run network and extraction on views.

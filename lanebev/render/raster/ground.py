@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -22,6 +24,18 @@ from lanebev.render.rows import take_rows
 from lanebev.render.scene.world import Scene
 
 STUD_ALBEDO = 0.62
+
+
+class Surface(NamedTuple):
+    """The ground's surface at M points; functions change it in place.
+
+    Attributes:
+        albedo: (3, M) linear reflectance.
+        coverage: (2, M) by paint and by studs, 0 to 1.
+    """
+
+    albedo: Tensor
+    coverage: Tensor
 
 
 def headlight_irradiance(x: Tensor, z: Tensor) -> Tensor:
@@ -56,18 +70,17 @@ def ground_radiance(
     inside = torch.minimum(ground.across - left, right - ground.across)
     inside = inside + 0.15 * blotch[3] * (1 - world.street.kerbed[row, None])
     paved = (inside / ground.reach_across + 0.5).clamp(0, 1)
-    albedo, coverage = _albedo(scene, row, ground, paved, blotch, features)
-    _add_kinds(scene, below, ground, albedo, coverage, paved, blotch[2], features)
-    shape = (3, *paved.shape)
-    albedo, (coverage, studs) = albedo.view(shape).transpose(0, 1), coverage.view(2, *paved.shape)
+    surface = _plain_surface(scene, row, ground, paved, blotch, features)
+    _add_kinds(scene, below, ground, surface, paved, blotch[2], features)
+    albedo, coverage = (part.view(-1, *paved.shape) for part in surface)
 
     x = ray_x * ground.z
     sunlit, open_sky = shadows(scene, below, x, ground, features)
     lit = light.direct[..., None] * (light.sun[:, 1, None] * sunlit)[:, None]
     lit = lit + light.ambient[..., None] * open_sky[:, None]
-    _add_headlights(scene, below, x, ground, coverage, studs, features.rows, lit)
+    _add_headlights(scene, below, x, ground, coverage, features.rows, lit)
     gloss = _gloss(scene, row, ray_x, ray_y, sunlit, open_sky, blotch[2], features)
-    return albedo * lit + gloss * paved[:, None]
+    return albedo.transpose(0, 1) * lit + gloss * paved[:, None]
 
 
 def _add_headlights(
@@ -76,7 +89,6 @@ def _add_headlights(
     x: Tensor,
     ground: Ground,
     coverage: Tensor,
-    studs: Tensor,
     rows: KindRows,
     lit: Tensor,
 ) -> None:
@@ -87,8 +99,7 @@ def _add_headlights(
         below: the points, in blocks.
         x: (T, N) m, right of the camera's foot.
         ground: (T, N) points.
-        coverage: (T, N) by paint, which throws the headlights' light back.
-        studs: (T, N) coverage by studs, which do so more.
+        coverage: (2, T, N) by paint, which throws the headlights' light back, and by studs, which do so more.
         rows: on which rows there are which kinds.
         lit: irradiance over pi.
     """
@@ -97,7 +108,7 @@ def _add_headlights(
         if not len(index):
             continue
         row = below.row.index_select(0, index)
-        own_x, painted, studded, under = (lines_of(t, index) for t in (x, coverage, studs, lit))
+        own_x, painted, studded, under = (lines_of(t, index) for t in (x, *coverage, lit))
         z, along, across = (lines_of(t, index) for t in ground[:3])
         retro = 1 + 2.5 * painted + 8.0 * studded
         if name == "headlight":
@@ -110,13 +121,13 @@ def _add_headlights(
         lit.index_copy_(0, index, light)
 
 
-def _albedo(
+def _plain_surface(
     scene: Scene, row: Tensor, ground: Ground, paved: Tensor, blotch: Tensor, features: Features
-) -> tuple[Tensor, Tensor]:
-    """Compute a plain road's linear reflectance (3, T·N), and coverage by paint and by studs (2, T·N)."""
-    batch, planes = len(scene.place.along), paved.numel()
-    albedo = paved.new_zeros(3, planes)
-    coverage = paved.new_zeros(2, planes)  # by paint, by studs
+) -> Surface:
+    """Make the surface of a plain road and of the ground beside it, at T·N points."""
+    batch, points = len(scene.place.along), paved.numel()
+    surface = Surface(paved.new_zeros(3, points), paved.new_zeros(2, points))
+    albedo = surface.albedo
 
     road = make_blocks(paved > 0, row=row, num_rows=batch)
     part, stain = (
@@ -128,7 +139,7 @@ def _albedo(
     lanes = place_in_lanes(layout, part.across)
     bare = pavement_albedo(road, pavement, layout, part, lanes, stain, features)
     put(albedo, road.place, bare.transpose(0, 1))
-    _add_paint(scene, road.row, road.place, part, lanes, stain[2], features, albedo, coverage)
+    _add_paint(scene, road, part, lanes, stain[2], features, surface)
 
     beside = make_blocks(paved < 1, row=row, num_rows=batch)
     part = Ground(*(take(t, beside.place) for t in ground))
@@ -138,20 +149,19 @@ def _albedo(
     share = take(paved, beside.place)
     inner = take_channels(albedo, beside.place)
     put(albedo, beside.place, verge + (inner - verge) * share)
-    return albedo, coverage
+    return surface
 
 
 def _add_kinds(
     scene: Scene,
     below: Blocks,
     ground: Ground,
-    albedo: Tensor,
-    coverage: Tensor,
+    surface: Surface,
     paved: Tensor,
     stain: Tensor,
     features: Features,
 ) -> None:
-    """Put what only some kinds of road have on their ground; changes albedo and coverage."""
+    """Put what only some kinds of road have on their ground; changes the surface."""
     kinds = features.rows
     for name, rows in (("city", kinds.city), ("works", kinds.works), ("snow", kinds.snow)):
         index = below.of_rows(rows)
@@ -159,7 +169,7 @@ def _add_kinds(
             continue
         row = below.row.index_select(0, index)
         part = Ground(*(lines_of(t, index) for t in ground))
-        own, painted = (t.view(len(t), *paved.shape) for t in (albedo, coverage))
+        own, painted = (t.view(len(t), *paved.shape) for t in surface)
         channels, paint_on = own.index_select(1, index), painted[0].index_select(0, index)
         base = channels.transpose(0, 1)
         road, blotch = lines_of(paved, index), lines_of(stain, index)
@@ -178,33 +188,43 @@ def _add_kinds(
 
 def _add_paint(
     scene: Scene,
-    row: Tensor,
-    place: Tensor,
-    road: Ground,
+    road: Blocks,
+    ground: Ground,
     lanes: LanePlace,
     stain: Tensor,
     features: Features,
-    albedo: Tensor,
-    coverage: Tensor,
+    surface: Surface,
 ) -> None:
-    """Paint markings on the road; changes albedo (3, M) and coverage by paint and by studs (2, M)."""
+    """Paint markings on the road; changes the surface.
+
+    Args:
+        scene: B of them.
+        road: the points on the road, in blocks.
+        ground: the points.
+        lanes: their places in the lanes.
+        stain: how worn the paint is there.
+        features: what any of the scenes has.
+        surface: of all points.
+    """
     layout = scene.world.layout
-    near = near_marking(take_rows(layout, row), road, lanes.slot)
+    of_road = take_rows(layout, road.row)
+    near = near_marking(of_road, ground, lanes.slot)
     if features.symbols:
-        covered = symbols(take_rows(layout, row), road, lanes.lane)
+        covered = symbols(of_road, ground, lanes.lane)
         near |= covered > 0
-    marked = make_blocks(near, row=row, num_rows=len(layout.across))
-    part = Ground(*(take(t, marked.place) for t in road))
-    slot, where = take(lanes.slot, marked.place), take(place, marked.place)
+    marked = make_blocks(near, row=road.row, num_rows=len(layout.across))
+    part = Ground(*(take(t, marked.place) for t in ground))
+    slot, where = take(lanes.slot, marked.place), take(road.place, marked.place)
     grazing = part.z / scene.lens.extrinsics.height[marked.row, None]
     own = take_rows(layout, marked.row)
     paint_on, studs_on, tone = paint(own, part, slot, grazing, take(stain, marked.place), features)
     studs_on = studs_on * (1 - paint_on)
     if features.symbols:
         paint_on = torch.maximum(paint_on, take(covered, marked.place))
-    bare = take_channels(albedo, where)
-    put(albedo, where, bare + (tone.transpose(0, 1) - bare) * paint_on + (STUD_ALBEDO - bare) * studs_on)
-    put(coverage, where, torch.stack([paint_on, studs_on]))
+    bare = take_channels(surface.albedo, where)
+    painted = bare + (tone.transpose(0, 1) - bare) * paint_on + (STUD_ALBEDO - bare) * studs_on
+    put(surface.albedo, where, painted)
+    put(surface.coverage, where, torch.stack([paint_on, studs_on]))
 
 
 def _gloss(
