@@ -156,7 +156,7 @@ def motion(
 
 @lru_cache(maxsize=16)
 def _places(num_boundaries: int) -> tuple[int, ...]:
-    """Flat indices, in the order of :func:`motion`, of the entries of F and, after it, W."""
+    """Return the flat indices of the entries of F and, after it, W, in the order of :func:`motion`."""
     indices = layout(num_boundaries)
 
     def block(rows: Sequence[int], columns: Sequence[int]) -> list[int]:

@@ -65,7 +65,7 @@ def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor, weight
 
 @lru_cache(maxsize=16)
 def _free_pose(count: int) -> tuple[tuple[float, ...], ...]:
-    """The covariance O × O that is added where the pose is free."""
+    """Return the covariance O × O that is added where the pose is free."""
     added = [sigma**2 for sigma in _FREE_POSE] + [0.0] * (count - NUM_POSE)
     return tuple(tuple(value * (k == i) for k in range(count)) for i, value in enumerate(added))
 

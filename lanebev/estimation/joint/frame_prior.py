@@ -87,7 +87,7 @@ class FramePrior:
         return student_log(self._squared(params), self.freedom)
 
     def _squared(self, params: Tensor) -> Tensor:
-        """Squared normalised distances (..., P) of parameters from their means."""
+        """Compute the squared normalised distances (..., P) of parameters from their means."""
         count = params.shape[-1]
         return ((params - self.mean(params)[:count]) / self.std(params)[:count]).square()
 

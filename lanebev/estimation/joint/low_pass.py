@@ -92,7 +92,7 @@ def _covariance(bandwidth: float) -> Rows:
 
 @lru_cache(maxsize=16)
 def _modes(bandwidth: float) -> tuple[Rows, tuple[float, ...], tuple[float, ...]]:
-    """The low-pass with this cut-off frequency (Hz): modes, those of cosines first; decays and turns, 1/s."""
+    """Return the low-pass at a cut-off frequency (Hz): modes, cosines first; decays and turns, 1/s."""
     cutoff = 2 * math.pi * bandwidth
     powers = [cutoff ** (i - k) for i in range(ORDER) for k in range(ORDER)]
     modes = tuple(

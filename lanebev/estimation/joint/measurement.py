@@ -248,12 +248,12 @@ def sampson_distances(params: Tensor, places: Tensor, sight: Sight) -> Tensor:
 
 
 def _of_valid(distance: Tensor, valid: Tensor) -> Tensor:
-    """(…, B, M) distances to (…, B, 2, N), zero where not valid."""
+    """Reshape distances (…, B, M) to (…, B, 2, N), zero where not valid."""
     return torch.where(valid.unsqueeze(-2), by_ends(distance), 0.0)
 
 
 def _per_pixel(line: Tensor) -> Tensor:
-    """1 / |∂(n·d)/∂p| (…, M) px, for the lines l (…, 3, M) in which planes n appear, l·(x, y, 1) = n·d."""
+    """Compute 1 / |∂(n·d)/∂p| (…, M) px, of the lines l (…, 3, M) in which planes n appear, l·p = n·d."""
     across, down, _ = line.unbind(-2)
     return torch.addcmul(across * across, down, down).rsqrt()
 
@@ -264,23 +264,23 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _lateral(params: Tensor, places: Tensor) -> Tensor:
-    """X of every end point's boundary at Z = 0, (…, B, M) m, for places (…, B, N) less the offset."""
+    """Return X of every end point's boundary at Z = 0, (…, B, M) m, for places (…, B, N) less the offset."""
     return per_end(places + params[:, OFFSET : OFFSET + 1])
 
 
 def _road(params: Tensor, phase: Tensor | None) -> Road:
-    """The middle line of the road: a clothoid, or with a phase a spline."""
+    """Return the middle line of the road: a clothoid, or with a phase a spline."""
     return road_shape(params[:, NUM_STRAIGHT : None if phase is None else VERTICAL], phase)
 
 
 def _profile(params: Tensor, phase: Tensor | None) -> Profile:
-    """Height and vertical curvature, 0 for a single frame."""
+    """Return height and vertical curvature, 0 for a single frame."""
     height = params[:, HEIGHT : HEIGHT + 1]
     return road_profile(height, torch.zeros_like(height) if phase is None else params[:, VERTICAL:])
 
 
 def tangent_plane(z: Tensor, x_k: Tensor, profile: Profile, curve: RoadCurve) -> tuple[Tensor, Tensor]:
-    """Normal n (…, B, 3, M) of the plane through the camera and a boundary's tangent, and its slope X'(Z).
+    """Compute the normal n (…, B, 3, M) of the plane through camera and tangent of a boundary, and X'(Z).
 
     Source: (J2) and (J4).
 

@@ -108,7 +108,7 @@ def ego_lane_width(positions: Tensor) -> Tensor:
 
 @lru_cache(maxsize=16)
 def _places_by_widths(num_boundaries: int) -> tuple[tuple[float, ...], ...]:
-    """X of each boundary from the middle of the ego lane by the width of each lane: (L-1) × L."""
+    """Return X of each boundary from the ego lane's middle by the width of each lane, (L-1) × L."""
     lanes, ego = range(num_boundaries - 1), num_boundaries // 2 - 1
     middle = [0.5 * ((lane < ego) + (lane <= ego)) for lane in lanes]
     return tuple(tuple((lane < k) - middle[lane] for k in range(num_boundaries)) for lane in lanes)

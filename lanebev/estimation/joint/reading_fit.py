@@ -161,7 +161,7 @@ def _posterior_equations(
 
 
 def _half_log_det(matrix: Tensor) -> Tensor:
-    """Half the log determinant (R,) of positive definite matrices, scaled to a unit diagonal meanwhile."""
+    """Compute half the log determinant (R,) of positive definite matrices, scaled to a unit diagonal."""
     size = matrix.diagonal(dim1=1, dim2=2).sqrt()
     factor = cholesky(matrix / (size.unsqueeze(-1) * size.unsqueeze(-2)))
     return (factor.diagonal(dim1=1, dim2=2).log() + size.log()).sum(-1)

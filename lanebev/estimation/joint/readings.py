@@ -110,7 +110,7 @@ def readings(num_boundaries: int, cfg: ReadingConfig, like: Tensor) -> Readings:
 
 @lru_cache(maxsize=16)
 def _single_wrong_lines(num: int) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Which lines bound no lane and by how many lanes the others are counted wrong, (F, L) each.
+    """List which lines bound no lane and by how many lanes the others are counted wrong, (F, L) each.
 
     A wrong line may have been counted as a boundary, or not: those beyond it close up, or stay.
     """

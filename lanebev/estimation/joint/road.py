@@ -91,7 +91,7 @@ def step_variance(shape: Tensor, shape_cov: Tensor, cfg: MotionConfig) -> Tensor
 
 
 def _renumbering(passed: Tensor) -> Tensor:
-    """Transition (B, NUM_SHAPE, NUM_SHAPE) by which what was step j is step j - passed, or in the curvature.
+    """Return the transition (B, NUM_SHAPE, NUM_SHAPE) by which step j becomes step j - passed.
 
     Row and column 0 are the curvature at the first knot: it takes up the steps up to the last knot passed.
     """

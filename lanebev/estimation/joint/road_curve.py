@@ -90,7 +90,7 @@ def road_curve(z: Tensor, road: Road) -> RoadCurve:
 
 
 def _pieces_at(z: Tensor, road: Road) -> Tensor:
-    """Coefficients (B, 4, M) of the piece of the road in which z (B, M) m lies; (B, 4, 1) of a clothoid."""
+    """Return the coefficients (B, 4, M) of the road's piece in which z (B, M) m lies; (B, 4, 1): clothoid."""
     if road.past is None:
         return road.pieces
     passed = torch.add(road.past[:, 0], z, alpha=1 / KNOT_SPACING).long().clamp(0, NUM_STEPS)
@@ -122,6 +122,6 @@ def curve_by_shape(z: Tensor, by_bend: Tensor, by_heading: Tensor, road: Road) -
 
 
 def _behind(past: Tensor) -> tuple[Tensor, Tensor]:
-    """Heading and bend (B, 1) at the camera for a unit first step, of which ``past`` spacings are behind."""
+    """Compute heading and bend (B, 1) at the camera for a unit first step, ``past`` spacings behind."""
     square = past * past
     return _SQUARE * square, _CUBE * (square * past)

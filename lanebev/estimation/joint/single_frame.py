@@ -70,7 +70,7 @@ class SingleFrameFit(NamedTuple):
     valid: Tensor
 
     def params(self) -> Tensor:
-        """(B, 7) vector of parameters."""
+        """Return the vector of parameters (B, 7)."""
         return torch.cat([self.extrinsics.stack(), self.offset.unsqueeze(-1), self.curvature], dim=-1)
 
 
@@ -127,7 +127,7 @@ def fit_single_frame(
 def fit_observations(
     seen: Observations, places: Tensor, prior: FramePrior, iterations: int = 8
 ) -> SingleFrameFit:
-    """As :func:`fit_single_frame`, of segments made ready and places (B, N) of their boundaries, m."""
+    """Fit as :func:`fit_single_frame`, from prepared segments and places (B, N) m of their boundaries."""
     fixed, fixed_places = map_tensors(Tensor.detach, seen), places.detach()
     fewer, fewer_places = spread_subset(fixed, fixed_places, _START_SEGMENTS)
     starts = linear_starts(fewer, fewer_places, prior)  # (B, S, 7)
@@ -169,7 +169,7 @@ def refine(
     iterations: int,
     blur: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Reweighted Gauss-Newton on perpendicular distances, the noise scale falling by half at most each step.
+    """Take reweighted Gauss-Newton steps on perpendicular distances; the noise scale falls by half at most.
 
     Args:
         params: (B, 7) start.

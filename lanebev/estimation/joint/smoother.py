@@ -112,7 +112,7 @@ def smooth_states(
 def _backward_links(
     before: JointState, after: JointState, dt: Tensor, cfg: JointConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Prediction (B, D), gain (B, D, D) and covariance (B, D, D) that a step backward takes."""
+    """Compute prediction (B, D), gain (B, D, D) and covariance (B, D, D) of a step backward."""
     dtype = widest_dtype(before.mean.device)
     before, after = cast_floating(before, dtype), cast_floating(after, dtype)
     dt = dt.to(dtype)
@@ -153,7 +153,7 @@ def smooth_drive(
 
 
 def _joined(states: Sequence[JointState]) -> JointState:
-    """States of several frames as rows of one batch."""
+    """Return states of several frames as rows of one batch."""
     return JointState(*(torch.cat(parts) for parts in zip(*states, strict=True)))
 
 

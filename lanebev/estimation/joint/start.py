@@ -147,7 +147,7 @@ def with_vertical_curvature(cov: Tensor, by_vertical: Tensor, std: float) -> Ten
 
 @lru_cache(maxsize=16)
 def _by_parameters(num_boundaries: int) -> tuple[tuple[float, ...], ...]:
-    """The state's entries by parameters and vertical curvature of one frame, D × 8.
+    """Return the state's entries by parameters and vertical curvature of one frame, D × 8.
 
     The slow mean begins at the pose.
     """
@@ -161,7 +161,7 @@ def _by_parameters(num_boundaries: int) -> tuple[tuple[float, ...], ...]:
 
 @lru_cache(maxsize=16)
 def _start_variances(num_boundaries: int, motion: MotionConfig) -> tuple[float, ...]:
-    """Variances (D,) of a start beside those of the frame's fit."""
+    """Return the variances (D,) of a start beside those of the frame's fit."""
     swing = (*[motion.angle_std**2] * 3, motion.height_std**2)
     _, rate, acceleration, jerk = pose_variances(motion.bandwidth)
     return (

@@ -35,7 +35,7 @@ def spread_subset(seen: Observations, places: Tensor, count: int) -> tuple[Obser
 
 
 def _spread(steps: int, like: Tensor) -> Tensor:
-    """(steps,) evenly from -1 to 1; 0 where there is but one."""
+    """Return numbers (steps,) evenly from -1 to 1; 0 if there is but one."""
     end = 1.0 if steps > 1 else 0.0
     return torch.linspace(-end, end, steps, dtype=like.dtype, device=like.device)
 
@@ -102,7 +102,7 @@ def _linear_prior(prior: FramePrior, like: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _params_from_linear(solution: Tensor, axes: Tensor) -> Tensor:
-    """(…, 7) parameters from the linear solution (…, 4) and the axes (…, 3, 3) it was found in."""
+    """Return parameters (…, 7) from the linear solution (…, 4) and the axes (…, 3, 3) it was found in."""
     across, per_metre, tangent, bend = solution.unbind(-1)
     cos = (1 + tangent * tangent).rsqrt().unsqueeze(-1)
     sin = tangent.unsqueeze(-1) * cos

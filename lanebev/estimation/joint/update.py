@@ -220,14 +220,14 @@ def single_frame_std(matrix: Tensor) -> Tensor:
 
 
 def estimated_entries(single_frame_std: Tensor, num_boundaries: int) -> Tensor:
-    """(B, D): 0 for roll, its derivatives and slow mean where a frame does not determine roll, else 1."""
+    """Return (B, D): 0 for roll, its derivatives and slow mean where a frame leaves it open, else 1."""
     others = constant(_all_but_roll(num_boundaries), single_frame_std)
     return torch.where(single_frame_std[:, ROLL, None] > UNSEEN[ROLL], others, 1.0)
 
 
 @lru_cache(maxsize=16)
 def _all_but_roll(num_boundaries: int) -> tuple[float, ...]:
-    """0 for roll, its derivatives and slow mean, else 1: D numbers."""
+    """Return D numbers: 0 for roll, its derivatives and slow mean, else 1."""
     place = layout(num_boundaries)
     roll = place.chain(ROLL)
     return tuple(float(entry not in roll) for entry in range(place.size))
