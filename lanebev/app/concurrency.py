@@ -14,7 +14,7 @@ import torch
 T = TypeVar("T")
 Result = TypeVar("Result")
 _END = object()
-_MOST_CALLS = 8  # that wait in a background thread
+_MOST_CALLS = 8  # calls that wait for the background thread, at most
 
 
 def prefetch(items: Iterable[T], depth: int = 4) -> Iterator[T]:

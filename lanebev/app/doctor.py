@@ -33,11 +33,11 @@ from lanebev.types import Status
 OK, DOUBT, WRONG = 0, 1, 2
 _WORDS = ("ok", "doubt", "wrong")
 _SAMPLED = 40  # frames
-_SECONDS = 120.0  # of a source, from which they are taken
-_OFF_CENTRE = 0.1  # of the image's sides, between its centre and the principal point
+_SECONDS = 120.0  # s; frames are taken from so much of a source
+_OFF_CENTRE = 0.1  # distance of the principal point from the centre, as a fraction of the image's sides
 _GAP = 3.0  # times the median interval
-_LEAST_VERTICES = 4  # of a boundary that is seen
-_SHARE_SEEN = 0.5  # of frames with two boundaries
+_LEAST_VERTICES = 4  # a boundary with fewer is not seen
+_SHARE_SEEN = 0.5  # fraction of frames in which two boundaries must be seen
 
 
 class Finding(NamedTuple):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lanebev.io.results import ExtrinsicsRow
 
-_NUMBERS = 10  # of a row: nine from time_s on, and the vertical curvature
+_NUMBERS = 10  # numbers in a row: nine from time_s on, and the vertical curvature
 
 
 class KeptRows(Sequence[ExtrinsicsRow]):

@@ -39,9 +39,9 @@ from lanebev.types import NUM_BOUNDARIES, Extrinsics
 from lanebev.view.grid import BEVGrid
 
 _BEFORE_RESOLUTION = 0.1  # m, of the view before: it is only shown small
-_CRF = 23  # of the videos
+_CRF = 23  # quality of the videos, H.264's constant rate factor
 _LONGEST_NAME = 38  # characters of an image's name in its overlay
-_MOST_PROBLEMS = 1000  # of frames, that are listed
+_MOST_PROBLEMS = 1000  # problems of frames that are listed, at most
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,7 +46,7 @@ from lanebev.io.state import save_state
 from lanebev.io.video import Frame, FrameSource
 from lanebev.report.page import Report
 
-STILLS_FPS = Fraction(2)  # of the videos that show images one after another
+STILLS_FPS = Fraction(2)  # Hz, of the videos of still images
 
 
 logger = logging.getLogger(__name__)

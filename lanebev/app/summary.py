@@ -20,8 +20,8 @@ from lanebev.report.page import Report
 from lanebev.report.verdict import reason_words
 
 _SHOWN = {"pitch_deg": "deg", "yaw_deg": "deg", "roll_deg": "deg", "height_m": "m"}
-_PROBLEMS = 5  # that are printed
-_REASONS = 2  # likewise
+_PROBLEMS = 5  # problems that are printed, at most
+_REASONS = 2  # reasons that are printed, at most
 
 
 def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[str, str]:

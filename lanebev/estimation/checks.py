@@ -14,9 +14,9 @@ from lanebev.types import Calibration, Status, TensorTuple, check_tensor
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
 _MIN_SIGMA = 1e-3  # px; nothing is known better
-LEAST_SEGMENTS = 2  # that the estimators' reductions and pairs ask for; the rest is padding
+LEAST_SEGMENTS = 2  # of a row: the estimators need so many, and padding counts
 _HARMLESS_WIDTH = 3.7  # m
-LANE_WIDTHS = (1.0, 10.0)  # m, that a lane may have
+LANE_WIDTHS = (1.0, 10.0)  # m, smallest and largest of a lane
 
 
 def check_segments(segments: LaneSegments, intrinsics: Tensor) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _DRAWN_TEXTS = ("tty", "bin", "xbin", "adf", "idf")  # formats of which ffmpeg draws the letters
-_MOVING = 0.5  # of the longest stream's duration, the least of another that is no picture beside it
+_MOVING = 0.5  # a stream that lasts for less of the longest one's duration is a picture
 _NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS: raw streams, whose times ffmpeg makes up
 _MARKED = "one that the decoder marks as damaged"
 _EARLY = "one before the first key frame"

@@ -15,7 +15,7 @@ _LEFT_OUT = (
     *HEIC, ".avif", ".jxl", ".dng", ".cr2", ".nef", ".arw", ".tga", ".gif",
     ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".ts", ".mts",
 )  # fmt: skip
-_OWN_VIDEOS = ("bev.mp4", "overlay.mp4")  # of a run into the folder of its images
+_OWN_VIDEOS = ("bev.mp4", "overlay.mp4")  # an earlier run may have written them beside its images
 
 
 def images_of(source: str) -> list[str]:

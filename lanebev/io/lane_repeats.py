@@ -9,7 +9,7 @@ import numpy as np
 
 from lanebev.io.lane_parsing import FrameLines
 
-_MOST_REPEATED = 0.3  # of the frames; of a scene in which nothing moves, all are
+_MOST_REPEATED = 0.3  # fraction of frames with the lanes of the one before; all if nothing moves
 
 
 def repeats_remark(frames: Sequence[FrameLines]) -> str:

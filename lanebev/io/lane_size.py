@@ -15,12 +15,12 @@ _STATE_SIZE = "state their size with --lanes-size WIDTHxHEIGHT"
 _OUTSIDE = 0.1  # share of points below or far beside the images, of which more are of another size
 _OFF_CENTRE = 0.2  # share of a side, more than a principal point is off the centre
 _BESIDE = 0.5  # image widths beside an image that lines are drawn on to
-_REACHED = 0.8  # of both sides, one of which a drive's lanes reach: they leave images at the bottom
-_REACHED_UNCROPPED = 0.85  # of the height, likewise, by lanes whose horizon is above _HIGHEST_HORIZON
-_HIGHEST_HORIZON = 0.28  # of the height, counted from above
+_REACHED = 0.8  # lanes reach beyond this fraction of a side: they leave images at the bottom
+_REACHED_UNCROPPED = 0.85  # fraction of the height that lanes with a horizon so high must reach
+_HIGHEST_HORIZON = 0.28  # fraction of the height above the horizon
 _LOOKED_AT = 50  # frames, for the horizon
-_LEAST_SPREAD = 0.01  # of the lines' slopes, px per row, squared and summed
-_REACHED_DOWN = 0.55  # of the height, likewise; what is higher is the horizon
+_LEAST_SPREAD = 0.01  # sum of squares of the lines' slopes about their mean, px per row
+_REACHED_DOWN = 0.55  # lanes reach below this fraction of the height, where the horizon is
 
 
 def resized_lanes(

@@ -37,7 +37,7 @@ def _status(text: str) -> str:
 
 
 _COLUMN_TYPES: tuple[Callable[[str], Any], ...] = (int, *[float] * 9, _status, int, str, str, _number_or_none)
-_HEADERS = (CSV_COLUMNS, CSV_COLUMNS[:-1], CSV_COLUMNS[:-2])  # of this version and of earlier ones
+_HEADERS = (CSV_COLUMNS, CSV_COLUMNS[:-1], CSV_COLUMNS[:-2])  # headers of this version and of earlier ones
 
 OUTPUT_NAMES = (
     "extrinsics.csv", "filtered.csv", "lanes.json", "bev.mp4", "bev.png", "overlay.mp4", "overlay.png",

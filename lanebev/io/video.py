@@ -60,7 +60,7 @@ __all__ = [
 ]
 
 _LOOKED_AT = 20  # images, for the most frequent size and one that has it
-_DARK = 24  # of 255; 12 bits in 16 give 15 at most
+_DARK = 24  # an image with no brighter value, of 255, is dark; 12 bits in 16 give 15 at most
 _SAME_RATE = 0.05  # relative, by which two frame rates may differ and be the same
 _SAME_VIDEO = 2  # factor, by which a video's frames may come faster or slower than its mean rate
 _HIDING = ("vp8", "libvpx")  # codecs with frames that are decoded and not shown, in packets of their own

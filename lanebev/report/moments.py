@@ -9,7 +9,7 @@ import cv2
 
 from lanebev.report.lettering import Picture
 
-MOST_BYTES = 4_300_000  # of all pictures; base64 makes 5.7 MB of it
+MOST_BYTES = 4_300_000  # of all pictures together; 5.7 MB in base64
 _EVERY = 1  # frames between two pictures at first
 _QUALITY = 72  # of JPEG
 _LONGEST = 800  # px, side of a picture

@@ -28,7 +28,7 @@ from lanebev.view.tiles import LARGEST_WEIGHTS, interpolant
 
 _kept = KeptArrays()
 
-_MOST_PIXELS = 8  # of a frame, for each cell: to copy more takes longer than a fourth channel saves
+_MOST_PIXELS = 8  # pixels per cell; with more, adding a fourth channel takes longer than it saves
 
 
 @torch.inference_mode()

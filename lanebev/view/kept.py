@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-_MOST_BYTES = 1 << 28  # of all arrays of a thread
+_MOST_BYTES = 1 << 28  # that a thread keeps in all its arrays
 
 
 class KeptArrays(threading.local):

@@ -16,7 +16,7 @@ from torch import Tensor
 from lanebev.geometry.precision import full_precision
 from lanebev.view.lens import Lens, image_planes
 
-LEAST_DEPTH = 1e-3  # in front of the camera; m for cells of the road
+LEAST_DEPTH = 1e-3  # distance in front of the camera, m for cells of the road
 
 
 class Cells(Protocol):

@@ -27,11 +27,11 @@ from lanebev.view.lens import Lens
 from lanebev.view.projection import CellSums, image_coordinates
 from lanebev.view.thread_limits import ONE_THREAD, small_products
 
-_NODES = 12  # of a tile, along its rows and along its columns
-_LEAST_ROWS = 3 * _NODES  # of a tile
+_NODES = 12  # nodes along each side of a tile, at which positions are exact
+_LEAST_ROWS = 3 * _NODES  # a tile has at least so many
 _GROWTH = 0.5  # share of its least depth that the depth grows by within a tile
-_COLUMNS = 128  # of a tile; half as many of a lens
-_TOLERANCE = 4e-6  # of half the image, .004 px of 1920; what float32 rounds is a quarter of it
+_COLUMNS = 128  # a tile has so many; with a lens half
+_TOLERANCE = 4e-6  # error, in half images: 0.004 px of 1920; float32 rounds by a quarter of it
 _LOW = _NODES - 2  # the coefficients of this degree and higher tell what those of higher ones would add
 _SUMS = np.stack([np.ones(_NODES), np.arange(_NODES) >= _LOW], axis=1).astype(np.float32)
 LARGEST_WEIGHTS = 4.0  # the magnitudes of the weights of a cell sum up to less

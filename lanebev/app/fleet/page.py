@@ -23,7 +23,7 @@ from lanebev.report.templates import template
 _UNITS, _DIGITS = ("°", "°", "°", " m"), (2, 2, 2, 3)
 _SCALE = np.array([180 / math.pi] * 3 + [1.0])
 _COLOUR, _MOVED = "#1f6feb", "#e5484d"
-_MOST_DRIVES = 2000  # that are listed one by one, those that failed first
+_MOST_DRIVES = 2000  # drives that are listed one by one, at most; failed ones come first
 
 
 @dataclass(frozen=True)

@@ -43,10 +43,10 @@ from lanebev.observation.segments import LaneSegments
 from lanebev.types import Calibration, Extrinsics
 
 _START_STEPS, _STEPS = 6, 5  # Gauss-Newton steps of the start and of every reading
-_SEGMENTS = 192  # that are fitted
+_SEGMENTS = 192  # segments that are fitted, at most
 _ANGLES = [PITCH, ROLL]
-_KEEP = 3.0  # sigmas from the average within which the likeliest reading stands
-_FARTHER = 0.5  # sigmas by which it may be farther from the prior than the average is
+_KEEP = 3.0  # the likeliest reading is kept if it is within so many sigmas of the average
+_FARTHER = 0.5  # ... and at most so many sigmas farther from the prior than the average
 _POSE = slice(0, HEIGHT + 1)
 
 

@@ -19,9 +19,9 @@ from lanebev.tensors import constant
 _COMMON_ERROR = 0.2  # sigmas: standard deviation of the error that all end points of a boundary share
 _LEAST_VARIANCE = 1e-3  # ratio of a score's variance to Λᵢᵢ below which the prediction fixes the entry
 _FREE_POSE = (0.05, 0.05, 0.05, 0.3)  # rad, m: sigmas added where the pose is free
-_LARGEST_EXCESS = 4.0  # of a squared score; a larger one is a jump
-EQUAL = 0.1  # of the deviations of unequal lanes, up to which lanes are equal
-_OVER_HORIZON = 0.01  # fraction of segments over the horizon, above which the others are too low
+_LARGEST_EXCESS = 4.0  # of a squared score over 1; a larger one is a jump
+EQUAL = 0.1  # lanes are equal up to this fraction of ``JointConfig.open_deviation``
+_OVER_HORIZON = 0.01  # if more of the segments are over the horizon, the others are too low
 _CURVED_SIGMAS = 2.0  # ratio of the vertical curvature to its sigma from which it is a crest or a dip
 _POSE_DECAY = 0.85  # factor per frame on the pose's evidence, since a detector's errors last over frames
 CALL = 5.0  # sigmas of evidence at which half of the noise is admitted

@@ -47,7 +47,7 @@ from lanebev.estimation.joint.update import (
 from lanebev.estimation.reasons import Reason
 from lanebev.tensors import constant
 
-_NO_BOUNDARY_DEVIATION = 0.36  # m, from which a line bounds no lane: three sigmas of `open_deviation`
+_NO_BOUNDARY_DEVIATION = 0.36  # m; a line that deviates by more bounds no lane (3 ``open_deviation``)
 
 
 class FrameUpdate(NamedTuple):

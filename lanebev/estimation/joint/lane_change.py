@@ -12,7 +12,7 @@ from lanebev.estimation.joint.observations import Observations
 from lanebev.estimation.joint.robust import log_likelihood, scaled_variance, squared_distance, start_scale
 from lanebev.tensors import constant
 
-_SEGMENTS = 96  # that decide, at least
+_SEGMENTS = 96  # segments that decide, at least
 
 
 def best_shift(
@@ -68,7 +68,7 @@ def renumber(mean: Tensor, shift: Tensor, lane_width: Tensor, num_boundaries: in
         (B, D).
     """
     last = NUM_COMMON + num_boundaries
-    number = constant(tuple(range(1, num_boundaries + 1)), like=mean, dtype=torch.int64)  # in the padded
+    number = constant(tuple(range(1, num_boundaries + 1)), like=mean, dtype=torch.int64)  # padded
     own = pad(mean[:, NUM_COMMON:last], (1, 1)).gather(1, number + shift.long().unsqueeze(-1))
     offset = mean[:, OFFSET : OFFSET + 1] + (shift * lane_width).unsqueeze(-1)
     return torch.cat(

@@ -12,7 +12,7 @@ NUM_COMMON = VERTICAL + 1  # entries that all boundaries depend on
 POSE = slice(0, NUM_POSE)
 SHAPE = slice(CURVATURE, VERTICAL)  # 1/m: curvature at the first knot, then its steps
 STEPS = slice(CURVATURE + 1, VERTICAL)
-DEVIATIONS = slice(NUM_COMMON, None)  # m, of what a frame observes: each boundary from its place
+DEVIATIONS = slice(NUM_COMMON, None)  # m; of the observed entries, those of the boundaries' deviations
 
 
 class Layout(NamedTuple):

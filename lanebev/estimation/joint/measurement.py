@@ -49,8 +49,8 @@ NUM_SHAPE = 1 + NUM_STEPS
 VERTICAL = NUM_STRAIGHT + NUM_SHAPE
 """Index of the vertical curvature (1/m), the last parameter of a road whose bend is a spline."""
 
-LEAST_HEIGHT = 0.2  # m, of the camera in a fit of one frame
-FOOT_RANGE = 0.02  # of the focal length; a foot point farther off is an outlier's, perhaps above the horizon
+LEAST_HEIGHT = 0.2  # m; the height in a fit of one frame is at least this
+FOOT_RANGE = 0.02  # focal lengths from an end point to its foot point, at most: beyond are outliers
 
 
 class Sight(NamedTuple):

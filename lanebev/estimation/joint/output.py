@@ -19,16 +19,16 @@ from lanebev.tensors import constant
 from lanebev.types import Calibration, Extrinsics
 
 _ONLY_HEIGHT = (0.0, 0.0, 0.0, 1.0)
-_ALWAYS_FIT = 3  # number of boundaries that some pose over equal lanes always fits
+_ALWAYS_FIT = 3  # boundaries: some pose over equal lanes fits any three
 _CHANCE_FIT = 0.004  # probability that a further boundary fits though lanes are unequal
-_MISFIT_FACTOR = 4.0  # on the odds that a line bounds no lane, where other lines do not fit
-_EGO_LANE_SHARE = 0.2  # of the variance of other boundaries, for those of the ego lane, as such a line
-_NO_BOUNDARY_RANGE = 3.6  # m, over which the position of such a line is uniform
+_MISFIT_FACTOR = 4.0  # the odds that a line bounds no lane are so much larger where other lines do not fit
+_EGO_LANE_SHARE = 0.2  # such a line's variance on the ego lane's boundaries, relative to that on the others
+_NO_BOUNDARY_RANGE = 3.6  # m; the position of such a line is uniform over it
 _ROLL_PATTERN = 6.0  # sum of squares of (1, -2, 1), the proportion in which three boundaries change roll
 _LEAST_SENSITIVITY = 0.015  # rad/m or m/m of roll or height, from which a boundary counts as in view
-_HEADING_LENGTH = 15.0  # m along which a boundary keeps its own heading
+_HEADING_LENGTH = 15.0  # m; a boundary keeps its own heading along it
 _HEADING_BY_CURVATURE = 25.0  # m, ratio of the standard deviations of headings and curvatures: waves of 160 m
-_LEAST_HEIGHT = 0.1  # m, as a divisor
+_LEAST_HEIGHT = 0.1  # m; smaller heights are not divided by
 _LARGEST_DEVIATION = 0.6  # m; a line that deviates by more is on no boundary
 
 
@@ -93,7 +93,7 @@ def no_boundary_deviation(by_place: Tensor, roll: Tensor, misfit: Tensor, cfg: J
     total = by_place.square().sum(-1).clamp(min=_LEAST_SENSITIVITY**2)
     beyond = roll - cfg.prior.roll
     by_camera = student_density(beyond / cfg.prior.roll_std, cfg.prior.freedom) / cfg.prior.roll_std
-    density = by_camera * (total / _ROLL_PATTERN).sqrt()  # per m of the outer line's position
+    density = by_camera * (total / _ROLL_PATTERN).sqrt()  # 1/m, of the outer line's position
     odds = cfg.no_boundary_odds * torch.where(misfit, _MISFIT_FACTOR, 1.0) / (_NO_BOUNDARY_RANGE * density)
     of_roll = odds / (1 + odds) * beyond.square()
     ego = by_place.shape[-1] // 2 - 1

@@ -37,9 +37,9 @@ from lanebev.geometry.linalg import inverse_spd
 from lanebev.types import Status
 
 _CONTRADICTION = 25.7  # χ² with five degrees of freedom, exceeded by chance in one frame of 10,000
-_MISFIT_SHARE = 0.5  # fraction of segments that fit, below which the state is in doubt
-_UNDETERMINED_ROLL = 0.5  # of the prior's sigma of roll: sigma of a fit's roll from which it is undetermined
-_ROLL_NOISE = 1.5  # of the prior's sigma: distance from its mean within which such a roll may be noise
+_MISFIT_SHARE = 0.5  # the state is in doubt if a smaller fraction of the segments fits
+_UNDETERMINED_ROLL = 0.5  # roll is undetermined if its sigma is a larger fraction of the prior's
+_ROLL_NOISE = 1.5  # such a roll may be noise if it is within so many sigmas of the prior's mean
 
 
 class Compared(NamedTuple):

@@ -20,18 +20,18 @@ from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS
 from lanebev.geometry.linalg import cholesky, solve_lower
 from lanebev.tensors import constant
 
-CLEAR_BEND = (10.0, 20.0)  # χ² of the five steps: below, they do not change the speed; above, fully
-ENTRY = KNOT_SPACING / 3  # m, way over which a step comes into view
-_BENT = 3.0  # sigmas of the curvature at the farthest knot from which the road is taken to bend there
-_BEND_STEP = 0.07  # of that curvature: standard deviation of the next step, in a bend
-_SLOPE = 0.5 * (np.eye(1 + NUM_STEPS) + np.eye(1 + NUM_STEPS, k=1))  # at a knot, by the steps about it
+CLEAR_BEND = (10.0, 20.0)  # χ² of the steps, from which they begin to change the speed, and do so fully
+ENTRY = KNOT_SPACING / 3  # m; a step comes into view while the camera drives so far
+_BENT = 3.0  # the road bends at the farthest knot if its curvature there is so many sigmas
+_BEND_STEP = 0.07  # standard deviation of the next step in a bend, as a fraction of that curvature
+_SLOPE = 0.5 * (np.eye(1 + NUM_STEPS) + np.eye(1 + NUM_STEPS, k=1))  # at a knot: the mean of its steps
 _SLOPE[0] = np.eye(1 + NUM_STEPS)[1]
-_CHANGE = np.diff(_SLOPE, axis=0, prepend=0.0) / KNOT_SPACING  # of the shape parameters by a metre, 1/m
+_CHANGE = np.diff(_SLOPE, axis=0, prepend=0.0) / KNOT_SPACING  # 1/m, of the shape per metre driven
 _CHANGE_BY_SHAPE = tuple(map(tuple, _CHANGE.T.tolist()))
 _ORDER = range(1 + NUM_STEPS)
 _KNOTS = tuple(KNOT_SPACING * knot for knot in _ORDER)  # m, from the first
 _BEHIND = tuple(KNOT_SPACING * (NUM_STEPS - 1 - step) for step in range(NUM_STEPS))  # m
-_PASSED = (  # row 0 takes up the steps up to the last knot passed, the others are moved by the knots passed
+_PASSED = (  # row 0 sums the steps up to the last knot passed, the others move by the knots passed
     tuple(tuple(k - i if i == 0 or k > 0 else math.inf for k in _ORDER) for i in _ORDER),
     tuple(tuple(k - i if i > 0 else math.inf for k in _ORDER) for i in _ORDER),
 )

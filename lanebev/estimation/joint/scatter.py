@@ -23,13 +23,13 @@ from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
 from lanebev.tensors import constant
 
 _PRIOR_STD = (0.05, 0.003)  # m, rad: least prior sigmas of a boundary's own deviation and heading
-_NOISE_FACTOR = 1.5  # on the noise variance of the estimates, which is subtracted
-_ADDED_FREEDOM = 0.2  # degrees of freedom that are added, since there may be none
+_NOISE_FACTOR = 1.5  # so many times the noise variance of the estimates is subtracted
+_ADDED_FREEDOM = 0.2  # degrees of freedom that are added before dividing by them
 _FEW_FREEDOM = 2.0  # degrees of freedom at which a variance is doubled, because it may be small by chance
 _LEAST_SENSITIVITY = 0.001  # rad/m or m/m of roll or height, below which a boundary is not in view
-_BY_FREEDOM = 2.0  # decrease of the log of a start's variance by each degree of freedom of a frame
-_LEAST_WEIGHT = 1e-9  # of the frames before; 0 before the first
-_FULL_FREEDOM = 0.5  # degrees of freedom from which a frame counts fully
+_BY_FREEDOM = 2.0  # the log of a start's variance falls by this per degree of freedom of a frame
+_LEAST_WEIGHT = 1e-9  # of the frames so far; smaller ones are not divided by
+_FULL_FREEDOM = 0.5  # a frame with so many degrees of freedom counts fully
 _IS_ROLL = tuple(axis == ROLL for axis in range(NUM_POSE))
 _BY_HEADINGS = (False, True)  # columns of M: by deviations, by headings
 
@@ -92,7 +92,7 @@ def boundary_scatter(matrix: Tensor, vector: Tensor, precision: Tensor, moments:
     num = (vector.shape[-1] - count) // 2
     by_own = matrix[:, :count, count:]  # (B, P, 2 L)
     factor = cholesky(matrix[:, :count, :count] + precision.diag_embed())
-    across = torch.cholesky_inverse(factor) @ by_own  # change by what is own
+    across = torch.cholesky_inverse(factor) @ by_own  # change of the common parameters by each boundary's own
     known = solve_lower(factor, torch.cat([by_own, vector[:, :count, None]], dim=-1))
     own_known = known[:, :, :-1].mT
     left = matrix[:, count:, count:] - own_known @ known[:, :, :-1]  # (B, 2 L, 2 L)

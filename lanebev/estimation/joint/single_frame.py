@@ -38,8 +38,8 @@ from lanebev.observation.segments import LaneSegments
 from lanebev.tensors import map_tensors
 from lanebev.types import NUM_BOUNDARIES, Extrinsics
 
-_START_SEGMENTS = 96  # that are used to choose the start
-_OBSERVED = 0.2  # a parameter is observed if its sigma fell below this part of the prior's
+_START_SEGMENTS = 96  # segments by which the start is chosen, at most
+_OBSERVED = 0.2  # a parameter is observed if its sigma is below this fraction of the prior's
 
 
 class SingleFrameFit(NamedTuple):

@@ -25,7 +25,7 @@ UNSEEN = (0.01, 0.01, 0.01, 0.3)
 """Standard deviations (rad, m) of the pose from one frame alone, above which it is not determined."""
 
 _WIDE_PRIOR = (0.3, 0.3, 0.3, 1.0, 2.0)  # rad, m: prior of pose and offset when a frame is judged alone
-_FIXED = 1e-4  # factor on roll's prior sigma where roll is not estimated: known, but not singular
+_FIXED = 1e-4  # factor on roll's prior sigma where roll is not estimated; 0 would be singular
 _OFFSET_ALONE = tuple(float(entry == OFFSET) for entry in range(NUM_COMMON))
 _NO_INFORMATION = 1e-3  # 1/m², information about a boundary's place below which there is none
 
@@ -273,7 +273,7 @@ def _predicted_variance(jacobian: Tensor, cov: Tensor, boundary: Tensor) -> Tens
     """
     common, by_own = cov[:, :NUM_COMMON, :NUM_COMMON], cov[:, NUM_COMMON:, :NUM_COMMON]
     own = cov.diagonal(dim1=1, dim2=2)[:, NUM_COMMON:, None] * constant(_OFFSET_ALONE, like=cov)
-    spread = torch.bmm(common, jacobian).mul_(jacobian).sum(1)  # another copy takes longer
+    spread = torch.bmm(common, jacobian).mul_(jacobian).sum(1)  # in place: a copy takes longer
     more = torch.bmm(torch.add(own, by_own, alpha=2.0), jacobian)  # (B, L, M)
     more = more.gather(1, per_end(boundary).unsqueeze(1)).squeeze(1)
     return by_ends(torch.addcmul(spread, more, jacobian[:, OFFSET])).mean(1)

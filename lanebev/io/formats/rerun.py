@@ -19,7 +19,7 @@ from lanebev.io.video import Frame
 
 APPLICATION, VIEWER = "lanebev", "viewer"
 _QUALITY = 80  # of JPEG
-_FRAMES_HELD = 100  # in memory, at most
+_FRAMES_HELD = 100  # frames in memory, at most
 _NUMBERS = ExtrinsicsRow._fields[2:10]
 
 
