@@ -12,9 +12,9 @@ from lanebev.batch import flag, select_rows
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.checks import check_new_state, is_running, unused_frame
 from lanebev.estimation.reasons import Reason
-from lanebev.estimation.two_stage.direction import DirectionStep, track_direction
+from lanebev.estimation.two_stage.direction import DirectionStep, FrameRays, track_direction
 from lanebev.estimation.two_stage.lane_width import boundary_angles
-from lanebev.estimation.two_stage.roll_height import RollHeightStep, track_roll_height
+from lanebev.estimation.two_stage.roll_height import RollHeightStep, SeenLanes, track_roll_height
 from lanebev.estimation.two_stage.state import TwoStageConfig, TwoStageState
 from lanebev.geometry.road import segment_rays
 from lanebev.observation.segments import LaneSegments
@@ -103,11 +103,13 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
         known = state.status != int(Status.UNINITIALISED)
         stale = known & (state.unseen + dt > self.config.lost_after)
         state = state._replace(status=torch.where(stale, int(Status.LOST), state.status))
-        one = track_direction(segments, rays, intrinsics, state, dt, self.draws, self.config)
+        frame = FrameRays(segments, rays, intrinsics)
+        one = track_direction(frame, state, dt, self.draws, self.config)
         inliers = segments._replace(weight=segments.weight * one.inliers)
         pitch, yaw = one.mean[:, 0], one.mean[:, 1]
         boundaries = boundary_angles(inliers, rays, intrinsics, pitch, yaw, self.num_boundaries)
-        two = track_roll_height(boundaries, lane_width, one.cov[:, :2, :2], state, dt, one.fresh, self.config)
+        lanes = SeenLanes(boundaries, lane_width, one.cov[:, :2, :2])
+        two = track_roll_height(lanes, state, dt, one.fresh, self.config)
         unseen = torch.where(one.seen, 0.0, state.unseen + dt)
         status = _status(state.status, one.seen, unseen, self.config.lost_after)
         reasons = _reasons(segments, one, two, status) | flag(guessed, Reason.TIME)

@@ -41,14 +41,22 @@ class DirectionStep(NamedTuple):
     fresh: Tensor
 
 
+class FrameRays(NamedTuple):
+    """The segments of a frame with their rays.
+
+    Attributes:
+        segments: cleaned, see :func:`lanebev.estimation.checks.clean_segments`.
+        rays: (B, N, 2, 3) of the end points.
+        intrinsics: (B, 3, 3) px.
+    """
+
+    segments: LaneSegments
+    rays: Tensor
+    intrinsics: Tensor
+
+
 def track_direction(
-    segments: LaneSegments,
-    rays: Tensor,
-    intrinsics: Tensor,
-    state: TwoStageState,
-    dt: Tensor,
-    draws: Tensor,
-    cfg: TwoStageConfig,
+    frame: FrameRays, state: TwoStageState, dt: Tensor, draws: Tensor, cfg: TwoStageConfig
 ) -> DirectionStep:
     """Predict, gate and update pitch and yaw; start over where that fails.
 
@@ -57,9 +65,7 @@ def track_direction(
     prediction, so that lines of another direction, however many, do not turn it.
 
     Args:
-        segments: cleaned, see :func:`lanebev.estimation.checks.clean_segments`.
-        rays: (B, N, 2, 3) of the end points.
-        intrinsics: (B, 3, 3).
+        frame: its segments.
         state: state of the frame before.
         dt: (B,) s.
         draws: (N_loop, 2), see :func:`lanebev.estimation.two_stage.vanishing.segment_pairs`.
@@ -68,6 +74,7 @@ def track_direction(
     Returns:
         the step; a row that is neither supported nor started keeps its prediction.
     """
+    segments, rays, intrinsics = frame
     mean, cov = predict_direction(state, dt, cfg)
     normals = great_circle_normals(rays)
 
@@ -88,7 +95,7 @@ def track_direction(
     spread = cov[:, :2, :2].diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()
     start = ~tracking | (state.unseen + dt > cfg.reacquire_after) | (spread > cfg.reacquire_spread)
     wanted = start & there.any(-1)
-    started = start_direction(segments, rays, intrinsics, mean, wanted, draws, cfg)
+    started = start_direction(frame, mean, wanted, draws, cfg)
     fresh = start & started.seen
     seen = torch.where(start, fresh, supported)
     inliers = torch.where(fresh.unsqueeze(-1), started.inliers, inliers * supported.unsqueeze(-1))
@@ -131,18 +138,20 @@ def is_supported(segments: LaneSegments, inliers: Tensor, cfg: TwoStageConfig) -
 
 
 def start_direction(
-    segments: LaneSegments,
-    rays: Tensor,
-    intrinsics: Tensor,
-    mean: Tensor,
-    wanted: Tensor,
-    draws: Tensor,
-    cfg: TwoStageConfig,
+    frame: FrameRays, mean: Tensor, wanted: Tensor, draws: Tensor, cfg: TwoStageConfig
 ) -> DirectionStep:
     """Start pitch and yaw from the vanishing direction.
 
     Source: Algorithm 1 and Eqs. (3), (4), (7), (8).
+
+    Args:
+        frame: its segments.
+        mean: (B, 4) of pitch, yaw and their rates, for rows that are not wanted.
+        wanted: (B,) bool, rows that start.
+        draws: (N_loop, 2), see :func:`lanebev.estimation.two_stage.vanishing.segment_pairs`.
+        cfg: the configuration.
     """
+    segments, rays, intrinsics = frame
     if may_skip(wanted):
         nothing = torch.zeros_like(segments.weight)
         no = torch.zeros_like(wanted)

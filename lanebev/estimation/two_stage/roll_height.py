@@ -41,14 +41,22 @@ class RollHeightStep(NamedTuple):
     height_seen: Tensor
 
 
+class SeenLanes(NamedTuple):
+    """What a frame tells of roll and height.
+
+    Attributes:
+        boundaries: angles about the direction of stage 1.
+        lane_width: (B, L-1) m, the prior.
+        direction_cov: (B, 2, 2) of pitch and yaw.
+    """
+
+    boundaries: BoundaryAngles
+    lane_width: Tensor
+    direction_cov: Tensor
+
+
 def track_roll_height(
-    boundaries: BoundaryAngles,
-    lane_width: Tensor,
-    direction_cov: Tensor,
-    state: TwoStageState,
-    dt: Tensor,
-    fresh: Tensor,
-    cfg: TwoStageConfig,
+    lanes: SeenLanes, state: TwoStageState, dt: Tensor, fresh: Tensor, cfg: TwoStageConfig
 ) -> RollHeightStep:
     """Predict and update roll and height, or start them; one lane alone updates height only.
 
@@ -56,9 +64,7 @@ def track_roll_height(
     car has (``LARGEST_ROLL``, ``LEAST_HEIGHT``, ``LARGEST_HEIGHT``) is back at the prior and unknown.
 
     Args:
-        boundaries: angles about the direction of stage 1.
-        lane_width: (B, L-1) m, the prior.
-        direction_cov: (B, 2, 2) of pitch and yaw.
+        lanes: those of the frame.
         state: state of the frame before.
         dt: (B,) s.
         fresh: (B,) bool, stage 1 started over.
@@ -67,6 +73,7 @@ def track_roll_height(
     Returns:
         the step.
     """
+    boundaries, lane_width, _ = lanes
     num_lanes = (boundaries.present[:, :-1] & boundaries.present[:, 1:]).sum(-1)
     height_seen, roll_seen = num_lanes >= 1, num_lanes >= 2
     mean, cov = predict_roll_height(state, dt, roll_seen, height_seen, cfg)
@@ -83,7 +90,7 @@ def track_roll_height(
     cov = torch.where((first.unsqueeze(-1) | first.unsqueeze(-2)), wide, cov)
 
     seen = torch.stack([roll_seen, height_seen], dim=-1)
-    mean, cov = update_by_widths(boundaries, lane_width, direction_cov, mean, cov, seen, cfg.lane_noise)
+    mean, cov = update_by_widths(lanes, mean, cov, seen, cfg.lane_noise)
     # Widths of wrong boundaries can lead anywhere: impossible values start again.
     possible = (mean[:, 0].abs() < LARGEST_ROLL) & (mean[:, 1] > LEAST_HEIGHT) & (mean[:, 1] < LARGEST_HEIGHT)
     prior = torch.cat([mean.new_tensor(cfg.initial_pose[2:]), mean.new_zeros(2)])
@@ -95,13 +102,7 @@ def track_roll_height(
 
 
 def update_by_widths(
-    boundaries: BoundaryAngles,
-    lane_width: Tensor,
-    direction_cov: Tensor,
-    mean: Tensor,
-    cov: Tensor,
-    seen: Tensor,
-    lane_noise: float,
+    lanes: SeenLanes, mean: Tensor, cov: Tensor, seen: Tensor, lane_noise: float
 ) -> tuple[Tensor, Tensor]:
     """Update roll and height by the lanes' widths in an iterated extended Kalman filter.
 
@@ -111,9 +112,7 @@ def update_by_widths(
     good as its boundaries' pixels and as pitch and yaw, whose errors widths of one frame share.
 
     Args:
-        boundaries: angles about the direction of stage 1.
-        lane_width: (B, L-1) m, the prior.
-        direction_cov: (B, 2, 2) of pitch and yaw.
+        lanes: those of the frame.
         mean: (B, 4) predicted roll, height and their rates.
         cov: (B, 4, 4) their covariance.
         seen: (B, 2) bool, whether widths may move roll and height.
@@ -122,6 +121,7 @@ def update_by_widths(
     Returns:
         mean (B, 4) and covariance (B, 4, 4).
     """
+    boundaries, lane_width, direction_cov = lanes
     at, after = mean, cov
     for _ in range(_NUM_LINEARISATIONS):
         measured = measure_widths(boundaries, at[:, 0], at[:, 1], direction_cov, lane_noise)
