@@ -10,7 +10,7 @@ import torch
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.dynamics import MotionConfig, RoadMotion, motion
+from lanebev.estimation.joint.dynamics import MotionConfig, RoadMotion, Spread, motion
 from lanebev.estimation.joint.evidence import adapt_motion_scale
 from lanebev.estimation.joint.low_pass import pose_covariance, pose_transition
 from lanebev.estimation.joint.measurement import (
@@ -65,7 +65,7 @@ def test_motion_of_each_axis_scales_and_unequal_lanes_forget():
     scale = torch.tensor([[1.0] * 4, [1.0, 1.0, 2.0, 1.0]], dtype=DOUBLE)
     unequal = torch.tensor([0.0, 0.12], dtype=DOUBLE)
     vertical = torch.tensor([1e-4, 0.0], dtype=DOUBLE)
-    transition, noise = motion(dt, scale, unequal, vertical, no_road(2), PLACE, cfg)
+    transition, noise = motion(dt, Spread(scale, unequal, vertical), no_road(2), 6, cfg)
     move, density = pose_transition(dt[:1], cfg.bandwidth)
     for row in range(2):
         *chain, mean = PLACE.chain(ROLL)
@@ -136,6 +136,6 @@ def test_speed_wanders_about_its_mean_as_far_as_it_says():
     cfg = MotionConfig()
     time, equal = torch.tensor([1 / 30], dtype=DOUBLE), torch.zeros(1, dtype=DOUBLE)
     one = torch.ones(1, 4, dtype=DOUBLE)
-    transition, noise = motion(time, one, equal, equal, no_road(), PLACE, cfg)
+    transition, noise = motion(time, Spread(one, equal, equal), no_road(), 6, cfg)
     fade, more = transition[0, PLACE.speed, PLACE.speed], noise[0, PLACE.speed, PLACE.speed]
     assert float(more / (1 - fade**2)) == pytest.approx(cfg.speed_std**2, rel=0.01)

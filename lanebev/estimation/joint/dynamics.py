@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint.layout import NUM_POSE, SHAPE, Layout, layout
+from lanebev.estimation.joint.layout import NUM_POSE, SHAPE, layout
 from lanebev.estimation.joint.low_pass import ORDER, pose_transition
 from lanebev.estimation.joint.measurement import OFFSET, VERTICAL
 from lanebev.numbers import check_settings
@@ -88,43 +88,48 @@ class RoadMotion(NamedTuple):
     noise: Tensor
 
 
+class Spread(NamedTuple):
+    """How far entries of the state move about their means.
+
+    Attributes:
+        pose_scale: (B, 4), factor on the pose's standard deviations about its slow mean.
+        unequal: (B,) m, standard deviation of the deviations on a road of unequal lanes; 0 on equal lanes.
+        vertical: (B,) 1/m, standard deviation of the road's vertical curvature.
+    """
+
+    pose_scale: Tensor
+    unequal: Tensor
+    vertical: Tensor
+
+
 def motion(
-    dt: Tensor,
-    pose_scale: Tensor,
-    unequal: Tensor,
-    vertical: Tensor,
-    road: RoadMotion,
-    indices: Layout,
-    cfg: MotionConfig,
+    dt: Tensor, spread: Spread, road: RoadMotion, num_boundaries: int, cfg: MotionConfig
 ) -> tuple[Tensor, Tensor]:
     """Compute transition and process noise of the whole state.
 
     Args:
         dt: (B,) s, >= 0.
-        pose_scale: (B, 4), factor on the pose's standard deviations about its slow mean.
-        unequal: (B,) m, standard deviation of the deviations on a road of unequal lanes; 0 on equal lanes.
-        vertical: (B,) 1/m, standard deviation of the road's vertical curvature.
+        spread: how far entries move about their means.
         road: how the shape moves.
-        indices: of the state vector.
+        num_boundaries: L.
         cfg: the configuration.
 
     Returns:
         (B, D, D) F and (B, D, D) W.
     """
-    num = indices.deviations.stop - indices.deviations.start
+    num, size = num_boundaries, layout(num_boundaries).size
     pose_step, pose_noise = pose_transition(dt, cfg.bandwidth)
     to_mean = constant(((1,), (0,), (0,), (0,)), like=dt) - pose_step[:, :, :1]
     pose_step = torch.cat([pose_step, to_mean], dim=-1).flatten(1)  # (B, 20)
     offset_step, offset_noise = damped_velocity(dt, cfg.offset_memory)
     memories = (cfg.speed_memory, cfg.vertical_curvature_memory, cfg.deviation_memory, cfg.unequal_memory)
-    step, unequal, vertical = (part.unsqueeze(-1) for part in (dt, unequal, vertical))  # (B, 1)
+    step, unequal, vertical = (part.unsqueeze(-1) for part in (dt, *spread[1:]))  # (B, 1)
     decays = (-step / constant(memories, like=dt)).exp().chunk(4, dim=-1)
     speed_decay, vertical_decay, of_equal_lanes, of_unequal_lanes = decays
     deviation_decay = torch.where(unequal > 0, of_unequal_lanes, of_equal_lanes)
-    mean_step = torch.ones_like(pose_scale)
     moves = [
         *[pose_step] * NUM_POSE,
-        mean_step,
+        torch.ones_like(spread.pose_scale),
         offset_step,
         road.transition.flatten(1),
         road.by_speed,
@@ -134,7 +139,7 @@ def motion(
     ]
     std = constant((*[cfg.angle_std] * 3, cfg.height_std), like=dt)
     walk = constant((*[cfg.mean_angle_walk**2] * 3, cfg.mean_height_walk**2), like=dt)
-    variance = (pose_scale * std).square()
+    variance = (spread.pose_scale * std).square()
     deviation_noise = cfg.deviation_walk**2 * step + unequal.square() * (
         1 - deviation_decay * deviation_decay
     )
@@ -149,8 +154,8 @@ def motion(
     ]
     values = torch.cat([*moves, *noises], dim=-1)
     index = constant(_places(num), like=values, dtype=torch.int64).expand(values.shape[0], -1)
-    flat = values.new_zeros(values.shape[0], 2 * indices.size**2).scatter(1, index, values)
-    transition, noise = flat.unflatten(1, (2, indices.size, indices.size)).unbind(1)
+    flat = values.new_zeros(values.shape[0], 2 * size**2).scatter(1, index, values)
+    transition, noise = flat.unflatten(1, (2, size, size)).unbind(1)
     return transition, noise
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.dynamics import motion
+from lanebev.estimation.joint.dynamics import Spread, motion
 from lanebev.estimation.joint.evidence import deviation_prior_std, hill_variance
 from lanebev.estimation.joint.layout import SHAPE, layout
 from lanebev.estimation.joint.measurement import CURVATURE
@@ -69,7 +69,7 @@ def predict_state(state: JointState, dt: Tensor, cfg: JointConfig) -> Prediction
     scale = torch.where(unobserved, scale.clamp(min=cfg.motion.unobserved_scale), scale)
     unequal = deviation_prior_std(state.mean[:, indices.deviations], cfg)
     vertical = (cfg.motion.vertical_curvature_std**2 + hills).sqrt()
-    transition, noise = motion(dt, scale, unequal, vertical, road, indices, cfg.motion)
+    transition, noise = motion(dt, Spread(scale, unequal, vertical), road, cfg.num_boundaries, cfg.motion)
     mean, cov = predict(state.mean, state.cov, transition, noise)
     mean = torch.cat([mean[:, :CURVATURE], road.shape, mean[:, SHAPE.stop :]], dim=-1)
     predicted = state._replace(mean=mean, cov=cov, phase=road.phase, hills=hills)
