@@ -81,33 +81,60 @@ def outcomes(tasks: Sequence[Task], cluster: Cluster) -> Iterator[Outcome]:
             num_cpus=cluster.cpus, num_gpus=cluster.gpus, max_retries=cluster.retries
         )
         most = max(16, round(_IN_FLIGHT * ray.cluster_resources().get("CPU", 1)))
-        schedule = Schedule(tasks)
-        waiting = deque(groups_of(schedule.first, cluster.batch))
+        queue = _Queue(tasks, cluster)
         pending = dict[object, tuple[Task, ...]]()
-        failures, drives = Counter[str](), {task.name: task for task in tasks}
-        while waiting or pending:
-            while waiting and len(pending) < most:
-                group = waiting.popleft()
+        while queue.waiting or pending:
+            while queue.waiting and len(pending) < most:
+                group = queue.waiting.popleft()
                 pending[remote.remote(group)] = group
             ready, _ = ray.wait(list(pending), num_returns=1)
             for each in ready:
                 group = pending.pop(each)
                 found, is_last = _found(ray, each, group)
-                for task, outcome in zip(group, found, strict=True):
-                    failures[task.name] += bool(outcome.failure)
-                    if outcome.failure and not is_last and failures[task.name] <= cluster.retries:
-                        waiting.append((task,))
-                        continue
-                    follows, final = schedule.ended(task, outcome)
-                    if follows is not None:
-                        waiting.append((follows,))
-                    if final is not None:
-                        if final.is_final:
-                            with contextlib.suppress(OSError):  # a full disk: the next call tries it again
-                                write_mark(drives[final.name], final)
-                        yield final
+                ended = zip(group, found, strict=True)
+                yield from filter(None, (queue.end(task, outcome, is_last) for task, outcome in ended))
     finally:
         ray.shutdown()
+
+
+class _Queue:
+    """The groups of tasks that wait, and what follows when a task ends.
+
+    Args:
+        tasks: all of them.
+        cluster: how many are in a group, and how often a failed one is tried again.
+
+    Attributes:
+        waiting: groups of tasks in order.
+    """
+
+    def __init__(self, tasks: Sequence[Task], cluster: Cluster) -> None:
+        self._schedule, self._retries = Schedule(tasks), cluster.retries
+        self.waiting = deque(groups_of(self._schedule.first, cluster.batch))
+        self._failures, self._drives = Counter[str](), {task.name: task for task in tasks}
+
+    def end(self, task: Task, outcome: Outcome, is_last: bool) -> Outcome | None:
+        """Note what became of a task, and queue it again or the task that follows.
+
+        Args:
+            task: the task.
+            outcome: what became of it.
+            is_last: whether it must not be tried again.
+
+        Returns:
+            the outcome of the drive, if it has ended.
+        """
+        self._failures[task.name] += bool(outcome.failure)
+        if outcome.failure and not is_last and self._failures[task.name] <= self._retries:
+            self.waiting.append((task,))
+            return None
+        follows, final = self._schedule.ended(task, outcome)
+        if follows is not None:
+            self.waiting.append((follows,))
+        if final is not None and final.is_final:
+            with contextlib.suppress(OSError):  # a full disk: the next call tries it again
+                write_mark(self._drives[final.name], final)
+        return final
 
 
 def _found(ray: ModuleType, reference: object, group: Sequence[Task]) -> tuple[Sequence[Outcome], bool]:
