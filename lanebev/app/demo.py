@@ -17,7 +17,8 @@ from lanebev.app.progress import Progress
 from lanebev.app.run import run
 from lanebev.app.summary import summary
 from lanebev.io.lanes import tusimple_line
-from lanebev.io.results import ExtrinsicsRow, OutputFolder, extrinsics_row, write_extrinsics
+from lanebev.io.output_folder import OutputFolder
+from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video import VideoWriter
 from lanebev.observation.polylines import BoundaryRows, LaneLine, rows_from_vertices, vertices_from_lines
 from lanebev.render import Drive, RenderedFrame

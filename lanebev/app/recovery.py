@@ -16,7 +16,7 @@ from lanebev.app.config import RunConfig
 from lanebev.app.observers import Observation, Observer
 from lanebev.camera.model import Camera
 from lanebev.io.lane_parsing import FrameLines
-from lanebev.io.results import OutputFolder
+from lanebev.io.output_folder import OutputFolder
 from lanebev.io.tusimple import whole_tusimple_lines
 from lanebev.io.video import Frame, FrameSource
 

@@ -23,7 +23,7 @@ from lanebev.estimation.joint.smoother import smooth_states, smoothed_calibratio
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.tracker import Estimate
 from lanebev.io.lanes import tusimple_line
-from lanebev.io.results import OutputFolder
+from lanebev.io.output_folder import OutputFolder
 from lanebev.io.video import Frame, FrameSource
 from lanebev.types import Calibration, Extrinsics
 

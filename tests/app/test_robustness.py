@@ -26,7 +26,7 @@ from lanebev.app.recovery import recover_run
 from lanebev.app.run import run
 from lanebev.cli import main
 from lanebev.io.folder_lock import FolderLock
-from lanebev.io.results import OutputFolder
+from lanebev.io.output_folder import OutputFolder
 from lanebev.io.state import load_state, save_state
 from lanebev.io.video import VideoWriter, open_source
 
