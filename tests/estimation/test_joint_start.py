@@ -17,7 +17,7 @@ from lanebev.estimation.joint.road_curve import (
     KNOT_SPACING,
     NUM_STEPS,
 )
-from lanebev.estimation.joint.start import state_from_fit, straight_or_bend
+from lanebev.estimation.joint.start import start_moments, straight_or_bend
 from lanebev.testing.moments import moments
 from lanebev.testing.moments import observe as see
 from tests.estimation.joint_drives import DOUBLE, run
@@ -94,6 +94,6 @@ def test_single_images_of_bends_with_vague_lines_are_honest(radius):
 def test_a_clothoids_steps_are_its_rate_by_the_knots_spacing():
     calibrator = JointCalibrator()
     params = torch.tensor([[0.0, 0, 0, 1.5, 0, 2e-3, 1e-4]], dtype=DOUBLE)
-    mean, _ = state_from_fit(params, 1e-12 * torch.eye(7, dtype=DOUBLE)[None], 0 * params, calibrator.config)
+    mean, _ = start_moments(params, 1e-12 * torch.eye(7, dtype=DOUBLE)[None], 0 * params, calibrator.config)
     torch.testing.assert_close(mean[:, CURVATURE], params[:, 5])
     torch.testing.assert_close(mean[0, STEPS], torch.full((NUM_STEPS,), 1e-4 * KNOT_SPACING, dtype=DOUBLE))

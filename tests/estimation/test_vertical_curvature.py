@@ -16,9 +16,8 @@ from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.layout import NUM_COMMON
 from lanebev.estimation.joint.measurement import HEIGHT, ROLL, VERTICAL, boundary_residuals, look
 from lanebev.estimation.joint.observations import boundary_places, observe
-from lanebev.estimation.joint.restart import with_roll_of_prior
 from lanebev.estimation.joint.single_frame import fit_single_frame
-from lanebev.estimation.joint.start import with_vertical_curvature
+from lanebev.estimation.joint.start import with_roll_of_prior, with_vertical_curvature
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.moments import CAMERA, FPS, WIDTH, Moment, moments
 from lanebev.testing.moments import observe as see

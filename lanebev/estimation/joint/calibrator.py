@@ -26,7 +26,7 @@ from lanebev.estimation.joint.output import as_calibration
 from lanebev.estimation.joint.prediction import elapsed, predict_state
 from lanebev.estimation.joint.restart import restart
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
-from lanebev.estimation.joint.start import new_state, state_from_fit
+from lanebev.estimation.joint.start import new_state, start_moments
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.joint.status import update_track_status
 from lanebev.estimation.joint.tempering import temper_frame
@@ -66,7 +66,7 @@ class JointCalibrator(Calibrator[JointState]):
         params = cfg.prior.mean(like).repeat(batch_size, 1)
         with autocast_off(like.device, like.dtype):
             spread = cfg.prior.std(like).square().diag().repeat(batch_size, 1, 1)
-            mean, cov = state_from_fit(params, spread, torch.zeros_like(params), cfg)
+            mean, cov = start_moments(params, spread, torch.zeros_like(params), cfg)
         none = torch.zeros(batch_size, dtype=torch.int64, device=device)
         return new_state(mean, cov, Status.UNINITIALISED, none + int(Reason.NO_START))
 

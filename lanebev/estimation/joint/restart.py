@@ -16,9 +16,8 @@ from lanebev.batch import flag, replace_rows, select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.evidence import CALL
-from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, layout
-from lanebev.estimation.joint.measurement import HEIGHT, NUM_STRAIGHT, ROLL, boundary_residuals
+from lanebev.estimation.joint.measurement import NUM_STRAIGHT, boundary_residuals
 from lanebev.estimation.joint.observations import Observations
 from lanebev.estimation.joint.robust import log_likelihood, scaled_variance, squared_distance
 from lanebev.estimation.joint.scatter import (
@@ -29,7 +28,7 @@ from lanebev.estimation.joint.scatter import (
     with_headings,
 )
 from lanebev.estimation.joint.single_frame import SingleFrameFit, fit_observations
-from lanebev.estimation.joint.start import new_state, state_from_fit
+from lanebev.estimation.joint.start import state_of_fit
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.joint.update import information, membership
 from lanebev.estimation.reasons import Reason
@@ -38,8 +37,6 @@ from lanebev.types import Status
 
 _CONTRADICTION = 25.7  # χ² with five degrees of freedom, exceeded by chance in one frame of 10,000
 _MISFIT_SHARE = 0.5  # the state is in doubt if a smaller fraction of the segments fits
-_UNDETERMINED_ROLL = 0.5  # roll is undetermined if its sigma is a larger fraction of the prior's
-_ROLL_NOISE = 1.5  # such a roll may be noise if it is within so many sigmas of the prior's mean
 
 
 class Compared(NamedTuple):
@@ -203,33 +200,3 @@ def scatter_of_fit(fit: SingleFrameFit, places: Tensor, seen: Observations, cfg:
     found = boundary_scatter(*told, cfg.prior.precision(params), no_moments)
     determined = determined_sensitivity(fit.observed, cfg.num_boundaries)
     return found._replace(sensitivity=torch.where(determined, found.sensitivity, 0.0))
-
-
-def with_roll_of_prior(fit: SingleFrameFit, prior: FramePrior) -> tuple[Tensor, Tensor, Tensor]:
-    """Replace a roll that a fit hardly determines by the prior's mean and variance.
-
-    The two boundaries of one lane do not determine roll. The roll of such a fit is the effect of noise that
-    bends the lines, or of the road's vertical curvature, and precise lines can bring it far from the prior.
-    The other parameters follow by their regression on roll. A roll farther from the prior is kept.
-
-    Returns:
-        parameters (B, 7), covariance (B, 7, 7), and their change (B, 7) per 1/m of vertical curvature.
-    """
-    params, cov, by_vertical = fit.params(), fit.covariance, fit.by_vertical_curvature
-    variance, to_prior = cov[:, ROLL, ROLL, None], prior.roll - params[:, ROLL, None]
-    near_prior = to_prior.abs() < _ROLL_NOISE * prior.roll_std
-    undetermined = near_prior & (variance > (_UNDETERMINED_ROLL * prior.roll_std) ** 2)
-    by_roll = cov[:, ROLL] / variance * undetermined  # (B, 7), 1 in roll; 0 where it is determined
-    more = (prior.roll_std**2 - variance).unsqueeze(-1) * by_roll.unsqueeze(-1) * by_roll.unsqueeze(-2)
-    return params + to_prior * by_roll, cov + more, by_vertical - by_vertical[:, ROLL, None] * by_roll
-
-
-def state_of_fit(fit: SingleFrameFit, before: JointState, cfg: JointConfig) -> JointState:
-    """Make a state of one frame's fit; of the state before only the frames in doubt are kept."""
-    mean, cov = state_from_fit(*with_roll_of_prior(fit, cfg.prior), cfg)
-    reasons = (
-        int(Reason.RESTARTED)
-        | flag(~fit.observed[:, ROLL], Reason.ROLL_UNSEEN)
-        | flag(~fit.observed[:, HEIGHT], Reason.HEIGHT_UNSEEN)
-    )
-    return new_state(mean, cov, Status.TRACKING, reasons)._replace(doubt=before.doubt)

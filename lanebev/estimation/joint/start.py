@@ -9,19 +9,33 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from lanebev.batch import flag
 from lanebev.estimation import kalman
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, STEPS, layout
 from lanebev.estimation.joint.low_pass import pose_variances
-from lanebev.estimation.joint.measurement import CURVATURE, NUM_PARAMS, NUM_SHAPE, NUM_STRAIGHT, VERTICAL
+from lanebev.estimation.joint.measurement import (
+    CURVATURE,
+    HEIGHT,
+    NUM_PARAMS,
+    NUM_SHAPE,
+    NUM_STRAIGHT,
+    ROLL,
+    VERTICAL,
+)
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
+from lanebev.estimation.joint.single_frame import SingleFrameFit
 from lanebev.estimation.joint.state import JointState
+from lanebev.estimation.reasons import Reason
 from lanebev.geometry.linalg import cholesky, inverse_spd
 from lanebev.tensors import constant
 from lanebev.types import Status
 
 _OFFSET_RATE_STD = 0.5  # m/s, of a start
+_UNDETERMINED_ROLL = 0.5  # roll is undetermined if its sigma is a larger fraction of the prior's
+_ROLL_NOISE = 1.5  # such a roll may be noise if it is within so many sigmas of the prior's mean
 
 
 def new_state(mean: Tensor, cov: Tensor, status: Status, reasons: Tensor) -> JointState:
@@ -57,10 +71,40 @@ def new_state(mean: Tensor, cov: Tensor, status: Status, reasons: Tensor) -> Joi
     )
 
 
-def state_from_fit(
+def state_of_fit(fit: SingleFrameFit, before: JointState, cfg: JointConfig) -> JointState:
+    """Make a state of one frame's fit; of the state before only the frames in doubt are kept."""
+    mean, cov = start_moments(*with_roll_of_prior(fit, cfg.prior), cfg)
+    reasons = (
+        int(Reason.RESTARTED)
+        | flag(~fit.observed[:, ROLL], Reason.ROLL_UNSEEN)
+        | flag(~fit.observed[:, HEIGHT], Reason.HEIGHT_UNSEEN)
+    )
+    return new_state(mean, cov, Status.TRACKING, reasons)._replace(doubt=before.doubt)
+
+
+def with_roll_of_prior(fit: SingleFrameFit, prior: FramePrior) -> tuple[Tensor, Tensor, Tensor]:
+    """Replace a roll that a fit hardly determines by the prior's mean and variance.
+
+    The two boundaries of one lane do not determine roll. The roll of such a fit is the effect of noise that
+    bends the lines, or of the road's vertical curvature, and precise lines can bring it far from the prior.
+    The other parameters follow by their regression on roll. A roll farther from the prior is kept.
+
+    Returns:
+        parameters (B, 7), covariance (B, 7, 7), and their change (B, 7) per 1/m of vertical curvature.
+    """
+    params, cov, by_vertical = fit.params(), fit.covariance, fit.by_vertical_curvature
+    variance, to_prior = cov[:, ROLL, ROLL, None], prior.roll - params[:, ROLL, None]
+    near_prior = to_prior.abs() < _ROLL_NOISE * prior.roll_std
+    undetermined = near_prior & (variance > (_UNDETERMINED_ROLL * prior.roll_std) ** 2)
+    by_roll = cov[:, ROLL] / variance * undetermined  # (B, 7), 1 in roll; 0 where it is determined
+    more = (prior.roll_std**2 - variance).unsqueeze(-1) * by_roll.unsqueeze(-1) * by_roll.unsqueeze(-2)
+    return params + to_prior * by_roll, cov + more, by_vertical - by_vertical[:, ROLL, None] * by_roll
+
+
+def start_moments(
     params: Tensor, param_cov: Tensor, by_vertical: Tensor, cfg: JointConfig
 ) -> tuple[Tensor, Tensor]:
-    """Start a state from one frame's fit.
+    """Compute mean and covariance of a state that starts from one frame's fit.
 
     The fit takes the road as plane: see :func:`with_vertical_curvature`.
 
