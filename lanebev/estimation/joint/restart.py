@@ -1,4 +1,4 @@
-"""Starts of the joint filter: without a state, or with one that does not fit or is contradicted.
+"""When the joint filter starts: without a state, or with one that does not fit or that frames contradict.
 
 After a shock the filter may explain a wrong pose by unequal lanes or a bend. Therefore, for some frames after
 every jump, each frame is also fitted alone, without the filter's state.
