@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lanebev.app.kept import KeptNumbers, KeptRows
+from lanebev.app.storage import StoredNumbers, StoredRows
 from lanebev.io.results import ExtrinsicsRow, write_extrinsics
 from lanebev.report.page import Report, write_report
 from lanebev.types import NUM_BOUNDARIES
@@ -24,8 +24,8 @@ def main() -> None:
     frames = parser.parse_args().frames
     before, random = resident(), np.random.default_rng(0)
     folder = tempfile.gettempdir()
-    rows, widths = KeptRows(), KeptNumbers(2, NUM_BOUNDARIES - 1, folder=folder)
-    covariances = KeptNumbers(4, 4, folder=folder)
+    rows, widths = StoredRows(), StoredNumbers(2, NUM_BOUNDARIES - 1, folder=folder)
+    covariances = StoredNumbers(4, 4, folder=folder)
     for frame in range(frames):
         pose, reason = random.normal(size=3).tolist(), "" if frame % 700 else "ROLL_UNSEEN"
         numbers = [frame / FPS, *pose, 1.4, 0.1, 0.1, 0.1, 0.01]

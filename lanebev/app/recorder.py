@@ -14,10 +14,10 @@ import torch
 from numpy.typing import NDArray
 
 from lanebev.app.concurrency import Background
-from lanebev.app.kept import KeptNumbers, KeptRows
 from lanebev.app.observers import Observation
 from lanebev.app.plausibility import drive_remark
 from lanebev.app.repeats import RepeatedFrames
+from lanebev.app.storage import StoredNumbers, StoredRows
 from lanebev.app.view_changes import ViewChanges
 from lanebev.app.views import FixedPose, bird_view
 from lanebev.camera.model import Camera
@@ -90,7 +90,7 @@ class Recorder:
     grid: BEVGrid = field(default_factory=BEVGrid)
     videos: bool = True
     smoothed: bool = False
-    rows: KeptRows = field(default_factory=KeptRows)
+    rows: StoredRows = field(default_factory=StoredRows)
     problems: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -98,10 +98,10 @@ class Recorder:
         self.before_title = "level at 1.5 m" if alone else "first frame's"
         self._before = FixedPose(alone)
         self._coarse = replace(self.grid, resolution=max(self.grid.resolution, _BEFORE_RESOLUTION))
-        self._filtered_rows = KeptRows()
-        self._covariances = KeptNumbers(4, 4, folder=self.path("."))
+        self._filtered_rows = StoredRows()
+        self._covariances = StoredNumbers(4, 4, folder=self.path("."))
         self._first_number: int | None = None
-        self._widths = KeptNumbers(2, NUM_BOUNDARIES - 1, folder=self.path("."))
+        self._widths = StoredNumbers(2, NUM_BOUNDARIES - 1, folder=self.path("."))
         self._moments, self._scores = MomentSampler(), EventScores()
         self._repeats, self._views = RepeatedFrames(self.path(".")), ViewChanges()
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.app.kept import KeptNumbers
+from lanebev.app.storage import StoredNumbers
 
 _STRIDE = 8  # px, of the pixels that are compared
 _NEAR = 2  # frames before and after, among which the largest change is that of the drive
@@ -45,7 +45,7 @@ class RepeatedFrames:
 
     def __init__(self, folder: Path | None = None) -> None:
         self._before: NDArray[np.int16] | None = None
-        self._changes = KeptNumbers(folder=folder)
+        self._changes = StoredNumbers(folder=folder)
 
     def add(self, image: NDArray[np.uint8] | None) -> None:
         """Take the next frame (H, W, 3), None if it was lost."""

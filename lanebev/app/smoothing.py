@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 
 from lanebev.app.build import RunTracker
-from lanebev.app.kept import KeptNumbers
 from lanebev.app.observers import Observation
 from lanebev.app.recovery import LANES_FILE, frame_name
+from lanebev.app.storage import StoredNumbers
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.layout import POSE
 from lanebev.estimation.joint.measurement import VERTICAL
@@ -53,7 +53,7 @@ class SmoothedPoses(NamedTuple):
         return estimate._replace(calibration=calibration, vertical_curvature=vertical)
 
 
-class KeptStates(Sequence[JointState]):
+class StoredStates(Sequence[JointState]):
     """States of batch size 1 after every frame, stored in a file so that memory stays constant.
 
     A state of six boundaries takes 6 kB, so that an hour at 30 frames a second takes 0.7 GB.
@@ -131,8 +131,8 @@ def smooth_frames(
         config: configuration of the tracker's calibrator.
     """
     path = out / _STATES
-    states, intervals = KeptStates(path), KeptNumbers(1)
-    covariances, scales = KeptNumbers(4, 4), KeptNumbers(1)
+    states, intervals = StoredStates(path), StoredNumbers(1)
+    covariances, scales = StoredNumbers(4, 4), StoredNumbers(1)
     with closing(states), open(out / LANES_FILE, "w", encoding="utf-8", buffering=1) as lanes:  # whole lines
         for frame, seen in frames:
             lanes.write(tusimple_line(frame_name(frame, source), *_NO_LANES, *seen) + "\n")
@@ -147,10 +147,10 @@ def smooth_frames(
 
 
 def _smoothed(
-    states: KeptStates,
-    intervals: KeptNumbers,
-    covariances: KeptNumbers,
-    scales: KeptNumbers,
+    states: StoredStates,
+    intervals: StoredNumbers,
+    covariances: StoredNumbers,
+    scales: StoredNumbers,
     tracker: RunTracker,
     config: JointConfig,
 ) -> SmoothedPoses:

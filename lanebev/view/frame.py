@@ -20,13 +20,13 @@ from lanebev.types import Extrinsics
 from lanebev.view.blocks import BLOCK, image_coordinates_by_one_thread
 from lanebev.view.cells import cell_sums, rows_in_sight
 from lanebev.view.grid import BEVGrid
-from lanebev.view.kept import KeptArrays
 from lanebev.view.lens import Lens, make_lens
 from lanebev.view.projection import CellSums, normalised_intrinsics
+from lanebev.view.reused_memory import ReusedArrays
 from lanebev.view.thread_limits import ONE_THREAD
 from lanebev.view.tiles import LARGEST_WEIGHTS, interpolant
 
-_kept = KeptArrays()
+_kept = ReusedArrays()
 
 _MOST_PIXELS = 8  # pixels per cell; with more, adding a fourth channel takes longer than it saves
 

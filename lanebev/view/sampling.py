@@ -14,11 +14,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lanebev.view.blocks import Block, blocks, traced
-from lanebev.view.kept import KeptArrays
 from lanebev.view.lens import Lens
 from lanebev.view.projection import Cells
+from lanebev.view.reused_memory import ReusedArrays
 
-_kept = KeptArrays()
+_kept = ReusedArrays()
 
 _PUSH = 4.0  # half widths of a map by which what lies outside is moved away from it
 _FEW_CHANNELS = 8  # channels of which a copy costs less than to sample one image with one thread

@@ -16,7 +16,7 @@ import torch
 from lanebev import Camera, Extrinsics, image_from_road_points
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import NetworkObserver
-from lanebev.app.smoothing import KeptStates
+from lanebev.app.smoothing import StoredStates
 from lanebev.cli import main
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.io.state import load_state
@@ -198,7 +198,7 @@ def test_a_stream_has_no_second_pass(data, tmp_path, capsys):
 def test_kept_states_come_back_to_the_bit(num, kilobytes, tmp_path):
     """With two boundaries the sensitivity (1, 4, 4) is a square too, but not symmetric."""
     calibrator = JointCalibrator(num_boundaries=num)
-    kept, states = KeptStates(tmp_path / "states"), []
+    kept, states = StoredStates(tmp_path / "states"), []
     for k in range(3):
         state = calibrator.initial_state(1, dtype=torch.float64)
         slope = torch.arange(8.0 * num, dtype=torch.float64).view(1, 4, 2 * num)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lanebev.app.kept import KeptNumbers, KeptRows
+from lanebev.app.storage import StoredNumbers, StoredRows
 from lanebev.io.results import ExtrinsicsRow
 
 
@@ -23,7 +23,7 @@ def _row(number):
 
 def test_rows_come_back_as_they_were():
     rows = [_row(number) for number in range(6)]
-    kept = KeptRows(rows)
+    kept = StoredRows(rows)
     assert list(kept) == rows
     assert kept[-1] == rows[-1]
     assert list(kept[1:4]) == rows[1:4]
@@ -34,7 +34,7 @@ def test_rows_come_back_as_they_were():
 
 
 def test_a_row_takes_little():
-    kept = KeptRows()
+    kept = StoredRows()
     for number in range(2000):
         kept.append(_row(5)._replace(frame=number))
     parts = (kept._numbers, kept._counts, kept._codes)
@@ -47,11 +47,11 @@ def test_numbers_come_back_as_they_were(tmp_path, on_disk):
     folder = tmp_path if on_disk else None
     values = np.random.default_rng(0).normal(size=(5, 2, 3))
     values[1, 0, 2] = np.nan
-    kept = KeptNumbers(2, 3, folder=folder)
+    kept = StoredNumbers(2, 3, folder=folder)
     for value in values:
         kept.append(value)
     np.testing.assert_array_equal(kept.all(), values)
-    assert KeptNumbers(4, 4, folder=folder).all().shape == (0, 4, 4)
+    assert StoredNumbers(4, 4, folder=folder).all().shape == (0, 4, 4)
     with pytest.raises(ValueError, match=r"expected shape \(4, 4\), got \(2, 3\)"):
-        KeptNumbers(4, 4).append(values[0])
+        StoredNumbers(4, 4).append(values[0])
     assert list(tmp_path.iterdir()) == []  # the file has no name, and ends with its process

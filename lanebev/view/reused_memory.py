@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 _MOST_BYTES = 1 << 28  # that a thread keeps in all its arrays
 
 
-class KeptArrays(threading.local):
+class ReusedArrays(threading.local):
     """Arrays that every call fills again, separate for each thread.
 
     They are for what a function computes on its way, and are never part of what it returns.

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lanebev import BEVGrid, BEVWarp, Extrinsics
-from lanebev.view.kept import KeptArrays
+from lanebev.view.reused_memory import ReusedArrays
 
 GRID = BEVGrid(x=(-6.0, 6.0), z=(-2.0, 40.0), resolution=0.1)
 INTRINSICS = torch.tensor([[150.0, 0.0, 160.0], [0.0, 155.0, 90.0], [0.0, 0.0, 1.0]])
@@ -85,12 +85,12 @@ def test_rows_by_vmap_work_without_gradients():
 
 
 def test_arrays_are_kept_by_name_shape_and_type():
-    kept = KeptArrays()
+    kept = ReusedArrays()
     one = kept("a", (2, 3), np.float32)
     assert kept("a", (2, 3), np.float32) is one
     others = [kept("b", (2, 3), np.float32), kept("a", (3, 2), np.float32), kept("a", (2, 3), np.float64)]
     assert all(other is not one for other in others)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lanebev.view.kept._MOST_BYTES", 100)
+        patch.setattr("lanebev.view.reused_memory._MOST_BYTES", 100)
         assert kept("c", (1000,), np.uint8) is not kept("c", (1000,), np.uint8)
         assert kept("a", (2, 3), np.float32) is not one  # room was made

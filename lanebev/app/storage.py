@@ -18,7 +18,7 @@ from lanebev.io.results import ExtrinsicsRow
 _NUMBERS = 10  # numbers in a row: nine from time_s on, and the vertical curvature
 
 
-class KeptRows(Sequence[ExtrinsicsRow]):
+class StoredRows(Sequence[ExtrinsicsRow]):
     """Rows of ``extrinsics.csv`` stored as columns, 0.1 kB each; a row is made when it is requested."""
 
     def __init__(self, rows: Iterable[ExtrinsicsRow] = ()) -> None:
@@ -45,11 +45,11 @@ class KeptRows(Sequence[ExtrinsicsRow]):
     def __getitem__(self, place: int) -> ExtrinsicsRow: ...
 
     @overload
-    def __getitem__(self, place: slice) -> KeptRows: ...
+    def __getitem__(self, place: slice) -> StoredRows: ...
 
-    def __getitem__(self, place: int | slice) -> ExtrinsicsRow | KeptRows:
+    def __getitem__(self, place: int | slice) -> ExtrinsicsRow | StoredRows:
         if isinstance(place, slice):
-            return KeptRows(self[each] for each in range(*place.indices(len(self))))
+            return StoredRows(self[each] for each in range(*place.indices(len(self))))
         at = range(len(self))[place]
         frame, segments = self._counts[2 * at : 2 * at + 2]
         status, reasons = (self._known[code] for code in self._codes[2 * at : 2 * at + 2])
@@ -64,7 +64,7 @@ class KeptRows(Sequence[ExtrinsicsRow]):
         return self._texts[text]
 
 
-class KeptNumbers:
+class StoredNumbers:
     """Arrays of one shape, one for each frame, stored as their numbers only.
 
     Args:
