@@ -80,7 +80,7 @@ def run(
         ValueError: bad input; one line says which and what would be right.
     """
     check_installed(config.formats)
-    config, source = opened(config)
+    config, source = open_for_run(config)
     files = files_of(source)
     check_inputs_stay(config.out, input_files(config, source))
     camera = camera_of(config, source)
@@ -110,7 +110,7 @@ def run(
         recorder.problems += filter(None, said)
         frames = observed_frames(source, last_observer)
         with recorder, closing(frames), ended_by_signals(source):
-            for done in results(shown(frames, source, progress), config, source, tracker, smoothed):
+            for done in estimates(with_progress(frames, source, progress), config, source, tracker, smoothed):
                 recorder.add(done)
                 if viewer is not None:
                     viewer.add(_viewer_frame(recorder.rows[-1], done), done.frame.image)
@@ -123,7 +123,7 @@ def run(
         return report
 
 
-def results(
+def estimates(
     frames: Iterator[tuple[Frame, Observation]],
     config: RunConfig,
     source: FrameSource,
@@ -141,7 +141,7 @@ def results(
         yield Recorded(frame=frame, name=name, seen=seen, estimate=estimate, filtered=filtered)
 
 
-def shown(
+def with_progress(
     frames: Iterator[tuple[Frame, Observation]], source: FrameSource, progress: Progress | None
 ) -> Iterator[tuple[Frame, Observation]]:
     """Return the frames with their progress, if it is to be shown."""
@@ -173,7 +173,7 @@ def _write_formats(
         writer(name)(out / FORMATS[name].file, record, images)
 
 
-def opened(config: RunConfig) -> tuple[RunConfig, FrameSource]:
+def open_for_run(config: RunConfig) -> tuple[RunConfig, FrameSource]:
     """Open the source; the settings are those of a still if it is one image.
 
     A drive's first frame has smaller standard deviations, because the frames after it correct it.
@@ -225,4 +225,6 @@ def first_pass(
     """Process the whole drive once, and estimate every pose from all frames."""
     with closing(observed_frames(source, observer)) as frames:
         logger.info("first of two passes")
-        return smooth_frames(shown(frames, source, progress), tracker, out, source, joint_config(config))
+        return smooth_frames(
+            with_progress(frames, source, progress), tracker, out, source, joint_config(config)
+        )
