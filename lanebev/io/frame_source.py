@@ -14,7 +14,7 @@ from lanebev.io.decoding import rgb
 from lanebev.io.frames import ALL, Frame, Selection, taken_frames
 from lanebev.io.images import read_image
 from lanebev.io.rising_clock import RisingClock
-from lanebev.io.seeking import begun
+from lanebev.io.seeking import open_at
 
 DEFAULT_FPS = Fraction(30)
 
@@ -98,7 +98,7 @@ class FrameSource:
 
     def _video_frames(self) -> Iterator[Frame]:
         damaged, reported = False, False  # since the last key frame
-        with begun(self.source, self.selection.start) as video:
+        with open_at(self.source, self.selection.start) as video:
             first, before, tick = video.first, video.before, video.stream.time_base
             clock = RisingClock(1 / self.fps, before)
             for index, (pts, frame) in enumerate(video.frames, start=video.number):

@@ -17,7 +17,7 @@ _CODECS = ("h264", "hevc", "mpeg4", "mpeg2video", "mjpeg")  # each packet is a f
 _KEYS_BEFORE = 2  # in an open group, frames just before a key frame may refer to the one before it
 
 
-class Begun(NamedTuple):
+class StartedVideo(NamedTuple):
     """A video from some frame on.
 
     Attributes:
@@ -38,7 +38,7 @@ class Begun(NamedTuple):
 
 
 @contextmanager
-def begun(source: str, start: float) -> Iterator[Begun]:
+def open_at(source: str, start: float) -> Iterator[StartedVideo]:
     """Open a video, at the frame of a time if it can be told without decoding all before; else at its first.
 
     Args:
@@ -50,16 +50,16 @@ def begun(source: str, start: float) -> Iterator[Begun]:
     """
     if start > 0:
         with open_video(source) as container:
-            found = _begun_within(container, start)
+            found = _open_at_key_frame(container, start)
             if found is not None:
                 yield found
                 return
     with open_video(source) as container:
         stream = video_stream(container)
-        yield Begun(container, stream, decoded(container, stream))
+        yield StartedVideo(container, stream, decoded(container, stream))
 
 
-def _begun_within(container: av.container.InputContainer, start: float) -> Begun | None:
+def _open_at_key_frame(container: av.container.InputContainer, start: float) -> StartedVideo | None:
     """Decode from a key frame to the wanted frame; None unless all in between are whole and as expected."""
     stream = video_stream(container)
     tick = stream.time_base
@@ -79,7 +79,7 @@ def _begun_within(container: av.container.InputContainer, start: float) -> Begun
         if pts != expected or not isinstance(frame, av.VideoFrame) or frame.is_corrupt:
             return None
     rest = itertools.chain([(pts, frame)], frames)
-    return Begun(container, stream, rest, len(times) - 1, times[0] * tick, times[-2] * tick)
+    return StartedVideo(container, stream, rest, len(times) - 1, times[0] * tick, times[-2] * tick)
 
 
 def _times_to(

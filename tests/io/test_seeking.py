@@ -68,7 +68,7 @@ def video(request, tmp_path):
 def test_frames_are_those_of_decoding_all(video, monkeypatch):
     selections = [(1.23, 1.5, 1), (3.0, 3.6, 1), (4.01, math.inf, 3)]
     found = [_frames(video, *each) for each in selections]
-    monkeypatch.setattr(seeking, "_begun_within", lambda *_: None)
+    monkeypatch.setattr(seeking, "_open_at_key_frame", lambda *_: None)
     for one, each in zip(found, selections, strict=True):
         whole = _frames(video, *each)
         assert whole
@@ -78,7 +78,7 @@ def test_frames_are_those_of_decoding_all(video, monkeypatch):
 @pytest.mark.parametrize("name", ["open.mp4", "open.mkv", "intra.mp4", "mpeg4.mp4", "hevc.mp4"])
 def test_what_is_far_before_is_not_decoded(tmp_path, name):
     _write(tmp_path / name, *KINDS[name])
-    with seeking.begun(str(tmp_path / name), 5.0) as video:
+    with seeking.open_at(str(tmp_path / name), 5.0) as video:
         assert video.number == 100
         assert video.first is not None
 
@@ -87,6 +87,6 @@ def test_what_is_far_before_is_not_decoded(tmp_path, name):
 def test_a_damaged_video(tmp_path, monkeypatch, spoilt):
     _damaged(tmp_path / "v.mp4", spoilt, count=100, bf="3", b_strategy="0", g="10")
     found = _frames(tmp_path / "v.mp4", 2.2)
-    monkeypatch.setattr(seeking, "_begun_within", lambda *_: None)
+    monkeypatch.setattr(seeking, "_open_at_key_frame", lambda *_: None)
     _assert_same(found, _frames(tmp_path / "v.mp4", 2.2))
     assert len(found) == 45
