@@ -11,7 +11,7 @@ from lanebev.app.sources import source_of_run
 from lanebev.io.formats.folder import read_record
 from lanebev.io.formats.names import FORMATS, check_installed
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.video import Frame
+from lanebev.io.frames import Frame
 from lanebev.io.whole_file import whole_file
 from lanebev.report.run_folder import read_run
 

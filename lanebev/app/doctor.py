@@ -25,9 +25,9 @@ from lanebev.camera.plausibility import (
     resized_remark,
     view_remark,
 )
+from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Selection
 from lanebev.io.source_names import without_login
-from lanebev.io.video import FrameSource
 from lanebev.types import Status
 
 OK, DOUBT, WRONG = 0, 1, 2

@@ -24,9 +24,11 @@ from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration
 from lanebev.estimation.tracker import Estimate
 from lanebev.io.covariances import write_covariances
-from lanebev.io.lanes import tusimple_line
+from lanebev.io.frames import Frame
+from lanebev.io.images import write_png
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
-from lanebev.io.video import Frame, VideoWriter, write_png
+from lanebev.io.tusimple import tusimple_line
+from lanebev.io.video_writer import VideoWriter
 from lanebev.report.lane_curves import lane_curves
 from lanebev.report.measure import measure_boundaries, select_inliers
 from lanebev.report.moments import MomentSampler

@@ -15,10 +15,11 @@ from lanebev.app.build import input_files
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import Observation, Observer
 from lanebev.camera.model import Camera
+from lanebev.io.frame_source import FrameSource
+from lanebev.io.frames import Frame
 from lanebev.io.lane_parsing import FrameLines
 from lanebev.io.output_folder import OutputFolder
 from lanebev.io.tusimple import whole_tusimple_lines
-from lanebev.io.video import Frame, FrameSource
 
 LANES_FILE = "lanes.json"
 _SETTINGS, _SEEN = ".settings.json", ".seen.json"  # in the temporary folder

@@ -41,10 +41,11 @@ from lanebev.io.formats.folder import read_record
 from lanebev.io.formats.names import FORMATS, check_installed
 from lanebev.io.formats.record import RecordedFrame, vertex_lines
 from lanebev.io.formats.rerun import open_viewer
+from lanebev.io.frame_source import FrameSource
+from lanebev.io.frames import Frame
 from lanebev.io.output_folder import OutputFolder, check_inputs_stay
 from lanebev.io.results import ExtrinsicsRow
 from lanebev.io.state import save_state
-from lanebev.io.video import Frame, FrameSource
 from lanebev.report.page import Report
 
 STILLS_FPS = Fraction(2)  # Hz, of the videos of still images

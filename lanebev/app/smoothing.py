@@ -22,9 +22,10 @@ from lanebev.estimation.joint.measurement import VERTICAL
 from lanebev.estimation.joint.smoother import smooth_states, smoothed_calibration
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.tracker import Estimate
-from lanebev.io.lanes import tusimple_line
+from lanebev.io.frame_source import FrameSource
+from lanebev.io.frames import Frame
 from lanebev.io.output_folder import OutputFolder
-from lanebev.io.video import Frame, FrameSource
+from lanebev.io.tusimple import tusimple_line
 from lanebev.types import Calibration, Extrinsics
 
 _STATES = ".states"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from lanebev.app.recovery import size_and_time
+from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import ALL
 from lanebev.io.image_files import images_of
-from lanebev.io.video import FrameSource
 
 Files = dict[str, tuple[int, int]]
 """Size and time of change of files, by path."""

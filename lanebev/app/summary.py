@@ -13,9 +13,9 @@ from lanebev import __version__
 from lanebev.app.config import RunConfig
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration, MountStatus, describe_mount
+from lanebev.io.frame_source import FrameSource
 from lanebev.io.live import LiveSource
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.io.video import FrameSource
 from lanebev.report.page import Report
 from lanebev.report.verdict import reason_words
 

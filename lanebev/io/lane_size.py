@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.io.lanes import FrameLines
+from lanebev.io.lane_parsing import FrameLines
 
 _STATE_SIZE = "state their size with --lanes-size WIDTHxHEIGHT"
 _OUTSIDE = 0.1  # share of points below or far beside the images, of which more are of another size

@@ -24,23 +24,9 @@ from lanebev.io.images import IMAGE_SUFFIXES
 from lanebev.io.lane_parsing import FrameLines, json_values, lane_text
 from lanebev.io.llamas import read_llamas
 from lanebev.io.openlane import read_openlane
-from lanebev.io.tusimple import read_tusimple, tusimple_line
+from lanebev.io.tusimple import read_tusimple
 
 _OF_LLAMAS = re.compile(r"_(color|gray)_rect$")  # ends the names of LLAMAS' images, not of its labels
-
-__all__ = [
-    "FrameLines",
-    "lane_files",
-    "match_frames",
-    "read_bdd100k",
-    "read_culane",
-    "read_curvelanes",
-    "read_lanes",
-    "read_llamas",
-    "read_openlane",
-    "read_tusimple",
-    "tusimple_line",
-]
 
 
 def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) -> list[FrameLines]:

@@ -29,7 +29,6 @@ from lanebev.io.decoding import (
     video_stream,
 )
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
-from lanebev.io.frames import Frame
 from lanebev.io.image_files import (
     HEIC,
     endings_remedy,
@@ -38,26 +37,11 @@ from lanebev.io.image_files import (
     images_of,
     left_out_remark,
 )
-from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
-from lanebev.io.images import IMAGE_SUFFIXES, image_size, is_image, read_image, stated_size, write_png
+from lanebev.io.image_names import in_natural_order, times_from_names
+from lanebev.io.images import is_image, read_image, stated_size
 from lanebev.io.side_by_side import halves_remark
 from lanebev.io.source_names import SCHEMES
 from lanebev.io.video_remarks import LONGEST_STEP, appended_remark, gap_remark, restart_remark, stream_remarks
-from lanebev.io.video_writer import VideoWriter
-
-__all__ = [
-    "DEFAULT_FPS",
-    "IMAGE_SUFFIXES",
-    "Frame",
-    "FrameSource",
-    "VideoWriter",
-    "image_size",
-    "in_natural_order",
-    "natural_order",
-    "open_source",
-    "read_image",
-    "write_png",
-]
 
 _LOOKED_AT = 20  # images, for the most frequent size and one that has it
 _DARK = 24  # an image with no brighter value, of 255, is dark; 12 bits in 16 give 15 at most

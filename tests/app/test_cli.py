@@ -30,7 +30,8 @@ from lanebev.estimation.lane_width_prior import LANE_WIDTH, LANE_WIDTH_STD
 from lanebev.estimation.mount import MountReason
 from lanebev.io.results import CSV_COLUMNS, ExtrinsicsRow, write_extrinsics
 from lanebev.io.state import load_state
-from lanebev.io.video import VideoWriter, open_source
+from lanebev.io.video import open_source
+from lanebev.io.video_writer import VideoWriter
 from tools import pseudo_ground_truth
 
 HEIGHT, WIDTH, FRAMES = 240, 416, 6

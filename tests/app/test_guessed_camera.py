@@ -13,7 +13,7 @@ from lanebev.app.observers import NetworkObserver
 from lanebev.estimation.joint.frame_prior import FramePrior, prior_of_mount
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.road import lane_width_covariance
-from lanebev.io.video import Frame
+from lanebev.io.frames import Frame
 from lanebev.observation.polylines import LaneLine, vertices_from_lines
 from lanebev.render import Drive
 

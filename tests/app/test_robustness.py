@@ -28,7 +28,8 @@ from lanebev.cli import main
 from lanebev.io.folder_lock import FolderLock
 from lanebev.io.output_folder import OutputFolder
 from lanebev.io.state import load_state, save_state
-from lanebev.io.video import VideoWriter, open_source
+from lanebev.io.video import open_source
+from lanebev.io.video_writer import VideoWriter
 
 ROOT = Path(__file__).parents[2]
 HEIGHT, WIDTH, FRAMES = 96, 160, 6

@@ -30,7 +30,8 @@ from lanebev.io.images import write_png
 from lanebev.io.live import open_live
 from lanebev.io.results import read_extrinsics
 from lanebev.io.source_names import is_live, without_login
-from lanebev.io.video import VideoWriter, open_source
+from lanebev.io.video import open_source
+from lanebev.io.video_writer import VideoWriter
 from lanebev.report.comparison import common_frames
 from lanebev.report.run_folder import read_run
 from tests.app.rtsp_server import RtspServer, transport_stream

@@ -14,10 +14,13 @@ from lanebev import Camera
 from lanebev.app.config import RunConfig
 from lanebev.app.observers import LaneFileObserver
 from lanebev.app.run import run
+from lanebev.io.culane import read_culane
 from lanebev.io.lane_order import check_boundary_order, left_out_remark
+from lanebev.io.lane_parsing import FrameLines
 from lanebev.io.lane_size import lanes_of_whole_images, meeting_row, resized_lanes, size_remark
-from lanebev.io.lanes import FrameLines, read_culane, read_lanes, tusimple_line
+from lanebev.io.lanes import read_lanes
 from lanebev.io.openlane import camera_from_ground_points
+from lanebev.io.tusimple import tusimple_line
 from lanebev.io.video import open_source
 from lanebev.numbers import parse_crop, parse_size
 from lanebev.observation.polylines import LaneLine, vertices_from_lines

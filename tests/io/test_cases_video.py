@@ -13,7 +13,8 @@ from PIL import Image
 from lanebev.io.decoding import displayed
 from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
 from lanebev.io.lanes import lane_files
-from lanebev.io.video import VideoWriter, open_source
+from lanebev.io.video import open_source
+from lanebev.io.video_writer import VideoWriter
 
 SIZE = (48, 64)
 

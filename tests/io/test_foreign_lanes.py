@@ -10,7 +10,8 @@ from PIL import Image
 from lanebev import Camera
 from lanebev.app.config import RunConfig
 from lanebev.app.sources import make_source
-from lanebev.io.lanes import FrameLines, match_frames, read_lanes
+from lanebev.io.lane_parsing import FrameLines
+from lanebev.io.lanes import match_frames, read_lanes
 from lanebev.observation.boundary_order import boundary_indices
 from lanebev.observation.polylines import LaneLine, vertices_from_lines
 

@@ -20,8 +20,8 @@ from lanebev.io import image_names
 from lanebev.io.frames import Selection
 from lanebev.io.image_names import drives_remark, in_natural_order, jump_remark
 from lanebev.io.images import read_image
+from lanebev.io.lane_parsing import FrameLines
 from lanebev.io.lane_widths import unequal_lanes_remark
-from lanebev.io.lanes import FrameLines
 from lanebev.io.video import open_source
 from lanebev.observation.polylines import LaneLine
 

@@ -21,9 +21,9 @@ from lanebev.io.formats.names import FORMATS, parse_formats
 from lanebev.io.formats.openpilot import openpilot_angles
 from lanebev.io.formats.record import RunRecord, pose_from_degrees, with_images
 from lanebev.io.formats.ros_tf import static_transform
+from lanebev.io.frames import Frame
 from lanebev.io.images import write_png
 from lanebev.io.results import ExtrinsicsRow, write_extrinsics
-from lanebev.io.video import Frame
 from lanebev.io.whole_file import whole_file
 
 FRAMES = 5

@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 
 from lanebev import Camera
-from lanebev.io.lanes import (
-    FrameLines,
-    match_frames,
-    read_culane,
-    read_lanes,
-    read_tusimple,
-)
+from lanebev.io.culane import read_culane
+from lanebev.io.lane_parsing import FrameLines
+from lanebev.io.lanes import match_frames, read_lanes
+from lanebev.io.tusimple import read_tusimple
 from lanebev.observation.polylines import vertices_from_lines
 
 CAMERA = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720)

@@ -15,7 +15,10 @@ import torch
 from PIL import Image
 
 from lanebev.app.concurrency import Background, prefetch
-from lanebev.io.video import VideoWriter, natural_order, open_source, read_image, write_png
+from lanebev.io.image_names import natural_order
+from lanebev.io.images import read_image, write_png
+from lanebev.io.video import open_source
+from lanebev.io.video_writer import VideoWriter
 
 
 def _picture(value, height=48, width=64):

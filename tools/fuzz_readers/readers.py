@@ -228,7 +228,7 @@ def _images() -> list[bytes]:
 def _videos() -> list[bytes]:
     from fractions import Fraction
 
-    from lanebev.io.video import VideoWriter
+    from lanebev.io.video_writer import VideoWriter
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "v.mp4"

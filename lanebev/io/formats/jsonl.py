@@ -10,7 +10,7 @@ from typing import Any
 
 from lanebev.io.formats.record import RunRecord
 from lanebev.io.formats.table import frame_fields
-from lanebev.io.video import Frame
+from lanebev.io.frames import Frame
 
 
 def frame_lines(record: RunRecord) -> Iterator[str]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lanebev.io.calibration_file import ROAD_FROM_VEHICLE
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.video import Frame
+from lanebev.io.frames import Frame
 
 
 def kitti_calib(record: RunRecord) -> str:

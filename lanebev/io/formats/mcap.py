@@ -16,8 +16,8 @@ from lanebev.camera.model import Camera
 from lanebev.io.calibration_file import quaternion_xyzw, vehicle_from_camera
 from lanebev.io.formats.jsonl import frame_lines
 from lanebev.io.formats.record import Lines, RunRecord, with_images
+from lanebev.io.frames import Frame
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.io.video import Frame
 from lanebev.types import Extrinsics
 
 ROAD, CAMERA = "road", "camera"

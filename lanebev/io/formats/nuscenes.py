@@ -10,7 +10,7 @@ from typing import Any
 
 from lanebev.io.calibration_file import quaternion_xyzw, vehicle_from_camera
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.video import Frame
+from lanebev.io.frames import Frame
 
 
 def calibrated_sensor(record: RunRecord) -> list[dict[str, Any]]:

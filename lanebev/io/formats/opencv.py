@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lanebev.camera.files import camera_info, dump_yaml
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.video import Frame
+from lanebev.io.frames import Frame
 
 
 def opencv_poses(record: RunRecord) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.video import Frame
+from lanebev.io.frames import Frame
 from lanebev.types import Extrinsics
 
 _VIEW_FROM_DEVICE = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))

@@ -9,8 +9,8 @@ from typing import Any
 from lanebev import __version__
 from lanebev.io.formats.record import RunRecord
 from lanebev.io.formats.table import frame_fields
+from lanebev.io.frames import Frame
 from lanebev.io.results import CSV_COLUMNS
-from lanebev.io.video import Frame
 
 CONVENTIONS = (
     "pitch > 0: camera looks down; yaw > 0: it points left of the lanes; roll > 0: counter-clockwise seen "

@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from lanebev.camera.model import Camera
+from lanebev.io.frames import Frame
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.io.video import Frame
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.types import Extrinsics
 

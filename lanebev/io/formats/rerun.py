@@ -14,8 +14,8 @@ from lanebev.camera.model import Camera
 from lanebev.io.calibration_file import vehicle_from_camera
 from lanebev.io.formats.names import check_installed
 from lanebev.io.formats.record import RecordedFrame, RunRecord, with_images
+from lanebev.io.frames import Frame
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.io.video import Frame
 
 APPLICATION, VIEWER = "lanebev", "viewer"
 _QUALITY = 80  # of JPEG

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.video import Frame
+from lanebev.io.frames import Frame
 
 
 def write(path: Path, record: RunRecord, images: Iterable[Frame] | None = None) -> None:

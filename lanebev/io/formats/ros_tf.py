@@ -10,7 +10,7 @@ import yaml
 
 from lanebev.io.calibration_file import quaternion_xyzw, vehicle_from_camera
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.video import Frame
+from lanebev.io.frames import Frame
 
 PARENT, CHILD = "base_footprint", "camera_optical_frame"
 
