@@ -90,7 +90,7 @@ def _arrays(path: Path) -> dict[str, Any]:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name].tolist() for name in arrays.files if name not in _VIEWS}
     except Exception as error:  # what damaged bytes make of zipfile and NumPy
-        reason = " ".join(str(error).split())[:100] or type(error).__name__
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())[:100]
         raise ValueError(f"no arrays of numbers as by numpy.savez: {reason}") from error
 
 

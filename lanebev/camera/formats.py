@@ -19,7 +19,7 @@ _PROJECTION_KEYS = ("projection_matrix", "P", "p")
 _ROTATION_KEYS = ("rectification_matrix", "R", "r")
 _WIDTH_KEYS = ("image_width", "image_Width", "width")
 _HEIGHT_KEYS = ("image_height", "image_Height", "height")
-_MODEL_KEYS = ("distortion_model", "camera_model", "model")
+_MODEL_KEYS = ("distortion_model", "camera_model", "model", "DistModel")
 _IGNORED_KEYS = {
     # ROS camera_info beside the lens
     "camera_name", "header", "translation", "rotation",

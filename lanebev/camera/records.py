@@ -1,6 +1,6 @@
-"""Cameras of data sets in JSON: nuScenes, nuImages, OpenLane, Cityscapes, ONCE, A2D2, ZOD and DAIR-V2X.
+"""Cameras of data sets in JSON, of Autoware and of OpenCV's interactive calibration.
 
-Each is a record with the camera matrix under a name of the data set's own.
+Each is a record with the camera matrix under a name of the data set's or the program's own.
 """
 
 from __future__ import annotations
@@ -44,9 +44,19 @@ _LAYOUTS = (
     _Layout("A2D2's", "CamMatrixOriginal", sides="Resolution", rectified="CamMatrix"),
     _Layout("ZOD's", "intrinsics", sides="image_dimensions", model="fisheye"),
     _Layout("DAIR-V2X's", "cam_K", (1080, 1920)),
+    _Layout("Autoware's", "CameraMat", sides="ImageSize"),
+    _Layout("opencv_interactive-calibration's", "cameraMatrix", sides="cameraResolution"),
 )
 _CITYSCAPES = _Layout("Cityscapes'", "intrinsic", (1024, 2048))  # fx, fy, u0, v0 instead of the matrix
-_LENS_KEYS = (*DISTORTION_KEYS, "camera_distortion", "distortion", "Distortion", "cam_D", "distortion_coeffs")
+_LENS_KEYS = (
+    *DISTORTION_KEYS,
+    "camera_distortion",
+    "distortion",
+    "Distortion",
+    "cam_D",
+    "DistCoeff",
+    "distortion_coeffs",
+)
 _PLACES = ("calib", "cameras")  # keys below which ONCE and A2D2 have their cameras
 
 
@@ -58,7 +68,7 @@ def record_cameras(content: Any, image_size: tuple[int, int] | None, rectified: 
     if isinstance(content, list):
         records = [each for each in content if isinstance(each, Mapping) and each.get("camera_intrinsic")]
         named = dict(zip(telling_names([str(each.get("token")) for each in records]), records, strict=True))
-    elif _layout(content) and not _layout(content).sides:  # type: ignore[union-attr]
+    elif _layout(content):
         named = {"": content}
     else:
         places = [content, *(content[key] for key in _PLACES if isinstance(content.get(key), Mapping))]

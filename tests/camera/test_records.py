@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -36,6 +37,13 @@ ZOD_FRONT = {
     "undistortion": [9, 9, 9, 9],
 }
 DAIR = {"cam_K": [2183, 0, 940, 0, 2185, 567, 0, 0, 1], "cam_D": LENS, "width": 1920, "height": 1080}
+AUTOWARE = {  # as cv::FileStorage writes it
+    "CameraMat": {"rows": 3, "cols": 3, "dt": "d", "data": [2183, 0, 940, 0, 2185, 567, 0, 0, 1]},
+    "DistCoeff": {"rows": 1, "cols": 5, "dt": "d", "data": LENS},
+    "ImageSize": [1920, 1080],
+    "ReprojectionError": 0.2,
+    "DistModel": "plumb_bob",
+}
 LIKE_OPENLANE = {"intrinsic": _matrix(1000, 960, 540), "width": 1920, "height": 1080}
 
 
@@ -49,6 +57,8 @@ LIKE_OPENLANE = {"intrinsic": _matrix(1000, 960, 540), "width": 1920, "height": 
         (A2D2, "#rear_center", (1500, 1502, 970, 610, 1920, 1208, KANNALA_BRANDT, "fisheye")),
         ({"FC": ZOD_FRONT}, "", (1900, 1902, 1920, 1084, 3848, 2168, KANNALA_BRANDT, "fisheye")),
         (DAIR, "", (2183, 2185, 940, 567, 1920, 1080, LENS)),
+        (AUTOWARE, "", (2183, 2185, 940, 567, 1920, 1080, LENS)),
+        (ZOD_FRONT, "", (1900, 1902, 1920, 1084, 3848, 2168, KANNALA_BRANDT, "fisheye")),
         (LIKE_OPENLANE, "", (1000, 1002, 960, 540, 1920, 1080, ())),
         ({**LIKE_OPENLANE, "distortion": LENS}, "", (1000, 1002, 960, 540, 1920, 1080, LENS)),
         ({**LIKE_OPENLANE, "dist_coeffs": [LENS]}, "", (1000, 1002, 960, 540, 1920, 1080, LENS)),
@@ -66,6 +76,22 @@ def test_a_record_is_read_with_its_lens(tmp_path, content, name, expected):
     torch.testing.assert_close(camera.intrinsics, wanted.intrinsics, rtol=0, atol=0)
     torch.testing.assert_close(camera.distortion, wanted.distortion, rtol=0, atol=0)
     assert (camera.model, camera.image_size) == (wanted.model, wanted.image_size)
+
+
+def test_the_xml_of_opencvs_interactive_calibration(tmp_path):
+    storage = cv2.FileStorage(str(tmp_path / "c.xml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("calibrationDate", "Thu 07 Apr 2016 04:23:03 PM MSK")
+    storage.write("framesCount", 21)
+    storage.write("cameraMatrix", np.array(_matrix(900, 630, 370)))
+    storage.write("cameraMatrix_std_dev", np.ones((4, 1)))
+    storage.write("dist_coeffs", np.array([LENS]))
+    storage.release()
+    text = (tmp_path / "c.xml").read_text()  # Python's FileStorage cannot write a cv::Size
+    size = "<cameraResolution>\n  1280 720</cameraResolution>\n</opencv_storage>"
+    (tmp_path / "c.xml").write_text(text.replace("</opencv_storage>", size))
+    camera = Camera.from_file(tmp_path / "c.xml")
+    assert camera.intrinsics.tolist() == _matrix(900, 630, 370)
+    assert (camera.distortion.tolist(), camera.image_size) == (LENS, (720, 1280))
 
 
 def test_rectified_images_of_a2d2_have_a_matrix_of_their_own(tmp_path):
