@@ -99,7 +99,7 @@ def verdict(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> Verdict:
     whole = (states == AxisState.MEASURED).all(-1)
     share, complete = float(tracked.mean()), float(whole.mean())
     if not tracked.any():
-        why = _frequent(rows, _WHOLE_FRAME)
+        why = _frequent(rows)
         return Verdict("poor", f"Not calibrated: {why or 'no usable frame'}.", "", ())
     if stills:
         headline = f"{tracked.sum()} of {len(rows)} {_images(len(rows))} calibrated"
@@ -131,7 +131,7 @@ def drive_findings(rows: Sequence[ExtrinsicsRow]) -> list[Finding]:
     for status, words in _STATUS_WORDS.items():
         at = np.array([row.status == status for row in rows])
         for first, last in intervals(at, times):
-            why = _frequent([row for row in rows[first : last + 1] if row.status == status], _WHOLE_FRAME)
+            why = _frequent([row for row in rows[first : last + 1] if row.status == status])
             found.append(_finding("", words, first, last, times, why))
     states = all_axis_states(rows)
     undetermined = states == AxisState.UNDETERMINED
@@ -154,7 +154,7 @@ def image_findings(rows: Sequence[ExtrinsicsRow]) -> list[Finding]:
     states = all_axis_states(rows)
     tracked = np.array([row.status == "TRACKING" for row in rows])
     lost = [row for row in rows if row.status != "TRACKING"]
-    found = [*_in_images("", "no calibration", ~tracked, _frequent(lost, _WHOLE_FRAME))]
+    found = [*_in_images("", "no calibration", ~tracked, _frequent(lost))]
     for axis, name in enumerate(AXES):
         undetermined = tracked & (states[:, axis] == AxisState.UNDETERMINED)
         uncertain = states[:, axis] == AxisState.UNCERTAIN
@@ -240,9 +240,9 @@ def _joined_axes(parts: Sequence[Finding]) -> list[Finding]:
     return found
 
 
-def _frequent(rows: Sequence[ExtrinsicsRow], among: Sequence[str]) -> str:
-    """Return the reasons that hold in a fifth of the frames or more, in words."""
-    counts = Counter(name for row in rows for name in reasons_of(row) if name in among)
+def _frequent(rows: Sequence[ExtrinsicsRow]) -> str:
+    """Return the reasons of whole frames that hold in a fifth of them or more, in words."""
+    counts = Counter(name for row in rows for name in reasons_of(row) if name in _WHOLE_FRAME)
     frequent = [name for name, count in counts.most_common() if count >= 0.2 * len(rows)]
     return ", ".join(_WORDS[name] for name in frequent)
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from lanebev.render.raster.coverage import dash_coverage, stripe_coverage
 from lanebev.render.raster.features import Features
 from lanebev.render.raster.footprint import Ground
-from lanebev.render.raster.noise import GRAIN, sample_grain, smoothstep
+from lanebev.render.raster.noise import sample_grain, smoothstep
 from lanebev.render.raster.select import as_float, remainder
 from lanebev.render.scene.layout import Layout, presence
 
@@ -93,5 +93,5 @@ def _stud_pattern(along: Tensor, period: Tensor, group: Tensor, reach: Tensor, g
 
 def _wear(ground: Ground, wear: Tensor, patches: Tensor) -> Tensor:
     """Compute the remaining paint, (B, N) in [0, 1]: patches are worn off by tyres, grain shows through."""
-    grain = sample_grain(GRAIN, ground.along / 5.0, ground.across / 2.5) / (1 + ground.reach_along / 0.05)
+    grain = sample_grain(ground.along / 5.0, ground.across / 2.5) / (1 + ground.reach_along / 0.05)
     return smoothstep(-0.6, 0.5, patches * 0.5 + grain * 0.45 + 0.95 - 1.6 * wear)

@@ -8,7 +8,7 @@ from torch import Tensor
 from lanebev.render.raster.coverage import dash_coverage, stripe_coverage
 from lanebev.render.raster.edges import band, beyond
 from lanebev.render.raster.footprint import Ground
-from lanebev.render.raster.noise import CLOUD, GRAIN, hash01, sample_grain, sample_noise, smoothstep
+from lanebev.render.raster.noise import CLOUD, hash01, sample_grain, sample_noise, smoothstep
 from lanebev.render.scene.pavement import Pavement
 from lanebev.render.scene.street import GREEN, KERB, PATH, WALK, Street
 
@@ -37,8 +37,8 @@ def roadside(
     """
     _, along, across, reach_along, reach_across = ground
     colour, alpha = torch.zeros_like(across)[:, None].repeat(1, 3, 1), torch.zeros_like(across)
-    grain = sample_grain(GRAIN, along / 7.0, across / 7.0) / (1 + reach_along / 0.06)
-    tufts = sample_grain(GRAIN, along / 19.0, across / 17.0) / (1 + reach_along / 0.15)
+    grain = sample_grain(along / 7.0, across / 7.0) / (1 + reach_along / 0.06)
+    tufts = sample_grain(along / 19.0, across / 17.0) / (1 + reach_along / 0.15)
     growth = sample_noise(CLOUD, along / 37.0, across / 29.0)
     for side, sign, edge in ((0, -1.0, pavement.left), (1, 1.0, pavement.right)):
         foot = ((edge - eye_across) * sign).clamp(min=0.2)[:, None]

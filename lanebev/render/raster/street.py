@@ -9,7 +9,7 @@ from lanebev.render.raster.coverage import dash_coverage, stripe_coverage
 from lanebev.render.raster.edges import band
 from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.glyphs import GLYPH_LENGTH, GLYPH_WIDTH, glyph_coverage
-from lanebev.render.raster.noise import GRAIN, hash01, sample_grain, smoothstep
+from lanebev.render.raster.noise import hash01, sample_grain, smoothstep
 from lanebev.render.raster.roadside import junction_coverage
 from lanebev.render.raster.street_surface import strips_between
 from lanebev.render.raster.surface import count_below
@@ -41,7 +41,7 @@ def street_paint(
     )
     marks = torch.maximum(marks * on_lane, _across_the_road(street, layout, pavement, ground))
     marks = torch.maximum(marks, _bays(street, layout, pavement, ground))
-    grain = sample_grain(GRAIN, ground.along / 5.0, ground.across / 2.5) / (1 + ground.reach_along / 0.05)
+    grain = sample_grain(ground.along / 5.0, ground.across / 2.5) / (1 + ground.reach_along / 0.05)
     worn = smoothstep(-0.6, 0.5, blotch * 0.5 + grain * 0.45 + 0.95 - 1.4 * street.wear[:, None])
     return marks * worn * street.opacity[:, None]
 

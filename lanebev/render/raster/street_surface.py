@@ -8,7 +8,7 @@ from torch import Tensor
 from lanebev.render.raster.coverage import dash_coverage, stripe_coverage
 from lanebev.render.raster.edges import band, beyond
 from lanebev.render.raster.footprint import Ground
-from lanebev.render.raster.noise import GRAIN, hash01, sample_grain
+from lanebev.render.raster.noise import hash01, sample_grain
 from lanebev.render.scene.layout import Layout
 from lanebev.render.scene.pavement import Pavement
 from lanebev.render.scene.street import Street
@@ -26,7 +26,7 @@ def tracks(street: Street, ground: Ground, albedo: Tensor) -> Tensor:
         * street.tram_bed[:, None]
         * (on > 0)
     )
-    stones = sample_grain(GRAIN, along / 11.0, across / 11.0) / (1 + reach_along / 0.1)
+    stones = sample_grain(along / 11.0, across / 11.0) / (1 + reach_along / 0.1)
     sleeper = dash_coverage(along, torch.full_like(along, 0.26), torch.full_like(along, 0.65), reach_along)
     ballast = street.tram_ballast[:, None] * (0.5 * stones - 0.45 * sleeper)
     surface = street.tram_colour[..., None] * (1 + 0.1 * stones + ballast).clamp(min=0.2)[:, None]

@@ -14,7 +14,6 @@ from lanebev.render.raster.features import Features
 from lanebev.render.raster.footprint import Ground
 from lanebev.render.raster.noise import (
     CRACK,
-    GRAIN,
     SECOND,
     hash01,
     sample_grain,
@@ -119,7 +118,7 @@ def pavement_albedo(
 def _weathering(pavement: Pavement, ground: Ground, inside: Tensor, mottle: Tensor) -> Tensor:
     """Compute the relative change by aggregate, blotches, streaks, tyre tracks and oil, (B, N)."""
     u, v, reach = ground.along, ground.across, ground.reach_along
-    grain = sample_grain(GRAIN, u / 6.1, v / 6.1) / (1 + reach / 0.05)
+    grain = sample_grain(u / 6.1, v / 6.1) / (1 + reach / 0.05)
     medium = sample_noise(SECOND, u / 61.0, v / 47.0) / (1 + reach / 0.5)
     streak = sample_noise(SECOND, u / 2300.0, v / 23.0)
     tracks = torch.exp(-(((inside.abs() - 0.85) / 0.32) ** 2))

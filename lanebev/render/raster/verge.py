@@ -6,7 +6,7 @@ from torch import Tensor
 
 from lanebev.render.raster.colour import colour
 from lanebev.render.raster.footprint import Ground
-from lanebev.render.raster.noise import GRAIN, sample_grain
+from lanebev.render.raster.noise import sample_grain
 from lanebev.render.raster.select import choose, remainder
 from lanebev.render.scene.surroundings import Surroundings
 
@@ -22,7 +22,7 @@ def verge_albedo(surroundings: Surroundings, ground: Ground, patches: Tensor) ->
     along, across = ground.along, ground.across
     right = (across > 0)[:, None]
     grass = choose(right, surroundings.verge[:, 1, :, None], surroundings.verge[:, 0, :, None])
-    tufts = sample_grain(GRAIN, along / 19.0, across / 17.0) / (1 + ground.reach_along / 0.15)
+    tufts = sample_grain(along / 19.0, across / 17.0) / (1 + ground.reach_along / 0.15)
     shade = (1 + 0.3 * tufts + 0.22 * patches).clamp(0.25, 2.0)
     dry = colour(grass, 1.25, 1.05, 0.8)
     grass = grass * shade[:, None] * choose((patches > 0.7)[:, None], dry, 1.0)

@@ -9,7 +9,6 @@ from lanebev.render.raster.colour import colour
 from lanebev.render.raster.houses import house_front
 from lanebev.render.raster.noise import (
     CLOUD,
-    GRAIN,
     hash01,
     sample_grain,
     sample_line,
@@ -106,7 +105,7 @@ def _foliage(
     """Draw a row of trees or bushes: crowns by noise on their outline, lit from above, with holes of sky."""
     height, seed = wall.height[:, None], wall.seed[:, None]
     leaves = sample_noise(CLOUD, along / 33.0 + seed, up / 33.0)
-    fine = sample_grain(GRAIN, along / 22.0, up / 22.0 + seed) / (1 + footprint / 0.15)
+    fine = sample_grain(along / 22.0, up / 22.0 + seed) / (1 + footprint / 0.15)
     if kind == HEDGE or style == 0:
         outline = sample_line(along / (260.0 if kind == TREES else 90.0) + seed)
         outline = outline + 0.13 * sample_line(along / 37.0 + 0.4)

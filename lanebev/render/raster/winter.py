@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from lanebev.render.raster.footprint import Ground
-from lanebev.render.raster.noise import CLOUD, GRAIN, SECOND, sample_grain, sample_noise, smoothstep
+from lanebev.render.raster.noise import CLOUD, SECOND, sample_grain, sample_noise, smoothstep
 from lanebev.render.raster.surface import count_below, nearest_slot
 from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout, presence
 from lanebev.render.scene.pavement import Pavement
@@ -44,7 +44,7 @@ def snow_cover(winter: Winter, layout: Layout, pavement: Pavement, ground: Groun
     wheel = ((across - middle).abs() - 0.8).abs() - winter.track[:, None]
     patchy = smoothstep(-0.6, 0.8, blotch + 0.6 * sample_noise(SECOND, along / 19.0, across / 7.0))
     film = winter.film[:, None] * smoothstep(-0.15, 0.25, wheel) * patchy
-    grain = sample_grain(GRAIN, along / 9.0, across / 9.0) / (1 + reach_along / 0.08)
+    grain = sample_grain(along / 9.0, across / 9.0) / (1 + reach_along / 0.08)
     bare = 1 - here * smoothstep(0.55, 0.3, distance)  # wind and salt keep what is labelled in sight
     cover = torch.maximum(edge, torch.maximum(ridge, film)) * bare
     return (cover * (0.9 + 0.15 * grain)).clamp(0, 1) * winter.on[:, None]
