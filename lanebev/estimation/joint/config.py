@@ -19,7 +19,8 @@ class JointConfig:
         num_boundaries: L.
         iterations: Gauss-Newton steps per frame.
         start_iterations: Gauss-Newton steps for every start of a first frame.
-        lane_width_std: sigma of the common scale of the lane widths, m; 0: the widths are exact.
+        lane_width_std: sigma of the common scale of the lane widths, m; 0: the widths are exact. Its effect is in
+            the covariance, which ``LaneBEV`` multiplies by ``pose_sigma_scale`` squared.
         scatter_memory: time constant, s, of the mean squares of the boundaries' own deviations and headings;
             inf: they are taken for 0.
         start_heading_std: standard deviation of a boundary's own heading at a start, rad, unless frames show
