@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.dynamics import MotionConfig, RoadMotion, Spread, motion
 from lanebev.estimation.joint.evidence import adapt_motion_scale
 from lanebev.estimation.joint.low_pass import pose_covariance, pose_transition
@@ -87,15 +86,15 @@ def test_motion_of_each_axis_scales_and_unequal_lanes_forget():
 
 
 def test_motion_scale_follows_the_scores_and_decays():
-    cfg, one = JointConfig(), torch.ones(1, 4, dtype=DOUBLE)
+    one = torch.ones(1, 4, dtype=DOUBLE)
     dt, score = torch.full((1,), 1 / 30, dtype=DOUBLE), torch.tensor([[0.0, 1.0, 2.0, -2.0]], dtype=DOUBLE)
     scale = one
     for _ in range(10):
-        scale = adapt_motion_scale(scale, score, dt, cfg)
+        scale = adapt_motion_scale(scale, score, dt)
     assert scale[0, :2].tolist() == [1.0, 1.0]  # never below one, and unchanged at a mean square of one
     assert scale[0, 2] == scale[0, 3] > 2
     for _ in range(90):
-        scale = adapt_motion_scale(scale, torch.ones_like(score), dt, cfg)
+        scale = adapt_motion_scale(scale, torch.ones_like(score), dt)
     assert scale[0, 2] < 2.5
 
 

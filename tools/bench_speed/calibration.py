@@ -30,7 +30,7 @@ def extractors() -> Calls:
 
 
 def calibrators(rows: int, per_boundary: int) -> dict[str, partial[Any]]:
-    """Make calls of one frame of each calibrator, sure of its start: see ``JointConfig.doubt_frames``."""
+    """Make calls of one frame of each calibrator, sure of its start: see ``JointState.doubt``."""
     one = lanes(per=per_boundary, noise=0.5)
     seen = LaneSegments(*(part.expand(rows, *part.shape[1:]) for part in one))
     intrinsics = INTRINSICS.expand(rows, 3, 3)

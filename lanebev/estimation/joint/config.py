@@ -19,8 +19,8 @@ class JointConfig:
         num_boundaries: L.
         iterations: Gauss-Newton steps per frame.
         start_iterations: Gauss-Newton steps for every start of a first frame.
-        lane_width_std: sigma of the common scale of the lane widths, m; 0: the widths are exact. Its effect is in
-            the covariance, which ``LaneBEV`` multiplies by ``pose_sigma_scale`` squared.
+        lane_width_std: sigma of the common scale of the lane widths, m; 0: the widths are exact. ``LaneBEV``
+            multiplies its effect on the covariance by ``pose_sigma_scale`` squared, as all of it.
         scatter_memory: time constant, s, of the mean squares of the boundaries' own deviations and headings;
             inf: they are taken for 0.
         start_heading_std: standard deviation of a boundary's own heading at a start, rad, unless frames show
@@ -32,26 +32,16 @@ class JointConfig:
         prior: prior of a start and range of its search.
         open_pose: standard deviation of the process noise that the evidence (J16) adds to the pose where it
             is ten sigmas, rad (and ten times that in m for the height); proportional to the evidence.
-        open_curvature, open_step: the same for the curvature at the first knot and for its steps, 1/m.
         straight: standard deviations of c0 and c1 of a straight road, 1/m and 1/m².
         bends: prior probability that a start is on a bend, with the curvatures of ``prior``.
-        open_vertical_curvature: as ``open_pose``, for the vertical curvature, 1/m.
         open_deviation: standard deviation of a boundary's deviation on a road of unequal lanes, m, and the
             most that the evidence adds to it; 0: lanes are equal.
-        evidence_time: time constant of the evidence (J15), s.
-        motion_scale_rise: time, s, in which the variance of the pose's motion grows by a factor e if it is
-            half of the right one.
-        motion_scale_memory: time constant, s, of the decay to the variance of ``motion``.
-        motion_scale_most: largest factor on that variance.
         min_support: sum of inlier weights of a usable frame.
         min_share, enter_share: fraction of inliers needed to continue tracking, and to start again.
         assumed_dt: time between frames, s, if dt is not finite or the clock jumped back by more than 1 s.
         restart_after: time, s, without fitting segments before a new search.
         lost_after: time, s, without usable segments before the status is LOST.
         readings: priors of the readings of a single image.
-        doubt_frames: number of frames after a jump or a misfit that are fitted alone and compared with the
-            state.
-        contrary_frames: number of consecutive usable frames that must contradict it for a restart.
     """
 
     num_boundaries: int = NUM_BOUNDARIES
@@ -65,16 +55,9 @@ class JointConfig:
     motion: MotionConfig = field(default_factory=MotionConfig)
     prior: FramePrior = field(default_factory=FramePrior)
     open_pose: float = 0.01
-    open_curvature: float = 3e-4
-    open_step: float = 1e-3
-    open_vertical_curvature: float = 2e-4
     straight: tuple[float, float] = (1e-4, 3e-6)
     bends: float = 0.2
     open_deviation: float = 0.12
-    evidence_time: float = 0.15
-    motion_scale_rise: float = 0.3
-    motion_scale_memory: float = 1.0
-    motion_scale_most: float = 1e4
     min_support: float = 3.0
     min_share: float = 0.15
     enter_share: float = 0.25
@@ -82,8 +65,6 @@ class JointConfig:
     restart_after: float = 0.3
     lost_after: float = 5.0
     readings: ReadingConfig = field(default_factory=ReadingConfig)
-    doubt_frames: int = 15
-    contrary_frames: int = 5
 
     def __post_init__(self) -> None:
         if self.num_boundaries < 2 or self.num_boundaries % 2:
@@ -91,8 +72,8 @@ class JointConfig:
         if self.iterations < 1 or self.start_iterations < 1:
             got = min(self.iterations, self.start_iterations)
             raise ValueError(f"iterations: expected at least 1, got {got}")
-        times = ("scatter_memory", "evidence_time", "motion_scale_rise", "motion_scale_memory", "assumed_dt")
-        check_settings(self, positive=times, infinite=(*times[:-1], "lost_after", "restart_after"))
+        endless = ("scatter_memory", "lost_after", "restart_after")
+        check_settings(self, positive=("scatter_memory", "assumed_dt"), infinite=endless)
         bend = (self.prior.curvature_std, self.prior.curvature_rate_std)
         if not all(0 < sharp < wide for sharp, wide in zip(self.straight, bend, strict=True)):
             raise ValueError(

@@ -25,6 +25,15 @@ _OVER_HORIZON = 0.01  # if more of the segments are over the horizon, the others
 _CURVED_SIGMAS = 2.0  # ratio of the vertical curvature to its sigma from which it is a crest or a dip
 _POSE_DECAY = 0.85  # factor per frame on the pose's evidence, since a detector's errors last over frames
 CALL = 5.0  # sigmas of evidence at which half of the noise is admitted
+EVIDENCE_TIME = 0.15  # s, time constant of the evidence
+_OPEN_CURVATURE, _OPEN_STEP = (
+    3e-4,
+    1e-3,
+)  # 1/m, of curvature and steps, as ``open_pose``
+_OPEN_VERTICAL_CURVATURE = 2e-4  # 1/m, likewise
+_SCALE_RISE = 0.3  # s, in which the variance of the motion grows by a factor e if it is half of the right one
+_SCALE_MEMORY = 1.0  # s, time constant of the decay to the variance of ``MotionConfig``
+_LARGEST_SCALE = 1e4  # of the variance of the motion
 
 
 def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor, weight: Tensor) -> Tensor:
@@ -96,7 +105,7 @@ def accumulate_evidence(before: Tensor, score: Tensor, dt: Tensor, memory: float
     return torch.where((now * score).abs() > total.abs(), score, total)
 
 
-def adapt_motion_scale(before: Tensor, score: Tensor, dt: Tensor, cfg: JointConfig) -> Tensor:
+def adapt_motion_scale(before: Tensor, score: Tensor, dt: Tensor) -> Tensor:
     """Raise the variance of the pose's motion while its scores are too large, and let it decay.
 
     Source: (J17), covariance matching (Mehra 1972), axis by axis, as a multiplicative step: with the right
@@ -107,13 +116,12 @@ def adapt_motion_scale(before: Tensor, score: Tensor, dt: Tensor, cfg: JointConf
         before: (B, 4) >= 1, factor on the variance so far.
         score: (B, 4), normalised, of pitch, yaw, roll and height.
         dt: (B,) s.
-        cfg: the configuration.
     """
-    gain = 1 - (-dt / cfg.motion_scale_rise).exp().unsqueeze(-1)
+    gain = 1 - (-dt / _SCALE_RISE).exp().unsqueeze(-1)
     excess = (score.square() - 1).clamp(max=_LARGEST_EXCESS)
-    fade = (-dt / cfg.motion_scale_memory).exp().unsqueeze(-1)
+    fade = (-dt / _SCALE_MEMORY).exp().unsqueeze(-1)
     raised = before * (gain * excess).exp()
-    return (1 + (raised - 1) * fade).clamp(1.0, cfg.motion_scale_most)
+    return (1 + (raised - 1) * fade).clamp(1.0, _LARGEST_SCALE)
 
 
 def adaptive_process_noise(evidence: Tensor, cov: Tensor, cfg: JointConfig) -> Tensor:
@@ -135,10 +143,10 @@ def adaptive_process_noise(evidence: Tensor, cov: Tensor, cfg: JointConfig) -> T
     most = torch.cat(worst, dim=-1)
     pose, bend, crest, own = (0.01 * torch.sigmoid(0.5 * (most - CALL**2)) * most).chunk(4, dim=-1)
     jump = constant((*[cfg.open_pose**2] * 3, (10 * cfg.open_pose) ** 2, 0.0), like=evidence)
-    change = constant((cfg.open_curvature**2, *[cfg.open_step**2] * (NUM_SHAPE - 1)), like=evidence)
+    change = constant((_OPEN_CURVATURE**2, *[_OPEN_STEP**2] * (NUM_SHAPE - 1)), like=evidence)
     room = cfg.open_deviation**2 - cov.diagonal(dim1=1, dim2=2)[:, DEVIATIONS]
     freed = (parts[3] == worst[3]) * own.clamp(max=1.0) * room.clamp(min=0.0)
-    return torch.cat([pose * jump, bend * change, crest * cfg.open_vertical_curvature**2, freed], dim=-1)
+    return torch.cat([pose * jump, bend * change, crest * _OPEN_VERTICAL_CURVATURE**2, freed], dim=-1)
 
 
 def with_process_noise(cov: Tensor, variances: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 from lanebev.batch import flag
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.evidence import (
+    EVIDENCE_TIME,
     accumulate_evidence,
     adapt_motion_scale,
     adaptive_process_noise,
@@ -122,7 +123,7 @@ def update_state(
     last = iterate(prior, at_cov, residuals, scale, cov)
     support = torch.bmm(member, per_end(last.frame.trust * seen.weight).unsqueeze(-1)).squeeze(-1)
     score = normalized_score(at_cov, last.frame, support, seen.weight)
-    evidence, motion_scale = with_evidence(predicted, score, last.estimated[:, POSE] > 0, dt, cfg)
+    evidence, motion_scale = with_evidence(predicted, score, last.estimated[:, POSE] > 0, dt)
     cov = with_process_noise(cov, adaptive_process_noise(evidence, at_cov, cfg))
     for _ in range(cfg.iterations - 1):
         at = last.step.mean
@@ -163,7 +164,7 @@ def inliers_of_lanes(last: Iteration, seen: Observations) -> Tensor:
 
 
 def with_evidence(
-    predicted: JointState, score: Tensor, pose_determined: Tensor, dt: Tensor, cfg: JointConfig
+    predicted: JointState, score: Tensor, pose_determined: Tensor, dt: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Add a frame's scores to the evidence against the motion, and adapt the scale of the motion to them.
 
@@ -172,14 +173,13 @@ def with_evidence(
         score: (B, 11 + L), of :func:`~lanebev.estimation.joint.evidence.normalized_score`.
         pose_determined: (B, 4) bool, what of the pose the frame determines; the scale of the rest decays.
         dt: (B,) s since the last frame.
-        cfg: the configuration.
 
     Returns:
         evidence (B, 11 + L) and scale (B, 4).
     """
-    evidence = accumulate_evidence(predicted.evidence, score, dt, cfg.evidence_time)
+    evidence = accumulate_evidence(predicted.evidence, score, dt, EVIDENCE_TIME)
     scored = torch.where(pose_determined, score[:, POSE], 1.0)  # 1 is the score that is expected
-    return evidence, adapt_motion_scale(predicted.motion_scale, scored, dt, cfg)
+    return evidence, adapt_motion_scale(predicted.motion_scale, scored, dt)
 
 
 def scatter_of_frame(frame: FrameInformation, cov: Tensor, member: Tensor, moments: Tensor) -> Scatter:

@@ -36,6 +36,8 @@ from lanebev.geometry.linalg import inverse_spd
 from lanebev.types import Status
 
 _CONTRADICTION = 25.7  # χ² with five degrees of freedom, exceeded by chance in one frame of 10,000
+_DOUBT_FRAMES = 15.0  # frames after a jump or a misfit that are fitted alone and compared with the state
+_CONTRARY_FRAMES = 5  # consecutive usable frames that contradict the state, from which it starts again
 _MISFIT_SHARE = 0.5  # the state is in doubt if a smaller fraction of the segments fits
 
 
@@ -76,7 +78,7 @@ def restart(
     """
     total = seen.weight.sum(-1)
     share = (agreed * seen.weight).sum(-1) / total.clamp(min=1e-6)
-    state = state._replace(doubt=remaining_doubt(state, share, cfg))
+    state = state._replace(doubt=remaining_doubt(state, share))
     running = is_running(state.status)
     wanted = ~running | (~supported & (state.misfit > cfg.restart_after))
     asked = (wanted | (state.doubt > 0)) & (total > 0)
@@ -117,7 +119,7 @@ def compare_with_frame(
     )
     contrary = usable & is_contrary(state, begun, fit, places, seen, cfg)
     count = torch.where(usable, (state.contrary + 1) * contrary, state.contrary)
-    fresh = usable & (wanted | (count >= cfg.contrary_frames))
+    fresh = usable & (wanted | (count >= _CONTRARY_FRAMES))
     doubted = contrary & ~fresh
     kept = state._replace(
         contrary=count,
@@ -129,18 +131,15 @@ def compare_with_frame(
     return Compared(select_rows(fresh, begun, kept), inliers, apart)
 
 
-def remaining_doubt(state: JointState, share: Tensor, cfg: JointConfig) -> Tensor:
+def remaining_doubt(state: JointState, share: Tensor) -> Tensor:
     """Compute the number (B,) of frames, this one too, that are compared after a jump or a misfit.
 
     Args:
         state: after the frame.
         share: (B,), of the frame's segments that fit the state.
-        cfg: the configuration.
     """
     jumped = (state.evidence[:, :NUM_POSE].abs() > CALL).any(-1)
-    return torch.where(
-        jumped | (share < _MISFIT_SHARE), float(cfg.doubt_frames), (state.doubt - 1).clamp(min=0)
-    )
+    return torch.where(jumped | (share < _MISFIT_SHARE), _DOUBT_FRAMES, (state.doubt - 1).clamp(min=0))
 
 
 def is_contrary(
