@@ -63,8 +63,8 @@ class RunConfig:
     )
     lanes: str | None = option(
         None,
-        "lanes of another detector: JSON of TuSimple, CurveLanes, OpenLane, LLAMAS or BDD100K, .lines.txt of "
-        "CULane, or a folder of them",
+        "lanes of another detector or a person: JSON of TuSimple, CurveLanes, OpenLane, LLAMAS, BDD100K, "
+        "VIL-100 or LabelMe, .lines.txt of CULane, or a folder of them",
         "FILE",
     )
     stills: bool = option(False, "treat every image as independent, not as a frame of a drive")

@@ -21,16 +21,23 @@ from lanebev.io.culane import read_culane
 from lanebev.io.curvelanes import read_curvelanes
 from lanebev.io.image_names import in_natural_order
 from lanebev.io.images import IMAGE_SUFFIXES
+from lanebev.io.labelme import read_labelme, read_vil100
 from lanebev.io.lane_parsing import FrameLines, json_values, lane_text
 from lanebev.io.llamas import read_llamas
 from lanebev.io.openlane import read_openlane
 from lanebev.io.tusimple import read_tusimple
 
+_READERS = {  # of files of one image, by a key that no other has
+    "Lines": read_curvelanes,
+    "image_name": read_llamas,
+    "shapes": read_labelme,
+    "annotations": read_vil100,
+}
 _OF_LLAMAS = re.compile(r"_(color|gray)_rect$")  # ends the names of LLAMAS' images, not of its labels
 
 
 def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) -> list[FrameLines]:
-    """Read a file of TuSimple, CULane, CurveLanes, OpenLane, LLAMAS or BDD100K, or a folder of such files.
+    """Read a lane file of any of the formats, which its keys tell, or a folder of such files.
 
     Args:
         path: path of the file or folder.
@@ -48,12 +55,11 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
     text = lane_text(path)
     if path.name.endswith(".txt") and not text.lstrip("[ \r\n").startswith("{"):
         return [read_culane(path)]
-    if _has_key("Lines", path, text):
-        return [read_curvelanes(path)]
     if _has_key("lane_lines", path, text):
         return [read_openlane(path, intrinsics)]
-    if _has_key("image_name", path, text):
-        return [read_llamas(path)]
+    for key, read in _READERS.items():
+        if _has_key(key, path, text):
+            return [read(path)]
     if any(_has_key(key, path, text) for key in ("labels", "frames")):
         return read_bdd100k(path)
     return read_tusimple(path)

@@ -35,6 +35,10 @@ _BDD100K = [
     b'"poly2d": [{"vertices": [[5, 590], [7, 580.5], [9, 560], [10, 540]], "types": "LCCC"}]}]}]',
     b'{"name": "1", "frames": [{"objects": [{"category": "lane/x", "poly2d": [[5, 590, "L"], [7, 8]]}]}]}',
 ]
+_DRAWN = [
+    b'{"imagePath": "1.png", "shapes": [{"shape_type": "linestrip", "points": [[5, 590], [7.5, 580]]}]}',
+    b'{"info": {"image_path": "a/1.jpg"}, "annotations": {"lane": [{"points": [[5, 590], [7, 580]]}]}}',
+]
 
 
 class Reader(NamedTuple):
@@ -70,7 +74,9 @@ def readers() -> dict[str, Reader]:
             ],
         ),
         "lanes.json": Reader(read_lanes, ".json", _tusimple(), 30),
-        "openlane.json": Reader(read_lanes, ".json", [*_openlane(), _CURVELANES, _LLAMAS, *_BDD100K], 20),
+        "openlane.json": Reader(
+            read_lanes, ".json", [*_openlane(), _CURVELANES, _LLAMAS, *_BDD100K, *_DRAWN], 20
+        ),
         "culane": Reader(
             read_lanes, ".lines.txt", [b"10 590 12.5 580 15 570 17 560\n500.25 590 510 580 520 570\n"], 20
         ),

@@ -1,0 +1,73 @@
+"""Lanes drawn in LabelMe, and the labels of VIL-100."""
+
+import json
+
+import numpy as np
+import pytest
+
+from lanebev.io.lanes import match_frames, read_lanes
+
+LEFT = [[600.5, 300.0], [400.0, 500.0], [250.25, 700.0]]
+RIGHT = [[680.0, 300.0], [900.0, 700.0]]
+
+
+def _shape(points, kind="linestrip"):
+    return {"label": "lane", "points": points, "shape_type": kind, "group_id": None, "flags": {}}
+
+
+def _labelme(*shapes, image="..\\images\\7.png"):
+    size = {"imageHeight": 720, "imageWidth": 1280, "imageData": None}
+    return {"version": "5.0.1", "flags": {}, "shapes": list(shapes), "imagePath": image, **size}
+
+
+def _vil(**changes):
+    lanes = [{"id": i, "lane_id": i + 1, "points": points} for i, points in enumerate((LEFT, RIGHT))]
+    info = {"height": 720, "width": 1280, "image_path": "0_Road001_Trim003_frames/7.jpg"}
+    return {"camera_id": 8272, "info": info, "annotations": {"lane": lanes}, **changes}
+
+
+def _read(path, value):
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(value))
+    return read_lanes(path)
+
+
+def test_lines_of_labelme_and_of_vil_100(tmp_path):
+    car = _shape([[0, 0], [9, 9]], "rectangle")
+    files = {
+        "7.json": _labelme(_shape(LEFT), car, _shape(RIGHT, "line"), _shape([])),
+        "7.jpg.json": _vil(),
+    }
+    for name, content in files.items():
+        (frame,) = _read(tmp_path / "labels" / name, content)
+        assert len(frame.lines) == 2
+        for line, expected in zip(frame.lines, (LEFT, RIGHT), strict=True):
+            np.testing.assert_array_equal(line.points, expected)
+            assert line.boundary is None
+        other = f"{tmp_path}/other/7.png"
+        images = [other, f"{tmp_path}/images/7.png", f"{tmp_path}/0_Road001_Trim003_frames/7.jpg"]
+        assert match_frames(images, [frame]) == ([None, 0, None] if "jpg" not in name else [None, None, 0])
+
+
+def test_an_image_without_lanes_has_an_entry(tmp_path):
+    assert _read(tmp_path / "7.json", _labelme())[0].lines == []
+    assert _read(tmp_path / "8.json", _vil(annotations={"lane": []}))[0].lines == []
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (_labelme(_shape(LEFT, "polygon")), "shapes: expected lanes of type linestrip, got polygon; draw"),
+        (_labelme(_shape([[1, 2, 3]])), r"shapes\[0\].points: expected 2 numbers, got 3"),
+        (_labelme(_shape([[1, "a"]])), r"shapes\[0\].points: expected finite numbers, got 1, a"),
+        (_labelme(_shape(None)), "points: expected a list, got NoneType"),
+        (_labelme(image=None), "imagePath: expected a str, got NoneType"),
+        (_labelme(3), "expected a JSON object, got int"),
+        (_vil(annotations=[]), "annotations: expected a dict, got list"),  # COCO's
+        (_vil(info={}), "image_path: expected a str, got none"),
+    ],
+)
+def test_bad_files_are_one_clear_line(tmp_path, content, message):
+    with pytest.raises(ValueError, match=rf"lane file .*7.json: {message}") as error:
+        _read(tmp_path / "7.json", content)
+    assert "\n" not in str(error.value)
