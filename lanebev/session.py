@@ -23,9 +23,8 @@ from lanebev.estimation.mount import MountCalibration, describe_mount
 from lanebev.estimation.reasons import Reason, describe_reasons
 from lanebev.estimation.tracker import Tracker
 from lanebev.io.frame_clock import FrameClock
+from lanebev.io.lane_doubts import LaneDoubts
 from lanebev.io.lane_parsing import FrameLines
-from lanebev.io.lane_size import size_doubt
-from lanebev.io.lane_widths import unequal_lanes_remark
 from lanebev.io.state import lane_width_remark, load_state, save_state
 from lanebev.numbers import check_number
 from lanebev.observation.boundary_vertices import BoundaryVertices
@@ -38,8 +37,6 @@ from lanebev.view.frame import remap_frame
 from lanebev.view.grid import BEVGrid
 
 logger = logging.getLogger(__name__)
-
-_LANES_LOOKED_AT = 20  # frames whose polylines are checked together
 
 
 class SessionResult(NamedTuple):
@@ -141,8 +138,7 @@ class Session:
         """Reset the state, as for another drive with another camera."""
         self.tracker: Tracker[Any] = Tracker(*self._parts)
         self._clock = FrameClock()
-        self._drawn: list[FrameLines] = []
-        self._doubt = ""
+        self._lanes = LaneDoubts(self.camera)
 
     def __call__(
         self,
@@ -195,7 +191,7 @@ class Session:
             status=Status(int(calibration.status[0])),
             reasons=remarks
             + lost
-            + ([self._doubt] if self._doubt else [])
+            + ([self._lanes.doubt] if self._lanes.doubt else [])
             + describe_reasons(reasons & ~Reason.TIME if remarks else reasons),
             mount=mounted,
             mount_needs=describe_mount(mounted, self.tracker.mount_estimator.config),
@@ -231,7 +227,7 @@ class Session:
         fresh.state, fresh.mount_state = loaded.states["calibrator"], loaded.states["mount"]
         self.tracker = fresh
         self._clock = FrameClock(**(loaded.metadata.get("clock") or {}))
-        self._doubt, self._drawn = "", []
+        self._lanes = LaneDoubts(self.camera)
 
     def _rgb(self, frame: NDArray[np.uint8] | Tensor) -> Tensor:
         """Check a frame and return it as (3, H, W) RGB."""
@@ -246,7 +242,7 @@ class Session:
         """Return the frame's vertices and the scale of the pose's sigmas that their detector needs."""
         if polylines is not None or image is None:
             lines = lines_from_polylines([] if polylines is None else polylines, self.polyline_sigma)
-            self._look_at_lanes(FrameLines("", lines))
+            self._lanes.add(FrameLines("", lines))
             return vertices_from_lines(lines, self.camera), 1.0
         if self._model is None:
             self._model = LaneBEV.from_pretrained()
@@ -254,18 +250,6 @@ class Session:
         point = None if model.far_view is None else self.tracker.vanishing_point()
         _, vertices = model.boundary_vertices(network_image(image, self.device), point)
         return map_tensors(Tensor.cpu, vertices), model.pose_sigma_scale
-
-    def _look_at_lanes(self, lines: FrameLines) -> None:
-        """Doubt polylines in pixels of other images, or of unequal lanes, by all of some frames together."""
-        self._drawn += [lines] if lines.lines else []
-        if len(self._drawn) == _LANES_LOOKED_AT:
-            doubt = size_doubt(self._drawn, self.camera.image_size)
-            remedy = "give pixels of the camera's images, or a camera by Camera.scaled or Camera.cropped"
-            words = f"polylines: {doubt.words} {remedy}" if doubt else ""
-            words = words or unequal_lanes_remark(self._drawn, self.camera)
-            if words and not self._doubt:  # once, as long as it lasts
-                logger.warning(words)
-            self._doubt, self._drawn = words, []
 
 
 def _check_numbers(
