@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
-from lanebev.tensors import constant, map_tensors
-from lanebev.torch_internals import handled_by_mode, is_batched_by_vmap
+from lanebev.tensors import constant, map_tensors, recorded
+from lanebev.torch_internals import is_batched_by_vmap
 
 T = TypeVar("T")
 FlagT = TypeVar("FlagT", bound=IntFlag)
@@ -37,20 +37,19 @@ def select_rows(rows: Tensor, yes: T, no: T) -> T:
 def may_skip(wanted: Tensor) -> bool:
     """Tell whether a costly step, such as a search, can be left out because no row wants its result.
 
-    Beside :func:`replace_rows` the one place where the maths asks the device. A compiled or exported program,
-    ``torch.vmap`` and ``FakeTensorMode`` cannot, and always search.
+    Beside :func:`replace_rows` the one place where the maths asks the device. A compiled, exported or traced
+    program, ``torch.vmap``, ``FakeTensorMode`` and the device meta cannot, and always search.
     """
-    return not (torch.compiler.is_compiling() or _is_without_numbers(wanted)) and not bool(wanted.any())
+    return not _is_without_numbers(wanted) and not bool(wanted.any())
 
 
 def readable(value: Tensor) -> bool:
     """Tell whether a check may read a tensor's numbers: now, and without waiting for a device."""
-    recorded = torch.compiler.is_compiling() or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
-    return value.device.type == "cpu" and not (recorded or _is_without_numbers(value))
+    return value.device.type == "cpu" and not _is_without_numbers(value)
 
 
 def _is_without_numbers(value: Tensor) -> bool:
-    return handled_by_mode() or is_batched_by_vmap(value)
+    return recorded() or value.is_meta or is_batched_by_vmap(value)
 
 
 def replace_rows(rows: Tensor, values: T, function: Callable[..., T], *operands: Any) -> T:
@@ -58,7 +57,7 @@ def replace_rows(rows: Tensor, values: T, function: Callable[..., T], *operands:
 
     The device is asked how many rows there are. A compiled or exported program has both ways
     (``torch.cond``): it computes the function for all rows where there is any, else not at all. Under
-    ``torch.vmap`` and ``FakeTensorMode`` it is computed for all rows.
+    ``torch.vmap``, ``torch.jit.trace`` and ``FakeTensorMode`` it is computed for all rows.
 
     Args:
         rows: (B,) bool.
@@ -134,8 +133,10 @@ def in_blocks(numbers: int, function: Callable[..., T], *operands: Any) -> T:
     first = operands[0]
     while isinstance(first, tuple):
         first = first[0]
+    if recorded() or first.device.type != "cpu":
+        return function(*operands)
     count = round(numbers * first.shape[0] / _BLOCK)
-    if torch.compiler.is_compiling() or count < 2 or first.device.type != "cpu":
+    if count < 2:
         return function(*operands)
     parts, structure = tree_flatten(operands)
     blocks = zip(*(part.chunk(count) for part in parts), strict=True)

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from lanebev.batch import select_rows
 from lanebev.clips import drive_starts, frame_intervals, stack_frames
 from lanebev.estimation.expected_view import expected_vanishing_point
-from lanebev.geometry.lens import check_intrinsics
-from lanebev.geometry.precision import autocast_off, common_dtype
+from lanebev.geometry.lens import check_distortion, check_intrinsics
+from lanebev.geometry.precision import autocast_is_on, autocast_off, common_dtype
 from lanebev.observation.boundary_detector import BoundaryDetector
 from lanebev.observation.far_view import FarView
 from lanebev.observation.frames import black_unless_finite, check_images
@@ -159,8 +159,8 @@ class LaneBEV(BoundaryDetector):
         """
         initial_state: Any = self.calibrator.initial_state
         device = torch.device(device or "cpu")
-        off = torch.is_autocast_enabled(device.type)  # asked, since torch.export cannot keep an empty context
-        with autocast_off(device) if off else nullcontext():
+        # asked, since torch.export cannot keep an empty context
+        with autocast_off(device) if autocast_is_on(device) else nullcontext():
             return initial_state(batch_size, dtype=dtype, device=device)
 
     def forward(
@@ -202,6 +202,7 @@ class LaneBEV(BoundaryDetector):
         """
         check_images(image)
         cameras = _frame_cameras(intrinsics, image)
+        check_distortion(distortion, model, image.shape[0])
         if truncation is not None and truncation < 1:
             raise ValueError(f"truncation: expected 1 frame or more, or None, got {truncation}")
         frames = image if image.ndim == 5 else image.unsqueeze(1)

@@ -60,6 +60,12 @@ def one_thread() -> Iterator[None]:
             _before.pop()
 
 
+def recorded() -> bool:
+    """Tell whether operations are recorded for other numbers, by a compiler, an exporter or a mode."""
+    traced = torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
+    return torch.compiler.is_compiling() or traced or handled_by_mode()
+
+
 def usable_device(device: torch.device | str | int) -> torch.device:
     """Return a device by its name.
 

@@ -197,7 +197,8 @@ def check_extrinsics(extrinsics: object, *rows: int) -> None:
     for name, part in extrinsics._asdict().items():
         check_tensor(f"extrinsics.{name}", part)
         if rows and part.shape != rows:
-            raise ValueError(f"extrinsics.{name}: expected {rows}, got {tuple(part.shape)}")
+            joined = "; join poses of one row each by torch.cat" if part.shape == (*rows, 1) else ""
+            raise ValueError(f"extrinsics.{name}: expected {rows}, got {tuple(part.shape)}{joined}")
 
 
 def check_calibration(calibration: object) -> None:

@@ -82,9 +82,11 @@ def check_new_state(batch_size: object, dtype: torch.dtype) -> None:
         TypeError: a batch size that is no whole number.
         ValueError: a negative batch size, or another dtype than float32 and float64.
     """
+    if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]  # sizes are tensors
+        return
     if not isinstance(batch_size, (int, torch.SymInt, Integral)) or isinstance(batch_size, bool):
         raise TypeError(f"batch_size: expected a whole number, got {batch_size!r}")
-    if int(batch_size) < 0:
+    if batch_size < 0:  # int() would fix the batch size of an exported program
         raise ValueError(f"batch_size: expected 0 or more, got {batch_size}")
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")

@@ -20,18 +20,24 @@ _HARMLESS_FOCAL = 1000.0  # px
 _NO_PIXEL = 0.5  # px
 
 
-def check_rows(distortion: Tensor, points: Tensor) -> None:
-    """Raise unless (..., D) coefficients go with (..., N, 2) points, row by row."""
-    if distortion.shape[:-1] != points.shape[:-2]:
-        rows = "".join(f"{size}, " for size in points.shape[:-2])
-        raise ValueError(f"distortion: expected ({rows}D) like the points, got {tuple(distortion.shape)}")
+def check_distortion(distortion: Tensor | None, model: str, *rows: int) -> None:
+    """Raise unless these are (*rows, D) coefficients, or None, of a lens that exists.
+
+    Raises:
+        TypeError: not a tensor.
+        ValueError: saying what was expected and what came.
+    """
+    if distortion is not None:
+        check_tensor("distortion", distortion)
+        if distortion.shape[:-1] != rows:
+            expected = "".join(f"{size}, " for size in rows)
+            raise ValueError(f"distortion: expected ({expected}D), got {tuple(distortion.shape)}")
+    check_lens(distortion, model)
 
 
 def _check(points: Tensor, distortion: Tensor, model: str) -> None:
     check_points(points)
-    check_tensor("distortion", distortion)
-    check_lens(distortion, model)
-    check_rows(distortion, points)
+    check_distortion(distortion, model, *points.shape[:-2])
 
 
 def check_intrinsics(intrinsics: Tensor, *rows: int) -> None:

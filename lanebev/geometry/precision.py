@@ -49,8 +49,12 @@ def _is_precise(tensors: list[Tensor]) -> bool:
         return True
     if torch.compiler.is_compiling() or dtypes != {torch.float32}:
         return False
-    device = tensors[0].device.type
-    return not (torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device))
+    return not autocast_is_on(tensors[0].device)
+
+
+def autocast_is_on(device: torch.device) -> bool:
+    """Tell whether autocast is on for a device; some, such as meta, have none."""
+    return torch.amp.is_autocast_available(device.type) and torch.is_autocast_enabled(device.type)
 
 
 def autocast_off(device: torch.device, dtype: torch.dtype = torch.float32) -> AbstractContextManager[object]:
@@ -59,7 +63,9 @@ def autocast_off(device: torch.device, dtype: torch.dtype = torch.float32) -> Ab
     Autocast leaves double precision as it is, so an exported program needs no region for it (one with a
     ``torch.cond`` inside could not be saved, torch 2.13).
     """
-    return nullcontext() if dtype == torch.float64 else torch.autocast(device.type, enabled=False)
+    if dtype == torch.float64 or not torch.amp.is_autocast_available(device.type):
+        return nullcontext()
+    return torch.autocast(device.type, enabled=False)
 
 
 def common_dtype(*tensors: Tensor) -> torch.dtype:

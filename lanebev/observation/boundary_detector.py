@@ -178,8 +178,21 @@ class BoundaryDetector(nn.Module):
         return logits, vertices._replace(weight=weight)
 
     def _gradients(self, stage: str) -> AbstractContextManager[object]:
-        """Return the context of a stage: without gradients if it is frozen."""
-        return torch.no_grad() if stage in self.frozen else nullcontext()
+        """Return the context of a stage: without gradients if it is frozen.
+
+        Raises:
+            ValueError: it is frozen and has parameters that want gradients, which would silently be zero.
+        """
+        if stage not in self.frozen:
+            return nullcontext()
+        parts = self.get_submodule(stage).parameters()
+        if torch.is_grad_enabled() and any(part.requires_grad for part in parts):
+            raise ValueError(
+                f"{stage}: expected parameters without gradients, since it is frozen, got some with; to "
+                f"train it, set model.frozen = model.frozen - {{{stage!r}}}, else "
+                f"{stage}.requires_grad_(False)"
+            )
+        return torch.no_grad()
 
 
 def check_vanishing_point(point: Tensor, rows: int) -> None:

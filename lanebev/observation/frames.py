@@ -116,7 +116,7 @@ def resized_size(image_size: tuple[int, int], network_width: int, pixels: int | 
         pixels: number of pixels that the input should have: w is as large as this allows, in steps of 64 px,
             and at most W. None: w is ``network_width``.
     """
-    height, width = image_size
+    height, width = map(int, image_size)  # torch.jit.trace has tensors for them
     wanted = network_width
     if pixels is not None:
         equal = min(math.sqrt(pixels * width / height), width)

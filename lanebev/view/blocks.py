@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.tensors import one_thread
-from lanebev.torch_internals import handled_by_mode, is_in_transform
+from lanebev.tensors import one_thread, recorded
+from lanebev.torch_internals import is_in_transform
 from lanebev.view.lens import Lens
 from lanebev.view.projection import Cells, CellSums, image_coordinates, outside_image
 from lanebev.view.thread_limits import ONE_THREAD
@@ -130,5 +130,4 @@ def _spans(rows: tuple[int, int], step: int) -> Iterator[tuple[int, int]]:
 
 def traced() -> bool:
     """Tell whether operations are recorded for all possible values."""
-    compiled = torch.compiler.is_compiling() or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
-    return compiled or handled_by_mode() or is_in_transform()
+    return recorded() or is_in_transform()

@@ -109,7 +109,7 @@ class CanonicalView(nn.Module):
         check_size(size)
         check_covers(image, size)
         check_cameras(image.shape[0], intrinsics, extrinsics, distortion, model)
-        intrinsics, distortion = blind_unless_usable(intrinsics, distortion)
+        intrinsics, extrinsics, distortion = blind_unless_usable(intrinsics, extrinsics, distortion)
         dtype, image_from_cam = common_dtype(image), normalised_intrinsics(intrinsics, size)
         lens = None
         if distortion is not None and distortion.shape[-1] > 0:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from lanebev.geometry.distortion import check_lens
-from lanebev.geometry.lens import check_intrinsics, last_row_is_small
+from lanebev.batch import readable
+from lanebev.geometry.lens import check_distortion, check_intrinsics, last_row_is_small
 from lanebev.tensors import constant
 from lanebev.types import Extrinsics, check_extrinsics, check_tensor
 
@@ -50,18 +50,47 @@ def check_covers(image: Tensor, size: tuple[int, int]) -> None:
         )
 
 
-def blind_unless_usable(intrinsics: Tensor, distortion: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Replace cameras (B, 3, 3), (B, D) that cannot be used by one whose image has nothing in it.
+def check_stride(image: Tensor, stride: float | None, size: tuple[int, int]) -> None:
+    """Raise ValueError if the cells of a map (B, C, h, w) of this stride do not cover an image (H, W) px.
+
+    One cell more or less, and padding or cropping by a third, are let through.
+    """
+    if stride is None or torch.compiler.is_compiling():
+        return
+    for name, cells, pixels in zip(("rows", "columns"), image.shape[-2:], size, strict=True):
+        if not pixels / (1.5 * stride) - 1 <= cells <= 1.5 * pixels / stride + 1:
+            raise ValueError(
+                f"strides: expected about {pixels / cells:.3g} px, since {cells} {name} of a map cover "
+                f"{pixels} px, got {stride:g}; give strides in the order of the maps, and image_size of the "
+                "image"
+            )
+
+
+def blind_unless_usable(
+    intrinsics: Tensor, extrinsics: Extrinsics, distortion: Tensor | None
+) -> tuple[Tensor, Extrinsics, Tensor | None]:
+    """Replace cameras and poses that cannot be used by those of a camera whose image has nothing in it.
 
     NaN would become the value and the gradient of every cell. Transposed intrinsics would show another place;
     :func:`check_cameras` does not notice them on a GPU or in a compiled program.
+
+    Args:
+        intrinsics: (B, 3, 3).
+        extrinsics: each (B,).
+        distortion: (B, D), or None.
     """
     usable = intrinsics.isfinite().all(-1).all(-1) & last_row_is_small(intrinsics)
+    usable = usable & sum(extrinsics[1:], extrinsics[0]).isfinite()
     if distortion is not None:
         usable = usable & distortion.isfinite().all(-1)
-        distortion = torch.where(usable.unsqueeze(-1), distortion, 0.0)
+    if readable(usable) and bool(usable.all()):
+        return intrinsics, extrinsics, distortion
     blind = constant(((1.0, 0.0, _BESIDE), (0.0, 1.0, _BESIDE), (0.0, 0.0, 1.0)), like=intrinsics)
-    return torch.where(usable[:, None, None], intrinsics, blind), distortion
+    intrinsics = torch.where(usable[:, None, None], intrinsics, blind)
+    extrinsics = Extrinsics(*(torch.where(usable, part, 0.0) for part in extrinsics))
+    if distortion is not None:
+        distortion = torch.where(usable.unsqueeze(-1), distortion, 0.0)
+    return intrinsics, extrinsics, distortion
 
 
 def check_cameras(
@@ -70,9 +99,4 @@ def check_cameras(
     """Raise TypeError or ValueError unless there are ``batch`` cameras with poses, and lenses that exist."""
     check_intrinsics(intrinsics, batch)
     check_extrinsics(extrinsics, batch)
-    if distortion is not None:
-        check_tensor("distortion", distortion)
-        if distortion.shape[:-1] != (batch,):
-            got = tuple(distortion.shape)
-            raise ValueError(f"distortion: expected ({batch}, D) like the points, got {got}")
-    check_lens(distortion, model)
+    check_distortion(distortion, model, batch)

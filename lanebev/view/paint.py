@@ -85,7 +85,7 @@ class ImageFromBEV(nn.Module):
         check_image(bev, "bev")
         check_size(image_size)
         check_cameras(bev.shape[0], intrinsics, extrinsics, distortion, model)
-        intrinsics, distortion = blind_unless_usable(intrinsics, distortion)
+        intrinsics, extrinsics, distortion = blind_unless_usable(intrinsics, extrinsics, distortion)
         size, dtype = self.grid.shape, common_dtype(bev)
         cells: CellSums | PixelCells
         if vertical_curvature is not None:

@@ -15,7 +15,14 @@ from lanebev.geometry.road_profile import check_vertical_curvature
 from lanebev.numbers import check_number
 from lanebev.types import Extrinsics, check_type
 from lanebev.view.cells import cells_and_lens, rows_in_sight
-from lanebev.view.checks import blind_unless_usable, check_cameras, check_covers, check_image, check_size
+from lanebev.view.checks import (
+    blind_unless_usable,
+    check_cameras,
+    check_covers,
+    check_image,
+    check_size,
+    check_stride,
+)
 from lanebev.view.grid import BEVGrid
 from lanebev.view.projection import image_coordinates, normalised_intrinsics
 from lanebev.view.sampling import MapSize, resampled
@@ -110,7 +117,7 @@ class BEVWarp(nn.Module):
         maps = [image] if isinstance(image, Tensor) or not isinstance(image, Sequence) else list(image)
         sizes, size = _map_sizes(maps, strides, image_size)
         check_cameras(maps[0].shape[0], intrinsics, extrinsics, distortion, model)
-        intrinsics, distortion = blind_unless_usable(intrinsics, distortion)
+        intrinsics, extrinsics, distortion = blind_unless_usable(intrinsics, extrinsics, distortion)
         if vertical_curvature is not None:
             check_vertical_curvature(vertical_curvature, maps[0].shape[0])
         heights = self.plane_heights or (0.0,)
@@ -183,8 +190,9 @@ def _map_sizes(
             raise ValueError("image_size: expected (H, W) px of the image that maps belong to, got None")
         image_size = (maps[0].shape[-2], maps[0].shape[-1])
     check_size(image_size)
-    for each in maps:
+    for each, step in zip(maps, steps, strict=True):
         check_covers(each, image_size)
+        check_stride(each, step, image_size)
     sizes = [MapSize(each.shape[-2], each.shape[-1], step) for each, step in zip(maps, steps, strict=True)]
     return sizes, image_size
 

@@ -19,6 +19,7 @@ from lanebev import (
     JointCalibrator,
     LaneBEV,
     LaneSegmenter,
+    LaneSegments,
     LineExtractor,
     SegmenterConfig,
     Status,
@@ -389,3 +390,165 @@ def test_gradients_flow_through_rows_that_a_compiled_program_replaces():
         results.append((*out, *torch.autograd.grad((out[0] + out[1]).sum(), numbers)))
     for one, other in zip(*results, strict=True):
         torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize("kind", [BEVWarp, CanonicalView, ImageFromBEV])
+def test_a_pose_with_nan_shows_nothing_and_leaves_gradients_finite(kind):
+    """As of somebody's own network that regresses it."""
+    grid = BEVGrid(x=(-6.0, 6.0), z=(3.0, 30.0), resolution=0.5)
+    view = CanonicalView(CAMERA[0], (64, 128), POSE) if kind is CanonicalView else kind(grid)
+    image = torch.rand(2, 3, *(grid.shape if kind is ImageFromBEV else (64, 128)), requires_grad=True)
+    options = {"image_size": (64, 128)} if kind is ImageFromBEV else {}
+    values = POSE.stack().repeat(2, 1)
+    values[1, 2] = torch.nan
+    values.requires_grad_()
+    found, valid = view(image, CAMERA.repeat(2, 1, 1), Extrinsics.unstack(values), **options)
+    assert valid.flatten(1).any(1).tolist() == [True, False]
+    assert found.flatten(1).ne(0).any(1).tolist() == [True, False]
+    gradients = torch.autograd.grad(found.square().sum(), (image, values))
+    assert all(each.isfinite().all() for each in gradients)
+    assert gradients[1].ne(0).any(1).tolist() == [True, False]
+
+
+@pytest.mark.filterwarnings("ignore")
+@CALIBRATORS
+def test_a_program_of_torch_jit_trace_computes_frames_of_every_kind(calibrator):
+    """Recorded where no row has to start, it starts rows; of another number of rows too."""
+    start = calibrator.initial_state(1, dtype=torch.float64)
+
+    def frame(dt, *parts):
+        segments, state = LaneSegments(*parts[:4]), type(start)(*parts[4:])
+        out, after = calibrator(segments, K.expand(len(dt), 3, 3), state, dt)
+        return out.extrinsics.stack(), out.covariance, out.status, *after
+
+    with torch.no_grad():
+        going = frame(torch.full((1,), 0.05), *lanes(seed=0), *start)
+        recorded = torch.jit.trace(
+            frame, (torch.full((1,), 0.05), *lanes(seed=1), *going[3:]), check_trace=False
+        )
+        state = other = tuple(calibrator.initial_state(2, dtype=torch.float64))
+        for segments in (stack_rows(lanes(seed=2), no_lanes()), stack_rows(no_lanes(), lanes(seed=3))):
+            expected = frame(torch.full((2,), 0.1), *segments, *state)
+            found = recorded(torch.full((2,), 0.1), *segments, *other)
+            state, other = expected[3:], found[3:]
+            for one, two in zip(found, expected, strict=True):
+                torch.testing.assert_close(one, two)
+    assert found[2].tolist() == [Status.COASTING, Status.TRACKING]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_whole_model_is_recorded_by_torch_jit_trace():
+    class Net(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.lanes = model().eval()
+
+        def forward(self, image, camera):
+            out, _ = self.lanes(image, camera)
+            return out.bev, out.logits, out.calibration.covariance
+
+    net, image = Net(), torch.rand(2, 3, 64, 128, generator=torch.Generator().manual_seed(0))
+    net.lanes.network_width = 96
+    with torch.no_grad():
+        recorded = torch.jit.trace(net, (image[:1], CAMERA), check_trace=False)
+        for found, expected in zip(recorded(image[1:], CAMERA), net(image[1:], CAMERA), strict=True):
+            torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+
+
+@CALIBRATORS
+def test_a_model_on_the_device_meta_has_the_shapes_of_its_results(calibrator):
+    """As a tool that counts operations runs it."""
+    made = model().eval()
+    made.calibrator = calibrator
+    made = made.to("meta")
+    out, state = made(torch.rand(2, 3, 64, 128, device="meta"), CAMERA.repeat(2, 1, 1).to("meta"))
+    assert out.bev.shape == (2, 3, *made.warp.grid.shape)
+    assert out.calibration.covariance.shape == (2, 4, 4)
+    assert {part.device.type for part in state} == {"meta"}
+
+
+@pytest.mark.slow
+def test_clips_that_begin_drives_are_exported_with_a_free_batch_size():
+    class Net(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.lanes = stand_in()
+
+        def forward(self, clip, cameras):
+            out, _ = self.lanes(clip, cameras)
+            return out.bev, out.calibration.extrinsics.stack()
+
+    net, batch = Net(), torch.export.Dim("batch", min=1)
+    arguments = (images(2, 2), SMALL_K.repeat(2, 1, 1))
+    program = torch.export.export(net, arguments, dynamic_shapes=({0: batch}, {0: batch})).module()
+    other = (images(3, 2, seed=1), SMALL_K.repeat(3, 1, 1))
+    for found, expected in zip(program(*other), net(*other), strict=True):
+        torch.testing.assert_close(found, expected)
+
+
+def test_shapes_of_poses_and_lenses_that_do_not_fit_are_named():
+    clips, cameras = images(2, 3), SMALL_K.expand(2, 3, 3)
+    with pytest.raises(ValueError, match=r"distortion: expected \(2, D\), got \(2, 3, 5\)"):
+        stand_in()(clips, cameras, distortion=torch.zeros(2, 3, 5))
+    collated = default_collate([POSE, POSE])
+    with pytest.raises(ValueError, match=r"pitch: expected \(2,\), got \(2, 1\); join poses of one row each"):
+        BEVWarp()(torch.rand(2, 3, 64, 128), CAMERA.repeat(2, 1, 1), collated)
+
+
+def test_a_frozen_stage_that_is_to_learn_is_named():
+    """Its gradients would silently be none."""
+    net = stand_in(frozen=["segmenter"])
+    net.requires_grad_(True)
+    with pytest.raises(ValueError, match=r"segmenter: expected parameters without gradients, since it is"):
+        net(images(1), SMALL_K[None])
+    with torch.no_grad():
+        net(images(1), SMALL_K[None])
+    net.frozen = net.frozen - {"segmenter"}
+    out, _ = net(images(1), SMALL_K[None])
+    (gradient,) = torch.autograd.grad(out.logits.sum(), net.segmenter.gain)
+    assert gradient != 0
+
+
+def test_strides_that_are_not_those_of_the_maps_are_named():
+    """Such as those of two maps in the wrong order, whose views would be of other places."""
+    maps = [torch.rand(1, 2, 33, 60), torch.rand(1, 2, 17, 30)]  # of 33 rows by padding
+    warp = BEVWarp(BEVGrid(x=(-6.0, 6.0), z=(6.0, 30.0), resolution=0.5))
+    warp(maps, CAMERA, POSE, image_size=(256, 480), strides=(8, 16))
+    expected = r"strides: expected about 7.76 px, since 33 rows of a map cover 256 px, got 16; give"
+    with pytest.raises(ValueError, match=expected):
+        warp(maps, CAMERA, POSE, image_size=(256, 480), strides=(16, 8))
+    warp(torch.rand(1, 2, 3, 4), CAMERA, POSE, image_size=(64, 100), strides=32)
+
+
+def test_a_view_in_the_layout_of_bevdet_has_an_object_in_its_cell():
+    """Cells of mmdetection3d: x forward from 0, y to the left from -51.2 m, edges at the limits."""
+    half = 0.4
+    grid = BEVGrid(x=(-51.2 + half, 51.2 + half), z=(0.0 - half, 51.2 - half), resolution=2 * half)
+    places = torch.rand(50, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([102.4, 51.2])
+    for right, forward in places - torch.tensor([51.2, 0.0]):
+        column, row = grid.bev_from_road_points(torch.stack([right, forward])).round().long()
+        view = torch.zeros(1, 1, *grid.shape)
+        view[0, 0, row, column] = 1.0
+        expected = [math.floor((-right + 51.2) / 0.8), math.floor(forward / 0.8)]
+        assert view.flip(-2, -1).mT[0, 0].nonzero().tolist() == [expected]
+
+
+def test_a_map_of_the_frame_before_is_aligned_through_the_camera():
+    """By odometry on a plane: the lanes turn by 2 degrees to the right, the car moves 1.7 m ahead and 0.4 m
+    to the right of them, and turns to the right of them."""
+    yaw, turn, right, ahead = 0.05, math.radians(2), 0.4, 1.7
+    before = Extrinsics.from_values(0.0, yaw, 0.0, 1.5)
+    now = Extrinsics.from_values(0.0, -0.02, 0.0, 1.45)
+    heading = yaw + turn + 0.02  # by which the camera turned to the right, seen from above
+    moved = torch.eye(4, dtype=torch.float64)  # camera before from camera now
+    moved[0, 0] = moved[2, 2] = math.cos(heading)
+    moved[0, 2], moved[2, 0] = math.sin(heading), -math.sin(heading)
+    moved[0, 3] = math.cos(yaw) * right + math.sin(yaw) * ahead
+    moved[1, 3] = 1.5 - 1.45
+    moved[2, 3] = math.cos(yaw) * ahead - math.sin(yaw) * right
+    found = now.road_from_camera() @ moved.inverse() @ before.camera_from_road()
+    for across, forward in ((0.0, 0.0), (3.5, 20.0), (-2.0, 60.0)):
+        x, z = across - right, forward - ahead  # turned by hand into the axes of the lanes now
+        expected = [math.cos(turn) * x - math.sin(turn) * z, math.sin(turn) * x + math.cos(turn) * z]
+        point = found[0] @ torch.tensor([across, 0.0, forward, 1.0], dtype=torch.float64)
+        assert point[[0, 2]].tolist() == pytest.approx(expected)

@@ -420,7 +420,7 @@ def test_arguments_are_checked():
             model()(torch.zeros(nothing), INTRINSICS[None])
     with pytest.raises(ValueError, match=r"image: expected floating point in \[0, 1\], got torch.uint8"):
         model()((255 * images(1)).to(torch.uint8), INTRINSICS[None])
-    with pytest.raises(ValueError, match=r"distortion: expected \(1, D\) like the points, got \(5,\)"):
+    with pytest.raises(ValueError, match=r"distortion: expected \(1, D\), got \(5,\)"):
         model()(images(1), INTRINSICS[None], distortion=torch.zeros(5, dtype=torch.float64))
     with pytest.raises(ValueError, match=r"state.direction_mean: expected \(2, ...\)"):
         model()(images(2), INTRINSICS.expand(2, 3, 3), model().initial_state(1))

@@ -185,7 +185,7 @@ def test_whole_numbers_and_lenses_that_do_not_fit_are_named():
     with pytest.raises(ValueError, match=r"image: expected floating point, got torch.uint8"):
         BEVWarp(GRID)(torch.zeros(2, 3, 4, 5, dtype=torch.uint8), *args)
     for shape in ((5,), (3, 5)):
-        with pytest.raises(ValueError, match=r"distortion: expected \(2, D\) like the points, got \("):
+        with pytest.raises(ValueError, match=r"distortion: expected \(2, D\), got \("):
             BEVWarp(GRID)(smooth_image(2), *args, torch.zeros(shape, dtype=torch.float64))
     with pytest.raises(ValueError, match=r"extrinsics.pitch: expected \(2,\), got \(1,\)"):
         BEVWarp(GRID)(smooth_image(2), args[0], pose([0.0, 0.0, 0.0, 1.5]))
