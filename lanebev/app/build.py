@@ -138,8 +138,9 @@ def make_observer(
             entries = lanes_of_whole_images(entries, config.lanes_size, config.lanes_crop, camera.image_size)
         return LaneFileObserver(entries, source, camera, config.stills)
     if config.backend == "onnxruntime":
-        return NetworkObserver(onnx_model(Path(config.exported), camera), camera)
-    loaded = network or make_network(config.weights, config.device)
+        loaded: LaneBEV | SharedNetwork = onnx_model(Path(config.exported), camera, config.far_view)
+    else:
+        loaded = network or make_network(config.weights, config.device)
     if config.far_view and tracker is not None:
         return FarViewObserver(loaded, tracker, camera, config.stills)
     return NetworkObserver(loaded, camera)

@@ -221,7 +221,7 @@ class RunConfig:
     def _check_backend(self) -> None:
         if self.backend not in BACKENDS:
             raise ValueError(f"backend: expected {' or '.join(BACKENDS)}, got {self.backend!r}")
-        torch_only = ("mount", "hilly", "weights", "far_view")
+        torch_only = ("mount", "hilly", "weights")
         given = next((name for name in torch_only if getattr(self, name)), None)
         given = given or ("device" if self.device != "cpu" else None)
         if self.backend != "torch" and given:

@@ -36,7 +36,7 @@ class ExportConfig:
     weights: str | None = option(None, "weights of the network instead of the shipped ones", "FILE")
     int8: bool = option(False, "quantise the segmenter's convolutions to 8 bits, by rendered views")
     far_view: bool = option(
-        False, "the step with a far view, see lanebev run --help; no other part is written"
+        False, "for runs with a far view, see lanebev run --help: no extractor and no warp are written"
     )
 
     def __post_init__(self) -> None:
@@ -45,12 +45,14 @@ class ExportConfig:
             raise ValueError("camera: expected --camera FILE, got none")
         if self.int8 and (self.format != "onnx" or "segmenter" not in self.parts):
             raise ValueError("int8: expected --format onnx and the part segmenter with it, got another")
-        if self.far_view and self.part not in (None, "step"):
-            raise ValueError(f"far_view: expected the part step, which alone has one, got {self.part}")
+        if self.far_view and self.part not in (None, "segmenter", "step"):
+            raise ValueError(f"far_view: expected the part segmenter or step with it, got {self.part}")
+        if self.far_view and self.int8:
+            raise ValueError("int8: expected no far view with it, got both; leave one of them out")
 
     @property
     def parts(self) -> tuple[str, ...]:
         """The parts to write."""
         if self.far_view:
-            return ("step",)
+            return (self.part,) if self.part else ("segmenter", self.calibrator, "step")
         return (self.part,) if self.part else ("segmenter", "extractor", self.calibrator, "warp", "step")

@@ -24,12 +24,14 @@ class Part:
         inputs: an example by name; the first dimension of each is the batch.
         outputs: names.
         facts: what its caller has to know, as JSON can hold it.
+        free: further dimensions of all inputs that are not fixed, and of what number each is a multiple.
     """
 
     module: nn.Module
     inputs: Inputs
     outputs: tuple[str, ...]
     facts: Mapping[str, Any] = field(default_factory=dict)
+    free: Mapping[int, int] = field(default_factory=dict)
 
 
 def lens_inputs(camera: Camera) -> Inputs:

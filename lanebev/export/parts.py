@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
@@ -30,14 +31,14 @@ def make_part(name: str, model: LaneBEV, camera: Camera) -> Part:
         camera: camera whose image size and lens model are fixed; its numbers stay inputs.
 
     Raises:
-        ValueError: another name, or a segmenter or extractor alone of a model with a far view.
+        ValueError: another name, or the extractor alone of a model with a far view.
     """
     if name not in PARTS:
         raise ValueError(f"part: expected one of {', '.join(PARTS)}, got {name!r}")
-    if model.far_view is not None and name in ("segmenter", "extractor"):
+    if model.far_view is not None and name == "extractor":
         raise ValueError(
-            f"far view: expected the part step, which has all three inputs of the network, got {name}; "
-            "export the step, or a model without far view"
+            "far view: expected another part than the extractor, which has images of one size; export the "
+            "step, or a model without far view"
         )
     model = model.eval()
     if name == "segmenter":
@@ -52,7 +53,7 @@ def make_part(name: str, model: LaneBEV, camera: Camera) -> Part:
         kind: type[Calibrator[Any]] = JointCalibrator if name == "joint" else TwoStageCalibrator
         own = model.calibrator
         part = calibrator_part(own if isinstance(own, kind) else kind(), _segment_count(model, camera))
-    return Part(part.module, part.inputs, part.outputs, {"part": name, **_facts(model, camera), **part.facts})
+    return replace(part, facts={"part": name, **_facts(model, camera), **part.facts})
 
 
 def _facts(model: LaneBEV, camera: Camera) -> dict[str, Any]:
@@ -83,8 +84,12 @@ class _Segmenter(nn.Module):
 
 
 def _segmenter_part(model: LaneBEV, camera: Camera) -> Part:
+    """Make the segmenter: with a far view for inputs of any size, whose lines PyTorch extracts."""
     image = torch.rand(ROWS, 3, *model.network_size(camera.image_size))
-    return Part(_Segmenter(model), {"image": image}, ("logits",))
+    part = Part(_Segmenter(model), {"image": image}, ("logits",))
+    if model.far_view is None:
+        return part
+    return replace(part, facts={"lines": asdict(model.extractor.config)}, free={2: 32, 3: 32})
 
 
 class _Extractor(nn.Module):

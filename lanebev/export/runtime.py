@@ -17,6 +17,7 @@ from lanebev.estimation.checks import padded
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.export.write import METADATA, MISSING
 from lanebev.observation.boundary_vertices import BoundaryVertices
+from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segments import LaneSegments
 from lanebev.observation.vertices import LineConfig
 from lanebev.pipeline import LaneBEV
@@ -152,6 +153,10 @@ class OnnxCalibrator(Calibrator[StateT]):
         )
         return calibration, type(state)(*(found[f"next_{name}"] for name in states))
 
+    def pitch_and_yaw(self, state: StateT) -> tuple[Tensor, Tensor] | None:
+        """See :meth:`~lanebev.estimation.calibrator.Calibrator.pitch_and_yaw`."""
+        return self.calibrator.pitch_and_yaw(state)
+
     def weigh_still(
         self,
         calibration: Calibration,
@@ -176,23 +181,34 @@ class OnnxCalibrator(Calibrator[StateT]):
         return self.calibrator.vertical_curvature(state)
 
 
-def onnx_model(folder: Path, camera: Camera) -> LaneBEV:
+def onnx_model(folder: Path, camera: Camera, far_view: bool = False) -> LaneBEV:
     """Make a model of the segmenter and the extractor in a folder; its calibrator is PyTorch's.
+
+    So is its extractor for a far view, since there are inputs of three sizes.
 
     Raises:
         ValueError: files that are missing, or for images or a lens of another kind than the camera's.
     """
-    segmenter, extractor = (_part(folder, name) for name in ("segmenter", "extractor"))
+    segmenter = _part(folder, "segmenter")
+    lines = segmenter.facts.get("lines", {})
+    if far_view and not lines:
+        raise ValueError(
+            f"{folder / 'segmenter.onnx'}: expected one for far views, got one for whole images; export it "
+            "again with --far-view"
+        )
+    extractor = segmenter if far_view else _part(folder, "extractor")
     expected = (list(camera.image_size), camera.model if camera.distortion.numel() else None)
     found = (extractor.facts["image_size"], extractor.facts["lens"])
     if found != expected:
         raise ValueError(
-            f"{folder}: expected an extractor for this camera, {_words(*expected)}, got one for "
-            f"{_words(*found)}; export it again with this camera file"
+            f"{folder}: expected files for this camera, {_words(*expected)}, got some for "
+            f"{_words(*found)}; export them again with this camera file"
         )
+    # LaneBEV asks it for vertices only
+    finder: Any = LineExtractor(LineConfig(**lines)) if far_view else OnnxExtractor(extractor, camera)
     return LaneBEV(
         OnnxSegmenter(segmenter),
-        OnnxExtractor(extractor, camera),  # type: ignore[arg-type]  # LaneBEV asks it for vertices only
+        finder,
         JointCalibrator(num_boundaries=segmenter.facts["num_boundaries"]),
         network_width=extractor.facts["network_size"][1],
     )

@@ -9,6 +9,7 @@ import logging
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch.export import Dim, ExportedProgram
@@ -23,9 +24,10 @@ MISSING = "expected the packages of ONNX; install them with: pip install 'lanebe
 
 
 def export_program(part: Part) -> ExportedProgram:
-    """Trace a part for any batch size."""
+    """Trace a part for any batch size, and any size of its free dimensions."""
     arguments = tuple(part.inputs.values())
-    batch = {0: Dim("batch", min=1)}
+    free = {axis: step * Dim(f"steps_{axis}", min=1) for axis, step in part.free.items()}
+    batch = {0: Dim("batch", min=1), **free}
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return torch.export.export(
@@ -75,7 +77,7 @@ def quiet_logs() -> Iterator[None]:
         logging.disable(before)
 
 
-def _like_arguments(part: Part, batch: dict[int, Dim]) -> tuple[object, ...]:
+def _like_arguments(part: Part, batch: dict[int, Any]) -> tuple[object, ...]:
     """Return the free dimensions as the module's arguments are: those after the named ones are one tuple."""
     kinds = inspect.signature(part.module.forward).parameters.values()
     named = sum(each.kind is not inspect.Parameter.VAR_POSITIONAL for each in kinds)

@@ -202,8 +202,12 @@ def _fold(x: Tensor, size: torch.Size) -> Tensor:
 
 
 def _positions(features: Tensor) -> Tensor:
-    """Return x and y of each cell, -1 to 1 over the map, (B, 2, h, w)."""
-    height, width = features.shape[-2:]
-    y = torch.linspace(-1, 1, height, dtype=features.dtype, device=features.device)
-    x = torch.linspace(-1, 1, width, dtype=features.dtype, device=features.device)
+    """Return x and y of each cell, -1 to 1 over the map, (B, 2, h, w); a program computes them for any size.
+
+    ONNX would have ``linspace`` as a constant.
+    """
+    y, x = (
+        (2 * torch.arange(size, dtype=features.dtype, device=features.device) - (size - 1)) / max(size - 1, 1)
+        for size in features.shape[-2:]
+    )
     return torch.stack(torch.meshgrid(y, x, indexing="ij")).flip(0).expand(features.shape[0], -1, -1, -1)

@@ -18,6 +18,7 @@ from lanebev.estimation.checks import padded
 from lanebev.export import parts, runtime
 from lanebev.export.names import PARTS
 from lanebev.export.quantize import rendered_views
+from lanebev.observation.far_view import FarView, place_crop
 
 FRAME = Path(__file__).parents[1] / "golden" / "frame.png"
 CAMERA = "{fx: 300, fy: 300, cx: 159.5, cy: 89.5, width: 320, height: 180, distortion: [-0.1, 0.01, 0, 0]}"
@@ -28,7 +29,8 @@ class EagerPart:
 
     def __init__(self, path):
         self.camera = Camera.from_file(path.parent / "camera.yaml")
-        self.part = parts.make_part(path.stem, LaneBEV.from_pretrained(), self.camera)
+        far_view = FarView() if path.stem == "segmenter" else None
+        self.part = parts.make_part(path.stem, LaneBEV.from_pretrained(far_view=far_view), self.camera)
         self.facts, self.inputs = self.part.facts, self.part.inputs
 
     def __call__(self, values):
@@ -56,15 +58,32 @@ def settings(folder, **changes):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "options", [{}, {"calibrator": "two-stage"}, {"stills": True}, {"smooth": True}], ids=str
+    "options",
+    [
+        {},
+        {"calibrator": "two-stage"},
+        {"stills": True},
+        {"smooth": True},
+        {"stills": True, "far_view": True},
+        {"far_view": True},
+    ],
+    ids=str,
 )
 def test_the_rows_are_the_same(folder, options, monkeypatch):
     monkeypatch.setattr(runtime, "OnnxPart", EagerPart)
+    places = []
+    monkeypatch.setattr(
+        "lanebev.observation.boundary_detector.place_crop",
+        lambda *given: places.append(given) or place_crop(*given),
+    )
     for backend in ("torch", "onnxruntime"):
         run(settings(folder, backend=backend, out=str(folder / backend), **options))
     rows = (folder / "torch" / "extrinsics.csv").read_text()
     assert rows.count("TRACKING") == 2
     assert (folder / "onnxruntime" / "extrinsics.csv").read_text() == rows
+    far = options.get("far_view", False)
+    assert len(places) % 2 == 0  # as many of both
+    assert bool(places) == far
 
 
 @pytest.mark.slow
@@ -94,7 +113,7 @@ def test_files_of_another_camera_or_calibrator_are_refused(folder, monkeypatch):
     monkeypatch.setattr(runtime, "OnnxPart", EagerPart)
     other = Camera.from_fov(60.0, 640, 360)
     with pytest.raises(
-        ValueError, match="this camera, 640 x 360 px without lens, got one for 320 x 180 px pinhole"
+        ValueError, match="this camera, 640 x 360 px without lens, got some for 320 x 180 px pinhole"
     ):
         runtime.onnx_model(folder, other)
     monkeypatch.setattr(runtime, "OnnxPart", lambda path: EagerPart(path.with_stem("joint")))
@@ -102,6 +121,12 @@ def test_files_of_another_camera_or_calibrator_are_refused(folder, monkeypatch):
         runtime.onnx_calibrator(folder, "two-stage", LaneBEV.from_pretrained().calibrator)
     with pytest.raises(ValueError, match=r"segmenter\.onnx: expected the segmenter, got the joint"):
         runtime.onnx_model(folder, other)
+
+
+def test_a_segmenter_without_far_view_is_refused(folder, monkeypatch):
+    monkeypatch.setattr(runtime, "OnnxPart", lambda path: SimpleNamespace(facts={"part": path.stem}))
+    with pytest.raises(ValueError, match=r"segmenter\.onnx: expected one for far views, got one for whole"):
+        runtime.onnx_model(folder, Camera.from_fov(60.0, 640, 360), far_view=True)
 
 
 def test_a_run_without_the_files_is_one_line(folder, capsys):
@@ -127,9 +152,11 @@ def test_settings_are_checked():
         ExportConfig()
     assert ExportConfig(camera="c", part="warp").parts == ("warp",)
     assert ExportConfig(camera="c", calibrator="two-stage").parts[2] == "two-stage"
-    assert ExportConfig(camera="c", far_view=True).parts == ("step",)
-    with pytest.raises(ValueError, match="far_view: expected the part step, which alone has one, got warp"):
+    assert ExportConfig(camera="c", far_view=True).parts == ("segmenter", "joint", "step")
+    with pytest.raises(ValueError, match="far_view: expected the part segmenter or step with it, got warp"):
         ExportConfig(camera="c", part="warp", far_view=True)
+    with pytest.raises(ValueError, match="int8: expected no far view with it, got both"):
+        ExportConfig(camera="c", int8=True, far_view=True)
     for other in ({"format": "torch-export"}, {"part": "warp"}):
         with pytest.raises(ValueError, match="int8: expected --format onnx and the part segmenter"):
             ExportConfig(camera="c", int8=True, **other)

@@ -237,6 +237,16 @@ def test_a_far_view_equals_eager_where_it_is_known_and_where_it_is_not(tmp_path)
 
 
 @pytest.mark.slow
+def test_the_segmenter_for_far_views_takes_images_of_any_size(tmp_path):
+    made = model(96, far_view=FarView()).eval()
+    other = onnx(make_part("segmenter", made, camera()), tmp_path)
+    for rows, *size in ((2, 64, 96), (1, 96, 64), (3, 32, 32)):
+        image = torch.rand(rows, 3, *size, generator=torch.Generator().manual_seed(3))
+        with torch.no_grad():
+            equals(other({"image": image}), {"logits": made.segmenter(image)}, 1e-4)
+
+
+@pytest.mark.slow
 def test_the_step_with_a_far_view_as_a_program_equals_eager():
     """In the first row the state knows where the lanes meet, in the second one it does not."""
     part = make_part("step", model(96, far_view=FarView()), camera())
