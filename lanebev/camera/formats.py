@@ -41,9 +41,11 @@ _MODELS = {
     "": "",  # what a driver of an ideal camera leaves empty
     "pinhole": "pinhole",
     "plumb_bob": "pinhole",
+    "radtan": "pinhole",
     "rational_polynomial": "pinhole",
     "fisheye": "fisheye",
     "equidistant": "fisheye",
+    "equi": "fisheye",
     "kannala_brandt": "fisheye",
     "omni": "omni",
     "mei": "omni",

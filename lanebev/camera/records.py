@@ -5,6 +5,7 @@ Each is a record with the camera matrix under a name of the data set's or the pr
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -12,7 +13,8 @@ from typing import Any, NamedTuple
 from lanebev.camera.choice import Readers, telling_names
 from lanebev.camera.formats import DISTORTION_KEYS, stated_model
 from lanebev.camera.parameters import OFF_CENTRE, CameraParameters, centre_offset, size_of_images
-from lanebev.camera.parsing import mapping, number, numbers, whole_number
+from lanebev.camera.parsing import number, numbers, whole_number
+from lanebev.numbers import shown
 
 Record = Mapping[str, Any]
 
@@ -47,7 +49,7 @@ _LAYOUTS = (
     _Layout("Autoware's", "CameraMat", sides="ImageSize"),
     _Layout("opencv_interactive-calibration's", "cameraMatrix", sides="cameraResolution"),
 )
-_CITYSCAPES = _Layout("Cityscapes'", "intrinsic", (1024, 2048))  # fx, fy, u0, v0 instead of the matrix
+_CITYSCAPES = _Layout("Cityscapes'", "intrinsic", (1024, 2048))  # by numbers with names
 _LENS_KEYS = (
     *DISTORTION_KEYS,
     "camera_distortion",
@@ -57,6 +59,7 @@ _LENS_KEYS = (
     "DistCoeff",
     "distortion_coeffs",
 )
+_LIKE_LENS = re.compile(r"dist(?!ance|.*(model|type|std))|radial|tangential|[kp][1-6]$", re.IGNORECASE)
 _PLACES = ("calib", "cameras")  # keys below which ONCE and A2D2 have their cameras
 
 
@@ -80,10 +83,25 @@ def _layout(record: Any) -> _Layout | None:
     """Return the layout of a record; None if it is no camera's."""
     if not isinstance(record, Mapping):
         return None
-    if isinstance(record.get("intrinsic"), Mapping):
+    if _named_numbers(record):
         return _CITYSCAPES
     fits = (each for each in _LAYOUTS if record.get(each.matrix) and (not each.sides or each.sides in record))
     return next(fits, None)
+
+
+def _named_numbers(record: Record) -> Record | None:
+    """Return fx, fy and the principal point by name, which stand for the matrix; None without them."""
+    found = (record.get(key) for key in ("intrinsic", "intrinsics"))
+    return next((each for each in found if isinstance(each, Mapping) and "fx" in each), None)
+
+
+def _check_lens_keys(record: Record) -> None:
+    """Raise if a lens is stated under a name that is not known, so that it would not count."""
+    for key in record:
+        if _LIKE_LENS.match(key) and key not in _LENS_KEYS and record[key]:
+            raise ValueError(
+                f"distortion: expected k1 k2 p1 p2 k3 under this key, got {shown(key)}; rename it"
+            )
 
 
 def _read(record: Record, image_size: tuple[int, int] | None, rectified: bool) -> CameraParameters:
@@ -92,12 +110,13 @@ def _read(record: Record, image_size: tuple[int, int] | None, rectified: bool) -
     if rectified and layout.rectified:
         matrix = numbers(record, layout.rectified, count=9)
         return CameraParameters(matrix, [], "pinhole", _size(matrix, record, image_size, layout))
-    if layout is _CITYSCAPES:
-        intrinsic = mapping("intrinsic", record["intrinsic"])
-        fx, fy, cx, cy = (number(intrinsic, key) for key in ("fx", "fy", "u0", "v0"))
+    if named := _named_numbers(record):
+        record = {**record, **named}  # whose lens and size count too
+        fx, fy, cx, cy = (number(record, *keys) for keys in (("fx",), ("fy",), ("cx", "u0"), ("cy", "v0")))
         matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
     else:
         matrix = numbers(record, layout.matrix, count=9)
+    _check_lens_keys(record)
     has_lens = any(record.get(key) is not None for key in _LENS_KEYS)
     distortion = numbers(record, *_LENS_KEYS) if has_lens else []
     model = "fisheye" if record.get("Lens") == "Fisheye" else stated_model(record, layout.model)

@@ -48,6 +48,8 @@ def _is(camera, *parameters):
         (MODEL, "fisheye"),
         ("camera_model: plumb_bob", "pinhole"),
         ("distortion_model: EQUIDISTANT", "fisheye"),
+        ("distortion_model: equi", "fisheye"),  # Kalibr's
+        ("distortion_model: radtan", "pinhole"),
         ("distortion_model: equidistant\nmodel: GoPro", "fisheye"),  # a product's name
         ("fisheye_model: 1", "fisheye"),
         ("fisheye_model: true", "fisheye"),  # booleans of OpenCV 5

@@ -52,6 +52,21 @@ LIKE_OPENLANE = {"intrinsic": _matrix(1000, 960, 540), "width": 1920, "height": 
     [
         ([NUIMAGES], "", (1272, 1274, 826, 479, 1600, 900, LENS)),
         (CITYSCAPES, "", (2262, 2265, 1096, 513, 2048, 1024, ())),
+        (
+            {
+                "intrinsics": {
+                    "fx": 900,
+                    "fy": 902,
+                    "cx": 640,
+                    "cy": 360,
+                    "D": LENS,
+                    "width": 1280,
+                    "height": 720,
+                }
+            },
+            "",
+            (900, 902, 640, 360, 1280, 720, LENS),
+        ),
         (ONCE, "", (966, 968, 977, 518, 1920, 1020, LENS)),
         (A2D2, "#front_center", (1500, 1502, 970, 610, 1920, 1208, LENS)),
         (A2D2, "#rear_center", (1500, 1502, 970, 610, 1920, 1208, KANNALA_BRANDT, "fisheye")),
@@ -59,6 +74,7 @@ LIKE_OPENLANE = {"intrinsic": _matrix(1000, 960, 540), "width": 1920, "height": 
         (DAIR, "", (2183, 2185, 940, 567, 1920, 1080, LENS)),
         (AUTOWARE, "", (2183, 2185, 940, 567, 1920, 1080, LENS)),
         (ZOD_FRONT, "", (1900, 1902, 1920, 1084, 3848, 2168, KANNALA_BRANDT, "fisheye")),
+        ({**LIKE_OPENLANE, "dist_coefs": [], "distance": 5}, "", (1000, 1002, 960, 540, 1920, 1080, ())),
         (LIKE_OPENLANE, "", (1000, 1002, 960, 540, 1920, 1080, ())),
         ({**LIKE_OPENLANE, "distortion": LENS}, "", (1000, 1002, 960, 540, 1920, 1080, LENS)),
         ({**LIKE_OPENLANE, "dist_coeffs": [LENS]}, "", (1000, 1002, 960, 540, 1920, 1080, LENS)),
@@ -110,7 +126,18 @@ def test_rectified_images_of_a2d2_have_a_matrix_of_their_own(tmp_path):
             {**LIKE_OPENLANE, "dist": LENS, "distortion": [0.1] * 5},
             "expected one of .* got both, which differ",
         ),
-        ({"intrinsic": {"fx": 340, "model": "radial_poly"}}, "fy: expected a value, got none"),
+        (
+            {"intrinsic": {"fx": 9, "fy": 9, "u0": 5, "v0": 5, "k1": 0.1}},
+            "under this key, got 'k1'; rename it",
+        ),
+        ({"intrinsic": {"fx": 340}}, "fy: expected a value, got none"),
+        (
+            {"intrinsic": {"k1": 340, "model": "radial_poly"}},
+            "expected rows, cols, dt, data, got the key 'k1'",
+        ),
+        ({**LIKE_OPENLANE, "dist_coefs": LENS}, "expected k1 .* under this key, got 'dist_coefs'; rename it"),
+        ({**LIKE_OPENLANE, "k1": -0.3}, "expected k1 .* under this key, got 'k1'; rename it"),
+        ({**LIKE_OPENLANE, "radial_distortion": [0.1]}, "under this key, got 'radial_distortion'; rename it"),
         ({**LIKE_OPENLANE, "distortion": LENS, "model": "ftheta"}, "model: expected one of .*, got 'ftheta'"),
     ],
 )
