@@ -23,6 +23,7 @@ _TABS = re.compile(r"(?<=\S) *\t[ \t]*")  # between words; PyYAML takes none the
 _NO_SPACE = re.compile(r"^\w{1,40}:[\w.]{1,20}", re.MULTILINE)  # which OpenCV reads, and YAML does not know
 _NO_BREAK_SPACE = "\u00a0"  # of texts copied from web pages
 _ROS_INI = re.compile(r"^\[image\]\s*$", re.MULTILINE)
+_SECTION = re.compile(r"^\[[A-Za-z]\w*\]\s*$", re.MULTILINE)  # of other programs' INI, and of TOML
 _INI_KEYS = {
     "width": "image_width",
     "height": "image_height",
@@ -49,6 +50,11 @@ def parse_documents(text: str) -> list[Any]:
     """
     if _ROS_INI.search(text):
         return [_parse_ini(text)]
+    if section := _SECTION.search(text):
+        raise ValueError(
+            f"expected YAML, JSON or XML, got the section {section[0].strip()}, as of INI or TOML; write its "
+            "numbers as fx: 1150"
+        )
     start = text.lstrip()[:1]
     if start == "<":
         return [_parse_xml(text)]

@@ -224,6 +224,11 @@ ORBextractor.nFeatures: 1200
         ("cameras.txt", "1 FOV 1280 720 1 1 1 1 1\n", "model: expected one of SIMPLE_PINHOLE, .*, got FOV"),
         ("cameras.txt", "1 PINHOLE 1280 720 800 800 640\n", "PINHOLE: expected 4 numbers, got 3"),
         ("calib_velo_to_cam.txt", "R: 7.5 1\nT: 1 2 3\n", "expected P_rect_02 or P2 .*, got 'R:'"),
+        (
+            "SN1.conf",
+            "[LEFT_CAM_HD]\nfx=700.1\nk1=-0.17\n",
+            r"got the section \[LEFT_CAM_HD\], as of INI or TOML",
+        ),
         ("k.txt", "1000 0 640\n0 1000 360\n", "of KITTI, or keys such as fx: 1150, got '1000'"),
         (
             "c.yaml",
