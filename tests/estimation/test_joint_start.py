@@ -38,7 +38,7 @@ def fitted_bend(curvature, sigma, dtype=DOUBLE):
 
 def test_straight_or_bend_is_the_mean_of_both_by_their_evidence():
     params, cov = fitted_bend((5e-4, 2e-6), (2e-4, 4e-6))
-    mean, spread = straight_or_bend(params, cov, STRAIGHT, BEND, 0.2)
+    mean, spread, _ = straight_or_bend(params, cov, STRAIGHT, BEND, 0.2)
     # by sampling: curvatures of either kind of road, weighed by what is left of the fit without its prior
     torch.manual_seed(0)
     known = torch.linalg.inv(cov[0, 5:, 5:])
@@ -62,11 +62,11 @@ def test_straight_or_bend_is_the_mean_of_both_by_their_evidence():
 
 def test_what_is_clearly_straight_or_bent_is_taken_as_that():
     params, cov = fitted_bend((3e-5, 0.0), (3e-5, 1e-6))
-    mean, spread = straight_or_bend(params, cov, STRAIGHT, BEND, 0.2)
+    mean, spread, _ = straight_or_bend(params, cov, STRAIGHT, BEND, 0.2)
     assert (mean[0, 1] - params[0, 1]) / (3e-5 * 15) == pytest.approx(3e-5**2 / (3e-5**2 + 1e-4**2), rel=0.05)
     assert spread[0, 1, 1] < cov[0, 1, 1]
     params, cov = fitted_bend((2e-3, 0.0), (3e-5, 1e-6))
-    mean, spread = straight_or_bend(params, cov, STRAIGHT, BEND, 0.2)
+    mean, spread, _ = straight_or_bend(params, cov, STRAIGHT, BEND, 0.2)
     torch.testing.assert_close(mean, params)
     torch.testing.assert_close(spread, cov)
     params, cov = fitted_bend((5e-4, 2e-6), (2e-4, 4e-6))

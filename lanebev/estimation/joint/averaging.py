@@ -35,7 +35,7 @@ from lanebev.estimation.joint.readings import (
     readings,
 )
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
-from lanebev.estimation.joint.start import straight_log_odds, straight_or_bend
+from lanebev.estimation.joint.start import straight_or_bend
 from lanebev.estimation.joint.start_search import linear_starts, spread_subset
 from lanebev.geometry.linalg import solve_spd
 from lanebev.geometry.road import lane_width_covariance
@@ -159,9 +159,8 @@ def fit_all_readings(
     fits = fit_readings(begin, reading_model(seen, positions, ways, 1, prior), _STEPS)
 
     straight, bend = positions.new_tensor(cfg.straight), prior.std(positions)[OFFSET + 1 :]
-    roads = (fits.params, fits.covariance, straight, bend, cfg.bends)
-    params, covariance = straight_or_bend(*roads)
-    evidence = fits.evidence + softplus(straight_log_odds(*roads))
+    params, covariance, odds = straight_or_bend(fits.params, fits.covariance, straight, bend, cfg.bends)
+    evidence = fits.evidence + softplus(odds)
     found = (params[:, _POSE], covariance[:, _POSE, _POSE], evidence)
     pose, cov, evidence = (part.unflatten(0, (batch, len(ways.kind))) for part in found)
     return pose, cov, evidence

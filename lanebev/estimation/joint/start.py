@@ -118,7 +118,7 @@ def start_moments(
         mean (B, D) and covariance (B, D, D).
     """
     straight, bend = constant(cfg.straight, like=params), cfg.prior.std(params)[CURVATURE:]
-    params, param_cov = straight_or_bend(params, param_cov, straight, bend, cfg.bends)
+    params, param_cov, _ = straight_or_bend(params, param_cov, straight, bend, cfg.bends)
     params = pad(params, (0, 1))  # the vertical curvature's mean is 0
     param_cov = with_vertical_curvature(param_cov, by_vertical, cfg.prior.vertical_curvature_std)
     copies = constant(_by_parameters(cfg.num_boundaries), like=params)
@@ -128,7 +128,7 @@ def start_moments(
 
 def straight_or_bend(
     params: Tensor, cov: Tensor, straight: Tensor, bend: Tensor, share: float
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Average one frame's fit over two models of the road, straight and bent, weighted by their evidence.
 
     Source: (J18).
@@ -146,30 +146,22 @@ def straight_or_bend(
         share: prior probability of bends.
 
     Returns:
-        mean (B, 7) and covariance (B, 7, 7).
+        mean (B, 7), covariance (B, 7, 7), and the log odds (B,) of a straight road against a bend.
     """
     noise = 1 / (straight.square().reciprocal() - bend.square().reciprocal())
     curvature, gain = params[:, CURVATURE:], cov[:, :, CURVATURE:]
-    inverse = inverse_spd(cov[:, CURVATURE:, CURVATURE:] + noise.diag())
-    solved = inverse @ curvature.unsqueeze(-1)  # (B, 2, 1)
-    odds = straight_log_odds(params, cov, straight, bend, share)
-    is_straight = odds.sigmoid()[:, None, None]
-    pull = gain @ solved  # (B, 7, 1), from the bend to the straight road
-    known = gain @ inverse @ gain.mT
-    spread = is_straight * (1 - is_straight) * (pull @ pull.mT)
-    return params - (is_straight * pull).squeeze(-1), kalman.symmetrise(cov - is_straight * known + spread)
-
-
-def straight_log_odds(params: Tensor, cov: Tensor, straight: Tensor, bend: Tensor, share: float) -> Tensor:
-    """Compute the log odds (B,) of a straight road against a bend, see :func:`straight_or_bend`."""
-    noise = 1 / (straight.square().reciprocal() - bend.square().reciprocal())
-    curvature = params[:, CURVATURE:]
     predicted = cov[:, CURVATURE:, CURVATURE:] + noise.diag()
-    chi2 = (curvature.unsqueeze(1) @ inverse_spd(predicted) @ curvature.unsqueeze(-1)).flatten()
+    inverse = inverse_spd(predicted)
+    chi2 = (curvature.unsqueeze(1) @ inverse @ curvature.unsqueeze(-1)).flatten()
     sharper = 0.5 * (bend.square() + noise).log().sum()
     sharper = sharper - cholesky(predicted).diagonal(dim1=1, dim2=2).log().sum(-1)
-    odds: Tensor = math.log((1 - share) / share) + sharper - 0.5 * chi2
-    return odds
+    odds = math.log((1 - share) / share) + sharper - 0.5 * chi2
+    is_straight = odds.sigmoid()[:, None, None]
+    pull = gain @ (inverse @ curvature.unsqueeze(-1))  # (B, 7, 1), from the bend to the straight road
+    known = gain @ inverse @ gain.mT
+    spread = is_straight * (1 - is_straight) * (pull @ pull.mT)
+    mean = params - (is_straight * pull).squeeze(-1)
+    return mean, kalman.symmetrise(cov - is_straight * known + spread), odds
 
 
 def with_vertical_curvature(cov: Tensor, by_vertical: Tensor, std: float) -> Tensor:
