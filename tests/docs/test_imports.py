@@ -1,6 +1,7 @@
 """Data flows one way: no package of lanebev imports one above it, no two modules import each other."""
 
 import ast
+import re
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -93,3 +94,15 @@ def test_nothing_is_of_any_type_where_parts_are_put_together():
         if isinstance(node, ast.Name) and node.id == "Any"
     }
     assert not found
+
+
+@pytest.mark.parametrize(
+    "package", ["estimation", "estimation/joint", "estimation/two_stage", "observation", "view"]
+)
+def test_a_package_names_all_of_its_modules(package):
+    folder = ROOT / "lanebev" / package
+    named = re.findall(
+        r"``(\w+)``", ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8")))
+    )
+    modules = {path.stem for path in folder.iterdir() if path.suffix == ".py" or path.is_dir()}
+    assert sorted(named) == sorted(modules - {"__init__", "__pycache__"})
