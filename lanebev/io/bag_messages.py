@@ -15,17 +15,15 @@ IMAGE_TYPES = (
     "foxglove.RawImage",
     "foxglove_msgs/msg/CompressedImage",
     "foxglove_msgs/msg/RawImage",
+    "foxglove.CompressedVideo",
+    "foxglove_msgs/msg/CompressedVideo",
 )
 LENS_TYPES = (
     "sensor_msgs/msg/CameraInfo",
     "foxglove.CameraCalibration",
     "foxglove_msgs/msg/CameraCalibration",
 )
-VIDEO_TYPES = (
-    "foxglove.CompressedVideo",
-    "foxglove_msgs/msg/CompressedVideo",
-    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
-)
+VIDEO_TYPES = ("ffmpeg_image_transport_msgs/msg/FFMPEGPacket",)
 """Types of messages with packets of a video, which are not read."""
 
 _ROS = (("cdr", "ros2msg"), ("ros1", "ros1msg"))  # encodings of messages and of their types

@@ -13,6 +13,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +41,9 @@ _PLAIN = {  # encoding of ROS to channels, and to OpenCV's conversion to RGB
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
     "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
 }
+_CODECS = {"h264": "h264", "h265": "hevc", "hevc": "hevc", "vp9": "vp9"}  # of Foxglove's CompressedVideo
 _LOOKED_AT = 50  # frames, for their rate
+_LONGEST_GROUP = 600  # frames, which a video in a bag may begin before its first key frame
 _JPEG = b"\xff\xd8"  # begins such an image
 _LENS_FIELDS = ("width", "height", "distortion_model", "D", "K", "R", "P", "binning_x", "binning_y")
 _REGION = ("x_offset", "y_offset", "height", "width")
@@ -81,6 +84,7 @@ class BagSource(FrameSource):
 
     def _video_frames(self) -> Iterator[Frame]:
         first = before = None
+        images = TopicImages()
         number, interval = 0, float(1 / self.fps)
         clock = RisingClock(interval)
         try:
@@ -90,9 +94,9 @@ class BagSource(FrameSource):
                     first = time if first is None else first
                     dt = interval if before is None else time - before
                     image = None
-                    if self.selection.takes(number, time - first):
+                    if self.selection.takes(number, time - first) or is_video(message):
                         try:
-                            image = self._right_size(message_image(message))
+                            image = self._right_size(images(message))
                         except ValueError as error:
                             problem = str(error)
                     yield Frame(number, time - first, dt, "", image, problem)
@@ -116,10 +120,7 @@ def open_bag_source(source: str, topic: str | None = None, fps: Fraction | None 
     """
     with open_bag(Path(source)) as bag:
         chosen = _image_topic(source, bag.topics, topic)
-        size = None
-        for _, message in bag.messages(chosen.name):
-            size = message_image(message).shape[:2]
-            break
+        size = _first_size(bag, chosen.name)
         if size is None:
             raise ValueError(f"bag {source}: expected images on {chosen.name}, got none")
         lens = _lens(bag, chosen.name)
@@ -129,6 +130,59 @@ def open_bag_source(source: str, topic: str | None = None, fps: Fraction | None 
     words = f"bag {source}: {clock.unstamped} of its first images have no stamps; they follow as recorded"
     rate = fps or (Fraction(1 / median(steps)).limit_denominator(1000) if steps else found.fps)
     return replace(found, fps=rate, problem=words if clock.unstamped else "")
+
+
+def is_video(message: Any) -> bool:
+    """Return whether a message has a packet of a video, whose image depends on those before."""
+    return not hasattr(message, "encoding") and message.format.strip().lower() in _CODECS
+
+
+class TopicImages:
+    """Returns the images of a topic's messages, which are given in their order, as :func:`message_image`."""
+
+    def __init__(self) -> None:
+        self._decoder: av.VideoCodecContext | None = None
+
+    def __call__(self, message: Any) -> NDArray[np.uint8]:
+        """Return the image of the next message as (H, W, 3) RGB.
+
+        Source: Foxglove's ``CompressedVideo``: a packet holds one frame, and none refers to later ones.
+
+        Raises:
+            ValueError: see :func:`message_image`; or a packet without an image, as before a key frame.
+        """
+        if not is_video(message):
+            return message_image(message)
+        if self._decoder is None:
+            self._decoder = av.VideoCodecContext.create(_CODECS[message.format.strip().lower()], "r")
+            self._decoder.flags |= av.codec.context.Flags.low_delay  # else frames come packets later
+        try:
+            frames = self._decoder.decode(av.Packet(bytes(message.data)))
+        except av.error.FFmpegError as error:
+            raise ValueError(
+                f"expected a packet of {message.format[:40]} that decodes, got: {error.strerror}"
+            ) from error
+        if not frames or frames[-1].is_corrupt:
+            raise ValueError("expected a whole frame, got none; packets before the first key frame have none")
+        image: NDArray[np.uint8] = frames[-1].to_ndarray(format="rgb24")
+        return image
+
+
+def _first_size(bag: Bag, topic: str) -> tuple[int, int] | None:
+    """Return the (height, width) px of a topic's first image, of a video from its first key frame on.
+
+    Raises:
+        ValueError: it does not decode.
+    """
+    images = TopicImages()
+    for number, (_, message) in enumerate(bag.messages(topic)):
+        try:
+            height, width = images(message).shape[:2]
+            return height, width
+        except ValueError:
+            if not is_video(message) or number > _LONGEST_GROUP:
+                raise
+    return None
 
 
 def message_image(message: Any) -> NDArray[np.uint8]:

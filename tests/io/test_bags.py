@@ -1,7 +1,9 @@
 """MCAP files and ROS bags as sources, written by the libraries of their own."""
 
 from dataclasses import replace
+from fractions import Fraction
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -466,8 +468,40 @@ def test_foxgloves_messages_in_ros_2(tmp_path):
     assert [frame.time for frame in frames] == pytest.approx(np.arange(COUNT) / 10, abs=1e-6)
 
 
+def _packets(count):
+    """Return the packets of a video in H.264 with a key frame every fourth, and no B-frames."""
+    encoder = av.VideoCodecContext.create("libx264", "w")
+    encoder.width, encoder.height, encoder.pix_fmt, encoder.time_base = 64, 48, "yuv444p", Fraction(1, 10)
+    encoder.options = {"g": "4", "bf": "0", "crf": "5", "tune": "zerolatency"}
+    frames = [av.VideoFrame.from_ndarray(_picture(number), "rgb24") for number in range(count)]
+    return [bytes(packet) for frame in [*frames, None] for packet in encoder.encode(frame)]
+
+
+@pytest.mark.parametrize("lost", [0, 2])
+def test_a_video_of_foxglove(tmp_path, lost):
+    name, packets = "foxglove_msgs/msg/CompressedVideo", _packets(10)
+    fields = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(fields, name))
+    with Writer(tmp_path / "bag", version=9) as writer:
+        connection = writer.add_connection("/cam", name, typestore=store)
+        for number in range(lost, 10):
+            data = np.frombuffer(packets[number], np.uint8)
+            message = store.types[name](_header(number).stamp, "camera", data, "h264")
+            writer.write(connection, round(1e9 * START) + number, store.serialize_cdr(message, name))
+    frames = list(make_source(RunConfig(str(tmp_path / "bag"), "c")))
+    early = 4 - lost if lost else 0  # before the first key frame
+    assert [frame.image is None for frame in frames] == [True] * early + [False] * (10 - lost - early)
+    for number, frame in enumerate(frames[early:], start=lost + early):
+        assert np.abs(frame.image.astype(int) - _picture(number)).mean() < 4
+    some = list(make_source(RunConfig(str(tmp_path / "bag"), "c", every=3)))
+    assert [frame.source_number for frame in some] == list(range(0, 10 - lost, 3))
+    assert np.abs(some[-1].image.astype(int) - _picture(lost + some[-1].source_number)).mean() < 4
+
+
 def test_packets_of_a_video_are_named(tmp_path):
-    path = _mcap(tmp_path / "a.mcap", "foxglove.CompressedVideo", ("protobuf", "protobuf", ""), [b"x"])
+    name = "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
+    path = _mcap(tmp_path / "a.mcap", name, ("cdr", "ros2msg", ""), [b"x"])
     with pytest.raises(ValueError, match="got: none; make a video file of /cam/images, whose packets are"):
         open_bag_source(path)
 
