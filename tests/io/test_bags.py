@@ -19,7 +19,8 @@ from lanebev import Camera
 from lanebev.app.config import RunConfig
 from lanebev.app.sources import camera_of, make_source
 from lanebev.cli import main
-from lanebev.io.bags import BagSource, message_image, open_bag_source
+from lanebev.io.bag_images import message_image
+from lanebev.io.bags import BagSource, open_bag_source
 from lanebev.io.formats.mcap import write
 from lanebev.io.formats.record import RunRecord
 from lanebev.io.frames import Frame
