@@ -135,9 +135,19 @@ def frames(distortion: list[float], model: str = "pinhole") -> Calls:
         return first, second
 
     ready, exact = maps(), maps(cv2.CV_32FC1)
+    wide, sampled = (np.empty((*size, 4), np.uint8) for size in (scene.SIZE, scene.GRID.shape))
+    first = int(np.clip(exact[1].min(), 0, scene.SIZE[0] - 1))
+    rows, bev = slice(first, None), np.empty((*scene.GRID.shape, 3), np.uint8)
+
+    def four_channels() -> None:
+        cv2.cvtColor(frame[rows], cv2.COLOR_RGB2RGBA, wide[rows])
+        cv2.remap(wide, *exact, cv2.INTER_LINEAR, sampled)
+        cv2.cvtColor(sampled, cv2.COLOR_RGBA2RGB, bev)
+
     return {
         "cv2.remap": lambda: cv2.remap(frame, *ready, cv2.INTER_LINEAR),
         "cv2.remap, float32": lambda: cv2.remap(frame, *exact, cv2.INTER_LINEAR),
+        "cv2.remap, four channels": four_channels,
         "cv2 maps and remap": lambda: cv2.remap(frame, *maps(), cv2.INTER_LINEAR),
         "remap_frame": lambda: remap_frame(frame, taken, extrinsics, scene.GRID),
     }
