@@ -62,8 +62,9 @@ def one_thread() -> Iterator[None]:
 
 def recorded() -> bool:
     """Tell whether operations are recorded for other numbers, by a compiler, an exporter or a mode."""
-    traced = torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
-    return torch.compiler.is_compiling() or traced or handled_by_mode()
+    if torch.compiler.is_compiling() or handled_by_mode():
+        return True
+    return bool(torch.jit.is_tracing())  # type: ignore[attr-defined, no-untyped-call]
 
 
 def usable_device(device: torch.device | str | int) -> torch.device:
@@ -90,8 +91,8 @@ def device_of_numbers() -> torch.device:
 def made_once(function: Callable[P, T]) -> Callable[P, T]:
     """Decorate a function of hashable arguments that makes tensors, to be called once for each of them.
 
-    A compiled or exported program makes its own, and so does each call inside a context in which tensors are
-    of another kind, such as ``FakeTensorMode``. The tensors must not be changed in place.
+    A compiled, exported or traced program makes its own, and so does each call inside a context in which
+    tensors are of another kind, such as ``FakeTensorMode``. The tensors must not be changed in place.
     """
 
     @lru_cache(maxsize=256)
@@ -101,7 +102,7 @@ def made_once(function: Callable[P, T]) -> Callable[P, T]:
 
     @wraps(function)
     def once(*args: P.args, **kwargs: P.kwargs) -> T:
-        if torch.compiler.is_compiling() or handled_by_mode():
+        if recorded():
             return function(*args, **kwargs)
         return cast("Callable[..., T]", kept)(*args, **kwargs)
 

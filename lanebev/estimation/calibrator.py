@@ -17,7 +17,7 @@ from lanebev.estimation.checks import (
 )
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.observation.segments import LaneSegments
-from lanebev.tensors import map_tensors
+from lanebev.tensors import map_tensors, recorded
 from lanebev.torch_internals import is_in_forward_mode
 from lanebev.types import Calibration, TensorTuple
 
@@ -111,7 +111,7 @@ class Calibrator(nn.Module, Generic[StateT]):
             raise ValueError(f"state: expected {rows}, got {tuple(given.shape)}; join states by torch.cat")
         frame = (segments, intrinsics, state, dt, lane_width, given)
         differentiable = torch.is_grad_enabled() or is_in_forward_mode()
-        if torch.compiler.is_compiling() or differentiable or torch.is_inference_mode_enabled():
+        if recorded() or differentiable or torch.is_inference_mode_enabled():
             calibration, after = self._estimate(*frame)
         else:
             with torch.inference_mode():  # takes a fifth less time than torch.no_grad

@@ -423,9 +423,7 @@ def test_a_program_of_torch_jit_trace_computes_frames_of_every_kind(calibrator):
 
     with torch.no_grad():
         going = frame(torch.full((1,), 0.05), *lanes(seed=0), *start)
-        recorded = torch.jit.trace(
-            frame, (torch.full((1,), 0.05), *lanes(seed=1), *going[3:]), check_trace=False
-        )
+        recorded = torch.jit.trace(frame, (torch.full((1,), 0.05), *lanes(seed=1), *going[3:]))
         state = other = tuple(calibrator.initial_state(2, dtype=torch.float64))
         for segments in (stack_rows(lanes(seed=2), no_lanes()), stack_rows(no_lanes(), lanes(seed=3))):
             expected = frame(torch.full((2,), 0.1), *segments, *state)
@@ -434,6 +432,10 @@ def test_a_program_of_torch_jit_trace_computes_frames_of_every_kind(calibrator):
             for one, two in zip(found, expected, strict=True):
                 torch.testing.assert_close(one, two)
     assert found[2].tolist() == [Status.COASTING, Status.TRACKING]
+    points = lanes(seed=1).endpoints.requires_grad_()
+    inputs = (torch.full((1,), 0.05), points, *lanes(seed=1)[1:], *start)
+    one, two = (torch.autograd.grad(each(*inputs)[0].sum(), points) for each in (recorded, frame))
+    torch.testing.assert_close(one, two)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -450,7 +452,7 @@ def test_a_whole_model_is_recorded_by_torch_jit_trace():
     net, image = Net(), torch.rand(2, 3, 64, 128, generator=torch.Generator().manual_seed(0))
     net.lanes.network_width = 96
     with torch.no_grad():
-        recorded = torch.jit.trace(net, (image[:1], CAMERA), check_trace=False)
+        recorded = torch.jit.trace(net, (image[:1], CAMERA))
         for found, expected in zip(recorded(image[1:], CAMERA), net(image[1:], CAMERA), strict=True):
             torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
