@@ -93,7 +93,7 @@ def test_a_fleet_that_is_stopped_says_so_and_continues(tmp_path):
     with log.open("wb") as file:
         begun = subprocess.Popen(command, stdout=file, stderr=file)
     drives = tmp_path / "fleet" / "drives"
-    end = time.monotonic() + 120
+    end = time.monotonic() + 300
     while (
         begun.poll() is None and time.monotonic() < end and _lines_of(drives / ".long.partial/lanes.json") < 5
     ):
