@@ -50,12 +50,12 @@ def parse_documents(text: str) -> list[Any]:
     """
     if _ROS_INI.search(text):
         return [_parse_ini(text)]
-    if section := _SECTION.search(text):
+    start = text.lstrip()[:1]
+    if start not in ("<", "{") and (section := _SECTION.search(text)):
         raise ValueError(
             f"expected YAML, JSON or XML, got the section {section[0].strip()}, as of INI or TOML; write its "
             "numbers as fx: 1150"
         )
-    start = text.lstrip()[:1]
     if start == "<":
         return [_parse_xml(text)]
     if start in ("{", "["):

@@ -44,9 +44,8 @@ _ORB_SLAM_MODELS = {  # Camera.type -> model and coefficients
 
 def is_kalibr(fields: Mapping[str, Any]) -> bool:
     """Tell whether the keys are those of Kalibr's camera chain, or of one camera as in EuRoC."""
-    return {"intrinsics", "camera_model"} <= fields.keys() or any(
-        re.fullmatch(r"cam\d+", key, re.ASCII) for key in fields
-    )
+    of_one = "intrinsics" in fields and not fields.keys().isdisjoint({"camera_model", "resolution"})
+    return of_one or any(re.fullmatch(r"cam\d+", key, re.ASCII) for key in fields)
 
 
 def kalibr_cameras(fields: Mapping[str, Any]) -> Readers:

@@ -27,4 +27,4 @@ def is_bag(source: str) -> bool:
     path = Path(source)
     if path.suffix.lower() in (".mcap", ".bag", ".db3") or (path / "metadata.yaml").is_file():
         return True
-    return path.is_dir() and any(path.glob("*.db3"))
+    return path.is_dir() and {file.suffix for file in path.iterdir()} == {".db3"}

@@ -375,6 +375,12 @@ def test_nuscenes_and_openlane_json(tmp_path):
         ("c.xml", "<a><b>1</b><b>2</b></a>", "expected each key once, got 'b' twice"),
         ("c.yaml", "cam0: 3", "cam0: expected keys and values, got '3'"),
         ("c.yaml", "intrinsics: [1, 2]\ncamera_model: dsx", "camera_model: expected one of pinhole-none"),
+        (
+            "c.yaml",
+            "intrinsics: [1, 2, 3, 4]\nresolution: [5, 6]",
+            "camera_model: expected a value, got none",
+        ),
+        ("c.xml", "<!--\n[note]\n-->\n<a><b>1</b><b>2</b></a>", "expected each key once, got 'b' twice"),
         ("c.yaml", "? [1, 2]\n: 3\n", "expected plain keys"),
         ("c.yaml", "x: &x [*x]", "expected YAML, got a syntax error|unknown key"),
         ("c.yaml", "fx: 1\n" * 200_000, "characters of YAML"),

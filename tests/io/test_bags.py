@@ -26,6 +26,7 @@ from lanebev.io.formats.record import RunRecord
 from lanebev.io.frames import Frame
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
 from lanebev.io.rising_clock import RisingClock
+from lanebev.io.source_names import is_bag
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 TYPES = STORE.types
@@ -515,3 +516,6 @@ def test_a_file_of_a_ros_2_bag_and_a_folder_without_metadata_say_what_to_give(ba
             ValueError, match=r"with its metadata.yaml, got none; give the folder of the .db3"
         ):
             make_source(RunConfig(str(source), ""))
+    assert is_bag(str(tmp_path))
+    (tmp_path / "0.png").write_bytes(b"")  # images that were taken out of it
+    assert not is_bag(str(tmp_path))

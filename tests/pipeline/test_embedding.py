@@ -519,6 +519,11 @@ def test_strides_that_are_not_those_of_the_maps_are_named():
     expected = r"strides: expected about 7.76 px, since 33 rows of a map cover 256 px, got 16; give"
     with pytest.raises(ValueError, match=expected):
         warp(maps, CAMERA, POSE, image_size=(256, 480), strides=(16, 8))
+    square = torch.nn.functional.pad(maps[0], (0, 0, 0, 27))  # of an image that was padded to a square
+    expected, valid = warp(maps[0], CAMERA, POSE, image_size=(264, 480), strides=8)
+    found, _ = warp(square, CAMERA, POSE, image_size=(264, 480), strides=8)
+    torch.testing.assert_close(found[..., 20:, :], expected[..., 20:, :])
+    assert valid[..., 20:, :].any()
     warp(torch.rand(1, 2, 3, 4), CAMERA, POSE, image_size=(64, 100), strides=32)
 
 
