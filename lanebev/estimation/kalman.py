@@ -124,7 +124,7 @@ def update(mean: Tensor, cov: Tensor, info_matrix: Tensor, info_vector: Tensor) 
 def smoother_gain(cov: Tensor, transition: Tensor, process_noise: Tensor, linked: Tensor) -> Tensor:
     """Compute the gain of a smoother, C = P Fᵀ (F P Fᵀ + W)⁻¹, its entries outside of a mask being zero.
 
-    Source: (J33) of docs/method/joint.md; Särkkä 2013, Bayesian Filtering and Smoothing, Sec. 8.2.
+    Source: (J32) of docs/method/joint.md; Särkkä 2013, Bayesian Filtering and Smoothing, Sec. 8.2.
 
     Args:
         cov: (..., D, D), P, filtered.
@@ -147,7 +147,7 @@ def smoother_gain(cov: Tensor, transition: Tensor, process_noise: Tensor, linked
 def smoother_covariance(cov: Tensor, transition: Tensor, process_noise: Tensor, gain: Tensor) -> Tensor:
     """Compute the covariance of a smoothed state if the later one were known exactly.
 
-    Source: (J34); Särkkä 2013, Sec. 8.2, P + C (P' - F P Fᵀ - W) Cᵀ. Deviation: as a sum of positive terms,
+    Source: (J33); Särkkä 2013, Sec. 8.2, P + C (P' - F P Fᵀ - W) Cᵀ. Deviation: as a sum of positive terms,
     (I - C F) P (I - C F)ᵀ + C W Cᵀ + C P' Cᵀ, which holds for every C and keeps sign in floating point. The
     last term, with the later state's covariance P', is left to the recursion.
 

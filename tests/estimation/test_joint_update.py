@@ -70,7 +70,7 @@ def test_update_equals_a_plain_gauss_newton_on_all_data():
     places = places + state.mean[:, PLACE.deviations].gather(1, seen.boundary)
     at = boundary_residuals(state.mean[:, :NUM_COMMON], places, seen, state.phase)
     scale, doubt = torch.ones(2, dtype=DOUBLE), state.cov[:, PLACE.observed, PLACE.observed]
-    frame = frame_information(at, scale, doubt, 0 * scale, seen, membership(seen.boundary, 6, like=doubt))
+    frame = frame_information(at, scale, doubt, seen, membership(seen.boundary, 6, like=doubt))
     estimated, mean = torch.ones_like(state.mean), state.mean[:, PLACE.observed]
     moved = observed_step(mean, doubt, mean, frame, estimated[:, PLACE.observed])
     gain = kalman_gain(state.cov, moved, frame, estimated)
@@ -106,8 +106,7 @@ def test_weights_allow_for_the_predicted_variance_of_the_end_points():
     member = membership(seen.boundary, 6, like=own)
     full = torch.cat([at.jacobian, member * at.jacobian[:, OFFSET, None]], dim=1)
     cov = state.cov[:, PLACE.observed, PLACE.observed]
-    ones = torch.ones(2, dtype=DOUBLE)
-    trust = frame_information(at, ones, cov, 0 * ones, seen, member).trust
+    trust = frame_information(at, torch.ones(2, dtype=DOUBLE), cov, seen, member).trust
     count = seen.boundary.shape[1]
     for row, segment in itertools.product(range(2), range(count)):
         first, second = (full[row, :, end * count + segment] for end in (0, 1))

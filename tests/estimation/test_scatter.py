@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from lanebev import JointCalibrator, LaneSegments
-from lanebev.estimation.joint import update
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.measurement import NUM_STRAIGHT, PITCH, ROLL, boundary_residuals
 from lanebev.estimation.joint.observations import boundary_places, observe
@@ -21,12 +20,11 @@ from lanebev.estimation.joint.scatter import (
     boundary_scatter,
     determined_sensitivity,
     scatter_variance,
-    shared_heading_variance,
     start_variance,
     with_headings,
 )
 from lanebev.estimation.joint.single_frame import fit_observations
-from lanebev.estimation.joint.update import independent_share, information, membership
+from lanebev.estimation.joint.update import information, membership
 from lanebev.testing.moments import CAMERA, PLACES, WIDTH, moments
 from lanebev.testing.moments import observe as see
 from lanebev.testing.segments import stack_rows
@@ -92,9 +90,9 @@ def test_parallel_boundaries_add_almost_nothing(visible):
 def test_the_sensitivity_to_a_heading_is_the_change_of_the_fit():
     headings = torch.zeros(6, dtype=DOUBLE)
     headings[3] = 1e-4
-    before, found = scatter_of_frame(PLACES, 0 * headings, 0.0)
+    before, scatter = scatter_of_frame(PLACES, 0 * headings, 0.0)
     after, _ = scatter_of_frame(PLACES, headings, 0.0)
-    expected = 1e-4 * found.sensitivity[0, :, 6 + 3]
+    expected = 1e-4 * scatter.sensitivity[0, :, 6 + 3]
     torch.testing.assert_close((after - before)[0], expected, rtol=0.1, atol=2e-6)
     assert expected[PITCH].abs() > 5e-6
 
@@ -229,8 +227,6 @@ def test_a_vertical_curvature_that_two_boundaries_show_may_be_their_own_curvatur
     _, of_two, pose = follow(moments(0.2), (2, 3))
     _, of_six, _ = follow(moments(0.2), (0, 1, 2, 3, 4, 5))
     width, scatter = torch.tensor([WIDTH], dtype=DOUBLE), torch.tensor([0.002**2], dtype=DOUBLE)
-    assert shared_heading_variance(of_two) == 0
-    assert shared_heading_variance(of_six) == scatter_variance(of_six.scatter)[0, 1] < 0.003**2
     for curvature in (0.0, 1e-4):
         expected = 25.0 * curvature * WIDTH / 2 / pose[3].item()
         hills = torch.tensor([curvature**2], dtype=DOUBLE)
@@ -278,46 +274,6 @@ def test_the_covariance_contains_the_boundaries_of_a_street_that_wander(speed):
                 found.append((error @ torch.linalg.inv(covariance[0]) @ error.T).item() / 4)
     assert 0.2 < sum(nees) / len(nees) < 3.0
     assert sum(nees_of_filter) / len(nees_of_filter) > 30.0
-
-
-def test_a_heading_of_its_own_limits_what_a_boundary_tells():
-    """(J30) is what elimination of that heading leaves of the information on a heading of all boundaries."""
-    [moment] = moments(ONE_FRAME)
-    _, segments = next(iter(see([moment], 1, 1.0, 20, 0, DOUBLE)))
-    seen = observe(segments, CAMERA[None], 6)
-    places = boundary_places(WIDTH, 6, seen.sigma).expand(1, -1).gather(1, seen.boundary)
-    params = torch.tensor([[*moment.pose, moment.offset, 0.0, 0.0]], dtype=DOUBLE)
-    residuals = boundary_residuals(params, places, seen)
-    member = membership(seen.boundary, 6, seen.sigma)
-    told = information(residuals, seen.weight, member)
-    known = with_headings(*told, residuals, seen.weight, member)[0].diagonal(dim1=1, dim2=2)[:, -6:]
-    for variance in (0.0, 0.001**2, 0.01**2):
-        left = known if variance == 0 else known - known.square() / (known + 1 / variance)
-        share = independent_share(residuals, seen.weight, member, torch.tensor([variance], dtype=DOUBLE))
-        torch.testing.assert_close(share * known, left, rtol=1e-9, atol=0)
-    assert (share < 0.1).all()
-
-
-def test_the_filter_follows_the_frames_of_a_street_less(monkeypatch):
-    """Its pitch is more accurate; with parallel boundaries of unequal lanes it is not less."""
-
-    def errors(places):
-        found = []
-        for seed in range(6):
-            aside = wandering(seed, 0.15) if places is PLACES else lambda z: 0.0
-            drive = moments(1.0, lambda t, m, aside=aside: replace(
-                m, places=places, near=4.0, far=30.0, wander=lambda z: aside(z + 8.0 * t)
-            ))  # fmt: skip
-            calibration, _, pose = follow(drive, (0, 1, 2, 3, 4), seed)
-            found.append((calibration.extrinsics.pitch[0] - pose[PITCH]).item())
-        return torch.tensor(found).square().mean().sqrt().item()
-
-    unequal = PLACES + torch.tensor([0.1, -0.05, 0.0, 0.1, -0.1, 0.05])
-    street, parallel = errors(PLACES), errors(unequal)
-    every = lambda residuals, weight, member, of_headings: torch.ones(1, 6, dtype=DOUBLE)  # noqa: E731
-    monkeypatch.setattr(update, "independent_share", every)
-    assert street < 0.6 * errors(PLACES)
-    assert parallel < 1.1 * errors(unequal)
 
 
 def test_skipped_and_unsupported_frames_keep_the_scatter_and_rows_are_independent():

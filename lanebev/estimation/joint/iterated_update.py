@@ -20,7 +20,6 @@ from lanebev.estimation.joint.evidence import (
 from lanebev.estimation.joint.lane_change import best_shift, renumber
 from lanebev.estimation.joint.layout import NUM_COMMON, POSE, layout
 from lanebev.estimation.joint.measurement import (
-    NUM_SHAPE,
     NUM_STRAIGHT,
     VERTICAL,
     Residuals,
@@ -30,13 +29,7 @@ from lanebev.estimation.joint.measurement import (
     look,
 )
 from lanebev.estimation.joint.observations import Observations, ego_lane_width, per_end
-from lanebev.estimation.joint.scatter import (
-    Scatter,
-    averaged_moments,
-    boundary_scatter,
-    shared_heading_variance,
-    with_headings,
-)
+from lanebev.estimation.joint.scatter import Scatter, averaged_moments, boundary_scatter, with_headings
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.joint.update import (
     FrameInformation,
@@ -45,7 +38,6 @@ from lanebev.estimation.joint.update import (
     boundary_deviation,
     estimated_entries,
     frame_information,
-    information,
     kalman_gain,
     membership,
     observed_step,
@@ -56,10 +48,6 @@ from lanebev.estimation.joint.update import (
 from lanebev.estimation.reasons import Reason
 from lanebev.tensors import constant
 
-_FREE_SHAPE_PRECISION = (
-    1e4,
-    *[1e6] * (NUM_SHAPE - 1),
-)  # m²: 1e-2 1/m, and 1e-3 for each step
 _NO_BOUNDARY_DEVIATION = 0.36  # m; a line that deviates by more bounds no lane (3 ``open_deviation``)
 
 
@@ -118,10 +106,10 @@ def update_state(
     shift, scale = best_shift(predicted.mean, positions, seen, sight, width)
     mean = renumber(predicted.mean, shift, width, num)
     prior, places = mean[:, indices.observed], positions.gather(1, seen.boundary)  # (B, O), (B, N)
-    member, of_headings = membership(seen.boundary, num, like=places), shared_heading_variance(predicted)
+    member = membership(seen.boundary, num, like=places)
 
     def iterate(at: Tensor, at_cov: Tensor, residuals: Residuals, scale: Tensor, cov: Tensor) -> Iteration:
-        frame = frame_information(residuals, scale, at_cov, of_headings, seen, member)
+        frame = frame_information(residuals, scale, at_cov, seen, member)
         alone = single_frame_std(frame.matrix)
         estimated = estimated_entries(alone, num)
         observed = cov[:, indices.observed, indices.observed]
@@ -195,10 +183,7 @@ def with_evidence(
 
 
 def scatter_of_frame(frame: FrameInformation, cov: Tensor, member: Tensor, moments: Tensor) -> Scatter:
-    """Estimate the scatter of the boundaries, and how it changes the pose.
-
-    The scatter is what neither the pose nor any shape of the road explains, so that errors of the predicted
-    shape are not taken for headings. The pose changes by it as on a road whose horizontal shape is known.
+    """Estimate the scatter of the boundaries beside pose, offset and vertical curvature.
 
     Args:
         frame: its information, near the state.
@@ -206,13 +191,9 @@ def scatter_of_frame(frame: FrameInformation, cov: Tensor, member: Tensor, momen
         member: (B, L, M), boundary of each end point.
         moments: (B, 2, 3) of the frames before.
     """
-    by_noise = information(frame.residuals, frame.weight, member)
-    matrix, vector = with_headings(*by_noise, frame.residuals, frame.weight, member)
-    straight, of_vertical = wide_precision(cov), cov[:, VERTICAL, VERTICAL, None].reciprocal()
-    of_shape = constant(_FREE_SHAPE_PRECISION, like=cov).expand(cov.shape[0], -1)
-    precision = torch.cat([straight, of_shape, of_vertical], dim=-1)
-    moments = boundary_scatter(matrix, vector, precision, moments).moments
+    matrix, vector = with_headings(frame.matrix, frame.vector, frame.residuals, frame.weight, member)
     kept = constant((*range(NUM_STRAIGHT), *range(VERTICAL, vector.shape[-1])), matrix, torch.int64)
     matrix, vector = matrix.index_select(1, kept).index_select(2, kept), vector.index_select(1, kept)
-    precision = torch.cat([straight, of_vertical], dim=-1)
-    return boundary_scatter(matrix, vector, precision, moments)._replace(moments=moments)
+    of_vertical = cov[:, VERTICAL, VERTICAL, None].reciprocal()
+    precision = torch.cat([wide_precision(cov), of_vertical], dim=-1)
+    return boundary_scatter(matrix, vector, precision, moments)

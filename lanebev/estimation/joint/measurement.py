@@ -1,6 +1,6 @@
 """The measurement of the joint estimators: end points against projected lane boundaries, in pixels.
 
-The equations (J1) to (J34) that this package cites are in docs/method/joint.md.
+The equations (J1) to (J33) that this package cites are in docs/method/joint.md.
 
 Boundary k lies on the road at X_k(Z) = b(Z) + x_k (1 + b'(Z)² / 2), with x_k = offset + (its position from
 the ego lane's middle): parallel curves, to second order in their heading b'. The bend b is linear in the

@@ -11,7 +11,7 @@ from lanebev.estimation.joint.evidence import EQUAL
 from lanebev.estimation.joint.frame_prior import student_density
 from lanebev.estimation.joint.layout import POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL
-from lanebev.estimation.joint.scatter import had_three, scatter_variance, start_variance
+from lanebev.estimation.joint.scatter import scatter_variance, start_variance
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.road import lane_width_covariance
@@ -131,8 +131,9 @@ def heading_variance(state: JointState, of_scatter: Tensor, width: Tensor, cfg: 
     """
     own_curvature = state.hills * (0.5 * width / state.mean[:, HEIGHT].clamp(min=_LEAST_HEIGHT)).square()
     of_two = torch.where(has_flag(state.reasons, Reason.ROLL_UNSEEN), own_curvature, 0.0)
+    more_than_two = (state.pose_sensitivity[:, ROLL] != 0).any(-1)  # in some frame
     of_more = of_scatter + start_variance(state.scatter, cfg.start_heading_std)
-    return of_two * _HEADING_BY_CURVATURE**2 + torch.where(had_three(state), of_more, 0.0)
+    return of_two * _HEADING_BY_CURVATURE**2 + torch.where(more_than_two, of_more, 0.0)
 
 
 def covariance_by_boundaries(state: JointState, width: Tensor, cfg: JointConfig) -> Tensor:
@@ -160,7 +161,7 @@ def covariance_by_boundaries(state: JointState, width: Tensor, cfg: JointConfig)
 def height_variance_by_roll(height: Tensor, left: Tensor, right: Tensor, roll_variance: Tensor) -> Tensor:
     """Compute the variance (B,) m² of the height by the second-order effect of an error of the roll.
 
-    Source: (J31). The ego lane's boundaries stay where they are seen.
+    Source: (J30). The ego lane's boundaries stay where they are seen.
 
     Args:
         height: (B,) m.
@@ -179,7 +180,7 @@ def as_calibration(
 
     Its covariance adds what the filter does not estimate: the common scale of the lane widths (J25); the
     boundaries' own deviations and headings (J29); the difference from a frame that contradicts the
-    state; and, if roll is not observed, the second-order effect of its error on the height (J31).
+    state; and, if roll is not observed, the second-order effect of its error on the height (J30).
 
     Args:
         state: (B, ...).

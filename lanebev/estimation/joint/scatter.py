@@ -4,7 +4,7 @@ The pose is fitted to a road whose boundaries are parallel and whose lanes have 
 every boundary has a lateral deviation and a heading of its own. Errors of a detector
 that last along a boundary have the same effect. All vertices of the boundary share them, and so do
 consecutive frames, so they do not average out as noise does. Their variances are estimated from the residuals
-of every frame's fit. The filter's weights allow for the headings, and the covariance of the output for both.
+of every frame's fit.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.layout import NUM_POSE
 from lanebev.estimation.joint.measurement import OFFSET, ROLL, Residuals
 from lanebev.estimation.joint.observations import per_end
-from lanebev.estimation.joint.state import JointState
 from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
 from lanebev.tensors import constant
 
@@ -134,21 +133,6 @@ def scatter_variance(moments: Tensor) -> Tensor:
     weight = weight.clamp(min=_LEAST_WEIGHT)
     freedom = freedom / weight + _ADDED_FREEDOM
     return squares.clamp(min=0.0) / weight / freedom * (1 + _FEW_FREEDOM / freedom)
-
-
-def had_three(state: JointState) -> Tensor:
-    """Tell whether more than two boundaries were in view in some frame, (B,) bool."""
-    return (state.pose_sensitivity[:, ROLL] != 0).any(-1)
-
-
-def shared_heading_variance(state: JointState) -> Tensor:
-    """Compute the variance (B,) rad² of a boundary's own heading for which the filter's weights allow.
-
-    Source: (J30). It is that of the scatter of the last frames, at most that of the prior; and 0 if never
-    more than two boundaries were in view, whose scatter is noise.
-    """
-    of_headings = scatter_variance(state.scatter)[:, 1].clamp(max=_PRIOR_STD[1] ** 2)
-    return torch.where(had_three(state), of_headings, 0.0)
 
 
 def start_variance(moments: Tensor, heading_std: float) -> Tensor:

@@ -82,7 +82,7 @@ def smooth_states(
 ) -> Iterator[JointState]:
     """Yield the smoothed states of a drive, the last one first, with ``mean`` and ``cov`` replaced.
 
-    Source: (J33), (J34); Rauch, Tung and Striebel 1965, Särkkä 2013, Sec. 9.1, on the filter's linearisation.
+    Source: (J32), (J33); Rauch, Tung and Striebel 1965, Särkkä 2013, Sec. 9.1, on the filter's linearisation.
 
     Args:
         states: after every frame, (B, ...) each, in order; they are accessed once, from the last to the

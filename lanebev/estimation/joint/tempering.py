@@ -11,7 +11,7 @@ from lanebev.geometry.linalg import inverse_spd
 def temper_frame(pose: Tensor, covariance: Tensor, prior: FramePrior, factor: float) -> tuple[Tensor, Tensor]:
     """Multiply the standard deviations of a frame's information, not those of the prior, by a factor.
 
-    Source: (J32), the power posterior p(x) p(frame | x)^(1/factor²) of Gaussians (Grünwald and van Ommen
+    Source: (J31), the power posterior p(x) p(frame | x)^(1/factor²) of Gaussians (Grünwald and van Ommen
     2017).
 
     Args:

@@ -34,10 +34,10 @@ class FrameInformation(NamedTuple):
     """Information of one frame on the O observed entries of the state, linearised.
 
     Attributes:
-        matrix: (B, O, O), Λ = Hᵀ Q⁻¹ H, with weights that allow for the headings of the boundaries (J30).
-        vector: (B, O), Hᵀ Q⁻¹ y at the point of linearisation, likewise.
+        matrix: (B, O, O), Λ = Hᵀ Q⁻¹ H.
+        vector: (B, O), Hᵀ Q⁻¹ y at the point of linearisation.
         trust: (B, N) in [0, 1], weights of the segments.
-        weight: (B, N) px⁻², of every end point by its own noise.
+        weight: (B, N) px⁻², of every end point in these sums: the diagonal of Q⁻¹.
         scale: (B,) >= 1, of the noise.
         residuals: at the point of linearisation.
     """
@@ -71,12 +71,7 @@ def membership(boundary: Tensor, num_boundaries: int, like: Tensor) -> Tensor:
 
 
 def frame_information(
-    residuals: Residuals,
-    scale: Tensor,
-    at_cov: Tensor,
-    of_headings: Tensor,
-    seen: Observations,
-    member: Tensor,
+    residuals: Residuals, scale: Tensor, at_cov: Tensor, seen: Observations, member: Tensor
 ) -> FrameInformation:
     """Weigh a frame's linearised measurements and sum them up.
 
@@ -84,32 +79,13 @@ def frame_information(
         residuals: at the point of linearisation.
         scale: (B,) noise scale so far; it is lowered.
         at_cov: (B, O, O), covariance of the point of linearisation. A residual within it is not an outlier.
-        of_headings: (B,) rad², variance of a boundary's own heading.
         seen: what was observed.
         member: (B, L, M) of :func:`membership`.
     """
     by_state = _predicted_variance(residuals.jacobian, at_cov, seen.boundary)
     trust, scale = reweigh(squared_distance(residuals.distance), residuals.valid, seen, scale, by_state)
     weight = trust * seen.weight / scaled_variance(seen.sigma, scale)
-    share = independent_share(residuals, weight, member, of_headings).gather(1, seen.boundary)
-    return FrameInformation(*information(residuals, weight * share, member), trust, weight, scale, residuals)
-
-
-def independent_share(residuals: Residuals, weight: Tensor, member: Tensor, of_headings: Tensor) -> Tensor:
-    """Compute the factor (B, L) on the weights of a boundary's end points, which share its own heading.
-
-    Source: (J30). With it the variance of a line's heading is 1 / Λ_ηη + σ², where Λ_ηη is its information by
-    independent noise and σ² the variance of the boundary's own heading.
-
-    Args:
-        residuals: with Z of the foot points.
-        weight: (B, N) px⁻², of every end point by its own noise.
-        member: (B, L, M) of :func:`membership`.
-        of_headings: (B,) rad², σ².
-    """
-    by_heading = residuals.jacobian[:, OFFSET] * residuals.z  # (B, M)
-    known = torch.bmm(member, (per_end(weight) * by_heading.square()).unsqueeze(-1)).squeeze(-1)  # (B, L)
-    return 1 / (1 + of_headings.unsqueeze(-1) * known)
+    return FrameInformation(*information(residuals, weight, member), trust, weight, scale, residuals)
 
 
 def information(residuals: Residuals, weight: Tensor, member: Tensor) -> tuple[Tensor, Tensor]:
