@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import queue
-import threading
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import torch
 
@@ -22,37 +21,15 @@ def prefetch(items: Iterable[T], depth: int = 4) -> Iterator[T]:
 
     An exception of the producer is raised here. Leaving the loop early stops the thread.
     """
-    ready: queue.Queue[object] = queue.Queue(depth)
-    stop = threading.Event()
-
-    def put(item: object) -> bool:
-        while not stop.is_set():
-            try:
-                ready.put(item, timeout=0.1)
-                return True
-            except queue.Full:
-                continue
-        return False
-
-    def produce() -> None:
-        try:
-            for item in items:
-                if not put(item):
-                    return
-            put(_END)
-        except BaseException as error:
-            put(_Failure(error))
-
-    thread = threading.Thread(target=produce, name="prefetch", daemon=True)
-    thread.start()
+    iterator = iter(items)
+    pool = ThreadPoolExecutor(1, "prefetch")
     try:
-        while (item := ready.get()) is not _END:
-            if isinstance(item, _Failure):
-                raise item.error
-            yield item  # type: ignore[misc]
+        ahead = deque(pool.submit(next, iterator, _END) for _ in range(depth))
+        while (item := ahead.popleft().result()) is not _END:
+            ahead.append(pool.submit(next, iterator, _END))
+            yield cast(T, item)
     finally:
-        stop.set()
-        thread.join()
+        pool.shutdown(cancel_futures=True)
 
 
 def map_ahead(call: Callable[[T], Result], items: Iterable[T], workers: int) -> Generator[tuple[T, Result]]:
@@ -83,37 +60,23 @@ class Background:
     """Runs calls one after another in a thread; ``with`` waits for them and raises their exceptions."""
 
     def __init__(self) -> None:
-        self._calls: queue.Queue[Callable[[], object] | None] = queue.Queue(_MOST_CALLS)
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name="background", daemon=True)
+        self._pool = ThreadPoolExecutor(1, "background")
+        self._calls: deque[Future[object]] = deque()
 
     def __enter__(self) -> Background:
-        self._thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._calls.put(None)
-        self._thread.join()
-        if error is None and self._error is not None:
-            raise self._error
+        try:
+            while self._calls and error is None:
+                self._calls.popleft().result()
+        finally:
+            self._pool.shutdown(cancel_futures=True)
 
     def submit(self, call: Callable[[], object]) -> None:
         """Queue a call; waits while the queue is full, raises if an earlier call failed."""
-        if self._error is not None:
-            raise self._error
-        self._calls.put(call)
-
-    def _run(self) -> None:
-        while (call := self._calls.get()) is not None:
-            if self._error is None:
-                try:
-                    call()
-                except BaseException as error:
-                    self._error = error
-
-
-class _Failure:
-    def __init__(self, error: BaseException) -> None:
-        self.error = error
+        while self._calls and (self._calls[0].done() or len(self._calls) >= _MOST_CALLS):
+            self._calls.popleft().result()
+        self._calls.append(self._pool.submit(call))

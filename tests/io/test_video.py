@@ -3,8 +3,6 @@
 import gc
 import io
 import struct
-import threading
-import time
 from fractions import Fraction
 
 import av
@@ -14,7 +12,6 @@ import pytest
 import torch
 from PIL import Image
 
-from lanebev.app.concurrency import Background, prefetch
 from lanebev.io.image_names import natural_order
 from lanebev.io.images import read_image, write_png
 from lanebev.io.video import open_source
@@ -395,56 +392,6 @@ def test_natural_order():
         "a/9.jpg",
         "a/10.jpg",
     ]
-
-
-def test_prefetch_keeps_order_and_runs_ahead():
-    made = []
-
-    def produce():
-        for i in range(6):
-            made.append(i)
-            yield i
-
-    items = prefetch(produce(), depth=3)
-    assert next(items) == 0
-    deadline = time.monotonic() + 5
-    while len(made) < 4 and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert len(made) >= 4
-    assert list(items) == [1, 2, 3, 4, 5]
-
-
-def test_prefetch_raises_what_the_producer_raised_and_stops_when_left():
-    def broken():
-        yield 1
-        raise ValueError("frame 2")
-
-    items = prefetch(broken())
-    assert next(items) == 1
-    with pytest.raises(ValueError, match="frame 2"):
-        next(items)
-    endless = prefetch(iter(int, 1))
-    next(endless)
-    endless.close()
-    assert not any(thread.name == "prefetch" for thread in threading.enumerate())
-
-
-def test_background_runs_in_order_and_raises():
-    done = []
-    with Background() as background:
-        for i in range(20):
-            background.submit(lambda i=i: done.append(i))
-    assert done == list(range(20))
-
-    def fail():
-        raise OSError("disk full")
-
-    def run():
-        with Background() as background:
-            background.submit(fail)
-
-    with pytest.raises(OSError, match="disk full"):
-        run()
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
