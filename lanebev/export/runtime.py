@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from copy import copy
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Generic
 
 import torch
 from torch import Tensor, nn
@@ -105,30 +106,16 @@ class OnnxExtractor(nn.Module):
         return BoundaryVertices._make(found[f"vertex_{name}"] for name in BoundaryVertices._fields)
 
 
-class OnnxCalibrator(Calibrator[StateT]):
-    """Stands in for a calibrator.
+class OnnxStep(Generic[StateT]):
+    """Stands in for :meth:`~lanebev.estimation.calibrator.Calibrator.step`."""
 
-    Args:
-        part: part of the calibrator.
-        calibrator: exported calibrator, which gives the initial state.
-    """
+    def __init__(self, part: OnnxPart) -> None:
+        self.part = part
 
-    def __init__(self, part: OnnxPart, calibrator: Calibrator[StateT]) -> None:
-        super().__init__()
-        self.part, self.calibrator = part, calibrator
-        self.state_type, self.num_boundaries = calibrator.state_type, calibrator.num_boundaries
-        self.still_passes, self.lane_width_std = calibrator.still_passes, calibrator.lane_width_std
-
-    def initial_state(
-        self, batch_size: int, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
-    ) -> StateT:
-        """See :meth:`~lanebev.estimation.calibrator.Calibrator.initial_state`."""
-        return self.calibrator.initial_state(batch_size, dtype, device)
-
-    def step(
+    def __call__(
         self, segments: LaneSegments, intrinsics: Tensor, state: StateT, dt: Tensor, lane_width: Tensor
     ) -> tuple[Calibration, StateT]:
-        """See :meth:`~lanebev.estimation.calibrator.Calibrator.step`."""
+        """Estimate the pose of one frame."""
         (rows, count), most = segments.weight.shape, self.part.facts["segments"]
         if count > most:
             raise ValueError(
@@ -153,32 +140,12 @@ class OnnxCalibrator(Calibrator[StateT]):
         )
         return calibration, type(state)(*(found[f"next_{name}"] for name in states))
 
-    def pitch_and_yaw(self, state: StateT) -> tuple[Tensor, Tensor] | None:
-        """See :meth:`~lanebev.estimation.calibrator.Calibrator.pitch_and_yaw`."""
-        return self.calibrator.pitch_and_yaw(state)
 
-    def weigh_still(
-        self,
-        calibration: Calibration,
-        state: StateT,
-        segments: LaneSegments,
-        intrinsics: Tensor,
-        lane_width: float | Tensor,
-    ) -> Calibration:
-        """See :meth:`~lanebev.estimation.calibrator.Calibrator.weigh_still`."""
-        return self.calibrator.weigh_still(calibration, state, segments, intrinsics, lane_width)
-
-    def scale_still(self, calibration: Calibration, factor: float) -> Calibration:
-        """See :meth:`~lanebev.estimation.calibrator.Calibrator.scale_still`."""
-        return self.calibrator.scale_still(calibration, factor)
-
-    def curvature(self, state: StateT) -> Tensor | None:
-        """See :meth:`~lanebev.estimation.calibrator.Calibrator.curvature`."""
-        return self.calibrator.curvature(state)
-
-    def vertical_curvature(self, state: StateT) -> Tensor | None:
-        """See :meth:`~lanebev.estimation.calibrator.Calibrator.vertical_curvature`."""
-        return self.calibrator.vertical_curvature(state)
+def with_exported_step(calibrator: Calibrator[StateT], part: OnnxPart) -> Calibrator[StateT]:
+    """Return a calibrator whose step is that of a part; its initial state and all else are its own."""
+    stepped = copy(calibrator)
+    stepped.step = OnnxStep[StateT](part)  # type: ignore[method-assign]
+    return stepped
 
 
 def onnx_model(folder: Path, camera: Camera, far_view: bool = False) -> LaneBEV:
@@ -225,7 +192,7 @@ def onnx_calibrator(folder: Path, name: str, calibrator: Calibrator[StateT]) -> 
         raise ValueError(
             f"{folder / name}.onnx: expected one of this version of lanebev, got another's; export it again"
         )
-    return OnnxCalibrator(part, calibrator)
+    return with_exported_step(calibrator, part)
 
 
 def _part(folder: Path, name: str) -> OnnxPart:

@@ -137,7 +137,7 @@ def test_a_run_without_the_files_is_one_line(folder, capsys):
 
 def test_more_segments_than_exported_are_refused():
     segments = parts.LaneSegments(*(torch.zeros(1, 5, *shape) for shape in ((2, 2), (), (), ())))
-    calibrator = runtime.OnnxCalibrator(SimpleNamespace(facts={"segments": 4}), JointCalibrator())
+    calibrator = runtime.with_exported_step(JointCalibrator(), SimpleNamespace(facts={"segments": 4}))
     frame = (segments, torch.eye(3)[None], calibrator.initial_state(1), torch.ones(1), torch.ones(1, 5))
     with pytest.raises(
         ValueError, match="segments: expected 4 at most, as the calibrator was exported for, got 5"

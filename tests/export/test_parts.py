@@ -24,7 +24,7 @@ from lanebev.export.operators import translations
 from lanebev.export.part import Part
 from lanebev.export.parts import make_part
 from lanebev.export.quantize import quantize_segmenter
-from lanebev.export.runtime import OnnxCalibrator, OnnxPart
+from lanebev.export.runtime import OnnxPart, with_exported_step
 from lanebev.export.state_parts import calibrator_part
 from lanebev.export.write import export_program, write_onnx
 from lanebev.tensors import constant
@@ -142,7 +142,7 @@ def test_a_segmenter_of_8_bits_is_near_that_of_float(tmp_path):
 @pytest.mark.slow
 def test_a_calibrator_equals_eager_frame_after_frame(tmp_path):
     calibrator = TwoStageCalibrator(num_hypotheses=20)
-    other = OnnxCalibrator(onnx(calibrator_part(calibrator, 48), tmp_path), calibrator)
+    other = with_exported_step(calibrator, onnx(calibrator_part(calibrator, 48), tmp_path))
     state = again = calibrator.initial_state(3, dtype=torch.float64)
     for frame in range(3):
         segments = stack_rows(lanes(seed=frame), no_lanes(), lanes(boundaries=(2,), per=48, seed=frame))
