@@ -6,36 +6,19 @@ python -m tools.readme_picture [--demo out/demo] [--frame 48]
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
-import math
 from pathlib import Path
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics
+from lanebev import BEVGrid, Camera
+from lanebev.app.views import bird_view
+from lanebev.io.results import poses_of, read_extrinsics
 from lanebev.io.video import open_source
 from train.commands import one_line_errors
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "assets" / "before_after.jpg"
 GRID = BEVGrid(x=(-10.0, 10.0), z=(5.0, 40.0), resolution=35 / 360)
-
-
-def pose_of(row: dict[str, str]) -> Extrinsics:
-    """Return the pose of a row of extrinsics.csv, batch size 1."""
-    angles = [math.radians(float(row[f"{name}_deg"])) for name in ("pitch", "yaw", "roll")]
-    return Extrinsics(*torch.tensor([*angles, float(row["height_m"])]).split(1))
-
-
-def bird_view(image: NDArray[np.uint8], camera: Camera, pose: Extrinsics) -> Image.Image:
-    """Convert an image (H, W, 3) to its bird's-eye view."""
-    tensor = torch.from_numpy(image.copy()).permute(2, 0, 1)[None] / 255
-    lens = camera.distortion[None].float() if camera.distortion.numel() else None
-    bev, _ = BEVWarp(GRID)(tensor, camera.intrinsics[None].float(), pose, lens, camera.model)
-    return Image.fromarray((255 * bev[0].permute(1, 2, 0)).round().byte().numpy())
 
 
 def side_by_side(titled: list[tuple[str, Image.Image]], gap: int = 8, bar: int = 26) -> Image.Image:
@@ -64,11 +47,11 @@ def main() -> None:
     frame = next(itertools.islice(source, args.frame, None), None)
     if frame is None or frame.image is None:
         raise ValueError(f"--frame: expected one of the {source.count} frames of the demo, got {args.frame}")
-    with open(args.demo / "extrinsics.csv", newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    first = next(row for row in rows if row["status"] == "TRACKING")
-    fixed, own = (bird_view(frame.image, camera, pose_of(row)) for row in (first, rows[args.frame]))
-    panels = [("input", Image.fromarray(frame.image)), ("fixed pose", fixed), ("estimated pose", own)]
+    rows = read_extrinsics(args.demo / "extrinsics.csv")
+    first = next(row for row in rows if row.status == "TRACKING")
+    panels = [("input", Image.fromarray(frame.image))]
+    for title, row in (("fixed pose", first), ("estimated pose", rows[args.frame])):
+        panels.append((title, Image.fromarray(bird_view(GRID, frame.image, camera, poses_of([row])))))
     side_by_side(panels).save(args.out, quality=88)
 
 

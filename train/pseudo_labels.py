@@ -30,9 +30,10 @@ from lanebev.camera.model import Camera
 from lanebev.estimation.joint.boundary_curves import Boundaries, boundary_polylines, fit_boundaries
 from lanebev.io.frames import Frame
 from lanebev.io.lanes import read_lanes
-from lanebev.io.results import ExtrinsicsRow, read_extrinsics
+from lanebev.io.results import ExtrinsicsRow, poses_of, read_extrinsics
 from lanebev.observation.polylines import image_rows
 from lanebev.observation.segments import segments_from_lines
+from lanebev.report.lane_curves import curves_on_rows
 from lanebev.report.run_folder import read_run
 from lanebev.types import Extrinsics
 from train.commands import one_line_errors
@@ -80,17 +81,9 @@ def smoothed(curves: Boundaries, reach: int, least: float = 0.5) -> tuple[Bounda
 
 def label_rows(curves: Boundaries, camera: Camera, extrinsics: Extrinsics) -> NDArray[np.float64]:
     """Draw curves on the rows of ``lanes.json``: (F, L, R) px of the image as it came, NaN for none."""
-    rows = image_rows(camera.image_size[0])
     intrinsics = camera.intrinsics.to(curves.offset).expand(len(curves.offset), 3, 3)
     lines, shown = boundary_polylines(curves, intrinsics, extrinsics, num_points=96)
-    x = np.full((*lines.shape[:2], len(rows)), np.nan)
-    for frame, index in np.ndindex(x.shape[:2]):
-        points = camera.distort_points(lines[frame, index][shown[frame, index]]).double().numpy()
-        if len(points) > 1:
-            order = np.argsort(points[:, 1])
-            across = np.interp(rows, points[order, 1], points[order, 0], np.nan, np.nan)
-            x[frame, index] = np.where((across >= 0) & (across < camera.image_size[1]), across, np.nan)
-    return x
+    return np.stack([curves_on_rows(*each, camera) for each in zip(lines, shown, strict=True)])
 
 
 def fitted_curves(result: Path, camera: Camera) -> tuple[Boundaries, list[ExtrinsicsRow]]:
@@ -107,15 +100,7 @@ def fitted_curves(result: Path, camera: Camera) -> tuple[Boundaries, list[Extrin
         )
     segments = segments_from_lines([entry.lines for entry in entries], camera)
     intrinsics = camera.intrinsics.to(segments.endpoints).expand(len(rows), 3, 3)
-    pose = poses(rows, segments.endpoints)
-    return fit_boundaries(segments, intrinsics, pose, least_support=SUPPORT), rows
-
-
-def poses(rows: list[ExtrinsicsRow], like: Tensor) -> Extrinsics:
-    """Return the poses of ``extrinsics.csv`` in rad and m, each (F,)."""
-    degrees = [[row.pitch_deg, row.yaw_deg, row.roll_deg] for row in rows]
-    pitch, yaw, roll = like.new_tensor(degrees).deg2rad().unbind(-1)
-    return Extrinsics(pitch, yaw, roll, like.new_tensor([row.height_m for row in rows]))
+    return fit_boundaries(segments, intrinsics, poses_of(rows), least_support=SUPPORT), rows
 
 
 def write_labels(result: Path, source: str, out: Path, camera: Camera, reach: int, stride: int) -> int:
@@ -135,7 +120,7 @@ def write_labels(result: Path, source: str, out: Path, camera: Camera, reach: in
     check_camera_of_run(result, camera)
     curves, rows = fitted_curves(result, camera)
     curves, steady = smoothed(curves, reach)
-    x = label_rows(curves, camera, poses(rows, curves.offset))
+    x = label_rows(curves, camera, poses_of(rows))
     sure = [row.status == "TRACKING" and bool(fine) for row, fine in zip(rows, steady, strict=True)]
     chosen = set([number for number, is_sure in enumerate(sure) if is_sure][::stride])
     if not chosen:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from lanebev.app.concurrency import Background
 from lanebev.app.config import RunConfig
@@ -98,17 +97,12 @@ def against_truth(found: Sequence[ExtrinsicsRow], truth: Sequence[ExtrinsicsRow]
     tracked = [(row, true) for row, true in zip(found, truth, strict=True) if row.status == "TRACKING"]
     if not tracked:
         return "RMSE against the truth: no frame was tracked"
-    error = np.array([pose_of(row) - pose_of(true) for row, true in tracked])
+    error = np.array([np.subtract(row.pose, true.pose) for row, true in tracked])
     pitch, yaw, roll, height = np.sqrt((error**2).mean(0))
     return (
         f"RMSE against the truth: pitch {pitch:.3f} deg  yaw {yaw:.3f} deg  roll {roll:.3f} deg  "
         f"height {100 * height:.1f} cm"
     )
-
-
-def pose_of(row: ExtrinsicsRow) -> NDArray[np.float64]:
-    """Return pitch, yaw, roll (deg) and height (m), (4,)."""
-    return np.array([row.pitch_deg, row.yaw_deg, row.roll_deg, row.height_m])
 
 
 def _truth_row(number: int, time: float, frame: RenderedFrame) -> ExtrinsicsRow:

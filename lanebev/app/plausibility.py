@@ -57,9 +57,7 @@ def pose_remark(pose: Sequence[float]) -> str:
 
 def drive_remark(rows: Iterable[ExtrinsicsRow]) -> str:
     """Return a remark on the median pose of the frames that were tracked; empty if it is plausible."""
-    poses = [
-        (row.pitch_deg, row.yaw_deg, row.roll_deg, row.height_m) for row in rows if row.status == "TRACKING"
-    ]
+    poses = [row.pose for row in rows if row.status == "TRACKING"]
     return pose_remark(np.median(poses, axis=0).tolist()) if poses else ""
 
 

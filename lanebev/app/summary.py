@@ -98,7 +98,7 @@ def mount_facts(mounted: MountCalibration) -> dict[str, str]:
 def untracked_words(rows: Iterable[ExtrinsicsRow]) -> list[str]:
     """Return the most frequent reasons of frames that are not tracked, in a line; none if all are."""
     others = [row for row in rows if row.status != "TRACKING"]
-    names = ([name for name in row.reasons.split("|") if name not in ("", "NO_START")] for row in others)
+    names = ([name for name in row.reason_names if name != "NO_START"] for row in others)
     reasons = Counter(words for each in names for words in reason_words(each))  # NO_START has another cause
     if not reasons:
         return []

@@ -9,10 +9,11 @@ from enum import Flag
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from lanebev.numbers import shown
-from lanebev.types import Calibration, Status
+from lanebev.types import Calibration, Extrinsics, Status
 
 CSV_COLUMNS = (
     "frame", "time_s", "pitch_deg", "yaw_deg", "roll_deg", "height_m", "pitch_std_deg", "yaw_std_deg",
@@ -53,6 +54,28 @@ class ExtrinsicsRow(NamedTuple):
     image: str
     reasons: str = ""
     vertical_curvature_per_m: float | None = None
+
+    @property
+    def pose(self) -> tuple[float, float, float, float]:
+        """Pitch, yaw, roll (deg) and height (m)."""
+        return self.pitch_deg, self.yaw_deg, self.roll_deg, self.height_m
+
+    @property
+    def std(self) -> tuple[float, float, float, float]:
+        """Standard deviations of pitch, yaw, roll (deg) and height (m)."""
+        return self.pitch_std_deg, self.yaw_std_deg, self.roll_std_deg, self.height_std_m
+
+    @property
+    def reason_names(self) -> list[str]:
+        """Names of the reasons that hold in the frame."""
+        return [name for name in self.reasons.split("|") if name]
+
+
+def poses_of(rows: Iterable[ExtrinsicsRow]) -> Extrinsics:
+    """Return the poses of N rows, each (N,) rad and m, float64."""
+    scale = torch.tensor([math.pi / 180] * 3 + [1.0], dtype=torch.float64)
+    degrees = torch.tensor([row.pose for row in rows], dtype=torch.float64)
+    return Extrinsics.unstack(degrees.reshape(-1, 4) * scale)
 
 
 def extrinsics_row(

@@ -30,29 +30,14 @@ class AxisState(IntEnum):
     UNKNOWN = 4  # nothing known yet
 
 
-def pose(row: ExtrinsicsRow) -> tuple[float, float, float, float]:
-    """Return pitch, yaw, roll (deg) and height (m) of a row."""
-    return row.pitch_deg, row.yaw_deg, row.roll_deg, row.height_m
-
-
-def sigmas(row: ExtrinsicsRow) -> tuple[float, float, float, float]:
-    """Return the standard deviations of pitch, yaw, roll (deg) and height (m) of a row."""
-    return row.pitch_std_deg, row.yaw_std_deg, row.roll_std_deg, row.height_std_m
-
-
 def estimates(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.float64]:
     """Return (F, 4) pitch, yaw, roll (deg) and height (m)."""
-    return np.array([pose(row) for row in rows], dtype=np.float64).reshape(-1, 4)
+    return np.array([row.pose for row in rows], dtype=np.float64).reshape(-1, 4)
 
 
 def estimate_stds(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.float64]:
     """Return (F, 4) standard deviations of pitch, yaw, roll (deg) and height (m)."""
-    return np.array([sigmas(row) for row in rows], dtype=np.float64).reshape(-1, 4)
-
-
-def reasons_of(row: ExtrinsicsRow) -> list[str]:
-    """Return the names of the reasons that hold in a frame."""
-    return [name for name in row.reasons.split("|") if name]
+    return np.array([row.std for row in rows], dtype=np.float64).reshape(-1, 4)
 
 
 def axis_states(row: ExtrinsicsRow) -> tuple[AxisState, AxisState, AxisState, AxisState]:
@@ -61,10 +46,9 @@ def axis_states(row: ExtrinsicsRow) -> tuple[AxisState, AxisState, AxisState, Ax
     state = whole.get(row.status, AxisState.UNKNOWN)
     if state != AxisState.MEASURED:
         return state, state, state, state
-    reasons = reasons_of(row)
     pitch, yaw, roll, height = (
-        _tracked_state(_UNSEEN[axis] in reasons, std, most)
-        for axis, std, most in zip(AXES, sigmas(row), LARGEST_STD, strict=True)
+        _tracked_state(_UNSEEN[axis] in row.reason_names, std, most)
+        for axis, std, most in zip(AXES, row.std, LARGEST_STD, strict=True)
     )
     return pitch, yaw, roll, height
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lanebev.camera.model import Camera
@@ -34,9 +35,8 @@ def lane_curves(
         (L, R) px of the image as it came; none of them where the pose is not known.
     """
     rows = image_rows(camera.image_size[0])
-    x = np.full((NUM_BOUNDARIES, len(rows)), np.nan)
     if int(calibration.status[0]) not in (Status.TRACKING, Status.COASTING):
-        return BoundaryRows(rows, x)
+        return BoundaryRows(rows, np.full((NUM_BOUNDARIES, len(rows)), np.nan))
     intrinsics = camera.intrinsics[None].to(segments.endpoints)
     pose = calibration.extrinsics
     curves = fit_boundaries(
@@ -45,10 +45,26 @@ def lane_curves(
     far = curves.extent[..., 1].clamp(min=_LEAST_REACH)
     curves = curves._replace(extent=torch.stack([torch.ones_like(far), far], dim=-1))
     lines, shown = boundary_polylines(curves, intrinsics, pose, _POINTS, vertical_curvature)
-    for own, line, there in zip(x, lines[0], shown[0], strict=True):
+    return BoundaryRows(rows, curves_on_rows(lines[0], shown[0], camera))
+
+
+def curves_on_rows(lines: Tensor, shown: Tensor, camera: Camera) -> NDArray[np.float64]:
+    """Interpolate one frame's curves on the rows of ``lanes.json``.
+
+    Args:
+        lines: (L, P, 2) undistorted px.
+        shown: (L, P) bool.
+        camera: the lens.
+
+    Returns:
+        (L, R) px of the image as it came, NaN where there is no curve.
+    """
+    rows = image_rows(camera.image_size[0])
+    x = np.full((len(lines), len(rows)), np.nan)
+    for own, line, there in zip(x, lines, shown, strict=True):
         points = camera.distort_points(line[there]).double().numpy()
         if len(points) > 1:
             order = np.argsort(points[:, 1])
             across = np.interp(rows, points[order, 1], points[order, 0], np.nan, np.nan)
             own[:] = np.where((across >= 0) & (across <= camera.image_size[1] - 1), across, np.nan)
-    return BoundaryRows(rows, x)
+    return x

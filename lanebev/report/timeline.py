@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AXES, AxisState, all_axis_states, reasons_of
+from lanebev.report.axis_states import AXES, AxisState, all_axis_states
 from lanebev.report.verdict import reason_words
 
 STATUSES = ("TRACKING", "COASTING", "LOST", "UNINITIALISED")  # the better first
@@ -106,5 +106,5 @@ def _strip(
 
 
 def _usual_reasons(rows: Sequence[ExtrinsicsRow]) -> list[str]:
-    (most, _), *_ = Counter(row.reasons for row in rows).most_common(1)
-    return reason_words(reasons_of(rows[0]._replace(reasons=most)))
+    (most, _), *_ = Counter(tuple(row.reason_names) for row in rows).most_common(1)
+    return reason_words(most)

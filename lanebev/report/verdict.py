@@ -18,7 +18,6 @@ from lanebev.report.axis_states import (
     AxisState,
     all_axis_states,
     estimate_stds,
-    reasons_of,
 )
 
 _WORDS = {str(reason.name): words for reason, words in REASON_WORDS.items()}
@@ -242,14 +241,14 @@ def _joined_axes(parts: Sequence[Finding]) -> list[Finding]:
 
 def _frequent(rows: Sequence[ExtrinsicsRow]) -> str:
     """Return the reasons of whole frames that hold in a fifth of them or more, in words."""
-    counts = Counter(name for row in rows for name in reasons_of(row) if name in _WHOLE_FRAME)
+    counts = Counter(name for row in rows for name in row.reason_names if name in _WHOLE_FRAME)
     frequent = [name for name, count in counts.most_common() if count >= 0.2 * len(rows)]
     return ", ".join(_WORDS[name] for name in frequent)
 
 
 def _unseen_why(rows: Iterable[ExtrinsicsRow]) -> str:
     """Return why an axis was not seen in most of the frames, in words."""
-    named = [next((name for name in _UNSEEN if name in reasons_of(row)), None) for row in rows]
+    named = [next((name for name in _UNSEEN if name in row.reason_names), None) for row in rows]
     counts = Counter(name for name in named if name)
     return _WORDS[counts.most_common(1)[0][0]] if counts else ""
 

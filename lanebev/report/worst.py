@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AXES, pose, sigmas
+from lanebev.report.axis_states import AXES
 
 SETTLING = 1.0  # s after the first tracked frame, in which large sigmas and jumps are a matter of course
 _STATUSES = ("COASTING", "LOST")
@@ -40,13 +40,13 @@ def scores(
     """
     found: dict[str, float] = {}
     if settled and row.status == "TRACKING":
-        found |= {f"sigma {axis}": value for axis, value in zip(AXES, sigmas(row), strict=True)}
+        found |= {f"sigma {axis}": value for axis, value in zip(AXES, row.std, strict=True)}
     if row.status in _STATUSES:
         found[row.status] = row.pitch_std_deg
-    if settled and "RESTARTED" in row.reasons.split("|"):
+    if settled and "RESTARTED" in row.reason_names:
         found["RESTARTED"] = 1.0
     if settled and len(before) == 2 and all(one.status in ("TRACKING", *_STATUSES) for one in before):
-        large = zip(AXES, jumps(row, *before), sigmas(before[1]), _LEAST_JUMP, strict=True)
+        large = zip(AXES, jumps(row, *before), before[1].std, _LEAST_JUMP, strict=True)
         for axis, jump, std, least in large:
             if abs(jump) > max(least, _LEAST_SIGMAS * std):
                 found[f"jump {axis}"] = abs(jump) / max(std, 1e-9)
@@ -63,7 +63,7 @@ def jumps(row: ExtrinsicsRow, earlier: ExtrinsicsRow, before: ExtrinsicsRow) -> 
     """
     step = before.time_s - earlier.time_s
     share = (row.time_s - before.time_s) / step if step > 0 else 0.0
-    values = zip(pose(row), pose(earlier), pose(before), strict=True)
+    values = zip(row.pose, earlier.pose, before.pose, strict=True)
     return [now - (then + share * (then - first)) for now, first, then in values]
 
 

@@ -19,18 +19,18 @@ from lanebev.io.covariances import diagonal_covariances, read_covariances, write
 from lanebev.io.formats.folder import read_record
 from lanebev.io.formats.names import FORMATS, parse_formats
 from lanebev.io.formats.openpilot import openpilot_angles
-from lanebev.io.formats.record import RunRecord, pose_from_degrees, with_images
+from lanebev.io.formats.record import RunRecord, with_images
 from lanebev.io.formats.ros_tf import static_transform
 from lanebev.io.frames import Frame
 from lanebev.io.images import write_png
-from lanebev.io.results import ExtrinsicsRow, write_extrinsics
+from lanebev.io.results import ExtrinsicsRow, poses_of, write_extrinsics
 from lanebev.io.whole_file import whole_file
 
 FRAMES = 5
 LENS = (-0.1, 0.02, 0.001, -0.002, 0.003)
 CAMERA = Camera.from_parameters(330, 335, 207, 118, 416, 240, LENS)
 POSE = (2.5, -1.75, 0.75, 1.4)  # deg, deg, deg, m
-MOUNT = Extrinsics.unstack(pose_from_degrees([POSE]).stack())
+MOUNT = Extrinsics.from_values(*map(math.radians, POSE[:3]), POSE[3])
 LINE = np.array([[100.0, 200.0], [120.5, 190.0], [140.0, 180.0]])
 
 
@@ -226,7 +226,7 @@ def test_opencv_projects_as_we_do(tmp_path):
     pixels, _ = cv2.projectPoints(ROAD.numpy(), rvec, tvec, matrix, lens)
     assert np.allclose(pixels[:, 0], _pixels(MOUNT, lens=True), rtol=0, atol=1e-6)
     pixels, _ = cv2.projectPoints(ROAD.numpy(), rvecs[3], tvecs[3], matrix, lens)
-    frame = pose_from_degrees([RECORD.rows[3][2:6]])
+    frame = poses_of([RECORD.rows[3]])
     assert np.allclose(pixels[:, 0], _pixels(frame, lens=True), rtol=0, atol=1e-6)
     assert frames.flatten().tolist() == list(range(FRAMES))
 
@@ -270,7 +270,7 @@ def test_mcap_by_its_library(tmp_path):
         assert sorted(times)[:2] == [1_700_000_000_250_000_000, 1_700_000_000_283_333_333]
         for number, (_, name, transforms) in enumerate(messages["/tf"]):
             (transform,) = transforms.transforms
-            expected = vehicle_from_camera(pose_from_degrees([RECORD.rows[number][2:6]]))[0].numpy()
+            expected = vehicle_from_camera(poses_of([RECORD.rows[number]]))[0].numpy()
             turn, place = transform.rotation, transform.translation
             assert np.allclose(_rotation(turn.w, turn.x, turn.y, turn.z), expected[:3, :3], atol=1e-9)
             assert (place.x, place.y, place.z) == (0.0, 0.0, pytest.approx(1.4))
@@ -308,7 +308,7 @@ def test_rerun_by_its_reader(tmp_path):
     height = [place[0][2] for place in columns["/road/camera", "Transform3D:translation"]]
     assert height == pytest.approx([1.4] * FRAMES)
     matrix = np.reshape(columns["/road/camera", "Transform3D:mat3x3"][0], (3, 3), order="F")
-    expected = vehicle_from_camera(pose_from_degrees([RECORD.rows[0][2:6]]))[0, :3, :3].numpy()
+    expected = vehicle_from_camera(poses_of([RECORD.rows[0]]))[0, :3, :3].numpy()
     assert np.allclose(matrix, expected, rtol=0, atol=1e-6)
     strips = columns["/road/camera/boundaries", "LineStrips2D:strips"]
     assert np.allclose(strips[1][0], LINE + 1.5)

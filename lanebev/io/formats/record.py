@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import repeat
@@ -10,12 +9,11 @@ from pathlib import PurePath
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from lanebev.camera.model import Camera
 from lanebev.io.frames import Frame
-from lanebev.io.results import ExtrinsicsRow
+from lanebev.io.results import ExtrinsicsRow, poses_of
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.types import Extrinsics
 
@@ -93,8 +91,7 @@ class RunRecord:
 
     def poses(self) -> Extrinsics:
         """Return the pose of every frame, each (N,), float64."""
-        values = [(row.pitch_deg, row.yaw_deg, row.roll_deg, row.height_m) for row in self.rows]
-        return pose_from_degrees(values)
+        return poses_of(self.rows)
 
     def standing_pose(self) -> StandingPose:
         """Return the mount's pose if it is calibrated, else the median of the frames that were tracked.
@@ -112,12 +109,6 @@ class RunRecord:
         values = self.poses().stack()[tracked].quantile(0.5, dim=0)[None]
         words = f"the median of {len(tracked)} TRACKING frames; the mount is not calibrated"
         return StandingPose(Extrinsics.unstack(values), words)
-
-
-def pose_from_degrees(values: Sequence[Sequence[float]]) -> Extrinsics:
-    """Return poses, each (N,) rad and m, from N of pitch, yaw, roll (deg) and height (m)."""
-    scale = torch.tensor([math.pi / 180] * 3 + [1.0], dtype=torch.float64)
-    return Extrinsics.unstack(torch.tensor(values, dtype=torch.float64).reshape(-1, 4) * scale)
 
 
 def with_images(
