@@ -1,14 +1,19 @@
-"""Camera files of KITTI and of COLMAP."""
+"""Camera files of KITTI, of COLMAP and of WoodScape."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
+import numpy as np
+
+from lanebev.camera.approximation import kannala_brandt_like
 from lanebev.camera.choice import Readers, telling_names
 from lanebev.camera.parameters import OFF_CENTRE, CameraParameters, centre_offset, size_of_images
-from lanebev.camera.parsing import once
+from lanebev.camera.parsing import mapping, number, once, whole_number
 from lanebev.numbers import finite_numbers, shown
 
 _KITTI = re.compile(r"^[ \t]*P(?:_rect_)?\d+[ \t]*:", re.MULTILINE | re.ASCII)
@@ -106,3 +111,32 @@ def _colmap(name: str, width: str, height: str, values: str) -> CameraParameters
     distortion = [given.get(key, 0.0) for key in order.split()]
     matrix = [fx, 0.0, given["cx"] - 0.5, 0.0, fy, given["cy"] - 0.5, 0.0, 0.0, 1.0]
     return CameraParameters(matrix, distortion, model, (int(height), int(width)))
+
+
+def is_woodscape(record: Any) -> bool:
+    """Tell whether a content is that of WoodScape's calibration of a fisheye."""
+    intrinsic = record.get("intrinsic") if isinstance(record, Mapping) else None
+    return isinstance(intrinsic, Mapping) and intrinsic.get("model") == "radial_poly"
+
+
+def woodscape(record: Mapping[str, Any]) -> CameraParameters:
+    """Return the Kannala-Brandt camera nearest to WoodScape's, of radius k1 θ + k2 θ² + k3 θ³ + k4 θ⁴ px.
+
+    Source: WoodScape (Yogamani et al. 2019), scripts/calibration/projection.py.
+    """
+    fields = mapping("intrinsic", record["intrinsic"])
+    height, width = whole_number(fields, "height"), whole_number(fields, "width")
+    slopes = [number(fields, key) for key in ("k1", "k2", "k3", "k4")]
+    aspect = number(fields, "aspect_ratio")
+    cx = 0.5 * (width - 1) + number(fields, "cx_offset")
+    cy = 0.5 * (height - 1) + number(fields, "cy_offset")
+    if not (slopes[0] > 0 and aspect > 0):
+        raise ValueError(f"k1, aspect_ratio: expected numbers above 0, got {slopes[0]:g}, {aspect:g}")
+    corner = math.hypot(max(cx, width - 1 - cx), max(cy, height - 1 - cy) / aspect) / slopes[0]
+    relative = np.array(slopes) / slopes[0]
+    scale, distortion = kannala_brandt_like(
+        lambda angle: angle * np.polyval(relative[::-1], angle), corner, slopes[0]
+    )
+    fx = scale * slopes[0]
+    matrix = [fx, 0.0, cx, 0.0, fx * aspect, cy, 0.0, 0.0, 1.0]
+    return CameraParameters(matrix, distortion, "fisheye", (height, width))

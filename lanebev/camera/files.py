@@ -23,12 +23,19 @@ from lanebev.camera.datasets import (
 from lanebev.camera.formats import opencv_or_ros, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
 from lanebev.camera.parsing import parse_documents
-from lanebev.camera.programs import gyroflow, matlab
+from lanebev.camera.programs import gyroflow, matlab, metashape, nerf, realsense
 from lanebev.camera.records import record_cameras
-from lanebev.camera.slam import camodocal, is_kalibr, is_orb_slam, kalibr_cameras, orb_slam_cameras
+from lanebev.camera.slam import camodocal, is_kalibr, kalibr_cameras, orb_slam_cameras, orb_slam_fields
 from lanebev.numbers import read_text, shown
 
-_BY_KEY = {"RadialDistortion": matlab, "fisheye_params": gyroflow, "model_type": camodocal}
+_BY_KEY = {
+    "RadialDistortion": matlab,
+    "fisheye_params": gyroflow,
+    "model_type": camodocal,
+    "fl_x": nerf,
+    "ppx": realsense,
+    "projection": metashape,
+}
 _VIEWS = ("ret", "rvecs", "tvecs", "objpoints", "imgpoints")  # of a calibration, beside the camera
 
 
@@ -43,9 +50,9 @@ def read_camera(
       its ``roi`` and ``binning_x``, ``binning_y`` applied;
     - our short YAML: fx, fy, cx, cy, width, height, distortion, model;
     - Kalibr's camchain, EuRoC's ``sensor.yaml``, CamOdoCal's YAML (VINS, KITTI-360), the
-      settings of ORB-SLAM;
+      settings of ORB-SLAM and stella_vslam;
     - KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt``: rectified images (``P_rect_02``, ``P2``);
-    - JSON of MATLAB and of Gyroflow, see :mod:`lanebev.camera.programs`;
+    - files of MATLAB, Gyroflow, Nerfstudio, RealSense and Metashape, see :mod:`lanebev.camera.programs`;
     - JSON of data sets, see :mod:`lanebev.camera.records`;
     - COLMAP's ``cameras.txt``.
 
@@ -132,8 +139,8 @@ def _camera(
         raise ValueError("camera_intrinsic: expected that of a camera, got none")
     if is_kalibr(content):
         return checked(chosen(kalibr_cameras(content), name, has_usual=True))
-    if is_orb_slam(content):
-        return checked(chosen(orb_slam_cameras(content, rectified), name, has_usual=True))
+    if settings := orb_slam_fields(content):
+        return checked(chosen(orb_slam_cameras(settings, rectified), name, has_usual=True))
     if name is not None:
         raise ValueError(f"expected no name after # for a file of one camera, got {shown(name)}")
     for key, read in _BY_KEY.items():

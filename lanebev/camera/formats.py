@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from lanebev.camera.named_lens import LENS_NAMES, stated_lens
 from lanebev.camera.parameters import CameraParameters, centre_offset, checked
 from lanebev.camera.parsing import mapping, number, numbers, whole_number
 from lanebev.numbers import shown
 
-_SHORT_KEYS = {"fx", "fy", "cx", "cy", "width", "height", "distortion", "model"}
 _MATRIX_KEYS = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "k", "mtx")
 DISTORTION_KEYS = (
     "distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "D", "d", "dist", "dist_coeff",
@@ -20,6 +20,10 @@ _ROTATION_KEYS = ("rectification_matrix", "R", "r")
 _WIDTH_KEYS = ("image_width", "image_Width", "width")
 _HEIGHT_KEYS = ("image_height", "image_Height", "height")
 _MODEL_KEYS = ("distortion_model", "camera_model", "model", "DistModel")
+_LENS_KEYS = ("distortion", *DISTORTION_KEYS)
+_SHORT_KEYS = {
+    "fx", "fy", "cx", "cy", *_WIDTH_KEYS, *_HEIGHT_KEYS, *_LENS_KEYS, *LENS_NAMES["pinhole"], *_MODEL_KEYS,
+}  # fmt: skip
 _IGNORED_KEYS = {
     # ROS camera_info beside the lens
     "camera_name", "header", "translation", "rotation",
@@ -116,12 +120,11 @@ def _of_images(fields: Mapping[str, Any], rectified: bool, image_size: tuple[int
 
 
 def _short(fields: Mapping[str, Any], rectified: bool) -> CameraParameters:
-    height, width = whole_number(fields, "height"), whole_number(fields, "width")
+    height, width = whole_number(fields, *_HEIGHT_KEYS[::-1]), whole_number(fields, *_WIDTH_KEYS[::-1])
     fx, fy, cx, cy = (number(fields, key) for key in ("fx", "fy", "cx", "cy"))
-    distortion = [] if fields.get("distortion") is None else numbers(fields, "distortion")
-    camera = CameraParameters(
-        [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, stated_model(fields), (height, width)
-    )
+    model = stated_model(fields)
+    matrix, lens = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], stated_lens(fields, _LENS_KEYS, model)
+    camera = CameraParameters(matrix, lens, model, (height, width))
     return without_lens(camera) if rectified else camera
 
 

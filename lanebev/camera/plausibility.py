@@ -14,6 +14,7 @@ _IMPOSSIBLE_VIEW = 170.0  # degrees, of focal lengths in mm
 _RESCALED = (0.08, 0.02)  # sides: least offset of a principal point, most difference of that in x and y
 _OFF_CENTRE = (0.2, 0.4)  # sides, more than a principal point is off the middle in x and y; skies are cut off
 _MOST_TANGENTIAL = 0.025  # coefficient of a lens that is not doubted
+_LIKE_RADIAL = 0.008  # coefficient, from which on a p1 much larger than p2 and k3 may be k3
 _WIDE = 95.0  # degrees, from which on lenses distort
 _MOST_EDGE_RATIO = 0.93  # of an edge's distance from the centre to an ideal lens's, of wide lenses
 _MOST_PINCUSHION = 1.25  # the same ratio of any lens
@@ -121,7 +122,9 @@ def model_remark(camera: Camera) -> str:
     angle, ratio, asked = field_of_view(camera), _edge_ratio(camera), "is the order k1 k2 p1 p2 k3?"
     if may_be_fisheye := not any(given[4:]) and 0.0 not in given[2:4]:
         asked = "are they k1 k2 k3 k4 of a fisheye? then model: fisheye is missing"
-    if max(map(abs, given[2:4])) > _MOST_TANGENTIAL:
+    p1, p2, k3 = given[2], given[3], given[4] if len(given) > 4 else math.inf
+    like_radial = abs(p1) > max(_LIKE_RADIAL, 4 * abs(p2), 4 * abs(k3))  # k1 k2 k3 p1 p2
+    if like_radial or max(map(abs, given[2:4])) > _MOST_TANGENTIAL:
         return f"distortion {_listed(given)} has more tangential distortion than is usual; {asked}"
     if may_be_fisheye and angle > _WIDE and ratio > _MOST_EDGE_RATIO:
         return f"distortion {_listed(given)} hardly distorts, with {angle:.0f} degrees of view; {asked}"

@@ -1,15 +1,24 @@
-"""Camera files in JSON of MATLAB and of Gyroflow."""
+"""Camera files of MATLAB, Gyroflow, instant-ngp and Nerfstudio, librealsense and Metashape."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
+from lanebev.camera.named_lens import named_lens
 from lanebev.camera.parameters import CameraParameters
-from lanebev.camera.parsing import mapping, numbers, required, whole_number
+from lanebev.camera.parsing import mapping, number, numbers, required, whole_number
 from lanebev.numbers import shown
 
 _GYROFLOW_MODELS = {"": "fisheye", "opencv_fisheye": "fisheye", "opencv_standard": "pinhole"}
+_NERF_MODELS = {
+    "OPENCV": "pinhole",
+    "PINHOLE": "pinhole",
+    "SIMPLE_PINHOLE": "pinhole",
+    "OPENCV_FISHEYE": "fisheye",
+}
+_REALSENSE_MODELS = ("none", "brownconrady", "inversebrownconrady", "modifiedbrownconrady")
 
 
 def matlab(fields: Mapping[str, Any]) -> CameraParameters:
@@ -51,4 +60,69 @@ def gyroflow(fields: Mapping[str, Any]) -> CameraParameters:
     matrix, distortion = numbers(lens, "camera_matrix", count=9), numbers(lens, "distortion_coeffs")
     return CameraParameters(
         matrix, distortion, _GYROFLOW_MODELS[name], (whole_number(size, "h"), whole_number(size, "w"))
+    )
+
+
+def nerf(fields: Mapping[str, Any]) -> CameraParameters:
+    """Read ``transforms.json`` of instant-ngp or Nerfstudio, whose pixels are COLMAP's.
+
+    Source: instant-ngp, scripts/colmap2nerf.py; Nerfstudio, docs/quickstart/data_conventions.md.
+
+    Raises:
+        ValueError: the camera model is none of OpenCV's.
+    """
+    name = str(fields.get("camera_model") or "OPENCV").strip().upper()
+    if name not in _NERF_MODELS:
+        raise ValueError(f"camera_model: expected one of {', '.join(_NERF_MODELS)}, got {shown(name)}")
+    is_fisheye = str(fields.get("is_fisheye")).lower() == "true"
+    model = "fisheye" if is_fisheye else _NERF_MODELS[name]
+    fx, cx, cy = (number(fields, key) for key in ("fl_x", "cx", "cy"))
+    fy = fx if fields.get("fl_y") is None else number(fields, "fl_y")
+    matrix = [fx, 0.0, cx - 0.5, 0.0, fy, cy - 0.5, 0.0, 0.0, 1.0]
+    return CameraParameters(
+        matrix, named_lens(fields, model), model, (whole_number(fields, "h"), whole_number(fields, "w"))
+    )
+
+
+def realsense(fields: Mapping[str, Any]) -> CameraParameters:
+    """Read the intrinsics of Intel's librealsense, written as JSON or YAML.
+
+    Raises:
+        ValueError: a lens whose model OpenCV does not have.
+    """
+    distortion = numbers(fields, "coeffs") if fields.get("coeffs") is not None else []
+    name = re.sub(r"[\W_]", "", str(fields.get("model") or "none").lower().removeprefix("distortion."))
+    if name not in _REALSENSE_MODELS or (name != "brownconrady" and any(distortion)):
+        raise ValueError(
+            f"model: expected brown_conrady, or coeffs of zeros, got {shown(str(fields.get('model')))}; "
+            "calibrate by OpenCV"
+        )
+    fx, fy, cx, cy = (number(fields, key) for key in ("fx", "fy", "ppx", "ppy"))
+    size = (whole_number(fields, "height"), whole_number(fields, "width"))
+    return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, "pinhole", size)
+
+
+def metashape(fields: Mapping[str, Any]) -> CameraParameters:
+    """Read a camera that Metashape exported in its own XML.
+
+    Source: Agisoft Metashape, User Manual, "Camera models": cx and cy are relative to the middle of the
+    image, the centre of the first pixel is at (0.5, 0.5), and P1 and P2 are OpenCV's p2 and p1.
+
+    Raises:
+        ValueError: a projection or coefficients that OpenCV does not have.
+    """
+    name = str(fields["projection"]).strip().lower()
+    unfit = [key for key in ("k4", "p3", "p4") if fields.get(key) is not None and number(fields, key)]
+    if name != "frame" or unfit:
+        got = unfit[0] if unfit else shown(name)
+        raise ValueError(f"projection: expected frame with k1 k2 k3 p1 p2, got {got}; export it as OpenCV's")
+    width, height = whole_number(fields, "width"), whole_number(fields, "height")
+    focal = number(fields, "f")
+    cx, cy, b1, b2, k1, k2, k3, p1, p2 = (
+        number(fields, key) if fields.get(key) is not None else 0.0
+        for key in ("cx", "cy", "b1", "b2", "k1", "k2", "k3", "p1", "p2")
+    )
+    x, y = 0.5 * width + cx - 0.5, 0.5 * height + cy - 0.5
+    return CameraParameters(
+        [focal + b1, b2, x, 0.0, focal, y, 0.0, 0.0, 1.0], [k1, k2, p2, p1, k3], "pinhole", (height, width)
     )

@@ -11,7 +11,9 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from lanebev.camera.choice import Readers, telling_names
+from lanebev.camera.datasets import is_woodscape, woodscape
 from lanebev.camera.formats import DISTORTION_KEYS, stated_model
+from lanebev.camera.named_lens import LENS_NAMES, stated_lens
 from lanebev.camera.parameters import OFF_CENTRE, CameraParameters, centre_offset, size_of_images
 from lanebev.camera.parsing import number, numbers, whole_number
 from lanebev.numbers import shown
@@ -71,6 +73,8 @@ def record_cameras(content: Any, image_size: tuple[int, int] | None, rectified: 
     if isinstance(content, list):
         records = [each for each in content if isinstance(each, Mapping) and each.get("camera_intrinsic")]
         named = dict(zip(telling_names([str(each.get("token")) for each in records]), records, strict=True))
+    elif is_woodscape(content):
+        return {"": partial(woodscape, content)}
     elif _layout(content):
         named = {"": content}
     else:
@@ -98,7 +102,7 @@ def _named_numbers(record: Record) -> Record | None:
 def _check_lens_keys(record: Record) -> None:
     """Raise if a lens is stated under a name that is not known, so that it would not count."""
     for key in record:
-        if _LIKE_LENS.match(key) and key not in _LENS_KEYS and record[key]:
+        if _LIKE_LENS.match(key) and key not in (*_LENS_KEYS, *LENS_NAMES["pinhole"]) and record[key]:
             raise ValueError(
                 f"distortion: expected k1 k2 p1 p2 k3 under this key, got {shown(key)}; rename it"
             )
@@ -116,11 +120,18 @@ def _read(record: Record, image_size: tuple[int, int] | None, rectified: bool) -
         matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
     else:
         matrix = numbers(record, layout.matrix, count=9)
+        if _is_waymos(matrix):
+            record = {**record, "distortion": matrix[4:]}
+            matrix = [matrix[0], 0.0, matrix[2], 0.0, matrix[1], matrix[3], 0.0, 0.0, 1.0]
     _check_lens_keys(record)
-    has_lens = any(record.get(key) is not None for key in _LENS_KEYS)
-    distortion = numbers(record, *_LENS_KEYS) if has_lens else []
     model = "fisheye" if record.get("Lens") == "Fisheye" else stated_model(record, layout.model)
+    distortion = stated_lens(record, _LENS_KEYS, model)
     return CameraParameters(matrix, distortion, model, _size(matrix, record, image_size, layout))
+
+
+def _is_waymos(values: list[float]) -> bool:
+    """Tell whether nine numbers are Waymo's fx fy cx cy k1 k2 p1 p2 k3, and no camera matrix."""
+    return values[8] != 1.0 and values[1] > 0.5 * values[0] > 0.0
 
 
 def _size(

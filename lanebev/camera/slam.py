@@ -1,4 +1,4 @@
-"""Camera files of Kalibr and EuRoC, of CamOdoCal and VINS, and of ORB-SLAM."""
+"""Camera files of Kalibr and EuRoC, of CamOdoCal and VINS, and of ORB-SLAM and stella_vslam."""
 
 from __future__ import annotations
 
@@ -35,10 +35,12 @@ _KALIBR_RADIAL: dict[tuple[str, str], tuple[int, int, Callable[..., Array]]] = {
     ("eucm", "none"): (2, 0, extended_unified),
     ("pinhole", "fov"): (0, 1, fov_model),
 }
-_ORB_SLAM_MODELS = {  # Camera.type -> model and coefficients
+_ORB_SLAM_MODELS = {  # Camera.type, or Camera.model of stella_vslam -> model and coefficients
     "pinhole": ("pinhole", "k1 k2 p1 p2 k3"),
+    "perspective": ("pinhole", "k1 k2 p1 p2 k3"),
     "rectified": ("pinhole", ""),
     "kannalabrandt8": ("fisheye", "k1 k2 k3 k4"),
+    "fisheye": ("fisheye", "k1 k2 k3 k4"),
 }
 
 
@@ -137,9 +139,12 @@ def camodocal(fields: Mapping[str, Any]) -> CameraParameters:
     return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, model, size)
 
 
-def is_orb_slam(fields: Mapping[str, Any]) -> bool:
-    """Return whether these are the keys of ORB-SLAM's settings."""
-    return "Camera.fx" in fields or "Camera1.fx" in fields
+def orb_slam_fields(fields: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return ORB-SLAM's settings, or stella_vslam's as these; None if they are neither."""
+    below = fields.get("Camera")
+    if isinstance(below, Mapping) and "fx" in below:
+        return {f"Camera.{key}": value for key, value in below.items()}
+    return fields if "Camera.fx" in fields or "Camera1.fx" in fields else None
 
 
 def orb_slam_cameras(fields: Mapping[str, Any], rectified: bool) -> Readers:
@@ -166,14 +171,17 @@ def _as_taken(fields: Mapping[str, Any], name: str) -> CameraParameters:
 
 def _orb_slam(fields: Mapping[str, Any], of: str) -> CameraParameters:
     """Read the camera whose keys begin with ``of``."""
-    kind = str(fields.get("Camera.type") or "PinHole").strip()
+    kind = str(fields.get("Camera.type") or fields.get("Camera.model") or "PinHole").strip()
     if kind.lower() not in _ORB_SLAM_MODELS:
-        raise ValueError(f"Camera.type: expected PinHole, Rectified or KannalaBrandt8, got {shown(kind)}")
+        raise ValueError(f"Camera.type: expected one of {', '.join(_ORB_SLAM_MODELS)}, got {shown(kind)}")
     model, names = _ORB_SLAM_MODELS[kind.lower()]
     fx, fy, cx, cy = (number(fields, of + key) for key in ("fx", "fy", "cx", "cy"))
     given = [of + key for key in names.split()]
     distortion = [number(fields, key) if fields.get(key) is not None else 0.0 for key in given]
     if model == "pinhole" and fields.get(of + "k4") is not None and number(fields, of + "k4"):
         raise ValueError(f"{of}k4: expected none of {kind}, got one; is Camera.type: KannalaBrandt8 missing?")
-    size = (whole_number(fields, "Camera.height"), whole_number(fields, "Camera.width"))
+    size = (
+        whole_number(fields, "Camera.height", "Camera.rows"),
+        whole_number(fields, "Camera.width", "Camera.cols"),
+    )
     return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, model, size)

@@ -1,4 +1,4 @@
-"""Cameras of data sets in JSON: nuImages, Cityscapes, ONCE, A2D2, ZOD, DAIR-V2X; OpenCV's Python tutorial."""
+"""Cameras of data sets and programs in JSON, whose numbers have names of their own; OpenCV's tutorial."""
 
 import json
 
@@ -44,6 +44,20 @@ AUTOWARE = {  # as cv::FileStorage writes it
     "ReprojectionError": 0.2,
     "DistModel": "plumb_bob",
 }
+WAYMO = {"name": "FRONT", "intrinsic": [2059, 2061, 936, 635, *LENS], "width": 1920, "height": 1280}
+NERF = {
+    "fl_x": 900,
+    "fl_y": 902,
+    "cx": 640.5,
+    "cy": 360.5,
+    "w": 1280,
+    "h": 720.0,
+    "frames": [{"file_path": "a"}],
+}
+BY_NAME = dict(zip(("k1", "k2", "p1", "p2", "k3"), LENS, strict=True))
+FISHEYE_BY_NAME = dict(zip(("k1", "k2", "k3", "k4"), KANNALA_BRANDT, strict=True))
+REALSENSE = {"fx": 900, "fy": 902, "ppx": 640, "ppy": 360, "width": 1280, "height": 720}
+SHORT = {"fx": 900, "fy": 902, "cx": 640, "cy": 360, "width": 1280, "height": 720}
 LIKE_OPENLANE = {"intrinsic": _matrix(1000, 960, 540), "width": 1920, "height": 1080}
 
 
@@ -77,6 +91,36 @@ LIKE_OPENLANE = {"intrinsic": _matrix(1000, 960, 540), "width": 1920, "height": 
         ({**LIKE_OPENLANE, "dist_coefs": [], "distance": 5}, "", (1000, 1002, 960, 540, 1920, 1080, ())),
         (LIKE_OPENLANE, "", (1000, 1002, 960, 540, 1920, 1080, ())),
         ({**LIKE_OPENLANE, "distortion": LENS}, "", (1000, 1002, 960, 540, 1920, 1080, LENS)),
+        ({**LIKE_OPENLANE, "k1": -0.3}, "", (1000, 1002, 960, 540, 1920, 1080, (-0.3, 0, 0, 0, 0))),
+        (WAYMO, "", (2059, 2061, 936, 635, 1920, 1280, LENS)),
+        ({**NERF, **BY_NAME}, "", (900, 902, 640, 360, 1280, 720, LENS)),
+        (
+            {**NERF, **FISHEYE_BY_NAME, "camera_model": "OPENCV_FISHEYE"},
+            "",
+            (900, 902, 640, 360, 1280, 720, KANNALA_BRANDT, "fisheye"),
+        ),
+        ({**REALSENSE, "model": "Brown Conrady", "coeffs": LENS}, "", (900, 902, 640, 360, 1280, 720, LENS)),
+        (
+            {**REALSENSE, "model": "distortion.inverse_brown_conrady", "coeffs": [0] * 5},
+            "",
+            (900, 902, 640, 360, 1280, 720),
+        ),
+        ({**SHORT, **BY_NAME}, "", (900, 902, 640, 360, 1280, 720, LENS)),
+        ({**SHORT, "distortion": BY_NAME}, "", (900, 902, 640, 360, 1280, 720, LENS)),
+        ({**SHORT, "distortion_coefficients": LENS}, "", (900, 902, 640, 360, 1280, 720, LENS)),
+        (
+            {
+                "Camera": {
+                    **{k: SHORT[k] for k in ("fx", "fy", "cx", "cy")},
+                    **FISHEYE_BY_NAME,
+                    "cols": 1280,
+                    "rows": 720,
+                    "model": "fisheye",
+                }
+            },
+            "",
+            (900, 902, 640, 360, 1280, 720, KANNALA_BRANDT, "fisheye"),
+        ),
         ({**LIKE_OPENLANE, "dist_coeffs": [LENS]}, "", (1000, 1002, 960, 540, 1920, 1080, LENS)),
         (
             {**LIKE_OPENLANE, "D": KANNALA_BRANDT, "camera_model": "fisheye"},
@@ -127,17 +171,28 @@ def test_rectified_images_of_a2d2_have_a_matrix_of_their_own(tmp_path):
             "expected one of .* got both, which differ",
         ),
         (
-            {"intrinsic": {"fx": 9, "fy": 9, "u0": 5, "v0": 5, "k1": 0.1}},
-            "under this key, got 'k1'; rename it",
+            {**LIKE_OPENLANE, "distortion": LENS, "k1": 0.1},
+            "expected one of k1, k2, ... and distortion, got both",
         ),
         ({"intrinsic": {"fx": 340}}, "fy: expected a value, got none"),
         (
             {"intrinsic": {"k1": 340, "model": "radial_poly"}},
-            "expected rows, cols, dt, data, got the key 'k1'",
+            "height: expected a value, got none",
         ),
         ({**LIKE_OPENLANE, "dist_coefs": LENS}, "expected k1 .* under this key, got 'dist_coefs'; rename it"),
-        ({**LIKE_OPENLANE, "k1": -0.3}, "expected k1 .* under this key, got 'k1'; rename it"),
+        ({**LIKE_OPENLANE, "k4": -0.3}, r"k4: expected none of this lens \(pinhole\), got -0.3"),
+        ({**LIKE_OPENLANE, "k1": -0.3, "p1": 0.1, "model": "fisheye"}, "p1: expected none of this lens"),
         ({**LIKE_OPENLANE, "radial_distortion": [0.1]}, "under this key, got 'radial_distortion'; rename it"),
+        (
+            {**NERF, "camera_model": "EQUIRECTANGULAR"},
+            "camera_model: expected one of OPENCV, .* 'EQUIRECTANGULAR'",
+        ),
+        (
+            {**REALSENSE, "model": "Inverse Brown Conrady", "coeffs": LENS},
+            "expected brown_conrady, or coeffs of zeros",
+        ),
+        ({**SHORT, "distortion": {**BY_NAME, "k9": 1}}, "expected k1, k2, p1, p2, k3, got the key 'k9'"),
+        ({**SHORT, "k1": 0.1, "D": LENS}, "expected one of k1, k2, ... and D, got both"),
         ({**LIKE_OPENLANE, "distortion": LENS, "model": "ftheta"}, "model: expected one of .*, got 'ftheta'"),
     ],
 )
@@ -145,6 +200,71 @@ def test_what_cannot_be_read_is_one_clear_line(tmp_path, content, message):
     (tmp_path / "c.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=message):
         Camera.from_file(tmp_path / "c.json")
+
+
+METASHAPE = """<?xml version="1.0" encoding="UTF-8"?>
+<calibration>
+  <projection>{0}</projection>
+  <width>1280</width>
+  <height>720</height>
+  <f>900</f>
+  <cx>3.5</cx>
+  <cy>-2.5</cy>
+  <b1>2</b1>
+  <k1>-0.3</k1>
+  <k2>0.1</k2>
+  <p1>0.002</p1>
+  <p2>-0.001</p2>
+  {1}
+  <date>2024-01-01T00:00:00Z</date>
+</calibration>"""
+
+
+def test_metashapes_projection(tmp_path):
+    """Agisoft Metashape, User Manual: u = w / 2 + cx + x' f + x' B1, the first pixel's centre at 0.5."""
+    (tmp_path / "c.xml").write_text(METASHAPE.format("frame", "<k3>0.02</k3>"))
+    camera = Camera.from_file(tmp_path / "c.xml")
+    x, y = 0.4, -0.2
+    r2 = x * x + y * y
+    radial = 1 - 0.3 * r2 + 0.1 * r2**2 + 0.02 * r2**3
+    distorted_x = x * radial + 0.002 * (r2 + 2 * x * x) + 2 * -0.001 * x * y
+    distorted_y = y * radial - 0.001 * (r2 + 2 * y * y) + 2 * 0.002 * x * y
+    expected = [639.5 + 3.5 + 902 * distorted_x, 359.5 - 2.5 + 900 * distorted_y]
+    points = cv2.projectPoints(
+        np.array([[x, y, 1.0]]),
+        np.zeros(3),
+        np.zeros(3),
+        camera.intrinsics.numpy(),
+        camera.distortion.numpy(),
+    )[0]
+    np.testing.assert_allclose(points.ravel(), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(("kind", "more"), [("fisheye", ""), ("frame", "<k4>0.1</k4>")])
+def test_what_opencv_does_not_have_of_metashapes_is_refused(tmp_path, kind, more):
+    (tmp_path / "c.xml").write_text(METASHAPE.format(kind, more))
+    with pytest.raises(
+        ValueError, match=r"projection: expected frame with k1 k2 k3 p1 p2, got .* export it as"
+    ):
+        Camera.from_file(tmp_path / "c.xml")
+
+
+def test_woodscapes_fisheye_is_the_nearest_kannala_brandt_lens(tmp_path):
+    intrinsic = {
+        "aspect_ratio": 1.0, "cx_offset": 3.9, "cy_offset": -3.1, "width": 1280.0, "height": 966.0,
+        "k1": 339.7, "k2": -32.0, "k3": 48.3, "k4": -7.2, "model": "radial_poly", "poly_order": 4,
+    }  # fmt: skip
+    (tmp_path / "c.json").write_text(json.dumps({"intrinsic": intrinsic, "name": "FV"}))
+    camera = Camera.from_file(tmp_path / "c.json")
+    assert (camera.model, camera.image_size) == ("fisheye", (966, 1280))
+    angles = np.radians([5.0, 30.0, 60.0, 80.0])
+    rays = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=-1)[None]
+    points = cv2.fisheye.projectPoints(
+        rays, np.zeros(3), np.zeros(3), camera.intrinsics.numpy(), camera.distortion.numpy()
+    )[0]
+    radius = 339.7 * angles - 32.0 * angles**2 + 48.3 * angles**3 - 7.2 * angles**4
+    np.testing.assert_allclose(points[0, :, 0], 639.5 + 3.9 + radius, atol=0.5)
+    np.testing.assert_allclose(points[0, :, 1], 482.5 - 3.1, atol=1e-6)
 
 
 def test_rectified_images_of_a_lens_without_such_a_matrix_are_refused(tmp_path):

@@ -1,0 +1,68 @@
+"""Coefficients of a lens that a file states one by one, under names such as k1 and p1."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lanebev.camera.parsing import number, numbers
+from lanebev.numbers import shown
+
+LENS_NAMES = {
+    "pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+"""OpenCV's order of the coefficients of each model."""
+
+_USUAL = 5  # coefficients of a pinhole camera without the rational model's k4, k5 and k6
+
+
+def named_lens(fields: Mapping[str, Any], model: str) -> list[float]:
+    """Return the coefficients in OpenCV's order; those that are not stated are 0.
+
+    Args:
+        fields: fields of the camera or of its lens.
+        model: "pinhole" or "fisheye"; another one has no such names.
+
+    Raises:
+        ValueError: a coefficient that the model does not have, or k4 without k5 and k6.
+    """
+    names = LENS_NAMES.get(model, ())
+    given = {name: number(fields, name) for name in LENS_NAMES["pinhole"] if fields.get(name) is not None}
+    alone = "k4" in given and "k5" not in given and model == "pinhole"
+    unfit = [
+        name for name, value in given.items() if value and (name not in names or (alone and name == "k4"))
+    ]
+    if unfit:
+        raise ValueError(
+            f"{unfit[0]}: expected none of this lens ({model}), got {given[unfit[0]]:g}; "
+            "is model: fisheye missing, or wrong?"
+        )
+    coefficients = [given.get(name, 0.0) for name in names]
+    if model == "pinhole" and not any(coefficients[_USUAL:]):
+        return coefficients[:_USUAL]
+    return coefficients
+
+
+def stated_lens(fields: Mapping[str, Any], keys: Sequence[str], model: str) -> list[float]:
+    """Return the coefficients in a list, or under their names, also where these are below the list's key.
+
+    Args:
+        fields: fields of the camera.
+        keys: spellings of the list's key.
+        model: "pinhole", "fisheye" or "omni".
+
+    Raises:
+        ValueError: they are stated twice, or beside them another key that would not count.
+    """
+    given = [key for key in keys if fields.get(key) is not None]
+    if any(fields.get(name) is not None for name in LENS_NAMES["pinhole"]):
+        if given:
+            raise ValueError(f"expected one of k1, k2, ... and {given[0]}, got both; keep the right one")
+        return named_lens(fields, model)
+    below = fields[given[0]] if given else None
+    if not isinstance(below, Mapping) or "k1" not in below:
+        return numbers(fields, *keys) if given else []
+    if unknown := [key for key in below if key not in LENS_NAMES["pinhole"]]:
+        raise ValueError(f"{given[0]}: expected k1, k2, p1, p2, k3, got the key {shown(unknown[0])}")
+    return named_lens(below, model)
