@@ -11,7 +11,7 @@ from lanebev.camera.model import Camera
 from lanebev.camera.plausibility import field_of_view
 from lanebev.io.results import ExtrinsicsRow
 
-_POSE = ((-15.0, 25.0), (-15.0, 15.0), (-8.0, 8.0), (0.8, 4.0))  # pitch, yaw, roll (degrees), height (m)
+_POSE = ((-15.0, 25.0), (-8.0, 8.0), (-8.0, 8.0), (0.8, 4.0))  # pitch, yaw, roll (degrees), height (m)
 _SAME_VIEW = 2.0  # degrees, by which fields of view of one camera may differ
 _BAR, _BAR_NOISE = 24, 8  # of 255: the most of a black bar, and how much it varies in a column
 _BAR_WIDTH = 0.02  # of the image, the least
@@ -52,7 +52,10 @@ def pose_remark(pose: Sequence[float]) -> str:
     ]
     if not unusual:
         return ""
-    return f"pose: {', '.join(unusual)} is unusual for a camera in a car: are camera and lane width right?"
+    return (
+        f"pose: {', '.join(unusual)} is unusual for a camera in a car: are camera and lane width right, "
+        "and the image size of lanes that were given?"
+    )
 
 
 def drive_remark(rows: Iterable[ExtrinsicsRow]) -> str:

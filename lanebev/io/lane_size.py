@@ -15,6 +15,7 @@ _STATE_SIZE = "state their size with --lanes-size WIDTHxHEIGHT"
 _OUTSIDE = 0.1  # share of points below or far beside the images, of which more are of another size
 _OFF_CENTRE = 0.2  # share of a side, more than a principal point is off the centre
 _BESIDE = 0.5  # image widths beside an image that lines are drawn on to
+_BEYOND = 0.03  # share of points beyond the right edge alone; lines that are drawn on go over both
 _REACHED = 0.8  # lanes reach beyond this fraction of a side: they leave images at the bottom
 _REACHED_UNCROPPED = 0.85  # fraction of the height that lanes with a horizon so high must reach
 _HIGHEST_HORIZON = 0.28  # fraction of the height above the horizon
@@ -160,6 +161,12 @@ def _doubt_of_points(frames: Sequence[FrameLines], image_size: tuple[int, int]) 
             f"the farthest at {x.max():.0f}, {y.max():.0f}; of images of another size?",
             _STATE_SIZE,
             is_outside=True,
+        )
+    if x.min() >= 0 and (beyond := (x > width).mean()) > _BEYOND:
+        return SizeDoubt(
+            f"{beyond:.0%} of the points lie beyond the right edge, up to column {x.max():.0f}, and none "
+            "beyond the left; of wider images?",
+            _STATE_SIZE,
         )
     if points.min() >= 0 and points.max() <= 1:
         return SizeDoubt(

@@ -166,6 +166,7 @@ def test_a_mount_of_another_camera(tmp_path):
 def test_a_pose_that_is_unusual_for_a_camera_in_a_car():
     assert pose_remark(GOOD_POSE) == ""
     assert pose_remark([2.0, -17.2, 0.5, 0.5]).startswith("pose: yaw -17.2 degrees, height +0.5 m is unusual")
+    assert "yaw +9.0 degrees is unusual" in pose_remark([2.0, 9.0, 0.5, 1.4])  # openpilot allows 4 degrees
 
 
 def test_field_of_view_of_a_lens():

@@ -253,6 +253,17 @@ def test_lanes_of_smaller_images_are_noticed(scale):
     assert "of smaller images? state their size with --lanes-size" in remark
 
 
+def test_lanes_of_wider_and_flatter_images_are_noticed():
+    """CULane's 1640 x 590, of which no point is below 1280 x 720."""
+    (frame,) = _entries()
+    lines = [line._replace(points=line.points * [1640 / 1280, 590 / 720]) for line in frame.lines]
+    remark = size_remark([frame._replace(lines=lines)], (720, 1280))
+    assert "beyond the right edge, up to column" in remark
+    assert "and none beyond the left; of wider images? state their size" in remark
+    drawn_on = FrameLines("0.png", [LaneLine(line) for line in _lines()])  # over both edges
+    assert size_remark([drawn_on], (720, 1280)) == ""
+
+
 def test_lanes_of_their_images_get_no_remark():
     assert size_remark(_entries(), (720, 1280)) == ""
     assert size_remark([FrameLines("0.png", [])], (720, 1280)) == ""
