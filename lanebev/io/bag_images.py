@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lanebev.io.decoding import tell_damage
 from lanebev.io.images import is_damaged_jpeg
 
 _PLAIN = {  # encoding of ROS to channels, and to OpenCV's conversion to RGB
@@ -55,6 +56,7 @@ class TopicImages:
             return message_image(message)
         if self._decoder is None:
             self._decoder = av.VideoCodecContext.create(_CODECS[message.format.strip().lower()], "r")
+            tell_damage(self._decoder)
             self._decoder.flags |= av.codec.context.Flags.low_delay  # else frames come packets later
         try:
             frames = self._decoder.decode(av.Packet(bytes(message.data)))

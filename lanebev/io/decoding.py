@@ -41,17 +41,25 @@ def open_video(source: str) -> av.container.InputContainer:
             f"{source}: expected a video, got a text; images are given as a folder or as a quoted glob"
         )
     for stream in container.streams.video:
-        tell_damaged_jpegs(stream)
+        tell_damage(stream.codec_context)
     if not moving_pictures(container):
         container.close()
         raise ValueError(f"video {source}: expected a video stream, got none")
     return container
 
 
-def tell_damaged_jpegs(stream: av.VideoStream) -> None:
-    """Let a decoder of JPEG fail at damaged images, which it silently shows as grey or garbage."""
-    if stream.codec_context is not None and stream.codec_context.name == "mjpeg":
-        stream.codec_context.options = {"err_detect": "explode"}
+def tell_damage(decoder: av.VideoCodecContext | None) -> None:
+    """Let a decoder tell damaged images; None, of an unknown codec, tells nothing.
+
+    One of JPEG silently shows grey or garbage, and one of H.264 marks no frame as damaged if several threads
+    decode its slices.
+    """
+    if decoder is None:
+        return
+    if decoder.name == "mjpeg":
+        decoder.options = {"err_detect": "explode"}
+    if decoder.name == "h264":
+        decoder.thread_type = "NONE"
 
 
 def moving_pictures(container: av.container.InputContainer) -> list[av.VideoStream]:

@@ -20,7 +20,7 @@ from lanebev.io.decoding import (
     moving_pictures,
     pixel_aspect,
     rgb,
-    tell_damaged_jpegs,
+    tell_damage,
     video_stream,
 )
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
@@ -230,7 +230,7 @@ def open_live(
         if not moving_pictures(container):
             raise ValueError(f"stream {name}: expected a video stream, got none")
         stream = video_stream(container)
-        tell_damaged_jpegs(stream)
+        tell_damage(stream.codec_context)
         frames = _whole_frames(container, stream, figures)
         first = next(frames)
         matrix = display_matrix(first)

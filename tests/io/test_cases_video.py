@@ -123,6 +123,20 @@ def test_damage_ends_at_the_next_key_frame(tmp_path):
     assert [frame.number for frame in frames if frame.problem] == [3]
 
 
+def test_damage_of_h264_is_noticed_by_several_threads_too(tmp_path):
+    """With threads of slices, as many as there are cores, FFmpeg's decoder marks no frame."""
+    path = _encode(tmp_path / "v.mp4", images=_noise(), count=12, g="100", bf="0")
+    with av.open(str(path)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+        middle = packets[3].pos + packets[3].size // 2
+    data = bytearray(path.read_bytes())
+    data[middle : middle + 200] = b"\xff" * 200
+    path.write_bytes(data)
+    frames = list(open_source(str(path)))
+    assert [frame.image is None for frame in frames] == [i == 3 for i in range(12)]
+    assert frames[3].problem == "expected a whole frame, got: one that the decoder marks as damaged"
+
+
 # streams without times, B-frames
 
 
