@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import av
 import pytest
@@ -22,11 +23,11 @@ from train.detector.drives import (
     render_drive,
     write_drive,
 )
-from train.detector.experiment import Experiment
 from train.detector.frames import DriveFrames, StepBatches, mirrored
 from train.detector.module import NOISE, DetectorTraining, arm_poses, one_cycle
 from train.detector.network import VehicleDetector
 from train.detector.predict import OFFSETS_DEG, offset_poses
+from train.detector.settings import Experiment
 from train.detector.table import main as show
 from train.detector.video import main as film
 
@@ -132,7 +133,7 @@ def test_the_cycle_is_that_of_torch():
 
 
 def test_gradients_of_detector_and_lane_network_are_clipped_separately():
-    module = DetectorTraining("nominal", GRID, 8, 8, top=32)
+    module = DetectorTraining(small(Path("train"), Path("out")), "nominal", 1)
     near, far = (torch.nn.Parameter(torch.zeros(2)) for _ in range(2))
     near.grad, far.grad = torch.tensor([0.3, 0.4]), torch.tensor([300.0, 400.0])
     optimizer = torch.optim.SGD([{"params": [near]}, {"params": [far]}], lr=1.0)

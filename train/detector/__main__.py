@@ -18,19 +18,12 @@ from torch.utils.data import DataLoader
 
 from lanebev.io.whole_file import whole_file
 from train.commands import one_line_errors
-from train.detector.experiment import (
-    Experiment,
-    begun_checkpoint,
-    checkpoint_step,
-    experiment_of,
-    experiment_parser,
-    new_module,
-    test_poses,
-)
+from train.detector.arms import begun_checkpoint, checkpoint_step, test_poses
 from train.detector.frames import DriveFrames, StepBatches
-from train.detector.module import ARMS, Arm, DetectorTraining
+from train.detector.module import DetectorTraining
 from train.detector.precision import Centres, score_range
 from train.detector.predict import find, offset_poses, pose_rmse, true_centres
+from train.detector.settings import ARMS, Arm, Experiment, experiment_of, experiment_parser
 
 RANGES = ((5.0, 53.0), (5.0, 20.0), (20.0, 35.0), (35.0, 53.0))
 """m ahead; the first is all of it."""
@@ -43,7 +36,7 @@ def trained(experiment: Experiment, arm: Arm, seed: int, frames: DriveFrames) ->
         ValueError: "tuned" before "online".
     """
     L.seed_everything(seed, verbose=False)
-    module, steps = new_module(experiment, arm, seed), int(experiment.steps)
+    module, steps = DetectorTraining(experiment, arm, seed), int(experiment.steps)
     last = begun_checkpoint(experiment, arm, seed)
     begin = 0 if last is None else checkpoint_step(last)
     batches = StepBatches(len(frames), experiment.batch_size, steps, seed, begin)

@@ -13,10 +13,11 @@ from torch import Tensor
 
 from lanebev.types import Extrinsics
 from train.commands import one_line_errors
-from train.detector.experiment import experiment_of, experiment_parser, trained_arm
+from train.detector.arms import trained_arm
 from train.detector.frames import DriveFrames
 from train.detector.module import DetectorTraining
 from train.detector.predict import TOGETHER
+from train.detector.settings import experiment_of, experiment_parser
 from train.detector.targets import detection_loss
 
 QUANTITIES = ("pitch", "yaw", "roll", "height")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, get_args
+from typing import Any
 
 import lightning as L
 import torch
@@ -11,14 +11,12 @@ from torch import Tensor
 
 from lanebev.pipeline import LaneBEV
 from lanebev.types import Extrinsics
-from lanebev.view.grid import BEVGrid
 from train.detector.drives import NOMINAL
 from train.detector.frames import Frames, mirrored
 from train.detector.network import VehicleDetector
+from train.detector.settings import Arm, Experiment
 from train.detector.targets import detection_loss
 
-Arm = Literal["nominal", "noisy", "online", "tuned", "true"]
-ARMS: tuple[Arm, ...] = get_args(Arm)
 NOISE = (math.radians(0.75), math.radians(0.75), math.radians(0.75), 0.03)
 """Standard deviations of the noise on pitch, yaw, roll and height of the arm ``noisy``."""
 
@@ -44,46 +42,25 @@ class DetectorTraining(L.LightningModule):
     """Training of a :class:`VehicleDetector` with one arm's poses.
 
     Args:
+        experiment: the settings.
         arm: see :func:`arm_poses`; "tuned" trains the lane network too, by the detector's loss alone, and
             must continue a training of "online".
-        grid: grid of the bird's-eye view.
-        width: channels of the image features.
-        bev_width: channels of the bird's-eye features.
-        top: px of the image above which nothing is used.
-        learning_rate: the detector's largest, see :func:`one_cycle`.
-        lane_rate: the lane network's largest, of a cycle of its own over the ``tuned_steps``.
-        steps: number of steps of the training.
-        tuned_steps: the last steps, which train the lane network of "tuned".
-        network_width: px of the lane network's input.
-        fps: frame rate of the drives.
         seed: seed of the mirroring and of the noise.
     """
 
-    def __init__(
-        self,
-        arm: Arm,
-        grid: BEVGrid,
-        width: int = 32,
-        bev_width: int = 48,
-        top: int = 96,
-        learning_rate: float = 3e-3,
-        lane_rate: float = 1e-4,
-        steps: int = 6000,
-        tuned_steps: int = 600,
-        network_width: int | None = None,
-        fps: float = 10.0,
-        seed: int = 1,
-    ) -> None:
+    def __init__(self, experiment: Experiment, arm: Arm, seed: int) -> None:
         super().__init__()
-        self.arm, self.grid = arm, grid
-        self.fps, self.seed = fps, seed
-        self.learning_rate = float(learning_rate)  # a plain number, which a checkpoint may hold
-        self.lane_rate = float(lane_rate)
-        self.steps, self.tuned_steps = int(steps), int(tuned_steps)
-        self.detector = VehicleDetector(grid, width, bev_width, top)
+        self.arm, self.grid = arm, experiment.grid
+        self.fps, self.seed = experiment.fps, seed
+        self.learning_rate = float(experiment.learning_rate)  # a plain number, which a checkpoint may hold
+        self.lane_rate = float(experiment.lane_rate)
+        self.steps, self.tuned_steps = int(experiment.steps), int(experiment.tuned_steps)
+        self.detector = VehicleDetector(
+            experiment.grid, experiment.width, experiment.bev_width, experiment.top
+        )
         self.lanes: LaneBEV | None = None
         if arm == "tuned":
-            self.lanes = LaneBEV.from_pretrained(network_width=network_width)
+            self.lanes = LaneBEV.from_pretrained(network_width=experiment.network_width)
 
     def training_step(self, batch: Frames, batch_idx: int) -> Tensor:
         """Find the boxes of a batch by the arm's poses, in half of the steps mirrored."""

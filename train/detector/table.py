@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from train.commands import one_line_errors
-from train.detector.module import ARMS
 from train.detector.precision import DISTANCES
 from train.detector.predict import AXES, OFFSETS_DEG
+from train.detector.settings import ARMS
 
 NAMES = {
     "nominal": "(a) nominal mount",

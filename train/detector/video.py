@@ -22,10 +22,11 @@ from lanebev.types import Extrinsics
 from lanebev.view.grid import BEVGrid
 from lanebev.view.warp import BEVWarp
 from train.commands import one_line_errors
+from train.detector.arms import test_poses, trained_arm
 from train.detector.boxes import box_corners
-from train.detector.experiment import Experiment, experiment_of, experiment_parser, test_poses, trained_arm
 from train.detector.frames import DriveFrames
 from train.detector.module import DetectorTraining
+from train.detector.settings import Experiment, experiment_of, experiment_parser
 from train.detector.table import NAMES
 from train.detector.targets import decode_boxes
 
