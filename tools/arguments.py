@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from train.commands import command_parser
+
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
@@ -14,7 +16,7 @@ def evaluation_parser(description: str | None) -> argparse.ArgumentParser:
     Args:
         description: docstring of the program, shown as it is.
     """
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(description)
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the data (../shared/data)")
     parser.add_argument("--weights", type=Path, help="other weights than the shipped")
     return parser

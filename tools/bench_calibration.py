@@ -13,7 +13,6 @@ own. The first half second is left out of every figure.
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import json
 import math
@@ -39,7 +38,7 @@ from lanebev.testing.scenarios import SCENARIOS
 from lanebev.types import Status
 from tools.bench_kinds import measure_all
 from tools.textbook_ekf import TextbookEKF
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 
 CALIBRATORS: dict[str, Callable[[], Any]] = {
     "joint": JointCalibrator,
@@ -188,9 +187,7 @@ def speed(calibrator: Any, frames: int = 60) -> dict[str, float]:
 
 @one_line_errors()
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     parser.add_argument("--calibrators", nargs="+", choices=list(CALIBRATORS), default=DEFAULT)
     parser.add_argument("--scenarios", nargs="+", choices=list(SCENARIOS), default=list(SCENARIOS))
     parser.add_argument("--rows", type=PositiveInt, default=32, help="Monte Carlo runs")

@@ -7,7 +7,6 @@ The gain form is Eqs. (15)-(17) as printed, which solves for the N × N innovati
 
 from __future__ import annotations
 
-import argparse
 import json
 import platform
 from pathlib import Path
@@ -18,7 +17,7 @@ from torch import Tensor
 from torch.utils.benchmark import Timer
 
 from lanebev.estimation import kalman
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 
 
 def information_form(
@@ -63,9 +62,7 @@ def measure(rows: int, seconds: float) -> dict[str, float]:
 
 @one_line_errors()
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     parser.add_argument("--rows", type=PositiveInt, nargs="+", default=[60, 180, 408, 816])
     parser.add_argument("--seconds", type=PositiveFloat, default=1.0, help="seconds per measurement")
     parser.add_argument("--out", type=Path, default=Path("out/bench_filter.json"))

@@ -34,7 +34,7 @@ from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.pipeline import LaneBEV
 from lanebev.weights import load_segmenter
 from tools.real_figures import tusimple_pixels
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 from train.drives import observe_drive
 from train.evaluate_poses import AXES
 from train.evaluate_roads import evaluate
@@ -108,7 +108,7 @@ def figures(network: Any, options: argparse.Namespace) -> dict[str, float]:
 @one_line_errors()
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("--views", type=PositiveInt, default=64, help="number of views")
     parser.add_argument("--drives", type=PositiveInt, default=4, help="number of drives")
     parser.add_argument("--frames", type=PositiveInt, default=60, help="frames per drive")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import resource
 import tempfile
 import time
@@ -14,12 +13,13 @@ from lanebev.app.storage import StoredNumbers, StoredRows
 from lanebev.io.results import ExtrinsicsRow, write_extrinsics
 from lanebev.report.page import Report, write_report
 from lanebev.types import NUM_BOUNDARIES
+from train.commands import command_parser
 
 FPS, MEGA = 30, 2**20
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = command_parser(__doc__)
     parser.add_argument("--frames", type=int, default=200_000)
     frames = parser.parse_args().frames
     before, random = resident(), np.random.default_rng(0)

@@ -10,7 +10,6 @@ the run's time is its processor time by the number of cores.
 
 from __future__ import annotations
 
-import argparse
 import cProfile
 import json
 import pstats
@@ -28,7 +27,7 @@ from lanebev.app.run import run
 from lanebev.io.video_writer import VideoWriter
 from lanebev.render import Drive
 from lanebev.weights import load_segmenter
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 
 SIZE, FPS, RENDERED = (720, 1280), 20, 8
 
@@ -74,7 +73,7 @@ def _since(begin: tuple[float, float]) -> tuple[float, float]:
 @one_line_errors()
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("--frames", type=PositiveInt, default=60)
     parser.add_argument("--json", type=Path, help="file for the results as JSON")
     parser.add_argument("--profile", action="store_true", help="print where the main thread spends its time")

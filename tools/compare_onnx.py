@@ -31,6 +31,7 @@ from lanebev.io.results import ExtrinsicsRow, read_extrinsics
 from lanebev.io.video import open_source
 from lanebev.observation.frames import check_frame, network_image
 from lanebev.pipeline import LaneBEV
+from train.commands import command_parser
 
 LEVEL = 1 / 255
 
@@ -143,7 +144,7 @@ def export_missing(options: argparse.Namespace) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("video")
     parser.add_argument("--camera", required=True)
     parser.add_argument("--exported", type=Path, default=Path("lanebev-export"), metavar="DIR")

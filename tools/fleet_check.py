@@ -28,6 +28,7 @@ from lanebev.app.demo import write_drive
 from lanebev.app.fleet.manifest import read_manifest
 from lanebev.app.run import run
 from lanebev.render import Drive
+from train.commands import command_parser
 
 IMAGE_SIZE, FPS = (96, 160), 20
 COMPARED = ("extrinsics.csv", "covariance.csv", "lanes.json", "calibration.yaml")
@@ -36,7 +37,7 @@ PATIENCE = 600.0  # s
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = command_parser(__doc__)
     parser.add_argument("--drives", type=int, default=40)
     parser.add_argument("--frames", type=int, default=20, help="frames per drive (%(default)s)")
     parser.add_argument(

@@ -8,7 +8,6 @@ are rendered ones, of a road with traffic, or those of ``--video``.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -28,6 +27,7 @@ from lanebev.app.run import run
 from lanebev.app.shared_network import SharedNetwork
 from lanebev.numbers import parse_size
 from lanebev.render import Drive
+from train.commands import command_parser
 
 _OUTPUTS = ("lanes.json", "extrinsics.csv", "covariance.csv", "frames.parquet", "bev.mp4", "overlay.mp4")
 
@@ -113,7 +113,7 @@ def _cpu_since(begin: os.times_result) -> float:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, plan, print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = command_parser(__doc__)
     parser.add_argument("--hours", type=float, default=1e5, help="hours of video (%(default)g)")
     parser.add_argument("--fps", type=float, nargs="+", default=[30.0, 10.0], help="frame rates (30 10)")
     parser.add_argument("--cores", type=int, default=1000, help="number of cores (%(default)s)")

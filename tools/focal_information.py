@@ -10,7 +10,6 @@ how much the estimate would be off if the road's crossfall changed by 1 % over 1
 
 from __future__ import annotations
 
-import argparse
 import math
 from typing import NamedTuple
 
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.testing.moments import CAMERA, IMAGE, PLACES
+from train.commands import command_parser
 
 RADII = (math.inf, 3000.0, 1000.0, 300.0, 150.0, 60.0)
 POSE = (0.03, 0.02, 0.01, 1.5, 0.2)  # pitch, yaw, roll (rad), height, offset (m)
@@ -85,7 +85,7 @@ def frame_information(radius: float) -> Information:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.parse_args()
     print(f"{'radius':>8} | one frame | a minute | crossfall, crest, wide lane")
     for radius in RADII:

@@ -10,7 +10,6 @@ by order.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import math
 from collections.abc import Sequence
@@ -32,7 +31,7 @@ from lanebev.io.lanes import match_frames, read_lanes
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
 from lanebev.observation.segments import segments_from_lines
 from lanebev.types import NUM_BOUNDARIES
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 
 COLUMNS = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
 
@@ -128,9 +127,7 @@ def plot(table: np.ndarray, estimate: np.ndarray | None, path: Path) -> None:
 
 @one_line_errors()
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     parser.add_argument("lanes", type=Path, help="TuSimple JSON lines, CULane .lines.txt or OpenLane JSON")
     parser.add_argument("--camera", type=Path, required=True)
     parser.add_argument("--lane-width", type=PositiveFloat, default=3.7, help="lane width, m")

@@ -5,7 +5,6 @@ python -m tools.readme_picture [--demo out/demo] [--frame 48]
 
 from __future__ import annotations
 
-import argparse
 import itertools
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from lanebev import BEVGrid, Camera
 from lanebev.app.views import bird_view
 from lanebev.io.results import poses_of, read_extrinsics
 from lanebev.io.video import open_source
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "assets" / "before_after.jpg"
 GRID = BEVGrid(x=(-10.0, 10.0), z=(5.0, 40.0), resolution=35 / 360)
@@ -35,9 +34,7 @@ def side_by_side(titled: list[tuple[str, Image.Image]], gap: int = 8, bar: int =
 
 @one_line_errors()
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     parser.add_argument("--demo", type=Path, default=Path("out/demo"), help="output folder of lanebev demo")
     parser.add_argument("--frame", type=int, default=48, help="number of the frame to show")
     parser.add_argument("--out", type=Path, default=OUT)

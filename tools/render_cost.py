@@ -13,7 +13,6 @@ longest, and how often memory is allocated. If it computes nearly all the time, 
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import torch
@@ -24,6 +23,7 @@ from lanebev.render import WindowConfig
 from lanebev.render.scene.world import Scene
 from lanebev.render.views import render_scenes, sample_scene
 from tools.other_device import ELSEWHERE, other_device
+from train.commands import command_parser
 
 TINY = (16, 24)
 FEW = 16  # views, whose operations take the host as long as those of many
@@ -102,7 +102,7 @@ def on_gpu(views: int, size: tuple[int, int], repeats: int) -> None:
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("--views", type=PositiveInt, nargs="+", default=(64, 512, 1024))
     parser.add_argument("--size", type=int, nargs=2, default=(320, 576), metavar=("HEIGHT", "WIDTH"))
     parser.add_argument("--bytes", type=int, default=0, metavar="VIEWS", help="count bytes of so many views")

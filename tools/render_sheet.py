@@ -5,7 +5,6 @@ python tools/render_sheet.py --out sheet.png [--count 100] [--kind city] [--real
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from lanebev.geometry.lens import distort_points
 from lanebev.render import RenderedFrame, render_views
 from lanebev.render.scene.kinds import KINDS
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 
 COLOURS = [(255, 80, 80), (255, 160, 0), (60, 220, 60), (60, 200, 255), (120, 120, 255), (255, 90, 255)]
 
@@ -46,7 +45,7 @@ def real_frames(folder: Path, count: int, size: tuple[int, int]) -> list[np.ndar
 
 @one_line_errors()
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = command_parser(__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--count", type=PositiveInt, default=100)
     parser.add_argument("--columns", type=PositiveInt, default=10)

@@ -8,7 +8,6 @@ table1.json and table1.png (estimate against truth).
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import platform
@@ -20,14 +19,14 @@ from typing import Any
 import torch
 from jsonargparse.typing import PositiveInt
 
-import lanebev
+from lanebev.app.build import make_calibrator
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.smoother import smooth_drive
 from lanebev.estimation.kalman import symmetrise
 from lanebev.testing.experiment import Experiment, frames
 from lanebev.types import Status
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 
 VARIANCES = (0.5, 1.0, 2.0, 4.0, 9.0)
 PAPER = {  # Table I: pitch, yaw, roll in degrees, height in centimetres
@@ -39,14 +38,6 @@ PAPER = {  # Table I: pitch, yaw, roll in degrees, height in centimetres
 }
 UNITS = torch.tensor([180 / math.pi] * 3 + [100.0], dtype=torch.float64)
 NAMES = ("pitch", "yaw", "roll", "height")
-
-
-def calibrator_named(name: str) -> Calibrator[Any]:
-    """Return a calibrator with its default settings."""
-    calibrator: Calibrator[Any] = (
-        lanebev.JointCalibrator() if name == "joint" else lanebev.TwoStageCalibrator()
-    )
-    return calibrator
 
 
 def run(
@@ -163,9 +154,7 @@ def plot(result: dict[str, torch.Tensor], exp: Experiment, path: Path) -> None:
 
 @one_line_errors()
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     parser.add_argument("--calibrator", choices=("two-stage", "joint"), default="two-stage")
     parser.add_argument(
         "--smooth", action="store_true", help="estimate every pose from all frames; joint only"
@@ -197,7 +186,7 @@ def main() -> None:
     for per_boundary in args.segments:
         exp = replace(Experiment(), segments_per_boundary=per_boundary, num_frames=args.frames)
         began = time.perf_counter()
-        result = run(calibrator_named(args.calibrator), exp, args.runs, dtype, args.seed, args.smooth)
+        result = run(make_calibrator(args.calibrator), exp, args.runs, dtype, args.seed, args.smooth)
         rows = table(result)
         seconds = time.perf_counter() - began
         show(

@@ -17,7 +17,6 @@ Prints the figures, problems, and at the end all of it as a line of JSON.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import re
@@ -39,6 +38,7 @@ from numpy.typing import NDArray
 
 from lanebev.io.results import read_extrinsics
 from lanebev.numbers import parse_size
+from train.commands import command_parser
 
 _BOUNDARY = "frame"
 _WARM_UP = 30.0  # s, in which buffers fill; memory is compared from then on
@@ -160,7 +160,7 @@ def resident_mib(process: int) -> float:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Play the stream, run on it, print; return 1 if a figure is out of bounds."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = command_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--fps", type=float, default=30.0)
     parser.add_argument(

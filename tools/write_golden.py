@@ -9,7 +9,6 @@ noise of 1 px. References: ``segments.csv``, what the shipped network sees in th
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import csv
 import json
@@ -25,7 +24,7 @@ from PIL import Image
 import lanebev
 from lanebev.cli import main as command
 from lanebev.render import Drive
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 
 FOLDER = Path(__file__).resolve().parents[1] / "tests" / "golden"
 FRAMES, SIZE = 10, (180, 320)
@@ -89,9 +88,7 @@ def write_inputs() -> None:
 
 @one_line_errors()
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     parser.add_argument("--inputs", action="store_true", help="also draw the inputs again")
     args = parser.parse_args()
     FOLDER.mkdir(exist_ok=True)

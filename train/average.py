@@ -7,14 +7,13 @@ The training settings in its file are those of the last network.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import torch
 
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.weights import save_segmenter
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 from train.export import trained_segmenter
 
 
@@ -44,7 +43,7 @@ def average(segmenters: list[LaneSegmenter]) -> LaneSegmenter:
 @one_line_errors()
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("weights", type=Path, nargs="+", help="weights files or checkpoints")
     args = parser.parse_args()

@@ -1,7 +1,8 @@
-"""Error handling that the commands of train and tools share."""
+"""What the commands of train and tools share: their arguments and their errors."""
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,3 +19,9 @@ def one_line_errors() -> Iterator[None]:
     except (ValueError, OSError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
+
+
+def command_parser(description: str | None) -> argparse.ArgumentParser:
+    """Return a parser whose ``--help`` shows a docstring as it is written."""
+    formatter = argparse.RawDescriptionHelpFormatter
+    return argparse.ArgumentParser(description=description, formatter_class=formatter)

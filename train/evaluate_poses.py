@@ -8,7 +8,6 @@ calibrator runs on each drive, and all frames after its warm-up count. For every
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from pathlib import Path
@@ -24,7 +23,7 @@ from torch import Tensor
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.render import Drive
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 from train.drives import WARM_UP, observe_drive, run_calibrator
 from train.export import trained_segmenter
 from train.poses import fit_poses
@@ -119,7 +118,7 @@ def summary(error: Tensor, counted: Tensor) -> dict[str, Any]:
 @one_line_errors()
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("weights", type=Path, nargs="+")
     parser.add_argument("--drives", type=PositiveInt, default=12)
     parser.add_argument(

@@ -10,7 +10,6 @@ On held-out rendered views, by boundary, distance ahead, kind of road
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import math
@@ -30,7 +29,7 @@ from lanebev.geometry.road import road_from_image_points
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.render import RenderedFrame, render_views
 from lanebev.render.scene.kinds import KINDS
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 from train.export import trained_segmenter
 from train.labels import ViewConfig
 from train.maps import boundaries_as_taken, label_maps
@@ -179,7 +178,7 @@ def records(total: dict[tuple[str, str], Sums]) -> list[dict[str, str | float]]:
 @one_line_errors()
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("weights", type=Path)
     parser.add_argument(
         "--views", type=PositiveInt, default=64, help="number of views, all kinds together (about)"

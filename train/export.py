@@ -5,7 +5,6 @@ A weights file, such as one of ``train.average``, may be given too, to change it
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import pickle
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from lanebev.observation.segmenter import LaneSegmenter
 from lanebev.weights import load_segmenter, read_metadata, save_segmenter, segmenter_config
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 from train.losses import unweighted_bias
 
 
@@ -184,7 +183,7 @@ def export(
 @one_line_errors()
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = command_parser(__doc__)
     parser.add_argument("checkpoint", type=Path, help="checkpoint or weights file")
     parser.add_argument("out", type=Path)
     parser.add_argument("--seed", type=int, required=True)

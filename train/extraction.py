@@ -6,7 +6,6 @@ the standard deviations they come with.
 
 from __future__ import annotations
 
-import argparse
 import json
 from typing import NamedTuple
 
@@ -17,7 +16,7 @@ from torch import Tensor
 from lanebev.observation.lines import extract_segments
 from lanebev.observation.vertices import LineConfig
 from lanebev.render import RenderedFrame, boundary_masks, render_views
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 from train.maps import boundaries_as_taken
 
 
@@ -81,7 +80,7 @@ def join(errors: list[ExtractionError]) -> ExtractionError:
 @one_line_errors()
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = command_parser(__doc__)
     parser.add_argument("--frames", type=PositiveInt, default=64)
     parser.add_argument("--size", type=int, nargs=2, default=(144, 256), metavar=("HEIGHT", "WIDTH"))
     parser.add_argument("--seed", type=int, default=0)

@@ -16,7 +16,6 @@ continues; if there is time, measure that of the final weights with ``python -m 
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -33,7 +32,7 @@ import torch
 from jsonargparse.typing import PositiveFloat, PositiveInt
 
 from lanebev.io.whole_file import whole_file
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 from train.evaluate_roads import HELD_OUT_SEED, OWN_KINDS, evaluate, records
 from train.export import checkout_commit, export, trained_segmenter
 from train.processes import Measurement, Training
@@ -149,7 +148,7 @@ def held_out_recall(weights: Path, views: int, until: float) -> list[dict[str, A
 @one_line_errors()
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("--minutes", type=PositiveFloat, default=9.0, help="duration of the whole command")
     parser.add_argument("--out", type=Path, required=True, help="output folder")
     parser.add_argument("--work", type=Path, help="folder of the checkpoints (default: a temporary one)")

@@ -9,7 +9,6 @@ square root of the remaining NEES is the factor on the pose's sigmas, ``--pose-s
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from collections.abc import Callable, Iterable
@@ -23,7 +22,7 @@ from jsonargparse.typing import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from lanebev.estimation.joint.config import HILLY_ROADS, JointConfig
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 from train.drives import DriveObservations, observe_drive, run_calibrator
 from train.evaluate_poses import AXES
 from train.export import trained_segmenter
@@ -81,7 +80,7 @@ def _observe_one(weights: Path, frames: int, fps: float, seed: int) -> DriveObse
 @one_line_errors()
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("weights", type=Path)
     parser.add_argument("--drives", type=PositiveInt, default=12)
     parser.add_argument("--frames", type=PositiveInt, default=90, help="frames per drive")

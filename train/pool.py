@@ -6,7 +6,6 @@ costs about as much as training on a view, and several views can be drawn from e
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +19,7 @@ from jsonargparse.typing import PositiveInt
 from lanebev.geometry.vanishing_point import vanishing_point
 from lanebev.render import RenderedFrame, render_views
 from train.archives import as_bytes, decode_jpeg, encode_jpegs, read_arrays, write_arrays
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 from train.labels import LabelledImage
 from train.maps import boundaries_as_taken
 
@@ -134,7 +133,7 @@ def shard_size(path: Path) -> int:
 @one_line_errors()
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--shards", type=PositiveInt, default=10)
     parser.add_argument("--frames", type=PositiveInt, default=64, help="frames per shard")

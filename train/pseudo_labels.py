@@ -10,7 +10,6 @@ Source: self-training with pseudo-labels (Lee 2013) made consistent over time.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from collections.abc import Iterator
@@ -36,7 +35,7 @@ from lanebev.observation.segments import segments_from_lines
 from lanebev.report.lane_curves import curves_on_rows
 from lanebev.report.run_folder import read_run
 from lanebev.types import Extrinsics
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 
 SUPPORT = 1.0  # sum of segments' weights that a boundary needs in a frame
 REACH = 60.0  # m ahead that a boundary is drawn at least
@@ -190,7 +189,7 @@ def write_entry(out: Path, frame: Frame, x: NDArray[np.float64]) -> dict[str, ob
 @one_line_errors()
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("result", type=Path, help="output folder of lanebev run")
     parser.add_argument("source", help="video or images of that run")
     parser.add_argument("out", type=Path, help="new folder of the data")

@@ -7,7 +7,6 @@ sheet of labelled views. A batch that does not fit in memory is reported and ski
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from functools import partial
@@ -19,7 +18,7 @@ from jsonargparse.typing import PositiveInt
 
 from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.render import WindowConfig
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 from train.labels import ViewConfig
 from train.module import Segmentation, unpack
 from train.rendering import labelled, rendered
@@ -65,7 +64,7 @@ def _wait(device: torch.device) -> None:
 @one_line_errors()
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("--out", type=Path, required=True, help="output folder")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--size", type=int, nargs=2, default=(320, 576), metavar=("HEIGHT", "WIDTH"))

@@ -22,7 +22,6 @@ clock's: of one thread, and for a machine that others use too.
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
 
@@ -31,14 +30,12 @@ import torch
 from jsonargparse.typing import PositiveFloat, PositiveInt
 
 from tools.bench_speed.parts import GROWTHS, TABLES, run
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 
 
 @one_line_errors()
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     every = [*TABLES, *GROWTHS]
     default = [part for part in every if not part.startswith("compiled")]
     parser.add_argument("--parts", nargs="+", choices=every, default=default)

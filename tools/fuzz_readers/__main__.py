@@ -9,7 +9,6 @@ seconds are faults: each kind is printed once, and kept with ``--keep``. Exit st
 
 from __future__ import annotations
 
-import argparse
 import random
 import signal
 import sys
@@ -24,6 +23,7 @@ from pathlib import Path
 
 from tools.fuzz_readers.mutations import mutated
 from tools.fuzz_readers.readers import Reader, readers
+from train.commands import command_parser
 
 LONGEST_MESSAGE = 500
 
@@ -69,7 +69,7 @@ def fault(reader: Reader, data: bytes, folder: Path, limit: float = 10.0) -> str
 def main() -> int:
     """Read mutated files and print each kind of fault once."""
     known = readers()
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
+    parser = command_parser(__doc__)
     parser.add_argument("--count", type=int, default=20_000, help="number of inputs (%(default)s)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--limit", type=float, default=10.0, help="time limit per input, s (%(default)s)")

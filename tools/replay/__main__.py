@@ -8,7 +8,6 @@ Say in the commit why they moved. Exit status 1 where something differs and noth
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Mapping, Sequence
 
@@ -29,14 +28,12 @@ from tools.replay.check import (
 from tools.replay.figures import after_shock, as_track, figures, markdown
 from tools.replay.kinds import KINDS
 from tools.replay.references import Difference, Row, write_rows
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 
 
 @one_line_errors()
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     parser.add_argument("kinds", nargs="*", metavar="KIND", help="kinds to replay (default: all)")
     parser.add_argument("--write", action="store_true", help="write the references that differ")
     args = parser.parse_args(arguments)

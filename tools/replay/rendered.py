@@ -8,7 +8,6 @@ only: another renderer or other weights change nothing until they are written.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ from lanebev.testing.motions import Motion, Pose, fall, landing_time, moved
 from lanebev.types import Extrinsics
 from tools.replay.kinds import FRAMES, KNOCK
 from tools.replay.recording import Recording
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 
 DRIVES = Path(__file__).resolve().parents[2] / "tests" / "replay" / "drives"
 FPS = 20.0
@@ -157,9 +156,7 @@ def load(name: str) -> Recording:
 
 @one_line_errors()
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="drives to render (default: all)")
     args = parser.parse_args(arguments)
     unknown = sorted(set(args.names) - set(RENDERED))

@@ -7,7 +7,6 @@ calibration follows the elevation.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lanebev.render.scene.alignment import elevation_at
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 from train.detector.drives import GRID, NOMINAL, WARM_UP, ShakingDrive
 from train.detector.frames import DriveFrames
 
@@ -55,7 +54,7 @@ def summary(elevation: Tensor, pitch_error: Tensor) -> list[list[float]]:
 @one_line_errors()
 def main(args: list[str] | None = None) -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("drives", type=Path, help="folder of files of train.detector.drives")
     parser.add_argument("--fps", type=float, default=10.0, help="frames per second of the drives")
     given = parser.parse_args(args)

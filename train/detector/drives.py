@@ -6,7 +6,6 @@ online calibration on those images. Existing files are not rendered again.
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from pathlib import Path
@@ -26,7 +25,7 @@ from lanebev.render.scene.sampler import BatchSampler
 from lanebev.types import Extrinsics
 from lanebev.view.grid import BEVGrid
 from train.archives import as_bytes, decode_jpeg, encode_jpegs, read_arrays, write_arrays
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 from train.detector.boxes import in_grid, visible_share
 
 NOMINAL = (math.radians(2.0), 0.0, 0.0, 1.5)
@@ -189,7 +188,7 @@ def read_drive(path: Path) -> DriveRecord:
 @one_line_errors()
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--drives", type=PositiveInt, default=160)
     parser.add_argument("--frames", type=PositiveInt, default=12, help="frames per drive")

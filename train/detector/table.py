@@ -5,7 +5,6 @@ Means over seeds, and the standard deviation between them.
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from train.commands import one_line_errors
+from train.commands import command_parser, one_line_errors
 from train.detector.precision import DISTANCES
 from train.detector.predict import AXES, OFFSETS_DEG
 from train.detector.settings import ARMS
@@ -138,7 +137,7 @@ def plot_offsets(true: list[dict[str, Any]], path: Path) -> None:
 @one_line_errors()
 def main(args: list[str] | None = None) -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = command_parser(__doc__)
     parser.add_argument("run", type=Path, help="folder of results")
     parser.add_argument("--plot", type=Path, help="file for the plot of AP by angle")
     given = parser.parse_args(args)
