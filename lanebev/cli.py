@@ -8,7 +8,6 @@ import logging
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -17,6 +16,7 @@ from lanebev.app.config import RunConfig
 from lanebev.app.export_config import ExportConfig
 from lanebev.app.progress import Item, Progress
 from lanebev.app.settings_file import read_settings
+from lanebev.app.signals import handlers_kept
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -62,25 +62,17 @@ def _signals_unwind(received: list[int]) -> Iterator[None]:
     Args:
         received: numbers of the signals are added to it, since Ray raises an exception of its own instead.
     """
-    known = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = {each: signal.getsignal(each) for each in known}
-    default = (signal.SIG_DFL, signal.default_int_handler)
-    own = [each for each, handler in before.items() if handler in default]  # not what nohup ignores
-    if threading.current_thread() is not threading.main_thread():
-        own = []  # Python lets no other thread set them
 
     def stop(number: int, _: object) -> None:
         received.append(number)
         if len(received) != 2:  # the first may have been swallowed, or what it undoes may hang
             raise KeyboardInterrupt
 
-    for each in own:
-        signal.signal(each, stop)
-    try:
+    with handlers_kept() as before:
+        for number, handler in before.items():
+            if handler in (signal.SIG_DFL, signal.default_int_handler):  # not what nohup ignores
+                signal.signal(number, stop)
         yield
-    finally:
-        for each in own:
-            signal.signal(each, before[each])
 
 
 def _run(options: dict[str, Any]) -> str:

@@ -9,5 +9,5 @@
   ``smoothing`` in two passes, ``part_observation`` of long videos.
 - Remarks: ``plausibility`` of the result, ``repeats`` of frames, ``view_changes``, ``source_changes``.
 - Other commands: ``demo``, ``compare``, ``convert``, ``doctor``, ``export``, ``fleet``.
-- ``concurrency`` and ``progress`` serve all of them.
+- ``concurrency``, ``signals`` and ``progress`` serve all of them.
 """

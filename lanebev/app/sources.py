@@ -6,7 +6,6 @@ import contextlib
 import math
 import re
 import signal
-import threading
 from collections.abc import Generator, Iterator
 from dataclasses import replace
 from fractions import Fraction
@@ -19,6 +18,7 @@ from lanebev.app.build import make_camera
 from lanebev.app.concurrency import map_ahead, prefetch
 from lanebev.app.config import RunConfig, rate_as_fraction
 from lanebev.app.observers import Observation, Observer
+from lanebev.app.signals import handlers_kept
 from lanebev.camera.model import Camera
 from lanebev.io.bags import BagSource, open_bag_source
 from lanebev.io.frame_source import FrameSource
@@ -131,21 +131,14 @@ def ended_by_signals(source: FrameSource) -> Iterator[None]:
 
     Other sources, and threads other than the main one, are left as they are.
     """
-    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    if not isinstance(source, LiveSource) or threading.current_thread() is not threading.main_thread():
-        numbers = []
-    before = {number: signal.getsignal(number) for number in numbers}
+    with handlers_kept() as before:
 
-    def stop(number: int, frame: FrameType | None) -> None:
-        source.stop()  # type: ignore[attr-defined]  # no signal is taken of another
-        for each, handler in before.items():
-            signal.signal(each, handler)
+        def stop(number: int, frame: FrameType | None) -> None:
+            source.stop()  # type: ignore[attr-defined]  # no signal is taken of another
+            for each, handler in before.items():
+                signal.signal(each, handler)
 
-    for number, handler in before.items():
-        if handler is not signal.SIG_IGN:  # nohup's
-            signal.signal(number, stop)
-    try:
-        yield
-    finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if isinstance(source, LiveSource) and handler is not signal.SIG_IGN:  # nohup's
+                signal.signal(number, stop)
+        yield

@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import signal
-import threading
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,6 +15,7 @@ from lanebev.app.build import needs_network
 from lanebev.app.fleet.plan import Outcome, Task, write_mark
 from lanebev.app.fleet.schedule import Schedule
 from lanebev.app.fleet.worker import run_tasks
+from lanebev.app.signals import handlers_kept
 
 _IN_FLIGHT = 4  # tasks a core that Ray knows of at a time
 _STORE = 80 * 2**20  # bytes of shared memory: results are a few numbers
@@ -163,7 +162,7 @@ def _started(cluster: Cluster) -> ModuleType:
             "object_store_memory": _STORE,
         }
     try:
-        with _signal_handlers_kept():
+        with handlers_kept():  # by Ray's own handler SIGTERM aborts with a dump of the stack
             ray.init(
                 address=cluster.address or "local",
                 logging_level=logging.ERROR,
@@ -178,16 +177,3 @@ def _started(cluster: Cluster) -> ModuleType:
         ) from error
     module: ModuleType = ray
     return module
-
-
-@contextlib.contextmanager
-def _signal_handlers_kept() -> Iterator[None]:
-    """Set the handlers of signals again afterwards: by Ray's own, SIGTERM aborts with a dump of the stack."""
-    names = ("SIGINT", "SIGTERM", "SIGHUP")
-    own = {number: signal.getsignal(number) for name in names if (number := getattr(signal, name, None))}
-    try:
-        yield
-    finally:
-        if threading.current_thread() is threading.main_thread():  # Python lets no other thread set them
-            for number, handler in own.items():
-                signal.signal(number, handler)
