@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from types import FrameType
+
+Handler = Callable[[int, FrameType | None], object] | int
 
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has not all of them
 
 
 @contextmanager
-def handlers_kept() -> Iterator[dict[int, Any]]:
+def handlers_kept() -> Iterator[dict[int, Handler]]:
     """Set the handlers of SIGINT, SIGTERM and SIGHUP again after a block, which is given them by signal.
 
     It is given none in a thread other than the main one, since Python lets no other thread set handlers.
