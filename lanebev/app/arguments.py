@@ -47,7 +47,14 @@ _LONGEST = 300  # characters of an error, in which a glob without quotes has all
 
 
 class _Parser(argparse.ArgumentParser):
-    """Reports an error in one line."""
+    """Reports an error in one line, that names the command to ask for help."""
+
+    def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]  # of typeshed: three
+        """Parse the arguments; what no option of a command takes is an error of this command."""
+        parsed, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return parsed, unknown
 
     def error(self, message: str) -> NoReturn:
         remedy = ""

@@ -55,7 +55,7 @@ def test_bad_input_is_one_line_and_status_2(data, tmp_path, capsys):
     fails(capsys, ["run", tmp_path / "none.mp4", "--camera", camera], "none.mp4", "nothing there")
     fails(capsys, ["run", data / "images"], "--camera")
     fails(capsys, [], "demo", "run", "--help")
-    fails(capsys, [*good, "--lane-widht", "3"], "unrecognized arguments: --lane-widht")
+    fails(capsys, [*good, "--lane-widht", "3"], "--lane-widht 3; see lanebev run --help")
     fails(capsys, [*good, "b.jpg", "c.jpg"], "unrecognized arguments: b.jpg c.jpg; a glob needs quotes")
     fails(capsys, [*good, *[f"{i:05d}.jpg" for i in range(3000)]], " …; a glob needs quotes; see lan")
     fails(capsys, [*good, "--lane-width", "wide"], "invalid float value: 'wide'")
