@@ -97,6 +97,10 @@ class Status(IntEnum):
     LOST = 3
 
 
+AXES = ("pitch", "yaw", "roll", "height")
+"""Names of the fields of :class:`Extrinsics`, in the order of every pose and covariance."""
+
+
 @register_pytree
 class Extrinsics(NamedTuple):
     """Camera pose over the road, each (B,): rad, rad, rad, m; always in this order.

@@ -24,8 +24,9 @@ from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.smoother import smooth_drive
 from lanebev.estimation.kalman import symmetrise
+from lanebev.testing.evaluation import UNITS
 from lanebev.testing.experiment import Experiment, frames
-from lanebev.types import Status
+from lanebev.types import AXES, Status
 from train.commands import command_parser, one_line_errors
 
 VARIANCES = (0.5, 1.0, 2.0, 4.0, 9.0)
@@ -36,8 +37,6 @@ PAPER = {  # Table I: pitch, yaw, roll in degrees, height in centimetres
     4.0: (0.056, 0.120, 0.090, 1.03),
     9.0: (0.060, 0.141, 0.114, 1.40),
 }
-UNITS = torch.tensor([180 / math.pi] * 3 + [100.0], dtype=torch.float64)
-NAMES = ("pitch", "yaw", "roll", "height")
 
 
 def run(
@@ -113,7 +112,7 @@ def show(rows: list[dict[str, object]], title: str) -> None:
     print(f"\n{title}")
     print(
         f"{'σ²':>4} | "
-        + " | ".join(f"{n + ' paper':>12} {'here':>7} {'bound':>7}" for n in NAMES)
+        + " | ".join(f"{n + ' paper':>12} {'here':>7} {'bound':>7}" for n in AXES)
         + " | NEES/dof"
     )
     for row in rows:
@@ -134,7 +133,7 @@ def plot(result: dict[str, torch.Tensor], exp: Experiment, path: Path) -> None:
 
     t = torch.arange(exp.num_frames) / exp.fps
     figure, axes = plt.subplots(4, 2, figsize=(13, 9), sharex=True, gridspec_kw={"width_ratios": [3, 2]})
-    for k, name in enumerate(NAMES):
+    for k, name in enumerate(AXES):
         unit = "cm" if name == "height" else "deg"
         for index, colour in ((-1, "tab:orange"), (1, "tab:blue")):
             label = f"σ² = {VARIANCES[index]:g}"

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lanebev.camera.model import Camera
 from lanebev.camera.plausibility import field_of_view
 from lanebev.io.results import ExtrinsicsRow
+from lanebev.types import AXES
 
 _POSE = ((-15.0, 25.0), (-8.0, 8.0), (-8.0, 8.0), (0.8, 4.0))  # pitch, yaw, roll (degrees), height (m)
 _SAME_VIEW = 2.0  # degrees, by which fields of view of one camera may differ
@@ -39,8 +40,8 @@ def mount_remark(path: str | None, camera: Camera) -> str:
 
 def pose_words(pose: Sequence[float]) -> list[str]:
     """Return pitch, yaw, roll (degrees) and height (m) with their names and units."""
-    names, units = ("pitch", "yaw", "roll", "height"), (" degrees", " degrees", " degrees", " m")
-    return [f"{name} {value:+.1f}{unit}" for name, value, unit in zip(names, pose, units, strict=True)]
+    units = ("degrees", "degrees", "degrees", "m")
+    return [f"{name} {value:+.1f} {unit}" for name, value, unit in zip(AXES, pose, units, strict=True)]
 
 
 def pose_remark(pose: Sequence[float]) -> str:

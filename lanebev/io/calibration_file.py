@@ -14,10 +14,9 @@ from lanebev.camera.files import camera_info, dump_yaml
 from lanebev.camera.model import Camera
 from lanebev.camera.parsing import parse
 from lanebev.estimation.mount import MountCalibration, MountReason, MountStatus, describe_mount
-from lanebev.estimation.mount.results import AXES
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.numbers import finite_numbers, read_text
-from lanebev.types import Extrinsics
+from lanebev.types import AXES, Extrinsics
 
 ROAD_FROM_VEHICLE = ((0.0, -1.0, 0.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0))
 """Axes of the road (X right, Y down, Z along the lanes) from the vehicle's (x forward, y left, z up)."""

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.numbers import finite_numbers, shown
+from lanebev.types import AXES
 
-AXES = ("pitch", "yaw", "roll", "height")
 PAIRS = tuple(itertools.combinations_with_replacement(range(4), 2))
 COVARIANCE_COLUMNS = ("frame", *(f"{AXES[i]}_{AXES[j]}" for i, j in PAIRS))
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from lanebev.estimation.mount import MountConfig
 from lanebev.io.results import ExtrinsicsRow
+from lanebev.types import AXES
 
-AXES = ("pitch", "yaw", "roll", "height")
 _UNSEEN = {
     "pitch": "DIRECTION_UNSEEN", "yaw": "DIRECTION_UNSEEN", "roll": "ROLL_UNSEEN", "height": "HEIGHT_UNSEEN",
 }  # fmt: skip

@@ -12,13 +12,14 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AXES, AxisState, all_axis_states, estimate_stds, estimates
+from lanebev.report.axis_states import AxisState, all_axis_states, estimate_stds, estimates
 from lanebev.report.figures import bokeh_script
 from lanebev.report.plots import plot_differences, plot_two
 from lanebev.report.run_folder import RunFolder
 from lanebev.report.templates import template
 from lanebev.report.timeline import places_on_axis, shown_frames, strips, ticks
 from lanebev.report.verdict import describe, percent, verdict
+from lanebev.types import AXES
 
 Pair = tuple[ExtrinsicsRow, ExtrinsicsRow]
 _ANGLE, _LENGTH = "{:+.3f}°", "{:+.1f} cm"

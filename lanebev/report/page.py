@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration, MountStatus, describe_mount
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AXES, AxisState, all_axis_states, axis_states, estimate_stds, estimates
+from lanebev.report.axis_states import AxisState, all_axis_states, axis_states, estimate_stds, estimates
 from lanebev.report.figures import bokeh_script
 from lanebev.report.lens_table import lens_table
 from lanebev.report.moments import Jpegs
@@ -25,6 +25,7 @@ from lanebev.report.templates import template
 from lanebev.report.timeline import STATE_WORDS, places_on_axis, shown_frames, strips, ticks
 from lanebev.report.verdict import describe, reason_words, verdict
 from lanebev.report.worst import worst_moments
+from lanebev.types import AXES
 
 _UNITS = ("°", "°", "°", " m")
 _DIGITS = (2, 2, 2, 3)

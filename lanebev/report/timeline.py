@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AXES, AxisState, all_axis_states
+from lanebev.report.axis_states import AxisState, all_axis_states
 from lanebev.report.verdict import reason_words
+from lanebev.types import AXES
 
 STATUSES = ("TRACKING", "COASTING", "LOST", "UNINITIALISED")  # the better first
 STATE_WORDS = {

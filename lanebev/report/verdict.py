@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from lanebev.estimation.reasons import REASON_WORDS, UNSEEN, WHOLE_FRAME, Reason, telling_reasons
 from lanebev.io.results import ExtrinsicsRow
 from lanebev.report.axis_states import (
-    AXES,
     LARGEST_STD,
     AxisState,
     all_axis_states,
     estimate_stds,
 )
+from lanebev.types import AXES
 
 _WORDS = {str(reason.name): words for reason, words in REASON_WORDS.items()}
 _WHOLE_FRAME, _UNSEEN = ([str(reason.name) for reason in some] for some in (WHOLE_FRAME, UNSEEN))

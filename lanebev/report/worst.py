@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AXES
+from lanebev.types import AXES
 
 SETTLING = 1.0  # s after the first tracked frame, in which large sigmas and jumps are a matter of course
 _STATUSES = ("COASTING", "LOST")

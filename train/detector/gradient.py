@@ -11,7 +11,7 @@ import torch
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from lanebev.types import Extrinsics
+from lanebev.types import AXES, Extrinsics
 from train.commands import one_line_errors
 from train.detector.arms import trained_arm
 from train.detector.frames import DriveFrames
@@ -19,8 +19,6 @@ from train.detector.module import DetectorTraining
 from train.detector.predict import TOGETHER
 from train.detector.settings import experiment_of, experiment_parser
 from train.detector.targets import detection_loss
-
-QUANTITIES = ("pitch", "yaw", "roll", "height")
 
 
 def pose_gradients(module: DetectorTraining, frames: DriveFrames) -> Tensor:
@@ -65,8 +63,8 @@ def main(args: list[str] | None = None) -> None:
     for seed in experiment.seeds:
         gradient = pose_gradients(trained_arm(experiment, "online", seed), frames)[with_boxes]
         rows.append([rank_correlation(gradient, error), sign_agreement(gradient, error)])
-    print("| | " + " | ".join(QUANTITIES) + " |")
-    print("|---" * (1 + len(QUANTITIES)) + "|")
+    print("| | " + " | ".join(AXES) + " |")
+    print("|---" * (1 + len(AXES)) + "|")
     for name, values in zip(("rank correlation", "same sign"), np.mean(rows, axis=0), strict=True):
         print(f"| {name} | " + " | ".join(f"{value:.2f}" for value in values) + " |")
 

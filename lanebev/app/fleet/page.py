@@ -16,9 +16,9 @@ from markupsafe import Markup
 from lanebev.app.fleet.manifest import Drive
 from lanebev.app.fleet.mounts import DriveMount, Stretch, days
 from lanebev.app.fleet.plan import DRIVES, Outcome
-from lanebev.report.axis_states import AXES
 from lanebev.report.figures import bokeh_script, finish, new_figure, stacked, value_limits, x_range
 from lanebev.report.templates import template
+from lanebev.types import AXES
 
 _UNITS, _DIGITS = ("°", "°", "°", " m"), (2, 2, 2, 3)
 _SCALE = np.array([180 / math.pi] * 3 + [1.0])

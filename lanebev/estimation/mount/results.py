@@ -10,8 +10,6 @@ from torch import Tensor
 from lanebev.torch_internals import register_pytree
 from lanebev.types import Extrinsics
 
-AXES = ("pitch", "yaw", "roll", "height")
-
 
 class MountStatus(IntEnum):
     """Status of a mount estimate or of one axis.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from lanebev.estimation.mount.config import MountConfig
-from lanebev.estimation.mount.results import AXES, MountCalibration, MountReason, MountStatus
+from lanebev.estimation.mount.results import MountCalibration, MountReason, MountStatus
+from lanebev.types import AXES
 
 _FRAME_REASONS = {
     MountReason.NOT_TRACKING: "no lane boundaries in this frame",
