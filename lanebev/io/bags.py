@@ -107,7 +107,8 @@ def open_bag_source(source: str, topic: str | None = None, fps: Fraction | None 
     steps = [after - before for before, after in pairwise(islice(found.frame_times(clock), _LOOKED_AT))]
     words = f"bag {source}: {clock.unstamped} of its first images have no stamps; they follow as recorded"
     rate = fps or (Fraction(1 / median(steps)).limit_denominator(1000) if steps else found.fps)
-    return replace(found, fps=rate, problem=words if clock.unstamped else "")
+    is_unstamped = clock.unstamped > 1  # times from zero on have one stamp of zero
+    return replace(found, fps=rate, problem=words if is_unstamped else "")
 
 
 def _first_size(bag: Bag, topic: str) -> tuple[int, int] | None:

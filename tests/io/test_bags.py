@@ -306,6 +306,7 @@ def test_an_mcap_of_ours_is_a_source(tmp_path):
     write(tmp_path / "run.mcap", record, images)
     config = RunConfig(str(tmp_path / "run.mcap"), "")
     source = make_source(config)
+    assert source.problem == ""
     shown = [frame.image[..., 0].mean() for frame in source]
     assert shown == pytest.approx([20 * number for number in range(COUNT)], abs=4)
     assert camera_of(config, source).fingerprint() == CAMERA.fingerprint()
