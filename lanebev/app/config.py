@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 
-from lanebev.app.options import check_grid, check_types, option, parse_grid
+from lanebev.app.options import check_grid, check_types, option, parse_grid, parse_rate
 from lanebev.estimation.lane_width_prior import (
     LANE_WIDTH,
     LANE_WIDTH_STD,
@@ -78,7 +78,7 @@ class RunConfig:
         None,
         "frame rate of a folder, a glob or a raw stream (default: from image names that are times, else 30)",
         "HZ",
-        float,
+        parse_rate,
     )
     lanes_size: tuple[int, int] | None = option(
         None, "size of the images that --lanes was drawn on, if not the source's", "WxH", parse_size

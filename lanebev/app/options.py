@@ -33,6 +33,19 @@ def parse_path(text: str) -> str:
     return os.path.expanduser(text)
 
 
+def parse_rate(text: str) -> float:
+    """Return a frame rate of a text such as ``29.97`` or ``30000/1001``.
+
+    Raises:
+        ValueError: the text is neither.
+    """
+    match = re.fullmatch(r"\s*(\d{1,9})\s*/\s*(\d{1,9})\s*", text, re.ASCII)
+    try:
+        return int(match[1]) / int(match[2]) if match else float(text)
+    except (ValueError, ZeroDivisionError) as error:
+        raise ValueError(f"expected a number such as 29.97 or 30000/1001, got {text!r}") from error
+
+
 def parse_grid(text: str) -> tuple[float, float, float, float, float]:
     """Return (near, far, left, right, resolution) in m from a text such as ``3:60,-10:10/0.05``.
 

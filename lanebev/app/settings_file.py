@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping
@@ -63,7 +64,7 @@ def read_settings(path: str | Path) -> dict[str, object]:
     try:
         given = load_plain_yaml(read_text(Path(path)))
     except (ValueError, yaml.YAMLError) as error:
-        reason = "not YAML" if isinstance(error, yaml.YAMLError) else error
+        reason = _not_yaml(error) if isinstance(error, yaml.YAMLError) else error
         raise ValueError(f"config {path}: expected a YAML file of settings, got: {reason}") from error
     if given is None:
         raise ValueError(f"config {path}: expected a YAML file of settings, got none; is it empty?")
@@ -73,6 +74,13 @@ def read_settings(path: str | Path) -> dict[str, object]:
         return parsed_settings(given)
     except ValueError as error:
         raise ValueError(f"config {path}: {error}") from error
+
+
+def _not_yaml(error: yaml.YAMLError) -> str:
+    """Return what is wrong with a text that is no YAML."""
+    mark = getattr(error, "problem_mark", None)
+    remedy = "; write spaces instead of a tab" if "\\t" in str(getattr(error, "problem", "")) else ""
+    return f"not YAML at line {mark.line + 1}{remedy}" if mark else "not YAML"
 
 
 def parsed_settings(given: Mapping[str, object]) -> dict[str, object]:
@@ -86,7 +94,9 @@ def parsed_settings(given: Mapping[str, object]) -> dict[str, object]:
     for key, value in given.items():
         name = str(key).replace("-", "_")
         if name not in known:
-            raise ValueError(f"expected one of {', '.join(known)}, got {key!r}")
+            like = difflib.get_close_matches(name.lower(), known, n=1)
+            asked = f"; is {like[0]} meant?" if like else ""
+            raise ValueError(f"expected one of {', '.join(known)}, got {key!r}{asked}")
         if name in values:
             raise ValueError(f"{key}: expected it once, got it with - and with _")
         try:
@@ -105,6 +115,8 @@ def _parsed(value: object, default: object, parse: Callable[[str], object]) -> o
             expected = "true or false" if isinstance(default, bool) else "a text or number"
             raise ValueError(f"expected {expected}, got {value!r}")
         return value
+    if isinstance(default, tuple) and not default and isinstance(value, list):
+        value = ",".join(map(str, value))  # of names
     if not isinstance(value, (str, int, float)):
         raise ValueError(f"expected a text or number, got {value!r}")
     try:

@@ -118,7 +118,10 @@ def test_settings_are_checked_when_they_are_made(settings, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("lane_widht: 3", "expected one of source, camera, .*, got 'lane_widht'"),
+        ("lane_widht: 3", r"expected one of source, .*, got 'lane_widht'; is lane_width meant\?"),
+        ("every:\t2", "expected a YAML .*, got: not YAML at line 1; write spaces instead of a tab"),
+        ("fps: 10 Hz", "fps: expected a number such as 29.97 or 30000/1001, got '10 Hz'"),
+        ("fps: 10/0", "fps: expected a number such as 29.97 or 30000/1001, got '10/0'"),
         ("lane_width: wide", "lane_width: expected a number, got 'wide'"),
         ("lane_width: 3,5", "lane_width: expected a number, got '3,5'"),
         ("every: 1.5", "every: expected a whole number, got '1.5'"),
@@ -134,6 +137,7 @@ def test_settings_are_checked_when_they_are_made(settings, message):
         ("- 1", "expected a YAML file of settings, got list"),
         ("# lane_width: 3.5", "expected a YAML file of settings, got none; is it empty"),
         ("{", "expected a YAML file of settings, got: not YAML"),
+        ("formats: [csv]", "formats: .*got 'csv'"),
     ],
 )
 def test_a_bad_file_is_one_line_that_names_it(tmp_path, text, message):
@@ -159,6 +163,11 @@ def test_a_bad_file_is_one_line_that_names_it(tmp_path, text, message):
 def test_settings_check_themselves(values, message):
     with pytest.raises(ValueError, match=message):
         RunConfig(**{"source": "a", "camera": "b", **values})
+
+
+def test_rates_may_be_fractions_and_names_a_list(tmp_path):
+    given = read_settings(_file(tmp_path, "fps: 30000/1001\nformats: [jsonl, kitti]\n"))
+    assert given == {"fps": 30000 / 1001, "formats": ("jsonl", "kitti")}
 
 
 def test_options_override_a_file(tmp_path, capsys):
