@@ -20,6 +20,7 @@ from lanebev.io.lane_parsing import (
     field,
     json_object,
     lane_text,
+    stated_size,
 )
 from lanebev.numbers import finite_numbers
 from lanebev.observation.polylines import LaneLine
@@ -42,7 +43,9 @@ def read_labelme(path: str | Path) -> FrameLines:
             got = f"{shapes[0].get('shape_type')!s:.20}"
             raise ValueError(f"shapes: expected lanes of type linestrip, got {got}; draw lines")
         image = field(fields, "imagePath", str).replace("\\", "/")
-        return FrameLines(os.path.normpath(f"{path.parent}/{image}"), _lines("shapes", lines))
+        name = os.path.normpath(f"{path.parent}/{image}")
+        size = stated_size(fields, "imageHeight", "imageWidth")
+        return FrameLines(name, _lines("shapes", lines), image_size=size)
 
 
 def read_vil100(path: str | Path) -> FrameLines:
@@ -51,8 +54,9 @@ def read_vil100(path: str | Path) -> FrameLines:
     with Where(path, None):
         fields = json_object(lane_text(path))
         lanes = field(field(fields, "annotations", dict), "lane", list)
-        name = field(field(fields, "info", dict), "image_path", str)
-        return FrameLines(name, _lines("annotations.lane", lanes))
+        info = field(fields, "info", dict)
+        name, size = field(info, "image_path", str), stated_size(info, "height", "width")
+        return FrameLines(name, _lines("annotations.lane", lanes), image_size=size)
 
 
 def _lines(name: str, lanes: list[Any]) -> list[LaneLine]:

@@ -31,12 +31,14 @@ class FrameLines(NamedTuple):
         pose_sigma_scale: factor on the standard deviations of the pose estimated from them; 1 unless stated.
         principal_point: (x, y) px of the camera by which all lines were projected from 3D points, perhaps to
             places outside of the image; None for lines that were drawn in the image.
+        image_size: (height, width) px of the image that the lines were drawn on; None if the file says none.
     """
 
     name: str
     lines: list[LaneLine]
     pose_sigma_scale: float = 1.0
     principal_point: tuple[float, float] | None = None
+    image_size: tuple[int, int] | None = None
 
 
 class Where:
@@ -118,6 +120,12 @@ def field(fields: Any, key: str, kind: type) -> Any:
         got = type(fields.get(key)).__name__ if isinstance(fields, dict) and key in fields else "none"
         raise ValueError(f"{key}: expected a {kind.__name__}, got {got}; {_FORMATS}")
     return fields[key]
+
+
+def stated_size(fields: dict[str, Any], height: str, width: str) -> tuple[int, int] | None:
+    """Return (height, width) px by these keys, None if one of them has no whole number above 0."""
+    sides = (fields.get(height), fields.get(width))
+    return (sides[0], sides[1]) if all(type(side) is int and side > 0 for side in sides) else None
 
 
 def as_list(name: str, values: Any) -> list[Any]:

@@ -53,6 +53,7 @@ def resized_lanes(
 def _moved(frame: FrameLines, scale: NDArray[np.float64], shift: NDArray[np.float64]) -> FrameLines:
     """Return a frame with all pixels p replaced by scale · p + shift, each (2,)."""
     lines = [line._replace(points=scale * line.points + shift) for line in frame.lines]
+    frame = frame._replace(image_size=None)
     if frame.principal_point is None:
         return frame._replace(lines=lines)
     x, y = (scale * np.array(frame.principal_point) + shift).tolist()
@@ -127,7 +128,24 @@ def size_doubt(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> Siz
         frames: frames of one drive.
         image_size: (height, width) px of its images.
     """
-    return _doubt_of_camera(frames, image_size) or _doubt_of_points(frames, image_size)
+    return (
+        _doubt_of_size(frames, image_size)
+        or _doubt_of_camera(frames, image_size)
+        or _doubt_of_points(frames, image_size)
+    )
+
+
+def _doubt_of_size(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> SizeDoubt | None:
+    """Return a doubt if the lane file states another size of images."""
+    others = [frame.image_size for frame in frames if frame.image_size not in (None, image_size)]
+    if not others or others[0] is None:
+        return None
+    (height, width), (rows, columns) = image_size, others[0]
+    return SizeDoubt(
+        f"expected points in images of {width} x {height} px, got ones of {columns} x {rows} as the file says;",
+        _STATE_SIZE.replace("WIDTHxHEIGHT", f"{columns}x{rows}"),
+        is_outside=True,
+    )
 
 
 def _doubt_of_camera(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> SizeDoubt | None:

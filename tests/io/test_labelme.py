@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from lanebev.io.lane_size import lanes_of_whole_images, size_remark
 from lanebev.io.lanes import match_frames, read_lanes
 
 LEFT = [[600.5, 300.0], [400.0, 500.0], [250.25, 700.0]]
@@ -47,6 +48,17 @@ def test_lines_of_labelme_and_of_vil_100(tmp_path):
         other = f"{tmp_path}/other/7.png"
         images = [other, f"{tmp_path}/images/7.png", f"{tmp_path}/0_Road001_Trim003_frames/7.jpg"]
         assert match_frames(images, [frame]) == ([None, 0, None] if "jpg" not in name else [None, None, 0])
+
+
+@pytest.mark.parametrize("content", [_labelme(_shape(LEFT), _shape(RIGHT)), _vil()])
+def test_the_size_that_a_file_states_is_compared_with_that_of_the_images(tmp_path, content):
+    frames = _read(tmp_path / "7.json", content)
+    assert size_remark(frames, (720, 1280)) == ""
+    with pytest.raises(ValueError, match=r"got ones of 1280 x 720 .*; state .* --lanes-size 1280x720"):
+        size_remark(frames, (710, 1280))
+    (frame,) = lanes_of_whole_images(frames, (720, 1280), None, (710, 1280))
+    np.testing.assert_allclose(frame.lines[0].points[1], [400.0, 500.5 * 71 / 72 - 0.5])
+    assert size_remark([frame], (710, 1280)) == ""
 
 
 def test_an_image_without_lanes_has_an_entry(tmp_path):
