@@ -124,8 +124,10 @@ def field(fields: Any, key: str, kind: type) -> Any:
 
 def stated_size(fields: dict[str, Any], height: str, width: str) -> tuple[int, int] | None:
     """Return (height, width) px by these keys, None if one of them has no whole number above 0."""
-    sides = (fields.get(height), fields.get(width))
-    return (sides[0], sides[1]) if all(type(side) is int and side > 0 for side in sides) else None
+    rows, columns = fields.get(height), fields.get(width)
+    if isinstance(rows, int) and isinstance(columns, int) and min(rows, columns) > 0:
+        return rows, columns
+    return None
 
 
 def as_list(name: str, values: Any) -> list[Any]:

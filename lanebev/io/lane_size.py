@@ -142,7 +142,7 @@ def _doubt_of_size(frames: Sequence[FrameLines], image_size: tuple[int, int]) ->
         return None
     (height, width), (rows, columns) = image_size, others[0]
     return SizeDoubt(
-        f"expected points in images of {width} x {height} px, got ones of {columns} x {rows} as the file says;",
+        f"expected lanes of images of {width} x {height} px, got {columns} x {rows} in the file;",
         _STATE_SIZE.replace("WIDTHxHEIGHT", f"{columns}x{rows}"),
         is_outside=True,
     )
