@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from lanebev.io.output_folder import check_result
 from lanebev.io.whole_file import whole_file
 from lanebev.report.comparison import comparison_summary, render_comparison
 from lanebev.report.run_folder import read_run
@@ -20,9 +21,10 @@ def compare(first: str, second: str, out: str) -> str:
 
     Raises:
         ValueError: a folder without a run's ``extrinsics.csv``, no frame in common, or a page that cannot be
-            written.
+            written or would replace an output of these runs.
     """
     runs = read_run(first), read_run(second)
+    check_result(out, (first, second))
     page = render_comparison(*runs)
     with whole_file(out) as whole:
         whole.write_text(page, encoding="utf-8", errors="replace")

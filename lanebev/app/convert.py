@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Protocol, cast
 
 from lanebev.app.sources import source_of_run
+from lanebev.camera.choice import camera_file
 from lanebev.io.formats.folder import read_record
 from lanebev.io.formats.names import FORMATS, check_installed
 from lanebev.io.formats.record import RunRecord
 from lanebev.io.frames import Frame
+from lanebev.io.output_folder import check_result
 from lanebev.io.whole_file import whole_file
 from lanebev.report.run_folder import read_run
 
@@ -52,13 +54,15 @@ def convert(
 
     Raises:
         ValueError: the folder is no run's, something that the format needs is not in it, the images are not
-            the run's, or a library is not installed.
+            the run's, a library is not installed, or the file is one of those that are read.
     """
     write, record = writer(to), read_record(run, camera)
     source = None
     if images is not None:
         source = source_of_run(images, read_run(run))
     path = Path(run) / FORMATS[to].file if out is None else Path(out)
+    shown = [] if source is None else source.paths or [source.source]
+    check_result(path, [run], [*shown, *([camera_file(camera)] if camera else [])])
     with whole_file(path) as whole:
         write(whole, record, source)
     return f"{path}: {len(record.rows)} frame{'s'[: len(record.rows) != 1]}"

@@ -14,11 +14,11 @@ from lanebev.io.folder_lock import LOCK_NAME, FolderLock
 from lanebev.io.formats.names import FORMATS
 from lanebev.io.late_signals import late_signals_ignored
 
-OUTPUT_NAMES = (
+_OWN_NAMES = (
     "extrinsics.csv", "filtered.csv", "lanes.json", "bev.mp4", "bev.png", "overlay.mp4", "overlay.png",
     "report.html", "state.safetensors", "calibration.yaml", "covariance.csv",
-    *(known.file for known in FORMATS.values()),
 )  # fmt: skip
+OUTPUT_NAMES = (*_OWN_NAMES, *(known.file for known in FORMATS.values()))
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # what a disk says that has no room
 
@@ -40,6 +40,25 @@ def check_inputs_stay(folder: str | Path, inputs: Iterable[str | Path]) -> None:
                 f"input {path}: expected a file that the run leaves as it is, got one of the outputs in "
                 f"{folder}; give another folder with --out"
             )
+
+
+def check_result(path: str | Path, runs: Iterable[str | Path], inputs: Iterable[str | Path] = ()) -> None:
+    """Raise if the file that a command writes would replace one that it reads.
+
+    Args:
+        path: path of the file.
+        runs: output folders of runs, whose own outputs stay; those in other formats are meant to be renewed.
+        inputs: other files that it reads.
+
+    Raises:
+        ValueError: it would.
+    """
+    kept = {Path(os.path.realpath(run)) / name for run in runs for name in _OWN_NAMES}
+    kept |= {Path(os.path.realpath(each)) for each in inputs}
+    if Path(os.path.realpath(path)) in kept:
+        raise ValueError(
+            f"out {path}: expected a file beside those that are read, got one of them; give another with --out"
+        )
 
 
 class OutputFolderError(ValueError):

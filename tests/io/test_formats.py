@@ -437,6 +437,20 @@ def test_convert_says_what_is_amiss(tmp_path, capsys, monkeypatch):
     fails(folder, "--to", "parquet", word="pip install 'lanebev[formats]'")
 
 
+def test_what_is_read_is_not_replaced(tmp_path, capsys):
+    folder, camera, link = _folder(tmp_path), tmp_path / "camera.yaml", tmp_path / "link"
+    CAMERA.to_file(camera)
+    link.symlink_to(folder / "extrinsics.csv")
+    before = {path: path.read_bytes() for path in (camera, *folder.iterdir())}
+    for out in (folder / "extrinsics.csv", folder / "covariance.csv", camera, link):
+        command = ["convert", str(folder), "--to", "kitti", "--camera", str(camera), "--out", str(out)]
+        assert main(command) == 2
+        assert "expected a file beside those that are read, got one of them" in capsys.readouterr().err
+    assert main(["compare", str(folder), str(folder), "--out", str(folder / "extrinsics.csv")]) == 2
+    assert {path: path.read_bytes() for path in before} == before
+    assert main(["compare", str(folder), str(folder), "--out", str(folder / "page.html")]) == 0
+
+
 def test_names_of_formats():
     assert parse_formats("mcap, parquet,mcap") == ("mcap", "parquet")
     with pytest.raises(ValueError, match="got 'xml'"):
