@@ -57,7 +57,7 @@ def check_result(path: str | Path, runs: Iterable[str | Path], inputs: Iterable[
     kept |= {Path(os.path.realpath(each)) for each in inputs}
     if Path(os.path.realpath(path)) in kept:
         raise ValueError(
-            f"out {path}: expected a file beside those that are read, got one of them; give another with --out"
+            f"out {path}: expected a file that is not read, got one that is; give another with --out"
         )
 
 

@@ -445,10 +445,20 @@ def test_what_is_read_is_not_replaced(tmp_path, capsys):
     for out in (folder / "extrinsics.csv", folder / "covariance.csv", camera, link):
         command = ["convert", str(folder), "--to", "kitti", "--camera", str(camera), "--out", str(out)]
         assert main(command) == 2
-        assert "expected a file beside those that are read, got one of them" in capsys.readouterr().err
+        assert "expected a file that is not read, got one that is" in capsys.readouterr().err
     assert main(["compare", str(folder), str(folder), "--out", str(folder / "extrinsics.csv")]) == 2
     assert {path: path.read_bytes() for path in before} == before
     assert main(["compare", str(folder), str(folder), "--out", str(folder / "page.html")]) == 0
+
+
+def test_another_camera_than_the_runs_is_refused(tmp_path):
+    folder, camera = _folder(tmp_path), tmp_path / "camera.yaml"
+    CAMERA.to_file(folder / "calibration.yaml")
+    CAMERA.to_file(camera)
+    assert read_record(folder, camera).camera.fingerprint() == CAMERA.fingerprint()
+    CAMERA.scaled((2 * CAMERA.image_size[0], 2 * CAMERA.image_size[1])).to_file(camera)
+    with pytest.raises(ValueError, match=r"expected the run's, which is in .*calibration.yaml, got another"):
+        read_record(folder, camera)
 
 
 def test_names_of_formats():

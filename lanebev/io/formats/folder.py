@@ -44,8 +44,15 @@ def read_record(folder: str | Path, camera: str | Path | None = None) -> RunReco
             raise ValueError(
                 f"{folder / name}: expected {len(rows)} frames as in extrinsics.csv, got {len(parts)}"
             )
-    file = Path(camera) if camera is not None else folder / CALIBRATION
-    lens = Camera.from_file(file) if camera is not None or file.is_file() else None
+    lens = Camera.from_file(folder / CALIBRATION) if (folder / CALIBRATION).is_file() else None
+    if camera is not None:
+        given = Camera.from_file(camera)
+        if lens is not None and lens.fingerprint() != given.fingerprint():
+            raise ValueError(
+                f"camera {camera}: expected the run's, which is in {folder / CALIBRATION}, got another; "
+                "leave --camera out"
+            )
+        lens = given
     return RunRecord(
         name=folder.resolve().name,
         rows=rows,
