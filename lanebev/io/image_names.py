@@ -25,10 +25,11 @@ _STEPS = (Fraction(1, 2000), Fraction(60))  # s between two frames of a drive
 _MOST_ALIKE = 0.5
 
 Key = list[tuple[int, int | Fraction, str]]
+_END = (-1, 0, "")  # of a name, before any that goes on
 
 
 def natural_order(path: str, decimal: bool = False) -> Key:
-    """Return a sort key with numbers by value: 2.jpg before 10.jpg.
+    """Return a sort key with numbers by value: 2.jpg before 10.jpg, and image.jpg before image 2.jpg.
 
     Args:
         path: path of a file.
@@ -37,11 +38,19 @@ def natural_order(path: str, decimal: bool = False) -> Key:
     match = _DECIMAL.search(path) if decimal else None
     if match is not None:
         value = Fraction(int(match[1])) + Fraction(int(match[2]), 10 ** len(match[2]))
-        before, after = path[: match.start()], path[match.end() :]
-        return [*natural_order(before), (0, value, match[0]), *natural_order(after)]
+        return [
+            *_numbers_by_value(path[: match.start()]),
+            (0, value, match[0]),
+            *natural_order(path[match.end() :]),
+        ]
+    stem, suffix = splitext(path)
+    return [*_numbers_by_value(stem), _END, *_numbers_by_value(suffix)]
+
+
+def _numbers_by_value(text: str) -> Key:
     return [
         (0, int(part), part) if part.isascii() and part.isdigit() else (1, 0, part)
-        for part in re.split(r"([0-9]+)", path)
+        for part in re.split(r"([0-9]+)", text)
     ]
 
 

@@ -188,6 +188,8 @@ def test_decimal_seconds_are_in_order_of_time():
     small = [f"{i / 20}.png" for i in range(50)]
     assert in_natural_order(reversed(small)) == small
     assert times_from_names(small) == ()  # seconds or versions: not without doubt
+    without_zeros = [f"{i / 10:g}.png" for i in range(24)]  # 0.png, 0.1.png, ..., 1.png, 1.1.png
+    assert in_natural_order(reversed(without_zeros)) == without_zeros
 
 
 @pytest.mark.parametrize(
@@ -199,6 +201,8 @@ def test_decimal_seconds_are_in_order_of_time():
         ["1700000000.99999999.jpg", "1700000000.149999999.jpg"],  # nanoseconds without leading zeros
         ["a/2/10.jpg", "a/10/2.jpg"],
         ["00810.MP4/1.jpg", "00810.MP4/10.jpg"],
+        ["image.jpg", "image 2.jpg", "image 10.jpg"],  # copies
+        ["frame.png", "frame1.png", "frame02.png"],
         ["0000.jpg", "0009.jpg", "000a.jpg", "000f.jpg", "0010.jpg"],  # hexadecimal
         ["2/0009.JPG", "2/000A.JPG", "10/0000.JPG"],
     ],
