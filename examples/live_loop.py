@@ -20,5 +20,5 @@ while (frame := video.read()[1]) is not None:
     seconds = time.monotonic() if is_camera else video.get(cv2.CAP_PROP_POS_MSEC) / 1000
     result = session(frame, stamp=seconds)
     pitch, std = float(result.extrinsics.pitch), float(result.std.pitch)
-    print(f"{result.status.name} pitch {pitch:.4f} +- {std:.4f} rad; {', '.join(result.reasons)}")
+    print(f"{result.status.name} pitch {pitch:.4f} +- {std:.4f} rad", *result.reasons, sep="; ")
 session.save("state.safetensors")

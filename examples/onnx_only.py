@@ -13,7 +13,10 @@ import numpy as np
 import onnxruntime
 
 TYPES = {"tensor(double)": np.float64, "tensor(int64)": np.int64, "tensor(bool)": np.bool_}
-COLUMNS = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
+COLUMNS = (
+    "frame", "pitch_deg", "yaw_deg", "roll_deg", "height_m",
+    "pitch_std_deg", "yaw_std_deg", "roll_std_deg", "height_std_m", "status",
+)  # fmt: skip
 
 
 def first_state(session):
@@ -49,6 +52,7 @@ def rows(session, video, facts):
 
 def main(model, source, out):
     """Write the rows and the last view."""
+    onnxruntime.set_default_logger_severity(3)  # errors only
     session = onnxruntime.InferenceSession(model)
     facts = json.loads(session.get_modelmeta().custom_metadata_map["lanebev"])
     video = cv2.VideoCapture(source)
@@ -57,7 +61,7 @@ def main(model, source, out):
         sys.exit(f"{source}: expected images of {facts['image_size']} (height, width), got {size}")
     with open(out, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
-        table.writerow(["frame", *COLUMNS, *(f"std_{name}" for name in COLUMNS), "status"])
+        table.writerow(COLUMNS)
         for number, (pose, std, status, bev) in enumerate(rows(session, video, facts)):
             table.writerow([number, *(f"{value:.6f}" for value in (*pose, *std)), status])
             view = (255 * bev[::-1]).round().astype(np.uint8).transpose(1, 2, 0)

@@ -220,7 +220,7 @@ def test_a_step_runs_without_torch(tmp_path):
         cwd=tmp_path, check=True,
     )  # fmt: skip
     rows = (tmp_path / "out.csv").read_text().splitlines()
-    assert rows[0].startswith("frame,pitch_deg,yaw_deg,roll_deg,height_m,std_pitch_deg")
+    assert rows[0].startswith("frame,pitch_deg,yaw_deg,roll_deg,height_m,pitch_std_deg")
     assert len(rows) == 4
     assert rows[1] == "0,1.000000,2.864789,211.994384,80.000000,57.295780,57.295780,57.295780,1.000000,1"
     assert [row.split(",")[1] for row in rows[1:]] == ["1.000000", "2.000000", "3.000000"]
