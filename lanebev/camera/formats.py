@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -53,6 +54,20 @@ _MODELS = {
     "kannala_brandt": "fisheye",
     "omni": "omni",
     "mei": "omni",
+    "none": "",
+}
+_ALSO = {  # other programs' names of these, with _ for blanks and hyphens
+    "perspective": "pinhole",
+    "no_distortion": "none",
+    "opencv": "plumb_bob",
+    "brown_conrady": "plumb_bob",
+    "radial_tangential": "plumb_bob",
+    "pinhole_radtan": "plumb_bob",
+    "opencv_fisheye": "fisheye",
+    "kannala_brandt4": "fisheye",
+    "kannala_brandt8": "fisheye",
+    "kannalabrandt8": "fisheye",
+    "pinhole_equi": "fisheye",
 }
 _OFF_CENTRE = 0.1  # shares of the sides, more than which a file without a size is of other images
 _IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
@@ -168,12 +183,17 @@ def stated_model(fields: Mapping[str, Any], usual: str = "pinhole") -> str:
     Raises:
         ValueError: the first model is not known, or two that differ are stated.
     """
-    names = [str(fields[key]).strip().lower() for key in _MODEL_KEYS if fields.get(key) is not None]
+    written = [str(fields[key]).strip().lower() for key in _MODEL_KEYS if fields.get(key) is not None]
+    names = [_ALSO.get(name, name) for name in (re.sub(r"[\s_-]+", "_", each) for each in written)]
+    if names[:1] == ["none"] and any(stated_lens(fields, _LENS_KEYS, "pinhole")):
+        raise ValueError("model: expected that of the coefficients, got none; write it, or leave them out")
     if names and names[0] not in _MODELS:
         known = ", ".join(each for each in _MODELS if each)
-        raise ValueError(f"model: expected one of {known}, got {shown(names[0])}")
+        raise ValueError(f"model: expected one of {known}, got {shown(written[0])}")
     is_fisheye = str(fields.get("fisheye_model")).strip().lower() in ("1", "true")  # true since OpenCV 5
-    stated = {name: _MODELS[name] for name in names if name in _MODELS and name not in ("", "pinhole")}
+    stated = {
+        name: _MODELS[name] for name in names if name in _MODELS and name not in ("", "none", "pinhole")
+    }
     stated |= {"fisheye_model": "fisheye"} if is_fisheye else {}
     stated |= {"xi of an omni": "omni"} if fields.get("xi") is not None else {}
     if len(set(stated.values())) > 1:

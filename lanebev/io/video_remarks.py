@@ -20,7 +20,7 @@ from lanebev.io.side_by_side import halves_remark
 
 LONGEST_STEP = 60  # s between two frames of a drive
 _HEAD = 8  # bytes, which tell what kind of file it is
-_HEAD_AGAIN = ("mpegts", "mxf")  # formats in which these bytes come again in one file
+_HEAD_AGAIN = ("mpegts", "mxf", "mpjpeg")  # formats in which these bytes come again in one file
 _SPHERICAL = range(4)  # AVSphericalProjection: equirectangular, cube maps, half of one
 _OF_TWO_CAMERAS = range(1, 8)  # AVStereo3DType: side by side, one above the other, in turn, ...
 

@@ -50,6 +50,12 @@ def _is(camera, *parameters):
         ("distortion_model: EQUIDISTANT", "fisheye"),
         ("distortion_model: equi", "fisheye"),  # Kalibr's
         ("distortion_model: radtan", "pinhole"),
+        ("distortion_model: Plumb Bob", "pinhole"),
+        ("distortion_model: radial-tangential", "pinhole"),
+        ("distortion_model: brown_conrady", "pinhole"),  # realsense-ros
+        ("camera_model: OPENCV_FISHEYE", "fisheye"),
+        ("distortion_model: kannala_brandt4", "fisheye"),
+        ("distortion_model: pinhole-equi", "fisheye"),
         ("distortion_model: equidistant\nmodel: GoPro", "fisheye"),  # a product's name
         ("fisheye_model: 1", "fisheye"),
         ("fisheye_model: true", "fisheye"),  # booleans of OpenCV 5
@@ -61,6 +67,15 @@ def test_the_lens_has_the_model_that_the_file_names(tmp_path, line, model):
     camera = _read(tmp_path / "ost.yaml", OST.replace(MODEL, line))
     assert camera.model == model
     assert camera.intrinsics[0, 1] == -0.96635  # skew
+
+
+@pytest.mark.parametrize("name", ["none", "None", "no_distortion"])
+def test_a_camera_may_state_that_it_has_no_lens(tmp_path, name):
+    zeros = OST.replace("[0.175653, -0.031772, 0.000362, -0.000719]", "[0, 0, 0, 0]")
+    camera = _read(tmp_path / "c.yaml", zeros.replace(MODEL, f"distortion_model: {name}"))
+    assert (camera.model, camera.distortion.tolist()) == ("pinhole", [])
+    with pytest.raises(ValueError, match="model: expected that of the coefficients, got none; write it"):
+        _read(tmp_path / "c.yaml", OST.replace(MODEL, f"distortion_model: {name}"))
 
 
 def test_skew_moves_pixels_as_opencv_moves_them(tmp_path):
