@@ -25,7 +25,14 @@ from lanebev.camera.parameters import CameraParameters, checked
 from lanebev.camera.parsing import parse_documents
 from lanebev.camera.programs import gyroflow, matlab, metashape, nerf, realsense
 from lanebev.camera.records import record_cameras
-from lanebev.camera.slam import camodocal, is_kalibr, kalibr_cameras, orb_slam_cameras, orb_slam_fields
+from lanebev.camera.slam import (
+    as_kalibr,
+    camodocal,
+    is_kalibr,
+    kalibr_cameras,
+    orb_slam_cameras,
+    orb_slam_fields,
+)
 from lanebev.numbers import read_text, shown
 
 _BY_KEY = {
@@ -49,8 +56,8 @@ def read_camera(
     - ROS ``camera_info`` (YAML or INI, or a message as ``rostopic``, ``ros2 topic`` and Foxglove print it),
       its ``roi`` and ``binning_x``, ``binning_y`` applied;
     - our short YAML: fx, fy, cx, cy, width, height, distortion, model;
-    - Kalibr's camchain, EuRoC's ``sensor.yaml``, CamOdoCal's YAML (VINS, KITTI-360), the
-      settings of ORB-SLAM and stella_vslam;
+    - Kalibr's camchain, EuRoC's ``sensor.yaml``, calibrations of Basalt and maplab, CamOdoCal's YAML (VINS,
+      KITTI-360), the settings of ORB-SLAM and stella_vslam;
     - KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt``: rectified images (``P_rect_02``, ``P2``);
     - files of MATLAB, Gyroflow, Nerfstudio, RealSense and Metashape, see :mod:`lanebev.camera.programs`;
     - JSON of data sets, see :mod:`lanebev.camera.records`;
@@ -137,6 +144,7 @@ def _camera(
         return checked(chosen(cameras, name, has_usual=False))
     if isinstance(content, list):
         raise ValueError("camera_intrinsic: expected that of a camera, got none")
+    content = as_kalibr(content)
     if is_kalibr(content):
         return checked(chosen(kalibr_cameras(content), name, has_usual=True))
     if settings := orb_slam_fields(content):

@@ -1,4 +1,4 @@
-"""Camera files of Kalibr and EuRoC, of CamOdoCal and VINS, and of ORB-SLAM and stella_vslam."""
+"""Camera files of Kalibr, EuRoC, Basalt and maplab, of CamOdoCal and VINS, of ORB-SLAM and stella_vslam."""
 
 from __future__ import annotations
 
@@ -42,6 +42,59 @@ _ORB_SLAM_MODELS = {  # Camera.type, or Camera.model of stella_vslam -> model an
     "kannalabrandt8": ("fisheye", "k1 k2 k3 k4"),
     "fisheye": ("fisheye", "k1 k2 k3 k4"),
 }
+
+
+_BASALT_MODELS = {  # camera_type -> models of Kalibr, its intrinsics, and its distortion_coeffs
+    "ds": ("ds", "none", "xi alpha fx fy cx cy", ""),
+    "eucm": ("eucm", "none", "alpha beta fx fy cx cy", ""),
+    "pinhole": ("pinhole", "none", "fx fy cx cy", ""),
+    "kb4": ("pinhole", "equidistant", "fx fy cx cy", "k1 k2 k3 k4"),
+}
+
+
+def as_kalibr(fields: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a calibration of Basalt or maplab with the keys of Kalibr's camera chain; another as it is.
+
+    Source: Basalt, "calibration.json"; aslam_cv2, NCamera's YAML.
+    """
+    rig = fields.get("value0")
+    if isinstance(rig, Mapping) and isinstance(rig.get("intrinsics"), list):
+        sizes = rig.get("resolution") or []
+        cameras = [_of_basalt(camera, size) for camera, size in zip(rig["intrinsics"], sizes, strict=False)]
+    elif isinstance(fields.get("cameras"), list):
+        cameras = [_of_maplab(mapping("cameras", each)) for each in fields["cameras"]]
+    else:
+        return fields
+    if not cameras:
+        raise ValueError("resolution: expected that of each camera, got none")
+    return {f"cam{number}": camera for number, camera in enumerate(cameras)}
+
+
+def _of_basalt(camera: Any, size: Any) -> Mapping[str, Any]:
+    name = str(required(mapping("intrinsics", camera), ["camera_type"]))
+    if name not in _BASALT_MODELS:
+        raise ValueError(f"camera_type: expected one of {', '.join(_BASALT_MODELS)}, got {shown(name)}")
+    *models, intrinsics, distortion = _BASALT_MODELS[name]
+    values = mapping("intrinsics", required(camera, ["intrinsics"]))
+    return {
+        "camera_model": models[0],
+        "distortion_model": models[1],
+        "intrinsics": [number(values, key) for key in intrinsics.split()],
+        "distortion_coeffs": [number(values, key) for key in distortion.split()],
+        "resolution": size,
+    }
+
+
+def _of_maplab(entry: Mapping[str, Any]) -> Mapping[str, Any]:
+    camera = mapping("camera", required(entry, ["camera"]))
+    lens = mapping("distortion", camera.get("distortion") or {})
+    return {
+        "camera_model": required(camera, ["type"]),
+        "distortion_model": lens.get("type"),
+        "intrinsics": required(camera, ["intrinsics"]),
+        "distortion_coeffs": lens.get("parameters"),
+        "resolution": [whole_number(camera, "image_width"), whole_number(camera, "image_height")],
+    }
 
 
 def is_kalibr(fields: Mapping[str, Any]) -> bool:

@@ -380,6 +380,69 @@ def test_orb_slams_settings(tmp_path, of, kind, more, expected):  # ORB_SLAM3#49
         _read(tmp_path / "c.yaml", ORB_SLAM.format(kind, of, "").replace("Camera.height", "Camera.high"))
 
 
+BASALT = {
+    "value0": {
+        "intrinsics": [
+            {
+                "camera_type": "kb4",
+                "intrinsics": {
+                    **{"fx": 350, "fy": 351, "cx": 366, "cy": 249},
+                    **{"k1": 0.01, "k2": -0.02, "k3": 0.003, "k4": 0.0},
+                },
+            },
+            {"camera_type": "pinhole", "intrinsics": {"fx": 450, "fy": 451, "cx": 370, "cy": 250}},
+        ],
+        "resolution": [[752, 480], [752, 480]],
+    }
+}
+MAPLAB = """label: "Euroc dataset - original intrinsics"
+cameras:
+- camera:
+    label: cam0
+    line-delay-nanoseconds: 0
+    image_height: 480
+    image_width: 752
+    type: pinhole
+    intrinsics:
+      cols: 1
+      rows: 4
+      data: [458.654, 457.296, 367.215, 248.375]
+    distortion:
+      type: radial-tangential
+      parameters:
+        cols: 1
+        rows: 4
+        data: [-0.28, 0.07, 0.0002, 0.00002]
+  T_B_C:
+    cols: 4
+    rows: 4
+    data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+"""
+
+
+def test_calibrations_of_basalt_and_maplab(tmp_path):  # maplab#4
+    camera = _read(tmp_path / "c.yaml", MAPLAB)
+    _is(camera, 458.654, 457.296, 367.215, 248.375, 752, 480, [-0.28, 0.07, 0.0002, 0.00002])
+    (tmp_path / "calibration.json").write_text(json.dumps(BASALT))
+    first = Camera.from_file(f"{tmp_path / 'calibration.json'}#cam0")
+    _is(first, 350, 351, 366, 249, 752, 480, [0.01, -0.02, 0.003, 0.0], "fisheye")
+    second = Camera.from_file(f"{tmp_path / 'calibration.json'}#cam1")
+    _is(second, 450, 451, 370, 250, 752, 480)
+    sphere = {"fx": 349.7, "fy": 348.7, "cx": 365.8, "cy": 249.3, "xi": -0.28, "alpha": 0.57}
+    kalibr = {"cam0": {"camera_model": "ds", "distortion_model": "none", "resolution": [752, 480]}}
+    kalibr["cam0"]["intrinsics"] = [-0.28, 0.57, 349.7, 348.7, 365.8, 249.3]
+    basalt = {"intrinsics": [{"camera_type": "ds", "intrinsics": sphere}], "resolution": [[752, 480]]}
+    one, other = (_read(tmp_path / "c.json", json.dumps(each)) for each in ({"value0": basalt}, kalibr))
+    assert one.fingerprint() == other.fingerprint()
+    basalt["intrinsics"][0]["camera_type"] = "pinhole-radtan8"
+    with pytest.raises(
+        ValueError, match="camera_type: expected one of ds, eucm, pinhole, kb4, got 'pinhole-radtan8'"
+    ):
+        _read(tmp_path / "c.json", json.dumps({"value0": basalt}))
+    with pytest.raises(ValueError, match="resolution: expected that of each camera, got none"):
+        _read(tmp_path / "c.json", json.dumps({"value0": {**basalt, "resolution": None}}))
+
+
 MESSAGE = (
     "{K: [500, 0, 320, 0, 500, 240, 0, 0, 1], width: 640, height: 480, distortion_model: equidistant, D: %s}"
 )

@@ -64,7 +64,7 @@ json_values = st.recursive(
 CAMERA_KEYS = (
     "K D P R roi width height distortion_model binning_x xi cam0 intrinsics camera_model resolution "
     "camera_intrinsic intrinsic model_type projection_parameters fx "
-    "fl_x ppx projection Camera Camera.fx k1 k4 distortion w h cx"
+    "fl_x ppx projection Camera Camera.fx k1 k4 distortion w h cx value0 cameras"
 )
 LANE_KEYS = (
     "raw_file h_samples lanes boundary sigma seen pose_sigma_scale file_path lane_lines "
