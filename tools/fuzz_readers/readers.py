@@ -160,6 +160,18 @@ def _opencv(suffix: str) -> bytes:
 def _camera_json() -> list[bytes]:
     matrix = [[1266.4, 0, 816.3], [0, 1266.4, 491.5], [0, 0, 1]]
     records: list[Any] = [{"camera_intrinsic": matrix}, [{"camera_intrinsic": matrix}], {"intrinsic": matrix}]
+    lens = {"k1": -0.3, "k2": 0.1, "p1": 0.001, "p2": 0.0}
+    named = {"fx": 900, "fy": 900, "cx": 640, "cy": 360}
+    fisheye = {"k1": 339.7, "k2": -32.0, "k3": 48.3, "k4": -7.2, "cx_offset": 3.9, "cy_offset": -3.1}
+    basalt = {"camera_type": "ds", "intrinsics": {**named, "xi": -0.28, "alpha": 0.57}}
+    records += [
+        {"fl_x": 900, "cx": 640, "cy": 360, "w": 1280, "h": 720, **lens},
+        {"fx": 900, "fy": 900, "ppx": 640, "ppy": 360, "width": 1280, "height": 720, "coeffs": [0] * 5},
+        {"intrinsic": [2059, 2061, 936, 635, -0.3, 0.1, 0, 0, 0], "width": 1920, "height": 1280},
+        {"intrinsic": {"aspect_ratio": 1, "width": 1280, "height": 966, "model": "radial_poly", **fisheye}},
+        {"Camera": {**named, **lens, "cols": 1280, "rows": 720, "model": "perspective"}},
+        {"value0": {"intrinsics": [basalt], "resolution": [[1280, 720]]}},
+    ]
     return [_opencv(".json"), *(json.dumps(each).encode() for each in records)]
 
 
