@@ -16,6 +16,8 @@ _NOT_THERE = (
     -2.0,
     -1.0,
 )  # x of points that detectors made for TuSimple do not see; else it is a pixel outside
+_MOST_CLASSES = 20  # of lanes
+_FAR = 10  # times the median distance of rows
 _GAP = 2.5  # times the median distance of rows: from there on a line is not seen in between
 
 
@@ -34,15 +36,33 @@ def read_culane(path: str | Path) -> FrameLines:
             texts = text.split()
             values = numbers_or_gaps("points", texts)
             if len(values) % 2:
-                raise ValueError(f"expected x y pairs, got {len(values)} numbers; is the file cut?")
+                raise ValueError(
+                    f"expected x y pairs, got {len(values)} numbers; is the file cut, or a class beside them?"
+                )
             pairs = (pair for pair in zip(values[::2], values[1::2], strict=True) if pair[1] == pair[1])
             points = np.array([point for point, _ in groupby(pairs)]).reshape(-1, 2)
+            _check_first_pair(points)
             if number == len(rows) and texts:
                 _check_last_row(points[:, 1], texts[-1])
             points[np.isin(points[:, 0], _NOT_THERE), 0] = np.nan
             if np.isfinite(points).all(-1).any():
                 lines.append(LaneLine(_with_gaps(checked_pixels("points", points))))
     return FrameLines(str(path).removesuffix(".txt").removesuffix(".lines"), lines)
+
+
+def _check_first_pair(points: NDArray[np.float64]) -> None:
+    """Raise if the first of several points (P, 2) is none: small numbers far from the other rows.
+
+    So it is where a line begins with its class and its score.
+    """
+    if len(points) < 3 or not 0 <= points[0, 1] <= 1 or abs(points[0, 0]) > _MOST_CLASSES:
+        return
+    first, *others = np.abs(np.diff(points[:, 1]))
+    if first > _FAR * np.median(others) > 0:
+        raise ValueError(
+            f"expected x y pairs in px, got {points[0, 0]:g} {points[0, 1]:g} before them; leave out classes "
+            "and scores"
+        )
 
 
 def _check_last_row(y: NDArray[np.float64], last: str) -> None:

@@ -134,6 +134,18 @@ def test_culane_points_that_are_not_there_draw_no_line(tmp_path, missing):
     np.testing.assert_allclose(seen, [[325, 640], [315, 650], [305, 660]])  # and not 150 at 670
 
 
+def test_a_class_and_a_score_before_culane_points_are_refused(tmp_path):
+    path = tmp_path / "1.lines.txt"
+    path.write_text("1 0.98 600 590 610 580 620 570 630 560\n")
+    with pytest.raises(ValueError, match=r"line 1: expected x y pairs in px, got 1 0.98 before them; leave"):
+        read_lanes(path)
+    path.write_text("600 590 610 580 620 570 0.98\n")
+    with pytest.raises(ValueError, match="got 7 numbers; is the file cut, or a class beside them"):
+        read_lanes(path)
+    path.write_text("5 0 6 10 7 20 8 30\n0 1 600 590\n")  # rows from the first one, and two points
+    assert len(read_lanes(path)[0].lines) == 2
+
+
 def test_culane_rows_may_repeat_and_turn(tmp_path):
     path = tmp_path / "1.lines.txt"
     path.write_text("5 590 7 580 9 580 11 570\n5 590 7 580 9 570 12 575 15 580 18 585\n")
