@@ -64,7 +64,7 @@ class RunConfig:
     lanes: str | None = option(
         None,
         "lanes of another detector or a person: JSON of TuSimple, CurveLanes, OpenLane, LLAMAS, BDD100K, "
-        "VIL-100 or LabelMe, .lines.txt of CULane, or a folder of them",
+        "VIL-100 or LabelMe, .lines.txt of CULane, a folder of them, or CVAT's XML",
         "FILE",
     )
     stills: bool = option(False, "treat every image as independent, not as a frame of a drive")

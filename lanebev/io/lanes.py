@@ -21,7 +21,7 @@ from lanebev.io.culane import read_culane
 from lanebev.io.curvelanes import read_curvelanes
 from lanebev.io.image_names import in_natural_order
 from lanebev.io.images import IMAGE_SUFFIXES
-from lanebev.io.labelme import read_labelme, read_vil100
+from lanebev.io.labelme import read_cvat, read_labelme, read_vil100
 from lanebev.io.lane_parsing import FrameLines, json_values, lane_text
 from lanebev.io.llamas import read_llamas
 from lanebev.io.openlane import read_openlane
@@ -33,6 +33,7 @@ _READERS = {  # of files of one image, by a key that no other has
     "shapes": read_labelme,
     "annotations": read_vil100,
 }
+_BEGIN = 1_000  # characters
 _OF_LLAMAS = re.compile(r"_(color|gray)_rect$")  # ends the names of LLAMAS' images, not of its labels
 
 
@@ -55,6 +56,8 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
     text = lane_text(path)
     if path.name.endswith(".txt") and not text.lstrip("[ \r\n").startswith("{"):
         return [read_culane(path)]
+    if "<annotations>" in text[:_BEGIN]:
+        return read_cvat(path)
     if _has_key("lane_lines", path, text):
         return [read_openlane(path, intrinsics)]
     for key, read in _READERS.items():

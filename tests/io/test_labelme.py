@@ -1,4 +1,4 @@
-"""Lanes drawn in LabelMe, and the labels of VIL-100."""
+"""Lanes drawn in LabelMe and CVAT, and the labels of VIL-100."""
 
 import json
 
@@ -83,3 +83,45 @@ def test_bad_files_are_one_clear_line(tmp_path, content, message):
     with pytest.raises(ValueError, match=rf"lane file .*7.json: {message}") as error:
         _read(tmp_path / "7.json", content)
     assert "\n" not in str(error.value)
+
+
+def _cvat(shapes):
+    image = '<image id="0" name="a/7.jpg" width="1280" height="720">{}</image>'
+    empty = '<image id="1" name="a/8.jpg" width="1280" height="720">\n  </image>'
+    head = (
+        '<?xml version="1.0" encoding="utf-8"?>\n<annotations>\n  <version>1.1</version>\n  <meta></meta>\n'
+    )
+    return f"{head}{image.format(shapes)}{empty}</annotations>"
+
+
+def _polyline(points, kind="polyline"):
+    return f'<{kind} label="lane" occluded="0" points="{";".join(f"{x},{y}" for x, y in points)}"/>'
+
+
+def test_polylines_of_cvat(tmp_path):
+    path = tmp_path / "annotations.xml"
+    path.write_text(_cvat(_polyline(LEFT) + '<box xtl="1" ytl="2" xbr="3" ybr="4"/>' + _polyline(RIGHT)))
+    drawn, empty = read_lanes(path)
+    assert (drawn.name, empty.name, empty.lines) == ("a/7.jpg", "a/8.jpg", [])
+    for line, expected in zip(drawn.lines, (LEFT, RIGHT), strict=True):
+        np.testing.assert_array_equal(line.points, expected)
+    with pytest.raises(ValueError, match="got 1280 x 720 in the file; state their size with --lanes-size"):
+        size_remark([drawn], (360, 640))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (_cvat(_polyline(LEFT, "polygon")), "expected lanes drawn as polylines, got other shapes only"),
+        (_cvat(_polyline(LEFT))[:-20], "expected CVAT's XML, got a syntax error; is the file cut"),
+        ("<annotations><track id='0'/></annotations>", "with images, got none; export as CVAT for images"),
+        (_cvat('<polyline points="1,2;3"/>'), r"image 'a/7.jpg'\[0\].points: expected 2 numbers, got 1"),
+        (_cvat('<polyline points=""/>'), r"points: expected 2 numbers, got 1"),
+        ("<annotations><image><polyline/></image></annotations>", "image: expected its name, got none"),
+        ("<!DOCTYPE html><html></html>", "line 1: expected JSON, got '<!DOCTYPE"),
+    ],
+)
+def test_bad_files_of_cvat_are_one_clear_line(tmp_path, content, message):
+    (tmp_path / "a.xml").write_text(content)
+    with pytest.raises(ValueError, match=message):
+        read_lanes(tmp_path / "a.xml")
