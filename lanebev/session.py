@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -129,14 +130,14 @@ class Session:
         if calibrator is None:
             calibrator = JointCalibrator() if model is None else _calibrator_of(model)
         width, width_std = _lane_width_of(calibrator, lane_width, lane_width_std)
-        self._parts: tuple[Any, ...] = (calibrator, camera, width, float(focal_std), width_std)
+        self._new_tracker = partial(Tracker, calibrator, camera, width, float(focal_std), width_std)
         for remark in camera_remarks(camera):
             logger.warning(remark)
         self.reset()
 
     def reset(self) -> None:
-        """Reset the state, as for another drive with another camera."""
-        self.tracker: Tracker[Any] = Tracker(*self._parts)
+        """Forget the drive and the mount, as if the session were new."""
+        self.tracker: Tracker[Any] = self._new_tracker()
         self._clock = FrameClock()
         self._lanes = LaneDoubts(self.camera)
 
@@ -216,7 +217,7 @@ class Session:
         Raises:
             ValueError: the file cannot be used, or is of another calibrator or camera; nothing is changed.
         """
-        fresh: Tracker[Any] = Tracker(*self._parts)
+        fresh = self._new_tracker()
         loaded = load_state(path, fresh.states())
         if loaded.problem is not None:
             raise ValueError(f"{loaded.problem}; leave out load to start anew")

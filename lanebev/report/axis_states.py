@@ -58,6 +58,11 @@ def all_axis_states(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.int64]:
     return np.array([axis_states(row) for row in rows], dtype=np.int64).reshape(-1, 4)
 
 
+def with_unit(axis: str, value: float, sign: str = "") -> str:
+    """Return a value of an axis (deg, m) in words, such as "0.12°" or "3.4 cm"; sign "+" shows it always."""
+    return f"{100 * value:{sign}.1f} cm" if axis == "height" else f"{value:{sign}.2f}°"
+
+
 def _tracked_state(unseen: bool, std: float, most: float) -> AxisState:
     if unseen:
         return AxisState.UNDETERMINED

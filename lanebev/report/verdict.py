@@ -17,6 +17,7 @@ from lanebev.report.axis_states import (
     AxisState,
     all_axis_states,
     estimate_stds,
+    with_unit,
 )
 from lanebev.types import AXES
 
@@ -137,7 +138,7 @@ def drive_findings(rows: Sequence[ExtrinsicsRow]) -> list[Finding]:
     tracked = np.array([row.status == "TRACKING" for row in rows])
     parts: list[Finding] = []
     for axis, name in enumerate(AXES):
-        most = f"σ above {_value(axis, LARGEST_STD[axis])}"
+        most = f"σ above {with_unit(name, LARGEST_STD[axis])}"
         for first, last in intervals(undetermined[:, axis] & tracked, times):
             part = slice(first, last + 1)
             why = _unseen_why(compress(rows[part], undetermined[part, axis]))
@@ -159,7 +160,7 @@ def image_findings(rows: Sequence[ExtrinsicsRow]) -> list[Finding]:
         uncertain = states[:, axis] == AxisState.UNCERTAIN
         why = _unseen_why(compress(rows, undetermined))
         found += _in_images(name, "not determined", undetermined, why)
-        found += _in_images(name, "uncertain", uncertain, f"σ above {_value(axis, LARGEST_STD[axis])}")
+        found += _in_images(name, "uncertain", uncertain, f"σ above {with_unit(name, LARGEST_STD[axis])}")
     return found
 
 
@@ -257,15 +258,11 @@ def _precision(rows: Sequence[ExtrinsicsRow], states: NDArray[np.int64]) -> str:
     """Return the median of ±2σ over the frames that measure an axis."""
     std = estimate_stds(rows)
     parts = [
-        f"{name} ±{_value(axis, 2 * float(np.median(std[states[:, axis] <= AxisState.UNCERTAIN, axis])))}"
+        f"{name} ±{with_unit(name, 2 * float(np.median(std[states[:, axis] <= AxisState.UNCERTAIN, axis])))}"
         for axis, name in enumerate(AXES)
         if (states[:, axis] <= AxisState.UNCERTAIN).any()
     ]
     return f"Typical uncertainty (2σ): {', '.join(parts)}." if parts else ""
-
-
-def _value(axis: int, value: float) -> str:
-    return f"{100 * value:.1f} cm" if AXES[axis] == "height" else f"{value:.2f}°"
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from lanebev.io.results import ExtrinsicsRow
+from lanebev.report.axis_states import with_unit
 from lanebev.types import AXES
 
 SETTLING = 1.0  # s after the first tracked frame, in which large sigmas and jumps are a matter of course
@@ -104,19 +105,15 @@ def _describe(events: Mapping[str, tuple[float, int]], rows: Sequence[Extrinsics
     for kind, (score, place) in events.items():
         name, _, axis = kind.partition(" ")
         if name == "sigma":
-            stds.append(f"{axis} {_value(axis, score)}")
+            stds.append(f"{axis} {with_unit(axis, score)}")
         elif name == "jump":
             jump = jumps(rows[place], *rows[place - 2 : place])[AXES.index(axis)]
-            leaps.append(f"{axis} {_value(axis, jump, '+')} ({score:.0f} σ)")
+            leaps.append(f"{axis} {with_unit(axis, jump, '+')} ({score:.0f} σ)")
         elif name == "RESTARTED":
             words.append("started in this frame")
         else:
             doing = "predicted" if name == "COASTING" else "lost"
-            words.append(f"least certain while {doing}: σ of pitch {_value('pitch', score)}")
+            words.append(f"least certain while {doing}: σ of pitch {with_unit('pitch', score)}")
     words += [f"largest jump: {', '.join(leaps)}"] if leaps else []
     words += [f"largest σ while tracking: {', '.join(stds)}"] if stds else []
     return "; ".join(words)
-
-
-def _value(axis: str, value: float, sign: str = "") -> str:
-    return f"{100 * value:{sign}.1f} cm" if axis == "height" else f"{value:{sign}.2f}°"
