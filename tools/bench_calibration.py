@@ -5,7 +5,8 @@
 Prints and writes (bench.json, bench.md) the RMSE of every parameter, its ratio to the per-frame Cramér-Rao
 bound, NEES per degree of freedom, the time in each status and the time to recover. ``--stream N`` runs N
 frames of an endless drive and watches memory, covariance, drift, and float32 against float64. ``--kinds N``
-draws N drives of each kind of ``tools/random_drives.py``, motions and shocks at random.
+draws N drives of each kind of ``tools/random_drives.py``, motions and shocks at random, and runs the joint
+calibrator; with ``--calibrators two-stage`` that one.
 
 "Hard" frames are those a scenario names (nothing to see, a bump, a line crossed); they are counted on their
 own. The first half second is left out of every figure.
@@ -36,7 +37,7 @@ from lanebev.testing.evaluation import NAMES, UNITS, WARM_UP, rms, summarise, tr
 from lanebev.testing.moments import CAMERA, FPS, WIDTH, moments, observe
 from lanebev.testing.scenarios import SCENARIOS
 from lanebev.types import Status
-from tools.bench_kinds import measure_all
+from tools.bench_kinds import measure_all, measure_two_stage
 from tools.textbook_ekf import TextbookEKF
 from train.commands import command_parser, one_line_errors
 
@@ -217,7 +218,8 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
         (args.out / "stream.json").write_text(json.dumps(report, indent=1))
         return report
     if args.kinds:
-        report["kinds"] = measure_all(args.kinds)
+        measured = measure_two_stage if list(args.calibrators) == ["two-stage"] else measure_all
+        report["kinds"] = measured(args.kinds)
         (args.out / "kinds.json").write_text(json.dumps(report, indent=1))
         return report
     scenarios = args.scenarios[:2] if args.quick else args.scenarios

@@ -1,4 +1,4 @@
-"""The joint filter on the drives of ``tools/random_drives.py``.
+"""The calibrators on the drives of ``tools/random_drives.py``.
 
 Every seed is another drive, a row of one batch. The seeds are none that a test or a replay uses.
 """
@@ -6,22 +6,24 @@ Every seed is another drive, a row of one batch. The seeds are none that a test 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.config import HILLY_ROADS
 from lanebev.estimation.joint.dynamics import MotionConfig
 from lanebev.estimation.joint.update import UNSEEN
+from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, within_3_sigma
 from lanebev.testing.moments import FPS
 from tools.known_road import KnownRoad
-from tools.random_drives import CREST, HILLS, IN_CURVE, KINDS
+from tools.random_drives import CONSTANT_BENDS, CREST, HILLS, IN_CURVE, KINDS
 from tools.replay.figures import as_track
-from tools.replay.recording import record, replay
+from tools.replay.recording import Recording, record, replay
 
 FIRST_SEED = 20_000
 ALLOWED = 15
@@ -31,12 +33,19 @@ _GIVEN = ", speed given"
 _TOLD = ", speed and road given"
 _HILLY = ", HILLY_ROADS"
 
+_NOT_TWO_STAGE = (  # kinds of the joint calibrator that show nothing new of this one
+    "resumed",
+    *(f"{kind}, ego lane" for kind in ("motion up to 2.5°, 1.5 Hz", "drop", "knock", "cut", "resumed")),
+    *(f"{kind}, ego lane, roll drawn" for kind in (IN_CURVE, "drop")),
+)
+
 
 class KindFigures(NamedTuple):
     """Of all drives of a kind.
 
     Attributes:
         ratio: RMSE of pitch, yaw, roll and height by the per-frame bound; NaN where there is none.
+        rmse: of pitch, yaw, roll (°) and height (cm).
         nees: NEES per degree of freedom of the whole pose.
         nees_seen: the same of what a single frame determines. These leave out the first half second, and
             ``ALLOWED`` frames after a shock.
@@ -45,16 +54,26 @@ class KindFigures(NamedTuple):
     """
 
     ratio: tuple[float, ...]
+    rmse: tuple[float, ...]
     nees: float
     nees_seen: float
     within: float
     back: tuple[float, ...]
 
 
-def measure(kind: str, seeds: Sequence[int], calibrator: JointCalibrator | None = None) -> KindFigures:
+def measure(kind: str, seeds: Sequence[int], calibrator: Calibrator[Any] | None = None) -> KindFigures:
     """Draw the drives of a kind, follow them, and compute the figures."""
-    drives = [record(KINDS[kind](seed), seed) for seed in seeds]
-    made = replay(calibrator or JointCalibrator(), drives)
+    return figures_of(drawn(kind, seeds), calibrator or JointCalibrator())
+
+
+def drawn(kind: str, seeds: Iterable[int]) -> list[Recording]:
+    """Draw the drives of a kind."""
+    return [record((KINDS | CONSTANT_BENDS)[kind](seed), seed) for seed in seeds]
+
+
+def figures_of(drives: Sequence[Recording], calibrator: Calibrator[Any]) -> KindFigures:
+    """Follow drives of one kind, and compute the figures."""
+    made = replay(calibrator, drives)
     each = [as_track(drive, made, row) for row, drive in enumerate(drives)]
     shock = each[0].hard
     after = torch.nn.functional.max_pool1d(
@@ -69,6 +88,7 @@ def measure(kind: str, seeds: Sequence[int], calibrator: JointCalibrator | None 
     easy = (torch.arange(len(shock)) >= WARM_UP) & ~run.hard
     return KindFigures(
         ratio=tuple(found["ratio_to_bound"]),
+        rmse=tuple(found["rmse"]),
         nees=found["nees_per_dof"],
         nees_seen=nees_of_determined(error[easy], made.covariance[easy], bound[easy]),
         within=float(windows.amin()),
@@ -106,7 +126,7 @@ def informed(kind: str) -> JointCalibrator:
 
 
 def measure_all(count: int) -> dict[str, dict[str, Any]]:
-    """Measure every kind on so many drives, print a row of each, and return them for JSON."""
+    """Measure the joint filter on so many drives of every kind, print a row of each, and return them."""
     seeds = range(FIRST_SEED, FIRST_SEED + count)
     print(
         "| kind | × bound: pitch yaw roll height | NEES/dof | NEES/dof, observed axes "
@@ -124,6 +144,26 @@ def measure_all(count: int) -> dict[str, dict[str, Any]]:
         nees = f"{found.nees:.2f} | {found.nees_seen:.2f}"
         print(f"| {kind} | {ratio} | {nees} | {100 * found.within:.0f} % | {back} |", flush=True)
         results[kind] = found._asdict()
+    return results
+
+
+def measure_two_stage(count: int) -> dict[str, dict[str, Any]]:
+    """Measure the paper's calibrator likewise, also with the covariance of its filters alone."""
+    seeds = range(FIRST_SEED, FIRST_SEED + count)
+    print(
+        "| kind | RMSE pitch, yaw, roll °, height cm | NEES/dof | within 3 σ, worst second "
+        "| filters alone: NEES/dof | within 3 σ, worst second |"
+    )
+    print("|---|---|---|---|---|---|")
+    results = {}
+    for kind in (*(kind for kind in KINDS if kind not in _NOT_TWO_STAGE), *CONSTANT_BENDS):
+        drives = [drive._replace(moments=()) for drive in drawn(kind, seeds)]  # without the bound
+        found = figures_of(drives, TwoStageCalibrator())
+        alone = figures_of(drives, TwoStageCalibrator(departures=False))
+        rmse = " ".join(f"{value:.3f}" for value in found.rmse)
+        two = " | ".join(f"{each.nees:.2f} | {100 * each.within:.0f} %" for each in (found, alone))
+        print(f"| {kind} | {rmse} | {two} |", flush=True)
+        results[kind] = {**found._asdict(), "filters_alone": alone._asdict()}
     return results
 
 

@@ -154,6 +154,15 @@ def _two_lanes(seed: int, std: float) -> Generated:
     return replace(drive, moments=lambda: [replace(one, visible=(1, 2, 3)) for one in drive.moments()])
 
 
+def _bend(seed: int, radius: float) -> Generated:
+    """Drive in a bend of constant radius, seen from 5 to 40 m."""
+
+    def bent(z: torch.Tensor) -> torch.Tensor:
+        return torch.full_like(z, 1 / radius)
+
+    return _drawn(seed, lambda t, moment: replace(moment, near=5.0, far=40.0, curvature=bent))
+
+
 def _kerb(seed: int) -> Generated:
     """Leave the ego lane in view; a second later a line joins it, 0.5 to 1.8 m from where a lane ends."""
     random = Random(seed)
@@ -227,3 +236,8 @@ KINDS: dict[str, Callable[[int], Generated]] = {
     },
 }
 """A drive of each kind by its seed."""
+
+CONSTANT_BENDS: dict[str, Callable[[int], Generated]] = {
+    f"constant bend, R {radius} m": partial(_bend, radius=float(radius)) for radius in (300, 1000, 3000)
+}
+"""For calibrators that do not estimate the curvature."""

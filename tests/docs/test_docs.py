@@ -155,6 +155,19 @@ def test_equations_that_the_joint_calibrator_cites_are_on_its_page():
     assert cited == set(numbered)
 
 
+def test_equations_that_the_two_stage_calibrator_adds_are_on_the_paper_s_page_with_their_functions():
+    page = (ROOT / "docs" / "method" / "paper.md").read_text(encoding="utf-8")
+    numbered = [int(number) for number in re.findall(r"\\tag\{T(\d+)\}", page)]
+    assert numbered == list(range(1, len(numbered) + 1))
+    folder = ROOT / "lanebev" / "estimation" / "two_stage"
+    code = "".join(path.read_text(encoding="utf-8") for path in folder.glob("*.py"))
+    assert {int(number) for number in re.findall(r"\(T(\d+)\)", code)} == set(numbered)
+    rows = re.findall(r"^\| \(T(\d+)\) \|.*\|(.*)\|$", page, re.MULTILINE)
+    assert [int(number) for number, _ in rows] == numbered
+    for name in re.findall(r"`(\w+)`", "".join(names for _, names in rows)):
+        assert f"def {name}(" in code, name
+
+
 def test_every_equation_of_the_joint_calibrator_has_a_function():
     """In the table of steps: dotted names, of the joint calibrator's package or of one above it."""
     page = (ROOT / "docs" / "method" / "joint.md").read_text(encoding="utf-8")

@@ -157,6 +157,7 @@ def test_above_the_rolled_horizon_is_not_a_lane():
         *t([1e-6] * 3),
         *t([[0.0, 0.0]] * 3),
         torch.ones(1, 3, dtype=torch.bool),
+        *t([[0.0, 0.0]] * 3),
     )
     for roll, there in ((20, [True, False]), (2, [True, False]), (-5, [True, True])):
         measured = lw.measure_widths(found, *t(math.radians(roll)), *t(1.5))

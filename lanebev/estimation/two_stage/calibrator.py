@@ -7,12 +7,30 @@ from typing import Self
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lanebev.batch import flag, select_rows
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.checks import check_new_state, is_running, unused_frame
 from lanebev.estimation.reasons import Reason
-from lanebev.estimation.two_stage.direction import DirectionStep, FrameRays, track_direction
+from lanebev.estimation.two_stage.departures import (
+    NUM_SHAPE,
+    boundary_moments,
+    boundary_variance,
+    covariance_by_departures,
+    faded_sum,
+    no_boundary_deviation,
+    shape_information,
+    shape_moment,
+    unseen_variance,
+)
+from lanebev.estimation.two_stage.direction import (
+    DirectionDepartures,
+    DirectionStep,
+    FrameRays,
+    follow_departures,
+    track_direction,
+)
 from lanebev.estimation.two_stage.lane_width import boundary_angles
 from lanebev.estimation.two_stage.roll_height import RollHeightStep, SeenLanes, track_roll_height
 from lanebev.estimation.two_stage.state import TwoStageConfig, TwoStageState
@@ -81,9 +99,13 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
         unseen = torch.zeros(batch_size, dtype=dtype, device=device)
         status = torch.full((batch_size,), int(Status.UNINITIALISED), dtype=torch.int64, device=device)
         reasons = torch.full_like(status, int(Reason.NO_START))
-        return TwoStageState(
-            direction, direction_cov, roll_height, roll_height_cov, no, no.clone(), unseen, status, reasons
+        filters = (direction, direction_cov, roll_height, roll_height_cov, no, no.clone())
+        nothing = (
+            direction.new_zeros(batch_size, 8, NUM_SHAPE + 2 * self.num_boundaries + 1),
+            direction.new_zeros(batch_size, 2, 3),
+            direction.new_zeros(batch_size, 2, 4),
         )
+        return TwoStageState(*filters, unseen, *nothing, status, reasons)
 
     def step(
         self,
@@ -107,13 +129,17 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
         one = track_direction(frame, state, dt, self.draws, self.config)
         inliers = segments._replace(weight=segments.weight * one.inliers)
         pitch, yaw = one.mean[:, 0], one.mean[:, 1]
-        boundaries = boundary_angles(inliers, rays, intrinsics, pitch, yaw, self.num_boundaries)
-        lanes = SeenLanes(boundaries, lane_width, one.cov[:, :2, :2])
+        of_one = follow_departures(one, frame, state)
+        boundaries = boundary_angles(
+            inliers, rays, intrinsics, pitch, yaw, self.num_boundaries, of_one.distance
+        )
+        lanes = SeenLanes(boundaries, lane_width, one.cov[:, :2, :2], of_one.sensitivity[:, :2])
         two = track_roll_height(lanes, state, dt, one.fresh, self.config)
         unseen = torch.where(one.seen, 0.0, state.unseen + dt)
         status = _status(state.status, one.seen, unseen, self.config.lost_after)
         reasons = _reasons(segments, one, two, status) | flag(guessed, Reason.TIME)
-        after = TwoStageState(one.mean, one.cov, *two[:4], unseen, status, reasons)
+        departures = self._departures(state, dt, one.seen, of_one, two)
+        after = TwoStageState(one.mean, one.cov, *two[:4], unseen, *departures, status, reasons)
         skipped = before._replace(reasons=before.reasons | int(Reason.TIME))
         state = select_rows(skip, skipped, after)
         return unused_frame(self._calibration(state, lane_width, one.inliers), skip), state
@@ -121,6 +147,31 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
     def pitch_and_yaw(self, state: TwoStageState) -> tuple[Tensor, Tensor]:
         """Return pitch and yaw of a state, (B, 2) rad, and their variances (B, 2)."""
         return state.direction_mean[:, :2], state.direction_cov[:, :2, :2].diagonal(dim1=-2, dim2=-1)
+
+    def _departures(
+        self, state: TwoStageState, dt: Tensor, seen: Tensor, one: DirectionDepartures, two: RollHeightStep
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return sensitivity, shape and scatter of the state after a frame."""
+        num, memory = self.num_boundaries, self.config.departure_memory
+        sensitivity = torch.cat([pad(one.sensitivity, (0, num + 1)), two.sensitivity], dim=1)
+        headings = boundary_moments(one.matrix, one.vector, 2 + NUM_SHAPE, num)
+        deviations = boundary_moments(two.matrix, two.vector, 2, num)
+        shape = faded_sum(shape_information(one.matrix, one.vector), state.shape, dt, seen, memory)
+        scatter = faded_sum(torch.stack([headings, deviations], 1), state.scatter, dt, seen, memory)
+        return sensitivity, shape, scatter
+
+    def _covariance_by_departures(self, state: TwoStageState, lane_width: Tensor) -> Tensor:
+        """Return the covariance (B, 4, 4) of the pose by the road's departures from the model."""
+        cfg, first = self.config, NUM_SHAPE + self.num_boundaries
+        sensitivity = torch.cat([state.sensitivity[:, :2], state.sensitivity[:, 4:6]], dim=1)
+        roll, height = state.roll_height_mean[:, 0], state.roll_height_mean[:, 1]
+        odd = no_boundary_deviation(
+            sensitivity[:, 2, first:-1], roll - cfg.initial_pose[2], cfg.initial_pose_std[2]
+        )
+        shape = shape_moment(state.shape)
+        spread = 0.5 * lane_width.mean(-1) / height
+        own = boundary_variance(state.scatter, unseen_variance(shape, spread, odd, cfg.lane_deviation_std))
+        return covariance_by_departures(sensitivity, shape, own, state.roll_height_cov[:, 0, 0])
 
     def _calibration(self, state: TwoStageState, lane_width: Tensor, inliers: Tensor) -> Calibration:
         pose = torch.cat([state.direction_mean[:, :2], state.roll_height_mean[:, :2]], dim=-1)
@@ -130,6 +181,8 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
         scale = pose[:, 3] * self.config.lane_width_std / lane_width.mean(-1)
         prior = torch.stack([torch.zeros_like(scale)] * 3 + [scale.square()], dim=-1).diag_embed()
         cov = torch.cat([upper, lower], dim=-2) + prior
+        if self.config.departures:
+            cov = cov + self._covariance_by_departures(state, lane_width)
         return Calibration(Extrinsics.unstack(pose), cov, state.status, inliers)
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from lanebev.batch import may_skip
 from lanebev.estimation import kalman
 from lanebev.estimation.checks import is_running
+from lanebev.estimation.two_stage import departures
 from lanebev.estimation.two_stage.state import TwoStageConfig, TwoStageState
 from lanebev.estimation.two_stage.vanishing import (
     gate_angles,
@@ -20,7 +21,11 @@ from lanebev.estimation.two_stage.vanishing import (
     vanishing_dir_least_squares,
 )
 from lanebev.geometry.road import great_circle_normals
-from lanebev.geometry.rotation import pitch_yaw_from_vanishing_dir, vanishing_dir_from_pitch_yaw
+from lanebev.geometry.rotation import (
+    pitch_yaw_from_vanishing_dir,
+    road_from_cam,
+    vanishing_dir_from_pitch_yaw,
+)
 from lanebev.observation.segments import LaneSegments
 
 
@@ -32,6 +37,7 @@ class DirectionStep(NamedTuple):
         inliers: (B, N) in {0, 1}, L_c.
         seen: (B,) bool, the frame supported the vanishing point.
         fresh: (B,) bool, started over in this frame.
+        transition: (B, 4, 4), of the prediction.
     """
 
     mean: Tensor
@@ -39,6 +45,22 @@ class DirectionStep(NamedTuple):
     inliers: Tensor
     seen: Tensor
     fresh: Tensor
+    transition: Tensor
+
+
+class Start(NamedTuple):
+    """Pitch and yaw of one frame.
+
+    Attributes:
+        mean: (B, 4) pitch, yaw and their rates; cov: (B, 4, 4).
+        inliers: (B, N) in {0, 1}, L_c.
+        seen: (B,) bool, the frame supported the vanishing point.
+    """
+
+    mean: Tensor
+    cov: Tensor
+    inliers: Tensor
+    seen: Tensor
 
 
 class FrameRays(NamedTuple):
@@ -75,7 +97,7 @@ def track_direction(
         the step; a row that is neither supported nor started keeps its prediction.
     """
     segments, rays, intrinsics = frame
-    mean, cov = predict_direction(state, dt, cfg)
+    mean, cov, transition = predict_direction(state, dt, cfg)
     normals = great_circle_normals(rays)
 
     residual, jacobian, noise = incidence(mean, normals, rays, segments.sigma, intrinsics)
@@ -104,17 +126,17 @@ def track_direction(
     mean, cov = kalman.update(mean, cov, *kalman.information(innovation, jacobian, noise, use))
     mean = torch.where(fresh.unsqueeze(-1), started.mean, mean)
     cov = torch.where(fresh[:, None, None], started.cov, cov)
-    return DirectionStep(mean, cov, inliers, seen, fresh)
+    return DirectionStep(mean, cov, inliers, seen, fresh, transition)
 
 
-def predict_direction(state: TwoStageState, dt: Tensor, cfg: TwoStageConfig) -> tuple[Tensor, Tensor]:
+def predict_direction(state: TwoStageState, dt: Tensor, cfg: TwoStageConfig) -> tuple[Tensor, Tensor, Tensor]:
     """Predict pitch and yaw at constant velocity, for ``reacquire_after`` at most.
 
     Source: Eqs. (9), (10), (12), (13). Deviation: the paper extrapolates for ever; after a gap the pose keeps
     its value and only its variance grows, up to that of the initial guess.
 
     Returns:
-        mean (B, 4) and covariance (B, 4, 4).
+        mean (B, 4), covariance (B, 4, 4) and transition (B, 4, 4).
     """
     density = dt.new_full((2,), cfg.angular_acceleration_density)
     moving = torch.minimum(dt, (cfg.reacquire_after - state.unseen).clamp_min(0.0))
@@ -123,7 +145,7 @@ def predict_direction(state: TwoStageState, dt: Tensor, cfg: TwoStageConfig) -> 
     _, noise = kalman.constant_velocity(torch.where(tracking, dt, 0.0), density)
     mean, cov = kalman.predict(state.direction_mean, state.direction_cov, transition, noise)
     limit = dt.new_tensor([*cfg.initial_pose_std[:2], *cfg.initial_rate_std[:2]]).square()
-    return mean, kalman.limit_variance(cov, limit)
+    return mean, kalman.limit_variance(cov, limit), transition
 
 
 def is_supported(segments: LaneSegments, inliers: Tensor, cfg: TwoStageConfig) -> Tensor:
@@ -139,7 +161,7 @@ def is_supported(segments: LaneSegments, inliers: Tensor, cfg: TwoStageConfig) -
 
 def start_direction(
     frame: FrameRays, mean: Tensor, wanted: Tensor, draws: Tensor, cfg: TwoStageConfig
-) -> DirectionStep:
+) -> Start:
     """Start pitch and yaw from the vanishing direction.
 
     Source: Algorithm 1 and Eqs. (3), (4), (7), (8).
@@ -155,7 +177,7 @@ def start_direction(
     if may_skip(wanted):
         nothing = torch.zeros_like(segments.weight)
         no = torch.zeros_like(wanted)
-        return DirectionStep(mean, torch.zeros_like(mean).diag_embed(), nothing, no, no)
+        return Start(mean, torch.zeros_like(mean).diag_embed(), nothing, no)
     _, agree = ransac_vanishing_point(
         segments.endpoints, segments.weight, segments.sigma, draws.to(mean.dtype), cfg.gate_sigmas
     )
@@ -174,7 +196,52 @@ def start_direction(
     cov = torch.cat([torch.cat([angle_cov, zero], -1), torch.cat([zero, rate_cov], -1)], -2)
     determined = angle_cov.diagonal(dim1=-2, dim2=-1).amax(-1) < math.radians(2.0) ** 2
     seen = is_supported(segments, inliers, cfg) & determined
-    return DirectionStep(torch.stack([pitch, yaw, rates, rates], dim=-1), cov, inliers, seen, seen)
+    return Start(torch.stack([pitch, yaw, rates, rates], dim=-1), cov, inliers, seen)
+
+
+class DirectionDepartures(NamedTuple):
+    """Effect of the road's departures from the model on stage 1.
+
+    Attributes:
+        distance: (B, N, 2) m, of the segments' ends ahead on the road.
+        sensitivity: (B, 4, 2 + L) of the state to curvature, vertical curvature and headings.
+        matrix: (B, 4 + L, 4 + L), information of the frame on pitch, yaw and these departures.
+        vector: (B, 4 + L), likewise.
+    """
+
+    distance: Tensor
+    sensitivity: Tensor
+    matrix: Tensor
+    vector: Tensor
+
+
+def follow_departures(step: DirectionStep, frame: FrameRays, state: TwoStageState) -> DirectionDepartures:
+    """Follow the sensitivity of pitch and yaw to curvatures and headings through a frame.
+
+    Source: docs/method/paper.md, Eqs. (T1) to (T3).
+
+    Args:
+        step: stage 1 after the frame.
+        frame: its segments.
+        state: state of the frame before.
+    """
+    segments, rays, intrinsics = frame
+    pitch, yaw = step.mean[:, 0], step.mean[:, 1]
+    roll, height = state.roll_height_mean[:, 0], state.roll_height_mean[:, 1]
+    normals = great_circle_normals(rays)
+    residual, jacobian, noise = incidence(step.mean[:, :2], normals, rays, segments.sigma, intrinsics)
+    feet = departures.foot_points(rays, vanishing_dir_from_pitch_yaw(pitch, yaw), residual, noise)
+    distance = departures.road_distances(feet, road_from_cam(pitch, yaw, roll), height)
+
+    before = state.sensitivity[:, :4]
+    num_boundaries = (before.shape[-1] - departures.NUM_SHAPE - 1) // 2
+    own = departures.direction_by_departures(jacobian, distance, segments.boundary, num_boundaries)
+    both, weight = torch.cat([jacobian, own], dim=-1), segments.weight * step.inliers
+    matrix, vector = kalman.information(kalman.innovation(residual), both, noise, weight)
+    predicted = step.transition @ before[..., : departures.NUM_SHAPE + num_boundaries]
+    predicted = torch.where(step.fresh[:, None, None], 0.0, predicted)
+    sensitivity = departures.updated_sensitivity(predicted, step.cov, matrix)
+    return DirectionDepartures(distance, sensitivity, matrix, vector)
 
 
 def incidence(

@@ -26,12 +26,14 @@ class BoundaryAngles(NamedTuple):
         noise: (B, L) rad², variances from the pixels.
         jacobian: (B, L, 2), by pitch and yaw.
         present: (B, L) bool.
+        by_shape: (B, L, 2) rad m, by curvature and vertical curvature of the road.
     """
 
     angles: Tensor
     noise: Tensor
     jacobian: Tensor
     present: Tensor
+    by_shape: Tensor
 
 
 def line_angles(rays: Tensor) -> Tensor:
@@ -105,6 +107,7 @@ def boundary_angles(
     pitch: Tensor,
     yaw: Tensor,
     num_boundaries: int,
+    distance: Tensor | None = None,
 ) -> BoundaryAngles:
     """Compute one angle α per boundary from all its segments, with variance and Jacobian.
 
@@ -120,6 +123,7 @@ def boundary_angles(
         pitch: (B,) rad.
         yaw: (B,) rad.
         num_boundaries: L.
+        distance: (B, N, 2) m ahead of both ends on the road, for the derivative by its shape; None is 0.
 
     Returns:
         angles with noise, Jacobian and presence.
@@ -129,6 +133,7 @@ def boundary_angles(
     far = (world[..., :2].square().sum(-1) > _MIN_RADIUS**2).all(-1) & (weight > 0)  # (B, N)
     world = torch.where(far[..., None, None], world, world.new_tensor([0.0, 1.0, 1.0]))
     angle, by_pose, pull = _segment_angles(world, yaw)
+    by_shape = torch.zeros_like(by_pose) if distance is None else angles_by_shape(world, distance)
     focal = 0.5 * (intrinsics[:, 0, 0] + intrinsics[:, 1, 1]).unsqueeze(-1)
     variance = (sigma / focal).square() / pull
     index = torch.arange(num_boundaries, device=boundary.device)[:, None]
@@ -141,7 +146,8 @@ def boundary_angles(
     present = total > 0
     share = precision / torch.where(present, total, 1.0).unsqueeze(-1)
     angles = (share @ angle.unsqueeze(-1)).squeeze(-1)
-    return BoundaryAngles(angles, 1.0 / torch.where(present, total, 1.0), share @ by_pose, present)
+    noise = 1.0 / torch.where(present, total, 1.0)
+    return BoundaryAngles(angles, noise, share @ by_pose, present, share @ by_shape)
 
 
 def _segment_angles(world: Tensor, yaw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -167,6 +173,26 @@ def _segment_angles(world: Tensor, yaw: Tensor) -> tuple[Tensor, Tensor, Tensor]
     return angle, torch.stack([by_pitch, by_yaw], dim=-1), pull
 
 
+def angles_by_shape(world: Tensor, distance: Tensor) -> Tensor:
+    """Compute the derivative of each segment's angle by curvature and vertical curvature of the road.
+
+    Source: Eq. (T2). At the distance Z a curvature moves a boundary to the right by c Z²/2, and a
+    vertical curvature moves the road down by κ Z²/2.
+
+    Args:
+        world: (B, N, 2, 3), rays to the end points in the lane-aligned frame without roll.
+        distance: (B, N, 2) m, Z.
+
+    Returns:
+        (B, N, 2) rad m.
+    """
+    x, y, z = world.unbind(-1)
+    half = 0.5 * z * distance  # of a ray, per unit of curvature
+    moved = torch.stack([-(y * half).sum(-1), (x * half).sum(-1)], dim=-1)
+    by_shape: Tensor = moved / (x * x + y * y).sum(-1, keepdim=True)
+    return by_shape
+
+
 class WidthMeasurement(NamedTuple):
     """Lane widths, linearised in (roll, height).
 
@@ -175,12 +201,14 @@ class WidthMeasurement(NamedTuple):
         jacobian: (B, L-1, 2), by roll and height.
         noise: (B, L-1, L-1) m², identity where a lane is not there.
         present: (B, L-1) bool.
+        by_angle: (B, L-1, L) m, by the boundaries' angles.
     """
 
     widths: Tensor
     jacobian: Tensor
     noise: Tensor
     present: Tensor
+    by_angle: Tensor
 
 
 def measure_widths(
@@ -223,7 +251,7 @@ def measure_widths(
     both = present.unsqueeze(-1) & present.unsqueeze(-2)
     lanes = eye[:-1, :-1]
     noise = torch.where(both, noise + lane_noise**2 * lanes, lanes)
-    return WidthMeasurement(widths, jacobian, noise, present)
+    return WidthMeasurement(widths, jacobian, noise, present, difference)
 
 
 def initial_roll_height(

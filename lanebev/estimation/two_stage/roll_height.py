@@ -9,8 +9,10 @@ from torch import Tensor
 
 from lanebev.batch import may_skip
 from lanebev.estimation import kalman
+from lanebev.estimation.two_stage.departures import updated_sensitivity
 from lanebev.estimation.two_stage.lane_width import (
     BoundaryAngles,
+    WidthMeasurement,
     initial_roll_height,
     measure_widths,
     width_residuals,
@@ -31,6 +33,10 @@ class RollHeightStep(NamedTuple):
         mean: (B, 4) roll, height and their rates; cov: (B, 4, 4).
         roll_known: (B,) bool; height_known: (B,) bool.
         roll_seen: (B,) bool, two lanes or more in this frame; height_seen: (B,) bool, one lane or more.
+        sensitivity: (B, 4, 3 + 2 L) of the state to the road's departures from the model.
+        matrix: (B, 2 + 2 + 2 L, 2 + 2 + 2 L), information of the frame on roll, height and these departures
+            without the last, the roll's own.
+        vector: (B, 2 + 2 + 2 L), likewise.
     """
 
     mean: Tensor
@@ -39,6 +45,9 @@ class RollHeightStep(NamedTuple):
     height_known: Tensor
     roll_seen: Tensor
     height_seen: Tensor
+    sensitivity: Tensor
+    matrix: Tensor
+    vector: Tensor
 
 
 class SeenLanes(NamedTuple):
@@ -48,11 +57,13 @@ class SeenLanes(NamedTuple):
         boundaries: angles about the direction of stage 1.
         lane_width: (B, L-1) m, the prior.
         direction_cov: (B, 2, 2) of pitch and yaw.
+        direction_sensitivity: (B, 2, 2 + L) of pitch and yaw to curvatures and headings.
     """
 
     boundaries: BoundaryAngles
     lane_width: Tensor
     direction_cov: Tensor
+    direction_sensitivity: Tensor
 
 
 def track_roll_height(
@@ -73,10 +84,10 @@ def track_roll_height(
     Returns:
         the step.
     """
-    boundaries, lane_width, _ = lanes
+    boundaries, lane_width = lanes.boundaries, lanes.lane_width
     num_lanes = (boundaries.present[:, :-1] & boundaries.present[:, 1:]).sum(-1)
     height_seen, roll_seen = num_lanes >= 1, num_lanes >= 2
-    mean, cov = predict_roll_height(state, dt, roll_seen, height_seen, cfg)
+    mean, cov, transition = predict_roll_height(state, dt, roll_seen, height_seen, cfg)
 
     lost = fresh & (state.status == int(Status.LOST))
     start_roll = roll_seen & (~state.roll_known | lost)
@@ -90,20 +101,27 @@ def track_roll_height(
     cov = torch.where((first.unsqueeze(-1) | first.unsqueeze(-2)), wide, cov)
 
     seen = torch.stack([roll_seen, height_seen], dim=-1)
-    mean, cov = update_by_widths(lanes, mean, cov, seen, cfg.lane_noise)
+    mean, cov, measured = update_by_widths(lanes, mean, cov, seen, cfg.lane_noise)
+    matrix, vector = departure_information(lanes, measured, seen)
+    sensitivity = torch.where(first.unsqueeze(-1), 0.0, transition @ state.sensitivity[:, 4:])
+    sensitivity = updated_sensitivity(sensitivity, cov, matrix)
     # Widths of wrong boundaries can lead anywhere: impossible values start again.
     possible = (mean[:, 0].abs() < LARGEST_ROLL) & (mean[:, 1] > LEAST_HEIGHT) & (mean[:, 1] < LARGEST_HEIGHT)
     prior = torch.cat([mean.new_tensor(cfg.initial_pose[2:]), mean.new_zeros(2)])
     mean = torch.where(possible.unsqueeze(-1), mean, prior)
     cov = torch.where(possible[:, None, None], cov, wide)
+    sensitivity = torch.where(possible[:, None, None], sensitivity, 0.0)
     roll_known = (state.roll_known | roll_seen) & possible
     height_known = (state.height_known | height_seen) & possible
-    return RollHeightStep(mean, cov, roll_known, height_known, roll_seen, height_seen)
+    information = matrix[:, :-1, :-1], vector[:, :-1]
+    return RollHeightStep(
+        mean, cov, roll_known, height_known, roll_seen, height_seen, sensitivity, *information
+    )
 
 
 def update_by_widths(
     lanes: SeenLanes, mean: Tensor, cov: Tensor, seen: Tensor, lane_noise: float
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, WidthMeasurement]:
     """Update roll and height by the lanes' widths in an iterated extended Kalman filter.
 
     Source: Eqs. (15)-(17) with the measurement of Eq. (20); iterated as in Bell and Cathey 1993.
@@ -119,9 +137,9 @@ def update_by_widths(
         lane_noise: m, standard deviation of a lane's width about the prior.
 
     Returns:
-        mean (B, 4) and covariance (B, 4, 4).
+        mean (B, 4), covariance (B, 4, 4), and the widths of the last linearisation.
     """
-    boundaries, lane_width, direction_cov = lanes
+    boundaries, lane_width, direction_cov, _ = lanes
     at, after = mean, cov
     for _ in range(_NUM_LINEARISATIONS):
         measured = measure_widths(boundaries, at[:, 0], at[:, 1], direction_cov, lane_noise)
@@ -133,17 +151,51 @@ def update_by_widths(
         white = solve_lower(cholesky(measured.noise), both)
         info = kalman.information(white[..., -1], white[..., :-1], torch.ones_like(error))
         at, after = kalman.update(mean, cov, *info)
-    return at, after
+    return at, after, measured
+
+
+def departure_information(
+    lanes: SeenLanes, measured: WidthMeasurement, seen: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Compute a frame's information on roll, height and the road's departures from the model.
+
+    Source: docs/method/paper.md, Eq. (T2): derivatives of w_p - w by curvature, vertical curvature, headings,
+    deviations and a roll that the frame does not determine.
+
+    Args:
+        lanes: those of the frame.
+        measured: their widths.
+        seen: (B, 2) bool, whether widths may move roll and height.
+
+    Returns:
+        (B, 5 + 2 L, 5 + 2 L) and (B, 5 + 2 L).
+    """
+    boundaries = lanes.boundaries
+    error = width_residuals(measured.widths, lanes.lane_width, measured.present)
+    eye = torch.eye(boundaries.present.shape[1], dtype=error.dtype, device=error.device)
+    turned = boundaries.jacobian[..., 1:] * eye  # a boundary's heading acts as a yaw of its own
+    own = torch.cat([boundaries.by_shape, -turned], dim=-1)
+    angles = boundaries.jacobian @ lanes.direction_sensitivity + own
+    ends = (eye[:-1] - eye[1:]).expand_as(measured.by_angle)
+    moved, unseen = measured.jacobian * seen.unsqueeze(1), measured.jacobian[..., :1] * ~seen[:, None, :1]
+    columns = [moved, -measured.by_angle @ angles, ends, -unseen, error.unsqueeze(-1)]
+    there = measured.present.unsqueeze(-1)
+    white = solve_lower(cholesky(measured.noise), torch.where(there, torch.cat(columns, dim=-1), 0.0))
+    both = white[..., :-1].mT @ white
+    return both[..., :-1], both[..., -1]
 
 
 def predict_roll_height(
     state: TwoStageState, dt: Tensor, roll_seen: Tensor, height_seen: Tensor, cfg: TwoStageConfig
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Predict roll and height at constant velocity, for ``reacquire_after`` at most.
 
     Source: Eqs. (21)-(22). Deviation: what this frame does not observe keeps its value, and only its variance
     grows. The paper extrapolates roll on one lane for ever (paper.md D6), and across any gap, so
     far that one linearised update does not lead back.
+
+    Returns:
+        mean (B, 4), covariance (B, 4, 4) and transition (B, 4, 4).
     """
     density = dt.new_tensor([cfg.angular_acceleration_density, cfg.height_acceleration_density])
     transition, _ = kalman.constant_velocity(dt.clamp(max=cfg.reacquire_after), density)
@@ -163,4 +215,4 @@ def predict_roll_height(
     cov = cov + torch.cat([torch.zeros_like(rates), rates], dim=-1).diag_embed()
     # Without roll in the measurement, its correlation with height would still move it: cut it.
     together = moving.unsqueeze(-1) == moving.unsqueeze(-2)
-    return mean, torch.where(together, cov, 0.0)
+    return mean, torch.where(together, cov, 0.0), transition

@@ -38,6 +38,11 @@ class TwoStageConfig:
         assumed_dt: time between frames, s, where it is not finite.
         lane_noise: standard deviation of each lane's width about the prior, m.
         lane_width_std: standard deviation of the prior itself, m: a common scale of the height.
+        lane_deviation_std: standard deviation of each boundary's deviation from its place, m, as far as too
+            few boundaries are in view to show it; in the covariance only.
+        departures: whether the covariance contains the effect of the road's departures from the model; else
+            it is that of the filters.
+        departure_memory: time constant over which the road's departures from the model are measured, s.
     """
 
     num_boundaries: int = NUM_BOUNDARIES
@@ -57,6 +62,9 @@ class TwoStageConfig:
     assumed_dt: float = 1 / 30
     lane_noise: float = 0.0
     lane_width_std: float = 0.0
+    lane_deviation_std: float = 0.05
+    departures: bool = True
+    departure_memory: float = 1.0
 
     def __post_init__(self) -> None:
         if self.num_boundaries < 2:
@@ -74,6 +82,10 @@ class TwoStageState(NamedTuple):
         roll_height_mean: (B, 4) roll, height and their rates; roll_height_cov: (B, 4, 4).
         roll_known, height_known: (B,) bool, initialised from lane widths.
         unseen: (B,) s since the vanishing point was last supported.
+        sensitivity: (B, 8, 3 + 2 L) of direction_mean and roll_height_mean to the road's departures from the
+            model, see :mod:`lanebev.estimation.two_stage.departures`.
+        shape: (B, 2, 3), information on the road's curvature and vertical curvature.
+        scatter: (B, 2, 4), moments of the boundaries' own headings and deviations.
         status: (B,) int64.
         reasons: (B,) int64, :class:`~lanebev.estimation.reasons.Reason` flags of the last frame.
     """
@@ -85,6 +97,9 @@ class TwoStageState(NamedTuple):
     roll_known: Tensor
     height_known: Tensor
     unseen: Tensor
+    sensitivity: Tensor
+    shape: Tensor
+    scatter: Tensor
     status: Tensor
     reasons: Tensor
 
