@@ -17,6 +17,7 @@ _DRAWN_TEXTS = ("tty", "bin", "xbin", "adf", "idf")  # formats of which ffmpeg d
 _MOVING = 0.5  # a stream that lasts for less of the longest one's duration is a picture
 _NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS: raw streams, whose times ffmpeg makes up
 _MARKED = "one that the decoder marks as damaged"
+_IN_DAMAGE = "one beside data that is missing"
 _EARLY = "one before the first key frame"
 _WITHOUT_KEY_CHECK = ("mpeg4", "msmpeg4v2", "msmpeg4v3", "h263", "flv1", "wmv1", "wmv2", "mpeg1video")
 """Codecs whose decoders show grey frames, or others' remains, before the first key frame of a cut stream."""
@@ -119,13 +120,15 @@ def decoded(  # noqa: C901 - every loop is a way in which files are damaged
     """Return frames as they are shown, with the times that the file gives; of a lost one, what was got.
 
     A packet that yields no frame is lost if the file is damaged before it; in an undamaged file it shows
-    nothing. A frame that the decoder marks as corrupt is lost too, and one without a key frame before it. AVI
+    nothing. A frame that the decoder marks as corrupt is lost too, one without a key frame before it, and one
+    in a packet that the container marks, beside which others may be missing, unless it is a key frame. AVI
     has no display times, so the frames of a stream with B-frames come with wrong ones: they get the packets'
     times in order. Frame threads are not used, because they drop what follows the last error.
     """
     in_order = container.format.name == "avi" and stream.codec_context.has_b_frames
     due: list[int] = []  # times of packets whose frames have not come
     lost: set[int] = set()
+    doubted: set[int] = set()  # times of packets that the container marks as damaged
     damage = ""
     keyed = stream.codec_context.name not in _WITHOUT_KEY_CHECK
     for packet in packets(container, stream):
@@ -133,6 +136,7 @@ def decoded(  # noqa: C901 - every loop is a way in which files are damaged
             bisect.insort(due, packet.pts)
         if packet.is_corrupt:
             damage = damage or "a damaged one"
+            doubted.update([] if packet.pts is None else [packet.pts])
         frames: Sequence[av.VideoFrame] = ()
         try:
             frames = packet.decode()
@@ -152,7 +156,8 @@ def decoded(  # noqa: C901 - every loop is a way in which files are damaged
                 if (earlier := due.pop(0)) < pts and damage:
                     yield earlier, damage
             keyed = keyed or frame.key_frame
-            yield pts, _if_whole(frame, keyed)
+            cut = pts in doubted and not frame.key_frame
+            yield pts, _IN_DAMAGE if cut else _if_whole(frame, keyed)
     if damage:
         yield from ((pts, damage) for pts in due)
 

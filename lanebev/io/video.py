@@ -41,7 +41,14 @@ from lanebev.io.image_names import in_natural_order, times_from_names
 from lanebev.io.images import is_image, read_image, stated_size
 from lanebev.io.side_by_side import halves_remark
 from lanebev.io.source_names import SCHEMES
-from lanebev.io.video_remarks import LONGEST_STEP, appended_remark, gap_remark, restart_remark, stream_remarks
+from lanebev.io.video_remarks import (
+    LONGEST_STEP,
+    appended_remark,
+    gap_remark,
+    missing_remark,
+    restart_remark,
+    stream_remarks,
+)
 
 _LOOKED_AT = 20  # images, for the most frequent size and one that has it
 _DARK = 24  # an image with no brighter value, of 255, is dark; 12 bits in 16 give 15 at most
@@ -228,7 +235,8 @@ def _survey(source: str, lost: Sequence[int], first: int | None, fps: Fraction) 
                 end = max(end, packet.pts - begin + max(packet.duration or 0, 1 / fps / tick))
         declared, appended = declared_duration(stream), appended_remark(container, read)
     restart = restart_remark(keys, most_early)
-    problems = [*filter(None, (appended, restart, gap_remark(shown, tick)))]
+    gaps = gap_remark(shown, tick) or missing_remark(container.format.name, shown)
+    problems = [*filter(None, (appended, restart, gaps))]
     return _Survey(shown, tick, float(end * tick), declared, is_edited, is_complete and not restart, problems)
 
 

@@ -19,6 +19,7 @@ from lanebev.io.rising_clock import REORDERED
 from lanebev.io.side_by_side import halves_remark
 
 LONGEST_STEP = 60  # s between two frames of a drive
+_MOST_MISSING = 0.2  # of the frames; with more of them, times are those of a camera that varies
 _HEAD = 8  # bytes, which tell what kind of file it is
 _HEAD_AGAIN = ("mpegts", "mxf", "mpjpeg")  # formats in which these bytes come again in one file
 _SPHERICAL = range(4)  # AVSphericalProjection: equirectangular, cube maps, half of one
@@ -83,6 +84,25 @@ def gap_remark(times: Sequence[int], tick: Fraction) -> str:
     """Return a remark on times (ticks) of frames between which a minute or more is missing; else nothing."""
     longest = max((after - before for before, after in pairwise(sorted(times))), default=0) * tick
     return f"its times jump by {float(longest):.0f} s; is it one drive?" if longest > LONGEST_STEP else ""
+
+
+def missing_remark(kind: str, times: Sequence[int]) -> str:
+    """Return how many frames a transport stream lost, by evenly spaced times with gaps; else nothing.
+
+    Args:
+        kind: format of the container; others drop frames that the camera was too slow for.
+        times: ticks, of its frames in any order.
+    """
+    steps = np.diff(sorted(times))
+    if kind != "mpegts" or not len(steps) or (usual := float(np.median(steps))) <= 0:
+        return ""
+    missing = int(np.maximum(np.rint(steps / usual) - 1, 0).sum())
+    if not 0 < missing <= _MOST_MISSING * len(times):
+        return ""
+    return (
+        f"its times leave out {missing} frame{'s'[: missing != 1]}; after such a gap images may be damaged "
+        "up to the next key frame"
+    )
 
 
 def _begins_again(path: Path, end: int) -> bool:

@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from lanebev.io.decoding import displayed
+from lanebev.io.decoding import decoded, displayed, packets
 from lanebev.io.image_names import in_natural_order, natural_order, times_from_names
 from lanebev.io.lanes import lane_files
 from lanebev.io.video import open_source
+from lanebev.io.video_remarks import missing_remark
 from lanebev.io.video_writer import VideoWriter
 
 SIZE = (48, 64)
@@ -135,6 +136,58 @@ def test_damage_of_h264_is_noticed_by_several_threads_too(tmp_path):
     frames = list(open_source(str(path)))
     assert [frame.image is None for frame in frames] == [i == 3 for i in range(12)]
     assert frames[3].problem == "expected a whole frame, got: one that the decoder marks as damaged"
+
+
+def test_packets_that_a_transport_stream_lost_are_noticed(tmp_path):
+    """The frames after them are built on ones that are not there."""
+    path = _encode(tmp_path / "v.ts", images=_noise(30), count=30, g="15", bf="0", sc_threshold="0")
+    whole = list(open_source(str(path)))
+    assert not any(frame.problem for frame in whole)
+    with av.open(str(path)) as container:
+        place = [packet.pos for packet in container.demux(video=0) if packet.size][5]
+    data = path.read_bytes()
+    path.write_bytes(data[: place + 188] + data[place + 4 * 188 :])  # of 188 bytes each
+    source = open_source(str(path))
+    problems = {round(10 * frame.time): frame.problem for frame in source if frame.problem}
+    assert min(problems) in (4, 5)
+    assert "up to the next key frame, images may show a lost frame's damage" in problems.values()
+    assert max(problems) < 15
+
+
+class _Doubted:
+    """A packet that the container marks as damaged."""
+
+    is_corrupt = True
+
+    def __init__(self, packet):
+        self.packet = packet
+
+    def __getattr__(self, name):
+        return getattr(self.packet, name)
+
+
+@pytest.mark.parametrize(("number", "lost"), [(5, [5]), (15, [])])  # of a key frame nothing is missing
+def test_a_frame_in_a_packet_that_the_container_marks_is_lost(tmp_path, monkeypatch, number, lost):
+    path = _encode(tmp_path / "v.ts", images=_noise(30), count=30, g="15", bf="0", sc_threshold="0")
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        read = [_Doubted(each) if i == number else each for i, each in enumerate(packets(container, stream))]
+        monkeypatch.setattr("lanebev.io.decoding.packets", lambda *_: read)
+        frames = [frame for _, frame in decoded(container, stream)]
+    assert [i for i, frame in enumerate(frames) if isinstance(frame, str)] == lost
+    assert len(frames) == 30
+
+
+def test_frames_that_a_transport_stream_lost_as_a_whole_are_counted(tmp_path):
+    path = _encode(tmp_path / "v.ts", images=_noise(30), count=30, g="15", bf="0")
+    with av.open(str(path)) as container:
+        places = [packet.pos for packet in container.demux(video=0) if packet.size]
+    data = path.read_bytes()
+    path.write_bytes(data[: places[5]] + data[places[7] :])
+    problem = open_source(str(path)).problem
+    assert "its times leave out 2 frames; after such a gap images may be damaged up to the next" in problem
+    assert missing_remark("mpegts", [0, 3, 6, 9]) == missing_remark("mov,mp4", [0, 3, 9, 12]) == ""
+    assert missing_remark("mpegts", [0, 3, 8, 11, 18, 21, 29]) == ""  # steps that vary
 
 
 # streams without times, B-frames
