@@ -134,7 +134,10 @@ def _openlane_points(
     if not isinstance(lane, dict):
         raise ValueError(f"{name}: expected an object, got {shown(lane)}")
     if not _is_3d(lane):
-        return checked_pixels(f"{name}.uv", columns(f"{name}.uv", field(lane, "uv", list), 2).T)
+        uv = field(lane, "uv", list)
+        if len(uv) > 2 and all(isinstance(each, list) and len(each) == 2 for each in uv):  # points
+            uv = [list(axis) for axis in zip(*uv, strict=True)]
+        return checked_pixels(f"{name}.uv", columns(f"{name}.uv", uv, 2).T)
     xyz = field(lane, "xyz", list)
     rows_of_three = _is_list_of_points(lane) or (by_point and _are_threes(xyz))
     by_axis = [list(axis) for axis in zip(*xyz, strict=True)] if rows_of_three and xyz else xyz

@@ -150,6 +150,13 @@ def test_3d_points_alone_are_projected_by_the_intrinsics(tmp_path, layout):
         read_lanes(path)
 
 
+def test_uv_may_be_a_list_of_points(tmp_path):
+    (line,) = read_lanes(_openlane(tmp_path / "1.json", {"uv": PIXELS.tolist()}))[0].lines
+    np.testing.assert_array_equal(line.points, PIXELS)
+    two = read_lanes(_openlane(tmp_path / "1.json", {"uv": [[1, 2], [590, 580]]}))[0].lines[0]
+    np.testing.assert_array_equal(two.points, [[1, 590], [2, 580]])  # two lists, as OpenLane has them
+
+
 def test_three_3d_points_are_laid_out_as_those_of_the_other_lines(tmp_path):
     path = tmp_path / "1.json"
     three, four = {"xyz": LABEL[:3].tolist()}, {"xyz": LABEL.tolist()}
