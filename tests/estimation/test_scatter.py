@@ -19,6 +19,7 @@ from lanebev.estimation.joint.scatter import (
     averaged_moments,
     boundary_scatter,
     determined_sensitivity,
+    renumbered_moments,
     scatter_variance,
     start_variance,
     with_headings,
@@ -64,8 +65,8 @@ def test_the_variances_of_places_and_headings_are_found(place_std, heading_std):
     member = membership(seen.boundary, 6, seen.sigma)
     told = with_headings(*information(straight, weight, member), straight, weight, member)
     precision = torch.ones(60, NUM_STRAIGHT, dtype=DOUBLE)
-    found = boundary_scatter(*told, precision, torch.zeros(60, 2, 3, dtype=DOUBLE))
-    squares, freedom, weight = found.moments.mean(0).unbind(-1)
+    found = boundary_scatter(*told, precision, torch.zeros(60, 2, 6 + 4, dtype=DOUBLE))
+    squares, _, freedom, weight = found.moments.mean(0)[:, 6:].unbind(-1)
     assert (squares / freedom).sqrt().tolist() == [
         pytest.approx(place_std, rel=0.15, abs=0.008),
         pytest.approx(heading_std, rel=0.15),
@@ -97,33 +98,82 @@ def test_the_sensitivity_to_a_heading_is_the_change_of_the_fit():
     assert expected[PITCH].abs() > 5e-6
 
 
+def moments_of(squares, freedom, found=(0.0,) * 6, noise=0.0):
+    """Moments (1, 2, 6 + 4) of one frame, the same for deviations and headings."""
+    return torch.tensor([[[*found, squares, noise, freedom, 1.0]] * 2], dtype=DOUBLE)
+
+
 def test_frames_that_tell_nothing_leave_the_moments_and_the_first_that_tells_counts_fully():
-    now = torch.tensor([[[4e-4, 2.0, 1.0], [9e-6, 3.0, 1.0]]] * 2, dtype=DOUBLE)
-    now[1, :, :2] = 0.0  # two boundaries fit parallel lanes whatever they are
+    tells, tells_nothing = moments_of(4e-4, 2.0), moments_of(0.0, 0.0)  # two boundaries fit parallel lanes
+    now = torch.cat([tells, tells_nothing])
     step = torch.full((2,), ONE_FRAME, dtype=DOUBLE)
     first = averaged_moments(now, torch.zeros_like(now), step, 1.0)
     torch.testing.assert_close(scatter_variance(first)[0], scatter_variance(now)[0])
     assert (scatter_variance(first)[1] == 0).all()
     again = averaged_moments(now, first, step, 1.0)
     torch.testing.assert_close(scatter_variance(again)[0], scatter_variance(now)[0])
-    quiet = torch.tensor([[[0.0, 2.0, 1.0], [0.0, 3.0, 1.0]]], dtype=DOUBLE)
-    later = averaged_moments(quiet, now[:1], torch.ones(1, dtype=DOUBLE), 1.0)
-    torch.testing.assert_close(scatter_variance(later), math.exp(-1) * scatter_variance(now[:1]))
+    later = averaged_moments(moments_of(0.0, 2.0), tells, torch.ones(1, dtype=DOUBLE), 1.0)
+    torch.testing.assert_close(scatter_variance(later), math.exp(-1) * scatter_variance(tells))
+
+
+def test_the_mean_of_the_estimates_tells_what_lasts_and_not_noise():
+    """Estimates as noisy as large: squares less noise tell nothing, the mean tells the lasting part only."""
+    own, std = torch.tensor([3.0, -1.0, -2.0, 0.0, 2.0, -2.0], dtype=DOUBLE) * 1e-3, 2e-3
+    noises = std * torch.randn(400, 6, generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
+    lasting = torch.zeros(1, 2, 10, dtype=DOUBLE)
+    without = torch.zeros_like(lasting)
+    step = torch.full((1,), ONE_FRAME, dtype=DOUBLE)
+    for noise in noises:
+        now = moments_of(0.0, 3.0, (own + noise).tolist(), 6 * std**2)
+        lasting = averaged_moments(now, lasting, step, 1.0)
+        now = moments_of(0.0, 3.0, noise.tolist(), 6 * std**2)
+        without = averaged_moments(now, without, step, 1.0)
+    frames = 2 / (1 - math.exp(-ONE_FRAME)) - 1  # as many equally weighted ones
+    torch.testing.assert_close(lasting[0, :, 7], torch.full((2,), 6 * std**2 / frames, dtype=DOUBLE))
+    found = scatter_variance(lasting)
+    expected = scatter_variance(moments_of(own.square().sum().item(), 3.0))
+    torch.testing.assert_close(found, expected, rtol=0.3, atol=0)
+    assert (scatter_variance(without) == 0).all()
+
+
+def test_after_a_lane_change_the_estimates_are_those_of_the_same_boundaries():
+    now = moments_of(1e-4, 3.0, (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)).expand(3, -1, -1)
+    found = renumbered_moments(now, torch.tensor([0.0, 1.0, -1.0], dtype=DOUBLE))
+    assert found[0].equal(now[0])
+    assert found[1, 0, :6].tolist() == [2.0, 3.0, 4.0, 5.0, 6.0, 0.0]
+    assert found[2, 1, :6].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+    assert found[:, :, 6:].equal(now[:, :, 6:])
 
 
 def test_few_degrees_of_freedom_enlarge_the_variance():
-    few, many = (torch.tensor([[[1e-4 * n, n, 1.0]] * 2], dtype=DOUBLE) for n in (1.0, 100.0))
+    few, many = (moments_of(1e-4 * n, n) for n in (1.0, 100.0))
     assert (scatter_variance(few) > 2 * scatter_variance(many)).all()
     assert scatter_variance(many).tolist() == [pytest.approx([1e-4, 1e-4], rel=0.03)]
 
 
 def test_the_variance_of_a_start_decreases_with_time_and_with_degrees_of_freedom():
     """By e in two seconds, and by e² for each degree of freedom, of deviations and headings together."""
-    now = torch.tensor([[[0.0, 0.0, 1.0]] * 2, [[0.0, 0.25, 1.0]] * 2, [[0.0, 1.0, 1.0]] * 2], dtype=DOUBLE)
+    now = torch.cat([moments_of(0.0, freedom) for freedom in (0.0, 0.25, 1.0)])
     two_seconds = torch.full((3,), 2.0, dtype=DOUBLE)
     later = averaged_moments(now, torch.zeros_like(now), two_seconds, 1.0)
     expected = torch.tensor([0.0, math.exp(-1 - 1), math.exp(-1 - 4)], dtype=DOUBLE)
     torch.testing.assert_close(start_variance(later, 0.003) / 0.003**2, expected)  # the first: no frame yet
+
+
+def test_headings_smaller_than_the_noise_of_a_frame_are_found_in_a_second():
+    """Of 3 mrad, seen with 2 px: in three of four drives, and the covariance contains the error."""
+    headings = 3e-3 * torch.tensor([1.0, -0.5, -1.0, 1.5, -1.0, 0.0], dtype=DOUBLE)
+    drive = moments(1.5, lambda t, m: replace(m, headings=headings, far=30.0))
+    calibrator, rows = JointCalibrator(start_heading_std=0.0), 8
+    state = calibrator.initial_state(rows, dtype=DOUBLE)
+    for moment, segments in see(drive, rows, 2.0, 10, 3, DOUBLE):
+        calibration, state = calibrator(segments, CAMERA.expand(rows, 3, 3), state, moment.dt, WIDTH)
+    found = scatter_variance(state.scatter)[:, 1].sqrt()
+    assert (found > 1e-3).double().mean() >= 0.75
+    error = calibration.extrinsics.stack() - torch.tensor(moment.pose, dtype=DOUBLE)
+    variances = calibration.covariance.diagonal(dim1=1, dim2=2)
+    assert (error.square() < 9 * variances).all()
+    assert error[:, PITCH].square().mean() > 9 * state.cov[:, PITCH, PITCH].mean()  # the filter's does not
 
 
 @pytest.mark.parametrize(
@@ -285,7 +335,7 @@ def test_skipped_and_unsupported_frames_keep_the_scatter_and_rows_are_independen
         _, state = calibrator(segments, CAMERA.expand(3, 3, 3), state, moment.dt, WIDTH)
         first = LaneSegments(*(part[:1] for part in segments))
         _, alone = calibrator(first, CAMERA[None], alone, moment.dt, WIDTH)
-    assert (state.scatter[..., 0] > 0).all()
+    assert (state.scatter[..., 6] > 0).all()
     torch.testing.assert_close(state.scatter[:1], alone.scatter, rtol=1e-9, atol=0)
     nothing = segments._replace(weight=torch.zeros_like(segments.weight))
     _, unsupported = calibrator(nothing, CAMERA.expand(3, 3, 3), state, 1 / 30, WIDTH)

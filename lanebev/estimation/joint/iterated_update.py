@@ -29,7 +29,13 @@ from lanebev.estimation.joint.measurement import (
     look,
 )
 from lanebev.estimation.joint.observations import Observations, ego_lane_width, per_end
-from lanebev.estimation.joint.scatter import Scatter, averaged_moments, boundary_scatter, with_headings
+from lanebev.estimation.joint.scatter import (
+    Scatter,
+    averaged_moments,
+    boundary_scatter,
+    renumbered_moments,
+    with_headings,
+)
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.joint.update import (
     FrameInformation,
@@ -132,14 +138,15 @@ def update_state(
         residuals = residuals._replace(distance=distance, valid=valid)  # the Jacobian stays
         last = iterate(at, last.step.cov, residuals, last.frame.scale, cov)
 
-    scatter = scatter_of_frame(last.frame, cov, member, predicted.scatter)
+    moments = renumbered_moments(predicted.scatter, shift)
+    scatter = scatter_of_frame(last.frame, cov, member, moments)
     gain = kalman_gain(last.prior_cov, last.step, last.frame, last.estimated)
     updated = predicted._replace(
         mean=torch.baddbmm(mean.unsqueeze(-1), gain, last.step.pull.unsqueeze(-1)).squeeze(-1),
         cov=posterior_covariance(cov, last.frame.matrix, gain),
         evidence=evidence,
         pose_sensitivity=scatter.sensitivity,
-        scatter=averaged_moments(scatter.moments, predicted.scatter, dt, cfg.scatter_memory),
+        scatter=averaged_moments(scatter.moments, moments, dt, cfg.scatter_memory),
         motion_scale=motion_scale,
         reasons=flag(shift != 0, Reason.LANE_CHANGE),
     )
@@ -189,7 +196,7 @@ def scatter_of_frame(frame: FrameInformation, cov: Tensor, member: Tensor, momen
         frame: its information, near the state.
         cov: (B, D, D), of the state before the frame.
         member: (B, L, M), boundary of each end point.
-        moments: (B, 2, 3) of the frames before.
+        moments: (B, 2, L + 4) of the frames before.
     """
     matrix, vector = with_headings(frame.matrix, frame.vector, frame.residuals, frame.weight, member)
     kept = constant((*range(NUM_STRAIGHT), *range(VERTICAL, vector.shape[-1])), matrix, torch.int64)

@@ -68,9 +68,14 @@ def renumber(mean: Tensor, shift: Tensor, lane_width: Tensor, num_boundaries: in
         (B, D).
     """
     last = NUM_COMMON + num_boundaries
-    number = constant(tuple(range(1, num_boundaries + 1)), like=mean, dtype=torch.int64)  # padded
-    own = pad(mean[:, NUM_COMMON:last], (1, 1)).gather(1, number + shift.long().unsqueeze(-1))
+    own = shifted(mean[:, NUM_COMMON:last], shift)
     offset = mean[:, OFFSET : OFFSET + 1] + (shift * lane_width).unsqueeze(-1)
     return torch.cat(
         [mean[:, :OFFSET], offset, mean[:, OFFSET + 1 : NUM_COMMON], own, mean[:, last:]], dim=-1
     )
+
+
+def shifted(values: Tensor, shift: Tensor) -> Tensor:
+    """Shift values (B, L) of each boundary by (B,) lanes, -1, 0 or 1; 0 comes in at the end."""
+    number = constant(tuple(range(1, values.shape[-1] + 1)), like=values, dtype=torch.int64)  # padded
+    return pad(values, (1, 1)).gather(1, number + shift.long().unsqueeze(-1))

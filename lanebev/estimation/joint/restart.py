@@ -195,7 +195,7 @@ def scatter_of_fit(fit: SingleFrameFit, places: Tensor, seen: Observations, cfg:
     weight = residuals.valid * fit.inliers * seen.weight / scaled_variance(seen.sigma, fit.scale)
     member = membership(seen.boundary, cfg.num_boundaries, like=places)
     told = with_headings(*information(residuals, weight, member), residuals, weight, member)
-    no_moments = places.new_zeros(places.shape[0], 2, 3)
+    no_moments = places.new_zeros(places.shape[0], 2, cfg.num_boundaries + 4)
     found = boundary_scatter(*told, cfg.prior.precision(params), no_moments)
     determined = determined_sensitivity(fit.observed, cfg.num_boundaries)
     return found._replace(sensitivity=torch.where(determined, found.sensitivity, 0.0))

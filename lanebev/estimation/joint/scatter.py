@@ -4,7 +4,7 @@ The pose is fitted to a road whose boundaries are parallel and whose lanes have 
 every boundary has a lateral deviation and a heading of its own. Errors of a detector
 that last along a boundary have the same effect. All vertices of the boundary share them, and so do
 consecutive frames, so they do not average out as noise does. Their variances are estimated from the residuals
-of every frame's fit.
+of the last frames' fits: of each, and in their mean, in which noise is small and what lasts remains.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lanebev.estimation.joint.config import JointConfig
+from lanebev.estimation.joint.lane_change import shifted
 from lanebev.estimation.joint.layout import NUM_POSE
 from lanebev.estimation.joint.measurement import OFFSET, ROLL, Residuals
 from lanebev.estimation.joint.observations import per_end
@@ -24,6 +25,7 @@ from lanebev.tensors import constant
 
 _PRIOR_STD = (0.05, 0.003)  # m, rad: least prior sigmas of a boundary's own deviation and heading
 _NOISE_FACTOR = 1.5  # so many times the noise variance of the estimates is subtracted
+_MEAN_NOISE_FACTOR = 3.0  # the same of the averaged estimates, which are as few but less noisy
 _ADDED_FREEDOM = 0.2  # degrees of freedom that are added before dividing by them
 _FEW_FREEDOM = 2.0  # degrees of freedom at which a variance is doubled, because it may be small by chance
 _LEAST_SENSITIVITY = 0.001  # rad/m or m/m of roll or height, below which a boundary is not in view
@@ -31,6 +33,7 @@ _BY_FREEDOM = 2.0  # the log of a start's variance falls by this per degree of f
 _LEAST_WEIGHT = 1e-9  # of the frames so far; smaller ones are not divided by
 _FULL_FREEDOM = 0.5  # a frame with so many degrees of freedom counts fully
 _IS_ROLL = tuple(axis == ROLL for axis in range(NUM_POSE))
+_SQUARES, _NOISE, _FREEDOM, _WEIGHT = -4, -3, -2, -1  # of the last axis of moments, after the estimates
 _BY_HEADINGS = (False, True)  # columns of M: by deviations, by headings
 
 
@@ -40,8 +43,9 @@ class Scatter(NamedTuple):
     Attributes:
         sensitivity: (B, 4, 2 L), change of the pose by the boundaries' own deviations (per m), then by their
             headings (per rad).
-        moments: (B, 2, 3), for deviations (m²) and headings (rad²): the sum of squares minus that of noise,
-            the degrees of freedom that the fit leaves (at most 2 L - 5 together), and 1, the frame's weight.
+        moments: (B, 2, L + 4), for deviations (m) and headings (rad): the estimates of the L boundaries; the
+            sum of their squares minus that of noise; the sum of their noise variances; the degrees of freedom
+            that the fit leaves (at most 2 L - 5 together); and 1, the frame's weight.
     """
 
     sensitivity: Tensor
@@ -86,7 +90,7 @@ def boundary_scatter(matrix: Tensor, vector: Tensor, precision: Tensor, moments:
             offset first, on the deviations and on the headings.
         vector: (B, P + 2 L), likewise.
         precision: (B, P), of the priors of the parameters.
-        moments: (B, 2, 3) of the frames before; they decide the prior of the deviations and headings.
+        moments: (B, 2, L + 4) of the frames before; they decide the prior of the deviations and headings.
     """
     count = precision.shape[-1]
     num = (vector.shape[-1] - count) // 2
@@ -103,15 +107,18 @@ def boundary_scatter(matrix: Tensor, vector: Tensor, precision: Tensor, moments:
     own_cov = inverse_spd(left + prior.reciprocal().diag_embed())
     seen = own_cov @ left  # ζ̂ is this times the own deviations and headings, and noise
     found = (own_cov @ pull).squeeze(-1)
-    by_noise = (seen @ own_cov).diagonal(dim1=1, dim2=2)
-    squares = (found.square() - _NOISE_FACTOR * by_noise).unflatten(-1, (2, num)).sum(-1)
+    noise = (seen @ own_cov).diagonal(dim1=1, dim2=2).unflatten(-1, (2, num)).sum(-1)
     freedom = seen.square().unflatten(1, (2, num)).unflatten(-1, (2, num)).sum((2, 4))  # (B, 2, 2)
-    each = torch.stack([squares, freedom.diagonal(dim1=1, dim2=2)], dim=-1)
-    return Scatter(across[:, :NUM_POSE], pad(each, (0, 1), value=1.0))
+    found = found.unflatten(-1, (2, num))
+    squares = found.square().sum(-1) - _NOISE_FACTOR * noise
+    sums = torch.stack([squares, noise, freedom.diagonal(dim1=1, dim2=2)], dim=-1)
+    return Scatter(across[:, :NUM_POSE], pad(torch.cat([found, sums], dim=-1), (0, 1), value=1.0))
 
 
 def averaged_moments(now: Tensor, before: Tensor, dt: Tensor, memory: float) -> Tensor:
-    """Average the moments (B, 2, 3) of scatter over the last frames, as far as a frame tells any.
+    """Average the moments (B, 2, L + 4) of scatter over the last frames, as far as a frame tells any.
+
+    The noise variances are those of the averaged estimates, the noise of frames being independent.
 
     Args:
         now: of this frame.
@@ -119,20 +126,33 @@ def averaged_moments(now: Tensor, before: Tensor, dt: Tensor, memory: float) -> 
         dt: (B,) s since the last frame.
         memory: s, time constant.
     """
-    told = (now[..., 1].sum(-1) / _FULL_FREEDOM).clamp(max=1.0)
-    gain = told * (1 - (-dt / memory).exp())
-    return before + gain[:, None, None] * (now - before)
+    told = (now[..., _FREEDOM].sum(-1) / _FULL_FREEDOM).clamp(max=1.0)
+    gain = (told * (1 - (-dt / memory).exp()))[:, None, None]
+    mean = before + gain * (now - before)
+    noise = (1 - gain).square() * before[..., _NOISE, None] + gain.square() * now[..., _NOISE, None]
+    return torch.cat([mean[..., :_NOISE], noise, mean[..., _NOISE + 1 :]], dim=-1)
 
 
 def scatter_variance(moments: Tensor) -> Tensor:
     """Compute the variances (B, 2) of a boundary's own deviation (m²) and heading (rad²) from their moments.
 
     Source: (J28). The fewer the degrees of freedom, the larger: one deviation may be small by chance.
+
+    Args:
+        moments: (B, 2, L + 4), averaged.
     """
-    squares, freedom, weight = moments.unbind(-1)
+    found, (squares, noise, freedom, weight) = moments[..., :_SQUARES], moments[..., _SQUARES:].unbind(-1)
     weight = weight.clamp(min=_LEAST_WEIGHT)
+    of_mean = (found.square().sum(-1) - _MEAN_NOISE_FACTOR * noise) / weight.square()
+    squares = (squares / weight).maximum(of_mean).clamp(min=0.0)
     freedom = freedom / weight + _ADDED_FREEDOM
-    return squares.clamp(min=0.0) / weight / freedom * (1 + _FEW_FREEDOM / freedom)
+    return squares / freedom * (1 + _FEW_FREEDOM / freedom)
+
+
+def renumbered_moments(moments: Tensor, shift: Tensor) -> Tensor:
+    """Shift the estimates of each boundary in moments (B, 2, L + 4) by (B,) lanes, -1, 0 or 1."""
+    own = shifted(moments[..., :_SQUARES].flatten(0, 1), shift.repeat_interleave(2))
+    return torch.cat([own.unflatten(0, (-1, 2)), moments[..., _SQUARES:]], dim=-1)
 
 
 def start_variance(moments: Tensor, heading_std: float) -> Tensor:
@@ -143,10 +163,10 @@ def start_variance(moments: Tensor, heading_std: float) -> Tensor:
     and with the time for which frames have had any; it is 0 before.
 
     Args:
-        moments: (B, 2, 3), averaged.
+        moments: (B, 2, L + 4), averaged.
         heading_std: rad, at a start whose frame has no degrees of freedom.
     """
-    freedom, weight = moments[..., 1].sum(-1), moments[:, 0, 2]
+    freedom, weight = moments[..., _FREEDOM].sum(-1), moments[:, 0, _WEIGHT]
     of_frame = freedom / weight.clamp(min=_LEAST_WEIGHT)
     by_time = (1 - weight).clamp(min=_LEAST_WEIGHT).sqrt()  # falls by e in two time constants
     left = by_time * (-_BY_FREEDOM * of_frame).exp()

@@ -58,7 +58,7 @@ def new_state(mean: Tensor, cov: Tensor, status: Status, reasons: Tensor) -> Joi
         phase=zero(),
         evidence=zero(NUM_POSE + NUM_COMMON - CURVATURE + num),
         pose_sensitivity=zero(NUM_POSE, 2 * num),
-        scatter=zero(2, 3),
+        scatter=zero(2, num + 4),
         motion_scale=mean.new_ones(batch, NUM_POSE),
         hills=zero(),
         early=zero(),

@@ -22,8 +22,8 @@ class JointState(NamedTuple):
         evidence: (B, 11 + L) evidence against the motion, the accumulated scores of (J15).
         pose_sensitivity: (B, 4, 2 L) change of the pose by each boundary's own deviation (per m) and heading
             (per rad), in the last frames that determined the pose.
-        scatter: (B, 2, 3) mean over the last frames, for the boundaries' own deviations (m²) and headings
-            (rad²): sum of squares, degrees of freedom, weight of the frames.
+        scatter: (B, 2, L + 4) moments of the boundaries' own deviations and headings in the last frames, see
+            :func:`~lanebev.estimation.joint.scatter.averaged_moments`.
         motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, adapted to the drive.
         hills: (B,) 1/m², variance of the road's vertical curvature beyond that of a plane road, by the crests
             and dips so far (J21).
