@@ -226,8 +226,9 @@ def _mismatch(name: str, kind: str, fields: Mapping[str, Tensor], like: Any) -> 
     for field, tensor in expected.items():
         got = fields[field]
         if got.shape != tensor.shape or got.dtype != tensor.dtype:
+            asked = "; is it of another version of lanebev, batch size or number of boundaries?"
             return (
                 f"{name}{_SEPARATOR}{field} is {got.dtype} {tuple(got.shape)}, "
-                f"expected {tensor.dtype} {tuple(tensor.shape)}"
+                f"expected {tensor.dtype} {tuple(tensor.shape)}{asked if got.shape != tensor.shape else ''}"
             )
     return None

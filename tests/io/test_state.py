@@ -102,6 +102,16 @@ def test_a_state_of_another_version_is_one_short_line(tmp_path, states):
     assert problem == f"{tmp_path / 's'}: {words}"
 
 
+def test_a_state_whose_shape_differs_asks_for_its_version(tmp_path, states):
+    earlier = states["calibrator"]._replace(scatter=torch.zeros(2, 2, 3))  # without the boundaries' estimates
+    save_state(tmp_path / "s", {"calibrator": earlier})
+    problem = load_state(tmp_path / "s", like={"calibrator": states["calibrator"]}).problem
+    assert problem.endswith("; is it of another version of lanebev, batch size or number of boundaries?")
+    double = {"calibrator": JointCalibrator().initial_state(2, dtype=torch.float64)}
+    save_state(tmp_path / "s", {"calibrator": states["calibrator"]})
+    assert "another version" not in load_state(tmp_path / "s", like=double).problem
+
+
 def test_failed_write_keeps_the_old_file(tmp_path, states):
     path = tmp_path / "s"
     save_state(path, {"frame": 1, **states})
