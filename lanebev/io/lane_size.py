@@ -15,7 +15,8 @@ _STATE_SIZE = "state their size with --lanes-size WIDTHxHEIGHT"
 _OUTSIDE = 0.1  # share of points below or far beside the images, of which more are of another size
 _OFF_CENTRE = 0.2  # share of a side, more than a principal point is off the centre
 _BESIDE = 0.5  # image widths beside an image that lines are drawn on to
-_BEYOND = 0.03  # share of points beyond the right edge alone; lines that are drawn on go over both
+_BEYOND = 0.03  # share of points beyond the right edge alone
+_MEET_RIGHT = 0.56  # fraction of the width, right of which lines of wider images meet
 _REACHED = 0.8  # lanes reach beyond this fraction of a side: they leave images at the bottom
 _REACHED_UNCROPPED = 0.85  # fraction of the height that lanes with a horizon so high must reach
 _HIGHEST_HORIZON = 0.28  # fraction of the height above the horizon
@@ -180,7 +181,9 @@ def _doubt_of_points(frames: Sequence[FrameLines], image_size: tuple[int, int]) 
             _STATE_SIZE,
             is_outside=True,
         )
-    if x.min() >= 0 and (beyond := (x > width).mean()) > _BEYOND:
+    column, horizon = meeting_point(frames)
+    right = x.min() >= 0 and column > _MEET_RIGHT * width
+    if right and (beyond := (x > width).mean()) > _BEYOND:
         return SizeDoubt(
             f"{beyond:.0%} of the points lie beyond the right edge, up to column {x.max():.0f}, and none "
             "beyond the left; of wider images?",
@@ -191,7 +194,6 @@ def _doubt_of_points(frames: Sequence[FrameLines], image_size: tuple[int, int]) 
             "all points lie between 0 and 1; are they shares of the sides instead of pixels?",
             "multiply them by the sides",
         )
-    horizon = meeting_row(frames)
     if horizon > y.max():
         return SizeDoubt(
             f"they meet at row {horizon:.0f}, below all of their points; are rows counted from below, or in "
@@ -215,19 +217,20 @@ def _doubt_of_points(frames: Sequence[FrameLines], image_size: tuple[int, int]) 
     )
 
 
-def meeting_row(frames: Sequence[FrameLines]) -> float:
-    """Return the row at which the near parts of lines meet, the median over frames; NaN if none do.
+def meeting_point(frames: Sequence[FrameLines]) -> tuple[float, float]:
+    """Return the column and row at which the near parts of lines meet, medians over frames; NaN if none do.
 
-    It is roughly that of the horizon. Of each frame it is the row of the point with the least sum of squared
+    It is roughly the vanishing point. Of each frame it is the point with the least sum of squared
     horizontal distances from the lines' near two thirds.
     """
-    rows = [_meeting_row(frame) for frame in frames[:: max(1, len(frames) // _LOOKED_AT)]]
-    known = [row for row in rows if math.isfinite(row)]
-    return float(np.median(known)) if known else math.nan
+    points = [_meeting_point(frame) for frame in frames[:: max(1, len(frames) // _LOOKED_AT)]]
+    known = [point for point in points if math.isfinite(point[1])]
+    column, row = np.median(known, axis=0).tolist() if known else (math.nan, math.nan)
+    return column, row
 
 
-def _meeting_row(frame: FrameLines) -> float:
-    """Return the row of one frame; NaN with fewer than two lines that differ in direction."""
+def _meeting_point(frame: FrameLines) -> tuple[float, float]:
+    """Return the column and row of one frame; NaN with fewer than two lines that differ in direction."""
     slopes, offsets = [], []
     for line in frame.lines:
         points = line.points[np.isfinite(line.points).all(-1)]
@@ -238,7 +241,10 @@ def _meeting_row(frame: FrameLines) -> float:
             offsets.append(offset)
     spread = np.array(slopes) - np.mean(slopes) if slopes else np.zeros(0)
     variance = float(spread @ spread)
-    return -float(spread @ np.array(offsets)) / variance if variance > _LEAST_SPREAD else math.nan
+    if not variance > _LEAST_SPREAD:
+        return math.nan, math.nan
+    row = -float(spread @ np.array(offsets)) / variance
+    return float(np.mean(slopes)) * row + float(np.mean(offsets)), row
 
 
 def _all_points(frames: Sequence[FrameLines]) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from lanebev.app.run import run
 from lanebev.io.culane import read_culane
 from lanebev.io.lane_order import check_boundary_order, left_out_remark
 from lanebev.io.lane_parsing import FrameLines
-from lanebev.io.lane_size import lanes_of_whole_images, meeting_row, resized_lanes, size_remark
+from lanebev.io.lane_size import lanes_of_whole_images, meeting_point, resized_lanes, size_remark
 from lanebev.io.lanes import read_lanes
 from lanebev.io.openlane import camera_from_ground_points
 from lanebev.io.tusimple import tusimple_line
@@ -267,8 +267,11 @@ def test_lanes_of_wider_and_flatter_images_are_noticed():
     remark = size_remark([frame._replace(lines=lines)], (720, 1280))
     assert "beyond the right edge, up to column" in remark
     assert "and none beyond the left; of wider images? state their size" in remark
-    drawn_on = FrameLines("0.png", [LaneLine(line) for line in _lines()])  # over both edges
-    assert size_remark([drawn_on], (720, 1280)) == ""
+    drawn_on = [LaneLine(line) for line in _lines()]  # over both edges
+    assert size_remark([FrameLines("0.png", drawn_on)], (720, 1280)) == ""
+    leftmost = [line for line in drawn_on if (line.points[:, 0] >= 0).all()]  # over the right edge alone
+    assert max(line.points[:, 0].max() for line in leftmost) > 1280
+    assert size_remark([FrameLines("0.png", leftmost)], (720, 1280)) == ""
 
 
 def test_lanes_of_their_images_get_no_remark():
@@ -315,10 +318,11 @@ def test_boundary_numbers_that_fall_from_left_to_right_are_refused():
 
 
 def test_lines_meet_at_the_horizon():
-    assert meeting_row(_entries()) == pytest.approx(HORIZON, abs=1e-6)
-    assert meeting_row([*_entries(), FrameLines("1.png", [])]) == pytest.approx(HORIZON, abs=1e-6)
+    assert meeting_point(_entries()) == pytest.approx((640.0, HORIZON), abs=1e-6)
+    assert meeting_point([*_entries(), FrameLines("1.png", [])])[1] == pytest.approx(HORIZON, abs=1e-6)
     parallel = [LaneLine(np.array([[x, 500.0], [x, 600.0]])) for x in (100.0, 700.0)]
-    assert math.isnan(meeting_row([FrameLines("0.png", parallel), FrameLines("1.png", parallel[:1])]))
+    found = meeting_point([FrameLines("0.png", parallel), FrameLines("1.png", parallel[:1])])
+    assert all(map(math.isnan, found))
 
 
 def test_rows_counted_from_below_are_noticed():
