@@ -122,8 +122,9 @@ def model_remark(camera: Camera) -> str:
     angle, ratio, asked = field_of_view(camera), _edge_ratio(camera), "is the order k1 k2 p1 p2 k3?"
     if may_be_fisheye := not any(given[4:]) and 0.0 not in given[2:4]:
         asked = "are they k1 k2 k3 k4 of a fisheye? then model: fisheye is missing"
-    p1, p2, k3 = given[2], given[3], given[4] if len(given) > 4 else math.inf
-    like_radial = abs(p1) > max(_LIKE_RADIAL, 4 * abs(p2), 4 * abs(k3))  # k1 k2 k3 p1 p2
+    p1, p2, k3 = given[2], given[3], given[4] if len(given) > 4 else 0.0
+    all_five = len(given) > 4 and (k3 != 0.0 or p2 == 0.0)  # a calibration without k3 leaves it 0
+    like_radial = all_five and abs(p1) > max(_LIKE_RADIAL, 4 * abs(p2), 4 * abs(k3))  # k1 k2 k3 p1 p2
     if like_radial or max(map(abs, given[2:4])) > _MOST_TANGENTIAL:
         return f"distortion {_listed(given)} has more tangential distortion than is usual; {asked}"
     if may_be_fisheye and angle > _WIDE and ratio > _MOST_EDGE_RATIO:

@@ -97,6 +97,8 @@ def test_coefficients_in_another_order_or_of_another_sign():
     for given in ((-0.1, 0.05, 0.04, 0.0, 0.001), (-0.3, 0.1, -0.012, 1e-4, 5e-4), (-0.3, 0.1, 0.02, 0, 0)):
         (remark,) = camera_remarks(_lens(600, given))  # k1 k2 k3 p1 p2
         assert "more tangential distortion than is usual; is the order k1 k2 p1 p2 k3?" in remark
+    assert model_remark(_lens(600, (-0.3, 0.1, 0.009, 0.001, 0.0))) == ""  # calibrated without k3
+    assert model_remark(_lens(600, (-0.3, 0.1, 0.009, 0.0, 0.0)))  # k1 k2 k3 without p1 and p2
     assert not camera_remarks(_lens(600, (-0.3, 0.1, 0.002, 1e-4, 0.0)))
     (remark,) = camera_remarks(_lens(500, (1.5, 0.0, 0.0, 0.0)))
     assert "moves the left edge 1.3 times as far from the centre, more than is usual" in remark
