@@ -6,7 +6,7 @@ import struct
 import sys
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from itertools import pairwise
+from itertools import accumulate, groupby, pairwise
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
@@ -91,12 +91,15 @@ def missing_remark(kind: str, times: Sequence[int]) -> str:
 
     Args:
         kind: format of the container; others drop frames that the camera was too slow for.
-        times: ticks, of its frames in any order.
+        times: ticks, of its frames in the order of their packets. Of a recording that was cut off, the last
+            B-frames may not have come; their places are no gaps.
     """
+    early = [time < latest for time, latest in zip(times, accumulate(times, max), strict=True)]
+    reordered = max((len(list(run)) for is_early, run in groupby(early) if is_early), default=0)
     steps = np.diff(sorted(times))
     if kind != "mpegts" or not len(steps) or (usual := float(np.median(steps))) <= 0:
         return ""
-    missing = int(np.maximum(np.rint(steps / usual) - 1, 0).sum())
+    missing = int(np.maximum(np.rint(steps[: len(steps) - reordered] / usual) - 1, 0).sum())
     if not 0 < missing <= _MOST_MISSING * len(times):
         return ""
     return (

@@ -188,6 +188,9 @@ def test_frames_that_a_transport_stream_lost_as_a_whole_are_counted(tmp_path):
     assert "its times leave out 2 frames; after such a gap images may be damaged up to the next" in problem
     assert missing_remark("mpegts", [0, 3, 6, 9]) == missing_remark("mov,mp4", [0, 3, 9, 12]) == ""
     assert missing_remark("mpegts", [0, 3, 8, 11, 18, 21, 29]) == ""  # steps that vary
+    reordered = [0, *(first + step for first in range(0, 30, 3) for step in (3, 1, 2))]
+    assert missing_remark("mpegts", reordered) == missing_remark("mpegts", reordered[:-2]) == ""  # cut off
+    assert "leave out 3 frames" in missing_remark("mpegts", reordered[:7] + reordered[10:])
 
 
 # streams without times, B-frames
