@@ -194,14 +194,14 @@ def test_a_stream_has_no_second_pass(data, tmp_path, capsys):
     assert "expected no --smooth with a stream, got it" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("num", "kilobytes"), [(6, 6.3), (2, 4.86)])
+@pytest.mark.parametrize(("num", "kilobytes"), [(6, 8.13), (4, 6.74)])
 def test_kept_states_come_back_to_the_bit(num, kilobytes, tmp_path):
-    """With two boundaries the sensitivity (1, 4, 4) is a square too, but not symmetric."""
+    """With four boundaries the sensitivity (1, 4, 4) is a square too, but not symmetric."""
     calibrator = JointCalibrator(num_boundaries=num)
     kept, states = StoredStates(tmp_path / "states"), []
     for k in range(3):
         state = calibrator.initial_state(1, dtype=torch.float64)
-        slope = torch.arange(8.0 * num, dtype=torch.float64).view(1, 4, 2 * num)
+        slope = torch.arange(4.0 * num, dtype=torch.float64).view(1, 4, num)
         state = state._replace(pose_sensitivity=slope, mean=state.mean + k, reasons=state.reasons + k)
         states.append(state._replace(phase=state.phase + 0.1 * k))
         kept.append(states[-1])

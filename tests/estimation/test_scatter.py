@@ -19,6 +19,7 @@ from lanebev.estimation.joint.scatter import (
     averaged_moments,
     boundary_scatter,
     determined_sensitivity,
+    renumbered_columns,
     renumbered_moments,
     scatter_variance,
     start_variance,
@@ -34,6 +35,7 @@ from lanebev.testing.streets import wandering
 DOUBLE = torch.float64
 ONE_FRAME = 1 / 30
 CONFIG = JointConfig()
+CALIBRATOR = JointCalibrator()
 
 
 def scatter_of_frame(places, headings, sigma=1.0, seed=0):
@@ -96,6 +98,34 @@ def test_the_sensitivity_to_a_heading_is_the_change_of_the_fit():
     expected = 1e-4 * scatter.sensitivity[0, :, 6 + 3]
     torch.testing.assert_close((after - before)[0], expected, rtol=0.1, atol=2e-6)
     assert expected[PITCH].abs() > 5e-6
+
+
+@pytest.mark.parametrize("visible", [(0, 1, 2, 3, 4, 5), (2, 3, 4)])
+def test_the_sensitivity_to_a_heading_that_lasts_is_the_change_of_the_filter_s_estimate(visible):
+    """The same drive, the same noise, and one boundary turned by 0.01 mrad: after each half second."""
+    headings = torch.zeros(6, dtype=DOUBLE)
+    headings[3] = 1e-5
+    states = []
+    for turned in (0 * headings, headings):
+        change = partial(lambda t, m, turned: replace(m, headings=turned, visible=visible), turned=turned)
+        state = CALIBRATOR.initial_state(1, dtype=DOUBLE)
+        passed = []
+        for moment, segments in see(moments(1.5, change), 1, 0.5, 20, 5, DOUBLE):
+            _, state = CALIBRATOR(segments, CAMERA[None], state, moment.dt, WIDTH)
+            passed.append(state)
+        states.append(passed[14::15])
+    for before, after in zip(*states, strict=True):
+        found = (after.mean - before.mean)[0, :4] / 1e-5
+        expected = before.heading_sensitivity[0, :4, 3]
+        torch.testing.assert_close(found, expected, rtol=0.1, atol=0.02)
+        assert expected.abs().max() > 0.2
+
+
+def test_after_a_lane_change_the_columns_of_a_sensitivity_are_those_of_the_same_boundaries():
+    by_headings = torch.arange(12, dtype=DOUBLE).reshape(1, 2, 6).expand(2, -1, -1)
+    found = renumbered_columns(by_headings, torch.tensor([1.0, -1.0], dtype=DOUBLE))
+    assert found[0].tolist() == [[1, 2, 3, 4, 5, 0], [7, 8, 9, 10, 11, 0]]
+    assert found[1].tolist() == [[0, 0, 1, 2, 3, 4], [0, 6, 7, 8, 9, 10]]
 
 
 def moments_of(squares, freedom, found=(0.0,) * 6, noise=0.0):
@@ -264,7 +294,7 @@ def test_two_boundaries_determine_how_headings_change_the_other_parameters():
 def test_headings_of_the_ego_lane_s_boundaries_turn_pitch_and_yaw():
     """Lines that meet at a depth of w / Δη have a vanishing point lower by h Δη / w."""
     _, state, pose = follow(moments(0.5), (2, 3))
-    by_headings = state.pose_sensitivity[0, :2, 6:]
+    by_headings = state.heading_sensitivity[0, :2]
     ratio = pose[3] / WIDTH
     assert by_headings[0, 2:4].abs().tolist() == [pytest.approx(ratio.item(), rel=0.05)] * 2
     assert by_headings[0, 2:4].sum().abs() < 0.05 * ratio  # equal headings are no pitch
@@ -343,3 +373,4 @@ def test_skipped_and_unsupported_frames_keep_the_scatter_and_rows_are_independen
     for after in (unsupported, skipped):
         assert (after.scatter == state.scatter).all()
         assert (after.pose_sensitivity == state.pose_sensitivity).all()
+    assert (skipped.heading_sensitivity == state.heading_sensitivity).all()

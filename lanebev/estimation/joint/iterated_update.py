@@ -33,7 +33,9 @@ from lanebev.estimation.joint.scatter import (
     Scatter,
     averaged_moments,
     boundary_scatter,
+    renumbered_columns,
     renumbered_moments,
+    updated_sensitivity,
     with_headings,
 )
 from lanebev.estimation.joint.state import JointState
@@ -138,19 +140,22 @@ def update_state(
         residuals = residuals._replace(distance=distance, valid=valid)  # the Jacobian stays
         last = iterate(at, last.step.cov, residuals, last.frame.scale, cov)
 
-    moments = renumbered_moments(predicted.scatter, shift)
-    scatter = scatter_of_frame(last.frame, cov, member, moments)
-    gain = kalman_gain(last.prior_cov, last.step, last.frame, last.estimated)
+    frame, moments = last.frame, renumbered_moments(predicted.scatter, shift)
+    informed = with_headings(frame.matrix, frame.vector, frame.residuals, frame.weight, member)
+    scatter = scatter_of_frame(*informed, cov, moments)
+    gain = kalman_gain(last.prior_cov, last.step, frame, last.estimated)
+    by_headings = renumbered_columns(predicted.heading_sensitivity, shift)
     updated = predicted._replace(
         mean=torch.baddbmm(mean.unsqueeze(-1), gain, last.step.pull.unsqueeze(-1)).squeeze(-1),
-        cov=posterior_covariance(cov, last.frame.matrix, gain),
+        cov=posterior_covariance(cov, frame.matrix, gain),
         evidence=evidence,
-        pose_sensitivity=scatter.sensitivity,
+        pose_sensitivity=scatter.sensitivity[..., :num],
+        heading_sensitivity=updated_sensitivity(by_headings, gain, informed[0]),
         scatter=averaged_moments(scatter.moments, moments, dt, cfg.scatter_memory),
         motion_scale=motion_scale,
         reasons=flag(shift != 0, Reason.LANE_CHANGE),
     )
-    return FrameUpdate(updated, last.frame.trust, inliers_of_lanes(last, seen), last.single_frame_std)
+    return FrameUpdate(updated, frame.trust, inliers_of_lanes(last, seen), last.single_frame_std)
 
 
 def lateral_places(at: Tensor, places: Tensor, seen: Observations) -> Tensor:
@@ -189,16 +194,15 @@ def with_evidence(
     return evidence, adapt_motion_scale(predicted.motion_scale, scored, dt)
 
 
-def scatter_of_frame(frame: FrameInformation, cov: Tensor, member: Tensor, moments: Tensor) -> Scatter:
+def scatter_of_frame(matrix: Tensor, vector: Tensor, cov: Tensor, moments: Tensor) -> Scatter:
     """Estimate the scatter of the boundaries beside pose, offset and vertical curvature.
 
     Args:
-        frame: its information, near the state.
+        matrix: (B, O + L, O + L), information of the frame and on headings, see :func:`with_headings`.
+        vector: (B, O + L), likewise.
         cov: (B, D, D), of the state before the frame.
-        member: (B, L, M), boundary of each end point.
         moments: (B, 2, L + 4) of the frames before.
     """
-    matrix, vector = with_headings(frame.matrix, frame.vector, frame.residuals, frame.weight, member)
     kept = constant((*range(NUM_STRAIGHT), *range(VERTICAL, vector.shape[-1])), matrix, torch.int64)
     matrix, vector = matrix.index_select(1, kept).index_select(2, kept), vector.index_select(1, kept)
     of_vertical = cov[:, VERTICAL, VERTICAL, None].reciprocal()

@@ -149,13 +149,13 @@ def covariance_by_boundaries(state: JointState, width: Tensor, cfg: JointConfig)
     own = layout(cfg.num_boundaries).deviations
     deviations, variances = state.mean[:, own], state.cov.diagonal(dim1=1, dim2=2)[:, own]
     of_places, of_headings = scatter_variance(state.scatter).unbind(-1)
-    by_place = state.pose_sensitivity[..., : cfg.num_boundaries]
+    by_place, by_heading = state.pose_sensitivity, state.heading_sensitivity[:, POSE]
     unverified = unverified_deviation(by_place, deviations, of_headings, state.mean[:, ROLL], cfg)
     expected = single_deviation(deviations, cfg).unsqueeze(-1).maximum(unverified)
     of_places = of_places.unsqueeze(-1).maximum(beyond_filter(expected, variances))  # (B, L)
-    of_headings = heading_variance(state, of_headings, width, cfg).unsqueeze(-1).expand_as(of_places)
-    each = torch.cat([of_places, of_headings], dim=-1).unsqueeze(1)  # (B, 1, 2 L)
-    return torch.bmm(each * state.pose_sensitivity, state.pose_sensitivity.mT)
+    of_headings = heading_variance(state, of_headings, width, cfg)[:, None, None]
+    covariance = torch.bmm(of_places.unsqueeze(1) * by_place, by_place.mT)
+    return covariance + of_headings * torch.bmm(by_heading, by_heading.mT)
 
 
 def height_variance_by_roll(height: Tensor, left: Tensor, right: Tensor, roll_variance: Tensor) -> Tensor:

@@ -38,7 +38,7 @@ class Prediction(NamedTuple):
     """A predicted state.
 
     Attributes:
-        state: with mean, covariance, phase and hills predicted.
+        state: with mean, covariance, phase, hills and heading sensitivity predicted.
         transition: (B, D, D), F.
         noise: (B, D, D), W.
     """
@@ -60,7 +60,7 @@ def elapsed(dt: Tensor, state: JointState, cfg: JointConfig) -> Interval:
 def predict_state(state: JointState, dt: Tensor, cfg: JointConfig) -> Prediction:
     """Predict a state over dt (B,) s.
 
-    Source: (J11), (J12), (J20), (J21).
+    Source: (J11), (J12), (J20), (J21), (J29).
     """
     indices, hills = layout(cfg.num_boundaries), hill_variance(state, dt, cfg)
     road = propagate_road_shape(state.mean, state.cov[:, SHAPE, SHAPE], state.phase, dt, indices, cfg.motion)
@@ -72,5 +72,8 @@ def predict_state(state: JointState, dt: Tensor, cfg: JointConfig) -> Prediction
     transition, noise = motion(dt, Spread(scale, unequal, vertical), road, cfg.num_boundaries, cfg.motion)
     mean, cov = predict(state.mean, state.cov, transition, noise)
     mean = torch.cat([mean[:, :CURVATURE], road.shape, mean[:, SHAPE.stop :]], dim=-1)
-    predicted = state._replace(mean=mean, cov=cov, phase=road.phase, hills=hills)
+    by_headings = torch.bmm(transition, state.heading_sensitivity)
+    predicted = state._replace(
+        mean=mean, cov=cov, phase=road.phase, hills=hills, heading_sensitivity=by_headings
+    )
     return Prediction(predicted, transition, noise)

@@ -112,9 +112,11 @@ def compare_with_frame(
     usable = fit.valid & ((fit.inliers * seen.weight).sum(-1) / total >= cfg.enter_share)
     begun = state_of_fit(fit, state, cfg)
     scatter = scatter_of_fit(fit, places, seen, cfg)
+    by_headings = scatter.sensitivity[..., cfg.num_boundaries :]
     assumed_step = torch.full_like(total, cfg.assumed_dt)
     begun = begun._replace(
-        pose_sensitivity=scatter.sensitivity,
+        pose_sensitivity=scatter.sensitivity[..., : cfg.num_boundaries],
+        heading_sensitivity=torch.cat([by_headings, begun.heading_sensitivity[:, NUM_POSE:]], dim=1),
         scatter=averaged_moments(scatter.moments, begun.scatter, assumed_step, cfg.scatter_memory),
     )
     contrary = usable & is_contrary(state, begun, fit, places, seen, cfg)

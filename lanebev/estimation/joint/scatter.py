@@ -151,8 +151,8 @@ def scatter_variance(moments: Tensor) -> Tensor:
 
 def renumbered_moments(moments: Tensor, shift: Tensor) -> Tensor:
     """Shift the estimates of each boundary in moments (B, 2, L + 4) by (B,) lanes, -1, 0 or 1."""
-    own = shifted(moments[..., :_SQUARES].flatten(0, 1), shift.repeat_interleave(2))
-    return torch.cat([own.unflatten(0, (-1, 2)), moments[..., _SQUARES:]], dim=-1)
+    own = renumbered_columns(moments[..., :_SQUARES], shift)
+    return torch.cat([own, moments[..., _SQUARES:]], dim=-1)
 
 
 def start_variance(moments: Tensor, heading_std: float) -> Tensor:
@@ -174,7 +174,7 @@ def start_variance(moments: Tensor, heading_std: float) -> Tensor:
 
 
 def determined_sensitivity(determined: Tensor, num_boundaries: int) -> Tensor:
-    """Tell which entries of the sensitivity M a frame determines, (B, 4, 2 L) bool.
+    """Tell which entries of the sensitivity a frame by itself determines, (B, 4, 2 L) bool.
 
     All if it determines the whole pose. If it determines all but the roll, as with two boundaries in view,
     those of the other parameters and the headings.
@@ -189,8 +189,34 @@ def determined_sensitivity(determined: Tensor, num_boundaries: int) -> Tensor:
     return determined.all(-1)[:, None, None] | (all_but_roll & by_headings & ~is_roll.unsqueeze(-1))
 
 
+def updated_sensitivity(predicted: Tensor, gain: Tensor, matrix: Tensor) -> Tensor:
+    """Update the change of the state by each boundary's own heading with a frame.
+
+    Source: (J29), S⁺ = S⁻ + G (Λ_xη - Λ S⁻): parameters that are considered and not estimated (Schmidt 1966;
+    Tapley, Schutz and Born 2004, Statistical Orbit Determination, Sec. 6.2).
+
+    Args:
+        predicted: (B, D, L), S⁻, in the numbering of the frame.
+        gain: (B, D, O), G.
+        matrix: (B, O + L, O + L) of :func:`with_headings`: Λ and, in the last columns, Λ_xη.
+
+    Returns:
+        (B, D, L).
+    """
+    count = gain.shape[-1]
+    by_frame, by_headings = matrix[:, :count, :count], matrix[:, :count, count:]
+    change = torch.baddbmm(by_headings, by_frame, predicted[:, :count], alpha=-1)
+    return torch.baddbmm(predicted, gain, change)
+
+
+def renumbered_columns(sensitivity: Tensor, shift: Tensor) -> Tensor:
+    """Shift the columns of a sensitivity (B, D, L) by (B,) lanes, -1, 0 or 1."""
+    moved = shifted(sensitivity.flatten(0, 1), shift.repeat_interleave(sensitivity.shape[1]))
+    return moved.view_as(sensitivity)
+
+
 def remembered_sensitivity(now: Tensor, before: Tensor, dt: Tensor, cfg: JointConfig) -> Tensor:
-    """Blend the pose's change by each boundary's own deviation and heading over the last frames.
+    """Blend the pose's change by each boundary's own deviation over the last frames.
 
     Source: M of (J26) and (J29).
 
@@ -198,13 +224,12 @@ def remembered_sensitivity(now: Tensor, before: Tensor, dt: Tensor, cfg: JointCo
     share decays as deviations do. So the covariance changes gradually when boundaries come and go.
 
     Args:
-        now: (B, 4, 2 L) by this frame.
-        before: (B, 4, 2 L); its row of the roll is 0 where no frame has determined the whole pose yet.
+        now: (B, 4, L) by this frame.
+        before: (B, 4, L); its row of the roll is 0 where no frame has determined the whole pose yet.
         dt: (B,) s since then; inf where the boundaries' numbers have changed.
         cfg: the configuration.
     """
-    num = now.shape[-1] // 2
-    gone = (now[:, ROLL:, :num].abs().amax(1, keepdim=True) < _LEAST_SENSITIVITY).repeat(1, 1, 2)
+    gone = now[:, ROLL:].abs().amax(1, keepdim=True) < _LEAST_SENSITIVITY
     memory = torch.where(gone, cfg.motion.deviation_memory, cfg.motion.unequal_memory)
     begun = (before[:, ROLL] != 0).any(-1)[:, None, None]
     fade = torch.where(begun, (-dt[:, None, None] / memory).exp(), 0.0)

@@ -20,8 +20,9 @@ class JointState(NamedTuple):
         cov: (B, D, D).
         phase: (B,) m, how far the first knot of the road's curvature lies behind the camera.
         evidence: (B, 11 + L) evidence against the motion, the accumulated scores of (J15).
-        pose_sensitivity: (B, 4, 2 L) change of the pose by each boundary's own deviation (per m) and heading
-            (per rad), in the last frames that determined the pose.
+        pose_sensitivity: (B, 4, L) change of the pose by each boundary's own deviation (per m), in the last
+            frames that determined the pose.
+        heading_sensitivity: (B, D, L) change of the mean by each boundary's own heading (per rad) that lasts.
         scatter: (B, 2, L + 4) moments of the boundaries' own deviations and headings in the last frames, see
             :func:`~lanebev.estimation.joint.scatter.averaged_moments`.
         motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, adapted to the drive.
@@ -42,6 +43,7 @@ class JointState(NamedTuple):
     phase: Tensor
     evidence: Tensor
     pose_sensitivity: Tensor
+    heading_sensitivity: Tensor
     scatter: Tensor
     motion_scale: Tensor
     hills: Tensor

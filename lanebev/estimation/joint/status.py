@@ -12,7 +12,7 @@ from lanebev.estimation.joint.iterated_update import FrameUpdate
 from lanebev.estimation.joint.layout import POSE
 from lanebev.estimation.joint.measurement import HEIGHT, ROLL
 from lanebev.estimation.joint.observations import Observations
-from lanebev.estimation.joint.scatter import determined_sensitivity, remembered_sensitivity
+from lanebev.estimation.joint.scatter import remembered_sensitivity
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.joint.update import UNSEEN
 from lanebev.estimation.reasons import Reason
@@ -50,13 +50,16 @@ def update_track_status(
     sensitivity = remembered_sensitivity(
         updated.pose_sensitivity, predicted.pose_sensitivity, torch.where(changed, torch.inf, dt), cfg
     )
-    determined = determined_sensitivity(~blind, cfg.num_boundaries)
+    determined = ~blind.any(-1)[:, None, None]
     after = predicted._replace(
         mean=select_rows(supported, updated.mean, predicted.mean),
         cov=select_rows(supported, updated.cov, predicted.cov),
         motion_scale=select_rows(supported, updated.motion_scale, predicted.motion_scale),
         scatter=select_rows(supported, updated.scatter, predicted.scatter),
         pose_sensitivity=torch.where(determined, sensitivity, predicted.pose_sensitivity),
+        heading_sensitivity=select_rows(
+            supported, updated.heading_sensitivity, predicted.heading_sensitivity
+        ),
         evidence=select_rows(supported, updated.evidence, torch.zeros_like(updated.evidence)),
         early=torch.zeros_like(unseen),
         unseen=unseen,
