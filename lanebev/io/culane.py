@@ -53,9 +53,14 @@ def read_culane(path: str | Path) -> FrameLines:
 def _check_first_pair(points: NDArray[np.float64]) -> None:
     """Raise if the first of several points (P, 2) is none: small numbers far from the other rows.
 
-    So it is where a line begins with its class and its score.
+    So it is where a line begins with its class and its score. Zeros may be padding, or a corner.
     """
-    if len(points) < 3 or not 0 <= points[0, 1] <= 1 or abs(points[0, 0]) > _MOST_CLASSES:
+    if (
+        len(points) < 3
+        or not points[0].any()
+        or not 0 <= points[0, 1] <= 1
+        or abs(points[0, 0]) > _MOST_CLASSES
+    ):
         return
     first, *others = np.abs(np.diff(points[:, 1]))
     if first > _FAR * np.median(others) > 0:

@@ -51,7 +51,8 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
     if path.is_dir():
         frames = [frame for file in lane_files(path) for frame in read_lanes(file, intrinsics)]
         if not frames:
-            raise ValueError(f"lane folder {path}: expected .lines.txt or .json files, got none")
+            wanted = "expected .lines.txt or .json files, got none; give an .xml file by its name"
+            raise ValueError(f"lane folder {path}: {wanted}")
         return frames
     text = lane_text(path)
     if path.name.endswith(".txt") and not text.lstrip("[ \r\n").startswith("{"):

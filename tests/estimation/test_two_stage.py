@@ -283,3 +283,7 @@ def test_arguments_are_checked():
         TwoStageCalibrator(no_such_number=1)
     with pytest.raises(ValueError, match="num_boundaries: expected at least 2"):
         TwoStageConfig(num_boundaries=1)
+    with pytest.raises(ValueError, match="lane_deviation_std: expected a finite number, at least 0, got nan"):
+        TwoStageConfig(lane_deviation_std=float("nan"))
+    with pytest.raises(ValueError, match="departure_memory: expected a finite number, more than 0, got -1"):
+        TwoStageConfig(departure_memory=-1.0)

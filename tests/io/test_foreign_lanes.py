@@ -144,6 +144,16 @@ def test_a_class_and_a_score_before_culane_points_are_refused(tmp_path):
         read_lanes(path)
     path.write_text("5 0 6 10 7 20 8 30\n0 1 600 590\n")  # rows from the first one, and two points
     assert len(read_lanes(path)[0].lines) == 2
+    path.write_text("0 0 300 400 310 390 320 380\n")  # padding, or the image's corner
+    assert len(read_lanes(path)[0].lines) == 1
+
+
+def test_a_folder_of_other_files_says_which_it_reads(tmp_path):
+    (tmp_path / "annotations.xml").write_text("<annotations></annotations>")
+    with pytest.raises(
+        ValueError, match=r"expected .lines.txt or .json files, got none; give an .xml file by"
+    ):
+        read_lanes(tmp_path)
 
 
 def test_culane_rows_may_repeat_and_turn(tmp_path):

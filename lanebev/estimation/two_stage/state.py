@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -71,6 +72,13 @@ class TwoStageConfig:
             raise ValueError(f"num_boundaries: expected at least 2, got {self.num_boundaries}")
         if self.num_hypotheses < 1:
             raise ValueError(f"num_hypotheses: expected at least 1, got {self.num_hypotheses}")
+        for name in ("lane_noise", "lane_width_std", "lane_deviation_std"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected a finite number, at least 0, got {getattr(self, name)}")
+        if not 0 < self.departure_memory < math.inf:
+            raise ValueError(
+                f"departure_memory: expected a finite number, more than 0, got {self.departure_memory}"
+            )
 
 
 @register_pytree
