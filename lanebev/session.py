@@ -24,8 +24,8 @@ from lanebev.estimation.mount import MountCalibration, describe_mount
 from lanebev.estimation.reasons import Reason, describe_reasons
 from lanebev.estimation.tracker import Tracker
 from lanebev.io.frame_clock import FrameClock
-from lanebev.io.lane_doubts import LaneDoubts
-from lanebev.io.lane_parsing import FrameLines
+from lanebev.io.lanes.doubts import LaneDoubts
+from lanebev.io.lanes.parsing import FrameLines
 from lanebev.io.state import lane_width_remark, load_state, save_state
 from lanebev.numbers import check_number
 from lanebev.observation.boundary_vertices import BoundaryVertices

@@ -24,7 +24,7 @@ from jsonargparse.typing import PositiveInt
 import lanebev
 from lanebev.app.config import RunConfig
 from lanebev.app.run import run
-from lanebev.io.video_writer import VideoWriter
+from lanebev.io.video.writer import VideoWriter
 from lanebev.render import Drive
 from lanebev.weights import load_segmenter
 from train.commands import command_parser, one_line_errors

@@ -27,8 +27,8 @@ from lanebev.camera.model import Camera
 from lanebev.export.part import Part
 from lanebev.export.parts import make_part
 from lanebev.export.runtime import OnnxPart
+from lanebev.io.opening import open_source
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
-from lanebev.io.video import open_source
 from lanebev.observation.frames import check_frame, network_image
 from lanebev.pipeline import LaneBEV
 from train.commands import command_parser

@@ -28,7 +28,7 @@ from lanebev import BEVGrid, Extrinsics, LaneSegments
 from lanebev.app.build import make_calibrator
 from lanebev.app.views import bird_view
 from lanebev.estimation.still import calibrate_still
-from lanebev.io.video import open_source
+from lanebev.io.opening import open_source
 from lanebev.report.overlay import Panel, draw_panels, joined
 from tools.arguments import add_far_view, evaluation_parser
 from tools.real_figures import (

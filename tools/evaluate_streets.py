@@ -31,7 +31,7 @@ from lanebev import Camera, FarView, JointCalibrator, LaneBEV
 from lanebev.estimation.joint.frame_prior import FramePrior, prior_of_mount
 from lanebev.estimation.tracker import Tracker
 from lanebev.geometry.rotation import road_from_cam
-from lanebev.io.images import read_image
+from lanebev.io.images.pixels import read_image
 from lanebev.observation.frames import check_frame, network_image
 from lanebev.render import render_views
 from tools.arguments import add_far_view, evaluation_parser

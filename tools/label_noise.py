@@ -29,7 +29,7 @@ from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.single_frame import fit_single_frame
 from lanebev.estimation.still import calibrate_still
 from lanebev.io.lanes import read_lanes
-from lanebev.io.video import open_source
+from lanebev.io.opening import open_source
 from lanebev.observation.polylines import rows_from_vertices
 from tools.arguments import evaluation_parser
 from tools.real_figures import TUSIMPLE_FOCAL, TUSIMPLE_LANE_WIDTH, tusimple_camera, tusimple_segments

@@ -26,8 +26,8 @@ from lanebev.estimation.two_stage.lane_width import boundary_angles, initial_rol
 from lanebev.estimation.two_stage.vanishing import incidence_noise, vanishing_dir_least_squares
 from lanebev.geometry.road import great_circle_normals, segment_rays
 from lanebev.geometry.rotation import pitch_yaw_from_vanishing_dir
-from lanebev.io.lane_parsing import FrameLines
 from lanebev.io.lanes import match_frames, read_lanes
+from lanebev.io.lanes.parsing import FrameLines
 from lanebev.io.results import ExtrinsicsRow, read_extrinsics
 from lanebev.observation.segments import segments_from_lines
 from lanebev.types import NUM_BOUNDARIES

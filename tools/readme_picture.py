@@ -12,8 +12,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lanebev import BEVGrid, Camera
 from lanebev.app.views import bird_view
+from lanebev.io.opening import open_source
 from lanebev.io.results import poses_of, read_extrinsics
-from lanebev.io.video import open_source
 from train.commands import command_parser, one_line_errors
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "assets" / "before_after.jpg"

@@ -16,7 +16,7 @@ from lanebev.app.observers import FarViewObserver, NetworkObserver
 from lanebev.estimation.still import calibrate_still
 from lanebev.estimation.tracker import Tracker
 from lanebev.io.lanes import match_frames, read_lanes
-from lanebev.io.video import open_source
+from lanebev.io.opening import open_source
 from lanebev.observation.segments import camera_segments, segments_from_lines
 from lanebev.report.lane_curves import lane_curves
 from lanebev.report.measure import measure_boundaries, select_inliers, spread

@@ -15,7 +15,7 @@ from lanebev import BEVGrid, Calibration, Camera, JointCalibrator, LaneBEV, Lane
 from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.tracker import Tracker
 from lanebev.geometry.rotation import road_from_cam
-from lanebev.io.images import read_image
+from lanebev.io.images.pixels import read_image
 from lanebev.observation.frames import check_frame, network_image
 from lanebev.report.overlay import draw_panels
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lanebev.io.whole_file import whole_file
+from lanebev.io.output.whole_file import whole_file
 
 _QUALITY = 94  # of JPEG
 

@@ -13,12 +13,12 @@ from jsonargparse.typing import PositiveInt
 from lightning.pytorch.utilities import rank_zero_warn
 from torch.utils.data import DataLoader, IterableDataset
 
-from lanebev.io.culane import read_culane
-from lanebev.io.images import image_size, read_image
-from lanebev.io.lane_parsing import FrameLines
-from lanebev.io.lane_size import size_doubt
-from lanebev.io.openlane import read_openlane
-from lanebev.io.tusimple import read_tusimple
+from lanebev.io.images.pixels import image_size, read_image
+from lanebev.io.lanes.culane import read_culane
+from lanebev.io.lanes.openlane import read_openlane
+from lanebev.io.lanes.parsing import FrameLines
+from lanebev.io.lanes.size import size_doubt
+from lanebev.io.lanes.tusimple import read_tusimple
 from lanebev.observation.boundary_order import boundary_indices
 from lanebev.types import NUM_BOUNDARIES
 from train.data import Batch, Seed, ViewBatches, run_position

@@ -31,7 +31,7 @@ from typing import Any
 import torch
 from jsonargparse.typing import PositiveFloat, PositiveInt
 
-from lanebev.io.whole_file import whole_file
+from lanebev.io.output.whole_file import whole_file
 from train.commands import command_parser, one_line_errors
 from train.evaluate_roads import HELD_OUT_SEED, OWN_KINDS, evaluate, records
 from train.export import checkout_commit, export, trained_segmenter

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from lanebev.io.lane_parsing import FrameLines
+from lanebev.io.lanes.parsing import FrameLines
 
 Points = npt.NDArray[np.float64]
 

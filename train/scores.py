@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
-from lanebev.io.lane_parsing import FrameLines
+from lanebev.io.lanes.parsing import FrameLines
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.polylines import BoundaryRows, rows_from_vertices
 from lanebev.observation.vertices import LineConfig

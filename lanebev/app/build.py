@@ -22,9 +22,9 @@ from lanebev.estimation.two_stage.state import TwoStageState
 from lanebev.export.runtime import onnx_calibrator, onnx_model
 from lanebev.io.calibration_file import read_mount
 from lanebev.io.frame_source import FrameSource
-from lanebev.io.images import image_size
-from lanebev.io.lane_size import lanes_of_whole_images
+from lanebev.io.images.pixels import image_size
 from lanebev.io.lanes import lane_files, read_lanes
+from lanebev.io.lanes.size import lanes_of_whole_images
 from lanebev.pipeline import LaneBEV
 from lanebev.tensors import usable_device
 from lanebev.view.grid import BEVGrid

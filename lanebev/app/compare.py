@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from lanebev.io.output_folder import check_result
-from lanebev.io.whole_file import whole_file
+from lanebev.io.output.folder import check_result
+from lanebev.io.output.whole_file import whole_file
 from lanebev.report.comparison import comparison_summary, render_comparison
 from lanebev.report.run_folder import read_run
 

@@ -13,8 +13,8 @@ from lanebev.io.formats.folder import read_record
 from lanebev.io.formats.names import FORMATS, check_installed
 from lanebev.io.formats.record import RunRecord
 from lanebev.io.frames import Frame
-from lanebev.io.output_folder import check_result
-from lanebev.io.whole_file import whole_file
+from lanebev.io.output.folder import check_result
+from lanebev.io.output.whole_file import whole_file
 from lanebev.report.run_folder import read_run
 
 

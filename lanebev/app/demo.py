@@ -15,10 +15,10 @@ from lanebev.app.config import RunConfig
 from lanebev.app.progress import Progress
 from lanebev.app.run import run
 from lanebev.app.summary import summary
-from lanebev.io.output_folder import OutputFolder
+from lanebev.io.lanes.tusimple import tusimple_line
+from lanebev.io.output.folder import OutputFolder
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
-from lanebev.io.tusimple import tusimple_line
-from lanebev.io.video_writer import VideoWriter
+from lanebev.io.video.writer import VideoWriter
 from lanebev.observation.polylines import BoundaryRows, LaneLine, rows_from_vertices, vertices_from_lines
 from lanebev.render import Drive, RenderedFrame
 from lanebev.types import Calibration, Extrinsics, Status

@@ -17,8 +17,8 @@ from lanebev.app.recovery import RecoveredObserver, RestoringObserver
 from lanebev.app.shared_network import SharedNetwork
 from lanebev.app.sources import camera_of, make_source, observed_frames
 from lanebev.io.frames import Frame
-from lanebev.io.tusimple import tusimple_line, whole_tusimple_lines
-from lanebev.io.whole_file import whole_file
+from lanebev.io.lanes.tusimple import tusimple_line, whole_tusimple_lines
+from lanebev.io.output.whole_file import whole_file
 
 _NO_ROWS, _NO_LANES = np.zeros(0), np.zeros((0, 0))
 

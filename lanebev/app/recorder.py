@@ -25,10 +25,10 @@ from lanebev.estimation.mount import MountCalibration
 from lanebev.estimation.tracker import Estimate
 from lanebev.io.covariances import write_covariances
 from lanebev.io.frames import Frame
-from lanebev.io.images import write_png
+from lanebev.io.images.pixels import write_png
+from lanebev.io.lanes.tusimple import tusimple_line
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
-from lanebev.io.tusimple import tusimple_line
-from lanebev.io.video_writer import VideoWriter
+from lanebev.io.video.writer import VideoWriter
 from lanebev.report.lane_curves import lane_curves
 from lanebev.report.measure import measure_boundaries, select_inliers
 from lanebev.report.moments import MomentSampler

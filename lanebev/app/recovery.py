@@ -17,9 +17,9 @@ from lanebev.app.observers import Observation, Observer
 from lanebev.camera.model import Camera
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Frame
-from lanebev.io.lane_parsing import FrameLines
-from lanebev.io.output_folder import OutputFolder
-from lanebev.io.tusimple import whole_tusimple_lines
+from lanebev.io.lanes.parsing import FrameLines
+from lanebev.io.lanes.tusimple import whole_tusimple_lines
+from lanebev.io.output.folder import OutputFolder
 
 LANES_FILE = "lanes.json"
 _SETTINGS, _SEEN = ".settings.json", ".seen.json"  # in the temporary folder

@@ -8,7 +8,7 @@ from pathlib import Path
 from lanebev.app.build import RunTracker, make_tracker
 from lanebev.app.config import CALIBRATORS, RunConfig
 from lanebev.camera.model import Camera
-from lanebev.io.output_folder import OutputFolder
+from lanebev.io.output.folder import OutputFolder
 from lanebev.io.state import lane_width_remark, load_state
 
 STATE_FILE, CALIBRATION_FILE = "state.safetensors", "calibration.yaml"

@@ -43,7 +43,7 @@ from lanebev.io.formats.record import RecordedFrame, vertex_lines
 from lanebev.io.formats.rerun import open_viewer
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Frame
-from lanebev.io.output_folder import OutputFolder, check_inputs_stay
+from lanebev.io.output.folder import OutputFolder, check_inputs_stay
 from lanebev.io.results import ExtrinsicsRow
 from lanebev.io.state import save_state
 from lanebev.report.page import Report

@@ -24,8 +24,8 @@ from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.tracker import Estimate
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Frame
-from lanebev.io.output_folder import OutputFolder
-from lanebev.io.tusimple import tusimple_line
+from lanebev.io.lanes.tusimple import tusimple_line
+from lanebev.io.output.folder import OutputFolder
 from lanebev.types import Calibration, Extrinsics
 
 _STATES = ".states"

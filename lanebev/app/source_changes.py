@@ -7,7 +7,7 @@ from pathlib import Path
 from lanebev.app.recovery import size_and_time
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import ALL
-from lanebev.io.image_files import images_of
+from lanebev.io.images.files import images_of
 
 Files = dict[str, tuple[int, int]]
 """Size and time of change of files, by path."""

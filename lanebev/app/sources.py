@@ -23,10 +23,10 @@ from lanebev.camera.model import Camera
 from lanebev.io.bags import BagSource, open_bag_source
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import ALL, Frame, Selection
-from lanebev.io.image_names import drives_remark, jump_remark, untimed_remark
+from lanebev.io.images.names import drives_remark, jump_remark, untimed_remark
 from lanebev.io.live import LiveSource, open_live
+from lanebev.io.opening import open_source
 from lanebev.io.source_names import is_bag, is_live, without_login
-from lanebev.io.video import open_source
 from lanebev.report.run_folder import RunFolder
 
 _RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")  # in topics of ROS's image_proc, which P is of

@@ -1,12 +1,9 @@
 """Files and streams, in and out.
 
-- Frames: ``video`` opens videos and images as a ``frame_source`` of ``frames``, ``bags`` (``bag_messages``)
-  and ``live`` the other sources; ``source_names`` tells them apart. Videos: ``decoding``, ``seeking``,
-  ``video_remarks``, ``side_by_side``, ``video_writer``. Images: ``images``, ``image_files``, ``image_names``,
-  ``name_clocks``. Times: ``frame_clock``, ``rising_clock``.
-- Lanes: ``lanes`` reads files of ``tusimple``, ``culane``, ``curvelanes``, ``openlane``, ``llamas``,
-  ``bdd100k`` and ``labelme`` by ``lane_parsing``. Remarks on them: ``lane_doubts``, ``lane_order``,
-  ``lane_repeats``, ``lane_size``, ``lane_widths``.
-- Outputs: ``output_folder``, ``results``, ``covariances``, ``calibration_file``, ``state``, and ``formats``
-  of other programs; ``whole_file``, ``folder_lock`` and ``late_signals`` keep them whole.
+- Frames: ``opening`` makes a ``frame_source`` of ``frames`` of a video or of images; ``bags`` and ``live``
+  are other sources, ``source_names`` tells them apart. ``video`` and ``images`` decode what is inside.
+  Times: ``frame_clock``, ``rising_clock``.
+- Lanes: ``lanes`` reads all kinds of lane files.
+- Outputs: ``results``, ``covariances``, ``calibration_file``, ``state``, and ``formats`` of other programs;
+  ``output`` keeps the folder and its files whole.
 """

@@ -10,11 +10,11 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.io.decoding import rgb
 from lanebev.io.frames import ALL, Frame, Selection, taken_frames
-from lanebev.io.images import read_image
+from lanebev.io.images.pixels import read_image
 from lanebev.io.rising_clock import RisingClock
-from lanebev.io.seeking import open_at
+from lanebev.io.video.decoding import rgb
+from lanebev.io.video.seeking import open_at
 
 DEFAULT_FPS = Fraction(30)
 
@@ -36,7 +36,7 @@ class FrameSource:
         pixel_aspect: width of a pixel over its height, as a video states it; frames are not resized by it.
         selection: which of the frames are taken. ``fps`` and ``count`` are those of the whole source.
         most: how many frames are yielded at most, so that a file that grows is the same twice; None for all.
-        matrix: by which a video's frames are shown, see :func:`lanebev.io.decoding.display_matrix`.
+        matrix: by which a video's frames are shown, see :func:`lanebev.io.video.decoding.display_matrix`.
     """
 
     source: str

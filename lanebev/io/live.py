@@ -14,7 +14,11 @@ from pathlib import Path
 
 import av
 
-from lanebev.io.decoding import (
+from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
+from lanebev.io.frames import ALL, Frame, Selection
+from lanebev.io.rising_clock import RisingClock
+from lanebev.io.source_names import PIPE, without_login
+from lanebev.io.video.decoding import (
     display_matrix,
     has_times,
     moving_pictures,
@@ -23,10 +27,6 @@ from lanebev.io.decoding import (
     tell_damage,
     video_stream,
 )
-from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
-from lanebev.io.frames import ALL, Frame, Selection
-from lanebev.io.rising_clock import RisingClock
-from lanebev.io.source_names import PIPE, without_login
 from lanebev.pipes import await_bytes, open_pipe
 
 _TIMEOUT = 10.0  # s without a frame, after which a stream has ended

@@ -7,7 +7,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from lanebev.io.video_writer import VideoWriter
+from lanebev.io.video.writer import VideoWriter
 from tests.app.straight_road import FRAMES, HEIGHT, WIDTH, lane_lines, run
 
 

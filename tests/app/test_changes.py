@@ -19,8 +19,8 @@ from lanebev.app.run import run
 from lanebev.app.source_changes import changes_remark, count_remark, files_of
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Selection
-from lanebev.io.output_folder import OutputFolder, OutputFolderError
-from lanebev.io.video import open_source
+from lanebev.io.opening import open_source
+from lanebev.io.output.folder import OutputFolder, OutputFolderError
 from tests.app.rtsp_server import transport_stream
 from tests.app.test_robustness import HEIGHT, WIDTH, write_drive
 

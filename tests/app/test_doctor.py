@@ -26,8 +26,8 @@ from lanebev.app.doctor import (
 from lanebev.app.plausibility import bars_remark, mount_remark, pose_remark
 from lanebev.camera.plausibility import camera_remarks, field_of_view, model_remark
 from lanebev.cli import main
-from lanebev.io.video import open_source
-from lanebev.io.video_writer import VideoWriter
+from lanebev.io.opening import open_source
+from lanebev.io.video.writer import VideoWriter
 
 CAMERA = Camera.from_fov(60.0, 640, 360)
 GOOD_POSE = [2.0, -1.0, 0.5, 1.4]

@@ -14,7 +14,7 @@ from lanebev.app.build import make_tracker
 from lanebev.app.config import RunConfig
 from lanebev.app.run import run
 from lanebev.io.lanes import read_lanes
-from lanebev.io.video_writer import VideoWriter
+from lanebev.io.video.writer import VideoWriter
 from lanebev.observation.segments import segments_from_lines
 from lanebev.report.measure import measure_boundaries
 

@@ -13,10 +13,10 @@ from lanebev.app.build import make_calibrator
 from lanebev.app.config import RunConfig
 from lanebev.app.run import run
 from lanebev.estimation.still import calibrate_still
-from lanebev.io.images import write_png
+from lanebev.io.images.pixels import write_png
+from lanebev.io.opening import open_source
 from lanebev.io.results import extrinsics_row
-from lanebev.io.video import open_source
-from lanebev.io.video_writer import VideoWriter
+from lanebev.io.video.writer import VideoWriter
 from lanebev.render import Drive
 from lanebev.tensors import map_tensors
 

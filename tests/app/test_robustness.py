@@ -25,11 +25,11 @@ from lanebev.app.observers import NetworkObserver
 from lanebev.app.recovery import recover_run
 from lanebev.app.run import run
 from lanebev.cli import main
-from lanebev.io.folder_lock import FolderLock
-from lanebev.io.output_folder import OutputFolder
+from lanebev.io.opening import open_source
+from lanebev.io.output.folder import OutputFolder
+from lanebev.io.output.lock import FolderLock
 from lanebev.io.state import load_state, save_state
-from lanebev.io.video import open_source
-from lanebev.io.video_writer import VideoWriter
+from lanebev.io.video.writer import VideoWriter
 
 ROOT = Path(__file__).parents[2]
 HEIGHT, WIDTH, FRAMES = 96, 160, 6

@@ -16,9 +16,9 @@ from lanebev import Extrinsics, JointCalibrator, image_from_road_points
 from lanebev.app.summary import untracked_words
 from lanebev.estimation.lane_width_prior import LANE_WIDTH, LANE_WIDTH_STD
 from lanebev.estimation.mount import MountReason
+from lanebev.io.opening import open_source
 from lanebev.io.results import CSV_COLUMNS, ExtrinsicsRow, write_extrinsics
 from lanebev.io.state import load_state
-from lanebev.io.video import open_source
 from tests.app.straight_road import CAMERA, FRAMES, POSE, ROWS, lane_lines, run, table
 from tools import pseudo_ground_truth
 

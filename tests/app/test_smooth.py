@@ -20,7 +20,7 @@ from lanebev.app.smoothing import StoredStates
 from lanebev.cli import main
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.io.state import load_state
-from lanebev.io.video_writer import VideoWriter
+from lanebev.io.video.writer import VideoWriter
 from lanebev.testing.moments import swing
 
 HEIGHT, WIDTH, FRAMES, FPS = 240, 416, 20, 25

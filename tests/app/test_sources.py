@@ -26,12 +26,12 @@ from lanebev.app.summary import setting_words
 from lanebev.camera.files import read_camera
 from lanebev.cli import main
 from lanebev.io.frames import Selection
-from lanebev.io.images import write_png
+from lanebev.io.images.pixels import write_png
 from lanebev.io.live import open_live
+from lanebev.io.opening import open_source
 from lanebev.io.results import read_extrinsics
 from lanebev.io.source_names import is_live, without_login
-from lanebev.io.video import open_source
-from lanebev.io.video_writer import VideoWriter
+from lanebev.io.video.writer import VideoWriter
 from lanebev.report.comparison import common_frames
 from lanebev.report.run_folder import read_run
 from tests.app.rtsp_server import RtspServer, transport_stream

@@ -18,7 +18,7 @@ from torch import nn
 import lanebev
 from lanebev.export.part import Part
 from lanebev.export.write import write_onnx
-from lanebev.io.video_writer import VideoWriter
+from lanebev.io.video.writer import VideoWriter
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 GOLDEN = Path(__file__).parents[1] / "golden"

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from lanebev import Camera
 from lanebev.io.calibration_file import read_mount
-from lanebev.io.images import read_image
+from lanebev.io.images.pixels import read_image
 from lanebev.io.lanes import read_lanes
+from lanebev.io.opening import open_source
 from lanebev.io.state import load_state
-from lanebev.io.video import open_source
 from lanebev.weights import load_segmenter
 from tools.fuzz_readers.__main__ import fault
 from tools.fuzz_readers.mutations import mutated

@@ -15,7 +15,7 @@ from lanebev.geometry.rotation import (
     vanishing_dir_from_pitch_yaw,
 )
 from lanebev.io.lanes import read_lanes
-from lanebev.io.tusimple import tusimple_line
+from lanebev.io.lanes.tusimple import tusimple_line
 from lanebev.observation.boundary_vertices import BoundaryVertices
 
 files = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

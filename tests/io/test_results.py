@@ -10,7 +10,7 @@ import torch
 
 from lanebev import Calibration, Extrinsics, Reason, Status
 from lanebev.io.covariances import read_covariances, write_covariances
-from lanebev.io.output_folder import OutputFolder, check_inputs_stay
+from lanebev.io.output.folder import OutputFolder, check_inputs_stay
 from lanebev.io.results import CSV_COLUMNS, extrinsics_row, read_extrinsics, write_extrinsics
 
 ROW = "7,0.5,1.25,-0.5,0.25,1.3,0.1,0.2,0.3,0.02,TRACKING,9,,,0.000000000"

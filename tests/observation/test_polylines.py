@@ -8,7 +8,7 @@ import torch
 
 from lanebev import Camera, LaneSegments
 from lanebev.io.lanes import read_lanes
-from lanebev.io.tusimple import tusimple_line
+from lanebev.io.lanes.tusimple import tusimple_line
 from lanebev.observation.boundary_order import boundary_indices
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.polylines import (

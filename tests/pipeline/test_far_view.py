@@ -21,7 +21,7 @@ from lanebev.estimation.tracker import Tracker
 from lanebev.export.parts import make_part
 from lanebev.geometry.vanishing_point import vanishing_point
 from lanebev.io.frames import Frame
-from lanebev.io.images import write_png
+from lanebev.io.images.pixels import write_png
 from lanebev.render import Drive
 
 DT, WIDTH = 0.05, 3.6

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from lanebev.io.lane_parsing import FrameLines
+from lanebev.io.lanes.parsing import FrameLines
 from lanebev.observation.polylines import LaneLine
 from train.metrics import CULaneCounts, culane_counts, point_recall, tusimple_lane_score, tusimple_score
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from lanebev.io.lane_parsing import FrameLines
+from lanebev.io.lanes.parsing import FrameLines
 from lanebev.observation.polylines import BoundaryRows, LaneLine
 from train.__main__ import main
 from train.data import Batch, ViewBatches

@@ -18,11 +18,11 @@ from safetensors.torch import save
 
 from lanebev import Camera, Extrinsics
 from lanebev.io.calibration_file import read_mount
-from lanebev.io.images import read_image
+from lanebev.io.images.pixels import read_image
 from lanebev.io.lanes import read_lanes
+from lanebev.io.opening import open_source
 from lanebev.io.results import read_extrinsics
 from lanebev.io.state import load_state, save_state
-from lanebev.io.video import open_source
 from lanebev.weights import load_segmenter, read_metadata
 
 _CURVELANES = b'{"Lines": [[{"x": "5.0", "y": "590"}, {"x": 7, "y": 580}]]}'
@@ -246,7 +246,7 @@ def _images() -> list[bytes]:
 def _videos() -> list[bytes]:
     from fractions import Fraction
 
-    from lanebev.io.video_writer import VideoWriter
+    from lanebev.io.video.writer import VideoWriter
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "v.mp4"

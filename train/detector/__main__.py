@@ -16,7 +16,7 @@ import lightning as L
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.utils.data import DataLoader
 
-from lanebev.io.whole_file import whole_file
+from lanebev.io.output.whole_file import whole_file
 from train.commands import one_line_errors
 from train.detector.arms import begun_checkpoint, checkpoint_step, test_poses
 from train.detector.frames import DriveFrames, StepBatches

@@ -17,7 +17,7 @@ from jsonargparse.typing import PositiveInt
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lanebev.io.video_writer import VideoWriter
+from lanebev.io.video.writer import VideoWriter
 from lanebev.types import Extrinsics
 from lanebev.view.grid import BEVGrid
 from lanebev.view.warp import BEVWarp

@@ -12,7 +12,7 @@ from lanebev.app.fleet.plan import drive_folder
 from lanebev.io.formats.folder import read_record
 from lanebev.io.formats.names import check_installed
 from lanebev.io.formats.parquet import frame_table
-from lanebev.io.whole_file import whole_file
+from lanebev.io.output.whole_file import whole_file
 
 if TYPE_CHECKING:
     import pyarrow

@@ -25,11 +25,11 @@ from lanebev.app.fleet.plan import Outcome, Task, drive_folder, earlier_outcome,
 from lanebev.app.progress import Progress
 from lanebev.app.resume import STATE_FILE
 from lanebev.estimation.mount import MountEstimator, MountState
-from lanebev.io.folder_lock import FolderLock
 from lanebev.io.formats.names import check_installed
+from lanebev.io.output.lock import FolderLock
+from lanebev.io.output.whole_file import whole_file
 from lanebev.io.results import read_extrinsics
 from lanebev.io.state import load_state
-from lanebev.io.whole_file import whole_file
 from lanebev.report.verdict import verdict
 from lanebev.types import AXES
 

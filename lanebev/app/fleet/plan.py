@@ -16,7 +16,7 @@ from lanebev.app.fleet.cutting import Part, duration, parts_of
 from lanebev.app.fleet.manifest import PATHS, Drive
 from lanebev.app.recovery import size_and_time
 from lanebev.camera.choice import camera_file
-from lanebev.io.image_files import glob_pattern
+from lanebev.io.images.files import glob_pattern
 
 DRIVES, MARK, SEEN = "drives", "fleet.json", "seen.json"
 

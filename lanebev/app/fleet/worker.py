@@ -16,7 +16,7 @@ from lanebev.app.part_observation import observe_part
 from lanebev.app.recovery import size_and_time
 from lanebev.app.run import run
 from lanebev.app.shared_network import SharedNetwork
-from lanebev.io.output_folder import OutputFolderError
+from lanebev.io.output.folder import OutputFolderError
 from lanebev.pipeline import LaneBEV
 
 

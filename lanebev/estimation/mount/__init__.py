@@ -1,4 +1,8 @@
-"""The camera's mount in the vehicle: a slow estimate from the poses of frames, axis by axis."""
+"""The camera's mount in the vehicle: a slow estimate from the poses of frames, axis by axis.
+
+The ``estimator`` averages the poses in ``blocks``. ``config`` has its settings,
+``results`` its state and results, ``words`` their description for people.
+"""
 
 from lanebev.estimation.mount.config import MountConfig
 from lanebev.estimation.mount.estimator import MountEstimator

@@ -12,7 +12,7 @@ from lanebev.camera.model import Camera
 from lanebev.io.calibration_file import read_mount
 from lanebev.io.covariances import diagonal_covariances, read_covariances
 from lanebev.io.formats.record import Lines, RunRecord
-from lanebev.io.lane_parsing import Where, field, json_object, number_array
+from lanebev.io.lanes.parsing import Where, field, json_object, number_array
 from lanebev.io.results import read_extrinsics
 from lanebev.numbers import finite_numbers
 from lanebev.types import Extrinsics

@@ -19,7 +19,7 @@ from lanebev.app.observers import NetworkObserver
 from lanebev.app.part_observation import observe_part
 from lanebev.app.run import run
 from lanebev.io.state import load_state
-from lanebev.io.video_writer import VideoWriter
+from lanebev.io.video.writer import VideoWriter
 from lanebev.render import Drive as RenderedDrive
 from lanebev.report.run_folder import read_run
 

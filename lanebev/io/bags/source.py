@@ -1,0 +1,197 @@
+"""Frames and lens of an MCAP file or a ROS bag."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from functools import cached_property
+from itertools import islice, pairwise
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from lanebev.io.bags.images import TopicImages, is_video
+from lanebev.io.bags.messages import IMAGE_TYPES, LENS_TYPES, VIDEO_TYPES, Bag, Topic, open_bag
+from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
+from lanebev.io.frames import ALL, Frame
+from lanebev.io.rising_clock import RisingClock
+
+_LOOKED_AT = 50  # frames, for their rate
+_LONGEST_GROUP = 600  # frames, which a video in a bag may begin before its first key frame
+_LENS_FIELDS = ("width", "height", "distortion_model", "D", "K", "R", "P", "binning_x", "binning_y")
+_REGION = ("x_offset", "y_offset", "height", "width")
+
+
+@dataclass(frozen=True)
+class BagSource(FrameSource):
+    """Images of one topic of a bag.
+
+    Attributes:
+        topic: topic of the images.
+        lens: fields of a ``camera_info`` beside them, None if there is none.
+    """
+
+    topic: str = ""
+    lens: Mapping[str, Any] | None = field(default=None, compare=False)
+
+    @cached_property  # once: the times are in all messages
+    def taken_numbers(self) -> list[int]:
+        """Numbers of the frames that are taken, by their times if not all are."""
+        if self.selection == ALL:
+            return list(range(self.count))
+        times = self.frame_times()
+        return [number for number, time in enumerate(times) if self.selection.takes(number, time)]
+
+    def frame_times(self, clock: RisingClock[float] | None = None) -> Iterator[float]:
+        """Yield the times of the frames, s since the first, up to where the bag cannot be read.
+
+        Args:
+            clock: what gives them; None for a new one.
+        """
+        first, clock = None, clock or RisingClock(float(1 / self.fps))
+        with contextlib.suppress(ValueError), open_bag(Path(self.source)) as bag:
+            for logged, message in bag.messages(self.topic):
+                time, _ = clock.time(_stamp(message), 1e-9 * logged)
+                first = time if first is None else first
+                yield time - first
+
+    def _video_frames(self) -> Iterator[Frame]:
+        first = before = None
+        images = TopicImages()
+        number, interval = 0, float(1 / self.fps)
+        clock = RisingClock(interval)
+        try:
+            with open_bag(Path(self.source)) as bag:
+                for number, (logged, message) in enumerate(bag.messages(self.topic)):
+                    time, problem = clock.time(_stamp(message), 1e-9 * logged)
+                    first = time if first is None else first
+                    dt = interval if before is None else time - before
+                    image = None
+                    if self.selection.takes(number, time - first) or is_video(message):
+                        try:
+                            image = self._right_size(images(message))
+                        except ValueError as error:
+                            problem = str(error)
+                    yield Frame(number, time - first, dt, "", image, problem)
+                    before = time
+        except ValueError as error:  # from here on the bag cannot be read
+            if first is None or before is None:
+                raise
+            yield Frame(number + 1, before - first + interval, interval, "", None, str(error))
+
+
+def open_bag_source(source: str, topic: str | None = None, fps: Fraction | None = None) -> BagSource:
+    """Open a bag and check that an image of it decodes.
+
+    Args:
+        source: an MCAP file, a ROS bag, or the folder of a ROS 2 bag.
+        topic: topic of the images; None for the only one with images.
+        fps: nominal frame rate, None for that of the images' times.
+
+    Raises:
+        ValueError: the bag cannot be read, has no such topic or more than one, or its image does not decode.
+    """
+    with open_bag(Path(source)) as bag:
+        chosen = _image_topic(source, bag.topics, topic)
+        size = _first_size(bag, chosen.name)
+        if size is None:
+            raise ValueError(f"bag {source}: expected images on {chosen.name}, got none")
+        lens = _lens(bag, chosen.name)
+    found = BagSource(source, (), fps or DEFAULT_FPS, chosen.size, size, topic=chosen.name, lens=lens)
+    clock = RisingClock(float(1 / found.fps))
+    steps = [after - before for before, after in pairwise(islice(found.frame_times(clock), _LOOKED_AT))]
+    words = f"bag {source}: {clock.unstamped} of its first images have no stamps; they follow as recorded"
+    rate = fps or (Fraction(1 / median(steps)).limit_denominator(1000) if steps else found.fps)
+    is_unstamped = clock.unstamped > 1  # times from zero on have one stamp of zero
+    return replace(found, fps=rate, problem=words if is_unstamped else "")
+
+
+def _first_size(bag: Bag, topic: str) -> tuple[int, int] | None:
+    """Return the (height, width) px of a topic's first image, of a video from its first key frame on.
+
+    Raises:
+        ValueError: it does not decode.
+    """
+    images = TopicImages()
+    for number, (_, message) in enumerate(bag.messages(topic)):
+        try:
+            height, width = images(message).shape[:2]
+            return height, width
+        except ValueError:
+            if not is_video(message) or number > _LONGEST_GROUP:
+                raise
+    return None
+
+
+def lens_fields(message: Any) -> dict[str, Any]:
+    """Return a message of a lens as the fields of a ROS ``camera_info``.
+
+    Raises:
+        ValueError: K is zero, which says that the camera is not calibrated.
+    """
+    fields: dict[str, Any] = {}
+    for name in _LENS_FIELDS:
+        value = getattr(message, name, None)
+        value = getattr(message, name.lower(), None) if value is None else value
+        if value is not None:
+            fields[name] = value if isinstance(value, str) else np.asarray(value).tolist()
+    if not any(fields.get("K") or ()):
+        raise ValueError("K is zero: the camera was not calibrated")
+    region = getattr(message, "roi", None)
+    if region is not None:
+        fields["roi"] = {name: int(getattr(region, name)) for name in _REGION}
+    return fields
+
+
+def _lens(bag: Bag, images: str) -> dict[str, Any] | None:
+    """Return the lens of the topic nearest to the images, or of a bag's only camera; None without one.
+
+    Of several as near, such as ``camera_info`` and ``camera_info_raw``, it is that with the most words of the
+    images' topic and the fewest others.
+    """
+    cameras = sum(each.kind in IMAGE_TYPES and each.size > 0 for each in bag.topics)
+    topics = [each.name for each in bag.topics if each.kind in LENS_TYPES and each.size]
+    folders = {name: name.rpartition("/")[0] + "/" for name in topics}
+    beside = [name for name in topics if images.startswith(folders[name])]
+    words = {name: set(re.split("[/_]", name)) for name in (*beside, images)}
+
+    def fit(name: str) -> tuple[int, int, int]:
+        return len(folders[name]), len(words[name] & words[images]), -len(words[name] - words[images])
+
+    nearest = sorted(beside, key=fit)[-1:]
+    for name in nearest or (topics if len(topics) == cameras == 1 else []):
+        for _, message in bag.messages(name):
+            try:
+                return lens_fields(message)
+            except ValueError:
+                return None
+    return None
+
+
+def _image_topic(source: str, topics: Sequence[Topic], wanted: str | None) -> Topic:
+    found = {each.name: each for each in topics if each.kind in IMAGE_TYPES and each.size}
+    names = ", ".join(sorted(found)) or "none"
+    if wanted is not None and wanted not in found:
+        raise ValueError(f"bag {source}: expected images on {wanted}, got them on: {names}")
+    if wanted is None and len(found) != 1:
+        videos = ", ".join(each.name for each in topics if each.kind in VIDEO_TYPES and each.size)
+        packets = f"; make a video file of {videos}, whose packets are not read" if videos else ""
+        remedy = "; choose one with --topic" if found else packets
+        raise ValueError(f"bag {source}: expected one topic of images, got: {names}{remedy}")
+    return next(iter(found.values())) if wanted is None else found[wanted]
+
+
+def _stamp(message: Any) -> float | None:
+    """Return a message's own time (s); None if it is zero."""
+    stamp = message.header.stamp if hasattr(message, "header") else message.timestamp
+    seconds = getattr(stamp, "sec", None)
+    if seconds is None:
+        seconds, fraction = stamp.seconds, stamp.nanos
+    else:
+        fraction = stamp.nanosec
+    return float(seconds + 1e-9 * fraction) if seconds or fraction else None

@@ -1,0 +1,11 @@
+"""Lane files.
+
+- ``files`` finds out the format of a file, reads it and matches its entries to images.
+- Formats: ``tusimple``, ``culane``, ``curvelanes``, ``openlane``, ``llamas``, ``bdd100k``, ``labelme``; they
+  share ``parsing``.
+- Remarks on lanes: ``doubts``, ``order``, ``repeats``, ``size``, ``widths``.
+"""
+
+from lanebev.io.lanes.files import lane_files, match_frames, read_lanes
+
+__all__ = ["lane_files", "match_frames", "read_lanes"]

@@ -1,0 +1,172 @@
+"""Lane files of other detectors and data sets, and which frame each entry belongs to.
+
+Everything here is in pixels of the image as it came. A cut or malformed file is a ``ValueError`` of one line
+that names file and line.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path, PurePath
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanebev.io.images.names import in_natural_order
+from lanebev.io.images.pixels import IMAGE_SUFFIXES
+from lanebev.io.lanes.bdd100k import read_bdd100k
+from lanebev.io.lanes.culane import read_culane
+from lanebev.io.lanes.curvelanes import read_curvelanes
+from lanebev.io.lanes.labelme import read_cvat, read_labelme, read_vil100
+from lanebev.io.lanes.llamas import read_llamas
+from lanebev.io.lanes.openlane import read_openlane
+from lanebev.io.lanes.parsing import FrameLines, json_values, lane_text
+from lanebev.io.lanes.tusimple import read_tusimple
+
+_READERS = {  # of files of one image, by a key that no other has
+    "Lines": read_curvelanes,
+    "image_name": read_llamas,
+    "shapes": read_labelme,
+    "annotations": read_vil100,
+}
+_BEGIN = 1_000  # characters
+_OF_LLAMAS = re.compile(r"_(color|gray)_rect$")  # ends the names of LLAMAS' images, not of its labels
+
+
+def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) -> list[FrameLines]:
+    """Read a lane file of any of the formats, which its keys tell, or a folder of such files.
+
+    Args:
+        path: path of the file or folder.
+        intrinsics: (3, 3) px of the camera, for OpenLane's 3D points in a file without ``intrinsic``.
+
+    Raises:
+        ValueError: there is no such file, or it is cut, malformed or of no known format.
+    """
+    path = Path(path)
+    if path.is_dir():
+        frames = [frame for file in lane_files(path) for frame in read_lanes(file, intrinsics)]
+        if not frames:
+            wanted = "expected .lines.txt or .json files, got none; give an .xml file by its name"
+            raise ValueError(f"lane folder {path}: {wanted}")
+        return frames
+    text = lane_text(path)
+    if path.name.endswith(".txt") and not text.lstrip("[ \r\n").startswith("{"):
+        return [read_culane(path)]
+    if "<annotations>" in text[:_BEGIN]:
+        return read_cvat(path)
+    if _has_key("lane_lines", path, text):
+        return [read_openlane(path, intrinsics)]
+    for key, read in _READERS.items():
+        if _has_key(key, path, text):
+            return [read(path)]
+    if any(_has_key(key, path, text) for key in ("labels", "frames")):
+        return read_bdd100k(path)
+    return read_tusimple(path)
+
+
+def lane_files(path: str | Path) -> list[Path]:
+    """Return the files that :func:`read_lanes` reads: the file itself, or a folder's in natural order."""
+    path = Path(path)
+    if not path.is_dir():
+        return [path]
+    found = [*path.rglob("*.lines.txt"), *path.rglob("*.json")]
+    seen = (file for file in found if not any(part[0] == "." for part in file.relative_to(path).parts))
+    return [Path(file) for file in in_natural_order(map(str, seen))]  # macOS leaves ._ files
+
+
+class _Match(NamedTuple):
+    """The entry of an image, and how many parts of the paths they have in common."""
+
+    entry: int
+    length: int
+
+
+def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int | None]:
+    """Find the lane entry of each image: the one whose path has the longest common end with its path.
+
+    An entry with exactly the image's name is its own. Else whole path components are compared from the end,
+    the last without an image's suffix. An entry goes to the image that shares most with it, so an image
+    without an entry of its own gets None rather than another image's.
+
+    Args:
+        names: paths of the images.
+        frames: entries of the lane file.
+
+    Returns:
+        for each image an index into ``frames``, or None.
+
+    Raises:
+        ValueError: no image matches, or two entries (or two images) match equally well.
+    """
+    result: list[int | None] = [None] * len(names)
+    images_of: dict[int, dict[int, int]] = defaultdict(dict)  # by entry: the lengths by image
+    for image, match in enumerate(_best_entries(names, frames)):
+        if match is not None:
+            images_of[match.entry][image] = match.length
+    for entry, lengths in images_of.items():
+        best = [image for image, length in lengths.items() if length == max(lengths.values())]
+        if len(best) > 1:
+            raise ValueError(
+                f"lane entry {frames[entry].name!r}: expected one image, got {names[best[0]]} and "
+                f"{names[best[1]]}, which fit equally well; give entries a longer path"
+            )
+        result[best[0]] = entry
+    if names and all(entry is None for entry in result):
+        raise ValueError(
+            f"lanes: expected an entry for at least one image, got none that ends like {names[0]}; "
+            f"the file's first is {frames[0].name!r}"
+        )
+    return result
+
+
+def _best_entries(names: Sequence[str], frames: Sequence[FrameLines]) -> list[_Match | None]:
+    """Return for each image the entry that shares the longest end of the path with it.
+
+    Raises:
+        ValueError: two entries match an image equally well.
+    """
+    by_tail: dict[tuple[str, ...], list[int]] = defaultdict(list)
+    for entry, frame in enumerate(frames):
+        parts = _parts(frame.name)
+        for start in range(len(parts)):
+            by_tail[parts[start:]].append(entry)
+    exact = {frame.name: entry for entry, frame in enumerate(frames)}
+    exact = exact if len(exact) == len(frames) else {}  # names are not unique
+    matches: list[_Match | None] = []
+    for name in names:
+        parts = _parts(name)
+        if name in exact:
+            matches.append(_Match(exact[name], len(parts) + 1))
+            continue
+        tail = next((parts[k:] for k in range(len(parts)) if parts[k:] in by_tail), None)
+        matches.append(None if tail is None else _Match(by_tail[tail][0], len(tail)))
+        if tail is not None and len(by_tail[tail]) > 1:
+            first, second = (frames[entry].name for entry in by_tail[tail][:2])
+            raise ValueError(
+                f"image {name}: expected one lane entry, got {first!r} and {second!r}, which fit equally "
+                "well; give images by a path that tells them apart"
+            )
+    return matches
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    path = PurePath(unicodedata.normalize("NFC", name).replace("\\", "/"))  # macOS takes letters apart
+    if path.suffix.lower() in IMAGE_SUFFIXES:  # what follows the last dot may be part of the name
+        path = path.with_suffix("")
+    parts = [part for part in path.parts if part not in ("/", ".")]
+    return (*parts[:-1], *(_OF_LLAMAS.sub("", part) for part in parts[-1:]))
+
+
+def _has_key(key: str, path: Path, text: str) -> bool:
+    """Tell whether the first object of a JSON text has the key; of one that breaks off, its first line."""
+    if f'"{key}"' not in text:
+        return False
+    try:
+        return key in next((value for _, value in json_values(path, text)), {})
+    except (ValueError, TypeError):
+        return f'"{key}"' in text.lstrip().split("\n", 1)[0]
