@@ -11,11 +11,11 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from lanebev.app.arguments import parser
 from lanebev.app.config import RunConfig
-from lanebev.app.export_config import ExportConfig
+from lanebev.app.config.arguments import parser
+from lanebev.app.config.export import ExportConfig
+from lanebev.app.config.file import read_settings
 from lanebev.app.progress import Item, Progress
-from lanebev.app.settings_file import read_settings
 from lanebev.app.signals import handlers_kept
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lanebev.app.storage import StoredNumbers, StoredRows
+from lanebev.app.recording.storage import StoredNumbers, StoredRows
 from lanebev.io.results import ExtrinsicsRow, write_extrinsics
 from lanebev.report.page import Report, write_report
 from lanebev.types import NUM_BOUNDARIES

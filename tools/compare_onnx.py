@@ -18,10 +18,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.app.build import make_calibrator
 from lanebev.app.config import BACKENDS, CALIBRATORS, RunConfig
+from lanebev.app.config.export import ExportConfig
+from lanebev.app.drive.build import make_calibrator
 from lanebev.app.export import export
-from lanebev.app.export_config import ExportConfig
 from lanebev.app.run import run
 from lanebev.camera.model import Camera
 from lanebev.export.part import Part

@@ -25,8 +25,8 @@ from rich.table import Table
 
 import lanebev
 from lanebev import BEVGrid, Extrinsics, LaneSegments
-from lanebev.app.build import make_calibrator
-from lanebev.app.views import bird_view
+from lanebev.app.drive.build import make_calibrator
+from lanebev.app.recording.views import bird_view
 from lanebev.estimation.still import calibrate_still
 from lanebev.io.opening import open_source
 from lanebev.report.overlay import Panel, draw_panels, joined

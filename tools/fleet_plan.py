@@ -19,12 +19,12 @@ from pathlib import Path
 
 import torch
 
-from lanebev.app.build import make_network
 from lanebev.app.config import RunConfig
+from lanebev.app.continued.part_observation import observe_part
 from lanebev.app.demo import write_drive
-from lanebev.app.part_observation import observe_part
+from lanebev.app.drive.build import make_network
+from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.app.run import run
-from lanebev.app.shared_network import SharedNetwork
 from lanebev.numbers import parse_size
 from lanebev.render import Drive
 from train.commands import command_parser

@@ -24,7 +24,7 @@ from torch import Tensor
 
 import lanebev
 from lanebev import LaneSegments
-from lanebev.app.observers import NetworkObserver
+from lanebev.app.drive.observers import NetworkObserver
 from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.single_frame import fit_single_frame
 from lanebev.estimation.still import calibrate_still

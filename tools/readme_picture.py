@@ -11,7 +11,7 @@ from pathlib import Path
 from PIL import Image, ImageDraw, ImageFont
 
 from lanebev import BEVGrid, Camera
-from lanebev.app.views import bird_view
+from lanebev.app.recording.views import bird_view
 from lanebev.io.opening import open_source
 from lanebev.io.results import poses_of, read_extrinsics
 from train.commands import command_parser, one_line_errors

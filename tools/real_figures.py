@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from lanebev import Camera, Extrinsics, JointCalibrator, LaneSegments, Status
-from lanebev.app.observers import FarViewObserver, NetworkObserver
+from lanebev.app.drive.observers import FarViewObserver, NetworkObserver
 from lanebev.estimation.still import calibrate_still
 from lanebev.estimation.tracker import Tracker
 from lanebev.io.lanes import match_frames, read_lanes

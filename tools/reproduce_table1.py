@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from jsonargparse.typing import PositiveInt
 
-from lanebev.app.build import make_calibrator
+from lanebev.app.drive.build import make_calibrator
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.smoother import smooth_drive

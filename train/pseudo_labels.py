@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from lanebev.app.sources import source_of_run
+from lanebev.app.drive.sources import source_of_run
 from lanebev.batch import masked_median
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.boundary_curves import Boundaries, boundary_polylines, fit_boundaries

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Protocol, cast
 
-from lanebev.app.sources import source_of_run
+from lanebev.app.drive.sources import source_of_run
 from lanebev.camera.choice import camera_file
 from lanebev.io.formats.folder import read_record
 from lanebev.io.formats.names import FORMATS, check_installed

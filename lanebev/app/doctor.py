@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from lanebev.app.build import make_observer, make_tracker
 from lanebev.app.config import RunConfig
-from lanebev.app.plausibility import pose_remark, pose_words
+from lanebev.app.drive.build import make_observer, make_tracker
+from lanebev.app.drive.sources import camera_of, make_source
 from lanebev.app.progress import Progress
-from lanebev.app.sources import camera_of, make_source
+from lanebev.app.recording.plausibility import pose_remark, pose_words
 from lanebev.camera.model import Camera
 from lanebev.camera.plausibility import (
     field_of_view,

@@ -7,8 +7,8 @@ import os
 import tempfile
 from pathlib import Path
 
-from lanebev.app.build import make_calibrator
-from lanebev.app.export_config import ExportConfig
+from lanebev.app.config.export import ExportConfig
+from lanebev.app.drive.build import make_calibrator
 from lanebev.camera.model import Camera
 from lanebev.export.parts import make_part
 from lanebev.export.quantize import quantize_segmenter, rendered_views

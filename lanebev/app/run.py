@@ -11,7 +11,20 @@ from pathlib import Path
 
 import torch
 
-from lanebev.app.build import (
+from lanebev.app.config import RunConfig
+from lanebev.app.continued.part_observation import observer_of_parts
+from lanebev.app.continued.recovery import facts_of, frame_name, observer_of_second_pass, recover_run
+from lanebev.app.continued.resume import (
+    CALIBRATION_FILE,
+    STATE_FILE,
+    backup_state,
+    load_states,
+    resume_remark,
+)
+from lanebev.app.continued.smoothing import SmoothedPoses, smooth_frames
+from lanebev.app.continued.source_changes import files_of, source_remarks
+from lanebev.app.convert import writer
+from lanebev.app.drive.build import (
     RunTracker,
     input_files,
     joint_config,
@@ -20,19 +33,12 @@ from lanebev.app.build import (
     make_tracker,
     match_image_size,
 )
-from lanebev.app.config import RunConfig
-from lanebev.app.convert import writer
-from lanebev.app.observers import Observation, Observer
-from lanebev.app.part_observation import observer_of_parts
-from lanebev.app.plausibility import bars_remark, mount_remark
+from lanebev.app.drive.observers import Observation, Observer
+from lanebev.app.drive.shared_network import SharedNetwork
+from lanebev.app.drive.sources import camera_of, ended_by_signals, first_image, make_source, observed_frames
 from lanebev.app.progress import Progress
-from lanebev.app.recorder import Recorded, Recorder
-from lanebev.app.recovery import facts_of, frame_name, observer_of_second_pass, recover_run
-from lanebev.app.resume import CALIBRATION_FILE, STATE_FILE, backup_state, load_states, resume_remark
-from lanebev.app.shared_network import SharedNetwork
-from lanebev.app.smoothing import SmoothedPoses, smooth_frames
-from lanebev.app.source_changes import files_of, source_remarks
-from lanebev.app.sources import camera_of, ended_by_signals, first_image, make_source, observed_frames
+from lanebev.app.recording.plausibility import bars_remark, mount_remark
+from lanebev.app.recording.recorder import Recorded, Recorder
 from lanebev.app.summary import mount_facts, run_facts
 from lanebev.camera.model import Camera
 from lanebev.camera.plausibility import camera_remarks
@@ -71,8 +77,8 @@ def run(
         progress: wraps the frames, given their number.
         truth: truth of a rendered drive, a row per frame, for the report.
         network: an already loaded network with the weights and device of the settings.
-        parts: files of :func:`lanebev.app.part_observation.observe_part` for parts of the source, in order;
-            the network is not run again on their frames.
+        parts: files of :func:`lanebev.app.continued.part_observation.observe_part` for parts of the source,
+            in order; the network is not run again on their frames.
 
     Returns:
         what the report page shows.
@@ -180,7 +186,7 @@ def open_for_run(config: RunConfig) -> tuple[RunConfig, FrameSource]:
     A drive's first frame has smaller standard deviations, because the frames after it correct it.
 
     Raises:
-        ValueError: see :func:`~lanebev.app.sources.make_source`.
+        ValueError: see :func:`~lanebev.app.drive.sources.make_source`.
     """
     source = make_source(config)
     is_still = source.is_single and not (config.resume or config.smooth)

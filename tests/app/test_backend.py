@@ -10,8 +10,8 @@ from PIL import Image
 
 from lanebev import Camera, JointCalibrator, LaneBEV
 from lanebev.app.config import RunConfig
+from lanebev.app.config.export import ExportConfig
 from lanebev.app.export import export
-from lanebev.app.export_config import ExportConfig
 from lanebev.app.run import run
 from lanebev.cli import main
 from lanebev.estimation.checks import padded

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from lanebev import Camera
-from lanebev.app.build import match_image_size
 from lanebev.app.doctor import (
     DOUBT,
     OK,
@@ -23,7 +22,8 @@ from lanebev.app.doctor import (
     check_size,
     check_times,
 )
-from lanebev.app.plausibility import bars_remark, mount_remark, pose_remark
+from lanebev.app.drive.build import match_image_size
+from lanebev.app.recording.plausibility import bars_remark, mount_remark, pose_remark
 from lanebev.camera.plausibility import camera_remarks, field_of_view, model_remark
 from lanebev.cli import main
 from lanebev.io.opening import open_source

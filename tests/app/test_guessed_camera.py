@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from lanebev import Camera, Extrinsics, LaneBEV, Session, Status, image_from_road_points
-from lanebev.app.build import make_camera, make_tracker
 from lanebev.app.config import FOV_FOCAL_STD, RunConfig
-from lanebev.app.observers import NetworkObserver
+from lanebev.app.drive.build import make_camera, make_tracker
+from lanebev.app.drive.observers import NetworkObserver
 from lanebev.estimation.joint.frame_prior import FramePrior, prior_of_mount
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.road import lane_width_covariance

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from lanebev import Camera, Extrinsics, image_from_road_points
-from lanebev.app.build import make_tracker
 from lanebev.app.config import RunConfig
+from lanebev.app.drive.build import make_tracker
 from lanebev.app.run import run
 from lanebev.io.lanes import read_lanes
 from lanebev.io.video.writer import VideoWriter

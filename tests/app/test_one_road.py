@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from lanebev import Camera, FarView, LaneBEV, Session
-from lanebev.app.build import make_calibrator
 from lanebev.app.config import RunConfig
+from lanebev.app.drive.build import make_calibrator
 from lanebev.app.run import run
 from lanebev.estimation.still import calibrate_still
 from lanebev.io.images.pixels import write_png

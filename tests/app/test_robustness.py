@@ -21,8 +21,8 @@ import yaml
 
 from lanebev import Camera
 from lanebev.app.config import RunConfig
-from lanebev.app.observers import NetworkObserver
-from lanebev.app.recovery import recover_run
+from lanebev.app.continued.recovery import recover_run
+from lanebev.app.drive.observers import NetworkObserver
 from lanebev.app.run import run
 from lanebev.cli import main
 from lanebev.io.opening import open_source
@@ -135,7 +135,7 @@ def _killed(data, out, lanes):
     """Leave what a run by the network leaves that is killed after it wrote ``lanes``."""
     script = (
         "import os, signal, sys\n"
-        "from lanebev.app.recorder import Recorder\n"
+        "from lanebev.app.recording.recorder import Recorder\n"
         "from lanebev.cli import main\n"
         "draw = Recorder._draw\n"
         f"def kill(self, done):\n"

@@ -192,7 +192,7 @@ def test_a_lane_file_may_begin_with_a_byte_order_mark(data, tmp_path):
 
 
 def test_a_damaged_image_in_a_drive_is_a_row(data, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("lanebev.app.recorder.drive_remark", lambda rows: "pose: odd")
+    monkeypatch.setattr("lanebev.app.recording.recorder.drive_remark", lambda rows: "pose: odd")
     shutil.copytree(data / "images", tmp_path / "images")
     (tmp_path / "images" / "2.png").write_bytes((tmp_path / "images" / "2.png").read_bytes()[:2000])
     assert run(data, source=tmp_path / "images", out=tmp_path / "out") == 0

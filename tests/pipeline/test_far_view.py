@@ -10,11 +10,11 @@ import torch
 
 from lanebev import Camera, FarView, JointCalibrator, LaneBEV, Status, TwoStageCalibrator
 from lanebev.app.config import RunConfig
+from lanebev.app.drive.observers import FarViewObserver
+from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.app.fleet.manifest import Drive as FleetDrive
 from lanebev.app.fleet.plan import tasks_of
-from lanebev.app.observers import FarViewObserver
 from lanebev.app.run import run
-from lanebev.app.shared_network import SharedNetwork
 from lanebev.estimation.expected_view import expected_vanishing_point
 from lanebev.estimation.joint.frame_prior import prior_of_mount
 from lanebev.estimation.tracker import Tracker

@@ -1,1 +1,6 @@
-"""Many drives in parallel, on the cores of one machine or of a cluster."""
+"""Runs on many drives.
+
+``manifest`` lists the drives, ``plan`` makes tasks of them, with long videos in parts (``cutting``), and
+``schedule`` orders the tasks. ``cluster`` gives them to processes or machines, each a ``worker``. ``fleet``
+does all this, then ``collect`` gathers the results, ``mounts`` compares the cars' and ``page`` reports.
+"""

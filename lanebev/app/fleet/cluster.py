@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from types import ModuleType
 
-from lanebev.app.build import needs_network
+from lanebev.app.drive.build import needs_network
 from lanebev.app.fleet.plan import Outcome, Task, write_mark
 from lanebev.app.fleet.schedule import Schedule
 from lanebev.app.fleet.worker import run_tasks

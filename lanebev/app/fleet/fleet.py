@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from lanebev.app.continued.resume import STATE_FILE
 from lanebev.app.fleet.cluster import Cluster, check_ray, outcomes
 from lanebev.app.fleet.collect import FRAMES, collect_frames
 from lanebev.app.fleet.manifest import Drive, read_manifest
@@ -23,7 +24,6 @@ from lanebev.app.fleet.mounts import Stretch, days, drive_mounts, stretches
 from lanebev.app.fleet.page import CameraMounts, DriveVerdict, fleet_page
 from lanebev.app.fleet.plan import Outcome, Task, drive_folder, earlier_outcome, tasks_of
 from lanebev.app.progress import Progress
-from lanebev.app.resume import STATE_FILE
 from lanebev.estimation.mount import MountEstimator, MountState
 from lanebev.io.formats.names import check_installed
 from lanebev.io.output.lock import FolderLock

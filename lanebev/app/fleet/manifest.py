@@ -15,7 +15,7 @@ from pathlib import Path
 import yaml
 
 from lanebev.app.config import RunConfig
-from lanebev.app.settings_file import load_plain_yaml, parsed_settings
+from lanebev.app.config.file import load_plain_yaml, parsed_settings
 from lanebev.camera.choice import split_name
 from lanebev.io.source_names import is_live, without_login
 from lanebev.numbers import read_text, shown

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from lanebev import __version__
 from lanebev.app.config import RunConfig
+from lanebev.app.continued.recovery import size_and_time
 from lanebev.app.fleet.cutting import Part, duration, parts_of
 from lanebev.app.fleet.manifest import PATHS, Drive
-from lanebev.app.recovery import size_and_time
 from lanebev.camera.choice import camera_file
 from lanebev.io.images.files import glob_pattern
 

@@ -9,13 +9,13 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
 from pathlib import Path
 
-from lanebev.app.build import make_network, needs_network
 from lanebev.app.config import RunConfig
+from lanebev.app.continued.part_observation import observe_part
+from lanebev.app.continued.recovery import size_and_time
+from lanebev.app.drive.build import make_network, needs_network
+from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.app.fleet.plan import Outcome, Task, earlier_outcome, write_mark
-from lanebev.app.part_observation import observe_part
-from lanebev.app.recovery import size_and_time
 from lanebev.app.run import run
-from lanebev.app.shared_network import SharedNetwork
 from lanebev.io.output.folder import OutputFolderError
 from lanebev.pipeline import LaneBEV
 

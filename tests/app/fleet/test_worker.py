@@ -10,11 +10,11 @@ import torch
 
 from lanebev.app.config import RunConfig
 from lanebev.app.demo import write_drive
+from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.app.fleet import cluster, worker
 from lanebev.app.fleet.cluster import Cluster, groups_of, outcomes
 from lanebev.app.fleet.plan import Outcome, Task
 from lanebev.app.run import run
-from lanebev.app.shared_network import SharedNetwork
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.pipeline import LaneBEV
 from lanebev.render import Drive

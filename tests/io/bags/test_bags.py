@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lanebev import Camera
 from lanebev.app.config import RunConfig
-from lanebev.app.sources import camera_of, make_source
+from lanebev.app.drive.sources import camera_of, make_source
 from lanebev.cli import main
 from lanebev.io.bags import BagSource, open_bag_source
 from lanebev.io.bags.images import message_image

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from lanebev.app.config import RunConfig
-from lanebev.app.sources import make_source
+from lanebev.app.drive.sources import make_source
 from lanebev.io.images import names as image_names
 from lanebev.io.images.names import drives_remark, in_natural_order, jump_remark
 from lanebev.io.images.pixels import read_image

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from lanebev.app.config import RunConfig
-from lanebev.app.sources import make_source
+from lanebev.app.drive.sources import make_source
 from lanebev.io.images import name_clocks
 from lanebev.io.images.names import in_natural_order, times_from_names
 from lanebev.io.opening import open_source

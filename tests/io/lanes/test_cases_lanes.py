@@ -12,7 +12,7 @@ from PIL import Image
 
 from lanebev import Camera
 from lanebev.app.config import RunConfig
-from lanebev.app.observers import LaneFileObserver
+from lanebev.app.drive.observers import LaneFileObserver
 from lanebev.app.run import run
 from lanebev.io.lanes import read_lanes
 from lanebev.io.lanes.culane import read_culane

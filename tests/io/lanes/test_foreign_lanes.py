@@ -9,7 +9,7 @@ from PIL import Image
 
 from lanebev import Camera
 from lanebev.app.config import RunConfig
-from lanebev.app.sources import make_source
+from lanebev.app.drive.sources import make_source
 from lanebev.io.lanes import match_frames, read_lanes
 from lanebev.io.lanes.parsing import FrameLines
 from lanebev.observation.boundary_order import boundary_indices

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from lanebev import Camera
-from lanebev.app.observers import LaneFileObserver
+from lanebev.app.drive.observers import LaneFileObserver
 from lanebev.io.frames import Selection
 from lanebev.io.lanes.parsing import FrameLines
 from lanebev.io.lanes.widths import unequal_lanes_remark

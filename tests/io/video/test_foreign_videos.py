@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from lanebev import Camera
-from lanebev.app.build import make_camera
 from lanebev.app.config import RunConfig
-from lanebev.app.observers import LaneFileObserver
+from lanebev.app.drive.build import make_camera
+from lanebev.app.drive.observers import LaneFileObserver
 from lanebev.io.frames import Selection
 from lanebev.io.lanes.parsing import FrameLines
 from lanebev.io.opening import open_source

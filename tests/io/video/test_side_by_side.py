@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from lanebev import Camera
-from lanebev.app.build import match_image_size
+from lanebev.app.drive.build import match_image_size
 from lanebev.io.opening import open_source
 from lanebev.io.video.side_by_side import halves_remark, row_correlation
 from lanebev.io.video.writer import VideoWriter

@@ -13,10 +13,10 @@ import pytest
 from PIL import Image
 
 from lanebev.app.config import RunConfig
+from lanebev.app.continued.source_changes import changes_remark, count_remark, files_of
 from lanebev.app.fleet import worker
 from lanebev.app.fleet.plan import Task, earlier_outcome, write_mark
 from lanebev.app.run import run
-from lanebev.app.source_changes import changes_remark, count_remark, files_of
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Selection
 from lanebev.io.opening import open_source

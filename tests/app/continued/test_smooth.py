@@ -15,8 +15,8 @@ import torch
 
 from lanebev import Camera, Extrinsics, image_from_road_points
 from lanebev.app.config import RunConfig
-from lanebev.app.observers import NetworkObserver
-from lanebev.app.smoothing import StoredStates
+from lanebev.app.continued.smoothing import StoredStates
+from lanebev.app.drive.observers import NetworkObserver
 from lanebev.cli import main
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.io.state import load_state
@@ -161,7 +161,7 @@ def test_a_run_killed_in_its_second_pass_does_not_look_again(data, tmp_path, mon
     del options[options.index("--lanes") : options.index("--lanes") + 2]
     script = (
         "import os, signal, sys\n"
-        "from lanebev.app.recorder import Recorder\n"
+        "from lanebev.app.recording.recorder import Recorder\n"
         "from lanebev.cli import main\n"
         "Recorder._draw = lambda self, done: os.kill(os.getpid(), signal.SIGKILL)\n"
         "main(sys.argv[1:])\n"

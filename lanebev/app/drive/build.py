@@ -7,8 +7,8 @@ from fractions import Fraction
 from pathlib import Path
 
 from lanebev.app.config import RunConfig
-from lanebev.app.observers import FarViewObserver, LaneFileObserver, NetworkObserver, Observer
-from lanebev.app.shared_network import SharedNetwork
+from lanebev.app.drive.observers import FarViewObserver, LaneFileObserver, NetworkObserver, Observer
+from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.camera.choice import camera_file
 from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator, StateT

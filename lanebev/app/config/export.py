@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lanebev.app.config import CALIBRATORS
-from lanebev.app.options import check_types, option
+from lanebev.app.config.options import check_types, option
+from lanebev.app.config.run import CALIBRATORS
 from lanebev.export.names import PARTS
 
 FORMATS = ("onnx", "torch-export")

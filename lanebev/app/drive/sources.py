@@ -14,10 +14,10 @@ from types import FrameType
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.app.build import make_camera
 from lanebev.app.concurrency import map_ahead, prefetch
 from lanebev.app.config import RunConfig, rate_as_fraction
-from lanebev.app.observers import Observation, Observer
+from lanebev.app.drive.build import make_camera
+from lanebev.app.drive.observers import Observation, Observer
 from lanebev.app.signals import handlers_kept
 from lanebev.camera.model import Camera
 from lanebev.io.bags import BagSource, open_bag_source

@@ -14,12 +14,12 @@ import torch
 from numpy.typing import NDArray
 
 from lanebev.app.concurrency import Background
-from lanebev.app.observers import Observation
-from lanebev.app.plausibility import drive_remark
-from lanebev.app.repeats import RepeatedFrames
-from lanebev.app.storage import StoredNumbers, StoredRows
-from lanebev.app.view_changes import ViewChanges
-from lanebev.app.views import FixedPose, bird_view
+from lanebev.app.drive.observers import Observation
+from lanebev.app.recording.plausibility import drive_remark
+from lanebev.app.recording.repeats import RepeatedFrames
+from lanebev.app.recording.storage import StoredNumbers, StoredRows
+from lanebev.app.recording.view_changes import ViewChanges
+from lanebev.app.recording.views import FixedPose, bird_view
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration
 from lanebev.estimation.tracker import Estimate

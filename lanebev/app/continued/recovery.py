@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Protocol, cast
 
 from lanebev import __version__
-from lanebev.app.build import input_files
 from lanebev.app.config import RunConfig
-from lanebev.app.observers import Observation, Observer
+from lanebev.app.drive.build import input_files
+from lanebev.app.drive.observers import Observation, Observer
 from lanebev.camera.model import Camera
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Frame
@@ -68,7 +68,7 @@ class RecoveredObserver:
         self.remark, self.workers, self.frames = observer.remark, observer.workers, 0
 
     def __call__(self, frame: Frame) -> Observation:
-        """See :class:`lanebev.app.observers.Observer`."""
+        """See :class:`lanebev.app.drive.observers.Observer`."""
         entry = self._entry(self._name_of(frame))
         if entry is None or frame.image is None:
             return self._observer(frame)

@@ -20,8 +20,8 @@ from PIL import Image
 
 from lanebev import Camera
 from lanebev.app.config import RunConfig
-from lanebev.app.options import parse_grid
-from lanebev.app.sources import first_image, make_source, source_of_run
+from lanebev.app.config.options import parse_grid
+from lanebev.app.drive.sources import first_image, make_source, source_of_run
 from lanebev.app.summary import setting_words
 from lanebev.camera.files import read_camera
 from lanebev.cli import main

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 
-from lanebev.app.options import check_grid, check_types, option, parse_grid, parse_rate
+from lanebev.app.config.options import check_grid, check_types, option, parse_grid, parse_rate
 from lanebev.estimation.lane_width_prior import (
     LANE_WIDTH,
     LANE_WIDTH_STD,

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lanebev.app.arguments import RUN_GROUPS
 from lanebev.app.config import RunConfig
-from lanebev.app.export_config import ExportConfig
-from lanebev.app.settings_file import read_settings
+from lanebev.app.config.arguments import RUN_GROUPS
+from lanebev.app.config.export import ExportConfig
+from lanebev.app.config.file import read_settings
 from lanebev.app.summary import setting_words
 from lanebev.cli import main, parser
 

@@ -10,12 +10,12 @@ from typing import cast
 
 import numpy as np
 
-from lanebev.app.build import make_observer, match_image_size
 from lanebev.app.config import RunConfig
-from lanebev.app.observers import Observer
-from lanebev.app.recovery import RecoveredObserver, RestoringObserver
-from lanebev.app.shared_network import SharedNetwork
-from lanebev.app.sources import camera_of, make_source, observed_frames
+from lanebev.app.continued.recovery import RecoveredObserver, RestoringObserver
+from lanebev.app.drive.build import make_observer, match_image_size
+from lanebev.app.drive.observers import Observer
+from lanebev.app.drive.shared_network import SharedNetwork
+from lanebev.app.drive.sources import camera_of, make_source, observed_frames
 from lanebev.io.frames import Frame
 from lanebev.io.lanes.tusimple import tusimple_line, whole_tusimple_lines
 from lanebev.io.output.whole_file import whole_file

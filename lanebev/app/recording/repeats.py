@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.app.storage import StoredNumbers
+from lanebev.app.recording.storage import StoredNumbers
 
 _STRIDE = 8  # px, of the pixels that are compared
 _NEAR = 2  # frames before and after, among which the largest change is that of the drive

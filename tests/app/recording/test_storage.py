@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lanebev.app.storage import StoredNumbers, StoredRows
+from lanebev.app.recording.storage import StoredNumbers, StoredRows
 from lanebev.io.results import ExtrinsicsRow
 
 

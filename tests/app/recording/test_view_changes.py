@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lanebev.app.view_changes import ViewChanges
+from lanebev.app.recording.view_changes import ViewChanges
 
 SIZE = (96, 160)
 

@@ -9,10 +9,10 @@ from dataclasses import Field, fields
 from typing import NoReturn
 
 from lanebev import __version__
-from lanebev.app.completion import PrintCompletion
-from lanebev.app.config import RunConfig
-from lanebev.app.export_config import ExportConfig
-from lanebev.app.options import parse_path
+from lanebev.app.config.completion import PrintCompletion
+from lanebev.app.config.export import ExportConfig
+from lanebev.app.config.options import parse_path
+from lanebev.app.config.run import RunConfig
 from lanebev.io.formats.names import FORMATS
 
 DESCRIPTION = "Online camera-to-road calibration from lane boundaries, and a stable bird's-eye view."

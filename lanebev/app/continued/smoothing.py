@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lanebev.app.build import RunTracker
-from lanebev.app.observers import Observation
-from lanebev.app.recovery import LANES_FILE, frame_name
-from lanebev.app.storage import StoredNumbers
+from lanebev.app.continued.recovery import LANES_FILE, frame_name
+from lanebev.app.drive.build import RunTracker
+from lanebev.app.drive.observers import Observation
+from lanebev.app.recording.storage import StoredNumbers
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.layout import POSE
 from lanebev.estimation.joint.measurement import VERTICAL

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lanebev.app.recovery import size_and_time
+from lanebev.app.continued.recovery import size_and_time
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import ALL
 from lanebev.io.images.files import images_of

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import yaml
 
-from lanebev.app.config import RunConfig
+from lanebev.app.config.run import RunConfig
 from lanebev.numbers import read_text
 
 _NUMBERS: dict[object, str] = {float: "a number", int: "a whole number"}

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from lanebev.app.shared_network import SharedNetwork
+from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.camera.model import Camera
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Frame

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from lanebev.app.repeats import RepeatedFrames, repeated
+from lanebev.app.recording.repeats import RepeatedFrames, repeated
 
 
 def _drive(pattern, folder=None, noise=0.1):
