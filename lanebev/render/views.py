@@ -11,9 +11,9 @@ from torch import Tensor
 from lanebev.geometry.precision import autocast_off
 from lanebev.geometry.vanishing_point import vanishing_point
 from lanebev.render.frame import RenderedFrame
-from lanebev.render.raster.features import features_of
+from lanebev.render.raster.base.features import features_of
 from lanebev.render.raster.paint import paint_view, prepare
-from lanebev.render.raster.sensor import take_image
+from lanebev.render.raster.sensor.sensor import take_image
 from lanebev.render.rows import send, take_rows
 from lanebev.render.scene.alignment import build_alignment
 from lanebev.render.scene.camera import Lens, sample_distortion, sample_extrinsics, sample_intrinsics

@@ -98,7 +98,7 @@ def test_nothing_is_of_any_type_where_parts_are_put_together():
 
 MAPPED = sorted(  # the packages whose docstrings say which module does what
     path.parent.relative_to(ROOT / "lanebev").as_posix()
-    for name in ("estimation", "observation", "view", "io", "app")
+    for name in ("estimation", "observation", "view", "io", "app", "render/raster")
     for path in (ROOT / "lanebev" / name).rglob("__init__.py")
 )
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lanebev.render import Drive, RenderedFrame, WindowConfig, render_views, views
-from lanebev.render.raster.blocks import make_blocks, multiply_rows
+from lanebev.render.raster.base.blocks import make_blocks, multiply_rows
 from lanebev.render.rows import send, take_rows, tensors_of
 from lanebev.render.scene.kinds import KINDS
 from lanebev.render.scene.world import Scene

@@ -9,15 +9,15 @@ import torch
 
 from lanebev.geometry.lens import distort_points
 from lanebev.render import Drive, RenderedFrame, render_views
-from lanebev.render.raster.effects import add_bonnet
-from lanebev.render.raster.footprint import Ground
-from lanebev.render.raster.glass import behind_glass, recorded
-from lanebev.render.raster.glyphs import GLYPH_LENGTH, glyph_coverage
-from lanebev.render.raster.night import lamp_light, low_beam
-from lanebev.render.raster.rays import View
-from lanebev.render.raster.roadside import roadside
-from lanebev.render.raster.tunnel import add_ceiling
-from lanebev.render.raster.winter import snow_cover
+from lanebev.render.raster.base.footprint import Ground
+from lanebev.render.raster.base.rays import View
+from lanebev.render.raster.light.night import lamp_light, low_beam
+from lanebev.render.raster.objects.tunnel import add_ceiling
+from lanebev.render.raster.road.glyphs import GLYPH_LENGTH, glyph_coverage
+from lanebev.render.raster.road.roadside import roadside
+from lanebev.render.raster.road.winter import snow_cover
+from lanebev.render.raster.sensor.effects import add_bonnet
+from lanebev.render.raster.sensor.glass import behind_glass, recorded
 from lanebev.render.scene.alignment import arc_nodes, build_alignment
 from lanebev.render.scene.camera import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
 from lanebev.render.scene.glass import sample_glass

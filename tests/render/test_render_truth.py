@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
-from lanebev.render.raster.features import features_of
+from lanebev.render.raster.base.features import features_of
+from lanebev.render.raster.base.select import take_channels
 from lanebev.render.raster.paint import paint_view, prepare
-from lanebev.render.raster.select import take_channels
 from lanebev.render.scene.alignment import build_alignment
 from lanebev.render.scene.camera import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
 from lanebev.render.scene.sampler import BatchSampler

@@ -7,19 +7,19 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.blocks import Blocks, make_blocks
-from lanebev.render.raster.canvas import Canvas, empty_canvas
-from lanebev.render.raster.features import Features
-from lanebev.render.raster.footprint import Ground, ground_under
-from lanebev.render.raster.ground import ground_radiance
-from lanebev.render.raster.hexahedra import Hexahedra, hexahedra
-from lanebev.render.raster.night import add_lights, sprites
-from lanebev.render.raster.objects import add_objects
-from lanebev.render.raster.rays import View, coarse_plane, pixel_rays
-from lanebev.render.raster.select import as_float, put, take, take_channels
-from lanebev.render.raster.sky import sky_along
-from lanebev.render.raster.tunnel import add_ceiling
-from lanebev.render.raster.walls import add_walls
+from lanebev.render.raster.base.blocks import Blocks, make_blocks
+from lanebev.render.raster.base.canvas import Canvas, empty_canvas
+from lanebev.render.raster.base.features import Features
+from lanebev.render.raster.base.footprint import Ground, ground_under
+from lanebev.render.raster.base.rays import View, coarse_plane, pixel_rays
+from lanebev.render.raster.base.select import as_float, put, take, take_channels
+from lanebev.render.raster.light.night import add_lights, sprites
+from lanebev.render.raster.light.sky import sky_along
+from lanebev.render.raster.objects.hexahedra import Hexahedra, hexahedra
+from lanebev.render.raster.objects.objects import add_objects
+from lanebev.render.raster.objects.tunnel import add_ceiling
+from lanebev.render.raster.objects.walls import add_walls
+from lanebev.render.raster.road.ground import ground_radiance
 from lanebev.render.rows import take_rows
 from lanebev.render.scene.alignment import ground_hit, lowest_slopes
 from lanebev.render.scene.world import Scene
@@ -31,7 +31,7 @@ class Prepared(NamedTuple):
     """What of B scenes does not go by pixels.
 
     Attributes:
-        plane: (B, 2, rows, columns), see :func:`~lanebev.render.raster.rays.coarse_plane`.
+        plane: (B, 2, rows, columns), see :func:`~lanebev.render.raster.base.rays.coarse_plane`.
         solids: the objects.
     """
 

@@ -1,0 +1,1 @@
+"""Light: the ``sky``, ``shadows`` on the ground, and lamps at ``night``."""

@@ -1,0 +1,151 @@
+"""Paint on a street that bounds no lane: arrows, hatching, stop lines, crossings, bays."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lanebev.render.raster.base.coverage import dash_coverage, stripe_coverage
+from lanebev.render.raster.base.edges import band
+from lanebev.render.raster.base.footprint import Ground
+from lanebev.render.raster.base.noise import hash01, sample_grain, smoothstep
+from lanebev.render.raster.road.glyphs import GLYPH_LENGTH, GLYPH_WIDTH, glyph_coverage
+from lanebev.render.raster.road.roadside import junction_coverage
+from lanebev.render.raster.road.street_surface import strips_between
+from lanebev.render.raster.road.surface import count_below
+from lanebev.render.scene.glyphs import BICYCLE, NUM_GLYPHS
+from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
+from lanebev.render.scene.pavement import Pavement
+from lanebev.render.scene.street import CYCLING, FORD, PARKING, ZEBRA, Street
+
+
+def street_paint(
+    street: Street,
+    layout: Layout,
+    pavement: Pavement,
+    ground: Ground,
+    blotch: Tensor,
+) -> Tensor:
+    """Compute the coverage of a pixel by paint that bounds no lane, (B, N).
+
+    Args:
+        street: what is painted.
+        layout: the lanes.
+        pavement: the carriageway's edges.
+        ground: (B, N) points.
+        blotch: (B, N) slow noise: where the paint is worn.
+    """
+    lane, inside, width, on_lane = lane_coordinates(layout, ground.across)
+    marks = torch.maximum(
+        _glyphs(street, ground, lane, inside, width), _hatching(street, ground, lane, inside, width)
+    )
+    marks = torch.maximum(marks * on_lane, _across_the_road(street, layout, pavement, ground))
+    marks = torch.maximum(marks, _bays(street, layout, pavement, ground))
+    grain = sample_grain(ground.along / 5.0, ground.across / 2.5) / (1 + ground.reach_along / 0.05)
+    worn = smoothstep(-0.6, 0.5, blotch * 0.5 + grain * 0.45 + 0.95 - 1.4 * street.wear[:, None])
+    return marks * worn * street.opacity[:, None]
+
+
+def lane_coordinates(layout: Layout, across: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the lane (int64), m right of its middle, its width (m) and whether there is one, (B, N) each."""
+    lane = count_below(layout.across, across) - 1
+    lanes = layout.exists.sum(1, keepdim=True) - 1
+    on_lane = (lane >= 0) & (lane < lanes)
+    lane = lane.clamp(0, MAX_BOUNDARIES - 2)
+    low, high = layout.across.gather(1, lane), layout.across.gather(1, lane + 1)
+    return lane, across - 0.5 * (low + high), high - low, on_lane
+
+
+def _glyphs(street: Street, ground: Ground, lane: Tensor, inside: Tensor, width: Tensor) -> Tensor:
+    _, along, _, reach_along, reach_across = ground
+    period, scale = street.glyph_period[:, None], street.glyph_scale[:, None]
+    shifted = along + street.phase[:, None] + 3.0
+    cell = (shifted / period).floor()
+    seed = lane.to(along.dtype)
+    glyph = street.glyph.gather(1, lane)
+    other = (hash01(cell, seed, 11.0) * NUM_GLYPHS).long()
+    glyph = torch.where((glyph >= 0) & (hash01(cell, seed, 12.0) < 0.2), other, glyph)
+    glyph = glyph.masked_fill(hash01(cell, seed, 13.0) < 0.2, -1)
+    length = scale * (1 + 0.3 * (hash01(cell, seed, 14.0) - 0.5))
+    wide = torch.minimum(scale, width / (GLYPH_WIDTH + 0.3))
+    position = shifted - cell * period - 1.0
+    glyph = glyph.masked_fill((position < -1) | (position > length * GLYPH_LENGTH + 1), -1)
+    return glyph_coverage(glyph, inside / wide, position / length, reach_across / wide, reach_along / length)
+
+
+def _hatching(street: Street, ground: Ground, lane: Tensor, inside: Tensor, width: Tensor) -> Tensor:
+    """Draw oblique stripes or chevrons that fill a lane, or grow into it from its left boundary."""
+    _, along, _, reach_along, reach_across = ground
+    chevron = street.hatch_chevron[:, None]
+    slope = street.hatch_slope[:, None]
+    oblique = along + slope * torch.where(chevron > 0, inside.abs(), inside)
+    reach = reach_along + slope.abs() * reach_across
+    stripe = dash_coverage(
+        oblique,
+        (street.hatch_width * (1 + street.hatch_slope**2).sqrt()).minimum(0.6 * street.hatch_period)[:, None],
+        street.hatch_period[:, None],
+        reach,
+    )
+    start = (along + street.phase[:, None] + 40.0) % street.hatch_every[:, None]  # m beyond its begin
+    taper = street.hatch_taper[:, None]
+    share = torch.where(taper > 0, start * taper, width).minimum(width)
+    from_left = inside + 0.5 * width
+    stripe = stripe * band(from_left, 0.2 + 0 * share, share - 0.1, reach_across)
+    rim = stripe_coverage(from_left - share, torch.full_like(share, 0.14), reach_across) * (share < width)
+    here = start < street.hatch_length[:, None]
+    return torch.maximum(stripe, rim) * here * street.hatch.gather(1, lane)
+
+
+def _across_the_road(street: Street, layout: Layout, pavement: Pavement, ground: Ground) -> Tensor:
+    """Draw stop lines, crossings and grids at the junctions."""
+    _, along, across, reach_along, reach_across = ground
+    there = (street.junction_length > 0)[:, None]
+    period = street.junction_period[:, None]
+    left = layout.across.gather(1, street.first[:, None])
+    right = layout.across.gather(1, (street.first + street.own)[:, None])
+    stop_width = street.stop_width[:, None]
+    crossing = street.crossing[:, None]
+    setback = torch.where(crossing > 0, 5.2, 0.8)
+    stop = dash_coverage(
+        along + street.phase[:, None] + setback + stop_width, stop_width, period, reach_along
+    )
+    stop = stop * band(across, left, right, reach_across) * (stop_width > 0)
+
+    edges = band(across, pavement.left[:, None], pavement.right[:, None], reach_across)
+    ahead = along + street.phase[:, None]
+    half = torch.full_like(across, 0.5)
+    stripes = dash_coverage(across, half, 2 * half, reach_across)
+    zebra = dash_coverage(ahead + 4.4, torch.full_like(along, 3.4), period, reach_along) * stripes
+    thin = torch.full_like(along, 0.14)
+    pair = dash_coverage(ahead + 4.4, thin, period, reach_along) + dash_coverage(
+        ahead + 1.2, thin, period, reach_along
+    )
+    ford = pair * dash_coverage(across, half, 1.5 * half, reach_across)
+    walk = torch.where(crossing == ZEBRA, zebra, torch.where(crossing == FORD, ford, 0.0)) * edges
+
+    slanted, other = (ahead + across) / 1.4, (ahead - across) / 1.4
+    reach = (reach_along + reach_across) / 1.4
+    line, cell = torch.full_like(along, 0.12), torch.ones_like(along)
+    grid = torch.maximum(dash_coverage(slanted, line, cell, reach), dash_coverage(other, line, cell, reach))
+    grid = grid * junction_coverage(street, along, reach_along) * edges * street.box[:, None]
+    return torch.maximum(torch.maximum(stop, walk) * there, grid)
+
+
+def _bays(street: Street, layout: Layout, pavement: Pavement, ground: Ground) -> Tensor:
+    """Draw lines across parking strips, the outer line of cycle strips, and bicycles on them."""
+    _, along, across, reach_along, reach_across = ground
+    marks = torch.zeros_like(along)
+    for side, low, high in strips_between(layout, pavement):
+        kind = street.strip[:, side, None]
+        bay = street.bay[:, side, None].clamp(min=1.0).expand_as(along)
+        lines = dash_coverage(along + street.phase[:, None], torch.full_like(along, 0.1), bay, reach_along)
+        bays = lines * band(across, low, high, reach_across) * (kind == PARKING)
+        outer = high - 0.15 if side else low + 0.15
+        line = stripe_coverage(across - outer, torch.full_like(across, 0.1), reach_across) * (kind == CYCLING)
+        middle = 0.5 * (low + high)
+        position = (along + street.phase[:, None]) % 45.0
+        bicycle = torch.where(kind == CYCLING, BICYCLE, -1).expand_as(along)
+        bicycle = bicycle.masked_fill((position > 5) | ((across - middle).abs() > 1.1), -1)
+        bicycle = glyph_coverage(bicycle, across - middle, position, reach_across, reach_along)
+        marks = torch.maximum(marks, torch.maximum(torch.maximum(bays, line), bicycle))
+    return marks * (1 - junction_coverage(street, along, reach_along))

@@ -1,0 +1,50 @@
+"""Snow over the ground of a road."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lanebev.render.raster.base.footprint import Ground
+from lanebev.render.raster.base.noise import CLOUD, SECOND, sample_grain, sample_noise, smoothstep
+from lanebev.render.raster.road.surface import count_below, nearest_slot
+from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout, presence
+from lanebev.render.scene.pavement import Pavement
+from lanebev.render.scene.winter import Winter
+
+
+def snow_cover(winter: Winter, layout: Layout, pavement: Pavement, ground: Ground, blotch: Tensor) -> Tensor:
+    """Compute the share of a pixel under snow, (B, N); none where a boundary's paint is visible.
+
+    Args:
+        winter: the snow.
+        layout: the boundaries.
+        pavement: its edges.
+        ground: (B, N) points.
+        blotch: (B, N) slow noise.
+    """
+    _, along, across, reach_along, reach_across = ground
+    torn = sample_noise(CLOUD, along / 47.0, across / 23.0)
+    wave = winter.ragged[:, None] * (0.5 * blotch + 0.4 * torn)
+    inward = torch.minimum(
+        across - pavement.left[:, None] - winter.edge[:, :1],
+        pavement.right[:, None] - across - winter.edge[:, 1:],
+    )
+    soft = 0.12 + reach_across
+    edge = smoothstep(soft, -soft, inward + wave)
+
+    slot = nearest_slot(layout, across)
+    there = layout.exists.gather(1, slot)
+    here = presence(layout, slot, along) * there
+    distance = (across - layout.across.gather(1, slot)).abs()
+    ridge = smoothstep(soft, -soft, distance - winter.line[:, None] - 0.6 * wave) * (1 - here) * there
+
+    lane = (count_below(layout.across, across) - 1).clamp(0, MAX_BOUNDARIES - 2)
+    middle = 0.5 * (layout.across.gather(1, lane) + layout.across.gather(1, lane + 1))
+    wheel = ((across - middle).abs() - 0.8).abs() - winter.track[:, None]
+    patchy = smoothstep(-0.6, 0.8, blotch + 0.6 * sample_noise(SECOND, along / 19.0, across / 7.0))
+    film = winter.film[:, None] * smoothstep(-0.15, 0.25, wheel) * patchy
+    grain = sample_grain(along / 9.0, across / 9.0) / (1 + reach_along / 0.08)
+    bare = 1 - here * smoothstep(0.55, 0.3, distance)  # wind and salt keep what is labelled in sight
+    cover = torch.maximum(edge, torch.maximum(ridge, film)) * bare
+    return (cover * (0.9 + 0.15 * grain)).clamp(0, 1) * winter.on[:, None]
