@@ -19,8 +19,15 @@ _NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS: raw streams, whose times ffmpeg makes up
 _MARKED = "one that the decoder marks as damaged"
 _IN_DAMAGE = "one beside data that is missing"
 _EARLY = "one before the first key frame"
-_WITHOUT_KEY_CHECK = ("mpeg4", "msmpeg4v2", "msmpeg4v3", "h263", "flv1", "wmv1", "wmv2", "mpeg1video")
-"""Codecs whose decoders show grey frames, or others' remains, before the first key frame of a cut stream."""
+_OF_MICROSOFT = ("msmpeg4v2", "msmpeg4", "wmv1", "wmv2")
+_WITHOUT_KEY_CHECK = (*_OF_MICROSOFT, "mpeg4", "h263", "flv", "mpeg1video")
+"""Decoders that show grey frames, or others' remains, before the first key frame of a cut stream."""
+
+_STRICT = {"mjpeg": "explode", "hevc": "explode", **dict.fromkeys(_OF_MICROSOFT, "buffer")}
+"""``err_detect`` of decoders that else show garbage without a mark."""
+
+_ONE_THREAD = ("h264", "hevc", "vp9")
+"""Decoders that mark no frame as damaged if several threads decode its slices or tiles."""
 
 
 def open_video(source: str) -> av.container.InputContainer:
@@ -50,16 +57,12 @@ def open_video(source: str) -> av.container.InputContainer:
 
 
 def tell_damage(decoder: av.VideoCodecContext | None) -> None:
-    """Let a decoder tell damaged images; None, of an unknown codec, tells nothing.
-
-    One of JPEG silently shows grey or garbage, and one of H.264 marks no frame as damaged if several threads
-    decode its slices.
-    """
+    """Let a decoder tell damaged images; None, of an unknown codec, tells nothing."""
     if decoder is None:
         return
-    if decoder.name == "mjpeg":
-        decoder.options = {"err_detect": "explode"}
-    if decoder.name == "h264":
+    if decoder.name in _STRICT:
+        decoder.options = {"err_detect": _STRICT[decoder.name]}
+    if decoder.name in _ONE_THREAD:
         decoder.thread_type = "NONE"
 
 
@@ -120,10 +123,11 @@ def decoded(  # noqa: C901 - every loop is a way in which files are damaged
     """Return frames as they are shown, with the times that the file gives; of a lost one, what was got.
 
     A packet that yields no frame is lost if the file is damaged before it; in an undamaged file it shows
-    nothing. A frame that the decoder marks as corrupt is lost too, one without a key frame before it, and one
-    in a packet that the container marks, beside which others may be missing, unless it is a key frame. AVI
-    has no display times, so the frames of a stream with B-frames come with wrong ones: they get the packets'
-    times in order. Frame threads are not used, because they drop what follows the last error.
+    nothing. A frame that the decoder marks as corrupt is lost too, one that it shows in spite of an error in
+    its packet, one without a key frame before it, and one in a packet that the container marks, beside which
+    others may be missing, unless it is a key frame. AVI has no display times, so the frames of a stream with
+    B-frames come with wrong ones: they get the packets' times in order. Frame threads are not used, because
+    they drop what follows the last error.
     """
     in_order = container.format.name == "avi" and stream.codec_context.has_b_frames
     due: list[int] = []  # times of packets whose frames have not come
@@ -157,7 +161,7 @@ def decoded(  # noqa: C901 - every loop is a way in which files are damaged
                     yield earlier, damage
             keyed = keyed or frame.key_frame
             cut = pts in doubted and not frame.key_frame
-            yield pts, _IN_DAMAGE if cut else _if_whole(frame, keyed)
+            yield pts, damage if pts in lost else _IN_DAMAGE if cut else _if_whole(frame, keyed)
     if damage:
         yield from ((pts, damage) for pts in due)
 

@@ -162,13 +162,15 @@ def test_frames_before_the_first_key_frame_are_not_counted(tmp_path, suffix):
     assert source.count == source.taken_count == 8
 
 
-def test_a_decoder_that_shows_frames_before_the_first_key_frame_is_not_believed(tmp_path):
-    with av.open(str(tmp_path / "v.mkv"), "w") as container:
-        stream = _stream(container, codec="mpeg4")
+@pytest.mark.parametrize(("codec", "suffix"), [("mpeg4", "mkv"), ("msmpeg4", "mkv"), ("flv1", "flv")])
+def test_a_decoder_that_shows_frames_before_the_first_key_frame_is_not_believed(tmp_path, codec, suffix):
+    path, cut = tmp_path / f"v.{suffix}", tmp_path / f"cut.{suffix}"
+    with av.open(str(path), "w") as container:
+        stream = _stream(container, codec=codec)
         stream.gop_size, stream.codec_context.options = 12, {"sc_threshold": "1000000000"}
         _write(container, stream, range(20))
-    _cut(tmp_path / "v.mkv", tmp_path / "cut.mkv", 5)
-    source = open_source(str(tmp_path / "cut.mkv"))
+    _cut(path, cut, 5)
+    source = open_source(str(cut))
     frames = list(source)
     assert len(frames) == source.count == 15
     assert [frame.image is None for frame in frames] == [True] * 7 + [False] * 8
