@@ -107,7 +107,7 @@ def _export(options: dict[str, Any]) -> str:
     config = ExportConfig(**options)
     from lanebev.app.export import export
 
-    return export(config)
+    return export(config, lambda line: print(f"lanebev export: {line}", file=sys.stderr, flush=True))
 
 
 def _doctor(options: dict[str, Any]) -> tuple[str, int]:

@@ -153,7 +153,10 @@ def test_settings_are_checked():
     assert ExportConfig(camera="c", part="warp").parts == ("warp",)
     assert ExportConfig(camera="c", calibrator="two-stage").parts[2] == "two-stage"
     assert ExportConfig(camera="c", far_view=True).parts == ("segmenter", "joint", "step")
-    with pytest.raises(ValueError, match="far_view: expected the part segmenter or step with it, got warp"):
+    assert ExportConfig(camera="c", part="joint", far_view=True).parts == ("joint",)
+    with pytest.raises(
+        ValueError, match="part: expected segmenter, joint, two-stage or step with --far-view, got warp, of"
+    ):
         ExportConfig(camera="c", part="warp", far_view=True)
     with pytest.raises(ValueError, match="int8: expected no far view with it, got both"):
         ExportConfig(camera="c", int8=True, far_view=True)
@@ -182,6 +185,21 @@ def test_export_writes_a_program_that_computes_the_same(folder, monkeypatch):
         torch.export.load(out / "warp.pt2").module()(*one), part.module(*one), strict=True
     ):
         torch.testing.assert_close(found, expected)
+
+
+def test_each_part_is_named_before_it_is_exported(folder, monkeypatch, capsys):
+    """Since the joint calibrator takes minutes."""
+    said = []
+
+    def write(part, path):
+        said.append(capsys.readouterr().err)
+        path.write_bytes(b"")
+
+    monkeypatch.setattr("lanebev.app.export.write_onnx", write)
+    words = ["--camera", str(folder / "camera.yaml"), "--far-view", "--out", str(folder / "named")]
+    assert main(["export", *words]) == 0
+    names = ("segmenter", "joint", "step")
+    assert said == [f"lanebev export: {name}, {n} of 3\n" for n, name in enumerate(names, 1)]
 
 
 def test_an_export_that_cannot_be_written_is_one_line(folder, capsys):

@@ -45,8 +45,11 @@ class ExportConfig:
             raise ValueError("camera: expected --camera FILE, got none")
         if self.int8 and (self.format != "onnx" or "segmenter" not in self.parts):
             raise ValueError("int8: expected --format onnx and the part segmenter with it, got another")
-        if self.far_view and self.part not in (None, "segmenter", "step"):
-            raise ValueError(f"far_view: expected the part segmenter or step with it, got {self.part}")
+        if self.far_view and self.part in ("extractor", "warp"):
+            raise ValueError(
+                f"part: expected segmenter, {', '.join(CALIBRATORS)} or step with --far-view, "
+                f"got {self.part}, of which such a run needs no file"
+            )
         if self.far_view and self.int8:
             raise ValueError("int8: expected no far view with it, got both; leave one of them out")
 
