@@ -11,6 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from lanebev.camera.parameters import CameraParameters
+
 Array = NDArray[np.float64]
 Radius = Callable[[Array], Array]
 
@@ -48,6 +50,26 @@ def fov_model(angle: Array, omega: float) -> Array:
     return radius
 
 
+def radial_camera(
+    focal: tuple[float, float], centre: tuple[float, float], size: tuple[int, int], radius: Radius
+) -> CameraParameters:
+    """Return the Kannala-Brandt camera that is nearest to a radial one.
+
+    Args:
+        focal: (fx, fy) px.
+        centre: (cx, cy) px.
+        size: (height, width) px.
+        radius: r(θ) for a focal length of 1.
+    """
+    (fx, fy), (cx, cy), (height, width) = focal, centre, size
+    if not (fx > 0 and fy > 0):
+        raise ValueError(f"intrinsics: expected positive focal lengths, got {fx:g}, {fy:g}")
+    corner = math.hypot(max(cx, width - 1 - cx) / fx, max(cy, height - 1 - cy) / fy)
+    scale, distortion = kannala_brandt_like(radius, corner, max(fx, fy))
+    matrix = [scale * fx, 0.0, cx, 0.0, scale * fy, cy, 0.0, 0.0, 1.0]
+    return CameraParameters(matrix, distortion, "fisheye", size)
+
+
 def kannala_brandt_like(radius: Radius, corner: float, focal: float) -> tuple[float, list[float]]:
     """Return a factor on the focal lengths, and k1 to k4, of the Kannala-Brandt lens nearest to a radial one.
 
@@ -74,8 +96,9 @@ def kannala_brandt_like(radius: Radius, corner: float, focal: float) -> tuple[fl
             "got one that does not; calibrate with pinhole-equi"
         )
     powers = angles[:, None] ** np.array([1, 3, 5, 7, 9])
-    solution = np.linalg.lstsq(powers, values, rcond=None)[0]
-    error = focal * float(np.abs(powers @ solution - values).max())
+    with np.errstate(all="ignore"):
+        solution = np.linalg.lstsq(powers, values, rcond=None)[0]
+        error = focal * float(np.abs(powers @ solution - values).max())
     if not (solution[0] > 0 and error <= _MOST_ERROR):
         raise ValueError(
             f"distortion: expected a lens that a Kannala-Brandt lens equals within {_MOST_ERROR:g} px, got "

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lanebev.camera.approximation import kannala_brandt_like
+from lanebev.camera.approximation import fov_model, kannala_brandt_like, radial_camera
 from lanebev.camera.choice import Readers, telling_names
 from lanebev.camera.parameters import OFF_CENTRE, CameraParameters, centre_offset, size_of_images
 from lanebev.camera.parsing import mapping, number, once, whole_number
@@ -28,6 +28,9 @@ _COLMAP_MODELS = {  # names of their parameters
     "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
     "RADIAL_FISHEYE": "f cx cy k1 k2",
     "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "SIMPLE_FISHEYE": "f cx cy",
+    "FISHEYE": "fx fy cx cy",
+    "FOV": "fx fy cx cy omega",
 }
 _KITTI_SIZES = {  # focal length of the rectified cameras of each recording day -> (height, width)
     721.5377: (375, 1242),
@@ -109,8 +112,10 @@ def _colmap(name: str, width: str, height: str, values: str) -> CameraParameters
     model = "fisheye" if name.endswith("FISHEYE") else "pinhole"
     order = "k1 k2 k3 k4" if model == "fisheye" else "k1 k2 p1 p2 k3 k4 k5 k6"
     distortion = [given.get(key, 0.0) for key in order.split()]
-    matrix = [fx, 0.0, given["cx"] - 0.5, 0.0, fy, given["cy"] - 0.5, 0.0, 0.0, 1.0]
-    return CameraParameters(matrix, distortion, model, (int(height), int(width)))
+    cx, cy, size = given["cx"] - 0.5, given["cy"] - 0.5, (int(height), int(width))
+    if name == "FOV":
+        return radial_camera((fx, fy), (cx, cy), size, partial(fov_model, omega=given["omega"]))
+    return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, model, size)
 
 
 def is_woodscape(record: Any) -> bool:

@@ -13,17 +13,18 @@ from typing import Any
 import numpy as np
 import yaml
 
-from lanebev.camera.choice import chosen, split_name
+from lanebev.camera.choice import Readers, chosen, split_name
 from lanebev.camera.datasets import (
     colmap_cameras,
     is_colmap,
     is_kitti,
     kitti_cameras,
 )
-from lanebev.camera.formats import opencv_or_ros, without_lens
+from lanebev.camera.formats import opencv_or_ros, stereo_cameras, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
 from lanebev.camera.parsing import parse_documents
-from lanebev.camera.programs import gyroflow, matlab, metashape, nerf, realsense
+from lanebev.camera.programs import depthai_cameras, gyroflow, matlab, metashape, nerf, realsense
+from lanebev.camera.reconstruction import openmvg_cameras, opensfm_cameras
 from lanebev.camera.records import record_cameras
 from lanebev.camera.slam import (
     as_kalibr,
@@ -51,15 +52,16 @@ def read_camera(
 ) -> CameraParameters:
     """Read a camera file of any of these kinds, told apart by what is in it.
 
-    - OpenCV's FileStorage (YAML, XML, JSON) by its calibration programs' keys, and ``mtx`` and ``dist`` of
-      its Python tutorial, also in NumPy's ``.npz``;
+    - OpenCV's FileStorage (YAML, XML, JSON) by its calibration programs' keys (``M1`` and ``D1`` of two
+      cameras), and ``mtx`` and ``dist`` of its Python tutorial, also in NumPy's ``.npz``;
     - ROS ``camera_info`` (YAML or INI, or a message as ``rostopic``, ``ros2 topic`` and Foxglove print it),
       its ``roi`` and ``binning_x``, ``binning_y`` applied;
     - our short YAML: fx, fy, cx, cy, width, height, distortion, model;
     - Kalibr's camchain, EuRoC's ``sensor.yaml``, calibrations of Basalt and maplab, CamOdoCal's YAML (VINS,
       KITTI-360), the settings of ORB-SLAM and stella_vslam;
     - KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt``: rectified images (``P_rect_02``, ``P2``);
-    - files of MATLAB, Gyroflow, Nerfstudio, RealSense and Metashape, see :mod:`lanebev.camera.programs`;
+    - files of MATLAB, Gyroflow, Nerfstudio, RealSense, DepthAI and Metashape, see
+      :mod:`lanebev.camera.programs`, and of OpenSfM and OpenMVG, see :mod:`lanebev.camera.reconstruction`;
     - JSON of data sets, see :mod:`lanebev.camera.records`;
     - COLMAP's ``cameras.txt``.
 
@@ -140,21 +142,37 @@ def _camera(
         raise ValueError(f"expected keys with a colon and a space, such as fx: 1150, got {shown(content)}")
     if not isinstance(content, dict | list) or content == {}:
         raise ValueError("expected keys such as fx, fy, cx, cy, width, height, got none; is the file empty?")
-    if cameras := record_cameras(content, image_size, rectified):
+    if cameras := _unordered_cameras(content, image_size, rectified):
         return checked(chosen(cameras, name, has_usual=False))
     if isinstance(content, list):
         raise ValueError("camera_intrinsic: expected that of a camera, got none")
     content = as_kalibr(content)
-    if is_kalibr(content):
-        return checked(chosen(kalibr_cameras(content), name, has_usual=True))
-    if settings := orb_slam_fields(content):
-        return checked(chosen(orb_slam_cameras(settings, rectified), name, has_usual=True))
+    if cameras := _ordered_cameras(content, image_size, rectified):
+        return checked(chosen(cameras, name, has_usual=True))
     if name is not None:
         raise ValueError(f"expected no name after # for a file of one camera, got {shown(name)}")
     for key, read in _BY_KEY.items():
         if key in content:
             return checked(read(content))
     return opencv_or_ros(content, rectified, image_size)
+
+
+def _unordered_cameras(content: Any, image_size: tuple[int, int] | None, rectified: bool) -> Readers:
+    """Return what reads the cameras of a file that has them in no order; nothing of other files."""
+    finders = (opensfm_cameras, openmvg_cameras, depthai_cameras)
+    found = (record_cameras(content, image_size, rectified), *(find(content) for find in finders))
+    return next(filter(None, found), {})
+
+
+def _ordered_cameras(
+    fields: Mapping[str, Any], image_size: tuple[int, int] | None, rectified: bool
+) -> Readers:
+    """Return what reads the cameras of a file whose first is the usual one; nothing of other files."""
+    if is_kalibr(fields):
+        return kalibr_cameras(fields)
+    if settings := orb_slam_fields(fields):
+        return orb_slam_cameras(settings, rectified)
+    return stereo_cameras(fields, rectified, image_size)
 
 
 def camera_from_fields(fields: Mapping[str, Any], rectified: bool = False) -> CameraParameters:

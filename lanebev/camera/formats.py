@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from lanebev.camera.named_lens import LENS_NAMES, stated_lens
@@ -40,7 +41,7 @@ _IGNORED_KEYS = {
 }  # fmt: skip
 _KNOWN_KEYS = {
     *_MATRIX_KEYS, *DISTORTION_KEYS, *_PROJECTION_KEYS, *_ROTATION_KEYS, *_WIDTH_KEYS, *_HEIGHT_KEYS,
-    *_MODEL_KEYS, *_IGNORED_KEYS, "binning_x", "binning_y", "roi", "xi",
+    *_MODEL_KEYS, *_IGNORED_KEYS, *LENS_NAMES["pinhole"], "binning_x", "binning_y", "roi", "xi",
 }  # fmt: skip
 _MODELS = {
     "": "",  # what a driver of an ideal camera leaves empty
@@ -69,6 +70,11 @@ _ALSO = {  # other programs' names of these, with _ for blanks and hyphens
     "kannalabrandt8": "fisheye",
     "pinhole_equi": "fisheye",
 }
+_STEREO = [  # keys of matrix and coefficients of both cameras, as of OpenCV's stereo_calib
+    [(f"{matrix}{side}", f"{lens}{side}") for side in sides]
+    for matrix, lens in (("M", "D"), ("K", "D"), ("cameraMatrix", "distCoeffs"))
+    for sides in ("12", "LR")
+]
 _OFF_CENTRE = 0.1  # shares of the sides, more than which a file without a size is of other images
 _IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
@@ -108,13 +114,26 @@ def opencv_or_ros(
         camera = CameraParameters(_projection(fields), [], "pinhole", size)
         return _as_taken(checked(camera, _restates(fields)), fields)
     matrix = numbers(fields, *_MATRIX_KEYS, count=9)
-    distortion = numbers(fields, *DISTORTION_KEYS)
     model = stated_model(fields)
+    distortion = stated_lens(fields, DISTORTION_KEYS, model) or numbers(fields, *DISTORTION_KEYS)
     if fields.get("xi") is not None:
         xi = numbers(fields, "xi", count=1) if not isinstance(fields["xi"], str) else [number(fields, "xi")]
         distortion = [*xi, *(distortion or [0.0] * 4)]
     camera = CameraParameters(matrix, distortion, model, size)
     return _as_taken(checked(camera, _restates(fields)), fields)
+
+
+def stereo_cameras(
+    fields: Mapping[str, Any], rectified: bool, image_size: tuple[int, int] | None
+) -> dict[str, Callable[[], CameraParameters]]:
+    """Return what reads the cameras of OpenCV's stereo calibration, the left one first; nothing of others.
+
+    Their names are those of their matrices.
+    """
+    pair = next((each for each in _STEREO if all(key in fields for keys in each for key in keys)), [])
+    of_both = {key: fields[key] for key in (*_WIDTH_KEYS, *_HEIGHT_KEYS, *_MODEL_KEYS) if key in fields}
+    own = {matrix: {**of_both, "K": fields[matrix], "D": fields[lens]} for matrix, lens in pair}
+    return {name: partial(opencv_or_ros, each, rectified, image_size) for name, each in own.items()}
 
 
 def _of_images(fields: Mapping[str, Any], rectified: bool, image_size: tuple[int, int]) -> CameraParameters:

@@ -1,11 +1,13 @@
-"""Camera files of MATLAB, Gyroflow, instant-ngp and Nerfstudio, librealsense and Metashape."""
+"""Camera files of MATLAB, Gyroflow, instant-ngp and Nerfstudio, librealsense, DepthAI and Metashape."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
+from lanebev.camera.choice import Readers
 from lanebev.camera.named_lens import named_lens
 from lanebev.camera.parameters import CameraParameters
 from lanebev.camera.parsing import mapping, number, numbers, required, whole_number
@@ -100,6 +102,23 @@ def realsense(fields: Mapping[str, Any]) -> CameraParameters:
     fx, fy, cx, cy = (number(fields, key) for key in ("fx", "fy", "ppx", "ppy"))
     size = (whole_number(fields, "height"), whole_number(fields, "width"))
     return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, "pinhole", size)
+
+
+def depthai_cameras(content: Any) -> Readers:
+    """Return what reads the cameras of a calibration of Luxonis' DepthAI, by the numbers of their sockets."""
+    data = content.get("cameraData") if isinstance(content, Mapping) else None
+    pairs = (
+        [each for each in data if isinstance(each, list) and len(each) == 2] if isinstance(data, list) else []
+    )
+    return {str(socket): partial(_depthai, mapping("cameraData", fields)) for socket, fields in pairs}
+
+
+def _depthai(fields: Mapping[str, Any]) -> CameraParameters:
+    """Read a camera of ``cameraData``; ``cameraType`` 1 is a fisheye, of whose coefficients four count."""
+    matrix, distortion = numbers(fields, "intrinsicMatrix", count=9), numbers(fields, "distortionCoeff")
+    size = (whole_number(fields, "height"), whole_number(fields, "width"))
+    is_fisheye = str(fields.get("cameraType")).strip().lower() in ("1", "fisheye")
+    return CameraParameters(matrix, distortion, "fisheye" if is_fisheye else "pinhole", size)
 
 
 def metashape(fields: Mapping[str, Any]) -> CameraParameters:

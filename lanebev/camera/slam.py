@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -13,7 +12,7 @@ from lanebev.camera.approximation import (
     double_sphere,
     extended_unified,
     fov_model,
-    kannala_brandt_like,
+    radial_camera,
 )
 from lanebev.camera.choice import Readers
 from lanebev.camera.parameters import CameraParameters
@@ -162,12 +161,8 @@ def _radial(
     if after:
         shape += numbers(fields, "distortion_coeffs", count=after)
     width, height = numbers(fields, "resolution", count=2)
-    if not (fx > 0 and fy > 0):
-        raise ValueError(f"intrinsics: expected positive focal lengths, got {fx:g}, {fy:g}")
-    corner = math.hypot(max(cx, width - 1 - cx) / fx, max(cy, height - 1 - cy) / fy)
-    scale, distortion = kannala_brandt_like(lambda angle: radius(angle, *shape), corner, max(fx, fy))
-    matrix = [scale * fx, 0.0, cx, 0.0, scale * fy, cy, 0.0, 0.0, 1.0]
-    return CameraParameters(matrix, distortion, "fisheye", (round(height), round(width)))
+    size = (round(height), round(width))
+    return radial_camera((fx, fy), (cx, cy), size, lambda angle: radius(angle, *shape))
 
 
 def camodocal(fields: Mapping[str, Any]) -> CameraParameters:

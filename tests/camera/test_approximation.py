@@ -106,3 +106,8 @@ def test_what_the_lens_does_outside_the_image_does_not_count():
     assert (scale, *found) == pytest.approx((1.0, -0.2, 0.0, 0.0, 0.0), abs=1e-6)
     with pytest.raises(ValueError, match="expected a lens that images larger angles farther out"):
         kannala_brandt_like(radius, 0.9, 300.0)
+
+
+def test_a_lens_of_huge_coefficients_is_one_clear_line():
+    with pytest.raises(ValueError, match="expected a lens that a Kannala-Brandt lens equals within 0.5 px"):
+        kannala_brandt_like(lambda angle: angle + 1e308 * angle**4, 1.0, 1e3)

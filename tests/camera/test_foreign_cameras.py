@@ -236,7 +236,11 @@ ORBextractor.nFeatures: 1200
             "1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 2 2 1 1\n",
             "one camera, got 2: 1, 2;",
         ),
-        ("cameras.txt", "1 FOV 1280 720 1 1 1 1 1\n", "model: expected one of SIMPLE_PINHOLE, .*, got FOV"),
+        (
+            "cameras.txt",
+            "1 THIN_PRISM_FISHEYE 1280 720 1 1 1 1 1\n",
+            "model: expected one of SIMPLE_PINHOLE, .*, got THIN_PRISM_FISHEYE",
+        ),
         ("cameras.txt", "1 PINHOLE 1280 720 800 800 640\n", "PINHOLE: expected 4 numbers, got 3"),
         ("calib_velo_to_cam.txt", "R: 7.5 1\nT: 1 2 3\n", "expected P_rect_02 or P2 .*, got 'R:'"),
         (

@@ -69,6 +69,7 @@ def readers() -> dict[str, Reader]:
             [
                 b"P2: 721.5377 0 609.5 44.8 0 721.5377 172.8 0.2 0 0 1 0\n",
                 b"1 OPENCV 1280 720 800 801 640 360 -0.3 0.1 0.001 -0.002\n",
+                b"1 FOV 1280 720 800 801 640 360 0.9\n",
                 b"[image]\n\nwidth\n640\n\nheight\n480\n\n[a]\n\ncamera matrix\n369 0 320\n0 367 203\n0 0 1\n"
                 b"distortion\n0.19 -0.02 0 0 0\n",
             ],
@@ -163,6 +164,8 @@ def _camera_json() -> list[bytes]:
     lens = {"k1": -0.3, "k2": 0.1, "p1": 0.001, "p2": 0.0}
     named = {"fx": 900, "fy": 900, "cx": 640, "cy": 360}
     fisheye = {"k1": 339.7, "k2": -32.0, "k3": 48.3, "k4": -7.2, "cx_offset": 3.9, "cy_offset": -3.1}
+    size = {"width": 1600, "height": 900}
+    openmvg = {**size, "focal_length": 1266.4, "principal_point": [816.3, 491.5], "disto_k1": [-0.1]}
     basalt = {"camera_type": "ds", "intrinsics": {**named, "xi": -0.28, "alpha": 0.57}}
     records += [
         {"fl_x": 900, "cx": 640, "cy": 360, "w": 1280, "h": 720, **lens},
@@ -171,6 +174,23 @@ def _camera_json() -> list[bytes]:
         {"intrinsic": {"aspect_ratio": 1, "width": 1280, "height": 966, "model": "radial_poly", **fisheye}},
         {"Camera": {**named, **lens, "cols": 1280, "rows": 720, "model": "perspective"}},
         {"value0": {"intrinsics": [basalt], "resolution": [[1280, 720]]}},
+        {
+            "a": {
+                "projection_type": "brown",
+                "focal_x": 0.6,
+                "focal_y": 0.6,
+                "width": 1280,
+                "height": 720,
+                **lens,
+            }
+        },
+        {"sfm_data_version": "0.3", "intrinsics": [{"key": 0, "value": {"ptr_wrapper": {"data": openmvg}}}]},
+        {
+            "cameraData": [
+                [0, {"cameraType": 0, "intrinsicMatrix": matrix, "distortionCoeff": [0] * 14, **size}]
+            ]
+        },
+        {"M1": matrix, "D1": [0.1] * 5, "M2": matrix, "D2": [0.1] * 5, **size},
     ]
     return [_opencv(".json"), *(json.dumps(each).encode() for each in records)]
 
