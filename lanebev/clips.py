@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.geometry.precision import common_dtype
-from lanebev.types import check_tensor
+from lanebev.types import check_number_or_tensor, check_tensor
 
 
 def frame_intervals(dt: float | Tensor, batch: int, steps: int, like: Tensor) -> Tensor:
@@ -21,8 +21,12 @@ def frame_intervals(dt: float | Tensor, batch: int, steps: int, like: Tensor) ->
         like: tensor whose device and dtype are taken.
 
     Raises:
+        TypeError: neither number nor tensor.
         ValueError: another shape.
     """
+    check_number_or_tensor("dt", dt)
+    if isinstance(dt, (int, float)):  # a tensor made of a number would be a constant to torch.compile
+        return torch.full((batch, steps), dt, dtype=common_dtype(like), device=like.device)
     intervals = torch.as_tensor(dt, dtype=common_dtype(like), device=like.device)
     got = tuple(intervals.shape)
     if intervals.ndim < 2:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection
 from contextlib import nullcontext
 from pathlib import Path
@@ -15,17 +16,22 @@ from lanebev.clips import drive_starts, frame_intervals, stack_frames
 from lanebev.estimation.expected_view import expected_vanishing_point
 from lanebev.geometry.lens import check_distortion, check_intrinsics
 from lanebev.geometry.precision import autocast_is_on, autocast_off, common_dtype
+from lanebev.numbers import check_number
 from lanebev.observation.boundary_detector import BoundaryDetector
 from lanebev.observation.far_view import FarView
 from lanebev.observation.frames import black_unless_finite, check_images
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segments import LaneSegments, segments_from_vertices
 from lanebev.torch_internals import register_pytree
-from lanebev.types import Calibration, Extrinsics, check_tensor
+from lanebev.types import Calibration, Extrinsics, check_devices, check_tensor
+from lanebev.view.checks import doubt_intrinsics
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
 
 STAGES = ("segmenter", "extractor", "calibrator", "warp")
+_USUAL = dict(
+    zip(STAGES, ("LaneSegmenter()", "LineExtractor()", "JointCalibrator()", "BEVWarp()"), strict=True)
+)
 
 
 @register_pytree
@@ -74,7 +80,9 @@ class LaneBEV(BoundaryDetector):
             not known (not TRACKING, or a sharp turn) have the whole image alone. None: all rows have.
 
     Raises:
-        ValueError: segmenter and calibrator have different numbers of boundaries, or a stage does not exist.
+        TypeError: a part is no module.
+        ValueError: segmenter and calibrator have different numbers of boundaries, a stage does not exist, or
+            a number is not positive.
     """
 
     def __init__(
@@ -89,9 +97,13 @@ class LaneBEV(BoundaryDetector):
         network_pixels: int | None = None,
         far_view: FarView | None = None,
     ) -> None:
+        parts = {"segmenter": segmenter, "extractor": extractor, "calibrator": calibrator}
+        for name, part in (parts | ({} if warp is None else {"warp": warp})).items():
+            if not isinstance(part, nn.Module):
+                raise TypeError(f"{name}: expected a module, such as lanebev.{_USUAL[name]}, got {part!r}")
+        if isinstance(frozen, str) or not isinstance(frozen, Collection):
+            raise TypeError(f"frozen: expected a list of names, got {frozen!r}; write ['segmenter']")
         super().__init__(segmenter, extractor, network_width, network_pixels, frozen, far_view)
-        if isinstance(frozen, str):
-            raise TypeError(f"frozen: expected a list of names, got {frozen!r}; write [{frozen!r}]")
         if unknown := set(frozen) - set(STAGES):
             raise ValueError(
                 f"frozen: expected some of {', '.join(STAGES)}, got {', '.join(sorted(unknown))}"
@@ -104,6 +116,9 @@ class LaneBEV(BoundaryDetector):
             )
         if pose_sigma_scale is None:
             pose_sigma_scale = _configured(segmenter, "pose_sigma_scale", 1.0)
+        check_number("pose_sigma_scale", pose_sigma_scale)
+        if not 0 < pose_sigma_scale < math.inf:
+            raise ValueError(f"pose_sigma_scale: expected more than 0 and finite, got {pose_sigma_scale}")
         self.calibrator = calibrator
         self.warp = warp or BEVWarp()
         self.pose_sigma_scale = pose_sigma_scale
@@ -198,7 +213,7 @@ class LaneBEV(BoundaryDetector):
             the output, every tensor with (B, T, ...) where the image has T, and the state after it.
 
         Raises:
-            ValueError: shapes that don't fit, or an image of whole numbers.
+            ValueError: shapes or devices that don't fit, or an image of whole numbers.
         """
         check_images(image)
         cameras = _frame_cameras(intrinsics, image)
@@ -208,6 +223,9 @@ class LaneBEV(BoundaryDetector):
         frames = image if image.ndim == 5 else image.unsqueeze(1)
         batch, steps = frames.shape[:2]
         begins = None if reset is None else drive_starts(reset, batch, steps)
+        given = {"intrinsics": intrinsics, "distortion": distortion, "reset": begins}
+        check_devices({"image": image, **given})
+        doubt_intrinsics(intrinsics, (image.shape[-2], image.shape[-1]))
         if state is None or begins is not None:
             dtype = common_dtype(intrinsics) if state is None else state[0].dtype
             fresh = self.initial_state(batch, dtype, image.device)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from enum import IntEnum
+from numbers import Real
 from typing import NamedTuple, Protocol, TypeVar
 
 import torch
@@ -40,6 +41,28 @@ def check_tensor(name: str, value: object) -> None:
         kind = f"{type(value).__module__}.{type(value).__qualname__}".removeprefix("builtins.")
         remedy = "torch.from_numpy(...)" if kind == "numpy.ndarray" else "torch.as_tensor(...)"
         raise TypeError(f"{name}: expected a torch.Tensor, got {kind}; convert numbers with {remedy}")
+
+
+def check_number_or_tensor(name: str, value: object) -> None:
+    """Raise TypeError unless this is a number, a symbolic one of ``torch.export`` too, or a tensor."""
+    if not isinstance(value, (int, float, Tensor, torch.SymInt, torch.SymFloat, Real)):
+        raise TypeError(f"{name}: expected a number or a torch.Tensor, got {type(value).__qualname__}")
+
+
+def check_devices(tensors: Mapping[str, Tensor | None]) -> None:
+    """Raise unless all tensors are on the device of the first.
+
+    Raises:
+        ValueError: naming the first that is not, and where it should be.
+    """
+    (first, like), *others = tensors.items()
+    assert like is not None
+    for name, tensor in others:
+        if tensor is not None and tensor.device != like.device:
+            raise ValueError(
+                f"{name}: expected on {like.device} as the {first}, got on {tensor.device}; move it with "
+                f".to({str(like.device)!r})"
+            )
 
 
 def check_numbers_known(name: str, value: Tensor) -> None:

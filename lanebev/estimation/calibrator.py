@@ -19,7 +19,7 @@ from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.observation.segments import LaneSegments
 from lanebev.tensors import map_tensors, recorded
 from lanebev.torch_internals import is_in_forward_mode
-from lanebev.types import Calibration, TensorTuple
+from lanebev.types import Calibration, TensorTuple, check_devices
 
 
 class CalibratorState(TensorTuple, Protocol):
@@ -102,13 +102,15 @@ class Calibrator(nn.Module, Generic[StateT]):
             calibration of this frame, which shares no memory with the inputs, and the state after it.
 
         Raises:
-            ValueError: a shape that doesn't fit, whole numbers, another calibrator's state.
+            ValueError: a shape that doesn't fit, whole numbers, another device, another calibrator's state.
         """
         check_segments(segments, intrinsics)
         given = check_state(state, self.state_type, intrinsics.shape[0])
         if given.ndim != 2:  # as default_collate stacks states
             rows = f"({given.shape[0]}, D)"
             raise ValueError(f"state: expected {rows}, got {tuple(given.shape)}; join states by torch.cat")
+        own = {f"segments.{name}": part for name, part in segments._asdict().items()}
+        check_devices({"state": given, "intrinsics": intrinsics, **own})
         frame = (segments, intrinsics, state, dt, lane_width, given)
         differentiable = torch.is_grad_enabled() or is_in_forward_mode()
         if recorded() or differentiable or torch.is_inference_mode_enabled():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from numbers import Integral, Real
+from numbers import Integral
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ from torch import Tensor
 from lanebev.geometry.lens import check_intrinsics, placeholder_intrinsics, usable_cameras
 from lanebev.observation.segments import LaneSegments
 from lanebev.tensors import constant
-from lanebev.types import Calibration, Status, TensorTuple, check_tensor
+from lanebev.types import Calibration, Status, TensorTuple, check_number_or_tensor, check_tensor
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
 _MIN_SIGMA = 1e-3  # px; nothing is known better
@@ -177,19 +177,13 @@ def as_batch(value: float | Tensor, like: Tensor, name: str = "dt") -> Tensor:
         TypeError: neither number nor tensor.
         ValueError: another shape.
     """
-    _check_number(name, value)
+    check_number_or_tensor(name, value)
     if isinstance(value, (int, float)):  # a tensor made of a number would be a constant to torch.compile
         return torch.full(like.shape[:1], value, dtype=like.dtype, device=like.device)
     tensor = torch.as_tensor(value, dtype=like.dtype, device=like.device)
     if tensor.ndim > 1 or (tensor.ndim == 1 and tensor.shape[0] not in (1, like.shape[0])):
         raise ValueError(f"{name}: expected a float or ({like.shape[0]},), got {tuple(tensor.shape)}")
     return tensor.expand(like.shape[0])
-
-
-def _check_number(name: str, value: object) -> None:
-    """Raise TypeError unless this is a number, a symbolic one of ``torch.export`` too, or a tensor."""
-    if not isinstance(value, (int, float, torch.Tensor, torch.SymInt, torch.SymFloat, Real)):
-        raise TypeError(f"{name}: expected a number or a torch.Tensor, got {type(value).__qualname__}")
 
 
 def as_lane_width(value: float | Tensor, like: Tensor, num_boundaries: int) -> Tensor:
@@ -199,7 +193,7 @@ def as_lane_width(value: float | Tensor, like: Tensor, num_boundaries: int) -> T
         TypeError: neither number nor tensor.
         ValueError: another shape, or a number that is no lane's width in metres.
     """
-    _check_number("lane_width", value)
+    check_number_or_tensor("lane_width", value)
     least, most = LANE_WIDTHS
     if isinstance(value, (int, float)) and not least <= value <= most:
         raise ValueError(f"lane_width: expected {least:g} to {most:g} m, got {value}")

@@ -49,10 +49,13 @@ class BoundaryDetector(nn.Module):
             raise TypeError(
                 f"far_view: expected a lanebev.FarView or None, got {far_view!r}; write FarView()"
             )
+        for name, value in (("network_width", network_width), ("network_pixels", network_pixels)):
+            if value is not None and (value != int(value) or value <= 0):
+                raise ValueError(f"{name}: expected a whole number of px above 0, or None, got {value!r}")
         self.segmenter = segmenter
         self.extractor = extractor
-        self.network_width = network_width
-        self.network_pixels = network_pixels
+        self.network_width = None if network_width is None else int(network_width)
+        self.network_pixels = None if network_pixels is None else int(network_pixels)
         self.frozen = frozenset(frozen)
         self.far_view = far_view
 

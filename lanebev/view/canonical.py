@@ -12,7 +12,14 @@ from lanebev.geometry.precision import common_dtype, full_precision
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.tensors import constant
 from lanebev.types import Extrinsics, check_numbers_known
-from lanebev.view.checks import blind_unless_usable, check_cameras, check_covers, check_image, check_size
+from lanebev.view.checks import (
+    blind_unless_usable,
+    check_cameras,
+    check_covers,
+    check_image,
+    check_size,
+    doubt_intrinsics,
+)
 from lanebev.view.lens import make_lens
 from lanebev.view.projection import CellSums, normalised_intrinsics
 from lanebev.view.sampling import MapSize, resampled
@@ -108,7 +115,8 @@ class CanonicalView(nn.Module):
         size = image_size or (image.shape[-2], image.shape[-1])
         check_size(size)
         check_covers(image, size)
-        check_cameras(image.shape[0], intrinsics, extrinsics, distortion, model)
+        check_cameras(image, intrinsics, extrinsics, distortion, model)
+        doubt_intrinsics(intrinsics, size)
         intrinsics, extrinsics, distortion = blind_unless_usable(intrinsics, extrinsics, distortion)
         dtype, image_from_cam = common_dtype(image), normalised_intrinsics(intrinsics, size)
         lens = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import torch
@@ -10,9 +11,10 @@ from torch import Tensor
 from lanebev.batch import readable
 from lanebev.geometry.lens import check_distortion, check_intrinsics, last_row_is_small
 from lanebev.tensors import constant
-from lanebev.types import Extrinsics, check_extrinsics, check_tensor
+from lanebev.types import Extrinsics, check_devices, check_extrinsics, check_tensor
 
 _SAME_SHAPE = 1.25  # factor between height over width of a map and of the image that it covers, padded
+_CORNER = 0.9  # of width and height, from which on a principal point is doubted
 _BESIDE = -1e6  # px, place of every point in the image of a camera that cannot be used
 
 
@@ -98,9 +100,47 @@ def blind_unless_usable(
 
 
 def check_cameras(
-    batch: int, intrinsics: Tensor, extrinsics: Extrinsics, distortion: Tensor | None, model: str
+    image: Tensor,
+    intrinsics: Tensor,
+    extrinsics: Extrinsics,
+    distortion: Tensor | None,
+    model: str,
+    name: str = "image",
 ) -> None:
-    """Raise TypeError or ValueError unless there are ``batch`` cameras with poses, and lenses that exist."""
+    """Raise TypeError or ValueError unless images (B, ...) have cameras with poses, and lenses that exist.
+
+    Args:
+        image: whose device is that of all.
+        intrinsics: (B, 3, 3).
+        extrinsics: each (B,).
+        distortion: (B, D), or None.
+        model: name of the lens.
+        name: of ``image``, for messages.
+    """
+    batch = image.shape[0]
     check_intrinsics(intrinsics, batch)
     check_extrinsics(extrinsics, batch)
     check_distortion(distortion, model, batch)
+    poses = {f"extrinsics.{axis}": part for axis, part in extrinsics._asdict().items()}
+    check_devices({name: image, "intrinsics": intrinsics, **poses, "distortion": distortion})
+
+
+def doubt_intrinsics(intrinsics: Tensor, size: tuple[int, int]) -> None:
+    """Warn if the principal points are at the lower right corner of images of (H, W) px, or beyond it.
+
+    Intrinsics of a larger image are so: of one that was made smaller, or of that which a feature map covers.
+    Where reading numbers would wait for a device, there is no warning.
+
+    Args:
+        intrinsics: (..., 3, 3) px.
+        size: (H, W) px.
+    """
+    if not (readable(intrinsics) and intrinsics.numel()):
+        return
+    x, y = intrinsics.detach()[..., :2, 2].unbind(-1)
+    if bool(((x > _CORNER * size[1]) & (y > _CORNER * size[0])).all()):
+        warnings.warn(
+            "intrinsics: expected those of the image, got a principal point at its lower right corner or "
+            "beyond: scale them as the image, or give image_size=(H, W) of the image with a feature map",
+            stacklevel=2,
+        )

@@ -41,6 +41,8 @@ class BEVGrid:
             if not (isinstance(interval, Sequence) and len(interval) == 2):
                 raise TypeError(f"{name}: expected (low, high) in m, got {interval!r}")
             low, high = interval
+            check_number(f"{name}[0]", low, "m as a number")
+            check_number(f"{name}[1]", high, "m as a number")
             if not (high - low >= self.resolution and math.isfinite(high - low)):
                 raise ValueError(
                     f"{name}: expected finite (low, high), high above low by {self.resolution} m, a cell, at "

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from lanebev.geometry.lens import check_intrinsics
 from lanebev.torch_internals import register_pytree
-from lanebev.types import Extrinsics
+from lanebev.types import Extrinsics, check_extrinsics, check_tensor
 
 
 def ego_from_road(dtype: torch.dtype = torch.float32, device: torch.device | str | None = None) -> Tensor:
@@ -65,9 +65,10 @@ def image_from_ego(
         (B, 4, 4); its first three rows are the 3 × 4 projection, the last is (0, 0, 0, 1).
 
     Raises:
-        ValueError: intrinsics of another batch.
+        TypeError: an argument of another kind.
+        ValueError: intrinsics of another batch, or matrices of another size.
     """
-    check_intrinsics(intrinsics, *extrinsics.pitch.shape)
+    _check_cameras(extrinsics, intrinsics, image_transform)
     camera_from_road = extrinsics.camera_from_road()
     road_from_ego = torch.linalg.inv(_ego_from_road(extrinsics, ego_from_road_matrix))
     image = intrinsics if image_transform is None else image_transform.to(intrinsics) @ intrinsics
@@ -108,7 +109,7 @@ def lift_splat_inputs(
     Its points are rots · intrins⁻¹ · (u d, v d, d) + trans with (u, v, 1) = post_rots⁻¹ ((u', v', 1) -
     post_trans), (u', v') pixels of the image that the network is given.
     """
-    check_intrinsics(intrinsics, *extrinsics.pitch.shape)
+    _check_cameras(extrinsics, intrinsics, image_transform)
     pose = ego_from_camera(extrinsics, ego_from_road_matrix)
     intrinsics = intrinsics.to(pose)
     eye = torch.eye(3, dtype=intrinsics.dtype, device=intrinsics.device).expand_as(intrinsics)
@@ -120,5 +121,25 @@ def lift_splat_inputs(
 
 
 def _ego_from_road(extrinsics: Extrinsics, matrix: Tensor | None) -> Tensor:
+    check_extrinsics(extrinsics)
     pitch = extrinsics.pitch
-    return ego_from_road(pitch.dtype, pitch.device) if matrix is None else matrix.to(pitch)
+    if matrix is None:
+        return ego_from_road(pitch.dtype, pitch.device)
+    _check_matrix("ego_from_road_matrix", matrix, 4, pitch)
+    return matrix.to(pitch)
+
+
+def _check_cameras(extrinsics: Extrinsics, intrinsics: Tensor, image_transform: Tensor | None) -> None:
+    """Raise unless these are poses, as many cameras, and one matrix of pixels or as many, or None."""
+    check_extrinsics(extrinsics)
+    check_intrinsics(intrinsics, *extrinsics.pitch.shape)
+    if image_transform is not None:
+        _check_matrix("image_transform", image_transform, 3, extrinsics.pitch)
+
+
+def _check_matrix(name: str, matrix: Tensor, size: int, rows: Tensor) -> None:
+    """Raise unless this is (size, size), or one for each of ``rows`` (B,)."""
+    check_tensor(name, matrix)
+    expected = ((size, size), (*rows.shape, size, size))
+    if matrix.shape not in expected:
+        raise ValueError(f"{name}: expected {expected[0]} or {expected[1]}, got {tuple(matrix.shape)}")

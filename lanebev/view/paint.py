@@ -11,7 +11,13 @@ from lanebev.geometry.lens import invert_distortion
 from lanebev.geometry.precision import common_dtype, full_precision
 from lanebev.geometry.road import road_from_image_points
 from lanebev.types import Extrinsics, check_type
-from lanebev.view.checks import blind_unless_usable, check_cameras, check_image, check_size
+from lanebev.view.checks import (
+    blind_unless_usable,
+    check_cameras,
+    check_image,
+    check_size,
+    doubt_intrinsics,
+)
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.projection import CellSums, normalised_intrinsics
 from lanebev.view.sampling import MapSize, resampled
@@ -84,7 +90,8 @@ class ImageFromBEV(nn.Module):
         """
         check_image(bev, "bev")
         check_size(image_size)
-        check_cameras(bev.shape[0], intrinsics, extrinsics, distortion, model)
+        check_cameras(bev, intrinsics, extrinsics, distortion, model, "bev")
+        doubt_intrinsics(intrinsics, image_size)
         intrinsics, extrinsics, distortion = blind_unless_usable(intrinsics, extrinsics, distortion)
         size, dtype = self.grid.shape, common_dtype(bev)
         cells: CellSums | PixelCells

@@ -22,6 +22,7 @@ from lanebev.view.checks import (
     check_image,
     check_size,
     check_stride,
+    doubt_intrinsics,
 )
 from lanebev.view.grid import BEVGrid
 from lanebev.view.projection import image_coordinates, normalised_intrinsics
@@ -116,7 +117,8 @@ class BEVWarp(nn.Module):
         """
         maps = [image] if isinstance(image, Tensor) or not isinstance(image, Sequence) else list(image)
         sizes, size = _map_sizes(maps, strides, image_size)
-        check_cameras(maps[0].shape[0], intrinsics, extrinsics, distortion, model)
+        check_cameras(maps[0], intrinsics, extrinsics, distortion, model)
+        doubt_intrinsics(intrinsics, size)
         intrinsics, extrinsics, distortion = blind_unless_usable(intrinsics, extrinsics, distortion)
         if vertical_curvature is not None:
             check_vertical_curvature(vertical_curvature, maps[0].shape[0])

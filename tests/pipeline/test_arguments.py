@@ -1,6 +1,7 @@
 """A careless caller's mistake is one error that names the argument and what was expected."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -8,9 +9,12 @@ import torch
 
 import lanebev
 from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics, LaneSegments
+from lanebev.view.matrices import ego_from_camera, image_from_ego, lift_splat_inputs
 
 K = torch.tensor([[[500.0, 0, 319.5], [0, 500, 179.5], [0, 0, 1]]])
+SMALL_K = torch.tensor([[[75.0, 0, 47.5], [0, 75, 31.5], [0, 0, 1]]])  # of IMAGE
 POSE = Extrinsics.unstack(torch.tensor([[0.02, 0.01, 0.0, 1.5]]))
+POSE_TWICE = Extrinsics.unstack(POSE.stack().expand(2, 4))
 NUMBERS = Extrinsics(0.02, 0.01, 0.0, 1.5)
 POINTS = torch.tensor([[[300.0, 300.0]]])
 GRID = BEVGrid(resolution=1.0)
@@ -115,6 +119,7 @@ def test_padding_may_hold_anything():
         (lambda: lanebev.bev_from_image(K, POSE, GRID), TypeError, "extrinsics: expected lanebev.Extrinsics"),
         (lambda: lanebev.bev_from_image(POSE, K, (10, 10)), TypeError, "grid: expected lanebev.BEVGrid"),
         (lambda: BEVGrid(resolution="1"), TypeError, "resolution: expected m as a number, got str"),
+        (lambda: BEVGrid(x="ab"), TypeError, r"x\[0\]: expected m as a number, got str"),
         (lambda: BEVGrid(x=10), TypeError, r"x: expected \(low, high\) in m, got 10"),
         (lambda: Extrinsics.unstack([0, 0, 0, 1.5]), TypeError, "values: expected a torch.Tensor, got list"),
         (
@@ -162,6 +167,22 @@ def test_padding_may_hold_anything():
             ValueError,
             "sigma: expected more than 0 px, got -1.0",
         ),
+        (
+            lambda: image_from_ego(POSE, K, torch.eye(3)),
+            ValueError,
+            r"ego_from_road_matrix: expected \(4, 4\) or \(1, 4, 4\), got \(3, 3\)",
+        ),
+        (
+            lambda: lift_splat_inputs(POSE, K, image_transform=torch.eye(4)),
+            ValueError,
+            r"image_transform: expected \(3, 3\) or \(1, 3, 3\), got \(4, 4\)",
+        ),
+        (
+            lambda: image_from_ego(POSE, K, np.eye(4)),
+            TypeError,
+            "ego_from_road_matrix: expected a torch.Tensor",
+        ),
+        (lambda: ego_from_camera(NUMBERS), TypeError, "extrinsics.pitch: .* got float"),
         (
             lambda: Camera.from_fov(60, 640, 360).scaled(2),
             TypeError,
@@ -235,11 +256,71 @@ def model():
 )
 def test_lanebev_images(model, image, error, message):
     with pytest.raises(error, match=message):
-        model(image, K)
+        model(image, SMALL_K)
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        (
+            {"calibrator": "two-stage"},
+            TypeError,
+            r"calibrator: expected a module, such as lanebev.JointCalibrator\(\), got 'two-stage'",
+        ),
+        ({"calibrator": lanebev.JointCalibrator}, TypeError, "calibrator: expected a module, .* got <class"),
+        ({"warp": GRID}, TypeError, r"warp: expected a module, such as lanebev.BEVWarp\(\), got BEVGrid"),
+        ({"frozen": True}, TypeError, r"frozen: expected a list of names, got True; write \['segmenter'\]"),
+        ({"network_width": 0}, ValueError, "network_width: expected a whole number of px above 0, .* got 0"),
+        ({"network_width": 320.5}, ValueError, "network_width: expected a whole number of px above 0"),
+        ({"network_pixels": -1}, ValueError, "network_pixels: expected a whole number of px above 0"),
+        ({"pose_sigma_scale": 0}, ValueError, "pose_sigma_scale: expected more than 0 and finite, got 0"),
+    ],
+)
+def test_lanebev_parts(model, settings, error, message):
+    parts = {"segmenter": model.segmenter, "extractor": model.extractor, "calibrator": model.calibrator}
+    with pytest.raises(error, match=message):
+        lanebev.LaneBEV(**(parts | settings))
+
+
+def test_an_interval_that_is_no_number(model):
+    with pytest.raises(TypeError, match=r"dt: expected a number or a torch.Tensor, got NoneType"):
+        model(IMAGE, SMALL_K, dt=None)
+
+
+def test_tensors_on_different_devices_are_named(model):
+    """Meta stands for a GPU."""
+    with pytest.raises(
+        ValueError, match=r"intrinsics: expected on cpu as the image, got on meta; move it with .to\('cpu'\)"
+    ):
+        model(IMAGE, SMALL_K.to("meta"))
+    with pytest.raises(ValueError, match="reset: expected on cpu as the image, got on meta"):
+        model(IMAGE, SMALL_K, reset=torch.tensor([True]).to("meta"))
+    pose = POSE._replace(height=POSE.height.to("meta"))
+    with pytest.raises(ValueError, match=r"extrinsics.height: expected on cpu as the image, got on meta"):
+        BEVWarp(GRID)(IMAGE, K, pose)
+    for calibrator in CALIBRATORS:
+        state = calibrator.initial_state(1, device="meta")
+        with pytest.raises(ValueError, match="intrinsics: expected on meta as the state, got on cpu; move"):
+            calibrator(SEGMENTS, K, state, 0.1)
+
+
+def test_intrinsics_of_a_larger_image_are_doubted(model):
+    """Of an image that was made smaller, or of that of a feature map whose image_size was forgotten."""
+    features, doubt = torch.rand(1, 4, 45, 80), "a principal point at its lower right corner or beyond"
+    for view in (BEVWarp(GRID), lanebev.CanonicalView(K[0], (360, 640), POSE)):
+        with pytest.warns(UserWarning, match=doubt):
+            view(features, K, POSE)
+    with pytest.warns(UserWarning, match=doubt):
+        model(torch.rand(1, 3, 180, 320), K, bev=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        BEVWarp(GRID)(features, K, POSE, image_size=(360, 640))
+        BEVWarp(GRID)(torch.rand(1, 3, 180, 640), K, POSE)  # without the lower half
+        BEVWarp(GRID)(features.expand(2, 4, 45, 80), torch.cat([K, K / 8]), POSE_TWICE)
 
 
 def test_an_image_of_more_contrast_is_no_normalised_one(model):
-    assert model(0.5 + 1.8 * (IMAGE - 0.5), K)[0].logits.isfinite().all()
+    assert model(0.5 + 1.8 * (IMAGE - 0.5), SMALL_K)[0].logits.isfinite().all()
 
 
 @pytest.mark.parametrize(

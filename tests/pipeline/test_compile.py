@@ -15,6 +15,7 @@ from lanebev import (
     TwoStageCalibrator,
 )
 from lanebev.batch import replace_rows
+from lanebev.clips import frame_intervals
 from lanebev.estimation.mount import MountEstimator
 from lanebev.tensors import constant
 from lanebev.testing.segments import INTRINSICS as K
@@ -113,6 +114,21 @@ def test_an_interval_that_varies_makes_no_graph_per_frame(calibrator):
     state = calibrator.initial_state(1, dtype=torch.float64)
     for frame in range(6):
         _, state = compiled(lanes(seed=frame), K[None], state, 0.033 + 1e-4 * frame)
+    assert len(graphs) <= 2
+
+
+def test_neither_does_that_of_a_clip():
+    torch.compiler.reset()
+    graphs = []
+
+    def backend(module, _):
+        graphs.append(module)
+        return module.forward
+
+    compiled = torch.compile(lambda dt, like: 2 * frame_intervals(dt, 2, 3, like), backend=backend)
+    for frame in range(6):
+        dt = 0.033 + 1e-4 * frame
+        assert torch.equal(compiled(dt, K), torch.full((2, 3), 2 * dt, dtype=K.dtype))
     assert len(graphs) <= 2
 
 
