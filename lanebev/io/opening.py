@@ -28,6 +28,7 @@ from lanebev.io.images.files import (
 )
 from lanebev.io.images.names import in_natural_order, times_from_names
 from lanebev.io.images.pixels import is_image, read_image, stated_size
+from lanebev.io.images.time_files import times_from_file
 from lanebev.io.source_names import SCHEMES
 from lanebev.io.video.decoding import (
     declared_duration,
@@ -103,16 +104,16 @@ def _address_remedy(source: str) -> str:
 
 def _image_source(source: str, paths: Sequence[str], fps: Fraction | None, left_out: str = "") -> FrameSource:
     image = _typical_image(paths)
-    size, times = image.shape[:2], times_from_names(paths)
-    remarks = [left_out, _dark_remark(image), halves_remark(image)]
+    size, times, stated, unused = image.shape[:2], times_from_names(paths), "its names state", ""
+    if not times:
+        (times, unused), stated = times_from_file(paths), "a file of times beside it states"
+    remarks = [left_out, _dark_remark(image), halves_remark(image), "" if fps else unused]
     rate = fps or DEFAULT_FPS
     if times:
         own = 1 / Fraction(median(np.diff(times).tolist())).limit_denominator(1_000_000)
         times, rate = (times, own) if fps is None else ((), fps)
         if abs(own / rate - 1) > _SAME_RATE:
-            remarks.append(
-                f"its names state {float(own):.4g} frames per second, --fps {float(rate):g} was given"
-            )
+            remarks.append(f"{stated} {float(own):.4g} frames per second, --fps {float(rate):g} was given")
     said = "; ".join(filter(None, remarks))
     problem = f"{source}: {said}" if said else ""
     return FrameSource(source, tuple(paths), rate, len(paths), size, problem, times)

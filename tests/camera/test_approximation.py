@@ -109,5 +109,5 @@ def test_what_the_lens_does_outside_the_image_does_not_count():
 
 
 def test_a_lens_of_huge_coefficients_is_one_clear_line():
-    with pytest.raises(ValueError, match="expected a lens that a Kannala-Brandt lens equals within 0.5 px"):
+    with pytest.raises(ValueError, match="expected a lens that a Kannala-Brandt lens equals within"):
         kannala_brandt_like(lambda angle: angle + 1e308 * angle**4, 1.0, 1e3)

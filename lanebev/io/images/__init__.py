@@ -1,1 +1,1 @@
-"""Images: their ``files``, their ``names`` and the times in those (``name_clocks``), their ``pixels``."""
+"""Images: their ``files``, ``names``, ``pixels``, and their times by ``name_clocks`` or ``time_files``."""

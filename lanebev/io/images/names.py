@@ -88,7 +88,7 @@ def times_from_names(paths: Sequence[str]) -> tuple[float, ...]:
     """
     clocks = read_clocks(tuple(paths))
     by_clock = clocks.seconds if clocks is not None and clocks.is_one_camera else ()
-    times = next(filter(_are_of_a_drive, (by_clock, _times_since_1970(paths))), ())
+    times = next(filter(are_of_a_drive, (by_clock, _times_since_1970(paths))), ())
     return tuple(float(time - times[0]) for time in times)
 
 
@@ -100,7 +100,7 @@ def untimed_remark(paths: Sequence[str]) -> tuple[str, str]:
     """
     clocks = read_clocks(tuple(paths))
     times = clocks.seconds if clocks else ()
-    if _are_of_a_drive(times):
+    if are_of_a_drive(times):
         words = "numbers beside the times in their names may be those of cameras"
         return f"{words}, as from {_two_names(paths)}", "give the images of one as a quoted glob"
     if times and len(set(times)) < len(times) and all(time.denominator == 1 for time in times):
@@ -125,11 +125,11 @@ def _times_since_1970(paths: Sequence[str]) -> Sequence[Fraction]:
         times = with_fractions(whole, [match[2] for match in seconds if match])
         return times if _are_plausible(times) else ()
     if all(stamps) and len({len(match[1]) for match in stamps if match}) == 1:
-        return _times_of_stamps([match[1] for match in stamps if match])
+        return times_of_stamps([match[1] for match in stamps if match])
     return ()
 
 
-def _times_of_stamps(stamps: Sequence[str]) -> Sequence[Fraction]:
+def times_of_stamps(stamps: Sequence[str]) -> Sequence[Fraction]:
     """Return times (s) by whole numbers of one length; none if one is not from 1980 to 2040.
 
     They are 10 digits of seconds and those of a fraction. If that gives no such time they are nanoseconds
@@ -147,7 +147,7 @@ def _are_plausible(times: Sequence[Fraction]) -> bool:
     return all(_EPOCH[0] <= time < _EPOCH[1] for time in times)
 
 
-def _are_of_a_drive(times: Sequence[Fraction]) -> bool:
+def are_of_a_drive(times: Sequence[Fraction]) -> bool:
     """Tell whether times (s) are of several frames and rise as those of a drive."""
     steps = [b - a for a, b in pairwise(times)]
     return bool(steps) and _STEPS[0] <= min(steps) <= max(steps) <= _STEPS[1] and median_low(steps) >= FASTEST
