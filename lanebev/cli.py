@@ -1,7 +1,5 @@
 """The command line: call the commands and report how they end."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging

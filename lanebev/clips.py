@@ -1,7 +1,5 @@
 """Clips of T frames: their time steps, the frames that begin a drive, and their outputs."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

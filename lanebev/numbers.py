@@ -1,7 +1,5 @@
 """Texts and numbers from files, and numbers of settings."""
 
-from __future__ import annotations
-
 import codecs
 import math
 import re

@@ -1,7 +1,5 @@
 """Pipes that another program writes into, without waiting for it for ever."""
 
-from __future__ import annotations
-
 import os
 import select
 from io import FileIO

@@ -1,7 +1,5 @@
 """The private names of torch that the package uses, since there are no public ones (torch 2.13)."""
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import torch

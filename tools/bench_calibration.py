@@ -12,8 +12,6 @@ calibrator; with ``--calibrators two-stage`` that one.
 own. The first half second is left out of every figure.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import math

@@ -5,8 +5,6 @@
 The gain form is Eqs. (15)-(17) as printed, which solves for the N × N innovation covariance.
 """
 
-from __future__ import annotations
-
 import json
 import platform
 from pathlib import Path

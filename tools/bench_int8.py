@@ -9,8 +9,6 @@ of ``train.noise``. Both are on held-out rendered roads; with ``--data`` also th
 of ``tools.real_figures``.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import tempfile

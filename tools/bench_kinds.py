@@ -3,8 +3,6 @@
 Every seed is another drive, a row of one batch. The seeds are none that a test or a replay uses.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple

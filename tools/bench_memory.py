@@ -1,7 +1,5 @@
 """Measure the memory that a run needs per frame and for its report: python -m tools.bench_memory."""
 
-from __future__ import annotations
-
 import resource
 import tempfile
 import time

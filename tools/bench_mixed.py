@@ -8,8 +8,6 @@ drives and of those with each difficulty, then the drives with the smallest shar
 TRACKING, and half a second after a start and after a knock, are left out.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

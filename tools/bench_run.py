@@ -8,8 +8,6 @@ the ratio of processor times, which says more where other programs run: all core
 the run's time is its processor time by the number of cores.
 """
 
-from __future__ import annotations
-
 import cProfile
 import json
 import pstats

@@ -5,8 +5,6 @@ With ``--what step`` the step: poses and views, each with its own state. With ``
 exported, which takes minutes for a joint calibrator.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import tempfile

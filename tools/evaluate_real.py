@@ -6,8 +6,6 @@
 Nothing of these images has been trained on.
 """
 
-from __future__ import annotations
-
 import json
 import platform
 import sys

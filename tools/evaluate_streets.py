@@ -12,8 +12,6 @@ the number of calibrated frames counts. ``streets``: two images with a known pos
 ``--rendered``: in place of these, rendered views of all kinds of road, as wide as KITTI's images.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Iterator

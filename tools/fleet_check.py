@@ -6,8 +6,6 @@ drives: the speed-up, and what a drive costs besides its run. Prints a line of J
 is as it should be.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json

@@ -6,8 +6,6 @@ these follow cores, hours and disk, for the frame rates of the plan; nothing is 
 are rendered ones, of a road with traffic, or those of ``--video``.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -8,8 +8,6 @@ how much the estimate would be off if the road's crossfall changed by 1 % over 1
 10 km radius, and if one lane were 3 cm wider. On a straight road it is unknown, however many the frames.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

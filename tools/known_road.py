@@ -1,7 +1,5 @@
 """The joint filter when the shape of the road is known: what remains to be estimated is the pose."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -12,8 +12,6 @@ And how far the labels agree with themselves: the yaw by two of an image's lines
 Half of the difference estimates, in the median over images, the error of the yaw by all four.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

@@ -7,8 +7,6 @@ several runs for each operation; the bytes that they read and write, MB; and the
 operations, without bytes. At last the bandwidth of the memory, in the caches and beyond them. One thread.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 import time

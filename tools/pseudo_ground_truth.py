@@ -8,8 +8,6 @@ run's extrinsics.csv to it is printed and both are drawn; images are paired by t
 by order.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Sequence

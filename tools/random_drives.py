@@ -1,7 +1,5 @@
 """Drives whose motions and shocks are drawn at random, of each kind one by its seed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -3,8 +3,6 @@
 python -m tools.readme_picture [--demo out/demo] [--frame 48]
 """
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 

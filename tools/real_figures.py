@@ -1,7 +1,5 @@
 """Results of ``evaluate_real.py``: evaluate each part of the data beside its targets."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass

@@ -11,8 +11,6 @@ On a GPU (``--device cuda``) also frames a second, the seconds in which it compu
 longest, and how often memory is allocated. If it computes nearly all the time, pixels are what limits.
 """
 
-from __future__ import annotations
-
 import time
 
 import torch

@@ -3,8 +3,6 @@
 python tools/render_sheet.py --out sheet.png [--count 100] [--kind city] [--real FOLDER] [--truth]
 """
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

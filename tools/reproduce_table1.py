@@ -6,8 +6,6 @@ Prints "paper | here | bound" in degrees and centimetres at 30 and at 68 segment
 table1.json and table1.png (estimate against truth).
 """
 
-from __future__ import annotations
-
 import json
 import math
 import platform

@@ -1,7 +1,5 @@
 """Calibrate single images, and summarise the errors of pitch and roll."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

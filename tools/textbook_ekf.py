@@ -5,8 +5,6 @@ pixel distance of every end point to its boundary, linearised once. No robust we
 changes or status. It loops over rows and inverts a matrix of all end points. Needs ``pip install filterpy``.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

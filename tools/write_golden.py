@@ -7,8 +7,6 @@ noise of 1 px. References: ``segments.csv``, what the shipped network sees in th
 ``extrinsics.csv``, what a run on the lane points writes. Say in the commit why they moved.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import json

@@ -3,8 +3,6 @@
 ``predict`` writes each frame's classes as a PNG, 0 where there is no boundary, into the run's folder.
 """
 
-from __future__ import annotations
-
 import pickle
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Arrays and JPEG images in one ``.npz`` file."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Photometric changes of an image by the camera, from kornia."""
 
-from __future__ import annotations
-
 import kornia.augmentation as K
 from torch import Tensor, nn
 

@@ -5,8 +5,6 @@ fine-tuned to lie networks that are better than both. The same holds for two tha
 The training settings in its file are those of the last network.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

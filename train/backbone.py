@@ -1,7 +1,5 @@
 """Start a trunk from the weights of an image classifier."""
 
-from __future__ import annotations
-
 import pickle
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The used fraction of a run's budget of steps or minutes, and what depends on it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

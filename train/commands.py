@@ -1,7 +1,5 @@
 """What the commands of train and tools share: their arguments and their errors."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Labelled images on disk in the layouts of TuSimple, CULane and OpenLane, for your own data."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Run a network and the online calibrator on held-out rendered drives."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Fine-tune a network through extractor and calibrator by a loss on the pose."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -6,8 +6,6 @@ calibrator runs on each drive, and all frames after its warm-up count. For every
 95 % interval of the reduction of its RMSE against the first is printed too.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

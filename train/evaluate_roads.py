@@ -8,8 +8,6 @@ On held-out rendered views, by boundary, distance ahead, kind of road
     false     rows in which a boundary is reported where there is none, as a share of the rows with one
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

@@ -3,8 +3,6 @@
 A weights file, such as one of ``train.average``, may be given too, to change its metadata.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

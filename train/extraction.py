@@ -4,8 +4,6 @@ Prints how far the vertices are from the true boundaries, in pixels of the mask,
 the standard deviations they come with.
 """
 
-from __future__ import annotations
-
 import json
 from typing import NamedTuple
 

@@ -14,8 +14,6 @@ continues; if there is time, measure that of the final weights with ``python -m 
 --minutes 1.5`` does everything once, after ``python -m train.smoke``.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """Boundary points to thin, soft, anti-aliased label maps, and views of a labelled image."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

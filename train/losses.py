@@ -1,7 +1,5 @@
 """Losses on per-boundary logits."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Label maps of a whole batch on its device: :mod:`train.labels` without OpenCV."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Metrics of lane detection: held-out recall, and the scores of TuSimple and CULane."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The training step."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

@@ -7,8 +7,6 @@ train.evaluate_poses``), so the shipped weights have 2.25 (``python -m train.exp
 square root of the remaining NEES is the factor on the pose's sigmas, ``--pose-sigma-scale``.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Iterable

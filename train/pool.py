@@ -4,8 +4,6 @@ A shard is one ``.npz`` of frames: JPEG bytes, boundaries in pixels as taken, an
 costs about as much as training on a view, and several views can be drawn from each frame.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from pathlib import Path

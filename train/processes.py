@@ -1,7 +1,5 @@
 """Processes that a run on a GPU starts: a training, and a measurement beside it."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -8,8 +8,6 @@ are left out. OUT has images and ``labels.json`` in TuSimple's layout, for ``con
 Source: self-training with pseudo-labels (Lee 2013) made consistent over time.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator

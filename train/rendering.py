@@ -1,7 +1,5 @@
 """Rendered views, mirrored and labelled: scenes on the CPU, all else on one device."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

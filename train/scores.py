@@ -1,7 +1,5 @@
 """Scores of TuSimple, CULane and OpenLane from logits, over a data set."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

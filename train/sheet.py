@@ -1,7 +1,5 @@
 """Draw views with their labels on one sheet."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

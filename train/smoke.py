@@ -5,8 +5,6 @@ call and the peak memory; on a GPU also of training after cuDNN has searched for
 sheet of labelled views. A batch that does not fit in memory is reported and skipped.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial

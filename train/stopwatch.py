@@ -1,7 +1,5 @@
 """Measure the time of parts of a loop, on the device where they run."""
 
-from __future__ import annotations
-
 import time
 from collections import defaultdict
 from collections.abc import Iterator

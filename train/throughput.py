@@ -1,7 +1,5 @@
 """Print and store how a training uses its time."""
 
-from __future__ import annotations
-
 import csv
 import time
 from pathlib import Path

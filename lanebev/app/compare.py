@@ -1,7 +1,5 @@
 """``lanebev compare``: compare two runs on one page."""
 
-from __future__ import annotations
-
 from lanebev.io.output.folder import check_result
 from lanebev.io.output.whole_file import whole_file
 from lanebev.report.comparison import comparison_summary, render_comparison

@@ -1,7 +1,5 @@
 """``lanebev convert``: write the results of a finished run in another program's format."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Iterable
 from pathlib import Path

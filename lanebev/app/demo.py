@@ -1,7 +1,5 @@
 """``lanebev demo``: run on a rendered drive and compare the result with the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from functools import partial

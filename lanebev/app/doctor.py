@@ -1,7 +1,5 @@
 """``lanebev doctor``: check if a camera fits a source, and if a run on it can be trusted."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from fractions import Fraction

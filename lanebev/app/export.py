@@ -1,7 +1,5 @@
 """``lanebev export``: write parts of the model as files for other runtimes."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Progress of a long job."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Protocol, TypeVar
 

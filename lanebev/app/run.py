@@ -1,7 +1,5 @@
 """``lanebev run``: frames in, extrinsics and a stable bird's-eye view out."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import closing

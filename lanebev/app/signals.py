@@ -1,7 +1,5 @@
 """Handlers of the signals that end a program. Imports nothing heavy."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Facts about a run: for the report, and printed at its end."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import fields

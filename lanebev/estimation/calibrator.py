@@ -1,7 +1,5 @@
 """The interface of all online calibrators, and the checks and casts that they share."""
 
-from __future__ import annotations
-
 from typing import Generic, Protocol, Self, TypeVar
 
 import torch

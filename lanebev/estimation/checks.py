@@ -1,7 +1,5 @@
 """Checks of a calibrator's input: shapes at the border, weight zero for unusable entries."""
 
-from __future__ import annotations
-
 from numbers import Integral
 
 import torch

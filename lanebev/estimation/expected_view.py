@@ -1,7 +1,5 @@
 """Where the lanes are expected to meet in the next image, by the state before it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -5,8 +5,6 @@ costs O(N D²) where the gain form inverts an N × N matrix (Eq. (15)), and a me
 effect.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The lane width that an estimate takes, and its standard deviation. Imports nothing heavy."""
 
-from __future__ import annotations
-
 LANE_WIDTH, LANE_WIDTH_STD = 3.7, 0.2
 """Mean and standard deviation (m) of an unknown lane width: most main roads have lanes of 3.25 to 3.75 m."""
 _MOST_STD = 2.0  # m

@@ -1,7 +1,5 @@
 """Reasons why a frame is not, or not fully, tracked."""
 
-from __future__ import annotations
-
 from enum import IntFlag
 
 

@@ -1,7 +1,5 @@
 """Single images: a calibrator from its initial state, without a drive before or after."""
 
-from __future__ import annotations
-
 import math
 
 from torch import Tensor

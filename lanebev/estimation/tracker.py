@@ -1,7 +1,5 @@
 """A calibrator and a mount estimator over the frames of a drive, with their states."""
 
-from __future__ import annotations
-
 from typing import Generic, NamedTuple
 
 import torch

@@ -8,8 +8,6 @@ here they keep theirs.
 ``torch.onnx.export`` takes :func:`translations` as its ``custom_translation_table``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A module of tensors only that can be exported, with the names and an example of what goes in and out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any

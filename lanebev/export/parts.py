@@ -1,7 +1,5 @@
 """The parts of a model that can be exported, by name."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The segmenter's ONNX file with 8-bit convolutions, by ONNX Runtime's quantisation."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """ONNX files at work: parts of :class:`lanebev.LaneBEV` that compute by ONNX Runtime."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from copy import copy

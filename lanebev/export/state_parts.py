@@ -1,7 +1,5 @@
 """Parts with a state: a calibrator, and the step, all of a frame in one."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

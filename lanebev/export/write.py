@@ -1,7 +1,5 @@
 """Parts to files: ONNX, or a program of ``torch.export``."""
 
-from __future__ import annotations
-
 import contextlib
 import inspect
 import json

@@ -10,8 +10,6 @@ Coefficients are (B, D), points (B, N, 2). D and its order are OpenCV's:
   keeps ξ apart; also called MEI.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

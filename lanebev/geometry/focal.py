@@ -1,7 +1,5 @@
 """How far a pose depends on the focal length that was assumed for it."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

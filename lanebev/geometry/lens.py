@@ -4,8 +4,6 @@ Pixels are (x, y) with centres at integers. "Undistorted" pixels are those of th
 camera with the same intrinsics.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -3,8 +3,6 @@
 A matrix that is not positive definite spoils its own row of a batch only: nothing raises.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The road's height profile, h + κ Z²/2 below the camera, and where directions meet it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

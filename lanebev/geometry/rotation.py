@@ -4,8 +4,6 @@ Frames: camera x right, y down, z forward (OpenCV); road X right, Y down, Z alon
 Matrices are named ``dst_from_src`` and act on column vectors.
 """
 
-from __future__ import annotations
-
 import torch
 from kornia.geometry import rotation_matrix_to_axis_angle
 from torch import Tensor

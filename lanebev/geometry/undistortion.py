@@ -5,8 +5,6 @@ influence each other and the steps export. Its gradient is that of the solution 
 not of the steps that found it.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

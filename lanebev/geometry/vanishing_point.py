@@ -1,7 +1,5 @@
 """The vanishing point of the lanes in the image as taken."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from lanebev.geometry.lens import denormalise_points, distort_points

@@ -1,7 +1,5 @@
 """How a camera moves on its vehicle: suspension, bumps and lane changes."""
 
-from __future__ import annotations
-
 import math
 
 import torch

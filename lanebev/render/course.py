@@ -1,7 +1,5 @@
 """The course of a drive's road: straights and curves joined by clothoids, crests and dips."""
 
-from __future__ import annotations
-
 import math
 
 import torch

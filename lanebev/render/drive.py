@@ -1,7 +1,5 @@
 """A camera that drives through one world: the same seed gives the same drive, bit for bit."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

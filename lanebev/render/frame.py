@@ -1,7 +1,5 @@
 """A rendered image and its exact ground truth."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from torch import Tensor

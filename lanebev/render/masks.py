@@ -1,7 +1,5 @@
 """Per-boundary masks from the exact points: the labels of a segmentation network."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

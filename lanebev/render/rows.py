@@ -1,7 +1,5 @@
 """Rows of nested NamedTuples of tensors (B, ...)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 

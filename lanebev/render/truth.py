@@ -1,7 +1,5 @@
 """Ground truth of a rendered image: boundaries in pixels, lanes, boxes."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

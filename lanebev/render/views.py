@@ -1,7 +1,5 @@
 """Independent random views: training material."""
 
-from __future__ import annotations
-
 import math
 from contextlib import nullcontext
 

@@ -1,7 +1,5 @@
 """State of pitch, yaw, roll and height in each frame: measured, uncertain, undetermined, lost or unknown."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from enum import IntEnum
 

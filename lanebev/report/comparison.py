@@ -1,7 +1,5 @@
 """Compare two runs: differences of their estimates over common frames, and of their settings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath

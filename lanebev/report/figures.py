@@ -1,7 +1,5 @@
 """Common style of all plots, and Bokeh for the page."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from typing import Any

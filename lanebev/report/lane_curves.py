@@ -1,7 +1,5 @@
 """The lane boundaries of one frame as curves on the calibrated road, on rows of the image."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """A table of all parameters of a lens."""
 
-from __future__ import annotations
-
 import math
 
 from lanebev.camera.model import Camera

@@ -1,7 +1,5 @@
 """Draw text on pictures, in place."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Measure the bird's-eye view: are boundaries parallel and lanes equally wide?"""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

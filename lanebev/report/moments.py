@@ -1,7 +1,5 @@
 """Small pictures of some frames of a drive, of limited total size."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """The overlay: a frame with its detections and estimate, and its bird's-eye views."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

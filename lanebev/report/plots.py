@@ -1,7 +1,5 @@
 """Interactive plots of a run: the four estimates with ±2 sigma, and lane widths with both poses."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Read the outputs of a run back: rows, settings, lens and pictures."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

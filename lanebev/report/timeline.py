@@ -1,7 +1,5 @@
 """The timeline: strips of status and of every axis over the drive, as stretches of equal state."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The verdict on a run in words: how much of it is calibrated, and what is not determined, when and why."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The worst moments of a drive: largest sigmas, largest jumps, losses of tracking."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Run a calibrator on a drive with known truth: errors, covariance, status, and their statistics."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

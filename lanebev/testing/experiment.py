@@ -4,8 +4,6 @@ Shared by reproduce_table1.py, bench_calibration.py and the tests. Segments are 
 every 30 px along each boundary, paired at random, Gaussian noise on every end point.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Drives with known truth seen through a real lens: vertices in pixels as taken."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -4,8 +4,6 @@ Each is drawn from a stated family by a seed. The random numbers are those of :c
 are the same in every version of Python.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from random import Random

@@ -1,7 +1,5 @@
 """Drives that break the paper's assumptions one at a time, as changes of the standard drive."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Line segments of lane boundaries seen from a known pose."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Streets whose boundaries are not parallel: each wanders from side to side along the road."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from random import Random

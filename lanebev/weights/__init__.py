@@ -5,8 +5,6 @@ A weights file is safetensors with JSON metadata: ``config`` (:class:`SegmenterC
 numbers with a scale per output channel; they are loaded in single precision.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import asdict

@@ -20,8 +20,6 @@ clock's: of one thread, and for a machine that others use too.
   each, and by segments, the warp by cells.
 """
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

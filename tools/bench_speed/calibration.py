@@ -1,7 +1,5 @@
 """The extractor, and one frame of each calibrator."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Time alternatives in turns, and judge the results by targets."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

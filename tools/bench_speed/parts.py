@@ -1,7 +1,5 @@
 """The parts of the benchmark: what is timed against what, and at which sizes."""
 
-from __future__ import annotations
-
 import json
 import platform
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The image, camera, pose and grid that views are timed with."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Tables and plots of what was measured."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Views of images and feature maps, and of frames of bytes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -6,8 +6,6 @@
 Say in the commit why they moved. Exit status 1 where something differs and nothing is written.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping, Sequence
 

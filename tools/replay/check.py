@@ -1,7 +1,5 @@
 """Run the estimators on the drives of a replay and compare the results with the references."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Statistics of a calibrator on a drive with known truth, as a row of a table."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

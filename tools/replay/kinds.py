@@ -1,7 +1,5 @@
 """The kinds of drive of a replay, and the generated drives."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """References of a replay as CSV files: written, read, and compared in sigmas."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Sequence

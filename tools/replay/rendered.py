@@ -6,8 +6,6 @@ writes ``tests/replay/drives/NAME.npz`` anew, which takes some minutes a drive. 
 only: another renderer or other weights change nothing until they are written.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass
 from pathlib import Path

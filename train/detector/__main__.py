@@ -5,8 +5,6 @@ What was tested is not trained again, and an interrupted training goes on from i
 are one JSON file each in the folder ``out``; ``python -m train.detector.table`` shows them.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from dataclasses import asdict

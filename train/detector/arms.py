@@ -1,7 +1,5 @@
 """An arm of the experiment: its checkpoints, the trained arm, and the poses that it tests with."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Vehicles as boxes on the road: (..., 5) X, Z, length, width in m, heading in rad, positive to the right."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -5,8 +5,6 @@ road over this plane, the error of a position that is read off the plane, and ho
 calibration follows the elevation.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ A drive is one ``.npz``: JPEG images, the boxes on the road, the true pose, and 
 online calibration on those images. Existing files are not rendered again.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from pathlib import Path

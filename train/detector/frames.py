@@ -1,7 +1,5 @@
 """Frames of drives in memory, for the detector's training."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple

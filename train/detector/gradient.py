@@ -4,8 +4,6 @@ Prints how the gradient of the loss on pitch, yaw, roll and height of arm "onlin
 the test drives: only a gradient that has the sign of the error can lower it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from scipy.stats import spearmanr

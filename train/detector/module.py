@@ -1,7 +1,5 @@
 """The detector's training, with the pose that an arm of the experiment gives it."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

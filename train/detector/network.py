@@ -1,7 +1,5 @@
 """A small detector: image features, bird's-eye features by the pose, CenterPoint's maps."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """Average precision of boxes by the distance of their centres, as nuScenes defines it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

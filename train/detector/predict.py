@@ -1,7 +1,5 @@
 """Run a detector on frames of drives, with given poses."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Settings of the experiment, as a class and as a command line."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Literal, get_args

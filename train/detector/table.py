@@ -3,8 +3,6 @@
 Means over seeds, and the standard deviation between them.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -5,8 +5,6 @@ Tracking". Maps (B, 7, U, V): logit of a centre; offset of the centre from the c
 logarithms of length and width in m; sine and cosine of the heading.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

@@ -4,8 +4,6 @@ Each frame of the test drives shows the image and, for each arm, its bird's-eye 
 for true, with the boxes that it finds (red) over those that are there (white).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path

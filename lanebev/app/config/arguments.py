@@ -1,7 +1,5 @@
 """The command line's arguments. Imports nothing heavy."""
 
-from __future__ import annotations
-
 import argparse
 import re
 from collections.abc import Callable

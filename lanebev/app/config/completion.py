@@ -1,7 +1,5 @@
 """Completion of commands and options in a shell. Imports nothing heavy."""
 
-from __future__ import annotations
-
 import argparse
 
 

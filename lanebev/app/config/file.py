@@ -1,7 +1,5 @@
 """Read the settings of a run from YAML. Imports nothing heavy."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections import Counter

@@ -1,7 +1,5 @@
 """Run the network on a part of a drive, for the later run on the whole drive."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import closing
 from itertools import chain

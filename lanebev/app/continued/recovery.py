@@ -1,7 +1,5 @@
 """Continue a run that was killed: the network is not run again on the frames that it had processed."""
 
-from __future__ import annotations
-
 import json
 import os
 import threading

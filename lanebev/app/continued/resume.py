@@ -1,7 +1,5 @@
 """Start from the state of an earlier run."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """First pass of ``lanebev run --smooth``: estimate every pose of a drive from all of its frames."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Sequence
 from contextlib import closing

@@ -1,7 +1,5 @@
 """Notice that the files of a source changed during a run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from lanebev.app.continued.recovery import size_and_time

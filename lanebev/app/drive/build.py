@@ -1,7 +1,5 @@
 """Build the parts of a run from its settings."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path

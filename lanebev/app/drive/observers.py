@@ -1,7 +1,5 @@
 """Sources of a run's boundary vertices: a lane file, or the network."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol

@@ -1,7 +1,5 @@
 """Open the source of a run from its settings, and end a stream."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import re

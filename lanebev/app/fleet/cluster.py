@@ -1,7 +1,5 @@
 """Run tasks on Ray; the only module that imports it."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

@@ -1,7 +1,5 @@
 """Cut long drives into parts that the network processes in parallel."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """``lanebev fleet``: run on all drives of a manifest and collect their results."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math

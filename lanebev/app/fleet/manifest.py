@@ -1,7 +1,5 @@
 """The manifest: a list of drives and their settings, as YAML or CSV."""
 
-from __future__ import annotations
-
 import csv
 import io
 import os

@@ -5,8 +5,6 @@ after those of another, as if they were one long drive, and says where the camer
 moves, drives are averaged.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

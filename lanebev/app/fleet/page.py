@@ -1,7 +1,5 @@
 """``index.html`` of a fleet: verdicts, failures, mounts over time, a link to each drive's report."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Decide which tasks can start: parts of a cut drive first, then the run on the whole drive."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from lanebev.app.fleet.plan import Outcome, Task, is_done

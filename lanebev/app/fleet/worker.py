@@ -1,7 +1,5 @@
 """Run several drives in one process, as the command line does, each in its own thread."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Sequence

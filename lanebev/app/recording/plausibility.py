@@ -1,7 +1,5 @@
 """Remarks on an implausible pose, mount or image of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 Their errors are those of the frame before. The motion stops in them and is twice as large in the next frame.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

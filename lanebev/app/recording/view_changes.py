@@ -1,7 +1,5 @@
 """Frames of another view than the ones before: mirrored or turned images, cuts, and two cameras in turn."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from typing import NamedTuple
 

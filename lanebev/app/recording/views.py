@@ -1,7 +1,5 @@
 """Bird's-eye views of a run, with a fixed pose and with the estimated one."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor

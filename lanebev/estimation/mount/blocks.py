@@ -1,7 +1,5 @@
 """Blocks of seconds in which the poses of frames are averaged, per axis."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

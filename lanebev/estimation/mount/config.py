@@ -1,7 +1,5 @@
 """Configuration of the mount estimator."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 PerAxis = tuple[float, float, float, float]

@@ -6,8 +6,6 @@ Each axis has its own blocks, so that an axis that the road does not determine d
 blocks, limits and gates are those of openpilot's calibrationd; axes, hysteresis, ageing and reasons are new.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

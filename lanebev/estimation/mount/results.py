@@ -1,7 +1,5 @@
 """State and results of the mount estimator."""
 
-from __future__ import annotations
-
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The mount's state in words, for people."""
 
-from __future__ import annotations
-
 from lanebev.estimation.mount.config import MountConfig
 from lanebev.estimation.mount.results import MountCalibration, MountReason, MountStatus
 from lanebev.types import AXES

@@ -11,8 +11,6 @@ boundary (rad), deviation δ_k of every boundary (m), and the error of a roll th
 (rad). docs/method/paper.md has the equations.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Stage 1: pitch and yaw from the vanishing direction, by EKF."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

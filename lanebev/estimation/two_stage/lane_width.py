@@ -1,7 +1,5 @@
 """Roll and height from the equality of lane widths."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Stage 2: roll and height from lane widths, by EKF."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

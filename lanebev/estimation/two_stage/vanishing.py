@@ -1,7 +1,5 @@
 """The vanishing direction of a set of segments: Algorithm 1, batched over rows and hypotheses."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Linear radiance of every pixel: sky, ground, walls, objects, in the order of their distance."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -4,8 +4,6 @@ Local road frame: origin on the road below the camera, X right, Z along the road
 the same knots in Z, dense near the camera, so a look-up is arithmetic and two gathers.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Cameras over the road: random lenses and poses."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Lane boundaries of city streets."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

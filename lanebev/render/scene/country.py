@@ -1,7 +1,5 @@
 """Country roads: narrow, mostly without any paint, where no boundary is the right answer."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Faults between the road and the file: windscreen, dirt, shake, time stamps, old codecs."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

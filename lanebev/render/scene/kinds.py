@@ -1,7 +1,5 @@
 """Which kinds of road a world shows: independent draws, so that kinds combine."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple, TypeVar
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Which boundaries a road has, where they lie and how they are painted."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

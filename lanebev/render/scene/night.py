@@ -1,7 +1,5 @@
 """Lights of the night: the own low beam, street lamps, other vehicles, the town."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """What stands on the road, in the local road frame: vehicles, poles, signs, bridges."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from torch import Tensor

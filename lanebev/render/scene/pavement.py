@@ -1,7 +1,5 @@
 """The road's surface: asphalt and concrete with everything that age and traffic leave on it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """What a camera does to the light: exposure, colours, blur, noise, compression, its own bonnet."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Texts that recorders burn into the image: date, time, speed."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

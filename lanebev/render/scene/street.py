@@ -1,7 +1,5 @@
 """City streets: what is painted between lane boundaries, and the strips beside the carriageway."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

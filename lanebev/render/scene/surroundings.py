@@ -1,7 +1,5 @@
 """What stands beside and above the road: verge, walls that follow it, hills, sky."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

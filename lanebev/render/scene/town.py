@@ -1,7 +1,5 @@
 """How a city changes what stands beside and on the road: edges, houses, parked and oncoming vehicles."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Which vehicles, signs, poles and bridges stand where along the road."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Tunnels: walls on both sides, a ceiling with its lamps, no daylight."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

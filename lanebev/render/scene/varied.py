@@ -1,7 +1,5 @@
 """What weather, camera and mount are where a world is more than the plain highway."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Weather, and the light that it leaves on the scene."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

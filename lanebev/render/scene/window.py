@@ -1,7 +1,5 @@
 """Windows: what a crop about the horizon of a camera with more pixels would see, as other intrinsics."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Snow and slush: at the edges, over stretches of the lines, between the wheel tracks."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

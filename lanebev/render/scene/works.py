@@ -1,7 +1,5 @@
 """Road works: yellow lines in force over white ones that are not, cones and barriers."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """A whole world: everything along one road, and where the camera is in it."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The templates of pages; values in them are escaped."""
 
-from __future__ import annotations
-
 from functools import cache
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template

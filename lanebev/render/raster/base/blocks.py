@@ -5,8 +5,6 @@ parameters those of each block's row. So a batch is shaded at once, without a lo
 without work on pixels that have not what is shaded.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import accumulate
 from typing import Any, NamedTuple

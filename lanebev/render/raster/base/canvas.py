@@ -1,7 +1,5 @@
 """What is painted: one radiance and one depth for every pixel of a batch."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Constant colours as tensors."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Shares of pixels that stripes and dashes cover, integrated over the pixel's footprint."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Shares of pixels within and beyond edges, by a box of the pixel's size."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Features that any scene of a batch has, read on the host, so that absent ones cost nothing."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

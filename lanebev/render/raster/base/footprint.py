@@ -1,7 +1,5 @@
 """Where pixels meet the ground, and what of it each covers."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

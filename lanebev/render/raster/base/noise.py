@@ -1,7 +1,5 @@
 """Noise tiles, computed once, sampled anywhere: the grain of everything that is rendered."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import torch

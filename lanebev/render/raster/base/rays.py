@@ -1,7 +1,5 @@
 """Every pixel's ray in the road frame."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

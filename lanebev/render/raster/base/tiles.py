@@ -1,7 +1,5 @@
 """Tiles of 8 x 8 pixels: pieces of an image that are taken or left as a whole."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

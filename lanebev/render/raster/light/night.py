@@ -1,7 +1,5 @@
 """Light at night: irradiance by lamps and headlights, lights in the image, their glare and mirrors."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

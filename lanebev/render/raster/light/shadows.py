@@ -1,7 +1,5 @@
 """Shadows on the ground: of bridges, trees, walls and vehicles."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple
 

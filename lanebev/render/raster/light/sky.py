@@ -1,7 +1,5 @@
 """Sky, clouds, sun and hills."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Objects on the road as pairs of convex hexahedra: planes, bounds in the image, and rays against them."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """House fronts: plaster, windows, shops, roofs; and which windows are lit at night."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -4,8 +4,6 @@ What an object may cover is tested in tiles of 8 x 8 pixels: one ray to the pixe
 outlines.
 """
 
-from __future__ import annotations
-
 from itertools import accumulate
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """How bright points on vehicles, signs, bridges and poles are."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

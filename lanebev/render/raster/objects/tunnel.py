@@ -1,7 +1,5 @@
 """The inside of a tunnel: its light, its ceiling and the lamps on it."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """What walls beside the road look like, by kind."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Walls beside the road in the image, from the outside inwards."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import groupby
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Arrows, words and signs painted in lanes: a table of pictures, sampled with the pixel's exact footprint."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import cv2

@@ -1,7 +1,5 @@
 """How bright the ground is under pixels."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

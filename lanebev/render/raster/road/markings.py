@@ -1,7 +1,5 @@
 """Paint on the road, anti-aliased analytically: coverage from road coordinates and pixel footprint."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

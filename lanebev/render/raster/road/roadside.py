@@ -1,7 +1,5 @@
 """Beside a street: kerbs, grass, cycle paths, pavements, and the mouths of junctions."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

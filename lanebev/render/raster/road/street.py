@@ -1,7 +1,5 @@
 """Paint on a street that bounds no lane: arrows, hatching, stop lines, crossings, bays."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

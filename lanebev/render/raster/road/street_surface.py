@@ -1,7 +1,5 @@
 """What lies in a street's surface: tram rails, coloured cycle lanes, manhole covers, cuts."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Reflectance of the bare road: asphalt and concrete with all that age and traffic leave on them."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple
 

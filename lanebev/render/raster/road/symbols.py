@@ -1,7 +1,5 @@
 """Arrows, words and diamonds painted inside the lanes."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The ground of all kinds of road, over that of a plain one."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

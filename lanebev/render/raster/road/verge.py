@@ -1,7 +1,5 @@
 """Reflectance of the ground beside the road."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from lanebev.render.raster.base.colour import colour

@@ -1,7 +1,5 @@
 """Snow over the ground of a road."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

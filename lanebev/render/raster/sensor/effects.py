@@ -1,7 +1,5 @@
 """What lies between the scene and the sensor: the own bonnet, rain in the air, drops on the glass."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

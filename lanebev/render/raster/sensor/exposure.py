@@ -1,7 +1,5 @@
 """From linear radiance to display values: metering, veils of light, and the tone curve."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import torch

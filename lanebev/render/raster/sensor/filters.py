@@ -1,7 +1,5 @@
 """Blurring images, each row of a batch by its own width."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """What windscreen, lens and recorder add to an image, in batches."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn import functional

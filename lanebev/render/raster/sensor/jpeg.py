@@ -1,7 +1,5 @@
 """JPEG there and back: what quantising the cosine transform of 8 x 8 blocks does to an image."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 

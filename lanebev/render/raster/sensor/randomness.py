@@ -1,7 +1,5 @@
 """Random pixels, each row of a batch from its own generator: a row's noise does not depend on the others."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """A camera's image of painted views."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import torch

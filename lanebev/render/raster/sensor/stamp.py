@@ -1,7 +1,5 @@
 """Text burnt into the image, as recorders do: date, time, speed."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import cv2
