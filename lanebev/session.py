@@ -1,7 +1,5 @@
 """Live use: one object that holds a drive's state from frame to frame."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,6 @@
 A radial lens images what it sees at an angle θ off its axis at a distance r(θ) from the principal point.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Files with several cameras: ``FILE#NAME`` chooses one of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 

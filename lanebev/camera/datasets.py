@@ -1,7 +1,5 @@
 """Camera files of KITTI, of COLMAP and of WoodScape."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

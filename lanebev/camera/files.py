@@ -3,8 +3,6 @@
 Reading is strict: an unknown key, a missing, non-finite or absurd value is a ``ValueError`` of one line.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Camera files of OpenCV, of its Python tutorial, of ROS, and our short YAML."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from functools import partial

@@ -1,7 +1,5 @@
 """Coefficients of a lens that a file states one by one, under names such as k1 and p1."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

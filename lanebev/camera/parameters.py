@@ -1,7 +1,5 @@
 """A camera as plain numbers, and checks of their range."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 YAML 1.1 would make 416 of a width of 0640, and 750 of 12:30.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

@@ -1,7 +1,5 @@
 """Remarks on an implausible camera: values that are unusual for cameras in cars."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from fractions import Fraction

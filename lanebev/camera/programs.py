@@ -1,7 +1,5 @@
 """Camera files of MATLAB, Gyroflow, instant-ngp and Nerfstudio, librealsense, DepthAI and Metashape."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from functools import partial

@@ -1,7 +1,5 @@
 """Camera files of programs that reconstruct scenes from pictures: OpenSfM, OpenDroneMap and OpenMVG."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any

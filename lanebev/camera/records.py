@@ -3,8 +3,6 @@
 Each is a record with the camera matrix under a name of the data set's or the program's own.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from functools import partial

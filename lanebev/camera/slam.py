@@ -1,7 +1,5 @@
 """Camera files of Kalibr, EuRoC, Basalt and maplab, of CamOdoCal and VINS, of ORB-SLAM and stella_vslam."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from functools import partial

@@ -1,7 +1,5 @@
 """``calibration.yaml``: the lens and how it is mounted, in formats others read."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any, NamedTuple

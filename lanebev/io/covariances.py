@@ -1,7 +1,5 @@
 """``covariance.csv``: every frame's covariance, which ``extrinsics.csv`` has the diagonal of."""
 
-from __future__ import annotations
-
 import csv
 import itertools
 from collections.abc import Iterable

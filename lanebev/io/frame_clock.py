@@ -1,7 +1,5 @@
 """Time steps between the frames of a live source, by their stamps."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Frames of a video or of images, iterated as often as wanted."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction

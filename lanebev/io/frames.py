@@ -1,7 +1,5 @@
 """A frame of a source, and which of its frames are taken."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Rows of ``extrinsics.csv``: made of calibrations, written and read."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Callable, Iterable, Sequence

@@ -1,7 +1,5 @@
 """Times of a source's frames that rise, whatever their stamps do."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from typing import Generic, TypeVar
 

@@ -1,7 +1,5 @@
 """The kind of a source by its name and the file system. Imports nothing heavy."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 SCHEMES = ("rtsp", "rtsps", "rtmp", "http", "https", "udp", "rtp", "tcp", "srt")

@@ -1,7 +1,5 @@
 """States of calibrators and mount on disk: written atomically, read back exactly or not at all."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

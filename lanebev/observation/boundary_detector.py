@@ -1,7 +1,5 @@
 """Images to vertices of lane boundaries: network and line extraction, of one view or of two."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from contextlib import AbstractContextManager, nullcontext
 from typing import Self

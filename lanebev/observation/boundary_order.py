@@ -1,7 +1,5 @@
 """Number the lines of a frame as semantic boundaries, by their side of the ego lane."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise

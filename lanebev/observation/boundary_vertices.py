@@ -1,7 +1,5 @@
 """Vertices on lane boundaries, the common output of all detectors, before pairing."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """A far view: the image about the horizon at a larger scale, beside the whole image at a smaller one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

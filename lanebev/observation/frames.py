@@ -1,7 +1,5 @@
 """Convert frames of cameras and decoders to the network's input, and resize them."""
 
-from __future__ import annotations
-
 import math
 import warnings
 

@@ -1,7 +1,5 @@
 """The paper's own vertices of lane boundaries: threshold, mean of on-pixels, sampling. Not differentiable."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

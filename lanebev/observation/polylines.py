@@ -1,7 +1,5 @@
 """Convert polylines of any lane detector, in pixels as taken, to boundary vertices and back."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The ResNet-18 trunk, with torchvision's parameter names."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch.nn.functional as F

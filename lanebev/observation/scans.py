@@ -5,8 +5,6 @@ column; all are computed together, rows first, then ``GAP`` empty ones, then col
 and the first column are not neighbours. Tensors over scans have their number, h + GAP + w, last.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Images to per-boundary logits: an FCN on ResNet-18."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

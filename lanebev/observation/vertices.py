@@ -3,8 +3,6 @@
 Label pixels are cells of the map. Everything is differentiable in the probabilities.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

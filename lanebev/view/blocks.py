@@ -1,7 +1,5 @@
 """Compute where an image shows the cells of a view, in blocks of rows."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterator
 from typing import NamedTuple

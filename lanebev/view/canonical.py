@@ -1,7 +1,5 @@
 """Resample an image as a fixed virtual camera over the same road would take it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

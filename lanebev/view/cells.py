@@ -1,7 +1,5 @@
 """The cells of a bird's-eye grid as a camera sees them: a row's part plus a column's part."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 

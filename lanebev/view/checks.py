@@ -1,7 +1,5 @@
 """Checks of the arguments of all views."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 

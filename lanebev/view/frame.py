@@ -1,7 +1,5 @@
 """Resample camera frames as files hold them: one image of bytes."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator

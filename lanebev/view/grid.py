@@ -1,7 +1,5 @@
 """The bird's-eye grid and the homography from the image to it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Lens distortion of one point per cell: the models of ``geometry.distortion``, in few passes over memory."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -14,8 +14,6 @@ With a fixed mount these are constants of the data set; here they change from fr
 pose. All are differentiable in it.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Resample a map of the road to the image, the inverse of the bird's-eye view."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Memory that is reused from call to call: allocating a page takes longer than filling it."""
 
-from __future__ import annotations
-
 import threading
 from typing import Any
 

@@ -3,8 +3,6 @@
 Coordinates are computed in blocks of rows that stay in the cache; without gradients, in memory that is kept.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

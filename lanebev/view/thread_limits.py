@@ -1,7 +1,5 @@
 """Sizes of operations that one thread computes: divided, short operations take longer than undivided ones."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

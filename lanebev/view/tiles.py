@@ -10,8 +10,6 @@ Source: Trefethen, Approximation Theory and Approximation Practice, ch. 3 (coeff
 (they fall off geometrically and bound the error where a function is analytic).
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import NamedTuple
 

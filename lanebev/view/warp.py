@@ -1,7 +1,5 @@
 """Resample an image, or its feature maps, to the bird's-eye grid."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from numbers import Real

@@ -7,8 +7,6 @@ from another kind. A traceback, a message of several lines and an input that tak
 seconds are faults: each kind is printed once, and kept with ``--keep``. Exit status 1 if there is any.
 """
 
-from __future__ import annotations
-
 import random
 import signal
 import sys

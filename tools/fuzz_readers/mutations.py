@@ -1,7 +1,5 @@
 """Changes to the bytes of a file, by chance."""
 
-from __future__ import annotations
-
 import random
 import re
 from collections.abc import Callable

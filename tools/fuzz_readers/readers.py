@@ -1,7 +1,5 @@
 """Every kind of file that the package reads, with valid files of it."""
 
-from __future__ import annotations
-
 import io
 import json
 import tempfile

@@ -1,7 +1,5 @@
 """Images of a bag's messages, as RGB."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import av

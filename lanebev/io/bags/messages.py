@@ -1,7 +1,5 @@
 """Messages of MCAP files and ROS bags, by topic: those of ROS and of Foxglove."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec

@@ -1,7 +1,5 @@
 """Frames and lens of an MCAP file or a ROS bag."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections.abc import Iterator, Mapping, Sequence

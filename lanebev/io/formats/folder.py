@@ -1,7 +1,5 @@
 """A finished run's folder, read back for conversion."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

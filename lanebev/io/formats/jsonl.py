@@ -1,7 +1,5 @@
 """JSON lines: a line per frame."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """KITTI's object ``calib.txt``: projection matrices, and where the camera is."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

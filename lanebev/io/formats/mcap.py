@@ -1,7 +1,5 @@
 """MCAP with Foxglove's messages: boundaries over the image, where the camera is, its lens, all estimates."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable
 from pathlib import Path

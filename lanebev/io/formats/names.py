@@ -1,7 +1,5 @@
 """Formats by name: the file, the module that writes it, and what must be installed. Imports nothing heavy."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from importlib.util import find_spec
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """nuScenes' ``calibrated_sensor.json``."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """OpenCV: lens and poses for ``cv2.projectPoints``, in a file of ``cv2.FileStorage``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """openpilot's ``liveCalibration``: roll, pitch and yaw of its device."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterable

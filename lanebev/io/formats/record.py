@@ -1,7 +1,5 @@
 """Results of a run, the input of every format."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import repeat

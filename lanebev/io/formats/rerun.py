@@ -1,7 +1,5 @@
 """Rerun: a recording, or what is sent to a viewer while a run goes on."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any

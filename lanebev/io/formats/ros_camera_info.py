@@ -1,7 +1,5 @@
 """ROS's ``camera_info`` YAML, as ``camera_info_manager`` reads it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

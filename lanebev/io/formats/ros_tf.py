@@ -1,7 +1,5 @@
 """ROS 2: a launch file that publishes where the camera is."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """One row per frame with everything that is known of it: the columns of Parquet and JSON lines."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Images in folders and of globs, and what is beside them."""
 
-from __future__ import annotations
-
 import glob
 import os
 from collections.abc import Iterable

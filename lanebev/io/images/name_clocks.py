@@ -1,7 +1,5 @@
 """Dates and times of day in images' names, such as 2026-11-29_10-15-30.123.jpg."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Images' names: their natural order, and the times that they state."""
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """Images in and out: upright, 8 bits, whole."""
 
-from __future__ import annotations
-
 import struct
 import warnings
 import zlib

@@ -1,7 +1,5 @@
 """Times of images in a file beside them, as of KITTI and of many recorders."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 Source: BDD100K, "Label Format" (doc.bdd100k.com/format.html), and ``poly2patch`` of its viewer for curves.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """CULane's ``.lines.txt``."""
 
-from __future__ import annotations
-
 from itertools import groupby
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Source: CurveLanes (Xu et al. 2020, CurveLane-NAS), ``X.lines.json`` beside ``X.jpg``.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

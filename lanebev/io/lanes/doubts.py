@@ -1,7 +1,5 @@
 """Doubts about polylines that are given frame by frame."""
 
-from __future__ import annotations
-
 import logging
 
 from lanebev.camera.model import Camera

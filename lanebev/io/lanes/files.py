@@ -4,8 +4,6 @@ Everything here is in pixels of the image as it came. A cut or malformed file is
 that names file and line.
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections import defaultdict

@@ -4,8 +4,6 @@ Source: LabelMe's file format (``shapes``); VIL-100 (Zhang et al. 2021), ``annot
 "CVAT for images 1.1".
 """
 
-from __future__ import annotations
-
 import os
 import xml.etree.ElementTree as ET
 from pathlib import Path

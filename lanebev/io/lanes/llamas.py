@@ -4,8 +4,6 @@ Source: Behrendt and Soussan 2019, "Unsupervised Labeled Lane Markers Using Maps
 ``label_scripts/spline_creator.py``, which joins a line's markers too.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

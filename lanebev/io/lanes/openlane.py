@@ -5,8 +5,6 @@ vehicle's axes (x forward, y left, z up). Predictions for the benchmark are in t
 camera (x right, y forward, z up), whose pose is the label's ``extrinsic``.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

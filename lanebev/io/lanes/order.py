@@ -1,7 +1,5 @@
 """Lanes whose boundary numbers run the wrong way or leave one out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """What lane files' readers have in common: their result, text and JSON, and messages that say where."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Lanes that a detector gave out for several frames, since it is slower than the camera."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

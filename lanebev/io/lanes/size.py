@@ -1,7 +1,5 @@
 """Lanes in pixels of images of another size, or of parts of images: converted, or noticed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """TuSimple's JSON lines, and lanebev's additional keys."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

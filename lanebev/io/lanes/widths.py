@@ -1,7 +1,5 @@
 """Lanes that are not equally wide, which the pose takes them for."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

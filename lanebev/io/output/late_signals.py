@@ -1,7 +1,5 @@
 """Signals that come when the work is done."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import threading

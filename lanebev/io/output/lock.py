@@ -1,7 +1,5 @@
 """A lock on a folder that ends with the process that holds it, however that ends."""
 
-from __future__ import annotations
-
 import errno
 import importlib
 import importlib.util

@@ -1,7 +1,5 @@
 """Start a video in its middle with exactly the frames of a decoding from its beginning."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator

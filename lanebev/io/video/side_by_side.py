@@ -1,7 +1,5 @@
 """Images of two cameras in one frame, side by side, as stereo cameras record them."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
