@@ -184,6 +184,7 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
         stream = video_stream(container)
         timed = has_times(container)
         own = Fraction((timed and stream.average_rate) or stream.guessed_rate or DEFAULT_FPS)
+        states_rate = container.format.name != "mpegts"  # of whose times ffmpeg guesses it
         fps = own if timed else stated or own
         lost, first, frame = _first_whole(source, decoded(container, stream))
         matrix = display_matrix(frame)
@@ -198,7 +199,8 @@ def _video_source(source: str, stated: Fraction | None) -> FrameSource:
             count = sum(1 for _ in decoded(container, video_stream(container)))
     problems += found.problems
     if timed and (rate := _rate_of_times(found.shown, found.tick, own)) != own:
-        problems.append(f"it states {float(own):.4g} frames per second, they come at {float(rate):.4g}")
+        words = f"it states {float(own):.4g} frames per second, they come at {float(rate):.4g}"
+        problems += [words] if states_rate else []
         fps = own = rate
     problems += filter(None, [_length_remark(found, fps) if timed else "", _rate_remark(timed, own, stated)])
     problem = f"video {source}: {'; '.join(problems)}" if problems else ""

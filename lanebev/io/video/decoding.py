@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import bisect
+import math
 import os
 import re
 import struct
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
+from typing import NamedTuple
 
 import av
 import numpy as np
@@ -130,40 +132,73 @@ def decoded(  # noqa: C901 - every loop is a way in which files are damaged
     they drop what follows the last error.
     """
     in_order = container.format.name == "avi" and stream.codec_context.has_b_frames
-    due: list[int] = []  # times of packets whose frames have not come
-    lost: set[int] = set()
-    doubted: set[int] = set()  # times of packets that the container marks as damaged
+    part, latest = 0, -math.inf
+    due: list[_Due] = []  # packets whose frames have not come
+    lost: set[_Due] = set()
+    doubted: set[_Due] = set()  # packets that the container marks as damaged
     damage = ""
     keyed = stream.codec_context.name not in _WITHOUT_KEY_CHECK
     for packet in packets(container, stream):
-        if packet.pts is not None and not packet.is_discard:
-            bisect.insort(due, packet.pts)
+        own: _Due | None = None
+        if packet.pts is not None:
+            begins = packet.is_keyframe and packet.pts < latest
+            part, latest = part + begins, packet.pts if begins else max(latest, packet.pts)
+            own = _Due(part, packet.pts)
+            if not packet.is_discard:
+                bisect.insort(due, own)
         if packet.is_corrupt:
             damage = damage or "a damaged one"
-            doubted.update([] if packet.pts is None else [packet.pts])
+            doubted.update([] if own is None else [own])
         frames: Sequence[av.VideoFrame] = ()
         try:
             frames = packet.decode()
         except av.error.FFmpegError as error:  # one frame lost, the next may be whole
             damage = error.strerror
-            if packet.pts is None and packet.size:
+            if own is None and packet.size:
                 yield None, damage
-            elif packet.pts is not None:
-                lost.add(packet.pts)
+            elif own is not None:
+                lost.add(own)
         for frame in frames:
             pts = frame.pts
             if in_order:
                 while due and due[0] in lost:
-                    yield due.pop(0), damage
-                pts = due.pop(0) if due else None
-            while due and pts is not None and due[0] <= pts:
-                if (earlier := due.pop(0)) < pts and damage:
-                    yield earlier, damage
+                    yield due.pop(0).pts, damage
+                pts = due[0].pts if due else None
+            earlier, shown = _taken(due, pts)
+            yield from ((each.pts, damage) for each in earlier if damage)
             keyed = keyed or frame.key_frame
-            cut = pts in doubted and not frame.key_frame
-            yield pts, damage if pts in lost else _IN_DAMAGE if cut else _if_whole(frame, keyed)
+            cut = shown in doubted and not frame.key_frame
+            yield pts, damage if shown in lost else _IN_DAMAGE if cut else _if_whole(frame, keyed)
     if damage:
-        yield from ((pts, damage) for pts in due)
+        yield from ((each.pts, damage) for each in due)
+
+
+class _Due(NamedTuple):
+    """A packet whose frame is due.
+
+    Attributes:
+        part: number of the part of the file; in the next one times begin again, as in files that were joined.
+        pts: its time, ticks.
+    """
+
+    part: int
+    pts: int
+
+
+def _taken(due: list[_Due], pts: int | None) -> tuple[list[_Due], _Due | None]:
+    """Take a frame's packet from those that are due, and those that are shown before it.
+
+    Returns:
+        those before it, and its own; None for a frame without a time.
+    """
+    if pts is None:
+        return [], None
+    known = next((each for each in due if each.pts == pts), None)
+    own = known or _Due(due[0].part if due else 0, pts)
+    place = bisect.bisect_left(due, own)
+    earlier = due[:place]
+    del due[: place + (known is not None)]
+    return earlier, own
 
 
 def _if_whole(frame: av.VideoFrame, keyed: bool) -> av.VideoFrame | str:

@@ -103,8 +103,8 @@ def missing_remark(kind: str, times: Sequence[int]) -> str:
     if not 0 < missing <= _MOST_MISSING * len(times):
         return ""
     return (
-        f"its times leave out {missing} frame{'s'[: missing != 1]}; after such a gap images may be damaged "
-        "up to the next key frame"
+        f"its times leave out {missing} frame{'s'[: missing != 1]}; if they were lost, images after such a "
+        "gap may be damaged up to the next key frame"
     )
 
 
