@@ -14,7 +14,7 @@ from lanebev.app.config.arguments import parser
 from lanebev.app.config.export import ExportConfig
 from lanebev.app.config.file import read_settings
 from lanebev.app.progress import Item, Progress
-from lanebev.app.signals import handlers_kept
+from lanebev.signals import handlers_kept
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

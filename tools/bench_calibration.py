@@ -15,7 +15,6 @@ own. The first half second is left out of every figure.
 import importlib.util
 import json
 import math
-import platform
 import resource
 import time
 from collections.abc import Callable
@@ -37,7 +36,7 @@ from lanebev.testing.scenarios import SCENARIOS
 from lanebev.types import Status
 from tools.bench_kinds import measure_all, measure_two_stage
 from tools.textbook_ekf import TextbookEKF
-from train.commands import command_parser, one_line_errors
+from train.commands import command_parser, one_line_errors, versions
 
 CALIBRATORS: dict[str, Callable[[], Any]] = {
     "joint": JointCalibrator,
@@ -201,9 +200,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     if len(names) < len(args.calibrators):
         print("textbook EKF: left out, filterpy is not installed (pip install filterpy)")
     report: dict[str, Any] = {
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-        "threads": torch.get_num_threads(),
+        **versions(),
         "seed": 0,
         "rows": 2 if args.quick else args.rows,
         "sigma_px": args.sigma,

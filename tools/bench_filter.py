@@ -6,7 +6,6 @@ The gain form is Eqs. (15)-(17) as printed, which solves for the N × N innovati
 """
 
 import json
-import platform
 from pathlib import Path
 
 import torch
@@ -15,7 +14,7 @@ from torch import Tensor
 from torch.utils.benchmark import Timer
 
 from lanebev.estimation import kalman
-from train.commands import command_parser, one_line_errors
+from train.commands import command_parser, one_line_errors, versions
 
 
 def information_form(
@@ -74,12 +73,7 @@ def main() -> None:
             f"{r['rows']:>5.0f} {r['gain_ms']:>9.3f} {r['information_ms']:>15.3f} {r['ratio']:>6.1f} "
             f"{r['largest_relative_difference']:>11.1e}"
         )
-    setup = {
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-        "threads": torch.get_num_threads(),
-    }
-    args.out.write_text(json.dumps({**setup, "seed": 0, "results": results}, indent=1))
+    args.out.write_text(json.dumps({**versions(), "seed": 0, "results": results}, indent=1))
 
 
 if __name__ == "__main__":

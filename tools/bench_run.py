@@ -19,13 +19,12 @@ from pathlib import Path
 import torch
 from jsonargparse.typing import PositiveInt
 
-import lanebev
 from lanebev.app.config import RunConfig
 from lanebev.app.run import run
 from lanebev.io.video.writer import VideoWriter
 from lanebev.render import Drive
 from lanebev.weights import load_segmenter
-from train.commands import command_parser, one_line_errors
+from train.commands import command_parser, one_line_errors, versions
 
 SIZE, FPS, RENDERED = (720, 1280), 20, 8
 
@@ -97,9 +96,7 @@ def main() -> None:
         "run_cpu_ms": round(processor, 1),
         "forward_cpu_ms": round(forward_processor, 1),
         "cpu_ratio": round(processor / forward_processor, 2),
-        "threads": torch.get_num_threads(),
-        "torch": torch.__version__,
-        "lanebev": lanebev.__version__,
+        **versions(),
     }
     print(json.dumps(figures))
     if args.profile:

@@ -7,7 +7,6 @@ Nothing of these images has been trained on.
 """
 
 import json
-import platform
 import sys
 import time
 from collections.abc import Iterable, Iterator
@@ -15,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jsonargparse.typing import PositiveInt
 from PIL import Image
 from rich.console import Console
@@ -28,7 +26,6 @@ from lanebev.app.recording.views import bird_view
 from lanebev.estimation.still import calibrate_still
 from lanebev.io.opening import open_source
 from lanebev.report.overlay import Panel, draw_panels, joined
-from tools.arguments import add_far_view, evaluation_parser
 from tools.real_figures import (
     Figure,
     carla_drive,
@@ -39,7 +36,7 @@ from tools.real_figures import (
     tusimple_segments,
     udacity,
 )
-from train.commands import one_line_errors
+from train.commands import evaluation_parser, one_line_errors, versions
 
 NEEDED = {
     "tusimple": "label_data.json",
@@ -51,8 +48,7 @@ SHEET = tuple(range(0, 88, 8))  # and the last: a dozen
 
 @one_line_errors()
 def main() -> None:
-    parser = evaluation_parser(__doc__)
-    add_far_view(parser)
+    parser = evaluation_parser(__doc__, far_view=True)
     parser.add_argument("--json", type=Path, help="file for the results as JSON")
     parser.add_argument("--sheet", type=Path, help="write a PNG of a dozen TuSimple images, before and after")
     parser.add_argument("--width", type=PositiveInt, help="px of the network's input, instead of its own")
@@ -132,10 +128,7 @@ def as_json(figures: list[Figure], options: Any, seconds: float) -> dict[str, An
     """Return the figures with the versions and settings that gave them."""
     return {
         "command": "python tools/evaluate_real.py",
-        "lanebev": lanebev.__version__,
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-        "threads": torch.get_num_threads(),
+        **versions(),
         "weights": str(options.weights.name) if options.weights else "shipped",
         "seconds": round(seconds, 1),
         "figures": [figure.as_dict() for figure in figures],

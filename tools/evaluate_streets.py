@@ -32,9 +32,8 @@ from lanebev.geometry.rotation import road_from_cam
 from lanebev.io.images.pixels import read_image
 from lanebev.observation.frames import check_frame, network_image
 from lanebev.render import render_views
-from tools.arguments import add_far_view, evaluation_parser
 from tools.single_images import as_answer, calibrate, calibrate_frame, plane_angles, summarise
-from train.commands import one_line_errors
+from train.commands import evaluation_parser, one_line_errors
 
 KITTI_LANE_WIDTH = 3.5  # m
 ASSUMED_FOV = 60.0  # deg, of a camera that is not published
@@ -171,8 +170,7 @@ def save_sheet(folder: Path | None, name: str, pictures: list[NDArray[np.uint8]]
 @one_line_errors()
 def main() -> None:
     """Run the evaluation from the command line."""
-    parser = evaluation_parser(__doc__)
-    add_far_view(parser)
+    parser = evaluation_parser(__doc__, far_view=True)
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--sheets", type=Path, help="write contact sheets with the segments into this folder")
     parser.add_argument(

@@ -29,9 +29,8 @@ from lanebev.estimation.still import calibrate_still
 from lanebev.io.lanes import read_lanes
 from lanebev.io.opening import open_source
 from lanebev.observation.polylines import rows_from_vertices
-from tools.arguments import evaluation_parser
 from tools.real_figures import TUSIMPLE_FOCAL, TUSIMPLE_LANE_WIDTH, tusimple_camera, tusimple_segments
-from train.commands import one_line_errors
+from train.commands import evaluation_parser, one_line_errors
 
 REACH = 30  # px about a line in which its stripe is looked for
 APART = 25.0  # px, label and network mean the same stripe if nearer

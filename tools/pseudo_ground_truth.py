@@ -105,12 +105,10 @@ def estimate_table(rows: Sequence[ExtrinsicsRow], frames: Sequence[FrameLines]) 
 
 def plot(table: np.ndarray, estimate: np.ndarray | None, path: Path) -> None:
     """Plot the pseudo truth, and a run's estimate, of every frame."""
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(4, 1, figsize=(11, 8), sharex=True)
+    figure = Figure(figsize=(11, 8), layout="tight")
+    axes = figure.subplots(4, 1, sharex=True)
     for axis, name, column in zip(axes, COLUMNS, range(4), strict=True):
         axis.plot(table[:, column], "k.", ms=3, label="pseudo ground truth, each frame alone")
         if estimate is not None:
@@ -119,7 +117,6 @@ def plot(table: np.ndarray, estimate: np.ndarray | None, path: Path) -> None:
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)
     axes[-1].set_xlabel("frame")
-    figure.tight_layout()
     figure.savefig(path, dpi=110)
 
 

@@ -11,19 +11,13 @@ import torch
 
 from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.testing.moments import FPS, PLACES, Moment, moments
-from lanebev.testing.motions import Pose, fall, landing_time, moved, sinusoids
-from lanebev.testing.scenarios import SCENARIOS
+from lanebev.testing.motions import Pose, moved, sinusoids
 from lanebev.testing.streets import wandering
-from tools.replay.kinds import EGO_LANE, FRAMES, Generated
+from tools.replay.kinds import EGO_LANE, FRAMES, SHOCK, Change, Generated, drop, in_curve, knock
 
 IN_CURVE = "motion up to 1.5°, 1.2 Hz, R 300 m"
 CREST = "crest or dip, R 5 to 20 km"
 HILLS = "crests and dips in turn"
-
-SHOCK = 1.5
-"""s, when a knock or a cut comes."""
-
-Change = Callable[[float, Moment], Moment]
 
 
 def _drawn(
@@ -36,8 +30,7 @@ def _drawn(
 
 def _curve(seed: int) -> Generated:
     """Draw the same motion from the straight through a clothoid into R = 300 m and half out of it."""
-    change = SCENARIOS["curves R 300 m, 5-40 m"][1]
-    return Generated("", lambda: moments(FRAMES / FPS, change, sinusoids(seed), start=2.0))
+    return Generated("", in_curve(seed))
 
 
 def difference(seed: int, degrees: float, metres: float) -> Pose:
@@ -49,24 +42,12 @@ def difference(seed: int, degrees: float, metres: float) -> Pose:
 
 
 def _drop(seed: int) -> Generated:
-    """Fall 1.2 m onto the wheels from the first frame on."""
-
-    def change(t: float, moment: Moment) -> Moment:
-        tag = "falling" if t < landing_time() else ""
-        return replace(moment, pose=moved(moment.pose, fall(t)), tag=tag)
-
-    return _drawn(seed, change)
+    return _drawn(seed, drop)
 
 
 def _knock(seed: int) -> Generated:
     """Knock the camera by 3° and 25 cm in 0.1 s, for good."""
-    by = difference(seed, 3.0, 0.25)
-
-    def change(t: float, moment: Moment) -> Moment:
-        share = min(max((t - SHOCK) / 0.1, 0.0), 1.0)
-        return replace(moment, pose=moved(moment.pose, by, share), tag="knock" if 0 < share < 1 else "")
-
-    return _drawn(seed, change)
+    return _drawn(seed, knock(difference(seed, 3.0, 0.25)))
 
 
 def _other_vehicle(seed: int, moment: Moment) -> Moment:

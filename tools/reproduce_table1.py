@@ -8,7 +8,6 @@ table1.json and table1.png (estimate against truth).
 
 import json
 import math
-import platform
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -25,7 +24,7 @@ from lanebev.estimation.kalman import symmetrise
 from lanebev.testing.evaluation import UNITS
 from lanebev.testing.experiment import Experiment, frames
 from lanebev.types import AXES, Status
-from train.commands import command_parser, one_line_errors
+from train.commands import command_parser, one_line_errors, versions
 
 VARIANCES = (0.5, 1.0, 2.0, 4.0, 9.0)
 PAPER = {  # Table I: pitch, yaw, roll in degrees, height in centimetres
@@ -124,13 +123,11 @@ def show(rows: list[dict[str, object]], title: str) -> None:
 
 def plot(result: dict[str, torch.Tensor], exp: Experiment, path: Path) -> None:
     """Estimate of the first run against truth, at the lowest and the highest noise."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     t = torch.arange(exp.num_frames) / exp.fps
-    figure, axes = plt.subplots(4, 2, figsize=(13, 9), sharex=True, gridspec_kw={"width_ratios": [3, 2]})
+    figure = Figure(figsize=(13, 9), layout="tight")
+    axes = figure.subplots(4, 2, sharex=True, gridspec_kw={"width_ratios": [3, 2]})
     for k, name in enumerate(AXES):
         unit = "cm" if name == "height" else "deg"
         for index, colour in ((-1, "tab:orange"), (1, "tab:blue")):
@@ -145,7 +142,6 @@ def plot(result: dict[str, torch.Tensor], exp: Experiment, path: Path) -> None:
     axes[0, 0].legend(loc="upper right", ncol=3, fontsize=8)
     axes[-1, 0].set_xlabel("time (s)")
     axes[-1, 1].set_xlabel("time (s)")
-    figure.tight_layout()
     figure.savefig(path, dpi=110)
 
 
@@ -175,9 +171,7 @@ def main() -> None:
         "runs": args.runs,
         "seed": args.seed,
         "dtype": str(dtype),
-        "torch": torch.__version__,
-        "threads": torch.get_num_threads(),
-        "python": platform.python_version(),
+        **versions(),
     }
     worst, name = 0.0, args.calibrator + ("_smoothed" if args.smooth else "")
     for per_boundary in args.segments:

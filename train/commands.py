@@ -1,9 +1,17 @@
-"""What the commands of train and tools share: their arguments and their errors."""
+"""What the commands of train and tools share: arguments, errors, and the versions they report."""
 
 import argparse
+import platform
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+import lanebev
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 @contextmanager
@@ -23,3 +31,29 @@ def command_parser(description: str | None) -> argparse.ArgumentParser:
     """Return a parser whose ``--help`` shows a docstring as it is written."""
     formatter = argparse.RawDescriptionHelpFormatter
     return argparse.ArgumentParser(description=description, formatter_class=formatter)
+
+
+def versions() -> dict[str, object]:
+    """Return what figures depend on beside the command: versions, and the number of threads."""
+    return {
+        "lanebev": lanebev.__version__,
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "threads": torch.get_num_threads(),
+    }
+
+
+def evaluation_parser(description: str | None, far_view: bool = False) -> argparse.ArgumentParser:
+    """Return such a parser with the folder of the evaluation data and the network's weights as options.
+
+    Args:
+        description: docstring of the program, shown as it is.
+        far_view: add the option of a far view.
+    """
+    parser = command_parser(description)
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the data (../shared/data)")
+    parser.add_argument("--weights", type=Path, help="other weights than the shipped")
+    if far_view:
+        words = "the network also processes far views about the horizon"
+        parser.add_argument("--far-view", action="store_true", help=words)
+    return parser

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 LAYERS = (  # from the bottom: a package imports packages of lower layers only, and its own modules
-    {"pipes", "torch_internals"},
+    {"pipes", "signals", "torch_internals"},
     {"numbers", "tensors"},
     {"geometry.rotation"},  # angles to matrices, which Extrinsics offers as methods
     {"types", "batch"},

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from tools.bench_speed import measuring, parts, scene, tables, views
+from tools.bench_speed import measuring, parts, scene, views
 
 
 @pytest.mark.slow
@@ -53,11 +53,11 @@ def test_targets_are_met_or_missed_to_two_decimals():
         }
     )
     assert [each.get("met") for each in table.values()] == [None, True, False, True]
-    text = tables.shown("one image", table)
+    text = measuring.shown("one image", table)
     assert "met: ratio at most 1.2 |" in text
     assert "missed: ratio at most 1.3 |" in text
     assert "met: ms at most 4 |" in text
-    text = tables.overview(
+    text = measuring.overview(
         {"one image": table, "another": {"remap_frame": {"ratio": 1.1, "met": True, **entry}}}
     )
     assert "| one image | 1.00 | 1.20 | **1.31** | 25.00 |  |" in text

@@ -11,8 +11,7 @@ import kornia
 import torch
 
 from tools.bench_speed import calibration, scene, views
-from tools.bench_speed.measuring import Calls, Table, judged, measure
-from tools.bench_speed.tables import grown, overview, plot, shown
+from tools.bench_speed.measuring import Calls, Table, grown, judged, measure, overview, plot, shown
 
 Growth = tuple[str, list[int], Callable[[int], Calls]]
 

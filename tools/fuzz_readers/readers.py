@@ -19,7 +19,7 @@ from lanebev.io.calibration_file import read_mount
 from lanebev.io.images.pixels import read_image
 from lanebev.io.lanes import read_lanes
 from lanebev.io.opening import open_source
-from lanebev.io.results import read_extrinsics
+from lanebev.io.results import ExtrinsicsRow, read_extrinsics, write_extrinsics
 from lanebev.io.state import load_state, save_state
 from lanebev.weights import load_segmenter, read_metadata
 
@@ -235,12 +235,8 @@ def _weights() -> bytes:
 def _extrinsics() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "extrinsics.csv"
-        from lanebev.io.results import ExtrinsicsRow, write_extrinsics
-
         values: dict[str, Any] = dict.fromkeys(ExtrinsicsRow._fields, 0.5)
-        values |= {"frame": 0, "status": "TRACKING", "segments": 5, "image": "a,b.jpg"}
-        if "reasons" in values:
-            values["reasons"] = ""
+        values |= {"frame": 0, "status": "TRACKING", "segments": 5, "image": "a,b.jpg", "reasons": ""}
         write_extrinsics(path, [ExtrinsicsRow(**values)])
         return path.read_bytes()
 

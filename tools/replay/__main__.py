@@ -24,7 +24,6 @@ from tools.replay.check import (
     replay_all,
 )
 from tools.replay.figures import after_shock, as_track, figures, markdown
-from tools.replay.kinds import KINDS
 from tools.replay.references import Difference, Row, write_rows
 from train.commands import command_parser, one_line_errors
 
@@ -35,13 +34,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("kinds", nargs="*", metavar="KIND", help="kinds to replay (default: all)")
     parser.add_argument("--write", action="store_true", help="write the references that differ")
     args = parser.parse_args(arguments)
-    unknown = sorted(set(args.kinds) - set(KINDS))
+    kinds = drive_kinds()
+    unknown = sorted(set(args.kinds) - set(kinds.values()))
     if unknown:
-        raise ValueError(f"kind: expected some of {', '.join(KINDS)}, got {', '.join(unknown)}")
+        known = ", ".join(dict.fromkeys(kinds.values()))
+        raise ValueError(f"kind: expected some of {known}, got {', '.join(unknown)}")
     torch.set_num_threads(1)
-    drives = recordings(
-        [name for name, kind in drive_kinds().items() if not args.kinds or kind in args.kinds]
-    )
+    drives = recordings([name for name, kind in kinds.items() if not args.kinds or kind in args.kinds])
     rows, replayed = replay_all(drives, calibrators())
     print(
         markdown(

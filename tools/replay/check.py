@@ -43,11 +43,6 @@ def drive_kinds() -> dict[str, str]:
     return {name: drive.kind for name, drive in _DRIVES.items()}
 
 
-def missing_kinds(required: Collection[str], drives: Mapping[str, str]) -> list[str]:
-    """Return the kinds that no drive shows, and the drives' kinds that are not required."""
-    return sorted(set(required) ^ set(drives.values()))
-
-
 def recordings(names: Collection[str]) -> dict[str, Recording]:
     """Draw or read the drives of these names. Each has its own seed, whatever others there are."""
     return {

@@ -15,38 +15,8 @@ from lanebev.testing.streets import wandering
 FRAMES = 120
 """Of every drive, so that all of them are rows of one batch."""
 
-KINDS = (
-    "straight",
-    "strong motion",
-    "strong motion in a curve",
-    "suspension",
-    "sharp bends",
-    "crest",
-    "drop",
-    "knock",
-    "cut",
-    "resumed",
-    "ego lane",
-    "lane change",
-    "outliers",
-    "unequal lanes",
-    "street",
-    "gap",
-    "clock",
-    "remount",
-    "lens: pinhole, radial",
-    "lens: pinhole, rational",
-    "lens: pinhole, thin prism",
-    "lens: pinhole, tilted",
-    "lens: fisheye",
-    "lens: omni",
-    "rendered: highway",
-    "rendered: city",
-    "rendered: night",
-    "rendered: drop",
-    "rendered: knock",
-)
-"""Each needs one drive at least; what each is, is said beside the drives below."""
+Change = Callable[[float, Moment], Moment]
+"""Changes the moment at a time in s."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +24,7 @@ class Generated:
     """A drive with known truth, drawn with a seed.
 
     Attributes:
-        kind: one of :data:`KINDS`.
+        kind: what is difficult about it, for several drives.
         moments: the truth of every frame; called once.
         camera: the lens; None is the ideal camera of :mod:`lanebev.testing.moments`.
         resumed: the drive whose last state is the first one here; None begins anew.
@@ -77,11 +47,12 @@ EGO_LANE = (2, 3)
 KNOCK = _degrees(3.0, -2.0, 3.0, -0.25)  # a knocked camera: 3° and 25 cm in 0.1 s, for good
 REMOUNT = _degrees(3.0, -4.0, 3.0, 0.2)
 TRUCK = _degrees(-3.0, 3.0, -2.0, 0.9)  # the camera of another vehicle
-_KNOCKED_AT, _CUT_AT, _MOVED_AT = 1.5, 2.0, 20.0  # s
+SHOCK = 1.5  # s, when a knock comes
+_CUT_AT, _MOVED_AT = 2.0, 20.0  # s
 
 
 def _drive(
-    change: Callable[[float, Moment], Moment] | None = None,
+    change: Change | None = None,
     motion: Motion = swing,
     fps: float = 30.0,
     start: float = 0.0,
@@ -94,7 +65,7 @@ def _scenario(name: str, fps: float = 30.0, start: float = 0.0) -> Callable[[], 
     return _drive(SCENARIOS[name][1], fps=fps, start=start)
 
 
-def _in_curve(seed: int) -> Callable[[], list[Moment]]:
+def in_curve(seed: int) -> Callable[[], list[Moment]]:
     """Return a road from straight through a clothoid to R = 300 m and half out of it, from 75 to 195 m."""
     return _drive(SCENARIOS["curves R 300 m, 5-40 m"][1], sinusoids(seed), start=2.0)
 
@@ -107,14 +78,20 @@ def _hill(t: float, moment: Moment) -> Moment:
     return replace(moment, near=5.0, far=40.0, profile=1e-4 * math.cos(t))
 
 
-def _drop(t: float, moment: Moment) -> Moment:
+def drop(t: float, moment: Moment) -> Moment:
+    """Fall 1.2 m onto the wheels from the first frame on."""
     tag = "falling" if t < landing_time() else ""
     return replace(moment, pose=moved(moment.pose, fall(t)), tag=tag)
 
 
-def _knock(t: float, moment: Moment) -> Moment:
-    share = min(max((t - _KNOCKED_AT) / 0.1, 0.0), 1.0)
-    return replace(moment, pose=moved(moment.pose, KNOCK, share), tag="knock" if 0 < share < 1 else "")
+def knock(by: Pose) -> Change:
+    """Turn and move the camera by a pose in 0.1 s, for good."""
+
+    def change(t: float, moment: Moment) -> Moment:
+        share = min(max((t - SHOCK) / 0.1, 0.0), 1.0)
+        return replace(moment, pose=moved(moment.pose, by, share), tag="knock" if 0 < share < 1 else "")
+
+    return change
 
 
 def _cut(t: float, moment: Moment) -> Moment:
@@ -154,7 +131,7 @@ def _in_street(t: float, moment: Moment) -> Moment:
     return _along_street(0.0, replace(moment, pose=MOUNT, offset=-0.4))
 
 
-def _nothing(first: float, last: float) -> Callable[[float, Moment], Moment]:
+def _nothing(first: float, last: float) -> Change:
     def change(t: float, moment: Moment) -> Moment:
         gone = first <= t < last
         return replace(moment, visible=() if gone else moment.visible, tag="gap" if gone else "")
@@ -181,7 +158,7 @@ def _remount(t: float, moment: Moment) -> Moment:
     return replace(moment, pose=moved(moment.pose, REMOUNT, float(t >= _MOVED_AT)), tag=tag)
 
 
-def _in_ego_lane(change: Callable[[float, Moment], Moment]) -> Callable[[float, Moment], Moment]:
+def _in_ego_lane(change: Change) -> Change:
     return lambda t, moment: _only(EGO_LANE, change(t, moment))
 
 
@@ -199,18 +176,18 @@ GENERATED: dict[str, Generated] = {
     "strong-motion-1": Generated("strong motion", _drive(motion=sinusoids(1))),
     "strong-motion-2": Generated("strong motion", _drive(motion=sinusoids(2))),
     "strong-motion-3": Generated("strong motion", _drive(motion=sinusoids(3))),
-    "curve-1": Generated("strong motion in a curve", _in_curve(4)),
-    "curve-2": Generated("strong motion in a curve", _in_curve(5)),
+    "curve-1": Generated("strong motion in a curve", in_curve(4)),
+    "curve-2": Generated("strong motion in a curve", in_curve(5)),
     "suspension": Generated("suspension", _drive(motion=suspension(6, 4.0))),
     # R = 60 m at 15 m/s, boundaries 1, 2, 3 in sight, 45 to 105 m.
     "sharp-bends": Generated("sharp bends", _scenario("sharp bends R 60 m, three boundaries", start=3.0)),
     "crest": Generated("crest", _scenario("crest R 10 km, 5-40 m")),
     # From a crest into a dip of R = 10 km.
     "crest-and-dip": Generated("crest", _drive(_hill)),
-    "drop": Generated("drop", _drive(_drop)),
-    "drop-ego-lane": Generated("drop", _drive(_in_ego_lane(_drop))),
-    "knock": Generated("knock", _drive(_knock)),
-    "knock-ego-lane": Generated("knock", _drive(_in_ego_lane(_knock))),
+    "drop": Generated("drop", _drive(drop)),
+    "drop-ego-lane": Generated("drop", _drive(_in_ego_lane(drop))),
+    "knock": Generated("knock", _drive(knock(KNOCK))),
+    "knock-ego-lane": Generated("knock", _drive(_in_ego_lane(knock(KNOCK)))),
     "cut": Generated("cut", _drive(_cut)),
     "cut-ego-lane": Generated("cut", _drive(_in_ego_lane(_cut))),
     # With the state of another vehicle's camera in a bend.

@@ -1,7 +1,7 @@
 """Settings of the commands. Nothing here imports anything heavy.
 
 ``run`` and ``export`` have the settings of these commands, made of the ``options`` that ``arguments`` and
-a YAML ``file`` give; ``completion`` completes them in a shell.
+a YAML ``file`` give.
 """
 
 from lanebev.app.config.run import BACKENDS, CALIBRATORS, FOV_FOCAL_STD, RunConfig, rate_as_fraction

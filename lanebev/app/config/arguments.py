@@ -7,7 +7,6 @@ from dataclasses import Field, fields
 from typing import NoReturn
 
 from lanebev import __version__
-from lanebev.app.config.completion import PrintCompletion
 from lanebev.app.config.export import ExportConfig
 from lanebev.app.config.options import parse_path
 from lanebev.app.config.run import RunConfig
@@ -223,3 +222,30 @@ _COMMANDS: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None]]] = {
     ),
     "fleet": ("calibrate on many drives, on all cores or a cluster", _add_fleet),
 }
+
+
+class PrintCompletion(argparse.Action):
+    """Prints the completion script of a shell, by shtab."""
+
+    def __call__(self, parser: argparse.ArgumentParser, _: object, values: object, __: object = None) -> None:
+        """Print it and end."""
+        try:
+            import shtab
+        except ImportError:
+            parser.error(
+                "--print-completion: expected the library shtab, got none; install it with "
+                "pip install 'lanebev[completion]'"
+            )
+        _complete_files(parser, shtab.FILE)
+        print(shtab.complete(parser, shell=str(values)))
+        parser.exit(0)
+
+
+def _complete_files(parser: argparse.ArgumentParser, files: dict[str, str]) -> None:
+    """Let every argument that is a path complete file names, also in subcommands."""
+    for action in parser._actions:
+        if action.metavar in ("FILE", "DIR", "SOURCE", "A", "B"):
+            action.complete = files  # type: ignore[attr-defined]  # shtab looks for it
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                _complete_files(command, files)

@@ -13,11 +13,14 @@ from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Frame
 from lanebev.io.images.names import in_natural_order
 from lanebev.io.lanes import match_frames
-from lanebev.io.lanes.order import check_boundary_order, left_out_remark
 from lanebev.io.lanes.parsing import FrameLines
-from lanebev.io.lanes.repeats import repeats_remark
+from lanebev.io.lanes.remarks import (
+    check_boundary_order,
+    left_out_remark,
+    repeats_remark,
+    unequal_lanes_remark,
+)
 from lanebev.io.lanes.size import size_remark
-from lanebev.io.lanes.widths import unequal_lanes_remark
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.frames import check_frame, network_image
 from lanebev.observation.polylines import VERTICES_PER_LINE, distorted_line, vertices_from_lines

@@ -16,7 +16,6 @@ from lanebev.app.concurrency import map_ahead, prefetch
 from lanebev.app.config import RunConfig, rate_as_fraction
 from lanebev.app.drive.build import make_camera
 from lanebev.app.drive.observers import Observation, Observer
-from lanebev.app.signals import handlers_kept
 from lanebev.camera.model import Camera
 from lanebev.io.bags import BagSource, open_bag_source
 from lanebev.io.frame_source import FrameSource
@@ -26,6 +25,7 @@ from lanebev.io.live import LiveSource, open_live
 from lanebev.io.opening import open_source
 from lanebev.io.source_names import is_bag, is_live, without_login
 from lanebev.report.run_folder import RunFolder
+from lanebev.signals import handlers_kept
 
 _RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")  # in topics of ROS's image_proc, which P is of
 _LONG_STEP = 5  # s between frames, in which a pose has nothing to do with the one before

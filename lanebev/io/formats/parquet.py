@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from lanebev import __version__
+from lanebev.io.formats.jsonl import frame_fields
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.formats.table import frame_fields
 from lanebev.io.frames import Frame
 from lanebev.io.results import CSV_COLUMNS
 

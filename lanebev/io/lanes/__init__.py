@@ -3,7 +3,7 @@
 - ``files`` finds out the format of a file, reads it and matches its entries to images.
 - Formats: ``tusimple``, ``culane``, ``curvelanes``, ``openlane``, ``llamas``, ``bdd100k``, ``labelme``; they
   share ``parsing``.
-- Remarks on lanes: ``doubts``, ``order``, ``repeats``, ``size``, ``widths``.
+- ``remarks`` and ``doubts`` about lanes, also about the ``size`` of their images.
 """
 
 from lanebev.io.lanes.files import lane_files, match_frames, read_lanes

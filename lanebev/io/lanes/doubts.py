@@ -4,8 +4,8 @@ import logging
 
 from lanebev.camera.model import Camera
 from lanebev.io.lanes.parsing import FrameLines
+from lanebev.io.lanes.remarks import unequal_lanes_remark
 from lanebev.io.lanes.size import size_doubt
-from lanebev.io.lanes.widths import unequal_lanes_remark
 
 _LOOKED_AT = 20  # frames that are judged together
 _REMEDY = "give pixels of the camera's images, or a camera by Camera.scaled or Camera.cropped"

@@ -1,5 +1,4 @@
 """The folder of a run's results.
 
-``folder`` makes it, ``lock`` keeps other runs out, and ``whole_file`` and ``late_signals`` leave no file
-half-written.
+``folder`` makes it, ``lock`` keeps other runs out, and ``whole_file`` leaves no file half-written.
 """

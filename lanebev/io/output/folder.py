@@ -5,14 +5,15 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import signal
 from collections.abc import Iterable
 from itertools import count
 from pathlib import Path
 from types import TracebackType
 
 from lanebev.io.formats.names import FORMATS
-from lanebev.io.output.late_signals import late_signals_ignored
 from lanebev.io.output.lock import LOCK_NAME, FolderLock
+from lanebev.signals import handlers_kept
 
 _OWN_NAMES = (
     "extrinsics.csv", "filtered.csv", "lanes.json", "bev.mp4", "bev.png", "overlay.mp4", "overlay.png",
@@ -120,7 +121,9 @@ class OutputFolder:
         try:
             if error is None:
                 # a signal would leave some outputs of this run beside others of an earlier one
-                with late_signals_ignored():
+                with handlers_kept() as handlers:
+                    for number in handlers:
+                        signal.signal(number, signal.SIG_IGN)
                     self._publish()
         except OSError as unpublished:
             failure = unpublished

@@ -13,10 +13,18 @@ from lanebev.app.continued.part_observation import observe_part
 from lanebev.app.demo import write_drive
 from lanebev.app.drive.observers import NetworkObserver
 from lanebev.app.fleet import worker
-from lanebev.app.fleet.cutting import Part, duration, parts_of
+from lanebev.app.fleet.cluster import Schedule
 from lanebev.app.fleet.manifest import Drive
-from lanebev.app.fleet.plan import Outcome, earlier_outcome, is_done, tasks_of, write_mark
-from lanebev.app.fleet.schedule import Schedule
+from lanebev.app.fleet.plan import (
+    Outcome,
+    Part,
+    duration,
+    earlier_outcome,
+    is_done,
+    parts_of,
+    tasks_of,
+    write_mark,
+)
 from lanebev.app.run import run
 from lanebev.io.state import load_state
 from lanebev.io.video.writer import VideoWriter

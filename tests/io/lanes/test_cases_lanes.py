@@ -17,8 +17,8 @@ from lanebev.app.run import run
 from lanebev.io.lanes import read_lanes
 from lanebev.io.lanes.culane import read_culane
 from lanebev.io.lanes.openlane import camera_from_ground_points
-from lanebev.io.lanes.order import check_boundary_order, left_out_remark
 from lanebev.io.lanes.parsing import FrameLines
+from lanebev.io.lanes.remarks import check_boundary_order, left_out_remark
 from lanebev.io.lanes.size import lanes_of_whole_images, meeting_point, resized_lanes, size_remark
 from lanebev.io.lanes.tusimple import tusimple_line
 from lanebev.io.opening import open_source

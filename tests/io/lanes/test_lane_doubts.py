@@ -12,7 +12,7 @@ from lanebev import Camera
 from lanebev.app.drive.observers import LaneFileObserver
 from lanebev.io.frames import Selection
 from lanebev.io.lanes.parsing import FrameLines
-from lanebev.io.lanes.widths import unequal_lanes_remark
+from lanebev.io.lanes.remarks import unequal_lanes_remark
 from lanebev.io.opening import open_source
 from lanebev.io.video.writer import VideoWriter
 from lanebev.observation.polylines import LaneLine

@@ -1,4 +1,4 @@
-"""Shares of pixels that stripes and dashes cover, integrated over the pixel's footprint."""
+"""Shares of pixels that stripes, dashes and what is beyond edges cover, over the pixel's footprint."""
 
 import torch
 from torch import Tensor
@@ -28,3 +28,14 @@ def dash_coverage(along: Tensor, length: Tensor, period: Tensor, footprint: Tens
         return whole * length + torch.minimum(s - whole * period, length)
 
     return (painted_up_to(along + reach) - painted_up_to(along - reach)) / (2 * reach)
+
+
+def band(position: Tensor, low: Tensor, high: Tensor, reach: Tensor) -> Tensor:
+    """Compute the share of a pixel between ``low`` and ``high``, all m, over a box of ``reach`` m."""
+    top, bottom = torch.minimum(position + 0.5 * reach, high), torch.maximum(position - 0.5 * reach, low)
+    return ((top - bottom) / reach).clamp(0, 1)
+
+
+def beyond(position: Tensor, edge: Tensor, reach: Tensor) -> Tensor:
+    """Compute the share of a pixel that lies beyond an edge."""
+    return ((position - edge) / reach + 0.5).clamp(0, 1)

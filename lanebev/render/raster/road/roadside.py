@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.base.coverage import dash_coverage, stripe_coverage
-from lanebev.render.raster.base.edges import band, beyond
+from lanebev.render.raster.base.coverage import band, beyond, dash_coverage, stripe_coverage
 from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.noise import CLOUD, hash01, sample_grain, sample_noise, smoothstep
 from lanebev.render.scene.pavement import Pavement

@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from lanebev.render.raster.base.coverage import dash_coverage, stripe_coverage
-from lanebev.render.raster.base.edges import band
+from lanebev.render.raster.base.coverage import band, dash_coverage, stripe_coverage
 from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.noise import hash01, sample_grain, smoothstep
 from lanebev.render.raster.road.glyphs import GLYPH_LENGTH, GLYPH_WIDTH, glyph_coverage

@@ -1,14 +1,21 @@
-"""Lanes whose boundary numbers run the wrong way or leave one out."""
+"""Remarks on the lanes of a drive: the order of their numbers, repeated lines, unequal widths."""
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lanebev.camera.model import Camera
 from lanebev.io.lanes.parsing import FrameLines
+from lanebev.observation.polylines import lane_width_ratios
 
 _LEAST_FRAMES = 10  # with lanes, among which each boundary is seen in one
+_MOST_REPEATED = 0.3  # fraction of frames with the lanes of the one before; all if nothing moves
+_LOOKED_AT = 50  # frames
+_UNEQUAL = 1.8  # ratio
+_MOST_ROLL = 2  # degrees; with it six boundaries of equally wide lanes look as if of a ratio of up to 2.4
 
 
 def check_boundary_order(frames: Sequence[FrameLines]) -> None:
@@ -65,3 +72,48 @@ def _upwards(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the known points (P, 2) of a line in order of rising rows."""
     known = points[np.isfinite(points).all(-1)]
     return known[np.argsort(known[:, 1], kind="stable")]
+
+
+def repeats_remark(frames: Sequence[FrameLines]) -> str:
+    """Return how many frames have the lines of the frame before, if these are many but not all; else nothing.
+
+    Args:
+        frames: lanes of a drive, in order.
+    """
+    pairs = [(before, frame) for before, frame in pairwise(frames) if frame.lines]
+    repeated = sum(_have_the_same_lines(*pair) for pair in pairs)
+    if not _MOST_REPEATED * len(pairs) < repeated < len(pairs):
+        return ""
+    return (
+        f"lanes: {repeated} of {len(frames)} frames have the lines of the frame before, to the last digit; "
+        "they tell nothing new, but count as if they did: leave repeated lines out"
+    )
+
+
+def _have_the_same_lines(one: FrameLines, other: FrameLines) -> bool:
+    first, second = ([line.points for line in frame.lines] for frame in (one, other))
+    pairs = zip(first, second, strict=False)
+    return len(first) == len(second) and all(np.array_equal(*pair, equal_nan=True) for pair in pairs)
+
+
+def unequal_lanes_remark(frames: Sequence[FrameLines], camera: Camera) -> str:
+    """Return a remark on lanes whose widths differ much for any usual roll of the camera; else nothing.
+
+    Two lanes of any widths look like equal ones to a camera with a certain roll, so that the pose does not
+    tell.
+
+    Args:
+        frames: lanes of a drive.
+        camera: the lens.
+    """
+    looked_at = frames[:: max(1, len(frames) // _LOOKED_AT)]
+    rolls = [0.0, *(math.radians(sign * roll) for roll in range(1, _MOST_ROLL + 1) for sign in (-1, 1))]
+    ratios = np.array([lane_width_ratios(frame.lines, camera, rolls) for frame in looked_at])
+    known = ratios[np.isfinite(ratios[:, 0])] if len(ratios) else ratios
+    if not len(known) or np.median(np.nanmin(known, axis=-1)) < _UNEQUAL:
+        return ""
+    return (
+        f"lanes: one lane is {np.median(known[:, 0]):.1f} times as wide as another, unless the camera is "
+        f"rolled by more than {_MOST_ROLL} degrees; if a line bounds no lane, as that of a shoulder, leave "
+        "it out, since roll and height suppose equal lanes"
+    )
