@@ -36,6 +36,14 @@ _BDD100K = [
 _DRAWN = [
     b'{"imagePath": "1.png", "shapes": [{"shape_type": "linestrip", "points": [[5, 590], [7.5, 580]]}]}',
     b'{"info": {"image_path": "a/1.jpg"}, "annotations": {"lane": [{"points": [[5, 590], [7, 580]]}]}}',
+    b'{"objects": [{"geometryType": "line", "points": {"exterior": [[5, 590], [7, 580]], "interior": []}}]}',
+    b'{"item": {"name": "1"}, "annotations": [{"line": {"path": [{"x": 5, "y": 590}, {"x": 7, "y": 580}]}}]}',
+    b'{"data_row": {"external_id": "1"}, "projects": {"a": {"labels": [{"annotations": {"objects": '
+    b'[{"line": [{"x": 5, "y": 590}]}]}}]}}}',
+    b'{"items": [{"id": "1", "image": {"size": [9, 9]}, "annotations": [{"type": "polyline", '
+    b'"points": [5, 6]}]}]}',
+    b'{"a": {"filename": "1", "regions": [{"shape_attributes": {"name": "polyline", "all_points_x": [5], '
+    b'"all_points_y": [6]}}]}}',
 ]
 
 

@@ -1,8 +1,8 @@
 """Lane files.
 
 - ``files`` finds out the format of a file, reads it and matches its entries to images.
-- Formats: ``tusimple``, ``culane``, ``curvelanes``, ``openlane``, ``llamas``, ``bdd100k``, ``labelme``; they
-  share ``parsing``.
+- Formats: ``tusimple``, ``culane``, ``curvelanes``, ``openlane``, ``llamas``, ``bdd100k``, ``labelme``,
+  ``annotators``; they share ``parsing``.
 - ``remarks`` and ``doubts`` about lanes, also about the ``size`` of their images.
 """
 

@@ -7,15 +7,17 @@ that names file and line.
 import re
 import unicodedata
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path, PurePath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.io.images.names import in_natural_order
 from lanebev.io.images.pixels import IMAGE_SUFFIXES
+from lanebev.io.lanes.annotators import ANNOTATORS, read_annotations, via
 from lanebev.io.lanes.bdd100k import read_bdd100k
 from lanebev.io.lanes.culane import read_culane
 from lanebev.io.lanes.curvelanes import read_curvelanes
@@ -25,11 +27,22 @@ from lanebev.io.lanes.openlane import read_openlane
 from lanebev.io.lanes.parsing import FrameLines, json_values, lane_text
 from lanebev.io.lanes.tusimple import read_tusimple
 
-_READERS = {  # of files of one image, by a key that no other has
+
+def _of_one(read: Callable[[Path], FrameLines], path: Path) -> list[FrameLines]:
+    return [read(path)]
+
+
+_OF_ONE: dict[str, Callable[[Path], FrameLines]] = {  # what reads files of one image
     "Lines": read_curvelanes,
     "image_name": read_llamas,
     "shapes": read_labelme,
     "annotations": read_vil100,
+}
+_READERS: dict[str, Callable[[Path], list[FrameLines]]] = {  # by a key that no other kind before it has
+    **{key: partial(read_annotations, pictures=pictures) for key, pictures in ANNOTATORS.items()},
+    **{key: partial(_of_one, read) for key, read in _OF_ONE.items()},
+    "labels": read_bdd100k,
+    "frames": read_bdd100k,
 }
 _BEGIN = 1_000  # characters
 _OF_LLAMAS = re.compile(r"_(color|gray)_rect$")  # ends the names of LLAMAS' images, not of its labels
@@ -57,14 +70,12 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
         return [read_culane(path)]
     if "<annotations>" in text[:_BEGIN]:
         return read_cvat(path)
-    if _has_key("lane_lines", path, text):
+    if '"shape_attributes"' in text:
+        return read_annotations(path, via)
+    keys = _first_keys(path, text)
+    if "lane_lines" in keys:
         return [read_openlane(path, intrinsics)]
-    for key, read in _READERS.items():
-        if _has_key(key, path, text):
-            return [read(path)]
-    if any(_has_key(key, path, text) for key in ("labels", "frames")):
-        return read_bdd100k(path)
-    return read_tusimple(path)
+    return next((read for key, read in _READERS.items() if key in keys), read_tusimple)(path)
 
 
 def lane_files(path: str | Path) -> list[Path]:
@@ -160,11 +171,10 @@ def _parts(name: str) -> tuple[str, ...]:
     return (*parts[:-1], *(_OF_LLAMAS.sub("", part) for part in parts[-1:]))
 
 
-def _has_key(key: str, path: Path, text: str) -> bool:
-    """Tell whether the first object of a JSON text has the key; of one that breaks off, its first line."""
-    if f'"{key}"' not in text:
-        return False
+def _first_keys(path: Path, text: str) -> set[str]:
+    """Return the keys of a JSON text's first object; of one that breaks off, the words of its first line."""
     try:
-        return key in next((value for _, value in json_values(path, text)), {})
-    except (ValueError, TypeError):
-        return f'"{key}"' in text.lstrip().split("\n", 1)[0]
+        first: Any = next((value for _, value in json_values(path, text)), {})
+    except ValueError:
+        return set(re.findall(r'"(\w+)"', text.lstrip().split("\n", 1)[0]))
+    return set(first) if isinstance(first, dict) else set()

@@ -16,7 +16,7 @@ _FARTHEST = 1e6  # px or m, of any coordinate
 _DECODER = json.JSONDecoder()
 _NO_VALUE = re.compile(r"[\s,]*")  # between JSON values
 _SHOWN = 30  # characters of what is no JSON
-_FORMATS = "formats: TuSimple, CULane, CurveLanes, OpenLane, LLAMAS, BDD100K, VIL-100, LabelMe, CVAT"
+_FORMATS = "formats: TuSimple, CULane, CurveLanes, OpenLane, LLAMAS, BDD100K, VIL-100, LabelMe, CVAT, ..."
 _NO_JSON = "expected JSON, got a line that breaks off or is none; is the file cut?"
 
 

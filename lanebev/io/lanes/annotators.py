@@ -1,0 +1,152 @@
+"""Lines drawn in Supervisely, V7, Labelbox or VIA, and exports of Datumaro: in pixels, as JSON.
+
+Source: Supervisely's annotation format; Darwin JSON 2.0; Labelbox's export as NDJSON; Datumaro's format;
+annotations and projects of VIA.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path, PurePath
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lanebev.io.lanes.parsing import (
+    FrameLines,
+    Where,
+    as_list,
+    as_object,
+    checked_pixels,
+    field,
+    json_values,
+    lane_text,
+    stated_size,
+)
+from lanebev.numbers import finite_numbers, shown
+from lanebev.observation.polylines import LaneLine
+
+
+class _Picture(NamedTuple):
+    """A picture and what is drawn in it.
+
+    Attributes:
+        name: its name, perhaps with folders.
+        sides: object with its ``height`` and ``width``, px; None if the file says none.
+        drawn: the points of each line, [x, y] or {"x": x, "y": y}; None for another shape.
+    """
+
+    name: Any
+    sides: Any
+    drawn: list[Any]
+
+
+Pictures = Callable[[Path, dict[str, Any]], Iterator[_Picture]]
+"""What reads the pictures of a JSON object in a file."""
+
+
+def read_annotations(path: Path, pictures: Pictures) -> list[FrameLines]:
+    """Read the lines that were drawn in a tool; other shapes are left out.
+
+    Raises:
+        ValueError: the pictures have shapes and none is a line.
+    """
+    found: list[_Picture] = []
+    frames: list[FrameLines] = []
+    for line, value in json_values(path, lane_text(path)):
+        with Where(path, line):
+            found += pictures(path, as_object(value))
+            frames = [_frame(picture) for picture in found]
+    if any(None in picture.drawn for picture in found) and not any(frame.lines for frame in frames):
+        raise ValueError(
+            f"lane file {path}: expected lanes drawn as lines, got other shapes only; draw lines"
+        )
+    return frames
+
+
+def _frame(picture: _Picture) -> FrameLines:
+    if not isinstance(picture.name, str) or not picture.name:
+        raise ValueError(f"name: expected the image's, got {shown(picture.name)}")
+    lines = []
+    for i, points in enumerate(picture.drawn):
+        name = f"{shown(PurePath(picture.name).name)}, line {i}"
+        pairs = [finite_numbers(name, _pair(name, point), 2) for point in as_list(name, points or [])]
+        lines += [LaneLine(checked_pixels(name, np.array(pairs)))] if pairs else []
+    size = stated_size(picture.sides, "height", "width") if isinstance(picture.sides, dict) else None
+    return FrameLines(picture.name, lines, image_size=size)
+
+
+def _pair(name: str, point: Any) -> list[Any]:
+    return [point.get("x"), point.get("y")] if isinstance(point, dict) else as_list(name, point)
+
+
+def _objects(fields: Any, key: str) -> list[dict[str, Any]]:
+    """Return the objects in a list; none if there is no list."""
+    return [as_object(each) for each in as_list(key, as_object(fields).get(key) or [])]
+
+
+def supervisely(path: Path, value: dict[str, Any]) -> Iterator[_Picture]:
+    """Yield the picture of a file, which is named after it (``1.jpg.json``)."""
+    objects = _objects(value, "objects")
+    are_lines = [each.get("geometryType") in ("line", "polyline") for each in objects]
+    drawn = [
+        field(field(each, "points", dict), "exterior", list) if is_line else None
+        for each, is_line in zip(objects, are_lines, strict=True)
+    ]
+    yield _Picture(str(path).removesuffix(".json"), value.get("size"), drawn)
+
+
+def darwin(_: Path, value: dict[str, Any]) -> Iterator[_Picture]:
+    """Yield the picture of a file of V7."""
+    item = field(value, "item", dict)
+    drawn = [
+        each["line"] and field(each["line"], "path", list) if "line" in each else None
+        for each in _objects(value, "annotations")
+    ]
+    yield _Picture(item.get("name"), next(iter(_objects(item, "slots")), None), drawn)
+
+
+def labelbox(_: Path, value: dict[str, Any]) -> Iterator[_Picture]:
+    """Yield the picture of a row of Labelbox's export."""
+    row = field(value, "data_row", dict)
+    labels = [
+        label for project in field(value, "projects", dict).values() for label in _objects(project, "labels")
+    ]
+    drawn = [
+        each.get("line") for label in labels for each in _objects(label.get("annotations") or {}, "objects")
+    ]
+    name = row.get("external_id") or row.get("global_key") or row.get("row_data")
+    yield _Picture(name, value.get("media_attributes"), drawn)
+
+
+def datumaro(_: Path, value: dict[str, Any]) -> Iterator[_Picture]:
+    """Yield the pictures of a file of Datumaro, whose points are x y x y ..."""
+    for item in _objects(value, "items"):
+        drawn: list[Any] = []
+        for each in _objects(item, "annotations"):
+            flat = as_list("points", each.get("points") or [])
+            pairs = [flat[place : place + 2] for place in range(0, len(flat), 2)]
+            drawn.append(pairs if each.get("type") == "polyline" else None)
+        image = as_object(item.get("image") or {})
+        sides = dict(zip(("height", "width"), as_list("size", image.get("size") or []), strict=False))
+        yield _Picture(image.get("path") or item.get("id"), sides, drawn)
+
+
+def via(_: Path, value: dict[str, Any]) -> Iterator[_Picture]:
+    """Yield the pictures of VIA's annotations or project."""
+    for image in map(as_object, as_object(value.get("_via_img_metadata", value)).values()):
+        regions = image.get("regions") or []  # by number in VIA 1
+        listed = list(regions.values()) if isinstance(regions, dict) else as_list("regions", regions)
+        drawn: list[Any] = []
+        for shape in (field(each, "shape_attributes", dict) for each in listed):
+            is_line = shape.get("name") == "polyline"
+            axes = [field(shape, f"all_points_{axis}", list) for axis in "xy"] if is_line else []
+            drawn.append([list(pair) for pair in zip(*axes, strict=False)] if is_line else None)
+        yield _Picture(image.get("filename"), None, drawn)
+
+
+ANNOTATORS: dict[str, Pictures] = {
+    "objects": supervisely,
+    "item": darwin,
+    "data_row": labelbox,
+    "items": datumaro,
+}
+"""What reads a tool's pictures, by a key that files of no other have."""
