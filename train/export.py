@@ -199,7 +199,10 @@ def main() -> None:
     parser.add_argument("--pose-sigma-scale", type=float, help="factor measured by train.noise")
     parser.add_argument("--note", default="", help="any note")
     args = parser.parse_args()
-    metrics = json.loads(args.metrics)
+    try:
+        metrics = json.loads(args.metrics)
+    except ValueError as error:
+        raise ValueError(f"metrics: expected JSON, got {args.metrics!r}: {error}") from error
     given = {
         "image_size": args.image_size and tuple(args.image_size),
         "sigma_scale": args.sigma_scale,

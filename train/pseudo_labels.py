@@ -122,6 +122,7 @@ def write_labels(result: Path, source: str, out: Path, camera: Camera, reach: in
     chosen = set([number for number, is_sure in enumerate(sure) if is_sure][::stride])
     if not chosen:
         raise ValueError(f"{result}: expected frames that are TRACKING, got none; is it the right camera?")
+    out.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out.parent, prefix=f"{out.name}-") as folder:
         made = Path(folder) / out.name
         (made / "images").mkdir(parents=True)

@@ -67,7 +67,7 @@ def save_segmenter(
 
     Args:
         segmenter: network to save.
-        path: path of the file.
+        path: path of the file, whose folder is made.
         half: store weights of convolutions as float16; norms and biases stay float32.
         compact: store convolutions of more than 2²⁰ weights as :func:`quantised`.
         record: JSON-able facts for the metadata: training, seed, commit, metrics.
@@ -88,8 +88,9 @@ def save_segmenter(
         **{name: json.dumps(value) for name, value in facts.items()},
     }
     try:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
         save_file(tensors, str(path), metadata)
-    except SafetensorError as error:
+    except (SafetensorError, OSError) as error:
         raise ValueError(f"{path}: expected a file that can be written: {error}") from error
 
 

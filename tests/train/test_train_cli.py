@@ -195,9 +195,14 @@ def test_checkpoints_of_another_kind_are_one_line(tmp_path, capsys):
     said = refused(capsys, "fit", "fast.yaml", tmp_path, f"--model.init_args.init_from={path}", wider)
     assert "weights do not fit the network" in said
     with pytest.raises(ValueError, match="expected a file that can be written"):
-        export(path, tmp_path / "none" / "w.safetensors", {})
+        export(path, notes / "w.safetensors", {})
     with pytest.raises(ValueError, match=r"image_size: expected \(height, width\) above 0, got \(0, -5\)"):
         export(path, tmp_path / "w.safetensors", {"image_size": (0, -5)})
+
+
+def test_a_device_that_is_not_there_is_one_line(tmp_path, capsys):
+    said = refused(capsys, "fit", "fast.yaml", tmp_path, "--trainer.accelerator=cpu", "--trainer.devices=0")
+    assert said.startswith("error: `Trainer(devices=")
 
 
 @pytest.mark.parametrize("option", ["batch_size=0", "sizes=[[0,0]]", "val_size=[64,0]"])

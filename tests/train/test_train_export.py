@@ -7,7 +7,7 @@ import torch
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.weights import load_segmenter, quantised, read_metadata, save_segmenter
-from train.export import checkout_commit, checkpoint_weights, export
+from train.export import checkout_commit, checkpoint_weights, export, main
 
 
 def test_rounding_to_8_bits_is_within_half_a_scale_of_each_channel():
@@ -41,12 +41,11 @@ def test_a_compact_file_is_smaller_than_15_megabytes_and_gives_single_precision(
 
 def test_export_makes_a_weights_file_compact(wide, tmp_path):
     save_segmenter(wide, tmp_path / "half.safetensors")
-    export(tmp_path / "half.safetensors", tmp_path / "out.safetensors", {}, seed=1)
-    again = load_segmenter(tmp_path / "out.safetensors")
+    out = tmp_path / "new" / "out.safetensors"
+    export(tmp_path / "half.safetensors", out, {}, seed=1)
+    again = load_segmenter(out)
     torch.testing.assert_close(again.head.bias, wide.head.bias)
-    assert (tmp_path / "out.safetensors").stat().st_size < 0.7 * (
-        tmp_path / "half.safetensors"
-    ).stat().st_size
+    assert out.stat().st_size < 0.7 * (tmp_path / "half.safetensors").stat().st_size
 
 
 def test_a_checkpoint_in_place_of_weights_is_told_how_to_export(tmp_path):
@@ -54,6 +53,13 @@ def test_a_checkpoint_in_place_of_weights_is_told_how_to_export(tmp_path):
     path.write_bytes(b"anything")
     with pytest.raises(ValueError, match=r"python -m train\.export .*last\.ckpt last\.safetensors"):
         load_segmenter(path)
+
+
+def test_metrics_that_are_no_json_are_named(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["export", "last.ckpt", "out", "--seed", "1", "--metrics", "{recall: 1}"])
+    with pytest.raises(SystemExit, match="2"):
+        main()
+    assert "metrics: expected JSON, got '{recall: 1}'" in capsys.readouterr().err
 
 
 def test_commit_is_the_environments_where_one_is_given(monkeypatch):
