@@ -47,7 +47,7 @@ CALIBRATORS: dict[str, Callable[[], Any]] = {
 DEFAULT = ("joint", "two-stage", "textbook EKF")
 
 
-def compare(
+def run_scenarios(
     names: list[str], scenarios: list[str], rows: int, seconds: float | None, sigma: float
 ) -> dict[str, Any]:
     """Run all scenarios with all calibrators; return figures by scenario and calibrator."""
@@ -219,7 +219,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
         return report
     scenarios = args.scenarios[:2] if args.quick else args.scenarios
     with torch.inference_mode():
-        results = compare(names, scenarios, report["rows"], 1.5 if args.quick else None, args.sigma)
+        results = run_scenarios(names, scenarios, report["rows"], 1.5 if args.quick else None, args.sigma)
     report["speed"] = {name: speed(CALIBRATORS[name](), 20 if args.quick else 60) for name in names}
     report["scenarios"] = results
     for name, took in report["speed"].items():

@@ -36,7 +36,7 @@ from train.commands import command_parser, one_line_errors
 from train.drives import observe_drive
 from train.evaluate_poses import AXES
 from train.evaluate_roads import evaluate
-from train.noise import compare
+from train.noise import summaries
 
 KINDS = ("highway", "varied")
 
@@ -81,7 +81,7 @@ def times(networks: Sequence[SegmenterFile], repeats: int = 20) -> list[float]:
     return least
 
 
-def figures(network: Any, options: argparse.Namespace) -> dict[str, float]:
+def accuracy(network: Any, options: argparse.Namespace) -> dict[str, float]:
     """Return the accuracy of one network by name."""
     views = -(-options.views // len(KINDS))
     found: dict[str, float] = {}
@@ -92,7 +92,7 @@ def figures(network: Any, options: argparse.Namespace) -> dict[str, float]:
     seeds = range(81_000, 81_000 + options.drives)
     drives = [observe_drive([network], seed, options.frames, 20.0)[0] for seed in seeds]
     factor = network.config.sigma_scale
-    summary = compare(drives, (factor,))[factor]
+    summary = summaries(drives, (factor,))[factor]
     found |= {f"drives: {axis}": value for axis, value in zip(AXES, summary.rmse.tolist(), strict=True)}
     found["drives: NEES"] = float(summary.nees) / network.config.pose_sigma_scale**2
     if options.data is not None:
@@ -121,7 +121,7 @@ def main() -> None:
             "processor time, ms": times(networks),
         }
         with torch.inference_mode():
-            columns = [figures(network, options) for network in networks]
+            columns = [accuracy(network, options) for network in networks]
     rows |= {name: [column[name] for column in columns] for name in columns[0]}
     print("| | float | int8 |\n|---|---|---|")
     for name, (one, other) in rows.items():

@@ -68,7 +68,7 @@ def check(args: argparse.Namespace, folder: Path) -> dict[str, object]:
     before = times_of(out / "drives")
     again, second, _ = call(manifest, out, args.workers, options)
     changed = sum(before.get(path) != time for path, time in times_of(out / "drives").items())
-    equal, single = compare(manifest, out, folder / "single")
+    equal, single = equal_to_single_runs(manifest, out, folder / "single")
     found: dict[str, object] = {
         "drives": args.drives,
         "finished": counts[0],
@@ -139,7 +139,7 @@ def busy_workers(ancestor: int) -> Iterator[int]:
             yield process
 
 
-def compare(manifest: Path, out: Path, singles: Path) -> tuple[int, list[float]]:
+def equal_to_single_runs(manifest: Path, out: Path, singles: Path) -> tuple[int, list[float]]:
     """Run on each drive by itself; how many have exactly the fleet's outputs, and the seconds of each run."""
     equal, seconds = 0, []
     for drive in read_manifest(manifest):

@@ -54,7 +54,7 @@ def outcome(seen: DriveObservations, factor: float, config: JointConfig | None =
     return Outcome(torch.cat([rmse[:3].rad2deg(), 100 * rmse[3:]]), nees.mean())
 
 
-def compare(
+def summaries(
     drives: list[DriveObservations],
     factors: tuple[float, ...] = FACTORS,
     over: Callable[..., Iterable[Outcome]] = map,
@@ -91,13 +91,13 @@ def main() -> None:
     seeds = range(args.seed, args.seed + args.drives)
     config = HILLY_ROADS if args.hilly else None
     if args.jobs == 1:
-        report = compare([one(seed) for seed in seeds], config=config)
+        report = summaries([one(seed) for seed in seeds], config=config)
     else:
         context = torch.multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(
             args.jobs, context, initializer=torch.set_num_threads, initargs=(1,)
         ) as pool:
-            report = compare(list(pool.map(one, seeds)), over=pool.map, config=config)
+            report = summaries(list(pool.map(one, seeds)), over=pool.map, config=config)
     for factor, (rmse, nees, mean) in report.items():
         errors = dict(zip(AXES, (round(value, 3) for value in rmse.tolist()), strict=True))
         line = {"weights": args.weights.name, "factor": factor, **errors}

@@ -23,10 +23,10 @@ from tools.replay.check import (
     reference_paths,
     replay_all,
 )
-from tools.replay.figures import after_shock, as_track, figures
+from tools.replay.figures import after_shock, as_track, drive_figures
 from tools.replay.kinds import FRAMES
 from tools.replay.recording import replay
-from tools.replay.references import compare
+from tools.replay.references import difference_of
 from tools.replay.rendered import DRIVES, FPS, RENDERED
 
 torch.set_num_threads(1)
@@ -45,7 +45,7 @@ def test_a_rendered_drive_holds_its_truth():
     """On the highway the joint filter is within 3 sigma of it, and not by large sigmas alone."""
     drives = recordings(["rendered-highway"])
     _, replayed = replay_all(drives, {"joint": JointCalibrator()})
-    found = figures(drives["rendered-highway"], replayed["joint"], 0)
+    found = drive_figures(drives["rendered-highway"], replayed["joint"], 0)
     assert found.within > 0.95
     assert all(error < most for error, most in zip(found.rmse, (0.3, 0.3, 0.3, 5.0), strict=True))
 
@@ -133,7 +133,7 @@ def _rows(**changes):
 
 def test_compare_counts_in_sigmas_of_the_reference():
     reference = _rows(yaw_std_deg="0.1")
-    difference = compare(_rows(yaw_deg="1.02", yaw_std_deg="0.1"), reference)
+    difference = difference_of(_rows(yaw_deg="1.02", yaw_std_deg="0.1"), reference)
     assert difference.sigmas["yaw_deg"] == pytest.approx(0.2)
     assert difference.within(0.21)
     assert not difference.within(0.19)
@@ -144,21 +144,21 @@ def test_compare_counts_in_sigmas_of_the_reference():
     ("changes", "word"), [({"status": "LOST"}, "status"), ({"mean_px": "10.02"}, "mean_px")]
 )
 def test_compare_takes_words_as_they_are(changes, word):
-    difference = compare(_rows(**changes), _rows())
+    difference = difference_of(_rows(**changes), _rows())
     assert not difference.within(math.inf)
     assert str(difference) == f"{word} in 1 frames"
 
 
 def test_compare_says_when_there_is_nothing_to_compare():
-    assert compare(_rows() * 2, _rows()).problem is not None
-    assert not compare(_rows(pitch_deg="nan"), _rows()).within(TOLERANCE)
-    assert compare(_rows(pitch_deg="nan"), _rows(pitch_deg="nan")).within(0.0)
+    assert difference_of(_rows() * 2, _rows()).problem is not None
+    assert not difference_of(_rows(pitch_deg="nan"), _rows()).within(TOLERANCE)
+    assert difference_of(_rows(pitch_deg="nan"), _rows(pitch_deg="nan")).within(0.0)
 
 
 @pytest.mark.slow
 def test_figures_of_a_straight_drive(straight):
     _, replayed = replay_all(straight, {"joint": JointCalibrator()})
-    found = figures(straight["straight"], replayed["joint"], 0)
+    found = drive_figures(straight["straight"], replayed["joint"], 0)
     assert all(0.5 < ratio < 1.5 for ratio in found.ratio)
     assert 0.5 < found.nees < 1.5
     assert found.within > 0.97

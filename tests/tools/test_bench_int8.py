@@ -55,14 +55,14 @@ def test_figures_are_those_of_roads_and_drives(network, monkeypatch):
         figures = {"recall": 0.9, "error_px": 1.5, "false": 0.1, "rows": 7}
         return {("kind", kind): SimpleNamespace(figures=lambda: figures) for kind in kinds}
 
-    def compare(drives, factors):
+    def summaries(drives, factors):
         assert (drives, factors) == ([81_000, 81_001], (1.0,))
         return {1.0: SimpleNamespace(rmse=torch.tensor([0.1, 0.2, 0.3, 4.0]), nees=torch.tensor(2.0))}
 
     monkeypatch.setattr(bench_int8, "evaluate", evaluate)
     monkeypatch.setattr(bench_int8, "observe_drive", lambda networks, seed, frames, fps: [seed])
-    monkeypatch.setattr(bench_int8, "compare", compare)
-    found = bench_int8.figures(network, SimpleNamespace(views=5, drives=2, frames=9, data=None))
+    monkeypatch.setattr(bench_int8, "summaries", summaries)
+    found = bench_int8.accuracy(network, SimpleNamespace(views=5, drives=2, frames=9, data=None))
     assert asked == [3]  # of each of two kinds
     assert len(found) == 2 * 3 + 4 + 1
     assert found["highway: recall"] == 0.9

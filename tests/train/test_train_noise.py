@@ -11,7 +11,7 @@ from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.testing.moments import CAMERA, FPS, WIDTH, moments
 from lanebev.testing.moments import observe as see
 from train.drives import DriveObservations, observe_drive
-from train.noise import compare, outcome
+from train.noise import outcome, summaries
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def drive():
 
 @pytest.mark.slow
 def test_sigmas_half_as_large_as_the_errors_are_found_out(drive):
-    report = compare([drive], (1.0, 2.0, 8.0))
+    report = summaries([drive], (1.0, 2.0, 8.0))
     assert 0.5 < report[2.0].nees < 1.6  # one second is some ten independent errors an axis
     assert report[1.0].nees > report[2.0].nees > 2 * report[8.0].nees  # at 8 px it lags behind the swing
     assert (report[2.0].rmse < torch.tensor([0.05, 0.15, 0.1, 1.0])).all()

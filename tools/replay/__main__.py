@@ -23,7 +23,7 @@ from tools.replay.check import (
     reference_paths,
     replay_all,
 )
-from tools.replay.figures import after_shock, as_track, figures, markdown
+from tools.replay.figures import after_shock, as_track, drive_figures, markdown
 from tools.replay.references import Difference, Row, write_rows
 from train.commands import command_parser, one_line_errors
 
@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(
         markdown(
             [
-                (name, label, figures(recording, made, row))
+                (name, label, drive_figures(recording, made, row))
                 for row, (name, recording) in enumerate(drives.items())
                 for label, made in replayed.items()
             ]

@@ -10,7 +10,7 @@ from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from tools.replay.kinds import GENERATED, Generated
 from tools.replay.recording import Recording, Replayed, record, replay
-from tools.replay.references import Difference, Row, compare, mount_rows, pose_rows, read_rows
+from tools.replay.references import Difference, Row, difference_of, mount_rows, pose_rows, read_rows
 from tools.replay.rendered import RENDERED, Rendered, load
 
 REFERENCES = Path(__file__).resolve().parents[2] / "tests" / "replay" / "references"
@@ -85,5 +85,7 @@ def differences(rows: Mapping[Key, Sequence[Row]]) -> dict[Key, Difference]:
     found = {}
     for key, own in rows.items():
         path = reference_path(key)
-        found[key] = compare(own, read_rows(path)) if path.is_file() else Difference({}, {}, "no reference")
+        found[key] = (
+            difference_of(own, read_rows(path)) if path.is_file() else Difference({}, {}, "no reference")
+        )
     return found

@@ -32,7 +32,7 @@ class Figures(NamedTuple):
     back: float
 
 
-def figures(recording: Recording, replayed: Replayed, row: int) -> Figures:
+def drive_figures(recording: Recording, replayed: Replayed, row: int) -> Figures:
     """Compute the figures of one drive; RMSE, ratio and NEES leave out the first 15 frames and the event."""
     run = as_track(recording, replayed, row)
     found = summarise(run)

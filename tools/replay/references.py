@@ -121,7 +121,7 @@ def read_rows(path: Path) -> list[Row]:
         return list(csv.DictReader(file))
 
 
-def compare(rows: Sequence[Row], reference: Sequence[Row]) -> Difference:
+def difference_of(rows: Sequence[Row], reference: Sequence[Row]) -> Difference:
     """Compare rows with their reference: numbers in sigmas of the reference, words as they are."""
     if len(rows) != len(reference) or list(rows[0]) != list(reference[0]):
         return Difference({}, {}, "other frames or columns than the reference")

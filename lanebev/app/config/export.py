@@ -8,7 +8,7 @@ from lanebev.app.config.options import check_types, option
 from lanebev.app.config.run import CALIBRATORS
 from lanebev.export.names import PARTS
 
-FORMATS = ("onnx", "torch-export")
+EXPORT_FORMATS = ("onnx", "torch-export")
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class ExportConfig:
         "export this part only (default: the step, and all that a run by ONNX Runtime needs)",
         choices=PARTS,
     )
-    format: str = option("onnx", "format of the files (default {})", choices=FORMATS)
+    format: str = option("onnx", "format of the files (default {})", choices=EXPORT_FORMATS)
     out: str = option("lanebev-export", "output folder (default {})", "DIR")
     calibrator: str = option(
         "joint",
