@@ -77,7 +77,7 @@ def test_the_table_has_a_column_for_each_file(network, monkeypatch, capsys, tmp_
     monkeypatch.setattr(bench_int8, "write_files", lambda folder: (file, file))
     monkeypatch.setattr(bench_int8, "load_segmenter", lambda: network.segmenter)
     monkeypatch.setattr(bench_int8, "OnnxPart", lambda path: network.part)
-    monkeypatch.setattr(bench_int8, "figures", lambda network, options: {"highway: recall": 0.91234})
+    monkeypatch.setattr(bench_int8, "accuracy", lambda network, options: {"highway: recall": 0.91234})
     monkeypatch.setattr(torch, "set_num_threads", lambda count: None)
     monkeypatch.setattr("sys.argv", ["bench_int8", "--views", "2"])
     bench_int8.main()
