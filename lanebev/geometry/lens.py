@@ -29,8 +29,16 @@ def check_distortion(distortion: Tensor | None, model: str, *rows: int) -> None:
         check_tensor("distortion", distortion)
         if distortion.shape[:-1] != rows:
             expected = "".join(f"{size}, " for size in rows)
-            raise ValueError(f"distortion: expected ({expected}D), got {tuple(distortion.shape)}")
+            got = f"{tuple(distortion.shape)}{_remedy(distortion, rows, *distortion.shape[-1:])}"
+            raise ValueError(f"distortion: expected ({expected}D), got {got}")
     check_lens(distortion, model)
+
+
+def _remedy(of_one: Tensor, rows: tuple[int, ...], *size: int) -> str:
+    """Return what to do with a tensor of this size, or one of one row, that should have more rows."""
+    if not (rows and size) or of_one.shape not in (size, (1, *size)):
+        return ""
+    return f"; give it to every row by .expand({', '.join(map(str, (*rows, *size)))})"
 
 
 def _check(points: Tensor, distortion: Tensor, model: str) -> None:
@@ -50,7 +58,8 @@ def check_intrinsics(intrinsics: Tensor, *rows: int) -> None:
     """
     check_tensor("intrinsics", intrinsics)
     if intrinsics.shape != (*rows, 3, 3):
-        raise ValueError(f"intrinsics: expected {(*rows, 3, 3)}, got {tuple(intrinsics.shape)}")
+        got = f"{tuple(intrinsics.shape)}{_remedy(intrinsics, rows, 3, 3)}"
+        raise ValueError(f"intrinsics: expected {(*rows, 3, 3)}, got {got}")
     if not intrinsics.is_floating_point():
         raise ValueError(f"intrinsics: expected floating point, got {intrinsics.dtype}")
     if intrinsics.element_size() < 4:  # bfloat16 rounds 554 px to 556

@@ -40,7 +40,11 @@ CALIBRATORS = (lanebev.JointCalibrator(), lanebev.TwoStageCalibrator())
             r"segments.endpoints: expected a torch.Tensor, got numpy.ndarray; .* torch.from_numpy",
         ),
         ({"intrinsics": K.numpy()}, TypeError, "intrinsics: expected a torch.Tensor, got numpy.ndarray"),
-        ({"intrinsics": K[0]}, ValueError, r"intrinsics: expected \(1, 3, 3\), got \(3, 3\)"),
+        (
+            {"intrinsics": K[0]},
+            ValueError,
+            r"intrinsics: expected \(1, 3, 3\), got \(3, 3\); give it to every row by .expand\(1, 3, 3\)",
+        ),
         ({"state": None}, ValueError, r"state: expected \w+, begun by initial_state\(batch_size\)"),
         ({"dt": None}, TypeError, "dt: expected a number or a torch.Tensor, got NoneType"),
         ({"dt": "0.1"}, TypeError, "dt: expected a number or a torch.Tensor, got str"),
@@ -207,6 +211,12 @@ def test_geometry(call, error, message):
             ValueError,
             r"extrinsics.pitch: expected \(1,\)",
         ),
+        (
+            (IMAGE, K, POSE, torch.zeros(5)),
+            ValueError,
+            r"distortion: expected \(1, D\), got \(5,\); give it to every row by .expand\(1, 5\)",
+        ),
+        ((IMAGE, K, POSE, torch.zeros(2, 5)), ValueError, r"distortion: expected \(1, D\), got \(2, 5\)$"),
         ((IMAGE, K, POSE, [0.1, 0, 0, 0]), TypeError, "distortion: expected a torch.Tensor, got list"),
         (
             (IMAGE, K, POSE, None, ["omni"]),

@@ -1,6 +1,7 @@
 """LaneBEV as a module among others: loaded, copied, pickled, in batches of any size, differentiated."""
 
 import copy
+import importlib.util
 import io
 import pickle
 from pathlib import Path
@@ -51,6 +52,15 @@ def model(seed=0):
 def test_torch_hub_loads_it(name, kind):
     root = str(Path(__file__).parents[2])
     assert isinstance(torch.hub.load(root, name, source="local", trust_repo=True), kind)
+
+
+def test_torch_hub_lists_no_other_names():
+    """As ``torch.hub.list`` finds them: what can be called and has no underscore in front."""
+    spec = importlib.util.spec_from_file_location("hubconf", Path(__file__).parents[2] / "hubconf.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    names = {name for name in dir(module) if callable(getattr(module, name)) and not name.startswith("_")}
+    assert names == {"lanebev", "lane_segmenter", "joint_calibrator", "two_stage_calibrator"}
 
 
 @pytest.mark.parametrize("way", ["pickle", "deepcopy", "state_dict"])
