@@ -15,7 +15,9 @@ _OFF_CENTRE = 0.2  # share of a side, more than a principal point is off the cen
 _BESIDE = 0.5  # image widths beside an image that lines are drawn on to
 _BEYOND = 0.03  # share of points beyond the right edge alone
 _MEET_RIGHT = 0.56  # fraction of the width, right of which lines of wider images meet
-_REACHED = 0.8  # lanes reach beyond this fraction of a side: they leave images at the bottom
+_REACHED = 0.8  # lanes reach beyond this fraction of a side: they leave images at the bottom, unless
+_LEFT = 0.42  # fraction of the width, left of which are lines of smaller images, and
+_HIGH_HORIZON = 0.33  # fraction of the height, above which they meet; else lines begin far ahead
 _REACHED_UNCROPPED = 0.85  # fraction of the height that lanes with a horizon so high must reach
 _HIGHEST_HORIZON = 0.28  # fraction of the height above the horizon
 _LOOKED_AT = 50  # frames, for the horizon
@@ -198,8 +200,10 @@ def _doubt_of_points(frames: Sequence[FrameLines], image_size: tuple[int, int]) 
             "another order than the points?",
             "count them from the image's first row",
         )
-    low = y.max() < _REACHED * height and x.max() < _REACHED * width
-    if low or y.max() < _REACHED_DOWN * height:
+    centre = float(np.nanmean([column, 0.5 * (x.min() + x.max())]))  # at the left of larger images
+    low = y.max() < _REACHED * height and x.max() < _REACHED * width and centre < _LEFT * width
+    flat = y.max() < _REACHED_DOWN * height and not horizon >= _HIGH_HORIZON * height
+    if low or flat:
         return SizeDoubt(
             f"none of them reaches beyond {x.max():.0f}, {y.max():.0f} in images of {width} x {height} px; "
             "of smaller images?",

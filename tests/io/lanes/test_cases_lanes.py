@@ -254,6 +254,16 @@ def test_lanes_of_larger_images_lie_outside(scale):
         size_remark(_entries(scale), (720, 1280))
 
 
+@pytest.mark.parametrize("begin", [6.0, 12.0])  # m, as lanes in 3D or behind a bonnet
+@pytest.mark.parametrize("yaw", [-5.0, 0.0, 5.0])
+def test_lanes_that_begin_far_ahead_are_not_of_smaller_images(begin, yaw):
+    focal = 500.0  # px: 104 degrees of view
+    z = np.array([begin, 20.0, 40.0, 80.0])
+    x = [639.5 + focal * (math.tan(math.radians(yaw)) + offset / z) for offset in OFFSETS]
+    lines = [LaneLine(np.stack([line, 359.5 + focal * HEIGHT / z], axis=-1)) for line in x]
+    assert size_remark([FrameLines("0.png", lines)], (720, 1280)) == ""
+
+
 @pytest.mark.parametrize("scale", [0.25, 0.5, 2 / 3, 0.75, 0.78])
 def test_lanes_of_smaller_images_are_noticed(scale):
     remark = size_remark(_entries(scale), (720, 1280))
