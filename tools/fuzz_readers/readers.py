@@ -4,6 +4,7 @@ import io
 import json
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -82,7 +83,10 @@ def readers() -> dict[str, Reader]:
         ),
         "lanes.json": Reader(read_lanes, ".json", _tusimple(), 30),
         "openlane.json": Reader(
-            read_lanes, ".json", [*_openlane(), _CURVELANES, _LLAMAS, *_BDD100K, *_DRAWN], 20
+            partial(read_lanes, intrinsics=np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]])),
+            ".json",
+            [*_openlane(), *_lanes3d(), _CURVELANES, _LLAMAS, *_BDD100K, *_DRAWN],
+            20,
         ),
         "culane": Reader(
             read_lanes, ".lines.txt", [b"10 590 12.5 580 15 570 17 560\n500.25 590 510 580 520 570\n"], 20
@@ -207,6 +211,22 @@ def _tusimple() -> list[bytes]:
     vertices = {"points": [[[5, 500], [6, 510.5]]], "sigma": [[1, 2]], "weight": [[1, 0.5]], "boundary": [2]}
     seen = {**frame, "raw_file": "a/3.jpg", "seen": vertices, "pose_sigma_scale": 1.5}
     return ["\n".join(json.dumps(each) for each in (frame, sure, seen)).encode()]
+
+
+def _lanes3d() -> list[bytes]:
+    ground = {
+        "raw_file": "1.jpg",
+        "cam_height": 1.5,
+        "cam_pitch": 0.1,
+        "laneLines": [[[1.8, 10, 0], [1.8, 20, 0]]],
+    }
+    once = {
+        "lanes": [[[1.8, 1.5, 10], [1.8, 1.5, 20]]],
+        "calibration": [[900, 0, 640], [0, 900, 360], [0, 0, 1]],
+    }
+    return [
+        json.dumps(each).encode() for each in (ground, {**ground, "laneLines_visibility": [[1, 0]]}, once)
+    ]
 
 
 def _openlane() -> list[bytes]:

@@ -22,6 +22,7 @@ from lanebev.io.lanes.bdd100k import read_bdd100k
 from lanebev.io.lanes.culane import read_culane
 from lanebev.io.lanes.curvelanes import read_curvelanes
 from lanebev.io.lanes.labelme import read_cvat, read_labelme, read_vil100
+from lanebev.io.lanes.lanes3d import read_apollo, read_once
 from lanebev.io.lanes.llamas import read_llamas
 from lanebev.io.lanes.openlane import read_openlane
 from lanebev.io.lanes.parsing import FrameLines, json_values, lane_text
@@ -53,7 +54,7 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
 
     Args:
         path: path of the file or folder.
-        intrinsics: (3, 3) px of the camera, for OpenLane's 3D points in a file without ``intrinsic``.
+        intrinsics: (3, 3) px of the camera, for 3D points in a file without them.
 
     Raises:
         ValueError: there is no such file, or it is cut, malformed or of no known format.
@@ -75,6 +76,10 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
     keys = _first_keys(path, text)
     if "lane_lines" in keys:
         return [read_openlane(path, intrinsics)]
+    if "laneLines" in keys:
+        return read_apollo(path, intrinsics)
+    if "calibration" in keys or keys == {"lanes"}:
+        return [read_once(path, intrinsics)]
     return next((read for key, read in _READERS.items() if key in keys), read_tusimple)(path)
 
 

@@ -1,0 +1,115 @@
+"""3D lanes of ONCE-3DLanes and of the Apollo synthetic data set in JSON.
+
+Source: ONCE-3DLanes (Yan et al. 2022), in camera axes; Gen-LaneNet (Guo et al. 2020), tools/utils.py,
+``projection_g2im``: on the ground below the camera, x right, y forward, z up.
+"""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanebev.io.lanes.openlane import image_from_camera_points
+from lanebev.io.lanes.parsing import (
+    FrameLines,
+    Where,
+    as_list,
+    as_object,
+    columns,
+    field,
+    json_object,
+    json_values,
+    lane_text,
+    within,
+)
+from lanebev.numbers import finite_numbers
+from lanebev.observation.polylines import LaneLine
+
+Array = NDArray[np.float64]
+
+_FARTHEST = 1e6  # px of the image
+
+
+def read_once(path: Path, intrinsics: Array | None = None) -> FrameLines:
+    """Read a label or a prediction of ONCE-3DLanes, of the image that is named as the file is.
+
+    Args:
+        path: path of the file.
+        intrinsics: (3, 3) px, for a file without ``calibration``.
+    """
+    with Where(path, None):
+        fields = json_object(lane_text(path))
+        if fields.get("calibration") is not None:
+            rows = [
+                finite_numbers("calibration", as_list("calibration", row)) for row in fields["calibration"]
+            ]
+            if len(rows) != 3 or any(len(row) not in (3, 4) for row in rows):
+                raise ValueError("calibration: expected the camera matrix, 3 x 3 or 3 x 4, got other numbers")
+            intrinsics = within("calibration", "numbers of a camera", np.array([row[:3] for row in rows]))
+        lanes = [_points(f"lanes[{i}]", lane) for i, lane in enumerate(field(fields, "lanes", list))]
+        return _projected(str(path).removesuffix(".json"), lanes, intrinsics)
+
+
+def read_apollo(path: Path, intrinsics: Array | None = None) -> list[FrameLines]:
+    """Read the ``laneLines`` of Apollo's synthetic images, one image a line.
+
+    Args:
+        path: path of the file.
+        intrinsics: (3, 3) px; the file has none.
+    """
+    frames = []
+    for line, value in json_values(path, lane_text(path)):
+        with Where(path, line):
+            fields = as_object(value)
+            height, pitch = finite_numbers(
+                "cam_height, cam_pitch", [fields.get("cam_height"), fields.get("cam_pitch")]
+            )
+            lines = field(fields, "laneLines", list)
+            seen = as_list("laneLines_visibility", fields.get("laneLines_visibility") or [None] * len(lines))
+            lanes = [
+                camera_from_apollo(_visible(f"laneLines[{i}]", lane, visible), height, pitch)
+                for i, (lane, visible) in enumerate(zip(lines, seen, strict=False))
+            ]
+            frames.append(_projected(field(fields, "raw_file", str), lanes, intrinsics))
+    return frames
+
+
+def camera_from_apollo(points: Array, height: float, pitch: float) -> Array:
+    """Return points (P, 3) m on the ground in the axes of a camera with a height (m) and a pitch (rad)."""
+    sine, cosine = math.sin(pitch), math.cos(pitch)
+    x, y, z = points.T
+    return np.stack([x, height - sine * y - cosine * z, cosine * y - sine * z], axis=-1)
+
+
+def _points(name: str, lane: Any) -> Array:
+    """Return a list of three numbers each as (P, 3) m."""
+    rows = [
+        list(axis) for axis in zip(*(as_list(name, point) for point in as_list(name, lane)), strict=False)
+    ]
+    return within(name, "m", columns(name, rows or [[], [], []], 3).T)
+
+
+def _visible(name: str, lane: Any, visibility: Any) -> Array:
+    points = _points(name, lane)
+    if visibility is None:
+        return points
+    seen = columns(f"{name}_visibility", [visibility], 1)[0]
+    if len(seen) != len(points):
+        raise ValueError(f"{name}_visibility: expected {len(points)} numbers, got {len(seen)}")
+    kept: Array = points[seen > 0.5]
+    return kept
+
+
+def _projected(name: str, lanes: list[Array], intrinsics: Array | None) -> FrameLines:
+    """Return lanes in camera axes in pixels of the image."""
+    if intrinsics is None:
+        raise ValueError("intrinsics: expected the camera matrix of lanes in 3D, got none; give the camera")
+    lines = []
+    for lane in lanes:
+        image = image_from_camera_points(lane, intrinsics)
+        kept = image[(np.abs(image) < _FARTHEST).all(-1)]
+        lines += [LaneLine(kept)] if len(kept) else []
+    centre = (float(intrinsics[0, 2]), float(intrinsics[1, 2]))
+    return FrameLines(name, lines, principal_point=centre if lines else None)
