@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"lanebev {command}: interrupted, {kept}", file=sys.stderr)
         return 128 + (received[0] if received else signal.SIGINT)
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # of signs that a terminal's encoding lacks
+        sys.stdout.reconfigure(errors="replace")  # for characters that a terminal's encoding lacks
     try:
         print(report, flush=True)
     except OSError:  # nobody reads it; the outputs are there

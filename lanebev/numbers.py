@@ -14,12 +14,12 @@ from lanebev.pipes import await_bytes, open_pipe
 
 _BYTE_ORDER_MARKS = {
     codecs.BOM_UTF8: "utf-8-sig",
-    codecs.BOM_UTF16_LE: "utf-16",  # what PowerShell's > writes
+    codecs.BOM_UTF16_LE: "utf-16",  # as PowerShell's > writes
     codecs.BOM_UTF16_BE: "utf-16",
 }
 _BEGINNING = 65_536  # bytes of a file that tell whether it is a text
 _GZIP = b"\x1f\x8b"
-_MOST_FOREIGN = 0.3  # of a text's letters, in an encoding that is not known
+_MOST_FOREIGN = 0.3  # fraction of a text's letters, if its encoding is not known
 _REPR = reprlib.Repr()
 _REPR.maxlist = _REPR.maxdict = _REPR.maxtuple = 4
 _REPR.maxlevel, _REPR.maxstring = 3, 200

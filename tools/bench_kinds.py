@@ -39,7 +39,7 @@ _NOT_TWO_STAGE = (  # kinds of the joint calibrator that show nothing new of thi
 
 
 class KindFigures(NamedTuple):
-    """Of all drives of a kind.
+    """Statistics of all drives of a kind.
 
     Attributes:
         ratio: RMSE of pitch, yaw, roll and height by the per-frame bound; NaN where there is none.

@@ -68,7 +68,7 @@ class Drive:
 
 
 class Errors(NamedTuple):
-    """Of the F evaluated frames of a drive: errors by sigma (F, 4), NEES per degree of freedom (F,)."""
+    """Errors by sigma (F, 4) and NEES per degree of freedom (F,) of the F evaluated frames of a drive."""
 
     by_sigma: Tensor
     nees: Tensor

@@ -1,4 +1,4 @@
-"""Where a frame of the joint calibrator spends its time: processor time of torch's operations by function.
+"""Processor time of torch's operations in a frame of the joint calibrator, by function.
 
     python -m tools.profile_joint --rows 256 --segments 408
 

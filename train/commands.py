@@ -1,4 +1,4 @@
-"""What the commands of train and tools share: arguments, errors, and the versions they report."""
+"""Parts of all commands of train and tools: arguments, errors, and the versions they report."""
 
 import argparse
 import platform

@@ -14,7 +14,7 @@ from lanebev.camera.parameters import CameraParameters
 Array = NDArray[np.float64]
 Radius = Callable[[Array], Array]
 
-_WIDEST = math.radians(89.5)  # what is seen further off the axis has no place on the z = 1 plane
+_WIDEST = math.radians(89.5)  # farther off the axis, a ray has no point on the z = 1 plane
 _SAMPLES = 400
 _MOST_ERROR = 0.5  # px
 

@@ -63,8 +63,8 @@ def read_camera(
     - JSON of data sets, see :mod:`lanebev.camera.records`;
     - COLMAP's ``cameras.txt``.
 
-    Of a file with several cameras the first is taken, of KITTI's the left colour camera. If others differ
-    from it, that is remarked on, or refused with COLMAP's and those of data sets in JSON.
+    The first camera of a file with several is taken, of KITTI's files the left colour camera. If others
+    differ from it, there is a remark; COLMAP's files and those of data sets in JSON are then refused.
 
     KITTI's object and odometry files and some data sets' JSON do not hold the image's size: it is then
     ``image_size``, or the data set's. Other files without it are taken for ``image_size`` with a remark, if
@@ -81,7 +81,7 @@ def read_camera(
     path, name = split_name(path)
     try:
         arrays = _arrays(path) if path.suffix.lower() == ".npz" else None
-        # of comments and names in other encodings nothing is needed
+        # comments and names may be in other encodings: they are not needed
         text = read_text(path, "replace") if arrays is None else ""
     except ValueError as error:
         raise ValueError(f"camera file {path}: expected a readable camera file, got: {error}") from error
@@ -103,7 +103,7 @@ def _arrays(path: Path) -> dict[str, Any]:
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name].tolist() for name in arrays.files if name not in _VIEWS}
-    except Exception as error:  # what damaged bytes make of zipfile and NumPy
+    except Exception as error:  # zipfile and NumPy raise many kinds for damaged bytes
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())[:100]
         raise ValueError(f"no arrays of numbers as by numpy.savez: {reason}") from error
 

@@ -29,7 +29,7 @@ _IGNORED_KEYS = {
     "camera_name", "header", "translation", "rotation",
     # Foxglove's CameraCalibration
     "timestamp", "frame_id",
-    # what OpenCV's calibration programs note down
+    # records of OpenCV's calibration programs
     "calibration_time", "nframes", "nFrames", "nr_of_frames", "nrOfFrames", "board_width", "board_height",
     "board_size", "square_size", "marker_size", "aspectRatio", "fix_aspect_ratio", "flags", "flagValue",
     "fisheye_model", "avg_reprojection_error", "per_view_reprojection_errors", "extrinsic_parameters",
@@ -42,7 +42,7 @@ _KNOWN_KEYS = {
     *_MODEL_KEYS, *_IGNORED_KEYS, *LENS_NAMES["pinhole"], "binning_x", "binning_y", "roi", "xi",
 }  # fmt: skip
 _MODELS = {
-    "": "",  # what a driver of an ideal camera leaves empty
+    "": "",  # a driver of an ideal camera leaves it empty
     "pinhole": "pinhole",
     "plumb_bob": "pinhole",
     "radtan": "pinhole",

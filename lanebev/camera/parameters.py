@@ -13,7 +13,7 @@ OFF_CENTRE = 0.2
 """Shares of the sides, more than any data set's principal point is off the centre."""
 
 _LONGEST_SIDE = 99_999  # px
-_LARGEST_XI = 100.0  # of the unified model; 1 is a parabolic mirror, fisheyes have 1 to 4
+_LARGEST_XI = 100.0  # ξ of the unified model; 1 is a parabolic mirror, fisheyes have 1 to 4
 
 
 class CameraParameters(NamedTuple):

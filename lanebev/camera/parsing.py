@@ -16,7 +16,7 @@ import yaml
 from lanebev.numbers import finite_numbers, shown
 
 _LARGEST_YAML = 1_000_000  # characters; PyYAML reads some 100,000 a second
-_MOST_NUMBERS = 1_000  # of one matrix
+_MOST_NUMBERS = 1_000  # numbers in one matrix
 _TABS = re.compile(r"(?<=\S) *\t[ \t]*")  # between words; PyYAML takes none there, YAML and other readers do
 _NO_SPACE = re.compile(r"^\w{1,40}:[\w.]{1,20}", re.MULTILINE)  # which OpenCV reads, and YAML does not know
 _NO_BREAK_SPACE = "\u00a0"  # of texts copied from web pages

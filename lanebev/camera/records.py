@@ -20,7 +20,7 @@ Record = Mapping[str, Any]
 
 
 class _Layout(NamedTuple):
-    """How a data set writes its cameras down.
+    """The keys under which a data set states its cameras.
 
     Attributes:
         whose: its name, for messages.

@@ -12,7 +12,7 @@ from lanebev.types import Calibration, Status, TensorTuple, check_number_or_tens
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
 _MIN_SIGMA = 1e-3  # px; nothing is known better
-LEAST_SEGMENTS = 2  # of a row: the estimators need so many, and padding counts
+LEAST_SEGMENTS = 2  # smallest N: the estimators need so many, padding included
 _HARMLESS_WIDTH = 3.7  # m
 LANE_WIDTHS = (1.0, 10.0)  # m, smallest and largest of a lane
 

@@ -1,4 +1,4 @@
-"""Where the lanes are expected to meet in the next image, by the state before it."""
+"""The point where the lanes are expected to meet in the next image, by the state before it."""
 
 from typing import Any
 

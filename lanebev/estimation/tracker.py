@@ -60,7 +60,7 @@ class Tracker(Generic[StateT]):
         self.state: StateT = calibrator.initial_state(1, dtype=torch.float64)
         self.mount_state: MountState = self.mount_estimator.initial_state(1, dtype=torch.float64)
         self.mount: MountCalibration | None = None  # after a first frame
-        self.unscaled_covariance: Tensor = torch.zeros(1, 4, 4)  # of the last frame, before any scaling
+        self.unscaled_covariance: Tensor = torch.zeros(1, 4, 4)  # that of the last frame, before any scaling
 
     def states(self) -> dict[str, StateT | MountState]:
         """Return the states by name."""

@@ -21,7 +21,7 @@ from lanebev.tensors import made_once
 MODELS = ("pinhole", "fisheye", "omni")
 DISTORTION_LENGTHS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "omni": (5,)}
 _OTHER_NAMES = {"mei": "omni"}
-_REACH_STEPS = 2000  # of the search for the radius where a lens folds over
+_REACH_STEPS = 2000  # number of steps in the search for the radius at which a lens folds over
 _PINHOLE_REACH = 10.0  # the largest radius that is searched
 
 

@@ -1,4 +1,4 @@
-"""How far a pose depends on the focal length that was assumed for it."""
+"""The derivative of a pose by the focal length that was assumed for it."""
 
 import torch
 from torch import Tensor

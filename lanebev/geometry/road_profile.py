@@ -11,7 +11,7 @@ FARTHEST = 200.0  # m; beyond it a pixel is tens of metres, and the shape of the
 
 _BEFORE_CREST = 0.8  # of the distance at which a crest hides the road, up to which points are on the road
 
-_AHEAD = 1e-3  # of a direction's component ahead; below it a point is not in front of the camera
+_AHEAD = 1e-3  # smallest component ahead of the direction of a point in front of the camera
 
 
 def check_vertical_curvature(curvature: Tensor, batch: int) -> None:

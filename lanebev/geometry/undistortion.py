@@ -25,7 +25,7 @@ from lanebev.geometry.distortion import (
 _TABLE_BITS = 7  # of the table of distances from the centre: 2^7 intervals up to the lens's reach
 _ANGLE_STEPS = 6  # Newton from the table: quadratic, to 1e-15 rad
 _PLANE_STEPS = 10  # Newton from the radial solution: 4 for real lenses, more near where they fold over
-_TOLERANCE = 1e-5  # of a solution, on the z = 1 plane: 0.01 px of a focal length of 1000 px
+_TOLERANCE = 1e-5  # error of a solution on the z = 1 plane: 0.01 px at a focal length of 1000 px
 
 
 def undistort_plane(plane: Tensor, distortion: Tensor, model: str, reach: Tensor) -> tuple[Tensor, Tensor]:
@@ -58,7 +58,7 @@ def undistort_plane(plane: Tensor, distortion: Tensor, model: str, reach: Tensor
 
 
 class Bracket(NamedTuple):
-    """Where an increasing function takes a value, by a table of it.
+    """Find the argument at which an increasing function has a value, by a table of the function.
 
     Attributes:
         low, high: (B, N) nodes on both sides.

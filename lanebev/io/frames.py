@@ -31,7 +31,7 @@ class Frame(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """Which frames of a source are taken.
+    """The frames of a source that are taken.
 
     Attributes:
         start: s since the source's first frame, of the first that is taken.

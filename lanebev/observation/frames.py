@@ -35,7 +35,7 @@ def check_frame(frame: NDArray[np.uint8] | Tensor, image_size: tuple[int, int]) 
             got = f"got {frame.shape} {frame.dtype}; {_remedy(frame, image_size)}"
             raise ValueError(f"frame: expected ({height}, {width}, 3) uint8, the camera's size, {got}")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of arrays that must not be written: it is not
+            warnings.simplefilter("ignore", UserWarning)  # about read-only arrays: nothing writes it
             return torch.from_numpy(np.ascontiguousarray(frame)).permute(2, 0, 1)
     if not isinstance(frame, Tensor):
         raise TypeError(
@@ -127,7 +127,7 @@ def resize_image(image: Tensor, size: tuple[int, int]) -> Tensor:
     if size == image.shape[-2:]:
         return image
     resized = nn.functional.interpolate(
-        image.to(common_dtype(image)),  # of half precision there is no kernel on the CPU
+        image.to(common_dtype(image)),  # the CPU has no kernel of half precision
         size=size,
         mode="bilinear",
         antialias=True,

@@ -25,7 +25,7 @@ LINE_SIGMA = 1.5
 VERTICES_PER_LINE = 60
 """At most; more do not make a frame's pose better, only slower."""
 
-_MOST_TURNS = 0.25  # of a line's steps: points with more turns are in no order
+_MOST_TURNS = 0.25  # fraction of a line's steps; points that turn in more of them are in no order
 _BESIDE_EDGE = 3.0  # px from an edge, where points of the same x were moved to it
 _GAP, _GAP_ROWS = 4.0, 30.0  # between vertices: times the median distance, and px
 

@@ -20,7 +20,7 @@ _FLOOR = 0.01  # probability of background noise, which counts as 0
 _LEAST_MASS = 1e-3  # px, what is divided by of an empty window
 _PEAK = 2  # half-width of the box whose largest sum is a scan's peak, label px
 _TINY = 1e-30  # times the number of cells it is less than any difference of two sums
-_FADE = 0.2  # of a stripe's mass, over which a scan's weight goes to zero below ``max_mass``
+_FADE = 0.2  # fraction of a stripe's mass below ``max_mass`` in which a scan's weight falls to zero
 
 
 class Scans(NamedTuple):
@@ -72,15 +72,15 @@ def scan_vertices(probabilities: Tensor, config: LineConfig) -> Vertices:
     least, full, most = (part * whole for part in (config.min_mass, config.full_mass, config.max_mass))
     step = _ramp(mass, least, full)
     slope, scatter = local_line(position, step)
-    cos2 = 1 / (1 + slope.square())  # of the angle between the line and the normal of the scan
+    cos2 = 1 / (1 + slope.square())  # squared cosine of the angle between the line and the normal of the scan
     cos = cos2.sqrt()
     across = mass * cos
     weight = _eroded(_ramp(across, least, full) * _ramp(across, most, most - _FADE * whole))
     steep = _ramp(cos2, 0.4, 0.6)  # 1 below 39 degrees, 0 above 51
-    reach = config.half_width / cos + 1.0  # of the stripe's band in its scan
+    reach = config.half_width / cos + 1.0  # half of the stripe's width in its scan
     inside = (position >= reach) & (position + reach <= scans.last) & (steep > 0)
     stripe = config.half_width**2 / 3 + 1 / 12  # variance across a uniform stripe drawn in pixels
-    excess = _local_mean(spread * cos2 - stripe, step).clamp(min=0)  # of one scan it depends on pixel phase
+    excess = _local_mean(spread * cos2 - stripe, step).clamp(min=0)  # one scan depends on the pixel phase
     return Vertices(
         points=_as_xy(position, scans.number.to(position), scans),
         normal=_as_xy(cos, -slope * cos, scans),

@@ -11,7 +11,7 @@ from lanebev.observation.resnet import ResNet18
 from lanebev.tensors import constant
 from lanebev.types import NUM_BOUNDARIES, check_tensor, check_type
 
-_LARGEST = 8.0  # of an image in [0, 1], whatever was done to its contrast; one in [0, 255] has more
+_LARGEST = 8.0  # largest value of an image in [0, 1] after changes of contrast; one in [0, 255] has more
 _SMALLEST = -0.75  # likewise; one that was normalised by mean and standard deviation, or to [-1, 1], has less
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -194,7 +194,7 @@ def upsample_aligned(x: Tensor, size: torch.Size | tuple[int, int]) -> Tensor:
 def _fold(x: Tensor, size: torch.Size) -> Tensor:
     """Return stride-2 cells (2i, 2i+1) as channels of stride-4 cell i: (B, C, ·, ·) to (B, 4C, *size)."""
     padded = F.pad(x, (0, 2 * size[1] - x.shape[-1], 0, 2 * size[0] - x.shape[-2]))
-    if x.shape[0] == 0:  # of which torch 2.13 makes no channels
+    if x.shape[0] == 0:  # torch 2.13 makes no channels of it
         return padded.reshape(0, 4 * x.shape[1], *size)
     return F.pixel_unshuffle(padded, 2)
 

@@ -109,7 +109,7 @@ def representative_vertices(vertices: Vertices, config: LineConfig) -> Vertices:
         torch.cat([alone, share.unsqueeze(-2) * torch.cat([points, normal], -2)], -2), stretch, config
     )  # (B, L, 8, 2S)
     counted, mass, common, own = sums[:, :, :4].unbind(-2)
-    safe = mass.clamp(min=1e-6)  # of weights of a mean
+    safe = mass.clamp(min=1e-6)  # weights of a mean
     mean, across = (sums[:, :, 4:] / safe.unsqueeze(-2)).split(2, -2)  # (B, L, 2, 2S)
     off_tangent = ((_take_columns(mean, stretch) - points) * normal).sum(-2)  # (B, L, V) px
     moved = _sums((share * off_tangent).unsqueeze(-2) * normal, stretch, config)
@@ -202,7 +202,7 @@ def order_along(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """
     total = weight.sum(-1, keepdim=True).clamp(min=1e-6)
     x, y = (part - (part * weight).sum(-1, keepdim=True) / total for part in points.unbind(-1))
-    xy, difference = (weight * x * y).sum(-1), (weight * (x + y) * (x - y)).sum(-1)  # of xx and yy
+    xy, difference = (weight * x * y).sum(-1), (weight * (x + y) * (x - y)).sum(-1)  # products of xx and yy
     angle = 0.5 * torch.atan2(2 * xy, difference).unsqueeze(-1)
     along = x * angle.cos() + y * angle.sin()
     order = torch.where(weight > 0, along, math.inf).argsort(dim=-1)

@@ -1,4 +1,4 @@
-"""How a camera moves on its vehicle: suspension, bumps and lane changes."""
+"""The motion of a camera on its vehicle: suspension, bumps and lane changes."""
 
 import math
 

@@ -131,7 +131,7 @@ class Drive:
     def _world_at(self, arc: float, time: float) -> World:
         """Return the world with its traffic at this time and its scenery wrapped about the camera."""
         traffic = self.world.traffic
-        ahead = traffic.along + traffic.speed * time  # of the camera
+        ahead = traffic.along + traffic.speed * time  # distance ahead of the camera
         oncoming, still = traffic.speed < _COMING, traffic.speed == 0
         ahead = torch.where(oncoming, (ahead + _BEHIND) % _ONCOMING_PERIOD - _BEHIND, ahead)
         ahead = torch.where(still, (traffic.along - arc + _BEHIND) % _SCENERY_PERIOD - _BEHIND, ahead)

@@ -186,7 +186,7 @@ def _through_window(
     pitch, yaw = lens.extrinsics[:2]
     horizon = vanishing_point(pitch, yaw, lens.intrinsics, lens.distortion, lens.model)
     matrix = window_from_native(sampler, config, scale, size, horizon)
-    zoom = scale.clamp(max=1.0) ** -sampler.uniform(0.0, 1.0)  # of native images with more, or as few, pixels
+    zoom = scale.clamp(max=1.0) ** -sampler.uniform(0.0, 1.0)  # native images have as many pixels, or more
     sensor = world.sensor._replace(blur=world.sensor.blur * zoom)
     return world._replace(sensor=sensor), lens._replace(intrinsics=matrix @ lens.intrinsics)
 

@@ -19,7 +19,7 @@ LARGEST_STD = (*np.degrees(_RADIANS[:3]).tolist(), _RADIANS[3])
 
 
 class AxisState(IntEnum):
-    """How well a frame determines one axis, best first."""
+    """The states of an axis in a frame, by how well the frame determines it, best first."""
 
     MEASURED = 0  # from this frame's lane boundaries
     UNCERTAIN = 1  # measured, but with a standard deviation above LARGEST_STD

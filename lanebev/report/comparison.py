@@ -25,7 +25,7 @@ _ANGLE, _LENGTH = "{:+.3f}°", "{:+.1f} cm"
 
 @dataclass(frozen=True)
 class AxisDifference:
-    """How an axis differs, second run minus first, over the frames in which both measured it.
+    """The differences of an axis, second run minus first, over the frames in which both measured it.
 
     Attributes:
         axis: its name.

@@ -13,7 +13,7 @@ from lanebev.types import NUM_BOUNDARIES, Calibration, Status
 
 _LEAST_SUPPORT = 1.0  # sum of segments' weights that a boundary needs to be drawn
 _LEAST_REACH = 60.0  # m ahead that a boundary is drawn at least: all lead to one horizon
-_POINTS = 96  # of a curve
+_POINTS = 96  # number of points of a curve
 
 
 def lane_curves(

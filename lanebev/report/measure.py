@@ -16,7 +16,7 @@ _MIN_VERTICES = 4
 _MIN_ROWS = 50.0  # px of the image that a boundary must cross: on fewer, its errors are correlated
 _MIN_STRETCH = 5.0  # m of road that a boundary must cover
 _REWEIGHTINGS = 3
-_LEAST_SCALE = 1e-6  # of the residuals in sigmas
+_LEAST_SCALE = 1e-6  # smallest scale of the residuals, in sigmas
 _NEAR = 5.0  # m, nearest Z that counts
 _WIDTH_STD = 0.03  # m; a width with a larger standard deviation is left out
 

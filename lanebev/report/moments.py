@@ -7,7 +7,7 @@ import cv2
 
 from lanebev.report.lettering import Picture
 
-MOST_BYTES = 4_300_000  # of all pictures together; 5.7 MB in base64
+MOST_BYTES = 4_300_000  # size of all pictures together; 5.7 MB in base64
 _EVERY = 1  # frames between two pictures at first
 _QUALITY = 72  # of JPEG
 _LONGEST = 800  # px, side of a picture

@@ -12,7 +12,7 @@ from lanebev.tensors import constant
 from lanebev.types import Extrinsics, check_devices, check_extrinsics, check_tensor
 
 _SAME_SHAPE = 1.25  # factor between height over width of a map and of the image that it covers, padded
-_CORNER = 0.9  # of width and height, from which on a principal point is doubted
+_CORNER = 0.9  # fraction of width and height beyond which a principal point is doubted
 _BESIDE = -1e6  # px, place of every point in the image of a camera that cannot be used
 
 

@@ -83,7 +83,7 @@ def remap_frame(
 
 
 class _Strip(NamedTuple):
-    """Where an image shows some rows of cells.
+    """The coordinates at which an image shows some rows of cells.
 
     Attributes:
         rows: of the view.

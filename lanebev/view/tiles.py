@@ -241,7 +241,7 @@ def tile_bounds(
     """
     along = small_products(values.reshape(-1, _NODES), columns.coefficients.T)
     size = np.abs(rows.coefficients @ along.reshape(*values.shape[:4], -1))
-    sums = small_products(size.reshape(-1, _NODES), _SUMS)  # of the columns' degrees
+    sums = small_products(size.reshape(-1, _NODES), _SUMS)  # sums over the degrees of the columns
     sums = sums.reshape(*values.shape[:5], 2)
     most = sums[..., 0].sum(3)
     error = sums[:, :, :, :_LOW, :, 1].sum(3) + sums[:, :, :, _LOW:, :, 0].sum(3)

@@ -1,4 +1,4 @@
-"""What views, extractor and calibrators cost, beside what others take for the same, and how it grows.
+"""Times of views, extractor and calibrators beside those of other libraries, and their growth.
 
     python -m tools.bench_speed --out out/bench_speed
     python -m tools.bench_speed --parts warp frame --threads 1 --cpu-time

@@ -1,8 +1,8 @@
 """The experiment: ``python -m train.detector --config configs/detector.yaml``.
 
 Trains and tests a detector with the poses of each arm (:func:`train.detector.module.arm_poses`) and seed.
-What was tested is not trained again, and an interrupted training goes on from its last checkpoint. Results
-are one JSON file each in the folder ``out``; ``python -m train.detector.table`` shows them.
+Arms that were tested are not trained again, and an interrupted training goes on from its last checkpoint.
+The folder ``out`` has a JSON file of each result; ``python -m train.detector.table`` shows them.
 """
 
 import json

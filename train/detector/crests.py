@@ -1,4 +1,4 @@
-"""How far the road of drives leaves its tangent plane: ``python -m train.detector.crests FOLDER``.
+"""Distance of the road of drives from its tangent plane: ``python -m train.detector.crests FOLDER``.
 
 The true pose is that over the tangent plane under the camera. Prints, by distance ahead, the elevation of the
 road over this plane, the error of a position that is read off the plane, and how the pitch of the online

@@ -120,7 +120,7 @@ def smooth_frames(
 ) -> SmoothedPoses:
     """Track all frames, and then smooth from the last one to the first.
 
-    What was seen is written to lanes.json, for the second pass or, if this one is killed, for another run.
+    The detections are written to lanes.json, for the second pass or, if this one is killed, for another run.
 
     Args:
         frames: frames of a drive, with what is seen in them.

@@ -20,7 +20,7 @@ _STORE = 80 * 2**20  # bytes of shared memory: results are a few numbers
 
 @dataclass(frozen=True)
 class Cluster:
-    """Where tasks run.
+    """The processes or machines on which tasks run.
 
     Attributes:
         address: address of a running Ray cluster; None starts one on this machine for this call.

@@ -12,8 +12,8 @@ from lanebev.types import AXES
 
 _POSE = ((-15.0, 25.0), (-8.0, 8.0), (-8.0, 8.0), (0.8, 4.0))  # pitch, yaw, roll (degrees), height (m)
 _SAME_VIEW = 2.0  # degrees, by which fields of view of one camera may differ
-_BAR, _BAR_NOISE = 24, 8  # of 255: the most of a black bar, and how much it varies in a column
-_BAR_WIDTH = 0.02  # of the image, the least
+_BAR, _BAR_NOISE = 24, 8  # grey levels of 255: largest of a black bar, and largest range in a column of it
+_BAR_WIDTH = 0.02  # fraction of the image, the smallest
 
 
 def mount_remark(path: str | None, camera: Camera) -> str:

@@ -16,7 +16,7 @@ _NEAR = 2  # frames before and after, among which the largest change is that of 
 _MOVING = 1.0  # grey levels of 255 on average, of a change that counts
 _REPEATED = 0.2  # a frame repeats if it changes by less of the largest change near by; codecs cause 0.1
 _FROZEN = 0.05  # grey levels on average, of a change that no camera's noise leaves
-_MOST_SHARE, _MOST_COUNT = 0.1, 4  # of a drive's frames, and in number: more repeated ones are reported
+_MOST_SHARE, _MOST_COUNT = 0.1, 4  # fraction and number of frames; more repeated frames are reported
 
 
 def repeated(changes: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 _STRIDE = 8  # px, of the pixels that are compared
 _MOVING = 1.0  # grey levels of 255 on average, of a change that counts
-_MORE_ALIKE, _LARGER = 0.6, 1.5  # of the change without turning the image, and times those near by
+_MORE_ALIKE, _LARGER = 0.6, 1.5  # fraction of the change of the unturned image; multiple of nearby changes
 _NEAR = 2  # frames before and after a cut
 _CUT, _LEAST_CUT = 2.5, 12.0  # times the changes near by, and grey levels on average
 _SAME_VIEW = 0.75  # least correlation of two images of one view, also when the exposure changes
@@ -25,7 +25,7 @@ _TURNED = {
 
 
 class _Change(NamedTuple):
-    """How a frame differs from those before it, grey levels on average without that of the brightness.
+    """Mean differences of a frame from those before it, grey levels, without the difference of brightness.
 
     Attributes:
         number: number of the frame.

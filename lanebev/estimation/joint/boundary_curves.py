@@ -23,7 +23,7 @@ from lanebev.types import NUM_BOUNDARIES, Extrinsics
 _HEADING_STD = 0.02  # rad; real boundaries differ by about a degree in direction
 _CURVE_HEADING_STD = 0.005  # rad, likewise, while a curvature is fitted that would pass for it
 _CURVATURE_STD = (2e-3, 2e-5)  # 1/m, 1/m²; of c0 and c1 where they are not given
-_TOLERANCE = 0.008  # of the focal length: distance at which a segment's weight is a quarter
+_TOLERANCE = 0.008  # focal lengths: distance at which a segment's weight is a quarter
 _REWEIGHTINGS = 5
 
 

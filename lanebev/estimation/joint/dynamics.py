@@ -71,7 +71,7 @@ class MotionConfig:
 
 
 class RoadMotion(NamedTuple):
-    """How the road's shape moves over a step, see :func:`lanebev.estimation.joint.road.propagate_road_shape`.
+    """The shape's motion over a step, see :func:`lanebev.estimation.joint.road.propagate_road_shape`.
 
     Attributes:
         shape: (B, NUM_SHAPE) after it.

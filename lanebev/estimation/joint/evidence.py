@@ -19,7 +19,7 @@ from lanebev.tensors import constant
 _COMMON_ERROR = 0.2  # sigmas: standard deviation of the error that all end points of a boundary share
 _LEAST_VARIANCE = 1e-3  # ratio of a score's variance to Λᵢᵢ below which the prediction fixes the entry
 _FREE_POSE = (0.05, 0.05, 0.05, 0.3)  # rad, m: sigmas added where the pose is free
-_LARGEST_EXCESS = 4.0  # of a squared score over 1; a larger one is a jump
+_LARGEST_EXCESS = 4.0  # excess of a squared score over 1; a larger one is a jump
 EQUAL = 0.1  # lanes are equal up to this fraction of ``JointConfig.open_deviation``
 _OVER_HORIZON = 0.01  # if more of the segments are over the horizon, the others are too low
 _CURVED_SIGMAS = 2.0  # ratio of the vertical curvature to its sigma from which it is a crest or a dip
@@ -33,7 +33,7 @@ _OPEN_CURVATURE, _OPEN_STEP = (
 _OPEN_VERTICAL_CURVATURE = 2e-4  # 1/m, likewise
 _SCALE_RISE = 0.3  # s, in which the variance of the motion grows by a factor e if it is half of the right one
 _SCALE_MEMORY = 1.0  # s, time constant of the decay to the variance of ``MotionConfig``
-_LARGEST_SCALE = 1e4  # of the variance of the motion
+_LARGEST_SCALE = 1e4  # largest factor on the variance of the motion
 
 
 def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor, weight: Tensor) -> Tensor:
@@ -64,7 +64,7 @@ def normalized_score(cov: Tensor, frame: FrameInformation, count: Tensor, weight
     )
     known = variance > (_LEAST_VARIANCE * frame.matrix.diagonal(dim1=1, dim2=2)).clamp(min=0.0)
     mean_count = count.square().sum(-1, keepdim=True) / count.sum(-1, keepdim=True).clamp(min=1.0)
-    counts = torch.cat([mean_count, count], dim=-1)  # of the vertical curvature, and of each boundary
+    counts = torch.cat([mean_count, count], dim=-1)  # for the vertical curvature, and for each boundary
     inflation = pad(_COMMON_ERROR**2 * counts, (cov.shape[-1] - counts.shape[-1], 0)) + 1
     normal = torch.where(known, score * torch.where(known, variance * inflation, 1.0).rsqrt(), 0.0)
     raised = (weight * ~frame.residuals.valid).sum(-1) > _OVER_HORIZON * weight.sum(-1)

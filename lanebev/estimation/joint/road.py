@@ -84,7 +84,7 @@ def step_variance(shape: Tensor, shape_cov: Tensor, cfg: MotionConfig) -> Tensor
         shape_cov: (B, NUM_SHAPE, NUM_SHAPE).
         cfg: the configuration.
     """
-    farthest, variance = shape.sum(-1), shape_cov.sum((1, 2))  # of the curvature at the last knot
+    farthest, variance = shape.sum(-1), shape_cov.sum((1, 2))  # curvature at the last knot, and its variance
     excess = (farthest.square() - _BENT**2 * variance).clamp(min=0.0)
     total: Tensor = cfg.curvature_step**2 + _BEND_STEP**2 * excess
     return total

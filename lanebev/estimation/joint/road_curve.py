@@ -19,7 +19,7 @@ _KNOTS = tuple(map(float, range(1 + NUM_STEPS)))  # knot spacings, from the firs
 _BEGIN_AND_END = tuple(
     tuple(float(k == j) - (k == j + 1) for k in range(1 + NUM_STEPS)) for j in range(NUM_STEPS)
 )
-_POWERS = ((3.0,), (2.0,), (1.0,), (0.0,))  # of the way past a knot, in the coefficients of a piece
+_POWERS = ((3.0,), (2.0,), (1.0,), (0.0,))  # powers of the distance past a knot, for each coefficient
 _BY_RAMP = tuple(  # the coefficients by a ramp from each knot on; the first is not ahead, see road_shape
     (factor * first, *[factor] * NUM_STEPS)
     for factor, first in ((_CUBE, 0.0), (_SQUARE, 0.0), (1.0, 1.0), (1 / KNOT_SPACING, 1.0))

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lanebev.estimation.joint.observations import Observations
 
-OUTLIER_RANGE = 0.2  # of the focal length: gross outliers spread over some 200 px at f = 1000 px
+OUTLIER_RANGE = 0.2  # focal lengths: gross outliers spread over some 200 px at f = 1000 px
 OUTLIER_ODDS = 0.3  # prior odds of a gross outlier
 SCALE_PRIOR = 20.0  # number of segments as which the prior for the given sigmas counts
 

@@ -49,7 +49,7 @@ class RollHeightStep(NamedTuple):
 
 
 class SeenLanes(NamedTuple):
-    """What a frame tells of roll and height.
+    """The information of a frame on roll and height.
 
     Attributes:
         boundaries: angles about the direction of stage 1.

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class FormatName(NamedTuple):
-    """What is known of a format before it is written.
+    """Name, module and requirements of a format.
 
     Attributes:
         file: its name in a run's folder.

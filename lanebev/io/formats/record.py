@@ -23,7 +23,7 @@ _SAME_TIME = 2e-3  # s, by which times of one frame may differ: files have micro
 
 @dataclass(frozen=True)
 class StandingPose:
-    """How the camera stands over the road, as one pose for a whole run.
+    """The pose of the camera over the road, one for a whole run.
 
     Attributes:
         extrinsics: each (1,), float64.

@@ -23,7 +23,7 @@ _STEPS = (Fraction(1, 2000), Fraction(60))  # s between two frames of a drive
 _MOST_ALIKE = 0.5
 
 Key = list[tuple[int, int | Fraction, str]]
-_END = (-1, 0, "")  # of a name, before any that goes on
+_END = (-1, 0, "")  # end of a name, before any name that goes on
 
 
 def natural_order(path: str, decimal: bool = False) -> Key:

@@ -13,7 +13,7 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".jfif", ".jp2")
 
 _LYING = (5, 6, 7, 8)  # EXIF orientations whose images are shown with their sides exchanged
-_UNREADABLE = (  # what Pillow raises of files that are cut or none
+_UNREADABLE = (  # Pillow's errors for files that are cut or no images
     OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, EOFError, MemoryError,
     struct.error, zlib.error, Image.DecompressionBombError,
 )  # fmt: skip
@@ -38,7 +38,7 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of odd EXIF; errors are errors
+            warnings.simplefilter("ignore")  # about odd EXIF; errors are raised
             with Image.open(path) as image:
                 _check_single(image)
                 pixels = np.asarray(_eight_bit(_upright(image)).convert("RGB"))

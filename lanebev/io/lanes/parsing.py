@@ -1,4 +1,4 @@
-"""What lane files' readers have in common: their result, text and JSON, and messages that say where."""
+"""Parts of all readers of lane files: their result, text and JSON, and messages that name file and line."""
 
 import json
 import re

@@ -21,7 +21,7 @@ _OWN_NAMES = (
 )  # fmt: skip
 OUTPUT_NAMES = (*_OWN_NAMES, *(known.file for known in FORMATS.values()))
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # what a disk says that has no room
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # errors of a disk without room
 
 
 def check_inputs_stay(folder: str | Path, inputs: Iterable[str | Path]) -> None:
@@ -78,7 +78,7 @@ class OutputFolder:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-        self._target = Path(os.path.realpath(folder))  # of a link, where it leads to
+        self._target = Path(os.path.realpath(folder))  # of a link, its target
 
     def __enter__(self) -> OutputFolder:
         """Make the temporary folder.

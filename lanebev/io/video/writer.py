@@ -49,7 +49,7 @@ class VideoWriter:
     def write(self, image: NDArray[np.uint8], time: float | None = None) -> None:
         """Write (H, W, 3) uint8 RGB, always of one size, shown at ``time`` s or a frame after the last.
 
-        Of a pause longer than an hour the rest is left out.
+        The part of a pause beyond an hour is left out.
         """
         height, width = image.shape[:2]
         if height % 2 or width % 2:

@@ -26,7 +26,7 @@ _METERED = 40.0  # m of road by which the exposure is set
 
 
 class Prepared(NamedTuple):
-    """What of B scenes does not go by pixels.
+    """The parts of B scenes that are the same for all pixels.
 
     Attributes:
         plane: (B, 2, rows, columns), see :func:`~lanebev.render.raster.base.rays.coarse_plane`.

@@ -1,1 +1,1 @@
-"""What there is to see: sampled roads, surroundings, traffic, light."""
+"""The content of scenes: sampled roads, surroundings, traffic, light."""

@@ -22,7 +22,7 @@ from lanebev.render.scene.surroundings import (
     Surroundings,
 )
 
-_BARE, _MIDDLE, _EDGES = range(3)  # what is painted
+_BARE, _MIDDLE, _EDGES = range(3)  # the lines that are painted
 
 
 def country_layout(

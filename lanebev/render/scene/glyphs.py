@@ -1,4 +1,4 @@
-"""Which arrows, words and signs can be painted in lanes."""
+"""The arrows, words and signs that can be painted in lanes."""
 
 AHEAD, AHEAD_SLIM, LEFT, RIGHT, AHEAD_LEFT, AHEAD_RIGHT, LEFT_RIGHT, MERGE_LEFT, MERGE_RIGHT = range(9)
 ARROWS = (AHEAD, AHEAD_SLIM, LEFT, RIGHT, AHEAD_LEFT, AHEAD_RIGHT, LEFT_RIGHT, MERGE_LEFT, MERGE_RIGHT)

@@ -1,4 +1,4 @@
-"""Which kinds of road a world shows: independent draws, so that kinds combine."""
+"""The kinds of road that a world shows, drawn independently, so that kinds combine."""
 
 from typing import Any, NamedTuple, TypeVar
 
@@ -13,7 +13,7 @@ _VARIED = 0.43  # share of the worlds of "any" that are not the plain highway
 
 
 class Kinds(NamedTuple):
-    """What a world has besides the plain road, (B,) bool each.
+    """The kinds of road that a world has besides the plain road, (B,) bool each.
 
     Attributes:
         city: a street with kerbs, pavements, parked cars and all that is painted in towns.

@@ -1,4 +1,4 @@
-"""Which boundaries a road has, where they lie and how they are painted."""
+"""The boundaries of a road, their places and their paint."""
 
 from typing import NamedTuple
 

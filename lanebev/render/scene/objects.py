@@ -1,4 +1,4 @@
-"""What stands on the road, in the local road frame: vehicles, poles, signs, bridges."""
+"""Objects on the road, in the local road frame: vehicles, poles, signs, bridges."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""What a camera does to the light: exposure, colours, blur, noise, compression, its own bonnet."""
+"""Properties of a camera: exposure, colours, blur, noise, compression, its own bonnet."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from lanebev.render.scene.weather import DUSK, NIGHT, Weather
 
 
 class Sensor(NamedTuple):
-    """What the camera does to the light, each (B,) unless said otherwise.
+    """Properties of the camera, each (B,) unless said otherwise.
 
     Attributes:
         exposure: linear level that the road's mean gets.

@@ -16,7 +16,7 @@ KERB, GREEN, PATH, WALK = range(4)  # strips from the kerb outwards
 
 
 class Street(NamedTuple):
-    """What a street has besides lane boundaries, (B,) unless said otherwise; strengths are in [0, 1].
+    """Parts of a street besides lane boundaries, (B,) unless said otherwise; strengths are in [0, 1].
 
     Attributes:
         kerbed: 1 where kerbs bound the carriageway; 0: the pavement's edge is ragged.

@@ -1,4 +1,4 @@
-"""What stands beside and above the road: verge, walls that follow it, hills, sky."""
+"""Everything beside and above the road: verge, walls that follow it, hills, sky."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from lanebev.render.scene.sampler import BatchSampler
 
 NUM_WALLS = 6  # left and right, from the outside inwards
 NOTHING, CONCRETE, RAIL, TREES, FENCE, SLOPE, HEDGE, HOUSES = range(8)
-STYLES = 3  # of trees: a dense row, single crowns, conifers
+STYLES = 3  # styles of trees: a dense row, single crowns, conifers
 
 GREENS = [
     (0.05, 0.10, 0.025),

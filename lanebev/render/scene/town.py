@@ -1,4 +1,4 @@
-"""How a city changes what stands beside and on the road: edges, houses, parked and oncoming vehicles."""
+"""The changes of a scene to one in a city: edges, houses, parked and oncoming vehicles."""
 
 import math
 

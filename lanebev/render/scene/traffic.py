@@ -1,4 +1,4 @@
-"""Which vehicles, signs, poles and bridges stand where along the road."""
+"""Vehicles, signs, poles and bridges along the road, and their places."""
 
 import math
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""What weather, camera and mount are where a world is more than the plain highway."""
+"""Weather, camera and mount of worlds that are more varied than the plain highway."""
 
 import torch
 from torch import Tensor

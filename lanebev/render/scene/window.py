@@ -10,7 +10,7 @@ from lanebev.render.scene.sampler import BatchSampler
 
 @dataclass(frozen=True)
 class WindowConfig:
-    """How windows of the camera's own, native image are drawn.
+    """The distribution of windows of the camera's native image.
 
     The native image has the proportions of the rendered one and as many pixels as the window needs.
 

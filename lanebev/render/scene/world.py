@@ -81,7 +81,7 @@ class World(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where the camera is.
+    """The place of the camera.
 
     Attributes:
         along: (B,) m, arc length in the world.

@@ -1,4 +1,4 @@
-"""What is painted: one radiance and one depth for every pixel of a batch."""
+"""The painted image: one radiance and one depth for every pixel of a batch."""
 
 from typing import NamedTuple
 

@@ -48,7 +48,7 @@ class KindRows(NamedTuple):
 
 
 class Features(NamedTuple):
-    """What scenes of the batch have: true where at least one has it, or the rows that do.
+    """Features of the scenes of a batch: true if at least one scene has it, or the rows that do.
 
     Attributes:
         sun: direct light that casts shadows.

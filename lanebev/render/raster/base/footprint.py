@@ -1,4 +1,4 @@
-"""Where pixels meet the ground, and what of it each covers."""
+"""The points of the ground that pixels show, and the area that each covers."""
 
 from typing import NamedTuple
 

@@ -50,7 +50,7 @@ def shadows(
 
 
 class _Shaders(NamedTuple):
-    """What bridges and trees over the road do to the light, of T blocks.
+    """The light below bridges and trees over the road, of T blocks.
 
     Attributes:
         bridge: (T, 2) m along, of a bridge's beginning and end.

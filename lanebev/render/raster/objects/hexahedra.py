@@ -16,7 +16,7 @@ _TINY = 1e-20  # keeps a ray along a plane from dividing by zero
 
 
 class Hexahedra(NamedTuple):
-    """Where the objects of B scenes are, as seen from the camera.
+    """The objects of B scenes, as seen from the camera.
 
     Attributes:
         box: (B, M, 4) int64, pixel bounds, see :func:`bounding_boxes`.

@@ -1,4 +1,4 @@
-"""How bright points on vehicles, signs, bridges and poles are."""
+"""The radiance of points on vehicles, signs, bridges and poles."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""What walls beside the road look like, by kind."""
+"""The appearance of walls beside the road, by kind."""
 
 import torch
 from torch import Tensor

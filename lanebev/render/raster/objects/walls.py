@@ -48,7 +48,7 @@ class WallHits(NamedTuple):
 
 
 class WallRows(NamedTuple):
-    """Of which wall T rows of points are.
+    """The walls to which T rows of points belong.
 
     Attributes:
         row: (T,) int64, the scene.
@@ -62,7 +62,7 @@ class WallRows(NamedTuple):
 
 
 class WallColours(NamedTuple):
-    """How points on walls look.
+    """The appearance of points on walls.
 
     Attributes:
         albedo: (T, 3, N) linear reflectance.

@@ -1,4 +1,4 @@
-"""How bright the ground is under pixels."""
+"""The radiance of the ground in pixels."""
 
 from typing import NamedTuple
 

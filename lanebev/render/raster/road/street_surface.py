@@ -1,4 +1,4 @@
-"""What lies in a street's surface: tram rails, coloured cycle lanes, manhole covers, cuts."""
+"""Objects in a street's surface: tram rails, coloured cycle lanes, manhole covers, cuts."""
 
 import torch
 from torch import Tensor

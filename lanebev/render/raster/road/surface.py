@@ -25,7 +25,7 @@ from lanebev.render.scene.pavement import Pavement
 
 
 class LanePlace(NamedTuple):
-    """Where points lie among a road's boundaries, each (B, N).
+    """The places of points among a road's boundaries, each (B, N).
 
     Attributes:
         lane: int64, number of boundaries to the left.

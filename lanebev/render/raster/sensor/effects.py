@@ -1,4 +1,4 @@
-"""What lies between the scene and the sensor: the own bonnet, rain in the air, drops on the glass."""
+"""Objects between the scene and the sensor: the own bonnet, rain in the air, drops on the glass."""
 
 from collections.abc import Sequence
 

@@ -73,7 +73,7 @@ def _toned(value: Tensor, contrast: Tensor, black: Tensor) -> Tensor:
 def _add_bloom(value: Tensor, gain: Tensor, strength: Tensor) -> None:
     """Spread light from what is brighter than white over its neighbourhood; changes ``value``."""
     height, width = value.shape[2:]
-    white = gain / gain.amax(1, keepdim=True)  # of each channel, where the first saturates
+    white = gain / gain.amax(1, keepdim=True)  # value of each channel at which the first one saturates
     rows = indices_where((strength > 0) & (value.amax((2, 3)) > white).any(1))
     if not len(rows):
         return

@@ -1,4 +1,4 @@
-"""What windscreen, lens and recorder add to an image, in batches."""
+"""The effects of windscreen, lens and recorder on an image, in batches."""
 
 import torch
 from torch import Tensor
