@@ -66,6 +66,26 @@ def inverse_spd(matrix: Tensor) -> Tensor:
     return size.unsqueeze(-1) * inverse * size.unsqueeze(-2)
 
 
+def reduced_information(matrix: Tensor, vector: Tensor, precision: Tensor) -> Tensor:
+    """Compute the information on the last parameters of a fit, whatever the first ones are.
+
+    Source: the Schur complement of the first parameters' information, to which their prior is added.
+
+    Args:
+        matrix: (B, P + K, P + K), information matrix.
+        vector: (B, P + K), information vector.
+        precision: (B, P) or (P,), of independent priors of the first P parameters.
+
+    Returns:
+        (B, K, K + 1), matrix and vector side by side.
+    """
+    first = precision.shape[-1]
+    both = torch.cat([matrix[..., first:], vector.unsqueeze(-1)], dim=-1)
+    factor = cholesky(matrix[:, :first, :first] + precision.diag_embed())
+    known = solve_lower(factor, both[:, :first])
+    return both[:, first:] - known[..., :-1].mT @ known
+
+
 def _scaled_factor(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """Return the scale (..., D) to a unit diagonal and the Cholesky factor of the scaled matrix."""
     size = matrix.diagonal(dim1=-2, dim2=-1).rsqrt()

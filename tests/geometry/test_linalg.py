@@ -58,3 +58,18 @@ def test_gradcheck():
     eye = torch.eye(3, dtype=DOUBLE)
     assert torch.autograd.gradcheck(lambda r, b: linalg.solve_spd(r @ r.mT + eye, b), (root, right))
     assert torch.autograd.gradcheck(lambda r: linalg.inverse_spd(r @ r.mT + eye), (root,))
+
+
+def test_reduced_information_is_that_of_the_other_parameters_by_least_squares():
+    """Its inverse is their covariance in the fit of all parameters, and its solution their estimate."""
+    generator = torch.Generator().manual_seed(5)
+    design = torch.randn(2, 40, 5, generator=generator, dtype=DOUBLE)
+    measured = torch.randn(2, 40, 1, generator=generator, dtype=DOUBLE)
+    matrix, vector = design.mT @ design, (design.mT @ measured).squeeze(-1)
+    precision = torch.tensor([0.0, 3.0, 1.0], dtype=DOUBLE)
+    with_prior = matrix + torch.nn.functional.pad(precision, (0, 2)).diag()
+    found = linalg.reduced_information(matrix, vector, precision)
+    own = torch.linalg.inv(with_prior)[:, 3:, 3:]
+    torch.testing.assert_close(torch.linalg.inv(found[..., :2]), own)
+    all_of_them = torch.linalg.solve(with_prior, vector)
+    torch.testing.assert_close(torch.linalg.solve(found[..., :2], found[..., 2]), all_of_them[:, 3:])

@@ -18,9 +18,10 @@ from lanebev.estimation.joint.evidence import (
     with_process_noise,
 )
 from lanebev.estimation.joint.lane_change import best_shift, renumber
-from lanebev.estimation.joint.layout import NUM_COMMON, POSE, layout
+from lanebev.estimation.joint.layout import NUM_COMMON, POSE, SHAPE, layout
 from lanebev.estimation.joint.measurement import (
     NUM_STRAIGHT,
+    ROLL,
     VERTICAL,
     Residuals,
     boundary_distances,
@@ -54,6 +55,7 @@ from lanebev.estimation.joint.update import (
     wide_precision,
 )
 from lanebev.estimation.reasons import Reason
+from lanebev.geometry.linalg import reduced_information
 from lanebev.tensors import constant
 
 _NO_BOUNDARY_DEVIATION = 0.36  # m; a line that deviates by more bounds no lane (3 ``open_deviation``)
@@ -144,6 +146,8 @@ def update_state(
     informed = with_headings(frame.matrix, frame.vector, frame.residuals, frame.weight, member)
     scatter = scatter_of_frame(*informed, cov, moments)
     gain = kalman_gain(last.prior_cov, last.step, frame, last.estimated)
+    of_two = 1 - last.estimated[:, ROLL, None]  # boundaries, which do not determine the roll
+    vertical = of_two * vertical_information(frame, cov, last.at[:, VERTICAL])
     by_headings = renumbered_columns(predicted.heading_sensitivity, shift)
     updated = predicted._replace(
         mean=torch.baddbmm(mean.unsqueeze(-1), gain, last.step.pull.unsqueeze(-1)).squeeze(-1),
@@ -152,6 +156,7 @@ def update_state(
         pose_sensitivity=scatter.sensitivity[..., :num],
         heading_sensitivity=updated_sensitivity(by_headings, gain, informed[0]),
         scatter=averaged_moments(scatter.moments, moments, dt, cfg.scatter_memory),
+        vertical=vertical + (-dt / cfg.scatter_memory).exp().unsqueeze(-1) * predicted.vertical,
         motion_scale=motion_scale,
         reasons=flag(shift != 0, Reason.LANE_CHANGE),
     )
@@ -208,3 +213,20 @@ def scatter_of_frame(matrix: Tensor, vector: Tensor, cov: Tensor, moments: Tenso
     of_vertical = cov[:, VERTICAL, VERTICAL, None].reciprocal()
     precision = torch.cat([wide_precision(cov), of_vertical], dim=-1)
     return boundary_scatter(matrix, vector, precision, moments)
+
+
+def vertical_information(frame: FrameInformation, cov: Tensor, at: Tensor) -> Tensor:
+    """Compute a frame's information (B, 2) on the vertical curvature, whatever its pose and offset are.
+
+    Source: (J28), of two boundaries.
+
+    Args:
+        frame: linearised where the vertical curvature is ``at``.
+        cov: (B, D, D), of the state before the frame, for the curvatures.
+        at: (B,) 1/m.
+    """
+    matrix, vector = frame.matrix[:, :NUM_COMMON, :NUM_COMMON], frame.vector[:, :NUM_COMMON]
+    of_shape = cov.diagonal(dim1=1, dim2=2)[:, SHAPE].reciprocal()
+    found = reduced_information(matrix, vector, torch.cat([wide_precision(matrix), of_shape], dim=-1))
+    known, pull = found.flatten(1).unbind(-1)
+    return torch.stack([known, pull + known * at], dim=-1)

@@ -11,7 +11,7 @@ from lanebev.estimation.joint.evidence import EQUAL
 from lanebev.estimation.joint.frame_prior import student_density
 from lanebev.estimation.joint.layout import POSE, layout
 from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL
-from lanebev.estimation.joint.scatter import scatter_variance, start_variance
+from lanebev.estimation.joint.scatter import scatter_variance, shown_freedom, start_variance
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.road import lane_width_covariance
@@ -27,7 +27,9 @@ _NO_BOUNDARY_RANGE = 3.6  # m; the position of such a line is uniform over it
 _ROLL_PATTERN = 6.0  # sum of squares of (1, -2, 1), the proportion in which three boundaries change roll
 _LEAST_SENSITIVITY = 0.015  # rad/m or m/m of roll or height, from which a boundary counts as in view
 _HEADING_LENGTH = 15.0  # m; a boundary keeps its own heading along it
-_HEADING_BY_CURVATURE = 25.0  # m, ratio of the standard deviations of headings and curvatures: waves of 160 m
+_HEADING_BY_CURVATURE = 37.0  # m, see (J28): 25 m in waves of 160 m, times 1.5 for one degree of freedom
+_VERTICAL_STD = 4e-4  # 1/m, prior of the vertical curvature that two boundaries show
+_NOISE_FACTOR = 1.5  # so many times the noise variance is subtracted from its square
 _LEAST_HEIGHT = 0.1  # m; smaller heights are not divided by
 _LARGEST_DEVIATION = 0.6  # m; a line that deviates by more is on no boundary
 
@@ -116,24 +118,51 @@ def beyond_filter(expected: Tensor, variances: Tensor) -> Tensor:
     return (expected - 0.5 * variances.sum(-1, keepdim=True)).clamp(min=0.0)
 
 
-def heading_variance(state: JointState, of_scatter: Tensor, width: Tensor, cfg: JointConfig) -> Tensor:
-    """Compute the variance (B,) rad² of a boundary's own heading.
+def vertical_moment(information: Tensor) -> Tensor:
+    """Compute the mean square (B,) 1/m² of the vertical curvature, at least 0, by the last frames alone.
 
-    Source: (J28), with that of a start and of two boundaries. Two lines fit parallel boundaries however they
-    converge, but not if each has a curvature of its own. The filter then finds a vertical curvature κ, since
-    it curves the image of a boundary at the lateral position X as a curvature of κ X / h does.
+    Source: (J28), of two boundaries: the square of the estimate less its noise.
+
+    Args:
+        information: (B, 2), matrix and vector.
+    """
+    known, pull = information.unbind(-1)
+    variance = 1 / (known + _VERTICAL_STD**-2)
+    return ((pull * variance).square() - _NOISE_FACTOR * variance).clamp(min=0.0)
+
+
+def wander_of_two(state: JointState, width: Tensor) -> Tensor:
+    """Compute the variance (B,) rad² of the headings of two boundaries that wander; 0 if more are in view.
+
+    Source: (J28). Two lines fit parallel boundaries however they converge, but not if each has a curvature of
+    its own. They then show a vertical curvature κ, since it curves the image of a boundary at the lateral
+    position X as a curvature of κ X / h does. It counts the less, the more degrees of freedom the frames
+    before have shown, with further boundaries.
 
     Args:
         state: (B, ...). Where a frame does not determine the roll, two boundaries are in view.
-        of_scatter: (B,) rad², by the scatter of the boundaries; noise if never more than two were in view.
         width: (B,) m, between the two.
+    """
+    vertical = state.hills.maximum(vertical_moment(state.vertical))
+    by_vertical = 0.5 * width / state.mean[:, HEIGHT].clamp(min=_LEAST_HEIGHT)
+    alone = (-2 * shown_freedom(state.scatter)).exp() * has_flag(state.reasons, Reason.ROLL_UNSEEN)
+    return alone * vertical * (_HEADING_BY_CURVATURE * by_vertical).square()
+
+
+def heading_variance(state: JointState, of_scatter: Tensor, width: Tensor, cfg: JointConfig) -> Tensor:
+    """Compute the variance (B,) rad² of a boundary's own heading.
+
+    Source: (J28), with that of a start and of two boundaries.
+
+    Args:
+        state: (B, ...).
+        of_scatter: (B,) rad², by the scatter of the boundaries; noise if never more than two were in view.
+        width: (B,) m, of the ego lane.
         cfg: the configuration.
     """
-    own_curvature = state.hills * (0.5 * width / state.mean[:, HEIGHT].clamp(min=_LEAST_HEIGHT)).square()
-    of_two = torch.where(has_flag(state.reasons, Reason.ROLL_UNSEEN), own_curvature, 0.0)
     more_than_two = (state.pose_sensitivity[:, ROLL] != 0).any(-1)  # in some frame
     of_more = of_scatter + start_variance(state.scatter, cfg.start_heading_std)
-    return of_two * _HEADING_BY_CURVATURE**2 + torch.where(more_than_two, of_more, 0.0)
+    return wander_of_two(state, width) + torch.where(more_than_two, of_more, 0.0)
 
 
 def covariance_by_boundaries(state: JointState, width: Tensor, cfg: JointConfig) -> Tensor:
@@ -195,8 +224,10 @@ def as_calibration(
     width = (positions[:, -1] - positions[:, 0]) / (cfg.num_boundaries - 1)
     by_roll = height_variance_by_roll(height, left, right, cov[:, ROLL, ROLL])
     by_roll = torch.where(has_flag(state.reasons, Reason.ROLL_UNSEEN), by_roll, 0.0)
+    of_width = 2 * _HEADING_LENGTH**2 * wander_of_two(state, right - left)  # m²
+    by_wander = of_width * (height / width).square()
     only_height = constant(_ONLY_HEIGHT, like=cov)
     cov = cov + covariance_by_boundaries(state, right - left, cfg) + apart.unsqueeze(-1) * apart.unsqueeze(-2)
     cov = cov + lane_width_covariance(height, cfg.lane_width_std / width)
-    cov = cov + (only_height * by_roll.unsqueeze(-1)).diag_embed()
+    cov = cov + (only_height * (by_roll + by_wander).unsqueeze(-1)).diag_embed()
     return Calibration(Extrinsics.unstack(state.mean[:, POSE]), cov, state.status, inliers)

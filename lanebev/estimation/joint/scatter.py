@@ -155,6 +155,11 @@ def renumbered_moments(moments: Tensor, shift: Tensor) -> Tensor:
     return torch.cat([own, moments[..., _SQUARES:]], dim=-1)
 
 
+def shown_freedom(moments: Tensor) -> Tensor:
+    """Return the degrees of freedom (B,) of deviations and headings that the last frames have shown."""
+    return moments[..., _FREEDOM].sum(-1)
+
+
 def start_variance(moments: Tensor, heading_std: float) -> Tensor:
     """Compute the variance (B,) rad² of a boundary's own heading that is left from the start.
 
@@ -166,7 +171,7 @@ def start_variance(moments: Tensor, heading_std: float) -> Tensor:
         moments: (B, 2, L + 4), averaged.
         heading_std: rad, at a start whose frame has no degrees of freedom.
     """
-    freedom, weight = moments[..., _FREEDOM].sum(-1), moments[:, 0, _WEIGHT]
+    freedom, weight = shown_freedom(moments), moments[:, 0, _WEIGHT]
     of_frame = freedom / weight.clamp(min=_LEAST_WEIGHT)
     by_time = (1 - weight).clamp(min=_LEAST_WEIGHT).sqrt()  # falls by e in two time constants
     left = by_time * (-_BY_FREEDOM * of_frame).exp()

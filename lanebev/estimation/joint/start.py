@@ -62,6 +62,7 @@ def new_state(mean: Tensor, cov: Tensor, status: Status, reasons: Tensor) -> Joi
         scatter=zero(2, num + 4),
         motion_scale=mean.new_ones(batch, NUM_POSE),
         hills=zero(),
+        vertical=zero(2),
         early=zero(),
         unseen=zero(),
         misfit=zero(),

@@ -28,6 +28,8 @@ class JointState(NamedTuple):
         motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, adapted to the drive.
         hills: (B,) 1/m², variance of the road's vertical curvature beyond that of a plane road, by the crests
             and dips so far (J21).
+        vertical: (B, 2) information on the road's vertical curvature, matrix (m²) and vector (m), of the last
+            frames that do not determine the roll, each by itself (J28).
         early: (B,) s by which the state is ahead of the last frame, which came out of order.
         unseen: (B,) s since the last usable frame.
         misfit: (B,) s for which there were segments that did not fit.
@@ -47,6 +49,7 @@ class JointState(NamedTuple):
     scatter: Tensor
     motion_scale: Tensor
     hills: Tensor
+    vertical: Tensor
     early: Tensor
     unseen: Tensor
     misfit: Tensor

@@ -16,7 +16,7 @@ import math
 import torch
 from torch import Tensor
 
-from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
+from lanebev.geometry.linalg import cholesky, inverse_spd, reduced_information, solve_lower
 from lanebev.tensors import constant
 
 NUM_SHAPE = 2
@@ -133,10 +133,9 @@ def shape_information(matrix: Tensor, vector: Tensor) -> Tensor:
     Returns:
         (B, 2, 3), matrix and vector side by side.
     """
-    both = torch.cat([matrix[..., 2 : 2 + NUM_SHAPE], vector.unsqueeze(-1)], dim=-1)
-    eye = torch.eye(2, dtype=matrix.dtype, device=matrix.device)  # rad, sigmas of pitch and yaw
-    known = solve_lower(cholesky(matrix[:, :2, :2] + eye), both[:, :2])
-    return both[:, 2 : 2 + NUM_SHAPE] - known[..., :NUM_SHAPE].mT @ known
+    precision = matrix.new_ones(2)  # sigmas of pitch and yaw of a radian
+    shared = 2 + NUM_SHAPE
+    return reduced_information(matrix[:, :shared, :shared], vector[:, :shared], precision)
 
 
 def shape_moment(information: Tensor) -> Tensor:
