@@ -34,8 +34,7 @@ docs: $(VENV)/ready  ## build the documentation strictly, into site
 coverage: $(VENV)/ready  ## run all tests and report the lines they run, into out/coverage
 	$(TEST) --cov=lanebev --cov-report=term:skip-covered --cov-report=html:out/coverage
 
-bench: $(VENV)/ready  ## measure speed and accuracy of the calibrators quickly, into out/bench
-	$(BIN)/python -m tools.bench_filter --out out/bench/filter.json
+bench: $(VENV)/ready  ## measure the accuracy of the calibrators quickly, into out/bench
 	$(BIN)/python -m tools.bench_calibration --quick --calibrators joint two-stage --out out/bench
 
 build: $(VENV)/ready  ## build wheel and source distribution, into dist

@@ -2,7 +2,7 @@
 
     python -m tools.bench_calibration --out out/bench
 
-Prints and writes (bench.json, bench.md) the RMSE of every parameter, its ratio to the per-frame Cramér-Rao
+Prints and writes (bench.json) the RMSE of every parameter, its ratio to the per-frame Cramér-Rao
 bound, NEES per degree of freedom, the time in each status and the time to recover. ``--stream N`` runs N
 frames of an endless drive and watches memory, covariance, drift, and float32 against float64. ``--kinds N``
 draws N drives of each kind of ``tools/random_drives.py``, motions and shocks at random, and runs the joint
@@ -92,27 +92,6 @@ def _seconds(value: float | None) -> str:
     return "not" if value is None else f"{value:.2f} s"
 
 
-def markdown(results: dict[str, Any]) -> str:
-    """Return the table of docs/benchmarks/synthetic.md."""
-    lines = [
-        "| drive | calibrator | pitch ° | yaw ° | roll ° | height cm | × bound | NEES/dof | tracking "
-        "| hard frames: pitch, yaw, roll °, height cm | recovery |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for scenario, by_name in results.items():
-        for name, figures in by_name.items():
-            rmse = " | ".join(f"{value:.3f}" for value in figures["rmse"])
-            ratio = " ".join(f"{value:.2f}" for value in figures["ratio_to_bound"])
-            hard = " ".join(f"{value:.3f}" for value in figures["hard"]["rmse"]) if "hard" in figures else ""
-            back = _seconds(figures["recovery_s"]) if "recovery_s" in figures else ""
-            tracking = f"{100 * figures['time_in_status']['TRACKING']:.0f} %"
-            lines.append(
-                f"| {scenario} | {name} | {rmse} | {ratio} | {figures['nees_per_dof']:.2f} | {tracking} "
-                f"| {hard} | {back} |"
-            )
-    return "\n".join(lines) + "\n"
-
-
 def stream(frames: int, rows: int, per_boundary: int = 8, seed: int = 0) -> dict[str, Any]:
     """Yield an endless straight drive, its observations drawn from one period of the motion and re-noised.
 
@@ -170,19 +149,6 @@ def smallest_eigenvalue(cov: Tensor) -> float:
     return float(torch.linalg.eigvalsh(size.unsqueeze(-1) * cov.double() * size.unsqueeze(-2)).min())
 
 
-def speed(calibrator: Any, frames: int = 60) -> dict[str, float]:
-    """Return milliseconds a frame of one row, 180 segments, float64 and one thread; median and quartiles."""
-    drive = list(observe(moments(frames / FPS), 1, 1.0, 30, 0, torch.float64))
-    state, took = calibrator.initial_state(1, dtype=torch.float64), []
-    with torch.inference_mode():
-        for _, segments in drive:
-            began = time.perf_counter()
-            _, state = calibrator(segments, CAMERA[None], state, 1 / FPS, WIDTH)
-            took.append(1e3 * (time.perf_counter() - began))
-    low, middle, high = torch.tensor(took[5:]).quantile(torch.tensor([0.25, 0.5, 0.75])).tolist()
-    return {"median_ms": middle, "quartile_ms": low, "upper_quartile_ms": high}
-
-
 @one_line_errors()
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser = command_parser(__doc__)
@@ -220,12 +186,8 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     scenarios = args.scenarios[:2] if args.quick else args.scenarios
     with torch.inference_mode():
         results = run_scenarios(names, scenarios, report["rows"], 1.5 if args.quick else None, args.sigma)
-    report["speed"] = {name: speed(CALIBRATORS[name](), 20 if args.quick else 60) for name in names}
     report["scenarios"] = results
-    for name, took in report["speed"].items():
-        print(f"{name}: {took['median_ms']:.1f} ms a frame of one row, 180 segments")
     (args.out / "bench.json").write_text(json.dumps(report, indent=1))
-    (args.out / "bench.md").write_text(markdown(results))
     return report
 
 

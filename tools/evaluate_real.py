@@ -1,7 +1,7 @@
 """Evaluate real and third-party images, with all results beside their targets.
 
-    python tools/evaluate_real.py [--data ../shared/data] [--json FILE] [--sheet FILE.png]
-        [--weights FILE] [--width PX] [--only PART] [--hilly] [--far-view]
+    python tools/evaluate_real.py [--data ../shared/data] [--json FILE] [--weights FILE]
+        [--width PX] [--only PART] [--hilly] [--far-view]
 
 Nothing of these images has been trained on.
 """
@@ -13,27 +13,18 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jsonargparse.typing import PositiveInt
-from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
 import lanebev
-from lanebev import BEVGrid, Extrinsics, LaneSegments
 from lanebev.app.drive.build import make_calibrator
-from lanebev.app.recording.views import bird_view
-from lanebev.estimation.still import calibrate_still
-from lanebev.io.opening import open_source
-from lanebev.report.overlay import Panel, draw_panels, joined
 from tools.real_figures import (
     Figure,
     carla_drive,
     carla_stills,
-    tusimple_camera,
     tusimple_labels,
     tusimple_pixels,
-    tusimple_segments,
     udacity,
 )
 from train.commands import evaluation_parser, one_line_errors, versions
@@ -43,14 +34,12 @@ NEEDED = {
     "carla": "truth.csv",
     "udacity": "camera.yaml",
 }
-SHEET = tuple(range(0, 88, 8))  # and the last: a dozen
 
 
 @one_line_errors()
 def main() -> None:
     parser = evaluation_parser(__doc__, far_view=True)
     parser.add_argument("--json", type=Path, help="file for the results as JSON")
-    parser.add_argument("--sheet", type=Path, help="write a PNG of a dozen TuSimple images, before and after")
     parser.add_argument("--width", type=PositiveInt, help="px of the network's input, instead of its own")
     parser.add_argument("--only", help="run only parts whose name contains this")
     parser.add_argument("--hilly", action="store_true", help="the joint calibrator with HILLY_ROADS")
@@ -66,8 +55,6 @@ def main() -> None:
     start = time.monotonic()
     figures = [figure for part in parts(options, model, calibrators) for figure in part]
     print_table(figures)
-    if options.sheet:
-        write_sheet(options.sheet, options.data, calibrators["joint"])
     if options.json:
         options.json.write_text(json.dumps(as_json(figures, options, time.monotonic() - start), indent=1))
 
@@ -100,28 +87,6 @@ def print_table(figures: list[Figure]) -> None:
     print(
         f"{sum(judged)} of {len(judged)} targets met; TuSimple's camera is not published: f = 1000 px assumed"
     )
-
-
-def write_sheet(path: Path, data: Path, calibrator: Any) -> None:
-    """Write input, view before and view after of a dozen labelled images, two in a row."""
-    images, segments = tusimple_segments(data)
-    camera, grid = tusimple_camera(), BEVGrid()
-    level = Extrinsics.from_values(0.0, 0.0, 0.0, 1.5)
-    pictures = []
-    for i in (*SHEET, 87):
-        one = LaneSegments(*(part[i : i + 1] for part in segments))
-        calibration = calibrate_still(calibrator, one, camera.intrinsics[None], 3.7)
-        frame = next(iter(open_source(images[i])))
-        assert frame.image is not None
-        views = tuple(
-            Panel(title, bird_view(grid, frame.image, camera, extrinsics), extrinsics)
-            for title, extrinsics in (("before", level), ("after", calibration.extrinsics))
-        )
-        name = "/".join(Path(images[i]).parts[-3:])
-        picture = joined(draw_panels(frame.image, camera, one, calibration, name, views, grid))
-        pictures.append(np.asarray(Image.fromarray(picture).resize((919, 360), Image.Resampling.LANCZOS)))
-    rows = [np.concatenate(pictures[k : k + 2], axis=1) for k in range(0, len(pictures), 2)]
-    Image.fromarray(np.concatenate(rows, axis=0)).save(path)
 
 
 def as_json(figures: list[Figure], options: Any, seconds: float) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """Figures on single images of streets, by day and by night, from pixels.
 
-    python -m tools.evaluate_streets [--data ../shared/data] [--weights FILE] [--json FILE] [--sheets FOLDER]
-        [--far-view]
+    python -m tools.evaluate_streets [--data ../shared/data] [--weights FILE] [--json FILE] [--far-view]
     python -m tools.evaluate_streets --rendered 24 [--width 576] [--far-view]
 
 ``kitti_road``: the road plane of the lidar is the truth of pitch and roll (0.1 to 0.2 degrees), yaw has none.
@@ -17,11 +16,8 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
-import numpy as np
 import torch
 from jsonargparse.typing import PositiveInt
-from numpy.typing import NDArray
 from torch import Tensor
 
 import lanebev
@@ -38,7 +34,6 @@ from train.commands import evaluation_parser, one_line_errors
 KITTI_LANE_WIDTH = 3.5  # m
 ASSUMED_FOV = 60.0  # deg, of a camera that is not published
 RENDERED_SEED, RENDERED_ROWS, RENDERED_SIZE = 621, 8, (375, 1242)  # views at once; px, as KITTI's images
-SHEET_COLUMNS, SHEET_WIDTH = 2, 900  # px of an image
 STANDING_FRAMES = 30  # of a drive in which the car stands
 MOUNT_STD = 0.001  # rad, of the median pose where it is given as a prior
 
@@ -50,20 +45,20 @@ def kitti_truth(path: Path) -> Tensor:
     return plane_angles(matrix.reshape(3, 4)[1, :3])
 
 
-def kitti_road(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
+def kitti_road(model: LaneBEV, data: Path) -> dict[str, float]:
     """Evaluate German city streets against the lidar's road plane."""
-    return _kitti_road(model, data, sheets, None)
+    return _kitti_road(model, data, None)
 
 
-def kitti_road_with_prior(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
+def kitti_road_with_prior(model: LaneBEV, data: Path) -> dict[str, float]:
     """Evaluate the same with the median of the true pitch and roll as the pose that ``--mount`` gives."""
     calibs = sorted((data / "kitti_road" / "calib").glob("*.txt"))
     pitch, roll = torch.stack([kitti_truth(path) for path in calibs]).median(0).values.tolist()
     pose, std = (pitch, 0.0, roll, 0.0), (MOUNT_STD, torch.inf, MOUNT_STD, torch.inf)
-    return _kitti_road(model, data, None, prior_of_mount(pose, std))
+    return _kitti_road(model, data, prior_of_mount(pose, std))
 
 
-def kitti_road_standing(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
+def kitti_road_standing(model: LaneBEV, data: Path) -> dict[str, float]:
     """Evaluate the last frame of drives in which the car stands, so that every frame is the same."""
     answers, truth = [], []
     for path, calib, camera in _kitti_images(data):
@@ -88,49 +83,38 @@ def _kitti_images(data: Path) -> Iterator[tuple[Path, Path, Camera]]:
         yield path, calib, Camera.from_file(calib, image_size=(height, width))
 
 
-def _kitti_road(
-    model: LaneBEV, data: Path, sheets: Path | None, prior: FramePrior | None
-) -> dict[str, float]:
-    answers, truth, pictures = [], [], []
+def _kitti_road(model: LaneBEV, data: Path, prior: FramePrior | None) -> dict[str, float]:
+    answers, truth = [], []
     for path, calib, camera in _kitti_images(data):
-        answer, picture = calibrate(model, path, camera, KITTI_LANE_WIDTH, prior)
-        answers.append(answer)
+        answers.append(calibrate(model, path, camera, KITTI_LANE_WIDTH, prior))
         truth.append(kitti_truth(calib))
-        pictures.append(picture)
-    save_sheet(sheets, "kitti_road", pictures)
     return summarise(answers, torch.stack(truth))
 
 
-def culane(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
+def culane(model: LaneBEV, data: Path) -> dict[str, float]:
     """Evaluate night frames: how many are calibrated."""
     paths = sorted((data / "culane").rglob("*.jpg"))
     height, width = read_image(paths[0]).shape[:2]
     camera = Camera.from_fov(ASSUMED_FOV, width, height)
-    seen = [calibrate(model, path, camera, 3.7) for path in paths]
-    save_sheet(sheets, "culane", [picture for _, picture in seen])
-    return {"images": len(seen), "tracking": sum(answer.tracking for answer, _ in seen)}
+    tracking = sum(calibrate(model, path, camera, 3.7).tracking for path in paths)
+    return {"images": len(paths), "tracking": tracking}
 
 
-def streets(model: LaneBEV, data: Path, sheets: Path | None) -> dict[str, float]:
-    """Evaluate two images with a known pose, in sigmas, and six to look at."""
+def streets(model: LaneBEV, data: Path) -> dict[str, float]:
+    """Evaluate two images with a known pose, in sigmas."""
     lines = (data / "streets" / "truth.csv").read_text().splitlines()
     rows = {row["image"]: row for row in csv.DictReader(line for line in lines if not line.startswith("#"))}
     figures: dict[str, float] = {}
-    pictures = []
-    for path in sorted(p for p in (data / "streets").iterdir() if p.suffix in (".jpg", ".png")):
+    for path in sorted(p for p in (data / "streets").iterdir() if p.name in rows):
         file = path.with_suffix(".yaml")
         height, width = read_image(path).shape[:2]
         camera = Camera.from_file(file) if file.exists() else Camera.from_fov(ASSUMED_FOV, width, height)
-        answer, picture = calibrate(model, path, camera, KITTI_LANE_WIDTH)
-        pictures.append(picture)
-        if path.name in rows:
-            row = rows[path.name]
-            truth = torch.tensor([float(row["pitch_deg"]), float(row["roll_deg"])]).double()
-            pitch, roll = ((answer.plane - truth).abs() / answer.sigma).tolist()
-            tall = abs(answer.height - float(row["height_m"])) / answer.height_sigma
-            for axis, value in (("pitch", pitch), ("roll", roll), ("height", tall)):
-                figures[f"{path.stem}_{axis}_error_in_sigma"] = value
-    save_sheet(sheets, "streets", pictures)
+        answer, row = calibrate(model, path, camera, KITTI_LANE_WIDTH), rows[path.name]
+        truth = torch.tensor([float(row["pitch_deg"]), float(row["roll_deg"])]).double()
+        pitch, roll = ((answer.plane - truth).abs() / answer.sigma).tolist()
+        tall = abs(answer.height - float(row["height_m"])) / answer.height_sigma
+        for axis, value in (("pitch", pitch), ("roll", roll), ("height", tall)):
+            figures[f"{path.stem}_{axis}_error_in_sigma"] = value
     return figures
 
 
@@ -147,24 +131,9 @@ def rendered(model: LaneBEV, views: int) -> dict[str, float]:
                 lens = (frame.intrinsics[row].double(), frame.distortion[row].double())
                 camera = Camera(*lens, "pinhole", RENDERED_SIZE)
                 width = float(frame.lane_width[row].mean())
-                calibration = calibrate_frame(model, image[None], camera, width)[1]
+                calibration = calibrate_frame(model, image[None], camera, width)
                 answers.append(as_answer(f"{start + row}", calibration))
     return summarise(answers, torch.cat(truth))
-
-
-def save_sheet(folder: Path | None, name: str, pictures: list[NDArray[np.uint8]]) -> None:
-    """Write a contact sheet as a JPEG, if a folder is given."""
-    if folder is None or not pictures:
-        return
-    folder.mkdir(parents=True, exist_ok=True)
-    small = [cv2.resize(p, (SHEET_WIDTH, round(SHEET_WIDTH * p.shape[0] / p.shape[1]))) for p in pictures]
-    tall = max(p.shape[0] for p in small)
-    padded = [cv2.copyMakeBorder(p, 0, tall - p.shape[0], 0, 0, cv2.BORDER_CONSTANT) for p in small]
-    padded += [np.zeros_like(padded[0])] * (-len(padded) % SHEET_COLUMNS)
-    rows = [np.hstack(padded[i : i + SHEET_COLUMNS]) for i in range(0, len(padded), SHEET_COLUMNS)]
-    for page, start in enumerate(range(0, len(rows), 8)):
-        sheet = cv2.cvtColor(np.vstack(rows[start : start + 8]), cv2.COLOR_RGB2BGR)
-        cv2.imwrite(str(folder / f"{name}-{page}.jpg"), sheet)
 
 
 @one_line_errors()
@@ -172,7 +141,6 @@ def main() -> None:
     """Run the evaluation from the command line."""
     parser = evaluation_parser(__doc__, far_view=True)
     parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--sheets", type=Path, help="write contact sheets with the segments into this folder")
     parser.add_argument(
         "--width", type=PositiveInt, help="px of the network's input, for images of any proportions"
     )
@@ -189,7 +157,7 @@ def main() -> None:
         if not (options.data / name).is_dir():
             raise ValueError(f"{options.data}: expected the folder {name}, got none; give --data")
     figures = {
-        part.__name__: part(model, options.data, options.sheets)
+        part.__name__: part(model, options.data)
         for part in (kitti_road, kitti_road_with_prior, kitti_road_standing, culane, streets)
     }
     report(figures, options.json)

@@ -3,19 +3,16 @@
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import scipy.stats
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from lanebev import BEVGrid, Calibration, Camera, JointCalibrator, LaneBEV, LaneSegments, Status
+from lanebev import Calibration, Camera, JointCalibrator, LaneBEV, Status
 from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.tracker import Tracker
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.io.images.pixels import read_image
 from lanebev.observation.frames import check_frame, network_image
-from lanebev.report.overlay import draw_panels
 
 SIGMAS = 3.0
 
@@ -43,19 +40,16 @@ def plane_angles(normal: Tensor) -> Tensor:
 
 def calibrate(
     model: LaneBEV, path: Path, camera: Camera, lane_width: float, prior: FramePrior | None = None
-) -> tuple[Answer, NDArray[np.uint8]]:
-    """Calibrate one image, as ``lanebev run --stills`` does; also return it with what was seen drawn."""
-    image = read_image(path)
+) -> Answer:
+    """Calibrate one image, as ``lanebev run --stills`` does."""
     with torch.inference_mode():
-        frame = network_image(check_frame(image, camera.image_size), torch.device("cpu"))
-        segments, calibration = calibrate_frame(model, frame, camera, lane_width, prior)
-        picture = draw_panels(image, camera, segments, calibration, path.name, (), BEVGrid())[0]
-    return as_answer(path.name, calibration), picture
+        frame = network_image(check_frame(read_image(path), camera.image_size), torch.device("cpu"))
+        return as_answer(path.name, calibrate_frame(model, frame, camera, lane_width, prior))
 
 
 def calibrate_frame(
     model: LaneBEV, frame: Tensor, camera: Camera, lane_width: float, prior: FramePrior | None = None
-) -> tuple[LaneSegments, Calibration]:
+) -> Calibration:
     """Calibrate one frame (1, 3, H, W) in [0, 1], as taken."""
     tracker = Tracker(JointCalibrator(prior=prior or FramePrior()), camera, lane_width)
     if model.far_view is None:
@@ -63,8 +57,7 @@ def calibrate_frame(
     else:
         _, whole = model.whole_vertices(frame)
         vertices = model.add_far_view(frame, whole, tracker.vanishing_point_of_still(whole))
-    estimate = tracker.still(vertices, model.pose_sigma_scale)
-    return estimate.segments, estimate.calibration
+    return tracker.still(vertices, model.pose_sigma_scale).calibration
 
 
 def as_answer(name: str, calibration: Calibration) -> Answer:

@@ -18,7 +18,7 @@ from tools.bench_mixed import draw, follow, row
 
 
 @pytest.mark.slow
-def test_quick_bench_writes_json_and_a_table(tmp_path):
+def test_quick_bench_writes_json(tmp_path):
     report = main(["--quick", "--calibrators", "joint", "two-stage", "--out", str(tmp_path)])
     written = json.loads((tmp_path / "bench.json").read_text())
     assert written["scenarios"].keys() == report["scenarios"].keys() == {"straight", "straight 5-40 m"}
@@ -26,10 +26,6 @@ def test_quick_bench_writes_json_and_a_table(tmp_path):
         assert set(figures) == {"joint", "two-stage"}
         assert all(0 < value < 1 for value in figures["joint"]["rmse"])
         assert figures["joint"]["time_in_status"]["TRACKING"] == 1.0
-    lines = (tmp_path / "bench.md").read_text().splitlines()
-    assert len(lines) == 2 + 4
-    assert len({line.count("|") for line in lines}) == 1
-    assert written["speed"]["joint"]["median_ms"] > 0
 
 
 @pytest.mark.slow

@@ -45,7 +45,6 @@ def test_the_commands_are_all_of_them():
             "odd.ckpt: expected a network of this",
         ),
         ("train.average TMP/out TMP/misfit.ckpt", "misfit.ckpt: expected a network of this version"),
-        ("tools.bench_filter --out TMP/file/out", "File exists"),
         ("tools.bench_calibration --quick --out TMP/file/out", "Not a directory"),
         ("tools.evaluate_real --data TMP", "give the folder with --data"),
         ("tools.label_noise --data TMP", "give the folder with --data"),

@@ -1,5 +1,5 @@
 """From radiance to an image.
 
 ``sensor`` combines ``effects`` before the ``glass``, ``exposure``, ``filters`` and ``jpeg``, with
-``randomness`` for the noise; ``stamp`` is a text in the image.
+``randomness`` for the noise.
 """
