@@ -1,7 +1,5 @@
 """Open a video, a folder, a glob or one image as a source of frames."""
 
-from __future__ import annotations
-
 import contextlib
 import glob
 import math

@@ -6,8 +6,6 @@ Bayesian model averaging (Hoeting et al. 1999) with Occam's window (Madigan and 
 evidence, since no model is exactly right (Grünwald and van Ommen 2017).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

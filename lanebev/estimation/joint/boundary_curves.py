@@ -1,7 +1,5 @@
 """The boundaries of a frame as curves, each with its own offset and heading, given the pose."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

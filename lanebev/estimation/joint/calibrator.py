@@ -1,7 +1,5 @@
 """One filter over the whole pose, with every end point as a measurement."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import torch

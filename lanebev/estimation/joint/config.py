@@ -1,7 +1,5 @@
 """Configuration of the joint calibrator."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from lanebev.estimation.joint.dynamics import MotionConfig

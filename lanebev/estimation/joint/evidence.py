@@ -1,7 +1,5 @@
 """Evidence against the motion model: normalised scores, and the process noise that follows from them."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """The prior of a frame's parameters: that of any camera, or that of a mount that is known."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace

@@ -1,7 +1,5 @@
 """Lane changes: all boundary indices change by one when the camera crosses a line."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import pad

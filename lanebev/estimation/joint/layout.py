@@ -1,7 +1,5 @@
 """Indices of the state vector of the joint filter."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ It is white noise through a fourth-order Butterworth low-pass. A vehicle's body 
 frame to frame and back to the mount's pose within a second.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from typing import NamedTuple

@@ -16,8 +16,6 @@ pixels is that of the end point to this tangent, n·d / |∂(n·d)/∂(x, y)|: e
 second order in the distance for curved ones.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

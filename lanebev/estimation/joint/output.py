@@ -1,7 +1,5 @@
 """The calibration that is given out: the pose, and its covariance with what the filter does not estimate."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

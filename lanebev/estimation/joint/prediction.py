@@ -1,7 +1,5 @@
 """Prediction of the joint filter's state from one frame to the next."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Robust fits of an image's readings, each with its own deviations and headings of the boundaries."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -4,8 +4,6 @@ One image seldom decides between them. :mod:`lanebev.estimation.joint.averaging`
 averages the fits by their evidence, so that the covariance contains the differences between them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple

@@ -4,8 +4,6 @@ After a shock the filter may explain a wrong pose by unequal lanes or a bend. Th
 every jump, each frame is also fitted alone, without the filter's state.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ estimated too: the curvature seen far ahead becomes the curvature near by. Proce
 farthest step, as it comes into view. The road frame turns with the road.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

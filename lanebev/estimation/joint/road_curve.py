@@ -1,7 +1,5 @@
 """The middle line of the road: bend, heading and curvature at a distance, as a clothoid or as a spline."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

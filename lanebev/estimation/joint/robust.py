@@ -4,8 +4,6 @@ Iterated reweighting maximises the mixture's likelihood. A segment within three 
 weight near one, so clean data loses almost nothing; the weight of a gross outlier goes to zero.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -7,8 +7,6 @@ consecutive frames, so they do not average out as noise does. Their variances ar
 of the last frames' fits: of each, and in their mean, in which noise is small and what lasts remains.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

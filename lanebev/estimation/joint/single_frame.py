@@ -6,8 +6,6 @@ every roll is the start of robust Gauss-Newton steps on perpendicular pixel dist
 scale.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

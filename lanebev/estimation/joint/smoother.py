@@ -3,8 +3,6 @@
 The predictions of the filter are repeated from its states, so the states of a drive are all that is needed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 

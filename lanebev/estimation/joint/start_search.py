@@ -1,7 +1,5 @@
 """The search of a start for the fit of a frame: robust linear fits on a grid of pitch and roll."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Status and reasons of a frame."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Scaling of the standard deviations of a single image's information."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from lanebev.estimation.joint.frame_prior import FramePrior

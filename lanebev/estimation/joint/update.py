@@ -1,7 +1,5 @@
 """Measurement update of the joint filter: linearise, weigh, update."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Remarks on a whole video: its streams, the layout of its frames, its times, and a video appended to it."""
 
-from __future__ import annotations
-
 import struct
 import sys
 from collections.abc import Iterator, Sequence
