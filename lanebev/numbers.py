@@ -19,10 +19,22 @@ _BYTE_ORDER_MARKS = {
 }
 _BEGINNING = 65_536  # bytes of a file that tell whether it is a text
 _GZIP = b"\x1f\x8b"
+_GIT_LFS = b"version https://git-lfs.github.com/"
 _MOST_FOREIGN = 0.3  # fraction of a text's letters, if its encoding is not known
 _REPR = reprlib.Repr()
 _REPR.maxlist = _REPR.maxdict = _REPR.maxtuple = 4
 _REPR.maxlevel, _REPR.maxstring = 3, 200
+
+
+def stand_in(begin: bytes) -> str:
+    """Return what came in place of another file, by its first bytes; empty if that is not known."""
+    if not begin:
+        return "an empty file"
+    if begin.startswith(_GIT_LFS):
+        return "a pointer of Git LFS; fetch the file by git lfs pull"
+    if begin.lstrip()[:14].lower().startswith((b"<!doctype html", b"<html")):
+        return "a web page; download the file again"
+    return ""
 
 
 def read_text(path: Path, errors: str = "strict") -> str:
@@ -39,6 +51,8 @@ def read_text(path: Path, errors: str = "strict") -> str:
         data = _bytes_of_pipe(path) if path.is_fifo() else _bytes_of_file(path)
         if data.startswith(_GZIP):
             raise ValueError("compressed by gzip; unpack it")
+        if data and (instead := stand_in(data)):
+            raise ValueError(instead)
         mark = next((each for each in _BYTE_ORDER_MARKS if data.startswith(each)), b"")
         text = data.decode(_BYTE_ORDER_MARKS.get(mark, "utf-8"), errors)
         if errors == "replace" and text.count("\ufffd") > _MOST_FOREIGN * len(text):

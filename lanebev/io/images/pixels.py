@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
+from lanebev.numbers import stand_in
+
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".jfif", ".jp2")
 
 _LYING = (5, 6, 7, 8)  # EXIF orientations whose images are shown with their sides exchanged
@@ -47,7 +49,8 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
                 return pixels
     except _UNREADABLE as error:
         if isinstance(error, UnidentifiedImageError):
-            reason = "no image or one whose header is cut"
+            with open(path, "rb") as file:
+                reason = stand_in(file.read(100)) or "no image or one whose header is cut"
         else:
             reason = " ".join((getattr(error, "strerror", None) or str(error)).split()).lower()[:100]
             reason = reason or type(error).__name__

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import contextlib
 import math
 import os
 import re
@@ -14,6 +15,8 @@ from typing import NamedTuple
 import av
 import numpy as np
 from numpy.typing import NDArray
+
+from lanebev.numbers import stand_in
 
 _DRAWN_TEXTS = ("tty", "bin", "xbin", "adf", "idf")  # formats of which ffmpeg draws the letters
 _MOVING = 0.5  # a stream that lasts for less of the longest one's duration is a picture
@@ -43,6 +46,8 @@ def open_video(source: str) -> av.container.InputContainer:
         container = av.open(os.path.abspath(source), metadata_errors="replace")
     except (av.error.FFmpegError, OSError) as error:
         reason = error.strerror or "unknown format"
+        with contextlib.suppress(OSError), open(source, "rb") as file:
+            reason = stand_in(file.read(100)) or reason
         words = f"video {source}: expected a video that opens, got: {reason}; is it a video, and whole?"
         raise ValueError(words) from error
     if container.format.name in _DRAWN_TEXTS:

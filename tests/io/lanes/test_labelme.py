@@ -118,7 +118,10 @@ def test_polylines_of_cvat(tmp_path):
         (_cvat('<polyline points="1,2;3"/>'), r"image 'a/7.jpg'\[0\].points: expected 2 numbers, got 1"),
         (_cvat('<polyline points=""/>'), r"points: expected 2 numbers, got 1"),
         ("<annotations><image><polyline/></image></annotations>", "image: expected its name, got none"),
-        ("<!DOCTYPE html><html></html>", "line 1: expected JSON, got '<!DOCTYPE"),
+        (
+            "<!DOCTYPE html><html></html>",
+            "expected a readable file, got: a web page; download the file again",
+        ),
     ],
 )
 def test_bad_files_of_cvat_are_one_clear_line(tmp_path, content, message):

@@ -12,8 +12,10 @@ import pytest
 import torch
 from PIL import Image
 
+from lanebev import Camera
 from lanebev.io.images.names import natural_order
 from lanebev.io.images.pixels import read_image, write_png
+from lanebev.io.lanes import read_lanes
 from lanebev.io.opening import open_source
 from lanebev.io.video.writer import VideoWriter
 
@@ -309,14 +311,25 @@ def test_uneven_frame_times_are_no_damage(tmp_path):
     assert source.problem == ""
 
 
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
         ("none.mp4", None, "expected a video, an image, a folder or a glob of images, got nothing there"),
         ("v.mp4", b"not a video", "expected a video that opens, got: Invalid data"),
-        ("v.mp4", b"", "expected a video that opens"),
+        ("v.mp4", b"", "expected a video that opens, got: an empty file; is it"),
+        (
+            "v.mp4",
+            b"<!DOCTYPE html><html>",
+            "got: a web page; download the file again",
+        ),
+        ("v.mp4", LFS, "got: a pointer of Git LFS; fetch the file by git lfs pull"),
+        ("i.jpg", LFS, "got: a pointer of Git LFS; fetch the file by git lfs pull"),
         ("i.png", b"\x89PNG\r\n\x1a\n", "expected a whole image, got"),
-        ("i.jpg", b"", "no image or one whose header is cut"),
+        ("i.jpg", b"", "expected a whole image, got: an empty file"),
+        ("i.jpg", b"none", "no image or one whose header is cut"),
         ("*.jpg", None, "expected images that match, got none"),
     ],
 )
@@ -328,6 +341,13 @@ def test_bad_sources_are_one_clear_line(tmp_path, name, content, message):
         open_source(str(path))
     assert "\n" not in str(error.value)
     assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("read", [Camera.from_file, read_lanes])
+def test_a_pointer_of_git_lfs_is_said(tmp_path, read):
+    (tmp_path / "f.json").write_bytes(LFS)
+    with pytest.raises(ValueError, match=r"f\.json: expected a readable .* got: a pointer of Git LFS"):
+        read(tmp_path / "f.json")
 
 
 def test_cut_video(tmp_path):
