@@ -1,7 +1,7 @@
 """Lane files.
 
 - ``files`` finds out the format of a file, reads it and matches its entries to images.
-- Formats: ``tusimple``, ``culane``, ``curvelanes``, ``openlane``, ``llamas``, ``bdd100k``, ``labelme``,
+- Formats: ``tusimple``, ``culane``, ``curvelanes``, ``openlane``, ``llamas``, ``bdd100k``,
   ``annotators``, ``lanes3d``; they share ``parsing``.
 - ``remarks`` and ``doubts`` about lanes, also about the ``size`` of their images.
 """

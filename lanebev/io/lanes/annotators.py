@@ -1,9 +1,11 @@
-"""Lines drawn in Supervisely, V7, Labelbox or VIA, and exports of Datumaro: in pixels, as JSON.
+"""Lines drawn in LabelMe, CVAT, Supervisely, V7, Labelbox or VIA, exports of Datumaro, and labels of VIL-100.
 
-Source: Supervisely's annotation format; Darwin JSON 2.0; Labelbox's export as NDJSON; Datumaro's format;
-annotations and projects of VIA.
+Source: LabelMe's file format; CVAT's "CVAT for images 1.1"; Supervisely's annotation format; Darwin JSON 2.0;
+Labelbox's export as NDJSON; Datumaro's format; annotations and projects of VIA; VIL-100 (Zhang et al. 2021).
 """
 
+import os
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
@@ -50,15 +52,42 @@ def read_annotations(path: Path, pictures: Pictures) -> list[FrameLines]:
         ValueError: the pictures have shapes and none is a line.
     """
     found: list[_Picture] = []
-    frames: list[FrameLines] = []
     for line, value in json_values(path, lane_text(path)):
         with Where(path, line):
             found += pictures(path, as_object(value))
-            frames = [_frame(picture) for picture in found]
-    if any(None in picture.drawn for picture in found) and not any(frame.lines for frame in frames):
-        raise ValueError(
-            f"lane file {path}: expected lanes drawn as lines, got other shapes only; draw lines"
-        )
+    with Where(path, None):
+        return _frames(found)
+
+
+def read_cvat(path: Path) -> list[FrameLines]:
+    """Read the polylines of the images in a file of "CVAT for images"; other shapes are left out.
+
+    Raises:
+        ValueError: it has no image, as that of "CVAT for video", or it has shapes and none is a polyline.
+    """
+    with Where(path, None):
+        try:
+            images = ET.fromstring(lane_text(path)).findall("image")
+        except ET.ParseError as error:
+            raise ValueError("expected CVAT's XML, got a syntax error; is the file cut?") from error
+        if not images:
+            raise ValueError("expected CVAT's XML with images, got none; export as CVAT for images")
+        return _frames([_cvat(image) for image in images])
+
+
+def _cvat(image: ET.Element) -> _Picture:
+    drawn = [
+        [pair.split(",") for pair in shape.get("points", "").split(";")] if shape.tag == "polyline" else None
+        for shape in image
+    ]
+    sides = {key: int(text) for key in ("height", "width") if (text := image.get(key, "")).isdecimal()}
+    return _Picture(image.get("name"), sides, drawn)
+
+
+def _frames(pictures: list[_Picture]) -> list[FrameLines]:
+    frames = [_frame(picture) for picture in pictures]
+    if any(None in picture.drawn for picture in pictures) and not any(frame.lines for frame in frames):
+        raise ValueError("expected lanes drawn as lines, got other shapes only; draw polylines (linestrips)")
     return frames
 
 
@@ -81,6 +110,26 @@ def _pair(name: str, point: Any) -> list[Any]:
 def _objects(fields: Any, key: str) -> list[dict[str, Any]]:
     """Return the objects in a list; none if there is no list."""
     return [as_object(each) for each in as_list(key, as_object(fields).get(key) or [])]
+
+
+def labelme(path: Path, value: dict[str, Any]) -> Iterator[_Picture]:
+    """Yield the picture of a file of LabelMe."""
+    shapes = [as_object(shape) for shape in field(value, "shapes", list)]
+    are_lines = [shape.get("shape_type") in ("linestrip", "line") for shape in shapes]
+    drawn = [
+        field(shape, "points", list) if is_line else None
+        for shape, is_line in zip(shapes, are_lines, strict=True)
+    ]
+    image = field(value, "imagePath", str).replace("\\", "/")
+    sides = {"height": value.get("imageHeight"), "width": value.get("imageWidth")}
+    yield _Picture(os.path.normpath(f"{path.parent}/{image}"), sides, drawn)
+
+
+def vil100(_: Path, value: dict[str, Any]) -> Iterator[_Picture]:
+    """Yield the picture of a label of VIL-100."""
+    lanes = field(field(value, "annotations", dict), "lane", list)
+    info = field(value, "info", dict)
+    yield _Picture(field(info, "image_path", str), info, [field(lane, "points", list) for lane in lanes])
 
 
 def supervisely(path: Path, value: dict[str, Any]) -> Iterator[_Picture]:
@@ -148,5 +197,7 @@ ANNOTATORS: dict[str, Pictures] = {
     "item": darwin,
     "data_row": labelbox,
     "items": datumaro,
+    "shapes": labelme,
+    "annotations": vil100,
 }
-"""What reads a tool's pictures, by a key that files of no other have."""
+"""What reads a tool's pictures, by a key that files of none before it have."""

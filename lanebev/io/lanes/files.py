@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from lanebev.io.images.names import in_natural_order
 from lanebev.io.images.pixels import IMAGE_SUFFIXES
-from lanebev.io.lanes.annotators import ANNOTATORS, read_annotations, via
+from lanebev.io.lanes.annotators import ANNOTATORS, read_annotations, read_cvat, via
 from lanebev.io.lanes.bdd100k import read_bdd100k
 from lanebev.io.lanes.culane import read_culane
 from lanebev.io.lanes.curvelanes import read_curvelanes
-from lanebev.io.lanes.labelme import read_cvat, read_labelme, read_vil100
 from lanebev.io.lanes.lanes3d import read_apollo, read_once
 from lanebev.io.lanes.llamas import read_llamas
 from lanebev.io.lanes.openlane import read_openlane
@@ -36,8 +35,6 @@ def _of_one(read: Callable[[Path], FrameLines], path: Path) -> list[FrameLines]:
 _OF_ONE: dict[str, Callable[[Path], FrameLines]] = {  # what reads files of one image
     "Lines": read_curvelanes,
     "image_name": read_llamas,
-    "shapes": read_labelme,
-    "annotations": read_vil100,
 }
 _READERS: dict[str, Callable[[Path], list[FrameLines]]] = {  # by a key that no other kind before it has
     **{key: partial(read_annotations, pictures=pictures) for key, pictures in ANNOTATORS.items()},

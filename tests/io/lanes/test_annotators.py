@@ -90,7 +90,7 @@ def test_pictures_without_a_line_are_an_error_if_other_shapes_are_drawn(tmp_path
     path = tmp_path / "1.jpg.json"
     path.write_text(json.dumps(write([])))
     with pytest.raises(
-        ValueError, match=r"1\.jpg\.json: expected lanes drawn as lines, got other shapes only; draw"
+        ValueError, match=r"1\.jpg\.json: expected lanes drawn as lines, got other shapes only"
     ):
         read_lanes(path)
 
@@ -106,7 +106,7 @@ def test_rows_of_labelbox_are_an_image_each(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (_supervisely([[[5, "x"]]]), "line 1: '1.jpg', line 0: expected finite numbers, got 5, x"),
+        (_supervisely([[[5, "x"]]]), "json: '1.jpg', line 0: expected finite numbers, got 5, x"),
         (_supervisely([[[5]]]), "line 0: expected 2 numbers, got 1"),
         (_darwin([[{"x": 5}]]), "'1.jpg', line 0: expected finite numbers, got 5, None"),
         (_darwin([[[np.inf, 2]]]), "expected finite numbers, got inf, 2"),

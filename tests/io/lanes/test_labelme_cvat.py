@@ -69,9 +69,12 @@ def test_an_image_without_lanes_has_an_entry(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (_labelme(_shape(LEFT, "polygon")), "shapes: expected lanes of type linestrip, got polygon; draw"),
-        (_labelme(_shape([[1, 2, 3]])), r"shapes\[0\].points: expected 2 numbers, got 3"),
-        (_labelme(_shape([[1, "a"]])), r"shapes\[0\].points: expected finite numbers, got 1, a"),
+        (
+            _labelme(_shape(LEFT, "polygon")),
+            "expected lanes drawn as lines, got other shapes only; draw polylines",
+        ),
+        (_labelme(_shape([[1, 2, 3]])), "'7.png', line 0: expected 2 numbers, got 3"),
+        (_labelme(_shape([[1, "a"]])), "'7.png', line 0: expected finite numbers, got 1, a"),
         (_labelme(_shape(None)), "points: expected a list, got NoneType"),
         (_labelme(image=None), "imagePath: expected a str, got NoneType"),
         (_labelme(3), "expected a JSON object, got int"),
@@ -80,7 +83,7 @@ def test_an_image_without_lanes_has_an_entry(tmp_path):
     ],
 )
 def test_bad_files_are_one_clear_line(tmp_path, content, message):
-    with pytest.raises(ValueError, match=rf"lane file .*7.json: {message}") as error:
+    with pytest.raises(ValueError, match=rf"lane file .*7.json(, line 1)?: {message}") as error:
         _read(tmp_path / "7.json", content)
     assert "\n" not in str(error.value)
 
@@ -112,12 +115,12 @@ def test_polylines_of_cvat(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (_cvat(_polyline(LEFT, "polygon")), "expected lanes drawn as polylines, got other shapes only"),
+        (_cvat(_polyline(LEFT, "polygon")), "expected lanes drawn as lines, got other shapes only"),
         (_cvat(_polyline(LEFT))[:-20], "expected CVAT's XML, got a syntax error; is the file cut"),
         ("<annotations><track id='0'/></annotations>", "with images, got none; export as CVAT for images"),
-        (_cvat('<polyline points="1,2;3"/>'), r"image 'a/7.jpg'\[0\].points: expected 2 numbers, got 1"),
-        (_cvat('<polyline points=""/>'), r"points: expected 2 numbers, got 1"),
-        ("<annotations><image><polyline/></image></annotations>", "image: expected its name, got none"),
+        (_cvat('<polyline points="1,2;3"/>'), "'7.jpg', line 0: expected 2 numbers, got 1"),
+        (_cvat('<polyline points=""/>'), "line 0: expected 2 numbers, got 1"),
+        ("<annotations><image><polyline/></image></annotations>", "name: expected the image's, got None"),
         (
             "<!DOCTYPE html><html></html>",
             "expected a readable file, got: a web page; download the file again",
