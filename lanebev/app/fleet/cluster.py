@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import os
+import signal
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -167,6 +168,9 @@ def _started(cluster: Cluster) -> ModuleType:
                 configure_logging=True,
                 **local,
             )
+    except SystemExit:  # of Ray's own handler of SIGTERM, before ours is set again
+        signal.raise_signal(signal.SIGTERM)
+        raise
     except (ConnectionError, ValueError, RuntimeError) as error:
         where = cluster.address or "this machine"
         raise ValueError(

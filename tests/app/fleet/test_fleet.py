@@ -11,6 +11,7 @@ import pytest
 
 from lanebev.app.fleet.fleet import fleet
 from lanebev.app.fleet.worker import run_tasks
+from lanebev.cli import main
 from tests.app.test_robustness import write_drive
 from tools import fleet_check
 
@@ -78,6 +79,21 @@ def test_a_folder_that_is_deleted_meanwhile_fails_the_drives_that_were_in_it(tmp
 
 def _lines_of(path):
     return path.read_text().count("\n") if path.is_file() else 0
+
+
+def test_a_fleet_that_is_stopped_while_ray_starts_says_so(tmp_path, monkeypatch, capsys):
+    """Ray's own handler of SIGTERM, which is set meanwhile, exits with status 15."""
+
+    def init(**_):
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(number))
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("ray.init", init)
+    write_drive(tmp_path, frames=3, name="a")
+    (tmp_path / "drives.csv").write_text("video,camera\na.mp4,camera.yaml\n")
+    status = main(["fleet", str(tmp_path / "drives.csv"), "--out", str(tmp_path / "out")])
+    assert status == 128 + signal.SIGTERM
+    assert capsys.readouterr().err == "lanebev fleet: interrupted, finished drives stay\n"
 
 
 @pytest.mark.slow
