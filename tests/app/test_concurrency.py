@@ -1,7 +1,5 @@
 """What runs side by side: frames and calls made ahead, and calls in the background."""
 
-from __future__ import annotations
-
 import threading
 import time
 

@@ -1,7 +1,5 @@
 """``lanebev run --hilly``, and outputs that follow the road's vertical curvature."""
 
-from __future__ import annotations
-
 import json
 from fractions import Fraction
 

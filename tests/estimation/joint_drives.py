@@ -1,7 +1,5 @@
 """Short drives and how the joint calibrator follows them, for several test files."""
 
-from __future__ import annotations
-
 import torch
 
 from lanebev.estimation.joint.layout import layout

@@ -1,7 +1,5 @@
 """Departures of the road from the model of the two-stage calibrator, and their part in its covariance."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Evidence against the motion model, and the process noise of a road that bends."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The joint calibrator: interface, life cycle, rows, precision, export."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

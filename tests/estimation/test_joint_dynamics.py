@@ -1,7 +1,5 @@
 """The motion model of pose, deviations and speed, and how its scale follows the scores."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

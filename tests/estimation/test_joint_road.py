@@ -1,7 +1,5 @@
 """How the shape of the road moves with the camera, and its curve."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -3,8 +3,6 @@
 The full figures are those of ``tools.reproduce_table1 --calibrator joint`` and ``tools.bench_calibration``.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Starts of the joint filter from one frame's fit: straight roads and bends."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

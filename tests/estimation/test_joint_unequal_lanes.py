@@ -1,7 +1,5 @@
 """What unequal lanes and single deviating boundaries do to pose and covariance."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

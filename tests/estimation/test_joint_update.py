@@ -1,7 +1,5 @@
 """The measurement update against plain least squares and automatic derivatives."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

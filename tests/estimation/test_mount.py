@@ -1,7 +1,5 @@
 """The slow mount behind the fast pose: blocks, gates, limits with hysteresis, a moved camera, honesty."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Scatter of the boundaries about parallel lanes of equal width, and its part in the covariance."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

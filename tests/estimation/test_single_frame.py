@@ -1,7 +1,5 @@
 """The single-frame fit: from anywhere, through outliers, and honest about what it cannot see."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The smoother: against least squares over a whole drive, and what it does to drives of the joint filter."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The road's vertical curvature in the joint calibrator."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Small positive definite solves: known answers, rows on their own, gradients."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

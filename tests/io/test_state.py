@@ -1,7 +1,5 @@
 """States on disk: whole and bit for bit, or refused with a reason."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import pytest

@@ -1,7 +1,5 @@
 """Live use: time, states, what another detector saw, resuming, and what is said in words."""
 
-from __future__ import annotations
-
 import math
 from copy import deepcopy
 

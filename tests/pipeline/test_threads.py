@@ -1,7 +1,5 @@
 """Computing on one thread, from several Python threads."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from threading import Event
 

@@ -1,7 +1,5 @@
 """Rendering on any device: the same scenes everywhere, nothing that meets across devices, few waits."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import pytest

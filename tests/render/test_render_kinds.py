@@ -1,7 +1,5 @@
 """Kinds of road: what each adds to the image, and that it adds nothing to the labels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """The truth of a rendered image is exact: measured on what is painted, not on what was meant."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

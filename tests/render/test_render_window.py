@@ -1,7 +1,5 @@
 """Windows: other intrinsics, the same truth."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Words on pictures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw

@@ -1,7 +1,5 @@
 """The bench tool runs, and its figures mean what they say."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The comparison of a segmenter in float and in 8 bits: what stands in for the network, and its figures."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

@@ -1,7 +1,5 @@
 """Labels from a run's own result, a config that trains on them, and trunks of image classifiers."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
 from pathlib import Path

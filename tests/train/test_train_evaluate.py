@@ -1,7 +1,5 @@
 """Recall, error and false claims by group, on maps of known answers."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Compact weights files, and what is told about a checkpoint in their place."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """What ten minutes of a GPU survive, without one."""
 
-from __future__ import annotations
-
 import math
 import sys
 

@@ -1,7 +1,5 @@
 """Rendering where the network trains: batches, schedules by the share of the budget, resumption."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 from concurrent.futures import ThreadPoolExecutor

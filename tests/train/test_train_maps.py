@@ -1,7 +1,5 @@
 """Label maps drawn on the device against those that OpenCV draws."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

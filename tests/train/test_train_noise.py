@@ -1,7 +1,5 @@
 """The factor on a network's sigmas, measured on drives."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

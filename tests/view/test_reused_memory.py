@@ -1,7 +1,5 @@
 """Views without a graph, computed in memory that is kept, against those with one."""
 
-from __future__ import annotations
-
 import threading
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``lanebev run --smooth``: two passes over a drive, every pose from all of it."""
 
-from __future__ import annotations
-
 import csv
 import json
 import signal
