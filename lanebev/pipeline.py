@@ -240,6 +240,7 @@ class LaneBEV(BoundaryDetector):
             if truncation is not None and step % truncation == 0:
                 state = state.detach()
             logits, segments = observed(step, state)
+            self._check_channels(logits)
             camera = cameras[:, step]
             with self._gradients("calibrator"):
                 calibration, state = self.calibrator(segments, camera, state, intervals[:, step], lane_width)
@@ -251,6 +252,15 @@ class LaneBEV(BoundaryDetector):
             homography = bev_from_image(calibration.extrinsics, camera, self.warp.grid)
             outputs.append(LaneBEVOutput(view, valid, calibration, homography, segments, logits))
         return (outputs[0] if image.ndim == 4 else stack_frames(outputs)), state
+
+    def _check_channels(self, logits: Tensor) -> None:
+        """Raise unless the network has a map of each boundary that the calibrator numbers, and background."""
+        known: int | None = getattr(self.calibrator, "num_boundaries", None)
+        if known is not None and logits.shape[1] != 1 + known:
+            raise ValueError(
+                f"logits: expected 1 + {known} channels, the background and the calibrator's boundaries, got "
+                f"{logits.shape[1]}; make the calibrator with num_boundaries={logits.shape[1] - 1}"
+            )
 
     def _view(
         self,

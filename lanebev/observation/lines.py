@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from lanebev.batch import readable
 from lanebev.geometry.precision import full_precision
 from lanebev.observation.boundary_vertices import BoundaryVertices, line_directions, move_to_front
 from lanebev.observation.scans import scan_vertices
@@ -16,6 +17,8 @@ from lanebev.types import check_tensor, check_type
 
 NETWORK_CORRELATION = 10.0
 """``LineConfig.correlation`` of a network, px: how far along a line its errors are one error."""
+
+_OFF_ONE = 0.02  # most by which a sum of probabilities of half precision is off
 
 
 class LineExtractor(nn.Module):
@@ -73,13 +76,18 @@ class LineExtractor(nn.Module):
             Vertices of L boundaries, at most 2S on each, those with a weight first.
 
         Raises:
-            ValueError: another shape, or a map that is not of the network's input by the stride.
+            ValueError: another shape, or a map that is not of the network's input by the stride; on the CPU
+                also probabilities.
         """
         check_tensor("logits", logits)
         if logits.ndim != 4 or logits.shape[1] < 2:
             raise ValueError(f"logits: expected (B, 1+L, h, w), got {tuple(logits.shape)}")
         if not logits.is_floating_point():
             raise ValueError(f"logits: expected floating point, got {logits.dtype}")
+        if _are_probabilities(logits):
+            raise ValueError(
+                "logits: expected those before the softmax, got probabilities; leave the softmax out"
+            )
         return extract_vertices(logits.softmax(1)[:, 1:], image_size, self.config, network_size)
 
 
@@ -124,6 +132,13 @@ def extract_segments(
 ) -> LaneSegments:
     """Extract segments from probability maps (B, L, h, w), without background; see :class:`LineExtractor`."""
     return pair_vertices(extract_vertices(probabilities, image_size, config, network_size))
+
+
+def _are_probabilities(logits: Tensor) -> bool:
+    """Tell whether maps (B, 1+L, h, w), where they can be read, are at least 0 and their sums 1."""
+    if not readable(logits) or logits.numel() == 0 or bool(logits.detach().amin() < 0):
+        return False
+    return bool(((logits.detach().sum(1) - 1).abs() < _OFF_ONE).all())
 
 
 def _across_scale(along: Tensor, scale: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 import lanebev
 from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics, LaneSegments
@@ -241,6 +242,17 @@ def test_warp(arguments, error, message):
         BEVWarp(GRID)(*arguments)
 
 
+class Changed(nn.Module):
+    """Changes what a network returns."""
+
+    def __init__(self, change):
+        super().__init__()
+        self.change = change
+
+    def forward(self, logits):
+        return self.change(logits)
+
+
 @pytest.fixture(scope="module")
 def model():
     network = lanebev.LaneSegmenter(lanebev.SegmenterConfig(base_width=4, decoder_width=8)).eval()
@@ -290,6 +302,24 @@ def test_lanebev_parts(model, settings, error, message):
     parts = {"segmenter": model.segmenter, "extractor": model.extractor, "calibrator": model.calibrator}
     with pytest.raises(error, match=message):
         lanebev.LaneBEV(**(parts | settings))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda logits: logits.softmax(1),
+            "logits: expected those before the softmax, got probabilities; le",
+        ),
+        (lambda logits: logits[:, :5], r"logits: expected 1 \+ 6 channels, .* got 5; .* num_boundaries=4"),
+    ],
+)
+def test_a_network_of_ones_own_that_cannot_be_meant_is_named(model, change, message):
+    """Else no boundary is found, or boundaries are numbered from the left of another lane."""
+    network = nn.Sequential(model.segmenter, Changed(change))
+    net = lanebev.LaneBEV(network, model.extractor, lanebev.JointCalibrator(), model.warp)
+    with pytest.raises(ValueError, match=message):
+        net(IMAGE, SMALL_K)
 
 
 def test_an_interval_that_is_no_number(model):
