@@ -63,9 +63,10 @@ def read_apollo(path: Path, intrinsics: Array | None = None) -> list[FrameLines]
     for line, value in json_values(path, lane_text(path)):
         with Where(path, line):
             fields = as_object(value)
-            height, pitch = finite_numbers(
+            given = finite_numbers(
                 "cam_height, cam_pitch", [fields.get("cam_height"), fields.get("cam_pitch")]
             )
+            height, pitch = within("cam_height, cam_pitch", "m and rad", np.array(given)).tolist()
             lines = field(fields, "laneLines", list)
             seen = as_list("laneLines_visibility", fields.get("laneLines_visibility") or [None] * len(lines))
             lanes = [

@@ -50,6 +50,10 @@ def test_lanes_of_apollo_are_on_the_ground(tmp_path, pitch):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
+        (
+            {"laneLines": [], "raw_file": "1.jpg", "cam_height": 1e308, "cam_pitch": 0},
+            "cam_height, cam_pitch: expected m and rad, got 1e",
+        ),
         ({"lanes": [[[1, 2]]]}, r"lanes\[0\]: expected three lists of one length"),
         ({"lanes": [[[1, 2, "x"]]]}, r"lanes\[0\]: expected finite numbers, or null"),
         (
