@@ -27,7 +27,13 @@ _PLAIN = {  # encoding of ROS to channels, and to OpenCV's conversion to RGB
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
     "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
 }
-_CODECS = {"h264": "h264", "h265": "hevc", "hevc": "hevc", "vp9": "vp9"}  # of Foxglove's CompressedVideo
+_CODECS = {  # formats of Foxglove's CompressedVideo, and ffmpeg's decoders
+    "h264": "h264",
+    "h265": "hevc",
+    "hevc": "hevc",
+    "vp9": "vp9",
+    "av1": "libdav1d",
+}
 _JPEG = b"\xff\xd8"  # begins such an image
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from fractions import Fraction
+from types import SimpleNamespace
 
 import av
 import cv2
@@ -20,7 +21,7 @@ from lanebev.app.config import RunConfig
 from lanebev.app.drive.sources import camera_of, make_source
 from lanebev.cli import main
 from lanebev.io.bags import BagSource, open_bag_source
-from lanebev.io.bags.images import message_image
+from lanebev.io.bags.images import TopicImages, message_image
 from lanebev.io.formats.mcap import write
 from lanebev.io.formats.record import RunRecord
 from lanebev.io.frames import Frame
@@ -500,6 +501,25 @@ def test_a_video_of_foxglove(tmp_path, lost):
     some = list(make_source(RunConfig(str(tmp_path / "bag"), "c", every=3)))
     assert [frame.source_number for frame in some] == list(range(0, 10 - lost, 3))
     assert np.abs(some[-1].image.astype(int) - _picture(lost + some[-1].source_number)).mean() < 4
+
+
+@pytest.mark.parametrize(
+    ("kind", "codec", "options"),
+    [
+        ("h265", "libx265", {"tune": "zerolatency", "x265-params": "log-level=none"}),
+        ("vp9", "libvpx-vp9", {"lag-in-frames": "0", "deadline": "realtime"}),
+        ("av1", "libsvtav1", {"svtav1-params": "pred-struct=1:lookahead=0"}),
+    ],
+)
+def test_a_packet_of_each_codec_is_an_image(kind, codec, options):
+    encoder = av.VideoCodecContext.create(codec, "w")
+    encoder.width, encoder.height, encoder.pix_fmt, encoder.time_base = 64, 64, "yuv420p", Fraction(1, 10)
+    encoder.options = options
+    frames = [av.VideoFrame.from_ndarray(np.full((64, 64, 3), 20 * i + 40, np.uint8)) for i in range(5)]
+    packets = [packet for frame in [*frames, None] for packet in encoder.encode(frame)]
+    images = TopicImages()
+    levels = [images(SimpleNamespace(format=kind, data=bytes(each))).mean() for each in packets]
+    assert levels == pytest.approx([40, 60, 80, 100, 120], abs=3)
 
 
 def test_packets_of_a_video_are_named(tmp_path):
