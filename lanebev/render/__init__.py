@@ -1,6 +1,9 @@
 """The rendered road: scenes, their images and their ground truth.
 
 Scenes are sampled on the CPU, the same on every machine; whole batches of them are rendered on any device.
+
+``scene`` samples, ``raster`` computes images, ``truth`` the ground truth of a ``frame``, ``masks`` labels.
+``views`` are independent; a ``drive`` has a ``course`` and a ``camera_motion``. ``rows`` selects of batches.
 """
 
 from lanebev.render.drive import Drive
