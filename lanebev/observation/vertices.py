@@ -202,7 +202,8 @@ def order_along(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """
     total = weight.sum(-1, keepdim=True).clamp(min=1e-6)
     x, y = (part - (part * weight).sum(-1, keepdim=True) / total for part in points.unbind(-1))
-    xy, difference = (weight * x * y).sum(-1), (weight * (x + y) * (x - y)).sum(-1)  # products of xx and yy
+    xy = (weight * x * y).sum(-1)
+    difference = (weight * (x + y) * (x - y)).sum(-1)  # of xx and yy
     angle = 0.5 * torch.atan2(2 * xy, difference).unsqueeze(-1)
     along = x * angle.cos() + y * angle.sin()
     order = torch.where(weight > 0, along, math.inf).argsort(dim=-1)

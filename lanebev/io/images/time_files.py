@@ -5,14 +5,17 @@ import re
 from collections.abc import Sequence
 from datetime import date
 from fractions import Fraction
+from itertools import pairwise
 from os.path import dirname
 from pathlib import Path, PurePath
+from statistics import median_low
 
 from lanebev.io.images.names import are_of_a_drive, times_of_stamps
 from lanebev.numbers import read_text
 
 _NAME = re.compile(r"(?:frame|image)?_?(?:timestamp|time)s?\.(?:txt|csv)", re.IGNORECASE)
 _DATED = re.compile(r"(\d{4})-(\d\d)-(\d\d)[T ](\d\d):(\d\d):(\d\d(?:\.\d+)?)", re.ASCII)
+_SLOWEST = 5  # s between frames of a drive; 33 between them are milliseconds
 _NUMBER = re.compile(r"\d+(?:\.\d*)?(?:e[+-]?\d\d?)?", re.ASCII | re.IGNORECASE)
 
 
@@ -45,7 +48,7 @@ def times_from_file(paths: Sequence[str]) -> tuple[tuple[float, ...], str]:
         return (), f"{file.name} beside them is not used: it has {len(stamps)} times for {len(paths)} images"
     times = times_of_stamps(stamps) if all(re.fullmatch(r"\d{13,19}", stamp) for stamp in stamps) else ()
     times = times or [Fraction(stamp) for stamp in stamps]
-    if not are_of_a_drive(times):
+    if not are_of_a_drive(times) or median_low(b - a for a, b in pairwise(times)) > _SLOWEST:
         return (), f"{file.name} beside them is not used: its times are not those of a drive, in seconds"
     return tuple(float(time - times[0]) for time in times), ""
 

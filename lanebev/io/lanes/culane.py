@@ -10,10 +10,7 @@ from lanebev.io.lanes.parsing import FrameLines, Where, checked_pixels, lane_tex
 from lanebev.numbers import numbers_or_gaps
 from lanebev.observation.polylines import LaneLine
 
-_NOT_THERE = (
-    -2.0,
-    -1.0,
-)  # x of points that detectors made for TuSimple do not see; else it is a pixel outside
+_NOT_THERE = (-2.0, -1.0)  # x of points that detectors made for TuSimple do not see, or a pixel outside
 _MOST_CLASSES = 20  # largest index of a lane's class
 _FAR = 10  # times the median distance of rows
 _GAP = 2.5  # times the median distance of rows: from there on a line is not seen in between

@@ -71,6 +71,8 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
     if '"shape_attributes"' in text:
         return read_annotations(path, via)
     keys = _first_keys(path, text)
+    if {"lanes", "raw_file"} <= keys:  # whatever else a detector adds
+        return read_tusimple(path)
     if "lane_lines" in keys:
         return [read_openlane(path, intrinsics)]
     if "laneLines" in keys:
@@ -130,7 +132,7 @@ def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int
     if names and all(entry is None for entry in result):
         raise ValueError(
             f"lanes: expected an entry for at least one image, got none that ends like {names[0]}; "
-            f"the file's first is {frames[0].name!r}"
+            + (f"the file's first is {frames[0].name!r}" if frames else "the file has none")
         )
     return result
 

@@ -61,6 +61,7 @@ def test_of_more_times_those_of_the_images_numbers_are_taken(tmp_path):
         ("0\n0.1\n", "it has 2 times for 6 images"),
         ("0\n0.1\nlater\n0.3\n0.4\n0.5\n", "expected a time for each image, got the line 'later'"),
         ("0\n100\n200\n300\n400\n500\n", "its times are not those of a drive, in seconds"),
+        ("0\n33\n66\n100\n133\n166\n", "its times are not those of a drive, in seconds"),
         ("0.5\n0.4\n0.3\n0.2\n0.1\n0\n", "its times are not those of a drive, in seconds"),
     ],
 )

@@ -36,6 +36,12 @@ def test_tusimple_lines(tmp_path):
     np.testing.assert_array_equal(frame.lines[1].points, [[7, 100], [np.nan, 110], [9, 120]])
 
 
+@pytest.mark.parametrize("key", ["objects", "items", "annotations", "calibration", "labels", "laneLines"])
+def test_tusimple_lines_may_have_keys_of_other_formats(tmp_path, key):
+    path = _write(tmp_path / "l.json", json.dumps(_tusimple(**{key: []})))
+    assert [len(frame.lines) for frame in read_lanes(path)] == [2]
+
+
 @pytest.mark.parametrize(("count", "first"), [(56, 160), (48, 240)])
 def test_predictions_for_tusimples_benchmark_leave_the_rows_out(tmp_path, count, first):
     lines = [{"raw_file": "a", "lanes": [[5.0] * count], "run_time": 10}, {"raw_file": "b", "lanes": []}]
@@ -231,6 +237,8 @@ def test_match_refuses_a_tie_and_strangers():
         match_frames(["1/20.jpg", "2/20.jpg"], _frames("20.jpg"))
     with pytest.raises(ValueError, match=r"at least one image, got none that ends like 3\.jpg"):
         match_frames(["3.jpg"], _frames("20.jpg"))
+    with pytest.raises(ValueError, match=r"at least one image, .* 3\.jpg; the file has none"):
+        match_frames(["3.jpg"], [])
 
 
 @needs_data
