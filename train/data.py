@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -112,6 +113,7 @@ class LiveFrames:
         return (image for image, _ in self.posed(seed, first))
 
 
+@dataclass(eq=False)
 class ViewBatches(IterableDataset[Batch]):
     """Endless batches of random views, each batch of one size.
 
@@ -124,18 +126,12 @@ class ViewBatches(IterableDataset[Batch]):
         first: batches that an interrupted run had; this one has those that would have followed.
     """
 
-    def __init__(
-        self,
-        frames: Frames,
-        batch_size: int,
-        sizes: list[tuple[int, int]],
-        view: ViewConfig,
-        seed: Seed,
-        first: int = 0,
-    ) -> None:
-        super().__init__()
-        self.frames, self.batch_size, self.sizes, self.view = frames, batch_size, sizes, view
-        self.seed, self.first = seed, first
+    frames: Frames
+    batch_size: int
+    sizes: list[tuple[int, int]]
+    view: ViewConfig
+    seed: Seed
+    first: int = 0
 
     def __iter__(self) -> Iterator[Batch]:
         """Draw."""
@@ -153,21 +149,16 @@ class ViewBatches(IterableDataset[Batch]):
             )
 
 
+@dataclass(eq=False)
 class FullBatches(IterableDataset[Batch]):
     """A fixed number of whole frames, the same every time."""
 
-    def __init__(
-        self,
-        frames: Frames,
-        batch_size: int,
-        size: tuple[int, int],
-        view: ViewConfig,
-        seed: int,
-        batches: int,
-    ) -> None:
-        super().__init__()
-        self.frames, self.batch_size, self.size = frames, batch_size, size
-        self.view, self.seed, self.batches = view, seed, batches
+    frames: Frames
+    batch_size: int
+    size: tuple[int, int]
+    view: ViewConfig
+    seed: int
+    batches: int
 
     def __iter__(self) -> Iterator[Batch]:
         """Draw."""

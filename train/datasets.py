@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -152,20 +153,15 @@ class EntryFrames:
             first = max(0, first - len(order))
 
 
+@dataclass(eq=False)
 class ScoredBatches(IterableDataset[ScoredBatch]):
     """All entries in order, as whole images."""
 
-    def __init__(
-        self, entries: list[Entry], layout: Format, batch_size: int, size: tuple[int, int], view: ViewConfig
-    ) -> None:
-        super().__init__()
-        self.entries, self.layout, self.batch_size, self.size, self.view = (
-            entries,
-            layout,
-            batch_size,
-            size,
-            view,
-        )
+    entries: list[Entry]
+    layout: Format
+    batch_size: int
+    size: tuple[int, int]
+    view: ViewConfig
 
     def __iter__(self) -> Iterator[ScoredBatch]:
         """Draw."""

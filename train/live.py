@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import lightning as L
@@ -147,21 +148,16 @@ class ScenesAhead:
         return self._next[2].result()
 
 
+@dataclass(eq=False)
 class HeldOutBatches(IterableDataset[Batch]):
     """A fixed number of whole frames, the same every time on one kind of device."""
 
-    def __init__(
-        self,
-        batches: int,
-        batch_size: int,
-        size: tuple[int, int],
-        view: ViewConfig,
-        seed: int,
-        device: torch.device,
-    ) -> None:
-        super().__init__()
-        self.batches, self.batch_size, self.size = batches, batch_size, size
-        self.view, self.seed, self.device = view, seed, device
+    batches: int
+    batch_size: int
+    size: tuple[int, int]
+    view: ViewConfig
+    seed: int
+    device: torch.device
 
     def __iter__(self) -> Iterator[Batch]:
         """Render and label."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,22 +55,17 @@ class PoseBatch(NamedTuple):
         return cls(*views, *(torch.from_numpy(field) for field in resized))
 
 
+@dataclass(eq=False)
 class PoseBatches(IterableDataset[PoseBatch]):
     """Batches of whole frames; ``batches`` of them, or endless with None."""
 
-    def __init__(
-        self,
-        frames: PoolFrames | LiveFrames,
-        batch_size: int,
-        size: tuple[int, int],
-        view: ViewConfig,
-        seed: Seed,
-        batches: int | None = None,
-        first: int = 0,
-    ) -> None:
-        super().__init__()
-        self.frames, self.batch_size, self.size = frames, batch_size, size
-        self.view, self.seed, self.batches, self.first = view, seed, batches, first
+    frames: PoolFrames | LiveFrames
+    batch_size: int
+    size: tuple[int, int]
+    view: ViewConfig
+    seed: Seed
+    batches: int | None = None
+    first: int = 0
 
     def __iter__(self) -> Iterator[PoseBatch]:
         """Draw."""
