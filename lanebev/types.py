@@ -43,6 +43,20 @@ def check_tensor(name: str, value: object) -> None:
         raise TypeError(f"{name}: expected a torch.Tensor, got {kind}; convert numbers with {remedy}")
 
 
+def check_pixels(name: str, value: Tensor) -> None:
+    """Raise ValueError unless a tensor of pixels is floating point of full precision.
+
+    bfloat16 rounds 554 px to 556.
+    """
+    if not value.is_floating_point():
+        raise ValueError(f"{name}: expected floating point, got {value.dtype}")
+    if value.element_size() < 4:
+        raise ValueError(
+            f"{name}: expected float32 or float64, got {value.dtype}, which rounds them by pixels; leave "
+            "them in float32"
+        )
+
+
 def check_number_or_tensor(name: str, value: object) -> None:
     """Raise TypeError unless this is a number, a symbolic one of ``torch.export`` too, or a tensor."""
     if not isinstance(value, (int, float, Tensor, torch.SymInt, torch.SymFloat, Real)):

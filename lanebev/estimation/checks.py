@@ -8,7 +8,7 @@ from torch import Tensor
 from lanebev.geometry.lens import check_intrinsics, placeholder_intrinsics, usable_cameras
 from lanebev.observation.segments import LaneSegments
 from lanebev.tensors import constant
-from lanebev.types import Calibration, Status, TensorTuple, check_number_or_tensor, check_tensor
+from lanebev.types import Calibration, Status, TensorTuple, check_number_or_tensor, check_pixels, check_tensor
 
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
 _MIN_SIGMA = 1e-3  # px; nothing is known better
@@ -36,6 +36,7 @@ def check_segments(segments: LaneSegments, intrinsics: Tensor) -> None:
         got = tuple(getattr(segments, name).shape)
         if got != shape:
             raise ValueError(f"segments.{name}: expected {shape} like the end points, got {got}")
+    check_pixels("segments.endpoints", ends)
     if segments.boundary.dtype != torch.int64:
         raise ValueError(f"segments.boundary: expected int64 indices, got {segments.boundary.dtype}")
     check_intrinsics(intrinsics, ends.shape[0])

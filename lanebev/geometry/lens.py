@@ -12,7 +12,7 @@ from lanebev.geometry.distortion import check_lens, distort_plane, lens_model, m
 from lanebev.geometry.precision import full_precision
 from lanebev.geometry.undistortion import undistort_plane
 from lanebev.tensors import constant
-from lanebev.types import check_tensor
+from lanebev.types import check_pixels, check_tensor
 
 _HARMLESS_FOCAL = 1000.0  # px
 _NO_PIXEL = 0.5  # px
@@ -60,13 +60,7 @@ def check_intrinsics(intrinsics: Tensor, *rows: int) -> None:
     if intrinsics.shape != (*rows, 3, 3):
         got = f"{tuple(intrinsics.shape)}{_remedy(intrinsics, rows, 3, 3)}"
         raise ValueError(f"intrinsics: expected {(*rows, 3, 3)}, got {got}")
-    if not intrinsics.is_floating_point():
-        raise ValueError(f"intrinsics: expected floating point, got {intrinsics.dtype}")
-    if intrinsics.element_size() < 4:  # bfloat16 rounds 554 px to 556
-        raise ValueError(
-            f"intrinsics: expected float32 or float64, got {intrinsics.dtype}, which rounds them by pixels; "
-            "leave them in float32"
-        )
+    check_pixels("intrinsics", intrinsics)
     if readable(intrinsics) and bool(intrinsics.detach()[..., 2, :2].any()):
         upright = (intrinsics.mT[..., 2, :2] != 0).any(-1) | last_row_is_small(intrinsics)
         if not bool(upright.all()):

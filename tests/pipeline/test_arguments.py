@@ -40,6 +40,16 @@ CALIBRATORS = (lanebev.JointCalibrator(), lanebev.TwoStageCalibrator())
             TypeError,
             r"segments.endpoints: expected a torch.Tensor, got numpy.ndarray; .* torch.from_numpy",
         ),
+        (
+            {"segments": SEGMENTS._replace(endpoints=SEGMENTS.endpoints.bfloat16())},
+            ValueError,
+            "segments.endpoints: expected float32 or float64, got torch.bfloat16, which rounds them",
+        ),
+        (
+            {"segments": SEGMENTS._replace(endpoints=SEGMENTS.endpoints.long())},
+            ValueError,
+            "segments.endpoints: expected floating point, got torch.int64",
+        ),
         ({"intrinsics": K.numpy()}, TypeError, "intrinsics: expected a torch.Tensor, got numpy.ndarray"),
         (
             {"intrinsics": K[0]},
