@@ -48,7 +48,7 @@ class Where:
     def __enter__(self) -> None:
         return None
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         if isinstance(error, ValueError) and not str(error).startswith("lane file"):
             raise ValueError(f"{self.place}: {error}") from error
 

@@ -9,7 +9,6 @@ import signal
 from collections.abc import Iterable
 from itertools import count
 from pathlib import Path
-from types import TracebackType
 
 from lanebev.io.formats.names import FORMATS
 from lanebev.io.output.lock import LOCK_NAME, FolderLock
@@ -114,9 +113,7 @@ class OutputFolder:
             ) from error
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         is_there, failure = self._partial.is_dir(), error
         try:
             if error is None:
