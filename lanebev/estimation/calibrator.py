@@ -108,7 +108,7 @@ class Calibrator(nn.Module, Generic[StateT]):
             rows = f"({given.shape[0]}, D)"
             raise ValueError(f"state: expected {rows}, got {tuple(given.shape)}; join states by torch.cat")
         own = {f"segments.{name}": part for name, part in segments._asdict().items()}
-        check_devices({"state": given, "intrinsics": intrinsics, **own})
+        check_devices({"intrinsics": intrinsics, **own, "state": given})
         frame = (segments, intrinsics, state, dt, lane_width, given)
         differentiable = torch.is_grad_enabled() or is_in_forward_mode()
         if recorded() or differentiable or torch.is_inference_mode_enabled():
