@@ -35,13 +35,14 @@ def read_culane(path: str | Path) -> FrameLines:
                     f"expected x y pairs, got {len(values)} numbers; is the file cut, or a class beside them?"
                 )
             pairs = (pair for pair in zip(values[::2], values[1::2], strict=True) if pair[1] == pair[1])
-            points = np.array([point for point, _ in groupby(pairs)]).reshape(-1, 2)
+            found = np.array([point for point, _ in groupby(pairs)]).reshape(-1, 2)
+            points = checked_pixels("points", found)
             _check_first_pair(points)
             if number == len(rows) and texts:
                 _check_last_row(points[:, 1], texts[-1])
             points[np.isin(points[:, 0], _NOT_THERE), 0] = np.nan
             if np.isfinite(points).all(-1).any():
-                lines.append(LaneLine(_with_gaps(checked_pixels("points", points))))
+                lines.append(LaneLine(_with_gaps(points)))
     return FrameLines(str(path).removesuffix(".txt").removesuffix(".lines"), lines)
 
 

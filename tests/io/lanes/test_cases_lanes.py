@@ -414,3 +414,13 @@ def test_a_run_takes_lanes_of_a_stated_size_and_remarks_others(tmp_path):
     assert report.rows[0].pitch_deg == pytest.approx(math.degrees(math.atan(59.5 / 1000)), abs=0.1)
     assert report.rows[0].height_m == pytest.approx(1.5, abs=0.1)
     assert report.facts["--lanes-size"] == "640x360"
+
+
+def test_huge_numbers_of_culane_are_one_clear_line(tmp_path):
+    path = tmp_path / "0.lines.txt"
+    path.write_text("10 1e-308 12.5 580 15 1e308 17 560\n")
+    with (
+        np.errstate(over="raise"),
+        pytest.raises(ValueError, match=r"line 1: points: expected pixels, got 1e\+308"),
+    ):
+        read_culane(path)
