@@ -1,4 +1,5 @@
 """Errors of the pose on held-out rendered drives: ``python -m train.evaluate_poses BEFORE AFTER``.
+
 All weights files (safetensors, or Lightning checkpoints) are evaluated on the same frames. Without
 ``--online`` each frame is fitted alone. An axis counts if every network's fit is valid and observes it;
 under ``every_frame`` all count, with the prior for what is not observed. With ``--online`` the joint

@@ -1,4 +1,5 @@
 """Measure the two sigma factors of a network: ``python -m train.noise WEIGHTS``.
+
 A network's errors are correlated along a line and from frame to frame. On held-out rendered drives this
 command prints, for several factors on all sigmas, the median errors of the calibrator over the drives, and
 NEES/dof, which is 1 if the covariance is as large as the errors. Drives alone would need a factor of 4, but

@@ -1,4 +1,5 @@
 """Make training data from unlabelled video: ``python -m train.pseudo_labels RESULT SOURCE OUT``.
+
 RESULT is the output folder of ``lanebev run`` on SOURCE. The labels are the network's boundaries, improved:
 all boundaries of a frame are fitted together on the run's pose; a boundary's place on the road is the median
 over neighbouring frames; one found in less than half of these is left out; a dashed or worn one is drawn as

@@ -541,8 +541,11 @@ def test_a_view_in_the_layout_of_bevdet_has_an_object_in_its_cell():
 
 
 def test_a_map_of_the_frame_before_is_aligned_through_the_camera():
-    """By odometry on a plane: the lanes turn by 2 degrees to the right, the car moves 1.7 m ahead and 0.4 m
-    to the right of them, and turns to the right of them."""
+    """By odometry on a plane.
+
+    The lanes turn by 2 degrees to the right, the car moves 1.7 m ahead and 0.4 m to the right of them, and
+    turns to the right of them.
+    """
     yaw, turn, right, ahead = 0.05, math.radians(2), 0.4, 1.7
     before = Extrinsics.from_values(0.0, yaw, 0.0, 1.5)
     now = Extrinsics.from_values(0.0, -0.02, 0.0, 1.45)

@@ -14,7 +14,7 @@ from lanebev.estimation.lane_width_prior import (
     lane_width_prior,
 )
 from lanebev.io.formats.names import FORMATS, check_formats, parse_formats
-from lanebev.io.source_names import is_bag, without_login
+from lanebev.io.source_names import is_bag
 from lanebev.numbers import parse_crop, parse_size
 
 CALIBRATORS = ("joint", "two-stage")
@@ -204,8 +204,6 @@ class RunConfig:
             )
 
     def _check_selection(self) -> None:
-        if self.topic and not is_bag(self.source):
-            raise ValueError(f"topic: expected a bag with it, got {without_login(self.source)}; leave it out")
         if not (math.isfinite(self.start) and self.start >= 0):
             raise ValueError(f"start: expected 0 s or later, got {self.start:g}")
         if self.end is not None and not self.end > self.start:

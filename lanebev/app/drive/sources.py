@@ -44,7 +44,8 @@ def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
     """
     selection = Selection(config.start, math.inf if config.end is None else config.end, config.every)
     if is_live(config.source):
-        unfit = {"--lanes": config.lanes, "--stills": config.stills, "--smooth": config.smooth}
+        names = ("lanes", "stills", "smooth", "topic")
+        unfit = {f"--{name}": getattr(config, name) for name in names}
         for name, given in unfit.items():
             if given:
                 shown = without_login(config.source)
@@ -75,7 +76,12 @@ def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
 
 
 def _opened(source: str, topic: str | None, fps: Fraction | None) -> FrameSource:
-    return open_bag_source(source, topic, fps) if is_bag(source) else open_source(source, fps)
+    if is_bag(source):
+        return open_bag_source(source, topic, fps)
+    found = open_source(source, fps)
+    if topic:
+        raise ValueError(f"topic: expected a bag with it, got {source}; leave it out")
+    return found
 
 
 def source_of_run(source: str, run: RunFolder) -> FrameSource:

@@ -233,9 +233,3 @@ def test_settings_in_the_report_are_as_given():
     }
     assert {value: setting_words(value) for value in cases} == cases
     assert [setting_words(value) for value in (True, False, "cpu")] == ["yes", "no", "cpu"]
-
-
-def test_a_topic_is_of_a_bag():
-    with pytest.raises(ValueError, match=r"topic: expected a bag with it, got a\.mp4; leave it out"):
-        RunConfig("a.mp4", fov=60.0, topic="/camera/image")
-    assert RunConfig("a.mcap", topic="/camera/image").topic == "/camera/image"

@@ -15,8 +15,10 @@ _TILE_SEED = 20261122
 
 @lru_cache(maxsize=1)
 def _tile_on_host() -> Tensor:
-    """Make a periodic tile (4, TILE + 1, TILE + 1): grain and its like of unit variance, four texels wide;
-    cloud, 1/f noise of unit variance; crack, 1 on the edges of irregular cells and 0 elsewhere.
+    """Make a periodic tile (4, TILE + 1, TILE + 1).
+
+    Its channels are grain and its like of unit variance, four texels wide; cloud, 1/f noise of unit variance;
+    crack, 1 on the edges of irregular cells and 0 elsewhere.
     """
     generator = torch.Generator().manual_seed(_TILE_SEED)
     frequency = torch.fft.fftfreq(TILE) * TILE
