@@ -45,11 +45,10 @@ def open_video(source: str) -> av.container.InputContainer:
         # abspath: else what precedes a colon is taken for a protocol; titles may be in any encoding
         container = av.open(os.path.abspath(source), metadata_errors="replace")
     except (av.error.FFmpegError, OSError) as error:
-        reason = error.strerror or "unknown format"
+        reason = f"{error.strerror or 'unknown format'}; is it a video, and whole?"
         with contextlib.suppress(OSError), open(source, "rb") as file:
             reason = stand_in(file.read(100)) or reason
-        words = f"video {source}: expected a video that opens, got: {reason}; is it a video, and whole?"
-        raise ValueError(words) from error
+        raise ValueError(f"video {source}: expected a video that opens, got: {reason}") from error
     if container.format.name in _DRAWN_TEXTS:
         container.close()
         raise ValueError(

@@ -319,11 +319,11 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\
     [
         ("none.mp4", None, "expected a video, an image, a folder or a glob of images, got nothing there"),
         ("v.mp4", b"not a video", "expected a video that opens, got: Invalid data"),
-        ("v.mp4", b"", "expected a video that opens, got: an empty file; is it"),
+        ("v.mp4", b"", "expected a video that opens, got: an empty file"),
         (
             "v.mp4",
             b"<!DOCTYPE html><html>",
-            "got: a web page; download the file again",
+            "got: a web page; download the file again$",
         ),
         ("v.mp4", LFS, "got: a pointer of Git LFS; fetch the file by git lfs pull"),
         ("i.jpg", LFS, "got: a pointer of Git LFS; fetch the file by git lfs pull"),
