@@ -100,6 +100,11 @@ def test_wheel_runs_without_the_checkout(tmp_path):
     assert (tmp_path / "out" / "extrinsics.csv").exists()
 
 
+def test_a_layer_in_another_network_loads_no_decoders():
+    code = "import sys, lanebev; print({'av', 'PIL', 'matplotlib'} & set(sys.modules))"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "set()"
+
+
 @pytest.mark.parametrize(
     "start", [["-m", "lanebev"], ["-c", "import sys; sys.argv[0] = 'lanebev'; import lanebev.cli"]]
 )

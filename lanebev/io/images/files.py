@@ -5,7 +5,8 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from lanebev.io.images.pixels import IMAGE_SUFFIXES, is_image
+from lanebev.io.images.names import IMAGE_SUFFIXES
+from lanebev.io.images.pixels import is_image
 
 HEIC = (".heic", ".heif")  # ffmpeg takes the tiles of such an image for videos
 

@@ -11,6 +11,8 @@ from statistics import median_low
 
 from lanebev.io.images.name_clocks import FASTEST, are_decimal, read_clocks, with_fractions
 
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".jfif", ".jp2")
+
 _SUFFIXES = r"(?:\.[A-Za-z]\w*)*$"  # .jpg, .lines.txt
 _DECIMAL = re.compile(rf"(?<![\d.])(\d+)\.(\d+)(?={_SUFFIXES})", re.ASCII)
 _SECONDS = re.compile(rf"(?<!\d)(\d{{10}})(?:\.|[_-](?=\d{{9}}\b|\d{{6}}\b))(\d{{1,9}}){_SUFFIXES}", re.ASCII)

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
+from lanebev.io.images.names import IMAGE_SUFFIXES
 from lanebev.numbers import stand_in
-
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".jfif", ".jp2")
 
 _LYING = (5, 6, 7, 8)  # EXIF orientations whose images are shown with their sides exchanged
 _UNREADABLE = (  # Pillow's errors for files that are cut or no images

@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.io.images.names import in_natural_order
-from lanebev.io.images.pixels import IMAGE_SUFFIXES
+from lanebev.io.images.names import IMAGE_SUFFIXES, in_natural_order
 from lanebev.io.lanes.annotators import ANNOTATORS, read_annotations, read_cvat, via
 from lanebev.io.lanes.bdd100k import read_bdd100k
 from lanebev.io.lanes.culane import read_culane
