@@ -18,7 +18,12 @@ from lanebev.estimation.joint.measurement import (
     ROLL,
 )
 from lanebev.estimation.joint.observations import boundary_places, observe
-from lanebev.estimation.joint.output import beyond_filter, single_deviation, unverified_deviation
+from lanebev.estimation.joint.output import (
+    as_calibration,
+    beyond_filter,
+    single_deviation,
+    unverified_deviation,
+)
 from lanebev.estimation.joint.restart import scatter_of_fit
 from lanebev.estimation.joint.scatter import remembered_sensitivity
 from lanebev.estimation.joint.single_frame import fit_observations
@@ -208,5 +213,11 @@ def test_height_doubts_roll_that_is_held_as_the_lane_seen_bends_it():
     roll = torch.zeros((), dtype=DOUBLE)
     bend = torch.func.grad(torch.func.grad(height_at))(roll)
     more = 3 * (0.5 * bend * state.cov[0, ROLL, ROLL]).square()
+    straight = state._replace(
+        vertical=torch.zeros_like(state.vertical)
+    )  # by chance the boundaries seem curved
+    positions = boundary_places(WIDTH, 6, state.mean)
+    none = torch.zeros_like(out.inliers), torch.zeros_like(state.mean[:, :NUM_POSE])
+    out = as_calibration(straight, *none, positions, JointConfig())
     added = out.covariance[0, 3, 3] - state.cov[0, HEIGHT, HEIGHT]
     torch.testing.assert_close(added, more, rtol=1e-6, atol=0)

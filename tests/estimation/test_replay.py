@@ -31,10 +31,47 @@ from tools.replay.rendered import DRIVES, FPS, RENDERED
 
 torch.set_num_threads(1)
 
+KINDS = (
+    "straight",
+    "strong motion",
+    "strong motion in a curve",
+    "suspension",
+    "sharp bends",
+    "crest",
+    "drop",
+    "knock",
+    "cut",
+    "resumed",
+    "ego lane",
+    "lane change",
+    "outliers",
+    "unequal lanes",
+    "street",
+    "gap",
+    "clock",
+    "remount",
+    "lens: pinhole, radial",
+    "lens: pinhole, rational",
+    "lens: pinhole, thin prism",
+    "lens: pinhole, tilted",
+    "lens: fisheye",
+    "lens: omni",
+    "rendered: highway",
+    "rendered: city",
+    "rendered: night",
+    "rendered: drop",
+    "rendered: knock",
+)
+"""Each needs one drive at least."""
+
 
 @pytest.fixture(scope="module")
 def straight():
     return recordings(["straight"])
+
+
+def test_every_kind_has_a_drive_and_every_drive_a_kind():
+    assert set(drive_kinds().values()) == set(KINDS)
 
 
 def test_every_rendered_drive_has_its_file_and_every_file_its_drive():
