@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from jsonargparse.typing import PositiveInt
+from jsonargparse.typing import PositiveFloat, PositiveInt
 from torch import Tensor
 
 import lanebev
@@ -147,9 +147,13 @@ def main() -> None:
     parser.add_argument(
         "--rendered", type=PositiveInt, metavar="N", help="evaluate on N rendered views instead"
     )
+    parser.add_argument(
+        "--pose-sigma-scale", type=PositiveFloat, help="instead of the factor that the weights state"
+    )
     options = parser.parse_args()
     far_view = FarView() if options.far_view else None
     model = LaneBEV.from_pretrained(options.weights, network_width=options.width, far_view=far_view).eval()
+    model.pose_sigma_scale = options.pose_sigma_scale or model.pose_sigma_scale
     if options.rendered:
         report({"rendered": rendered(model, options.rendered)}, options.json)
         return
