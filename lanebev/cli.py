@@ -41,7 +41,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"lanebev {command}: error: expected enough memory, got too little", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        exec("")  # else python -m ends by SIGINT if a text was interrupted, as imports run some
         kept = "finished drives stay" if command == "fleet" else "nothing written"
         print(f"lanebev {command}: interrupted, {kept}", file=sys.stderr)
         return 128 + (received[0] if received else signal.SIGINT)

@@ -145,18 +145,6 @@ def test_an_interrupted_run_leaves_nothing(data, tmp_path, capsys, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_status_is_that_of_the_signal_wherever_it_comes(tmp_path):
-    """An interrupt in a text, as imports run some, has Python end ``python -m`` by SIGINT."""
-    (tmp_path / "m.py").write_text(
-        "import sys, signal, lanebev.cli as cli\n"
-        "cli._COMMANDS['demo'] = lambda _: exec('signal.raise_signal(signal.SIGTERM)', {'signal': signal})\n"
-        "sys.exit(cli.main(['demo']))\n"
-    )
-    paths = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
-    done = subprocess.run([sys.executable, "-m", "m"], env={**os.environ, "PYTHONPATH": paths}, check=False)
-    assert done.returncode == 128 + signal.SIGTERM
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_run_stopped_by_the_system_leaves_nothing(data, tmp_path, capsys, monkeypatch, number):
     def stop(*_):

@@ -238,8 +238,7 @@ def test_nothing_is_unpickled():
             text = ast.unparse(call.func)
             keywords = {word.arg: ast.unparse(word.value) for word in call.keywords}
             assert text != "torch.load" or keywords.get("weights_only") == "True", path
-            runs_text = text in ("yaml.load", "yaml.unsafe_load", "eval", "exec")
-            assert not runs_text or ast.unparse(call) == "exec('')", path
+            assert text not in ("yaml.load", "yaml.unsafe_load", "eval", "exec"), path
             assert keywords.get("allow_pickle", "False") == "False", path
     for path in itertools.chain.from_iterable(
         (ROOT / name).rglob("*.py") for name in ("train", "tools", "examples")
