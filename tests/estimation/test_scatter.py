@@ -16,6 +16,7 @@ from lanebev.estimation.joint.output import (
     no_boundary_deviation,
     unverified_deviation,
     vertical_moment,
+    wander_of_two,
 )
 from lanebev.estimation.joint.restart import scatter_of_fit
 from lanebev.estimation.joint.scatter import (
@@ -316,9 +317,11 @@ def test_a_vertical_curvature_that_two_boundaries_show_may_be_their_own_curvatur
         hills = torch.tensor([curvature**2], dtype=DOUBLE)
         by_frames = 1e12 * torch.tensor([[1.0, curvature]], dtype=DOUBLE)
         for known in ({"hills": hills, "vertical": nothing}, {"vertical": by_frames}):
-            found = heading_variance(of_two._replace(**known), scatter, width, CONFIG).sqrt()
+            state = of_two._replace(**known)
+            found = heading_variance(state, scatter, wander_of_two(state, width), CONFIG).sqrt()
             assert found.item() == pytest.approx(expected, rel=0.02, abs=1e-6)
-            found = heading_variance(of_six._replace(**known), scatter, width, CONFIG).sqrt()
+            state = of_six._replace(**known)
+            found = heading_variance(state, scatter, wander_of_two(state, width), CONFIG).sqrt()
             assert found.item() == pytest.approx(0.002, rel=0.02)
 
 

@@ -147,7 +147,7 @@ def wander_of_two(state: JointState, width: Tensor) -> Tensor:
     return alone * vertical * (_HEADING_BY_CURVATURE * by_vertical).square()
 
 
-def heading_variance(state: JointState, of_scatter: Tensor, width: Tensor, cfg: JointConfig) -> Tensor:
+def heading_variance(state: JointState, of_scatter: Tensor, of_two: Tensor, cfg: JointConfig) -> Tensor:
     """Compute the variance (B,) rad² of a boundary's own heading.
 
     Source: (J28), with that of a start and of two boundaries.
@@ -155,22 +155,22 @@ def heading_variance(state: JointState, of_scatter: Tensor, width: Tensor, cfg: 
     Args:
         state: (B, ...).
         of_scatter: (B,) rad², by the scatter of the boundaries; noise if never more than two were in view.
-        width: (B,) m, of the ego lane.
+        of_two: (B,) rad² of :func:`wander_of_two`.
         cfg: the configuration.
     """
     more_than_two = (state.pose_sensitivity[:, ROLL] != 0).any(-1)  # in some frame
     of_more = of_scatter + start_variance(state.scatter, cfg.start_heading_std)
-    return wander_of_two(state, width) + torch.where(more_than_two, of_more, 0.0)
+    return of_two + torch.where(more_than_two, of_more, 0.0)
 
 
-def covariance_by_boundaries(state: JointState, width: Tensor, cfg: JointConfig) -> Tensor:
+def covariance_by_boundaries(state: JointState, of_two: Tensor, cfg: JointConfig) -> Tensor:
     """Compute the covariance (B, 4, 4) of the pose by the boundaries' own deviations and headings.
 
     Source: (J26) and (J29).
 
     Args:
         state: (B, ...).
-        width: (B,) m, of the ego lane.
+        of_two: (B,) rad² of :func:`wander_of_two`.
         cfg: the configuration.
     """
     own = layout(cfg.num_boundaries).deviations
@@ -180,7 +180,7 @@ def covariance_by_boundaries(state: JointState, width: Tensor, cfg: JointConfig)
     unverified = unverified_deviation(by_place, deviations, of_headings, state.mean[:, ROLL], cfg)
     expected = single_deviation(deviations, cfg).unsqueeze(-1).maximum(unverified)
     of_places = of_places.unsqueeze(-1).maximum(beyond_filter(expected, variances))  # (B, L)
-    of_headings = heading_variance(state, of_headings, width, cfg)[:, None, None]
+    of_headings = heading_variance(state, of_headings, of_two, cfg)[:, None, None]
     covariance = torch.bmm(of_places.unsqueeze(1) * by_place, by_place.mT)
     return covariance + of_headings * torch.bmm(by_heading, by_heading.mT)
 
@@ -222,10 +222,10 @@ def as_calibration(
     width = (positions[:, -1] - positions[:, 0]) / (cfg.num_boundaries - 1)
     by_roll = height_variance_by_roll(height, left, right, cov[:, ROLL, ROLL])
     by_roll = torch.where(has_flag(state.reasons, Reason.ROLL_UNSEEN), by_roll, 0.0)
-    of_width = 2 * _HEADING_LENGTH**2 * wander_of_two(state, right - left)  # m²
-    by_wander = of_width * (height / width).square()
+    of_two = wander_of_two(state, right - left)
+    by_wander = 2 * of_two * (_HEADING_LENGTH * height / width).square()
     only_height = constant(_ONLY_HEIGHT, like=cov)
-    cov = cov + covariance_by_boundaries(state, right - left, cfg) + apart.unsqueeze(-1) * apart.unsqueeze(-2)
+    cov = cov + covariance_by_boundaries(state, of_two, cfg) + apart.unsqueeze(-1) * apart.unsqueeze(-2)
     cov = cov + lane_width_covariance(height, cfg.lane_width_std / width)
     cov = cov + (only_height * (by_roll + by_wander).unsqueeze(-1)).diag_embed()
     return Calibration(Extrinsics.unstack(state.mean[:, POSE]), cov, state.status, inliers)
