@@ -19,7 +19,13 @@ _BYTE_ORDER_MARKS = {
 }
 _BEGINNING = 65_536  # bytes of a file that tell whether it is a text
 _GZIP = b"\x1f\x8b"
-_GIT_LFS = b"version https://git-lfs.github.com/"
+_STAND_INS = {  # what came in place of another file, by its first bytes
+    b"version https://git-lfs.github.com/": "a pointer of Git LFS; fetch the file by git lfs pull",
+    b"\x93NUMPY": "an array without names by numpy.save; save it by numpy.savez, or as JSON or YAML",
+    b"MATLAB ": "MATLAB's own format; save it as JSON by jsonencode",
+    b"PK\x03\x04": "a ZIP archive; unpack it, or give numpy.savez's by its ending .npz",
+    b"\x80": "a pickle of Python, which is not opened since it may run commands; save it as JSON",
+}
 _MOST_FOREIGN = 0.3  # fraction of a text's letters, if its encoding is not known
 _REPR = reprlib.Repr()
 _REPR.maxlist = _REPR.maxdict = _REPR.maxtuple = 4
@@ -30,11 +36,9 @@ def stand_in(begin: bytes) -> str:
     """Return what came in place of another file, by its first bytes; empty if that is not known."""
     if not begin:
         return "an empty file"
-    if begin.startswith(_GIT_LFS):
-        return "a pointer of Git LFS; fetch the file by git lfs pull"
     if begin.lstrip()[:14].lower().startswith((b"<!doctype html", b"<html")):
         return "a web page; download the file again"
-    return ""
+    return next((what for first, what in _STAND_INS.items() if begin.startswith(first)), "")
 
 
 def read_text(path: Path, errors: str = "strict") -> str:

@@ -84,7 +84,10 @@ def read_camera(
         # comments and names may be in other encodings: they are not needed
         text = read_text(path, "replace") if arrays is None else ""
     except ValueError as error:
-        raise ValueError(f"camera file {path}: expected a readable camera file, got: {error}") from error
+        remedy = "; COLMAP writes texts by model_converter --output_type TXT" if path.suffix == ".bin" else ""
+        raise ValueError(
+            f"camera file {path}: expected a readable camera file, got: {error}{remedy}"
+        ) from error
     try:
         if is_colmap(text):
             camera = checked(chosen(colmap_cameras(text), name, has_usual=False))

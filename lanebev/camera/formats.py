@@ -7,40 +7,31 @@ from typing import Any
 
 from lanebev.camera.named_lens import LENS_NAMES, stated_lens
 from lanebev.camera.parameters import CameraParameters, centre_offset, checked
-from lanebev.camera.parsing import mapping, number, numbers, whole_number
+from lanebev.camera.parsing import mapping, number, numbers, once, whole_number
 from lanebev.numbers import shown
 
-_MATRIX_KEYS = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "k", "mtx")
-DISTORTION_KEYS = (
-    "distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "D", "d", "dist", "dist_coeff",
-    "dist_coeffs",
-)  # fmt: skip
-_PROJECTION_KEYS = ("projection_matrix", "P", "p")
-_ROTATION_KEYS = ("rectification_matrix", "R", "r")
-_WIDTH_KEYS = ("image_width", "image_Width", "width")
-_HEIGHT_KEYS = ("image_height", "image_Height", "height")
+_MATRIX_KEYS = ("camera_matrix", "K", "mtx")
+_LENS_LISTS = ("distortion_coefficients", "D", "dist", "dist_coeff", "dist_coeffs")
+DISTORTION_KEYS = (*_LENS_LISTS, "Distortion_Coefficients", "distCoeffs", "d")
+_PROJECTION_KEYS = ("projection_matrix", "P")
+_ROTATION_KEYS = ("rectification_matrix", "R")
+_WIDTH_KEYS = ("image_width", "width")
+_HEIGHT_KEYS = ("image_height", "height")
 _MODEL_KEYS = ("distortion_model", "camera_model", "model", "DistModel")
-_LENS_KEYS = ("distortion", *DISTORTION_KEYS)
+_LENS_KEYS = ("distortion", *_LENS_LISTS)
 _SHORT_KEYS = {
     "fx", "fy", "cx", "cy", *_WIDTH_KEYS, *_HEIGHT_KEYS, *_LENS_KEYS, *LENS_NAMES["pinhole"], *_MODEL_KEYS,
 }  # fmt: skip
-_IGNORED_KEYS = {
-    # ROS camera_info beside the lens
-    "camera_name", "header", "translation", "rotation",
-    # Foxglove's CameraCalibration
-    "timestamp", "frame_id",
-    # records of OpenCV's calibration programs
-    "calibration_time", "nframes", "nFrames", "nr_of_frames", "nrOfFrames", "board_width", "board_height",
-    "board_size", "square_size", "marker_size", "aspectRatio", "fix_aspect_ratio", "flags", "flagValue",
-    "fisheye_model", "avg_reprojection_error", "per_view_reprojection_errors", "extrinsic_parameters",
-    "image_points", "grid_points", "ret", "rvecs", "tvecs",
-    # our own calibration.yaml
-    "mount", "vehicle_from_camera", "quaternion_xyzw",
-}  # fmt: skip
 _KNOWN_KEYS = {
-    *_MATRIX_KEYS, *DISTORTION_KEYS, *_PROJECTION_KEYS, *_ROTATION_KEYS, *_WIDTH_KEYS, *_HEIGHT_KEYS,
-    *_MODEL_KEYS, *_IGNORED_KEYS, *LENS_NAMES["pinhole"], "binning_x", "binning_y", "roi", "xi",
+    *_MATRIX_KEYS, *_LENS_LISTS, *_PROJECTION_KEYS, *_ROTATION_KEYS, *_WIDTH_KEYS, *_HEIGHT_KEYS,
+    *_MODEL_KEYS, *LENS_NAMES["pinhole"], "fisheye_model", "binning_x", "binning_y", "roi", "xi",
 }  # fmt: skip
+_SPELLED = {re.sub("_", "", key).lower(): key for key in (*_SHORT_KEYS, *_KNOWN_KEYS)}
+_OF_CAMERA = re.compile(  # words in keys that may say something of the lens or the images
+    r"^(?!board|grid|pattern|square|marker|chess|charuco).*(dist(?!ance)|lens|model|type|fish|omni|size|dim|"
+    r"width|height|resol|shape|crop|roi|bin|scale|focal|skew|radial|tangential|rectified|^xi|^[kp]_?\d)",
+    re.IGNORECASE,
+)
 _MODELS = {
     "": "",  # a driver of an ideal camera leaves it empty
     "pinhole": "pinhole",
@@ -86,6 +77,9 @@ def opencv_or_ros(
     order: what is returned is the camera of the images, as ``image_geometry`` has it. Deviation: a binned
     pixel's centre is the centre of those it binds together, not their corner: (x + 0.5) / b − 0.5.
 
+    Keys are read in any case, with underscores or not. Beside a camera matrix, unknown ones are ignored as
+    parts of a calibration's record, unless they may say something of the lens or the images.
+
     A file may state its matrix twice, in K and P, as our own writer does: then it is not a person's mistake.
 
     Args:
@@ -96,13 +90,14 @@ def opencv_or_ros(
     Raises:
         ValueError: an unknown key, or a value that no real camera has.
     """
+    fields = once((_SPELLED.get(key.replace("_", "").lower(), key), value) for key, value in fields.items())
     short = not {"fx", "fy", "cx", "cy"}.isdisjoint(fields)
     unknown = sorted(set(fields) - (_SHORT_KEYS if short else _KNOWN_KEYS))
+    if not (short or set(_MATRIX_KEYS).isdisjoint(fields)):
+        unknown = [*filter(_OF_CAMERA.match, unknown)]
     if unknown:
         known = "fx, fy, cx, cy, width, height, distortion, model"
-        case = ", in small letters" if unknown[0].lower() in _SHORT_KEYS else ""
-        words = f"unknown key {shown(unknown[0])}; expected {known}{case}, or those of OpenCV or ROS"
-        raise ValueError(words)
+        raise ValueError(f"unknown key {shown(unknown[0])}; expected {known}, or those of OpenCV or ROS")
     if image_size and not any(fields.get(key) is not None for key in (*_WIDTH_KEYS, *_HEIGHT_KEYS)):
         return _of_images(fields, rectified, image_size)
     if short:

@@ -51,8 +51,8 @@ def parse_documents(text: str) -> list[Any]:
     start = text.lstrip()[:1]
     if start not in ("<", "{") and (section := _SECTION.search(text)):
         raise ValueError(
-            f"expected YAML, JSON or XML, got the section {section[0].strip()}, as of INI or TOML; write its "
-            "numbers as fx: 1150"
+            f"expected YAML, JSON or XML, got the section {section[0].strip()}, as of INI or TOML; write the "
+            "numbers of one camera and image size as fx: 1150, with width and height"
         )
     if start == "<":
         return [_parse_xml(text)]

@@ -58,8 +58,10 @@ def as_kalibr(fields: Mapping[str, Any]) -> Mapping[str, Any]:
     if isinstance(rig, Mapping) and isinstance(rig.get("intrinsics"), list):
         sizes = rig.get("resolution") or []
         cameras = [_of_basalt(camera, size) for camera, size in zip(rig["intrinsics"], sizes, strict=False)]
-    elif isinstance(fields.get("cameras"), list):
-        cameras = [_of_maplab(mapping("cameras", each)) for each in fields["cameras"]]
+    elif isinstance(rig := fields.get("cameras"), list) and all(
+        "camera" in mapping("cameras", e) for e in rig
+    ):
+        cameras = [_of_maplab(each) for each in rig]
     else:
         return fields
     if not cameras:

@@ -1,6 +1,7 @@
 """Camera files as more programs write them, each after a public report, and what only looks like one."""
 
 import json
+import pickle
 
 import cv2
 import numpy as np
@@ -507,3 +508,74 @@ def test_what_python_dumps(tmp_path):
     _is(_read(tmp_path / "c.yaml", yaml.dump(fields)), 500, 500, 320, 240, 640, 480)
     with pytest.raises(ValueError, match=r"expected numbers, texts and lists, got another object at line 2$"):
         _read(tmp_path / "c.yaml", yaml.dump({**fields, "K": np.eye(3)}))
+
+
+# what the calibration program of OpenCV 2.4 and 3.0 writes
+OPENCV_2 = """%YAML:1.0
+calibration_Time: "Thu 05 Mar 2020 10:12:12 AM UTC"
+nrOfFrames: 2
+image_Width: 1280
+image_Height: 720
+board_Width: 9
+board_Height: 6
+square_Size: 25.
+FixAspectRatio: 1.
+# flags: +fix_aspectRatio+fix_principal_point+zero_tangent_dist
+flagValue: 14
+Camera_Matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 1150., 0., 640., 0., 1150., 360., 0., 0., 1. ]
+Distortion_Coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ -0.3, 0.1, 0., 0., 0. ]
+Avg_Reprojection_Error: 0.5
+Per_View_Reprojection_Errors: !!opencv-matrix
+   rows: 1
+   cols: 1
+   dt: f
+   data: [ 0.5 ]
+"""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        OPENCV_2,
+        OPENCV_2.replace("Camera_M", "CameraM").replace("Distortion_C", "DistortionC"),
+        OPENCV_2.replace("calibration_Time", "calibration_date") + "rms: 0.3\nT_cam_lidar: [1, 0, 0]\n",
+    ],
+)
+def test_keys_in_other_cases_and_what_a_program_records_beside_the_camera(tmp_path, text):
+    _is(_read(tmp_path / "c.yaml", text), 1150, 1150, 640, 360, 1280, 720, [-0.3, 0.1, 0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    "more", ["lens_type: fisheye", "crop: 1", "DIM: [640, 480]", "p_9: 1", "rectified: 1", "imgSize: [640]"]
+)
+def test_keys_beside_the_camera_that_may_concern_the_lens_or_the_images_are_refused(tmp_path, more):
+    with pytest.raises(ValueError, match=f"unknown key '{more.split(':')[0]}'; expected fx"):
+        _read(tmp_path / "c.yaml", OPENCV_2 + more)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        ("wide_dist_pickle.p", pickle.dumps({"mtx": MATRIX}), "a pickle of Python, .*; save it as JSON$"),
+        ("k.npy", b"\x93NUMPY\1\0", "an array without names by numpy.save; save it by numpy.savez, or"),
+        ("k.mat", b"MATLAB 5.0 MAT-file, Platform: PCWIN64\0\0", "MATLAB's own format; save it as JSON"),
+        ("c.zip", b"PK\x03\x04\0\0", "a ZIP archive; unpack it"),
+        ("cameras.bin", bytes(8), "COLMAP writes texts by model_converter --output_type TXT$"),
+    ],
+)
+def test_binary_files_say_how_to_write_them_as_texts(tmp_path, name, data, words):
+    with pytest.raises(ValueError, match=f"{name}: expected a readable camera file, got: .*{words}"):
+        _read(tmp_path / name, data)
+
+
+def test_a_list_of_cameras_of_another_program_is_named(tmp_path):  # OKVIS
+    with pytest.raises(ValueError, match="unknown key 'cameras'; expected fx"):
+        _read(tmp_path / "c.yaml", "cameras:\n - {image_dimension: [752, 480], focal_length: [458, 457]}\n")

@@ -198,6 +198,6 @@ ANNOTATORS: dict[str, Pictures] = {
     "data_row": labelbox,
     "items": datumaro,
     "shapes": labelme,
-    "annotations": vil100,
+    "annotations.lane": vil100,
 }
-"""What reads a tool's pictures, by a key that files of none before it have."""
+"""What reads a tool's pictures, by a key that files of none before it have; a.b is the key b below a."""

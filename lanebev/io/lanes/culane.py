@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from lanebev.io.lanes.parsing import FrameLines, Where, checked_pixels, lane_text
 from lanebev.numbers import numbers_or_gaps
 from lanebev.observation.polylines import LaneLine
+from lanebev.types import NUM_BOUNDARIES
 
 _NOT_THERE = (-2.0, -1.0)  # x of points that detectors made for TuSimple do not see, or a pixel outside
 _MOST_CLASSES = 20  # largest index of a lane's class
@@ -43,6 +44,8 @@ def read_culane(path: str | Path) -> FrameLines:
             points[np.isin(points[:, 0], _NOT_THERE), 0] = np.nan
             if np.isfinite(points).all(-1).any():
                 lines.append(LaneLine(_with_gaps(points)))
+    if len(lines) > NUM_BOUNDARIES and max(len(line.points) for line in lines) == 1:
+        raise ValueError(f"lane file {path}: expected a line of text for each lane, got one for each point")
     return FrameLines(str(path).removesuffix(".txt").removesuffix(".lines"), lines)
 
 

@@ -23,8 +23,9 @@ from lanebev.io.lanes.curvelanes import read_curvelanes
 from lanebev.io.lanes.lanes3d import read_apollo, read_once
 from lanebev.io.lanes.llamas import read_llamas
 from lanebev.io.lanes.openlane import read_openlane
-from lanebev.io.lanes.parsing import FrameLines, json_values, lane_text
+from lanebev.io.lanes.parsing import FORMATS, FrameLines, json_values, lane_text
 from lanebev.io.lanes.tusimple import read_tusimple
+from lanebev.numbers import shown
 
 
 def _of_one(read: Callable[[Path], FrameLines], path: Path) -> list[FrameLines]:
@@ -41,6 +42,7 @@ _READERS: dict[str, Callable[[Path], list[FrameLines]]] = {  # by a key that no 
     "labels": read_bdd100k,
     "frames": read_bdd100k,
 }
+_OF_TUSIMPLE = {"lanes", "h_samples", "raw_file"}
 _BEGIN = 1_000  # characters
 _OF_LLAMAS = re.compile(r"_(color|gray)_rect$")  # ends the names of LLAMAS' images, not of its labels
 
@@ -69,7 +71,11 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
         return read_cvat(path)
     if '"shape_attributes"' in text:
         return read_annotations(path, via)
-    keys = _first_keys(path, text)
+    return _read_json(path, _first_keys(path, text), intrinsics)
+
+
+def _read_json(path: Path, keys: set[str], intrinsics: NDArray[np.float64] | None) -> list[FrameLines]:
+    """Read a JSON file by the keys of its first object; one without keys is no JSON, as its reader says."""
     if {"lanes", "raw_file"} <= keys:  # whatever else a detector adds
         return read_tusimple(path)
     if "lane_lines" in keys:
@@ -78,7 +84,11 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
         return read_apollo(path, intrinsics)
     if "calibration" in keys or keys == {"lanes"}:
         return [read_once(path, intrinsics)]
-    return next((read for key, read in _READERS.items() if key in keys), read_tusimple)(path)
+    read = next((read for key, read in _READERS.items() if key in keys), read_tusimple)
+    if read is read_tusimple and keys and _OF_TUSIMPLE.isdisjoint(keys):
+        got = ", ".join(sorted(key for key in keys if key.rpartition(".")[0] not in keys))
+        raise ValueError(f"lane file {path}: expected keys of a known format, got {shown(got)}; {FORMATS}")
+    return read(path)
 
 
 def lane_files(path: str | Path) -> list[Path]:
@@ -175,9 +185,14 @@ def _parts(name: str) -> tuple[str, ...]:
 
 
 def _first_keys(path: Path, text: str) -> set[str]:
-    """Return the keys of a JSON text's first object; of one that breaks off, the words of its first line."""
+    """Return the keys of a JSON text's first object, those of objects in it as a.b; none of another text.
+
+    Of one that breaks off they are the words of its first line.
+    """
     try:
         first: Any = next((value for _, value in json_values(path, text)), {})
     except ValueError:
         return set(re.findall(r'"(\w+)"', text.lstrip().split("\n", 1)[0]))
-    return set(first) if isinstance(first, dict) else set()
+    fields = first if isinstance(first, dict) else {}
+    below = (f"{key}.{each}" for key, value in fields.items() if isinstance(value, dict) for each in value)
+    return {*fields, *below}

@@ -16,7 +16,10 @@ _FARTHEST = 1e6  # px or m, of any coordinate
 _DECODER = json.JSONDecoder()
 _NO_VALUE = re.compile(r"[\s,]*")  # between JSON values
 _SHOWN = 30  # characters of what is no JSON
-_FORMATS = "formats: TuSimple, CULane, CurveLanes, OpenLane, LLAMAS, BDD100K, VIL-100, LabelMe, CVAT, ..."
+FORMATS = (
+    "formats: TuSimple, CULane, CurveLanes, OpenLane, ONCE-3DLanes, Apollo, LLAMAS, BDD100K, VIL-100, "
+    "LabelMe, CVAT, Supervisely, V7, Labelbox, Datumaro, VIA"
+)
 _NO_JSON = "expected JSON, got a line that breaks off or is none; is the file cut?"
 
 
@@ -98,7 +101,9 @@ def json_values(path: str | Path, text: str) -> Iterator[tuple[int, Any]]:
                 value, end = _DECODER.raw_decode(text, place)
             except (ValueError, RecursionError) as error:
                 got = shown(text[place : place + _SHOWN].split("\n", maxsplit=1)[0])
-                words = _NO_JSON if text[place] in "{[" else f"expected JSON, got {got}; {_FORMATS}"
+                words = _NO_JSON if text[place] in "{[" else f"expected JSON, got {got}; {FORMATS}"
+                if text[place : place + 2] in ("{'", "['"):
+                    words = f"expected JSON, got single quotes: {got}; write it by json.dumps"
                 raise ValueError(words) from error
         listed = isinstance(value, list) and all(isinstance(each, dict) for each in value)
         yield from ((line, each) for each in (value if listed else [value]))
@@ -116,7 +121,7 @@ def field(fields: Any, key: str, kind: type) -> Any:
     """Return the value of a key, if it is of this kind; else it is a ValueError."""
     if not isinstance(fields, dict) or not isinstance(fields.get(key), kind):
         got = type(fields.get(key)).__name__ if isinstance(fields, dict) and key in fields else "none"
-        raise ValueError(f"{key}: expected a {kind.__name__}, got {got}; {_FORMATS}")
+        raise ValueError(f"{key}: expected a {kind.__name__}, got {got}")
     return fields[key]
 
 

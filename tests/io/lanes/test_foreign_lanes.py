@@ -257,3 +257,30 @@ def test_a_folder_whose_names_state_no_times_says_which_rate_is_assumed(tmp_path
     for settings in ({"fps": 10.0}, {"stills": True}):
         assert make_source(RunConfig(str(tmp_path), "c", **settings)).problem == ""
     assert make_source(RunConfig(str(tmp_path / "0.png"), "c")).problem == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        (  # SDLane
+            "1.json",
+            json.dumps({"geometry": [], "idx": [1], "shape": {"a": 1}}),
+            "expected keys of a known format, got 'geometry, idx, shape'; formats: TuSimple, .*, VIA$",
+        ),
+        ("1.json", json.dumps({"0.jpg": {"l0": [1]}}), "a known format, got '0.jpg'; formats"),
+        (
+            "1.json",
+            str({"raw_file": "0.jpg", "lanes": []}),
+            "line 1: expected JSON, got single quotes: .*; write it by json.dumps$",
+        ),
+        (
+            "1.lines.txt",
+            "".join(f"{500 - y / 2} {y}\n" for y in range(700, 600, -10)),
+            "expected a line of text for each lane, got one for each point$",
+        ),
+    ],
+)
+def test_what_others_write_is_refused_in_words(tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_lanes(tmp_path / name)
