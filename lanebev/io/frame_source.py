@@ -35,6 +35,7 @@ class FrameSource:
         selection: which of the frames are taken. ``fps`` and ``count`` are those of the whole source.
         most: how many frames are yielded at most, so that a file that grows is the same twice; None for all.
         matrix: by which a video's frames are shown, see :func:`lanebev.io.video.decoding.display_matrix`.
+        untimed: why a file of times beside images is not used, else empty.
     """
 
     source: str
@@ -49,6 +50,7 @@ class FrameSource:
     selection: Selection = ALL
     most: int | None = None
     matrix: tuple[int, ...] | None = None
+    untimed: str = ""
 
     @property
     def is_live(self) -> bool:

@@ -27,6 +27,7 @@ from lanebev.io.images.files import (
 from lanebev.io.images.names import in_natural_order, times_from_names
 from lanebev.io.images.pixels import is_image, read_image, stated_size
 from lanebev.io.images.time_files import times_from_file
+from lanebev.io.side_by_side import halves_remark
 from lanebev.io.source_names import SCHEMES
 from lanebev.io.video.decoding import (
     declared_duration,
@@ -47,7 +48,6 @@ from lanebev.io.video.remarks import (
     restart_remark,
     stream_remarks,
 )
-from lanebev.io.video.side_by_side import halves_remark
 
 _LOOKED_AT = 20  # images, for the most frequent size and one that has it
 _DARK = 24  # an image with no brighter value, of 255, is dark; 12 bits in 16 give 15 at most
@@ -105,7 +105,7 @@ def _image_source(source: str, paths: Sequence[str], fps: Fraction | None, left_
     size, times, stated, unused = image.shape[:2], times_from_names(paths), "its names state", ""
     if not times:
         (times, unused), stated = times_from_file(paths), "a file of times beside it states"
-    remarks = [left_out, _dark_remark(image), halves_remark(image), "" if fps else unused]
+    remarks = [left_out, _dark_remark(image), halves_remark(image)]
     rate = fps or DEFAULT_FPS
     if times:
         own = 1 / Fraction(median(np.diff(times).tolist())).limit_denominator(1_000_000)
@@ -114,7 +114,8 @@ def _image_source(source: str, paths: Sequence[str], fps: Fraction | None, left_
             remarks.append(f"{stated} {float(own):.4g} frames per second, --fps {float(rate):g} was given")
     said = "; ".join(filter(None, remarks))
     problem = f"{source}: {said}" if said else ""
-    return FrameSource(source, tuple(paths), rate, len(paths), size, problem, times)
+    untimed = "" if fps else unused
+    return FrameSource(source, tuple(paths), rate, len(paths), size, problem, times, untimed=untimed)
 
 
 def _typical_image(paths: Sequence[str]) -> NDArray[np.uint8]:

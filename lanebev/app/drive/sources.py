@@ -59,6 +59,7 @@ def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
             f"its frames are {float(step):.3g} s apart; is the frame rate right? if so, use --stills"
         )
     if found.paths and not config.stills:
+        remarks.append(found.untimed)
         remarks.append(drives_remark(found.paths) or ("" if found.times else jump_remark(found.paths)))
         if found.count > 1 and not (found.times or config.frame_rate):
             why, remedy = untimed_remark(found.paths)

@@ -15,8 +15,10 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".p
 
 _SUFFIXES = r"(?:\.[A-Za-z]\w*)*$"  # .jpg, .lines.txt
 _DECIMAL = re.compile(rf"(?<![\d.])(\d+)\.(\d+)(?={_SUFFIXES})", re.ASCII)
-_SECONDS = re.compile(rf"(?<!\d)(\d{{10}})(?:\.|[_-](?=\d{{9}}\b|\d{{6}}\b))(\d{{1,9}}){_SUFFIXES}", re.ASCII)
-_STAMP = re.compile(rf"(?<!\d)(\d{{13,19}}){_SUFFIXES}", re.ASCII)
+_WORDS = r"(?:[_-][A-Za-z]+\d?)*"  # of a camera after its time, as in _color_rect and _cam0
+_NANO = r"[_-](?:0(?=\d{9}(?!\d))|(?=(?:\d{9}|\d{6})(?!\d)))"  # before digits of a fraction; LLAMAS has ten
+_SECONDS = re.compile(rf"(?<!\d)(\d{{10}})(?:\.|{_NANO})(\d{{1,9}}){_WORDS}{_SUFFIXES}", re.ASCII)
+_STAMP = re.compile(rf"(?<!\d)(\d{{13,19}}){_WORDS}{_SUFFIXES}", re.ASCII)
 _DIGITS = re.compile(r"[0-9a-f]+", re.IGNORECASE)  # of numbers to the base 10 or 16
 _EPOCH = (315_964_800, 2_208_988_800)  # s: 1980, when the time of GPS begins, to 2040
 _STEPS = (Fraction(1, 2000), Fraction(60))  # s between two frames of a drive

@@ -25,7 +25,7 @@ def times_from_file(paths: Sequence[str]) -> tuple[tuple[float, ...], str]:
     The file is called ``times.txt``, ``timestamps.txt`` or the like and has a line for each image, in their
     order; if it has more, the names of the images must be numbers of its lines, from 0. A line is a date with
     a time of day, or a number: seconds, or milli-, micro- or nanoseconds since 1970. Before the number may be
-    the image's.
+    the image's; of several columns a first line says which has the times.
 
     Args:
         paths: paths of the images, in order.
@@ -73,6 +73,12 @@ def _stamps(text: str) -> list[str]:
     """
     rows = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     found = [_stamp(line) for line in rows]
+    titles = re.split(r"[\s,;]+", rows[0].strip().lower()) if rows and not found[0] else []
+    named = [place for place, title in enumerate(titles) if re.search("time|stamp", title)]
+    if len(named) == 1:
+        words = [re.split(r"[\s,;]+", line.strip()) for line in rows]
+        of_title = [each[named[0]] if len(each) == len(titles) else "" for each in words]
+        found = [_stamp(word) or stamp for word, stamp in zip(of_title, found, strict=True)]
     for line, stamp in list(zip(rows, found, strict=True))[1:]:
         if not stamp:
             raise ValueError(f"the line {line[:40]!r}")

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.io.rising_clock import REORDERED
+from lanebev.io.side_by_side import halves_remark
 from lanebev.io.video.decoding import moving_pictures
-from lanebev.io.video.side_by_side import halves_remark
 
 LONGEST_STEP = 60  # s between two frames of a drive
 _MOST_MISSING = 0.2  # of the frames; with more of them, times are those of a camera that varies

@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from lanebev.app.config import RunConfig
+from lanebev.app.drive.sources import make_source
 from lanebev.io.images.time_files import times_from_file
 from lanebev.io.opening import open_source
 
@@ -22,6 +24,7 @@ FILES = {
     "TUM mono": ("../times.txt", [f"{i:05d} {1446828471 + time:.6f} 0.5" for i, time in enumerate(TIMES)]),
     "nanoseconds": ("timestamps.txt", [str(each) for each in NANOSECONDS]),
     "table": ("frame_timestamps.csv", ["frame,time", *(f"{i},{time}" for i, time in enumerate(TIMES))]),
+    "titles": ("times.csv", ["speed;timestamp", *(f"{9 + i}.5;{time}" for i, time in enumerate(TIMES))]),
     "with names": ("times.csv", ["#s,name", *(f"{time},{i:04d}.png" for i, time in enumerate(TIMES))]),
 }
 
@@ -70,8 +73,10 @@ def test_a_file_that_is_not_used_is_said(tmp_path, text, why):
     (tmp_path / "times.txt").write_text(text)
     source = open_source(str(folder))
     assert source.times == ()
-    assert source.problem == f"{folder}: times.txt beside them is not used: {why}"
-    assert open_source(str(folder), Fraction(10)).problem == ""
+    said = f"{folder}: times.txt beside them is not used: {why}"
+    assert said in make_source(RunConfig(str(folder), fov=60.0)).problem
+    assert make_source(RunConfig(str(folder), fov=60.0, fps=10)).problem == ""
+    assert make_source(RunConfig(str(folder), fov=60.0, stills=True)).problem == ""
 
 
 @given(st.text(), st.integers(2, 4))

@@ -10,7 +10,7 @@ from PIL import Image
 from lanebev import Camera
 from lanebev.app.drive.build import match_image_size
 from lanebev.io.opening import open_source
-from lanebev.io.video.side_by_side import halves_remark, row_correlation
+from lanebev.io.side_by_side import halves_remark, row_correlation
 from lanebev.io.video.writer import VideoWriter
 
 REMARK = "its halves show the same, as of two cameras side by side; cut out one"
