@@ -4,7 +4,7 @@ import argparse
 import re
 from collections.abc import Callable
 from dataclasses import Field, fields
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from lanebev import __version__
 from lanebev.app.config.export import ExportConfig
@@ -43,8 +43,29 @@ Open report.html in the output folder first.
 _LONGEST = 300  # characters of an error, in which a glob without quotes has all its files
 
 
+class _Once(argparse.Action):
+    """Stores the value of an option, which may not be given again with another one."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        """Store it."""
+        before = getattr(namespace, self.dest, values)
+        if before not in (values, self.default):
+            parser.error(f"argument {option_string}: expected one value, got {before} and {values}")
+        setattr(namespace, self.dest, values)
+
+
 class _Parser(argparse.ArgumentParser):
     """Reports an error in one line, that names the command to ask for help."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.register("action", None, _Once)  # of options without an action of their own
 
     def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]  # of typeshed: three
         """Parse the arguments; what no option of a command takes is an error of this command."""

@@ -15,7 +15,7 @@ import yaml
 from lanebev.app.config import RunConfig
 from lanebev.app.config.file import load_plain_yaml, parsed_settings
 from lanebev.camera.choice import split_name
-from lanebev.io.source_names import is_live, without_login
+from lanebev.io.source_names import is_bag, is_live, without_login
 from lanebev.numbers import read_text, shown
 
 UNKNOWN_DAY = "unknown"
@@ -53,7 +53,8 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Driv
 
     Columns (or keys) are ``video``, ``camera``, and, where wanted, ``name``, ``camera_id``, ``day``, ``time``
     and any setting of ``lanebev run``. YAML is a list of mappings, or a mapping with ``drives``, the list,
-    and ``defaults``, settings of all drives. Relative paths begin at the manifest's folder.
+    and ``defaults``, settings of all drives (``topic``: of the bags). Relative paths begin at the manifest's
+    folder.
 
     Args:
         path: path of the file; .csv is CSV, anything else YAML.
@@ -120,7 +121,11 @@ def _rows(path: Path) -> list[Row]:
     drives: list[Row] = given if isinstance(given, list) else []
     if drives is not given or not all(isinstance(row, dict) for row in (*drives, defaults)):
         raise ValueError(f"manifest {path}: expected a list of drives, each with video and camera")
-    return [{str(key): value for key, value in {**defaults, **row}.items()} for row in drives]
+    of_bags = {key: value for key, value in defaults.items() if key == "topic"}
+    of_all = {key: value for key, value in defaults.items() if key != "topic"}
+    bags = [is_bag(str(path.parent / str(row.get("video")))) for row in drives]
+    together = [{**of_all, **(of_bags if bag else {}), **row} for bag, row in zip(bags, drives, strict=True)]
+    return [{str(key): value for key, value in row.items()} for row in together]
 
 
 def _csv_rows(text: str) -> list[Row]:

@@ -89,6 +89,12 @@ def test_yaml_with_defaults_says_the_same(write):
     assert read_manifest(write(listed)) == [first, second]
 
 
+def test_a_topic_of_all_drives_is_that_of_the_bags(write):
+    rows = [{"video": "a.mp4"}, {"video": "b.mcap"}, {"video": "c.bag", "topic": "/right"}]
+    drives = read_manifest(write({"defaults": {"fov": 60, "topic": "/left"}, "drives": rows}))
+    assert [drive.config.topic for drive in drives] == [None, "/left", "/right"]
+
+
 @pytest.mark.parametrize("key", ["video", "camera", "lanes", "weights", "mount", "resume", "exported"])
 @pytest.mark.parametrize("text", ["../x", "/etc/passwd", "a/../../x", "link/x"])
 def test_a_path_that_leaves_the_folder_is_refused(write, tmp_path, key, text):
