@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from lanebev.observation.segmenter import LaneSegmenter
-from lanebev.weights import load_segmenter, read_metadata, save_segmenter, segmenter_config
+from lanebev.weights import is_checkpoint, load_segmenter, read_metadata, save_segmenter, segmenter_config
 from train.commands import command_parser, one_line_errors
 from train.losses import unweighted_bias
 
@@ -31,6 +31,11 @@ def checkpoint_weights(path: Path) -> dict[str, Tensor]:
 
 def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read weights and settings."""
+    if path.is_file() and not is_checkpoint(path):
+        raise ValueError(
+            f"{path}: expected a checkpoint of python -m train, got another file; training begins with a "
+            "weights file by --model.init_args.init_from"
+        )
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         state, settings = checkpoint["state_dict"], dict(checkpoint["settings"])
@@ -58,7 +63,7 @@ def load_weights(segmenter: LaneSegmenter, path: Path, class_weight: Tensor) -> 
         path: a Lightning checkpoint, or a weights file, into whose last bias the class weights go again.
         class_weight: (1+L,) of the training to come.
     """
-    exported = path.suffix == ".safetensors"
+    exported = not is_checkpoint(path)
     weights = load_segmenter(path).state_dict() if exported else checkpoint_weights(path)
     if weights["trunk.conv1.weight"].shape[0] * 2 == segmenter.config.base_width:
         weights = widen(weights, segmenter.state_dict())
@@ -132,7 +137,7 @@ def trained_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
     Raises:
         ValueError: neither of them.
     """
-    if path.suffix != ".ckpt":
+    if not is_checkpoint(path):
         return load_segmenter(path), read_metadata(path).get("training", {})
     segmenter, settings = checkpoint_segmenter(path)
     training = {name: value for name, value in settings.items() if name != "network"}

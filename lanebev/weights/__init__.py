@@ -60,6 +60,16 @@ def read_metadata(path: str | Path | None = None) -> dict[str, Any]:
     return {name: json.loads(value) for name, value in metadata.items() if name != "format"}
 
 
+def is_checkpoint(path: Path) -> bool:
+    """Tell whether a file is a checkpoint of training, by its ending or by what torch.save begins with."""
+    if path.suffix == ".ckpt":
+        return True
+    if not path.is_file():
+        return False
+    with open(path, "rb") as file:
+        return file.read(len(_ZIP)) == _ZIP
+
+
 def save_segmenter(
     segmenter: LaneSegmenter, path: str | Path, half: bool = True, compact: bool = False, **record: Any
 ) -> None:
@@ -119,7 +129,7 @@ def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, t
         head = file.read(len(_GIT_LFS))
     if head == _GIT_LFS:
         raise ValueError(f"{path}: expected a weights file, got where Git LFS keeps it; run: git lfs pull")
-    if path.suffix == ".ckpt" or head.startswith(_ZIP):
+    if is_checkpoint(path):
         name = path.with_suffix(".safetensors").name
         raise ValueError(
             f"{path}: expected a weights file, got a checkpoint of training; "

@@ -5,7 +5,7 @@ import torch
 
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.weights import load_segmenter, quantised, read_metadata, save_segmenter
-from train.export import checkout_commit, checkpoint_weights, export, main
+from train.export import checkout_commit, checkpoint_weights, export, main, trained_segmenter
 
 
 def test_rounding_to_8_bits_is_within_half_a_scale_of_each_channel():
@@ -51,6 +51,22 @@ def test_a_checkpoint_in_place_of_weights_is_told_how_to_export(tmp_path):
     path.write_bytes(b"anything")
     with pytest.raises(ValueError, match=r"python -m train\.export .*last\.ckpt last\.safetensors"):
         load_segmenter(path)
+
+
+def test_checkpoints_are_told_from_weights_files_by_what_is_in_them(wide, tmp_path):
+    torch.save({"state_dict": {}}, tmp_path / "last.pt")
+    with pytest.raises(
+        ValueError, match="expected a checkpoint of python -m train, got: none with 'settings'"
+    ):
+        trained_segmenter(tmp_path / "last.pt")
+    save_segmenter(wide, tmp_path / "weights.safetensors")
+    for name, data in (("weights.safetensors", None), ("cut.safetensors", bytes(30)), ("notes.txt", b"none")):
+        if data is not None:
+            (tmp_path / name).write_bytes(data)
+        with pytest.raises(
+            ValueError, match=f"{name}: .* got another file; .*by --model.init_args.init_from"
+        ):
+            checkpoint_weights(tmp_path / name)
 
 
 def test_metrics_that_are_no_json_are_named(monkeypatch, capsys):
