@@ -155,6 +155,9 @@ def _camera(
     for key, read in _BY_KEY.items():
         if key in content:
             return checked(read(content))
+    only = next(iter(content.values())) if len(content) == 1 else None
+    if isinstance(only, Mapping) and "data" not in only:  # keys below the camera's name
+        content = only
     return opencv_or_ros(content, rectified, image_size)
 
 

@@ -64,6 +64,10 @@ _STEREO = [  # keys of matrix and coefficients of both cameras, as of OpenCV's s
     for matrix, lens in (("M", "D"), ("K", "D"), ("cameraMatrix", "distCoeffs"))
     for sides in ("12", "LR")
 ]
+_OF_NO_MODEL = (
+    "it states four coefficients and no lens model; they are taken as k1 k2 p1 p2 of a pinhole camera: "
+    "if it is a fisheye, add model: fisheye"
+)
 _OFF_CENTRE = 0.1  # shares of the sides, more than which a file without a size is of other images
 _IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
@@ -113,6 +117,13 @@ def opencv_or_ros(
         xi = numbers(fields, "xi", count=1) if not isinstance(fields["xi"], str) else [number(fields, "xi")]
         distortion = [*xi, *(distortion or [0.0] * 4)]
     camera = CameraParameters(matrix, distortion, model, size)
+    if (
+        model == "pinhole"
+        and len(distortion) == 4
+        and any(distortion[2:])
+        and not any(map(fields.get, _MODEL_KEYS))
+    ):
+        camera = camera._replace(remark=_OF_NO_MODEL)
     return _as_taken(checked(camera, _restates(fields)), fields)
 
 
@@ -143,7 +154,8 @@ def _of_images(fields: Mapping[str, Any], rectified: bool, image_size: tuple[int
             f"principal point {camera.matrix[2]:g}, {camera.matrix[5]:g} is not in the middle of "
             f"{width} x {height} px; add them"
         )
-    return camera._replace(remark=f"the file states no size of images; {width} x {height} px are taken")
+    remark = f"the file states no size of images; {width} x {height} px are taken"
+    return camera._replace(remark="; ".join(filter(None, (remark, camera.remark))))
 
 
 def _short(fields: Mapping[str, Any], rectified: bool) -> CameraParameters:

@@ -22,6 +22,7 @@ _NO_SPACE = re.compile(r"^\w{1,40}:[\w.]{1,20}", re.MULTILINE)  # which OpenCV r
 _NO_BREAK_SPACE = "\u00a0"  # of texts copied from web pages
 _ROS_INI = re.compile(r"^\[image\]\s*$", re.MULTILINE)
 _SECTION = re.compile(r"^\[[A-Za-z]\w*\]\s*$", re.MULTILINE)  # of other programs' INI, and of TOML
+_OF_FISHEYE = 4  # coefficients
 _INI_KEYS = {
     "width": "image_width",
     "height": "image_height",
@@ -151,7 +152,10 @@ def _parse_yaml(text: str) -> list[Any]:
 
 
 def _parse_ini(text: str) -> dict[str, Any]:
-    """Read names on lines of their own and the numbers below them; names of sections are ignored."""
+    """Read names on lines of their own and the numbers below them; names of sections are ignored.
+
+    ROS writes five coefficients or eight of a pinhole camera, four of a fisheye, and no lens model.
+    """
     entries: list[tuple[str, list[str]]] = []
     for line in text.splitlines():
         words = line.split("#")[0].strip()
@@ -159,7 +163,9 @@ def _parse_ini(text: str) -> dict[str, Any]:
             entries.append((_INI_KEYS.get(words, words), []))
         elif entries and not words.startswith("["):
             entries[-1][1].extend(words.split())
-    return {key: values[0] if len(values) == 1 else values for key, values in once(entries).items()}
+    found = {key: values[0] if len(values) == 1 else values for key, values in once(entries).items()}
+    is_fisheye = len(found.get("distortion_coefficients", "")) == _OF_FISHEYE
+    return {**found, **({"distortion_model": "fisheye"} if is_fisheye else {})}
 
 
 def _parse_xml(text: str) -> dict[str, Any]:

@@ -579,3 +579,59 @@ def test_binary_files_say_how_to_write_them_as_texts(tmp_path, name, data, words
 def test_a_list_of_cameras_of_another_program_is_named(tmp_path):  # OKVIS
     with pytest.raises(ValueError, match="unknown key 'cameras'; expected fx"):
         _read(tmp_path / "c.yaml", "cameras:\n - {image_dimension: [752, 480], focal_length: [458, 457]}\n")
+
+
+OST_INI = """# oST version 5.0 parameters
+
+[image]
+
+width
+1640
+
+height
+1232
+
+[narrow_stereo]
+
+camera matrix
+404.0 0.0 820.0
+0.0 404.0 616.0
+0.0 0.0 1.0
+
+distortion
+{}
+"""
+
+
+def test_four_coefficients_in_the_ini_of_ros_are_those_of_a_fisheye(tmp_path):
+    size = (404, 404, 820, 616, 1640, 1232)
+    _is(
+        _read(tmp_path / "ost.txt", OST_INI.format("0.01 -0.03 0.004 -0.0007")),
+        *size,
+        [0.01, -0.03, 0.004, -0.0007],
+        "fisheye",
+    )
+    lens = [-0.1, 0.01, 0.0004, -0.0007, 0.0]
+    _is(_read(tmp_path / "ost.txt", OST_INI.format(" ".join(map(str, lens)))), *size, lens)
+
+
+def test_four_coefficients_without_a_lens_model_are_remarked_on(tmp_path):
+    fields = {"K": MATRIX, "D": [[-0.05], [0.01], [-0.008], [0.002]], "width": 816, "height": 490}
+    camera = _read(tmp_path / "c.json", json.dumps(fields))
+    assert camera.remark.endswith(
+        "; they are taken as k1 k2 p1 p2 of a pinhole camera: if it is a fisheye, add model: fisheye"
+    )
+    for more in ({"model": "pinhole"}, {"D": [-0.05, 0.01, 0, 0]}, {"D": [-0.05, 0.01, 0.001, 0, 0.1]}):
+        assert _read(tmp_path / "c.json", json.dumps({**fields, **more})).remark == ""
+    del fields["width"], fields["height"]
+    remark = _read(tmp_path / "c.json", json.dumps(fields), image_size=(490, 816)).remark
+    assert remark.startswith("the file states no size of images; 816 x 490 px are taken; it states four")
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"fx": 500, "fy": 500, "cx": 320, "cy": 240}, {"K": [500, 0, 320, 0, 500, 240, 0, 0, 1], "D": []}],
+)
+def test_keys_below_the_cameras_name_are_read(tmp_path, fields):
+    text = yaml.safe_dump({"front": {**fields, "width": 640, "height": 480}})
+    _is(_read(tmp_path / "c.yaml", text), 500, 500, 320, 240, 640, 480)
