@@ -21,10 +21,13 @@ _BEGINNING = 65_536  # bytes of a file that tell whether it is a text
 _GZIP = b"\x1f\x8b"
 _STAND_INS = {  # what came in place of another file, by its first bytes
     b"version https://git-lfs.github.com/": "a pointer of Git LFS; fetch the file by git lfs pull",
-    b"\x93NUMPY": "an array without names by numpy.save; save it by numpy.savez, or as JSON or YAML",
+    b"\x93NUMPY": "an array of NumPy; write numbers as JSON or YAML, images as PNG",
     b"MATLAB ": "MATLAB's own format; save it as JSON by jsonencode",
-    b"PK\x03\x04": "a ZIP archive; unpack it, or give numpy.savez's by its ending .npz",
-    b"\x80": "a pickle of Python, which is not opened since it may run commands; save it as JSON",
+    b"PK\x03\x04": "a ZIP archive; unpack it",
+    **dict.fromkeys(
+        (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"),
+        "a pickle of Python, which is not opened since it may run commands; save it as JSON",
+    ),
 }
 _MOST_FOREIGN = 0.3  # fraction of a text's letters, if its encoding is not known
 _REPR = reprlib.Repr()

@@ -565,7 +565,7 @@ def test_keys_beside_the_camera_that_may_concern_the_lens_or_the_images_are_refu
     ("name", "data", "words"),
     [
         ("wide_dist_pickle.p", pickle.dumps({"mtx": MATRIX}), "a pickle of Python, .*; save it as JSON$"),
-        ("k.npy", b"\x93NUMPY\1\0", "an array without names by numpy.save; save it by numpy.savez, or"),
+        ("k.npy", b"\x93NUMPY\1\0", "an array of NumPy; write numbers as JSON"),
         ("k.mat", b"MATLAB 5.0 MAT-file, Platform: PCWIN64\0\0", "MATLAB's own format; save it as JSON"),
         ("c.zip", b"PK\x03\x04\0\0", "a ZIP archive; unpack it"),
         ("cameras.bin", bytes(8), "COLMAP writes texts by model_converter --output_type TXT$"),

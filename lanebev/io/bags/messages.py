@@ -131,7 +131,7 @@ class _Mcap:
         self._reader = make_reader(file, validate_crcs=True, decoder_factories=factories)
         summary = self._reader.get_summary()
         if summary is None or summary.statistics is None:
-            raise ValueError("no summary at its end")
+            raise ValueError("no summary at its end, which mcap recover writes")
         figures = summary.statistics
         topics = []
         for number, channel in summary.channels.items():

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from lanebev.numbers import stand_in
 
 _DRAWN_TEXTS = ("tty", "bin", "xbin", "adf", "idf")  # formats of which ffmpeg draws the letters
+_A_TEXT = "a text; images are given as a folder or as a quoted glob"
 _MOVING = 0.5  # a stream that lasts for less of the longest one's duration is a picture
 _NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS: raw streams, whose times ffmpeg makes up
 _MARKED = "one that the decoder marks as damaged"
@@ -47,13 +48,13 @@ def open_video(source: str) -> av.container.InputContainer:
     except (av.error.FFmpegError, OSError) as error:
         reason = f"{error.strerror or 'unknown format'}; is it a video, and whole?"
         with contextlib.suppress(OSError), open(source, "rb") as file:
-            reason = stand_in(file.read(100)) or reason
+            begin = file.read(100)
+            is_text = begin.isascii() and b"\0" not in begin
+            reason = stand_in(begin) or (_A_TEXT if is_text else reason)
         raise ValueError(f"video {source}: expected a video that opens, got: {reason}") from error
     if container.format.name in _DRAWN_TEXTS:
         container.close()
-        raise ValueError(
-            f"{source}: expected a video, got a text; images are given as a folder or as a quoted glob"
-        )
+        raise ValueError(f"{source}: expected a video, got {_A_TEXT}")
     for stream in container.streams.video:
         tell_damage(stream.codec_context)
     if not moving_pictures(container):

@@ -318,7 +318,7 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\
     ("name", "content", "message"),
     [
         ("none.mp4", None, "expected a video, an image, a folder or a glob of images, got nothing there"),
-        ("v.mp4", b"not a video", "expected a video that opens, got: Invalid data"),
+        ("v.mp4", b"no\0 video", "expected a video that opens, got: Invalid data"),
         ("v.mp4", b"", "expected a video that opens, got: an empty file"),
         (
             "v.mp4",
@@ -386,6 +386,24 @@ def test_a_list_of_images_is_no_video(tmp_path):  # of which ffmpeg draws the le
     (tmp_path / "train.txt").write_text("".join(f"images/{i:04d}.jpg\n" for i in range(100)))
     with pytest.raises(ValueError, match=r"train\.txt: expected a video, got a text; images are given"):
         open_source(str(tmp_path / "train.txt"))
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        (
+            "list.txt",
+            b"images/1.jpg\nimages/2.jpg\n",
+            "a text; images are given as a folder or as a quoted glob",
+        ),
+        ("images.zip", b"PK\x03\x04" + bytes(99), "a ZIP archive; unpack it"),
+        ("frames.npy", b"\x93NUMPY" + bytes(99), "an array of NumPy; write numbers .*, images as PNG"),
+    ],
+)
+def test_other_files_in_place_of_a_video_are_named(tmp_path, name, data, words):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(ValueError, match=f"{name}: expected a video that opens, got: {words}$"):
+        open_source(str(tmp_path / name))
 
 
 def test_folder_without_images_suggests_a_glob(tmp_path):
