@@ -71,3 +71,8 @@ def test_reduced_information_is_that_of_the_other_parameters_by_least_squares():
     torch.testing.assert_close(torch.linalg.inv(found[..., :2]), own)
     all_of_them = torch.linalg.solve(with_prior, vector)
     torch.testing.assert_close(torch.linalg.solve(found[..., :2], found[..., 2]), all_of_them[:, 3:])
+
+
+def test_matrices_times_vectors():
+    matrix, vector = torch.arange(12, dtype=DOUBLE).view(2, 2, 3), torch.tensor([[1, 0, 2], [0, 1, -1]])
+    assert linalg.times_vector(matrix, vector.to(DOUBLE)).tolist() == [[4, 13], [-1, -1]]

@@ -55,7 +55,7 @@ from lanebev.estimation.joint.update import (
     wide_precision,
 )
 from lanebev.estimation.reasons import Reason
-from lanebev.geometry.linalg import reduced_information
+from lanebev.geometry.linalg import reduced_information, times_vector
 from lanebev.tensors import constant
 
 _NO_BOUNDARY_DEVIATION = 0.36  # m; a line that deviates by more bounds no lane (3 ``open_deviation``)
@@ -131,7 +131,7 @@ def update_state(
     feet = foot_points(prior[:, :NUM_COMMON], on_road, seen, sight)
     residuals = boundary_residuals(prior[:, :NUM_COMMON], on_road, seen, predicted.phase, feet, sight)
     last = iterate(prior, at_cov, residuals, scale, cov)
-    support = torch.bmm(member, per_end(last.frame.trust * seen.weight).unsqueeze(-1)).squeeze(-1)
+    support = times_vector(member, per_end(last.frame.trust * seen.weight))
     score = normalized_score(at_cov, last.frame, support, seen.weight)
     evidence, motion_scale = with_evidence(predicted, score, last.estimated[:, POSE] > 0, dt)
     cov = with_process_noise(cov, adaptive_process_noise(evidence, at_cov, cfg))

@@ -31,6 +31,7 @@ from lanebev.estimation.joint.road_curve import (
     road_curve,
     road_shape,
 )
+from lanebev.geometry.linalg import times_vector
 from lanebev.geometry.road_profile import Profile, before_farthest, meet_road, road_profile
 from lanebev.geometry.rotation import road_from_cam_and_roll
 
@@ -218,7 +219,7 @@ def foot_points(params: Tensor, places: Tensor, seen: Observations, sight: Sight
 def normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Compute Jᵀ W J and Jᵀ W r, (B, P, P) and (B, P), from (B, P, 2N), (B, 2, N) and a weight (B, N)."""
     weighted = jacobian * per_end(weight).unsqueeze(1)
-    return weighted @ jacobian.mT, (weighted @ distance.flatten(1).unsqueeze(-1)).squeeze(-1)
+    return torch.bmm(weighted, jacobian.mT), times_vector(weighted, distance.flatten(1))
 
 
 def above_road(params: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from lanebev.estimation.joint.lane_change import shifted
 from lanebev.estimation.joint.layout import NUM_POSE
 from lanebev.estimation.joint.measurement import OFFSET, ROLL, Residuals
 from lanebev.estimation.joint.observations import per_end
-from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
+from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower, times_vector
 from lanebev.tensors import constant
 
 _PRIOR_STD = (0.05, 0.003)  # m, rad: least prior sigmas of a boundary's own deviation and heading
@@ -71,7 +71,7 @@ def with_headings(
     by_heading = jacobian[:, OFFSET] * residuals.z  # (B, M)
     own = member * (per_end(weight) * by_heading).unsqueeze(1)  # (B, L, M)
     shared = torch.bmm(own, jacobian.mT)  # (B, L, P)
-    alone, against = torch.bmm(own, torch.stack([by_heading, distance], dim=-1)).unbind(-1)
+    alone, against = times_vector(own, by_heading), times_vector(own, distance)
     across = torch.cat([shared, shared[:, :, OFFSET].diag_embed()], dim=-1)  # (B, L, P + L)
     upper = torch.cat([matrix, across.mT], dim=-1)
     lower = torch.cat([across, alone.diag_embed()], dim=-1)

@@ -16,7 +16,7 @@ from lanebev.estimation.joint.robust import (
     squared_distance,
 )
 from lanebev.estimation.kalman import symmetrise
-from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower
+from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower, times_vector
 from lanebev.tensors import constant, identity
 
 UNSEEN = (0.01, 0.01, 0.01, 0.3)
@@ -97,14 +97,14 @@ def information(residuals: Residuals, weight: Tensor, member: Tensor) -> tuple[T
         weight: (B, N) px⁻², the diagonal of Q⁻¹.
         member: (B, L, M) of :func:`membership`.
     """
-    jacobian, distance = residuals.jacobian, residuals.distance.flatten(1).unsqueeze(-1)
+    jacobian, distance = residuals.jacobian, residuals.distance.flatten(1)
     weighted = jacobian * per_end(weight).unsqueeze(1)  # (B, P, M)
     own = member * weighted[:, OFFSET : OFFSET + 1]  # (B, L, M)
     shared = torch.bmm(own, jacobian.mT)  # (B, L, P)
     common = torch.cat([torch.bmm(weighted, jacobian.mT), shared], dim=1)
     deviations = torch.cat([shared.mT, shared[:, :, OFFSET].diag_embed()], dim=1)
-    against = torch.cat([torch.bmm(weighted, distance), torch.bmm(own, distance)], dim=1)
-    return torch.cat([common, deviations], dim=-1), -against.squeeze(-1)
+    against = torch.cat([times_vector(weighted, distance), times_vector(own, distance)], dim=1)
+    return torch.cat([common, deviations], dim=-1), -against
 
 
 def observed_step(
