@@ -89,7 +89,12 @@ def main(args: list[str] | None = None) -> None:
             save_config_kwargs={"overwrite": True},
             trainer_defaults={"callbacks": [ClassWriter()]},
         )
-    except (ValueError, OSError, MisconfigurationException) as error:  # such as an accelerator not there
+    except (
+        ValueError,
+        OSError,
+        ImportError,
+        MisconfigurationException,
+    ) as error:  # also of what is not there
         cause: BaseException = error
         while "\n" in str(cause) and cause.__cause__ is not None:  # the parser wraps what constructors raise
             cause = cause.__cause__

@@ -15,7 +15,6 @@ continues; if there is time, measure that of the final weights with ``python -m 
 """
 
 import json
-import math
 import os
 import shutil
 import subprocess
@@ -39,6 +38,7 @@ START = 25.0  # s, imports and the first batch
 EXPORT = 6.0  # s, reading a checkpoint and writing weights
 RECALL = 25.0  # s, after which no further batch begins
 BATCH = 5.0  # s, kept for the first batch of the recall, whose time is not known before
+FIXED = START + RECALL + 2 * EXPORT
 SMOKE = 120.0  # s at most, before the given time begins
 GRACE = 20.0  # s, a training may take to end by itself
 SHARES = (1 / 3, 2 / 3)
@@ -104,7 +104,7 @@ def pose_scale(noise: list[dict[str, Any]]) -> dict[str, float]:
         (
             {"sigma_scale": SIGMA_SCALE, "pose_sigma_scale": max(1.0, line["pose_sigma_scale"])}
             for line in noise
-            if line["factor"] == SIGMA_SCALE and math.isfinite(line["pose_sigma_scale"])
+            if line["factor"] == SIGMA_SCALE and line["pose_sigma_scale"] is not None
         ),
         {},
     )
@@ -157,6 +157,11 @@ def main() -> None:
     )
     parser.add_argument("--smoke", action="store_true", help="time the parts first")
     args, options = parser.parse_known_args()
+    if 60 * args.minutes <= FIXED:
+        raise ValueError(
+            f"--minutes: expected more than {FIXED / 60:.1f}, which start, export and evaluation take, got "
+            f"{args.minutes:g}"
+        )
     begin = time.monotonic()
     args.out.mkdir(parents=True, exist_ok=True)
     work = args.work or Path(tempfile.mkdtemp(prefix="lanebev-"))
@@ -166,7 +171,8 @@ def main() -> None:
     record = {"seed": args.seed, "commit": _commit()}
     seeds = [f"--seed_everything={args.seed}", f"--data.init_args.seed={args.seed}"]
     training = Training(args.config, work, args.out / "fit.log", [*seeds, *options])
-    weights = args.out / "weights.safetensors"
+    weights, until_export = args.out / "weights.safetensors", end - RECALL - 2 * EXPORT
+    seconds = until_export - time.monotonic()
     noise: list[Measurement] = []
 
     def snapshot(number: int) -> None:
@@ -177,14 +183,18 @@ def main() -> None:
             noise.append(Measurement("train.noise", str(path), *amount))
 
     try:
-        train_until(training, end - RECALL - 2 * EXPORT, snapshot)
+        train_until(training, until_export, snapshot)
     finally:
         training.stop()
         there = save(training, weights, {}, record)
         for table in sorted(work.rglob("throughput.csv")):
             shutil.copy(table, args.out / "throughput.csv")
     if not there:
-        raise ValueError(f"{work}: expected a checkpoint, got none; see {args.out / 'fit.log'}")
+        raise ValueError(
+            f"{work}: expected a checkpoint of {seconds:.0f} s of training, got none; give more than "
+            f"--minutes {args.minutes:g}, unless {args.out / 'fit.log'} ends with an error; {args.config} is "
+            "for a GPU"
+        )
     until = end - EXPORT
     figures = {"recall": held_out_recall(weights, args.views, until)}
     figures["noise"] = noise[0].result(until - time.monotonic()) if noise else []

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from lanebev.estimation.joint.config import HILLY_ROADS, JointConfig
 from train.commands import command_parser, one_line_errors
-from train.drives import DriveObservations, observe_drive, run_calibrator
+from train.drives import WARM_UP, DriveObservations, observe_drive, run_calibrator
 from train.evaluate_poses import AXES
 from train.export import trained_segmenter
 
@@ -72,6 +72,15 @@ def summaries(
     return report
 
 
+def figures(summary: Summary) -> dict[str, float | None]:
+    """Round a summary for JSON, which has no NaN: what no tracked frame tells is None."""
+    rmse, nees, mean = summary
+    known = {name: round(value, 3) for name, value in zip(AXES, rmse.tolist(), strict=True)}
+    known |= {"nees_per_dof": round(float(nees), 2), "pose_sigma_scale": round(float(nees) ** 0.5, 2)}
+    known["mean_nees_per_dof"] = round(float(mean), 2)
+    return {name: None if math.isnan(value) else value for name, value in known.items()}
+
+
 def _observe_one(weights: Path, frames: int, fps: float, seed: int) -> DriveObservations:
     return observe_drive([trained_segmenter(weights)[0]], seed, frames, fps)[0]
 
@@ -88,6 +97,10 @@ def main() -> None:
     parser.add_argument("--hilly", action="store_true", help="with the configuration for hilly roads")
     parser.add_argument("--jobs", type=PositiveInt, default=1, help="number of processes")
     args = parser.parse_args()
+    if args.frames <= WARM_UP:
+        raise ValueError(
+            f"--frames: expected more than {WARM_UP}, which are not evaluated, got {args.frames}"
+        )
     one = partial(_observe_one, args.weights, args.frames, args.fps)
     seeds = range(args.seed, args.seed + args.drives)
     config = HILLY_ROADS if args.hilly else None
@@ -99,12 +112,8 @@ def main() -> None:
             args.jobs, context, initializer=torch.set_num_threads, initargs=(1,)
         ) as pool:
             report = summaries(list(pool.map(one, seeds)), over=pool.map, config=config)
-    for factor, (rmse, nees, mean) in report.items():
-        errors = dict(zip(AXES, (round(value, 3) for value in rmse.tolist()), strict=True))
-        line = {"weights": args.weights.name, "factor": factor, **errors}
-        left = {"nees_per_dof": round(float(nees), 2), "pose_sigma_scale": round(float(nees) ** 0.5, 2)}
-        left["mean_nees_per_dof"] = round(float(mean), 2)
-        print(json.dumps({**line, **left}))
+    for factor, summary in report.items():
+        print(json.dumps({"weights": args.weights.name, "factor": factor, **figures(summary)}))
 
 
 if __name__ == "__main__":

@@ -158,3 +158,11 @@ def test_gradients_of_view_pose_and_covariance_equal_finite_differences(calibrat
         numeric = (along(size * torch.ones(())) - along(-size * torch.ones(()))).flatten() / (2 * size)
     assert numeric.abs().max() > 0
     torch.testing.assert_close(analytic, numeric, rtol=2e-3, atol=1e-4 * float(numeric.abs().max()))
+
+
+def test_hooks_of_every_stage_run():
+    net, ran = model(), []
+    for name in ("segmenter", "extractor", "calibrator", "warp"):
+        net.get_submodule(name).register_forward_hook(lambda *_, name=name: ran.append(name))
+    net(torch.rand(1, 3, 64, 128), CAMERA)
+    assert ran == ["segmenter", "extractor", "calibrator", "warp"]

@@ -1,4 +1,5 @@
 import csv
+import importlib.util
 import warnings
 from pathlib import Path
 
@@ -203,6 +204,12 @@ def test_checkpoints_of_another_kind_are_one_line(tmp_path, capsys):
 def test_a_device_that_is_not_there_is_one_line(tmp_path, capsys):
     said = refused(capsys, "fit", "fast.yaml", tmp_path, "--trainer.accelerator=cpu", "--trainer.devices=0")
     assert said.startswith("error: `Trainer(devices=")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("torch_xla") is not None, reason="torch_xla is installed")
+def test_a_library_of_lightning_that_is_not_installed_is_one_line(tmp_path, capsys):
+    said = refused(capsys, "fit", "fast.yaml", tmp_path, "--trainer.accelerator=tpu")
+    assert said.startswith("error: Requirement 'torch_xla")
 
 
 @pytest.mark.parametrize("option", ["batch_size=0", "sizes=[[0,0]]", "val_size=[64,0]"])

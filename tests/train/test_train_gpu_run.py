@@ -144,4 +144,27 @@ def test_scale_of_the_pose_is_that_measured_with_the_sigma_scale_and_never_below
     ]
     assert pose_scale(noise) == {"sigma_scale": 2.25, "pose_sigma_scale": 1.0}
     assert pose_scale([]) == {}
-    assert pose_scale([{"factor": 2.25, "pose_sigma_scale": float("nan")}]) == {}
+    assert pose_scale([{"factor": 2.25, "pose_sigma_scale": None}]) == {}
+
+
+def complaint(monkeypatch, capsys, tmp_path, minutes):
+    """What the command says that ends with status 2."""
+    monkeypatch.setattr("sys.argv", ["gpu_run", f"--minutes={minutes}", f"--out={tmp_path / 'out'}"])
+    with pytest.raises(SystemExit) as stop:
+        gpu_run.main()
+    assert stop.value.code == 2
+    return capsys.readouterr().err
+
+
+def test_a_time_without_training_is_refused_before_it_begins(monkeypatch, capsys, tmp_path):
+    said = complaint(monkeypatch, capsys, tmp_path, 1)
+    assert (
+        said == "error: --minutes: expected more than 1.0, which start, export and evaluation take, got 1\n"
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_too_little_time_for_a_checkpoint_is_one_line_with_the_remedy(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(gpu_run, "train_until", lambda *_: None)
+    said = complaint(monkeypatch, capsys, tmp_path, 1.5)
+    assert "expected a checkpoint of 53 s of training, got none; give more than --minutes 1.5, unless" in said

@@ -9,7 +9,7 @@ from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.testing.moments import CAMERA, FPS, WIDTH, moments
 from lanebev.testing.moments import observe as see
 from train.drives import DriveObservations, observe_drive
-from train.noise import outcome, summaries
+from train.noise import Summary, figures, main, outcome, summaries
 
 
 @pytest.fixture(scope="module")
@@ -37,3 +37,19 @@ def test_watches_a_rendered_drive_through_a_network_without_its_factor():
     assert len(seen.segments) == 2
     assert seen.poses.shape == (2, 4)
     assert math.isnan(outcome(seen, 1.0).nees)  # no frame after the warm-up
+
+
+def test_what_no_frame_tells_is_null_in_json():
+    unknown = torch.tensor(math.nan)
+    said = figures(Summary(torch.tensor([1.0, 2.0, 3.0, math.nan]), torch.tensor(4.0), unknown))
+    assert list(said.values()) == [1.0, 2.0, 3.0, None, 4.0, 2.0, None]
+
+
+def test_no_frames_after_the_warm_up_are_refused_before_any_is_rendered(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["noise", "none.safetensors", "--frames=10"])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == (
+        "error: --frames: expected more than 10, which are not evaluated, got 10\n"
+    )

@@ -9,6 +9,8 @@ from torch.distributed.device_mesh import init_device_mesh
 from torch.distributed.fsdp import MixedPrecisionPolicy, fully_shard
 from two_processes import CAMERA, SIZE, Training
 
+from lanebev import LaneSegmenter, LineExtractor, SegmenterConfig
+
 
 class Detector(nn.Module):
     """A trunk whose features are seen from above, and LaneBEV."""
@@ -44,7 +46,25 @@ def train(rank, folder):
         found = value.full_tensor() if hasattr(value, "full_tensor") else value
         torch.testing.assert_close(found, whole[name], atol=1e-4, rtol=1e-3)
     assert not torch.equal(whole["trunk.weight"], Detector().trunk.weight)
+    train_in_bfloat16(mesh, images)
     distributed.destroy_process_group()
+
+
+def train_in_bfloat16(mesh, images):
+    """As the docs say: batch norms, whose statistics FSDP leaves in float32, by themselves, without policy."""
+    net = Detector()
+    net.lanes.segmenter = LaneSegmenter(SegmenterConfig(base_width=4, decoder_width=8))
+    net.lanes.extractor = LineExtractor.for_network(net.lanes.segmenter.config)
+    for part in net.lanes.segmenter.modules():
+        if isinstance(part, nn.BatchNorm2d):
+            fully_shard(part, mesh=mesh)
+    policy = MixedPrecisionPolicy(param_dtype=torch.bfloat16)
+    fully_shard(net.lanes.segmenter, mesh=mesh, mp_policy=policy)
+    fully_shard(net, mesh=mesh)
+    out, _ = net.lanes(images, CAMERA.repeat(len(images), 1, 1))
+    assert out.logits.dtype == torch.bfloat16
+    out.logits.float().square().mean().backward()
+    assert net.lanes.segmenter.head.weight.grad.full_tensor().abs().sum() > 0
 
 
 if __name__ == "__main__":
