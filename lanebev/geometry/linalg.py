@@ -37,7 +37,7 @@ def solve_lower(lower: Tensor, right: Tensor) -> Tensor:
 def times_vector(matrix: Tensor, vector: Tensor) -> Tensor:
     """Multiply matrices (B, K, M) with vectors (B, M), to (B, K).
 
-    The vector is a column whose two strides are those of a row: with others, ``bmm`` takes seven times as long.
+    The vector is a column with the strides of a row: with others, ``bmm`` takes up to seven times as long.
     """
     return torch.bmm(matrix, vector.unsqueeze(1).mT).squeeze(-1)
 

@@ -51,7 +51,7 @@ def train(rank, folder):
 
 
 def train_in_bfloat16(mesh, images):
-    """As the docs say: batch norms, whose statistics FSDP leaves in float32, by themselves, without policy."""
+    """As the docs say: batch norms, whose statistics stay in float32, by themselves and without policy."""
     net = Detector()
     net.lanes.segmenter = LaneSegmenter(SegmenterConfig(base_width=4, decoder_width=8))
     net.lanes.extractor = LineExtractor.for_network(net.lanes.segmenter.config)
