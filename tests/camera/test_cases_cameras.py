@@ -182,6 +182,10 @@ def test_a_region_of_interest_may_leave_out_the_principal_point(tmp_path):
         ({"roi": {"y_offset": -1}}, "roi: expected a part"),
         ({"roi": [1, 2]}, "roi: expected keys and values"),
         ({"distortion_model": "inverse_brown_conrady"}, "model: expected one of pinhole, plumb_bob"),
+        (
+            {"K": [0.0, 0, 320, 0, 0, 240, 0, 0, 1], "R": np.eye(3).tolist()},
+            "camera matrix: expected focal lengths, got zeros, by which ROS marks",
+        ),
         ({"K": [0.0] * 9}, "camera matrix: expected focal lengths, got zeros, by which ROS marks"),
     ],
 )

@@ -85,17 +85,18 @@ def open_bag(path: Path) -> Iterator[Bag]:
             store = get_typestore(Stores.ROS2_HUMBLE)
             with AnyReader([path], default_typestore=store) as reader:
                 yield _RosBag(reader)
-    except ValueError as error:
-        if str(error).startswith("bag "):
-            raise
-        raise _unreadable(path, error) from error
     except Exception as error:  # two libraries' own, and what damaged bytes make of any decoder
         raise _unreadable(path, error) from error
 
 
 def _unreadable(path: Path, error: Exception) -> ValueError:
+    if isinstance(error, ValueError) and str(error).startswith("bag "):
+        return ValueError(str(error))
+    if isinstance(error, ValueError) and str(error).startswith("expected "):  # of an image
+        return ValueError(f"bag {path}: {error}")
+    remedy = " mcap recover writes what is whole of it" if path.suffix.lower() == ".mcap" else ""
     reason = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
-    return ValueError(f"bag {path}: expected one that can be read, got: {reason[:160]}; is it cut?")
+    return ValueError(f"bag {path}: expected one that can be read, got: {reason[:160]}; is it cut?{remedy}")
 
 
 def _joined(topics: Iterable[Topic]) -> list[Topic]:
@@ -131,7 +132,7 @@ class _Mcap:
         self._reader = make_reader(file, validate_crcs=True, decoder_factories=factories)
         summary = self._reader.get_summary()
         if summary is None or summary.statistics is None:
-            raise ValueError("no summary at its end, which mcap recover writes")
+            raise ValueError("no summary at its end")
         figures = summary.statistics
         topics = []
         for number, channel in summary.channels.items():

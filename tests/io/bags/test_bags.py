@@ -392,6 +392,8 @@ def test_bags_that_cannot_be_a_source(tmp_path, capsys, monkeypatch):
     _fails(capsys, "run", empty, word="expected one topic of images, got: none")
     (tmp_path / "no.mcap").write_bytes(b"")
     _fails(capsys, "run", tmp_path / "no.mcap", word="expected one that can be read")
+    (tmp_path / "cut.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(99))
+    _fails(capsys, "run", tmp_path / "cut.mcap", word="is it cut? mcap recover writes what is whole of it")
     _fails(capsys, "run", tmp_path / "there.mcap", word="No such file")
     monkeypatch.setattr("lanebev.io.bags.messages.find_spec", lambda name: None)
     _fails(capsys, "run", two, word="pip install 'lanebev[formats]'")
@@ -454,6 +456,16 @@ def test_messages_of_ros_1_in_an_mcap_file(tmp_path):  # as mcap convert drive.b
     frames = list(open_bag_source(path))
     assert [frame.image[0, 0, 0] for frame in frames] == [20 * number for number in range(COUNT)]
     assert [frame.time for frame in frames] == pytest.approx(np.arange(COUNT) / 10, abs=1e-6)
+
+
+def test_an_encoding_that_is_not_known_is_no_damage(tmp_path):
+    store, name = get_typestore(Stores.ROS2_HUMBLE), "sensor_msgs/msg/Image"
+    kinds = ("cdr", "ros2msg", store.generate_msgdef(name)[0])
+    path = _mcap(
+        tmp_path / "a.mcap", name, kinds, [bytes(store.serialize_cdr(_raw(_picture(0), "16UC1"), name))]
+    )
+    with pytest.raises(ValueError, match=r"a\.mcap: expected an image of rgb8, .*, yuyv, got '16UC1'$"):
+        open_bag_source(path)
 
 
 def test_foxgloves_messages_in_ros_2(tmp_path):
