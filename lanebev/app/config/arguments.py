@@ -4,7 +4,7 @@ import argparse
 import re
 from collections.abc import Callable
 from dataclasses import Field, fields
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from lanebev import __version__
 from lanebev.app.config.export import ExportConfig
@@ -63,10 +63,6 @@ class _Once(argparse.Action):
 class _Parser(argparse.ArgumentParser):
     """Reports an error in one line, that names the command to ask for help."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.register("action", None, _Once)  # of options without an action of their own
-
     def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]  # of typeshed: three
         """Parse the arguments; what no option of a command takes is an error of this command."""
         parsed, unknown = super().parse_known_args(args, namespace)
@@ -99,6 +95,7 @@ def parser() -> argparse.ArgumentParser:
     for name, (words, add_arguments) in _COMMANDS.items():
         about = f"{words[0].upper()}{words[1:]}."
         command = commands.add_parser(name, help=words, description=about, allow_abbrev=False)
+        command.register("action", None, _Once)  # of options without an action of their own
         add_arguments(command)
         _add_verbose(command, argparse.SUPPRESS)
     return top
