@@ -9,6 +9,7 @@ import torch
 
 from lanebev import JointCalibrator, LaneSegments
 from lanebev.estimation.joint.config import JointConfig
+from lanebev.estimation.joint.lane_change import shifted
 from lanebev.estimation.joint.measurement import NUM_STRAIGHT, PITCH, ROLL, boundary_residuals
 from lanebev.estimation.joint.observations import boundary_places, observe
 from lanebev.estimation.joint.output import (
@@ -23,7 +24,6 @@ from lanebev.estimation.joint.scatter import (
     averaged_moments,
     boundary_scatter,
     determined_sensitivity,
-    renumbered_columns,
     renumbered_moments,
     scatter_variance,
     start_variance,
@@ -127,7 +127,7 @@ def test_the_sensitivity_to_a_heading_that_lasts_is_the_change_of_the_filter_s_e
 
 def test_after_a_lane_change_the_columns_of_a_sensitivity_are_those_of_the_same_boundaries():
     by_headings = torch.arange(12, dtype=DOUBLE).reshape(1, 2, 6).expand(2, -1, -1)
-    found = renumbered_columns(by_headings, torch.tensor([1.0, -1.0], dtype=DOUBLE))
+    found = shifted(by_headings, torch.tensor([1.0, -1.0], dtype=DOUBLE))
     assert found[0].tolist() == [[1, 2, 3, 4, 5, 0], [7, 8, 9, 10, 11, 0]]
     assert found[1].tolist() == [[0, 0, 1, 2, 3, 4], [0, 6, 7, 8, 9, 10]]
 

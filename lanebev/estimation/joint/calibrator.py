@@ -5,7 +5,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from lanebev.batch import flag, in_blocks, select_rows
+from lanebev.batch import flag, in_blocks, may_skip, select_rows
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.checks import (
     as_lane_width,
@@ -96,9 +96,10 @@ class JointCalibrator(Calibrator[JointState]):
         after, inliers, apart = restart(after, update.inliers, supported, seen, positions, cfg)
         after = after._replace(reasons=after.reasons | flag(time.guessed, Reason.TIME))
 
-        skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=time.early)
-        after = select_rows(time.skip, skipped, after)
-        apart = torch.where(time.skip.unsqueeze(-1), 0.0, apart)
+        if not may_skip(time.skip):
+            skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=time.early)
+            after = select_rows(time.skip, skipped, after)
+            apart = torch.where(time.skip.unsqueeze(-1), 0.0, apart)
         calibration = as_calibration(after, inliers, apart, positions, cfg)
         return unused_frame(calibration, time.skip), after
 

@@ -17,7 +17,7 @@ from lanebev.estimation.joint.evidence import (
     normalized_score,
     with_process_noise,
 )
-from lanebev.estimation.joint.lane_change import best_shift, renumber
+from lanebev.estimation.joint.lane_change import best_shift, renumber, shifted
 from lanebev.estimation.joint.layout import NUM_COMMON, POSE, SHAPE, layout
 from lanebev.estimation.joint.measurement import (
     NUM_STRAIGHT,
@@ -34,7 +34,6 @@ from lanebev.estimation.joint.scatter import (
     Scatter,
     averaged_moments,
     boundary_scatter,
-    renumbered_columns,
     renumbered_moments,
     updated_sensitivity,
     with_headings,
@@ -148,7 +147,7 @@ def update_state(
     gain = kalman_gain(last.prior_cov, last.step, frame, last.estimated)
     of_two = 1 - last.estimated[:, ROLL, None]  # boundaries, which do not determine the roll
     vertical = of_two * vertical_information(frame, cov, last.at[:, VERTICAL])
-    by_headings = renumbered_columns(predicted.heading_sensitivity, shift)
+    by_headings = shifted(predicted.heading_sensitivity, shift)
     updated = predicted._replace(
         mean=torch.baddbmm(mean.unsqueeze(-1), gain, last.step.pull.unsqueeze(-1)).squeeze(-1),
         cov=posterior_covariance(cov, frame.matrix, gain),

@@ -74,6 +74,7 @@ def renumber(mean: Tensor, shift: Tensor, lane_width: Tensor, num_boundaries: in
 
 
 def shifted(values: Tensor, shift: Tensor) -> Tensor:
-    """Shift values (B, L) of each boundary by (B,) lanes, -1, 0 or 1; 0 comes in at the end."""
+    """Shift values (B, ..., L) of each boundary by (B,) lanes, -1, 0 or 1; 0 comes in at the end."""
     number = constant(tuple(range(1, values.shape[-1] + 1)), like=values, dtype=torch.int64)  # padded
-    return pad(values, (1, 1)).gather(1, number + shift.long().unsqueeze(-1))
+    source = (number + shift.long().unsqueeze(-1)).view(-1, *[1] * (values.ndim - 2), values.shape[-1])
+    return pad(values, (1, 1)).gather(-1, source.expand_as(values))

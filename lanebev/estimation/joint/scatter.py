@@ -149,7 +149,7 @@ def scatter_variance(moments: Tensor) -> Tensor:
 
 def renumbered_moments(moments: Tensor, shift: Tensor) -> Tensor:
     """Shift the estimates of each boundary in moments (B, 2, L + 4) by (B,) lanes, -1, 0 or 1."""
-    own = renumbered_columns(moments[..., :_SQUARES], shift)
+    own = shifted(moments[..., :_SQUARES], shift)
     return torch.cat([own, moments[..., _SQUARES:]], dim=-1)
 
 
@@ -210,12 +210,6 @@ def updated_sensitivity(predicted: Tensor, gain: Tensor, matrix: Tensor) -> Tens
     by_frame, by_headings = matrix[:, :count, :count], matrix[:, :count, count:]
     change = torch.baddbmm(by_headings, by_frame, predicted[:, :count], alpha=-1)
     return torch.baddbmm(predicted, gain, change)
-
-
-def renumbered_columns(sensitivity: Tensor, shift: Tensor) -> Tensor:
-    """Shift the columns of a sensitivity (B, D, L) by (B,) lanes, -1, 0 or 1."""
-    moved = shifted(sensitivity.flatten(0, 1), shift.repeat_interleave(sensitivity.shape[1]))
-    return moved.view_as(sensitivity)
 
 
 def remembered_sensitivity(now: Tensor, before: Tensor, dt: Tensor, cfg: JointConfig) -> Tensor:
