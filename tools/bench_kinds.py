@@ -19,7 +19,7 @@ from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, within_3_sigma
 from lanebev.testing.moments import FPS
 from tools.known_road import KnownRoad
-from tools.random_drives import CONSTANT_BENDS, CREST, HILLS, IN_CURVE, KINDS
+from tools.random_drives import CONSTANT_BENDS, CREST, HILLS, IN_CURVE, KINDS, WINDING
 from tools.replay.figures import as_track
 from tools.replay.recording import Recording, record, replay
 
@@ -33,6 +33,7 @@ _HILLY = ", HILLY_ROADS"
 
 _NOT_TWO_STAGE = (  # kinds of the joint calibrator that show nothing new of this one
     "resumed",
+    WINDING,
     *(f"{kind}, ego lane" for kind in ("motion up to 2.5°, 1.5 Hz", "drop", "knock", "cut", "resumed")),
     *(f"{kind}, ego lane, roll drawn" for kind in (IN_CURVE, "drop")),
 )

@@ -16,6 +16,7 @@ from lanebev.testing.streets import wandering
 from tools.replay.kinds import EGO_LANE, FRAMES, SHOCK, Change, Generated, drop, in_curve, knock
 
 IN_CURVE = "motion up to 1.5°, 1.2 Hz, R 300 m"
+WINDING = "winding road at 3 to 12 m/s"
 CREST = "crest or dip, R 5 to 20 km"
 HILLS = "crests and dips in turn"
 
@@ -31,6 +32,28 @@ def _drawn(
 def _curve(seed: int) -> Generated:
     """Draw the same motion from the straight through a clothoid into R = 300 m and half out of it."""
     return Generated("", in_curve(seed))
+
+
+def _winding(seed: int) -> Generated:
+    """Drive along a road of bends of R >= 150 to 800 m in turn, seen from 5 to 40 m.
+
+    Its curvature is a sum of two sinusoids of 200 to 600 m.
+    """
+    random = Random(seed)
+    sharpest = random.uniform(150.0, 800.0)
+    waves = [(random.uniform(200.0, 600.0), random.random(), 0.3 + random.random()) for _ in range(2)]
+    speed = random.uniform(3.0, 12.0)
+    size = 1 / (sharpest * sum(part for *_, part in waves))
+
+    def change(t: float, moment: Moment) -> Moment:
+        def curvature(z: torch.Tensor) -> torch.Tensor:
+            way = z + speed * t
+            each = [part * (2 * math.pi * (way / length + at)).sin() for length, at, part in waves]
+            return size * torch.stack(each).sum(0)
+
+        return replace(moment, near=5.0, far=40.0, curvature=curvature)
+
+    return _drawn(seed, change)
 
 
 def difference(seed: int, degrees: float, metres: float) -> Pose:
@@ -198,6 +221,7 @@ def _rolled_ego_lane_of(kind: str, seed: int) -> Generated:
 
 KINDS: dict[str, Callable[[int], Generated]] = {
     **_ALL_LANES,
+    WINDING: _winding,
     CREST: _crest,
     HILLS: _hills,
     "lanes unequal by 2 cm": partial(_unequal, std=0.02),

@@ -37,6 +37,7 @@ KINDS = (
     "strong motion in a curve",
     "suspension",
     "sharp bends",
+    "winding road",
     "crest",
     "drop",
     "knock",

@@ -78,6 +78,15 @@ def _hill(t: float, moment: Moment) -> Moment:
     return replace(moment, near=5.0, far=40.0, profile=1e-4 * math.cos(t))
 
 
+def _winding(t: float, moment: Moment) -> Moment:
+    """Drive at 5 m/s along a road whose curvature is a sinusoid of 300 m, R = 250 m at the sharpest."""
+
+    def curvature(z: torch.Tensor) -> torch.Tensor:
+        return (2 * math.pi * (z + 5.0 * t) / 300.0).sin() / 250.0
+
+    return replace(moment, near=5.0, far=40.0, curvature=curvature)
+
+
 def drop(t: float, moment: Moment) -> Moment:
     """Fall 1.2 m onto the wheels from the first frame on."""
     tag = "falling" if t < landing_time() else ""
@@ -181,6 +190,7 @@ GENERATED: dict[str, Generated] = {
     "suspension": Generated("suspension", _drive(motion=suspension(6, 4.0))),
     # R = 60 m at 15 m/s, boundaries 1, 2, 3 in sight, 45 to 105 m.
     "sharp-bends": Generated("sharp bends", _scenario("sharp bends R 60 m, three boundaries", start=3.0)),
+    "winding-road": Generated("winding road", _drive(_winding, sinusoids(8))),
     "crest": Generated("crest", _scenario("crest R 10 km, 5-40 m")),
     # From a crest into a dip of R = 10 km.
     "crest-and-dip": Generated("crest", _drive(_hill)),

@@ -18,7 +18,6 @@ from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS
 from lanebev.geometry.linalg import cholesky, solve_lower
 from lanebev.tensors import constant
 
-CLEAR_BEND = (10.0, 20.0)  # χ² of the steps, from which they begin to change the speed, and do so fully
 ENTRY = KNOT_SPACING / 3  # m; a step comes into view while the camera drives so far
 _BENT = 3.0  # the road bends at the farthest knot if its curvature there is so many sigmas
 _BEND_STEP = 0.07  # standard deviation of the next step in a bend, as a fraction of that curvature
@@ -125,19 +124,19 @@ def turn_along(shape: Tensor, phase: Tensor, way: Tensor) -> Tensor:
 
 
 def _change_per_metre(shape: Tensor, cov: Tensor) -> Tensor:
-    """Compute the change (B, NUM_SHAPE) of the shape per metre driven, where a bend is significant.
+    """Compute the change (B, NUM_SHAPE) of the shape per metre driven, as far as its steps are no noise.
 
     On a straight road the steps are estimation noise, which does not move with the road. Were it moved, the
-    filter would estimate from it that the vehicle stands still. So the change is faded in between the two
-    values of χ² in ``CLEAR_BEND``.
+    filter would estimate from it that the vehicle stands still. So the change is multiplied by the share of
+    the steps' χ² that exceeds its mean for noise (Wiener filter).
     """
     change = shape @ constant(_CHANGE_BY_SHAPE, like=shape)
     steps, spread = shape[:, 1:], cov[:, 1:, 1:]
     size = spread.diagonal(dim1=1, dim2=2).rsqrt()  # (B, NUM_STEPS)
     factor = cholesky(size.unsqueeze(-1) * spread * size.unsqueeze(-2))
     white = solve_lower(factor, (size * steps).unsqueeze(-1))
-    chi2, (least, clear) = white.square().sum((1, 2)), CLEAR_BEND
-    known: Tensor = ((chi2 - least) / (clear - least)).clamp(0, 1)  # (B,)
+    chi2 = white.square().sum((1, 2))  # NUM_STEPS of noise alone
+    known: Tensor = 1 - NUM_STEPS / chi2.clamp(min=NUM_STEPS)
     return change * known.unsqueeze(-1)
 
 
