@@ -42,25 +42,38 @@ class LineExtractor(nn.Module):
         stride, factor = network.output_stride, network.sigma_scale
         return cls(LineConfig(stride=stride, sigma_scale=factor, correlation=correlation))
 
-    @full_precision
     def forward(
-        self,
-        logits: Tensor,
-        image_size: tuple[float, float],
-        network_size: tuple[int, int] | None = None,
-        paired: bool = True,
-    ) -> LaneSegments | BoundaryVertices:
+        self, logits: Tensor, image_size: tuple[int, int], network_size: tuple[int, int] | None = None
+    ) -> LaneSegments:
         """Extract segments in pixels of the given image; it must be undistorted if they are to be.
+
+        Args:
+            logits: as for :meth:`vertices`.
+            image_size: as for :meth:`vertices`.
+            network_size: as for :meth:`vertices`.
+
+        Returns:
+            Segments with N = L·S.
+
+        Raises:
+            ValueError: as for :meth:`vertices`.
+        """
+        return pair_vertices(self.vertices(logits, image_size, network_size))
+
+    @full_precision
+    def vertices(
+        self, logits: Tensor, image_size: tuple[float, float], network_size: tuple[int, int] | None = None
+    ) -> BoundaryVertices:
+        """Extract vertices, which :func:`~lanebev.observation.segments.segments_from_vertices` pairs.
 
         Args:
             logits: (B, 1+L, h, w), background first; half precision is converted to float32.
             image_size: (H, W) of the image in whose pixels the vertices are returned.
             network_size: (H', W') of the network's input, the resized image; None is the map's size times
                 the stride.
-            paired: whether vertices are paired to segments.
 
         Returns:
-            Segments with N = L·S; not paired, the result of :meth:`vertices`.
+            Vertices of L boundaries, at most 2S on each, those with a weight first.
 
         Raises:
             ValueError: another shape, or a map that is not of the network's input by the stride; on the CPU
@@ -75,21 +88,7 @@ class LineExtractor(nn.Module):
             raise ValueError(
                 "logits: expected those before the softmax, got probabilities; leave the softmax out"
             )
-        found = extract_vertices(logits.softmax(1)[:, 1:], image_size, self.config, network_size)
-        return pair_vertices(found) if paired else found
-
-    def vertices(
-        self, logits: Tensor, image_size: tuple[float, float], network_size: tuple[int, int] | None = None
-    ) -> BoundaryVertices:
-        """Extract vertices, which :func:`~lanebev.observation.segments.segments_from_vertices` pairs.
-
-        It calls the module, so that its hooks run. Arguments and errors are those of :meth:`forward`.
-
-        Returns:
-            Vertices of L boundaries, at most 2S on each, those with a weight first.
-        """
-        found: BoundaryVertices = self(logits, image_size, network_size, paired=False)
-        return found
+        return extract_vertices(logits.softmax(1)[:, 1:], image_size, self.config, network_size)
 
 
 @full_precision

