@@ -20,7 +20,7 @@ from lanebev.camera.datasets import (
 )
 from lanebev.camera.formats import opencv_or_ros, stereo_cameras, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
-from lanebev.camera.parsing import parse_documents
+from lanebev.camera.parsing import is_ros_ini, parse_documents
 from lanebev.camera.programs import depthai_cameras, gyroflow, matlab, metashape, nerf, realsense
 from lanebev.camera.reconstruction import openmvg_cameras, opensfm_cameras
 from lanebev.camera.records import record_cameras
@@ -42,6 +42,10 @@ _BY_KEY = {
     "ppx": realsense,
     "projection": metashape,
 }
+_OF_INI = (
+    "it states four coefficients and no lens model; they are taken as k1 k2 k3 k4 of a fisheye, as ROS "
+    "writes them: if it is a pinhole camera, add a fifth, 0"
+)
 _VIEWS = ("ret", "rvecs", "tvecs", "objpoints", "imgpoints")  # of a calibration, beside the camera
 
 
@@ -96,6 +100,8 @@ def read_camera(
         else:
             documents = parse_documents(text) if arrays is None else [arrays]
             camera = _camera_of(documents, image_size, rectified, name)
+            if camera.model == "fisheye" and is_ros_ini(text):
+                camera = camera._replace(remark="; ".join(filter(None, (camera.remark, _OF_INI))))
         return without_lens(camera) if rectified else camera
     except ValueError as error:
         raise ValueError(f"camera file {path}: {' '.join(str(error).split())}") from error

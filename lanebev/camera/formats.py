@@ -29,7 +29,8 @@ _KNOWN_KEYS = {
 _SPELLED = {re.sub("_", "", key).lower(): key for key in (*_SHORT_KEYS, *_KNOWN_KEYS)}
 _OF_CAMERA = re.compile(  # words in keys that may say something of the lens or the images
     r"^(?!board|grid|pattern|square|marker|chess|charuco).*(dist(?!ance)|lens|model|type|fish|omni|size|dim|"
-    r"width|height|resol|shape|crop|roi|bin|scale|focal|skew|radial|tangential|rectified|^xi|^[kp]_?\d)",
+    r"width|height|resol|shape|crop|roi|region|bin|scal|decim|downsamp|flip|mirror|rotate|[xy]_?offset|"
+    r"offset_?[xy]|focal|skew|radial|tangential|rectified|^xi|^[kp]_?\d|^[wh]$)",
     re.IGNORECASE,
 )
 _MODELS = {
@@ -82,7 +83,8 @@ def opencv_or_ros(
     pixel's centre is the centre of those it binds together, not their corner: (x + 0.5) / b − 0.5.
 
     Keys are read in any case, with underscores or not. Beside a camera matrix, unknown ones are ignored as
-    parts of a calibration's record, unless they may say something of the lens or the images.
+    parts of a calibration's record, unless they may say something of the lens or the images. Coefficients
+    may not be missing, so that a misspelled key of theirs is an error.
 
     A file may state its matrix twice, in K and P, as our own writer does: then it is not a person's mistake.
 
@@ -97,7 +99,7 @@ def opencv_or_ros(
     fields = once((_SPELLED.get(key.replace("_", "").lower(), key), value) for key, value in fields.items())
     short = not {"fx", "fy", "cx", "cy"}.isdisjoint(fields)
     unknown = sorted(set(fields) - (_SHORT_KEYS if short else _KNOWN_KEYS))
-    if not (short or set(_MATRIX_KEYS).isdisjoint(fields)):
+    if not (short or {*_MATRIX_KEYS, *_PROJECTION_KEYS}.isdisjoint(fields)):
         unknown = [*filter(_OF_CAMERA.match, unknown)]
     if unknown:
         known = "fx, fy, cx, cy, width, height, distortion, model"
@@ -121,7 +123,7 @@ def opencv_or_ros(
         model == "pinhole"
         and len(distortion) == 4
         and any(distortion[2:])
-        and not any(map(fields.get, _MODEL_KEYS))
+        and not any(map(fields.get, (*_MODEL_KEYS, "fisheye_model")))
     ):
         camera = camera._replace(remark=_OF_NO_MODEL)
     return _as_taken(checked(camera, _restates(fields)), fields)

@@ -92,14 +92,14 @@ def checked(camera: CameraParameters, restated: bool = False) -> CameraParameter
 def _check_matrix(matrix: list[float], size: tuple[int, int], restated: bool) -> None:
     height, width = size
     fx, skew, cx, zero, fy, cy, *last = matrix
-    if not (fx and fy):
+    if not (fx or fy):
         raise ValueError(
             "camera matrix: expected focal lengths, got zeros, by which ROS marks a camera without "
             "calibration; calibrate it, or give --fov"
         )
     low, high = (0.0, float("inf")) if restated else (limit * max(size) for limit in _FOCAL_RANGE)
     for name, focal in (("fx", fx), ("fy", fy)):
-        if not low <= focal <= high:
+        if not low <= focal <= high or focal == 0:
             raise ValueError(
                 f"{name}: expected {low:g} to {high:g} px for an image of {width} x {height}, got {focal:g}; "
                 "focal lengths are in pixels"

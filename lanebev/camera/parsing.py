@@ -47,7 +47,7 @@ def parse_documents(text: str) -> list[Any]:
     Raises:
         ValueError: the syntax is none of YAML, JSON, XML and ROS's INI, or a key is given twice.
     """
-    if _ROS_INI.search(text):
+    if is_ros_ini(text):
         return [_parse_ini(text)]
     start = text.lstrip()[:1]
     if start not in ("<", "{") and (section := _SECTION.search(text)):
@@ -70,6 +70,11 @@ def parse_documents(text: str) -> list[Any]:
         except (json.JSONDecodeError, RecursionError):
             pass  # YAML has braces too, and says where it breaks off
     return _parse_yaml(text)
+
+
+def is_ros_ini(text: str) -> bool:
+    """Tell whether a text is ROS's INI."""
+    return _ROS_INI.search(text) is not None
 
 
 def once(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
@@ -154,7 +159,8 @@ def _parse_yaml(text: str) -> list[Any]:
 def _parse_ini(text: str) -> dict[str, Any]:
     """Read names on lines of their own and the numbers below them; names of sections are ignored.
 
-    ROS writes five coefficients or eight of a pinhole camera, four of a fisheye, and no lens model.
+    ROS writes five coefficients or eight of a pinhole camera, four of a fisheye, and no lens model. Two zeros
+    at the end of four are no tangential distortion of a pinhole camera.
     """
     entries: list[tuple[str, list[str]]] = []
     for line in text.splitlines():
@@ -164,7 +170,8 @@ def _parse_ini(text: str) -> dict[str, Any]:
         elif entries and not words.startswith("["):
             entries[-1][1].extend(words.split())
     found = {key: values[0] if len(values) == 1 else values for key, values in once(entries).items()}
-    is_fisheye = len(found.get("distortion_coefficients", "")) == _OF_FISHEYE
+    lens = numbers(found, key) if isinstance(found.get(key := "distortion_coefficients"), list) else []
+    is_fisheye = len(lens) == _OF_FISHEYE and any(lens[2:])
     return {**found, **({"distortion_model": "fisheye"} if is_fisheye else {})}
 
 

@@ -87,7 +87,7 @@ def test_bad_camera_or_lane_file_writes_nothing(data, tmp_path, capsys):
         fails(capsys, ["run", data / source, *arguments], *words)
         assert list(tmp_path.iterdir()) == []
 
-    case("bad.yaml", "fx: expected", camera={**fields, "fx": 3})
+    case("bad.yaml", "fx: expected", camera={**fields, "fx": 0})
     case("expected one for the source's 416 x 240", camera={**fields, "width": 640})
     text = (data / "lanes.json").read_text()
     case("bad.json, line 6", "is the file cut", lanes=text[:-40])

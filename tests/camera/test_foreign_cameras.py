@@ -554,11 +554,31 @@ def test_keys_in_other_cases_and_what_a_program_records_beside_the_camera(tmp_pa
 
 
 @pytest.mark.parametrize(
-    "more", ["lens_type: fisheye", "crop: 1", "DIM: [640, 480]", "p_9: 1", "rectified: 1", "imgSize: [640]"]
+    "more",
+    [
+        "lens_type: fisheye",
+        "crop: 1",
+        "DIM: [640, 480]",
+        "p_9: 1",
+        "rectified: 1",
+        "imgSize: [640]",
+        "region_of_interest: [0, 0, 640, 360]",
+        "offset_x: 8",
+        "scaling: 0.5",
+        "flip: 1",
+        "rotate: 180",
+        "w: 640",
+    ],
 )
 def test_keys_beside_the_camera_that_may_concern_the_lens_or_the_images_are_refused(tmp_path, more):
     with pytest.raises(ValueError, match=f"unknown key '{more.split(':')[0]}'; expected fx"):
         _read(tmp_path / "c.yaml", OPENCV_2 + more)
+
+
+@pytest.mark.parametrize("key", ["disortion_coefficients", "coeffs", "kc", "D1"])
+def test_a_misspelled_key_of_the_coefficients_is_an_error(tmp_path, key):
+    with pytest.raises(ValueError, match="distortion_coefficients: expected a value, got none"):
+        _read(tmp_path / "c.yaml", OPENCV_2.replace("Distortion_Coefficients", key))
 
 
 @pytest.mark.parametrize(
@@ -611,8 +631,12 @@ def test_four_coefficients_in_the_ini_of_ros_are_those_of_a_fisheye(tmp_path):
         [0.01, -0.03, 0.004, -0.0007],
         "fisheye",
     )
-    lens = [-0.1, 0.01, 0.0004, -0.0007, 0.0]
-    _is(_read(tmp_path / "ost.txt", OST_INI.format(" ".join(map(str, lens)))), *size, lens)
+    remark = _read(tmp_path / "ost.txt", OST_INI.format("0.01 -0.03 0.004 -0.0007")).remark
+    assert remark.endswith("as ROS writes them: if it is a pinhole camera, add a fifth, 0")
+    for lens in ([-0.1, 0.01, 0.0004, -0.0007, 0.0], [-0.1, 0.01, 0.0, 0.0], [0.0] * 4):
+        camera = _read(tmp_path / "ost.txt", OST_INI.format(" ".join(map(str, lens))))
+        _is(camera, *size, lens if any(lens) else [])
+        assert camera.remark == ""
 
 
 def test_four_coefficients_without_a_lens_model_are_remarked_on(tmp_path):
@@ -621,7 +645,12 @@ def test_four_coefficients_without_a_lens_model_are_remarked_on(tmp_path):
     assert camera.remark.endswith(
         "; they are taken as k1 k2 p1 p2 of a pinhole camera: if it is a fisheye, add model: fisheye"
     )
-    for more in ({"model": "pinhole"}, {"D": [-0.05, 0.01, 0, 0]}, {"D": [-0.05, 0.01, 0.001, 0, 0.1]}):
+    for more in (
+        {"model": "pinhole"},
+        {"fisheye_model": 0},
+        {"D": [-0.05, 0.01, 0, 0]},
+        {"D": [-0.05, 0.01, 0.001, 0, 0.1]},
+    ):
         assert _read(tmp_path / "c.json", json.dumps({**fields, **more})).remark == ""
     del fields["width"], fields["height"]
     remark = _read(tmp_path / "c.json", json.dumps(fields), image_size=(490, 816)).remark

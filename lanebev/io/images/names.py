@@ -15,7 +15,7 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".p
 
 _SUFFIXES = r"(?:\.[A-Za-z]\w*)*$"  # .jpg, .lines.txt
 _DECIMAL = re.compile(rf"(?<![\d.])(\d+)\.(\d+)(?={_SUFFIXES})", re.ASCII)
-_WORDS = r"(?:[_-][A-Za-z]+\d?)*"  # of a camera after its time, as in _color_rect and _cam0
+_WORDS = r"((?:[_-][A-Za-z]+\d?)*)"  # of a camera after its time, as in _color_rect and _cam0
 _NANO = r"[_-](?:0(?=\d{9}(?!\d))|(?=(?:\d{9}|\d{6})(?!\d)))"  # before digits of a fraction; LLAMAS has ten
 _SECONDS = re.compile(rf"(?<!\d)(\d{{10}})(?:\.|{_NANO})(\d{{1,9}}){_WORDS}{_SUFFIXES}", re.ASCII)
 _STAMP = re.compile(rf"(?<!\d)(\d{{13,19}}){_WORDS}{_SUFFIXES}", re.ASCII)
@@ -122,6 +122,9 @@ def _times_since_1970(paths: Sequence[str]) -> Sequence[Fraction]:
     names = [PurePath(path).name for path in paths]
     seconds = [_SECONDS.search(name) for name in names]
     stamps = [_STAMP.search(name) for name in names]
+    found = [match for match in (seconds if all(seconds) else stamps) if match]
+    if len({match.groups()[-1] for match in found}) > 1:  # words of several cameras
+        return ()
     if all(seconds):
         whole = [int(match[1]) for match in seconds if match]
         times = with_fractions(whole, [match[2] for match in seconds if match])

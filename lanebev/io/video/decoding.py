@@ -49,7 +49,8 @@ def open_video(source: str) -> av.container.InputContainer:
         reason = f"{error.strerror or 'unknown format'}; is it a video, and whole?"
         with contextlib.suppress(OSError), open(source, "rb") as file:
             begin = file.read(100)
-            is_text = begin.isascii() and b"\0" not in begin
+            is_invalid = isinstance(error, av.error.InvalidDataError)
+            is_text = is_invalid and begin.isascii() and b"\0" not in begin
             reason = stand_in(begin) or (_A_TEXT if is_text else reason)
         raise ValueError(f"video {source}: expected a video that opens, got: {reason}") from error
     if container.format.name in _DRAWN_TEXTS:

@@ -319,6 +319,7 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\
     [
         ("none.mp4", None, "expected a video, an image, a folder or a glob of images, got nothing there"),
         ("v.mp4", b"no\0 video", "expected a video that opens, got: Invalid data"),
+        ("v.ffconcat", b"ffconcat version 1.0\nfile a.mp4\n", "got: No such file or directory"),
         ("v.mp4", b"", "expected a video that opens, got: an empty file"),
         (
             "v.mp4",
