@@ -16,6 +16,7 @@ from lanebev.numbers import read_text
 _NAME = re.compile(r"(?:frame|image)?_?(?:timestamp|time)s?\.(?:txt|csv)", re.IGNORECASE)
 _DATED = re.compile(r"(\d{4})-(\d\d)-(\d\d)[T ](\d\d):(\d\d):(\d\d(?:\.\d+)?)", re.ASCII)
 _SLOWEST = 5  # s between frames of a drive; 33 between them are milliseconds
+_TITLE = re.compile(r"(?!exposure|lap).*(time(?!_?zone)|stamp)")  # of a column of times
 _NUMBER = re.compile(r"\d+(?:\.\d*)?(?:e[+-]?\d\d?)?", re.ASCII | re.IGNORECASE)
 
 
@@ -74,7 +75,7 @@ def _stamps(text: str) -> list[str]:
     rows = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     found = [_stamp(line) for line in rows]
     titles = re.split(r"[\s,;]+", rows[0].strip().lower()) if rows and not found[0] else []
-    named = [place for place, title in enumerate(titles) if re.search("time|stamp", title)]
+    named = [place for place, title in enumerate(titles) if _TITLE.match(title)]
     if len(named) == 1:
         words = [re.split(r"[\s,;]+", line.strip()) for line in rows]
         of_title = [each[named[0]] if len(each) == len(titles) else "" for each in words]

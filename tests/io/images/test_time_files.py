@@ -25,6 +25,7 @@ FILES = {
     "nanoseconds": ("timestamps.txt", [str(each) for each in NANOSECONDS]),
     "table": ("frame_timestamps.csv", ["frame,time", *(f"{i},{time}" for i, time in enumerate(TIMES))]),
     "titles": ("times.csv", ["speed;timestamp", *(f"{9 + i}.5;{time}" for i, time in enumerate(TIMES))]),
+    "exposure": ("times.csv", ["t,exposure_time,timezone", *(f"{time},0.01,1" for time in TIMES)]),
     "with names": ("times.csv", ["#s,name", *(f"{time},{i:04d}.png" for i, time in enumerate(TIMES))]),
 }
 
