@@ -34,6 +34,8 @@ _HILLY = ", HILLY_ROADS"
 _NOT_TWO_STAGE = (  # kinds of the joint calibrator that show nothing new of this one
     "resumed",
     WINDING,
+    "three lanes in view",
+    "three lanes in view, unequal by 2 cm",
     *(f"{kind}, ego lane" for kind in ("motion up to 2.5°, 1.5 Hz", "drop", "knock", "cut", "resumed")),
     *(f"{kind}, ego lane, roll drawn" for kind in (IN_CURVE, "drop")),
 )

@@ -150,10 +150,10 @@ def _street(seed: int, std: float, speed: float) -> Generated:
     return _drawn(seed, change, largest_deg=0.4)
 
 
-def _two_lanes(seed: int, std: float) -> Generated:
-    """Leave two lanes in view, which the same pose fits whether they are equal or not."""
+def _unequal_in_view(seed: int, std: float, visible: tuple[int, ...]) -> Generated:
+    """Leave some boundaries in view; one pose fits three of them whether lanes are equal or not."""
     drive = _unequal(seed, std)
-    return replace(drive, moments=lambda: [replace(one, visible=(1, 2, 3)) for one in drive.moments()])
+    return replace(drive, moments=lambda: [replace(one, visible=visible) for one in drive.moments()])
 
 
 def _bend(seed: int, radius: float) -> Generated:
@@ -226,9 +226,12 @@ KINDS: dict[str, Callable[[int], Generated]] = {
     HILLS: _hills,
     "lanes unequal by 2 cm": partial(_unequal, std=0.02),
     "lanes unequal by 10 cm": partial(_unequal, std=0.1),
-    "two lanes in view": partial(_two_lanes, std=0.0),
     **{
-        f"two lanes in view, unequal by {size} cm": partial(_two_lanes, std=size / 100) for size in (2, 5, 10)
+        f"{number} lanes in view{f', unequal by {size} cm' if size else ''}": partial(
+            _unequal_in_view, std=size / 100, visible=visible
+        )
+        for number, visible, sizes in (("two", (1, 2, 3), (0, 2, 5, 10)), ("three", (1, 2, 3, 4), (0, 2)))
+        for size in sizes
     },
     "a kerb beside the ego lane": _kerb,
     **_STREETS,
