@@ -43,23 +43,6 @@ Open report.html in the output folder first.
 _LONGEST = 300  # characters of an error, in which a glob without quotes has all its files
 
 
-class _Once(argparse.Action):
-    """Stores the value of an option, which may not be given again with another one."""
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: object,
-        option_string: str | None = None,
-    ) -> None:
-        """Store it."""
-        before = getattr(namespace, self.dest, values)
-        if before not in (values, self.default):
-            parser.error(f"argument {option_string}: expected one value, got {before} and {values}")
-        setattr(namespace, self.dest, values)
-
-
 class _Parser(argparse.ArgumentParser):
     """Reports an error in one line, that names the command to ask for help."""
 
@@ -95,7 +78,6 @@ def parser() -> argparse.ArgumentParser:
     for name, (words, add_arguments) in _COMMANDS.items():
         about = f"{words[0].upper()}{words[1:]}."
         command = commands.add_parser(name, help=words, description=about, allow_abbrev=False)
-        command.register("action", None, _Once)  # of options without an action of their own
         add_arguments(command)
         _add_verbose(command, argparse.SUPPRESS)
     return top
