@@ -35,7 +35,7 @@ def _curve(seed: int) -> Generated:
 
 
 def _winding(seed: int) -> Generated:
-    """Drive along a road of bends of R >= 150 to 800 m in turn, seen from 5 to 40 m.
+    """Drive along a winding road, R = 150 to 800 m at the sharpest, seen from 5 to 40 m.
 
     Its curvature is a sum of two sinusoids of 200 to 600 m.
     """

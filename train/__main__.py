@@ -94,7 +94,7 @@ def main(args: list[str] | None = None) -> None:
         OSError,
         ImportError,
         MisconfigurationException,
-    ) as error:  # also of what is not there
+    ) as error:  # the last two also of an accelerator, or its library, that is not there
         cause: BaseException = error
         while "\n" in str(cause) and cause.__cause__ is not None:  # the parser wraps what constructors raise
             cause = cause.__cause__

@@ -26,7 +26,7 @@ _KNOWN_KEYS = {
     *_MATRIX_KEYS, *_LENS_LISTS, *_PROJECTION_KEYS, *_ROTATION_KEYS, *_WIDTH_KEYS, *_HEIGHT_KEYS,
     *_MODEL_KEYS, *LENS_NAMES["pinhole"], "fisheye_model", "binning_x", "binning_y", "roi", "xi",
 }  # fmt: skip
-_SPELLED = {re.sub("_", "", key).lower(): key for key in (*_SHORT_KEYS, *_KNOWN_KEYS)}
+_SPELLED = {key.replace("_", "").lower(): key for key in (*_SHORT_KEYS, *_KNOWN_KEYS)}
 _OF_CAMERA = re.compile(  # words in keys that may say something of the lens or the images
     r"^(?!board|grid|pattern|square|marker|chess|charuco).*(dist(?!ance)|lens|model|type|fish|omni|size|dim|"
     r"width|height|resol|shape|crop|roi|region|bin|scal|decim|downsamp|flip|mirror|rotate|[xy]_?offset|"

@@ -170,7 +170,8 @@ def _parse_ini(text: str) -> dict[str, Any]:
         elif entries and not words.startswith("["):
             entries[-1][1].extend(words.split())
     found = {key: values[0] if len(values) == 1 else values for key, values in once(entries).items()}
-    lens = numbers(found, key) if isinstance(found.get(key := "distortion_coefficients"), list) else []
+    key = "distortion_coefficients"
+    lens = numbers(found, key) if isinstance(found.get(key), list) else []
     is_fisheye = len(lens) == _OF_FISHEYE and any(lens[2:])
     return {**found, **({"distortion_model": "fisheye"} if is_fisheye else {})}
 

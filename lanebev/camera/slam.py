@@ -59,7 +59,7 @@ def as_kalibr(fields: Mapping[str, Any]) -> Mapping[str, Any]:
         sizes = rig.get("resolution") or []
         cameras = [_of_basalt(camera, size) for camera, size in zip(rig["intrinsics"], sizes, strict=False)]
     elif isinstance(rig := fields.get("cameras"), list) and all(
-        "camera" in mapping("cameras", e) for e in rig
+        "camera" in mapping("cameras", each) for each in rig
     ):
         cameras = [_of_maplab(each) for each in rig]
     else:

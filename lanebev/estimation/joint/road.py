@@ -135,7 +135,7 @@ def _change_per_metre(shape: Tensor, cov: Tensor) -> Tensor:
     size = spread.diagonal(dim1=1, dim2=2).rsqrt()  # (B, NUM_STEPS)
     factor = cholesky(size.unsqueeze(-1) * spread * size.unsqueeze(-2))
     white = solve_lower(factor, (size * steps).unsqueeze(-1))
-    chi2 = white.square().sum((1, 2))  # NUM_STEPS of noise alone
+    chi2 = white.square().sum((1, 2))  # its mean for noise is NUM_STEPS
     known: Tensor = 1 - NUM_STEPS / chi2.clamp(min=NUM_STEPS)
     return change * known.unsqueeze(-1)
 
