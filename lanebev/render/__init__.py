@@ -9,7 +9,7 @@ Scenes are sampled on the CPU, the same on every machine; whole batches of them 
 from lanebev.render.drive import Drive
 from lanebev.render.frame import RenderedFrame
 from lanebev.render.masks import boundary_masks, draw_stripes
-from lanebev.render.scene.window import WindowConfig
+from lanebev.render.scene.camera.window import WindowConfig
 from lanebev.render.views import render_views
 
 __all__ = ["Drive", "RenderedFrame", "WindowConfig", "boundary_masks", "draw_stripes", "render_views"]

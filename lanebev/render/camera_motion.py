@@ -4,9 +4,9 @@ import math
 
 import torch
 
-from lanebev.render.scene.layout import Layout
+from lanebev.render.scene.places.street import Street
+from lanebev.render.scene.road.layout import Layout
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.street import Street
 from lanebev.types import Extrinsics
 
 _LANE_CHANGE = 4.5  # s

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.alignment import Alignment, arc_nodes, build_alignment
+from lanebev.render.scene.road.alignment import Alignment, arc_nodes, build_alignment
 from lanebev.render.scene.sampler import BatchSampler
 
 _NODES = 90.0  # m between the nodes of the curvature

@@ -11,11 +11,11 @@ from lanebev.render.camera_motion import BodyMotion, LanePath
 from lanebev.render.course import Course
 from lanebev.render.frame import RenderedFrame
 from lanebev.render.rows import concatenate_rows
-from lanebev.render.scene.camera import Lens
+from lanebev.render.scene.camera.lens import Lens
+from lanebev.render.scene.light.weather import CLEAR
+from lanebev.render.scene.objects.traffic import NUM_VEHICLES
+from lanebev.render.scene.places.tunnel import endless
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.traffic import NUM_VEHICLES
-from lanebev.render.scene.tunnel import endless
-from lanebev.render.scene.weather import CLEAR
 from lanebev.render.scene.world import Place, Scene, World, sample_world, scene_at
 from lanebev.render.views import render_scenes
 from lanebev.types import Extrinsics

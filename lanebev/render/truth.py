@@ -5,11 +5,11 @@ from torch import Tensor
 
 from lanebev.geometry.lens import denormalise_points, distort_points
 from lanebev.render.frame import RenderedFrame
-from lanebev.render.scene.alignment import Alignment, elevation_at, hidden_by_crest, local_from_road
-from lanebev.render.scene.camera import Lens
-from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout, labelled_slots, presence
-from lanebev.render.scene.objects import SceneObjects
-from lanebev.render.scene.traffic import NUM_ONCOMING, NUM_VEHICLES
+from lanebev.render.scene.camera.lens import Lens
+from lanebev.render.scene.objects.objects import SceneObjects
+from lanebev.render.scene.objects.traffic import NUM_ONCOMING, NUM_VEHICLES
+from lanebev.render.scene.road.alignment import Alignment, elevation_at, hidden_by_crest, local_from_road
+from lanebev.render.scene.road.layout import MAX_BOUNDARIES, Layout, labelled_slots, presence
 from lanebev.render.scene.world import Place, Scene
 from lanebev.tensors import constant
 from lanebev.types import NUM_BOUNDARIES

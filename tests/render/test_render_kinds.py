@@ -16,17 +16,17 @@ from lanebev.render.raster.road.roadside import roadside
 from lanebev.render.raster.road.winter import snow_cover
 from lanebev.render.raster.sensor.effects import add_bonnet
 from lanebev.render.raster.sensor.glass import behind_glass, recorded
-from lanebev.render.scene.alignment import arc_nodes, build_alignment
-from lanebev.render.scene.camera import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
-from lanebev.render.scene.glass import sample_glass
-from lanebev.render.scene.glyphs import AHEAD, CROSS, LEFT, NUM_GLYPHS, RIGHT
+from lanebev.render.scene.camera.glass import sample_glass
+from lanebev.render.scene.camera.lens import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
 from lanebev.render.scene.kinds import KINDS, sample_kinds
-from lanebev.render.scene.layout import presence
-from lanebev.render.scene.night import sample_lights
+from lanebev.render.scene.light.night import sample_lights
+from lanebev.render.scene.light.weather import Light
+from lanebev.render.scene.objects.traffic import NUM_VEHICLES
+from lanebev.render.scene.places.street import PLAIN, no_street
+from lanebev.render.scene.road.alignment import arc_nodes, build_alignment
+from lanebev.render.scene.road.glyphs import AHEAD, CROSS, LEFT, NUM_GLYPHS, RIGHT
+from lanebev.render.scene.road.layout import presence
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.street import PLAIN, no_street
-from lanebev.render.scene.traffic import NUM_VEHICLES
-from lanebev.render.scene.weather import Light
 from lanebev.render.scene.world import Place, World, sample_course, sample_world, scene_at
 from lanebev.render.views import render_scenes, sample_place
 from lanebev.types import Extrinsics

@@ -8,10 +8,10 @@ import torch
 from lanebev.render.raster.base.features import features_of
 from lanebev.render.raster.base.select import take_channels
 from lanebev.render.raster.paint import paint_view, prepare
-from lanebev.render.scene.alignment import build_alignment
-from lanebev.render.scene.camera import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
+from lanebev.render.scene.camera.lens import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
+from lanebev.render.scene.places.street import no_street
+from lanebev.render.scene.road.alignment import build_alignment
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.street import no_street
 from lanebev.render.scene.world import World, sample_course, sample_world, scene_at
 from lanebev.render.truth import boundary_points, project
 from lanebev.render.views import sample_place

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.alignment import elevation_at
+from lanebev.render.scene.road.alignment import elevation_at
 from train.commands import command_parser, one_line_errors
 from train.detector.drives import GRID, NOMINAL, WARM_UP, ShakingDrive
 from train.detector.frames import DriveFrames

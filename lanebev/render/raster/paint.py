@@ -19,7 +19,7 @@ from lanebev.render.raster.objects.tunnel import add_ceiling
 from lanebev.render.raster.objects.walls import add_walls
 from lanebev.render.raster.road.ground import ground_radiance
 from lanebev.render.rows import take_rows
-from lanebev.render.scene.alignment import ground_hit, lowest_slopes
+from lanebev.render.scene.road.alignment import ground_hit, lowest_slopes
 from lanebev.render.scene.world import Scene
 
 _METERED = 40.0  # m of road by which the exposure is set

@@ -1,8 +1,6 @@
 """The content of scenes, sampled for whole batches.
 
-- ``world`` puts everything together, by the ``kinds`` of road; ``sampler`` has the randomness.
-- Road: ``alignment``, ``layout`` of the boundaries (``city_layout``, ``country``), ``pavement``, ``works``,
-  ``winter``, ``tunnel``, and a ``street`` in a ``town`` with painted ``glyphs``.
-- Beside and on it: ``surroundings``, ``traffic`` and other ``objects``.
-- Light: ``weather`` and ``night``. Camera: ``camera``, ``window``, ``sensor``, ``glass``; ``varied`` cameras.
+``world`` puts everything together, by the ``kinds`` of road: the ``road``, ``objects`` beside and on it,
+``places`` that change both, ``light`` and ``camera``. ``varied`` changes weather and camera of some kinds.
+``sampler`` has the randomness.
 """

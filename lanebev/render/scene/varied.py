@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
+from lanebev.render.scene.camera.sensor import Sensor
 from lanebev.render.scene.kinds import Kinds
+from lanebev.render.scene.light.weather import NIGHT, Weather
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.sensor import Sensor
-from lanebev.render.scene.weather import NIGHT, Weather
 from lanebev.types import Extrinsics
 
 

@@ -7,39 +7,48 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import select_rows
-from lanebev.render.scene.alignment import Alignment, arc_nodes
-from lanebev.render.scene.camera import Lens
-from lanebev.render.scene.city_layout import sample_city_layout
-from lanebev.render.scene.country import country_layout, country_pavement, country_surroundings
-from lanebev.render.scene.glass import Glass, sample_glass
+from lanebev.render.scene.camera.glass import Glass, sample_glass
+from lanebev.render.scene.camera.lens import Lens
+from lanebev.render.scene.camera.sensor import Sensor, sample_sensor
 from lanebev.render.scene.kinds import Kinds, sample_kinds
-from lanebev.render.scene.layout import Layout, sample_layout
-from lanebev.render.scene.night import Lights, night_light, sample_lights
-from lanebev.render.scene.objects import SceneObjects
-from lanebev.render.scene.pavement import Pavement, sample_pavement
-from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.sensor import Sensor, sample_sensor
-from lanebev.render.scene.street import Street, no_street, sample_street
-from lanebev.render.scene.surroundings import Surroundings, sample_surroundings
-from lanebev.render.scene.town import (
+from lanebev.render.scene.light.night import Lights, night_light, sample_lights
+from lanebev.render.scene.light.weather import (
+    CLEAR,
+    DUSK,
+    NIGHT,
+    RAIN,
+    Light,
+    Weather,
+    light_of,
+    sample_weather,
+)
+from lanebev.render.scene.objects.objects import SceneObjects
+from lanebev.render.scene.objects.surroundings import Surroundings, sample_surroundings
+from lanebev.render.scene.objects.traffic import Traffic, place_objects, sample_traffic
+from lanebev.render.scene.places.country import country_layout, country_pavement, country_surroundings
+from lanebev.render.scene.places.street import Street, no_street, sample_street
+from lanebev.render.scene.places.town import (
     NUM_PARKED,
     city_traffic,
     kerb_boundaries,
     street_edges,
     street_surroundings,
 )
-from lanebev.render.scene.traffic import Traffic, place_objects, sample_traffic
-from lanebev.render.scene.tunnel import (
+from lanebev.render.scene.places.tunnel import (
     Tunnel,
     sample_tunnel,
     tunnel_light,
     tunnel_surroundings,
     tunnel_traffic,
 )
+from lanebev.render.scene.places.winter import Winter, sample_winter, snowed_layout
+from lanebev.render.scene.places.works import Works, sample_works, works_traffic
+from lanebev.render.scene.road.alignment import Alignment, arc_nodes
+from lanebev.render.scene.road.city_layout import sample_city_layout
+from lanebev.render.scene.road.layout import Layout, sample_layout
+from lanebev.render.scene.road.pavement import Pavement, sample_pavement
+from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.varied import varied_camera, varied_weather
-from lanebev.render.scene.weather import CLEAR, DUSK, NIGHT, RAIN, Light, Weather, light_of, sample_weather
-from lanebev.render.scene.winter import Winter, sample_winter, snowed_layout
-from lanebev.render.scene.works import Works, sample_works, works_traffic
 
 
 class World(NamedTuple):

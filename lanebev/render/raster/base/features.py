@@ -5,10 +5,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.layout import Layout
-from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.surroundings import NOTHING, SLOPE, STYLES, TREES, Surroundings
-from lanebev.render.scene.weather import Light
+from lanebev.render.scene.light.weather import Light
+from lanebev.render.scene.objects.surroundings import NOTHING, SLOPE, STYLES, TREES, Surroundings
+from lanebev.render.scene.road.layout import Layout
+from lanebev.render.scene.road.pavement import Pavement
 from lanebev.render.scene.world import Scene
 
 SHORTEST_SHADOW = 0.05  # m, of a wall on the ground

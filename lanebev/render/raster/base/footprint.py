@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.alignment import Alignment, road_from_local
+from lanebev.render.scene.road.alignment import Alignment, road_from_local
 from lanebev.render.scene.world import Place
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from lanebev.geometry.lens import normalise_points, undistort_points
-from lanebev.render.scene.camera import Lens
+from lanebev.render.scene.camera.lens import Lens
 
 _COARSE = 8  # px between exactly undistorted pixels; cubic in between errs by less than 0.002 px
 

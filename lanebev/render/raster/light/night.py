@@ -8,10 +8,10 @@ from torch.nn import functional
 
 from lanebev.render.raster.base.noise import sample_line, smoothstep
 from lanebev.render.raster.base.rays import View
-from lanebev.render.scene.alignment import Alignment, elevation_at, local_from_road, z_from_arc
-from lanebev.render.scene.camera import Lens
-from lanebev.render.scene.night import NUM_LAMPS, Lights
-from lanebev.render.scene.objects import TRUCK, SceneObjects
+from lanebev.render.scene.camera.lens import Lens
+from lanebev.render.scene.light.night import NUM_LAMPS, Lights
+from lanebev.render.scene.objects.objects import TRUCK, SceneObjects
+from lanebev.render.scene.road.alignment import Alignment, elevation_at, local_from_road, z_from_arc
 from lanebev.render.scene.world import Place
 from lanebev.tensors import constant
 

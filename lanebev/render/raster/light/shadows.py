@@ -12,10 +12,10 @@ from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.noise import CLOUD, sample_line, sample_noise, smoothstep
 from lanebev.render.raster.base.select import as_float, choose, indices_where, take
 from lanebev.render.rows import take_rows
-from lanebev.render.scene.objects import TRUCK, SceneObjects
-from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.surroundings import FENCE, HEDGE, RAIL, TREES, Surroundings
-from lanebev.render.scene.weather import Light
+from lanebev.render.scene.light.weather import Light
+from lanebev.render.scene.objects.objects import TRUCK, SceneObjects
+from lanebev.render.scene.objects.surroundings import FENCE, HEDGE, RAIL, TREES, Surroundings
+from lanebev.render.scene.road.pavement import Pavement
 from lanebev.render.scene.world import Scene
 
 BRIDGE_UNDERSIDE = 6.2  # m, of all bridges as far as their shadows go

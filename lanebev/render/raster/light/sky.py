@@ -8,7 +8,7 @@ from lanebev.render.raster.base.features import Features
 from lanebev.render.raster.base.noise import CLOUD, sample_line, sample_noise, smoothstep
 from lanebev.render.raster.base.select import as_float, choose
 from lanebev.render.rows import take_rows
-from lanebev.render.scene.surroundings import Surroundings
+from lanebev.render.scene.objects.surroundings import Surroundings
 from lanebev.render.scene.world import Scene
 
 

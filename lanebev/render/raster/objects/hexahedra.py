@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from lanebev.render.raster.base.select import as_float, choose
-from lanebev.render.scene.camera import Lens
-from lanebev.render.scene.objects import SceneObjects
+from lanebev.render.scene.camera.lens import Lens
+from lanebev.render.scene.objects.objects import SceneObjects
 from lanebev.tensors import constant
 
 RIGHT, LEFT, FRONT, REAR, TOP, BOTTOM = range(6)  # faces in the object's own frame

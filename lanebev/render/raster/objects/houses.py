@@ -5,7 +5,7 @@ from torch import Tensor
 
 from lanebev.render.raster.base.colour import colour as colour_of
 from lanebev.render.raster.base.noise import CLOUD, hash01, sample_noise, smoothstep
-from lanebev.render.scene.surroundings import Wall
+from lanebev.render.scene.objects.surroundings import Wall
 
 _FLOOR = 3.1  # m
 

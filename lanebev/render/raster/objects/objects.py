@@ -23,7 +23,7 @@ from lanebev.render.raster.objects.hexahedra import (
 )
 from lanebev.render.raster.objects.shading import object_radiance
 from lanebev.render.rows import take_rows
-from lanebev.render.scene.objects import SceneObjects
+from lanebev.render.scene.objects.objects import SceneObjects
 from lanebev.render.scene.world import Scene
 from lanebev.tensors import constant, map_tensors
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from lanebev.render.raster.objects.hexahedra import BOTTOM, FRONT, LEFT, REAR, RIGHT, TOP
-from lanebev.render.scene.objects import BRIDGE, SIGN, TRUCK, SceneObjects
-from lanebev.render.scene.weather import Light
+from lanebev.render.scene.light.weather import Light
+from lanebev.render.scene.objects.objects import BRIDGE, SIGN, TRUCK, SceneObjects
 from lanebev.tensors import constant
 
 

@@ -4,9 +4,9 @@ import torch
 from torch import Tensor
 
 from lanebev.render.raster.base.rays import View
-from lanebev.render.scene.alignment import Alignment, road_from_local
-from lanebev.render.scene.camera import Lens
-from lanebev.render.scene.tunnel import Tunnel
+from lanebev.render.scene.camera.lens import Lens
+from lanebev.render.scene.places.tunnel import Tunnel
+from lanebev.render.scene.road.alignment import Alignment, road_from_local
 from lanebev.render.scene.world import Place
 
 _NO_CEILING = 900.0  # m; beyond, nothing of it is drawn

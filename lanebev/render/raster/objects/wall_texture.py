@@ -14,7 +14,7 @@ from lanebev.render.raster.base.noise import (
 )
 from lanebev.render.raster.base.select import as_float, choose
 from lanebev.render.raster.objects.houses import house_front
-from lanebev.render.scene.surroundings import CONCRETE, FENCE, HEDGE, HOUSES, RAIL, SLOPE, TREES, Wall
+from lanebev.render.scene.objects.surroundings import CONCRETE, FENCE, HEDGE, HOUSES, RAIL, SLOPE, TREES, Wall
 
 
 def wall_texture(

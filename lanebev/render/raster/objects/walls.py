@@ -17,8 +17,8 @@ from lanebev.render.raster.objects.houses import lit_windows
 from lanebev.render.raster.objects.wall_texture import wall_texture
 from lanebev.render.raster.road.ground import headlight_irradiance
 from lanebev.render.rows import concatenate_rows, take_rows
-from lanebev.render.scene.alignment import elevation_at, wall_hit, wall_table
-from lanebev.render.scene.surroundings import FENCE, HEDGE, HOUSES, NUM_WALLS, TREES, Wall, walls_of
+from lanebev.render.scene.objects.surroundings import FENCE, HEDGE, HOUSES, NUM_WALLS, TREES, Wall, walls_of
+from lanebev.render.scene.road.alignment import elevation_at, wall_hit, wall_table
 from lanebev.render.scene.world import Scene
 
 _TILES = 8  # tiles in a block of what may be wall

@@ -8,7 +8,7 @@ from lanebev.render.raster.base.features import Features
 from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.noise import sample_grain, smoothstep
 from lanebev.render.raster.base.select import as_float, remainder
-from lanebev.render.scene.layout import Layout, presence
+from lanebev.render.scene.road.layout import Layout, presence
 
 STUD_SPACING, STUD_SIZE, STUD_HEIGHT = 1.22, 0.11, 0.020  # m, Botts' dots
 _TAIL = 2.5  # px beside a stripe at which nothing is left of it: five standard deviations of the pixel

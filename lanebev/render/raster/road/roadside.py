@@ -6,8 +6,8 @@ from torch import Tensor
 from lanebev.render.raster.base.coverage import band, beyond, dash_coverage, stripe_coverage
 from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.noise import CLOUD, hash01, sample_grain, sample_noise, smoothstep
-from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.street import GREEN, KERB, PATH, WALK, Street
+from lanebev.render.scene.places.street import GREEN, KERB, PATH, WALK, Street
+from lanebev.render.scene.road.pavement import Pavement
 
 
 def roadside(

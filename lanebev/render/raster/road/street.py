@@ -10,10 +10,10 @@ from lanebev.render.raster.road.glyphs import GLYPH_LENGTH, GLYPH_WIDTH, glyph_c
 from lanebev.render.raster.road.roadside import junction_coverage
 from lanebev.render.raster.road.street_surface import strips_between
 from lanebev.render.raster.road.surface import count_below
-from lanebev.render.scene.glyphs import BICYCLE, NUM_GLYPHS
-from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
-from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.street import CYCLING, FORD, PARKING, ZEBRA, Street
+from lanebev.render.scene.places.street import CYCLING, FORD, PARKING, ZEBRA, Street
+from lanebev.render.scene.road.glyphs import BICYCLE, NUM_GLYPHS
+from lanebev.render.scene.road.layout import MAX_BOUNDARIES, Layout
+from lanebev.render.scene.road.pavement import Pavement
 
 
 def street_paint(

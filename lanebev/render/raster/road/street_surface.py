@@ -6,9 +6,9 @@ from torch import Tensor
 from lanebev.render.raster.base.coverage import band, beyond, dash_coverage, stripe_coverage
 from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.noise import hash01, sample_grain
-from lanebev.render.scene.layout import Layout
-from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.street import Street
+from lanebev.render.scene.places.street import Street
+from lanebev.render.scene.road.layout import Layout
+from lanebev.render.scene.road.pavement import Pavement
 
 RAIL_GAUGE = 1.435  # m
 

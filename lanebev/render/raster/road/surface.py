@@ -20,8 +20,8 @@ from lanebev.render.raster.base.noise import (
     smoothstep,
 )
 from lanebev.render.raster.base.select import as_float, choose, remainder
-from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
-from lanebev.render.scene.pavement import Pavement
+from lanebev.render.scene.road.layout import MAX_BOUNDARIES, Layout
+from lanebev.render.scene.road.pavement import Pavement
 
 
 class LanePlace(NamedTuple):

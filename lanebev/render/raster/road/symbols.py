@@ -7,7 +7,7 @@ from lanebev.render.raster.base.coverage import stripe_coverage
 from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.noise import hash01
 from lanebev.render.raster.base.select import remainder
-from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
+from lanebev.render.scene.road.layout import MAX_BOUNDARIES, Layout
 
 NO_SYMBOL, ARROW, TURN, WORD, DIAMOND = range(5)
 _LENGTH = 5.0  # m, of a symbol along the road

@@ -12,11 +12,11 @@ from lanebev.render.raster.road.street import lane_coordinates, street_paint
 from lanebev.render.raster.road.street_surface import ironwork, strips, tracks
 from lanebev.render.raster.road.winter import snow_cover
 from lanebev.render.rows import take_rows
-from lanebev.render.scene.layout import Layout
-from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.street import Street
-from lanebev.render.scene.winter import Winter
-from lanebev.render.scene.works import NUM_OLD, Works
+from lanebev.render.scene.places.street import Street
+from lanebev.render.scene.places.winter import Winter
+from lanebev.render.scene.places.works import NUM_OLD, Works
+from lanebev.render.scene.road.layout import Layout
+from lanebev.render.scene.road.pavement import Pavement
 from lanebev.render.scene.world import Scene
 
 

@@ -6,7 +6,7 @@ from lanebev.render.raster.base.colour import colour
 from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.noise import sample_grain
 from lanebev.render.raster.base.select import choose, remainder
-from lanebev.render.scene.surroundings import Surroundings
+from lanebev.render.scene.objects.surroundings import Surroundings
 
 
 def verge_albedo(surroundings: Surroundings, ground: Ground, patches: Tensor) -> Tensor:

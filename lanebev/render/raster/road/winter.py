@@ -6,9 +6,9 @@ from torch import Tensor
 from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.noise import CLOUD, SECOND, sample_grain, sample_noise, smoothstep
 from lanebev.render.raster.road.surface import count_below, nearest_slot
-from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout, presence
-from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.winter import Winter
+from lanebev.render.scene.places.winter import Winter
+from lanebev.render.scene.road.layout import MAX_BOUNDARIES, Layout, presence
+from lanebev.render.scene.road.pavement import Pavement
 
 
 def snow_cover(winter: Winter, layout: Layout, pavement: Pavement, ground: Ground, blotch: Tensor) -> Tensor:

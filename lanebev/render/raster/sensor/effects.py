@@ -9,8 +9,8 @@ from lanebev.render.raster.base.noise import CLOUD, sample_noise
 from lanebev.render.raster.base.select import as_float
 from lanebev.render.raster.sensor.filters import blur_reach, gaussian_blur
 from lanebev.render.raster.sensor.randomness import uniform_rows
-from lanebev.render.scene.sensor import Sensor
-from lanebev.render.scene.weather import Light
+from lanebev.render.scene.camera.sensor import Sensor
+from lanebev.render.scene.light.weather import Light
 
 _MOST_DROPS = 18
 

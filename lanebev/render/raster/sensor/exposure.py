@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from lanebev.render.raster.base.select import indices_where, take
-from lanebev.render.scene.sensor import Sensor
+from lanebev.render.scene.camera.sensor import Sensor
 
 _BLOOM_SCALE = 8
 _SHOULDER = 0.6  # display-linear level above which highlights are compressed

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from lanebev.render.raster.base.noise import CLOUD, sample_noise, smoothstep
-from lanebev.render.scene.glass import LETTERS, Glass
+from lanebev.render.scene.camera.glass import LETTERS, Glass
 
 _HIGH, _WIDE, _FONTS = 24, 16, (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX)
 
@@ -41,7 +41,7 @@ def stamp(
 
     Args:
         image: (B, 3, H, W) display values.
-        text: (B, T) int64, see :func:`~lanebev.render.scene.glass.sample_text`.
+        text: (B, T) int64, see :func:`~lanebev.render.scene.camera.glass.sample_text`.
         place: (B, 2) of its upper left corner, shares of width and height.
         high: (B,) of a letter, share of the height.
         colour: (B, 3).

@@ -14,7 +14,7 @@ from lanebev.render.raster.sensor.glass import behind_glass, frame_cover, record
 from lanebev.render.raster.sensor.jpeg import compress
 from lanebev.render.raster.sensor.randomness import normal_rows
 from lanebev.render.rows import take_rows
-from lanebev.render.scene.sensor import Sensor
+from lanebev.render.scene.camera.sensor import Sensor
 from lanebev.render.scene.world import Scene
 
 _REFERENCE_WIDTH = 640  # px, at which the blur is stated

@@ -6,10 +6,7 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import select_rows
-from lanebev.render.scene.layout import DASHED, MAX_BOUNDARIES, NONE, SOLID, Layout
-from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.surroundings import (
+from lanebev.render.scene.objects.surroundings import (
     EARTHS,
     FENCE,
     GREENS,
@@ -21,6 +18,9 @@ from lanebev.render.scene.surroundings import (
     TREES,
     Surroundings,
 )
+from lanebev.render.scene.road.layout import DASHED, MAX_BOUNDARIES, NONE, SOLID, Layout
+from lanebev.render.scene.road.pavement import Pavement
+from lanebev.render.scene.sampler import BatchSampler
 
 _BARE, _MIDDLE, _EDGES = range(3)  # the lines that are painted
 

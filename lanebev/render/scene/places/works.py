@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import select_rows
-from lanebev.render.scene.layout import DASHED, MAX_BOUNDARIES, NONE, SOLID, WHITE, Layout
-from lanebev.render.scene.objects import POLE
+from lanebev.render.scene.objects.objects import POLE
+from lanebev.render.scene.objects.traffic import Traffic
+from lanebev.render.scene.road.layout import DASHED, MAX_BOUNDARIES, NONE, SOLID, WHITE, Layout
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.traffic import Traffic
 
 NUM_OLD = 4  # old white lines
 

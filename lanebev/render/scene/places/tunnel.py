@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import select_rows
-from lanebev.render.scene.pavement import Pavement
+from lanebev.render.scene.light.weather import Light
+from lanebev.render.scene.objects.surroundings import CONCRETE, NOTHING, NUM_WALLS, Surroundings
+from lanebev.render.scene.objects.traffic import NUM_ONCOMING, NUM_VEHICLES, Traffic
+from lanebev.render.scene.road.pavement import Pavement
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.surroundings import CONCRETE, NOTHING, NUM_WALLS, Surroundings
-from lanebev.render.scene.traffic import NUM_ONCOMING, NUM_VEHICLES, Traffic
-from lanebev.render.scene.weather import Light
 
 _LAMP_COLOURS = [(1.0, 0.6, 0.2), (1.0, 0.75, 0.4), (1.0, 0.95, 0.85), (0.85, 0.95, 1.0)]
 

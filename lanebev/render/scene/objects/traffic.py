@@ -6,15 +6,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.alignment import (
+from lanebev.render.scene.objects.objects import BRIDGE, CAR, POLE, SIGN, TRUCK, SceneObjects
+from lanebev.render.scene.road.alignment import (
     Alignment,
     elevation_at,
     local_from_road,
     road_from_local,
     z_from_arc,
 )
-from lanebev.render.scene.layout import Layout
-from lanebev.render.scene.objects import BRIDGE, CAR, POLE, SIGN, TRUCK, SceneObjects
+from lanebev.render.scene.road.layout import Layout
 from lanebev.render.scene.sampler import BatchSampler
 
 NUM_VEHICLES, NUM_ONCOMING = 14, 5

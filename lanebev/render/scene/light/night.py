@@ -5,8 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lanebev.render.scene.light.weather import Light
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.weather import Light
 
 NUM_LAMPS = 10  # street lamps ahead on each side
 NUM_SPOTS = 28  # distant lights of the town

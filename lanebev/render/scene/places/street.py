@@ -5,10 +5,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.glyphs import ARROWS, BICYCLE, CROSS, WORDS
-from lanebev.render.scene.layout import MAX_BOUNDARIES, WHITE, Layout
+from lanebev.render.scene.objects.surroundings import GREENS
+from lanebev.render.scene.road.glyphs import ARROWS, BICYCLE, CROSS, WORDS
+from lanebev.render.scene.road.layout import MAX_BOUNDARIES, WHITE, Layout
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.surroundings import GREENS
 
 PLAIN, PARKING, CYCLING = range(3)  # strips between the outer boundary and the kerb
 NO_CROSSING, ZEBRA, FORD = range(3)  # a ford: two dashed lines

@@ -6,11 +6,7 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import select_rows
-from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
-from lanebev.render.scene.pavement import Pavement
-from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.street import CYCLING, KERB, PARKING, PLAIN, Street
-from lanebev.render.scene.surroundings import (
+from lanebev.render.scene.objects.surroundings import (
     FENCE,
     GREENS,
     HEDGE,
@@ -20,7 +16,11 @@ from lanebev.render.scene.surroundings import (
     TREES,
     Surroundings,
 )
-from lanebev.render.scene.traffic import CAR_COLOURS, NUM_VEHICLES, Traffic, vehicle_shapes
+from lanebev.render.scene.objects.traffic import CAR_COLOURS, NUM_VEHICLES, Traffic, vehicle_shapes
+from lanebev.render.scene.places.street import CYCLING, KERB, PARKING, PLAIN, Street
+from lanebev.render.scene.road.layout import MAX_BOUNDARIES, Layout
+from lanebev.render.scene.road.pavement import Pavement
+from lanebev.render.scene.sampler import BatchSampler
 
 NUM_PARKED = 10
 _COMING = -25.0  # m/s relative to the camera; below -20 a vehicle faces it

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lanebev.render.scene.light.weather import DUSK, NIGHT, Weather
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.weather import DUSK, NIGHT, Weather
 
 
 class Sensor(NamedTuple):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.layout import MAX_BOUNDARIES, Layout
+from lanebev.render.scene.road.layout import MAX_BOUNDARIES, Layout
 from lanebev.render.scene.sampler import BatchSampler
 
 

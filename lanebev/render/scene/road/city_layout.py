@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.layout import (
+from lanebev.render.scene.road.layout import (
     DASHED,
     DOUBLE,
     MAX_BOUNDARIES,

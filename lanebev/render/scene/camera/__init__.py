@@ -1,0 +1,1 @@
+"""The camera: ``lens`` and pose, ``window`` of the image, ``sensor``, and ``glass`` before the lens."""

@@ -1,0 +1,1 @@
+"""Daylight and ``weather``; lamps at ``night``."""
