@@ -13,7 +13,18 @@ from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.testing.moments import FPS, PLACES, Moment, moments
 from lanebev.testing.motions import Pose, moved, sinusoids
 from lanebev.testing.streets import wandering
-from tools.replay.kinds import EGO_LANE, FRAMES, SHOCK, Change, Generated, drop, in_curve, knock
+from tools.replay.kinds import (
+    EGO_LANE,
+    FRAMES,
+    SHOCK,
+    Change,
+    Generated,
+    bend,
+    drop,
+    in_curve,
+    knock,
+    winding,
+)
 
 IN_CURVE = "motion up to 1.5°, 1.2 Hz, R 300 m"
 WINDING = "winding road at 3 to 12 m/s"
@@ -43,17 +54,7 @@ def _winding(seed: int) -> Generated:
     sharpest = random.uniform(150.0, 800.0)
     waves = [(random.uniform(200.0, 600.0), random.random(), 0.3 + random.random()) for _ in range(2)]
     speed = random.uniform(3.0, 12.0)
-    size = 1 / (sharpest * sum(part for *_, part in waves))
-
-    def change(t: float, moment: Moment) -> Moment:
-        def curvature(z: torch.Tensor) -> torch.Tensor:
-            way = z + speed * t
-            each = [part * (2 * math.pi * (way / length + at)).sin() for length, at, part in waves]
-            return size * torch.stack(each).sum(0)
-
-        return replace(moment, near=5.0, far=40.0, curvature=curvature)
-
-    return _drawn(seed, change)
+    return _drawn(seed, winding(speed, sharpest, waves))
 
 
 def difference(seed: int, degrees: float, metres: float) -> Pose:
@@ -94,11 +95,8 @@ def _cut(seed: int) -> Generated:
 def _resumed(seed: int) -> Generated:
     """Resume with the state of another vehicle's camera in a bend of R = 400 m."""
 
-    def bend(z: torch.Tensor) -> torch.Tensor:
-        return torch.full_like(z, 1 / 400)
-
     def before(t: float, moment: Moment) -> Moment:
-        return replace(_other_vehicle(seed, moment), curvature=bend, far=40.0)
+        return replace(_other_vehicle(seed, moment), curvature=bend(400), far=40.0)
 
     def change(t: float, moment: Moment) -> Moment:
         return replace(moment, tag="resumed" if t == 0 else "")
@@ -158,11 +156,7 @@ def _unequal_in_view(seed: int, std: float, visible: tuple[int, ...]) -> Generat
 
 def _bend(seed: int, radius: float) -> Generated:
     """Drive in a bend of constant radius, seen from 5 to 40 m."""
-
-    def bent(z: torch.Tensor) -> torch.Tensor:
-        return torch.full_like(z, 1 / radius)
-
-    return _drawn(seed, lambda t, moment: replace(moment, near=5.0, far=40.0, curvature=bent))
+    return _drawn(seed, lambda t, moment: replace(moment, near=5.0, far=40.0, curvature=bend(radius)))
 
 
 def _kerb(seed: int) -> Generated:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -42,8 +42,7 @@ def boundary_indices(
         for each line its index, or None.
     """
     result: list[int | None] = [None] * len(lines)
-    drawn = [i for i, line in enumerate(lines) if len(line) > 1 and np.ptp(line[:, 1]) > 0]
-    straight = {i: _lower_half(lines[i]) for i in drawn}
+    straight = {i: _lower_half(line) for i, line in enumerate(lines) if _has_length(line)}
     slope = {i: found.slope for i, found in straight.items() if abs(found.slope) <= _FARTHEST}
     if not slope:
         return result
@@ -57,15 +56,11 @@ def boundary_indices(
     lanes = [crossing[b] - crossing[a] for a, b in pairwise(kept)]
     in_a_lane = 0 < left < len(kept) and _bound_one_lane(-slope[kept[left - 1]], slope[kept[left]])
     typical = lanes[left - 1] if in_a_lane else _median_gap(lanes)
-    steps = [2 if gap > _NEXT_BUT_ONE * typical else 1 for gap in lanes]
-    position = np.concatenate([[0], np.cumsum(steps)]).astype(int)
-    if left == 0:
-        origin = position[0] - num_boundaries // 2
-    else:
-        origin = position[left - 1] - (num_boundaries // 2 - 1)
-    for i, place in zip(kept, position - origin, strict=True):
-        if 0 <= place < num_boundaries:
-            result[i] = int(place)
+    position = list(accumulate((1 + (gap > _NEXT_BUT_ONE * typical) for gap in lanes), initial=0))
+    first = num_boundaries // 2 - (position[left - 1] + 1 if left else 0)
+    for i, place in zip(kept, position, strict=True):
+        if 0 <= first + place < num_boundaries:
+            result[i] = first + place
     return result
 
 
@@ -85,7 +80,7 @@ def width_ratios(
     found = sorted(
         (index, math.atan(_lower_half(line).slope))
         for line, index in zip(lines, indices, strict=True)
-        if index is not None and len(line) > 1 and np.ptp(line[:, 1]) > 0
+        if index is not None and _has_length(line)
     )
     if len(found) < 3:
         return np.full(len(rolls), math.nan)
@@ -108,6 +103,11 @@ class _Straight(NamedTuple):
     def at(self, row: float) -> float:
         """Return the x at which it meets a row."""
         return self.x + self.slope * (row - self.y)
+
+
+def _has_length(points: NDArray[np.float64]) -> bool:
+    """Tell whether a line has points on different rows."""
+    return len(points) > 1 and bool(np.ptp(points[:, 1]) > 0)
 
 
 def _lower_half(points: NDArray[np.float64]) -> _Straight:

@@ -15,6 +15,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
+from lanebev.numbers import stand_in
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
 from lanebev.tensors import device_of_numbers
 
@@ -22,7 +23,7 @@ SHIPPED = Path(__file__).with_name("lane_segmenter.safetensors")
 _FORMAT = "lanebev.LaneSegmenter/1"
 _COMPACT_FORMAT = "lanebev.LaneSegmenter/2"  # some tensors are int8 and have a scale beside them
 _SCALE = ".scale"
-_ZIP, _GIT_LFS = b"PK\x03\x04", b"version https://git-lfs"  # with what torch.save's files and pointers begin
+_ZIP = b"PK\x03\x04"  # with which torch.save's files begin
 _LARGE = 2**20  # weights; larger ones are 8-bit numbers in a compact file
 _MOST = {"num_boundaries": 64, "base_width": 512, "decoder_width": 512, "context": 16}
 _FORMER_NAMES = {"noise_factor": "sigma_scale", "pose_factor": "pose_sigma_scale"}
@@ -125,10 +126,6 @@ def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, t
     """Read metadata, and every tensor in single precision (counters unchanged)."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a weights file, there is none")
-    with open(path, "rb") as file:
-        head = file.read(len(_GIT_LFS))
-    if head == _GIT_LFS:
-        raise ValueError(f"{path}: expected a weights file, got where Git LFS keeps it; run: git lfs pull")
     if is_checkpoint(path):
         name = path.with_suffix(".safetensors").name
         raise ValueError(
@@ -140,16 +137,18 @@ def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, t
             metadata = file.metadata() or {}
             values = {name: file.get_tensor(name) for name in file.keys()} if tensors else {}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise ValueError(f"{path}: expected a whole safetensors file: {error}") from error
+        with open(path, "rb") as file:
+            instead = stand_in(file.read(100))
+        raise ValueError(f"{path}: expected a whole safetensors file, got: {instead or error}") from error
     if metadata.get("format") not in (_FORMAT, _COMPACT_FORMAT):
         raise ValueError(f"{path}: expected format {_FORMAT}, got {metadata.get('format')}")
     scales = {name: values.pop(name + _SCALE) for name in list(values) if name + _SCALE in values}
-    return metadata, {
-        name: value.float() * scales[name]
-        if name in scales
-        else (value.float() if value.is_floating_point() else value)
-        for name, value in values.items()
-    }
+    for name, value in values.items():
+        if name in scales:
+            values[name] = value.float() * scales[name]
+        elif value.is_floating_point():
+            values[name] = value.float()
+    return metadata, values
 
 
 def segmenter_config(values: Mapping[str, Any]) -> SegmenterConfig:

@@ -99,7 +99,7 @@ def test_what_is_no_weights_file_says_what_it_is(tmp_path, segmenter):
     with pytest.raises(ValueError, match="got a checkpoint of training; make one with: python -m"):
         load_segmenter(path)
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
-    with pytest.raises(ValueError, match="run: git lfs pull"):
+    with pytest.raises(ValueError, match="a pointer of Git LFS; fetch the file by git lfs pull"):
         load_segmenter(path)
     broken = copy.deepcopy(segmenter)
     with torch.no_grad():

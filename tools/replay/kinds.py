@@ -1,7 +1,7 @@
 """The kinds of drive of a replay, and the generated drives."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -78,13 +78,33 @@ def _hill(t: float, moment: Moment) -> Moment:
     return replace(moment, near=5.0, far=40.0, profile=1e-4 * math.cos(t))
 
 
-def _winding(t: float, moment: Moment) -> Moment:
-    """Drive at 5 m/s along a road whose curvature is a sinusoid of 300 m, R = 250 m at the sharpest."""
+def winding(speed: float, sharpest: float, waves: Sequence[tuple[float, float, float]]) -> Change:
+    """Drive along a road whose curvature is a sum of sinusoids, seen from 5 to 40 m.
 
-    def curvature(z: torch.Tensor) -> torch.Tensor:
-        return (2 * math.pi * (z + 5.0 * t) / 300.0).sin() / 250.0
+    Args:
+        speed: m/s.
+        sharpest: radius where all sinusoids are at their crest, m.
+        waves: wavelength in m, phase in turns and relative amplitude of each.
+    """
+    size = 1 / (sharpest * sum(part for *_, part in waves))
 
-    return replace(moment, near=5.0, far=40.0, curvature=curvature)
+    def change(t: float, moment: Moment) -> Moment:
+        def curvature(z: torch.Tensor) -> torch.Tensor:
+            way = z + speed * t
+            each = [part * (2 * math.pi * (way / length + at)).sin() for length, at, part in waves]
+            return size * torch.stack(each).sum(0)
+
+        return replace(moment, near=5.0, far=40.0, curvature=curvature)
+
+    return change
+
+
+def bend(radius: float) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return the curvature of a bend of constant radius (m), 1/m, as a function of Z."""
+    return lambda z: torch.full_like(z, 1 / radius)
+
+
+_WINDING = winding(5.0, 250.0, [(300.0, 0.0, 1.0)])
 
 
 def drop(t: float, moment: Moment) -> Moment:
@@ -112,8 +132,7 @@ def _cut(t: float, moment: Moment) -> Moment:
 
 
 def _truck(t: float, moment: Moment) -> Moment:
-    bend = lambda z: torch.full_like(z, 1 / 400)  # noqa: E731
-    return replace(moment, pose=moved(moment.pose, TRUCK), offset=-0.6, curvature=bend, far=40.0)
+    return replace(moment, pose=moved(moment.pose, TRUCK), offset=-0.6, curvature=bend(400), far=40.0)
 
 
 def _unequal(t: float, moment: Moment) -> Moment:
@@ -190,7 +209,7 @@ GENERATED: dict[str, Generated] = {
     "suspension": Generated("suspension", _drive(motion=suspension(6, 4.0))),
     # R = 60 m at 15 m/s, boundaries 1, 2, 3 in sight, 45 to 105 m.
     "sharp-bends": Generated("sharp bends", _scenario("sharp bends R 60 m, three boundaries", start=3.0)),
-    "winding-road": Generated("winding road", _drive(_winding, sinusoids(8))),
+    "winding-road": Generated("winding road", _drive(_WINDING, sinusoids(8))),
     "crest": Generated("crest", _scenario("crest R 10 km, 5-40 m")),
     # From a crest into a dip of R = 10 km.
     "crest-and-dip": Generated("crest", _drive(_hill)),
