@@ -140,20 +140,24 @@ def _parse_yaml(text: str) -> list[Any]:
             return found
         if isinstance(error, ValueError):
             raise
-        mark = getattr(error, "problem_mark", None)
-        where = f" at line {mark.line + 1}" if mark else ""
-        if isinstance(error, yaml.constructor.ConstructorError) and "!" in text:
-            raise ValueError(f"expected numbers, texts and lists, got another object{where}") from error
-        if "\\t" in str(getattr(error, "problem", "")):
-            raise ValueError(f"expected YAML, got a tab{where}; indent by spaces") from error
-        if without_space := _NO_SPACE.search(text):
-            raise ValueError(f"expected a space after each colon, got {without_space[0]}") from error
-        if found:
-            together = (
-                "in the braces" if text.lstrip()[:1] in ("{", "[") else "in one block, equally indented"
-            )
-            raise ValueError(f"expected all keys {together}, got more after them{where}") from error
-        raise ValueError(f"expected YAML, got a syntax error{where}; is the file cut?") from error
+        raise ValueError(_yaml_fault(error, text, bool(found))) from error
+
+
+def _yaml_fault(error: Exception, text: str, has_document: bool) -> str:
+    """Return what is wrong with a text that is no YAML, or none after its first document."""
+    mark, problem = getattr(error, "problem_mark", None), str(getattr(error, "problem", ""))
+    where = f" at line {mark.line + 1}" if mark else ""
+    if isinstance(error, yaml.constructor.ConstructorError) and "!" in text:
+        return f"expected numbers, texts and lists, got another object{where}"
+    if "\\t" in problem:
+        return f"expected YAML, got a tab{where}; indent by spaces"
+    if without_space := _NO_SPACE.search(text):
+        return f"expected a space after each colon, got {without_space[0]}"
+    if has_document:
+        is_in_braces = text.lstrip()[:1] in ("{", "[")
+        together = "in the braces" if is_in_braces else "in one block, equally indented"
+        return f"expected all keys {together}, got more after them{where}"
+    return f"expected YAML, got a syntax error{where}; is the file cut?"
 
 
 def _parse_ini(text: str) -> dict[str, Any]:

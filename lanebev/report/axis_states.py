@@ -17,6 +17,9 @@ _RADIANS = MountConfig().largest_std
 LARGEST_STD = (*np.degrees(_RADIANS[:3]).tolist(), _RADIANS[3])
 """deg, deg, deg, m: above this standard deviation a value counts as uncertain, as in the mount estimator."""
 
+UNITS, DIGITS = ("°", "°", "°", " m"), (2, 2, 2, 3)
+"""Of pitch, yaw, roll and height, as a page shows them."""
+
 
 class AxisState(IntEnum):
     """The states of an axis in a frame, by how well the frame determines it, best first."""
@@ -59,6 +62,12 @@ def all_axis_states(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.int64]:
 def with_unit(axis: str, value: float, sign: str = "") -> str:
     """Return a value of an axis (deg, m) in words, such as "0.12°" or "3.4 cm"; sign "+" shows it always."""
     return f"{100 * value:{sign}.1f} cm" if axis == "height" else f"{value:{sign}.2f}°"
+
+
+def plus_minus(axis: int, value: float, std: float, sign: str = "", more_digits: int = 0) -> str:
+    """Return a value of an axis (deg, m) and twice its standard deviation, such as "0.12 ± 0.03°"."""
+    digits = DIGITS[axis] + more_digits
+    return f"{value:{sign}.{digits}f} ± {2 * std:.{digits}f}{UNITS[axis]}"
 
 
 def _tracked_state(unseen: bool, std: float, most: float) -> AxisState:

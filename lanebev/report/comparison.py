@@ -116,22 +116,6 @@ def render_comparison(first: RunFolder, second: RunFolder) -> str:
     shown = shown_frames([row for row, _ in pairs], [each.at for each in found])
     shown_pairs = [pairs[place] for place in shown]
     x = places_on_axis([row for row, _ in pairs], stills)[:-1]
-    runs = []
-    for letter, run, i in (("A", first, 0), ("B", second, 1)):
-        rows = [pair[i] for pair in pairs]
-        edges = places_on_axis(rows, stills)
-        result = verdict(rows, stills)
-        runs.append(
-            {
-                "letter": letter,
-                "name": run.name,
-                "verdict": result,
-                "findings": [describe(finding) for finding in result.findings],
-                "strips": strips(rows, stills) if len(rows) > 1 else [],
-                "ticks": ticks(edges) if len(rows) > 1 else [],
-                "frames": len(run.rows),
-            }
-        )
     several = len(pairs) > 1
     plots = {
         "two": plot_two(x[shown], [a for a, _ in shown_pairs], [b for _, b in shown_pairs], stills),
@@ -139,7 +123,10 @@ def render_comparison(first: RunFolder, second: RunFolder) -> str:
     } if several else {}  # fmt: skip
     page: str = template("compare.html.j2").render(
         title=f"{first.name} and {second.name}",
-        runs=runs,
+        runs=[
+            _summary("A", first, [row for row, _ in pairs], stills),
+            _summary("B", second, [row for _, row in pairs], stills),
+        ],
         common=len(pairs),
         differences=found,
         percent=percent,
@@ -153,6 +140,20 @@ def render_comparison(first: RunFolder, second: RunFolder) -> str:
         bokeh=Markup(bokeh_script()) if several else "",
     )
     return page
+
+
+def _summary(letter: str, run: RunFolder, rows: Sequence[ExtrinsicsRow], stills: bool) -> dict[str, Any]:
+    """Return what the page shows of one run, its verdict over the common frames."""
+    result, several = verdict(rows, stills), len(rows) > 1
+    return {
+        "letter": letter,
+        "name": run.name,
+        "verdict": result,
+        "findings": [describe(finding) for finding in result.findings],
+        "strips": strips(rows, stills) if several else [],
+        "ticks": ticks(places_on_axis(rows, stills)) if several else [],
+        "frames": len(run.rows),
+    }
 
 
 def comparison_summary(first: RunFolder, second: RunFolder) -> str:

@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration, MountStatus, describe_mount
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import AxisState, all_axis_states, axis_states, estimate_stds, estimates
+from lanebev.report.axis_states import (
+    DIGITS,
+    UNITS,
+    AxisState,
+    all_axis_states,
+    axis_states,
+    estimate_stds,
+    estimates,
+    plus_minus,
+)
 from lanebev.report.figures import bokeh_script
 from lanebev.report.lens_table import lens_table
 from lanebev.report.moments import Jpegs
@@ -24,9 +33,6 @@ from lanebev.report.timeline import STATE_WORDS, places_on_axis, shown_frames, s
 from lanebev.report.verdict import describe, reason_words, verdict
 from lanebev.report.worst import worst_moments
 from lanebev.types import AXES
-
-_UNITS = ("°", "°", "°", " m")
-_DIGITS = (2, 2, 2, 3)
 
 
 @dataclass
@@ -151,7 +157,7 @@ def pose_table(rows: Sequence[ExtrinsicsRow]) -> list[tuple[str, list[str]]]:
         if seen.any():
             at = value[seen, axis]
             numbers = [np.median(at), at.min(), at.max(), np.median(std[seen, axis])]
-            table.append((name, [f"{float(each):.{_DIGITS[axis]}f}{_UNITS[axis]}" for each in numbers]))
+            table.append((name, [f"{float(each):.{DIGITS[axis]}f}{UNITS[axis]}" for each in numbers]))
     return table
 
 
@@ -163,16 +169,16 @@ def mount_table(mount: MountCalibration | None) -> list[dict[str, Any]]:
     stds = mount.covariance[0].diagonal().clamp_min(0).sqrt().tolist()
     table = []
     for axis, sentence in enumerate(describe_mount(mount)):
-        value, two_sigma = values[axis], 2 * stds[axis]
+        value, std = values[axis], stds[axis]
         if axis < 3:
-            value, two_sigma = math.degrees(value), math.degrees(two_sigma)
+            value, std = math.degrees(value), math.degrees(std)
         name, _, words = sentence.partition(": ")
         table.append(
             {
                 "name": name,
                 "status": MountStatus(int(mount.axis_status[0, axis])).name.lower(),
                 "progress": round(float(mount.axis_progress[0, axis])),
-                "value": f"{value:.{_DIGITS[axis]}f} ± {two_sigma:.{_DIGITS[axis]}f}{_UNITS[axis]}",
+                "value": plus_minus(axis, value, std),
                 "words": words,
             }
         )

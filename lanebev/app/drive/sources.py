@@ -44,29 +44,11 @@ def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
     """
     selection = Selection(config.start, math.inf if config.end is None else config.end, config.every)
     if is_live(config.source):
-        names = ("lanes", "stills", "smooth", "topic")
-        unfit = {f"--{name}": getattr(config, name) for name in names}
-        for name, given in unfit.items():
-            if given:
-                shown = without_login(config.source)
-                raise ValueError(f"source {shown}: expected no {name} with a stream, got it")
-        return open_live(config.source, config.frame_rate, config.keep_all, selection)
+        return _stream(config, selection)
     found = _opened(config.source, config.topic, config.frame_rate)
-    remarks = [found.problem]
-    step = config.every / found.fps
-    if (found.paths or found.times) and found.count > 1 and step > _LONG_STEP and not config.stills:
-        remarks.append(
-            f"its frames are {float(step):.3g} s apart; is the frame rate right? if so, use --stills"
-        )
-    if found.paths and not config.stills:
-        remarks.append(found.untimed)
-        remarks.append(drives_remark(found.paths) or ("" if found.times else jump_remark(found.paths)))
-        if found.count > 1 and not (found.times or config.frame_rate):
-            why, remedy = untimed_remark(found.paths)
-            remarks.append(f"{why}, {float(found.fps):g} frames per second are assumed; {remedy}")
-    said = [each if each is found.problem else f"{config.source}: {each}" for each in remarks if each]
-    found = replace(found, problem="; ".join(said))
-    source = replace(found, selection=selection)
+    remarks = [] if config.stills else [each for each in _remarks_on_drive(config, found) if each]
+    said = [*filter(None, [found.problem]), *(f"{config.source}: {each}" for each in remarks)]
+    source = replace(found, selection=selection, problem="; ".join(said))
     if selection != ALL and not may_take_none and not source.taken_count:
         last = source.times[-1] if source.times else float(source.count / source.fps)
         raise ValueError(
@@ -74,6 +56,28 @@ def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
             f"{config.source} is {last:.2f} s long"
         )
     return source
+
+
+def _stream(config: RunConfig, selection: Selection) -> FrameSource:
+    for name in ("lanes", "stills", "smooth", "topic"):
+        if getattr(config, name):
+            shown = without_login(config.source)
+            raise ValueError(f"source {shown}: expected no --{name} with a stream, got it")
+    return open_live(config.source, config.frame_rate, config.keep_all, selection)
+
+
+def _remarks_on_drive(config: RunConfig, found: FrameSource) -> Iterator[str]:
+    """Yield remarks, some of them empty, on the times of frames and on images of several drives."""
+    step = config.every / found.fps
+    if (found.paths or found.times) and found.count > 1 and step > _LONG_STEP:
+        yield f"its frames are {float(step):.3g} s apart; is the frame rate right? if so, use --stills"
+    if not found.paths:
+        return
+    yield found.untimed
+    yield drives_remark(found.paths) or ("" if found.times else jump_remark(found.paths))
+    if found.count > 1 and not (found.times or config.frame_rate):
+        why, remedy = untimed_remark(found.paths)
+        yield f"{why}, {float(found.fps):g} frames per second are assumed; {remedy}"
 
 
 def _opened(source: str, topic: str | None, fps: Fraction | None) -> FrameSource:

@@ -14,11 +14,11 @@ from markupsafe import Markup
 from lanebev.app.fleet.manifest import Drive
 from lanebev.app.fleet.mounts import DriveMount, Stretch, days
 from lanebev.app.fleet.plan import DRIVES, Outcome
+from lanebev.report.axis_states import UNITS, plus_minus
 from lanebev.report.figures import bokeh_script, finish, new_figure, stacked, value_limits, x_range
 from lanebev.report.templates import template
 from lanebev.types import AXES
 
-_UNITS, _DIGITS = ("°", "°", "°", " m"), (2, 2, 2, 3)
 _SCALE = np.array([180 / math.pi] * 3 + [1.0])
 _COLOUR, _MOVED = "#1f6feb", "#e5484d"
 _MOST_DRIVES = 2000  # drives that are listed one by one, at most; failed ones come first
@@ -108,17 +108,12 @@ def stretch_words(stretch: Stretch) -> StretchWords:
         part * _SCALE for part in (stretch.pose, stretch.std, stretch.drift, stretch.drift_std)
     )
     values = [
-        f"{value[axis]:.{_DIGITS[axis]}f} ± {2 * std[axis]:.{_DIGITS[axis]}f}{_UNITS[axis]}"
-        if math.isfinite(value[axis])
-        else "not known"
-        for axis in range(4)
+        plus_minus(axis, at, sigma) if math.isfinite(at) else "not known"
+        for axis, (at, sigma) in enumerate(zip(value, std, strict=True))
     ]
     drifts = [
-        f"{drift[axis]:+.{_DIGITS[axis] + 1}f} ± {2 * drift_std[axis]:.{_DIGITS[axis] + 1}f}"
-        f"{_UNITS[axis]} a day"
-        if math.isfinite(drift[axis])
-        else ""
-        for axis in range(4)
+        f"{plus_minus(axis, by, sigma, '+', 1)} a day" if math.isfinite(by) else ""
+        for axis, (by, sigma) in enumerate(zip(drift, drift_std, strict=True))
     ]
     names = stretch.first if stretch.drives == 1 else f"{stretch.first} to {stretch.last}"
     return {"drives": stretch.drives, "names": names, "values": values, "drifts": drifts}
@@ -136,7 +131,7 @@ def plot_mounts(camera: CameraMounts) -> dict[str, object]:
     for axis, name in enumerate(AXES):
         seen = np.isfinite(pose[:, axis])
         shown = figures[0].x_range if figures else x_range(x)
-        label = f"{name} ({_UNITS[axis].strip()})"
+        label = f"{name} ({UNITS[axis].strip()})"
         plot = new_figure(label, shown, value_limits(pose[:, axis], std[:, axis], seen, axis))
         source = ColumnDataSource(
             {

@@ -107,18 +107,33 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
     name = field(fields, "raw_file", str)
     if not name:
         raise ValueError("raw_file: expected the image's path, got an empty string")
+    rows = _rows(fields)
+    pose_sigma_scale = _pose_sigma_scale(fields)
+    seen = field(fields, "seen", dict) if "seen" in fields else None
+    lines = _lane_lines(fields, rows) if seen is None else _seen_lines(seen)
+    return FrameLines(name, lines, pose_sigma_scale)
+
+
+def _rows(fields: dict[str, Any]) -> NDArray[np.float64]:
+    """Return the rows (R,) px at which lanes have points."""
     if "h_samples" in fields:
         rows = finite_numbers("h_samples", field(fields, "h_samples", list))
     else:
         rows = _benchmark_rows(fields)
     if not (all(a < b for a, b in pairwise(rows)) or all(a > b for a, b in pairwise(rows))):
         raise ValueError("h_samples: expected rising rows, or falling ones, got others")
-    checked_pixels("h_samples", np.array(rows))
-    pose_sigma_scale = fields.get("pose_sigma_scale", fields.get("pose_factor", 1.0))  # its former name
-    if type(pose_sigma_scale) not in (int, float) or not 0 < pose_sigma_scale <= sys.float_info.max:
-        raise ValueError(f"pose_sigma_scale: expected a finite number above 0, got {shown(pose_sigma_scale)}")
-    if "seen" in fields:
-        return FrameLines(name, _seen_lines(field(fields, "seen", dict)), float(pose_sigma_scale))
+    return checked_pixels("h_samples", np.array(rows))
+
+
+def _pose_sigma_scale(fields: dict[str, Any]) -> float:
+    scale = fields.get("pose_sigma_scale", fields.get("pose_factor", 1.0))  # its former name
+    if type(scale) not in (int, float) or not 0 < scale <= sys.float_info.max:
+        raise ValueError(f"pose_sigma_scale: expected a finite number above 0, got {shown(scale)}")
+    return float(scale)
+
+
+def _lane_lines(fields: dict[str, Any], rows: NDArray[np.float64]) -> list[LaneLine]:
+    """Return the lanes that have points, in pixels, with their boundaries and standard deviations."""
     lanes = field(fields, "lanes", list)
     indices = _boundary_indices(fields, len(lanes))
     sigmas = fields.get("sigma") or [None] * len(lanes)
@@ -131,8 +146,8 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
         if sigma is not None and not (sigma[np.isfinite(x)] > 0).all():
             raise ValueError(f"sigma[{i}]: expected px above 0 where the lane is, got {shown(noise)}")
         if np.isfinite(x).any():
-            lines.append(LaneLine(np.stack([x, np.array(rows)], axis=-1), index, sigma))
-    return FrameLines(name, lines, float(pose_sigma_scale))
+            lines.append(LaneLine(np.stack([x, rows], axis=-1), index, sigma))
+    return lines
 
 
 def _boundary_indices(fields: dict[str, Any], count: int) -> Sequence[int | None]:

@@ -125,7 +125,7 @@ def packets(container: av.container.InputContainer, stream: av.VideoStream) -> I
         yield packet
 
 
-def decoded(  # noqa: C901 - every loop is a way in which files are damaged
+def decoded(
     container: av.container.InputContainer, stream: av.VideoStream
 ) -> Iterator[tuple[int | None, av.VideoFrame | str]]:
     """Return frames as they are shown, with the times that the file gives; of a lost one, what was got.
@@ -138,45 +138,33 @@ def decoded(  # noqa: C901 - every loop is a way in which files are damaged
     they drop what follows the last error.
     """
     in_order = container.format.name == "avi" and stream.codec_context.has_b_frames
-    part, latest = 0, -math.inf
-    due: list[_Due] = []  # packets whose frames have not come
-    lost: set[_Due] = set()
-    doubted: set[_Due] = set()  # packets that the container marks as damaged
-    damage = ""
+    due, damage = _DuePackets(), ""
     keyed = stream.codec_context.name not in _WITHOUT_KEY_CHECK
     for packet in packets(container, stream):
-        own: _Due | None = None
-        if packet.pts is not None:
-            begins = packet.is_keyframe and packet.pts < latest
-            part, latest = part + begins, packet.pts if begins else max(latest, packet.pts)
-            own = _Due(part, packet.pts)
-            if not packet.is_discard:
-                bisect.insort(due, own)
+        own = due.add(packet)
         if packet.is_corrupt:
             damage = damage or "a damaged one"
-            doubted.update([] if own is None else [own])
         frames: Sequence[av.VideoFrame] = ()
         try:
             frames = packet.decode()
         except av.error.FFmpegError as error:  # one frame lost, the next may be whole
             damage = error.strerror
-            if own is None and packet.size:
+            if own is not None:
+                due.lost.add(own)
+            elif packet.size:
                 yield None, damage
-            elif own is not None:
-                lost.add(own)
         for frame in frames:
             pts = frame.pts
             if in_order:
-                while due and due[0] in lost:
-                    yield due.pop(0).pts, damage
-                pts = due[0].pts if due else None
-            earlier, shown = _taken(due, pts)
+                yield from ((each.pts, damage) for each in due.take_lost())
+                pts = due.next_time()
+            earlier, shown = due.take(pts)
             yield from ((each.pts, damage) for each in earlier if damage)
             keyed = keyed or frame.key_frame
-            cut = shown in doubted and not frame.key_frame
-            yield pts, damage if shown in lost else _IN_DAMAGE if cut else _if_whole(frame, keyed)
+            in_damage = shown in due.doubted and not frame.key_frame
+            yield pts, damage if shown in due.lost else _IN_DAMAGE if in_damage else _if_whole(frame, keyed)
     if damage:
-        yield from ((each.pts, damage) for each in due)
+        yield from ((each.pts, damage) for each in due.packets)
 
 
 class _Due(NamedTuple):
@@ -191,20 +179,58 @@ class _Due(NamedTuple):
     pts: int
 
 
-def _taken(due: list[_Due], pts: int | None) -> tuple[list[_Due], _Due | None]:
-    """Take a frame's packet from those that are due, and those that are shown before it.
+class _DuePackets:
+    """Packets whose frames have not come, in the order in which these are shown.
 
-    Returns:
-        those before it, and its own; None for a frame without a time.
+    Attributes:
+        packets: the packets.
+        lost: those that were not decoded.
+        doubted: those that the container marks as damaged.
     """
-    if pts is None:
-        return [], None
-    known = next((each for each in due if each.pts == pts), None)
-    own = known or _Due(due[0].part if due else 0, pts)
-    place = bisect.bisect_left(due, own)
-    earlier = due[:place]
-    del due[: place + (known is not None)]
-    return earlier, own
+
+    def __init__(self) -> None:
+        self.packets: list[_Due] = []
+        self.lost: set[_Due] = set()
+        self.doubted: set[_Due] = set()
+        self._part, self._latest = 0, -math.inf
+
+    def add(self, packet: av.Packet) -> _Due | None:
+        """Add a packet, unless its frame is not shown; None of one without a time."""
+        if packet.pts is None:
+            return None
+        begins = packet.is_keyframe and packet.pts < self._latest
+        self._part += begins
+        self._latest = packet.pts if begins else max(self._latest, packet.pts)
+        own = _Due(self._part, packet.pts)
+        if not packet.is_discard:
+            bisect.insort(self.packets, own)
+        if packet.is_corrupt:
+            self.doubted.add(own)
+        return own
+
+    def next_time(self) -> int | None:
+        """Return the time of the next packet, ticks; None if there is none."""
+        return self.packets[0].pts if self.packets else None
+
+    def take_lost(self) -> Iterator[_Due]:
+        """Take the packets before the first one that was decoded."""
+        while self.packets and self.packets[0] in self.lost:
+            yield self.packets.pop(0)
+
+    def take(self, pts: int | None) -> tuple[list[_Due], _Due | None]:
+        """Take a frame's packet, and those that are shown before it.
+
+        Returns:
+            those before it, and its own; None for a frame without a time.
+        """
+        if pts is None:
+            return [], None
+        known = next((each for each in self.packets if each.pts == pts), None)
+        own = known or _Due(self.packets[0].part if self.packets else 0, pts)
+        place = bisect.bisect_left(self.packets, own)
+        earlier = self.packets[:place]
+        del self.packets[: place + (known is not None)]
+        return earlier, own
 
 
 def _if_whole(frame: av.VideoFrame, keyed: bool) -> av.VideoFrame | str:
