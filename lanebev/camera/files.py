@@ -20,7 +20,7 @@ from lanebev.camera.datasets import (
 )
 from lanebev.camera.formats import opencv_or_ros, stereo_cameras, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
-from lanebev.camera.parsing import is_ros_ini, parse_documents
+from lanebev.camera.parsing import bare_numbers, is_ros_ini, parse_documents
 from lanebev.camera.programs import depthai_cameras, gyroflow, matlab, metashape, nerf, realsense
 from lanebev.camera.reconstruction import openmvg_cameras, opensfm_cameras
 from lanebev.camera.records import record_cameras
@@ -46,6 +46,7 @@ _OF_INI = (
     "it states four coefficients and no lens model; they are taken as k1 k2 k3 k4 of a fisheye, as ROS "
     "writes them: if it is a pinhole camera, add a fifth, 0"
 )
+_OF_MATRIX = "it is a camera matrix alone, which is taken for that of a lens without distortion"
 _VIEWS = ("ret", "rvecs", "tvecs", "objpoints", "imgpoints")  # of a calibration, beside the camera
 
 
@@ -84,9 +85,10 @@ def read_camera(
     """
     path, name = split_name(path)
     try:
-        arrays = _arrays(path) if path.suffix.lower() == ".npz" else None
+        arrays = _arrays(path) if path.suffix.lower() in (".npz", ".npy") else None
         # comments and names may be in other encodings: they are not needed
         text = read_text(path, "replace") if arrays is None else ""
+        bare = bare_numbers(text)
     except ValueError as error:
         remedy = "; COLMAP writes texts by model_converter --output_type TXT" if path.suffix == ".bin" else ""
         raise ValueError(
@@ -95,26 +97,33 @@ def read_camera(
     try:
         if is_colmap(text):
             camera = checked(chosen(colmap_cameras(text), name, has_usual=False))
-        elif is_kitti(text) or (path.suffix.lower() == ".txt" and "width" not in text):
+        elif is_kitti(text) or (path.suffix.lower() == ".txt" and "width" not in text and not bare):
             camera = checked(chosen(kitti_cameras(text, image_size), name, has_usual=True))
         else:
-            documents = parse_documents(text) if arrays is None else [arrays]
-            camera = _camera_of(documents, image_size, rectified, name)
-            if camera.model == "fisheye" and is_ros_ini(text):
-                camera = camera._replace(remark="; ".join(filter(None, (camera.remark, _OF_INI))))
+            fields = arrays or bare
+            camera = _camera_of([fields] if fields else parse_documents(text), image_size, rectified, name)
+            of_ini = _OF_INI if camera.model == "fisheye" and is_ros_ini(text) else ""
+            of_matrix = _OF_MATRIX if fields and not fields.get("D", True) else ""
+            camera = camera._replace(remark="; ".join(filter(None, (camera.remark, of_ini, of_matrix))))
         return without_lens(camera) if rectified else camera
     except ValueError as error:
         raise ValueError(f"camera file {path}: {' '.join(str(error).split())}") from error
 
 
 def _arrays(path: Path) -> dict[str, Any]:
-    """Return the arrays of NumPy's ``savez``, but for those of the views of a calibration."""
+    """Return the arrays of NumPy's ``savez``, but for those of the views of a calibration.
+
+    The array of ``save`` is a camera matrix.
+    """
     try:
+        if path.suffix.lower() == ".npy":
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
+            return {"K": array.ravel()[:10].tolist(), "D": []}
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name].tolist() for name in arrays.files if name not in _VIEWS}
     except Exception as error:  # zipfile and NumPy raise many kinds for damaged bytes
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())[:100]
-        raise ValueError(f"no arrays of numbers as by numpy.savez: {reason}") from error
+        raise ValueError(f"no arrays of numbers as by numpy.save or savez: {reason}") from error
 
 
 def _camera_of(

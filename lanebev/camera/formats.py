@@ -17,6 +17,7 @@ _PROJECTION_KEYS = ("projection_matrix", "P")
 _ROTATION_KEYS = ("rectification_matrix", "R")
 _WIDTH_KEYS = ("image_width", "width")
 _HEIGHT_KEYS = ("image_height", "height")
+_SIDES_KEYS = ("image_size", "img_size", "image_shape", "img_shape", "resolution")  # of both
 _MODEL_KEYS = ("distortion_model", "camera_model", "model", "DistModel")
 _LENS_KEYS = ("distortion", *_LENS_LISTS)
 _SHORT_KEYS = {
@@ -26,7 +27,7 @@ _KNOWN_KEYS = {
     *_MATRIX_KEYS, *_LENS_LISTS, *_PROJECTION_KEYS, *_ROTATION_KEYS, *_WIDTH_KEYS, *_HEIGHT_KEYS,
     *_MODEL_KEYS, *LENS_NAMES["pinhole"], "fisheye_model", "binning_x", "binning_y", "roi", "xi",
 }  # fmt: skip
-_SPELLED = {key.replace("_", "").lower(): key for key in (*_SHORT_KEYS, *_KNOWN_KEYS)}
+_SPELLED = {key.replace("_", "").lower(): key for key in (*_SHORT_KEYS, *_KNOWN_KEYS, *_SIDES_KEYS)}
 _OF_CAMERA = re.compile(  # words in keys that may say something of the lens or the images
     r"^(?!board|grid|pattern|square|marker|chess|charuco).*(dist(?!ance)|lens|model|type|fish|omni|size|dim|"
     r"width|height|resol|shape|crop|roi|region|bin|scal|decim|downsamp|flip|mirror|rotate|[xy]_?offset|"
@@ -96,8 +97,9 @@ def opencv_or_ros(
     Raises:
         ValueError: an unknown key, or a value that no real camera has.
     """
-    fields = once((_SPELLED.get(key.replace("_", "").lower(), key), value) for key, value in fields.items())
+    fields = once((_spelled(key), value) for key, value in fields.items())
     short = not {"fx", "fy", "cx", "cy"}.isdisjoint(fields)
+    fields = with_sides(fields)
     unknown = sorted(set(fields) - (_SHORT_KEYS if short else _KNOWN_KEYS))
     if not (short or {*_MATRIX_KEYS, *_PROJECTION_KEYS}.isdisjoint(fields)):
         unknown = [*filter(_OF_CAMERA.match, unknown)]
@@ -129,6 +131,38 @@ def opencv_or_ros(
     return _as_taken(checked(camera, _restates(fields)), fields)
 
 
+def _spelled(key: str) -> str:
+    """Return a key as it is known, for one in any case, with underscores or not."""
+    return _SPELLED.get(key.replace("_", "").lower(), key)
+
+
+def with_sides(fields: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the fields with a width and a height in place of a list of both.
+
+    OpenCV has the width first, NumPy the height: it is the order in which the principal point is nearer to
+    the middle.
+
+    Raises:
+        ValueError: the list is none of two sides, and perhaps a number of channels.
+    """
+    given = next((key for key in fields if _spelled(key) in _SIDES_KEYS and fields[key] is not None), None)
+    if given is None or any(fields.get(key) is not None for key in (*_WIDTH_KEYS, *_HEIGHT_KEYS)):
+        return fields
+    rest = {key: value for key, value in fields.items() if key != given}
+    if isinstance(fields[given], Mapping) and "width" in fields[given]:
+        return {**rest, **fields[given]}
+    sides = numbers(fields, given)
+    if len(sides) not in (2, 3) or min(sides) <= 0:
+        raise ValueError(f"{given}: expected width and height, got {shown(fields[given])}")
+    if fields.get("cx") is not None:
+        matrix = [0.0, 0.0, number(fields, "cx"), 0.0, 0.0, number(fields, "cy")]
+    else:
+        matrix = numbers(fields, *_MATRIX_KEYS, count=9)
+    first, second = map(round, sides[:2])
+    height, width = min((second, first), (first, second), key=lambda size: centre_offset(matrix, size))
+    return {**rest, "width": width, "height": height}
+
+
 def stereo_cameras(
     fields: Mapping[str, Any], rectified: bool, image_size: tuple[int, int] | None
 ) -> dict[str, Callable[[], CameraParameters]]:
@@ -137,7 +171,8 @@ def stereo_cameras(
     Their names are those of their matrices.
     """
     pair = next((each for each in _STEREO if all(key in fields for keys in each for key in keys)), [])
-    of_both = {key: fields[key] for key in (*_WIDTH_KEYS, *_HEIGHT_KEYS, *_MODEL_KEYS) if key in fields}
+    shared = (*_WIDTH_KEYS, *_HEIGHT_KEYS, *_SIDES_KEYS, *_MODEL_KEYS)
+    of_both = {key: value for key, value in fields.items() if _spelled(key) in shared}
     own = {matrix: {**of_both, "K": fields[matrix], "D": fields[lens]} for matrix, lens in pair}
     return {name: partial(opencv_or_ros, each, rectified, image_size) for name, each in own.items()}
 

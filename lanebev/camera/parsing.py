@@ -23,6 +23,8 @@ _NO_BREAK_SPACE = "\u00a0"  # of texts copied from web pages
 _ROS_INI = re.compile(r"^\[image\]\s*$", re.MULTILINE)
 _SECTION = re.compile(r"^\[[A-Za-z]\w*\]\s*$", re.MULTILINE)  # of other programs' INI, and of TOML
 _OF_FISHEYE = 4  # coefficients
+_AROUND_NUMBERS = re.compile(r"#.*|[\s,;\[\]()]+")
+_MOST_BARE = 1_000  # characters of a text of numbers alone
 _INI_KEYS = {
     "width": "image_width",
     "height": "image_height",
@@ -158,6 +160,24 @@ def _yaml_fault(error: Exception, text: str, has_document: bool) -> str:
         together = "in the braces" if is_in_braces else "in one block, equally indented"
         return f"expected all keys {together}, got more after them{where}"
     return f"expected YAML, got a syntax error{where}; is the file cut?"
+
+
+def bare_numbers(text: str) -> dict[str, Any] | None:
+    """Return the fields of a text of numbers alone; None if it is another.
+
+    Nine are a camera matrix, whose last one is 1; four, eight or nine others are fx fy cx cy and the
+    coefficients, as DROID-SLAM has them.
+    """
+    words = [word for word in _AROUND_NUMBERS.split(text) if word] if len(text) <= _MOST_BARE else []
+    try:
+        values = [*map(float, words)]
+    except ValueError:
+        return None
+    if len(values) == 9 and values[8] == 1.0:
+        return {"K": words, "D": []}
+    if len(values) in (4, 8, 9):
+        return {**dict(zip(("fx", "fy", "cx", "cy"), words, strict=False)), "distortion": words[4:]}
+    return None
 
 
 def _parse_ini(text: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from lanebev.camera.choice import Readers, telling_names
 from lanebev.camera.datasets import is_woodscape, woodscape
-from lanebev.camera.formats import DISTORTION_KEYS, stated_model
+from lanebev.camera.formats import DISTORTION_KEYS, stated_model, with_sides
 from lanebev.camera.named_lens import LENS_NAMES, stated_lens
 from lanebev.camera.parameters import OFF_CENTRE, CameraParameters, centre_offset, size_of_images
 from lanebev.camera.parsing import number, numbers, whole_number
@@ -53,13 +53,16 @@ _CITYSCAPES = _Layout("Cityscapes'", "intrinsic", (1024, 2048))  # by numbers wi
 _LENS_KEYS = (
     *DISTORTION_KEYS,
     "camera_distortion",
+    "camera_dist_coeffs",
     "distortion",
     "Distortion",
     "cam_D",
     "DistCoeff",
     "distortion_coeffs",
 )
-_LIKE_LENS = re.compile(r"dist(?!ance|.*(model|type|std))|radial|tangential|[kp][1-6]$", re.IGNORECASE)
+_LIKE_LENS = re.compile(  # with words before it, but "undistorted" is none
+    r"([a-z]+_)*?(dist(?!ance|ribut|.*(model|type|std))|radial|tangential|[kp][1-6]$)", re.IGNORECASE
+)
 _PLACES = ("calib", "cameras")  # keys below which ONCE and A2D2 have their cameras
 
 
@@ -147,8 +150,10 @@ def _size(
     if layout.sides:
         width, height = numbers(record, layout.sides, count=2)
         return round(height), round(width)
-    if record.get("width") is not None and record.get("height") is not None:
-        return whole_number(record, "height"), whole_number(record, "width")
+    record = with_sides({**record, "cx": matrix[2], "cy": matrix[5]})
+    sides = (("height", "image_height"), ("width", "image_width"))
+    if all(any(record.get(key) is not None for key in keys) for keys in sides):
+        return whole_number(record, *sides[0]), whole_number(record, *sides[1])
     offset = centre_offset(matrix, layout.images)
     if image_size is not None and 2 * centre_offset(matrix, image_size) < offset:
         return image_size

@@ -263,7 +263,7 @@ ORBextractor.nFeatures: 1200
         (
             "c.npz",
             "PK\x03\x04" + 20 * "K.npy\0",
-            "got: no arrays of numbers as by numpy.savez: File is not a zip",
+            "got: no arrays of numbers as by numpy.save or savez: File is not a zip",
         ),
         (
             "c.yaml",
@@ -561,7 +561,7 @@ def test_keys_in_other_cases_and_what_a_program_records_beside_the_camera(tmp_pa
         "DIM: [640, 480]",
         "p_9: 1",
         "rectified: 1",
-        "imgSize: [640]",
+        "cropSize: [640]",
         "region_of_interest: [0, 0, 640, 360]",
         "offset_x: 8",
         "scaling: 0.5",
@@ -585,7 +585,7 @@ def test_a_misspelled_key_of_the_coefficients_is_an_error(tmp_path, key):
     ("name", "data", "words"),
     [
         ("wide_dist_pickle.p", pickle.dumps({"mtx": MATRIX}), "a pickle of Python, .*; save it as JSON$"),
-        ("k.npy", b"\x93NUMPY\1\0", "an array of NumPy; write numbers as JSON"),
+        ("k.npy", b"\x93NUMPY\1\0", "no arrays of numbers as by numpy.save"),
         ("k.mat", b"MATLAB 5.0 MAT-file, Platform: PCWIN64\0\0", "MATLAB's own format; save it as JSON"),
         ("c.zip", b"PK\x03\x04\0\0", "a ZIP archive; unpack it"),
         ("cameras.bin", bytes(8), "COLMAP writes texts by model_converter --output_type TXT$"),
@@ -594,6 +594,65 @@ def test_a_misspelled_key_of_the_coefficients_is_an_error(tmp_path, key):
 def test_binary_files_say_how_to_write_them_as_texts(tmp_path, name, data, words):
     with pytest.raises(ValueError, match=f"{name}: expected a readable camera file, got: .*{words}"):
         _read(tmp_path / name, data)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("K.txt", "# camera matrix\n6.33e+02 0.0 4.08e+02\r\n0 633 245\r\n0 0 1\r\n"),
+        ("K.csv", "633,0,408\n0,633,245\n0,0,1\n"),
+        ("K.json", json.dumps(MATRIX)),
+        ("K.txt", str(np.array(MATRIX))),
+        ("K.txt", "633 0 408; 0 633 245; 0 0 1"),
+    ],
+)
+def test_a_camera_matrix_alone_is_read_for_images_of_a_given_size(tmp_path, name, text):
+    camera = _read(tmp_path / name, text, image_size=(480, 800))
+    _is(camera, 633, 633, 408, 245, 800, 480)
+    assert camera.remark.endswith(
+        "it is a camera matrix alone, which is taken for that of a lens without distortion"
+    )
+    with pytest.raises(ValueError, match="principal point 408, 245 is not in the middle of 1280 x 720 px"):
+        Camera.from_file(tmp_path / name, image_size=(720, 1280))
+    np.save(tmp_path / "frames.npy", np.zeros((9, 9)))
+    with pytest.raises(ValueError, match="camera_matrix: expected 9 numbers, got 10"):
+        Camera.from_file(tmp_path / "frames.npy", image_size=(480, 800))
+    np.save(tmp_path / "K.npy", MATRIX)
+    assert Camera.from_file(tmp_path / "K.npy", image_size=(480, 800)).remark == camera.remark
+
+
+@pytest.mark.parametrize("lens", [[], [-0.3, 0.1, 0.001, 0.002], [-0.3, 0.1, 0.001, 0.002, 0.05]])
+def test_a_line_of_numbers_has_the_focal_lengths_the_principal_point_and_the_lens(tmp_path, lens):
+    text = " ".join(map(str, [633.0, 632.0, 408.0, 245.0, *lens]))  # of DROID-SLAM
+    _is(_read(tmp_path / "c.txt", text, image_size=(480, 800)), 633, 632, 408, 245, 800, 480, lens)
+
+
+@pytest.mark.parametrize(
+    "sides",
+    [
+        {"image_size": [800, 480]},
+        {"imgSize": [480, 800]},
+        {"image_shape": [480, 800, 3]},
+        {"resolution": {"width": 800, "height": 480}},
+    ],
+)
+def test_a_list_of_both_sides_is_in_the_order_in_which_the_principal_point_is_in_the_middle(tmp_path, sides):
+    lens = [-0.3, 0.1, 0.001, 0.002, 0.05]
+    fields = {"camera_matrix": MATRIX, "dist_coeff": [lens], **sides}
+    expected = (633, 633, 408, 245, 800, 480, lens)
+    _is(_read(tmp_path / "c.json", json.dumps(fields)), *expected)
+    stereo = {"M1": MATRIX, "D1": [lens], "M2": MATRIX, "D2": [lens], **sides}
+    _is(_read(tmp_path / "c.json", json.dumps(stereo)), *expected)
+    short = {"fx": 633, "fy": 633, "cx": 408, "cy": 245, "distortion": lens, **sides}
+    _is(_read(tmp_path / "c.json", json.dumps(short)), *expected)
+    record = {"camera_intrinsic": MATRIX, "camera_dist_coeffs": lens, **sides}  # as of R3LIVE
+    _is(_read(tmp_path / "c.json", json.dumps(record)), *expected)
+
+
+@pytest.mark.parametrize("sides", [[800], [800, 0], [1, 2, 3, 4]])
+def test_a_list_of_other_than_both_sides_is_refused(tmp_path, sides):
+    with pytest.raises(ValueError, match="image_size: expected width and height, got"):
+        _read(tmp_path / "c.json", json.dumps({"K": MATRIX, "D": [], "image_size": sides}))
 
 
 def test_a_list_of_cameras_of_another_program_is_named(tmp_path):  # OKVIS

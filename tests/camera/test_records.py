@@ -88,7 +88,11 @@ LIKE_OPENLANE = {"intrinsic": _matrix(1000, 960, 540), "width": 1920, "height": 
         (DAIR, "", (2183, 2185, 940, 567, 1920, 1080, LENS)),
         (AUTOWARE, "", (2183, 2185, 940, 567, 1920, 1080, LENS)),
         (ZOD_FRONT, "", (1900, 1902, 1920, 1084, 3848, 2168, KANNALA_BRANDT, "fisheye")),
-        ({**LIKE_OPENLANE, "dist_coefs": [], "distance": 5}, "", (1000, 1002, 960, 540, 1920, 1080, ())),
+        (
+            {**LIKE_OPENLANE, "dist_coefs": [], "distance": 5, "undistorted": 1},
+            "",
+            (1000, 1002, 960, 540, 1920, 1080, ()),
+        ),
         (LIKE_OPENLANE, "", (1000, 1002, 960, 540, 1920, 1080, ())),
         ({**LIKE_OPENLANE, "distortion": LENS}, "", (1000, 1002, 960, 540, 1920, 1080, LENS)),
         ({**LIKE_OPENLANE, "k1": -0.3}, "", (1000, 1002, 960, 540, 1920, 1080, (-0.3, 0, 0, 0, 0))),
@@ -180,6 +184,10 @@ def test_rectified_images_of_a2d2_have_a_matrix_of_their_own(tmp_path):
             "height: expected a value, got none",
         ),
         ({**LIKE_OPENLANE, "dist_coefs": LENS}, "expected k1 .* under this key, got 'dist_coefs'; rename it"),
+        (
+            {**LIKE_OPENLANE, "cam_dist_coefs": LENS},
+            "expected k1 .* under this key, got 'cam_dist_coefs'; rename it",
+        ),
         ({**LIKE_OPENLANE, "k4": -0.3}, r"k4: expected none of this lens \(pinhole\), got -0.3"),
         ({**LIKE_OPENLANE, "k1": -0.3, "p1": 0.1, "model": "fisheye"}, "p1: expected none of this lens"),
         ({**LIKE_OPENLANE, "radial_distortion": [0.1]}, "under this key, got 'radial_distortion'; rename it"),
