@@ -1,6 +1,6 @@
 """Evaluate real and third-party images, with all results beside their targets.
 
-    python tools/evaluate_real.py [--data ../shared/data] [--json FILE] [--weights FILE]
+    python -m tools.evaluate_real [--data ../shared/data] [--json FILE] [--weights FILE]
         [--width PX] [--only PART] [--hilly] [--far-view]
 
 Nothing of these images has been trained on.
@@ -92,7 +92,7 @@ def print_table(figures: list[Figure]) -> None:
 def as_json(figures: list[Figure], options: Any, seconds: float) -> dict[str, Any]:
     """Return the figures with the versions and settings that gave them."""
     return {
-        "command": "python tools/evaluate_real.py",
+        "command": "python -m tools.evaluate_real",
         **versions(),
         "weights": str(options.weights.name) if options.weights else "shipped",
         "seconds": round(seconds, 1),

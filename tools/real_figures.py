@@ -1,4 +1,4 @@
-"""Results of ``evaluate_real.py``: evaluate each part of the data beside its targets."""
+"""Results of ``tools.evaluate_real``: evaluate each part of the data beside its targets."""
 
 import csv
 from collections.abc import Iterable

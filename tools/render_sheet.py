@@ -1,6 +1,6 @@
 """A sheet of rendered frames as a PNG, with real ones beside them if a folder of them is given.
 
-python tools/render_sheet.py --out sheet.png [--count 100] [--kind city] [--real FOLDER] [--truth]
+python -m tools.render_sheet --out sheet.png [--count 100] [--kind city] [--real FOLDER] [--truth]
 """
 
 import time

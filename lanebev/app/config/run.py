@@ -63,8 +63,8 @@ class RunConfig:
     )
     lanes: str | None = option(
         None,
-        "lanes of another detector or a person: JSON of TuSimple, CurveLanes, OpenLane, LLAMAS, BDD100K, "
-        "VIL-100 or LabelMe, .lines.txt of CULane, a folder of them, or CVAT's XML",
+        "lanes of another detector or a person instead of the network's: JSON of TuSimple, OpenLane, LabelMe "
+        "and others, .lines.txt of CULane, a folder of them, or CVAT's XML",
         "FILE",
     )
     stills: bool = option(False, "treat every image as independent, not as a frame of a drive")
@@ -76,7 +76,8 @@ class RunConfig:
     )
     fps: float | None = option(
         None,
-        "frame rate of a folder, a glob or a raw stream (default: from image names that are times, else 30)",
+        "frame rate of a folder, a glob or a raw stream (default: from times in the names of images or in a "
+        "file beside them, else 30)",
         "HZ",
         parse_rate,
     )
