@@ -1,4 +1,4 @@
-"""Clips of T frames: their time steps, the frames that begin a drive, and their outputs."""
+"""Clips of T frames: their numbers such as time steps, the frames that begin a drive, and their outputs."""
 
 from typing import Any
 
@@ -9,11 +9,12 @@ from lanebev.geometry.precision import common_dtype
 from lanebev.types import check_number_or_tensor, check_tensor
 
 
-def frame_intervals(dt: float | Tensor, batch: int, steps: int, like: Tensor) -> Tensor:
-    """Convert time steps to (B, T) s, at least float32, on the device of ``like``.
+def per_frame(name: str, value: float | Tensor, batch: int, steps: int, like: Tensor) -> Tensor:
+    """Convert a number of each frame to (B, T), at least float32, on the device of ``like``.
 
     Args:
-        dt: s: a float, (B,) or (B, T).
+        name: what it is, for errors.
+        value: a float, (B,) or (B, T).
         batch: B.
         steps: T.
         like: tensor whose device and dtype are taken.
@@ -22,16 +23,16 @@ def frame_intervals(dt: float | Tensor, batch: int, steps: int, like: Tensor) ->
         TypeError: neither number nor tensor.
         ValueError: another shape.
     """
-    check_number_or_tensor("dt", dt)
-    if isinstance(dt, (int, float)):  # a tensor made of a number would be a constant to torch.compile
-        return torch.full((batch, steps), dt, dtype=common_dtype(like), device=like.device)
-    intervals = torch.as_tensor(dt, dtype=common_dtype(like), device=like.device)
-    got = tuple(intervals.shape)
-    if intervals.ndim < 2:
-        intervals = intervals.reshape(-1, 1)
-    if intervals.ndim > 2 or intervals.shape[0] not in (1, batch) or intervals.shape[1] not in (1, steps):
-        raise ValueError(f"dt: expected a float, ({batch},) or ({batch}, {steps}), got {got}")
-    return intervals.expand(batch, steps)
+    check_number_or_tensor(name, value)
+    if isinstance(value, (int, float)):  # a tensor made of a number would be a constant to torch.compile
+        return torch.full((batch, steps), value, dtype=common_dtype(like), device=like.device)
+    numbers = torch.as_tensor(value, dtype=common_dtype(like), device=like.device)
+    got = tuple(numbers.shape)
+    if numbers.ndim < 2:
+        numbers = numbers.reshape(-1, 1)
+    if numbers.ndim > 2 or numbers.shape[0] not in (1, batch) or numbers.shape[1] not in (1, steps):
+        raise ValueError(f"{name}: expected a float, ({batch},) or ({batch}, {steps}), got {got}")
+    return numbers.expand(batch, steps)
 
 
 def drive_starts(reset: Tensor, batch: int, steps: int) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.batch import select_rows
-from lanebev.clips import drive_starts, frame_intervals, stack_frames
+from lanebev.clips import drive_starts, per_frame, stack_frames
 from lanebev.estimation.expected_view import expected_vanishing_point
 from lanebev.geometry.lens import check_distortion, check_intrinsics
 from lanebev.geometry.precision import autocast_is_on, autocast_off, common_dtype
@@ -190,6 +190,7 @@ class LaneBEV(BoundaryDetector):
         reset: Tensor | None = None,
         truncation: int | None = None,
         bev: bool = True,
+        speed: float | Tensor | None = None,
     ) -> tuple[LaneBEVOutput, Any]:
         """Process one frame of every row, or T frames of every row in order.
 
@@ -208,6 +209,8 @@ class LaneBEV(BoundaryDetector):
             truncation: number N of frames over which gradients flow through the state: it is detached before
                 the first and then every N-th frame. None keeps the whole graph, also of earlier calls.
             bev: whether to resample the image; a detector that warps only its own features needs no view.
+            speed: m/s, of the vehicle at a frame: float, (B,) or, with T frames, (B, T); NaN where it is not
+                known. See :meth:`~lanebev.estimation.calibrator.Calibrator.with_speed`.
 
         Returns:
             the output, every tensor with (B, T, ...) where the image has T, and the state after it.
@@ -222,6 +225,11 @@ class LaneBEV(BoundaryDetector):
             raise ValueError(f"truncation: expected 1 frame or more, or None, got {truncation}")
         frames = image if image.ndim == 5 else image.unsqueeze(1)
         batch, steps = frames.shape[:2]
+        speeds = None if speed is None else per_frame("speed", speed, batch, steps, intrinsics)
+        with_speed: Any = getattr(self.calibrator, "with_speed", None)
+        if with_speed is None and speeds is not None:
+            got = type(self.calibrator).__qualname__
+            raise TypeError(f"speed: expected a calibrator with a method with_speed, got {got}; leave it out")
         begins = None if reset is None else drive_starts(reset, batch, steps)
         given = {"intrinsics": intrinsics, "distortion": distortion, "reset": begins}
         check_devices({"image": image, **given})
@@ -232,7 +240,7 @@ class LaneBEV(BoundaryDetector):
             state = fresh if state is None else state
         observer = self._observe_together if self.far_view is None else self._observe_in_turn
         observed = observer(frames, cameras, distortion, model)
-        intervals = frame_intervals(dt, batch, steps, intrinsics)
+        intervals = per_frame("dt", dt, batch, steps, intrinsics)
         outputs = []
         for step in range(steps):
             if begins is not None:
@@ -245,6 +253,8 @@ class LaneBEV(BoundaryDetector):
             with self._gradients("calibrator"):
                 calibration, state = self.calibrator(segments, camera, state, intervals[:, step], lane_width)
                 calibration = calibration.with_std_scaled(self.pose_sigma_scale)
+                if speeds is not None:
+                    state = with_speed(state, speeds[:, step])
             view, valid = None, None
             if bev:
                 pose = calibration.extrinsics

@@ -155,7 +155,8 @@ class Session:
             stamp: time, s, of any epoch; None assumes the time step of the frame before.
             polylines: lane boundaries of another detector, used instead of the network; see
                 :meth:`LaneSegments.from_polylines`.
-            speed: speed of the vehicle, m/s, if known; below ``MountConfig.min_speed`` the mount estimate is
+            speed: speed of the vehicle at this frame, m/s, if known. The pose on winding roads depends on it,
+                see :meth:`JointCalibrator.with_speed`; below ``MountConfig.min_speed`` the mount estimate is
                 not updated.
 
         Raises:

@@ -5,6 +5,7 @@ Every seed is another drive, a row of one batch. The seeds are none that a test 
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -13,7 +14,6 @@ from torch import Tensor
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.config import HILLY_ROADS
-from lanebev.estimation.joint.dynamics import MotionConfig
 from lanebev.estimation.joint.update import UNSEEN
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, within_3_sigma
@@ -68,8 +68,9 @@ def measure(kind: str, seeds: Sequence[int], calibrator: Calibrator[Any] | None 
 
 
 def drawn(kind: str, seeds: Iterable[int]) -> list[Recording]:
-    """Draw the drives of a kind."""
-    return [record((KINDS | CONSTANT_BENDS)[kind](seed), seed) for seed in seeds]
+    """Draw the drives of a kind; their speed is given if the name says so."""
+    of_seed = (KINDS | CONSTANT_BENDS)[kind.removesuffix(_GIVEN)]
+    return [record(replace(of_seed(seed), speed_given=kind.endswith(_GIVEN)), seed) for seed in seeds]
 
 
 def figures_of(drives: Sequence[Recording], calibrator: Calibrator[Any]) -> KindFigures:
@@ -112,17 +113,10 @@ def nees_of_determined(error: Tensor, covariance: Tensor, bound: Tensor) -> floa
     return float((left * torch.linalg.solve(own, left)).sum() / known.sum())
 
 
-def speed_given() -> JointCalibrator:
-    """Return the joint filter with the speed of the drives in bends as prior, to 0.5 m/s."""
-    return JointCalibrator(motion=MotionConfig(speed=30.0, speed_std=0.5))
-
-
 def informed(kind: str) -> JointCalibrator:
-    """Return the joint filter with the priors that the name of a row says are given."""
+    """Return the joint filter with what the name of a row says that it knows."""
     if kind.endswith(_TOLD):
         return KnownRoad(KINDS[IN_CURVE](FIRST_SEED).moments(), speed=30.0)
-    if kind.endswith(_GIVEN):
-        return speed_given()
     return JointCalibrator(HILLY_ROADS if kind.endswith(_HILLY) else None)
 
 
@@ -136,10 +130,8 @@ def measure_all(count: int) -> dict[str, dict[str, Any]]:
     print("|---|---|---|---|---|---|")
     results = {}
     others = (f"{kind}{what}" for kind in KINDS if kind.startswith(IN_CURVE) for what in (_GIVEN, _TOLD))
-    for kind in (*KINDS, *others, f"{CREST}{_HILLY}", f"{HILLS}{_HILLY}"):
-        found = measure(
-            kind.removesuffix(_GIVEN).removesuffix(_TOLD).removesuffix(_HILLY), seeds, informed(kind)
-        )
+    for kind in (*KINDS, *others, f"{WINDING}{_GIVEN}", f"{CREST}{_HILLY}", f"{HILLS}{_HILLY}"):
+        found = measure(kind.removesuffix(_TOLD).removesuffix(_HILLY), seeds, informed(kind))
         ratio = " ".join("–" if math.isnan(value) else f"{value:.2f}" for value in found.ratio)
         back = f"{min(found.back):.0f} to {max(found.back):.0f}" if found.back else ""
         nees = f"{found.nees:.2f} | {found.nees_seen:.2f}"

@@ -143,7 +143,7 @@ def _street(seed: int, std: float, speed: float) -> Generated:
 
     def change(t: float, moment: Moment) -> Moment:
         there = replace(moment, near=4.0, far=30.0, visible=visible, pose=moved(moment.pose, mount))
-        return replace(there, wander=lambda z: aside(z + speed * t))
+        return replace(there, speed=speed, wander=lambda z: aside(z + speed * t))
 
     return _drawn(seed, change, largest_deg=0.4)
 

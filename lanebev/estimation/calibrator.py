@@ -148,6 +148,21 @@ class Calibrator(nn.Module, Generic[StateT]):
         """Estimate as :meth:`forward`, from usable input of one dtype; dt is (B,), lane_width (B, L-1)."""
         raise NotImplementedError
 
+    def with_speed(self, state: StateT, speed: float | Tensor) -> StateT:
+        """Return a state updated by the vehicle's speed, where the calibrator estimates one.
+
+        Call it after a frame, with the state that is given to the next one.
+
+        Args:
+            state: state after a frame.
+            speed: speed of the vehicle at that frame, m/s, float or (B,). A row whose speed is not finite
+                keeps its state; below 0, driving backward, it counts as 0.
+
+        Raises:
+            ValueError: another shape.
+        """
+        return state
+
     def weigh_still(
         self,
         calibration: Calibration,

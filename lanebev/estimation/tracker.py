@@ -75,11 +75,14 @@ class Tracker(Generic[StateT]):
             vertices: vertices of batch size 1, in pixels of the image as taken.
             dt: s since the frame before.
             pose_sigma_scale: factor on the standard deviations of the pose.
-            speed: speed of the vehicle, m/s, if known; a slow one does not update the mount estimate.
+            speed: speed of the vehicle, m/s, if known, for the road's motion through the view; a slow vehicle
+                does not update the mount estimate.
         """
         segments = camera_segments(vertices, self.camera)
         intrinsics = self.camera.intrinsics[None]
         calibration, self.state = self.calibrator(segments, intrinsics, self.state, dt, self.lane_width)
+        if speed is not None:
+            self.state = self.calibrator.with_speed(self.state, speed)
         self.unscaled_covariance = calibration.covariance
         output = self.with_output_covariance(calibration, pose_sigma_scale)
         calibration = calibration.with_std_scaled(pose_sigma_scale)

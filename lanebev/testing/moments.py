@@ -45,6 +45,7 @@ class Moment:
     wrong_boundary: float = 0.0  # probability that a whole boundary has another one's index
     longest: int = 10**6  # points between the ends of a segment, at most
     dt: float = 1 / FPS
+    speed: float = math.nan  # m/s, of the vehicle, where the road is no straight one
     stale: Moment | None = None  # an older moment whose image comes instead
     tag: str = ""  # scenarios name the moments that they bound separately
 

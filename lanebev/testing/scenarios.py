@@ -25,7 +25,9 @@ def _clothoid(s: Tensor, radius: float, transition: float) -> Tensor:
 
 
 def _curves(t: float, moment: Moment) -> Moment:
-    return replace(moment, near=5.0, far=40.0, curvature=lambda z: _clothoid(z + 30.0 * t, 300.0, 60.0))
+    return replace(
+        moment, near=5.0, far=40.0, speed=30.0, curvature=lambda z: _clothoid(z + 30.0 * t, 300.0, 60.0)
+    )
 
 
 def _sharp_bends(t: float, moment: Moment) -> Moment:

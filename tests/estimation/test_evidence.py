@@ -104,6 +104,14 @@ def test_on_a_slow_winding_road_the_speed_is_found():
     assert found.within >= 0.97
 
 
+@pytest.mark.slow
+def test_with_the_speed_given_a_winding_road_is_like_any_other():
+    found = measure("winding road at 3 to 12 m/s, speed given", range(60_000, 60_006))
+    assert found.ratio[1] < 1.2
+    assert found.within >= 0.97
+    assert 0.7 < found.nees < 1.3
+
+
 def test_the_shape_that_a_filter_is_told_is_that_of_the_road():
     """A clothoid of 1e-5 /m² begins 20 m ahead; the first knot is 4 m behind."""
     moment = Moment((0.0, 0.0, 0.0, 1.5), curvature=lambda s: 1e-5 * (s - 20.0).clamp(min=0.0))

@@ -16,7 +16,10 @@ from lanebev.estimation.joint.measurement import (
     VERTICAL,
 )
 from lanebev.estimation.joint.prediction import predict_state
+from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason
+from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
+from lanebev.geometry.precision import cast_floating
 from lanebev.testing.moments import CAMERA, WIDTH, moments
 from lanebev.testing.moments import observe as see
 from tests.estimation.joint_drives import DOUBLE, PLACE, drive, run
@@ -136,3 +139,53 @@ def test_speed_wanders_about_its_mean_as_far_as_it_says():
     transition, noise = motion(time, Spread(one, equal, equal), no_road(), 6, cfg)
     fade, more = transition[0, PLACE.speed, PLACE.speed], noise[0, PLACE.speed, PLACE.speed]
     assert float(more / (1 - fade**2)) == pytest.approx(cfg.speed_std**2, rel=0.01)
+
+
+def moving(rows: int = 3) -> tuple[JointCalibrator, JointState]:
+    """A calibrator and a state in which everything is correlated with the speed."""
+    calibrator, generator = JointCalibrator(), torch.Generator().manual_seed(0)
+    state = calibrator.initial_state(rows, dtype=DOUBLE)
+    factor = 0.1 * torch.randn(rows, PLACE.size, PLACE.size, generator=generator, dtype=DOUBLE)
+    sensitivity = torch.randn(state.heading_sensitivity.shape, generator=generator, dtype=DOUBLE)
+    return calibrator, state._replace(
+        cov=state.cov + factor @ factor.mT, heading_sensitivity=sensitivity, phase=state.phase + 1.0
+    )
+
+
+def test_a_given_speed_is_one_more_measurement():
+    """Information form of the same update; σ of the speed is 0.5 m/s."""
+    calibrator, state = moving()
+    after = calibrator.with_speed(state, torch.tensor([3.0, 20.0, 41.0], dtype=DOUBLE))
+    row = torch.zeros(PLACE.size, dtype=DOUBLE)
+    row[PLACE.speed] = 1.0
+    information = torch.linalg.inv(state.cov) + torch.outer(row, row) / 0.5**2
+    torch.testing.assert_close(after.cov, torch.linalg.inv(information))
+    residual = torch.tensor([-17.0, 0.0, 21.0], dtype=DOUBLE) - state.mean[:, PLACE.speed]
+    step = after.cov[:, :, PLACE.speed] * residual.unsqueeze(-1) / 0.5**2
+    torch.testing.assert_close(after.mean, state.mean + step)
+    assert torch.equal(after.phase, state.phase)
+    shift = (
+        1e-3 * state.heading_sensitivity[..., 0]
+    )  # a boundary's heading moves the mean before, and so after
+    moved = calibrator.with_speed(state._replace(mean=state.mean + shift), 20.0)
+    found = calibrator.with_speed(state, 20.0)
+    torch.testing.assert_close(moved.mean - found.mean, 1e-3 * found.heading_sensitivity[..., 0])
+
+
+def test_an_unknown_speed_changes_nothing_and_backward_counts_as_standing():
+    calibrator, state = moving()
+    after = calibrator.with_speed(state, torch.tensor([math.nan, math.inf, -2.0], dtype=DOUBLE))
+    standing = calibrator.with_speed(state, 0.0)
+    for before, unknown, still in zip(state, after, standing, strict=True):
+        assert torch.equal(unknown[:2], before[:2])
+        assert torch.equal(unknown[2], still[2])
+    single = calibrator.with_speed(cast_floating(state, torch.float32), 5.0)
+    assert single.mean.dtype == single.cov.dtype == torch.float32
+    with pytest.raises(ValueError, match=r"speed: expected a float or \(3,\), got \(2,\)"):
+        calibrator.with_speed(state, torch.ones(2))
+
+
+def test_the_paper_s_calibrator_estimates_no_speed():
+    calibrator = TwoStageCalibrator()
+    state = calibrator.initial_state(1)
+    assert calibrator.with_speed(state, 5.0) is state

@@ -38,6 +38,7 @@ KINDS = (
     "suspension",
     "sharp bends",
     "winding road",
+    "speed given",
     "crest",
     "drop",
     "knock",

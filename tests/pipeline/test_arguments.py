@@ -337,6 +337,16 @@ def test_an_interval_that_is_no_number(model):
         model(IMAGE, SMALL_K, dt=None)
 
 
+def test_a_speed_that_does_not_fit(model):
+    with pytest.raises(ValueError, match=r"speed: expected a float, \(1,\) or \(1, 1\), got \(2,\)"):
+        model(IMAGE, SMALL_K, speed=torch.ones(2))
+    own = lanebev.LaneBEV(model.segmenter, model.extractor, nn.Identity(), model.warp)
+    with pytest.raises(
+        TypeError, match="speed: expected a calibrator with a method with_speed, got Identity"
+    ):
+        own(IMAGE, SMALL_K, speed=5.0)
+
+
 def test_tensors_on_different_devices_are_named(model):
     """Meta stands for a GPU."""
     with pytest.raises(

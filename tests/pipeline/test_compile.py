@@ -15,7 +15,7 @@ from lanebev import (
     TwoStageCalibrator,
 )
 from lanebev.batch import replace_rows
-from lanebev.clips import frame_intervals
+from lanebev.clips import per_frame
 from lanebev.estimation.mount import MountEstimator
 from lanebev.tensors import constant
 from lanebev.testing.segments import INTRINSICS as K
@@ -125,7 +125,7 @@ def test_neither_does_that_of_a_clip():
         graphs.append(module)
         return module.forward
 
-    compiled = torch.compile(lambda dt, like: 2 * frame_intervals(dt, 2, 3, like), backend=backend)
+    compiled = torch.compile(lambda dt, like: 2 * per_frame("dt", dt, 2, 3, like), backend=backend)
     for frame in range(6):
         dt = 0.033 + 1e-4 * frame
         assert torch.equal(compiled(dt, K), torch.full((2, 3), 2 * dt, dtype=K.dtype))

@@ -20,6 +20,8 @@ from lanebev import (
     Status,
     TwoStageCalibrator,
 )
+from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.layout import layout
 from lanebev.estimation.joint.measurement import VERTICAL
 from lanebev.geometry.lens import distort_points
 from lanebev.observation.boundary_vertices import BoundaryVertices
@@ -152,6 +154,23 @@ def test_frames_at_once_equal_frames_one_by_one():
         assert torch.equal(together.calibration.covariance[:, step], one.calibration.covariance)
         assert isinstance(together.calibration.extrinsics, Extrinsics)
     assert all(map(torch.equal, last, state))
+
+
+def test_the_speed_may_be_given_with_every_frame():
+    """At once and one by one, in one row only; where it is not a number it is not known."""
+    net = LaneBEV(BrightnessSegmenter(), FixedExtractor(), JointCalibrator(), BEVWarp(GRID))
+    frames, cameras = images(2, 3), INTRINSICS.expand(2, 3, 3)
+    speed = torch.tensor([[8.0, torch.nan, 9.0], [torch.nan] * 3])
+    _, together = net(frames, cameras, speed=speed)
+    _, unknown = net(frames, cameras)
+    state = None
+    for step in range(3):
+        _, state = net(frames[:, step], cameras, state, speed=speed[:, step])
+    assert all(map(torch.equal, together, state))
+    assert torch.equal(together.mean[1], unknown.mean[1])
+    place = layout(6).speed
+    assert MotionConfig().speed + together.mean[0, place].item() == pytest.approx(9.0, abs=0.4)
+    assert unknown.mean[0, place] == 0
 
 
 def test_gradients_flow_from_the_view_to_image_and_weights():

@@ -18,6 +18,8 @@ from lanebev import (
     TwoStageCalibrator,
     image_from_road_points,
 )
+from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.layout import layout
 from lanebev.estimation.reasons import REASON_WORDS, Reason, describe_reasons
 
 CAMERA = Camera.from_parameters(600, 600, 319.5, 179.5, 640, 360, distortion=(-0.2, 0.05, 0.0, 0.0, 0.0))
@@ -320,6 +322,19 @@ def test_a_speed_is_a_finite_number():
         session(stamp=0.0, speed="20")
     with pytest.raises(ValueError, match="speed: expected finite m/s, or None if it is not known, got nan"):
         session(stamp=0.0, speed=math.nan)
+
+
+def test_a_given_speed_is_that_of_the_road_that_passes():
+    sessions = Session(CAMERA), Session(CAMERA)
+    for number in range(3):
+        stamp = number / 30
+        sessions[0](polylines=lines(), stamp=stamp, speed=None)
+        sessions[1](polylines=lines(), stamp=stamp, speed=8.0)
+    prior, known = (session.tracker.state for session in sessions)
+    place = layout(6).speed
+    assert prior.mean[0, place] == 0
+    assert MotionConfig().speed + known.mean[0, place].item() == pytest.approx(8.0, abs=0.3)
+    assert known.cov[0, place, place].sqrt() < 0.5
 
 
 def test_a_session_uses_the_calibrator_of_its_model():

@@ -29,6 +29,7 @@ class Generated:
         camera: the lens; None is the ideal camera of :mod:`lanebev.testing.moments`.
         resumed: the drive whose last state is the first one here; None begins anew.
         mount: also run the mount estimator.
+        speed_given: also give the calibrator the vehicle's speed.
     """
 
     kind: str
@@ -36,6 +37,7 @@ class Generated:
     camera: Camera | None = None
     resumed: Callable[[], list[Moment]] | None = None
     mount: bool = False
+    speed_given: bool = False
 
 
 def _degrees(pitch: float, yaw: float, roll: float, height: float) -> Pose:
@@ -94,7 +96,7 @@ def winding(speed: float, sharpest: float, waves: Sequence[tuple[float, float, f
             each = [part * (2 * math.pi * (way / length + at)).sin() for length, at, part in waves]
             return size * torch.stack(each).sum(0)
 
-        return replace(moment, near=5.0, far=40.0, curvature=curvature)
+        return replace(moment, near=5.0, far=40.0, speed=speed, curvature=curvature)
 
     return change
 
@@ -210,6 +212,7 @@ GENERATED: dict[str, Generated] = {
     # R = 60 m at 15 m/s, boundaries 1, 2, 3 in sight, 45 to 105 m.
     "sharp-bends": Generated("sharp bends", _scenario("sharp bends R 60 m, three boundaries", start=3.0)),
     "winding-road": Generated("winding road", _drive(_WINDING, sinusoids(8))),
+    "winding-road-speed-given": Generated("speed given", _drive(_WINDING, sinusoids(8)), speed_given=True),
     "crest": Generated("crest", _scenario("crest R 10 km, 5-40 m")),
     # From a crest into a dip of R = 10 km.
     "crest-and-dip": Generated("crest", _drive(_hill)),

@@ -36,6 +36,7 @@ class Recording(NamedTuple):
         resumed: segments and dt of the drive whose last state is the first one here, or None.
         mount: also run the mount estimator.
         moments: moments of a generated drive, else empty.
+        speed: (T,) m/s, which the calibrator is given; None if it is not.
     """
 
     segments: LaneSegments
@@ -48,6 +49,7 @@ class Recording(NamedTuple):
     resumed: tuple[LaneSegments, Tensor] | None = None
     mount: bool = False
     moments: Sequence[Moment] = ()
+    speed: Tensor | None = None
 
     def begin_at(self, frame: int) -> Recording:
         """Return the drive without the frames before one, begun anew."""
@@ -58,6 +60,7 @@ class Recording(NamedTuple):
             hard=self.hard[frame:],
             resumed=None,
             moments=self.moments[frame:],
+            speed=None if self.speed is None else self.speed[frame:],
         )
 
 
@@ -100,6 +103,7 @@ def record(generated: Generated, seed: int) -> Recording:
         resumed=None if before is None else (_segments(before, seed + 1), _intervals(before)),
         mount=generated.mount,
         moments=drive,
+        speed=_numbers([moment.speed for moment in drive]) if generated.speed_given else None,
     )
 
 
@@ -110,7 +114,11 @@ def _segments(drive: list[Moment], seed: int) -> LaneSegments:
 
 
 def _intervals(drive: list[Moment]) -> Tensor:
-    return torch.tensor([moment.dt for moment in drive], dtype=torch.float64)
+    return _numbers([moment.dt for moment in drive])
+
+
+def _numbers(values: Sequence[float]) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def replay(calibrator: Calibrator[Any], recordings: Sequence[Recording]) -> Replayed:
@@ -121,6 +129,8 @@ def replay(calibrator: Calibrator[Any], recordings: Sequence[Recording]) -> Repl
     dt = torch.stack([recording.dt for recording in recordings], dim=1)  # (T, R)
     widths = torch.tensor([recording.lane_width for recording in recordings], dtype=torch.float64)
     scale = torch.tensor([recording.sigma_scale for recording in recordings], dtype=torch.float64)
+    unknown = torch.full_like(dt[:, 0], torch.nan)
+    speed = torch.stack([unknown if each.speed is None else each.speed for each in recordings], dim=1)
     mount = MountEstimator()
     mount_state = mount.initial_state(rows, dtype=torch.float64)
     state = _first_states(calibrator, recordings)
@@ -130,6 +140,7 @@ def replay(calibrator: Calibrator[Any], recordings: Sequence[Recording]) -> Repl
         for k in range(len(dt)):
             now = LaneSegments(*(part[k] for part in segments))
             answer, state = calibrator(now, intrinsics, state, dt[k], widths)
+            state = calibrator.with_speed(state, speed[k])
             answer = answer._replace(covariance=scale[:, None, None].square() * answer.covariance)
             bend = calibrator.curvature(state)
             mounted, mount_state = mount(answer, mount_state, dt[k], curvature=bend)

@@ -11,6 +11,7 @@ docs/method/joint.md defines it. ``calibrator`` passes a frame through these mod
 - ``restart``: whether the state must start again, by ``single_frame`` (``start_search``, ``frame_prior``) and
   ``start``.
 - ``output``: the calibration that is given out.
+- ``speed``: the state with the vehicle's speed, if it is given.
 
 ``config``, ``state`` and ``layout`` (indices of the state) serve all of them. ``averaging`` estimates the
 pose of a single image by its ``readings`` (``reading_fit``, ``tempering``), ``smoother`` that of a drive from

@@ -8,6 +8,7 @@ from torch import Tensor
 from lanebev.batch import flag, in_blocks, may_skip, select_rows
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.checks import (
+    as_batch,
     as_lane_width,
     check_new_state,
     is_running,
@@ -24,6 +25,7 @@ from lanebev.estimation.joint.output import as_calibration
 from lanebev.estimation.joint.prediction import elapsed, predict_state
 from lanebev.estimation.joint.restart import restart
 from lanebev.estimation.joint.road_curve import KNOT_SPACING
+from lanebev.estimation.joint.speed import update_by_speed
 from lanebev.estimation.joint.start import new_state, start_moments
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.joint.status import update_track_status
@@ -102,6 +104,19 @@ class JointCalibrator(Calibrator[JointState]):
             apart = torch.where(time.skip.unsqueeze(-1), 0.0, apart)
         calibration = as_calibration(after, inliers, apart, positions, cfg)
         return unused_frame(calibration, time.skip), after
+
+    def with_speed(self, state: JointState, speed: float | Tensor) -> JointState:
+        """Update a state by the vehicle's speed, at which the camera passes the road's bends.
+
+        Without it the speed is a prior, which a bend that moves through the view corrects; on slow, winding
+        roads that is not enough. Its standard deviation is ``MotionConfig.measured_speed_std``.
+        """
+        like = state.mean.to(widest_dtype(state.mean.device))
+        with autocast_off(like.device, like.dtype):
+            updated = update_by_speed(
+                cast_floating(state, like.dtype), as_batch(speed, like, "speed"), self.config
+            )
+        return cast_floating(updated, state.mean.dtype)
 
     def weigh_still(
         self,

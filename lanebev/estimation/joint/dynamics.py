@@ -39,6 +39,7 @@ class MotionConfig:
         curvature_step: 1/m, sigma of a step that comes into view on a straight road.
         speed, speed_std: m/s, prior of the speed.
         speed_memory: s, time constant of the return to it.
+        measured_speed_std: m/s, standard deviation of a given speed.
         deviation_memory: s, time constant of a boundary's deviation where lanes are equal.
         deviation_walk: m/√s, random walk of a boundary's deviation.
         unequal_memory: s, time constant of the deviations on a road of unequal lanes.
@@ -60,6 +61,7 @@ class MotionConfig:
     speed: float = 20.0
     speed_std: float = 10.0
     speed_memory: float = 30.0
+    measured_speed_std: float = 0.5
     deviation_memory: float = 20.0
     deviation_walk: float = 1e-4
     unequal_memory: float = 1.0
