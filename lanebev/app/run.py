@@ -140,7 +140,7 @@ def estimates(
         if config.stills:
             filtered = tracker.still(seen.vertices, seen.pose_sigma_scale)
         else:
-            filtered = tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale)
+            filtered = tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale, frame.speed)
         estimate = filtered if smoothed is None else smoothed.of(filtered, frame.number)
         name = frame_name(frame, source)
         yield Recorded(frame=frame, name=name, seen=seen, estimate=estimate, filtered=filtered)

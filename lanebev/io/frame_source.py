@@ -1,7 +1,7 @@
 """Frames of a video or of images, iterated as often as wanted."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from itertools import islice
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lanebev.io.frames import ALL, Frame, Selection, taken_frames
 from lanebev.io.images.pixels import read_image
 from lanebev.io.rising_clock import RisingClock
+from lanebev.io.speeds import Speeds
 from lanebev.io.video.decoding import rgb
 from lanebev.io.video.seeking import open_at
 
@@ -36,6 +37,7 @@ class FrameSource:
         most: how many frames are yielded at most, so that a file that grows is the same twice; None for all.
         matrix: by which a video's frames are shown, see :func:`lanebev.io.video.decoding.display_matrix`.
         untimed: why a file of times beside images is not used, else empty.
+        speeds: speeds of the vehicle, if they are given.
     """
 
     source: str
@@ -51,6 +53,7 @@ class FrameSource:
     most: int | None = None
     matrix: tuple[int, ...] | None = None
     untimed: str = ""
+    speeds: Speeds | None = field(default=None, compare=False)
 
     @property
     def is_live(self) -> bool:
@@ -80,6 +83,8 @@ class FrameSource:
 
     def __iter__(self) -> Iterator[Frame]:
         frames = self._video_frames() if self.is_video else self._image_frames()
+        if (speeds := self.speeds) is not None:
+            frames = (each._replace(speed=speeds.at(each.number, each.time)) for each in frames)
         taken = frames if self.selection == ALL else taken_frames(frames, self.selection)
         return taken if self.most is None else islice(taken, self.most)
 

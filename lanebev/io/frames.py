@@ -19,6 +19,7 @@ class Frame(NamedTuple):
         image: (H, W, 3) uint8 RGB, or None if it did not decode.
         problem: why not, or what else is to be said of it; else empty.
         source_number: its number in the whole source, where only some of its frames are taken; else None.
+        speed: speed of the vehicle, m/s; None if it is not known.
     """
 
     number: int
@@ -28,6 +29,7 @@ class Frame(NamedTuple):
     image: NDArray[np.uint8] | None
     problem: str = ""
     source_number: int | None = None
+    speed: float | None = None
 
 
 class Selection(NamedTuple):

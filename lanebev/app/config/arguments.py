@@ -24,7 +24,7 @@ RUN_GROUPS = {
     "source": ("source", "fps", "start", "end", "every", "stills", "topic", "keep_all"),
     "camera": ("camera", "fov", "focal_std", "rectified", "mount"),
     "lanes": ("lane_width", "lane_width_std", "lanes", "lanes_size", "lanes_crop"),
-    "estimation": ("calibrator", "smooth", "hilly", "resume"),
+    "estimation": ("calibrator", "smooth", "hilly", "speed", "speed_topic", "resume"),
     "network": ("weights", "device", "far_view", "backend", "exported"),
     "outputs": ("out", "formats", "no_video", "grid", "rerun"),
 }

@@ -148,6 +148,15 @@ class RunConfig:
     far_view: bool = option(
         False, "also show the network the far road at a larger scale; frames are processed one at a time"
     )
+    speed: str | None = option(
+        None,
+        "speeds of the vehicle, m/s: a text file with one for each frame, or CSV with the columns time "
+        "(seconds since the first frame) and speed",
+        "FILE",
+    )
+    speed_topic: str | None = option(
+        None, "topic of a bag with the vehicle's speed: Odometry, Twist, VelocityReport or GPSFix", "NAME"
+    )
     hilly: bool = option(False, "expect crests and dips everywhere (default: at the start and where evident)")
 
     @property
@@ -182,6 +191,10 @@ class RunConfig:
         self._check_backend()
         if self.smooth and self.stills:
             raise ValueError("smooth: expected a drive with it, got --stills")
+        if self.speed and self.speed_topic:
+            raise ValueError("speed: expected a file or a topic, got both; leave one of them out")
+        if self.stills and (self.speed or self.speed_topic):
+            raise ValueError("speed: expected a drive with it, got --stills")
         if self.stills and self.resume:
             raise ValueError("resume: expected a drive, got --stills; images on their own have no state")
         self._check_lanes()

@@ -135,7 +135,7 @@ def smooth_frames(
     with closing(states), open(out / LANES_FILE, "w", encoding="utf-8", buffering=1) as lanes:  # whole lines
         for frame, seen in frames:
             lanes.write(tusimple_line(frame_name(frame, source), *_NO_LANES, *seen) + "\n")
-            tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale)
+            tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale, frame.speed)
             states.append(cast(JointState, tracker.state))
             intervals.append(np.array([frame.dt]))
             covariances.append(tracker.unscaled_covariance[0].double().cpu().numpy())

@@ -149,7 +149,7 @@ def input_files(config: RunConfig, source: FrameSource) -> list[str | Path]:
     lanes = [] if config.lanes is None else lane_files(config.lanes)
     weights = [] if config.weights is None else [config.weights]
     files: list[str | Path] = [camera_file(config.camera)] if config.camera else []
-    files += [config.mount] if config.mount else []
+    files += [each for each in (config.mount, config.speed) if each]
     return [*(source.paths or [source.source]), *files, *lanes, *weights]
 
 

@@ -7,6 +7,7 @@ import signal
 from collections.abc import Generator, Iterator
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 from types import FrameType
 
 import numpy as np
@@ -17,13 +18,14 @@ from lanebev.app.config import RunConfig, rate_as_fraction
 from lanebev.app.drive.build import make_camera
 from lanebev.app.drive.observers import Observation, Observer
 from lanebev.camera.model import Camera
-from lanebev.io.bags import BagSource, open_bag_source
+from lanebev.io.bags import BagSource, bag_speeds, open_bag_source
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import ALL, Frame, Selection
 from lanebev.io.images.names import drives_remark, jump_remark, untimed_remark
 from lanebev.io.live import LiveSource, open_live
 from lanebev.io.opening import open_source
 from lanebev.io.source_names import is_bag, is_live, without_login
+from lanebev.io.speeds import Speeds, read_speeds
 from lanebev.report.run_folder import RunFolder
 from lanebev.signals import handlers_kept
 
@@ -48,7 +50,8 @@ def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
     found = _opened(config.source, config.topic, config.frame_rate)
     remarks = [] if config.stills else [each for each in _remarks_on_drive(config, found) if each]
     said = [*filter(None, [found.problem]), *(f"{config.source}: {each}" for each in remarks)]
-    source = replace(found, selection=selection, problem="; ".join(said))
+    speeds = _speeds(config, found)
+    source = replace(found, selection=selection, problem="; ".join(said), speeds=speeds)
     if selection != ALL and not may_take_none and not source.taken_count:
         last = source.times[-1] if source.times else float(source.count / source.fps)
         raise ValueError(
@@ -59,10 +62,11 @@ def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
 
 
 def _stream(config: RunConfig, selection: Selection) -> FrameSource:
-    for name in ("lanes", "stills", "smooth", "topic"):
+    for name in ("lanes", "stills", "smooth", "topic", "speed", "speed_topic"):
         if getattr(config, name):
             shown = without_login(config.source)
-            raise ValueError(f"source {shown}: expected no --{name} with a stream, got it")
+            option = name.replace("_", "-")
+            raise ValueError(f"source {shown}: expected no --{option} with a stream, got it")
     return open_live(config.source, config.frame_rate, config.keep_all, selection)
 
 
@@ -87,6 +91,31 @@ def _opened(source: str, topic: str | None, fps: Fraction | None) -> FrameSource
     if topic:
         raise ValueError(f"topic: expected a bag with it, got {source}; leave it out")
     return found
+
+
+def _speeds(config: RunConfig, source: FrameSource) -> Speeds | None:
+    """Return the speeds of the vehicle that the settings give.
+
+    Raises:
+        ValueError: they cannot be read, or are not those of the source's frames.
+    """
+    if config.speed_topic is not None:
+        if not isinstance(source, BagSource):
+            raise ValueError(f"speed topic: expected a bag with it, got {config.source}; leave it out")
+        return bag_speeds(Path(config.source), source.topic, config.speed_topic)
+    if config.speed is None:
+        return None
+    speeds = read_speeds(config.speed)
+    if speeds.times is None and len(speeds.speeds) != source.count:
+        got = f"{len(speeds.speeds)}; or add a column of times"
+        raise ValueError(f"speed {config.speed}: expected one for each of {source.count} frames, got {got}")
+    last = source.times[-1] if source.times else float(source.count / source.fps)
+    if speeds.times is not None and not (speeds.times[0] <= last and speeds.times[-1] >= 0):
+        raise ValueError(
+            f"speed {config.speed}: expected times since the first frame, 0 to {last:.2f} s, got "
+            f"{speeds.times[0]:.12g} to {speeds.times[-1]:.12g}; subtract the first frame's time"
+        )
+    return speeds
 
 
 def source_of_run(source: str, run: RunFolder) -> FrameSource:

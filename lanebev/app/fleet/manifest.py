@@ -19,9 +19,19 @@ from lanebev.io.source_names import is_bag, is_live, without_login
 from lanebev.numbers import read_text, shown
 
 UNKNOWN_DAY = "unknown"
-PATHS = ("source", "camera", "lanes", "weights", "mount", "resume", "exported")  # settings that are paths
+PATHS = (
+    "source",
+    "camera",
+    "lanes",
+    "weights",
+    "mount",
+    "speed",
+    "resume",
+    "exported",
+)  # settings that are paths
 _OWN = ("name", "camera_id", "day", "time")
 _REFUSED = ("out", "source")
+_OF_BAGS = ("topic", "speed_topic")
 _MOST_NAME = 150  # characters, of which names of files and folders are made
 
 
@@ -53,8 +63,8 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Driv
 
     Columns (or keys) are ``video``, ``camera``, and, where wanted, ``name``, ``camera_id``, ``day``, ``time``
     and any setting of ``lanebev run``. YAML is a list of mappings, or a mapping with ``drives``, the list,
-    and ``defaults``, settings of all drives (``topic``: of the bags). Relative paths begin at the manifest's
-    folder.
+    and ``defaults``, settings of all drives (``topic`` and ``speed_topic``: of the bags). Relative paths
+    begin at the manifest's folder.
 
     Args:
         path: path of the file; .csv is CSV, anything else YAML.
@@ -121,8 +131,8 @@ def _rows(path: Path) -> list[Row]:
     drives: list[Row] = given if isinstance(given, list) else []
     if drives is not given or not all(isinstance(row, dict) for row in (*drives, defaults)):
         raise ValueError(f"manifest {path}: expected a list of drives, each with video and camera")
-    of_bags = {key: value for key, value in defaults.items() if key == "topic"}
-    of_all = {key: value for key, value in defaults.items() if key != "topic"}
+    of_bags = {key: value for key, value in defaults.items() if key in _OF_BAGS}
+    of_all = {key: value for key, value in defaults.items() if key not in _OF_BAGS}
     bags = [is_bag(str(path.parent / str(row.get("video")))) for row in drives]
     together = [{**of_all, **(of_bags if bag else {}), **row} for bag, row in zip(bags, drives, strict=True)]
     return [{str(key): value for key, value in row.items()} for row in together]

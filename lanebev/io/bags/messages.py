@@ -24,8 +24,19 @@ LENS_TYPES = (
 VIDEO_TYPES = ("ffmpeg_image_transport_msgs/msg/FFMPEGPacket",)
 """Types of messages with packets of a video, which are not read."""
 
+SPEED_TYPES = {
+    "nav_msgs/msg/Odometry": "twist.twist.linear.x",
+    "geometry_msgs/msg/Twist": "linear.x",
+    "geometry_msgs/msg/TwistStamped": "twist.linear.x",
+    "geometry_msgs/msg/TwistWithCovarianceStamped": "twist.twist.linear.x",
+    "autoware_vehicle_msgs/msg/VelocityReport": "longitudinal_velocity",
+    "autoware_auto_vehicle_msgs/msg/VelocityReport": "longitudinal_velocity",
+    "gps_msgs/msg/GPSFix": "speed",
+}
+"""Types of messages with the vehicle's speed (m/s), and where it is in them."""
+
 _ROS = (("cdr", "ros2msg"), ("ros1", "ros1msg"))  # encodings of messages and of their types
-_KNOWN = {*IMAGE_TYPES, *LENS_TYPES, *VIDEO_TYPES}
+_KNOWN = {*IMAGE_TYPES, *LENS_TYPES, *VIDEO_TYPES, *SPEED_TYPES}
 
 
 class Topic(NamedTuple):
@@ -46,7 +57,7 @@ class Bag(Protocol):
     """A bag that is open.
 
     Attributes:
-        topics: topics of images, lenses and videos.
+        topics: topics of images, lenses, videos and speeds.
     """
 
     topics: list[Topic]
@@ -87,6 +98,19 @@ def open_bag(path: Path) -> Iterator[Bag]:
                 yield _RosBag(reader)
     except Exception as error:  # two libraries' own, and what damaged bytes make of any decoder
         raise _unreadable(path, error) from error
+
+
+def message_stamp(message: Any) -> float | None:
+    """Return a message's own time (s); None if it is zero or it has none."""
+    stamp = message.header.stamp if hasattr(message, "header") else getattr(message, "timestamp", None)
+    if stamp is None:
+        return None
+    seconds = getattr(stamp, "sec", None)
+    if seconds is None:
+        seconds, fraction = stamp.seconds, stamp.nanos
+    else:
+        fraction = stamp.nanosec
+    return float(seconds + 1e-9 * fraction) if seconds or fraction else None
 
 
 def _unreadable(path: Path, error: Exception) -> ValueError:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lanebev.io.bags.images import TopicImages, is_video
-from lanebev.io.bags.messages import IMAGE_TYPES, LENS_TYPES, VIDEO_TYPES, Bag, Topic, open_bag
+from lanebev.io.bags.messages import IMAGE_TYPES, LENS_TYPES, VIDEO_TYPES, Bag, Topic, message_stamp, open_bag
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import ALL, Frame
 from lanebev.io.rising_clock import RisingClock
@@ -54,7 +54,7 @@ class BagSource(FrameSource):
         first, clock = None, clock or RisingClock(float(1 / self.fps))
         with contextlib.suppress(ValueError), open_bag(Path(self.source)) as bag:
             for logged, message in bag.messages(self.topic):
-                time, _ = clock.time(_stamp(message), 1e-9 * logged)
+                time, _ = clock.time(message_stamp(message), 1e-9 * logged)
                 first = time if first is None else first
                 yield time - first
 
@@ -66,7 +66,7 @@ class BagSource(FrameSource):
         try:
             with open_bag(Path(self.source)) as bag:
                 for number, (logged, message) in enumerate(bag.messages(self.topic)):
-                    time, problem = clock.time(_stamp(message), 1e-9 * logged)
+                    time, problem = clock.time(message_stamp(message), 1e-9 * logged)
                     first = time if first is None else first
                     dt = interval if before is None else time - before
                     image = None
@@ -182,14 +182,3 @@ def _image_topic(source: str, topics: Sequence[Topic], wanted: str | None) -> To
         remedy = "; choose one with --topic" if found else packets
         raise ValueError(f"bag {source}: expected one topic of images, got: {names}{remedy}")
     return next(iter(found.values())) if wanted is None else found[wanted]
-
-
-def _stamp(message: Any) -> float | None:
-    """Return a message's own time (s); None if it is zero."""
-    stamp = message.header.stamp if hasattr(message, "header") else message.timestamp
-    seconds = getattr(stamp, "sec", None)
-    if seconds is None:
-        seconds, fraction = stamp.seconds, stamp.nanos
-    else:
-        fraction = stamp.nanosec
-    return float(seconds + 1e-9 * fraction) if seconds or fraction else None

@@ -91,8 +91,10 @@ def test_yaml_with_defaults_says_the_same(write):
 
 def test_a_topic_of_all_drives_is_that_of_the_bags(write):
     rows = [{"video": "a.mp4"}, {"video": "b.mcap"}, {"video": "c.bag", "topic": "/right"}]
-    drives = read_manifest(write({"defaults": {"fov": 60, "topic": "/left"}, "drives": rows}))
+    defaults = {"fov": 60, "topic": "/left", "speed_topic": "/odom"}
+    drives = read_manifest(write({"defaults": defaults, "drives": rows}))
     assert [drive.config.topic for drive in drives] == [None, "/left", "/right"]
+    assert [drive.config.speed_topic for drive in drives] == [None, "/odom", "/odom"]
 
 
 @pytest.mark.parametrize("key", ["video", "camera", "lanes", "weights", "mount", "resume", "exported"])

@@ -552,3 +552,46 @@ def test_a_file_of_a_ros_2_bag_and_a_folder_without_metadata_say_what_to_give(ba
     assert is_bag(str(tmp_path))
     (tmp_path / "0.png").write_bytes(b"")  # images that were taken out of it
     assert not is_bag(str(tmp_path))
+
+
+def _moves(name, speed):
+    vector = TYPES["geometry_msgs/msg/Vector3"]
+    twist = TYPES["geometry_msgs/msg/Twist"](vector(speed, 0.0, 0.0), vector(0.0, 0.0, 0.0))
+    if name == "geometry_msgs/msg/Twist":
+        return twist
+    if name == "geometry_msgs/msg/TwistStamped":
+        return TYPES[name](_header(2), twist)
+    point, turn = TYPES["geometry_msgs/msg/Point"], TYPES["geometry_msgs/msg/Quaternion"]
+    pose = TYPES["geometry_msgs/msg/Pose"](point(0.0, 0.0, 0.0), turn(0.0, 0.0, 0.0, 1.0))
+    none = np.zeros(36)
+    pose = TYPES["geometry_msgs/msg/PoseWithCovariance"](pose, none)
+    twist = TYPES["geometry_msgs/msg/TwistWithCovariance"](twist, none)
+    return TYPES[name](_header(2), "base_link", pose, twist)
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+@pytest.mark.parametrize(
+    ("name", "time"),
+    [
+        ("nav_msgs/msg/Odometry", 0.2),
+        ("geometry_msgs/msg/TwistStamped", 0.2),
+        ("geometry_msgs/msg/Twist", 0.3),
+    ],
+)
+def test_the_vehicles_speed_is_on_a_topic(tmp_path, plugin, name, time):
+    """At its own time; a message without one at that of its recording."""
+    with Writer(tmp_path / "bag", version=9, storage_plugin=plugin) as writer:
+        images = "sensor_msgs/msg/CompressedImage"
+        connection = writer.add_connection("/image", images, typestore=STORE)
+        for number in range(COUNT):
+            logged = round(1e9 * (START + 0.1 * number))
+            writer.write(connection, logged, STORE.serialize_cdr(_compressed(number), images))
+        connection = writer.add_connection("/odom", name, typestore=STORE)
+        writer.write(connection, round(1e9 * (START + 0.3)), STORE.serialize_cdr(_moves(name, 7.5), name))
+    config = RunConfig(str(tmp_path / "bag"), "", speed_topic="/odom")
+    source = make_source(config)
+    assert source.speeds.times == pytest.approx([time], abs=1e-6)
+    assert [frame.speed for frame in source] == [7.5] * COUNT
+    with pytest.raises(ValueError, match="expected speeds on /image, got them on: /odom"):
+        make_source(replace(config, speed_topic="/image"))
+    assert [frame.speed for frame in make_source(replace(config, speed_topic=None))] == [None] * COUNT

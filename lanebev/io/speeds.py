@@ -1,0 +1,140 @@
+"""Speeds of the vehicle over a drive, from a text file."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lanebev.numbers import read_text
+
+_NEAREST = 1.0  # s between a frame and the nearest speed, at most
+_FASTEST = 100.0  # m/s
+_SPEED = ("speed", "velocity", "vel", "v", "vf")  # words of a column's title
+_TIME = ("time", "timestamp", "stamp", "t")
+_SPEED_UNITS = {"km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6, "mph": 0.44704, "kn": 1852 / 3600}
+_TIME_UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+_UNKNOWN = ("", "nan", "none", "null")
+_FORM = "expected a speed in each line, or time and speed, or a first line of titles that names them"
+
+
+class Speeds(NamedTuple):
+    """Speeds of the vehicle over a drive.
+
+    Attributes:
+        speeds: (N,) m/s, NaN where it is not known.
+        times: (N,) s since the source's first frame, rising; None if there is a speed for each frame.
+    """
+
+    speeds: NDArray[np.float64]
+    times: NDArray[np.float64] | None = None
+
+    def at(self, number: int, time: float) -> float | None:
+        """Return the speed at a frame, m/s, linear between two times; None where it is not known.
+
+        Args:
+            number: number of the frame in the whole source.
+            time: its time in the source, s.
+        """
+        if self.times is None:
+            speed = float(self.speeds[number]) if number < len(self.speeds) else math.nan
+        else:
+            is_near = np.abs(self.times - time).min() <= _NEAREST
+            speed = float(np.interp(time, self.times, self.speeds)) if is_near else math.nan
+        return speed if math.isfinite(speed) else None
+
+
+def read_speeds(path: str | Path) -> Speeds:
+    """Read a table with a speed for each frame, or with times and speeds.
+
+    Its columns are separated by commas, semicolons, tabs or spaces. Without titles it has one column, a speed
+    (m/s) for each frame, or two, time (s since the source's first frame) and speed. Titles name the columns:
+    ``speed`` and, if there is one, ``time``, among others, with another unit than m/s and s in them, such as
+    ``speed_kmh`` and ``time_ms``. A speed that is empty or ``nan`` is not known.
+
+    Raises:
+        ValueError: the file cannot be read, or is no such table.
+    """
+    try:
+        return _speeds_of(_rows(read_text(Path(path))))
+    except (ValueError, csv.Error) as error:
+        raise ValueError(f"speed {path}: {error}") from error
+
+
+def _rows(text: str) -> list[list[str]]:
+    """Return the cells of each line; with semicolons between them, numbers may have decimal commas."""
+    lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
+    delimiter = next((sign for sign in ";\t," if lines and sign in lines[0]), None)
+    if delimiter is None:
+        return [line.split() for line in lines]
+    cells = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
+    return [[cell.strip().replace(",", ".") for cell in row] for row in cells]
+
+
+def _speeds_of(rows: list[list[str]]) -> Speeds:
+    titles = None if not rows or all(map(_is_number, rows[0])) else rows.pop(0)
+    if not rows:
+        raise ValueError(f"{_FORM}, got no numbers")
+    first = titles or rows[0]
+    if uneven := next((row for row in rows if len(row) != len(first)), None):
+        raise ValueError(
+            f"expected {len(first)} columns as in the first line, got {' '.join(uneven)[:100]!r}"
+        )
+    if titles is not None:
+        (time, seconds), (speed, metres) = (
+            _column(titles, _TIME, _TIME_UNITS),
+            _column(titles, _SPEED, _SPEED_UNITS),
+        )
+    else:
+        time, speed = {1: (None, 0), 2: (0, 1)}.get(len(first), (None, None))
+        seconds = metres = 1.0
+    if speed is None:
+        raise ValueError(f"{_FORM}, got {' '.join(first)[:100]!r}")
+    speeds = metres * np.array([_number(row[speed]) for row in rows])
+    if (fastest := np.nanmax(np.abs(speeds), initial=0.0)) > _FASTEST:
+        raise ValueError(f"expected m/s up to {_FASTEST:g}, got {fastest:g}; name another unit, as speed_kmh")
+    if time is None:
+        return Speeds(speeds)
+    times = seconds * np.array([_number(row[time]) for row in rows])
+    if not (np.diff(times) >= 0).all():  # false on NaN
+        raise ValueError("expected times that rise, got others")
+    return Speeds(speeds, times)
+
+
+def _number(cell: str) -> float:
+    if cell.lower() in _UNKNOWN:
+        return math.nan
+    try:
+        return float(cell)
+    except ValueError as error:
+        raise ValueError(f"expected a number, got {cell!r}") from error
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        _number(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _column(titles: list[str], names: Sequence[str], units: Mapping[str, float]) -> tuple[int | None, float]:
+    """Return which column has one of these words in its title, None if there is none, and its unit.
+
+    Raises:
+        ValueError: there are several.
+    """
+    words = [re.findall(r"[a-zµ]+(?:/[a-z]+)?", title.lower()) for title in titles]
+    found = [place for place, each in enumerate(words) if set(each) & set(names)]
+    if len(found) > 1:
+        several = ", ".join(titles[place] for place in found)
+        raise ValueError(f"expected one column of {names[0]}, got {several}; leave the others out")
+    if not found:
+        return None, 1.0
+    return found[0], next((units[word] for word in words[found[0]] if word in units), 1.0)

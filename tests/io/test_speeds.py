@@ -1,0 +1,100 @@
+"""Speeds of the vehicle from text files."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lanebev.io.speeds import Speeds, read_speeds
+
+
+@pytest.fixture
+def read(tmp_path):
+    def of(text):
+        path = tmp_path / "speed.csv"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return read_speeds(path)
+
+    return of
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0 10\n0.1 11\n0.2 13\n",
+        "# of the CAN bus\n0,10\n\n0.1,11\n0.2,13\n",
+        "time_s,speed\r\n0,10\r\n0.1,11\r\n0.2,13\r\n",
+        "speed (km/h);t\n36,0;0\n39,6;0,1\n46,8;0,2\n",  # a German Excel
+        "Timestamp_ms\tvehicle_speed_kph\tgear\n0\t36\t3\n100\t39.6\t3\n200\t46.8\t4\n",
+        '"time","velocity [m/s]","exposure time zone"\n0,10,x\n0.1,11,x\n0.2,13,x\n'.replace(
+            "exposure time", "a"
+        ),
+        "time_ns v\n0 10\n100000000 11\n200000000 13\n",
+        "t,speed_mph\n0,22.369363\n0.1,24.606299\n0.2,29.080172\n",
+        "\ufefftime,speed\n0,10\n0.1,11\n0.2,13\n",
+    ],
+)
+def test_times_and_speeds(read, text):
+    found = read(text)
+    np.testing.assert_allclose(found.times, [0.0, 0.1, 0.2], atol=1e-9)
+    np.testing.assert_allclose(found.speeds, [10.0, 11.0, 13.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "text", ["10\n11\nnan\n", "speed\n10\n11\nnan\n", "frame,speed_kmh\n0,36\n1,39.6\n2,\n"]
+)
+def test_a_speed_for_each_frame(read, text):
+    found = read(text)
+    assert found.times is None
+    assert [found.at(number, 100.0) for number in range(4)] == [10.0, pytest.approx(11.0), None, None]
+
+
+def test_a_speed_between_two_and_beside_them():
+    """Linear between two; unknown more than a second from the nearest, and where one of two is not known."""
+    found = Speeds(np.array([10.0, 12.0, 20.0, math.nan]), np.array([0.0, 1.0, 5.0, 6.0]))
+    assert [found.at(0, time) for time in (-0.5, 0.25, 1.0, 1.5, 3.0, 4.5)] == [10, 10.5, 12, 13, None, 19]
+    assert [found.at(0, time) for time in (-1.5, 5.5, 7.0, 8.0)] == [None] * 4
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "expected a speed in each line, .* got no numbers"),
+        ("time,speed\n", "expected a speed in each line, .* got no numbers"),
+        ("1,2,3\n4,5,6\n", ".*or a first line of titles that names them, got '1 2 3'"),
+        ("time,gear\n0,1\n", ".*or a first line of titles that names them, got 'time gear'"),
+        (
+            "time,speed_fl,speed_fr\n0,1,1\n",
+            "expected one column of speed, got speed_fl, speed_fr; leave the oth",
+        ),
+        ("time,speed\n0,1\n1\n", "expected 2 columns as in the first line, got '1'"),
+        ("time,speed\n0,fast\n", "expected a number, got 'fast'"),
+        ("0,10\n0.1,130\n", "expected m/s up to 100, got 130; name another unit, as speed_kmh"),
+        ("0.2,10\n0.1,11\n", "expected times that rise, got others"),
+        ("nan,10\n0.1,11\n", "expected times that rise, got others"),
+        (b"\x89PNG\x00\xff\xfe", "not a text file"),
+    ],
+)
+def test_what_is_no_table_of_speeds(read, text, message):
+    with pytest.raises(ValueError, match=rf"speed .*speed.csv: {message}"):
+        read(text)
+
+
+@settings(max_examples=200, deadline=None)
+@given(data=st.binary() | st.text(alphabet='time,speed v;0123.\n\t-nae"', max_size=60).map(str.encode))
+def test_any_bytes_are_speeds_or_one_error(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "any.csv"
+    path.write_bytes(data)
+    problem, found = "", None
+    try:
+        found = read_speeds(path)
+    except ValueError as error:
+        problem = str(error)
+    assert problem.startswith(f"speed {path}: ") != (found is not None)
+    assert "\n" not in problem
+    if found is not None:
+        assert len(found.speeds) > 0
+        assert found.times is None or len(found.times) == len(found.speeds)
+        assert abs(found.at(0, 0.0) or 0.0) <= 100.0
