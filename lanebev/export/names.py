@@ -1,3 +1,3 @@
 """Names of the parts that can be exported. Imports nothing heavy."""
 
-PARTS = ("segmenter", "extractor", "warp", "joint", "two-stage", "step")
+PARTS = ("segmenter", "extractor", "warp", "joint", "two-stage", "step", "speed")

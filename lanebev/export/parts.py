@@ -13,7 +13,7 @@ from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.export.names import PARTS
 from lanebev.export.part import ROWS, Part, lens_inputs
-from lanebev.export.state_parts import calibrator_part, exported_calibrator, step_part
+from lanebev.export.state_parts import calibrator_part, exported_calibrator, speed_part, step_part
 from lanebev.observation.polylines import VERTICES_PER_LINE
 from lanebev.observation.segments import LaneSegments, segments_from_vertices
 from lanebev.pipeline import LaneBEV
@@ -47,6 +47,9 @@ def make_part(name: str, model: LaneBEV, camera: Camera) -> Part:
         part = _warp_part(model, camera)
     elif name == "step":
         part = step_part(model, camera)
+    elif name == "speed":
+        own = model.calibrator
+        part = speed_part(own if isinstance(own, JointCalibrator) else JointCalibrator())
     else:
         kind: type[Calibrator[Any]] = JointCalibrator if name == "joint" else TwoStageCalibrator
         own = model.calibrator

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from lanebev.batch import select_rows
 from lanebev.camera.model import Camera
 from lanebev.estimation.calibrator import Calibrator
+from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.export.part import ROWS, Inputs, Part, lens_inputs
 from lanebev.observation.segments import LaneSegments
 from lanebev.pipeline import LaneBEV
@@ -116,6 +117,32 @@ def step_part(model: LaneBEV, camera: Camera) -> Part:
         *LaneSegments._fields, *_next_names(exported_calibrator(model)),
     )  # fmt: skip
     return Part(_Step(model, camera).eval(), inputs, outputs)
+
+
+class _Speed(nn.Module):
+    """State after a frame and the vehicle's speed to the state for the next one."""
+
+    FIELDS = ("mean", "cov", "heading_sensitivity")
+
+    def __init__(self, calibrator: JointCalibrator) -> None:
+        super().__init__()
+        self.calibrator = calibrator
+
+    def forward(
+        self, mean: Tensor, cov: Tensor, heading_sensitivity: Tensor, speed: Tensor
+    ) -> Sequence[Tensor]:
+        others = self.calibrator.initial_state(1, mean.dtype)
+        state = others._replace(mean=mean, cov=cov, heading_sensitivity=heading_sensitivity)
+        after = self.calibrator.with_speed(state, speed)
+        return [getattr(after, name) for name in self.FIELDS]
+
+
+def speed_part(calibrator: JointCalibrator) -> Part:
+    """Make the part that updates the joint calibrator's state by the vehicle's speed."""
+    state = calibrator.initial_state(ROWS, dtype=torch.float64)
+    inputs = {f"state_{name}": getattr(state, name) for name in _Speed.FIELDS}
+    inputs["speed"] = torch.full((ROWS,), 10.0, dtype=torch.float64)
+    return Part(_Speed(calibrator).eval(), inputs, tuple(f"next_state_{name}" for name in _Speed.FIELDS))
 
 
 def _results(calibration: Calibration) -> tuple[Tensor, ...]:

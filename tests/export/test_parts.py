@@ -12,6 +12,7 @@ from lanebev import (
     CanonicalView,
     Extrinsics,
     FarView,
+    JointCalibrator,
     LaneBEV,
     LaneSegmenter,
     LineExtractor,
@@ -76,6 +77,17 @@ def test_a_part_equals_eager_for_any_batch(name, distortion, tolerance, tmp_path
         with torch.no_grad():
             expected = dict(zip(part.outputs, part.module(*inputs.values()), strict=True))
         equals(other(inputs), expected, tolerance)
+
+
+def test_the_update_by_the_speed_equals_eager(tmp_path):
+    part, calibrator = make_part("speed", model(), camera()), JointCalibrator()
+    other = onnx(part, tmp_path)
+    for rows in (1, 3):
+        state = calibrator.initial_state(rows, torch.float64)
+        speed = torch.tensor([5.0, torch.nan, -1.0], dtype=torch.float64)[:rows]
+        expected = calibrator.with_speed(state, speed)._asdict()
+        found = other({**{name: getattr(state, name[6:]) for name in list(part.inputs)[:3]}, "speed": speed})
+        equals({name.removeprefix("next_state_"): value for name, value in found.items()}, expected, 1e-12)
 
 
 @pytest.mark.slow
