@@ -27,6 +27,8 @@ VERTICES_PER_LINE = 60
 
 _MOST_TURNS = 0.25  # fraction of a line's steps; points that turn in more of them are in no order
 _BESIDE_EDGE = 3.0  # px from an edge, where points of the same x were moved to it
+_EVEN = 0.01  # px, by which evenly spaced rows may differ
+_ABRUPT = 0.7  # of a step, from which a curve does not become vertical in the next
 _GAP, _GAP_ROWS = 4.0, 30.0  # between vertices: times the median distance, and px
 
 
@@ -72,7 +74,7 @@ def vertices_from_lines(
     Lines without a boundary index get one by :func:`boundary_indices`; those beyond the outermost boundary,
     and those that cross fewer than two rows, are left out. So are several points of a line with the same x at
     the left or the right edge of the image: some detectors move points to the edge that are outside of it,
-    or write 0 where they see no line.
+    or write 0 where they see no line. So are those that repeat the x of a line's end on rows beyond it.
 
     Args:
         lines: lines of one frame.
@@ -176,14 +178,38 @@ def rows_from_vertices(vertices: BoundaryVertices, image_size: tuple[int, int]) 
 
 
 def _without_edges(line: LaneLine, width: int) -> LaneLine:
-    """Return a polyline with NaN for several points of the same x at an edge of the image; vertices stay."""
+    """Return a polyline with NaN for points that were moved to an edge of the image or repeat an end of it.
+
+    Vertices stay.
+    """
+    if line.weight is not None:
+        return line
     x = line.points[:, 0]
     at_edge = x[(x < _BESIDE_EDGE) | (x > width - 1 - _BESIDE_EDGE)]
     values, counts = np.unique(at_edge, return_counts=True)
-    if line.weight is not None or (counts == 1).all():
-        return line
-    moved = np.isin(x, values[counts > 1])
+    moved = np.isin(x, values[counts > 1]) | _repeats_end(line.points)
     return line._replace(points=np.column_stack([np.where(moved, np.nan, x), line.points[:, 1]]))
+
+
+def _repeats_end(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which points (P, 2) have the x of a line's end on rows beyond it, as ``numpy.interp`` makes them.
+
+    They are two or more of one x on evenly spaced rows, along which the line would move by more than a pixel
+    if it went on as before; a curve becomes vertical by and by. Of whole numbers they are three or more, and
+    the line moves so from row to row, since rounding repeats x too.
+    """
+    found = np.zeros(len(points), dtype=bool)
+    there = np.flatnonzero(np.isfinite(points).all(-1))
+    whole = not (points[there, 0] % 1).any()
+    for own in (there, there[::-1]):
+        steps, rows = np.abs(np.diff(points[own], axis=0)).T
+        same = int(np.argmax([*(steps > 0), True]))  # steps of 0 at this end
+        if not whole < same < len(steps) - 1 or not np.ptp(rows[: same + 2]) < _EVEN < rows[0]:
+            continue
+        before, earlier = steps[same : same + 2]
+        if before * (1 if whole else same) > 1.0 and before > _ABRUPT * earlier:
+            found[own[: same + 1]] = True
+    return found
 
 
 def _indices(lines: Sequence[LaneLine], camera: Camera, num_boundaries: int) -> list[int | None]:

@@ -84,6 +84,40 @@ def test_points_that_were_moved_to_the_edge_are_missing(left, right):
     np.testing.assert_array_equal(found.weight, expected.weight)
 
 
+@pytest.mark.parametrize("shift", [0.0, 0.25])
+@pytest.mark.parametrize("order", [1, -1])
+def test_points_that_repeat_the_x_of_a_lines_end_are_missing(shift, order):
+    part = slice(4, -6) if shift == 0.0 else slice(1, -1)
+    rows = LEFT[:, 1]
+    lines = [line + np.array([shift, 0.0]) for line in (LEFT, RIGHT)]
+    repeating = [
+        np.stack([np.interp(rows, line[part, 1], line[part, 0]), rows], axis=-1)[::order] for line in lines
+    ]
+    found, expected = (
+        vertices_from_lines([LaneLine(line) for line in each], CAMERA)
+        for each in (repeating, [line[part][1:-1] for line in lines])
+    )
+    np.testing.assert_array_equal(found.points, expected.points)
+    np.testing.assert_array_equal(found.weight, expected.weight)
+
+
+@pytest.mark.parametrize(
+    "x",
+    [
+        [500, 500, 500, 500, 500, 500],
+        [500, 500, 500, 501, 501, 501],
+        [500, 500, 502, 506, 512, 520],
+        [500.5, 500.5, 502.4, 506.1, 511.9, 519.8],
+        [500.5, 500.5, 500.6, 500.8, 501.0, 501.2],
+    ],
+)
+def test_lines_that_are_vertical_or_become_so_are_whole(x):
+    line = np.stack([x, np.arange(400.0, 460.0, 10.0)], axis=-1)
+    assert vertices_from_lines([LaneLine(line, 2)], CAMERA).weight.sum() == 6
+    drawn = np.array([[640.0, 400.0], [640.0, 500.0], [600.0, 550.0], [560.0, 600.0]])  # by hand
+    assert vertices_from_lines([LaneLine(drawn, 2)], CAMERA).weight.sum() == 21
+
+
 def test_zeros_where_a_detector_sees_no_line_are_missing():
     with_zeros = LEFT.copy()
     with_zeros[5:9, 0] = 0.0
