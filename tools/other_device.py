@@ -75,30 +75,33 @@ class OtherDevice(TorchDispatchMode):
         name = func._schema.name
         values, _ = tree_flatten((args, kwargs))
         tensors = [v for v in values if isinstance(v, Tensor)]
-        away = [t for t in tensors if isinstance(t, Elsewhere)]
-        target = kwargs.get("device")
+        away = any(isinstance(t, Elsewhere) for t in tensors)
         _check_one_device(name, tensors)
-        to_elsewhere = ELSEWHERE in (target, str(target)) if target is not None else bool(away)
-        if name == "aten::copy_":
-            to_elsewhere = isinstance(args[0], Elsewhere)
-        if target is not None:
+        to_elsewhere = _is_for_elsewhere(name, args, kwargs.get("device"), away)
+        if kwargs.get("device") is not None:
             kwargs["device"] = torch.device("cpu")
         views = any(r.alias_info is not None and not r.alias_info.is_write for r in func._schema.returns)
-        if (away or to_elsewhere) and not views:
-            self.launches[name] += 1
-        if (away and name in _WAITS) or (away and name == "aten::_to_copy" and not to_elsewhere):
+        is_launch = (away or to_elsewhere) and not views
+        self.launches.update([name] if is_launch else [])
+        if away and (name in _WAITS or (name == "aten::_to_copy" and not to_elsewhere)):
             self.waits[name] += 1
         plain_args, plain = tree_map(lambda v: v.here if isinstance(v, Elsewhere) else v, (args, kwargs))
         result = func(*plain_args, **plain)
-        if (away or to_elsewhere) and not views:
+        if is_launch:
             self.read_and_written += _bytes(name, plain_args, result)
         if not to_elsewhere or name == "aten::_local_scalar_dense":
             return result
-        if func._schema.is_mutable and away and args and isinstance(args[0], Elsewhere):
-            first = tree_flatten(result)[0]
-            if first and first[0] is args[0].here:
-                return args[0]
+        first = args[0] if args and func._schema.is_mutable else None
+        if isinstance(first, Elsewhere) and any(v is first.here for v in tree_flatten(result)[0][:1]):
+            return first
         return tree_map(lambda v: Elsewhere(v) if isinstance(v, Tensor) else v, result)
+
+
+def _is_for_elsewhere(name: str, args: Any, target: Any, away: bool) -> bool:
+    """Return whether the result of an operation is elsewhere: by its target, else by its tensors."""
+    if name == "aten::copy_":
+        return isinstance(args[0], Elsewhere)
+    return away if target is None else ELSEWHERE in (target, str(target))
 
 
 def _check_one_device(name: str, tensors: list[Tensor]) -> None:

@@ -153,12 +153,11 @@ def main() -> None:
         counted["observed"] = torch.stack(said).all(0)
     counted["every_frame"] = torch.ones_like(errors[0]).bool()
     for path, share, error in zip(args.weights, shares, errors, strict=True):
-        line: dict[str, Any] = {"weights": path.name, **share}
-        for name, frames in counted.items():
-            line[name] = summary(error, frames)
-            if error is not errors[0] and args.drives > 1:
-                line[name]["rmse_below_first_by"] = gain(errors[0], error, frames, args.drives)
-        print(json.dumps(line))
+        figures = {name: summary(error, frames) for name, frames in counted.items()}
+        if error is not errors[0] and args.drives > 1:
+            for name, frames in counted.items():
+                figures[name]["rmse_below_first_by"] = gain(errors[0], error, frames, args.drives)
+        print(json.dumps({"weights": path.name, **share, **figures}))
 
 
 if __name__ == "__main__":

@@ -55,6 +55,7 @@ def _commands():
 
 @pytest.mark.parametrize("command", [*_commands()])
 def test_command_is_one(command):
+    assert " [" not in command, "expected a command that runs as written, got brackets for an option"
     words = shlex.split(command)
     if words[0] == "make":
         makefile = (ROOT / "Makefile").read_text(encoding="utf-8")

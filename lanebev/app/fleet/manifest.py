@@ -131,15 +131,20 @@ def _rows(path: Path) -> list[Row]:
     drives: list[Row] = given if isinstance(given, list) else []
     if drives is not given or not all(isinstance(row, dict) for row in (*drives, defaults)):
         raise ValueError(f"manifest {path}: expected a list of drives, each with video and camera")
-    of_bags = {key: value for key, value in defaults.items() if key in _OF_BAGS}
-    of_all = {key: value for key, value in defaults.items() if key not in _OF_BAGS}
-    bags = [is_bag(str(path.parent / str(row.get("video")))) for row in drives]
-    together = [{**of_all, **(of_bags if bag else {}), **row} for bag, row in zip(bags, drives, strict=True)]
-    return [{str(key): value for key, value in row.items()} for row in together]
+    return [_with_defaults(row, defaults, path.parent) for row in drives]
+
+
+def _with_defaults(row: Row, defaults: Row, folder: Path) -> Row:
+    """Return the settings of a drive with the defaults, of which some are for bags only."""
+    is_of_bag = is_bag(str(folder / str(row.get("video"))))
+    kept = {key: value for key, value in defaults.items() if is_of_bag or key not in _OF_BAGS}
+    return {str(key): value for key, value in {**kept, **row}.items()}
 
 
 def _csv_rows(text: str) -> list[Row]:
-    rows = []
+    rows: list[Row] = []
+    flags = {each.name for each in fields(RunConfig) if isinstance(each.default, bool)}
+    truth: dict[str, object] = {"true": True, "false": False}
     reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
     columns = Counter(name.strip() for name in reader.fieldnames or ())
     if len(columns) == 1 and (other := next((sign for sign in ";\t|" if sign in "".join(columns)), "")):
@@ -152,11 +157,8 @@ def _csv_rows(text: str) -> list[Row]:
         if None in row or None in row.values():
             raise ValueError(f"a row with another number of columns: {shown(row)}")
         filled = {str(key).strip(): value.strip() for key, value in row.items() if value.strip()}
-        flags = {each.name for each in fields(RunConfig) if isinstance(each.default, bool)}
-        truth = {"true": True, "false": False}
-        rows.append(
-            {key: truth.get(value.lower(), value) if key in flags else value for key, value in filled.items()}
-        )
+        read = {key: truth.get(value.lower(), value) for key, value in filled.items() if key in flags}
+        rows.append({**filled, **read})
     return rows
 
 

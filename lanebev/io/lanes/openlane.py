@@ -132,19 +132,12 @@ def _openlane_points(
     if not isinstance(lane, dict):
         raise ValueError(f"{name}: expected an object, got {shown(lane)}")
     if not _is_3d(lane):
-        uv = field(lane, "uv", list)
-        if len(uv) > 2 and all(isinstance(each, list) and len(each) == 2 for each in uv):  # points
-            uv = [list(axis) for axis in zip(*uv, strict=True)]
-        return checked_pixels(f"{name}.uv", columns(f"{name}.uv", uv, 2).T)
+        return _pixels(name, lane)
     xyz = field(lane, "xyz", list)
     rows_of_three = _is_list_of_points(lane) or (by_point and _are_threes(xyz))
-    by_axis = [list(axis) for axis in zip(*xyz, strict=True)] if rows_of_three and xyz else xyz
+    by_axis = _by_axis(xyz) if rows_of_three and xyz else xyz
     points = within(f"{name}.xyz", "m", columns(f"{name}.xyz", by_axis or [[], [], []], 3).T)
-    if (visibility := lane.get("visibility")) is not None:
-        seen = columns(f"{name}.visibility", [visibility], 1)[0]
-        if len(seen) != len(points):
-            raise ValueError(f"{name}.visibility: expected {len(points)} numbers, got {len(seen)}")
-        points = points[seen > 0.5]
+    points = _visible(name, lane, points)
     if rows_of_three and fields.get("extrinsic") is not None:
         camera = camera_from_ground_points(points, _square(fields, "extrinsic", 4))
     else:
@@ -156,6 +149,29 @@ def _openlane_points(
         raise ValueError(f"intrinsic: expected the camera matrix of {name}.xyz, got none")
     image = image_from_camera_points(camera, matrix)
     return image[(np.abs(image) < _FARTHEST).all(-1)]
+
+
+def _pixels(name: str, lane: dict[str, Any]) -> NDArray[np.float64]:
+    """Return the points (P, 2) px of a lane line's ``uv``: two lists of P, or P lists of two."""
+    uv = field(lane, "uv", list)
+    is_by_point = len(uv) > 2 and all(isinstance(each, list) and len(each) == 2 for each in uv)
+    return checked_pixels(f"{name}.uv", columns(f"{name}.uv", _by_axis(uv) if is_by_point else uv, 2).T)
+
+
+def _by_axis(points: list[list[Any]]) -> list[list[Any]]:
+    """Return points as a list for each axis."""
+    return [list(axis) for axis in zip(*points, strict=True)]
+
+
+def _visible(name: str, lane: dict[str, Any], points: Array) -> Array:
+    """Return the points that the line's ``visibility`` says are seen; all of them if it has none."""
+    if lane.get("visibility") is None:
+        return points
+    seen = columns(f"{name}.visibility", [lane["visibility"]], 1)[0]
+    if len(seen) != len(points):
+        raise ValueError(f"{name}.visibility: expected {len(points)} numbers, got {len(seen)}")
+    visible: Array = points[seen > 0.5]
+    return visible
 
 
 def _square(fields: dict[str, Any], name: str, size: int) -> NDArray[np.float64]:
