@@ -22,6 +22,7 @@ _STAMP = re.compile(rf"(?<!\d)(\d{{13,19}}){_WORDS}{_SUFFIXES}", re.ASCII)
 _DIGITS = re.compile(r"[0-9a-f]+", re.IGNORECASE)  # of numbers to the base 10 or 16
 _EPOCH = (315_964_800, 2_208_988_800)  # s: 1980, when the time of GPS begins, to 2040
 _STEPS = (Fraction(1, 2000), Fraction(60))  # s between two frames of a drive
+_JUMP = 1.5  # times the usual step of numbers
 
 # of the images, of which more with the same number or name are of several cameras or drives
 _MOST_ALIKE = 0.5
@@ -66,16 +67,26 @@ def in_natural_order(paths: Iterable[str]) -> list[str]:
     over midnight and with the day before the month.
     """
     paths = list(paths)
-    stems = [splitext(basename(path))[0] for path in paths]
-    if len({len(stem) for stem in stems}) == 1 and all(map(_DIGITS.fullmatch, stems)):
+    if _are_hexadecimal(paths):
         return sorted(paths, key=lambda path: (natural_order(str(PurePath(path).parent)), path))
-    decimal = are_decimal([match[2] for match in map(_DECIMAL.search, paths) if match])
+    decimal = _are_decimal(paths)
     ordered = sorted(paths, key=lambda path: natural_order(path, decimal))
     clocks = read_clocks(tuple(ordered))
     if clocks is None:
         return ordered
     places = sorted(range(len(ordered)), key=lambda place: clocks.seconds[place])
     return [ordered[place] for place in places]
+
+
+def _are_hexadecimal(paths: Sequence[str]) -> bool:
+    """Tell whether images' names are numbers of one length to the base 10 or 16."""
+    stems = [splitext(basename(path))[0] for path in paths]
+    return len({len(stem) for stem in stems}) == 1 and all(map(_DIGITS.fullmatch, stems))
+
+
+def _are_decimal(paths: Sequence[str]) -> bool:
+    """Tell whether numbers with a dot at the end of names are decimal; also if there are none."""
+    return are_decimal([match[2] for match in map(_DECIMAL.search, paths) if match])
 
 
 def times_from_names(paths: Sequence[str]) -> tuple[float, ...]:
@@ -169,8 +180,9 @@ def drives_remark(paths: Sequence[str]) -> str:
     """
     numbers: dict[tuple[str, tuple[str, ...]], list[str]] = defaultdict(list)
     folders: dict[str, list[str]] = defaultdict(list)
+    digits = r".+" if _are_hexadecimal(paths) else r"\d+"
     for folder, name in map(split, paths):
-        numbers[folder, tuple(re.findall(r"\d+", splitext(name)[0]))].append(name)
+        numbers[folder, tuple(re.findall(digits, splitext(name)[0]))].append(name)
         folders[name].append(folder or ".")
     alike = [names for (_, found), names in numbers.items() if found and len(names) > 1]
     if alike and sum(map(len, alike)) > _MOST_ALIKE * len(paths):
@@ -191,7 +203,8 @@ def drives_remark(paths: Sequence[str]) -> str:
 def jump_remark(paths: Sequence[str]) -> str:
     """Return where the times in images' names, or the only number that differs in these, jump; else nothing.
 
-    A number jumps where images are missing, and where a counter began again at 0: later images come first.
+    A number jumps where images are missing, and where a counter began again at 0: later images come first. Of
+    numbers that are times, such as milliseconds, steps differ a little.
 
     Args:
         paths: paths of the images, in order.
@@ -204,7 +217,7 @@ def jump_remark(paths: Sequence[str]) -> str:
     else:
         steps = _number_steps(paths)
         usual = median_low(steps or [0])
-        jumps = [step > usual > 0 for step in steps]
+        jumps = [step > _JUMP * usual > 0 for step in steps]
         kind, remedy = "their numbers jump", ", or number them anew"
     if True not in jumps:
         return ""
@@ -213,11 +226,12 @@ def jump_remark(paths: Sequence[str]) -> str:
     return f"{kind}, as from {place}, {taken}; give each part a run{remedy}"
 
 
-def _number_steps(paths: Sequence[str]) -> list[int]:
+def _number_steps(paths: Sequence[str]) -> list[Fraction]:
     """Return the steps of the only number that differs in images' names; none if there is no such."""
-    parts = [re.split(r"(\d+)", PurePath(path).stem, flags=re.ASCII) for path in paths]
+    number = re.compile(r"(\d+(?:\.\d+)?)" if _are_decimal(paths) else r"(\d+)", re.ASCII)
+    parts = [number.split(PurePath(path).stem) for path in paths]
     columns = list(zip(*parts, strict=True)) if len(set(map(len, parts))) == 1 else []
     varying = [column for column in columns if len(set(column)) > 1]
-    if len(varying) != 1 or not varying[0][0].isdigit():
+    if len(varying) != 1 or not varying[0][0][:1].isdigit():
         return []
-    return [int(after) - int(before) for before, after in pairwise(varying[0])]
+    return [Fraction(after) - Fraction(before) for before, after in pairwise(varying[0])]

@@ -154,6 +154,23 @@ def test_a_counter_that_began_again_or_has_gaps_is_noticed(numbers, words):
     assert bool(words) == bool(remark)
 
 
+@pytest.mark.parametrize(
+    ("write", "words"),
+    [
+        (lambda i: f"{round(i * 100 / 3)}.jpg", "from 133.jpg to 267.jpg"),  # ms
+        (lambda i: f"{i / 30:.3f}.jpg", "from 0.133.jpg to 0.267.jpg"),  # s
+        (lambda i: f"{i / 20}.jpg", "from 0.2.jpg to 0.4.jpg"),
+    ],
+)
+def test_numbers_that_are_times_jump_only_where_images_are_missing(write, words):
+    assert jump_remark(in_natural_order(write(i) for i in range(20))) == ""
+    assert words in jump_remark(in_natural_order(write(i) for i in [*range(5), *range(8, 20)]))
+
+
+def test_hexadecimal_numbers_are_not_the_same_for_their_letters():
+    assert drives_remark([f"{number:04x}.png" for number in range(200, 230)]) == ""
+
+
 def test_jumps_are_looked_for_in_time_that_grows_with_the_number_of_images(monkeypatch):
     """The median of all steps was calculated for each of them: minutes for 100,000 images."""
     calls = []
