@@ -2,8 +2,10 @@
 
 import math
 import re
+import struct
 from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,20 +18,22 @@ from lanebev.numbers import finite_numbers, shown
 
 _KITTI = re.compile(r"^[ \t]*P(?:_rect_)?\d+[ \t]*:", re.MULTILINE | re.ASCII)
 _COLMAP = re.compile(r"^[ \t]*(\d+)[ \t]+([A-Z_]+)[ \t]+(\d{1,6})[ \t]+(\d{1,6})[ \t]+(.+)$", re.MULTILINE)
-_COLMAP_MODELS = {  # names of their parameters
+_COLMAP_MODELS = {  # names of their parameters; the first ten are in the order of their numbers
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fx fy cx cy",
     "SIMPLE_RADIAL": "f cx cy k1",
     "RADIAL": "f cx cy k1 k2",
     "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
     "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "FOV": "fx fy cx cy omega",
     "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
     "RADIAL_FISHEYE": "f cx cy k1 k2",
-    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
     "SIMPLE_FISHEYE": "f cx cy",
     "FISHEYE": "fx fy cx cy",
-    "FOV": "fx fy cx cy omega",
 }
+_COLMAP_NUMBERS = [*_COLMAP_MODELS][:10]
+_LARGEST_BIN = 1_000_000  # bytes
 _KITTI_SIZES = {  # focal length of the rectified cameras of each recording day -> (height, width)
     721.5377: (375, 1242),
     707.0493: (370, 1224),
@@ -88,6 +92,36 @@ def _kitti(entries: Mapping[str, str], name: str, image_size: tuple[int, int] | 
 def is_colmap(text: str) -> bool:
     """Return whether a text has a line of COLMAP's ``cameras.txt``."""
     return _COLMAP.search(text) is not None
+
+
+def colmap_text(path: Path) -> str:
+    """Return COLMAP's ``cameras.bin`` as its ``cameras.txt`` would be.
+
+    Source: COLMAP, scripts/python/read_write_model.py.
+
+    Raises:
+        ValueError: it cannot be read, is none, is cut, or has a camera of a further model.
+    """
+    try:
+        with open(path, "rb") as file:
+            data = file.read(_LARGEST_BIN)
+        (count,), place, lines = struct.unpack_from("<Q", data), 8, []
+        for _ in range(count):
+            camera, model, width, height = struct.unpack_from("<iIQQ", data, place)
+            name = _COLMAP_NUMBERS[model]
+            values = struct.unpack_from(f"<{len(_COLMAP_MODELS[name].split())}d", data, place + 24)
+            place += 24 + 8 * len(values)
+            lines.append(" ".join(map(str, (camera, name, width, height, *values))))
+    except OSError as error:
+        raise ValueError(error.strerror or str(error)) from error
+    except (struct.error, IndexError):
+        lines = []
+    if place < len(data) or not lines:
+        raise ValueError(
+            "no whole cameras.bin of COLMAP, or one of further models; COLMAP writes texts by "
+            "model_converter --output_type TXT"
+        )
+    return "\n".join(lines)
 
 
 def colmap_cameras(text: str) -> Readers:

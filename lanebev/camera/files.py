@@ -12,12 +12,7 @@ import numpy as np
 import yaml
 
 from lanebev.camera.choice import Readers, chosen, split_name
-from lanebev.camera.datasets import (
-    colmap_cameras,
-    is_colmap,
-    is_kitti,
-    kitti_cameras,
-)
+from lanebev.camera.datasets import colmap_cameras, colmap_text, is_colmap, is_kitti, kitti_cameras
 from lanebev.camera.formats import opencv_or_ros, stereo_cameras, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
 from lanebev.camera.parsing import bare_numbers, is_ros_ini, parse_documents
@@ -66,7 +61,7 @@ def read_camera(
     - files of MATLAB, Gyroflow, Nerfstudio, RealSense, DepthAI and Metashape, see
       :mod:`lanebev.camera.programs`, and of OpenSfM and OpenMVG, see :mod:`lanebev.camera.reconstruction`;
     - JSON of data sets, see :mod:`lanebev.camera.records`;
-    - COLMAP's ``cameras.txt``.
+    - COLMAP's ``cameras.txt`` and ``cameras.bin``.
 
     The first camera of a file with several is taken, of KITTI's files the left colour camera. If others
     differ from it, there is a remark; COLMAP's files and those of data sets in JSON are then refused.
@@ -84,20 +79,18 @@ def read_camera(
         ValueError: the file is missing, cut, holds an unknown key, or a missing or absurd value.
     """
     path, name = split_name(path)
+    kind = path.suffix.lower()
     try:
-        arrays = _arrays(path) if path.suffix.lower() in (".npz", ".npy") else None
+        arrays = _arrays(path) if kind in (".npz", ".npy") else None
         # comments and names may be in other encodings: they are not needed
-        text = read_text(path, "replace") if arrays is None else ""
+        text = colmap_text(path) if kind == ".bin" else "" if arrays else read_text(path, "replace")
         bare = bare_numbers(text)
     except ValueError as error:
-        remedy = "; COLMAP writes texts by model_converter --output_type TXT" if path.suffix == ".bin" else ""
-        raise ValueError(
-            f"camera file {path}: expected a readable camera file, got: {error}{remedy}"
-        ) from error
+        raise ValueError(f"camera file {path}: expected a readable camera file, got: {error}") from error
     try:
         if is_colmap(text):
             camera = checked(chosen(colmap_cameras(text), name, has_usual=False))
-        elif is_kitti(text) or (path.suffix.lower() == ".txt" and "width" not in text and not bare):
+        elif is_kitti(text) or (kind == ".txt" and "width" not in text and not bare):
             camera = checked(chosen(kitti_cameras(text, image_size), name, has_usual=True))
         else:
             fields = arrays or bare

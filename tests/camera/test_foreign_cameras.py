@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import struct
 
 import cv2
 import numpy as np
@@ -28,6 +29,18 @@ distortion_coefficients:
   data: [0.175653, -0.031772, 0.000362, -0.000719]
 """
 MODEL = "camera_model: fisheye"
+COLMAP = {  # numbers of its models
+    "SIMPLE_PINHOLE": 0,
+    "PINHOLE": 1,
+    "SIMPLE_RADIAL": 2,
+    "RADIAL": 3,
+    "OPENCV": 4,
+    "OPENCV_FISHEYE": 5,
+    "FULL_OPENCV": 6,
+    "FOV": 7,
+    "SIMPLE_RADIAL_FISHEYE": 8,
+    "RADIAL_FISHEYE": 9,
+}
 MATRIX = [[633.0, 0, 408.0], [0, 633.0, 245.0], [0, 0, 1]]
 
 
@@ -207,6 +220,13 @@ def test_colmaps_pixels_begin_at_their_corner(tmp_path, line, expected):  # colm
     text = f"# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL\n1 {line}\n"
     camera = _read(tmp_path / "cameras.txt", text)
     _is(camera, 800, fy, 639.5, 359.5, 1280, 720, distortion, model)
+    name, *sides, values = line.split(maxsplit=3)
+    values = [float(value) for value in values.split()]
+    data = struct.pack(f"<QiiQQ{len(values)}d", 1, 1, COLMAP[name], *map(int, sides), *values)
+    _is(_read(tmp_path / "cameras.bin", data), 800, fy, 639.5, 359.5, 1280, 720, distortion, model)
+    for cut in (data[:-8], data[:40], data[:8], data + b"1"):
+        with pytest.raises(ValueError, match=r"got: no whole cameras\.bin of COLMAP, or"):
+            _read(tmp_path / "cameras.bin", cut)
 
 
 ORB_SLAM = """%YAML:1.0

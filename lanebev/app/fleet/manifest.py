@@ -149,7 +149,7 @@ def _csv_rows(text: str) -> list[Row]:
     columns = Counter(name.strip() for name in reader.fieldnames or ())
     if len(columns) == 1 and (other := next((sign for sign in ";\t|" if sign in "".join(columns)), "")):
         raise ValueError(f"columns separated by {other!r}; write commas, and points in numbers")
-    if twice := [name for name, count in columns.items() if count > 1]:
+    if twice := [name for name, count in columns.items() if name and count > 1]:  # spreadsheets add empty
         raise ValueError(f"the column {twice[0]!r} twice")
     for row in reader:
         if not any(filter(None, row.values())):  # as a spreadsheet adds them

@@ -22,7 +22,7 @@ _STAMP = re.compile(rf"(?<!\d)(\d{{13,19}}){_WORDS}{_SUFFIXES}", re.ASCII)
 _DIGITS = re.compile(r"[0-9a-f]+", re.IGNORECASE)  # of numbers to the base 10 or 16
 _EPOCH = (315_964_800, 2_208_988_800)  # s: 1980, when the time of GPS begins, to 2040
 _STEPS = (Fraction(1, 2000), Fraction(60))  # s between two frames of a drive
-_JUMP = 1.5  # times the usual step of numbers
+_JUMP = Fraction(3, 2)  # times the usual step of numbers
 
 # of the images, of which more with the same number or name are of several cameras or drives
 _MOST_ALIKE = 0.5
@@ -216,7 +216,7 @@ def jump_remark(paths: Sequence[str]) -> str:
         kind, remedy = "the times in their names jump", ""
     else:
         steps = _number_steps(paths)
-        usual = median_low(steps or [0])
+        usual = median_low(steps or [Fraction(0)])
         jumps = [step > _JUMP * usual > 0 for step in steps]
         kind, remedy = "their numbers jump", ", or number them anew"
     if True not in jumps:

@@ -150,6 +150,11 @@ def test_a_csv_row_with_too_many_cells_is_refused(write):
             read_manifest(write(f"video,camera\n{row}\n", "manifest.csv"))
 
 
+def test_empty_columns_that_a_spreadsheet_adds_are_ignored(tmp_path):
+    (tmp_path / "m.csv").write_text("video,camera,,\na.mp4,c.yaml,,\n")
+    assert [drive.name for drive in read_manifest(tmp_path / "m.csv")] == ["a"]
+
+
 def test_a_csv_column_that_is_there_twice_is_refused(tmp_path):
     (tmp_path / "drives.csv").write_text("video,camera, video\na.mp4,c.yaml,b.mp4\n")
     with pytest.raises(ValueError, match="expected YAML or CSV, got: the column 'video' twice"):
