@@ -21,7 +21,7 @@ from jsonargparse.typing import PositiveInt
 from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.testing.moments import CAMERA, PLACES, WIDTH, Moment, drift, observe
+from lanebev.testing.moments import CAMERA, PLACES, WIDTH, Change, Moment, drift, observe
 from lanebev.testing.motions import Motion, Pose, moved, sinusoids, suspension
 from lanebev.types import Status
 
@@ -76,10 +76,6 @@ class Errors(NamedTuple):
     def within(self) -> Tensor:
         """Compute the share (4,) of errors within 3 sigma."""
         return (self.by_sigma.abs() < SIGMAS).double().mean(0)
-
-
-Change = Callable[[float, Moment], Moment]
-"""Changes the moment at a time in s."""
 
 
 def draw(seed: int) -> Drive:

@@ -10,14 +10,13 @@ from statistics import NormalDist
 import torch
 
 from lanebev.estimation.joint.frame_prior import FramePrior
-from lanebev.testing.moments import FPS, PLACES, Moment, moments
+from lanebev.testing.moments import FPS, PLACES, Change, Moment, moments
 from lanebev.testing.motions import Pose, moved, sinusoids
 from lanebev.testing.streets import wandering
 from tools.replay.kinds import (
     EGO_LANE,
     FRAMES,
     SHOCK,
-    Change,
     Generated,
     bend,
     drop,

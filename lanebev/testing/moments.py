@@ -50,6 +50,10 @@ class Moment:
     tag: str = ""  # scenarios name the moments that they bound separately
 
 
+Change = Callable[[float, Moment], Moment]
+"""Changes the moment at a time in s."""
+
+
 def swing(t: float) -> tuple[float, float, float, float]:
     """Return the motion of the Table I experiment: ±1.5° pitch and yaw, ±1° roll, ±5 cm, up to 1 Hz."""
     turn = 2 * math.pi * t
@@ -68,7 +72,7 @@ def drift(t: float) -> float:
 
 def moments(
     seconds: float,
-    change: Callable[[float, Moment], Moment] | None = None,
+    change: Change | None = None,
     motion: Motion = swing,
     fps: float = FPS,
     start: float = 0.0,

@@ -1,13 +1,12 @@
 """Drives that break the paper's assumptions one at a time, as changes of the standard drive."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from lanebev.testing.moments import FPS, PLACES, WIDTH, Moment, drift, swing
+from lanebev.testing.moments import FPS, PLACES, WIDTH, Change, Moment, drift, swing
 
 
 def _clothoid(s: Tensor, radius: float, transition: float) -> Tensor:
@@ -75,7 +74,7 @@ _ONE_LARGE = torch.tensor([0.04, 0.17, 0.02, -0.03, 0.05, 0.22], dtype=torch.flo
 _SLIGHT = torch.tensor([-0.01, 0.03, 0.02, -0.01, -0.03, 0.02], dtype=torch.float64)
 
 
-def _only(visible: tuple[int, ...], first: float, last: float) -> Callable[[float, Moment], Moment]:
+def _only(visible: tuple[int, ...], first: float, last: float) -> Change:
     def change(t: float, moment: Moment) -> Moment:
         inside = first <= t < last
         return replace(moment, visible=visible if inside else moment.visible, tag="less" if inside else "")
@@ -117,7 +116,7 @@ def _wrong_class(t: float, moment: Moment) -> Moment:
     return replace(moment, shift=(0, 1, -1)[k % 40 // 13 if k % 13 == 5 else 0])
 
 
-SCENARIOS: dict[str, tuple[float, Callable[[float, Moment], Moment] | None]] = {
+SCENARIOS: dict[str, tuple[float, Change | None]] = {
     "straight": (6.0, None),
     "straight 5-40 m": (6.0, lambda t, m: replace(m, near=5.0, far=40.0)),
     "sharp bends R 60 m, three boundaries": (20.0, _sharp_bends),

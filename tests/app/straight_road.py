@@ -3,11 +3,11 @@
 import csv
 import json
 
-import numpy as np
 import torch
 
-from lanebev import Camera, Extrinsics, image_from_road_points
+from lanebev import Camera, Extrinsics
 from lanebev.cli import main
+from tests.drawn_road import boundary, on_rows
 
 HEIGHT, WIDTH, FRAMES = 240, 416, 6
 CAMERA = Camera.from_parameters(330, 330, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
@@ -19,13 +19,8 @@ ROWS = range(0, HEIGHT, 10)
 def lane_lines(names):
     """TuSimple lines of a straight road with 3.7 m lanes; no boundary index."""
     z = torch.logspace(0.5, 2.3, 300, dtype=torch.float64)
-    lanes = []
-    for offset in OFFSETS:
-        road = torch.stack([torch.full_like(z, offset), z], dim=-1)[None]
-        pixels = image_from_road_points(road, CAMERA.intrinsics[None], Extrinsics.from_values(*POSE))[0][0]
-        x, y = pixels.flip(0).numpy().T
-        on_rows = np.interp(ROWS, y, x, left=-2, right=-2)
-        lanes.append([round(v, 2) if 0 <= v < WIDTH else -2 for v in on_rows])
+    pose = Extrinsics.from_values(*POSE)
+    lanes = [on_rows(boundary(CAMERA, offset, z, pose), ROWS, WIDTH) for offset in OFFSETS]
     return [json.dumps({"raw_file": name, "lanes": lanes, "h_samples": list(ROWS)}) for name in names]
 
 

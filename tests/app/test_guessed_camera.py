@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lanebev import Camera, Extrinsics, LaneBEV, Session, Status, image_from_road_points
+from lanebev import Camera, Extrinsics, LaneBEV, Session, Status
 from lanebev.app.config import FOV_FOCAL_STD, RunConfig
 from lanebev.app.drive.build import make_camera, make_tracker
 from lanebev.app.drive.observers import NetworkObserver
@@ -16,22 +16,15 @@ from lanebev.geometry.road import lane_width_covariance
 from lanebev.io.frames import Frame
 from lanebev.observation.polylines import LaneLine, vertices_from_lines
 from lanebev.render import Drive
+from tests.drawn_road import PLACES, polylines
 
 CONFIG = RunConfig("a", fov=60.0)
 SIZE, POSE = (720, 1280), (0.05, 0.03, 0.01, 1.5)
 
 
-def lines(camera, pose=POSE, places=(-5.55, -1.85, 1.85, 5.55)):
+def lines(camera, pose=POSE, places=PLACES):
     """Polylines of lane boundaries."""
-    extrinsics = Extrinsics(*(torch.tensor([value], dtype=torch.float64) for value in pose))
-    z = torch.linspace(1 / 5, 1 / 40, 60, dtype=torch.float64) ** -1
-    found = []
-    for place in places:
-        road = torch.stack([torch.full_like(z, place), z], dim=-1)[None]
-        points = image_from_road_points(road, camera.intrinsics[None], extrinsics)[0][0]
-        inside = (points[:, 0] > 0) & (points[:, 0] < SIZE[1]) & (points[:, 1] < SIZE[0])
-        found.append(LaneLine(points[inside].numpy()))
-    return found
+    return [LaneLine(points) for points in polylines(camera, pose, places, count=60)]
 
 
 def tracked(config, camera, drawn, frames=3):

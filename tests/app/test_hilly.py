@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from lanebev import Camera, Extrinsics, image_from_road_points
+from lanebev import Camera, Extrinsics
 from lanebev.app.config import RunConfig
 from lanebev.app.drive.build import make_tracker
 from lanebev.app.run import run
@@ -15,12 +15,12 @@ from lanebev.io.lanes import read_lanes
 from lanebev.io.video.writer import VideoWriter
 from lanebev.observation.segments import segments_from_lines
 from lanebev.report.measure import measure_boundaries
+from tests.drawn_road import PLACES, boundary, on_rows
 
 HEIGHT, WIDTH, FRAMES, FPS = 480, 832, 12, 25
 CAMERA = Camera.from_parameters(660, 660, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
 POSE = Extrinsics.from_values(0.03, -0.01, 0.01, 1.4)
 CREST = torch.tensor([1 / 2000], dtype=torch.float64)
-OFFSETS = (-5.55, -1.85, 1.85, 5.55)
 
 
 @pytest.fixture(scope="module")
@@ -33,12 +33,8 @@ def data(tmp_path_factory):
             writer.write(np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8))
     z = torch.logspace(0.6, 1.7, 60, dtype=torch.float64)
     rows = list(range(HEIGHT // 2, HEIGHT, 4))
-    lanes = []
-    for offset in OFFSETS:
-        road = torch.stack([torch.full_like(z, offset), z], dim=-1)[None]
-        x, y = image_from_road_points(road, CAMERA.intrinsics[None], POSE, CREST)[0][0].flip(0).numpy().T
-        on_rows = np.interp(rows, y, x, left=-2, right=-2)
-        lanes.append([round(v, 2) if 0 <= v < WIDTH else -2 for v in on_rows])
+    seen = [boundary(CAMERA, place, z, POSE, vertical_curvature=CREST) for place in PLACES]
+    lanes = [on_rows(pixels, rows, WIDTH) for pixels in seen]
     fields = {"lanes": lanes, "h_samples": rows, "boundary": [1, 2, 3, 4]}
     lines = [json.dumps({"raw_file": f"drive.mp4/{k:06d}", **fields}) for k in range(FRAMES)]
     (folder / "lanes.json").write_text("\n".join(lines))

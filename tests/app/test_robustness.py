@@ -11,10 +11,8 @@ import shutil
 import signal
 import subprocess
 import sys
-from fractions import Fraction
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 import yaml
@@ -29,10 +27,9 @@ from lanebev.io.opening import open_source
 from lanebev.io.output.folder import OutputFolder
 from lanebev.io.output.lock import FolderLock
 from lanebev.io.state import load_state, save_state
-from lanebev.io.video.writer import VideoWriter
+from tests.app.noise_drive import write_drive
 
 ROOT = Path(__file__).parents[2]
-HEIGHT, WIDTH, FRAMES = 96, 160, 6
 HOSTILE = "<script>alert(1)</script>\"'&é…"
 
 
@@ -40,24 +37,6 @@ HOSTILE = "<script>alert(1)</script>\"'&é…"
 def data(tmp_path_factory):
     """A camera file, a video and its lanes."""
     return write_drive(tmp_path_factory.mktemp("data"))
-
-
-def write_drive(folder, frames=FRAMES, name="drive", seed=0):
-    """Write ``NAME.mp4`` of noise, lanes for it and a camera."""
-    camera = Camera.from_parameters(120, 120, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
-    camera.to_file(folder / "camera.yaml")
-    noise = np.random.default_rng(seed)
-    with VideoWriter(folder / f"{name}.mp4", Fraction(25)) as writer:
-        for _ in range(frames):
-            writer.write(noise.integers(60, 90, (HEIGHT, WIDTH, 3), dtype=np.uint8))
-    rows = list(range(50, HEIGHT, 2))
-    lanes = [[WIDTH / 2 + slope * (row - 48) for row in rows] for slope in (-1.3, 1.2)]
-    lines = [
-        json.dumps({"raw_file": f"x/{i}", "h_samples": rows, "lanes": lanes, "boundary": [2, 3]})
-        for i in range(frames)
-    ]
-    (folder / f"{name}.json").write_text("\n".join(lines))
-    return folder
 
 
 def _arguments(data, out, *extra):

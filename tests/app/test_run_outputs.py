@@ -12,7 +12,7 @@ import torch
 import yaml
 from PIL import Image
 
-from lanebev import Extrinsics, JointCalibrator, image_from_road_points
+from lanebev import Extrinsics, JointCalibrator
 from lanebev.app.summary import untracked_words
 from lanebev.estimation.lane_width_prior import LANE_WIDTH, LANE_WIDTH_STD
 from lanebev.estimation.mount import MountReason
@@ -20,6 +20,7 @@ from lanebev.io.opening import open_source
 from lanebev.io.results import CSV_COLUMNS, ExtrinsicsRow, write_extrinsics
 from lanebev.io.state import load_state
 from tests.app.straight_road import CAMERA, FRAMES, POSE, ROWS, lane_lines, run, table
+from tests.drawn_road import PLACES, boundary
 from tools import pseudo_ground_truth
 
 
@@ -80,9 +81,8 @@ def test_pseudo_ground_truth_compares_the_same_frames(data, tmp_path, capsys, mo
     for name, height in zip(names, (1.2, 1.4, 1.6), strict=True):
         at = Extrinsics.from_values(POSE[0], POSE[1], POSE[2], height)
         lanes = []
-        for offset in (-5.55, -1.85, 1.85, 5.55):
-            road = torch.stack([torch.full_like(z, offset), z], dim=-1)[None]
-            pixels = image_from_road_points(road, CAMERA.intrinsics[None], at)[0][0].flip(0).numpy()
+        for offset in PLACES:
+            pixels = boundary(CAMERA, offset, z, at).flip(0).numpy()
             y = np.arange(pixels[0, 1] + 1, pixels[-1, 1], 5)
             x = np.interp(y, pixels[:, 1], pixels[:, 0])
             lanes.append(" ".join(f"{u:.3f} {v:.3f}" for u, v in zip(x, y, strict=True)))

@@ -7,6 +7,7 @@ import torch
 from lanebev import Calibration, Camera, Extrinsics, LaneSegments, Status, image_from_road_points
 from lanebev.observation.polylines import image_rows
 from lanebev.report.lane_curves import lane_curves
+from tests.drawn_road import boundary
 
 DISTORTION = (-0.2, 0.05, 0.0, 0.0, 0.0)
 CAMERA = Camera.from_parameters(1000, 1000, 639.5, 359.5, 1280, 720, distortion=DISTORTION)
@@ -16,8 +17,7 @@ CURVATURE = 1 / 800
 
 
 def _boundary(place, z):
-    road = torch.stack([place + 0.5 * CURVATURE * z**2, z], dim=-1)[None]
-    return image_from_road_points(road, CAMERA.intrinsics[None], POSE)[0][0]
+    return boundary(CAMERA, place, z, POSE, CURVATURE)
 
 
 def _calibration(segments, status=Status.TRACKING):

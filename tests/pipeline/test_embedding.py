@@ -32,9 +32,9 @@ from lanebev.tensors import identity
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes, no_lanes, stack_rows
 from lanebev.weights import load_segmenter
-from tests.pipeline.test_pipeline import INTRINSICS as SMALL_K
-from tests.pipeline.test_pipeline import images
-from tests.pipeline.test_pipeline import model as stand_in
+from tests.pipeline.stand_ins import INTRINSICS as SMALL_K
+from tests.pipeline.stand_ins import images
+from tests.pipeline.stand_ins import model as stand_in
 
 CAMERA = torch.tensor([[[100.0, 0.0, 63.5], [0.0, 100.0, 31.5], [0.0, 0.0, 1.0]]])
 POSE = Extrinsics.unstack(torch.tensor([[0.02, 0.01, -0.01, 1.5]]))

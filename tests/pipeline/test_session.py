@@ -10,34 +10,24 @@ import torch
 from lanebev import (
     BEVGrid,
     Camera,
-    Extrinsics,
     JointCalibrator,
     LaneBEV,
     Session,
     Status,
     TwoStageCalibrator,
-    image_from_road_points,
 )
 from lanebev.estimation.joint.dynamics import MotionConfig
 from lanebev.estimation.joint.layout import layout
 from lanebev.estimation.reasons import REASON_WORDS, Reason, describe_reasons
+from tests.drawn_road import PLACES, polylines
 
 CAMERA = Camera.from_parameters(600, 600, 319.5, 179.5, 640, 360, distortion=(-0.2, 0.05, 0.0, 0.0, 0.0))
 POSE = (0.03, -0.01, 0.02, 1.4)
 
 
-def lines(pose=POSE, places=(-5.55, -1.85, 1.85, 5.55)):
+def lines(pose=POSE, places=PLACES):
     """Polylines of lane boundaries in pixels as taken."""
-    extrinsics = Extrinsics(*(torch.tensor([value], dtype=torch.float64) for value in pose))
-    z = torch.linspace(1 / 5, 1 / 40, 40, dtype=torch.float64) ** -1
-    found = []
-    for place in places:
-        road = torch.stack([torch.full_like(z, place), z], dim=-1)[None]
-        pixels = image_from_road_points(road, CAMERA.intrinsics[None], extrinsics)[0][0]
-        points = CAMERA.distort_points(pixels)
-        inside = (points[:, 0] > 0) & (points[:, 0] < 639) & (points[:, 1] < 359)
-        found.append(points[inside].numpy())
-    return found
+    return polylines(CAMERA, pose, places)
 
 
 def numbers(result):

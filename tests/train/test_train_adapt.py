@@ -12,12 +12,12 @@ from safetensors.torch import save_file
 
 from lanebev.camera.model import Camera
 from lanebev.estimation.joint.boundary_curves import Boundaries
-from lanebev.geometry.road import image_from_road_points
 from lanebev.io.results import ExtrinsicsRow, write_extrinsics
 from lanebev.observation.polylines import image_rows
 from lanebev.observation.resnet import ResNet18
 from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.types import Extrinsics
+from tests.drawn_road import boundary
 from train.__main__ import main
 from train.backbone import load_backbone
 from train.datasets import labelled_image, read_entries
@@ -34,11 +34,8 @@ MISSED, STRAY = (4, 3), (2, 5)  # frame and boundary
 def line(offset):
     """x on the rows of lanes.json of a straight boundary, -2 where there is none."""
     z = torch.linspace(2, 200, 4000, dtype=torch.float64)
-    road = torch.stack([torch.full_like(z, offset), z], dim=-1)[None]
-    angles = torch.tensor(POSE[:3], dtype=torch.float64).deg2rad()
-    pose = Extrinsics(*(value[None] for value in (*angles, torch.tensor(POSE[3], dtype=torch.float64))))
-    pixels, _ = image_from_road_points(road, CAMERA.intrinsics[None].double(), pose)
-    x, y = pixels[0].flip(0).unbind(-1)
+    pose = Extrinsics.from_values(*np.radians(POSE[:3]), POSE[3])
+    x, y = boundary(CAMERA, offset, z, pose).flip(0).unbind(-1)
     rows = image_rows(360)
     across = np.interp(rows, y, x, -2.0, -2.0)
     return np.where((across >= 0) & (across <= 639), across, -2.0)

@@ -7,16 +7,13 @@ from dataclasses import dataclass, replace
 import torch
 
 from lanebev.camera.model import Camera
-from lanebev.testing.moments import PLACES, Moment, moments, swing
+from lanebev.testing.moments import PLACES, Change, Moment, moments, swing
 from lanebev.testing.motions import MOUNT, Motion, Pose, fall, landing_time, moved, sinusoids, suspension
 from lanebev.testing.scenarios import SCENARIOS
 from lanebev.testing.streets import wandering
 
 FRAMES = 120
 """Of every drive, so that all of them are rows of one batch."""
-
-Change = Callable[[float, Moment], Moment]
-"""Changes the moment at a time in s."""
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Selection
 from lanebev.io.opening import open_source
 from lanebev.io.output.folder import OutputFolder, OutputFolderError
+from tests.app.noise_drive import HEIGHT, WIDTH, write_drive
 from tests.app.rtsp_server import transport_stream
-from tests.app.test_robustness import HEIGHT, WIDTH, write_drive
 
 COUNT = 14
 

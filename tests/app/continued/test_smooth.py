@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from lanebev import Camera, Extrinsics, image_from_road_points
+from lanebev import Camera, Extrinsics
 from lanebev.app.config import RunConfig
 from lanebev.app.continued.smoothing import StoredStates
 from lanebev.app.drive.observers import NetworkObserver
@@ -20,10 +20,10 @@ from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.io.state import load_state
 from lanebev.io.video.writer import VideoWriter
 from lanebev.testing.moments import swing
+from tests.drawn_road import PLACES, boundary, on_rows
 
 HEIGHT, WIDTH, FRAMES, FPS = 240, 416, 20, 25
 CAMERA = Camera.from_parameters(330, 330, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
-OFFSETS = (-5.55, -1.85, 1.85, 5.55)
 FILES = {"extrinsics.csv", "filtered.csv", "covariance.csv", "lanes.json", "report.html", "state.safetensors"}
 FILES |= {"calibration.yaml"}
 
@@ -36,13 +36,7 @@ def lane_lines():
     for k in range(FRAMES):
         pose = Extrinsics.from_values(*swing(k / FPS))
         rows = list(range(HEIGHT // 2, HEIGHT, 6))
-        lanes = []
-        for offset in OFFSETS:
-            road = torch.stack([torch.full_like(z, offset), z], dim=-1)[None]
-            x, y = image_from_road_points(road, CAMERA.intrinsics[None], pose)[0][0].flip(0).numpy().T
-            on_rows = np.interp(rows, y, x, left=-2, right=-2)
-            on_rows[on_rows > 0] += noise.normal(0, 1, (on_rows > 0).sum())
-            lanes.append([round(v, 2) if 0 <= v < WIDTH else -2 for v in on_rows])
+        lanes = [on_rows(boundary(CAMERA, place, z, pose), rows, WIDTH, noise) for place in PLACES]
         fields = {
             "raw_file": f"drive.mp4/{k:06d}",
             "lanes": lanes,

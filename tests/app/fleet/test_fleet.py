@@ -12,7 +12,7 @@ import pytest
 from lanebev.app.fleet.fleet import fleet
 from lanebev.app.fleet.worker import run_tasks
 from lanebev.cli import main
-from tests.app.test_robustness import write_drive
+from tests.app.noise_drive import write_drive
 from tools import fleet_check
 
 pytest.importorskip("ray", reason="Ray is not installed")

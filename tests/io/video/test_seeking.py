@@ -9,7 +9,7 @@ import pytest
 from lanebev.io.frames import Selection
 from lanebev.io.opening import open_source
 from lanebev.io.video import seeking
-from tests.io.video.test_video import _damaged
+from tests.io.video.damaged import write_damaged
 
 COUNT, FPS = 120, 20
 CLOSED = {"g": "12", "bf": "3", "b_strategy": "0", "x264-params": "keyint=12:min-keyint=12:bframes=3"}
@@ -85,7 +85,7 @@ def test_what_is_far_before_is_not_decoded(tmp_path, name):
 
 @pytest.mark.parametrize("spoilt", [(5,), (52,)])
 def test_a_damaged_video(tmp_path, monkeypatch, spoilt):
-    _damaged(tmp_path / "v.mp4", spoilt, count=100, bf="3", b_strategy="0", g="10")
+    write_damaged(tmp_path / "v.mp4", spoilt, count=100, bf="3", b_strategy="0", g="10")
     found = _frames(tmp_path / "v.mp4", 2.2)
     monkeypatch.setattr(seeking, "_open_at_key_frame", lambda *_: None)
     _assert_same(found, _frames(tmp_path / "v.mp4", 2.2))

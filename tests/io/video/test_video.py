@@ -18,6 +18,7 @@ from lanebev.io.images.pixels import read_image, write_png
 from lanebev.io.lanes import read_lanes
 from lanebev.io.opening import open_source
 from lanebev.io.video.writer import VideoWriter
+from tests.io.video.damaged import write_damaged
 
 
 def _picture(value, height=48, width=64):
@@ -209,28 +210,6 @@ def test_a_damaged_stretch_of_a_video_does_not_end_it(tmp_path):
     assert [frame.number for frame in frames] == list(range(len(frames)))
 
 
-def _damaged(path, spoilt, count=16, **options):
-    """A video of noise with some packets, in the order of the file, overwritten; their frames' numbers."""
-    noise = np.random.default_rng(0)
-    with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
-        stream = container.add_stream("libx264", rate=25)
-        stream.width, stream.height, stream.pix_fmt, stream.options = 64, 48, "yuv420p", options
-        for _ in range(count):
-            image = noise.integers(0, 255, (48, 64, 3), dtype=np.uint8)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        container.mux(stream.encode())
-    with av.open(str(path)) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size]
-        places = [(packets[i].pos, packets[i].size) for i in spoilt]
-        order = sorted(packet.pts for packet in packets)
-        numbers = [order.index(packets[i].pts) for i in spoilt]
-    data = bytearray(path.read_bytes())
-    for start, size in places:
-        data[start : start + size] = b"\xff" * size
-    path.write_bytes(data)
-    return sorted(numbers)
-
-
 @pytest.mark.parametrize(
     ("spoilt", "options"),
     [
@@ -239,7 +218,7 @@ def _damaged(path, spoilt, count=16, **options):
     ],
 )
 def test_every_frame_of_a_damaged_video_has_its_row_and_time(tmp_path, spoilt, options):
-    numbers = _damaged(tmp_path / "v.mp4", spoilt, **options)
+    numbers = write_damaged(tmp_path / "v.mp4", spoilt, **options)
     source = open_source(str(tmp_path / "v.mp4"))
     frames = list(source)
     assert source.count == len(frames) == 16
@@ -269,7 +248,7 @@ def test_half_a_jpeg_in_a_video_is_a_frame_without_image(tmp_path, suffix):
 
 
 def test_a_cut_video_says_so(tmp_path):
-    _damaged(tmp_path / "v.mp4", (), count=20)
+    write_damaged(tmp_path / "v.mp4", (), count=20)
     path = tmp_path / "v.mp4"
     assert open_source(str(path)).problem == ""
     with av.open(str(path)) as container:
@@ -284,7 +263,7 @@ def test_a_cut_video_says_so(tmp_path):
 
 def test_a_cut_matroska_says_so(tmp_path):
     path = tmp_path / "v.mkv"
-    _damaged(path, (), count=20)
+    write_damaged(path, (), count=20)
     assert open_source(str(path)).problem == ""
     with av.open(str(path)) as container:
         end = [packet.pos + packet.size for packet in container.demux(video=0) if packet.size][11]
