@@ -44,7 +44,7 @@ def read_record(folder: str | Path, camera: str | Path | None = None) -> RunReco
             )
     lens = Camera.from_file(folder / CALIBRATION) if (folder / CALIBRATION).is_file() else None
     if camera is not None:
-        given = Camera.from_file(camera)
+        given = Camera.from_file(camera, None if lens is None else lens.image_size)
         if lens is not None and lens.fingerprint() != given.fingerprint():
             raise ValueError(
                 f"camera {camera}: expected the run's, which is in {folder / CALIBRATION}, got another; "

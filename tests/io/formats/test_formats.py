@@ -461,6 +461,13 @@ def test_another_camera_than_the_runs_is_refused(tmp_path):
         read_record(folder, camera)
 
 
+def test_a_camera_that_states_no_size_is_that_of_the_runs_images(tmp_path):
+    folder, camera = _folder(tmp_path), Camera.from_parameters(330, 335, 207, 118, 416, 240)
+    camera.to_file(folder / "calibration.yaml")
+    (tmp_path / "K.txt").write_text("330 0 207\n0 335 118\n0 0 1\n")
+    assert read_record(folder, tmp_path / "K.txt").camera.fingerprint() == camera.fingerprint()
+
+
 def test_names_of_formats():
     assert parse_formats("mcap, parquet,mcap") == ("mcap", "parquet")
     with pytest.raises(ValueError, match="got 'xml'"):
