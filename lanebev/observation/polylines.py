@@ -187,7 +187,7 @@ def _without_edges(line: LaneLine, width: int) -> LaneLine:
     x = line.points[:, 0]
     at_edge = x[(x < _BESIDE_EDGE) | (x > width - 1 - _BESIDE_EDGE)]
     values, counts = np.unique(at_edge, return_counts=True)
-    moved = np.isin(x, values[counts > 1]) | _repeats_end(line.points)
+    moved = np.isin(x, values[counts > 1]) | (line.points == 0).all(-1) | _repeats_end(line.points)
     return line._replace(points=np.column_stack([np.where(moved, np.nan, x), line.points[:, 1]]))
 
 

@@ -20,6 +20,7 @@ _LEFT = 0.42  # fraction of the width; lines of smaller images have their middle
 _HIGH_HORIZON = 0.33  # fraction of the height; lines of smaller images meet above it
 _REACHED_UNCROPPED = 0.85  # fraction of the height that lanes with a horizon so high must reach
 _HIGHEST_HORIZON = 0.28  # fraction of the height above the horizon
+_ABOVE, _MOST_ABOVE = 0.1, 0.1  # fraction of the height above the horizon, and of points that lie there
 _LOOKED_AT = 50  # frames, for the horizon
 _LEAST_SPREAD = 0.01  # sum of squares of the lines' slopes about their mean, px per row
 _REACHED_DOWN = 0.55  # lanes reach below this fraction of the height, where the horizon is
@@ -199,6 +200,12 @@ def _doubt_of_points(frames: Sequence[FrameLines], image_size: tuple[int, int]) 
             f"they meet at row {horizon:.0f}, below all of their points; are rows counted from below, or in "
             "another order than the points?",
             "count them from the image's first row",
+        )
+    if (y < horizon - _ABOVE * height).mean() > _MOST_ABOVE:
+        return SizeDoubt(
+            f"{(y < horizon).mean():.0%} of the points lie above row {horizon:.0f}, where they meet; are "
+            "lines drawn on beyond the road?",
+            "leave out what is above it",
         )
     centre = float(np.nanmean([column, 0.5 * (x.min() + x.max())]))  # at the left of larger images
     low = y.max() < _REACHED * height and x.max() < _REACHED * width and centre < _LEFT * width

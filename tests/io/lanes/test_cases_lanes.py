@@ -291,6 +291,14 @@ def test_lanes_of_their_images_get_no_remark():
     assert size_remark(bonnet, (720, 1280)) == ""
 
 
+@pytest.mark.parametrize(("top", "share"), [(0.0, "42%"), (250.0, "")])
+def test_lines_that_go_on_above_the_horizon_are_noticed(top, share):
+    lines = [LaneLine(line) for line in _lines(np.arange(705.0, top, -10.0))]
+    remark = size_remark([FrameLines("0.png", lines)], (720, 1280))
+    assert remark.startswith(f"lanes: {share} of the points lie above row 300, where they" if share else "")
+    assert bool(remark) == bool(share)
+
+
 def _moved(entries, right, down):
     shift = np.array([right, down])
     return [

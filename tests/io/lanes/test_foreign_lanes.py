@@ -118,6 +118,16 @@ def test_lines_that_are_vertical_or_become_so_are_whole(x):
     assert vertices_from_lines([LaneLine(drawn, 2)], CAMERA).weight.sum() == 21
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_point_in_the_corner_is_padding(order):
+    padded = [np.concatenate([line[::order], [[0.0, 0.0]]]) for line in (LEFT, RIGHT)]
+    found, expected = (
+        vertices_from_lines([LaneLine(line) for line in each], CAMERA) for each in (padded, [LEFT, RIGHT])
+    )
+    np.testing.assert_array_equal(found.points, expected.points)
+    np.testing.assert_array_equal(found.weight, expected.weight)
+
+
 def test_zeros_where_a_detector_sees_no_line_are_missing():
     with_zeros = LEFT.copy()
     with_zeros[5:9, 0] = 0.0
