@@ -41,6 +41,9 @@ _KITTI_SIZES = {  # focal length of the rectified cameras of each recording day 
     707.0912: (370, 1226),
     718.856: (376, 1241),
 }
+KITTI_CAMERAS = 4
+"""Most cameras of KITTI's, of which the left colour camera is the usual one; others' files have more."""
+
 _KITTI_SPREAD = 8  # px, more than rectified images of one camera differ by
 
 
@@ -56,7 +59,7 @@ def kitti_cameras(text: str, image_size: tuple[int, int] | None) -> Readers:
     """
     lines = (line.split(":", 1) for line in text.splitlines() if ":" in line)
     entries = once((name.strip(), values) for name, values in lines if name.strip()[:1] in ("P", "S"))
-    names = [f"P_rect_{i:02d}" for i in (2, 3, 0, 1)] + [f"P{i}" for i in (2, 3, 0, 1)]
+    names = [kind.format(i) for kind in ("P_rect_{:02d}", "P{}") for i in (2, 3, 0, 1, *range(4, 10))]
     found = {name: partial(_kitti, entries, name, image_size) for name in names if name in entries}
     if not found:
         raise ValueError(

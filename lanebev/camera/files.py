@@ -12,7 +12,14 @@ import numpy as np
 import yaml
 
 from lanebev.camera.choice import Readers, chosen, split_name
-from lanebev.camera.datasets import colmap_cameras, colmap_text, is_colmap, is_kitti, kitti_cameras
+from lanebev.camera.datasets import (
+    KITTI_CAMERAS,
+    colmap_cameras,
+    colmap_text,
+    is_colmap,
+    is_kitti,
+    kitti_cameras,
+)
 from lanebev.camera.formats import opencv_or_ros, stereo_cameras, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
 from lanebev.camera.parsing import bare_numbers, is_ros_ini, parse_documents
@@ -91,7 +98,8 @@ def read_camera(
         if is_colmap(text):
             camera = checked(chosen(colmap_cameras(text), name, has_usual=False))
         elif is_kitti(text) or (kind == ".txt" and "width" not in text and not bare):
-            camera = checked(chosen(kitti_cameras(text, image_size), name, has_usual=True))
+            found = kitti_cameras(text, image_size)
+            camera = checked(chosen(found, name, has_usual=len(found) <= KITTI_CAMERAS))
         else:
             fields = arrays or bare
             camera = _camera_of([fields] if fields else parse_documents(text), image_size, rectified, name)

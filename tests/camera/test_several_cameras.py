@@ -127,6 +127,17 @@ def test_of_cameras_in_no_order_one_must_be_chosen(tmp_path, write, names, place
     assert Camera.from_file(_write(tmp_path, write(800, 800, 800))).intrinsics[0, 0] == 800
 
 
+def test_of_more_cameras_than_kittis_one_must_be_chosen(
+    tmp_path,
+):  # Waymo's in KITTI's format: P0 is in front
+    path = _write(tmp_path, _kitti(800, 810, 820, 830, 840))
+    with pytest.raises(
+        ValueError, match="expected one camera, got 5: P2, P3, P0, P1, P4; choose one as FILE#P2"
+    ):
+        Camera.from_file(path, image_size=(720, 1280))
+    assert Camera.from_file(f"{path}#P4", image_size=(720, 1280)).intrinsics[0, 0] == 840
+
+
 def test_fields_of_a_lens_have_no_camera_of_rectified_images():
     lens = {"camera_model": "pinhole", "distortion_model": "radtan", "distortion_coeffs": [-0.1, 0, 0, 0]}
     fields = {**lens, "intrinsics": [800, 800, 640, 360], "resolution": [1280, 720]}
