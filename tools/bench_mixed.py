@@ -16,7 +16,6 @@ from random import Random
 from typing import NamedTuple
 
 import torch
-from jsonargparse import auto_cli
 from jsonargparse.typing import PositiveInt
 from torch import Tensor
 
@@ -24,6 +23,7 @@ from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.testing.moments import CAMERA, PLACES, WIDTH, Change, Moment, drift, observe
 from lanebev.testing.motions import Motion, Pose, moved, sinusoids, suspension
 from lanebev.types import Status
+from train.commands import command_parser, one_line_errors
 
 FIRST_SEED = 1000
 SECONDS = 10.0
@@ -258,7 +258,7 @@ def row(name: str, errors: Sequence[Errors]) -> str:
     return f"| {name} | {len(errors)} | {nees:.2f} | {' '.join(f'{100 * one:.1f}' for one in within)} |"
 
 
-def print_mixed(drives: PositiveInt = 60, first: int = FIRST_SEED) -> None:
+def print_mixed(drives: int, first: int) -> None:
     """Measure the joint calibrator on drives drawn at random.
 
     Args:
@@ -279,9 +279,13 @@ def print_mixed(drives: PositiveInt = 60, first: int = FIRST_SEED) -> None:
         print(row(f"seed {seeds[k]}: {what}", found[k : k + 1]))
 
 
+@one_line_errors()
 def main() -> None:
-    """Run from the command line."""
-    auto_cli(print_mixed)
+    parser = command_parser(__doc__)
+    parser.add_argument("--drives", type=PositiveInt, default=60, help="number of drives (%(default)s)")
+    words = "seed of the first drive (%(default)s)"
+    parser.add_argument("--first", type=int, default=FIRST_SEED, metavar="SEED", help=words)
+    print_mixed(**vars(parser.parse_args()))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Compare exported files with PyTorch on a video.
+"""Compare exported files with PyTorch on a video: ``python -m tools.compare_onnx VIDEO --camera FILE``.
 
 With ``--what step`` the step: poses and views, each with its own state. With ``--what run`` the rows of
 ``extrinsics.csv`` by ``lanebev run --backend onnxruntime`` and by PyTorch. Files that are missing in DIR are

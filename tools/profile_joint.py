@@ -17,13 +17,13 @@ from types import FrameType
 from typing import Any
 
 import torch
-from jsonargparse import auto_cli
 from jsonargparse.typing import PositiveInt
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves
 
 import lanebev
 from tools.bench_speed.calibration import calibrators
+from train.commands import command_parser, one_line_errors
 
 _PACKAGE = str(Path(lanebev.__file__).parent)
 
@@ -113,7 +113,7 @@ def bandwidth(megabytes: int) -> float:
     return 2e6 * megabytes / min(times)
 
 
-def print_profile(rows: PositiveInt = 256, segments: PositiveInt = 408, runs: PositiveInt = 10) -> None:
+def print_profile(rows: int, segments: int, runs: int) -> None:
     """Print a frame's time by function.
 
     Args:
@@ -130,9 +130,15 @@ def print_profile(rows: PositiveInt = 256, segments: PositiveInt = 408, runs: Po
         print(f"{bandwidth(size):8.0f} GB/s of tensors of {size} MB")
 
 
+@one_line_errors()
 def main() -> None:
-    """Run from the command line."""
-    auto_cli(print_profile)
+    parser = command_parser(__doc__)
+    parser.add_argument("--rows", type=PositiveInt, default=256, help="rows of the batch (%(default)s)")
+    words = "segments of each row, on six boundaries (%(default)s)"
+    parser.add_argument("--segments", type=PositiveInt, default=408, help=words)
+    words = "runs, of which the smallest time of each operation counts (%(default)s)"
+    parser.add_argument("--runs", type=PositiveInt, default=10, help=words)
+    print_profile(**vars(parser.parse_args()))
 
 
 if __name__ == "__main__":
