@@ -18,9 +18,18 @@ _NEAREST = 1.0  # s between a frame and the nearest speed, at most
 _FASTEST = 100.0  # m/s
 _SPEED = ("speed", "velocity", "vel", "v", "vf")  # words of a column's title
 _TIME = ("time", "timestamp", "stamp", "t")
-_SPEED_UNITS = {"km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6, "mph": 0.44704, "kn": 1852 / 3600}
-_TIME_UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-_UNKNOWN = ("", "nan", "none", "null")
+_SPEED_UNITS = {
+    **dict.fromkeys(("km/h", "kmh", "kph", "kmph", "km", "km/hr", "kmhr"), 1 / 3.6),
+    **dict.fromkeys(("mph", "mi/h", "miles"), 0.44704),
+    **dict.fromkeys(("kn", "kt", "kts", "knot", "knots"), 1852 / 3600),
+    "ft/s": 0.3048,
+}
+_TIME_UNITS = {
+    **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "µs", "usec", "micros", "microseconds"), 1e-6),
+    **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), 1e-9),
+}
+_UNKNOWN = ("", "nan", "none", "null", "-1", "-1.0")  # phones write -1
 _FORM = "expected a speed in each line, or time and speed, or a first line of titles that names them"
 
 
@@ -48,6 +57,14 @@ class Speeds(NamedTuple):
             is_near = np.abs(self.times - time).min() <= _NEAREST
             speed = float(np.interp(time, self.times, self.speeds)) if is_near else math.nan
         return speed if math.isfinite(speed) else None
+
+    def without(self, times: NDArray[np.float64]) -> int:
+        """Return how many of these times of frames (N,) s have no speed near them."""
+        if self.times is None:
+            return 0
+        after = np.searchsorted(self.times, times).clip(1, max(len(self.times) - 1, 1))
+        around = self.times[np.stack([after - 1, after]).clip(0, len(self.times) - 1)]
+        return int((np.abs(around - times).min(0) > _NEAREST).sum())
 
 
 def read_speeds(path: str | Path) -> Speeds:
@@ -130,7 +147,8 @@ def _column(titles: list[str], names: Sequence[str], units: Mapping[str, float])
     Raises:
         ValueError: there are several.
     """
-    words = [re.findall(r"[a-zµ]+(?:/[a-z]+)?", title.lower()) for title in titles]
+    apart = [re.sub(r"(?<=[a-z])(?=[A-Z])", "_", title).lower() for title in titles]  # speedKmh
+    words = [re.findall(r"[a-zµ]+(?:/[a-z]+)?", title) for title in apart]
     found = [place for place, each in enumerate(words) if set(each) & set(names)]
     if len(found) > 1:
         several = ", ".join(titles[place] for place in found)

@@ -52,6 +52,18 @@ def test_speeds_are_those_of_the_whole_source(data, tmp_path):
     assert frames_of(data)[0].speed is None
 
 
+def test_speeds_of_other_times_are_noticed(data, tmp_path):
+    path = tmp_path / "speed.csv"
+    path.write_text("time,speed\n0,5\n1000,5\n2000,5\n3000,5\n")  # ms
+    remark = "speed: 4 of 6 frames have none within a second; are its times in seconds?"
+    config = RunConfig(str(data / "images"), str(data / "camera.yaml"), speed=str(path), fps=1.0)
+    assert make_source(config).problem.endswith(remark)
+    path.write_text("time,speed\n0,5\n1,5\n2,5\n3,5\n4,5\n5,5\n")
+    assert "speed" not in make_source(config).problem
+    with pytest.raises(ValueError, match="expected times in seconds, got numbers of the 6 frames; write tit"):
+        frames_of(data, speed=str(path), fps=30.0)
+
+
 def test_speeds_that_do_not_fit_are_one_line(capsys, data, tmp_path):
     wrong, later = tmp_path / "wrong.txt", tmp_path / "later.csv"
     wrong.write_text("5\n6\n")

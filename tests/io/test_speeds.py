@@ -33,6 +33,11 @@ def read(tmp_path):
         ),
         "time_ns v\n0 10\n100000000 11\n200000000 13\n",
         "t,speed_mph\n0,22.369363\n0.1,24.606299\n0.2,29.080172\n",
+        "timestampMillis,vehicleSpeedKmh\n0,36\n100,39.6\n200,46.8\n",
+        "Time (usec),Speed (OBD)(km/hr)\n0,36\n100000,39.6\n200000,46.8\n",
+        "t speed_kmph\n0 36\n0.1 39.6\n0.2 46.8\n",
+        "t speed_km_h\n0 36\n0.1 39.6\n0.2 46.8\n",
+        "t,speed_knots\n0,19.438445\n0.1,21.382289\n0.2,25.269978\n",
         "\ufefftime,speed\n0,10\n0.1,11\n0.2,13\n",
     ],
 )
@@ -49,6 +54,17 @@ def test_a_speed_for_each_frame(read, text):
     found = read(text)
     assert found.times is None
     assert [found.at(number, 100.0) for number in range(4)] == [10.0, pytest.approx(11.0), None, None]
+
+
+def test_a_speed_that_a_phone_does_not_know(read):
+    np.testing.assert_array_equal(read("time,speed\n0,-1\n1,-1.0\n2,-1.2\n").speeds, [np.nan, np.nan, -1.2])
+
+
+def test_how_many_frames_have_no_speed_near_them():
+    times = np.array([-1.5, -0.5, 0.0, 2.5, 3.5, 6.0, 6.5])
+    assert Speeds(np.ones(3), np.array([0.0, 1.0, 5.0])).without(times) == 4
+    assert Speeds(np.ones(1), np.array([0.0])).without(times) == 5
+    assert Speeds(np.ones(7)).without(times) == 0
 
 
 def test_a_speed_between_two_and_beside_them():

@@ -30,6 +30,7 @@ from lanebev.report.run_folder import RunFolder
 from lanebev.signals import handlers_kept
 
 _RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")  # in topics of ROS's image_proc, which P is of
+_MOST_WITHOUT = 0.5  # fraction of the frames, that may be without speed
 _LONG_STEP = 5  # s between frames, in which a pose has nothing to do with the one before
 
 
@@ -49,9 +50,9 @@ def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
         return _stream(config, selection)
     found = _opened(config.source, config.topic, config.frame_rate)
     remarks = [] if config.stills else [each for each in _remarks_on_drive(config, found) if each]
-    said = [*filter(None, [found.problem]), *(f"{config.source}: {each}" for each in remarks)]
     speeds = _speeds(config, found)
-    source = replace(found, selection=selection, problem="; ".join(said), speeds=speeds)
+    said = [found.problem, *(f"{config.source}: {each}" for each in remarks), _speeds_remark(speeds, found)]
+    source = replace(found, selection=selection, problem="; ".join(filter(None, said)), speeds=speeds)
     if selection != ALL and not may_take_none and not source.taken_count:
         last = source.times[-1] if source.times else float(source.count / source.fps)
         raise ValueError(
@@ -115,7 +116,24 @@ def _speeds(config: RunConfig, source: FrameSource) -> Speeds | None:
             f"speed {config.speed}: expected times since the first frame, 0 to {last:.2f} s, got "
             f"{speeds.times[0]:.12g} to {speeds.times[-1]:.12g}; subtract the first frame's time"
         )
+    are_numbers = speeds.times is not None and np.array_equal(
+        np.diff(speeds.times), np.ones(source.count - 1)
+    )
+    if are_numbers and last < 0.5 * source.count:
+        raise ValueError(
+            f"speed {config.speed}: expected times in seconds, got numbers of the {source.count} frames; "
+            "write titles, as frame,speed"
+        )
     return speeds
+
+
+def _speeds_remark(speeds: Speeds | None, source: FrameSource) -> str:
+    """Return a remark if most frames have no speed near them in time; else nothing."""
+    times = np.array(source.times or [float(number / source.fps) for number in range(source.count)])
+    without = 0 if speeds is None else speeds.without(times)
+    if without <= _MOST_WITHOUT * len(times):
+        return ""
+    return f"speed: {without} of {len(times)} frames have none within a second; are its times in seconds?"
 
 
 def source_of_run(source: str, run: RunFolder) -> FrameSource:
