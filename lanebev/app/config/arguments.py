@@ -8,7 +8,7 @@ from typing import NoReturn
 
 from lanebev import __version__
 from lanebev.app.config.export import ExportConfig
-from lanebev.app.config.options import parse_path
+from lanebev.app.config.options import parse_path, parsed
 from lanebev.app.config.run import RunConfig
 from lanebev.io.formats.names import FORMATS
 
@@ -143,7 +143,7 @@ def _add_fleet(fleet: argparse.ArgumentParser) -> None:
     words = "drives per worker at a time, whose frames the network takes as one batch (default %(default)s)"
     fleet.add_argument("--batch", type=_at_least(1), default=1, metavar="N", help=words)
     words = "fraction of a GPU per worker, with device: cuda in the manifest (default %(default)s)"
-    fleet.add_argument("--gpus", type=float, default=0.0, metavar="FRACTION", help=words)
+    fleet.add_argument("--gpus", type=_named(float), default=0.0, metavar="FRACTION", help=words)
     words = "folder outside which no path may be (default: that of the manifest)"
     fleet.add_argument("--root", type=_PATH, metavar="DIR", help=words)
     words = "length of the parts into which longer videos are cut, for several workers (default: not cut)"
@@ -197,16 +197,14 @@ def _add_setting(parser: argparse._ActionsContainer, setting: Field[object]) -> 
 
 def _named(parse: Callable[[str], object]) -> Callable[[str], object]:
     """Return the same function with its ValueError turned into argparse's error."""
-    if parse in (float, int):
-        return parse
 
-    def parsed(text: str) -> object:
+    def argument(text: str) -> object:
         try:
-            return parse(text)
+            return parsed(parse, text)
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from error
 
-    return parsed
+    return argument
 
 
 _PATH = _named(parse_path)

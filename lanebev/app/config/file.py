@@ -9,10 +9,10 @@ from pathlib import Path
 
 import yaml
 
+from lanebev.app.config.options import parsed
 from lanebev.app.config.run import RunConfig
 from lanebev.numbers import read_text
 
-_NUMBERS: dict[object, str] = {float: "a number", int: "a whole number"}
 _FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 
 
@@ -117,9 +117,4 @@ def _parsed(value: object, default: object, parse: Callable[[str], object]) -> o
         value = ",".join(map(str, value))  # of names
     if not isinstance(value, (str, int, float)):
         raise ValueError(f"expected a text or number, got {value!r}")
-    try:
-        return parse(str(value))
-    except ValueError as error:
-        if parse in _NUMBERS:
-            raise ValueError(f"expected {_NUMBERS[parse]}, got {value!r}") from error
-        raise
+    return parsed(parse, str(value))

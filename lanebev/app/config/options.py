@@ -22,6 +22,19 @@ _TYPES: dict[str, tuple[type | tuple[type, ...], str]] = {
 _MOST_CELLS = 4096  # pixels a side of the bird's-eye view, which H.264 encodes
 
 
+def parsed(parse: Callable[[str], object], text: str) -> object:
+    """Return a setting by its text.
+
+    Raises:
+        ValueError: the text is none of it.
+    """
+    try:
+        return parse(text)
+    except ValueError as error:
+        expected = {float: "a number", int: "a whole number"}.get(parse)  # type: ignore[call-overload]
+        raise ValueError(f"expected {expected}, got {text!r}" if expected else str(error)) from error
+
+
 def parse_path(text: str) -> str:
     """Return a path, with the home folder in place of ~, which shells leave in quotes and after =.
 
