@@ -54,8 +54,8 @@ class Speeds(NamedTuple):
         if self.times is None:
             speed = float(self.speeds[number]) if number < len(self.speeds) else math.nan
         else:
-            is_near = np.abs(self.times - time).min() <= _NEAREST
-            speed = float(np.interp(time, self.times, self.speeds)) if is_near else math.nan
+            is_far = self.without(np.array([time]))
+            speed = math.nan if is_far else float(np.interp(time, self.times, self.speeds))
         return speed if math.isfinite(speed) else None
 
     def without(self, times: NDArray[np.float64]) -> int:
