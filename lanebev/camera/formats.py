@@ -145,7 +145,8 @@ def with_sides(fields: Mapping[str, Any]) -> Mapping[str, Any]:
     Raises:
         ValueError: the list is none of two sides, and perhaps a number of channels.
     """
-    given = next((key for key in fields if _spelled(key) in _SIDES_KEYS and fields[key] is not None), None)
+    lists = (key for key, value in fields.items() if isinstance(value, list | Mapping))
+    given = next((key for key in lists if _spelled(key) in _SIDES_KEYS), None)
     if given is None or any(fields.get(key) is not None for key in (*_WIDTH_KEYS, *_HEIGHT_KEYS)):
         return fields
     rest = {key: value for key, value in fields.items() if key != given}

@@ -195,8 +195,8 @@ def _repeats_end(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Tell which points (P, 2) have the x of a line's end on rows beyond it, as ``numpy.interp`` makes them.
 
     They are two or more of one x on evenly spaced rows, along which the line would move by more than a pixel
-    if it went on as before; a curve becomes vertical by and by. Of whole numbers they are three or more, and
-    the line moves so from row to row, since rounding repeats x too.
+    if it went on as before; a curve becomes vertical by and by, and a line on a grid is so elsewhere too. Of
+    whole numbers they are three or more, and it moves so from row to row, since rounding repeats x.
     """
     found = np.zeros(len(points), dtype=bool)
     there = np.flatnonzero(np.isfinite(points).all(-1))
@@ -207,7 +207,7 @@ def _repeats_end(points: NDArray[np.float64]) -> NDArray[np.bool_]:
         if not whole < same < len(steps) - 1 or not np.ptp(rows[: same + 2]) < _EVEN < rows[0]:
             continue
         before, earlier = steps[same : same + 2]
-        if before * (1 if whole else same) > 1.0 and before > _ABRUPT * earlier:
+        if before * (1 if whole else same) > 1.0 and before > _ABRUPT * earlier > 0:
             found[own[: same + 1]] = True
     return found
 

@@ -89,7 +89,7 @@ LIKE_OPENLANE = {"intrinsic": _matrix(1000, 960, 540), "width": 1920, "height": 
         (AUTOWARE, "", (2183, 2185, 940, 567, 1920, 1080, LENS)),
         (ZOD_FRONT, "", (1900, 1902, 1920, 1084, 3848, 2168, KANNALA_BRANDT, "fisheye")),
         (
-            {**LIKE_OPENLANE, "dist_coefs": [], "distance": 5, "undistorted": 1},
+            {**LIKE_OPENLANE, "dist_coefs": [], "distance": 5, "undistorted": 1, "resolution": 0.1},
             "",
             (1000, 1002, 960, 540, 1920, 1080, ()),
         ),

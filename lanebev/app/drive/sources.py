@@ -129,8 +129,10 @@ def _speeds(config: RunConfig, source: FrameSource) -> Speeds | None:
 
 def _speeds_remark(speeds: Speeds | None, source: FrameSource) -> str:
     """Return a remark if most frames have no speed near them in time; else nothing."""
+    if speeds is None:
+        return ""
     times = np.array(source.times or [float(number / source.fps) for number in range(source.count)])
-    without = 0 if speeds is None else speeds.without(times)
+    without = speeds.without(times)
     if without <= _MOST_WITHOUT * len(times):
         return ""
     return f"speed: {without} of {len(times)} frames have none within a second; are its times in seconds?"

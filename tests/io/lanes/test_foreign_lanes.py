@@ -109,6 +109,7 @@ def test_points_that_repeat_the_x_of_a_lines_end_are_missing(shift, order):
         [500, 500, 502, 506, 512, 520],
         [500.5, 500.5, 502.4, 506.1, 511.9, 519.8],
         [500.5, 500.5, 500.6, 500.8, 501.0, 501.2],
+        [500.5, 500.5, 508.5, 508.5, 516.5, 516.5],  # of a grid
     ],
 )
 def test_lines_that_are_vertical_or_become_so_are_whole(x):
