@@ -102,6 +102,11 @@ def read_camera(
             camera = checked(chosen(found, name, has_usual=len(found) <= KITTI_CAMERAS))
         else:
             fields = arrays or bare
+            if image_size is None and (bare or kind == ".npy"):
+                raise ValueError(
+                    "expected the size of the images too, got numbers alone; write fx, fy, cx, cy, width and "
+                    "height as YAML"
+                )
             camera = _camera_of([fields] if fields else parse_documents(text), image_size, rectified, name)
             of_ini = _OF_INI if camera.model == "fisheye" and is_ros_ini(text) else ""
             of_matrix = _OF_MATRIX if fields and not fields.get("D", True) else ""

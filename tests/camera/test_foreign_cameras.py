@@ -634,6 +634,8 @@ def test_a_camera_matrix_alone_is_read_for_images_of_a_given_size(tmp_path, name
     )
     with pytest.raises(ValueError, match="principal point 408, 245 is not in the middle of 1280 x 720 px"):
         Camera.from_file(tmp_path / name, image_size=(720, 1280))
+    with pytest.raises(ValueError, match="expected the size of the images too, got numbers alone; write fx,"):
+        Camera.from_file(tmp_path / name)
     np.save(tmp_path / "frames.npy", np.zeros((9, 9)))
     with pytest.raises(ValueError, match="camera_matrix: expected 9 numbers, got 10"):
         Camera.from_file(tmp_path / "frames.npy", image_size=(480, 800))
