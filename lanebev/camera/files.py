@@ -20,12 +20,21 @@ from lanebev.camera.datasets import (
     is_kitti,
     kitti_cameras,
 )
-from lanebev.camera.formats import opencv_or_ros, stereo_cameras, without_lens
+from lanebev.camera.formats import opencv_or_ros, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
 from lanebev.camera.parsing import bare_numbers, is_ros_ini, parse_documents
-from lanebev.camera.programs import depthai_cameras, gyroflow, matlab, metashape, nerf, realsense
+from lanebev.camera.programs import (
+    depthai_cameras,
+    gyroflow,
+    matlab,
+    metashape,
+    nerf,
+    open3d,
+    realsense,
+)
 from lanebev.camera.reconstruction import openmvg_cameras, opensfm_cameras
 from lanebev.camera.records import record_cameras
+from lanebev.camera.several import named_cameras, stereo_cameras
 from lanebev.camera.slam import (
     as_kalibr,
     camodocal,
@@ -43,6 +52,7 @@ _BY_KEY = {
     "fl_x": nerf,
     "ppx": realsense,
     "projection": metashape,
+    "intrinsic_matrix": open3d,
 }
 _OF_INI = (
     "it states four coefficients and no lens model; they are taken as k1 k2 k3 k4 of a fisheye, as ROS "
@@ -186,7 +196,7 @@ def _unordered_cameras(content: Any, image_size: tuple[int, int] | None, rectifi
     """Return what reads the cameras of a file that has them in no order; nothing of other files."""
     finders = (opensfm_cameras, openmvg_cameras, depthai_cameras)
     found = (record_cameras(content, image_size, rectified), *(find(content) for find in finders))
-    return next(filter(None, found), {})
+    return next(filter(None, found), {}) or named_cameras(content, rectified, image_size)
 
 
 def _ordered_cameras(

@@ -1,8 +1,7 @@
 """Camera files of OpenCV, of its Python tutorial, of ROS, and our short YAML."""
 
 import re
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from typing import Any
 
 from lanebev.camera.named_lens import LENS_NAMES, stated_lens
@@ -10,21 +9,24 @@ from lanebev.camera.parameters import CameraParameters, centre_offset, checked
 from lanebev.camera.parsing import mapping, number, numbers, once, whole_number
 from lanebev.numbers import shown
 
-_MATRIX_KEYS = ("camera_matrix", "K", "mtx")
+MATRIX_KEYS = ("camera_matrix", "K", "mtx")
 _LENS_LISTS = ("distortion_coefficients", "D", "dist", "dist_coeff", "dist_coeffs")
 DISTORTION_KEYS = (*_LENS_LISTS, "Distortion_Coefficients", "distCoeffs", "d")
 _PROJECTION_KEYS = ("projection_matrix", "P")
 _ROTATION_KEYS = ("rectification_matrix", "R")
 _WIDTH_KEYS = ("image_width", "width")
 _HEIGHT_KEYS = ("image_height", "height")
-_SIDES_KEYS = ("image_size", "img_size", "image_shape", "img_shape", "resolution")  # of both
+_SIDES_KEYS = ("image_size", "img_size", "image_shape", "img_shape", "resolution", "camera_resolution")
 _MODEL_KEYS = ("distortion_model", "camera_model", "model", "DistModel")
 _LENS_KEYS = ("distortion", *_LENS_LISTS)
+SHARED_KEYS = (*_WIDTH_KEYS, *_HEIGHT_KEYS, *_SIDES_KEYS, *_MODEL_KEYS)
+"""Keys that may be those of several cameras of a file."""
+
 _SHORT_KEYS = {
     "fx", "fy", "cx", "cy", *_WIDTH_KEYS, *_HEIGHT_KEYS, *_LENS_KEYS, *LENS_NAMES["pinhole"], *_MODEL_KEYS,
 }  # fmt: skip
 _KNOWN_KEYS = {
-    *_MATRIX_KEYS, *_LENS_LISTS, *_PROJECTION_KEYS, *_ROTATION_KEYS, *_WIDTH_KEYS, *_HEIGHT_KEYS,
+    *MATRIX_KEYS, *_LENS_LISTS, *_PROJECTION_KEYS, *_ROTATION_KEYS, *_WIDTH_KEYS, *_HEIGHT_KEYS,
     *_MODEL_KEYS, *LENS_NAMES["pinhole"], "fisheye_model", "binning_x", "binning_y", "roi", "xi",
 }  # fmt: skip
 _SPELLED = {key.replace("_", "").lower(): key for key in (*_SHORT_KEYS, *_KNOWN_KEYS, *_SIDES_KEYS)}
@@ -61,11 +63,6 @@ _ALSO = {  # other programs' names of these, with _ for blanks and hyphens
     "kannalabrandt8": "fisheye",
     "pinhole_equi": "fisheye",
 }
-_STEREO = [  # keys of matrix and coefficients of both cameras, as of OpenCV's stereo_calib
-    [(f"{matrix}{side}", f"{lens}{side}") for side in sides]
-    for matrix, lens in (("M", "D"), ("K", "D"), ("cameraMatrix", "distCoeffs"))
-    for sides in ("12", "LR")
-]
 _OF_NO_MODEL = (
     "it states four coefficients and no lens model; they are taken as k1 k2 p1 p2 of a pinhole camera: "
     "if it is a fisheye, add model: fisheye"
@@ -97,11 +94,11 @@ def opencv_or_ros(
     Raises:
         ValueError: an unknown key, or a value that no real camera has.
     """
-    fields = once((_spelled(key), value) for key, value in fields.items())
+    fields = once((spelled(key), value) for key, value in fields.items())
     short = not {"fx", "fy", "cx", "cy"}.isdisjoint(fields)
     fields = with_sides(fields)
     unknown = sorted(set(fields) - (_SHORT_KEYS if short else _KNOWN_KEYS))
-    if not (short or {*_MATRIX_KEYS, *_PROJECTION_KEYS}.isdisjoint(fields)):
+    if not (short or {*MATRIX_KEYS, *_PROJECTION_KEYS}.isdisjoint(fields)):
         unknown = [*filter(_OF_CAMERA.match, unknown)]
     if unknown:
         known = "fx, fy, cx, cy, width, height, distortion, model"
@@ -114,7 +111,7 @@ def opencv_or_ros(
     if rectified:
         camera = CameraParameters(_projection(fields), [], "pinhole", size)
         return _as_taken(checked(camera, _restates(fields)), fields)
-    matrix = numbers(fields, *_MATRIX_KEYS, count=9)
+    matrix = numbers(fields, *MATRIX_KEYS, count=9)
     model = stated_model(fields)
     distortion = stated_lens(fields, DISTORTION_KEYS, model) or numbers(fields, *DISTORTION_KEYS)
     if fields.get("xi") is not None:
@@ -131,7 +128,7 @@ def opencv_or_ros(
     return _as_taken(checked(camera, _restates(fields)), fields)
 
 
-def _spelled(key: str) -> str:
+def spelled(key: str) -> str:
     """Return a key as it is known, for one in any case, with underscores or not."""
     return _SPELLED.get(key.replace("_", "").lower(), key)
 
@@ -146,7 +143,7 @@ def with_sides(fields: Mapping[str, Any]) -> Mapping[str, Any]:
         ValueError: the list is none of two sides, and perhaps a number of channels.
     """
     lists = (key for key, value in fields.items() if isinstance(value, list | Mapping))
-    given = next((key for key in lists if _spelled(key) in _SIDES_KEYS), None)
+    given = next((key for key in lists if spelled(key) in _SIDES_KEYS), None)
     if given is None or any(fields.get(key) is not None for key in (*_WIDTH_KEYS, *_HEIGHT_KEYS)):
         return fields
     rest = {key: value for key, value in fields.items() if key != given}
@@ -158,24 +155,10 @@ def with_sides(fields: Mapping[str, Any]) -> Mapping[str, Any]:
     if fields.get("cx") is not None:
         matrix = [0.0, 0.0, number(fields, "cx"), 0.0, 0.0, number(fields, "cy")]
     else:
-        matrix = numbers(fields, *_MATRIX_KEYS, count=9)
+        matrix = numbers(fields, *MATRIX_KEYS, count=9)
     first, second = map(round, sides[:2])
     height, width = min((second, first), (first, second), key=lambda size: centre_offset(matrix, size))
     return {**rest, "width": width, "height": height}
-
-
-def stereo_cameras(
-    fields: Mapping[str, Any], rectified: bool, image_size: tuple[int, int] | None
-) -> dict[str, Callable[[], CameraParameters]]:
-    """Return what reads the cameras of OpenCV's stereo calibration, the left one first; nothing of others.
-
-    Their names are those of their matrices.
-    """
-    pair = next((each for each in _STEREO if all(key in fields for keys in each for key in keys)), [])
-    shared = (*_WIDTH_KEYS, *_HEIGHT_KEYS, *_SIDES_KEYS, *_MODEL_KEYS)
-    of_both = {key: value for key, value in fields.items() if _spelled(key) in shared}
-    own = {matrix: {**of_both, "K": fields[matrix], "D": fields[lens]} for matrix, lens in pair}
-    return {name: partial(opencv_or_ros, each, rectified, image_size) for name, each in own.items()}
 
 
 def _of_images(fields: Mapping[str, Any], rectified: bool, image_size: tuple[int, int]) -> CameraParameters:
@@ -228,7 +211,7 @@ def _restates(fields: Mapping[str, Any]) -> bool:
     """Tell whether P = [K | 0] and R = I, which state no rectification."""
     try:
         rotation = numbers(fields, *_ROTATION_KEYS, count=9)
-        return rotation == _IDENTITY and _projection(fields) == numbers(fields, *_MATRIX_KEYS, count=9)
+        return rotation == _IDENTITY and _projection(fields) == numbers(fields, *MATRIX_KEYS, count=9)
     except ValueError:
         return False
 

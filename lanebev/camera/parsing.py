@@ -165,14 +165,16 @@ def _yaml_fault(error: Exception, text: str, has_document: bool) -> str:
 def bare_numbers(text: str) -> dict[str, Any] | None:
     """Return the fields of a text of numbers alone; None if it is another.
 
-    Nine are a camera matrix, whose last one is 1; four, eight or nine others are fx fy cx cy and the
-    coefficients, as DROID-SLAM has them.
+    Nine are a camera matrix, whose last one is 1, and twelve that of a projection matrix; four, eight or nine
+    others are fx fy cx cy and the coefficients, as DROID-SLAM has them.
     """
     words = [word for word in _AROUND_NUMBERS.split(text) if word] if len(text) <= _MOST_BARE else []
     try:
         values = [*map(float, words)]
     except ValueError:
         return None
+    if len(words) == 12:  # of a projection matrix
+        del words[3::4], values[3::4]
     if len(values) == 9 and values[8] == 1.0:
         return {"K": words, "D": []}
     if len(values) in (4, 8, 9):

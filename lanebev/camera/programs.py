@@ -1,4 +1,4 @@
-"""Camera files of MATLAB, Gyroflow, instant-ngp and Nerfstudio, librealsense, DepthAI and Metashape."""
+"""Camera files of MATLAB, Gyroflow, instant-ngp and Nerfstudio, librealsense, Open3D, DepthAI, Metashape."""
 
 import re
 from collections.abc import Mapping
@@ -100,6 +100,21 @@ def realsense(fields: Mapping[str, Any]) -> CameraParameters:
     fx, fy, cx, cy = (number(fields, key) for key in ("fx", "fy", "ppx", "ppy"))
     size = (whole_number(fields, "height"), whole_number(fields, "width"))
     return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, "pinhole", size)
+
+
+def open3d(fields: Mapping[str, Any]) -> CameraParameters:
+    """Read the intrinsics of Open3D, whose matrix is given column by column, also row by row.
+
+    Raises:
+        ValueError: other keys, such as of a lens, which Open3D does not have.
+    """
+    if unknown := sorted(set(fields) - {"intrinsic_matrix", "width", "height"}):
+        raise ValueError(f"expected intrinsic_matrix, width and height of Open3D, got {shown(unknown[0])}")
+    matrix = numbers(fields, "intrinsic_matrix", count=9)
+    if not (matrix[2] or matrix[5]):
+        matrix = [*matrix[0::3], *matrix[1::3], *matrix[2::3]]
+    size = (whole_number(fields, "height"), whole_number(fields, "width"))
+    return CameraParameters(matrix, [], "pinhole", size)
 
 
 def depthai_cameras(content: Any) -> Readers:

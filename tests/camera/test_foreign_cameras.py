@@ -624,6 +624,7 @@ def test_binary_files_say_how_to_write_them_as_texts(tmp_path, name, data, words
         ("K.json", json.dumps(MATRIX)),
         ("K.txt", str(np.array(MATRIX))),
         ("K.txt", "633 0 408; 0 633 245; 0 0 1"),
+        ("P.txt", "633 0 408 -380.5 0 633 245 0 0 0 1 0.01"),
     ],
 )
 def test_a_camera_matrix_alone_is_read_for_images_of_a_given_size(tmp_path, name, text):
@@ -655,6 +656,15 @@ def test_a_line_of_numbers_has_the_focal_lengths_the_principal_point_and_the_len
         {"image_size": [800, 480]},
         {"imgSize": [480, 800]},
         {"image_shape": [480, 800, 3]},
+        {
+            "camera_resolution": {
+                "type_id": "opencv-matrix",
+                "rows": 2,
+                "cols": 1,
+                "dt": "d",
+                "data": [480.0, 800.0],
+            }
+        },
         {"resolution": {"width": 800, "height": 480}},
     ],
 )

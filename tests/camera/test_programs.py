@@ -1,4 +1,4 @@
-"""Camera files of MATLAB and Gyroflow."""
+"""Camera files of MATLAB, Gyroflow and Open3D."""
 
 import json
 
@@ -46,6 +46,19 @@ def test_matlabs_camera_intrinsics(tmp_path):
     own = {"FocalLength": [900, 905], "PrincipalPoint": [641, 361], "RadialDistortion": [0, 0]}
     camera = _read(tmp_path, {**MATLAB, **own, "K": None})
     assert camera.intrinsics.tolist() == [[900, 0, 640], [0, 905, 360], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    "matrix", [[440.7, 0, 0, 0, 440.5, 0, 354.8, 232.1, 1], [[440.7, 0, 354.8], [0, 440.5, 232.1], [0, 0, 1]]]
+)
+def test_open3ds_matrix_is_given_column_by_column(tmp_path, matrix):
+    fields = {"height": 480, "intrinsic_matrix": matrix, "width": 720}
+    (tmp_path / "c.json").write_text(json.dumps(fields))
+    expected = Camera.from_parameters(440.7, 440.5, 354.8, 232.1, 720, 480)
+    assert Camera.from_file(tmp_path / "c.json").fingerprint() == expected.fingerprint()
+    (tmp_path / "c.json").write_text(json.dumps({**fields, "dist": [0.1, 0, 0, 0]}))
+    with pytest.raises(ValueError, match="expected intrinsic_matrix, width and height of Open3D, got 'dist'"):
+        Camera.from_file(tmp_path / "c.json")
 
 
 def test_a_lens_profile_of_gyroflow(tmp_path):

@@ -54,7 +54,18 @@ USUAL = [  # with the names of three cameras, the usual one first
     (_raw_kitti, ("P_rect_02", "P_rect_00", "P_rect_01"), (2, 0, 1)),
     (_orb_slam, ("Camera1", "Camera2"), (0, 1)),
 ]
+
+
+def _named(*focals):
+    cameras = [
+        {"K": [[f, 0, 640], [0, f, 360], [0, 0, 1]], "D": [], "width": 1280, "height": 720} for f in focals
+    ]
+    named = dict(zip(("CAM_1", "CAM_2", "CAM_3"), cameras, strict=False))
+    return json.dumps({"cameras": named} if len(focals) > 2 else named)
+
+
 UNUSUAL = [
+    (_named, ("CAM_1", "CAM_2", "CAM_3"), (0, 1, 2)),
     (_colmap, ("1", "2", "3"), (0, 1, 2)),
     (_nuscenes, ("a1", "b2", "c3"), (0, 1, 2)),
 ]
