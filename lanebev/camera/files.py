@@ -100,7 +100,9 @@ def read_camera(
     try:
         arrays = _arrays(path) if kind in (".npz", ".npy") else None
         # comments and names may be in other encodings: they are not needed
-        text = colmap_text(path) if kind == ".bin" else "" if arrays else read_text(path, "replace")
+        text = (
+            colmap_text(path) if kind == ".bin" else "" if arrays is not None else read_text(path, "replace")
+        )
         bare = bare_numbers(text)
     except ValueError as error:
         raise ValueError(f"camera file {path}: expected a readable camera file, got: {error}") from error
@@ -111,13 +113,15 @@ def read_camera(
             found = kitti_cameras(text, image_size)
             camera = checked(chosen(found, name, has_usual=len(found) <= KITTI_CAMERAS))
         else:
-            fields = arrays or bare
+            fields = bare if arrays is None else arrays
             if image_size is None and (bare or kind == ".npy"):
                 raise ValueError(
                     "expected the size of the images too, got numbers alone; write fx, fy, cx, cy, width and "
                     "height as YAML"
                 )
-            camera = _camera_of([fields] if fields else parse_documents(text), image_size, rectified, name)
+            camera = _camera_of(
+                parse_documents(text) if fields is None else [fields], image_size, rectified, name
+            )
             of_ini = _OF_INI if camera.model == "fisheye" and is_ros_ini(text) else ""
             of_matrix = _OF_MATRIX if fields and not fields.get("D", True) else ""
             camera = camera._replace(remark="; ".join(filter(None, (camera.remark, of_ini, of_matrix))))
@@ -129,12 +133,13 @@ def read_camera(
 def _arrays(path: Path) -> dict[str, Any]:
     """Return the arrays of NumPy's ``savez``, but for those of the views of a calibration.
 
-    The array of ``save`` is a camera matrix.
+    That of ``save`` is a camera matrix or a projection matrix.
     """
     try:
         if path.suffix.lower() == ".npy":
             array = np.load(path, mmap_mode="r", allow_pickle=False)
-            return {"K": array.ravel()[:10].tolist(), "D": []}
+            values = array.ravel()[:13].tolist()
+            return bare_numbers(" ".join(map(str, values))) or {"K": values[:10], "D": []}
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name].tolist() for name in arrays.files if name not in _VIEWS}
     except Exception as error:  # zipfile and NumPy raise many kinds for damaged bytes

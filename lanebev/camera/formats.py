@@ -17,6 +17,7 @@ _ROTATION_KEYS = ("rectification_matrix", "R")
 _WIDTH_KEYS = ("image_width", "width")
 _HEIGHT_KEYS = ("image_height", "height")
 _SIDES_KEYS = ("image_size", "img_size", "image_shape", "img_shape", "resolution", "camera_resolution")
+_LEAST_SIDE = 16  # px; a list of smaller numbers is no size of images
 _MODEL_KEYS = ("distortion_model", "camera_model", "model", "DistModel")
 _LENS_KEYS = ("distortion", *_LENS_LISTS)
 SHARED_KEYS = (*_WIDTH_KEYS, *_HEIGHT_KEYS, *_SIDES_KEYS, *_MODEL_KEYS)
@@ -137,7 +138,7 @@ def with_sides(fields: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the fields with a width and a height in place of a list of both.
 
     OpenCV has the width first, NumPy the height: it is the order in which the principal point is nearer to
-    the middle.
+    the middle. Of three numbers the smallest is that of channels, which PyTorch has first.
 
     Raises:
         ValueError: the list is none of two sides, and perhaps a number of channels.
@@ -150,13 +151,15 @@ def with_sides(fields: Mapping[str, Any]) -> Mapping[str, Any]:
     if isinstance(fields[given], Mapping) and "width" in fields[given]:
         return {**rest, **fields[given]}
     sides = numbers(fields, given)
-    if len(sides) not in (2, 3) or min(sides) <= 0:
+    if len(sides) == 3:
+        sides.remove(min(sides))
+    if len(sides) != 2 or min(sides) < _LEAST_SIDE:
         raise ValueError(f"{given}: expected width and height, got {shown(fields[given])}")
     if fields.get("cx") is not None:
         matrix = [0.0, 0.0, number(fields, "cx"), 0.0, 0.0, number(fields, "cy")]
     else:
         matrix = numbers(fields, *MATRIX_KEYS, count=9)
-    first, second = map(round, sides[:2])
+    first, second = map(round, sides)
     height, width = min((second, first), (first, second), key=lambda size: centre_offset(matrix, size))
     return {**rest, "width": width, "height": height}
 

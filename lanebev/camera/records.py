@@ -5,6 +5,7 @@ Each is a record with the camera matrix under a name of the data set's or the pr
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -63,6 +64,7 @@ _LENS_KEYS = (
 _LIKE_LENS = re.compile(  # with words before it, but "undistorted" is none
     r"([a-z]+_)*?(dist(?!ance|ribut|.*(model|type|std))|radial|tangential|[kp][1-6]$)", re.IGNORECASE
 )
+_BEFORE_DIST = re.compile(r"([a-z]+_)+dist", re.IGNORECASE)  # of one number it is a distance
 _PLACES = ("calib", "cameras")  # keys below which ONCE and A2D2 have their cameras
 
 
@@ -102,8 +104,10 @@ def _named_numbers(record: Record) -> Record | None:
 
 def _check_lens_keys(record: Record) -> None:
     """Raise if a lens is stated under a name that is not known, so that it would not count."""
-    for key in record:
-        if _LIKE_LENS.match(key) and key not in (*_LENS_KEYS, *LENS_NAMES["pinhole"]) and record[key]:
+    for key, value in record.items():
+        known = key in (*_LENS_KEYS, *LENS_NAMES["pinhole"])
+        is_other = _BEFORE_DIST.match(key) and not isinstance(value, list | Mapping)
+        if value and not known and _LIKE_LENS.match(key) and not is_other:
             raise ValueError(
                 f"distortion: expected k1 k2 p1 p2 k3 under this key, got {shown(key)}; rename it"
             )
@@ -150,7 +154,8 @@ def _size(
     if layout.sides:
         width, height = numbers(record, layout.sides, count=2)
         return round(height), round(width)
-    record = with_sides({**record, "cx": matrix[2], "cy": matrix[5]})
+    with suppress(ValueError):  # of a list that is no size, such as that of a map
+        record = with_sides({**record, "cx": matrix[2], "cy": matrix[5]})
     sides = (("height", "image_height"), ("width", "image_width"))
     if all(any(record.get(key) is not None for key in keys) for keys in sides):
         return whole_number(record, *sides[0]), whole_number(record, *sides[1])

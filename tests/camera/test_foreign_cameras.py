@@ -640,8 +640,9 @@ def test_a_camera_matrix_alone_is_read_for_images_of_a_given_size(tmp_path, name
     np.save(tmp_path / "frames.npy", np.zeros((9, 9)))
     with pytest.raises(ValueError, match="camera_matrix: expected 9 numbers, got 10"):
         Camera.from_file(tmp_path / "frames.npy", image_size=(480, 800))
-    np.save(tmp_path / "K.npy", MATRIX)
-    assert Camera.from_file(tmp_path / "K.npy", image_size=(480, 800)).remark == camera.remark
+    for matrix in (MATRIX, np.column_stack([MATRIX, [-380.5, 0.0, 0.01]])):
+        np.save(tmp_path / "K.npy", matrix)
+        assert Camera.from_file(tmp_path / "K.npy", image_size=(480, 800)).remark == camera.remark
 
 
 @pytest.mark.parametrize("lens", [[], [-0.3, 0.1, 0.001, 0.002], [-0.3, 0.1, 0.001, 0.002, 0.05]])
@@ -656,6 +657,7 @@ def test_a_line_of_numbers_has_the_focal_lengths_the_principal_point_and_the_len
         {"image_size": [800, 480]},
         {"imgSize": [480, 800]},
         {"image_shape": [480, 800, 3]},
+        {"image_shape": [3, 480, 800]},  # of PyTorch
         {
             "camera_resolution": {
                 "type_id": "opencv-matrix",
@@ -679,6 +681,27 @@ def test_a_list_of_both_sides_is_in_the_order_in_which_the_principal_point_is_in
     _is(_read(tmp_path / "c.json", json.dumps(short)), *expected)
     record = {"camera_intrinsic": MATRIX, "camera_dist_coeffs": lens, **sides}  # as of R3LIVE
     _is(_read(tmp_path / "c.json", json.dumps(record)), *expected)
+
+
+@pytest.mark.parametrize(
+    "field",
+    [
+        {"resolution": [0.1, 0.1]},  # m, of a map
+        {"resolution": []},
+        {"img_shape": 6 * [[900, 1600, 3]]},  # of all cameras
+        {"max_dist": 50.0},
+        {"image_distorted": "a/b.jpg"},
+    ],
+)
+def test_other_fields_of_a_record_are_no_size_and_no_lens(tmp_path, field):
+    text = json.dumps({"intrinsic": MATRIX, **field})
+    _is(_read(tmp_path / "c.json", text, image_size=(480, 800)), 633, 633, 408, 245, 800, 480)
+
+
+def test_numpys_file_without_a_camera_says_so(tmp_path):
+    np.savez(tmp_path / "c.npz", rvecs=np.zeros(3))
+    with pytest.raises(ValueError, match=r"c\.npz: expected keys such as fx, .*, got none"):
+        Camera.from_file(tmp_path / "c.npz", image_size=(480, 800))
 
 
 @pytest.mark.parametrize("sides", [[800], [800, 0], [1, 2, 3, 4]])
