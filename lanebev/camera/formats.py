@@ -10,8 +10,8 @@ from lanebev.camera.parsing import mapping, number, numbers, once, whole_number
 from lanebev.numbers import shown
 
 MATRIX_KEYS = ("camera_matrix", "K", "mtx")
-_LENS_LISTS = ("distortion_coefficients", "D", "dist", "dist_coeff", "dist_coeffs")
-DISTORTION_KEYS = (*_LENS_LISTS, "Distortion_Coefficients", "distCoeffs", "d")
+_LENS_LISTS = ("distortion_coefficients", "D", "dist", "dist_coeff", "dist_coeffs", "distortion_coeffs")
+DISTORTION_KEYS = (*_LENS_LISTS, "distortion", "Distortion_Coefficients", "distCoeffs", "d")
 _PROJECTION_KEYS = ("projection_matrix", "P")
 _ROTATION_KEYS = ("rectification_matrix", "R")
 _WIDTH_KEYS = ("image_width", "width")
@@ -27,7 +27,7 @@ _SHORT_KEYS = {
     "fx", "fy", "cx", "cy", *_WIDTH_KEYS, *_HEIGHT_KEYS, *_LENS_KEYS, *LENS_NAMES["pinhole"], *_MODEL_KEYS,
 }  # fmt: skip
 _KNOWN_KEYS = {
-    *MATRIX_KEYS, *_LENS_LISTS, *_PROJECTION_KEYS, *_ROTATION_KEYS, *_WIDTH_KEYS, *_HEIGHT_KEYS,
+    *MATRIX_KEYS, *_LENS_KEYS, *_PROJECTION_KEYS, *_ROTATION_KEYS, *_WIDTH_KEYS, *_HEIGHT_KEYS,
     *_MODEL_KEYS, *LENS_NAMES["pinhole"], "fisheye_model", "binning_x", "binning_y", "roi", "xi",
 }  # fmt: skip
 _SPELLED = {key.replace("_", "").lower(): key for key in (*_SHORT_KEYS, *_KNOWN_KEYS, *_SIDES_KEYS)}

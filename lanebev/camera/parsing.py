@@ -294,9 +294,8 @@ def _opencv_data(name: str, value: Mapping[str, Any], count: int | None) -> tupl
     as_list = {key: field.split() if isinstance(field, str) else field for key, field in value.items()}
     shape = as_list.get("sizes") or [entry for key in ("rows", "cols") for entry in _flat(as_list.get(key))]
     sizes = finite_numbers(f"{name}.rows and .cols", _sequence(name, shape))
-    if not sizes:
-        raise ValueError(f"{name}: expected rows and cols, got neither")
-    return _sequence(name, as_list.get("data") or []), count or round(min(math.prod(sizes), 1e6))
+    data = _sequence(name, as_list.get("data") or [])
+    return data, count or (round(min(math.prod(sizes), 1e6)) if sizes else len(data))
 
 
 def _entries(rows: list[Any]) -> Iterator[Any]:

@@ -55,11 +55,9 @@ _LENS_KEYS = (
     *DISTORTION_KEYS,
     "camera_distortion",
     "camera_dist_coeffs",
-    "distortion",
     "Distortion",
     "cam_D",
     "DistCoeff",
-    "distortion_coeffs",
 )
 _LIKE_LENS = re.compile(  # with words before it, but "undistorted" is none
     r"([a-z]+_)*?(dist(?!ance|ribut|.*(model|type|std))|radial|tangential|[kp][1-6]$)", re.IGNORECASE

@@ -704,6 +704,21 @@ def test_numpys_file_without_a_camera_says_so(tmp_path):
         Camera.from_file(tmp_path / "c.npz", image_size=(480, 800))
 
 
+@pytest.mark.parametrize("key", ["distortion", "distortion_coeffs", "dist_coeffs"])
+def test_matrices_without_rows_and_other_names_of_coefficients(tmp_path, key):
+    lens = [-0.3, 0.1, 0.001, 0.002, 0.05]
+    entries = np.ravel(MATRIX).tolist()
+    fields = {"cameraMatrix": {"data": entries}, "width": 800, "height": 480}
+    for value in (lens, [lens], {"data": lens}):
+        camera = _read(tmp_path / "c.json", json.dumps({**fields, key: value}))
+        _is(camera, 633, 633, 408, 245, 800, 480, lens)
+    with pytest.raises(ValueError, match="camera_matrix: expected 9 numbers, got 8"):
+        _read(
+            tmp_path / "c.json",
+            json.dumps({**fields, "cameraMatrix": {"data": entries[:8]}, key: lens}),
+        )
+
+
 @pytest.mark.parametrize("sides", [[800], [800, 0], [1, 2, 3, 4]])
 def test_a_list_of_other_than_both_sides_is_refused(tmp_path, sides):
     with pytest.raises(ValueError, match="image_size: expected width and height, got"):
