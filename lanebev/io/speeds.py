@@ -20,16 +20,20 @@ _SPEED = ("speed", "velocity", "vel", "v", "vf")  # words of a column's title
 _TIME = ("time", "timestamp", "stamp", "t")
 _SPEED_UNITS = {
     **dict.fromkeys(("km/h", "kmh", "kph", "kmph", "km", "km/hr", "kmhr"), 1 / 3.6),
-    **dict.fromkeys(("mph", "mi/h", "miles"), 0.44704),
+    **dict.fromkeys(("mph", "mi/h", "mi/hr", "miles"), 0.44704),
     **dict.fromkeys(("kn", "kt", "kts", "knot", "knots"), 1852 / 3600),
-    "ft/s": 0.3048,
+    **dict.fromkeys(("ft/s", "ft", "fps"), 0.3048),
+    **dict.fromkeys(("cm/s", "cm"), 0.01),
+    **dict.fromkeys(("mm/s", "mm"), 0.001),
 }
+_SPREAD = {"accuracy", "std", "stddev", "sigma", "error", "uncertainty"}  # in titles of other columns
 _TIME_UNITS = {
     **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), 1e-3),
     **dict.fromkeys(("us", "µs", "usec", "micros", "microseconds"), 1e-6),
     **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), 1e-9),
 }
-_UNKNOWN = ("", "nan", "none", "null", "-1", "-1.0")  # phones write -1
+_NO_NUMBER = ("", "nan", "none", "null")
+_UNKNOWN = ("-1", "-1.0")  # speeds that phones write
 _FORM = "expected a speed in each line, or time and speed, or a first line of titles that names them"
 
 
@@ -73,7 +77,8 @@ def read_speeds(path: str | Path) -> Speeds:
     Its columns are separated by commas, semicolons, tabs or spaces. Without titles it has one column, a speed
     (m/s) for each frame, or two, time (s since the source's first frame) and speed. Titles name the columns:
     ``speed`` and, if there is one, ``time``, among others, with another unit than m/s and s in them, such as
-    ``speed_kmh`` and ``time_ms``. A speed that is empty or ``nan`` is not known.
+    ``speed_kmh`` and ``time_ms``; they may be in a comment, as of ``numpy.savetxt``. A speed that is empty,
+    ``nan`` or -1 is not known.
 
     Raises:
         ValueError: the file cannot be read, or is no such table.
@@ -85,13 +90,32 @@ def read_speeds(path: str | Path) -> Speeds:
 
 
 def _rows(text: str) -> list[list[str]]:
-    """Return the cells of each line; with semicolons between them, numbers may have decimal commas."""
-    lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
-    delimiter = next((sign for sign in ";\t," if lines and sign in lines[0]), None)
-    if delimiter is None:
-        return [line.split() for line in lines]
-    cells = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
-    return [[cell.strip().replace(",", ".") for cell in row] for row in cells]
+    """Return the cells of each line; with semicolons between them, numbers may have decimal commas.
+
+    Lines that begin with # are left out, but for titles above the numbers, as by ``numpy.savetxt``.
+    """
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    first = next((place for place, line in enumerate(lines) if line[0] != "#"), len(lines))
+    table = [line for line in lines[first:] if line[0] != "#"]
+    numbers = table[min(1, len(table) - 1)] if table else ""
+    above = [lines[first - 1].lstrip("# ")] if first else []
+    delimiter = next((sign for sign in ";\t," if sign in numbers), None)
+    if delimiter is not None:
+        cells = csv.reader([*above, *table], delimiter=delimiter, skipinitialspace=True)
+        rows = [[cell.strip().replace(",", ".") for cell in row] for row in cells]
+    elif " " in numbers:
+        rows = [line.split() for line in (*above, *table)]
+    else:
+        rows = [[line] for line in (*above, *table)]
+    return rows if not above or _are_titles(rows[0], rows[1:2]) else rows[1:]
+
+
+def _are_titles(cells: list[str], below: list[list[str]]) -> bool:
+    """Tell whether a comment above a table names its columns."""
+    if not below or len(cells) != len(below[0]) or not all(map(_is_number, below[0])):
+        return False
+    words = set().union(*map(_words, cells))
+    return not words.isdisjoint(_SPEED) and (len(cells) == 1 or not words.isdisjoint(_TIME))
 
 
 def _speeds_of(rows: list[list[str]]) -> Speeds:
@@ -104,16 +128,15 @@ def _speeds_of(rows: list[list[str]]) -> Speeds:
             f"expected {len(first)} columns as in the first line, got {' '.join(uneven)[:100]!r}"
         )
     if titles is not None:
-        (time, seconds), (speed, metres) = (
-            _column(titles, _TIME, _TIME_UNITS),
-            _column(titles, _SPEED, _SPEED_UNITS),
-        )
+        speed, metres = _column(titles, _SPEED, _SPEED_UNITS)
+        time, seconds = _column(titles, _TIME, _TIME_UNITS) if len(titles) > 1 else (None, 1.0)
     else:
         time, speed = {1: (None, 0), 2: (0, 1)}.get(len(first), (None, None))
         seconds = metres = 1.0
     if speed is None:
         raise ValueError(f"{_FORM}, got {' '.join(first)[:100]!r}")
-    speeds = metres * np.array([_number(row[speed]) for row in rows])
+    cells = [row[speed] for row in rows]
+    speeds = metres * np.array([math.nan if cell in _UNKNOWN else _number(cell) for cell in cells])
     if (fastest := np.nanmax(np.abs(speeds), initial=0.0)) > _FASTEST:
         raise ValueError(f"expected m/s up to {_FASTEST:g}, got {fastest:g}; name another unit, as speed_kmh")
     if time is None:
@@ -125,7 +148,7 @@ def _speeds_of(rows: list[list[str]]) -> Speeds:
 
 
 def _number(cell: str) -> float:
-    if cell.lower() in _UNKNOWN:
+    if cell.lower() in _NO_NUMBER:
         return math.nan
     try:
         return float(cell)
@@ -147,12 +170,17 @@ def _column(titles: list[str], names: Sequence[str], units: Mapping[str, float])
     Raises:
         ValueError: there are several.
     """
-    apart = [re.sub(r"(?<=[a-z])(?=[A-Z])", "_", title).lower() for title in titles]  # speedKmh
-    words = [re.findall(r"[a-zµ]+(?:/[a-z]+)?", title) for title in apart]
-    found = [place for place, each in enumerate(words) if set(each) & set(names)]
+    words = [*map(_words, titles)]
+    found = [place for place, each in enumerate(words) if set(each) & set(names) and not set(each) & _SPREAD]
     if len(found) > 1:
         several = ", ".join(titles[place] for place in found)
         raise ValueError(f"expected one column of {names[0]}, got {several}; leave the others out")
     if not found:
         return None, 1.0
     return found[0], next((units[word] for word in words[found[0]] if word in units), 1.0)
+
+
+def _words(title: str) -> list[str]:
+    """Return the words of a title in lower case, such as "speed" and "kmh" of speedKmh."""
+    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", title).lower()
+    return re.findall(r"[a-zµ]+(?:/[a-z]+)?", apart)

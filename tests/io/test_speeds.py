@@ -39,6 +39,10 @@ def read(tmp_path):
         "t speed_km_h\n0 36\n0.1 39.6\n0.2 46.8\n",
         "t,speed_knots\n0,19.438445\n0.1,21.382289\n0.2,25.269978\n",
         "\ufefftime,speed\n0,10\n0.1,11\n0.2,13\n",
+        "# of NumPy\n# speed_kmh time\n36 0\n39.6 0.1\n46.8 0.2\n",
+        "# vehicle speed\n0 10\n0.1 11\n0.2 13\n",
+        "time,speedAccuracy,speed\n0,0.3,10\n0.1,0.3,11\n0.2,0.3,13\n",  # of a phone
+        "time,speed (cm/s)\n0,1000\n0.1,1100\n0.2,1300\n",
     ],
 )
 def test_times_and_speeds(read, text):
@@ -48,7 +52,14 @@ def test_times_and_speeds(read, text):
 
 
 @pytest.mark.parametrize(
-    "text", ["10\n11\nnan\n", "speed\n10\n11\nnan\n", "frame,speed_kmh\n0,36\n1,39.6\n2,\n"]
+    "text",
+    [
+        "10\n11\nnan\n",
+        "speed\n10\n11\nnan\n",
+        "frame,speed_kmh\n0,36\n1,39.6\n2,\n",
+        "Speed [km/h]\n36\n39.6\nnan\n",
+        "# speed_kmh\n36\n39.6\nnan\n",
+    ],
 )
 def test_a_speed_for_each_frame(read, text):
     found = read(text)
@@ -58,6 +69,10 @@ def test_a_speed_for_each_frame(read, text):
 
 def test_a_speed_that_a_phone_does_not_know(read):
     np.testing.assert_array_equal(read("time,speed\n0,-1\n1,-1.0\n2,-1.2\n").speeds, [np.nan, np.nan, -1.2])
+
+
+def test_a_time_a_second_before_the_first_frame(read):
+    np.testing.assert_array_equal(read("time,speed\n-1,10\n0,11\n").times, [-1.0, 0.0])
 
 
 def test_how_many_frames_have_no_speed_near_them():
