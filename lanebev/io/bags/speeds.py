@@ -27,13 +27,13 @@ def bag_speeds(path: Path, images: str, topic: str) -> Speeds:
             names = ", ".join(sorted(found)) or "none"
             raise ValueError(f"bag {path}: expected speeds on {topic}, got them on: {names}")
         speed = attrgetter(SPEED_TYPES[found[topic]])
-        start = next(_time(*message) for message in bag.messages(images))
-        rows = sorted((_time(*each) - start, float(speed(each[1]))) for each in bag.messages(topic))
+        first = next(bag.messages(images))
+        rows = sorted((_seconds_after(first, each), float(speed(each[1]))) for each in bag.messages(topic))
     times, speeds = np.array(rows).T
     return Speeds(speeds, times)
 
 
-def _time(logged: int, message: Any) -> float:
-    """Return a message's own time, s, or else that of its recording (ns)."""
-    stamp = message_stamp(message)
-    return 1e-9 * logged if stamp is None else stamp
+def _seconds_after(first: tuple[int, Any], later: tuple[int, Any]) -> float:
+    """Return the time between two messages, s, by their own times or else by those of their recording."""
+    start, end = message_stamp(first[1]), message_stamp(later[1])
+    return 1e-9 * (later[0] - first[0]) if start is None or end is None else end - start

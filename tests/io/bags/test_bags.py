@@ -579,15 +579,16 @@ def _moves(name, speed):
     ],
 )
 def test_the_vehicles_speed_is_on_a_topic(tmp_path, plugin, name, time):
-    """At its own time; a message without one at that of its recording."""
+    """At its own time; a message without one at that of its recording, here an hour after the images' own."""
+    start = START + 3600.0
     with Writer(tmp_path / "bag", version=9, storage_plugin=plugin) as writer:
         images = "sensor_msgs/msg/CompressedImage"
         connection = writer.add_connection("/image", images, typestore=STORE)
         for number in range(COUNT):
-            logged = round(1e9 * (START + 0.1 * number))
+            logged = round(1e9 * (start + 0.1 * number))
             writer.write(connection, logged, STORE.serialize_cdr(_compressed(number), images))
         connection = writer.add_connection("/odom", name, typestore=STORE)
-        writer.write(connection, round(1e9 * (START + 0.3)), STORE.serialize_cdr(_moves(name, 7.5), name))
+        writer.write(connection, round(1e9 * (start + 0.3)), STORE.serialize_cdr(_moves(name, 7.5), name))
     config = RunConfig(str(tmp_path / "bag"), "", speed_topic="/odom")
     source = make_source(config)
     assert source.speeds.times == pytest.approx([time], abs=1e-6)
