@@ -37,6 +37,7 @@ _OF_CAMERA = re.compile(  # words in keys that may say something of the lens or 
     r"offset_?[xy]|focal|skew|radial|tangential|rectified|^xi|^[kp]_?\d|^[wh]$)",
     re.IGNORECASE,
 )
+_OF_RECORD = re.compile(r"_?note|_?comment|rms|serial|.*(error|date|name)$", re.IGNORECASE)
 _MODELS = {
     "": "",  # a driver of an ideal camera leaves it empty
     "pinhole": "pinhole",
@@ -83,7 +84,8 @@ def opencv_or_ros(
 
     Keys are read in any case, with underscores or not. Beside a camera matrix, unknown ones are ignored as
     parts of a calibration's record, unless they may say something of the lens or the images. Coefficients
-    may not be missing, so that a misspelled key of theirs is an error.
+    may not be missing, so that a misspelled key of theirs is an error. Beside fx and fy only names, dates,
+    errors and notes are ignored.
 
     A file may state its matrix twice, in K and P, as our own writer does: then it is not a person's mistake.
 
@@ -99,7 +101,9 @@ def opencv_or_ros(
     short = not {"fx", "fy", "cx", "cy"}.isdisjoint(fields)
     fields = with_sides(fields)
     unknown = sorted(set(fields) - (_SHORT_KEYS if short else _KNOWN_KEYS))
-    if not (short or {*MATRIX_KEYS, *_PROJECTION_KEYS}.isdisjoint(fields)):
+    if short:
+        unknown = [key for key in unknown if _OF_CAMERA.match(key) or not _OF_RECORD.match(key)]
+    elif not {*MATRIX_KEYS, *_PROJECTION_KEYS}.isdisjoint(fields):
         unknown = [*filter(_OF_CAMERA.match, unknown)]
     if unknown:
         known = "fx, fy, cx, cy, width, height, distortion, model"

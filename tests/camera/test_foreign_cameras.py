@@ -719,6 +719,15 @@ def test_matrices_without_rows_and_other_names_of_coefficients(tmp_path, key):
         )
 
 
+def test_names_dates_and_errors_beside_the_focal_lengths_are_ignored(tmp_path):
+    fields = {"fx": 633, "fy": 633, "cx": 408, "cy": 245, "width": 800, "height": 480}
+    more = {"rms": 0.55, "camera_name": "front", "date": "2026-11-30", "reprojection_error": 0.2, "_note": ""}
+    _is(_read(tmp_path / "c.json", json.dumps({**fields, **more})), 633, 633, 408, 245, 800, 480)
+    for key in ("lens_name", "distorsion", "skew", "radial_error"):
+        with pytest.raises(ValueError, match=f"unknown key '{key}'"):
+            _read(tmp_path / "c.json", json.dumps({**fields, key: 1}))
+
+
 @pytest.mark.parametrize("sides", [[800], [800, 0], [1, 2, 3, 4]])
 def test_a_list_of_other_than_both_sides_is_refused(tmp_path, sides):
     with pytest.raises(ValueError, match="image_size: expected width and height, got"):
