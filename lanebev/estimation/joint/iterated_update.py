@@ -35,6 +35,7 @@ from lanebev.estimation.joint.scatter import (
     averaged_moments,
     boundary_scatter,
     renumbered_moments,
+    summed_places,
     updated_sensitivity,
     with_headings,
 )
@@ -155,6 +156,7 @@ def update_state(
         pose_sensitivity=scatter.sensitivity[..., :num],
         heading_sensitivity=updated_sensitivity(by_headings, gain, informed[0]),
         scatter=averaged_moments(scatter.moments, moments, dt, cfg.scatter_memory),
+        places=summed_places(scatter.places, last.at[:, NUM_COMMON:], predicted.places, shift, dt, cfg),
         vertical=vertical + (-dt / cfg.scatter_memory).exp().unsqueeze(-1) * predicted.vertical,
         motion_scale=motion_scale,
         reasons=flag(shift != 0, Reason.LANE_CHANGE),

@@ -1,5 +1,7 @@
 """The calibration that is given out: the pose, and its covariance with what the filter does not estimate."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -12,13 +14,15 @@ from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL
 from lanebev.estimation.joint.scatter import scatter_variance, shown_freedom, start_variance
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason
+from lanebev.geometry.linalg import cholesky, solve_lower
 from lanebev.geometry.road import lane_width_covariance
-from lanebev.tensors import constant
+from lanebev.tensors import constant, identity
 from lanebev.types import Calibration, Extrinsics
 
 _ONLY_HEIGHT = (0.0, 0.0, 0.0, 1.0)
 _ALWAYS_FIT = 3  # boundaries: some pose over equal lanes fits any three
-_CHANCE_FIT = 0.004  # probability that a further boundary fits though lanes are unequal
+_SCALES = (0.0, 0.15, 0.6, 2.4)  # possible sigmas of deviations, ratios to ``lane_deviation_std``
+_SHARES = (0.9, 1 / 30, 1 / 30, 1 / 30)  # their prior probabilities
 _MISFIT_FACTOR = 4.0  # the odds that a line bounds no lane are so much larger where other lines do not fit
 _EGO_LANE_SHARE = 0.2  # such a line's variance on the ego lane's boundaries, relative to that on the others
 _NO_BOUNDARY_RANGE = 3.6  # m; the position of such a line is uniform over it
@@ -53,7 +57,7 @@ def unverified_deviation(
     """Compute the variance (B, L) m² of each boundary's deviation where too few are in view to tell.
 
     Source: (J26). Three boundaries fit a pose of equal lanes, however unequal the lanes are; a fourth shows
-    whether they are, unless it deviates so much that it bounds no lane.
+    whether they are (:func:`learned_deviation`), unless it deviates so much that it bounds no lane.
 
     Args:
         sensitivity: (B, 4, L) change of the pose per metre of deviation of a boundary; 0 if not in view.
@@ -67,13 +71,33 @@ def unverified_deviation(
     in_view = (sensitivity[:, ROLL:].abs().amax(1) / _LEAST_SENSITIVITY).clamp(max=1.0) * fits
     further = (in_view.sum(-1) - _ALWAYS_FIT).clamp(min=0.0)
     of_three = (1 - further).clamp(min=0.0)
-    share = of_three.maximum(_CHANCE_FIT**further)
     if not cfg.lane_deviation_std:
         return torch.zeros_like(deviations)
     by_headings = of_headings * _HEADING_LENGTH**2
     odd = no_boundary_deviation(sensitivity[:, ROLL], roll, ~fits.all(-1), cfg)
-    of_any = (cfg.lane_deviation_std**2 + by_headings) * share
+    of_any = (cfg.lane_deviation_std**2 + by_headings) * of_three
     return of_any.unsqueeze(-1) + odd * of_three.unsqueeze(-1)
+
+
+def learned_deviation(places: Tensor, deviations: Tensor, cfg: JointConfig) -> Tensor:
+    """Compute the expected square (B,) m² of a boundary's deviation by what the frames so far tell of them.
+
+    Source: (J35), Bayesian model averaging over the standard deviation of the deviations.
+
+    Args:
+        places: (B, L, L + 1), information on the deviations, matrix and vector.
+        deviations: (B, L) m, by the filter; a boundary that bounds no lane tells nothing.
+        cfg: the configuration.
+    """
+    variances = constant(tuple((scale * cfg.lane_deviation_std) ** 2 for scale in _SCALES), like=places)
+    free = torch.where(deviations.abs() < _LARGEST_DEVIATION, 0.0, 1.0)  # m²
+    stds = (variances[:, None, None] + free).sqrt()  # (S, B, L)
+    matrix = stds.unsqueeze(-1) * places[..., :-1] * stds.unsqueeze(-2)
+    factor = cholesky(matrix + identity(places.shape[-2], places.dtype, places.device))
+    white = solve_lower(factor, (stds * places[..., -1]).unsqueeze(-1))
+    evidence = 0.5 * white.square().sum((-2, -1)) - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    weights = (evidence + constant(tuple(map(math.log, _SHARES)), like=places).unsqueeze(-1)).softmax(0)
+    return (weights * variances.unsqueeze(-1)).sum(0)
 
 
 def no_boundary_deviation(by_place: Tensor, roll: Tensor, misfit: Tensor, cfg: JointConfig) -> Tensor:
@@ -178,7 +202,8 @@ def covariance_by_boundaries(state: JointState, of_two: Tensor, cfg: JointConfig
     of_places, of_headings = scatter_variance(state.scatter).unbind(-1)
     by_place, by_heading = state.pose_sensitivity, state.heading_sensitivity[:, POSE]
     unverified = unverified_deviation(by_place, deviations, of_headings, state.mean[:, ROLL], cfg)
-    expected = single_deviation(deviations, cfg).unsqueeze(-1).maximum(unverified)
+    learned = learned_deviation(state.places, deviations, cfg)
+    expected = single_deviation(deviations, cfg).maximum(learned).unsqueeze(-1).maximum(unverified)
     of_places = of_places.unsqueeze(-1).maximum(beyond_filter(expected, variances))  # (B, L)
     of_headings = heading_variance(state, of_headings, of_two, cfg)[:, None, None]
     covariance = torch.bmm(of_places.unsqueeze(1) * by_place, by_place.mT)

@@ -116,6 +116,7 @@ def compare_with_frame(
         pose_sensitivity=scatter.sensitivity[..., : cfg.num_boundaries],
         heading_sensitivity=torch.cat([by_headings, begun.heading_sensitivity[:, NUM_POSE:]], dim=1),
         scatter=averaged_moments(scatter.moments, begun.scatter, assumed_step, cfg.scatter_memory),
+        places=scatter.places,
     )
     contrary = usable & is_contrary(state, begun, fit, places, seen, cfg)
     count = torch.where(usable, (state.contrary + 1) * contrary, state.contrary)

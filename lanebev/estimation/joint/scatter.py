@@ -44,10 +44,13 @@ class Scatter(NamedTuple):
         moments: (B, 2, L + 4), for deviations (m) and headings (rad): the estimates of the L boundaries; the
             sum of their squares minus that of noise; the sum of their noise variances; the degrees of freedom
             that the fit leaves (at most 2 L - 5 together); and 1, the frame's weight.
+        places: (B, L, L + 1), information on the deviations if boundaries are parallel, matrix (m⁻²) and
+            vector (m⁻¹), whatever the parameters are that all share.
     """
 
     sensitivity: Tensor
     moments: Tensor
+    places: Tensor
 
 
 def with_headings(
@@ -110,7 +113,9 @@ def boundary_scatter(matrix: Tensor, vector: Tensor, precision: Tensor, moments:
     found = found.unflatten(-1, (2, num))
     squares = found.square().sum(-1) - _NOISE_FACTOR * noise
     sums = torch.stack([squares, noise, freedom.diagonal(dim1=1, dim2=2)], dim=-1)
-    return Scatter(across[:, :NUM_POSE], pad(torch.cat([found, sums], dim=-1), (0, 1), value=1.0))
+    moments = pad(torch.cat([found, sums], dim=-1), (0, 1), value=1.0)
+    places = torch.cat([left[:, :num, :num], pull[:, :num]], dim=-1)
+    return Scatter(across[:, :NUM_POSE], moments, places)
 
 
 def averaged_moments(now: Tensor, before: Tensor, dt: Tensor, memory: float) -> Tensor:
@@ -151,6 +156,28 @@ def renumbered_moments(moments: Tensor, shift: Tensor) -> Tensor:
     """Shift the estimates of each boundary in moments (B, 2, L + 4) by (B,) lanes, -1, 0 or 1."""
     own = shifted(moments[..., :_SQUARES], shift)
     return torch.cat([own, moments[..., _SQUARES:]], dim=-1)
+
+
+def summed_places(
+    now: Tensor, at: Tensor, before: Tensor, shift: Tensor, dt: Tensor, cfg: JointConfig
+) -> Tensor:
+    """Sum the information (B, L, L + 1) on the boundaries' deviations from equal lanes over the frames.
+
+    Source: (J35).
+
+    Args:
+        now: of this frame, on changes of the deviations.
+        at: (B, L) m, the deviations where it was linearised.
+        before: so far.
+        shift: (B,) lanes, -1, 0 or 1, since then.
+        dt: (B,) s since then.
+        cfg: the configuration.
+    """
+    matrix, pull = now[..., :-1], now[..., -1]
+    now = torch.cat([matrix, (pull + times_vector(matrix, at)).unsqueeze(-1)], dim=-1)
+    rows = shifted(before.mT, shift).mT
+    before = torch.cat([shifted(rows[..., :-1], shift), rows[..., -1:]], dim=-1)
+    return now + (-dt / cfg.motion.deviation_memory).exp()[:, None, None] * before
 
 
 def shown_freedom(moments: Tensor) -> Tensor:

@@ -60,6 +60,7 @@ def new_state(mean: Tensor, cov: Tensor, status: Status, reasons: Tensor) -> Joi
         pose_sensitivity=zero(NUM_POSE, num),
         heading_sensitivity=zero(mean.shape[-1], num),
         scatter=zero(2, num + 4),
+        places=zero(num, num + 1),
         motion_scale=mean.new_ones(batch, NUM_POSE),
         hills=zero(),
         vertical=zero(2),

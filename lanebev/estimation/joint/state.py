@@ -25,6 +25,8 @@ class JointState(NamedTuple):
         heading_sensitivity: (B, D, L) change of the mean by each boundary's own heading (per rad) that lasts.
         scatter: (B, 2, L + 4) moments of the boundaries' own deviations and headings in the last frames, see
             :func:`~lanebev.estimation.joint.scatter.averaged_moments`.
+        places: (B, L, L + 1) information on the boundaries' deviations from equal lanes, matrix and vector,
+            of the frames so far, see (J35).
         motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, adapted to the drive.
         hills: (B,) 1/m², variance of the road's vertical curvature beyond that of a plane road, by the crests
             and dips so far (J21).
@@ -47,6 +49,7 @@ class JointState(NamedTuple):
     pose_sensitivity: Tensor
     heading_sensitivity: Tensor
     scatter: Tensor
+    places: Tensor
     motion_scale: Tensor
     hills: Tensor
     vertical: Tensor

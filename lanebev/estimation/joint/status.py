@@ -54,6 +54,7 @@ def update_track_status(
         cov=select_rows(supported, updated.cov, predicted.cov),
         motion_scale=select_rows(supported, updated.motion_scale, predicted.motion_scale),
         scatter=select_rows(supported, updated.scatter, predicted.scatter),
+        places=select_rows(supported, updated.places, predicted.places),
         vertical=select_rows(supported, updated.vertical, predicted.vertical),
         pose_sensitivity=torch.where(determined, sensitivity, predicted.pose_sensitivity),
         heading_sensitivity=select_rows(
