@@ -62,6 +62,10 @@ def test_speeds_of_other_times_are_noticed(data, tmp_path):
     assert "speed" not in make_source(config).problem
     with pytest.raises(ValueError, match="expected times in seconds, got numbers of the 6 frames; write tit"):
         frames_of(data, speed=str(path), fps=30.0)
+    path.write_text("time,speed\n0,5\n")
+    image = str(data / "images" / "*0.png")
+    config = RunConfig(image, str(data / "camera.yaml"), speed=str(path))
+    assert [frame.speed for frame in make_source(config)] == [5.0]
 
 
 def test_speeds_that_do_not_fit_are_one_line(capsys, data, tmp_path):

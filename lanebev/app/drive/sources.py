@@ -119,7 +119,7 @@ def _speeds(config: RunConfig, source: FrameSource) -> Speeds | None:
     are_numbers = speeds.times is not None and np.array_equal(
         np.diff(speeds.times), np.ones(source.count - 1)
     )
-    if are_numbers and last < 0.5 * source.count:
+    if are_numbers and source.count > 2 and last < 0.5 * source.count:
         raise ValueError(
             f"speed {config.speed}: expected times in seconds, got numbers of the {source.count} frames; "
             "write titles, as frame,speed"
