@@ -32,6 +32,7 @@ SPEED_TYPES = {
     "autoware_vehicle_msgs/msg/VelocityReport": "longitudinal_velocity",
     "autoware_auto_vehicle_msgs/msg/VelocityReport": "longitudinal_velocity",
     "gps_msgs/msg/GPSFix": "speed",
+    "gps_common/msg/GPSFix": "speed",
 }
 """Types of messages with the vehicle's speed (m/s), and where it is in them."""
 

@@ -554,7 +554,13 @@ def test_a_file_of_a_ros_2_bag_and_a_folder_without_metadata_say_what_to_give(ba
     assert not is_bag(str(tmp_path))
 
 
+GPS = "gps_common/msg/GPSFix"  # of ROS 1, here without the fields that are not read
+STORE.register(get_types_from_msg("std_msgs/Header header\nfloat64 speed\n", GPS))
+
+
 def _moves(name, speed):
+    if name == GPS:
+        return TYPES[name](_header(2), speed)
     vector = TYPES["geometry_msgs/msg/Vector3"]
     twist = TYPES["geometry_msgs/msg/Twist"](vector(speed, 0.0, 0.0), vector(0.0, 0.0, 0.0))
     if name == "geometry_msgs/msg/Twist":
@@ -576,6 +582,7 @@ def _moves(name, speed):
         ("nav_msgs/msg/Odometry", 0.2),
         ("geometry_msgs/msg/TwistStamped", 0.2),
         ("geometry_msgs/msg/Twist", 0.3),
+        (GPS, 0.2),
     ],
 )
 def test_the_vehicles_speed_is_on_a_topic(tmp_path, plugin, name, time):
