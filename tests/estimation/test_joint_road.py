@@ -8,7 +8,7 @@ from lanebev.estimation.joint.layout import SHAPE, STEPS
 from lanebev.estimation.joint.measurement import (
     NUM_SHAPE,
 )
-from lanebev.estimation.joint.road import propagate_road_shape, turn_along
+from lanebev.estimation.joint.road import propagate_road_shape, speed_share, turn_along
 from lanebev.estimation.joint.road_curve import (
     KNOT_SPACING,
     NUM_STEPS,
@@ -16,6 +16,7 @@ from lanebev.estimation.joint.road_curve import (
     road_curve,
     road_shape,
 )
+from lanebev.estimation.joint.update import estimated_entries
 from tests.estimation.joint_drives import DOUBLE, PLACE
 
 torch.set_num_threads(1)
@@ -92,3 +93,27 @@ def test_turning_along_at_once_is_turning_along_in_steps():
     far, farther = (turn_along(shape, none, none + way) for way in (50.0, 5000.0))
     torch.testing.assert_close(far, farther)
     assert (turn_along(torch.zeros_like(shape), none, none + 8.0) == 0).all()
+
+
+def test_steps_like_noise_tell_no_speed():
+    """χ² of the five steps, whose mean for noise is 5, of which the first shape has 20 and the second 4."""
+    cov = 1e-8 * torch.eye(NUM_SHAPE, dtype=DOUBLE).repeat(2, 1, 1)
+    shape = torch.zeros(2, NUM_SHAPE, dtype=DOUBLE)
+    shape[0, 1:], shape[1, 1:] = 2e-4, 1e-4 * 0.8**0.5
+    torch.testing.assert_close(speed_share(shape, cov), torch.tensor([0.75, 0.0], dtype=DOUBLE))
+
+
+def test_a_speed_that_the_road_does_not_tell_is_considered():
+    """Its gain is multiplied by the share; the shape's uncertainty by it stays in the covariance."""
+    std = torch.full((2, 5), 1e-3, dtype=DOUBLE)
+    share = torch.tensor([0.0, 0.6], dtype=DOUBLE)
+    estimated = estimated_entries(std, share, 6)
+    assert estimated[:, PLACE.speed].tolist() == [0.0, 0.6]
+    assert torch.equal(estimated.sum(-1), PLACE.size - 1 + share)
+    mean = torch.zeros(2, PLACE.size, dtype=DOUBLE)
+    mean[:, STEPS] = 1e-5 * torch.arange(5).double()  # in the first row like noise
+    cov = torch.tensor([1e-6, 1e-12], dtype=DOUBLE)[:, None, None] * torch.eye(NUM_SHAPE, dtype=DOUBLE)
+    none, dt = torch.zeros(2, dtype=DOUBLE), torch.full((2,), 0.1, dtype=DOUBLE)
+    by_speed = propagate_road_shape(mean, cov, none, dt, PLACE, MotionConfig()).by_speed
+    assert by_speed[0].abs().max() > 0
+    torch.testing.assert_close(by_speed[0], by_speed[1])

@@ -59,7 +59,7 @@ class MotionConfig:
     curvature_walk: float = 2e-6
     curvature_step: float = 1e-4
     speed: float = 20.0
-    speed_std: float = 10.0
+    speed_std: float = 9.0
     speed_memory: float = 30.0
     measured_speed_std: float = 0.5
     deviation_memory: float = 20.0

@@ -30,6 +30,7 @@ from lanebev.estimation.joint.measurement import (
     look,
 )
 from lanebev.estimation.joint.observations import Observations, ego_lane_width, per_end
+from lanebev.estimation.joint.road import speed_share
 from lanebev.estimation.joint.scatter import (
     Scatter,
     averaged_moments,
@@ -85,7 +86,7 @@ class Iteration(NamedTuple):
         prior_cov: (B, D, D), of the prediction, with the process noise so far.
         frame: information of the frame there.
         single_frame_std: (B, 5) rad and m, of pose and offset by the frame alone.
-        estimated: (B, D), 0 for entries that are considered only, else 1.
+        estimated: (B, D), shares by which entries are estimated, see :func:`estimated_entries`.
         step: what follows.
     """
 
@@ -117,11 +118,12 @@ def update_state(
     mean = renumber(predicted.mean, shift, width, num)
     prior, places = mean[:, indices.observed], positions.gather(1, seen.boundary)  # (B, O), (B, N)
     member = membership(seen.boundary, num, like=places)
+    of_speed = speed_share(predicted.mean[:, SHAPE], predicted.cov[:, SHAPE, SHAPE])
 
     def iterate(at: Tensor, at_cov: Tensor, residuals: Residuals, scale: Tensor, cov: Tensor) -> Iteration:
         frame = frame_information(residuals, scale, at_cov, seen, member)
         alone = single_frame_std(frame.matrix)
-        estimated = estimated_entries(alone, num)
+        estimated = estimated_entries(alone, of_speed, num)
         observed = cov[:, indices.observed, indices.observed]
         moved = observed_step(prior, observed, at, frame, estimated[:, indices.observed])
         return Iteration(at, cov, frame, alone, estimated, moved)

@@ -57,7 +57,7 @@ def propagate_road_shape(
     passed = (gone / KNOT_SPACING).floor()  # (B,) knots
     shape = turn_along(mean[:, SHAPE], phase, way)
     moved = _renumbering(passed)
-    change = _change_per_metre(shape, shape_cov)
+    change = shape @ constant(_CHANGE_BY_SHAPE, like=shape)  # 1/m, per metre driven
     both = torch.bmm(moved, torch.stack([shape, dt.unsqueeze(-1) * change], dim=-1))  # (B, NUM_SHAPE, 2)
     step = step_variance(shape, shape_cov, cfg).unsqueeze(-1)
     seen = step * _share_in_view(phase, gone, passed)
@@ -123,21 +123,25 @@ def turn_along(shape: Tensor, phase: Tensor, way: Tensor) -> Tensor:
     return torch.cat([bend[:, :1], bend.diff(dim=-1)], dim=-1)
 
 
-def _change_per_metre(shape: Tensor, cov: Tensor) -> Tensor:
-    """Compute the change (B, NUM_SHAPE) of the shape per metre driven, as far as its steps are no noise.
+def speed_share(shape: Tensor, cov: Tensor) -> Tensor:
+    """Compute the share (B,) by which the shape of the road tells the speed.
 
-    On a straight road the steps are estimation noise, which does not move with the road. Were it moved, the
-    filter would estimate from it that the vehicle stands still. So the change is multiplied by the share of
-    the steps' χ² that exceeds its mean for noise (Wiener filter).
+    Source: (J12). On a straight road the steps are estimation noise, which does not move with the road. Were
+    the speed estimated from it, the vehicle would seem to stand still. So the gain of the speed is multiplied
+    by the share of the steps' χ² that exceeds its mean for noise (Wiener filter); for the rest its
+    uncertainty is considered, but it is not estimated (Schmidt 1966).
+
+    Args:
+        shape: (B, NUM_SHAPE).
+        cov: (B, NUM_SHAPE, NUM_SHAPE).
     """
-    change = shape @ constant(_CHANGE_BY_SHAPE, like=shape)
     steps, spread = shape[:, 1:], cov[:, 1:, 1:]
     size = spread.diagonal(dim1=1, dim2=2).rsqrt()  # (B, NUM_STEPS)
     factor = cholesky(size.unsqueeze(-1) * spread * size.unsqueeze(-2))
     white = solve_lower(factor, (size * steps).unsqueeze(-1))
     chi2 = white.square().sum((1, 2))  # its mean for noise is NUM_STEPS
-    known: Tensor = 1 - NUM_STEPS / chi2.clamp(min=NUM_STEPS)
-    return change * known.unsqueeze(-1)
+    share: Tensor = 1 - NUM_STEPS / chi2.clamp(min=NUM_STEPS)
+    return share
 
 
 def _share_in_view(phase: Tensor, gone: Tensor, passed: Tensor) -> Tensor:

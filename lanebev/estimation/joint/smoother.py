@@ -45,7 +45,8 @@ def link_states(before: JointState, after: JointState, dt: Tensor, cfg: JointCon
 
     A start uses nothing of the state before. Where the boundaries' numbers changed, offset and deviations are
     other quantities. A skipped frame changed nothing. If roll was considered and not estimated, its error and
-    those of the other entries have no information on each other, as in the filter.
+    those of the other entries have no information on each other, as in the filter; so it is with the speed,
+    which is estimated in part only.
 
     Args:
         before: state after a frame.
@@ -60,10 +61,16 @@ def link_states(before: JointState, after: JointState, dt: Tensor, cfg: JointCon
     raised = adaptive_process_noise(evidence, predicted.cov[:, indices.observed, indices.observed], cfg)
     known = (skip.unsqueeze(-1) | ~other_quantities(after, cfg)).unsqueeze(-2)  # (B, 1, D)
     roll_alone = has_flag(after.reasons, Reason.ROLL_UNSEEN) & (after.unseen == 0)
-    is_roll = torch.tensor([k in indices.chain(ROLL) for k in range(indices.size)], device=dt.device)
-    same = is_roll.unsqueeze(-1) == is_roll  # (D, D)
-    linked = known & (same | ~roll_alone[:, None, None])
+    entries = torch.arange(indices.size, device=dt.device)
+    of_speed = _alike(entries == indices.speed)  # (D, D)
+    of_roll = _alike(torch.isin(entries, torch.tensor(indices.chain(ROLL), device=dt.device)))
+    linked = known & of_speed & (of_roll | ~roll_alone[:, None, None])
     return Link(predicted.mean, transition, with_process_noise(noise, raised), linked)
+
+
+def _alike(chosen: Tensor) -> Tensor:
+    """Tell of which pairs (D, D) both entries or neither are chosen (D,)."""
+    return chosen.unsqueeze(-1) == chosen
 
 
 def other_quantities(after: JointState, cfg: JointConfig) -> Tensor:

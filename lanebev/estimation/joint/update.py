@@ -123,7 +123,7 @@ def observed_step(
         cov: (B, O, O) of the prediction.
         at: (B, O), where the frame was linearised.
         frame: its information.
-        estimated: (B, O), 0 for entries that are considered only, else 1.
+        estimated: (B, O), shares of :func:`estimated_entries`.
     """
     moved = (at - predicted).unsqueeze(-1)
     pull = torch.baddbmm(frame.vector.unsqueeze(-1), frame.matrix, moved)
@@ -134,13 +134,13 @@ def observed_step(
 
 
 def kalman_gain(cov: Tensor, step: Step, frame: FrameInformation, estimated: Tensor) -> Tensor:
-    """Compute G (B, D, O) of (J9); the Kalman gain is G Hᵀ Q⁻¹. Rows that are not estimated are zero.
+    """Compute G (B, D, O) of (J9); the Kalman gain is G Hᵀ Q⁻¹. Its rows are multiplied by their shares.
 
     Args:
         cov: (B, D, D) of the prediction.
         step: the last.
         frame: its information.
-        estimated: (B, D), 0 for entries that are considered only, else 1.
+        estimated: (B, D), shares of :func:`estimated_entries`.
     """
     count = frame.vector.shape[-1]
     free = estimated[:, :count].clamp(min=_FIXED)
@@ -217,10 +217,19 @@ def single_frame_std(matrix: Tensor) -> Tensor:
     return cov.diagonal(dim1=1, dim2=2).sqrt()
 
 
-def estimated_entries(single_frame_std: Tensor, num_boundaries: int) -> Tensor:
-    """Return (B, D): 0 for roll, its derivatives and slow mean where a frame leaves it open, else 1."""
+def estimated_entries(single_frame_std: Tensor, of_speed: Tensor, num_boundaries: int) -> Tensor:
+    """Return the shares (B, D) by which entries are estimated: 1, or less of what is considered only.
+
+    Args:
+        single_frame_std: (B, 5) of :func:`single_frame_std`. Where the frame leaves roll open, roll, its
+            derivatives and slow mean have 0.
+        of_speed: (B,), that of the speed, see :func:`lanebev.estimation.joint.road.speed_share`.
+        num_boundaries: L.
+    """
     others = constant(_all_but_roll(num_boundaries), single_frame_std)
-    return torch.where(single_frame_std[:, ROLL, None] > UNSEEN[ROLL], others, 1.0)
+    shares = torch.where(single_frame_std[:, ROLL, None] > UNSEEN[ROLL], others, 1.0)
+    place = layout(num_boundaries).speed
+    return torch.cat([shares[:, :place], of_speed.unsqueeze(-1), shares[:, place + 1 :]], dim=-1)
 
 
 @lru_cache(maxsize=16)
