@@ -68,6 +68,17 @@ def test_speeds_of_other_times_are_noticed(data, tmp_path):
     assert [frame.speed for frame in make_source(config)] == [5.0]
 
 
+def test_speeds_that_may_be_in_kmh_are_noticed(data, tmp_path):
+    speed = tmp_path / "speed.txt"
+    for value, words in (
+        (50, "speed: up to 50 m/s, 180 km/h; if it is in km/h, title it speed_kmh"),
+        (40, ""),
+    ):
+        speed.write_text(f"{value}\n" * FRAMES)
+        config = RunConfig(str(data / "images"), str(data / "camera.yaml"), speed=str(speed), fps=30.0)
+        assert make_source(config).problem == words
+
+
 def test_speeds_that_do_not_fit_are_one_line(capsys, data, tmp_path):
     wrong, later = tmp_path / "wrong.txt", tmp_path / "later.csv"
     wrong.write_text("5\n6\n")

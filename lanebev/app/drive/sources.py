@@ -30,6 +30,7 @@ from lanebev.report.run_folder import RunFolder
 from lanebev.signals import handlers_kept
 
 _RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")  # in topics of ROS's image_proc, which P is of
+_FAST = 45.0  # m/s; more may be km/h
 _MOST_WITHOUT = 0.5  # fraction of the frames, that may be without speed
 _LONG_STEP = 5  # s between frames, in which a pose has nothing to do with the one before
 
@@ -128,9 +129,14 @@ def _speeds(config: RunConfig, source: FrameSource) -> Speeds | None:
 
 
 def _speeds_remark(speeds: Speeds | None, source: FrameSource) -> str:
-    """Return a remark if most frames have no speed near them in time; else nothing."""
+    """Return a remark if most frames have no speed near them in time, or it may be in km/h; else nothing."""
     if speeds is None:
         return ""
+    fastest = np.nanmax(np.abs(speeds.speeds), initial=0.0)
+    if fastest > _FAST:
+        return (
+            f"speed: up to {fastest:.3g} m/s, {3.6 * fastest:.0f} km/h; if it is in km/h, title it speed_kmh"
+        )
     times = np.array(source.times or [float(number / source.fps) for number in range(source.count)])
     without = speeds.without(times)
     if without <= _MOST_WITHOUT * len(times):
