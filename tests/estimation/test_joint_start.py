@@ -77,10 +77,7 @@ def test_what_is_clearly_straight_or_bent_is_taken_as_that():
 @pytest.mark.slow
 @pytest.mark.parametrize("radius", [math.inf, 2000.0, 1000.0, 500.0])
 def test_single_images_of_bends_with_vague_lines_are_honest(radius):
-    """Four boundaries to 40 m at 2.5 px: whether R = 1,000 m is a bend cannot be told for sure.
-
-    Nor whether lanes are equal, which makes errors smaller than the covariance says where they are.
-    """
+    """Four boundaries to 40 m at 2.5 px: whether R = 1,000 m is a bend cannot be told for sure."""
     visible, bent = (1, 2, 3, 4), lambda z: torch.full_like(z, 1 / radius)
     errors = []
     for seed, moment in enumerate(moments(2.0)[3::20]):
@@ -89,7 +86,7 @@ def test_single_images_of_bends_with_vague_lines_are_honest(radius):
         out, _ = run(JointCalibrator(), frames)
         error = out.extrinsics.stack() - torch.tensor(moment.pose, dtype=DOUBLE)
         errors.append((error * torch.linalg.solve(out.covariance, error)).sum(-1) / 4)
-    assert 0.35 < torch.cat(errors).mean() < 2.0
+    assert 0.5 < torch.cat(errors).mean() < 2.0
 
 
 def test_a_clothoids_steps_are_its_rate_by_the_knots_spacing():

@@ -22,7 +22,7 @@ from lanebev.types import Calibration, Extrinsics
 _ONLY_HEIGHT = (0.0, 0.0, 0.0, 1.0)
 _ALWAYS_FIT = 3  # boundaries: some pose over equal lanes fits any three
 _SCALES = (0.0, 0.15, 0.6, 2.4)  # possible sigmas of deviations, ratios to ``lane_deviation_std``
-_SHARES = (0.9, 1 / 30, 1 / 30, 1 / 30)  # their prior probabilities
+_SHARES = (0.957, 0.03, 0.01, 0.003)  # their prior probabilities
 _MISFIT_FACTOR = 4.0  # the odds that a line bounds no lane are so much larger where other lines do not fit
 _EGO_LANE_SHARE = 0.2  # such a line's variance on the ego lane's boundaries, relative to that on the others
 _NO_BOUNDARY_RANGE = 3.6  # m; the position of such a line is uniform over it
