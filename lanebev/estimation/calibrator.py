@@ -157,9 +157,6 @@ class Calibrator(nn.Module, Generic[StateT]):
             state: state after a frame.
             speed: speed of the vehicle at that frame, m/s, float or (B,). A row whose speed is not finite
                 keeps its state; below 0, driving backward, it counts as 0.
-
-        Raises:
-            ValueError: another shape.
         """
         return state
 

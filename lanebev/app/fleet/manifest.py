@@ -19,16 +19,8 @@ from lanebev.io.source_names import is_bag, is_live, without_login
 from lanebev.numbers import read_text, shown
 
 UNKNOWN_DAY = "unknown"
-PATHS = (
-    "source",
-    "camera",
-    "lanes",
-    "weights",
-    "mount",
-    "speed",
-    "resume",
-    "exported",
-)  # settings that are paths
+# settings that are paths
+PATHS = ("source", "camera", "lanes", "weights", "mount", "speed", "resume", "exported")
 _OWN = ("name", "camera_id", "day", "time")
 _REFUSED = ("out", "source")
 _OF_BAGS = ("topic", "speed_topic")

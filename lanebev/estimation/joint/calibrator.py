@@ -110,6 +110,9 @@ class JointCalibrator(Calibrator[JointState]):
 
         Without it the speed is a prior, which a bend that moves through the view corrects; on slow, winding
         roads that is not enough. Its standard deviation is ``MotionConfig.measured_speed_std``.
+
+        Raises:
+            ValueError: a speed of another shape.
         """
         like = state.mean.to(widest_dtype(state.mean.device))
         with autocast_off(like.device, like.dtype):
