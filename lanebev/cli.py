@@ -24,7 +24,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command. ``doctor`` returns 1 if something is doubtful and 2 if the camera does not fit; ``fleet`` returns
     1 if drives failed.
     """
-    options = vars(parser().parse_args(arguments))
+    try:
+        options = vars(parser().parse_args(arguments))
+    except SystemExit:
+        _print("")  # what --help or the like has said
+        raise
     command = options.pop("command")
     if options.pop("verbose"):
         logging.basicConfig(format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
@@ -46,11 +50,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 128 + (received[0] if received else signal.SIGINT)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # for characters that a terminal's encoding lacks
-    try:
-        print(report, flush=True)
-    except OSError:  # nobody reads it; the outputs are there
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - else closing it at exit fails once more
+    _print(f"{report}\n")
     return status
+
+
+def _print(text: str) -> None:
+    """Print a text; it is no error if nobody reads it."""
+    try:
+        print(text, end="", flush=True)
+    except OSError:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - else closing it at exit fails once more
 
 
 @contextlib.contextmanager

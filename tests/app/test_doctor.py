@@ -228,6 +228,14 @@ def test_completion(shell, capsys):
         assert checked.returncode == 0, checked.stderr
 
 
+@pytest.mark.parametrize("option", ["--print-completion=bash", "--help"])
+def test_words_that_nobody_reads_are_no_error(option):
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "lanebev", option]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_completion_without_its_library(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "shtab", None)
     with pytest.raises(SystemExit) as stopped:

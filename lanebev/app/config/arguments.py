@@ -1,6 +1,7 @@
 """The command line's arguments. Imports nothing heavy."""
 
 import argparse
+import contextlib
 import re
 from collections.abc import Callable
 from dataclasses import Field, fields
@@ -235,7 +236,8 @@ class PrintCompletion(argparse.Action):
                 "pip install 'lanebev[completion]'"
             )
         _complete_files(parser, shtab.FILE)
-        print(shtab.complete(parser, shell=str(values)))
+        with contextlib.suppress(OSError):  # nobody reads it
+            print(shtab.complete(parser, shell=str(values)))
         parser.exit(0)
 
 
