@@ -137,18 +137,24 @@ def _csv_rows(text: str) -> list[Row]:
     rows: list[Row] = []
     flags = {each.name for each in fields(RunConfig) if isinstance(each.default, bool)}
     truth: dict[str, object] = {"true": True, "false": False}
-    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
-    columns = Counter(name.strip() for name in reader.fieldnames or ())
+    lines = csv.reader(io.StringIO(text, newline=""), strict=True)
+    titles, *table = [[cell.strip() for cell in line] for line in lines] or [[]]
+    columns = Counter(titles)
     if len(columns) == 1 and (other := next((sign for sign in ";\t|" if sign in "".join(columns)), "")):
         raise ValueError(f"columns separated by {other!r}; write commas, and points in numbers")
     if twice := [name for name, count in columns.items() if name and count > 1]:  # spreadsheets add empty
         raise ValueError(f"the column {twice[0]!r} twice")
-    for row in reader:
-        if not any(filter(None, row.values())):  # as a spreadsheet adds them
+    for cells in table:
+        if not any(cells):  # as a spreadsheet adds them
             continue
-        if None in row or None in row.values():
-            raise ValueError(f"a row with another number of columns: {shown(row)}")
-        filled = {str(key).strip(): value.strip() for key, value in row.items() if value.strip()}
+        if len(cells) != len(titles):
+            raise ValueError(f"a row with another number of columns: {shown(cells)}")
+        filled = {key: cell for key, cell in zip(titles, cells, strict=True) if cell}
+        if "" in filled:
+            raise ValueError(
+                f"a column without a title, with {shown(filled[''])}; give it a title, or leave it out, in "
+                "pandas by to_csv(index=False)"
+            )
         read = {key: truth.get(value.lower(), value) for key, value in filled.items() if key in flags}
         rows.append({**filled, **read})
     return rows

@@ -155,6 +155,13 @@ def test_empty_columns_that_a_spreadsheet_adds_are_ignored(tmp_path):
     assert [drive.name for drive in read_manifest(tmp_path / "m.csv")] == ["a"]
 
 
+@pytest.mark.parametrize("text", [",video,camera\n0,a.mp4,c.yaml\n", "video,camera,,\na.mp4,c.yaml,0,\n"])
+def test_a_value_below_no_title_is_refused(tmp_path, text):
+    (tmp_path / "drives.csv").write_text(text)
+    with pytest.raises(ValueError, match="a column without a title, with '0'; give it a title, or leave it"):
+        read_manifest(tmp_path / "drives.csv")
+
+
 def test_a_csv_column_that_is_there_twice_is_refused(tmp_path):
     (tmp_path / "drives.csv").write_text("video,camera, video\na.mp4,c.yaml,b.mp4\n")
     with pytest.raises(ValueError, match="expected YAML or CSV, got: the column 'video' twice"):
