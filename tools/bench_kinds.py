@@ -14,7 +14,7 @@ from torch import Tensor
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.config import HILLY_ROADS
-from lanebev.estimation.joint.update import UNSEEN
+from lanebev.estimation.joint.filter.update import UNSEEN
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, within_3_sigma
 from lanebev.testing.moments import FPS

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.config import MotionConfig
 from lanebev.estimation.joint.layout import SHAPE
-from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS
+from lanebev.estimation.joint.measurement.road_curve import KNOT_SPACING, NUM_STEPS
 from lanebev.estimation.joint.state import JointState
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.moments import Moment

@@ -23,8 +23,8 @@ from torch import Tensor
 import lanebev
 from lanebev import LaneSegments
 from lanebev.app.drive.observers import NetworkObserver
+from lanebev.estimation.joint.frame.single_frame import fit_single_frame
 from lanebev.estimation.joint.frame_prior import FramePrior
-from lanebev.estimation.joint.single_frame import fit_single_frame
 from lanebev.estimation.still import calibrate_still
 from lanebev.io.lanes import read_lanes
 from lanebev.io.opening import open_source

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint.measurement import NUM_PARAMS, boundary_residuals
-from lanebev.estimation.joint.observations import boundary_places, observe
+from lanebev.estimation.joint.measurement.observations import boundary_places, observe
+from lanebev.estimation.joint.measurement.residuals import NUM_PARAMS, boundary_residuals
 from lanebev.estimation.kalman import constant_velocity
 from lanebev.observation.segments import LaneSegments
 from lanebev.types import NUM_BOUNDARIES, Calibration, Extrinsics, Status

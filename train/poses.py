@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
-from lanebev.estimation.joint.single_frame import SingleFrameFit, fit_single_frame
+from lanebev.estimation.joint.frame.single_frame import SingleFrameFit, fit_single_frame
 from lanebev.geometry.precision import cast_floating, widest_dtype
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segments import segments_from_vertices

@@ -25,7 +25,7 @@ from torch import Tensor
 from lanebev.app.drive.sources import source_of_run
 from lanebev.batch import masked_median
 from lanebev.camera.model import Camera
-from lanebev.estimation.joint.boundary_curves import Boundaries, boundary_polylines, fit_boundaries
+from lanebev.estimation.joint.frame.boundary_curves import Boundaries, boundary_polylines, fit_boundaries
 from lanebev.io.frames import Frame
 from lanebev.io.lanes import read_lanes
 from lanebev.io.results import ExtrinsicsRow, poses_of, read_extrinsics

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lanebev.camera.model import Camera
-from lanebev.estimation.joint.boundary_curves import boundary_polylines, fit_boundaries
+from lanebev.estimation.joint.frame.boundary_curves import boundary_polylines, fit_boundaries
 from lanebev.observation.polylines import BoundaryRows, image_rows
 from lanebev.observation.segments import LaneSegments
 from lanebev.types import NUM_BOUNDARIES, Calibration, Status

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint.measurement import NUM_PARAMS, boundary_residuals, normal_equations
-from lanebev.estimation.joint.observations import observe as make_ready
+from lanebev.estimation.joint.measurement.observations import observe as make_ready
+from lanebev.estimation.joint.measurement.residuals import NUM_PARAMS, boundary_residuals, normal_equations
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.moments import CAMERA, FPS, PLACES, WIDTH, Moment, observe
 from lanebev.types import Status

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint.observations import boundary_places
+from lanebev.estimation.joint.measurement.observations import boundary_places
 from lanebev.geometry.road import image_from_road_points
 from lanebev.observation.segments import LaneSegments
 from lanebev.types import Extrinsics
@@ -30,7 +30,7 @@ def project_boundaries(
     """Project the end points of segments on lane boundaries into the image, without noise.
 
     Boundary k is X(Z) = b(Z) + x_k (1 + b'(Z)² / 2) with b(Z) = c0 Z² / 2 + c1 Z³ / 6, see
-    :mod:`lanebev.estimation.joint.measurement`.
+    :mod:`lanebev.estimation.joint.measurement.residuals`.
 
     Args:
         params: (B, 7) pitch, yaw, roll, height, offset, c0, c1.

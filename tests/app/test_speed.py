@@ -6,7 +6,7 @@ import torch
 from lanebev.app.config import RunConfig
 from lanebev.app.drive.sources import make_source
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.config import MotionConfig
 from lanebev.estimation.joint.layout import layout
 from lanebev.estimation.mount import MountEstimator
 from lanebev.io.state import load_state

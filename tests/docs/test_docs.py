@@ -151,7 +151,7 @@ def test_equations_that_the_joint_calibrator_cites_are_on_its_page():
     page = (ROOT / "docs" / "method" / "joint.md").read_text(encoding="utf-8")
     numbered = [int(number) for number in re.findall(r"\\tag\{J(\d+)\}", page)]
     assert numbered == list(range(1, len(numbered) + 1))
-    code = "".join(path.read_text() for path in (ROOT / "lanebev" / "estimation" / "joint").glob("*.py"))
+    code = "".join(path.read_text() for path in (ROOT / "lanebev" / "estimation" / "joint").rglob("*.py"))
     cited = {int(number) for number in re.findall(r"\(J(\d+)\)", code)}
     assert cited == set(numbered)
 

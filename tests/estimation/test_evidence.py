@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lanebev.estimation.joint.dynamics import MotionConfig
-from lanebev.estimation.joint.evidence import CALL, accumulate_evidence
-from lanebev.estimation.joint.measurement import NUM_SHAPE
-from lanebev.estimation.joint.road import step_variance
+from lanebev.estimation.joint.config import MotionConfig
+from lanebev.estimation.joint.filter.evidence import CALL, accumulate_evidence
+from lanebev.estimation.joint.measurement.residuals import NUM_SHAPE
+from lanebev.estimation.joint.motion.road import step_variance
 from lanebev.testing.evaluation import track
 from lanebev.testing.moments import FPS, Moment, moments
 from tools.bench_kinds import measure

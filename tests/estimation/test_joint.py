@@ -7,8 +7,7 @@ import torch
 
 from lanebev import batch
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.config import JointConfig, MotionConfig
 from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.reasons import Reason
 from lanebev.observation.segments import LaneSegments

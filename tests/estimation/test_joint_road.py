@@ -3,20 +3,20 @@
 import pytest
 import torch
 
-from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.config import MotionConfig
+from lanebev.estimation.joint.filter.update import estimated_entries
 from lanebev.estimation.joint.layout import SHAPE, STEPS
-from lanebev.estimation.joint.measurement import (
+from lanebev.estimation.joint.measurement.residuals import (
     NUM_SHAPE,
 )
-from lanebev.estimation.joint.road import propagate_road_shape, speed_share, turn_along
-from lanebev.estimation.joint.road_curve import (
+from lanebev.estimation.joint.measurement.road_curve import (
     KNOT_SPACING,
     NUM_STEPS,
     curve_by_shape,
     road_curve,
     road_shape,
 )
-from lanebev.estimation.joint.update import estimated_entries
+from lanebev.estimation.joint.motion.road import propagate_road_shape, speed_share, turn_along
 from tests.estimation.joint_drives import DOUBLE, PLACE
 
 torch.set_num_threads(1)

@@ -7,15 +7,16 @@ import pytest
 import torch
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.filter.start import start_moments
+from lanebev.estimation.joint.frame.bends import straight_or_bend
 from lanebev.estimation.joint.layout import STEPS
-from lanebev.estimation.joint.measurement import (
+from lanebev.estimation.joint.measurement.residuals import (
     CURVATURE,
 )
-from lanebev.estimation.joint.road_curve import (
+from lanebev.estimation.joint.measurement.road_curve import (
     KNOT_SPACING,
     NUM_STEPS,
 )
-from lanebev.estimation.joint.start import start_moments, straight_or_bend
 from lanebev.testing.moments import moments
 from lanebev.testing.moments import observe as see
 from tests.estimation.joint_drives import DOUBLE, run

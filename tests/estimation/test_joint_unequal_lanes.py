@@ -8,16 +8,19 @@ import torch
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.evidence import CALL, deviation_prior_std
+from lanebev.estimation.joint.filter.evidence import CALL, deviation_prior_std
+from lanebev.estimation.joint.filter.restart import scatter_of_fit
+from lanebev.estimation.joint.filter.scatter import remembered_sensitivity, summed_places
+from lanebev.estimation.joint.frame.single_frame import fit_observations
 from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.layout import NUM_POSE
-from lanebev.estimation.joint.measurement import (
+from lanebev.estimation.joint.measurement.observations import boundary_places, observe
+from lanebev.estimation.joint.measurement.residuals import (
     HEIGHT,
     NUM_SHAPE,
     OFFSET,
     ROLL,
 )
-from lanebev.estimation.joint.observations import boundary_places, observe
 from lanebev.estimation.joint.output import (
     as_calibration,
     beyond_filter,
@@ -25,9 +28,6 @@ from lanebev.estimation.joint.output import (
     single_deviation,
     unverified_deviation,
 )
-from lanebev.estimation.joint.restart import scatter_of_fit
-from lanebev.estimation.joint.scatter import remembered_sensitivity, summed_places
-from lanebev.estimation.joint.single_frame import fit_observations
 from lanebev.estimation.reasons import Reason
 from lanebev.testing.moments import CAMERA, PLACES, WIDTH, moments
 from lanebev.testing.moments import observe as see

@@ -8,9 +8,18 @@ import pytest
 import torch
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.lane_change import renumber
+from lanebev.estimation.joint.filter.lane_change import renumber
+from lanebev.estimation.joint.filter.prediction import predict_state
+from lanebev.estimation.joint.filter.update import (
+    frame_information,
+    kalman_gain,
+    membership,
+    observed_step,
+    posterior_covariance,
+)
 from lanebev.estimation.joint.layout import NUM_COMMON, SHAPE
-from lanebev.estimation.joint.measurement import (
+from lanebev.estimation.joint.measurement.observations import boundary_places, observe
+from lanebev.estimation.joint.measurement.residuals import (
     NUM_SHAPE,
     OFFSET,
     ROLL,
@@ -19,15 +28,6 @@ from lanebev.estimation.joint.measurement import (
     boundary_residuals,
     foot_points,
     look,
-)
-from lanebev.estimation.joint.observations import boundary_places, observe
-from lanebev.estimation.joint.prediction import predict_state
-from lanebev.estimation.joint.update import (
-    frame_information,
-    kalman_gain,
-    membership,
-    observed_step,
-    posterior_covariance,
 )
 from lanebev.testing.moments import CAMERA, FPS, PLACES, WIDTH, moments
 from lanebev.testing.moments import observe as see

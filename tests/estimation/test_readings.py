@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from lanebev import JointCalibrator, LaneSegments, Status
-from lanebev.estimation.joint.averaging import distance, mixture_moments, window
-from lanebev.estimation.joint.readings import ReadingConfig, log_prior, log_prior_of_half, readings
-from lanebev.estimation.joint.single_frame import fit_single_frame
+from lanebev.estimation.joint.config import ReadingConfig
+from lanebev.estimation.joint.frame.averaging import distance, mixture_moments, window
+from lanebev.estimation.joint.frame.readings import log_prior, log_prior_of_half, readings
+from lanebev.estimation.joint.frame.single_frame import fit_single_frame
 from lanebev.estimation.still import calibrate_still
 from lanebev.testing.moments import CAMERA, Moment, observe
 from lanebev.testing.segments import INTRINSICS, POSE, lanes, no_lanes, stack_rows

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.config import JointConfig, MotionConfig
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.estimation.two_stage.state import TwoStageConfig
 from lanebev.testing.evaluation import Track, within_3_sigma

@@ -9,18 +9,9 @@ import torch
 
 from lanebev import JointCalibrator, LaneSegments
 from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.lane_change import shifted
-from lanebev.estimation.joint.measurement import NUM_STRAIGHT, PITCH, ROLL, boundary_residuals
-from lanebev.estimation.joint.observations import boundary_places, observe
-from lanebev.estimation.joint.output import (
-    heading_variance,
-    no_boundary_deviation,
-    unverified_deviation,
-    vertical_moment,
-    wander_of_two,
-)
-from lanebev.estimation.joint.restart import scatter_of_fit
-from lanebev.estimation.joint.scatter import (
+from lanebev.estimation.joint.filter.lane_change import shifted
+from lanebev.estimation.joint.filter.restart import scatter_of_fit
+from lanebev.estimation.joint.filter.scatter import (
     averaged_moments,
     boundary_scatter,
     determined_sensitivity,
@@ -29,8 +20,17 @@ from lanebev.estimation.joint.scatter import (
     start_variance,
     with_headings,
 )
-from lanebev.estimation.joint.single_frame import fit_observations
-from lanebev.estimation.joint.update import information, membership
+from lanebev.estimation.joint.filter.update import information, membership
+from lanebev.estimation.joint.frame.single_frame import fit_observations
+from lanebev.estimation.joint.measurement.observations import boundary_places, observe
+from lanebev.estimation.joint.measurement.residuals import NUM_STRAIGHT, PITCH, ROLL, boundary_residuals
+from lanebev.estimation.joint.output import (
+    heading_variance,
+    no_boundary_deviation,
+    unverified_deviation,
+    vertical_moment,
+    wander_of_two,
+)
 from lanebev.testing.moments import CAMERA, PLACES, WIDTH, moments
 from lanebev.testing.moments import observe as see
 from lanebev.testing.segments import stack_rows

@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint.boundary_curves import boundary_polylines, fit_boundaries
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.frame.boundary_curves import boundary_polylines, fit_boundaries
+from lanebev.estimation.joint.frame.single_frame import fit_single_frame
 from lanebev.estimation.joint.frame_prior import FramePrior
-from lanebev.estimation.joint.measurement import NUM_PARAMS, boundary_residuals
-from lanebev.estimation.joint.observations import boundary_places, observe
-from lanebev.estimation.joint.single_frame import fit_single_frame
+from lanebev.estimation.joint.measurement.observations import boundary_places, observe
+from lanebev.estimation.joint.measurement.residuals import NUM_PARAMS, boundary_residuals
 from lanebev.estimation.still import calibrate_still
 from lanebev.geometry.road import image_from_road_points
 from lanebev.observation.segments import LaneSegments

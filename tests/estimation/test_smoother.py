@@ -7,9 +7,9 @@ import torch
 
 from lanebev.estimation import kalman
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.filter.prediction import predict_state
 from lanebev.estimation.joint.layout import POSE, layout
-from lanebev.estimation.joint.measurement import OFFSET, ROLL
-from lanebev.estimation.joint.prediction import predict_state
+from lanebev.estimation.joint.measurement.residuals import OFFSET, ROLL
 from lanebev.estimation.joint.smoother import link_states, smooth_drive, smooth_states
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.precision import cast_floating

@@ -7,15 +7,14 @@ import pytest
 import torch
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.dynamics import MotionConfig
-from lanebev.estimation.joint.evidence import hill_variance
+from lanebev.estimation.joint.config import JointConfig, MotionConfig
+from lanebev.estimation.joint.filter.evidence import hill_variance
+from lanebev.estimation.joint.filter.start import with_roll_of_prior, with_vertical_curvature
+from lanebev.estimation.joint.frame.single_frame import fit_single_frame
 from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.layout import NUM_COMMON
-from lanebev.estimation.joint.measurement import HEIGHT, ROLL, VERTICAL, boundary_residuals, look
-from lanebev.estimation.joint.observations import boundary_places, observe
-from lanebev.estimation.joint.single_frame import fit_single_frame
-from lanebev.estimation.joint.start import with_roll_of_prior, with_vertical_curvature
+from lanebev.estimation.joint.measurement.observations import boundary_places, observe
+from lanebev.estimation.joint.measurement.residuals import HEIGHT, ROLL, VERTICAL, boundary_residuals, look
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.moments import CAMERA, FPS, WIDTH, Moment, moments
 from lanebev.testing.moments import observe as see

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from lanebev import Extrinsics, JointCalibrator, LaneSegments, image_from_road_points
-from lanebev.estimation.joint.measurement import boundary_residuals
-from lanebev.estimation.joint.observations import observe
+from lanebev.estimation.joint.measurement.observations import observe
+from lanebev.estimation.joint.measurement.residuals import boundary_residuals
 from lanebev.geometry.focal import focal_covariance, pose_by_log_focal
 from lanebev.testing.moments import CAMERA, moments, swing
 from lanebev.testing.moments import observe as see

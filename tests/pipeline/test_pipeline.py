@@ -19,9 +19,9 @@ from lanebev import (
     Status,
     TwoStageCalibrator,
 )
-from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.config import MotionConfig
 from lanebev.estimation.joint.layout import layout
-from lanebev.estimation.joint.measurement import VERTICAL
+from lanebev.estimation.joint.measurement.residuals import VERTICAL
 from lanebev.observation.frames import resized_size
 from lanebev.observation.segmenter import SegmenterConfig
 from lanebev.pipeline import STAGES

@@ -16,7 +16,7 @@ from lanebev import (
     Status,
     TwoStageCalibrator,
 )
-from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.config import MotionConfig
 from lanebev.estimation.joint.layout import layout
 from lanebev.estimation.reasons import REASON_WORDS, Reason, describe_reasons
 from tests.drawn_road import PLACES, polylines

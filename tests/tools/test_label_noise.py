@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from lanebev import LaneSegments
+from lanebev.estimation.joint.frame.single_frame import fit_single_frame
 from lanebev.estimation.joint.frame_prior import FramePrior
-from lanebev.estimation.joint.single_frame import fit_single_frame
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes
 from tools.label_noise import line_offsets, split_half_yaw, stripe_centre

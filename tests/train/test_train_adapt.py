@@ -11,7 +11,7 @@ from PIL import Image
 from safetensors.torch import save_file
 
 from lanebev.camera.model import Camera
-from lanebev.estimation.joint.boundary_curves import Boundaries
+from lanebev.estimation.joint.frame.boundary_curves import Boundaries
 from lanebev.io.results import ExtrinsicsRow, write_extrinsics
 from lanebev.observation.polylines import image_rows
 from lanebev.observation.resnet import ResNet18

@@ -16,7 +16,7 @@ from lanebev.app.drive.observers import Observation
 from lanebev.app.recording.storage import StoredNumbers
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.layout import POSE
-from lanebev.estimation.joint.measurement import VERTICAL
+from lanebev.estimation.joint.measurement.residuals import VERTICAL
 from lanebev.estimation.joint.smoother import smooth_states, smoothed_calibration
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.tracker import Estimate

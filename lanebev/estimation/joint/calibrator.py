@@ -15,21 +15,21 @@ from lanebev.estimation.checks import (
     mask_invalid_rows,
     unused_frame,
 )
-from lanebev.estimation.joint.averaging import weigh_readings
 from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.iterated_update import update_state
+from lanebev.estimation.joint.filter.iterated_update import update_state
+from lanebev.estimation.joint.filter.prediction import elapsed, predict_state
+from lanebev.estimation.joint.filter.restart import restart
+from lanebev.estimation.joint.filter.speed import update_by_speed
+from lanebev.estimation.joint.filter.start import new_state, start_moments
+from lanebev.estimation.joint.filter.status import update_track_status
+from lanebev.estimation.joint.frame.averaging import weigh_readings
+from lanebev.estimation.joint.frame.tempering import temper_frame
 from lanebev.estimation.joint.layout import NUM_COMMON, STEPS, layout
-from lanebev.estimation.joint.measurement import CURVATURE, VERTICAL
-from lanebev.estimation.joint.observations import boundary_places, observations
+from lanebev.estimation.joint.measurement.observations import boundary_places, observations
+from lanebev.estimation.joint.measurement.residuals import CURVATURE, VERTICAL
+from lanebev.estimation.joint.measurement.road_curve import KNOT_SPACING
 from lanebev.estimation.joint.output import as_calibration
-from lanebev.estimation.joint.prediction import elapsed, predict_state
-from lanebev.estimation.joint.restart import restart
-from lanebev.estimation.joint.road_curve import KNOT_SPACING
-from lanebev.estimation.joint.speed import update_by_speed
-from lanebev.estimation.joint.start import new_state, start_moments
 from lanebev.estimation.joint.state import JointState
-from lanebev.estimation.joint.status import update_track_status
-from lanebev.estimation.joint.tempering import temper_frame
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.observation.segments import LaneSegments

@@ -66,7 +66,7 @@ class FramePrior:
             raise ValueError(f"height: expected more than 0 m, got {self.height}")
 
     def mean(self, like: Tensor) -> Tensor:
-        """Return the means (7,), in the order of ``measurement``."""
+        """Return the means (7,), in the order of ``measurement.residuals``."""
         return constant((self.pitch, self.yaw, self.roll, self.height, 0.0, 0.0, 0.0), like=like)
 
     def std(self, like: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from functools import lru_cache
 from typing import NamedTuple
 
-from lanebev.estimation.joint.measurement import CURVATURE, NUM_STRAIGHT, VERTICAL
+from lanebev.estimation.joint.measurement.residuals import CURVATURE, NUM_STRAIGHT, VERTICAL
 
 NUM_POSE = 4
 NUM_COMMON = VERTICAL + 1  # entries that all boundaries depend on

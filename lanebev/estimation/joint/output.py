@@ -7,11 +7,11 @@ from torch import Tensor
 
 from lanebev.batch import has_flag
 from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.evidence import EQUAL
+from lanebev.estimation.joint.filter.evidence import EQUAL
+from lanebev.estimation.joint.filter.scatter import scatter_variance, shown_freedom, start_variance
 from lanebev.estimation.joint.frame_prior import student_density
 from lanebev.estimation.joint.layout import POSE, layout
-from lanebev.estimation.joint.measurement import HEIGHT, OFFSET, ROLL
-from lanebev.estimation.joint.scatter import scatter_variance, shown_freedom, start_variance
+from lanebev.estimation.joint.measurement.residuals import HEIGHT, OFFSET, ROLL
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.linalg import cholesky, solve_lower

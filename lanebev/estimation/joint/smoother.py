@@ -12,10 +12,10 @@ from torch import Tensor
 from lanebev.batch import has_flag
 from lanebev.estimation import kalman
 from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.evidence import adaptive_process_noise, with_process_noise
+from lanebev.estimation.joint.filter.evidence import adaptive_process_noise, with_process_noise
+from lanebev.estimation.joint.filter.prediction import elapsed, predict_state
 from lanebev.estimation.joint.layout import POSE, layout
-from lanebev.estimation.joint.measurement import OFFSET, ROLL
-from lanebev.estimation.joint.prediction import elapsed, predict_state
+from lanebev.estimation.joint.measurement.residuals import OFFSET, ROLL
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype

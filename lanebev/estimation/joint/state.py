@@ -24,7 +24,7 @@ class JointState(NamedTuple):
             frames that determined the pose.
         heading_sensitivity: (B, D, L) change of the mean by each boundary's own heading (per rad) that lasts.
         scatter: (B, 2, L + 4) moments of the boundaries' own deviations and headings in the last frames, see
-            :func:`~lanebev.estimation.joint.scatter.averaged_moments`.
+            :func:`~lanebev.estimation.joint.filter.scatter.averaged_moments`.
         places: (B, L, L + 1) information on the boundaries' deviations from equal lanes, matrix and vector,
             of the frames so far, see (J35).
         motion_scale: (B, 4) >= 1, factor on the variance of the pose's motion, adapted to the drive.

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.joint.frame_prior import FramePrior, student_log
-from lanebev.estimation.joint.observations import Observations, per_end
+from lanebev.estimation.joint.measurement.observations import Observations, per_end
 from lanebev.geometry.linalg import solve_spd
 from lanebev.geometry.rotation import pitch_yaw_roll, road_from_cam_and_roll
 from lanebev.tensors import constant

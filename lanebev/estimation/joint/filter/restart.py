@@ -13,22 +13,22 @@ from torch import Tensor
 from lanebev.batch import flag, replace_rows, select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.evidence import CALL
-from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, layout
-from lanebev.estimation.joint.measurement import NUM_STRAIGHT, boundary_residuals
-from lanebev.estimation.joint.observations import Observations
-from lanebev.estimation.joint.robust import log_likelihood, scaled_variance, squared_distance
-from lanebev.estimation.joint.scatter import (
+from lanebev.estimation.joint.filter.evidence import CALL
+from lanebev.estimation.joint.filter.scatter import (
     Scatter,
     averaged_moments,
     boundary_scatter,
     determined_sensitivity,
     with_headings,
 )
-from lanebev.estimation.joint.single_frame import SingleFrameFit, fit_observations
-from lanebev.estimation.joint.start import state_of_fit
+from lanebev.estimation.joint.filter.start import state_of_fit
+from lanebev.estimation.joint.filter.update import information, membership
+from lanebev.estimation.joint.frame.single_frame import SingleFrameFit, fit_observations
+from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, POSE, layout
+from lanebev.estimation.joint.measurement.observations import Observations
+from lanebev.estimation.joint.measurement.residuals import NUM_STRAIGHT, boundary_residuals
+from lanebev.estimation.joint.measurement.robust import log_likelihood, scaled_variance, squared_distance
 from lanebev.estimation.joint.state import JointState
-from lanebev.estimation.joint.update import information, membership
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.linalg import inverse_spd
 from lanebev.types import Status

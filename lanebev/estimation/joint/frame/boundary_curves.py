@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import masked_median
-from lanebev.estimation.joint.observations import Observations, observe, per_end
+from lanebev.estimation.joint.measurement.observations import Observations, observe, per_end
 from lanebev.geometry.road import image_from_road_points
 from lanebev.geometry.road_profile import (
     check_vertical_curvature,

@@ -14,10 +14,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.lane_change import shifted
+from lanebev.estimation.joint.filter.lane_change import shifted
 from lanebev.estimation.joint.layout import NUM_POSE
-from lanebev.estimation.joint.measurement import OFFSET, ROLL, Residuals
-from lanebev.estimation.joint.observations import per_end
+from lanebev.estimation.joint.measurement.observations import per_end
+from lanebev.estimation.joint.measurement.residuals import OFFSET, ROLL, Residuals
 from lanebev.geometry.linalg import cholesky, inverse_spd, solve_lower, times_vector
 from lanebev.tensors import constant
 
@@ -61,11 +61,11 @@ def with_headings(
     A heading moves an end point as an offset of Z times the heading does.
 
     Args:
-        matrix: (B, P + L, P + L) of :func:`~lanebev.estimation.joint.update.information`.
+        matrix: (B, P + L, P + L) of :func:`~lanebev.estimation.joint.filter.update.information`.
         vector: (B, P + L), likewise.
         residuals: distances, their Jacobian (B, P, M), and Z of the foot points.
         weight: (B, N) px⁻², of each segment over its variance.
-        member: (B, L, M) of :func:`~lanebev.estimation.joint.update.membership`.
+        member: (B, L, M) of :func:`~lanebev.estimation.joint.filter.update.membership`.
 
     Returns:
         (B, P + 2 L, P + 2 L) and (B, P + 2 L).

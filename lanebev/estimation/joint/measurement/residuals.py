@@ -22,8 +22,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lanebev.estimation.joint.observations import Observations, by_ends, per_end
-from lanebev.estimation.joint.road_curve import (
+from lanebev.estimation.joint.measurement.observations import Observations, by_ends, per_end
+from lanebev.estimation.joint.measurement.road_curve import (
     NUM_STEPS,
     Road,
     RoadCurve,

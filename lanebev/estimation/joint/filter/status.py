@@ -6,13 +6,13 @@ from torch import Tensor
 from lanebev.batch import flags, has_flag, select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.iterated_update import FrameUpdate
+from lanebev.estimation.joint.filter.iterated_update import FrameUpdate
+from lanebev.estimation.joint.filter.scatter import remembered_sensitivity
+from lanebev.estimation.joint.filter.update import UNSEEN
 from lanebev.estimation.joint.layout import POSE
-from lanebev.estimation.joint.measurement import HEIGHT, ROLL
-from lanebev.estimation.joint.observations import Observations
-from lanebev.estimation.joint.scatter import remembered_sensitivity
+from lanebev.estimation.joint.measurement.observations import Observations
+from lanebev.estimation.joint.measurement.residuals import HEIGHT, ROLL
 from lanebev.estimation.joint.state import JointState
-from lanebev.estimation.joint.update import UNSEEN
 from lanebev.estimation.reasons import Reason
 from lanebev.tensors import constant
 from lanebev.types import Status

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lanebev.estimation.joint.dynamics import MotionConfig, RoadMotion
+from lanebev.estimation.joint.config import MotionConfig
 from lanebev.estimation.joint.layout import SHAPE, Layout
-from lanebev.estimation.joint.road_curve import KNOT_SPACING, NUM_STEPS
+from lanebev.estimation.joint.measurement.road_curve import KNOT_SPACING, NUM_STEPS
+from lanebev.estimation.joint.motion.dynamics import RoadMotion
 from lanebev.geometry.linalg import cholesky, solve_lower
 from lanebev.tensors import constant
 

@@ -1,10 +1,9 @@
 """The readings of a single image: which lines bound lanes, and how equal the lanes are.
 
-One image seldom decides between them. :mod:`lanebev.estimation.joint.averaging` fits every reading and
+One image seldom decides between them. :mod:`lanebev.estimation.joint.frame.averaging` fits every reading and
 averages the fits by their evidence, so that the covariance contains the differences between them.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -13,51 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-
-@dataclass(frozen=True)
-class ReadingConfig:
-    """Prior probabilities and standard deviations of the readings of a single image.
-
-    Attributes:
-        deviation_std: standard deviation of a boundary's deviation, m, one for each kind of road, from a
-            motorway to a street whose lanes differ by half a metre.
-        heading_std: standard deviation of a boundary's heading against the road's, rad, for each kind of
-            road.
-        vertical_curvature_std: standard deviation of the road's vertical curvature, 1/m, for each kind of
-            road.
-        kind_probability: prior probability of each kind of road.
-        no_boundary_probability: probability that a line bounds no lane: a kerb, an arrow, a cycle path.
-        another_probability: probability that the next line does not either.
-        no_boundary_std: standard deviations of the deviation (m) and heading (rad) of such a line.
-        evidence_exponent: exponent of the evidence, below 1 since no reading is exactly right and a
-            detector's errors are correlated along a boundary.
-        least_weight: weight, as a fraction of the best reading's, below which a reading is left out.
-    """
-
-    deviation_std: tuple[float, ...] = (0.0005, 0.4, 0.1, 0.4)
-    heading_std: tuple[float, ...] = (0.00005, 0.001, 0.003, 0.012)
-    vertical_curvature_std: tuple[float, ...] = (1e-8, 1e-4, 1e-4, 5e-4)
-    kind_probability: tuple[float, ...] = (0.2, 0.2, 0.2, 0.4)
-    no_boundary_probability: float = 0.1
-    another_probability: float = 0.5
-    no_boundary_std: tuple[float, float] = (2.0, 0.1)
-    evidence_exponent: float = 0.5
-    least_weight: float = 0.05
-
-    def __post_init__(self) -> None:
-        kinds = (self.deviation_std, self.heading_std, self.vertical_curvature_std, self.kind_probability)
-        names = "deviation_std, heading_std, vertical_curvature_std, kind_probability"
-        counts = [len(part) for part in kinds]
-        if len(set(counts)) > 1 or not counts[0]:
-            got = ", ".join(map(str, counts))
-            raise ValueError(f"{names}: expected as many of each, got {got}")
-        numbers = (*[number for part in kinds for number in part], *self.no_boundary_std)
-        if not all(np.isfinite(number) and number > 0 for number in numbers):
-            raise ValueError(f"{names}, no_boundary_std: expected positive numbers, got {numbers}")
-        for name in ("no_boundary_probability", "another_probability", "evidence_exponent", "least_weight"):
-            value = getattr(self, name)
-            if not 0.0 < value <= 1.0:
-                raise ValueError(f"{name}: expected more than 0 and at most 1, got {value}")
+from lanebev.estimation.joint.config import ReadingConfig
 
 
 class Readings(NamedTuple):

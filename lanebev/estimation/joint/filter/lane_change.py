@@ -5,9 +5,14 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lanebev.estimation.joint.layout import NUM_COMMON
-from lanebev.estimation.joint.measurement import OFFSET, Sight, every_segment, sampson_distances
-from lanebev.estimation.joint.observations import Observations
-from lanebev.estimation.joint.robust import log_likelihood, scaled_variance, squared_distance, start_scale
+from lanebev.estimation.joint.measurement.observations import Observations
+from lanebev.estimation.joint.measurement.residuals import OFFSET, Sight, every_segment, sampson_distances
+from lanebev.estimation.joint.measurement.robust import (
+    log_likelihood,
+    scaled_variance,
+    squared_distance,
+    start_scale,
+)
 from lanebev.tensors import constant
 
 _SEGMENTS = 96  # segments that decide, at least

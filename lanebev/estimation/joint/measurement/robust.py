@@ -9,7 +9,7 @@ import math
 import torch
 from torch import Tensor
 
-from lanebev.estimation.joint.observations import Observations
+from lanebev.estimation.joint.measurement.observations import Observations
 
 OUTLIER_RANGE = 0.2  # focal lengths: gross outliers spread over some 200 px at f = 1000 px
 OUTLIER_ODDS = 0.3  # prior odds of a gross outlier

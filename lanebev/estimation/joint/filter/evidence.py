@@ -8,10 +8,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lanebev.estimation.joint.config import JointConfig
+from lanebev.estimation.joint.filter.update import FrameInformation, innovation_score
 from lanebev.estimation.joint.layout import DEVIATIONS, NUM_POSE, POSE, SHAPE
-from lanebev.estimation.joint.measurement import NUM_SHAPE, VERTICAL
+from lanebev.estimation.joint.measurement.residuals import NUM_SHAPE, VERTICAL
 from lanebev.estimation.joint.state import JointState
-from lanebev.estimation.joint.update import FrameInformation, innovation_score
 from lanebev.tensors import constant
 
 _COMMON_ERROR = 0.2  # sigmas: standard deviation of the error that all end points of a boundary share

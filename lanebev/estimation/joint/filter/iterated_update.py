@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lanebev.batch import flag
 from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.evidence import (
+from lanebev.estimation.joint.filter.evidence import (
     EVIDENCE_TIME,
     accumulate_evidence,
     adapt_motion_scale,
@@ -17,21 +17,8 @@ from lanebev.estimation.joint.evidence import (
     normalized_score,
     with_process_noise,
 )
-from lanebev.estimation.joint.lane_change import best_shift, renumber, shifted
-from lanebev.estimation.joint.layout import NUM_COMMON, POSE, SHAPE, layout
-from lanebev.estimation.joint.measurement import (
-    NUM_STRAIGHT,
-    ROLL,
-    VERTICAL,
-    Residuals,
-    boundary_distances,
-    boundary_residuals,
-    foot_points,
-    look,
-)
-from lanebev.estimation.joint.observations import Observations, ego_lane_width, per_end
-from lanebev.estimation.joint.road import speed_share
-from lanebev.estimation.joint.scatter import (
+from lanebev.estimation.joint.filter.lane_change import best_shift, renumber, shifted
+from lanebev.estimation.joint.filter.scatter import (
     Scatter,
     averaged_moments,
     boundary_scatter,
@@ -40,8 +27,7 @@ from lanebev.estimation.joint.scatter import (
     updated_sensitivity,
     with_headings,
 )
-from lanebev.estimation.joint.state import JointState
-from lanebev.estimation.joint.update import (
+from lanebev.estimation.joint.filter.update import (
     FrameInformation,
     Step,
     agreement,
@@ -55,6 +41,20 @@ from lanebev.estimation.joint.update import (
     single_frame_std,
     wide_precision,
 )
+from lanebev.estimation.joint.layout import NUM_COMMON, POSE, SHAPE, layout
+from lanebev.estimation.joint.measurement.observations import Observations, ego_lane_width, per_end
+from lanebev.estimation.joint.measurement.residuals import (
+    NUM_STRAIGHT,
+    ROLL,
+    VERTICAL,
+    Residuals,
+    boundary_distances,
+    boundary_residuals,
+    foot_points,
+    look,
+)
+from lanebev.estimation.joint.motion.road import speed_share
+from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.linalg import reduced_information, times_vector
 from lanebev.tensors import constant
@@ -190,7 +190,7 @@ def with_evidence(
 
     Args:
         predicted: state.
-        score: (B, 11 + L), of :func:`~lanebev.estimation.joint.evidence.normalized_score`.
+        score: (B, 11 + L), of :func:`~lanebev.estimation.joint.filter.evidence.normalized_score`.
         pose_determined: (B, 4) bool, what of the pose the frame determines; the scale of the rest decays.
         dt: (B,) s since the last frame.
 

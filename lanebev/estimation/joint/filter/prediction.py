@@ -7,11 +7,11 @@ from torch import Tensor
 
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.dynamics import Spread, motion
-from lanebev.estimation.joint.evidence import deviation_prior_std, hill_variance
+from lanebev.estimation.joint.filter.evidence import deviation_prior_std, hill_variance
 from lanebev.estimation.joint.layout import SHAPE, layout
-from lanebev.estimation.joint.measurement import CURVATURE
-from lanebev.estimation.joint.road import propagate_road_shape
+from lanebev.estimation.joint.measurement.residuals import CURVATURE
+from lanebev.estimation.joint.motion.dynamics import Spread, motion
+from lanebev.estimation.joint.motion.road import propagate_road_shape
 from lanebev.estimation.joint.state import JointState, unobserved_mask
 from lanebev.estimation.kalman import predict
 

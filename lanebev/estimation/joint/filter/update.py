@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.joint.layout import NUM_COMMON, layout
-from lanebev.estimation.joint.measurement import NUM_STRAIGHT, OFFSET, ROLL, Residuals
-from lanebev.estimation.joint.observations import Observations, by_ends, per_end
-from lanebev.estimation.joint.robust import (
+from lanebev.estimation.joint.measurement.observations import Observations, by_ends, per_end
+from lanebev.estimation.joint.measurement.residuals import NUM_STRAIGHT, OFFSET, ROLL, Residuals
+from lanebev.estimation.joint.measurement.robust import (
     inlier_weights,
     reweigh,
     scaled_variance,
@@ -223,7 +223,7 @@ def estimated_entries(single_frame_std: Tensor, of_speed: Tensor, num_boundaries
     Args:
         single_frame_std: (B, 5) of :func:`single_frame_std`. Where the frame leaves roll open, roll, its
             derivatives and slow mean have 0.
-        of_speed: (B,), that of the speed, see :func:`lanebev.estimation.joint.road.speed_share`.
+        of_speed: (B,), that of the speed, see :func:`lanebev.estimation.joint.motion.road.speed_share`.
         num_boundaries: L.
     """
     others = constant(_all_but_roll(num_boundaries), single_frame_std)

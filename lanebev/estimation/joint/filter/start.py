@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 
 import torch
@@ -10,13 +9,12 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lanebev.batch import flag
-from lanebev.estimation import kalman
-from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.dynamics import MotionConfig
+from lanebev.estimation.joint.config import JointConfig, MotionConfig
+from lanebev.estimation.joint.frame.bends import straight_or_bend
+from lanebev.estimation.joint.frame.single_frame import SingleFrameFit
 from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.layout import NUM_COMMON, NUM_POSE, STEPS, layout
-from lanebev.estimation.joint.low_pass import pose_variances
-from lanebev.estimation.joint.measurement import (
+from lanebev.estimation.joint.measurement.residuals import (
     CURVATURE,
     HEIGHT,
     NUM_PARAMS,
@@ -25,11 +23,10 @@ from lanebev.estimation.joint.measurement import (
     ROLL,
     VERTICAL,
 )
-from lanebev.estimation.joint.road_curve import KNOT_SPACING
-from lanebev.estimation.joint.single_frame import SingleFrameFit
+from lanebev.estimation.joint.measurement.road_curve import KNOT_SPACING
+from lanebev.estimation.joint.motion.low_pass import pose_variances
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason
-from lanebev.geometry.linalg import cholesky, inverse_spd
 from lanebev.tensors import constant
 from lanebev.types import Status
 
@@ -127,44 +124,6 @@ def start_moments(
     copies = constant(_by_parameters(cfg.num_boundaries), like=params)
     own = constant(_start_variances(cfg.num_boundaries, cfg.motion), like=params)
     return params @ copies.mT, copies @ param_cov @ copies.mT + own.diag()
-
-
-def straight_or_bend(
-    params: Tensor, cov: Tensor, straight: Tensor, bend: Tensor, share: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Average one frame's fit over two models of the road, straight and bent, weighted by their evidence.
-
-    Source: (J18).
-
-    A distant bend and a yaw have nearly the same effect. Choosing the likelier model would be wrong by many
-    standard deviations if the other holds, so the difference of the two fits enters the covariance. Source:
-    Bayesian model averaging (Hoeting et al. 1999) of two Gaussians, moments matched. The straight road is a
-    measurement of c0 = c1 = 0 whose noise turns the one prior into the other.
-
-    Args:
-        params: (B, 7) fitted to a frame as a bend, in the order of ``NUM_PARAMS``.
-        cov: (B, 7, 7).
-        straight: (2,) 1/m and 1/m², sigmas of c0 and c1 of a straight road.
-        bend: (2,), those of a bend, larger, which the fit had for a prior.
-        share: prior probability of bends.
-
-    Returns:
-        mean (B, 7), covariance (B, 7, 7), and the log odds (B,) of a straight road against a bend.
-    """
-    noise = 1 / (straight.square().reciprocal() - bend.square().reciprocal())
-    curvature, gain = params[:, CURVATURE:], cov[:, :, CURVATURE:]
-    predicted = cov[:, CURVATURE:, CURVATURE:] + noise.diag()
-    inverse = inverse_spd(predicted)
-    chi2 = (curvature.unsqueeze(1) @ inverse @ curvature.unsqueeze(-1)).flatten()
-    sharper = 0.5 * (bend.square() + noise).log().sum()
-    sharper = sharper - cholesky(predicted).diagonal(dim1=1, dim2=2).log().sum(-1)
-    odds = math.log((1 - share) / share) + sharper - 0.5 * chi2
-    is_straight = odds.sigmoid()[:, None, None]
-    pull = gain @ (inverse @ curvature.unsqueeze(-1))  # (B, 7, 1), from the bend to the straight road
-    known = gain @ inverse @ gain.mT
-    spread = is_straight * (1 - is_straight) * (pull @ pull.mT)
-    mean = params - (is_straight * pull).squeeze(-1)
-    return mean, kalman.symmetrise(cov - is_straight * known + spread), odds
 
 
 def with_vertical_curvature(cov: Tensor, by_vertical: Tensor, std: float) -> Tensor:

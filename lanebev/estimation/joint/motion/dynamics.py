@@ -1,79 +1,24 @@
-"""Dynamics of the joint filter's state, except the road (``road``); those of the pose are ``low_pass``."""
+"""Dynamics of the joint filter's state; ``low_pass`` has those of the pose, ``road`` those of the road."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from lanebev.estimation.joint.config import MotionConfig
 from lanebev.estimation.joint.layout import NUM_POSE, SHAPE, layout
-from lanebev.estimation.joint.low_pass import ORDER, pose_transition
-from lanebev.estimation.joint.measurement import OFFSET, VERTICAL
-from lanebev.numbers import check_settings
+from lanebev.estimation.joint.measurement.residuals import OFFSET, VERTICAL
+from lanebev.estimation.joint.motion.low_pass import ORDER, pose_transition
 from lanebev.tensors import constant
 
 
-@dataclass(frozen=True)
-class MotionConfig:
-    """Configuration of the motion model; angles in rad, lengths in m, times in s.
-
-    Attributes:
-        bandwidth: Hz, cut-off frequency of the pose's motion.
-        angle_std: rad, standard deviation of pitch, yaw and roll about their slow means.
-        height_std: m, standard deviation of the height about its slow mean.
-        unobserved_scale: least factor on these if the last frame did not determine an angle or the height.
-        mean_angle_walk: rad/√s, random walk of the slow mean of an angle.
-        mean_height_walk: m/√s, random walk of the slow mean of the height.
-        offset_density: spectral density of the lateral acceleration, m²/s³.
-        offset_memory: s, time constant of the lateral velocity.
-        vertical_curvature_std: 1/m, standard deviation of the road's vertical curvature where nothing says
-            that it is curved.
-        vertical_curvature_memory: s, time constant of the return to it.
-        hill_memory: s, time constant of the return to that standard deviation after a crest or a dip.
-        curvature_walk: 1/m/√s, random walk of every knot.
-        curvature_step: 1/m, sigma of a step that comes into view on a straight road.
-        speed, speed_std: m/s, prior of the speed.
-        speed_memory: s, time constant of the return to it.
-        measured_speed_std: m/s, standard deviation of a given speed.
-        deviation_memory: s, time constant of a boundary's deviation where lanes are equal.
-        deviation_walk: m/√s, random walk of a boundary's deviation.
-        unequal_memory: s, time constant of the deviations on a road of unequal lanes.
-    """
-
-    bandwidth: float = 1.0
-    angle_std: float = 0.011
-    height_std: float = 0.02
-    unobserved_scale: float = 2.0
-    mean_angle_walk: float = 5e-4
-    mean_height_walk: float = 1e-3
-    offset_density: float = 0.2
-    offset_memory: float = 2.0
-    vertical_curvature_std: float = 1e-6
-    vertical_curvature_memory: float = 10.0
-    hill_memory: float = 20.0
-    curvature_walk: float = 2e-6
-    curvature_step: float = 1e-4
-    speed: float = 20.0
-    speed_std: float = 9.0
-    speed_memory: float = 30.0
-    measured_speed_std: float = 0.5
-    deviation_memory: float = 20.0
-    deviation_walk: float = 1e-4
-    unequal_memory: float = 1.0
-
-    def __post_init__(self) -> None:
-        memories = [part.name for part in fields(self) if part.name.endswith("_memory")]
-        endless = [name for name in memories if name != "offset_memory"]
-        check_settings(self, positive=["bandwidth", *memories], infinite=endless)
-
-
 class RoadMotion(NamedTuple):
-    """The shape's motion over a step, see :func:`lanebev.estimation.joint.road.propagate_road_shape`.
+    """The shape's motion over a step, see :func:`lanebev.estimation.joint.motion.road.propagate_road_shape`.
 
     Attributes:
         shape: (B, NUM_SHAPE) after it.

@@ -1,9 +1,9 @@
 """The pose of a single image, averaged over its readings.
 
-Every reading (:mod:`lanebev.estimation.joint.readings`) is fitted with a deviation and a heading of its own
-for each boundary, Gaussian about the road's, and weighted by its evidence (Laplace's approximation). Source:
-Bayesian model averaging (Hoeting et al. 1999) with Occam's window (Madigan and Raftery 1994) and tempered
-evidence, since no model is exactly right (Grünwald and van Ommen 2017).
+Every reading (:mod:`lanebev.estimation.joint.frame.readings`) is fitted with a deviation and a heading of
+its own for each boundary, Gaussian about the road's, and weighted by its evidence (Laplace's approximation).
+Source: Bayesian model averaging (Hoeting et al. 1999) with Occam's window (Madigan and Raftery 1994) and
+tempered evidence, since no model is exactly right (Grünwald and van Ommen 2017).
 """
 
 from dataclasses import replace
@@ -16,25 +16,25 @@ from torch.nn.functional import one_hot, softplus
 from lanebev.batch import select_rows
 from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.config import JointConfig
-from lanebev.estimation.joint.frame_prior import FramePrior, student_log
-from lanebev.estimation.joint.layout import STEPS
-from lanebev.estimation.joint.measurement import (
-    HEIGHT,
-    OFFSET,
-    PITCH,
-    ROLL,
-)
-from lanebev.estimation.joint.observations import Observations, boundary_places, observations
-from lanebev.estimation.joint.reading_fit import fit_readings, reading_model
-from lanebev.estimation.joint.readings import (
+from lanebev.estimation.joint.frame.bends import straight_or_bend
+from lanebev.estimation.joint.frame.reading_fit import fit_readings, reading_model
+from lanebev.estimation.joint.frame.readings import (
     Readings,
     log_prior,
     log_prior_of_half,
     readings,
 )
-from lanebev.estimation.joint.road_curve import KNOT_SPACING
-from lanebev.estimation.joint.start import straight_or_bend
-from lanebev.estimation.joint.start_search import linear_starts, spread_subset
+from lanebev.estimation.joint.frame.start_search import linear_starts, spread_subset
+from lanebev.estimation.joint.frame_prior import FramePrior, student_log
+from lanebev.estimation.joint.layout import STEPS
+from lanebev.estimation.joint.measurement.observations import Observations, boundary_places, observations
+from lanebev.estimation.joint.measurement.residuals import (
+    HEIGHT,
+    OFFSET,
+    PITCH,
+    ROLL,
+)
+from lanebev.estimation.joint.measurement.road_curve import KNOT_SPACING
 from lanebev.geometry.linalg import solve_spd
 from lanebev.geometry.road import lane_width_covariance
 from lanebev.observation.segments import LaneSegments

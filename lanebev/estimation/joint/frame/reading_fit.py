@@ -6,8 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
+from lanebev.estimation.joint.frame.readings import Readings
 from lanebev.estimation.joint.frame_prior import FramePrior
-from lanebev.estimation.joint.measurement import (
+from lanebev.estimation.joint.measurement.observations import Observations, by_ends, ego_lane_width, per_end
+from lanebev.estimation.joint.measurement.residuals import (
     NUM_PARAMS,
     OFFSET,
     above_road,
@@ -16,9 +18,7 @@ from lanebev.estimation.joint.measurement import (
     look,
     normal_equations,
 )
-from lanebev.estimation.joint.observations import Observations, by_ends, ego_lane_width, per_end
-from lanebev.estimation.joint.readings import Readings
-from lanebev.estimation.joint.robust import (
+from lanebev.estimation.joint.measurement.robust import (
     log_likelihood,
     reweigh,
     scaled_variance,

@@ -12,16 +12,22 @@ import torch
 from torch import Tensor
 
 from lanebev.estimation.checks import as_lane_width, check_segments, mask_invalid_rows
+from lanebev.estimation.joint.frame.start_search import LAST_SCALE, linear_starts, spread_subset
 from lanebev.estimation.joint.frame_prior import FramePrior, student_log, student_weight
-from lanebev.estimation.joint.measurement import (
+from lanebev.estimation.joint.measurement.observations import (
+    Observations,
+    boundary_places,
+    observations,
+    per_end,
+)
+from lanebev.estimation.joint.measurement.residuals import (
     HEIGHT,
     NUM_PARAMS,
     OFFSET,
     boundary_residuals,
     normal_equations,
 )
-from lanebev.estimation.joint.observations import Observations, boundary_places, observations, per_end
-from lanebev.estimation.joint.robust import (
+from lanebev.estimation.joint.measurement.robust import (
     anneal_scale,
     inlier_weights,
     log_likelihood,
@@ -29,7 +35,6 @@ from lanebev.estimation.joint.robust import (
     scaled_variance,
     squared_distance,
 )
-from lanebev.estimation.joint.start_search import LAST_SCALE, linear_starts, spread_subset
 from lanebev.geometry.linalg import inverse_spd, solve_spd
 from lanebev.geometry.precision import full_precision
 from lanebev.observation.segments import LaneSegments
@@ -98,7 +103,7 @@ def fit_single_frame(
       that of the prior, see ``observed``.
 
     ``calibrate_still`` with the joint calibrator averages over other readings, and its sigmas contain the
-    differences between them (:mod:`lanebev.estimation.joint.averaging`).
+    differences between them (:mod:`lanebev.estimation.joint.frame.averaging`).
 
     Args:
         segments: (B, N) line segments.
