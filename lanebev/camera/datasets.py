@@ -17,7 +17,7 @@ from lanebev.camera.parsing import mapping, number, once, whole_number
 from lanebev.numbers import finite_numbers, shown
 
 _KITTI = re.compile(r"^[ \t]*P(?:_rect_)?\d+[ \t]*:", re.MULTILINE | re.ASCII)
-_COLMAP = re.compile(r"^[ \t]*(\d+)[ \t]+([A-Z_]+)[ \t]+(\d{1,6})[ \t]+(\d{1,6})[ \t]+(.+)$", re.MULTILINE)
+_COLMAP = re.compile(r"^[ \t]*(-?\d+)[ \t]+([A-Z_]+)[ \t]+(\d{1,6})[ \t]+(\d{1,6})[ \t]+(.+)$", re.MULTILINE)
 _COLMAP_MODELS = {  # names of their parameters; the first ten are in the order of their numbers
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fx fy cx cy",

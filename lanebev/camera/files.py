@@ -52,14 +52,15 @@ _BY_KEY = {
     "fl_x": nerf,
     "ppx": realsense,
     "projection": metashape,
-    "intrinsic_matrix": open3d,
 }
+_OF_OPEN3D = {"intrinsic_matrix", "width", "height"}
 _OF_INI = (
     "it states four coefficients and no lens model; they are taken as k1 k2 k3 k4 of a fisheye, as ROS "
     "writes them: if it is a pinhole camera, add a fifth, 0"
 )
 _OF_MATRIX = "it is a camera matrix alone, which is taken for that of a lens without distortion"
 _VIEWS = ("ret", "rvecs", "tvecs", "objpoints", "imgpoints")  # of a calibration, beside the camera
+_UNDISTORTED = "roi"  # of OpenCV's getOptimalNewCameraMatrix: what of an undistorted image has no black
 
 
 def read_camera(
@@ -141,10 +142,14 @@ def _arrays(path: Path) -> dict[str, Any]:
             values = array.ravel()[:13].tolist()
             return bare_numbers(" ".join(map(str, values))) or {"K": values[:10], "D": []}
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
-            return {name: arrays[name].tolist() for name in arrays.files if name not in _VIEWS}
+            left_out = (*_VIEWS, _UNDISTORTED)
+            found = {name: arrays[name].tolist() for name in arrays.files if name not in left_out}
     except Exception as error:  # zipfile and NumPy raise many kinds for damaged bytes
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())[:100]
         raise ValueError(f"no arrays of numbers as by numpy.save or savez: {reason}") from error
+    if "arr_0" in found:
+        raise ValueError("arrays without names; save them by numpy.savez(FILE, mtx=mtx, dist=dist)")
+    return found
 
 
 def _camera_of(
@@ -188,13 +193,19 @@ def _camera(
         return checked(chosen(cameras, name, has_usual=True))
     if name is not None:
         raise ValueError(f"expected no name after # for a file of one camera, got {shown(name)}")
-    for key, read in _BY_KEY.items():
-        if key in content:
-            return checked(read(content))
+    if read := _reader_by_keys(content):
+        return checked(read(content))
     only = next(iter(content.values())) if len(content) == 1 else None
     if isinstance(only, Mapping) and "data" not in only:  # keys below the camera's name
         content = only
     return opencv_or_ros(content, rectified, image_size)
+
+
+def _reader_by_keys(fields: Mapping[str, Any]) -> Callable[[Mapping[str, Any]], CameraParameters] | None:
+    """Return what reads the camera of a program that its keys tell; None of others."""
+    if fields.keys() == _OF_OPEN3D:  # beside a lens or a size in other keys the matrix is another program's
+        return open3d
+    return next((read for key, read in _BY_KEY.items() if key in fields), None)
 
 
 def _unordered_cameras(content: Any, image_size: tuple[int, int] | None, rectified: bool) -> Readers:

@@ -6,17 +6,19 @@ from typing import Any
 
 from lanebev.camera.named_lens import LENS_NAMES, stated_lens
 from lanebev.camera.parameters import CameraParameters, centre_offset, checked
-from lanebev.camera.parsing import mapping, number, numbers, once, whole_number
+from lanebev.camera.parsing import mapping, number, numbers, whole_number
 from lanebev.numbers import shown
 
-MATRIX_KEYS = ("camera_matrix", "K", "mtx")
-_LENS_LISTS = ("distortion_coefficients", "D", "dist", "dist_coeff", "dist_coeffs", "distortion_coeffs")
+MATRIX_KEYS = ("camera_matrix", "K", "mtx", "intrinsics", "intrinsic_matrix")
+_LENS_LISTS = (
+    "distortion_coefficients", "D", "dist", "dist_coeff", "dist_coeffs", "dist_coefs", "distortion_coeffs",
+)  # fmt: skip
 DISTORTION_KEYS = (*_LENS_LISTS, "distortion", "Distortion_Coefficients", "distCoeffs", "d")
 _PROJECTION_KEYS = ("projection_matrix", "P")
 _ROTATION_KEYS = ("rectification_matrix", "R")
 _WIDTH_KEYS = ("image_width", "width")
 _HEIGHT_KEYS = ("image_height", "height")
-_SIDES_KEYS = ("image_size", "img_size", "image_shape", "img_shape", "resolution", "camera_resolution")
+_SIDES_KEYS = ("image_size", "img_size", "image_shape", "img_shape", "resolution", "camera_resolution", "DIM")
 _LEAST_SIDE = 16  # px; a list of smaller numbers is no size of images
 _MODEL_KEYS = ("distortion_model", "camera_model", "model", "DistModel")
 _LENS_KEYS = ("distortion", *_LENS_LISTS)
@@ -97,7 +99,7 @@ def opencv_or_ros(
     Raises:
         ValueError: an unknown key, or a value that no real camera has.
     """
-    fields = once((spelled(key), value) for key, value in fields.items())
+    fields = _spelled_once(fields)
     short = not {"fx", "fy", "cx", "cy"}.isdisjoint(fields)
     fields = with_sides(fields)
     unknown = sorted(set(fields) - (_SHORT_KEYS if short else _KNOWN_KEYS))
@@ -106,8 +108,10 @@ def opencv_or_ros(
     elif not {*MATRIX_KEYS, *_PROJECTION_KEYS}.isdisjoint(fields):
         unknown = [*filter(_OF_CAMERA.match, unknown)]
     if unknown:
-        known = "fx, fy, cx, cy, width, height, distortion, model"
-        raise ValueError(f"unknown key {shown(unknown[0])}; expected {known}, or those of OpenCV or ROS")
+        raise ValueError(
+            f"unknown key {shown(unknown[0])}; expected fx, fy, cx, cy, width, height, distortion, model, or "
+            "camera_matrix and distortion_coefficients; rename it, or leave it out"
+        )
     if image_size and not any(fields.get(key) is not None for key in (*_WIDTH_KEYS, *_HEIGHT_KEYS)):
         return _of_images(fields, rectified, image_size)
     if short:
@@ -136,6 +140,22 @@ def opencv_or_ros(
 def spelled(key: str) -> str:
     """Return a key as it is known, for one in any case, with underscores or not."""
     return _SPELLED.get(key.replace("_", "").lower(), key)
+
+
+def _spelled_once(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields by their known keys.
+
+    Raises:
+        ValueError: two keys mean the same.
+    """
+    known: dict[str, str] = {}
+    for key in fields:
+        if (first := known.setdefault(spelled(key), key)) != key:
+            raise ValueError(
+                f"expected one of {first} and {key}, which are read alike, got both; rename one, or leave it "
+                "out"
+            )
+    return {name: fields[key] for name, key in known.items()}
 
 
 def with_sides(fields: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -258,6 +278,11 @@ def _as_taken(camera: CameraParameters, fields: Mapping[str, Any]) -> CameraPara
 
     The principal point may be outside of the region.
     """
+    if isinstance(fields.get("roi"), list):
+        raise ValueError(
+            "roi: expected x_offset, y_offset, width, height of the images in the full resolution, got a "
+            "list; if it is OpenCV's, of undistorted images, leave it out"
+        )
     roi = mapping("roi", fields.get("roi") or {})
     left, top, width, height = (
         whole_number(roi, key) if roi.get(key) is not None else 0

@@ -103,13 +103,7 @@ def realsense(fields: Mapping[str, Any]) -> CameraParameters:
 
 
 def open3d(fields: Mapping[str, Any]) -> CameraParameters:
-    """Read the intrinsics of Open3D, whose matrix is given column by column, also row by row.
-
-    Raises:
-        ValueError: other keys, such as of a lens, which Open3D does not have.
-    """
-    if unknown := sorted(set(fields) - {"intrinsic_matrix", "width", "height"}):
-        raise ValueError(f"expected intrinsic_matrix, width and height of Open3D, got {shown(unknown[0])}")
+    """Read the intrinsics of Open3D, whose matrix is given column by column, also row by row."""
     matrix = numbers(fields, "intrinsic_matrix", count=9)
     if not (matrix[2] or matrix[5]):
         matrix = [*matrix[0::3], *matrix[1::3], *matrix[2::3]]

@@ -6,11 +6,12 @@ from typing import Any
 
 from lanebev.camera.choice import Readers
 from lanebev.camera.formats import MATRIX_KEYS, SHARED_KEYS, opencv_or_ros, spelled
+from lanebev.camera.slam import is_kalibr
 
 _HAS_CAMERA = {*MATRIX_KEYS, "fx"}
 _STEREO = [  # keys of matrix and coefficients of both cameras, as of OpenCV's stereo_calib
     [(f"{matrix}{side}", f"{lens}{side}") for side in sides]
-    for matrix, lens in (("M", "D"), ("K", "D"), ("cameraMatrix", "distCoeffs"))
+    for matrix, lens in (("M", "D"), ("K", "D"), ("cameraMatrix", "distCoeffs"), ("mtx", "dist"))
     for sides in ("12", "LR")
 ]
 
@@ -21,7 +22,8 @@ def named_cameras(content: Any, rectified: bool, image_size: tuple[int, int] | N
     only = next(iter(fields.values())) if len(fields) == 1 else None
     fields = only if isinstance(only, Mapping) else fields
     if len(fields) < 2 or not all(
-        isinstance(each, Mapping) and _HAS_CAMERA & {*map(spelled, each)} for each in fields.values()
+        isinstance(each, Mapping) and _HAS_CAMERA & {*map(spelled, each)} and not is_kalibr(each)
+        for each in fields.values()
     ):
         return {}
     return {name: partial(opencv_or_ros, each, rectified, image_size) for name, each in fields.items()}

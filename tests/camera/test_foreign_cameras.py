@@ -656,6 +656,7 @@ def test_a_line_of_numbers_has_the_focal_lengths_the_principal_point_and_the_len
     [
         {"image_size": [800, 480]},
         {"imgSize": [480, 800]},
+        {"DIM": [800, 480]},
         {"image_shape": [480, 800, 3]},
         {"image_shape": [3, 480, 800]},  # of PyTorch
         {
@@ -696,6 +697,34 @@ def test_a_list_of_both_sides_is_in_the_order_in_which_the_principal_point_is_in
 def test_other_fields_of_a_record_are_no_size_and_no_lens(tmp_path, field):
     text = json.dumps({"intrinsic": MATRIX, **field})
     _is(_read(tmp_path / "c.json", text, image_size=(480, 800)), 633, 633, 408, 245, 800, 480)
+
+
+@pytest.mark.parametrize("matrix", ["intrinsics", "intrinsic_matrix", "Intrinsics"])
+@pytest.mark.parametrize("lens", ["dist_coefs", "distortion"])
+def test_other_usual_keys_of_matrix_and_coefficients(tmp_path, matrix, lens):
+    fields = {matrix: MATRIX, lens: [-0.3, 0.1, 0, 0, 0.05], "resolution": [800, 480]}
+    expected = 633, 633, 408, 245, 800, 480, [-0.3, 0.1, 0, 0, 0.05]
+    _is(_read(tmp_path / "c.json", json.dumps(fields)), *expected)
+    _is(_read(tmp_path / "c.json", json.dumps({"a": fields, "b": fields})), *expected)
+
+
+def test_keys_that_differ_in_case_only_are_an_error(tmp_path):
+    with pytest.raises(
+        ValueError, match="one of K and k, which are read alike, got both; rename one, or leave"
+    ):
+        _read(tmp_path / "c.json", json.dumps({"K": MATRIX, "k": [-0.3, 0.1], "p": [0, 0], "D": []}))
+
+
+def test_numpys_file_with_opencvs_roi_or_without_names(tmp_path):
+    lens = {"mtx": MATRIX, "dist": [[-0.3, 0.1, 0, 0, 0.05]]}
+    np.savez(tmp_path / "c.npz", **lens, newcameramtx=MATRIX, roi=(9, 9, 780, 460))
+    camera = Camera.from_file(tmp_path / "c.npz", image_size=(480, 800))
+    _is(camera, 633, 633, 408, 245, 800, 480, [-0.3, 0.1, 0, 0, 0.05])
+    np.savez(tmp_path / "c.npz", *lens.values())
+    with pytest.raises(
+        ValueError, match=r"got: arrays without names; save them by numpy.savez\(FILE, mtx=mtx"
+    ):
+        Camera.from_file(tmp_path / "c.npz", image_size=(480, 800))
 
 
 def test_numpys_file_without_a_camera_says_so(tmp_path):

@@ -56,8 +56,13 @@ def test_open3ds_matrix_is_given_column_by_column(tmp_path, matrix):
     (tmp_path / "c.json").write_text(json.dumps(fields))
     expected = Camera.from_parameters(440.7, 440.5, 354.8, 232.1, 720, 480)
     assert Camera.from_file(tmp_path / "c.json").fingerprint() == expected.fingerprint()
-    (tmp_path / "c.json").write_text(json.dumps({**fields, "dist": [0.1, 0, 0, 0]}))
-    with pytest.raises(ValueError, match="expected intrinsic_matrix, width and height of Open3D, got 'dist'"):
+
+
+def test_a_matrix_under_open3ds_key_beside_a_lens_is_no_open3ds(tmp_path):
+    fields = {"height": 480, "width": 720, "dist": [0.1, 0, 0, 0, 0]}
+    columns = [440.7, 0, 0, 0, 440.5, 0, 354.8, 232.1, 1]
+    (tmp_path / "c.json").write_text(json.dumps({**fields, "intrinsic_matrix": columns}))
+    with pytest.raises(ValueError, match="got its transpose"):
         Camera.from_file(tmp_path / "c.json")
 
 

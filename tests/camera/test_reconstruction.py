@@ -121,7 +121,9 @@ def test_colmaps_fov_camera_is_the_nearest_kannala_brandt_camera(tmp_path):
     assert (plain.model, plain.distortion.tolist()) == ("fisheye", [0, 0, 0, 0])
 
 
-@pytest.mark.parametrize(("matrix", "lens"), [("M", "D"), ("K", "D"), ("cameraMatrix", "distCoeffs")])
+@pytest.mark.parametrize(
+    ("matrix", "lens"), [("M", "D"), ("K", "D"), ("cameraMatrix", "distCoeffs"), ("mtx", "dist")]
+)
 def test_of_opencvs_stereo_calibration_the_left_camera_is_taken(tmp_path, matrix, lens):
     fields = {f"{matrix}{i}": [[700 + i, 0, 641], [0, 700, 357], [0, 0, 1]] for i in (1, 2)}
     fields |= {f"{lens}{i}": [[-0.3, 0.1, 0, 0, 0.01 * i]] for i in (1, 2)} | {"R": MATRIX, "T": [1, 0, 0]}

@@ -183,7 +183,10 @@ def test_rectified_images_of_a2d2_have_a_matrix_of_their_own(tmp_path):
             {"intrinsic": {"k1": 340, "model": "radial_poly"}},
             "height: expected a value, got none",
         ),
-        ({**LIKE_OPENLANE, "dist_coefs": LENS}, "expected k1 .* under this key, got 'dist_coefs'; rename it"),
+        (
+            {**LIKE_OPENLANE, "dist_koeffs": LENS},
+            "expected k1 .* under this key, got 'dist_koeffs'; rename it",
+        ),
         (
             {**LIKE_OPENLANE, "cam_dist_coefs": LENS},
             "expected k1 .* under this key, got 'cam_dist_coefs'; rename it",
