@@ -259,12 +259,20 @@ def _one_way(points: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _on_rows(points: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return x of a polyline on rows, NaN outside its extent and in its gaps."""
+    """Return x of a polyline on rows, NaN outside its extent and in its gaps.
+
+    Points that are missing between all others are no gaps: a detector that looks at every second or third row
+    writes them so.
+    """
     y, first = np.unique(points[:, 1], return_index=True)
     x = points[first, 0]
     there = np.isfinite(x)
     if not there.any():
         return np.full(len(rows), np.nan)
+    known = np.flatnonzero(there)
+    if len(known) > 2:
+        step = int(np.gcd.reduce(np.diff(known)))
+        x, y, there = (each[known[0] % step :: step] for each in (x, y, there))
     between = np.interp(rows, y, there.astype(np.float64), left=0.0, right=0.0)
     return np.where(between == 1.0, np.interp(rows, y[there], x[there]), np.nan)
 

@@ -168,6 +168,21 @@ def test_polylines_are_checked(polylines, message):
         LaneSegments.from_polylines([], "camera.yaml")
 
 
+@pytest.mark.parametrize("every", [2, 3])
+def test_points_that_are_missing_between_all_others_are_no_gaps(every):
+    """As a detector writes them that looks at every second row of those in the file."""
+    whole = np.column_stack([np.linspace(300, 100, 31), np.arange(4, 252, 8)]).astype(float)
+    sparse = whole.copy()
+    sparse[np.arange(31) % every > 0, 0] = np.nan
+    expected, found = (vertices_from_lines([LaneLine(points, 2)], CAMERA) for points in (whole, sparse))
+    torch.testing.assert_close(found, expected)
+    sparse[12, 0] = np.nan  # a gap
+    with_gap = vertices_from_lines([LaneLine(sparse, 2)], CAMERA)
+    rows = with_gap.points[0, 2, with_gap.weight[0, 2] > 0, 1]
+    assert len(rows) > 15
+    assert not ((rows > 100 - 8 * (every - 1)) & (rows < 100 + 8 * (every - 1))).any()
+
+
 def test_gaps_stay_gaps():
     rows = image_rows(720)
     x = np.where((rows > 400) & (rows < 500), np.nan, 600.0 - 0.5 * rows)
