@@ -13,23 +13,6 @@ from torch import Tensor
 from lanebev.numbers import shown
 from lanebev.types import Calibration, Extrinsics, Status
 
-CSV_COLUMNS = (
-    "frame", "time_s", "pitch_deg", "yaw_deg", "roll_deg", "height_m", "pitch_std_deg", "yaw_std_deg",
-    "roll_std_deg", "height_std_m", "status", "segments", "image", "reasons", "vertical_curvature_per_m",
-)  # fmt: skip
-
-
-def _number_or_none(text: str) -> float | None:
-    return float(text) if text else None
-
-
-def _status(text: str) -> str:
-    return Status[text].name
-
-
-_COLUMN_TYPES: tuple[Callable[[str], Any], ...] = (int, *[float] * 9, _status, int, str, str, _number_or_none)
-_HEADERS = (CSV_COLUMNS, CSV_COLUMNS[:-1], CSV_COLUMNS[:-2])  # headers of this version and of earlier ones
-
 
 class ExtrinsicsRow(NamedTuple):
     """One row of ``extrinsics.csv``, in its units and order.
@@ -67,6 +50,21 @@ class ExtrinsicsRow(NamedTuple):
     def reason_names(self) -> list[str]:
         """Names of the reasons that hold in the frame."""
         return [name for name in self.reasons.split("|") if name]
+
+
+CSV_COLUMNS = ExtrinsicsRow._fields
+_HEADERS = (CSV_COLUMNS, CSV_COLUMNS[:-1], CSV_COLUMNS[:-2])  # headers of this version and of earlier ones
+
+
+def _number_or_none(text: str) -> float | None:
+    return float(text) if text else None
+
+
+def _status(text: str) -> str:
+    return Status[text].name
+
+
+_COLUMN_TYPES: tuple[Callable[[str], Any], ...] = (int, *[float] * 9, _status, int, str, str, _number_or_none)
 
 
 def poses_of(rows: Iterable[ExtrinsicsRow]) -> Extrinsics:

@@ -8,11 +8,12 @@ import pytest
 from lanebev.app.config import RunConfig
 from lanebev.app.fleet.manifest import Drive
 from lanebev.app.fleet.mounts import DriveMount, stretches
-from lanebev.app.fleet.page import CameraMounts, DriveVerdict, fleet_page
+from lanebev.app.fleet.page import CameraMounts, fleet_page
 from lanebev.app.fleet.plan import Outcome
 from lanebev.report.comparison import render_comparison
 from lanebev.report.page import write_report
 from lanebev.report.run_folder import RunFolder
+from lanebev.report.verdict import Verdict
 from tests.report.report_data import FRAMES, eventful_report
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -184,7 +185,7 @@ def test_a_fleet_is_drawn(browser, tmp_path, screen):
     ]
     outcomes = {drive.name: Outcome(drive.name, frames=300, seconds=12.3) for drive in drives}
     outcomes[drives[3].name] = Outcome(drives[3].name, failure=f"video {HOSTILE}: expected a video")
-    verdicts = {drive.name: DriveVerdict("good", "Calibrated for 96 % of the drive.") for drive in drives}
+    verdicts = {drive.name: Verdict("good", "Calibrated for 96 % of the drive.", "", ()) for drive in drives}
     path = tmp_path / "index.html"
     path.write_text(fleet_page("fleet", drives, outcomes, verdicts, cameras), encoding="utf-8")
     page, seen = _open(browser, path, screen, plots=2)

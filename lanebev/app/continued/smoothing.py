@@ -1,8 +1,6 @@
 """First pass of ``lanebev run --smooth``: estimate every pose of a drive from all of its frames."""
 
-import os
 from collections.abc import Iterable, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple, cast, overload
 
@@ -26,7 +24,6 @@ from lanebev.io.lanes.tusimple import tusimple_line
 from lanebev.io.output.folder import OutputFolder
 from lanebev.types import Calibration, Extrinsics
 
-_STATES = ".states"
 _NO_LANES = (np.empty(0), np.empty((0, 0)))  # rows, and columns of curves: what was seen is enough
 
 
@@ -58,24 +55,20 @@ class StoredStates(Sequence[JointState]):
     A state of six boundaries takes 6 kB, so that an hour at 30 frames a second takes 0.7 GB.
 
     Args:
-        path: path of the file.
+        like: a state of the same shapes and dtypes.
+        folder: where the file, which has no name, is.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._file = open(path, "w+b")  # noqa: SIM115 - closed by close
-        self._count, self._size = 0, 0
-        self._like: JointState | None = None
+    def __init__(self, like: JointState, folder: Path) -> None:
+        self._like = like
+        self._numbers = StoredNumbers(sum(part.numel() for part in _packed(like)), folder=folder)
 
     def append(self, state: JointState) -> None:
         """Add the state after the next frame."""
-        self._like = state
-        record = torch.cat([part.flatten().double() for part in _packed(state)]).cpu().numpy().tobytes()
-        self._size = len(record)
-        self._file.write(record)
-        self._count += 1
+        self._numbers.append(torch.cat([part.flatten().double() for part in _packed(state)]).cpu().numpy())
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._numbers)
 
     @overload
     def __getitem__(self, place: int) -> JointState: ...
@@ -87,10 +80,7 @@ class StoredStates(Sequence[JointState]):
         if isinstance(place, slice):
             return [self[each] for each in range(*place.indices(len(self)))]
         at = range(len(self))[place]
-        like = cast(JointState, self._like)
-        self._file.flush()
-        record = os.pread(self._file.fileno(), self._size, at * self._size)
-        numbers = torch.frombuffer(bytearray(record), dtype=torch.float64)
+        like, numbers = self._like, torch.from_numpy(self._numbers.all()[at].copy())
         packed = _packed(like)
         parts = numbers.split([part.numel() for part in packed])
         shaped = (part.reshape(own.shape).to(own.dtype) for part, own in zip(parts, packed, strict=True))
@@ -99,10 +89,6 @@ class StoredStates(Sequence[JointState]):
         cov = state.cov.new_zeros(like.cov.shape)
         cov[:, row, column] = cov[:, column, row] = state.cov
         return state._replace(cov=cov)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
 
 
 def _packed(state: JointState) -> JointState:
@@ -129,10 +115,9 @@ def smooth_frames(
         source: name of the frames' source.
         config: configuration of the tracker's calibrator.
     """
-    path = out / _STATES
-    states, intervals = StoredStates(path), StoredNumbers(1)
+    states, intervals = StoredStates(cast(JointState, tracker.state), out / "."), StoredNumbers(1)
     covariances, scales = StoredNumbers(4, 4), StoredNumbers(1)
-    with closing(states), open(out / LANES_FILE, "w", encoding="utf-8", buffering=1) as lanes:  # whole lines
+    with open(out / LANES_FILE, "w", encoding="utf-8", buffering=1) as lanes:  # whole lines
         for frame, seen in frames:
             lanes.write(tusimple_line(frame_name(frame, source), *_NO_LANES, *seen) + "\n")
             tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale, frame.speed)
@@ -140,9 +125,7 @@ def smooth_frames(
             intervals.append(np.array([frame.dt]))
             covariances.append(tracker.unscaled_covariance[0].double().cpu().numpy())
             scales.append(np.array([seen.pose_sigma_scale]))
-        smoothed = _smoothed(states, intervals, covariances, scales, tracker, config)
-    path.unlink()
-    return smoothed
+    return _smoothed(states, intervals, covariances, scales, tracker, config)
 
 
 def _smoothed(

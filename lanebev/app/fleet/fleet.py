@@ -19,7 +19,7 @@ from lanebev.app.fleet.cluster import Cluster, check_ray, outcomes
 from lanebev.app.fleet.collect import FRAMES, collect_frames
 from lanebev.app.fleet.manifest import Drive, read_manifest
 from lanebev.app.fleet.mounts import Stretch, days, drive_mounts, stretches
-from lanebev.app.fleet.page import CameraMounts, DriveVerdict, fleet_page
+from lanebev.app.fleet.page import CameraMounts, fleet_page
 from lanebev.app.fleet.plan import Outcome, Task, drive_folder, earlier_outcome, tasks_of
 from lanebev.app.progress import Progress
 from lanebev.estimation.mount import MountEstimator, MountState
@@ -95,7 +95,12 @@ def fleet(
         collect_frames(done, out)
         cameras = camera_mounts(done, out)
         write_mounts(folder / "mounts.json", cameras)
-        verdicts = {drive.name: _verdict(out, drive) for drive in done}
+        verdicts = {
+            drive.name: verdict(
+                read_extrinsics(drive_folder(out, drive.name) / "extrinsics.csv"), drive.config.stills
+            )
+            for drive in done
+        }
         with whole_file(folder / "index.html") as path:
             page = fleet_page(folder.resolve().name, drives, found, verdicts, cameras)
             path.write_text(page, encoding="utf-8", errors="replace")
@@ -149,8 +154,8 @@ def _run(
 ) -> tuple[dict[str, Outcome], int]:
     """Run what is not finished; outcomes by name in the order of the tasks, and how many were run."""
     earlier = {task.name: earlier_outcome(task) for task in tasks}
-    to_do = [task for task in tasks if _is_to_do(earlier[task.name], again)]
     found = {name: outcome for name, outcome in earlier.items() if outcome is not None}
+    to_do = [task for task in tasks if task.name not in found or (again and found[task.name].failure)]
     logger.info("%d drives, %d of them to run", len(tasks), len(to_do))
     if to_do:
         ended: Iterator[Outcome] = outcomes(to_do, cluster)
@@ -165,15 +170,6 @@ def _kept(outcome: Outcome, task: Task) -> Outcome:
     if outcome.failure or task.result.is_file():
         return outcome
     return replace(outcome, failure="its outputs were deleted meanwhile; the same command runs it again")
-
-
-def _is_to_do(earlier: Outcome | None, again: bool) -> bool:
-    return earlier is None or (bool(earlier.failure) and again)
-
-
-def _verdict(out: str, drive: Drive) -> DriveVerdict:
-    found = verdict(read_extrinsics(drive_folder(out, drive.name) / "extrinsics.csv"), drive.config.stills)
-    return DriveVerdict(found.grade, found.headline)
 
 
 def _stretch_fields(stretch: Stretch) -> dict[str, object]:

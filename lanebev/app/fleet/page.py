@@ -17,24 +17,12 @@ from lanebev.app.fleet.plan import DRIVES, Outcome
 from lanebev.report.axis_states import UNITS, plus_minus
 from lanebev.report.figures import bokeh_script, finish, new_figure, stacked, value_limits, x_range
 from lanebev.report.templates import template
+from lanebev.report.verdict import Verdict
 from lanebev.types import AXES
 
 _SCALE = np.array([180 / math.pi] * 3 + [1.0])
 _COLOUR, _MOVED = "#1f6feb", "#e5484d"
 _MOST_DRIVES = 2000  # drives that are listed one by one, at most; failed ones come first
-
-
-@dataclass(frozen=True)
-class DriveVerdict:
-    """The verdict on one drive's run.
-
-    Attributes:
-        grade: "good", "fair" or "poor".
-        headline: one sentence.
-    """
-
-    grade: str
-    headline: str
 
 
 @dataclass(frozen=True)
@@ -65,7 +53,7 @@ def fleet_page(
     title: str,
     drives: Sequence[Drive],
     outcomes: Mapping[str, Outcome],
-    verdicts: Mapping[str, DriveVerdict],
+    verdicts: Mapping[str, Verdict],
     cameras: Sequence[CameraMounts],
 ) -> str:
     """Return the page; nothing in it is loaded from elsewhere, and every name in it is escaped.

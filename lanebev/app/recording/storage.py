@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import sys
 import tempfile
 from array import array
 from collections.abc import Iterable, Sequence
@@ -15,31 +16,28 @@ from numpy.typing import NDArray
 
 from lanebev.io.results import ExtrinsicsRow
 
-_NUMBERS = 10  # numbers in a row: nine from time_s on, and the vertical curvature
+_NUMBERS, _TEXTS = 12, 3  # in a row
 
 
 class StoredRows(Sequence[ExtrinsicsRow]):
-    """Rows of ``extrinsics.csv`` stored as columns, 0.1 kB each; a row is made when it is requested."""
+    """Rows of ``extrinsics.csv`` stored as numbers, 0.1 kB each; a row is made when it is requested."""
 
     def __init__(self, rows: Iterable[ExtrinsicsRow] = ()) -> None:
-        self._numbers, self._counts, self._codes = array("d"), array("q"), array("l")
-        self._texts: dict[str, int] = {}
-        self._known: list[str] = []
-        self._images: list[str] = []  # each is there once, in the source
+        self._numbers = array("d")
+        self._texts: list[str] = []  # status, image and reasons of each row; equal texts are one object
         for row in rows:
             self.append(row)
 
     def append(self, row: ExtrinsicsRow) -> None:
         """Add the row of the next frame."""
         curvature = row.vertical_curvature_per_m
-        self._numbers.extend(float(number) for number in row[1:10])
+        self._numbers.extend(map(float, (*row[:10], row.segments)))
         self._numbers.append(math.nan if curvature is None else curvature)
-        self._counts.extend((row.frame, row.segments))
-        self._codes.extend((self._code(row.status), self._code(row.reasons)))
-        self._images.append(row.image)  # last: from now on it is there for other threads
+        # last: from now on it is there for other threads; names of images are those of the source
+        self._texts += (sys.intern(row.status), row.image, sys.intern(row.reasons))
 
     def __len__(self) -> int:
-        return len(self._images)
+        return len(self._texts) // _TEXTS
 
     @overload
     def __getitem__(self, place: int) -> ExtrinsicsRow: ...
@@ -51,17 +49,10 @@ class StoredRows(Sequence[ExtrinsicsRow]):
         if isinstance(place, slice):
             return StoredRows(self[each] for each in range(*place.indices(len(self))))
         at = range(len(self))[place]
-        frame, segments = self._counts[2 * at : 2 * at + 2]
-        status, reasons = (self._known[code] for code in self._codes[2 * at : 2 * at + 2])
-        *numbers, curvature = self._numbers[_NUMBERS * at : _NUMBERS * (at + 1)]
-        texts = (status, segments, self._images[at], reasons)
-        return ExtrinsicsRow._make([frame, *numbers, *texts, None if math.isnan(curvature) else curvature])
-
-    def _code(self, text: str) -> int:
-        if text not in self._texts:
-            self._known.append(text)
-            self._texts[text] = len(self._known) - 1
-        return self._texts[text]
+        frame, *numbers, segments, curvature = self._numbers[_NUMBERS * at : _NUMBERS * (at + 1)]
+        status, image, reasons = self._texts[_TEXTS * at : _TEXTS * (at + 1)]
+        values = [int(frame), *numbers, status, int(segments), image, reasons]
+        return ExtrinsicsRow._make([*values, None if math.isnan(curvature) else curvature])
 
 
 class StoredNumbers:
@@ -87,6 +78,9 @@ class StoredNumbers:
             raise ValueError(f"values: expected shape {self._shape}, got {values.shape}")
         self._file.write(np.ascontiguousarray(values, np.float64).tobytes())
         self._count += 1
+
+    def __len__(self) -> int:
+        return self._count
 
     def all(self) -> NDArray[np.float64]:
         """Return all of them, (F, ...), without a copy; no more can be added while it is in use."""

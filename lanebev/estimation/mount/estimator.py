@@ -13,16 +13,16 @@ from lanebev.batch import flag
 from lanebev.estimation.checks import as_batch, check_new_state, check_state
 from lanebev.estimation.mount.blocks import add_frame, block_index, newest_age, push_block
 from lanebev.estimation.mount.config import MountConfig
-from lanebev.estimation.mount.results import MountCalibration, MountReason, MountState, MountStatus
+from lanebev.estimation.mount.results import (
+    LIMIT_REASONS,
+    MountCalibration,
+    MountReason,
+    MountState,
+    MountStatus,
+)
 from lanebev.tensors import constant
 from lanebev.types import Calibration, Extrinsics, Status, check_calibration, config_of
 
-_LIMIT_REASONS = (
-    MountReason.PITCH_LIMIT,
-    MountReason.YAW_LIMIT,
-    MountReason.ROLL_LIMIT,
-    MountReason.HEIGHT_LIMIT,
-)
 _HOUR = 3600.0  # s
 
 
@@ -277,7 +277,7 @@ class MountEstimator(nn.Module):
         lower, upper, margin = (constant(v, mean) for v in (cfg.lower, cfg.upper, cfg.margin))
         slack = torch.where(invalid, -margin, margin)
         broken = (mean < lower - slack) | (mean > upper + slack)
-        flags = constant(_LIMIT_REASONS, mean, torch.int64)
+        flags = constant(LIMIT_REASONS, mean, torch.int64)
         return broken * flags, broken
 
 

@@ -138,11 +138,11 @@ _FRAME_REASONS = {
     MountReason.TURNING: "the road or the vehicle turns",
     MountReason.TIME: "the frame's time does not advance",
 }
+LIMIT_REASONS = (  # of each axis
+    MountReason.PITCH_LIMIT, MountReason.YAW_LIMIT, MountReason.ROLL_LIMIT, MountReason.HEIGHT_LIMIT,
+)  # fmt: skip
 _STATE_REASONS = {
-    MountReason.PITCH_LIMIT: "outside the limits of a usable mount",
-    MountReason.YAW_LIMIT: "outside the limits of a usable mount",
-    MountReason.ROLL_LIMIT: "outside the limits of a usable mount",
-    MountReason.HEIGHT_LIMIT: "outside the limits of a usable mount",
+    **dict.fromkeys(LIMIT_REASONS, "outside the limits of a usable mount"),
     MountReason.SUSPECT: "the latest frames contradict the estimate",
     MountReason.STALE: "not confirmed for a long time",
 }

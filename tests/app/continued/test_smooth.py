@@ -190,7 +190,7 @@ def test_a_stream_has_no_second_pass(data, tmp_path, capsys):
 def test_kept_states_come_back_to_the_bit(num, kilobytes, tmp_path):
     """With four boundaries the sensitivity (1, 4, 4) is a square too, but not symmetric."""
     calibrator = JointCalibrator(num_boundaries=num)
-    kept, states = StoredStates(tmp_path / "states"), []
+    kept, states = StoredStates(calibrator.initial_state(1, dtype=torch.float64), tmp_path), []
     for k in range(3):
         state = calibrator.initial_state(1, dtype=torch.float64)
         slope = torch.arange(4.0 * num, dtype=torch.float64).view(1, 4, num)
@@ -202,9 +202,9 @@ def test_kept_states_come_back_to_the_bit(num, kilobytes, tmp_path):
     torch.testing.assert_close(kept[-3], states[0], rtol=0, atol=0)
     with pytest.raises(IndexError):
         kept[3]
-    size = (tmp_path / "states").stat().st_size / 3
-    kept.close()
+    size = kept._numbers.all().nbytes / 3
     assert size == pytest.approx(1000 * kilobytes, rel=0.03)  # of six boundaries as the documentation says
+    assert list(tmp_path.iterdir()) == []  # the file has no name, and ends with its process
 
 
 def test_smoothing_is_off_unless_asked_for():

@@ -11,7 +11,7 @@ from lanebev.app.config import BACKENDS, RunConfig
 from lanebev.app.fleet.fleet import write_mounts
 from lanebev.app.fleet.manifest import Drive
 from lanebev.app.fleet.mounts import DriveMount, stretches
-from lanebev.app.fleet.page import CameraMounts, DriveVerdict, fleet_page
+from lanebev.app.fleet.page import CameraMounts, fleet_page
 from lanebev.app.fleet.plan import (
     Outcome,
     earlier_outcome,
@@ -20,6 +20,7 @@ from lanebev.app.fleet.plan import (
     tasks_of,
     write_mark,
 )
+from lanebev.report.verdict import Verdict
 
 HOSTILE = "<script>alert(1)<_script>\"'&é…"
 
@@ -47,7 +48,7 @@ def test_every_name_is_escaped(tmp_path, camera):
         HOSTILE: Outcome(HOSTILE, frames=7, seconds=1.25),
         drives[1].name: Outcome(drives[1].name, failure=f"video {HOSTILE}: no"),
     }
-    page = fleet_page(HOSTILE, drives, outcomes, {HOSTILE: DriveVerdict("fair", HOSTILE)}, [camera])
+    page = fleet_page(HOSTILE, drives, outcomes, {HOSTILE: Verdict("fair", HOSTILE, "", ())}, [camera])
     assert "<script>alert" not in page
     assert "1 drives finished, 1 failed, 7 frames" in page
     assert "&lt;script&gt;alert(1)" in page

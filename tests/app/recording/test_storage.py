@@ -34,12 +34,12 @@ def test_rows_come_back_as_they_were():
 
 
 def test_a_row_takes_little():
-    kept = StoredRows()
+    kept, image = StoredRows(), "images/5.png"
     for number in range(2000):
-        kept.append(_row(5)._replace(frame=number))
-    parts = (kept._numbers, kept._counts, kept._codes)
-    assert sum(part.itemsize * len(part) for part in parts) == 2000 * (10 * 8 + 2 * 8 + 2 * 8)
-    assert len(kept._texts) == 2
+        kept.append(_row(5)._replace(frame=number, image=image, reasons="|".join("AB")))
+    assert kept._numbers.itemsize * len(kept._numbers) == 2000 * 12 * 8
+    assert len(kept._texts) == 3 * 2000
+    assert len(set(map(id, kept._texts))) == 3
 
 
 @pytest.mark.parametrize("on_disk", [False, True])
