@@ -24,6 +24,9 @@ _STAND_INS = {  # what came in place of another file, by its first bytes
     b"\x93NUMPY": "an array of NumPy; write numbers as JSON or YAML, images as PNG",
     b"MATLAB ": "MATLAB's own format; save it as JSON by jsonencode",
     b"PK\x03\x04": "a ZIP archive; unpack it",
+    b"\x89HDF": "HDF5, as of MATLAB 7.3 and h5py; save it as JSON",
+    b"PAR1": "a Parquet table; save it as JSON",
+    b"ARROW1": "a Feather table; save it as JSON",
     **dict.fromkeys(
         (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"),
         "a pickle of Python, which is not opened since it may run commands; save it as JSON",

@@ -25,7 +25,7 @@ from lanebev.io.images.files import (
     left_out_remark,
 )
 from lanebev.io.images.names import in_natural_order, times_from_names
-from lanebev.io.images.pixels import is_image, read_image, stated_size
+from lanebev.io.images.pixels import dark_remark, is_image, read_image, stated_size
 from lanebev.io.images.time_files import times_from_file
 from lanebev.io.side_by_side import halves_remark
 from lanebev.io.source_names import SCHEMES
@@ -50,7 +50,6 @@ from lanebev.io.video.remarks import (
 )
 
 _LOOKED_AT = 20  # images, for the most frequent size and one that has it
-_DARK = 24  # an image with no brighter value, of 255, is dark; 12 bits in 16 give 15 at most
 _SAME_RATE = 0.05  # relative, by which two frame rates may differ and be the same
 _SAME_VIDEO = 2  # factor, by which a video's frames may come faster or slower than its mean rate
 _HIDING = ("vp8", "libvpx")  # codecs with frames that are decoded and not shown, in packets of their own
@@ -105,7 +104,7 @@ def _image_source(source: str, paths: Sequence[str], fps: Fraction | None, left_
     size, times, stated, unused = image.shape[:2], times_from_names(paths), "its names state", ""
     if not times:
         (times, unused), stated = times_from_file(paths), "a file of times beside it states"
-    remarks = [left_out, _dark_remark(image), halves_remark(image)]
+    remarks = [left_out, dark_remark(image), halves_remark(image)]
     rate = fps or DEFAULT_FPS
     if times:
         own = 1 / Fraction(median(np.diff(times).tolist())).limit_denominator(1_000_000)
@@ -143,16 +142,6 @@ def _typical_image(paths: Sequence[str]) -> NDArray[np.uint8]:
     if found is None:
         raise ValueError(problem)
     return found
-
-
-def _dark_remark(image: NDArray[np.uint8]) -> str:
-    """Return a remark on an image whose brightest pixel is nearly black; else nothing."""
-    if not 0 < image.max() < _DARK:
-        return ""
-    return (
-        f"the first image is nearly black, its brightest value {image.max()} of 255; are values of 10 or 12 "
-        "bits stored in 16? multiply them by 64 or 16"
-    )
 
 
 class _Survey(NamedTuple):

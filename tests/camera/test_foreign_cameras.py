@@ -307,6 +307,7 @@ ORBextractor.nFeatures: 1200
             "expected a camera of 1920 x 1280 px, OpenLane's, got a",
         ),
         ("c.json", json.dumps({"intrinsic": {"fx": 1, "u0": 2}}), "fy: expected a value, got none"),
+        ("c.mat", b"\x89HDF\r\n\x1a\n" + bytes(99), "got: HDF5, as of MATLAB 7.3 and h5py; save it as JSON"),
         (
             "c.json",
             json.dumps({"K": np.array(MATRIX).T.tolist(), "D": [], "width": 800, "height": 450}),

@@ -27,6 +27,9 @@ _PLAIN = {  # encoding of ROS to channels, and to OpenCV's conversion to RGB
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
     "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
 }
+_SEMI_PLANAR = {"nv12": cv2.COLOR_YUV2RGB_NV12, "nv21": cv2.COLOR_YUV2RGB_NV21}
+"""Encodings of a plane of brightness and one of both colours, of half its width and height."""
+
 _CODECS = {  # formats of Foxglove's CompressedVideo, and ffmpeg's decoders
     "h264": "h264",
     "h265": "hevc",
@@ -92,13 +95,25 @@ def message_image(message: Any) -> NDArray[np.uint8]:
             )
         return np.ascontiguousarray(found[..., ::-1])
     encoding, height, width, step = message.encoding, message.height, message.width, message.step
-    if encoding not in _PLAIN:
-        raise ValueError(f"expected an image of {', '.join(_PLAIN)}, got {encoding[:40]!r}")
-    channels, conversion = _PLAIN[encoding]
-    if not (height > 0 and width > 0 and step >= width * channels and len(data) >= height * step):
+    is_wide = encoding.endswith("16")  # bits
+    encoding = f"{encoding[:-2]}8" if is_wide else encoding
+    if encoding in _SEMI_PLANAR:
+        height = height * 3 // 2
+    elif encoding not in _PLAIN:
+        known = ", ".join((*_PLAIN, *_SEMI_PLANAR))
+        raise ValueError(
+            f"expected an image of {known}, or 16 bits, got {message.encoding[:40]!r}; give the topic of a "
+            "camera's images, or convert them to rgb8"
+        )
+    channels, conversion = _PLAIN.get(encoding) or (1, _SEMI_PLANAR[encoding])
+    length = width * channels * (2 if is_wide else 1)
+    if not (height > 0 and width > 0 and step >= length and len(data) >= height * step):
         raise ValueError(f"expected {height} rows of {step} bytes, got {len(data)} bytes; is it cut?")
-    rows = data[: height * step].reshape(height, step)[:, : width * channels]
-    image = np.ascontiguousarray(rows.reshape(height, width, channels))
+    rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :length])
+    if is_wide:
+        values = rows.view(">u2" if getattr(message, "is_bigendian", 0) else "<u2")
+        rows = (values / 257).round().astype(np.uint8)
+    image = rows.reshape(height, width, channels)
     if conversion is None:
         return image
     try:

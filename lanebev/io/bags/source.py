@@ -12,12 +12,15 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lanebev.io.bags.images import TopicImages, is_video
 from lanebev.io.bags.messages import IMAGE_TYPES, LENS_TYPES, VIDEO_TYPES, Bag, Topic, message_stamp, open_bag
 from lanebev.io.frame_source import DEFAULT_FPS, FrameSource
 from lanebev.io.frames import ALL, Frame
+from lanebev.io.images.pixels import dark_remark
 from lanebev.io.rising_clock import RisingClock
+from lanebev.io.side_by_side import halves_remark
 
 _LOOKED_AT = 50  # frames, for their rate
 _LONGEST_GROUP = 600  # frames, which a video in a bag may begin before its first key frame
@@ -96,21 +99,27 @@ def open_bag_source(source: str, topic: str | None = None, fps: Fraction | None 
     """
     with open_bag(Path(source)) as bag:
         chosen = _image_topic(source, bag.topics, topic)
-        size = _first_size(bag, chosen.name)
-        if size is None:
+        image = _first_image(bag, chosen.name)
+        if image is None:
             raise ValueError(f"bag {source}: expected images on {chosen.name}, got none")
         lens = _lens(bag, chosen.name)
-    found = BagSource(source, (), fps or DEFAULT_FPS, chosen.size, size, topic=chosen.name, lens=lens)
+    rate, size = fps or DEFAULT_FPS, image.shape[:2]
+    found = BagSource(source, (), rate, chosen.size, size, topic=chosen.name, lens=lens)
     clock = RisingClock(float(1 / found.fps))
     steps = [after - before for before, after in pairwise(islice(found.frame_times(clock), _LOOKED_AT))]
-    words = f"bag {source}: {clock.unstamped} of its first images have no stamps; they follow as recorded"
-    rate = fps or (Fraction(1 / median(steps)).limit_denominator(1000) if steps else found.fps)
-    is_unstamped = clock.unstamped > 1  # times from zero on have one stamp of zero
-    return replace(found, fps=rate, problem=words if is_unstamped else "")
+    rate = fps or (Fraction(1 / median(steps)).limit_denominator(1000) if steps else rate)
+    said = "; ".join(filter(None, (_unstamped_remark(clock), dark_remark(image), halves_remark(image))))
+    return replace(found, fps=rate, problem=f"bag {source}: {said}" if said else "")
 
 
-def _first_size(bag: Bag, topic: str) -> tuple[int, int] | None:
-    """Return the (height, width) px of a topic's first image, of a video from its first key frame on.
+def _unstamped_remark(clock: RisingClock[float]) -> str:
+    """Return a remark on images without stamps; else nothing. Times from zero on have one stamp of zero."""
+    words = f"{clock.unstamped} of its first images have no stamps; they follow as recorded"
+    return words if clock.unstamped > 1 else ""
+
+
+def _first_image(bag: Bag, topic: str) -> NDArray[np.uint8] | None:
+    """Return a topic's first image, of a video the first one from a key frame on; None without images.
 
     Raises:
         ValueError: it does not decode.
@@ -118,8 +127,7 @@ def _first_size(bag: Bag, topic: str) -> tuple[int, int] | None:
     images = TopicImages()
     for number, (_, message) in enumerate(bag.messages(topic)):
         try:
-            height, width = images(message).shape[:2]
-            return height, width
+            return images(message)
         except ValueError:
             if not is_video(message) or number > _LONGEST_GROUP:
                 raise

@@ -14,6 +14,7 @@ from lanebev.io.images.names import IMAGE_SUFFIXES
 from lanebev.numbers import stand_in
 
 _LYING = (5, 6, 7, 8)  # EXIF orientations whose images are shown with their sides exchanged
+_DARK = 24  # an image with no brighter value, of 255, is dark; 12 bits in 16 give 15 at most
 _UNREADABLE = (  # Pillow's errors for files that are cut or no images
     OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, EOFError, MemoryError,
     struct.error, zlib.error, Image.DecompressionBombError,
@@ -76,6 +77,16 @@ def stated_size(path: str | Path) -> tuple[int, int] | None:
                 return (width, height) if lying else (height, width)
     except _UNREADABLE:
         return None
+
+
+def dark_remark(image: NDArray[np.uint8]) -> str:
+    """Return a remark on an image whose brightest pixel is nearly black; else nothing."""
+    if not 0 < image.max() < _DARK:
+        return ""
+    return (
+        f"the first image is nearly black, its brightest value {image.max()} of 255; are values of 10 or 12 "
+        "bits stored in 16? multiply them by 64 or 16"
+    )
 
 
 def write_png(path: str | Path, image: NDArray[np.uint8]) -> None:

@@ -20,6 +20,12 @@ from lanebev.numbers import stand_in
 
 _DRAWN_TEXTS = ("tty", "bin", "xbin", "adf", "idf")  # formats of which ffmpeg draws the letters
 _A_TEXT = "a text; images are given as a folder or as a quoted glob"
+_TEXTS = {  # by their first bytes
+    b"#EXTM3U": "a playlist whose files are not all on this machine; give the address of the stream, or a "
+    "video",
+    b"v=0": "the description of a stream; pipe the stream: ffmpeg -protocol_whitelist file,udp,rtp -i FILE "
+    "-c copy -f matroska - | lanebev run -",
+}
 _MOVING = 0.5  # a stream that lasts for less of the longest one's duration is a picture
 _NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS: raw streams, whose times ffmpeg makes up
 _MARKED = "one that the decoder marks as damaged"
@@ -51,7 +57,8 @@ def open_video(source: str) -> av.container.InputContainer:
             begin = file.read(100)
             is_invalid = isinstance(error, av.error.InvalidDataError)
             is_text = is_invalid and begin.isascii() and b"\0" not in begin
-            reason = stand_in(begin) or (_A_TEXT if is_text else reason)
+            text = next((what for first, what in _TEXTS.items() if begin.startswith(first)), _A_TEXT)
+            reason = stand_in(begin) or (text if is_text else reason)
         raise ValueError(f"video {source}: expected a video that opens, got: {reason}") from error
     if container.format.name in _DRAWN_TEXTS:
         container.close()

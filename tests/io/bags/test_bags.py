@@ -37,7 +37,7 @@ COUNT, START = 6, 1_700_000_000.5
 
 
 def _picture(number):
-    image = np.full((*SIZE, 3), 20, np.uint8)
+    image = np.full((*SIZE, 3), 40, np.uint8)
     image[:, :, 0] = 20 * number
     return image
 
@@ -347,6 +347,36 @@ def test_grey_and_bayer_images():
     assert max(blue[:2]) < 5
 
 
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_images_of_16_bits(order):
+    grey = np.random.default_rng(0).integers(0, 255, SIZE, dtype=np.uint8)
+    colour = np.random.default_rng(0).integers(0, 255, (*SIZE, 3), dtype=np.uint8)
+    for image, encoding in ((grey, "mono16"), (colour[..., ::-1], "bgr16")):
+        rows = (image.astype(f"{order}u2") * 257).reshape(SIZE[0], -1).view(np.uint8)
+        message = replace(_raw(rows, encoding, 4), width=SIZE[1], is_bigendian=int(order == ">"))
+        expected = colour if encoding == "bgr16" else np.dstack([grey] * 3)
+        assert np.array_equal(message_image(message), expected)
+
+
+def test_an_image_of_12_bits_in_16_is_noticed(tmp_path):
+    name = "sensor_msgs/msg/Image"
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection("/image", name, typestore=STORE)
+        image = replace(_raw(np.full((SIZE[0], 2 * SIZE[1]), 8, np.uint8), "mono16"), width=SIZE[1])
+        writer.write(connection, 0, STORE.serialize_cdr(image, name))
+    assert "nearly black, its brightest value 8 of 255" in open_bag_source(str(tmp_path / "bag")).problem
+
+
+@pytest.mark.parametrize(("encoding", "blue"), [("nv12", 0), ("nv21", 1)])
+def test_images_with_a_plane_of_colours(encoding, blue):
+    planes = np.full((SIZE[0] * 3 // 2, SIZE[1]), 128, np.uint8)
+    assert np.ptp(message_image(replace(_raw(planes, encoding, 8), height=SIZE[0]))) == 0  # grey
+    planes[SIZE[0] :, blue::2] = 240
+    shown = message_image(replace(_raw(planes, encoding, 8), height=SIZE[0]))
+    assert shown.shape == (*SIZE, 3)
+    assert shown[..., 2].min() > 200 > shown[..., 0].max()
+
+
 def test_yuv_images():
     uyvy = np.tile(np.array([128, 90], np.uint8), (*SIZE, 1))
     yuyv = np.tile(np.array([90, 128], np.uint8), (*SIZE, 1))
@@ -464,7 +494,7 @@ def test_an_encoding_that_is_not_known_is_no_damage(tmp_path):
     path = _mcap(
         tmp_path / "a.mcap", name, kinds, [bytes(store.serialize_cdr(_raw(_picture(0), "16UC1"), name))]
     )
-    with pytest.raises(ValueError, match=r"a\.mcap: expected an image of rgb8, .*, yuyv, got '16UC1'$"):
+    with pytest.raises(ValueError, match=r"a\.mcap: expected an image of rgb8, .*, got '16UC1'; give"):
         open_bag_source(path)
 
 

@@ -376,6 +376,8 @@ def test_a_list_of_images_is_no_video(tmp_path):  # of which ffmpeg draws the le
             b"images/1.jpg\nimages/2.jpg\n",
             "a text; images are given as a folder or as a quoted glob",
         ),
+        ("live.m3u8", b"#EXTM3U\nhttp://camera/1.ts\n", "a playlist whose files are not all .* or a video"),
+        ("cam.sdp", b"v=0\nm=video 5004 RTP/AVP 96\n", "the description of a stream; pipe .* lanebev run -"),
         ("images.zip", b"PK\x03\x04" + bytes(99), "a ZIP archive; unpack it"),
         ("frames.npy", b"\x93NUMPY" + bytes(99), "an array of NumPy; write numbers .*, images as PNG"),
     ],
