@@ -11,11 +11,7 @@ from typing import NamedTuple, Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from lanebev.geometry.rotation import (
-    camera_from_road_matrix,
-    road_from_camera_matrix,
-    rotation_vector,
-)
+from lanebev.geometry.rotation import camera_from_road_matrix, road_from_camera_matrix, rotation_vector
 from lanebev.numbers import check_number
 from lanebev.torch_internals import register_pytree
 

@@ -23,15 +23,7 @@ from lanebev.camera.datasets import (
 from lanebev.camera.formats import opencv_or_ros, without_lens
 from lanebev.camera.parameters import CameraParameters, checked
 from lanebev.camera.parsing import bare_numbers, is_ros_ini, parse_documents
-from lanebev.camera.programs import (
-    depthai_cameras,
-    gyroflow,
-    matlab,
-    metashape,
-    nerf,
-    open3d,
-    realsense,
-)
+from lanebev.camera.programs import depthai_cameras, gyroflow, matlab, metashape, nerf, open3d, realsense
 from lanebev.camera.reconstruction import openmvg_cameras, opensfm_cameras
 from lanebev.camera.records import record_cameras
 from lanebev.camera.several import named_cameras, stereo_cameras

@@ -5,13 +5,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from lanebev.camera.approximation import (
-    Array,
-    double_sphere,
-    extended_unified,
-    fov_model,
-    radial_camera,
-)
+from lanebev.camera.approximation import Array, double_sphere, extended_unified, fov_model, radial_camera
 from lanebev.camera.choice import Readers
 from lanebev.camera.parameters import CameraParameters
 from lanebev.camera.parsing import mapping, number, numbers, required, whole_number

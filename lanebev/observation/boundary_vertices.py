@@ -6,12 +6,7 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import order_true_first
-from lanebev.geometry.lens import (
-    invert_distortion,
-    placeholder_intrinsics,
-    undistorted_sigma,
-    usable_cameras,
-)
+from lanebev.geometry.lens import invert_distortion, placeholder_intrinsics, undistorted_sigma, usable_cameras
 from lanebev.observation.vertices import take
 from lanebev.torch_internals import register_pytree
 

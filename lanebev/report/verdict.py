@@ -10,13 +10,7 @@ from numpy.typing import NDArray
 
 from lanebev.estimation.reasons import REASON_WORDS, UNSEEN, WHOLE_FRAME, Reason, telling_reasons
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.axis_states import (
-    LARGEST_STD,
-    AxisState,
-    all_axis_states,
-    estimate_stds,
-    with_unit,
-)
+from lanebev.report.axis_states import LARGEST_STD, AxisState, all_axis_states, estimate_stds, with_unit
 from lanebev.types import AXES
 
 _WORDS = {str(reason.name): words for reason, words in REASON_WORDS.items()}

@@ -9,13 +9,7 @@ from lanebev.geometry.lens import invert_distortion
 from lanebev.geometry.precision import common_dtype, full_precision
 from lanebev.geometry.road import road_from_image_points
 from lanebev.types import Extrinsics, check_type
-from lanebev.view.checks import (
-    blind_unless_usable,
-    check_cameras,
-    check_image,
-    check_size,
-    doubt_intrinsics,
-)
+from lanebev.view.checks import blind_unless_usable, check_cameras, check_image, check_size, doubt_intrinsics
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.projection import CellSums, normalised_intrinsics
 from lanebev.view.sampling import MapSize, resampled

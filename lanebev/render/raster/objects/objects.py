@@ -14,13 +14,7 @@ from lanebev.render.raster.base.canvas import Canvas
 from lanebev.render.raster.base.rays import View
 from lanebev.render.raster.base.select import as_float, choose, indices_where, put, take, take_channels
 from lanebev.render.raster.base.tiles import TILE, TILE_PIXELS
-from lanebev.render.raster.objects.hexahedra import (
-    NEVER,
-    Hexahedra,
-    entered_face,
-    entry_depth,
-    plane_times,
-)
+from lanebev.render.raster.objects.hexahedra import NEVER, Hexahedra, entered_face, entry_depth, plane_times
 from lanebev.render.raster.objects.shading import object_radiance
 from lanebev.render.rows import take_rows
 from lanebev.render.scene.objects.objects import SceneObjects
