@@ -149,8 +149,7 @@ def flags(conditions: Mapping[FlagT, Tensor]) -> Tensor:
     """Return the bits of the reasons whose conditions (B,) hold, (B,) int64; no two share a bit."""
     holds = torch.stack(list(conditions.values()), dim=-1)
     bits = constant(tuple(map(int, conditions)), like=holds, dtype=torch.int64)
-    total: Tensor = (holds * bits).sum(-1)
-    return total
+    return (holds * bits).sum(-1)
 
 
 def flag(condition: Tensor, reason: IntFlag) -> Tensor:

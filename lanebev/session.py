@@ -303,5 +303,4 @@ def _calibrator_of(model: LaneBEV) -> Calibrator[Any]:
 def _as_bytes(image: Tensor) -> NDArray[np.uint8]:
     """Return an image (3, H, W), bytes or in [0, 1], as (H, W, 3) bytes."""
     pixels = image if image.dtype == torch.uint8 else (255 * image).round().clamp(0, 255).byte()
-    array: NDArray[np.uint8] = pixels.permute(1, 2, 0).contiguous().cpu().numpy()
-    return array
+    return pixels.permute(1, 2, 0).contiguous().cpu().numpy()

@@ -25,8 +25,7 @@ def double_sphere(angle: Array, xi: float, alpha: float) -> Array:
     Source: Usenko, Demmel and Cremers 2018, Eqs. (40)-(42).
     """
     x, shifted = np.sin(angle), np.cos(angle) + xi
-    radius: Array = x / (alpha * np.hypot(x, shifted) + (1 - alpha) * shifted)
-    return radius
+    return x / (alpha * np.hypot(x, shifted) + (1 - alpha) * shifted)
 
 
 def extended_unified(angle: Array, alpha: float, beta: float) -> Array:
@@ -44,8 +43,7 @@ def fov_model(angle: Array, omega: float) -> Array:
 
     Source: Devernay and Faugeras 2001, Eq. (13).
     """
-    radius: Array = np.arctan(2 * np.tan(angle) * math.tan(omega / 2)) / omega
-    return radius
+    return np.arctan(2 * np.tan(angle) * math.tan(omega / 2)) / omega
 
 
 def radial_camera(

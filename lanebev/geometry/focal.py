@@ -56,8 +56,7 @@ def focal_covariance(extrinsics: Extrinsics, intrinsics: Tensor, focal_std: floa
     slope = pose_by_log_focal(extrinsics, intrinsics.to(pose)).to(pose)
     share = torch.as_tensor(focal_std, dtype=pose.dtype, device=pose.device)
     change = slope * share.reshape(-1, 1)  # (B, 4)
-    covariance: Tensor = change.unsqueeze(-1) * change.unsqueeze(-2)
-    return covariance
+    return change.unsqueeze(-1) * change.unsqueeze(-2)
 
 
 def _image_of_lanes(pose: Tensor, intrinsics: Tensor, log_focal: Tensor) -> Tensor:

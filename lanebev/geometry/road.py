@@ -225,8 +225,7 @@ def lane_width_covariance(height: Tensor, relative_std: float | Tensor) -> Tenso
         relative_std: standard deviation of the lane width as a share of it, a float or (B,).
     """
     change = torch.nn.functional.pad((height * relative_std).unsqueeze(-1), (3, 0))  # (B, 4)
-    covariance: Tensor = change.unsqueeze(-1) * change.unsqueeze(-2)
-    return covariance
+    return change.unsqueeze(-1) * change.unsqueeze(-2)
 
 
 @full_precision

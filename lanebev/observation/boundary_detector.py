@@ -211,5 +211,4 @@ def check_vanishing_point(point: Tensor, rows: int) -> None:
 
 def _finite(image: Tensor) -> Tensor:
     """Return which images (B, ...) are finite, (B,) bool."""
-    finite: Tensor = image.isfinite().flatten(1).all(1)
-    return finite
+    return image.isfinite().flatten(1).all(1)

@@ -232,8 +232,7 @@ def _line_vertices(line: LaneLine, image_size: tuple[int, int]) -> NDArray[np.fl
 
 
 def _inside(x: NDArray[np.float64], width: int) -> NDArray[np.bool_]:
-    inside: NDArray[np.bool_] = (x >= 0) & (x <= width - 1)
-    return inside
+    return (x >= 0) & (x <= width - 1)
 
 
 def _spread(count: int, most: int) -> NDArray[np.int64]:
@@ -292,5 +291,4 @@ def _undistorted(points: NDArray[np.float64], camera: Camera) -> NDArray[np.floa
     if not len(points):
         return points
     undistorted, valid = camera.undistort_points(torch.from_numpy(points).to(camera.intrinsics))
-    kept: NDArray[np.float64] = undistorted[valid].double().numpy()
-    return kept
+    return undistorted[valid].double().numpy()

@@ -205,8 +205,7 @@ def first_maximum_(values: Tensor, dim: int) -> Tensor:
 def _about(padded: Tensor, centre: Tensor, offset: Tensor, scans: Scans) -> Tensor:
     """Return the values (..., 2·window + 1, V) at offsets from the scans' centres (..., V), px."""
     cells = (scans.start + scans.step * centre).unsqueeze(-2) + scans.step * offset
-    values: Tensor = padded.flatten(-2).gather(-1, cells.flatten(-2)).view(cells.shape)
-    return values
+    return padded.flatten(-2).gather(-1, cells.flatten(-2)).view(cells.shape)
 
 
 def _mean(values: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:

@@ -121,7 +121,7 @@ def render_comparison(first: RunFolder, second: RunFolder) -> str:
         "two": plot_two(x[shown], [a for a, _ in shown_pairs], [b for _, b in shown_pairs], stills),
         "differences": plot_differences(x[shown], *difference_and_sigma(shown_pairs), stills),
     } if several else {}  # fmt: skip
-    page: str = template("compare.html.j2").render(
+    return template("compare.html.j2").render(
         title=f"{first.name} and {second.name}",
         runs=[
             _summary("A", first, [row for row, _ in pairs], stills),
@@ -139,7 +139,6 @@ def render_comparison(first: RunFolder, second: RunFolder) -> str:
         plots=plots,
         bokeh=Markup(bokeh_script()) if several else "",
     )
-    return page
 
 
 def _summary(letter: str, run: RunFolder, rows: Sequence[ExtrinsicsRow], stills: bool) -> dict[str, Any]:
@@ -184,8 +183,7 @@ def _names(
 
 
 def _measured(rows: Sequence[ExtrinsicsRow]) -> NDArray[np.bool_]:
-    measured: NDArray[np.bool_] = all_axis_states(rows) <= AxisState.UNCERTAIN
-    return measured
+    return all_axis_states(rows) <= AxisState.UNCERTAIN
 
 
 def _moments(

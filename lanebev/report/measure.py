@@ -134,8 +134,7 @@ def _long_enough(
         of = seen & (boundary == k)
         long = of.sum() >= _MIN_VERTICES and np.ptp(z[of]) >= _MIN_STRETCH
         enough[k] = long and np.ptp(rows[of]) >= _MIN_ROWS
-    long_enough: NDArray[np.bool_] = enough[boundary]
-    return long_enough
+    return enough[boundary]
 
 
 def _fit(

@@ -187,8 +187,7 @@ def _extended(at: NDArray[np.bool_], other: NDArray[np.bool_]) -> NDArray[np.boo
     """Return ``at`` with the first frame of the other kind after each stretch, so that lines meet."""
     after = np.zeros_like(at)
     after[1:] = at[:-1] & other[1:]
-    extended: NDArray[np.bool_] = at | after
-    return extended
+    return at | after
 
 
 def _draw_estimate(

@@ -69,7 +69,7 @@ def fleet_page(
     done = [drive for drive in drives if not outcomes[drive.name].failure]
     poor = sorted(done, key=lambda drive: ("poor", "fair", "good").index(verdicts[drive.name].grade))
     plots = {str(number): plot_mounts(camera) for number, camera in enumerate(cameras) if camera.mounts}
-    page: str = template("fleet.html.j2").render(
+    return template("fleet.html.j2").render(
         title=title,
         failed=[(drive, outcomes[drive.name].failure) for drive in failed],
         drives=[
@@ -87,7 +87,6 @@ def fleet_page(
         plots=plots,
         bokeh=Markup(bokeh_script()) if plots else "",
     )
-    return page
 
 
 def stretch_words(stretch: Stretch) -> StretchWords:

@@ -187,8 +187,7 @@ def angles_by_shape(world: Tensor, distance: Tensor) -> Tensor:
     x, y, z = world.unbind(-1)
     half = 0.5 * z * distance  # lateral shift of a ray, per unit of curvature
     moved = torch.stack([-(y * half).sum(-1), (x * half).sum(-1)], dim=-1)
-    by_shape: Tensor = moved / (x * x + y * y).sum(-1, keepdim=True)
-    return by_shape
+    return moved / (x * x + y * y).sum(-1, keepdim=True)
 
 
 class WidthMeasurement(NamedTuple):

@@ -90,8 +90,7 @@ def image_from_camera_points(points: Array, intrinsics: Array) -> Array:
     """
     depth = np.where(points[:, 2] > _NEAREST, points[:, 2], np.nan)
     homogeneous = points @ intrinsics.T
-    pixels: Array = homogeneous[:, :2] / depth[:, None]
-    return pixels
+    return homogeneous[:, :2] / depth[:, None]
 
 
 def _is_list_of_points(lane: Any) -> bool:

@@ -260,5 +260,4 @@ def _all_points(frames: Sequence[FrameLines]) -> NDArray[np.float64]:
     """Return the points (P, 2) px of all lines."""
     points = [line.points for frame in frames for line in frame.lines]
     together = np.concatenate(points) if points else np.empty((0, 2))
-    there: NDArray[np.float64] = together[np.isfinite(together).all(-1)]
-    return there
+    return together[np.isfinite(together).all(-1)]

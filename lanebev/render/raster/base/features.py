@@ -150,5 +150,4 @@ def features_of(scene: Scene) -> Features:
 
 def _rows(mask: Tensor) -> list[int]:
     """Return the rows in which a mask (B,) holds."""
-    rows: list[int] = mask.nonzero()[:, 0].tolist()
-    return rows
+    return mask.nonzero()[:, 0].tolist()

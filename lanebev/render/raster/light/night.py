@@ -46,8 +46,7 @@ def low_beam(lights: Lights, x: Tensor, z: Tensor) -> Tensor:
     start = 1 - torch.exp(-((ahead / 4.0) ** 2))
     end = smoothstep(1.25, 0.75, ahead / (lights.beam_end[:, None] * (1 + 0.15 * aside)))
     rays = 1 + lights.beam_rays[:, None] * sample_line(x / (ahead + 3.0) * 0.11 + 0.5)
-    beam: Tensor = 1.3 * flat_top * fall * start * end * rays.clamp(min=0.2)
-    return beam
+    return 1.3 * flat_top * fall * start * end * rays.clamp(min=0.2)
 
 
 def lamp_light(lights: Lights, along: Tensor, across: Tensor) -> Tensor:
