@@ -1,7 +1,5 @@
 """Operations on the rows of a batch that all packages share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntFlag
 from typing import Any, TypeVar, cast

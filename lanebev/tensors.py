@@ -1,7 +1,5 @@
 """Generic operations on tensors and NamedTuples of tensors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache, wraps

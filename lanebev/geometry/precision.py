@@ -1,7 +1,5 @@
 """Keep geometry in single or double precision: bfloat16's 8 bits cannot represent a pixel among 1920."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from functools import reduce, wraps

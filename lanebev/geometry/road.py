@@ -1,7 +1,5 @@
 """Great circles, the road plane, and points between image and road, with their covariance."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -1,7 +1,5 @@
 """Speeds of the vehicle over a drive, from a text file."""
 
-from __future__ import annotations
-
 import csv
 import math
 import re

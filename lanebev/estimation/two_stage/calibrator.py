@@ -1,7 +1,5 @@
 """The paper's calibrator: pitch and yaw from the vanishing direction, roll and height from lane widths."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Self
 

@@ -1,7 +1,5 @@
 """Frames of a video container in the order in which they are shown, and what is wrong with them."""
 
-from __future__ import annotations
-
 import bisect
 import contextlib
 import math
