@@ -190,9 +190,10 @@ def _doubt_of_points(frames: Sequence[FrameLines], image_size: tuple[int, int]) 
             "beyond the left; of wider images?",
             _STATE_SIZE,
         )
-    if points.min() >= 0 and points.max() <= 1:
+    if points.min() >= 0 and min(x.max(), y.max()) <= 1:
+        what = "x" if y.max() > 1 else "y" if x.max() > 1 else "x and y"
         return SizeDoubt(
-            "all points lie between 0 and 1; are they shares of the sides instead of pixels?",
+            f"{what} of all points lie between 0 and 1; are they shares of the sides instead of pixels?",
             "multiply them by the sides",
         )
     if horizon > y.max():

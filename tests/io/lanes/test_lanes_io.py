@@ -142,6 +142,10 @@ def test_a_culane_point_given_twice_counts_once(tmp_path):
         ("1 590 2 580 3 580 4 570", "line 1: expected rows in one direction"),
         ("1 590 2 580 1 590 3 570", "line 1: expected rows in one direction"),
         ("1 590 2 x", "line 1: points: expected finite numbers"),
+        (
+            "1,590 2,580",
+            "line 1: expected spaces between numbers, got commas or semicolons; replace them",
+        ),
     ],
 )
 def test_bad_culane_lines_name_file_and_line(tmp_path, text, message):
