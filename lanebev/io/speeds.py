@@ -105,7 +105,21 @@ def _rows(text: str) -> list[list[str]]:
         rows = [line.split() for line in (*above, *table)]
     else:
         rows = [[line] for line in (*above, *table)]
-    return rows if not above or _are_titles(rows[0], rows[1:2]) else rows[1:]
+    titled = bool(above) and _are_titles(rows[0], rows[1:2])
+    rows = rows if titled else rows[len(above) :]
+    with_unit = next(filter(_states_unit, lines[: first - titled]), "")
+    if with_unit and not any(map(_states_unit, rows[0] if rows else [])):
+        raise ValueError(
+            f"expected titles with the unit, got {with_unit[:100]!r}; write them with the separator of the "
+            "numbers, as time,speed_kmh"
+        )
+    return rows
+
+
+def _states_unit(text: str) -> bool:
+    """Tell whether a title or a comment says in which unit speeds are."""
+    words = {*_words(text)}
+    return not words.isdisjoint(_SPEED) and not words.isdisjoint(_SPEED_UNITS)
 
 
 def _are_titles(cells: list[str], below: list[list[str]]) -> bool:
@@ -151,7 +165,10 @@ def _number(cell: str) -> float:
     try:
         return float(cell)
     except ValueError as error:
-        raise ValueError(f"expected a number, got {cell!r}") from error
+        raise ValueError(
+            f"expected a number, got {cell!r}; write times in seconds since the source's first frame, and "
+            "units in titles, as speed_kmh"
+        ) from error
 
 
 def _is_number(cell: str) -> bool:

@@ -59,6 +59,8 @@ def test_times_and_speeds(read, text):
         "frame,speed_kmh\n0,36\n1,39.6\n2,\n",
         "Speed [km/h]\n36\n39.6\nnan\n",
         "# speed_kmh\n36\n39.6\nnan\n",
+        "# speed in km/h\n# speed_kmh\n36\n39.6\nnan\n",
+        "# speed in km/h\nspeed_kmh\n36\n39.6\nnan\n",
     ],
 )
 def test_a_speed_for_each_frame(read, text):
@@ -102,6 +104,13 @@ def test_a_speed_between_two_and_beside_them():
         ),
         ("time,speed\n0,1\n1\n", "expected 2 columns as in the first line, got '1'"),
         ("time,speed\n0,fast\n", "expected a number, got 'fast'"),
+        ("time,speed\n10:15:30,9\n", "expected a number, got '10:15:30'; write times in seconds"),
+        (
+            "# time [s], speed [km/h]\n0 36\n",
+            r"expected titles with the unit, got '# time \[s\], speed \[km/h\]'; write them with",
+        ),
+        ("# speed in km/h\ntime,speed\n0,36\n", "expected titles with the unit, got '# speed in km/h'"),
+        ("# speed in km/h\n# time speed\n0 36\n", "expected titles with the unit, got '# speed in km/h'"),
         ("0,10\n0.1,130\n", "expected m/s up to 100, got 130; name another unit, as speed_kmh"),
         ("0.2,10\n0.1,11\n", "expected times that rise, got others"),
         ("nan,10\n0.1,11\n", "expected times that rise, got others"),
