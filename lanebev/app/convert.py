@@ -1,9 +1,8 @@
 """``lanebev convert``: write the results of a finished run in another program's format."""
 
 import importlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Protocol, cast
 
 from lanebev.app.drive.sources import source_of_run
 from lanebev.camera.choice import camera_file
@@ -16,23 +15,15 @@ from lanebev.io.output.whole_file import whole_file
 from lanebev.report.run_folder import read_run
 
 
-class Writer(Protocol):
-    """Writes a run to a file, with the images of its frames if given and if the format contains images."""
-
-    def __call__(self, path: Path, record: RunRecord, images: Iterable[Frame] | None = None) -> None:
-        """Write the file."""
-        ...
-
-
-def writer(name: str) -> Writer:
-    """Return what writes a format, one of FORMATS.
+def writer(name: str) -> Callable[[Path, RunRecord, Iterable[Frame] | None], None]:
+    """Return what writes a run in a format, one of FORMATS, with images if the format contains them.
 
     Raises:
         ValueError: a library that it needs is not installed.
     """
     check_installed([name])
-    module = importlib.import_module(f"lanebev.io.formats.{FORMATS[name].module}")
-    return cast(Writer, module.write)
+    write = importlib.import_module(f"lanebev.io.formats.{FORMATS[name].module}").write
+    return lambda path, record, images: write(path, record, *([images] if FORMATS[name].has_images else []))
 
 
 def convert(

@@ -29,19 +29,18 @@ def predict(mean: Tensor, cov: Tensor, transition: Tensor, process_noise: Tensor
     return predicted, symmetrise(transition @ cov @ transition.mT + process_noise)
 
 
-def innovation(predicted: Tensor, measured: float | Tensor = 0.0) -> Tensor:
-    """Compute the innovation, measured minus predicted.
+def innovation(predicted: Tensor) -> Tensor:
+    """Compute the innovation of measurements that are all zero.
 
-    Source: Eq. (14), whose measurements are all zero: y = -h(x̂).
+    Source: Eq. (14), y = -h(x̂).
 
     Args:
         predicted: (..., N), the measurement model at the predicted state.
-        measured: (..., N), or a number.
 
     Returns:
         (..., N).
     """
-    return measured - predicted
+    return -predicted
 
 
 def information(

@@ -18,10 +18,10 @@ VIEWS = 32
 Feed = dict[str, NDArray[Any]]
 
 
-def rendered_views(size: tuple[int, int], count: int = VIEWS, seed: int = 0) -> Iterator[Feed]:
+def rendered_views(size: tuple[int, int], count: int = VIEWS) -> Iterator[Feed]:
     """Render views of all kinds of roads, each an input of the segmenter (1, 3, h, w)."""
     for number in range(count):
-        frame = render_views(1, size, torch.Generator().manual_seed(seed + number))
+        frame = render_views(1, size, torch.Generator().manual_seed(number))
         yield {"image": frame.image.numpy().astype(np.float32)}
 
 

@@ -4,7 +4,6 @@ import json
 import math
 import os
 import re
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +12,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
+
+from lanebev.io.output.whole_file import replacement
 
 FORMAT = "lanebev-state"
 VERSION = 3
@@ -66,17 +67,11 @@ def save_state(path: str | Path, contents: Mapping[str, Any]) -> None:
         "kinds": json.dumps(kinds),
         "metadata": json.dumps(plain),
     }
-    path = Path(path)
-    descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-    os.close(descriptor)
-    try:
-        _save(tensors, temporary, header)
-        with open(temporary, "rb") as file:
+    with replacement(path) as whole:
+        _save(tensors, str(whole), header)
+        with open(whole, "rb") as file:
             os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        os.replace(temporary, path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
+        whole.chmod(0o644)
 
 
 def _save(tensors: Mapping[str, Tensor], path: str, header: dict[str, str]) -> None:

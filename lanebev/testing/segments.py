@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from lanebev.estimation.checks import padded
 from lanebev.estimation.joint.measurement.observations import boundary_places
 from lanebev.geometry.road import image_from_road_points
 from lanebev.observation.segments import LaneSegments
@@ -102,18 +103,13 @@ def lanes(
     return noisy_segments(endpoints, boundary, noise, generator)
 
 
-def no_lanes(count: int = 48) -> LaneSegments:
+def no_lanes() -> LaneSegments:
     """Return a row in which nothing was seen: segments of weight zero."""
-    segments = lanes(per=count // 6)
+    segments = lanes()
     return segments._replace(weight=torch.zeros_like(segments.weight))
 
 
 def stack_rows(*rows: LaneSegments) -> LaneSegments:
     """Make one batch of rows with different numbers of segments, padded with weight zero to the longest."""
     longest = max(row.weight.shape[1] for row in rows)
-
-    def pad(part: Tensor) -> Tensor:
-        missing = part.new_zeros(part.shape[0], longest - part.shape[1], *part.shape[2:])
-        return torch.cat([part, missing], dim=1)
-
-    return LaneSegments(*(torch.cat([pad(part) for part in parts]) for parts in zip(*rows, strict=True)))
+    return LaneSegments(*map(torch.cat, zip(*(padded(row, longest) for row in rows), strict=True)))

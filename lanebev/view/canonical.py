@@ -19,7 +19,7 @@ from lanebev.view.checks import (
     doubt_intrinsics,
 )
 from lanebev.view.lens import make_lens
-from lanebev.view.projection import CellSums, normalised_intrinsics
+from lanebev.view.projection import CellSums, normalised_intrinsics, pixel_sums
 from lanebev.view.sampling import MapSize, resampled
 
 
@@ -139,17 +139,8 @@ class CanonicalView(nn.Module):
         cam_from_pixel = cam_from_image(constant(self._intrinsics, like=matrix))
         road_from_pixel = road_from_cam(pitch, yaw, roll) @ cam_from_pixel  # (1, 3, 3)
         ratio = torch.ones_like(extrinsics.height) if self.keep_height else extrinsics.height / height
-        rows, columns = (
-            torch.arange(size, dtype=matrix.dtype, device=matrix.device) for size in self.image_size
-        )
         return CanonicalCells(
-            _pixel_sums(matrix @ road_from_pixel, rows, columns),
-            _pixel_sums(road_from_pixel[:, 1:2], rows, columns),
+            pixel_sums(matrix @ road_from_pixel, self.image_size),
+            pixel_sums(road_from_pixel[:, 1:2], self.image_size),
             (matrix[..., 1] * (ratio.clamp(min=0.0) - 1).unsqueeze(-1))[..., None, None],
         )
-
-
-def _pixel_sums(matrix: Tensor, rows: Tensor, columns: Tensor) -> CellSums:
-    """Compute the products of (B, k, 3) matrices with pixels (x, y, 1)."""
-    by_x, by_y, constant = matrix.unsqueeze(-1).unbind(-2)  # (B, k, 1)
-    return CellSums(by_y * rows + constant, by_x * columns)

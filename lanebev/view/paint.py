@@ -11,7 +11,7 @@ from lanebev.geometry.road import road_from_image_points
 from lanebev.types import Extrinsics, check_type
 from lanebev.view.checks import blind_unless_usable, check_cameras, check_image, check_size, doubt_intrinsics
 from lanebev.view.grid import BEVGrid, bev_from_image
-from lanebev.view.projection import CellSums, normalised_intrinsics
+from lanebev.view.projection import CellSums, normalised_intrinsics, pixel_sums
 from lanebev.view.sampling import MapSize, resampled
 
 _ABOVE = -1e6  # depth of what is not on the road
@@ -102,9 +102,7 @@ class ImageFromBEV(nn.Module):
 
     @full_precision
     def _sums(self, intrinsics: Tensor, extrinsics: Extrinsics, image_size: tuple[int, int]) -> CellSums:
-        by_x, by_y, constant = self._homography(intrinsics, extrinsics).unsqueeze(-1).unbind(-2)  # (B, 3, 1)
-        y, x = (torch.arange(side, dtype=by_x.dtype, device=by_x.device) for side in image_size)
-        return CellSums(by_y * y + constant, by_x * x)
+        return pixel_sums(self._homography(intrinsics, extrinsics), image_size)
 
     @full_precision
     def _points(

@@ -60,6 +60,13 @@ class CellSums(NamedTuple):
         return self.by_row[..., first:last].unsqueeze(-1) + self.by_column.unsqueeze(-2)
 
 
+def pixel_sums(matrix: Tensor, image_size: tuple[int, int]) -> CellSums:
+    """Compute the products of matrices (B, 3, 3), or rows (B, 1, 3) of them, with all pixels (x, y, 1)."""
+    by_x, by_y, constant = matrix.unsqueeze(-1).unbind(-2)
+    y, x = (torch.arange(side, dtype=matrix.dtype, device=matrix.device) for side in image_size)
+    return CellSums(by_y * y + constant, by_x * x)
+
+
 @full_precision
 def normalised_intrinsics(intrinsics: Tensor, image_size: tuple[int, int]) -> Tensor:
     """Convert intrinsics to coordinates in which the image, with the edges of its outer pixels, is [-1, 1].

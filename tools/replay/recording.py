@@ -13,10 +13,10 @@ from lanebev.batch import select_rows
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.mount import MountCalibration, MountEstimator
 from lanebev.observation.segments import LaneSegments, camera_segments
-from lanebev.testing.lens_drives import vertices_through_lens
 from lanebev.testing.moments import CAMERA, WIDTH, Moment, observe
 from lanebev.types import Calibration
 from tools.replay.kinds import Generated
+from tools.replay.lens_drives import vertices_through_lens
 
 SIGMA = 1.0  # px, noise of an end point
 SEGMENTS = 8  # of each boundary

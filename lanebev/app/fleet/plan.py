@@ -19,6 +19,7 @@ from lanebev.app.continued.recovery import size_and_time
 from lanebev.app.fleet.manifest import PATHS, Drive
 from lanebev.camera.choice import camera_file
 from lanebev.io.images.files import glob_pattern
+from lanebev.io.output.whole_file import replacement
 
 DRIVES, MARK, SEEN = "drives", "fleet.json", "seen.json"
 _TIME_BASE = 1_000_000  # ticks a second of a container's duration
@@ -182,14 +183,8 @@ def write_mark(task: Task, outcome: Outcome) -> None:
     """
     path = failure_path(task) if outcome.failure else Path(task.config.out) / MARK
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({"fingerprint": task.fingerprint, **asdict(outcome)})
-    half = path.with_name(f".{path.name}.part")
-    try:
-        half.write_text(text, encoding="utf-8")
-        half.replace(path)
-    except OSError:
-        half.unlink(missing_ok=True)
-        raise
+    with replacement(path) as whole:
+        whole.write_text(json.dumps({"fingerprint": task.fingerprint, **asdict(outcome)}), encoding="utf-8")
     if not outcome.failure:
         failure_path(task).unlink(missing_ok=True)
 

@@ -32,8 +32,8 @@ def read_record(folder: str | Path, camera: str | Path | None = None) -> RunReco
     rows = read_extrinsics(folder / "extrinsics.csv")
     if not rows:
         raise ValueError(f"{folder / 'extrinsics.csv'}: expected a row per frame, got none")
-    std = [(row.pitch_std_deg, row.yaw_std_deg, row.roll_std_deg, row.height_std_m) for row in rows]
-    covariances = diagonal_covariances(np.array(std) * (*[np.pi / 180] * 3, 1.0))
+    std = np.array([row.std for row in rows])
+    covariances = diagonal_covariances(std * (*[np.pi / 180] * 3, 1.0))
     if (folder / COVARIANCES).is_file():
         covariances = read_covariances(folder / COVARIANCES)
     lanes = FittedLanes(folder / LANES) if (folder / LANES).is_file() else None

@@ -2,14 +2,13 @@
 
 import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.frames import Frame
 
 
 def frame_fields(record: RunRecord) -> Iterator[dict[str, Any]]:
@@ -24,7 +23,7 @@ def frame_fields(record: RunRecord) -> Iterator[dict[str, Any]]:
         yield {
             **row._asdict(),
             "image": image,
-            "reasons": [name for name in row.reasons.split("|") if name],
+            "reasons": row.reason_names,
             "covariance": covariance.tolist() if known else None,
         }
 
@@ -38,8 +37,8 @@ def frame_lines(record: RunRecord) -> Iterator[str]:
         yield json.dumps({name: _finite(value) for name, value in fields.items()}, allow_nan=False)
 
 
-def write(path: Path, record: RunRecord, images: Iterable[Frame] | None = None) -> None:
-    """Write the run; ``images`` are not used."""
+def write(path: Path, record: RunRecord) -> None:
+    """Write the run."""
     with open(path, "w", encoding="utf-8") as file:
         file.writelines(line + "\n" for line in frame_lines(record))
 

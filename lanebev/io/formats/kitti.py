@@ -1,6 +1,5 @@
 """KITTI's object ``calib.txt``: projection matrices, and where the camera is."""
 
-from collections.abc import Iterable
 from pathlib import Path
 
 import torch
@@ -8,7 +7,6 @@ from torch import Tensor
 
 from lanebev.io.calibration_file import ROAD_FROM_VEHICLE
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.frames import Frame
 
 
 def kitti_calib(record: RunRecord) -> str:
@@ -35,8 +33,8 @@ def kitti_calib(record: RunRecord) -> str:
     return "".join(f"{name}: {_numbers(matrix)}\n" for name, matrix in lines.items())
 
 
-def write(path: Path, record: RunRecord, images: Iterable[Frame] | None = None) -> None:
-    """Write the run; ``images`` are not used."""
+def write(path: Path, record: RunRecord) -> None:
+    """Write the run."""
     path.write_text(kitti_calib(record), encoding="utf-8")
 
 

@@ -13,12 +13,14 @@ class FormatName(NamedTuple):
         module: module of this package with a function ``write``.
         needs: modules that must be installed.
         extra: extra of lanebev that installs them.
+        has_images: whether ``write`` takes the images of the frames too.
     """
 
     file: str
     module: str
     needs: tuple[str, ...] = ()
     extra: str = ""
+    has_images: bool = False
 
 
 FORMATS = {
@@ -30,8 +32,10 @@ FORMATS = {
     "ros-camera-info": FormatName("ros_camera_info.yaml", "ros_camera_info"),
     "openpilot": FormatName("openpilot_calibration.json", "openpilot"),
     "opencv": FormatName("opencv_poses.yaml", "opencv"),
-    "mcap": FormatName("run.mcap", "mcap", ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf"), "formats"),
-    "rerun": FormatName("run.rrd", "rerun", ("rerun",), "rerun"),
+    "mcap": FormatName(
+        "run.mcap", "mcap", ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf"), "formats", has_images=True
+    ),
+    "rerun": FormatName("run.rrd", "rerun", ("rerun",), "rerun", has_images=True),
 }
 
 

@@ -2,13 +2,11 @@
 
 import hashlib
 import json
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from lanebev.io.calibration_file import quaternion_xyzw, vehicle_from_camera
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.frames import Frame
 
 
 def calibrated_sensor(record: RunRecord) -> list[dict[str, Any]]:
@@ -35,8 +33,8 @@ def calibrated_sensor(record: RunRecord) -> list[dict[str, Any]]:
     ]
 
 
-def write(path: Path, record: RunRecord, images: Iterable[Frame] | None = None) -> None:
-    """Write the run; ``images`` are not used."""
+def write(path: Path, record: RunRecord) -> None:
+    """Write the run."""
     path.write_text(json.dumps(calibrated_sensor(record), indent=1) + "\n", encoding="utf-8")
 
 

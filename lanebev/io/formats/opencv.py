@@ -1,6 +1,5 @@
 """OpenCV: lens and poses for ``cv2.projectPoints``, in a file of ``cv2.FileStorage``."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,6 @@ from torch import Tensor
 
 from lanebev.camera.files import camera_info, dump_yaml
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.frames import Frame
 
 
 def opencv_poses(record: RunRecord) -> dict[str, Any]:
@@ -39,8 +37,8 @@ def opencv_poses(record: RunRecord) -> dict[str, Any]:
     }
 
 
-def write(path: Path, record: RunRecord, images: Iterable[Frame] | None = None) -> None:
-    """Write the run; ``images`` are not used."""
+def write(path: Path, record: RunRecord) -> None:
+    """Write the run."""
     path.write_text(dump_yaml(opencv_poses(record)), encoding="utf-8")
 
 

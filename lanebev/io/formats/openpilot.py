@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import torch
 from torch import Tensor
 
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.frames import Frame
 from lanebev.types import Extrinsics
 
 _VIEW_FROM_DEVICE = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
@@ -67,6 +65,6 @@ def live_calibration(record: RunRecord) -> dict[str, Any]:
     }
 
 
-def write(path: Path, record: RunRecord, images: Iterable[Frame] | None = None) -> None:
-    """Write the run; ``images`` are not used."""
+def write(path: Path, record: RunRecord) -> None:
+    """Write the run."""
     path.write_text(json.dumps(live_calibration(record), indent=1) + "\n", encoding="utf-8")

@@ -1,13 +1,11 @@
 """Parquet: a row per frame."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from lanebev import __version__
 from lanebev.io.formats.jsonl import frame_fields
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.frames import Frame
 from lanebev.io.results import CSV_COLUMNS
 
 CONVENTIONS = (
@@ -50,8 +48,8 @@ def frame_table(record: RunRecord) -> Any:
     return pa.table(columns, schema=schema)
 
 
-def write(path: Path, record: RunRecord, images: Iterable[Frame] | None = None) -> None:
-    """Write the run; ``images`` are not used."""
+def write(path: Path, record: RunRecord) -> None:
+    """Write the run."""
     import pyarrow.parquet
 
     pyarrow.parquet.write_table(frame_table(record), path)

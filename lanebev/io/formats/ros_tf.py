@@ -1,6 +1,5 @@
 """ROS 2: a launch file that publishes where the camera is."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,6 @@ import yaml
 
 from lanebev.io.calibration_file import quaternion_xyzw, vehicle_from_camera
 from lanebev.io.formats.record import RunRecord
-from lanebev.io.frames import Frame
 
 PARENT, CHILD = "base_footprint", "camera_optical_frame"
 
@@ -51,6 +49,6 @@ def launch_file(record: RunRecord) -> str:
     return f"# The camera's pose is {record.standing_pose().source}.\n{launch}"
 
 
-def write(path: Path, record: RunRecord, images: Iterable[Frame] | None = None) -> None:
-    """Write the run; ``images`` are not used."""
+def write(path: Path, record: RunRecord) -> None:
+    """Write the run."""
     path.write_text(launch_file(record), encoding="utf-8")

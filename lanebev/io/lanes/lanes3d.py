@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.io.lanes.openlane import image_from_camera_points
+from lanebev.io.lanes.openlane import image_from_camera_points, visible_points
 from lanebev.io.lanes.parsing import (
     FrameLines,
     Where,
@@ -70,8 +70,14 @@ def read_apollo(path: Path, intrinsics: Array | None = None) -> list[FrameLines]
             lines = field(fields, "laneLines", list)
             seen = as_list("laneLines_visibility", fields.get("laneLines_visibility") or [None] * len(lines))
             lanes = [
-                camera_from_apollo(_visible(f"laneLines[{i}]", lane, visible), height, pitch)
-                for i, (lane, visible) in enumerate(zip(lines, seen, strict=False))
+                camera_from_apollo(
+                    visible_points(
+                        f"laneLines[{i}]_visibility", _points(f"laneLines[{i}]", lane), visibility
+                    ),
+                    height,
+                    pitch,
+                )
+                for i, (lane, visibility) in enumerate(zip(lines, seen, strict=False))
             ]
             frames.append(_projected(field(fields, "raw_file", str), lanes, intrinsics))
     return frames
@@ -90,17 +96,6 @@ def _points(name: str, lane: Any) -> Array:
         list(axis) for axis in zip(*(as_list(name, point) for point in as_list(name, lane)), strict=False)
     ]
     return within(name, "m", columns(name, rows or [[], [], []], 3).T)
-
-
-def _visible(name: str, lane: Any, visibility: Any) -> Array:
-    points = _points(name, lane)
-    if visibility is None:
-        return points
-    seen = columns(f"{name}_visibility", [visibility], 1)[0]
-    if len(seen) != len(points):
-        raise ValueError(f"{name}_visibility: expected {len(points)} numbers, got {len(seen)}")
-    kept: Array = points[seen > 0.5]
-    return kept
 
 
 def _projected(name: str, lanes: list[Array], intrinsics: Array | None) -> FrameLines:

@@ -136,7 +136,7 @@ def _openlane_points(
     rows_of_three = _is_list_of_points(lane) or (by_point and _are_threes(xyz))
     by_axis = _by_axis(xyz) if rows_of_three and xyz else xyz
     points = within(f"{name}.xyz", "m", columns(f"{name}.xyz", by_axis or [[], [], []], 3).T)
-    points = _visible(name, lane, points)
+    points = visible_points(f"{name}.visibility", points, lane.get("visibility"))
     if rows_of_three and fields.get("extrinsic") is not None:
         camera = camera_from_ground_points(points, _square(fields, "extrinsic", 4))
     else:
@@ -162,13 +162,13 @@ def _by_axis(points: list[list[Any]]) -> list[list[Any]]:
     return [list(axis) for axis in zip(*points, strict=True)]
 
 
-def _visible(name: str, lane: dict[str, Any], points: Array) -> Array:
-    """Return the points that the line's ``visibility`` says are seen; all of them if it has none."""
-    if lane.get("visibility") is None:
+def visible_points(name: str, points: Array, visibility: Any) -> Array:
+    """Return the points (P, 3) whose visibility, a list of P, is above a half; all where it is None."""
+    if visibility is None:
         return points
-    seen = columns(f"{name}.visibility", [lane["visibility"]], 1)[0]
+    seen = columns(name, [visibility], 1)[0]
     if len(seen) != len(points):
-        raise ValueError(f"{name}.visibility: expected {len(points)} numbers, got {len(seen)}")
+        raise ValueError(f"{name}: expected {len(points)} numbers, got {len(seen)}")
     visible: Array = points[seen > 0.5]
     return visible
 

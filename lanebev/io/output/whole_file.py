@@ -8,8 +8,22 @@ from pathlib import Path
 
 
 @contextmanager
+def replacement(path: str | Path) -> Iterator[Path]:
+    """Give a path to write to, whose file takes the place of ``path`` if the ``with`` block ends well.
+
+    Raises:
+        OSError: the file cannot be written; an older one is as it was then.
+    """
+    path = Path(path)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.partial-", dir=path.parent) as partial:
+        whole = Path(partial) / path.name
+        yield whole
+        whole.replace(path)
+
+
+@contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
-    """Give a path to write to, whose file takes the place of ``path`` at the end of the ``with`` block.
+    """Give a path to write the result of a command to, see :func:`replacement`.
 
     Raises:
         ValueError: the file cannot be written; nothing of it is there then.
@@ -19,10 +33,8 @@ def whole_file(path: str | Path) -> Iterator[Path]:
         if target.is_dir():
             raise IsADirectoryError(0, "a folder")
         target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{target.name}.partial-", dir=target.parent) as partial:
-            whole = Path(partial) / target.name
+        with replacement(target) as whole:
             yield whole
-            whole.replace(target)
     except OSError as error:
         raise ValueError(
             f"out {path}: expected a file that can be written, got: {error.strerror or error}; "

@@ -13,6 +13,8 @@ from lanebev.render.scene.road.glyphs import TEXTS
 
 GLYPH_LENGTH, GLYPH_WIDTH = 5.0, 2.0  # m of a picture along and across the road
 _ROWS, _COLUMNS, _FINE = 200, 80, 4  # texels of 2.5 cm, drawn four times finer
+_FINE_SIZE = (_ROWS * _FINE, _COLUMNS * _FINE)
+_FINE_PER_METRE = (_COLUMNS * _FINE / GLYPH_WIDTH, _ROWS * _FINE / GLYPH_LENGTH)  # across and along
 
 Picture = npt.NDArray[np.uint8]
 Outline = list[tuple[float, float]]
@@ -40,24 +42,26 @@ def _mirrored(outlines: list[Outline]) -> list[Outline]:
     return [[(-x, y) for x, y in outline] for outline in outlines]
 
 
+def _texels(outline: Outline) -> npt.NDArray[np.int32]:
+    """Convert points (P, 2) m of a glyph to texels of its fine picture."""
+    points: npt.NDArray[np.float64] = np.array(outline) + np.array([0.5 * GLYPH_WIDTH, 0.0])
+    return (points * _FINE_PER_METRE).round().astype(np.int32)
+
+
 def _filled(outlines: list[Outline]) -> Picture:
-    picture = np.zeros((_ROWS * _FINE, _COLUMNS * _FINE), np.uint8)
-    scale = np.array([_COLUMNS * _FINE / GLYPH_WIDTH, _ROWS * _FINE / GLYPH_LENGTH])
+    picture = np.zeros(_FINE_SIZE, np.uint8)
     for outline in outlines:
-        points = (np.array(outline) + np.array([0.5 * GLYPH_WIDTH, 0.0])) * scale
-        cv2.fillPoly(picture, [points.round().astype(np.int32)], 255)
+        cv2.fillPoly(picture, [_texels(outline)], 255)
     return picture
 
 
 def _stroked(lines: list[Outline], wide: int, rings: list[tuple[float, float, float, float]]) -> Picture:
-    picture = np.zeros((_ROWS * _FINE, _COLUMNS * _FINE), np.uint8)
-    scale = np.array([_COLUMNS * _FINE / GLYPH_WIDTH, _ROWS * _FINE / GLYPH_LENGTH])
+    picture = np.zeros(_FINE_SIZE, np.uint8)
     for line in lines:
-        points = (np.array(line) + np.array([0.5 * GLYPH_WIDTH, 0.0])) * scale
-        cv2.polylines(picture, [points.round().astype(np.int32)], False, 255, wide)
+        cv2.polylines(picture, [_texels(line)], False, 255, wide)
     for x, y, a, b in rings:
-        centre = [round((x + 0.5 * GLYPH_WIDTH) * scale[0]), round(y * scale[1])]
-        cv2.ellipse(picture, centre, (int(a * scale[0]), int(b * scale[1])), 0, 0, 360, 255, wide)
+        radii = (int(a * _FINE_PER_METRE[0]), int(b * _FINE_PER_METRE[1]))
+        cv2.ellipse(picture, _texels([(x, y)])[0].tolist(), radii, 0, 0, 360, 255, wide)
     return picture
 
 
@@ -69,7 +73,7 @@ def _written(text: str) -> Picture:
     columns = int(_COLUMNS * _FINE * (0.45 if len(text) == 1 else 0.85))
     rows = int(_ROWS * _FINE * (0.5 if len(text) > 2 else 0.75))
     canvas = cv2.resize(canvas, (columns, rows), interpolation=cv2.INTER_AREA)[::-1]
-    picture = np.zeros((_ROWS * _FINE, _COLUMNS * _FINE), np.uint8)
+    picture = np.zeros(_FINE_SIZE, np.uint8)
     left = (picture.shape[1] - columns) // 2
     picture[:rows, left : left + columns] = canvas
     return picture
