@@ -35,7 +35,7 @@ from lanebev.app.drive.observers import Observation, Observer
 from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.app.drive.sources import camera_of, ended_by_signals, first_image, make_source, observed_frames
 from lanebev.app.progress import Progress
-from lanebev.app.recording.plausibility import bars_remark, mount_remark
+from lanebev.app.recording.plausibility import bars_remark, mount_remark, unfit_mount_remark
 from lanebev.app.recording.recorder import Recorded, Recorder
 from lanebev.app.summary import mount_facts, run_facts
 from lanebev.camera.model import Camera
@@ -120,6 +120,7 @@ def run(
                 if viewer is not None:
                     viewer.add(_viewer_frame(recorder.rows[-1], done), done.frame.image)
         recorder.problems += source_remarks(source, files, len(recorder.rows))
+        recorder.problems += filter(None, [unfit_mount_remark(config.mount, recorder.rows)])
         facts = run_facts(config, source, camera) | facts_of(reusing) | _save_tracker(tracker, camera, out)
         logger.info("writing the report")
         report = recorder.finish(facts, Path(source.source).name, truth, tracker.mount)

@@ -246,6 +246,15 @@ def test_a_cut_video_is_reported_and_takes_its_own_lanes(data, tmp_path, capsys)
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("pitch", "said"), [(2.0, False), (-9.0, True)])
+def test_a_mount_that_no_frame_fits_is_said(data, tmp_path, capsys, pitch, said):
+    text = f"mount: {{pitch_deg: {pitch}, pitch_std_deg: 0.1, yaw_deg: -0.6, yaw_std_deg: 0.1}}\n"
+    (tmp_path / "mount.yaml").write_text(text)
+    extra = ["--calibrator", "joint", "--mount", f"{tmp_path}/mount.yaml"]
+    assert run(data, *extra, "--no-video", "--fps", "25", out=tmp_path / "out") == 0
+    assert ("what was seen fits its pose in no frame" in capsys.readouterr().out) == said
+
+
 def test_the_mount_does_not_learn_in_a_bend(data, tmp_path, monkeypatch):
     monkeypatch.setattr(JointCalibrator, "curvature", lambda _, state: 0.002 + 0 * state.mean[:, 0])
     for name, turning in (("joint", True), ("two-stage", False)):  # which knows no curvature

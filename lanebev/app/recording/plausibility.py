@@ -36,6 +36,17 @@ def mount_remark(path: str | None, camera: Camera) -> str:
     )
 
 
+def unfit_mount_remark(path: str | None, rows: Sequence[ExtrinsicsRow]) -> str:
+    """Return a remark on a mount as a prior that lanes do not fit in any frame; else nothing."""
+    unfit = sum("FEW_INLIERS" in row.reason_names for row in rows)
+    if path is None or any(row.status == "TRACKING" for row in rows) or 2 * unfit <= len(rows):
+        return ""
+    return (
+        f"mount {path}: what was seen fits its pose in no frame; is it of another camera, or was the camera "
+        "moved? leave out --mount"
+    )
+
+
 def pose_words(pose: Sequence[float]) -> list[str]:
     """Return pitch, yaw, roll (degrees) and height (m) with their names and units."""
     units = ("degrees", "degrees", "degrees", "m")
