@@ -10,7 +10,7 @@ class Progress(Protocol):
     """Wraps the items of a job and shows how many are done."""
 
     def __call__(self, items: Iterator[Item], total: int) -> Iterator[Item]:
-        """Pass the items on.
+        """Yield the items unchanged and show how many are done.
 
         Args:
             items: what the job works on.

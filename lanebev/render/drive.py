@@ -113,7 +113,7 @@ class Drive:
         return Extrinsics(*(torch.tensor([v], dtype=torch.float32) for v in values))
 
     def _without_collisions(self, world: World) -> World:
-        """Take out vehicles that the camera would drive through; the rest of a lane moves at one speed."""
+        """Remove vehicles that the camera would drive through; the rest of a lane moves at one speed."""
         traffic = world.traffic
         lane = torch.tensor([self._ego_lane(a) for a in traffic.across[0, :NUM_VEHICLES].tolist()])
         speed = traffic.speed.clone()

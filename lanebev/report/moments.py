@@ -33,7 +33,7 @@ class MomentSampler:
     _best: dict[str, tuple[float, int]] = field(default_factory=dict)
 
     def add(self, number: int, pictures: Mapping[str, Picture], scores: Mapping[str, float]) -> None:
-        """Offer the pictures of a frame, by name; they are encoded only if they are kept."""
+        """Encode and keep a frame's pictures, by name, if its scores or its number select it."""
         for kind, score in scores.items():
             if kind not in self._best or score > self._best[kind][0]:
                 self._best[kind] = (score, number)

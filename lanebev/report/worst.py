@@ -53,7 +53,7 @@ def scores(
 
 
 def jumps(row: ExtrinsicsRow, earlier: ExtrinsicsRow, before: ExtrinsicsRow) -> list[float]:
-    """Return by how much pitch, yaw, roll (deg) and height (m) depart from going on as they went.
+    """Return the differences of pitch, yaw, roll (deg) and height (m) from their linear extrapolation.
 
     Args:
         row: row of the frame.

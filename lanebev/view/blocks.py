@@ -39,7 +39,7 @@ class Block(NamedTuple):
 
 
 def blocks(cells: Cells, lens: Lens | None, limit: float, memory: Memory | None = None) -> Iterator[Block]:
-    """Project cells, block by block, in order.
+    """Project cells to image coordinates, block by block, in order.
 
     float32 cells on a CPU are interpolated where that is as exact, see :mod:`lanebev.view.tiles`; a GPU would
     have to wait for the choice.

@@ -127,7 +127,7 @@ class CanonicalView(nn.Module):
 
     @full_precision
     def _cells(self, image_from_cam: Tensor | None, extrinsics: Extrinsics) -> CanonicalCells:
-        """Prepare the virtual camera's rays.
+        """Compute the virtual camera's rays in the real camera.
 
         A virtual ray d, in the road's frame, meets the road where the real camera sees it, along
         M (d₁, h/h' d₂, d₃) = M d + (h/h' - 1) d₂ m₂, with its matrix M and that one's second column m₂.

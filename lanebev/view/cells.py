@@ -30,7 +30,7 @@ def cells_and_lens(
     plane_heights: Sequence[float] = (0.0,),
     vertical_curvature: Tensor | None = None,
 ) -> tuple[CellSums, Lens | None]:
-    """Prepare the projection of cells.
+    """Compute the coordinates of cells in the image, or with a lens in the camera, and the lens.
 
     Matrices are computed in the dtype of the geometry, and rounded to the dtype in which cells are projected.
 

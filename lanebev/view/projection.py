@@ -86,7 +86,7 @@ def normalised_intrinsics(intrinsics: Tensor, image_size: tuple[int, int]) -> Te
 
 
 def image_coordinates(cells: Tensor, lens: Lens | None, continued: bool = False) -> tuple[Tensor, Tensor]:
-    """Project cells.
+    """Project cells to image coordinates.
 
     Args:
         cells: (B, 3, R, V) homogeneous coordinates in the image, or with a lens in the camera.

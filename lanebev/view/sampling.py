@@ -94,7 +94,7 @@ def sampling_maps(
 def _maps_written(
     cells: Cells, lens: Lens | None, sizes: Sequence[MapSize], image_size: tuple[int, int], limit: float
 ) -> list[Tensor]:
-    """Do the same without a graph, in memory that is kept."""
+    """Compute :func:`sampling_maps` without a graph, in memory that is kept."""
     maps = _kept_maps(len(sizes), cells)
     for block in blocks(cells, lens, limit, lambda first, last: maps[0][:, :, first:last]):
         rows = slice(block.first, block.last)

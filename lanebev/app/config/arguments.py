@@ -227,7 +227,7 @@ class PrintCompletion(argparse.Action):
     """Prints the completion script of a shell, by shtab."""
 
     def __call__(self, parser: argparse.ArgumentParser, _: object, values: object, __: object = None) -> None:
-        """Print it and end."""
+        """Print the completion script and exit."""
         try:
             import shtab
         except ImportError:

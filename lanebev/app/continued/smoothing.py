@@ -136,7 +136,7 @@ def _smoothed(
     tracker: RunTracker,
     config: JointConfig,
 ) -> SmoothedPoses:
-    """Smooth kept states.
+    """Smooth the poses of kept states, from the last frame to the first.
 
     Args:
         states: after every frame.

@@ -31,7 +31,7 @@ def frames_path(out: str | Path, drive: Drive) -> Path:
 
 
 def collect_frames(drives: Sequence[Drive], out: str | Path) -> None:
-    """Bring the data set up to date: finished drives in, all others out.
+    """Update the data set: add finished drives, remove all others.
 
     The columns are those of a run's Parquet file, and ``drive``. A file that is newer than the run stays.
 

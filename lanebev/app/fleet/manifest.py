@@ -51,7 +51,7 @@ class Drive:
 
 
 def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Drive]:
-    """Read a manifest.
+    """Read a table of drives with their settings.
 
     Columns (or keys) are ``video``, ``camera``, and, where wanted, ``name``, ``camera_id``, ``day``, ``time``
     and any setting of ``lanebev run``. YAML is a list of mappings, or a mapping with ``drives``, the list,

@@ -74,11 +74,11 @@ class ViewChanges:
             turned = _turned(seen, self._before[-1], size)
             is_same_view = size <= _LEAST_CUT or _correlation(seen, self._before[-1]) > _SAME_VIEW
             self._changes.append(_Change(number, is_next, size, turned, is_same_view))
-            self._look()
+            self._classify()
         self._before.append(seen)
 
-    def _look(self) -> None:
-        """Judge the change in the middle of the last ones."""
+    def _classify(self) -> None:
+        """Classify the middle one of the last changes, and count it if it is a cut or a turn."""
         if len(self._changes) <= 2 * _NEAR:
             return
         change = self._changes[_NEAR]

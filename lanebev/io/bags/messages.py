@@ -70,7 +70,7 @@ class Bag(Protocol):
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a bag.
+    """Open a ROS bag or an MCAP file for reading.
 
     Raises:
         ValueError: a library is missing, or the bag cannot be read, also within the ``with`` block.

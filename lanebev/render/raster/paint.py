@@ -64,7 +64,7 @@ def prepare(scene: Scene, size: tuple[int, int]) -> Prepared:
 
 
 def paint_view(scene: Scene, prepared: Prepared, size: tuple[int, int], features: Features) -> Painted:
-    """Paint scenes.
+    """Render scenes to linear radiance.
 
     Args:
         scene: B of them.

@@ -35,7 +35,7 @@ class Kinds(NamedTuple):
 
 
 def sample_kinds(sampler: BatchSampler, kind: str) -> Kinds:
-    """Draw what each world shows.
+    """Sample the kind of each world.
 
     Args:
         sampler: the randomness.

@@ -33,7 +33,7 @@ class Canvas(NamedTuple):
 
 
 def empty_canvas(pixels: int, device: torch.device) -> Canvas:
-    """Make a canvas of nothing."""
+    """Make a black canvas on which everything is infinitely far away."""
     planes = torch.full((5, pixels), torch.inf, device=device)
     planes[:3] = 0
     return Canvas(planes)

@@ -109,7 +109,10 @@ def _pictures() -> list[Picture]:
 
 @lru_cache(maxsize=8)
 def _integral_table(device: torch.device) -> Tensor:
-    """Sum pictures: at (g, r, c) the paint in rows < r, columns < c, (G · (ROWS + 1) · (COLUMNS + 1),)."""
+    """Compute the glyphs' integral images, (G · (ROWS + 1) · (COLUMNS + 1),).
+
+    At (g, r, c) is the paint of glyph g in rows < r and columns < c.
+    """
     small = [cv2.resize(p, (_COLUMNS, _ROWS), interpolation=cv2.INTER_AREA) for p in _pictures()]
     paint = torch.from_numpy(np.stack(small).astype(np.float64)) / 255
     table = torch.nn.functional.pad(paint.cumsum(1).cumsum(2), (1, 0, 1, 0))

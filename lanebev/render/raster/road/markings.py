@@ -32,7 +32,7 @@ def near_marking(layout: Layout, ground: Ground, slot: Tensor) -> Tensor:
 def paint(
     layout: Layout, ground: Ground, slot: Tensor, grazing: Tensor, blotch: Tensor, features: Features
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Paint and studs over road points.
+    """Compute the coverage of road points by paint and by studs.
 
     Args:
         layout: the road's boundaries.

@@ -55,7 +55,7 @@ def count_below(edges: Tensor, value: Tensor) -> Tensor:
 
 
 def place_in_lanes(layout: Layout, across: Tensor) -> LanePlace:
-    """Find lanes and boundaries.
+    """Find the lane, and the nearest boundary, of road points.
 
     Args:
         layout: the boundaries.

@@ -79,7 +79,7 @@ def rain(image: Tensor, wet: Tensor, generators: Sequence[torch.Generator]) -> T
 
 
 def _streaks(grain: Tensor, lean: Tensor) -> Tensor:
-    """Draw grains out along lines that lean by (R,) px to the right per px down, (R, 1, H, W)."""
+    """Blur noise along lines that lean by (R,) px to the right per px down, (R, 1, H, W)."""
     height, width = grain.shape[2:]
     length = max(3, height // 18)
     total = torch.zeros_like(grain)

@@ -16,7 +16,7 @@ _MIDDLE = 0.45  # display level that the contrast leaves as it is
 
 
 def expose(radiance: Tensor, sensor: Sensor, road_level: Tensor, bloom: bool = True) -> Tensor:
-    """Expose images, before noise.
+    """Convert radiance to display values, without noise.
 
     Args:
         radiance: (B, 3, H, W) linear.

@@ -81,7 +81,7 @@ class Glass(NamedTuple):
 
 
 def sample_glass(sampler: BatchSampler, camera: Tensor, night: Tensor) -> Glass:
-    """Sample random faults.
+    """Sample random faults of the windscreen and the recorder.
 
     Args:
         sampler: the randomness.

@@ -76,7 +76,7 @@ class Wall(NamedTuple):
 
 
 def walls_of(surroundings: Surroundings, row: Tensor, wall: Tensor) -> Wall:
-    """Select walls.
+    """Select some walls of some scenes.
 
     Args:
         surroundings: B of them.

@@ -58,7 +58,7 @@ def arc_nodes() -> Tensor:
 
 
 def build_alignment(curvature: Tensor, elevation: Tensor) -> Alignment:
-    """Integrate a course.
+    """Compute a road's alignment by integrating its curvature.
 
     Args:
         curvature: (B, A) 1/m at :func:`arc_nodes`.
@@ -249,7 +249,7 @@ class WallTable(NamedTuple):
 
 
 def wall_table(alignment: Alignment, across: Tensor) -> WallTable:
-    """Tabulate walls.
+    """Compute the tables of walls by which :func:`wall_hit` intersects rays.
 
     Args:
         alignment: (B, K) tables.
