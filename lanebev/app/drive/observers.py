@@ -17,6 +17,7 @@ from lanebev.io.lanes.parsing import FrameLines
 from lanebev.io.lanes.remarks import (
     check_boundary_order,
     left_out_remark,
+    other_camera_remark,
     repeats_remark,
     unequal_lanes_remark,
 )
@@ -100,7 +101,8 @@ class LaneFileObserver:
         in_order = [self.entries[match] for match in self.matches if match is not None]
         unmatched = "" if source.is_video else self._unmatched(source.taken_numbers)
         of_drive = [] if stills else [repeats_remark(in_order), unequal_lanes_remark(in_order, camera)]
-        remarks = (self.remark, unmatched, left_out_remark(in_order), *of_drive)
+        of_camera = other_camera_remark(entries, camera)
+        remarks = (self.remark, of_camera, unmatched, left_out_remark(in_order), *of_drive)
         self.remark = "; ".join(filter(None, remarks))
 
     def _unmatched(self, taken: Sequence[int]) -> str:

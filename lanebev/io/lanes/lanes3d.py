@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.io.lanes.openlane import image_from_camera_points, visible_points
+from lanebev.io.lanes.openlane import image_from_camera_points, of_camera, visible_points
 from lanebev.io.lanes.parsing import (
     FrameLines,
     Where,
@@ -107,5 +107,4 @@ def _projected(name: str, lanes: list[Array], intrinsics: Array | None) -> Frame
         image = image_from_camera_points(lane, intrinsics)
         kept = image[(np.abs(image) < _FARTHEST).all(-1)]
         lines += [LaneLine(kept)] if len(kept) else []
-    centre = (float(intrinsics[0, 2]), float(intrinsics[1, 2]))
-    return FrameLines(name, lines, principal_point=centre if lines else None)
+    return of_camera(FrameLines(name, lines), intrinsics if lines else None)

@@ -57,9 +57,15 @@ def read_openlane(path: str | Path, intrinsics: NDArray[np.float64] | None = Non
                 lines.append(LaneLine(points))
         projected = bool(lines) and all(_is_3d(lane) for lane in lanes)
         matrix = _camera_matrix(fields, intrinsics) if projected else None
-    return FrameLines(
-        name, lines, 1.0, None if matrix is None else (float(matrix[0, 2]), float(matrix[1, 2]))
-    )
+    return of_camera(FrameLines(name, lines), matrix)
+
+
+def of_camera(frame: FrameLines, intrinsics: Array | None) -> FrameLines:
+    """Return a frame whose lines were projected by a camera matrix (3, 3) px; by none, the frame itself."""
+    if intrinsics is None:
+        return frame
+    (focal, _, x), (_, _, y) = intrinsics[:2].tolist()
+    return frame._replace(principal_point=(x, y), focal_length=focal)
 
 
 def camera_from_label_points(points: Array) -> Array:

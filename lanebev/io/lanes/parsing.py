@@ -32,6 +32,7 @@ class FrameLines(NamedTuple):
         pose_sigma_scale: factor on the standard deviations of the pose estimated from them; 1 unless stated.
         principal_point: (x, y) px of the camera by which all lines were projected from 3D points, perhaps to
             places outside of the image; None for lines that were drawn in the image.
+        focal_length: px, along x, of that camera; None for lines that were drawn in the image.
         image_size: (height, width) px of the image that the lines were drawn on; None if the file says none.
     """
 
@@ -39,6 +40,7 @@ class FrameLines(NamedTuple):
     lines: list[LaneLine]
     pose_sigma_scale: float = 1.0
     principal_point: tuple[float, float] | None = None
+    focal_length: float | None = None
     image_size: tuple[int, int] | None = None
 
 

@@ -14,6 +14,7 @@ from lanebev.observation.polylines import lane_width_ratios
 _LEAST_FRAMES = 10  # with lanes, among which each boundary is seen in one
 _MOST_REPEATED = 0.3  # fraction of frames with the lanes of the one before; all if nothing moves
 _LOOKED_AT = 50  # frames
+_SAME_FOCAL = 0.01  # relative, by which focal lengths of one camera may differ
 _UNEQUAL = 1.8  # ratio
 _MOST_ROLL = 2  # degrees; with it six boundaries of equally wide lanes look as if of a ratio of up to 2.4
 
@@ -94,6 +95,18 @@ def _have_the_same_lines(one: FrameLines, other: FrameLines) -> bool:
     first, second = ([line.points for line in frame.lines] for frame in (one, other))
     pairs = zip(first, second, strict=False)
     return len(first) == len(second) and all(np.array_equal(*pair, equal_nan=True) for pair in pairs)
+
+
+def other_camera_remark(frames: Sequence[FrameLines], camera: Camera) -> str:
+    """Return a remark on 3D points that were projected by a camera of another focal length; else nothing."""
+    focals = [frame.focal_length for frame in frames if frame.focal_length is not None]
+    own = float(camera.intrinsics[0, 0])
+    if not focals or abs(float(np.median(focals)) / own - 1.0) <= _SAME_FOCAL:
+        return ""
+    return (
+        f"lanes: the camera of their 3D points has a focal length of {np.median(focals):.1f} px, that of the "
+        f"run {own:.1f} px; give a camera file with the first, since the images are of that camera"
+    )
 
 
 def unequal_lanes_remark(frames: Sequence[FrameLines], camera: Camera) -> str:

@@ -56,10 +56,11 @@ def _moved(frame: FrameLines, scale: NDArray[np.float64], shift: NDArray[np.floa
     """Return a frame with all pixels p replaced by scale · p + shift, each (2,)."""
     lines = [line._replace(points=scale * line.points + shift) for line in frame.lines]
     frame = frame._replace(image_size=None)
-    if frame.principal_point is None:
+    if frame.principal_point is None or frame.focal_length is None:
         return frame._replace(lines=lines)
     x, y = (scale * np.array(frame.principal_point) + shift).tolist()
-    return frame._replace(lines=lines, principal_point=(x, y))
+    focal = float(scale[0]) * frame.focal_length
+    return frame._replace(lines=lines, principal_point=(x, y), focal_length=focal)
 
 
 def lanes_of_whole_images(

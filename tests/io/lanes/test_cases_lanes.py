@@ -180,6 +180,7 @@ def test_3d_points_near_the_camera_may_lie_outside_of_the_images(tmp_path):
         size_remark(frames, (480, 854))
     half = lanes_of_whole_images(frames, (720, 1280), None, (360, 640))
     assert half[0].principal_point == (319.75, 179.75)
+    assert half[0].focal_length == 0.5 * INTRINSICS[0][0]
     assert size_remark(half, (360, 640)) == ""
 
 

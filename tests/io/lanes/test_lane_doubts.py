@@ -90,6 +90,18 @@ def test_lanes_of_different_widths_are_noticed(tmp_path):
     assert LaneFileObserver([ideal], source, lens).remark.startswith("lanes: one lane is 2.5 times as wide")
 
 
+def test_3d_points_of_a_camera_of_another_focal_length_are_noticed(tmp_path):
+    Image.new("RGB", SIZE[::-1]).save(tmp_path / "0.png")
+    camera, source = Camera.from_fov(60, *SIZE[::-1]), open_source(str(tmp_path))
+    focal = float(camera.intrinsics[0, 0])
+    rows = np.linspace(0.5, 0.99, 20) * SIZE[0]
+    entry = FrameLines("0.png", [LaneLine(np.stack([rows, rows], axis=-1))])
+    for own, said in ((None, False), (1.005 * focal, False), (1.02 * focal, True)):
+        frame = entry._replace(principal_point=(0.5 * SIZE[1], 0.5 * SIZE[0]), focal_length=own)
+        remark = LaneFileObserver([frame], source, camera).remark
+        assert ("of their 3D points has a focal length of" in remark) == said
+
+
 def test_images_without_lanes_are_counted(tmp_path):
     """As where names of lanes begin at 1 and those of images at 0."""
     for number in range(6):

@@ -20,7 +20,7 @@ def test_lanes_of_once_are_in_camera_axes(tmp_path, calibration):
     (tmp_path / "1616.json").write_text(json.dumps(fields))
     (frame,) = read_lanes(tmp_path / "1616.json", MATRIX if calibration is None else 2 * MATRIX)
     assert frame.name == f"{tmp_path}/1616"
-    assert frame.principal_point == (640, 360)
+    assert (frame.principal_point, frame.focal_length) == ((640, 360), 1000)
     (line,) = frame.lines
     np.testing.assert_allclose(line.points, PIXELS)
     if calibration is None:
