@@ -19,6 +19,7 @@ from lanebev.io.lanes.parsing import (
     as_object,
     columns,
     field,
+    is_probable,
     json_object,
     json_values,
     lane_text,
@@ -48,7 +49,7 @@ def read_once(path: Path, intrinsics: Array | None = None) -> FrameLines:
             if len(rows) != 3 or any(len(row) not in (3, 4) for row in rows):
                 raise ValueError("calibration: expected the camera matrix, 3 x 3 or 3 x 4, got other numbers")
             intrinsics = within("calibration", "numbers of a camera", np.array([row[:3] for row in rows]))
-        lanes = [_points(f"lanes[{i}]", lane) for i, lane in enumerate(field(fields, "lanes", list))]
+        lanes = [_once_points(f"lanes[{i}]", lane) for i, lane in enumerate(field(fields, "lanes", list))]
         return _projected(str(path).removesuffix(".json"), lanes, intrinsics)
 
 
@@ -67,20 +68,42 @@ def read_apollo(path: Path, intrinsics: Array | None = None) -> list[FrameLines]
                 "cam_height, cam_pitch", [fields.get("cam_height"), fields.get("cam_pitch")]
             )
             height, pitch = within("cam_height, cam_pitch", "m and rad", np.array(given)).tolist()
-            lines = field(fields, "laneLines", list)
-            seen = as_list("laneLines_visibility", fields.get("laneLines_visibility") or [None] * len(lines))
-            lanes = [
-                camera_from_apollo(
-                    visible_points(
-                        f"laneLines[{i}]_visibility", _points(f"laneLines[{i}]", lane), visibility
-                    ),
-                    height,
-                    pitch,
-                )
-                for i, (lane, visibility) in enumerate(zip(lines, seen, strict=False))
-            ]
+            lanes = [camera_from_apollo(points, height, pitch) for points in _apollo_points(fields)]
             frames.append(_projected(field(fields, "raw_file", str), lanes, intrinsics))
     return frames
+
+
+def _once_points(name: str, lane: Any) -> Array:
+    """Return the points of a label, or of a prediction with a score; none of an improbable one."""
+    if not isinstance(lane, dict):
+        return _points(name, lane)
+    return _points(name, field(lane, "points", list) if is_probable(name, lane.get("score")) else [])
+
+
+def _apollo_points(fields: dict[str, Any]) -> list[Array]:
+    """Return the visible points of each line, without improbable lines.
+
+    A file of predictions is made of one of labels, whose visibility is that of other lines.
+    """
+    named = {f"laneLines[{i}]": lane for i, lane in enumerate(field(fields, "laneLines", list))}
+    probabilities = _of_each("laneLines_prob", fields, len(named))
+    is_predicted = fields.get("laneLines_prob") is not None
+    visibilities = _of_each("laneLines_visibility", {} if is_predicted else fields, len(named))
+    return [
+        visible_points(f"{name}_visibility", _points(name, lane), visibility)
+        for (name, lane), visibility, probability in zip(
+            named.items(), visibilities, probabilities, strict=True
+        )
+        if is_probable(name, probability)
+    ]
+
+
+def _of_each(key: str, fields: dict[str, Any], count: int) -> list[Any]:
+    """Return what a key has for each of the lines; None for each without the key."""
+    given = as_list(key, fields.get(key) or [None] * count)
+    if len(given) != count:
+        raise ValueError(f"{key}: expected one for each of {count} lines, got {len(given)}")
+    return given
 
 
 def camera_from_apollo(points: Array, height: float, pitch: float) -> Array:

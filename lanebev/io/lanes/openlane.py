@@ -17,6 +17,7 @@ from lanebev.io.lanes.parsing import (
     checked_pixels,
     columns,
     field,
+    is_probable,
     json_object,
     lane_text,
     within,
@@ -34,7 +35,9 @@ _NEAREST = 0.1  # m in front of the camera; what is nearer or behind has no imag
 
 
 def read_openlane(path: str | Path, intrinsics: NDArray[np.float64] | None = None) -> FrameLines:
-    """Read an OpenLane 2D or 3D JSON, kerbs left out: the ``uv`` of its lane lines, else their ``xyz``.
+    """Read an OpenLane 2D or 3D JSON: the ``uv`` of its lane lines, else their ``xyz``.
+
+    Kerbs are left out, and lines that a detector gives a probability below one half.
 
     Points ``xyz`` alone, as predictions have them, are projected by the file's ``intrinsic``. Three lists of
     P numbers are in the camera's frame, as labels are; P lists of three are in the ground frame of the
@@ -53,7 +56,8 @@ def read_openlane(path: str | Path, intrinsics: NDArray[np.float64] | None = Non
         by_point = any(_is_list_of_points(lane) for lane in lanes)
         for i, lane in enumerate(lanes):
             points = _openlane_points(f"lane_lines[{i}]", lane, fields, intrinsics, by_point)
-            if lane.get("category") not in _CURBS and np.isfinite(points).any():
+            is_seen = is_probable(f"lane_lines[{i}]", lane.get("laneLines_prob"))
+            if is_seen and lane.get("category") not in _CURBS and np.isfinite(points).any():
                 lines.append(LaneLine(points))
         projected = bool(lines) and all(_is_3d(lane) for lane in lanes)
         matrix = _camera_matrix(fields, intrinsics) if projected else None

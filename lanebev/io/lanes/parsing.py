@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lanebev.numbers import finite_numbers, numbers_or_gaps, read_text, shown
 from lanebev.observation.polylines import LaneLine
 
+_PROBABLE = 0.5  # least probability of a line
 _FARTHEST = 1e6  # px or m, of any coordinate
 _DECODER = json.JSONDecoder()
 _NO_VALUE = re.compile(r"[\s,]*")  # between JSON values
@@ -154,6 +155,22 @@ def columns(name: str, values: list[Any], count: int) -> NDArray[np.float64]:
         many = {1: "one list", 2: "two lists", 3: "three lists"}[count]
         raise ValueError(f"{name}: expected {many} of one length, got {shown(values)}")
     return np.array([numbers_or_gaps(name, axis) for axis in values])
+
+
+def is_probable(name: str, probability: Any) -> bool:
+    """Tell whether a detector gives a line a probability of at least one half, or none at all.
+
+    The benchmarks' predictions contain lines of any probability, for curves of precision and recall.
+
+    Args:
+        name: of the line, for messages.
+        probability: number, or those of several classes, of which the largest counts; None if there is none.
+
+    Raises:
+        ValueError: it is no number.
+    """
+    given = probability if isinstance(probability, list) and probability else [probability]
+    return probability is None or max(finite_numbers(f"{name}: probability", given)) >= _PROBABLE
 
 
 def checked_pixels(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -47,6 +47,29 @@ def test_lanes_of_apollo_are_on_the_ground(tmp_path, pitch):
     np.testing.assert_allclose(np.tan(angles), down / forward, rtol=1e-9)
 
 
+def test_improbable_lines_of_predictions_are_left_out(tmp_path):
+    once = {"lanes": [{"points": CAMERA.tolist(), "score": score} for score in (0.9, 0.1)]}
+    apollo = {
+        "raw_file": "1.jpg", "cam_height": 1.5, "cam_pitch": 0.0,
+        "laneLines": [[[1, 9, 0], [1, 20, 0]], [[2, 9, 0]]],
+        "laneLines_prob": [0.6, 0.4], "laneLines_visibility": [[1.0]],  # of the labels
+    }  # fmt: skip
+    openlane = {
+        "file_path": "1.jpg", "intrinsic": MATRIX.tolist(),
+        "lane_lines": [
+            {"xyz": [[9, 20], [1, 1], [-1, -1]], "category": 1, "laneLines_prob": probability}
+            for probability in (0.7, 0.2, [0.1, 0.8], [0.3, 0.3])
+        ],
+    }  # fmt: skip
+    for fields, count in ((once, 1), (apollo, 1), (openlane, 2)):
+        (tmp_path / "1.json").write_text(json.dumps(fields))
+        (frame,) = read_lanes(tmp_path / "1.json", MATRIX)
+        assert len(frame.lines) == count
+    (tmp_path / "1.json").write_text(json.dumps({**apollo, "laneLines_prob": [0.6]}))
+    with pytest.raises(ValueError, match="laneLines_prob: expected one for each of 2 lines, got 1"):
+        read_lanes(tmp_path / "1.json", MATRIX)
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
