@@ -87,22 +87,22 @@ class ImageFromBEV(nn.Module):
         intrinsics, extrinsics, distortion = blind_unless_usable(intrinsics, extrinsics, distortion)
         size, dtype = self.grid.shape, common_dtype(bev)
         cells: CellSums | PixelCells
-        if vertical_curvature is not None:
-            points = self._curved_points(
-                intrinsics, extrinsics, image_size, distortion, model, vertical_curvature
-            )
-            cells = PixelCells(points.to(dtype))
-        elif distortion is None or distortion.shape[-1] == 0:
+        if vertical_curvature is None and (distortion is None or distortion.shape[-1] == 0):
             cells = self._sums(intrinsics, extrinsics, image_size).to(dtype)
         else:
-            points = self._points(intrinsics, extrinsics, image_size, distortion, model)
+            points = self._points(intrinsics, extrinsics, image_size, distortion, model, vertical_curvature)
             cells = PixelCells(points.to(dtype))
         (image,), valid = resampled([bev], cells, None, [MapSize(bev.shape[-2], bev.shape[-1])], size)
         return image, valid
 
     @full_precision
     def _sums(self, intrinsics: Tensor, extrinsics: Extrinsics, image_size: tuple[int, int]) -> CellSums:
-        return pixel_sums(self._homography(intrinsics, extrinsics), image_size)
+        """Compute where every undistorted pixel meets a plane road, homogeneous in [-1, 1]."""
+        below = extrinsics.height - self.plane_height
+        height = torch.where(below > 0, below, 1.0)
+        matrix = bev_from_image(extrinsics._replace(height=height), intrinsics, self.grid)
+        slope = normalised_intrinsics(matrix, self.grid.shape) * height[:, None, None]  # last row: of a ray
+        return pixel_sums(torch.where((below > 0)[:, None, None], slope, _ABOVE), image_size)
 
     @full_precision
     def _points(
@@ -110,28 +110,11 @@ class ImageFromBEV(nn.Module):
         intrinsics: Tensor,
         extrinsics: Extrinsics,
         image_size: tuple[int, int],
-        distortion: Tensor,
-        model: str,
-    ) -> Tensor:
-        homography = self._homography(intrinsics, extrinsics)
-        taken = _all_pixels(image_size, homography)
-        pixels, valid = invert_distortion(taken, intrinsics, distortion, model)
-        points = homography[..., :2] @ pixels.mT + homography[..., 2:]  # (B, 3, H·W)
-        points = torch.where(valid.unsqueeze(1), points, _ABOVE)
-        cells: Tensor = points.unflatten(-1, image_size)
-        return cells
-
-    @full_precision
-    def _curved_points(
-        self,
-        intrinsics: Tensor,
-        extrinsics: Extrinsics,
-        image_size: tuple[int, int],
         distortion: Tensor | None,
         model: str,
-        vertical_curvature: Tensor,
+        vertical_curvature: Tensor | None,
     ) -> Tensor:
-        """Compute where every pixel meets the curved road, (B, 3, H, W), homogeneous in [-1, 1]."""
+        """Compute where every pixel as taken meets the road, (B, 3, H, W), homogeneous in [-1, 1]."""
         pixels, valid = _all_pixels(image_size, intrinsics), None
         if distortion is not None and distortion.shape[-1]:
             pixels, valid = invert_distortion(pixels, intrinsics, distortion, model)
@@ -143,14 +126,6 @@ class ImageFromBEV(nn.Module):
         seen = on_road if valid is None else on_road & valid
         cells: Tensor = torch.where(seen.unsqueeze(1), points, _ABOVE).unflatten(-1, image_size)
         return cells
-
-    def _homography(self, intrinsics: Tensor, extrinsics: Extrinsics) -> Tensor:
-        """Compute undistorted pixels to the map as [-1, 1], (B, 3, 3), if the plane is below."""
-        below = extrinsics.height - self.plane_height
-        height = torch.where(below > 0, below, 1.0)
-        matrix = bev_from_image(extrinsics._replace(height=height), intrinsics, self.grid)
-        slope = normalised_intrinsics(matrix, self.grid.shape) * height[:, None, None]  # last row: of a ray
-        return torch.where((below > 0)[:, None, None], slope, _ABOVE)
 
 
 def _all_pixels(image_size: tuple[int, int], like: Tensor) -> Tensor:

@@ -142,6 +142,15 @@ def test_painting_keeps_to_the_rectangle_and_to_the_road():
     assert above.any()
 
 
+@pytest.mark.parametrize("camera", [CAMERA, LENS, FISHEYE], ids=["ideal", "lens", "fisheye"])
+def test_a_camera_below_the_plane_sees_nothing_of_it(camera):
+    extrinsics, bev = pose([0.06, 0.0, 0.0, -1.0]), torch.ones(1, 1, *GRID.shape, dtype=torch.float64)
+    lens = (camera.distortion[None], camera.model)
+    painted, valid = ImageFromBEV(GRID)(bev, camera.intrinsics[None], extrinsics, (180, 320), *lens)
+    assert not valid.any()
+    assert not painted.any()
+
+
 def test_painting_has_the_gradient_of_finite_differences():
     grid, size = BEVGrid(x=(-2.0, 2.0), z=(6.0, 12.0), resolution=1.0), (6, 8)
     small = torch.tensor([[[20.0, 0.0, 4.0], [0.0, 20.0, 1.0], [0.0, 0.0, 1.0]]], dtype=torch.float64)
