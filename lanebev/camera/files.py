@@ -131,7 +131,7 @@ def _arrays(path: Path) -> dict[str, Any]:
     try:
         if path.suffix.lower() == ".npy":
             array = np.load(path, mmap_mode="r", allow_pickle=False)
-            values = array.ravel()[:13].tolist()
+            values = array.ravel()[:17].tolist()
             return bare_numbers(" ".join(map(str, values))) or {"K": values[:10], "D": []}
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
             left_out = (*_VIEWS, _UNDISTORTED)

@@ -6,7 +6,7 @@ from typing import Any
 
 from lanebev.camera.named_lens import LENS_NAMES, stated_lens
 from lanebev.camera.parameters import CameraParameters, centre_offset, checked
-from lanebev.camera.parsing import mapping, number, numbers, whole_number
+from lanebev.camera.parsing import camera_matrix, mapping, number, numbers, whole_number
 from lanebev.numbers import shown
 
 MATRIX_KEYS = ("camera_matrix", "K", "mtx", "intrinsics", "intrinsic_matrix")
@@ -18,7 +18,17 @@ _PROJECTION_KEYS = ("projection_matrix", "P")
 _ROTATION_KEYS = ("rectification_matrix", "R")
 _WIDTH_KEYS = ("image_width", "width")
 _HEIGHT_KEYS = ("image_height", "height")
-_SIDES_KEYS = ("image_size", "img_size", "image_shape", "img_shape", "resolution", "camera_resolution", "DIM")
+_SIDES_KEYS = (
+    "image_size",
+    "img_size",
+    "image_shape",
+    "img_shape",
+    "resolution",
+    "camera_resolution",
+    "DIM",
+    "size",
+)
+_SIDES = re.compile(r"\s*(\d{2,5})\s*[x×]\s*(\d{2,5})\s*", re.ASCII)
 _LEAST_SIDE = 16  # px; a list of smaller numbers is no size of images
 _MODEL_KEYS = ("distortion_model", "camera_model", "model", "DistModel")
 _LENS_KEYS = ("distortion", *_LENS_LISTS)
@@ -120,7 +130,7 @@ def opencv_or_ros(
     if rectified:
         camera = CameraParameters(_projection(fields), [], "pinhole", size)
         return _as_taken(checked(camera, _restates(fields)), fields)
-    matrix = numbers(fields, *MATRIX_KEYS, count=9)
+    matrix = camera_matrix(fields, *MATRIX_KEYS)
     model = stated_model(fields)
     distortion = stated_lens(fields, DISTORTION_KEYS, model) or numbers(fields, *DISTORTION_KEYS)
     if fields.get("xi") is not None:
@@ -167,6 +177,7 @@ def with_sides(fields: Mapping[str, Any]) -> Mapping[str, Any]:
     Raises:
         ValueError: the list is none of two sides, and perhaps a number of channels.
     """
+    fields = {key: _two_sides(value) for key, value in fields.items()}
     lists = (key for key, value in fields.items() if isinstance(value, list | Mapping))
     given = next((key for key in lists if spelled(key) in _SIDES_KEYS), None)
     if given is None or any(fields.get(key) is not None for key in (*_WIDTH_KEYS, *_HEIGHT_KEYS)):
@@ -182,10 +193,16 @@ def with_sides(fields: Mapping[str, Any]) -> Mapping[str, Any]:
     if fields.get("cx") is not None:
         matrix = [0.0, 0.0, number(fields, "cx"), 0.0, 0.0, number(fields, "cy")]
     else:
-        matrix = numbers(fields, *MATRIX_KEYS, count=9)
+        matrix = camera_matrix(fields, *MATRIX_KEYS)
     first, second = map(round, sides)
     height, width = min((second, first), (first, second), key=lambda size: centre_offset(matrix, size))
     return {**rest, "width": width, "height": height}
+
+
+def _two_sides(value: Any) -> Any:
+    """Return width and height of a text such as 1280x720 as a list; another value as it is."""
+    found = _SIDES.fullmatch(value) if isinstance(value, str) else None
+    return [*found.groups()] if found else value
 
 
 def _of_images(fields: Mapping[str, Any], rectified: bool, image_size: tuple[int, int]) -> CameraParameters:
@@ -238,7 +255,7 @@ def _restates(fields: Mapping[str, Any]) -> bool:
     """Tell whether P = [K | 0] and R = I, which state no rectification."""
     try:
         rotation = numbers(fields, *_ROTATION_KEYS, count=9)
-        return rotation == _IDENTITY and _projection(fields) == numbers(fields, *MATRIX_KEYS, count=9)
+        return rotation == _IDENTITY and _projection(fields) == camera_matrix(fields, *MATRIX_KEYS)
     except ValueError:
         return False
 

@@ -153,6 +153,8 @@ def _yaml_fault(error: Exception, text: str, has_document: bool) -> str:
         return f"expected numbers, texts and lists, got another object{where}"
     if "\\t" in problem:
         return f"expected YAML, got a tab{where}; indent by spaces"
+    if "mapping values" in problem and ", " in text:
+        return f"expected a key a line, or all of them in braces, got more{where}"
     if without_space := _NO_SPACE.search(text):
         return f"expected a space after each colon, got {without_space[0]}"
     if has_document:
@@ -165,16 +167,17 @@ def _yaml_fault(error: Exception, text: str, has_document: bool) -> str:
 def bare_numbers(text: str) -> dict[str, Any] | None:
     """Return the fields of a text of numbers alone; None if it is another.
 
-    Nine are a camera matrix, whose last one is 1, and twelve that of a projection matrix; four, eight or nine
-    others are fx fy cx cy and the coefficients, as DROID-SLAM has them.
+    Nine are a camera matrix, whose last one is 1, twelve a projection matrix, and sixteen one of 4 x 4; four,
+    eight or nine others are fx fy cx cy and the coefficients, as DROID-SLAM has them.
     """
     words = [word for word in _AROUND_NUMBERS.split(text) if word] if len(text) <= _MOST_BARE else []
     try:
         values = [*map(float, words)]
     except ValueError:
         return None
-    if len(words) == 12:  # of a projection matrix
+    if len(words) in (12, 16):
         del words[3::4], values[3::4]
+        words, values = words[:9], values[:9]
     if len(values) == 9 and values[8] == 1.0:
         return {"K": words, "D": []}
     if len(values) in (4, 8, 9):
@@ -277,6 +280,18 @@ def _numbers(name: str, value: Any, count: int | None) -> list[float]:
     if len(entries) > _MOST_NUMBERS:
         raise ValueError(f"{name}: expected a few numbers, got more than {_MOST_NUMBERS}")
     return finite_numbers(name, entries, count)
+
+
+def camera_matrix(fields: Mapping[str, Any], *keys: str) -> list[float]:
+    """Return the nine entries of a camera matrix, row by row; it may be padded to 3 x 4 or 4 x 4."""
+    return _read_once(fields, keys, lambda value: _unpadded(keys[0], _numbers(keys[0], value, None)))
+
+
+def _unpadded(name: str, entries: list[float]) -> list[float]:
+    is_padded = len(entries) in (12, 16) and not any(entries[3:12:4])
+    if is_padded and entries[12:] in ([], [0.0, 0.0, 0.0, 1.0]):
+        entries = [*entries[0:3], *entries[4:7], *entries[8:11]]
+    return finite_numbers(name, entries, 9)
 
 
 def mapping(name: str, value: Any) -> Mapping[str, Any]:

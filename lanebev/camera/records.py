@@ -14,7 +14,7 @@ from lanebev.camera.datasets import is_woodscape, woodscape
 from lanebev.camera.formats import DISTORTION_KEYS, stated_model, with_sides
 from lanebev.camera.named_lens import LENS_NAMES, stated_lens
 from lanebev.camera.parameters import OFF_CENTRE, CameraParameters, centre_offset, size_of_images
-from lanebev.camera.parsing import number, numbers, whole_number
+from lanebev.camera.parsing import camera_matrix, number, numbers, whole_number
 from lanebev.numbers import shown
 
 Record = Mapping[str, Any]
@@ -96,7 +96,7 @@ def _layout(record: Any) -> _Layout | None:
 
 def _named_numbers(record: Record) -> Record | None:
     """Return fx, fy and the principal point by name, which stand for the matrix; None without them."""
-    found = (record.get(key) for key in ("intrinsic", "intrinsics"))
+    found = (record.get(key) for key in ("intrinsic", "intrinsics", "camera_matrix"))
     return next((each for each in found if isinstance(each, Mapping) and "fx" in each), None)
 
 
@@ -115,14 +115,14 @@ def _read(record: Record, image_size: tuple[int, int] | None, rectified: bool) -
     """Read a record; the lens beside the matrix counts, under any of its names."""
     layout = _layout(record) or _LAYOUTS[0]
     if rectified and layout.rectified:
-        matrix = numbers(record, layout.rectified, count=9)
+        matrix = camera_matrix(record, layout.rectified)
         return CameraParameters(matrix, [], "pinhole", _size(matrix, record, image_size, layout))
     if named := _named_numbers(record):
         record = {**record, **named}  # whose lens and size count too
         fx, fy, cx, cy = (number(record, *keys) for keys in (("fx",), ("fy",), ("cx", "u0"), ("cy", "v0")))
         matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
     else:
-        matrix = numbers(record, layout.matrix, count=9)
+        matrix = camera_matrix(record, layout.matrix)
         if _is_waymos(matrix):
             record = {**record, "distortion": matrix[4:]}
             matrix = [matrix[0], 0.0, matrix[2], 0.0, matrix[1], matrix[3], 0.0, 0.0, 1.0]

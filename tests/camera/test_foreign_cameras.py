@@ -306,6 +306,11 @@ ORBextractor.nFeatures: 1200
             json.dumps({"intrinsic": MATRIX}),
             "expected a camera of 1920 x 1280 px, OpenLane's, got a",
         ),
+        (
+            "c.yaml",
+            "fx: 1150, fy: 1150",
+            "expected a key a line, or all of them in braces, got more at line 1",
+        ),
         ("c.json", json.dumps({"intrinsic": {"fx": 1, "u0": 2}}), "fy: expected a value, got none"),
         ("c.mat", b"\x89HDF\r\n\x1a\n" + bytes(99), "got: HDF5, as of MATLAB 7.3 and h5py; save it as JSON"),
         (
@@ -658,6 +663,7 @@ def test_a_line_of_numbers_has_the_focal_lengths_the_principal_point_and_the_len
         {"image_size": [800, 480]},
         {"imgSize": [480, 800]},
         {"DIM": [800, 480]},
+        {"size": "800x480"},
         {"image_shape": [480, 800, 3]},
         {"image_shape": [3, 480, 800]},  # of PyTorch
         {
@@ -707,6 +713,29 @@ def test_other_usual_keys_of_matrix_and_coefficients(tmp_path, matrix, lens):
     expected = 633, 633, 408, 245, 800, 480, [-0.3, 0.1, 0, 0, 0.05]
     _is(_read(tmp_path / "c.json", json.dumps(fields)), *expected)
     _is(_read(tmp_path / "c.json", json.dumps({"a": fields, "b": fields})), *expected)
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+def test_a_camera_matrix_may_be_padded(tmp_path, rows):  # ScanNet's text, mmdetection3d's cam2img
+    padded = np.eye(4)[:rows]
+    padded[:3, :3] = MATRIX
+    expected, lens = (633, 633, 408, 245, 800, 480), [-0.3, 0.1, 0, 0, 0.05]
+    for key in ("K", "camera_intrinsic"):
+        fields = {key: padded.tolist(), "D": lens, "width": 800, "height": 480}
+        _is(_read(tmp_path / "c.json", json.dumps(fields)), *expected, lens)
+    np.savetxt(tmp_path / "intrinsic_color.txt", padded)
+    _is(Camera.from_file(tmp_path / "intrinsic_color.txt", image_size=(480, 800)), *expected)
+    np.save(tmp_path / "k.npy", padded)
+    _is(Camera.from_file(tmp_path / "k.npy", image_size=(480, 800)), *expected)
+    fields = {"K": (padded + np.eye(4)[:rows, ::-1]).tolist(), "D": [], "width": 800, "height": 480}
+    with pytest.raises(ValueError, match=f"camera_matrix: expected 9 numbers, got {4 * rows}"):
+        _read(tmp_path / "c.json", json.dumps(fields))
+
+
+def test_a_camera_matrix_by_names(tmp_path):
+    named = {"fx": 633, "fy": 633, "cx": 408, "cy": 245}
+    fields = {"camera_matrix": named, "distortion": [-0.3, 0.1, 0, 0, 0.05], "width": 800, "height": 480}
+    _is(_read(tmp_path / "c.json", json.dumps(fields)), *named.values(), 800, 480, fields["distortion"])
 
 
 def test_keys_that_differ_in_case_only_are_an_error(tmp_path):
