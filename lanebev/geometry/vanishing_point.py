@@ -27,6 +27,6 @@ def vanishing_point(
     """
     direction = vanishing_dir_from_pitch_yaw(pitch, yaw)
     point = denormalise_points((direction[:, :2] / direction[:, 2:])[:, None], intrinsics)
-    if distortion is not None and distortion.shape[-1]:
+    if distortion is not None:
         point = distort_points(point, intrinsics, distortion, model)
     return point[:, 0]

@@ -117,10 +117,8 @@ class CanonicalView(nn.Module):
         doubt_intrinsics(intrinsics, size)
         intrinsics, extrinsics, distortion = blind_unless_usable(intrinsics, extrinsics, distortion)
         dtype, image_from_cam = common_dtype(image), normalised_intrinsics(intrinsics, size)
-        lens = None
-        if distortion is not None and distortion.shape[-1] > 0:
-            lens = make_lens(image_from_cam.to(dtype), distortion.to(dtype), model)
-        cells = self._cells(None if lens else image_from_cam, extrinsics)
+        lens = make_lens(image_from_cam, distortion, model, dtype)
+        cells = self._cells(image_from_cam if lens is None else None, extrinsics)
         cells = CanonicalCells(cells.rays.to(dtype), cells.down.to(dtype), cells.stretch.to(dtype))
         (view,), valid = resampled([image], cells, lens, [MapSize(image.shape[-2], image.shape[-1])], size)
         return view, valid

@@ -47,12 +47,9 @@ def cells_and_lens(
     Returns:
         cells of P·U rows, those of the first plane first, and the lens, None for an undistorted image.
     """
-    if distortion is None or distortion.shape[-1] == 0:
-        sums, lens = cell_sums(grid, plane_heights, image_from_cam, extrinsics, vertical_curvature), None
-    else:
-        sums = cell_sums(grid, plane_heights, None, extrinsics, vertical_curvature)
-        lens = make_lens(image_from_cam.to(dtype), distortion.to(dtype), model)
-    return sums.to(dtype), lens
+    lens = make_lens(image_from_cam, distortion, model, dtype)
+    matrix = image_from_cam if lens is None else None
+    return cell_sums(grid, plane_heights, matrix, extrinsics, vertical_curvature).to(dtype), lens
 
 
 @full_precision

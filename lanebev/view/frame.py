@@ -222,6 +222,5 @@ class _Source:
 def _projection(camera: Camera) -> tuple[Tensor | None, Lens | None]:
     """Return the matrix, (1, 3, 3), or the lens that leads from camera to normalised coordinates."""
     image_from_cam = normalised_intrinsics(camera.intrinsics[None].cpu(), camera.image_size)
-    if len(camera.distortion) == 0:
-        return image_from_cam, None
-    return None, make_lens(image_from_cam.float(), camera.distortion[None].cpu().float(), camera.model)
+    lens = make_lens(image_from_cam, camera.distortion[None].cpu(), camera.model, torch.float32)
+    return image_from_cam if lens is None else None, lens

@@ -43,9 +43,14 @@ class Lens(NamedTuple):
         return torch.addcmul(x + y, self.squared_limit, z, value=-1).unsqueeze(1)
 
 
-def make_lens(image_from_cam: Tensor, distortion: Tensor, model: str) -> Lens:
-    """Make a lens of intrinsics (B, 3, 3) and distortion (B, D)."""
-    upper = image_from_cam[:, :2, :, None, None]  # (B, 2, 3, 1, 1)
+def make_lens(
+    image_from_cam: Tensor, distortion: Tensor | None, model: str, dtype: torch.dtype
+) -> Lens | None:
+    """Make a lens of intrinsics (B, 3, 3) and distortion (B, D); None of an undistorted image."""
+    if distortion is None or distortion.shape[-1] == 0:
+        return None
+    distortion = distortion.to(dtype)
+    upper = image_from_cam.to(dtype)[:, :2, :, None, None]  # (B, 2, 3, 1, 1)
     focal = torch.stack([upper[:, 0, 0], upper[:, 1, 1]], dim=1)
     skew = torch.stack([upper[:, 0, 1], torch.zeros_like(upper[:, 0, 1])], dim=1)
     limit = max_undistorted_radius(distortion.detach(), model).square()[:, None, None]

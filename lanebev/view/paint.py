@@ -116,7 +116,7 @@ class ImageFromBEV(nn.Module):
     ) -> Tensor:
         """Compute where every pixel as taken meets the road, (B, 3, H, W), homogeneous in [-1, 1]."""
         pixels, valid = _all_pixels(image_size, intrinsics), None
-        if distortion is not None and distortion.shape[-1]:
+        if distortion is not None:
             pixels, valid = invert_distortion(pixels, intrinsics, distortion, model)
         below = extrinsics._replace(height=extrinsics.height - self.plane_height)
         road, on_road = road_from_image_points(pixels, intrinsics, below, vertical_curvature)
