@@ -28,6 +28,7 @@ VERTICES_PER_LINE = 60
 _MOST_TURNS = 0.25  # fraction of a line's steps; points that turn in more of them are in no order
 _BESIDE_EDGE = 3.0  # px from an edge, where points of the same x were moved to it
 _EVEN = 0.01  # px, by which evenly spaced rows may differ
+_ROUNDED = 3.0  # px, by which whole numbers move at most in a row before rounding repeats one
 _ABRUPT = 0.7  # of a step, from which a curve does not become vertical in the next
 _GAP, _GAP_ROWS = 4.0, 30.0  # between vertices: times the median distance, and px
 
@@ -196,7 +197,8 @@ def _repeats_end(points: NDArray[np.float64]) -> NDArray[np.bool_]:
 
     They are two or more of one x on evenly spaced rows, along which the line would move by more than a pixel
     if it went on as before; a curve becomes vertical by and by, and a line on a grid is so elsewhere too. Of
-    whole numbers they are three or more, and it moves so from row to row, since rounding repeats x.
+    whole numbers, which rounding repeats, they are three or more and it moves so from row to row, or two and
+    it moves by more than three.
     """
     found = np.zeros(len(points), dtype=bool)
     there = np.flatnonzero(np.isfinite(points).all(-1))
@@ -204,10 +206,11 @@ def _repeats_end(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     for own in (there, there[::-1]):
         steps, rows = np.abs(np.diff(points[own], axis=0)).T
         same = int(np.argmax([*(steps > 0), True]))  # steps of 0 at this end
-        if not whole < same < len(steps) - 1 or not np.ptp(rows[: same + 2]) < _EVEN < rows[0]:
+        if not 0 < same < len(steps) - 1 or not np.ptp(rows[: same + 2]) < _EVEN < rows[0]:
             continue
         before, earlier = steps[same : same + 2]
-        if before * (1 if whole else same) > 1.0 and before > _ABRUPT * earlier > 0:
+        least = _ROUNDED if whole and same == 1 else 1.0
+        if before * (1 if whole else same) > least and before > _ABRUPT * earlier > 0:
             found[own[: same + 1]] = True
     return found
 

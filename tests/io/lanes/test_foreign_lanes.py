@@ -107,6 +107,8 @@ def test_points_that_repeat_the_x_of_a_lines_end_are_missing(shift, order):
         [500, 500, 500, 500, 500, 500],
         [500, 500, 500, 501, 501, 501],
         [500, 500, 502, 506, 512, 520],
+        [500, 500, 503, 506, 509, 512],
+        [500, 500, 504, 512, 524, 540],
         [500.5, 500.5, 502.4, 506.1, 511.9, 519.8],
         [500.5, 500.5, 500.6, 500.8, 501.0, 501.2],
         [500.5, 500.5, 508.5, 508.5, 516.5, 516.5],  # of a grid
@@ -117,6 +119,14 @@ def test_lines_that_are_vertical_or_become_so_are_whole(x):
     assert vertices_from_lines([LaneLine(line, 2)], CAMERA).weight.sum() == 6
     drawn = np.array([[640.0, 400.0], [640.0, 500.0], [600.0, 550.0], [560.0, 600.0]])  # by hand
     assert vertices_from_lines([LaneLine(drawn, 2)], CAMERA).weight.sum() == 21
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_whole_number_that_is_repeated_once_is_missing_where_the_line_moves_fast(order):
+    rows = np.arange(400.0, 470.0, 10.0)
+    x = np.array([500, 500, 505, 510, 516, 521, 527])
+    (found,) = vertices_from_lines([LaneLine(np.stack([x, rows], -1)[::order], 2)], CAMERA).weight[0, 2:3]
+    assert found.sum() == 5
 
 
 @pytest.mark.parametrize("order", [1, -1])
