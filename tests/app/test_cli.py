@@ -90,7 +90,11 @@ def test_bad_camera_or_lane_file_writes_nothing(data, tmp_path, capsys):
     text = (data / "lanes.json").read_text()
     case("bad.json, line 6", "is the file cut", lanes=text[:-40])
     case("at least one image", lanes="\n".join(lane_lines(["elsewhere.png"])))
-    case("expected 6 entries, one per frame", lanes="\n".join(text.splitlines()[:4]), source="drive.mp4")
+    words = (
+        "expected 6 entries, one per frame",
+        "write an entry without lanes for frames that were not looked",
+    )
+    case(*words, lanes="\n".join(text.splitlines()[:4]), source="drive.mp4")
 
 
 def test_an_undecodable_single_image_writes_nothing(data, tmp_path, capsys):

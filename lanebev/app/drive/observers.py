@@ -92,7 +92,8 @@ class LaneFileObserver:
             if len(entries) != source.count and not self._of_taken:
                 raise ValueError(
                     f"lanes: expected {source.count} entries, one per frame of {source.source}, got "
-                    f"{len(entries)}; is the lane file cut?"
+                    f"{len(entries)}; is the lane file cut? write an entry without lanes for frames that "
+                    "were not looked at"
                 )
             _check_order([entry.name for entry in entries], source.source)
             self.matches: list[int | None] = list(range(len(entries)))

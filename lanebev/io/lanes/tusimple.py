@@ -104,9 +104,9 @@ def _vertex_fields(vertices: BoundaryVertices) -> dict[str, Any]:
 
 
 def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
-    name = field(fields, "raw_file", str)
-    if not name:
-        raise ValueError("raw_file: expected the image's path, got an empty string")
+    name = fields.get("raw_file")
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"raw_file: expected the image's path under this key, got {shown(name)}")
     rows = _rows(fields)
     pose_sigma_scale = _pose_sigma_scale(fields)
     seen = field(fields, "seen", dict) if "seen" in fields else None
