@@ -23,7 +23,7 @@ _STAND_INS = {  # what came in place of another file, by its first bytes
     b"version https://git-lfs.github.com/": "a pointer of Git LFS; fetch the file by git lfs pull",
     b"\x93NUMPY": "an array of NumPy; write numbers as JSON or YAML, images as PNG",
     b"MATLAB ": "MATLAB's own format; save it as JSON by jsonencode",
-    b"PK\x03\x04": "a ZIP archive; unpack it",
+    b"PK\x03\x04": "a ZIP archive, or a sheet of Excel; unpack it, or save the sheet as CSV",
     b"\x89HDF": "HDF5, as of MATLAB 7.3 and h5py; save it as JSON",
     b"PAR1": "a Parquet table; save it as JSON",
     b"ARROW1": "a Feather table; save it as JSON",

@@ -613,7 +613,7 @@ def test_a_misspelled_key_of_the_coefficients_is_an_error(tmp_path, key):
         ("wide_dist_pickle.p", pickle.dumps({"mtx": MATRIX}), "a pickle of Python, .*; save it as JSON$"),
         ("k.npy", b"\x93NUMPY\1\0", "no arrays of numbers as by numpy.save"),
         ("k.mat", b"MATLAB 5.0 MAT-file, Platform: PCWIN64\0\0", "MATLAB's own format; save it as JSON"),
-        ("c.zip", b"PK\x03\x04\0\0", "a ZIP archive; unpack it"),
+        ("c.zip", b"PK\x03\x04\0\0", "a ZIP archive, or a sheet of Excel; unpack it, or save"),
         ("cameras.bin", bytes(8), "COLMAP writes texts by model_converter --output_type TXT$"),
     ],
 )

@@ -21,6 +21,7 @@ from lanebev.io.lanes.parsing import (
     field,
     json_values,
     lane_text,
+    may_bound_lane,
     stated_size,
 )
 from lanebev.numbers import finite_numbers, shown
@@ -77,7 +78,9 @@ def read_cvat(path: Path) -> list[FrameLines]:
 
 def _cvat(image: ET.Element) -> _Picture:
     drawn = [
-        [pair.split(",") for pair in shape.get("points", "").split(";")] if shape.tag == "polyline" else None
+        [pair.split(",") for pair in shape.get("points", "").split(";")]
+        if shape.tag == "polyline" and may_bound_lane(shape.get("label"))
+        else None
         for shape in image
     ]
     sides = {key: int(text) for key in ("height", "width") if (text := image.get(key, "")).isdecimal()}
@@ -115,7 +118,10 @@ def _objects(fields: Any, key: str) -> list[dict[str, Any]]:
 def labelme(path: Path, value: dict[str, Any]) -> Iterator[_Picture]:
     """Yield the picture of a file of LabelMe."""
     shapes = [as_object(shape) for shape in field(value, "shapes", list)]
-    are_lines = [shape.get("shape_type") in ("linestrip", "line") for shape in shapes]
+    are_lines = [
+        shape.get("shape_type") in ("linestrip", "line") and may_bound_lane(shape.get("label"))
+        for shape in shapes
+    ]
     drawn = [
         field(shape, "points", list) if is_line else None
         for shape, is_line in zip(shapes, are_lines, strict=True)
@@ -135,7 +141,10 @@ def vil100(_: Path, value: dict[str, Any]) -> Iterator[_Picture]:
 def supervisely(path: Path, value: dict[str, Any]) -> Iterator[_Picture]:
     """Yield the picture of a file, which is named after it (``1.jpg.json``)."""
     objects = _objects(value, "objects")
-    are_lines = [each.get("geometryType") in ("line", "polyline") for each in objects]
+    are_lines = [
+        each.get("geometryType") in ("line", "polyline") and may_bound_lane(each.get("classTitle"))
+        for each in objects
+    ]
     drawn = [
         field(field(each, "points", dict), "exterior", list) if is_line else None
         for each, is_line in zip(objects, are_lines, strict=True)
@@ -147,7 +156,9 @@ def darwin(_: Path, value: dict[str, Any]) -> Iterator[_Picture]:
     """Yield the picture of a file of V7."""
     item = field(value, "item", dict)
     drawn = [
-        each["line"] and field(each["line"], "path", list) if "line" in each else None
+        each["line"] and field(each["line"], "path", list)
+        if "line" in each and may_bound_lane(each.get("name"))
+        else None
         for each in _objects(value, "annotations")
     ]
     yield _Picture(item.get("name"), next(iter(_objects(item, "slots")), None), drawn)
@@ -159,9 +170,8 @@ def labelbox(_: Path, value: dict[str, Any]) -> Iterator[_Picture]:
     labels = [
         label for project in field(value, "projects", dict).values() for label in _objects(project, "labels")
     ]
-    drawn = [
-        each.get("line") for label in labels for each in _objects(label.get("annotations") or {}, "objects")
-    ]
+    objects = [each for label in labels for each in _objects(label.get("annotations") or {}, "objects")]
+    drawn = [each.get("line") if may_bound_lane(each.get("name")) else None for each in objects]
     name = row.get("external_id") or row.get("global_key") or row.get("row_data")
     yield _Picture(name, value.get("media_attributes"), drawn)
 

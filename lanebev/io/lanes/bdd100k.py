@@ -18,15 +18,17 @@ from lanebev.io.lanes.parsing import (
     as_object,
     checked_pixels,
     field,
+    is_probable,
     json_values,
     lane_text,
+    may_bound_lane,
 )
 from lanebev.numbers import finite_numbers, shown
 from lanebev.observation.polylines import LaneLine
 
 Array = NDArray[np.float64]
 
-_NO_BOUNDARIES = ("curb", "crosswalk", "vertical")  # kerbs, and what crosses the road
+_ACROSS = "vertical"  # direction of lines across the road
 _STEPS = np.linspace(0.125, 1.0, 8)  # along a Bézier curve, without its start
 
 
@@ -77,8 +79,8 @@ def _is_lane(label: dict[str, Any]) -> bool:
 def _lines(label: dict[str, Any]) -> list[LaneLine]:
     """Return the lines of a lane label; none if it is no boundary of a lane."""
     attributes = as_object(label.get("attributes") or {})
-    kind = [each for each in (label.get("category"), *attributes.values()) if isinstance(each, str)]
-    if any(word in each for word in _NO_BOUNDARIES for each in kind):
+    kind = (label.get("category"), *attributes.values())
+    if _ACROSS in kind or not may_bound_lane(*kind) or not is_probable("label", label.get("score")):
         return []
     parts = field(label, "poly2d", list)
     if any(isinstance(part, list) for part in parts):  # as first released: [x, y, type]

@@ -16,6 +16,7 @@ _PROBABLE = 0.5  # least probability of a line
 _FARTHEST = 1e6  # px or m, of any coordinate
 _DECODER = json.JSONDecoder()
 _NO_VALUE = re.compile(r"[\s,]*")  # between JSON values
+_NO_BOUNDARY = re.compile(r"curb|kerb|crosswalk|zebra|stop[ _-]?line|horizon", re.IGNORECASE)
 _SHOWN = 30  # characters of what is no JSON
 FORMATS = (
     "formats: TuSimple, CULane, CurveLanes, OpenLane, ONCE-3DLanes, Apollo, LLAMAS, BDD100K, VIL-100, "
@@ -155,6 +156,11 @@ def columns(name: str, values: list[Any], count: int) -> NDArray[np.float64]:
         many = {1: "one list", 2: "two lists", 3: "three lists"}[count]
         raise ValueError(f"{name}: expected {many} of one length, got {shown(values)}")
     return np.array([numbers_or_gaps(name, axis) for axis in values])
+
+
+def may_bound_lane(*labels: Any) -> bool:
+    """Tell whether a line with these labels may bound a lane; kerbs and what crosses the road do not."""
+    return not any(_NO_BOUNDARY.search(each) for each in labels if isinstance(each, str))
 
 
 def is_probable(name: str, probability: Any) -> bool:

@@ -85,6 +85,15 @@ def test_lines_that_a_tool_exports_are_read(tmp_path, write):
     assert frame.image_size == (None if "via" in write.__name__ else (720, 1280))
 
 
+@pytest.mark.parametrize("label", ["Curb", "stop line", "zebra_crossing"])
+@pytest.mark.parametrize("write", TOOLS[:3])
+def test_lines_whose_labels_say_that_they_bound_no_lane_are_left_out(tmp_path, write, label):
+    path = tmp_path / "1.jpg.json"
+    path.write_text(json.dumps(write()).replace('"lane"', f'"{label}"', 1))
+    (frame,) = read_lanes(path)
+    assert [line.points.tolist() for line in frame.lines] == POINTS[1:]
+
+
 @pytest.mark.parametrize("write", TOOLS)
 def test_pictures_without_a_line_are_an_error_if_other_shapes_are_drawn(tmp_path, write):
     path = tmp_path / "1.jpg.json"

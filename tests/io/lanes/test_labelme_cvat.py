@@ -36,7 +36,9 @@ def _read(path, value):
 def test_lines_of_labelme_and_of_vil_100(tmp_path):
     car = _shape([[0, 0], [9, 9]], "rectangle")
     files = {
-        "7.json": _labelme(_shape(LEFT), car, _shape(RIGHT, "line"), _shape([])),
+        "7.json": _labelme(
+            _shape(LEFT), car, _shape(RIGHT, "line"), _shape([]), {**_shape(LEFT), "label": "kerb"}
+        ),
         "7.jpg.json": _vil(),
     }
     for name, content in files.items():
@@ -103,7 +105,8 @@ def _polyline(points, kind="polyline"):
 
 def test_polylines_of_cvat(tmp_path):
     path = tmp_path / "annotations.xml"
-    path.write_text(_cvat(_polyline(LEFT) + '<box xtl="1" ytl="2" xbr="3" ybr="4"/>' + _polyline(RIGHT)))
+    others = '<box xtl="1" ytl="2" xbr="3" ybr="4"/>' + _polyline(LEFT).replace('"lane"', '"curb"')
+    path.write_text(_cvat(_polyline(LEFT) + others + _polyline(RIGHT)))
     drawn, empty = read_lanes(path)
     assert (drawn.name, empty.name, empty.lines) == ("a/7.jpg", "a/8.jpg", [])
     for line, expected in zip(drawn.lines, (LEFT, RIGHT), strict=True):

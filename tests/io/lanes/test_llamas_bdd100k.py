@@ -137,6 +137,7 @@ def test_bdd100ks_kerbs_and_what_crosses_the_road_are_left_out(tmp_path):
         _label(direction="vertical"),
         FORMER | {"attributes": {"direction": "vertical"}},
         FORMER | {"category": "lane/road curb"},
+        OF_ALL_LABELS | {"score": 0.3},
         _label([[1, 2], [3, 4]], "LL"),
     ]
     (frame,) = read_lanes(_write(tmp_path / "1.json", [{"name": "1", "labels": labels}]))
