@@ -1,7 +1,7 @@
 """Generic operations on tensors and NamedTuples of tensors."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import lru_cache, wraps
 from threading import Lock, local
 from typing import Any, ParamSpec, TypeVar, cast
@@ -56,6 +56,15 @@ def one_thread() -> Iterator[None]:
         with _lock:
             torch.set_num_threads(_before[0])
             _before.pop()
+
+
+def one_thread_if_small(batch: Tensor, most: int) -> AbstractContextManager[None]:
+    """Return :func:`one_thread` for a batch of at most ``most`` numbers on the CPU.
+
+    Otherwise, and where operations are only recorded, return a context without effect.
+    """
+    small = not recorded() and batch.device.type == "cpu" and batch.numel() <= most
+    return one_thread() if small else nullcontext()
 
 
 def recorded() -> bool:

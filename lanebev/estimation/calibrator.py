@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.estimation.checks import (
+    FEW_SEGMENTS,
     as_batch,
     as_lane_width,
     check_segments,
@@ -15,7 +16,7 @@ from lanebev.estimation.checks import (
 )
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.observation.segments import LaneSegments
-from lanebev.tensors import map_tensors, recorded
+from lanebev.tensors import map_tensors, one_thread_if_small, recorded
 from lanebev.torch_internals import is_in_forward_mode
 from lanebev.types import Calibration, TensorTuple, check_devices
 
@@ -111,12 +112,13 @@ class Calibrator(nn.Module, Generic[StateT]):
         check_devices({"intrinsics": intrinsics, **own, "state": given})
         frame = (segments, intrinsics, state, dt, lane_width, given)
         differentiable = torch.is_grad_enabled() or is_in_forward_mode()
-        if recorded() or differentiable or torch.is_inference_mode_enabled():
-            calibration, after = self._estimate(*frame)
-        else:
-            with torch.inference_mode():  # takes a fifth less time than torch.no_grad
+        with one_thread_if_small(segments.weight, FEW_SEGMENTS):
+            if recorded() or differentiable or torch.is_inference_mode_enabled():
                 calibration, after = self._estimate(*frame)
-            after = map_tensors(torch.clone, after)  # which a graph may use later
+            else:
+                with torch.inference_mode():  # takes a fifth less time than torch.no_grad
+                    calibration, after = self._estimate(*frame)
+                after = map_tensors(torch.clone, after)  # which a graph may use later
         return map_tensors(torch.clone, calibration), after
 
     def _estimate(

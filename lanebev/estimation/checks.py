@@ -10,6 +10,7 @@ from lanebev.observation.segments import LaneSegments
 from lanebev.tensors import constant
 from lanebev.types import Calibration, Status, TensorTuple, check_number_or_tensor, check_pixels, check_tensor
 
+FEW_SEGMENTS = 1 << 12  # of all rows, up to which one thread of the CPU computes a frame
 _MIN_LENGTH = 1e-3  # px; a shorter segment has no direction
 _MIN_SIGMA = 1e-3  # px; nothing is known better
 LEAST_SEGMENTS = 2  # smallest N: the estimators need so many, padding included

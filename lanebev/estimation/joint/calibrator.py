@@ -8,6 +8,7 @@ from torch import Tensor
 from lanebev.batch import flag, in_blocks, may_skip, select_rows
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.checks import (
+    FEW_SEGMENTS,
     as_batch,
     as_lane_width,
     check_new_state,
@@ -33,6 +34,7 @@ from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
 from lanebev.observation.segments import LaneSegments
+from lanebev.tensors import one_thread_if_small
 from lanebev.types import Calibration, Extrinsics, Status, config_of
 
 
@@ -134,7 +136,7 @@ class JointCalibrator(Calibrator[JointState]):
         segments, intrinsics = cast_floating(segments, like.dtype), cast_floating(intrinsics, like.dtype)
         widths = as_lane_width(lane_width, like, self.num_boundaries)
         segments, intrinsics, widths = mask_invalid_rows(segments, intrinsics, widths, self.num_boundaries)
-        with autocast_off(like.device, like.dtype):
+        with autocast_off(like.device, like.dtype), one_thread_if_small(segments.weight, FEW_SEGMENTS):
             weighed = weigh_readings(calibration, like, segments, intrinsics, widths, self.config)
         return cast_floating(weighed, calibration.covariance.dtype)
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.estimation.checks import as_lane_width, check_segments, mask_invalid_rows
+from lanebev.estimation.checks import FEW_SEGMENTS, as_lane_width, check_segments, mask_invalid_rows
 from lanebev.estimation.joint.frame.start_search import LAST_SCALE, linear_starts, spread_subset
 from lanebev.estimation.joint.frame_prior import FramePrior, student_log, student_weight
 from lanebev.estimation.joint.measurement.observations import (
@@ -38,7 +38,7 @@ from lanebev.estimation.joint.measurement.robust import (
 from lanebev.geometry.linalg import inverse_spd, solve_spd
 from lanebev.geometry.precision import full_precision
 from lanebev.observation.segments import LaneSegments
-from lanebev.tensors import map_tensors
+from lanebev.tensors import map_tensors, one_thread_if_small
 from lanebev.types import NUM_BOUNDARIES, Extrinsics
 
 _START_SEGMENTS = 96  # segments by which the start is chosen, at most
@@ -122,9 +122,10 @@ def fit_single_frame(
     check_segments(segments, intrinsics)
     widths = as_lane_width(lane_width, intrinsics, num_boundaries)
     segments, intrinsics, widths = mask_invalid_rows(segments, intrinsics, widths, num_boundaries)
-    seen = observations(segments, intrinsics)
-    places = boundary_places(widths, num_boundaries, intrinsics).gather(1, seen.boundary)  # (B, N)
-    return fit_observations(seen, places, prior or FramePrior(), iterations)
+    with one_thread_if_small(segments.weight, FEW_SEGMENTS):
+        seen = observations(segments, intrinsics)
+        places = boundary_places(widths, num_boundaries, intrinsics).gather(1, seen.boundary)  # (B, N)
+        return fit_observations(seen, places, prior or FramePrior(), iterations)
 
 
 def fit_observations(
