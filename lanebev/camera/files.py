@@ -3,6 +3,7 @@
 Reading is strict: an unknown key, a missing, non-finite or absurd value is a ``ValueError`` of one line.
 """
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -42,9 +43,9 @@ _BY_KEY = {
     "fisheye_params": gyroflow,
     "model_type": camodocal,
     "fl_x": nerf,
-    "ppx": realsense,
     "projection": metashape,
 }
+_OF_OTHERS = re.compile(r"width|\bf_?x\b|matrix", re.IGNORECASE)  # in texts other than KITTI's
 _OF_OPEN3D = {"intrinsic_matrix", "width", "height"}
 _OF_INI = (
     "it states four coefficients and no lens model; they are taken as k1 k2 k3 k4 of a fisheye, as ROS "
@@ -102,7 +103,7 @@ def read_camera(
     try:
         if is_colmap(text):
             camera = checked(chosen(colmap_cameras(text), name, has_usual=False))
-        elif is_kitti(text) or (kind == ".txt" and "width" not in text and not bare):
+        elif is_kitti(text) or (kind == ".txt" and not bare and not _OF_OTHERS.search(text)):
             found = kitti_cameras(text, image_size)
             camera = checked(chosen(found, name, has_usual=len(found) <= KITTI_CAMERAS))
         else:
@@ -185,11 +186,11 @@ def _camera(
         return checked(chosen(cameras, name, has_usual=True))
     if name is not None:
         raise ValueError(f"expected no name after # for a file of one camera, got {shown(name)}")
-    if read := _reader_by_keys(content):
-        return checked(read(content))
     only = next(iter(content.values())) if len(content) == 1 else None
     if isinstance(only, Mapping) and "data" not in only:  # keys below the camera's name
         content = only
+    if read := _reader_by_keys(content):
+        return checked(read(content))
     return opencv_or_ros(content, rectified, image_size)
 
 
@@ -197,6 +198,8 @@ def _reader_by_keys(fields: Mapping[str, Any]) -> Callable[[Mapping[str, Any]], 
     """Return what reads the camera of a program that its keys tell; None of others."""
     if fields.keys() == _OF_OPEN3D:  # beside a lens or a size in other keys the matrix is another program's
         return open3d
+    if "ppx" in map(str.lower, fields):
+        return realsense
     return next((read for key, read in _BY_KEY.items() if key in fields), None)
 
 

@@ -85,17 +85,18 @@ def nerf(fields: Mapping[str, Any]) -> CameraParameters:
 
 
 def realsense(fields: Mapping[str, Any]) -> CameraParameters:
-    """Read the intrinsics of Intel's librealsense, written as JSON or YAML.
+    """Read the intrinsics of Intel's librealsense: JSON, YAML, or what ``rs-enumerate-devices -c`` prints.
 
     Raises:
         ValueError: a lens whose model OpenCV does not have.
     """
+    fields = {key.lower(): value for key, value in fields.items()}
     distortion = numbers(fields, "coeffs") if fields.get("coeffs") is not None else []
-    name = re.sub(r"[\W_]", "", str(fields.get("model") or "none").lower().removeprefix("distortion."))
+    stated = str(fields.get("model") or fields.get("distortion") or "none")
+    name = re.sub(r"[\W_]", "", stated.lower().removeprefix("distortion."))
     if name not in _REALSENSE_MODELS or (name != "brownconrady" and any(distortion)):
         raise ValueError(
-            f"model: expected brown_conrady, or coeffs of zeros, got {shown(str(fields.get('model')))}; "
-            "calibrate by OpenCV"
+            f"model: expected brown_conrady, or coeffs of zeros, got {shown(stated)}; calibrate by OpenCV"
         )
     fx, fy, cx, cy = (number(fields, key) for key in ("fx", "fy", "ppx", "ppy"))
     size = (whole_number(fields, "height"), whole_number(fields, "width"))

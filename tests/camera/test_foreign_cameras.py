@@ -738,6 +738,13 @@ def test_a_camera_matrix_by_names(tmp_path):
     _is(_read(tmp_path / "c.json", json.dumps(fields)), *named.values(), 800, 480, fields["distortion"])
 
 
+def test_a_text_of_keys_without_a_size_is_of_the_images(tmp_path):
+    (tmp_path / "c.txt").write_text("fx: 633\nfy: 633\ncx: 408\ncy: 245\n")
+    camera = Camera.from_file(tmp_path / "c.txt", image_size=(480, 800))
+    _is(camera, 633, 633, 408, 245, 800, 480)
+    assert camera.remark == "the file states no size of images; 800 x 480 px are taken"
+
+
 def test_keys_that_differ_in_case_only_are_an_error(tmp_path):
     with pytest.raises(
         ValueError, match="one of K and k, which are read alike, got both; rename one, or leave"

@@ -42,6 +42,23 @@ def test_matlabs_first_pixel_is_at_1_and_its_lens_is_opencvs(tmp_path, fields):
     assert three.distortion.tolist() == pytest.approx([-0.3, 0.1, 0.001, -0.002, 0.02])
 
 
+def test_matlabs_camera_below_a_name(tmp_path):
+    expected = _read(tmp_path, MATLAB).fingerprint()
+    assert _read(tmp_path, {"cameraParams": MATLAB}).fingerprint() == expected
+
+
+def test_what_librealsenses_tool_prints(tmp_path):
+    text = "  Width:      \t{}\n  Height:     \t720\n  PPX:        \t640.25\n  PPY:        \t360.5\n"
+    text += "  Fx:  \t910\n  Fy:  \t911\n  Distortion: \tInverse Brown Conrady\n"
+    text += "  Coeffs: \t{}  \t0  \t0  \t0  \t0\n"
+    (tmp_path / "color.txt").write_text(text.format(1280, 0) + "  FOV (deg):  \t70.2 x 43.2\n")
+    expected = Camera.from_parameters(910, 911, 640.25, 360.5, 1280, 720)
+    assert Camera.from_file(tmp_path / "color.txt").fingerprint() == expected.fingerprint()
+    (tmp_path / "color.txt").write_text(text.format(1280, 0.1))
+    with pytest.raises(ValueError, match="coeffs of zeros, got 'Inverse Brown Conrady'; calibrate by OpenCV"):
+        Camera.from_file(tmp_path / "color.txt")
+
+
 def test_matlabs_camera_intrinsics(tmp_path):
     own = {"FocalLength": [900, 905], "PrincipalPoint": [641, 361], "RadialDistortion": [0, 0]}
     camera = _read(tmp_path, {**MATLAB, **own, "K": None})
