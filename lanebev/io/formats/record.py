@@ -129,6 +129,8 @@ def with_images(
         image = None
         if picture is not None and picture.number == frame.row.frame:
             _check_same(picture, frame.row)
+            if record.camera is not None:
+                _check_size(picture, record.camera)
             image, picture = picture.image, next(pictures, None)
         yield frame, image
     if picture is not None:
@@ -147,6 +149,16 @@ def _check_same(picture: Frame, row: ExtrinsicsRow) -> None:
         raise ValueError(
             f"images: expected frame {row.frame} at {row.time_s:.3f} s as in the run, got it at "
             f"{picture.time:.3f} s; is it the run's source?"
+        )
+
+
+def _check_size(picture: Frame, camera: Camera) -> None:
+    """Raise if a frame's image has not the size of those of the run's camera."""
+    if picture.image is not None and picture.image.shape[:2] != camera.image_size:
+        (height, width), (rows, columns) = camera.image_size, picture.image.shape[:2]
+        raise ValueError(
+            f"images: expected {width} x {height} px as of the run's camera, got {columns} x {rows} in frame "
+            f"{picture.number}; is it the run's source?"
         )
 
 

@@ -242,6 +242,10 @@ def _images():
     [
         ({"time": 0.2}, r"images: expected frame 3 at 0.100 s as in the run, got it at 0.200 s"),
         ({"name": "other/7.png"}, r"images: expected 3.png as frame 3, got other/7.png"),
+        (
+            {"image": np.zeros((480, 832, 3), np.uint8)},
+            "images: expected 416 x 240 px as of the run's camera, got 832 x 480 in frame 3; is it the run's",
+        ),
     ],
 )
 def test_images_that_are_not_the_runs_are_refused(changed, message):
