@@ -17,9 +17,10 @@ from lanebev.estimation.joint.measurement.road_curve import (
     KNOT_SPACING,
     NUM_STEPS,
 )
-from lanebev.testing.moments import moments
+from lanebev.testing.moments import WIDTH, moments
 from lanebev.testing.moments import observe as see
-from tests.estimation.joint_drives import DOUBLE, run
+from lanebev.types import Status
+from tests.estimation.joint_drives import DOUBLE, cameras, nothing, run
 
 torch.set_num_threads(1)
 STRAIGHT, BEND = torch.tensor([1e-4, 3e-6], dtype=DOUBLE), torch.tensor([2e-3, 2e-5], dtype=DOUBLE)
@@ -96,3 +97,27 @@ def test_a_clothoids_steps_are_its_rate_by_the_knots_spacing():
     mean, _ = start_moments(params, 1e-12 * torch.eye(7, dtype=DOUBLE)[None], 0 * params, calibrator.config)
     torch.testing.assert_close(mean[:, CURVATURE], params[:, 5])
     torch.testing.assert_close(mean[0, STEPS], torch.full((NUM_STEPS,), 1e-4 * KNOT_SPACING, dtype=DOUBLE))
+
+
+def test_frames_that_tell_nothing_do_not_end_a_contradiction():
+    """A start whose second line is named wrongly is 10 deg off in roll until frames have contradicted it."""
+    still = lambda t: (0.03, -0.02, 0.01, 1.5)  # noqa: E731
+    in_view = [(1, 2), *[(1, 2, 3)] * 2, (1,), (2,), *[(1, 2, 3)] * 8]
+    change = lambda t, moment: replace(moment, visible=in_view[round(30 * t)])  # noqa: E731
+    drive = moments(len(in_view) / 30, change, still)
+    frames = [segments for _, segments in see(drive, 3, 1.0, 12, 0, DOUBLE)]
+    frames[0] = frames[0]._replace(boundary=torch.where(frames[0].boundary == 2, 5, frames[0].boundary))
+    frames[4] = nothing(frames[4])
+    calibrator = JointCalibrator()
+    state, outs = calibrator.initial_state(3, dtype=DOUBLE), []
+    for segments in frames:
+        out, state = calibrator(segments, cameras(3), state, 1 / 30, WIDTH)
+        outs.append(out)
+    wrong = [(out.extrinsics.roll - 0.01).abs() / out.covariance[:, 2, 2].sqrt() for out in outs]
+    assert (outs[2].extrinsics.roll < -0.1).all()  # the wrong start
+    for k in (2, 3, 4):
+        assert (outs[k].status == Status.COASTING).all()
+        assert (wrong[k] < 3).all()
+    assert (outs[-1].status == Status.TRACKING).all()
+    assert (wrong[-1] < 3).all()
+    assert (outs[-1].extrinsics.roll > -0.01).all()

@@ -294,7 +294,6 @@ def test_height_doubts_roll_that_is_held_as_the_lane_seen_bends_it():
         vertical=torch.zeros_like(state.vertical)
     )  # by chance the boundaries seem curved
     positions = boundary_places(WIDTH, 6, state.mean)
-    none = torch.zeros_like(out.inliers), torch.zeros_like(state.mean[:, :NUM_POSE])
-    out = as_calibration(straight, *none, positions, JointConfig())
+    out = as_calibration(straight, torch.zeros_like(out.inliers), positions, JointConfig())
     added = out.covariance[0, 3, 3] - state.cov[0, HEIGHT, HEIGHT]
     torch.testing.assert_close(added, more, rtol=1e-6, atol=0)

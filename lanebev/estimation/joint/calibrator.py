@@ -97,14 +97,13 @@ class JointCalibrator(Calibrator[JointState]):
         numbers = 6 * indices.size**2 + NUM_COMMON * seen.pixels.shape[-1]  # above all the Jacobian
         update = in_blocks(numbers, partial(update_state, cfg=cfg), predicted, positions, seen, time.dt)
         after, supported = update_track_status(predicted, update, time.dt, seen, cfg)
-        after, inliers, apart = restart(after, update.inliers, supported, seen, positions, cfg)
+        after, inliers = restart(after, update.inliers, supported, seen, positions, cfg)
         after = after._replace(reasons=after.reasons | flag(time.guessed, Reason.TIME))
 
         if not may_skip(time.skip):
             skipped = state._replace(reasons=state.reasons | int(Reason.TIME), early=time.early)
             after = select_rows(time.skip, skipped, after)
-            apart = torch.where(time.skip.unsqueeze(-1), 0.0, apart)
-        calibration = as_calibration(after, inliers, apart, positions, cfg)
+        calibration = as_calibration(after, inliers, positions, cfg)
         return unused_frame(calibration, time.skip), after
 
     def with_speed(self, state: JointState, speed: float | Tensor) -> JointState:

@@ -225,19 +225,16 @@ def height_variance_by_roll(height: Tensor, left: Tensor, right: Tensor, roll_va
     return 0.75 * (second * roll_variance).square()
 
 
-def as_calibration(
-    state: JointState, inliers: Tensor, apart: Tensor, positions: Tensor, cfg: JointConfig
-) -> Calibration:
+def as_calibration(state: JointState, inliers: Tensor, positions: Tensor, cfg: JointConfig) -> Calibration:
     """Make the calibration of a state.
 
     Its covariance adds what the filter does not estimate: the common scale of the lane widths (J25); the
-    boundaries' own deviations and headings (J29); the difference from a frame that contradicts the
-    state; and, if roll is not observed, the second-order effect of its error on the height (J30).
+    boundaries' own deviations and headings (J29); the difference from the last frame, if it contradicted
+    the state; and, if roll is not observed, the second-order effect of its error on the height (J30).
 
     Args:
         state: (B, ...).
         inliers: (B, N).
-        apart: (B, 4), pose of a frame that contradicts the state, less the state's; else 0.
         positions: (B, L) m, of the boundaries from the ego lane's middle.
         cfg: the configuration.
     """
@@ -250,7 +247,8 @@ def as_calibration(
     of_two = wander_of_two(state, right - left)
     by_wander = 2 * of_two * (_HEADING_LENGTH * height / width).square()
     only_height = constant(_ONLY_HEIGHT, like=cov)
-    cov = cov + covariance_by_boundaries(state, of_two, cfg) + apart.unsqueeze(-1) * apart.unsqueeze(-2)
+    apart = state.contradiction.unsqueeze(-1)
+    cov = cov + covariance_by_boundaries(state, of_two, cfg) + apart @ apart.mT
     cov = cov + lane_width_covariance(height, cfg.lane_width_std / width)
     cov = cov + (only_height * (by_roll + by_wander).unsqueeze(-1)).diag_embed()
     return Calibration(Extrinsics.unstack(state.mean[:, POSE]), cov, state.status, inliers)

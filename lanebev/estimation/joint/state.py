@@ -37,6 +37,7 @@ class JointState(NamedTuple):
         misfit: (B,) s for which there were segments that did not fit.
         doubt: (B,) number of further frames to be fitted alone and compared with the state.
         contrary: (B,) number of consecutive usable frames that contradicted the state.
+        contradiction: (B, 4) pose of the last of them less that of the state, until a frame agrees.
         status: (B,) int64, values of Status.
         reasons: (B,) int64, :class:`Reason` flags of the last frame; those of what is unseen decide how the
             next prediction moves.
@@ -58,6 +59,7 @@ class JointState(NamedTuple):
     misfit: Tensor
     doubt: Tensor
     contrary: Tensor
+    contradiction: Tensor
     status: Tensor
     reasons: Tensor
 

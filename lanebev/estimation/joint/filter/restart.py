@@ -45,12 +45,10 @@ class Compared(NamedTuple):
     Attributes:
         state: after the frame, or begun from it.
         inliers: (B, N), of the state.
-        apart: (B, 4), difference of the pose from that of a frame that contradicts the state, else 0.
     """
 
     state: JointState
     inliers: Tensor
-    apart: Tensor
 
 
 def restart(
@@ -63,8 +61,8 @@ def restart(
 ) -> Compared:
     """Start rows from this frame alone if it determines the pose and there is no state, or a worse one.
 
-    A state that a second frame contradicts is COASTING until enough of them did. Only rows without a state,
-    or with one in doubt, are compared with the frame.
+    A state that a second frame contradicts is COASTING until enough of them did, or until one agrees with it.
+    Only rows without a state, or with one in doubt, are compared with the frame.
 
     Args:
         state: after the frame.
@@ -79,11 +77,14 @@ def restart(
     state = state._replace(doubt=remaining_doubt(state, share))
     running = is_running(state.status)
     wanted = ~running | (~supported & (state.misfit > cfg.restart_after))
-    asked = (wanted | (state.doubt > 0)) & (total > 0)
-    unasked = state._replace(contrary=torch.zeros_like(state.contrary))
-    kept = Compared(unasked, agreed, torch.zeros_like(state.mean[:, POSE]))
+    asked = wanted | (state.doubt > 0)
+    state = state._replace(
+        contrary=torch.where(asked, state.contrary, 0.0),
+        contradiction=torch.where(asked.unsqueeze(-1), state.contradiction, 0.0),
+    )
     compare = partial(compare_with_frame, cfg=cfg)
-    return replace_rows(asked, kept, compare, state, agreed, wanted, seen, positions)
+    compared = asked & (total > 0)
+    return replace_rows(compared, Compared(state, agreed), compare, state, agreed, wanted, seen, positions)
 
 
 def compare_with_frame(
@@ -121,15 +122,16 @@ def compare_with_frame(
     contrary = usable & is_contrary(state, begun, fit, places, seen, cfg)
     count = torch.where(usable, (state.contrary + 1) * contrary, state.contrary)
     fresh = usable & (wanted | (count >= _CONTRARY_FRAMES))
-    doubted = contrary & ~fresh
+    doubted = (count > 1) & (state.status == int(Status.TRACKING))
+    apart = torch.where(contrary.unsqueeze(-1), (begun.mean - state.mean)[:, POSE], 0.0)
     kept = state._replace(
         contrary=count,
-        status=torch.where(doubted & (count > 1), int(Status.COASTING), state.status),
-        reasons=state.reasons | flag(doubted & (count > 1), Reason.FEW_INLIERS),
+        contradiction=torch.where(usable.unsqueeze(-1), apart, state.contradiction),
+        status=torch.where(doubted, int(Status.COASTING), state.status),
+        reasons=state.reasons | flag(doubted, Reason.FEW_INLIERS),
     )
-    apart = torch.where(doubted.unsqueeze(-1), (begun.mean - state.mean)[:, POSE], 0.0)
     inliers = torch.where(fresh.unsqueeze(-1), fit.inliers, agreed)
-    return Compared(select_rows(fresh, begun, kept), inliers, apart)
+    return Compared(select_rows(fresh, begun, kept), inliers)
 
 
 def remaining_doubt(state: JointState, share: Tensor) -> Tensor:

@@ -66,6 +66,7 @@ def new_state(mean: Tensor, cov: Tensor, status: Status, reasons: Tensor) -> Joi
         misfit=zero(),
         doubt=zero(),
         contrary=zero(),
+        contradiction=zero(NUM_POSE),
         status=torch.full_like(reasons, int(status)),
         reasons=reasons,
     )
