@@ -1,6 +1,6 @@
 """Generic operations on tensors and NamedTuples of tensors."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import lru_cache, wraps
 from threading import Lock, local
@@ -28,6 +28,15 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: T) -> T:
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return cast(T, type(value)(*(map_tensors(function, part) for part in value)))
     return value
+
+
+def all_tensors(values: Iterable[object]) -> Iterator[Tensor]:
+    """Yield the tensors among values, those of NamedTuples too, in order."""
+    for value in values:
+        if isinstance(value, Tensor):
+            yield value
+        elif isinstance(value, tuple) and hasattr(value, "_fields"):
+            yield from all_tensors(value)
 
 
 @contextmanager

@@ -29,7 +29,7 @@ from torch import Tensor
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.config import HILLY_ROADS
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
-from lanebev.observation.segments import LaneSegments
+from lanebev.geometry.precision import cast_floating
 from lanebev.testing.evaluation import NAMES, UNITS, WARM_UP, rms, summarise, track
 from lanebev.testing.moments import CAMERA, FPS, WIDTH, moments, observe
 from lanebev.testing.scenarios import SCENARIOS
@@ -115,7 +115,7 @@ def stream(frames: int, rows: int, per_boundary: int = 8, seed: int = 0) -> dict
             moment, exact = bank[k % len(bank)]
             noise = torch.randn(exact.endpoints.shape, generator=generator, dtype=torch.float64)
             segments = exact._replace(endpoints=exact.endpoints + noise, sigma=torch.ones_like(exact.sigma))
-            rough = LaneSegments(*(p.float() if p.is_floating_point() else p for p in segments))
+            rough = cast_floating(segments, torch.float32)
             one, low = single(rough, CAMERA.float().expand(rows, 3, 3), low, 1 / FPS, WIDTH)
             two, high = double(segments, CAMERA.expand(rows, 3, 3), high, 1 / FPS, WIDTH)
             pose = two.extrinsics.stack()

@@ -1,6 +1,6 @@
 """Keep geometry in single or double precision: bfloat16's 8 bits cannot represent a pixel among 1920."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import reduce, wraps
 from typing import ParamSpec, TypeVar, cast
@@ -8,7 +8,7 @@ from typing import ParamSpec, TypeVar, cast
 import torch
 from torch import Tensor
 
-from lanebev.tensors import map_tensors
+from lanebev.tensors import all_tensors, map_tensors
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -24,7 +24,8 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def precise(*args: P.args, **kwargs: P.kwargs) -> R:
-        tensors = list(_floating((*args, *kwargs.values())))
+        values = all_tensors((*args, *kwargs.values()))
+        tensors = [value for value in values if value.is_floating_point()]
         if _is_precise(tensors):
             return function(*args, **kwargs)
         dtype = common_dtype(*tensors)
@@ -83,12 +84,3 @@ def cast_floating(value: T, dtype: torch.dtype) -> T:
         return part.to(dtype) if part.dtype != dtype and part.is_floating_point() else part
 
     return map_tensors(cast_part, value)
-
-
-def _floating(values: Iterable[object]) -> Iterator[Tensor]:
-    for value in values:
-        if isinstance(value, Tensor):
-            if value.is_floating_point():
-                yield value
-        elif isinstance(value, tuple) and hasattr(value, "_fields"):
-            yield from _floating(value)

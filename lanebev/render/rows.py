@@ -6,26 +6,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from lanebev.tensors import map_tensors
+from lanebev.tensors import all_tensors, map_tensors
 
 T = TypeVar("T", bound=tuple[Any, ...])
-
-
-def tensors_of(values: tuple[Any, ...]) -> list[Tensor]:
-    """Return all tensors of a nested NamedTuple, in order."""
-    found: list[Tensor] = []
-    for value in values:
-        if isinstance(value, tuple):
-            found += tensors_of(value)
-        elif isinstance(value, Tensor):
-            found.append(value)
-    return found
-
-
-def _first_of(values: tuple[Any, ...]) -> Tensor:
-    """Return the first tensor of a nested NamedTuple that begins with one."""
-    first = values[0]
-    return first if isinstance(first, Tensor) else _first_of(first)
 
 
 def through_tables(function: Callable[[Tensor], Tensor], values: T) -> T:
@@ -34,7 +17,7 @@ def through_tables(function: Callable[[Tensor], Tensor], values: T) -> T:
     Hundreds of small tensors so take a handful of operations: they become one table (B, F) for each dtype,
     and the results are views of what the function makes of these.
     """
-    leaves = tensors_of(values)
+    leaves = list(all_tensors(values))
     tables: dict[torch.dtype, Iterator[Tensor]] = {}
     for dtype in {leaf.dtype for leaf in leaves}:
         own = [leaf.flatten(1) if leaf.ndim > 1 else leaf[:, None] for leaf in leaves if leaf.dtype == dtype]
@@ -54,7 +37,7 @@ def take_rows(values: T, rows: Tensor | slice) -> T:
     """Select rows of a (nested) NamedTuple of (B, ...) tensors by an index tensor (R,) or a slice."""
     if isinstance(rows, slice):
         return map_tensors(lambda tensor: tensor[rows], values)
-    if _first_of(values).shape[0] == 1:  # a batch of one row has no other: views
+    if next(all_tensors(values)).shape[0] == 1:  # a batch of one row has no other: views
         count = rows.shape[0]
         return map_tensors(lambda tensor: tensor.expand(count, *[-1] * (tensor.ndim - 1)), values)
     return through_tables(lambda table: table.index_select(0, rows), values)

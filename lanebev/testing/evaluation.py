@@ -8,6 +8,7 @@ from torch import Tensor
 
 from lanebev.estimation.joint.measurement.observations import observe as make_ready
 from lanebev.estimation.joint.measurement.residuals import NUM_PARAMS, boundary_residuals, normal_equations
+from lanebev.geometry.precision import cast_floating
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.moments import CAMERA, FPS, PLACES, WIDTH, Moment, observe
 from lanebev.types import Status
@@ -77,7 +78,7 @@ def frame_bound(moment: Moment, segments: LaneSegments, intrinsics: Tensor = CAM
     """
     rows = segments.boundary.shape[0]
     cameras = intrinsics.double().expand(rows, 3, 3)
-    seen = make_ready(LaneSegments(*(_double(part) for part in segments)), cameras, 6)
+    seen = make_ready(cast_floating(segments, torch.float64), cameras, 6)
     params = torch.zeros(rows, NUM_PARAMS, dtype=torch.float64)
     params[:, :5] = torch.tensor([*moment.pose, moment.offset], dtype=torch.float64)
     at = boundary_residuals(params, PLACES[segments.boundary], seen)
@@ -86,10 +87,6 @@ def frame_bound(moment: Moment, segments: LaneSegments, intrinsics: Tensor = CAM
     cov = torch.linalg.inv(info + 1e-6 * torch.eye(5, dtype=torch.float64))
     variances = cov.diagonal(dim1=1, dim2=2)[:, :4]
     return torch.where(variances < variances.new_tensor(_DETERMINED).square(), variances, torch.inf)
-
-
-def _double(part: Tensor) -> Tensor:
-    return part.double() if part.is_floating_point() else part
 
 
 def summarise(run: Track, reference: Tensor | None = None) -> dict[str, Any]:

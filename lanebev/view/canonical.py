@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.geometry.lens import cam_from_image, check_intrinsics
-from lanebev.geometry.precision import common_dtype, full_precision
+from lanebev.geometry.precision import cast_floating, common_dtype, full_precision
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.tensors import constant
 from lanebev.types import Extrinsics, check_numbers_known
@@ -118,8 +118,7 @@ class CanonicalView(nn.Module):
         intrinsics, extrinsics, distortion = blind_unless_usable(intrinsics, extrinsics, distortion)
         dtype, image_from_cam = common_dtype(image), normalised_intrinsics(intrinsics, size)
         lens = make_lens(image_from_cam, distortion, model, dtype)
-        cells = self._cells(image_from_cam if lens is None else None, extrinsics)
-        cells = CanonicalCells(cells.rays.to(dtype), cells.down.to(dtype), cells.stretch.to(dtype))
+        cells = cast_floating(self._cells(image_from_cam if lens is None else None, extrinsics), dtype)
         (view,), valid = resampled([image], cells, lens, [MapSize(image.shape[-2], image.shape[-1])], size)
         return view, valid
 

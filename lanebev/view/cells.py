@@ -6,7 +6,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from lanebev.geometry.precision import full_precision
+from lanebev.geometry.precision import cast_floating, full_precision
 from lanebev.geometry.road_profile import in_sight
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.tensors import constant, made_once
@@ -49,7 +49,8 @@ def cells_and_lens(
     """
     lens = make_lens(image_from_cam, distortion, model, dtype)
     matrix = image_from_cam if lens is None else None
-    return cell_sums(grid, plane_heights, matrix, extrinsics, vertical_curvature).to(dtype), lens
+    sums = cell_sums(grid, plane_heights, matrix, extrinsics, vertical_curvature)
+    return cast_floating(sums, dtype), lens
 
 
 @full_precision

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lanebev.camera.model import Camera
+from lanebev.geometry.precision import cast_floating
 from lanebev.geometry.road_profile import check_vertical_curvature
 from lanebev.types import Extrinsics
 from lanebev.view.blocks import BLOCK, image_coordinates_by_one_thread
@@ -67,7 +68,7 @@ def remap_frame(
     if vertical_curvature is not None:
         check_vertical_curvature(vertical_curvature, 1)
         curvature = vertical_curvature.cpu()
-    cells = cell_sums(grid, (0.0,), image_from_cam, extrinsics, curvature).to(torch.float32)
+    cells = cast_floating(cell_sums(grid, (0.0,), image_from_cam, extrinsics, curvature), torch.float32)
     source = _Source(frame, grid.shape)
     bev = np.empty((*grid.shape, *frame.shape[2:]), np.uint8)
     valid = np.ones(grid.shape, np.bool_)

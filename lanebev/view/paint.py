@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.geometry.lens import invert_distortion
-from lanebev.geometry.precision import common_dtype, full_precision
+from lanebev.geometry.precision import cast_floating, common_dtype, full_precision
 from lanebev.geometry.road import road_from_image_points
 from lanebev.types import Extrinsics, check_type
 from lanebev.view.checks import blind_unless_usable, check_cameras, check_image, check_size, doubt_intrinsics
@@ -88,10 +88,10 @@ class ImageFromBEV(nn.Module):
         size, dtype = self.grid.shape, common_dtype(bev)
         cells: CellSums | PixelCells
         if vertical_curvature is None and (distortion is None or distortion.shape[-1] == 0):
-            cells = self._sums(intrinsics, extrinsics, image_size).to(dtype)
+            cells = self._sums(intrinsics, extrinsics, image_size)
         else:
-            points = self._points(intrinsics, extrinsics, image_size, distortion, model, vertical_curvature)
-            cells = PixelCells(points.to(dtype))
+            cells = self._points(intrinsics, extrinsics, image_size, distortion, model, vertical_curvature)
+        cells = cast_floating(cells, dtype)
         (image,), valid = resampled([bev], cells, None, [MapSize(bev.shape[-2], bev.shape[-1])], size)
         return image, valid
 
@@ -113,8 +113,8 @@ class ImageFromBEV(nn.Module):
         distortion: Tensor | None,
         model: str,
         vertical_curvature: Tensor | None,
-    ) -> Tensor:
-        """Compute where every pixel as taken meets the road, (B, 3, H, W), homogeneous in [-1, 1]."""
+    ) -> PixelCells:
+        """Compute where every pixel as taken meets the road, homogeneous in [-1, 1]."""
         pixels, valid = _all_pixels(image_size, intrinsics), None
         if distortion is not None:
             pixels, valid = invert_distortion(pixels, intrinsics, distortion, model)
@@ -124,8 +124,7 @@ class ImageFromBEV(nn.Module):
         to_unit = normalised_intrinsics(torch.eye(3).to(bev), self.grid.shape)
         points = to_unit[:, :2] @ bev + to_unit[:, 2:]
         seen = on_road if valid is None else on_road & valid
-        cells: Tensor = torch.where(seen.unsqueeze(1), points, _ABOVE).unflatten(-1, image_size)
-        return cells
+        return PixelCells(torch.where(seen.unsqueeze(1), points, _ABOVE).unflatten(-1, image_size))
 
 
 def _all_pixels(image_size: tuple[int, int], like: Tensor) -> Tensor:

@@ -5,8 +5,6 @@ sums that are zero inside it, since comparisons and ``where`` take several times
 CPU.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple, Protocol
 
 import torch
@@ -50,10 +48,6 @@ class CellSums(NamedTuple):
     def shape(self) -> tuple[int, int, int]:
         """(B, R, V)."""
         return self.by_row.shape[0], self.by_row.shape[2], self.by_column.shape[2]
-
-    def to(self, dtype: torch.dtype) -> CellSums:
-        """Return the same in another dtype."""
-        return self._replace(by_row=self.by_row.to(dtype), by_column=self.by_column.to(dtype))
 
     def rows(self, first: int, last: int) -> Tensor:
         """Return those of rows first to last - 1, (B, 3, last - first, V)."""

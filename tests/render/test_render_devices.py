@@ -8,10 +8,11 @@ from torch import Tensor
 
 from lanebev.render import Drive, RenderedFrame, WindowConfig, render_views, views
 from lanebev.render.raster.base.blocks import make_blocks, multiply_rows
-from lanebev.render.rows import send, take_rows, tensors_of
+from lanebev.render.rows import send, take_rows
 from lanebev.render.scene.kinds import KINDS
 from lanebev.render.scene.world import Scene
 from lanebev.render.views import render_scenes, sample_scene
+from lanebev.tensors import all_tensors
 from tools.other_device import ELSEWHERE, Elsewhere, other_device
 
 SIZE = (64, 112)
@@ -43,7 +44,7 @@ def assert_same(first: RenderedFrame, second: RenderedFrame, share: float = 0.0)
 
 def test_the_same_seed_gives_the_same_frames_bit_for_bit() -> None:
     first, second = (render_views(3, SIZE, generator(1)) for _ in range(2))
-    for one, other in zip(tensors_of(first), tensors_of(second), strict=True):
+    for one, other in zip(all_tensors(first), all_tensors(second), strict=True):
         assert torch.equal(one, other)
 
 
@@ -63,7 +64,7 @@ def test_no_tensor_of_the_host_meets_one_of_the_device(kind: str) -> None:
     expected = render_views(4, SIZE, generator(3), kind=kind, rows=4)
     with other_device() as device:
         frame = render_views(4, SIZE, generator(3), kind=kind, device=ELSEWHERE)
-    assert all(isinstance(t, Elsewhere) for t in tensors_of(frame))
+    assert all(isinstance(t, Elsewhere) for t in all_tensors(frame))
     assert torch.equal(frame.image.here, expected.image)  # type: ignore[attr-defined]
     assert sum(device.waits.values()) < 30
 
@@ -102,7 +103,7 @@ def test_frames_of_a_drive_are_those_asked_for_one_by_one() -> None:
     frames = drive.frames([6, 1, 3])
     for row, index in enumerate((6, 1, 3)):
         for one, other in zip(
-            tensors_of(take_rows(frames, slice(row, row + 1))), tensors_of(drive.frame(index)), strict=True
+            all_tensors(take_rows(frames, slice(row, row + 1))), all_tensors(drive.frame(index)), strict=True
         ):
             assert torch.equal(one, other)
 
@@ -110,7 +111,7 @@ def test_frames_of_a_drive_are_those_asked_for_one_by_one() -> None:
 @pytest.mark.parametrize("rows", [torch.tensor([2, 0, 0]), torch.tensor([1])])
 def test_selected_rows_are_those_of_every_tensor(rows: Tensor) -> None:
     scene = scene_of(3, 6)
-    for one, other in zip(tensors_of(take_rows(scene, rows)), tensors_of(scene), strict=True):
+    for one, other in zip(all_tensors(take_rows(scene, rows)), all_tensors(scene), strict=True):
         assert torch.equal(one, other[rows])
         assert one.dtype == other.dtype
 
@@ -129,8 +130,8 @@ def test_a_factor_of_some_rows_leaves_the_others_alone(rows: list[int]) -> None:
 def test_what_is_sent_elsewhere_arrives() -> None:
     scene = scene_of(2, 7)
     with other_device():
-        sent = tensors_of(send(scene, ELSEWHERE))
-    for one, other in zip(sent, tensors_of(scene), strict=True):
+        sent = all_tensors(send(scene, ELSEWHERE))
+    for one, other in zip(sent, all_tensors(scene), strict=True):
         assert torch.equal(one.here, other)  # type: ignore[attr-defined]
 
 
@@ -149,7 +150,7 @@ def test_cuda_repeats_bit_for_bit() -> None:
     first, second = (
         render_views(16, SIZE, generator(9), device="cuda", window=WindowConfig()) for _ in range(2)
     )
-    for one, other in zip(tensors_of(first), tensors_of(second), strict=True):
+    for one, other in zip(all_tensors(first), all_tensors(second), strict=True):
         assert torch.equal(one, other)
     from_cuda = torch.Generator("cuda").manual_seed(9)
     assert render_views(2, SIZE, from_cuda, device="cuda").image.isfinite().all()
