@@ -95,6 +95,8 @@ def test_bad_camera_or_lane_file_writes_nothing(data, tmp_path, capsys):
         "write an entry without lanes for frames that were not looked",
     )
     case(*words, lanes="\n".join(text.splitlines()[:4]), source="drive.mp4")
+    more = "\n".join(lane_lines(f"{i}.png" for i in range(8)))
+    case("expected 6 entries", "give the folder of those images", lanes=more, source="drive.mp4")
 
 
 def test_an_undecodable_single_image_writes_nothing(data, tmp_path, capsys):

@@ -593,6 +593,7 @@ def test_keys_in_other_cases_and_what_a_program_records_beside_the_camera(tmp_pa
         "scaling: 0.5",
         "flip: 1",
         "rotate: 180",
+        "digital_zoom: 2",
         "w: 640",
     ],
 )

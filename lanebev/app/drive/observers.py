@@ -90,10 +90,16 @@ class LaneFileObserver:
         self._of_taken = source.is_video and len(entries) == source.taken_count
         if source.is_video:
             if len(entries) != source.count and not self._of_taken:
+                remedy = (
+                    "is the lane file cut? write an entry without lanes for frames that were not looked at"
+                )
+                if len(entries) > source.count:
+                    remedy = (
+                        "were frames extracted at a fixed rate, as by ffmpeg? give the folder of those images"
+                    )
                 raise ValueError(
                     f"lanes: expected {source.count} entries, one per frame of {source.source}, got "
-                    f"{len(entries)}; is the lane file cut? write an entry without lanes for frames that "
-                    "were not looked at"
+                    f"{len(entries)}; {remedy}"
                 )
             _check_order([entry.name for entry in entries], source.source)
             self.matches: list[int | None] = list(range(len(entries)))

@@ -29,6 +29,8 @@ def read_culane(path: str | Path) -> FrameLines:
     rows = content.split("\n")
     for number, text in enumerate(rows, start=1):
         with Where(path, number):
+            if "/" in text:
+                raise ValueError("expected x y pairs, got a path; give the folder of the .lines.txt files")
             if "," in text or ";" in text:
                 raise ValueError("expected spaces between numbers, got commas or semicolons; replace them")
             texts = text.split()

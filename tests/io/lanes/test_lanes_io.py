@@ -146,6 +146,10 @@ def test_a_culane_point_given_twice_counts_once(tmp_path):
         ("1 590 2 580 1 590 3 570", "line 1: expected rows in one direction"),
         ("1 590 2 x", "line 1: points: expected finite numbers"),
         (
+            "/a/b.MP4/00000.jpg 1 1 1 1",
+            "line 1: expected x y pairs, got a path; give the folder of the .lines",
+        ),
+        (
             "1,590 2,580",
             "line 1: expected spaces between numbers, got commas or semicolons; replace them",
         ),
