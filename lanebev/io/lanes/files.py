@@ -44,6 +44,7 @@ _READERS: dict[str, Callable[[Path], list[FrameLines]]] = {  # by a key that no 
 }
 _OF_TUSIMPLE = {"lanes", "h_samples", "raw_file"}
 _BEGIN = 1_000  # characters
+_MOST_ENDINGS = 5  # in a message
 _OF_LLAMAS = re.compile(r"_(color|gray)_rect$")  # ends the names of LLAMAS' images, not of its labels
 
 
@@ -61,8 +62,11 @@ def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) 
     if path.is_dir():
         frames = [frame for file in lane_files(path) for frame in read_lanes(file, intrinsics)]
         if not frames:
-            wanted = "expected .lines.txt or .json files, got none; give an .xml file by its name"
-            raise ValueError(f"lane folder {path}: {wanted}")
+            endings = sorted({file.suffix for file in path.rglob("*") if file.is_file()})[:_MOST_ENDINGS]
+            raise ValueError(
+                f"lane folder {path}: expected .lines.txt or .json files, got {' '.join(endings) or 'none'}; "
+                "give an .xml file by its name, and lines instead of masks"
+            )
         return frames
     text = lane_text(path)
     if path.name.endswith(".txt") and not text.lstrip("[ \r\n").startswith("{"):

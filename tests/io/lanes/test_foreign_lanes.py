@@ -204,10 +204,12 @@ def test_a_class_and_a_score_before_culane_points_are_refused(tmp_path):
 
 
 def test_a_folder_of_other_files_says_which_it_reads(tmp_path):
+    message = r"expected .lines.txt or .json files, got {}; give an .xml file by its name, and lines instead"
+    with pytest.raises(ValueError, match=message.format("none")):
+        read_lanes(tmp_path)
     (tmp_path / "annotations.xml").write_text("<annotations></annotations>")
-    with pytest.raises(
-        ValueError, match=r"expected .lines.txt or .json files, got none; give an .xml file by"
-    ):
+    (tmp_path / "1.png").write_bytes(b"")
+    with pytest.raises(ValueError, match=message.format(".png .xml")):
         read_lanes(tmp_path)
 
 
