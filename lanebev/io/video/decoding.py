@@ -18,6 +18,10 @@ from lanebev.numbers import stand_in
 
 _DRAWN_TEXTS = ("tty", "bin", "xbin", "adf", "idf")  # formats of which ffmpeg draws the letters
 _A_TEXT = "a text; images are given as a folder or as a quoted glob"
+_RAW_PIXELS = (
+    "pixels without their size; convert them: ffmpeg -f rawvideo -pixel_format yuv420p -video_size "
+    "WIDTHxHEIGHT -framerate FPS -i FILE drive.mkv"
+)
 _TEXTS = {  # by their first bytes
     b"#EXTM3U": "a playlist whose files are not all on this machine; give the address of the stream, or a "
     "video",
@@ -51,6 +55,8 @@ def open_video(source: str) -> av.container.InputContainer:
         container = av.open(os.path.abspath(source), metadata_errors="replace")
     except (av.error.FFmpegError, OSError) as error:
         reason = f"{error.strerror or 'unknown format'}; is it a video, and whole?"
+        if isinstance(error, av.error.ArgumentError):  # of the reader of .yuv and .rgb
+            reason = _RAW_PIXELS
         with contextlib.suppress(OSError), open(source, "rb") as file:
             begin = file.read(100)
             is_invalid = isinstance(error, av.error.InvalidDataError)

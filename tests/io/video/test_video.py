@@ -378,6 +378,7 @@ def test_a_list_of_images_is_no_video(tmp_path):  # of which ffmpeg draws the le
         ),
         ("live.m3u8", b"#EXTM3U\nhttp://camera/1.ts\n", "a playlist whose files are not all .* or a video"),
         ("cam.sdp", b"v=0\nm=video 5004 RTP/AVP 96\n", "the description of a stream; pipe .* lanebev run -"),
+        ("raw.yuv", bytes(9999), "pixels without their size; convert them: ffmpeg -f rawvideo .* drive.mkv"),
         ("images.zip", b"PK\x03\x04" + bytes(99), "a ZIP archive, .* save the sheet as CSV"),
         ("frames.npy", b"\x93NUMPY" + bytes(99), "an array of NumPy; write numbers .*, images as PNG"),
     ],
