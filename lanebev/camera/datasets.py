@@ -58,7 +58,9 @@ def kitti_cameras(text: str, image_size: tuple[int, int] | None) -> Readers:
     The left colour camera is the usual one.
     """
     lines = (line.split(":", 1) for line in text.splitlines() if ":" in line)
-    entries = once((name.strip(), values) for name, values in lines if name.strip()[:1] in ("P", "S"))
+    entries = once(
+        (name.strip(), values) for name, values in lines if name.strip()[:1] in ("P", "S", "K", "D")
+    )
     names = [kind.format(i) for kind in ("P_rect_{:02d}", "P{}") for i in (2, 3, 0, 1, *range(4, 10))]
     found = {name: partial(_kitti, entries, name, image_size) for name in names if name in entries}
     if not found:
@@ -70,12 +72,16 @@ def kitti_cameras(text: str, image_size: tuple[int, int] | None) -> Readers:
 
 
 def _kitti(entries: Mapping[str, str], name: str, image_size: tuple[int, int] | None) -> CameraParameters:
-    """Read the entry of a rectified camera."""
+    """Read the entry of a rectified camera; for images as it took them, of another size, its K and D."""
+    number = name.removeprefix("P_rect_")
+    taken = {key: entries.get(f"{key}_{number}", "").split() for key in "SKD"}
+    if image_size is not None and taken["S"] and image_size == _kitti_size("S", taken["S"]):
+        matrix, lens = finite_numbers("K", taken["K"], 9), finite_numbers("D", taken["D"], 5)
+        return CameraParameters(matrix, lens, "pinhole", image_size)
     projection = finite_numbers(name, entries[name].split(), 12)
     known = next((s for f, s in _KITTI_SIZES.items() if abs(f - projection[0]) < 1e-3), None)
     if (size_name := name.replace("P", "S", 1)) in entries:
-        width, height = finite_numbers(size_name, entries[size_name].split(), 2)
-        size: tuple[int, int] | None = (round(height), round(width))
+        size: tuple[int, int] | None = _kitti_size(size_name, entries[size_name].split())
     else:
         size = size_of_images("KITTI's of this focal length", image_size, known, _KITTI_SPREAD)
     if size is None:
@@ -90,6 +96,11 @@ def _kitti(entries: Mapping[str, str], name: str, image_size: tuple[int, int] | 
             f"{matrix[2]:g}, {matrix[5]:g}; give the images as they came, or add 'S_rect_02: WIDTH HEIGHT'"
         )
     return CameraParameters(matrix, [], "pinhole", size)
+
+
+def _kitti_size(name: str, values: list[str]) -> tuple[int, int]:
+    width, height = finite_numbers(name, values, 2)
+    return round(height), round(width)
 
 
 def is_colmap(text: str) -> bool:
