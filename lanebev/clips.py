@@ -1,7 +1,5 @@
 """Clips of T frames: their numbers such as time steps, the frames that begin a drive, and their outputs."""
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
@@ -53,12 +51,3 @@ def drive_starts(reset: Tensor, batch: int, steps: int) -> Tensor:
             f"reset: expected bool ({batch},) or ({batch}, {steps}), got {reset.dtype} {tuple(reset.shape)}"
         )
     return reset if reset.ndim == 2 else nn.functional.pad(reset.unsqueeze(-1), (0, steps - 1))
-
-
-def stack_frames(outputs: list[Any]) -> Any:
-    """Stack per-frame (nested) tuples of tensors to one of (B, T, ...) tensors; None stays."""
-    if outputs[0] is None:
-        return None
-    if isinstance(outputs[0], Tensor):
-        return torch.stack(outputs, dim=1)
-    return type(outputs[0])(*(stack_frames(list(parts)) for parts in zip(*outputs, strict=True)))

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.batch import select_rows
-from lanebev.clips import drive_starts, per_frame, stack_frames
+from lanebev.clips import drive_starts, per_frame
 from lanebev.estimation.expected_view import expected_vanishing_point
 from lanebev.geometry.lens import check_distortion, check_intrinsics
 from lanebev.geometry.precision import autocast_is_on, autocast_off, common_dtype
@@ -22,6 +22,7 @@ from lanebev.observation.far_view import FarView
 from lanebev.observation.frames import black_unless_finite, check_images
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segments import LaneSegments, segments_from_vertices
+from lanebev.tensors import join_tensors
 from lanebev.torch_internals import register_pytree
 from lanebev.types import Calibration, Extrinsics, check_devices, check_tensor
 from lanebev.view.checks import doubt_intrinsics
@@ -261,7 +262,8 @@ class LaneBEV(BoundaryDetector):
                 view, valid = self._view(frames[:, step], camera, distortion, model, pose, state)
             homography = bev_from_image(calibration.extrinsics, camera, self.warp.grid)
             outputs.append(LaneBEVOutput(view, valid, calibration, homography, segments, logits))
-        return (outputs[0] if image.ndim == 4 else stack_frames(outputs)), state
+        output = outputs[0] if image.ndim == 4 else join_tensors(lambda each: torch.stack(each, 1), outputs)
+        return output, state
 
     def _check_channels(self, logits: Tensor) -> None:
         """Raise unless the network has a map of each boundary that the calibrator numbers, and background."""

@@ -1,6 +1,6 @@
 """Generic operations on tensors and NamedTuples of tensors."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import lru_cache, wraps
 from threading import Lock, local
@@ -28,6 +28,20 @@ def map_tensors(function: Callable[[Tensor], Tensor], value: T) -> T:
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return cast(T, type(value)(*(map_tensors(function, part) for part in value)))
     return value
+
+
+def join_tensors(function: Callable[[list[Tensor]], Tensor], values: Sequence[T]) -> T:
+    """Apply a function, such as ``torch.cat``, to corresponding tensors of NamedTuples.
+
+    What is no tensor is that of the first one.
+    """
+    first: Any = values[0]
+    if isinstance(first, Tensor):
+        return cast(T, function(cast("list[Tensor]", list(values))))
+    if isinstance(first, tuple) and hasattr(first, "_fields"):
+        parts = zip(*cast("Sequence[tuple[Any, ...]]", values), strict=True)
+        return cast(T, type(first)(*(join_tensors(function, part) for part in parts)))
+    return values[0]
 
 
 def all_tensors(values: Iterable[object]) -> Iterator[Tensor]:

@@ -10,7 +10,6 @@ from lanebev.camera.model import Camera
 from lanebev.render.camera_motion import BodyMotion, LanePath
 from lanebev.render.course import Course
 from lanebev.render.frame import RenderedFrame
-from lanebev.render.rows import concatenate_rows
 from lanebev.render.scene.camera.lens import Lens
 from lanebev.render.scene.light.weather import CLEAR
 from lanebev.render.scene.objects.traffic import NUM_VEHICLES
@@ -18,6 +17,7 @@ from lanebev.render.scene.places.tunnel import endless
 from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.world import Place, Scene, World, sample_world, scene_at
 from lanebev.render.views import render_scenes
+from lanebev.tensors import join_tensors
 from lanebev.types import Extrinsics
 
 _SCENERY_PERIOD = 450.0  # m; bridges, signs and lamps come again
@@ -183,7 +183,7 @@ class Drive:
         Raises:
             IndexError: there is no such frame.
         """
-        scenes = concatenate_rows([self._scene_at(index) for index in indices])
+        scenes = join_tensors(torch.cat, [self._scene_at(index) for index in indices])
         seeds = [self.seed * 1_000_003 + index for index in indices]
         size = self.camera.image_size
         return render_scenes(scenes, size, seeds, device=device, rows=rows, ideal_sensor=self.ideal_sensor)

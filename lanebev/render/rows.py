@@ -1,6 +1,6 @@
 """Rows of nested NamedTuples of tensors (B, ...)."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import torch
@@ -48,16 +48,3 @@ def send(values: T, device: torch.device) -> T:
     if device.type == "cpu":
         return values
     return through_tables(lambda table: table.to(device, non_blocking=True), values)
-
-
-def concatenate_rows(parts: Sequence[T]) -> T:
-    """Concatenate (nested) NamedTuples of (B, ...) tensors along the batch; all else is the first's."""
-    joined = [
-        concatenate_rows(group)
-        if isinstance(group[0], tuple)
-        else torch.cat(group)
-        if isinstance(group[0], Tensor)
-        else group[0]
-        for group in zip(*parts, strict=True)
-    ]
-    return type(parts[0])(*joined)

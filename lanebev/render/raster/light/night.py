@@ -13,7 +13,7 @@ from lanebev.render.scene.light.night import NUM_LAMPS, Lights
 from lanebev.render.scene.objects.objects import TRUCK, SceneObjects
 from lanebev.render.scene.road.alignment import Alignment, elevation_at, local_from_road, z_from_arc
 from lanebev.render.scene.world import Place
-from lanebev.tensors import constant
+from lanebev.tensors import constant, join_tensors
 
 _GLARE_GRID, _MIRROR_GRID = (8, 8), (4, 2)  # px of the image to one of the coarse pictures
 _FAR = 1000.0  # m, where distant lights are put
@@ -77,7 +77,7 @@ def sprites(lights: Lights, place: Place, alignment: Alignment, lens: Lens, obje
     """Return all lights that a camera may see."""
     parts = [_street_lamps(lights, place, alignment, lens), _vehicle_lamps(lights, lens, objects)]
     parts.append(_town(lights, place))
-    return Sprites(*(torch.cat(values, dim=1) for values in zip(*parts, strict=True)))
+    return join_tensors(lambda each: torch.cat(each, 1), parts)
 
 
 def _street_lamps(lights: Lights, place: Place, alignment: Alignment, lens: Lens) -> Sprites:

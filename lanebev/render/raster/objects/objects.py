@@ -17,7 +17,6 @@ from lanebev.render.raster.base.tiles import TILE, TILE_PIXELS
 from lanebev.render.raster.objects.hexahedra import NEVER, Hexahedra, entered_face, entry_depth, plane_times
 from lanebev.render.raster.objects.shading import object_radiance
 from lanebev.render.rows import take_rows
-from lanebev.render.scene.objects.objects import SceneObjects
 from lanebev.render.scene.world import Scene
 from lanebev.tensors import constant, map_tensors
 
@@ -69,7 +68,7 @@ def add_objects(scene: Scene, view: View, solids: Hexahedra, canvas: Canvas) -> 
         return
     hits = _unhidden(canvas, _hits(scene, view, solids, canvas, tiles))
     row = hits.owner // scene.objects.x.shape[1]
-    objects = take_rows(_flat(scene.objects), hits.owner)
+    objects = take_rows(map_tensors(lambda each: each.flatten(0, 1), scene.objects), hits.owner)
     ray_x, ray_y = take(view.ray_x, hits.pixel), take(view.ray_y, hits.pixel)
     up = scene.lens.extrinsics.height[row] - ray_y * hits.depth - objects.ground
     lit = object_radiance(
@@ -78,11 +77,6 @@ def add_objects(scene: Scene, view: View, solids: Hexahedra, canvas: Canvas) -> 
     clear = torch.exp(-hits.depth / scene.world.weather.visibility[row])[:, None]
     haze = scene.world.surroundings.skyline[row]
     _composite(canvas, hits, haze + (lit - haze) * clear, scene.objects.x.shape[1])
-
-
-def _flat(objects: SceneObjects) -> SceneObjects:
-    """Return the (B, M) objects as one row of B M."""
-    return map_tensors(lambda tensor: tensor.flatten(0, 1), objects)
 
 
 def _tiles(scene: Scene, box: Tensor, size: tuple[int, int]) -> Tiles:

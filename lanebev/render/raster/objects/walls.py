@@ -16,10 +16,11 @@ from lanebev.render.raster.base.tiles import tile_corners, tile_pixels
 from lanebev.render.raster.objects.houses import lit_windows
 from lanebev.render.raster.objects.wall_texture import wall_texture
 from lanebev.render.raster.road.ground import headlight_irradiance
-from lanebev.render.rows import concatenate_rows, take_rows
+from lanebev.render.rows import take_rows
 from lanebev.render.scene.objects.surroundings import FENCE, HEDGE, HOUSES, NUM_WALLS, TREES, Wall, walls_of
 from lanebev.render.scene.road.alignment import elevation_at, wall_hit, wall_table
 from lanebev.render.scene.world import Scene
+from lanebev.tensors import join_tensors
 
 _TILES = 8  # tiles in a block of what may be wall
 _BLOCK = 256  # pixels in a block of what is: a distant rail has few
@@ -166,7 +167,7 @@ def _textures(walls: Wall, blocks: Blocks, hits: WallHits, looks: list[tuple[int
         parts.append(
             WallColours(*wall_texture(own, *look, hits.along[part], hits.up[part], hits.footprint[part]))
         )
-    return concatenate_rows(parts)
+    return join_tensors(torch.cat, parts)
 
 
 def _parts(blocks: Blocks, looks: list[tuple[int, int]]) -> Iterator[tuple[tuple[int, int], slice]]:
