@@ -9,6 +9,7 @@ import unicodedata
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import islice
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
@@ -44,6 +45,7 @@ _READERS: dict[str, Callable[[Path], list[FrameLines]]] = {  # by a key that no 
 }
 _OF_TUSIMPLE = {"lanes", "h_samples", "raw_file"}
 _BEGIN = 1_000  # characters
+_FIRST = 100  # objects that tell the format
 _MOST_ENDINGS = 5  # in a message
 _OF_LLAMAS = re.compile(r"_(color|gray)_rect$")  # ends the names of LLAMAS' images, not of its labels
 
@@ -189,14 +191,17 @@ def _parts(name: str) -> tuple[str, ...]:
 
 
 def _first_keys(path: Path, text: str) -> set[str]:
-    """Return the keys of a JSON text's first object, those of objects in it as a.b; none of another text.
+    """Return the keys of a JSON text's first objects, those of objects in them as a.b; none of another text.
 
-    Of one that breaks off they are the words of its first line.
+    An image without lanes may lack a key. Of a first object that breaks off they are the words of its line.
     """
+    objects: list[dict[str, Any]] = []
     try:
-        first: Any = next((value for _, value in json_values(path, text)), {})
+        found = islice((value for _, value in json_values(path, text)), _FIRST)
+        objects.extend(value for value in found if isinstance(value, dict))
     except ValueError:
-        return set(re.findall(r'"(\w+)"', text.lstrip().split("\n", 1)[0]))
-    fields = first if isinstance(first, dict) else {}
-    below = (f"{key}.{each}" for key, value in fields.items() if isinstance(value, dict) for each in value)
-    return {*fields, *below}
+        if not objects:
+            return set(re.findall(r'"(\w+)"', text.lstrip().split("\n", 1)[0]))
+    pairs = [pair for each in objects for pair in each.items()]
+    below = (f"{key}.{each}" for key, value in pairs if isinstance(value, dict) for each in value)
+    return {*(key for key, _ in pairs), *below}

@@ -125,6 +125,11 @@ def test_an_image_of_a_folder_may_have_other_labels_only(tmp_path):
     assert [len(frame.lines) for frame in read_lanes(tmp_path)] == [1, 0]
 
 
+def test_bdd100ks_first_image_may_have_no_labels(tmp_path):
+    frames = [{"name": "1"}, {"name": "2", "labels": [_label([[1, 2], [3, 4]], "LL")]}]
+    assert [len(frame.lines) for frame in read_lanes(_write(tmp_path / "1.json", frames))] == [0, 1]
+
+
 def test_a_bezier_curve_with_controls_on_its_chord_is_the_chord():
     points = bezier_points(np.zeros(2), np.array([[1.0, 2.0], [2.0, 4.0], [3.0, 6.0]]))
     np.testing.assert_allclose(points, np.linspace(0, 1, 9)[1:, None] * [3.0, 6.0])
