@@ -1,4 +1,4 @@
-"""Clips of T frames: their numbers such as time steps, the frames that begin a drive, and their outputs."""
+"""Clips of T frames: their numbers such as time steps, and the frames that begin a drive."""
 
 import torch
 from torch import Tensor, nn

@@ -118,7 +118,8 @@ def run(
             for done in estimates(with_progress(frames, source, progress), config, source, tracker, smoothed):
                 recorder.add(done)
                 if viewer is not None:
-                    viewer.add(_viewer_frame(recorder.rows[-1], done), done.frame.image)
+                    pose, lines = done.estimate.calibration.extrinsics, vertex_lines(done.seen.vertices)
+                    viewer.add(RecordedFrame(recorder.rows[-1], pose, lines), done.frame.image)
         recorder.problems += source_remarks(source, files, len(recorder.rows))
         recorder.problems += filter(None, [unfit_mount_remark(config.mount, recorder.rows)])
         facts = run_facts(config, source, camera) | facts_of(reusing) | _save_tracker(tracker, camera, out)
@@ -152,11 +153,6 @@ def with_progress(
 ) -> Iterator[tuple[Frame, Observation]]:
     """Return the frames with their progress, if it is to be shown."""
     return progress(frames, source.taken_count) if progress else frames
-
-
-def _viewer_frame(row: ExtrinsicsRow, done: Recorded) -> RecordedFrame:
-    """Return what the viewer shows of a frame."""
-    return RecordedFrame(row, done.estimate.calibration.extrinsics, vertex_lines(done.seen.vertices))
 
 
 def _save_tracker(tracker: RunTracker, camera: Camera, out: OutputFolder) -> dict[str, str]:

@@ -20,6 +20,7 @@ from lanebev.report.verdict import reason_words
 _SHOWN = {"pitch_deg": "deg", "yaw_deg": "deg", "roll_deg": "deg", "height_m": "m"}
 _PROBLEMS = 5  # problems that are printed, at most
 _REASONS = 2  # reasons that are printed, at most
+_SMOOTHED = "every pose is from the whole drive, later frames too; those of the filter are in filtered.csv"
 
 
 def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[str, str]:
@@ -39,7 +40,7 @@ def run_facts(config: RunConfig, source: FrameSource, camera: Camera) -> dict[st
         "calibrator": config.calibrator,
         "lanebev": __version__,
         **({"stream": source.figures.words()} if isinstance(source, LiveSource) else {}),
-        **smoothing_facts(config),
+        **({"smoothed": _SMOOTHED} if config.smooth else {}),
         **_other_settings(config),
     }
 
@@ -51,12 +52,6 @@ def lane_width_words(config: RunConfig) -> str:
     if std:
         words += f", with a standard deviation of {std:.2g} m, which is {std / width:.1%} of the height"
     return words if config.lane_width is not None else f"{words}; if you know it, give --lane-width"
-
-
-def smoothing_facts(config: RunConfig) -> dict[str, str]:
-    """Return the fact that every pose is estimated from the whole drive, for the report."""
-    words = "every pose is from the whole drive, later frames too; those of the filter are in filtered.csv"
-    return {"smoothed": words} if config.smooth else {}
 
 
 def _other_settings(config: RunConfig) -> dict[str, str]:
