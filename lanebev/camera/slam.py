@@ -93,8 +93,10 @@ def _of_maplab(entry: Mapping[str, Any]) -> Mapping[str, Any]:
 def is_kalibr(fields: Mapping[str, Any]) -> bool:
     """Tell whether the keys are those of Kalibr's camera chain, or of one camera as in EuRoC."""
     lens = fields.get("intrinsics")
-    is_matrix = isinstance(lens, Mapping) or any(isinstance(row, list) for row in lens or [])
-    of_one = bool(lens) and not is_matrix and not fields.keys().isdisjoint({"camera_model", "resolution"})
+    is_row = isinstance(lens, str) or (
+        isinstance(lens, list) and not any(isinstance(row, list) for row in lens)
+    )
+    of_one = is_row and not fields.keys().isdisjoint({"camera_model", "resolution"})
     return of_one or any(re.fullmatch(r"cam\d+", key, re.ASCII) for key in fields)
 
 

@@ -758,6 +758,9 @@ def test_numpys_file_with_opencvs_roi_or_without_names(tmp_path):
     np.savez(tmp_path / "c.npz", **lens, newcameramtx=MATRIX, roi=(9, 9, 780, 460))
     camera = Camera.from_file(tmp_path / "c.npz", image_size=(480, 800))
     _is(camera, 633, 633, 408, 245, 800, 480, [-0.3, 0.1, 0, 0, 0.05])
+    np.savez(tmp_path / "c.npz", intrinsics=5.0, resolution=3.0)
+    with pytest.raises(ValueError, match="unknown key 'resolution'"):
+        Camera.from_file(tmp_path / "c.npz", image_size=(480, 800))
     np.savez(tmp_path / "c.npz", *lens.values())
     with pytest.raises(
         ValueError, match=r"got: arrays without names; save them by numpy.savez\(FILE, mtx=mtx"
