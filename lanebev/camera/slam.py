@@ -40,6 +40,7 @@ _BASALT_MODELS = {  # camera_type -> models of Kalibr, its intrinsics, and its d
     "eucm": ("eucm", "none", "alpha beta fx fy cx cy", ""),
     "pinhole": ("pinhole", "none", "fx fy cx cy", ""),
     "kb4": ("pinhole", "equidistant", "fx fy cx cy", "k1 k2 k3 k4"),
+    "pinhole-radtan8": ("pinhole", "radtan", "fx fy cx cy", "k1 k2 p1 p2 k3 k4 k5 k6"),
 }
 
 
@@ -131,7 +132,7 @@ def _kalibr(fields: Mapping[str, Any]) -> CameraParameters:
     coefficients = ("distortion_coeffs", "distortion_coefficients")
     distortion = [0.0] * 4
     if names[1] != "none":
-        distortion = numbers(fields, *coefficients, count=4)
+        distortion = numbers(fields, *coefficients, count=None if model == "pinhole" else 4)
     elif any(fields.get(key) for key in coefficients) and any(numbers(fields, *coefficients)):
         raise ValueError("distortion_model: expected the one of distortion_coeffs, got none; add the entry")
     *xi, fx, fy, cx, cy = intrinsics

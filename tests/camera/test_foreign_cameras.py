@@ -465,10 +465,14 @@ def test_calibrations_of_basalt_and_maplab(tmp_path):  # maplab#4
     basalt = {"intrinsics": [{"camera_type": "ds", "intrinsics": sphere}], "resolution": [[752, 480]]}
     one, other = (_read(tmp_path / "c.json", json.dumps(each)) for each in ({"value0": basalt}, kalibr))
     assert one.fingerprint() == other.fingerprint()
-    basalt["intrinsics"][0]["camera_type"] = "pinhole-radtan8"
-    with pytest.raises(
-        ValueError, match="camera_type: expected one of ds, eucm, pinhole, kb4, got 'pinhole-radtan8'"
-    ):
+    lens = [-0.3, 0.1, 0.001, 0.002, 0.01, 0.02, 0.03, 0.04]
+    named = dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), lens, strict=True))
+    rational = {"camera_type": "pinhole-radtan8", "intrinsics": {**sphere, **named, "rpmax": 2.7}}
+    rational = {"intrinsics": [rational], "resolution": [[752, 480]]}
+    camera = _read(tmp_path / "c.json", json.dumps({"value0": rational}))
+    _is(camera, 349.7, 348.7, 365.8, 249.3, 752, 480, lens)
+    basalt["intrinsics"][0]["camera_type"] = "ftheta"
+    with pytest.raises(ValueError, match=r"camera_type: expected one of ds, eucm, pinhole, .*, got 'ftheta'"):
         _read(tmp_path / "c.json", json.dumps({"value0": basalt}))
     with pytest.raises(ValueError, match="resolution: expected that of each camera, got none"):
         _read(tmp_path / "c.json", json.dumps({"value0": {**basalt, "resolution": None}}))
