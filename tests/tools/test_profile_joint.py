@@ -8,5 +8,5 @@ def test_operations_are_counted_for_the_function_that_calls_them(capsys):
     first, *rest, cache, memory = (line.split() for line in capsys.readouterr().out.splitlines())
     assert first[-1] == "all"
     assert int(first[4]) == sum(int(line[4]) for line in rest) > 1000
-    assert {"update.information", "measurement.look"} < {line[-1] for line in rest}
+    assert {"update.information", "residuals.look"} < {line[-1] for line in rest}
     assert cache[1] == memory[1] == "GB/s"
