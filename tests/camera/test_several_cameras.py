@@ -120,6 +120,14 @@ RIGHT.K: !!opencv-matrix {rows: 3, cols: 3, dt: d, data: [457.6, 0, 380.0, 0, 45
 """
 
 
+def test_a_camera_may_have_a_negative_number(tmp_path):
+    text = _colmap(800) + "-1 PINHOLE 1280 720 900 900 640.5 360.5\n"
+    path = _write(tmp_path, text)
+    assert Camera.from_file(f"{path}#-1").intrinsics[0, 0] == 900
+    with pytest.raises(ValueError, match="expected one camera, got 2: 1, -1; choose one as FILE#1"):
+        Camera.from_file(path)
+
+
 def test_orb_slams_stereo_settings_have_the_camera_of_rectified_images_too(tmp_path):
     path = _write(tmp_path, STEREO)
     taken = Camera.from_file(path)

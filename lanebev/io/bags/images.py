@@ -16,6 +16,7 @@ _PLAIN = {  # encoding of ROS to channels, and to OpenCV's conversion to RGB
     "8UC3": (3, cv2.COLOR_BGR2RGB),
     "rgba8": (4, cv2.COLOR_RGBA2RGB),
     "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "8UC4": (4, cv2.COLOR_BGRA2RGB),
     "mono8": (1, cv2.COLOR_GRAY2RGB),
     "8UC1": (1, cv2.COLOR_GRAY2RGB),
     "bayer_rggb8": (1, cv2.COLOR_BayerBG2RGB),  # OpenCV names the second row's pixels

@@ -327,6 +327,7 @@ def test_a_run_on_a_bag(bags, tmp_path, capsys):
         ("bgr8", lambda image: image[..., ::-1]),
         ("rgba8", lambda image: np.dstack([image, image[..., :1]])),
         ("bgra8", lambda image: np.dstack([image[..., ::-1], image[..., :1]])),
+        ("8UC4", lambda image: np.dstack([image[..., ::-1], image[..., :1]])),
     ],
 )
 def test_raw_images(encoding, convert):
