@@ -24,11 +24,16 @@ _SPEED_UNITS = {
     **dict.fromkeys(("cm/s", "cm"), 0.01),
     **dict.fromkeys(("mm/s", "mm"), 0.001),
 }
-_SPREAD = {"accuracy", "std", "stddev", "sigma", "error", "uncertainty"}  # in titles of other columns
+_OF_OTHERS = {  # in titles of other columns
+    "accuracy", "std", "stddev", "sigma", "error", "uncertainty", "limit", "desired", "target", "cruise",
+    "angular", "engine", "motor", "rpm", "fan", "wind",
+}  # fmt: skip
 _TIME_UNITS = {
     **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), 1e-3),
     **dict.fromkeys(("us", "µs", "usec", "micros", "microseconds"), 1e-6),
     **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), 1e-9),
+    **dict.fromkeys(("min", "mins", "minutes"), 60.0),
+    **dict.fromkeys(("h", "hr", "hours"), 3600.0),
 }
 _NO_NUMBER = ("", "nan", "none", "null")
 _UNKNOWN = ("-1", "-1.0")  # speeds that phones write
@@ -186,7 +191,9 @@ def _column(titles: list[str], names: Sequence[str], units: Mapping[str, float])
         ValueError: there are several.
     """
     words = [*map(_words, titles)]
-    found = [place for place, each in enumerate(words) if set(each) & set(names) and not set(each) & _SPREAD]
+    found = [
+        place for place, each in enumerate(words) if set(each) & set(names) and not set(each) & _OF_OTHERS
+    ]
     if len(found) > 1:
         several = ", ".join(titles[place] for place in found)
         raise ValueError(f"expected one column of {names[0]}, got {several}; leave the others out")

@@ -43,6 +43,7 @@ def read(tmp_path):
         "# vehicle speed\n0 10\n0.1 11\n0.2 13\n",
         "time,speedAccuracy,speed\n0,0.3,10\n0.1,0.3,11\n0.2,0.3,13\n",  # of a phone
         "time,speed (cm/s)\n0,1000\n0.1,1100\n0.2,1300\n",
+        "time_min,speed_limit,speed,engine_speed\n0,13,10,900\n0.0016666667,13,11,900\n0.0033333333,13,13,900\n",
     ],
 )
 def test_times_and_speeds(read, text):
@@ -104,6 +105,7 @@ def test_a_speed_between_two_and_beside_them():
         ),
         ("time,speed\n0,1\n1\n", "expected 2 columns as in the first line, got '1'"),
         ("time,speed\n0,fast\n", "expected a number, got 'fast'"),
+        ("time,angular_velocity\n0,0.1\n", ".* titles that names them, got 'time angular_velocity'"),
         ("time,speed\n10:15:30,9\n", "expected a number, got '10:15:30'; write times in seconds"),
         (
             "# time [s], speed [km/h]\n0 36\n",
