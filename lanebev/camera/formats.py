@@ -148,8 +148,8 @@ def opencv_or_ros(
 
 
 def spelled(key: str) -> str:
-    """Return a key as it is known, for one in any case, with underscores or not."""
-    return _SPELLED.get(key.replace("_", "").lower(), key)
+    """Return a key as it is known, for one in any case, with underscores or not, perhaps with its unit."""
+    return _SPELLED.get(key.lower().removesuffix("_px").replace("_", ""), key)
 
 
 def _spelled_once(fields: Mapping[str, Any]) -> dict[str, Any]:

@@ -737,6 +737,14 @@ def test_a_camera_matrix_may_be_padded(tmp_path, rows):  # ScanNet's text, mmdet
         _read(tmp_path / "c.json", json.dumps(fields))
 
 
+def test_keys_with_their_unit(tmp_path):  # of Argoverse 2
+    fields = {"fx_px": 633, "fy_px": 633, "cx_px": 408, "cy_px": 245, "width_px": 800, "height_px": 480}
+    camera = _read(
+        tmp_path / "c.json", json.dumps({"sensor_name": "ring_front_center", **fields, "k1": -0.3})
+    )
+    _is(camera, 633, 633, 408, 245, 800, 480, [-0.3, 0, 0, 0, 0])
+
+
 def test_a_camera_matrix_by_names(tmp_path):
     named = {"fx": 633, "fy": 633, "cx": 408, "cy": 245}
     fields = {"camera_matrix": named, "distortion": [-0.3, 0.1, 0, 0, 0.05], "width": 800, "height": 480}
