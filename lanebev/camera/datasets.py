@@ -17,6 +17,7 @@ from lanebev.camera.parsing import mapping, number, once, whole_number
 from lanebev.numbers import finite_numbers, shown
 
 _KITTI = re.compile(r"^[ \t]*P(?:_rect_)?\d+[ \t]*:", re.MULTILINE | re.ASCII)
+_KITTI_KEY = re.compile(r"\s*(P|S|[KD]_)")
 _COLMAP = re.compile(r"^[ \t]*(-?\d+)[ \t]+([A-Z_]+)[ \t]+(\d{1,6})[ \t]+(\d{1,6})[ \t]+(.+)$", re.MULTILINE)
 _COLMAP_MODELS = {  # names of their parameters; the first ten are in the order of their numbers
     "SIMPLE_PINHOLE": "f cx cy",
@@ -58,9 +59,7 @@ def kitti_cameras(text: str, image_size: tuple[int, int] | None) -> Readers:
     The left colour camera is the usual one.
     """
     lines = (line.split(":", 1) for line in text.splitlines() if ":" in line)
-    entries = once(
-        (name.strip(), values) for name, values in lines if name.strip()[:1] in ("P", "S", "K", "D")
-    )
+    entries = once((name.strip(), values) for name, values in lines if _KITTI_KEY.match(name))
     names = [kind.format(i) for kind in ("P_rect_{:02d}", "P{}") for i in (2, 3, 0, 1, *range(4, 10))]
     found = {name: partial(_kitti, entries, name, image_size) for name in names if name in entries}
     if not found:
@@ -74,10 +73,14 @@ def kitti_cameras(text: str, image_size: tuple[int, int] | None) -> Readers:
 def _kitti(entries: Mapping[str, str], name: str, image_size: tuple[int, int] | None) -> CameraParameters:
     """Read the entry of a rectified camera; for images as it took them, of another size, its K and D."""
     number = name.removeprefix("P_rect_")
-    taken = {key: entries.get(f"{key}_{number}", "").split() for key in "SKD"}
-    if image_size is not None and taken["S"] and image_size == _kitti_size("S", taken["S"]):
-        matrix, lens = finite_numbers("K", taken["K"], 9), finite_numbers("D", taken["D"], 5)
-        return CameraParameters(matrix, lens, "pinhole", image_size)
+    taken, rectified, own, lens = (
+        entries.get(f"{key}_{number}", "").split() for key in ("S", "S_rect", "K", "D")
+    )
+    has_both = all((taken, rectified, own, lens))
+    if has_both and image_size == _kitti_size("S", taken) != _kitti_size("S_rect", rectified):
+        return CameraParameters(
+            finite_numbers("K", own, 9), finite_numbers("D", lens, 5), "pinhole", image_size
+        )
     projection = finite_numbers(name, entries[name].split(), 12)
     known = next((s for f, s in _KITTI_SIZES.items() if abs(f - projection[0]) < 1e-3), None)
     if (size_name := name.replace("P", "S", 1)) in entries:

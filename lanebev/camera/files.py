@@ -140,7 +140,7 @@ def _arrays(path: Path) -> dict[str, Any]:
     except Exception as error:  # zipfile and NumPy raise many kinds for damaged bytes
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())[:100]
         raise ValueError(f"no arrays of numbers as by numpy.save or savez: {reason}") from error
-    if "arr_0" in found:
+    if found and all(name.startswith("arr_") for name in found):
         raise ValueError("arrays without names; save them by numpy.savez(FILE, mtx=mtx, dist=dist)")
     return found
 

@@ -45,8 +45,8 @@ _KNOWN_KEYS = {
 _SPELLED = {key.replace("_", "").lower(): key for key in (*_SHORT_KEYS, *_KNOWN_KEYS, *_SIDES_KEYS)}
 _OF_CAMERA = re.compile(  # words in keys that may say something of the lens or the images
     r"^(?!board|grid|pattern|square|marker|chess|charuco).*(dist(?!ance)|lens|model|type|fish|omni|size|dim|"
-    r"width|height|resol|shape|crop|roi|region|bin|scal|decim|downsamp|subsamp|zoom|letterbox|orientation|flip|"
-    r"mirror|rotate|[xy]_?offset|offset_?[xy]|focal|skew|radial|tangential|rectified|^xi|^[kp]_?\d|^[wh]$)",
+    r"width|height|resol|shape|crop|roi|region|bin|scal|decim|downsamp|subsamp|zoom|letterbox|"
+    r"image_?orientation|flip|mirror|rotate|[xy]_?offset|offset_?[xy]|focal|skew|radial|tangential|rectified|^xi|^[kp]_?\d|^[wh]$)",
     re.IGNORECASE,
 )
 _OF_RECORD = re.compile(r"_?note|_?comment|rms|serial|.*(error|date|name)$", re.IGNORECASE)

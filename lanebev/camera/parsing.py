@@ -283,11 +283,14 @@ def _numbers(name: str, value: Any, count: int | None) -> list[float]:
 
 
 def camera_matrix(fields: Mapping[str, Any], *keys: str) -> list[float]:
-    """Return the nine entries of a camera matrix, row by row; it may be padded to 3 x 4 or 4 x 4."""
+    """Return the nine entries of a camera matrix; it may be padded to 3 x 4 or 4 x 4, or be fx fy cx cy."""
     return _read_once(fields, keys, lambda value: _unpadded(keys[0], _numbers(keys[0], value, None)))
 
 
 def _unpadded(name: str, entries: list[float]) -> list[float]:
+    if len(entries) == 4:
+        fx, fy, cx, cy = entries
+        return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
     is_padded = len(entries) in (12, 16) and not any(entries[3:12:4])
     if is_padded and entries[12:] in ([], [0.0, 0.0, 0.0, 1.0]):
         entries = [*entries[0:3], *entries[4:7], *entries[8:11]]

@@ -123,16 +123,15 @@ def _rows(text: str) -> list[list[str]]:
 
 def _states_unit(text: str) -> bool:
     """Tell whether a title or a comment says in which unit speeds are."""
-    words = {*_words(text)}
-    return not words.isdisjoint(_SPEED) and not words.isdisjoint(_SPEED_UNITS)
+    return _names(text, _SPEED) and not _SPEED_UNITS.keys().isdisjoint(_words(text))
 
 
 def _are_titles(cells: list[str], below: list[list[str]]) -> bool:
     """Tell whether a comment above a table names its columns."""
     if not below or len(cells) != len(below[0]) or not all(map(_is_number, below[0])):
         return False
-    words = set().union(*map(_words, cells))
-    return not words.isdisjoint(_SPEED) and (len(cells) == 1 or not words.isdisjoint(_TIME))
+    has_time = len(cells) == 1 or any(_names(cell, _TIME) for cell in cells)
+    return has_time and any(_names(cell, _SPEED) for cell in cells)
 
 
 def _speeds_of(rows: list[list[str]]) -> Speeds:
@@ -190,16 +189,19 @@ def _column(titles: list[str], names: Sequence[str], units: Mapping[str, float])
     Raises:
         ValueError: there are several.
     """
-    words = [*map(_words, titles)]
-    found = [
-        place for place, each in enumerate(words) if set(each) & set(names) and not set(each) & _OF_OTHERS
-    ]
+    found = [place for place, title in enumerate(titles) if _names(title, names)]
     if len(found) > 1:
         several = ", ".join(titles[place] for place in found)
         raise ValueError(f"expected one column of {names[0]}, got {several}; leave the others out")
     if not found:
         return None, 1.0
-    return found[0], next((units[word] for word in words[found[0]] if word in units), 1.0)
+    return found[0], next((units[word] for word in _words(titles[found[0]]) if word in units), 1.0)
+
+
+def _names(title: str, names: Sequence[str]) -> bool:
+    """Tell whether a title has one of these words, and none of other quantities."""
+    words = _words(title)
+    return not {*words}.isdisjoint(names) and _OF_OTHERS.isdisjoint(words)
 
 
 def _words(title: str) -> list[str]:

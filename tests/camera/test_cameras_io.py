@@ -112,6 +112,15 @@ def test_kittis_images_as_its_cameras_took_them(tmp_path):
     assert not len(Camera.from_file(path, image_size=(375, 1242)).distortion)
 
 
+@pytest.mark.parametrize("change", [("1242 375", "1392 512"), ("D_02", "d_02"), ("K_02", "Date: 1\nDate")])
+def test_kittis_images_of_the_rectified_size_are_rectified(tmp_path, change):
+    text = "S_02: 1392 512\nK_02: 960 0 696 0 957 224 0 0 1\nD_02: -0.37 0.2 0.001 0.0006 -0.07\n"
+    text += f"S_rect_02: 1242 375\n{P2.replace('P2', 'P_rect_02')}\n"
+    path = _write(tmp_path / "calib.txt", text.replace(*change))
+    for rectified in (False, True):
+        assert not len(Camera.from_file(path, image_size=(512, 1392), rectified=rectified).distortion)
+
+
 def test_kitti_raw_file_prefers_its_own_size(tmp_path):
     text = "calib_time: 09-Jan-2012\nS_rect_02: 1.242e+03 3.75e+02\nP_rect_02:" + P2[3:].replace(
         "721.5377", "700"

@@ -577,6 +577,7 @@ Per_View_Reprojection_Errors: !!opencv-matrix
         OPENCV_2,
         OPENCV_2.replace("Camera_M", "CameraM").replace("Distortion_C", "DistortionC"),
         OPENCV_2.replace("calibration_Time", "calibration_date") + "rms: 0.3\nT_cam_lidar: [1, 0, 0]\n",
+        OPENCV_2 + "orientation: [1, 0, 0, 0]\nintrinsics: [1150, 1150, 640, 360]\n",
     ],
 )
 def test_keys_in_other_cases_and_what_a_program_records_beside_the_camera(tmp_path, text):
@@ -773,6 +774,17 @@ def test_numpys_file_with_opencvs_roi_or_without_names(tmp_path):
     np.savez(tmp_path / "c.npz", intrinsics=5.0, resolution=3.0)
     with pytest.raises(ValueError, match="unknown key 'resolution'"):
         Camera.from_file(tmp_path / "c.npz", image_size=(480, 800))
+    np.savez(tmp_path / "c.npz", np.zeros(3), **lens)
+    _is(
+        Camera.from_file(tmp_path / "c.npz", image_size=(480, 800)),
+        633,
+        633,
+        408,
+        245,
+        800,
+        480,
+        lens["dist"][0],
+    )
     np.savez(tmp_path / "c.npz", *lens.values())
     with pytest.raises(
         ValueError, match=r"got: arrays without names; save them by numpy.savez\(FILE, mtx=mtx"

@@ -61,6 +61,8 @@ def test_times_and_speeds(read, text):
         "Speed [km/h]\n36\n39.6\nnan\n",
         "# speed_kmh\n36\n39.6\nnan\n",
         "# speed in km/h\n# speed_kmh\n36\n39.6\nnan\n",
+        "# speed limit 50 km/h\n10\n11\nnan\n",
+        "# speed limit 50 km/h\nframe,speed\n0,10\n1,11\n2,\n",
         "# speed in km/h\nspeed_kmh\n36\n39.6\nnan\n",
     ],
 )
