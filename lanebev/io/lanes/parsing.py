@@ -16,7 +16,7 @@ _PROBABLE = 0.5  # least probability of a line
 _FARTHEST = 1e6  # px or m, of any coordinate
 _DECODER = json.JSONDecoder()
 _NO_VALUE = re.compile(r"[\s,]*")  # between JSON values
-_NO_BOUNDARY = re.compile(r"curb|kerb|crosswalk|zebra|stop[ _-]?line|horizon", re.IGNORECASE)
+_NO_BOUNDARY = re.compile(r"curb|kerb|crosswalk|zebra|stop[ _-]?line|horizon(?!tal)", re.IGNORECASE)
 _SHOWN = 30  # characters of what is no JSON
 FORMATS = (
     "formats: TuSimple, CULane, CurveLanes, OpenLane, ONCE-3DLanes, Apollo, LLAMAS, BDD100K, VIL-100, "
@@ -175,8 +175,8 @@ def is_probable(name: str, probability: Any) -> bool:
     Raises:
         ValueError: it is no number.
     """
-    given = probability if isinstance(probability, list) and probability else [probability]
-    return probability is None or max(finite_numbers(f"{name}: probability", given)) >= _PROBABLE
+    given = probability if isinstance(probability, list) else [probability]
+    return probability in (None, []) or max(finite_numbers(f"{name}: probability", given)) >= _PROBABLE
 
 
 def checked_pixels(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -94,6 +94,12 @@ def test_lines_whose_labels_say_that_they_bound_no_lane_are_left_out(tmp_path, w
     assert [line.points.tolist() for line in frame.lines] == POINTS[1:]
 
 
+def test_a_label_with_the_word_horizontal_is_no_horizon(tmp_path):
+    path = tmp_path / "1.jpg.json"
+    path.write_text(json.dumps(TOOLS[0]()).replace('"lane"', '"horizontal lane"', 1))
+    assert len(read_lanes(path)[0].lines) == len(POINTS)
+
+
 @pytest.mark.parametrize("write", TOOLS)
 def test_pictures_without_a_line_are_an_error_if_other_shapes_are_drawn(tmp_path, write):
     path = tmp_path / "1.jpg.json"

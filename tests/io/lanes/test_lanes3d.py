@@ -58,10 +58,10 @@ def test_improbable_lines_of_predictions_are_left_out(tmp_path):
         "file_path": "1.jpg", "intrinsic": MATRIX.tolist(),
         "lane_lines": [
             {"xyz": [[9, 20], [1, 1], [-1, -1]], "category": 1, "laneLines_prob": probability}
-            for probability in (0.7, 0.2, [0.1, 0.8], [0.3, 0.3])
+            for probability in (0.7, 0.2, [0.1, 0.8], [0.3, 0.3], [], None)
         ],
     }  # fmt: skip
-    for fields, count in ((once, 1), (apollo, 1), (openlane, 2)):
+    for fields, count in ((once, 1), (apollo, 1), (openlane, 4)):
         (tmp_path / "1.json").write_text(json.dumps(fields))
         (frame,) = read_lanes(tmp_path / "1.json", MATRIX)
         assert len(frame.lines) == count
