@@ -1,6 +1,6 @@
 """Compare the time of ``lanebev run`` per frame with the network's forward pass alone.
 
-    python -m tools.bench_run [--frames 60] [--json FILE] [--profile]
+    python -m tools.bench_run [--frames 60] [--precision bfloat16] [--json FILE] [--profile]
 
 A rendered drive of 1280 x 720 is written to a video, run with all outputs, and the network's forward pass is
 timed on its input before and after. The ratio is what counts: machines differ, and drift. Beside it stands
@@ -19,9 +19,11 @@ from pathlib import Path
 import torch
 from jsonargparse.typing import PositiveInt
 
-from lanebev.app.config import RunConfig
+from lanebev.app.config import PRECISIONS, RunConfig
+from lanebev.app.drive.build import with_precision
 from lanebev.app.run import run
 from lanebev.io.video.writer import VideoWriter
+from lanebev.pipeline import LaneBEV
 from lanebev.render import Drive
 from lanebev.weights import load_segmenter
 from train.commands import command_parser, one_line_errors, versions
@@ -43,16 +45,15 @@ def write_video(folder: Path, frames: int) -> tuple[str, str]:
     return str(video), str(camera)
 
 
-def forward_seconds(repeats: int = 9) -> tuple[float, float]:
+def forward_seconds(precision: str, repeats: int = 9) -> tuple[float, float]:
     """Time the network's forward pass on one image of its size: medians of wall and of processor time."""
-    segmenter = load_segmenter().eval()
-    height, width = (int(side) for side in segmenter.image_size)
-    image = torch.rand(1, 3, height, width)
+    model = with_precision(LaneBEV.from_pretrained(), precision).eval()
+    image = torch.rand(1, 3, *load_segmenter().image_size)
     taken = []
     with torch.inference_mode():
         for _ in range(repeats + 2):
             begin = _clocks()
-            segmenter(image)
+            model.segmenter(image)
             taken.append(_since(begin))
     wall, processor = (sorted(each)[repeats // 2] for each in zip(*taken[2:], strict=True))
     return wall, processor
@@ -72,24 +73,26 @@ def main() -> None:
     """Run the command line."""
     parser = command_parser(__doc__)
     parser.add_argument("--frames", type=PositiveInt, default=60)
+    parser.add_argument("--precision", choices=PRECISIONS, default=PRECISIONS[0], help="of the network")
     parser.add_argument("--json", type=Path, help="file for the results as JSON")
     parser.add_argument("--profile", action="store_true", help="print where the main thread spends its time")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         video, camera = write_video(Path(name), args.frames)
-        before = forward_seconds()
+        before = forward_seconds(args.precision)
         profile = cProfile.Profile()
         begin = _clocks()
         if args.profile:
             profile.enable()
-        run(RunConfig(video, camera, str(Path(name) / "out")))
+        run(RunConfig(video, camera, str(Path(name) / "out"), precision=args.precision))
         profile.disable()
         whole = _since(begin)
-        after = forward_seconds()
+        after = forward_seconds(args.precision)
     wall, processor = (1e3 * each / args.frames for each in whole)
     forward, forward_processor = (500 * (one + other) for one, other in zip(before, after, strict=True))
     figures = {
         "frames": args.frames,
+        "precision": args.precision,
         "run_ms": round(wall, 1),
         "forward_ms": round(forward, 1),
         "ratio": round(wall / forward, 2),

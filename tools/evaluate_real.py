@@ -1,7 +1,7 @@
 """Evaluate real and third-party images, with all results beside their targets.
 
     python -m tools.evaluate_real [--data ../shared/data] [--json FILE] [--weights FILE]
-        [--width PX] [--only PART] [--hilly] [--far-view]
+        [--width PX] [--only PART] [--hilly] [--far-view] [--precision bfloat16]
 
 Nothing of these images has been trained on.
 """
@@ -13,12 +13,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from jsonargparse.typing import PositiveInt
 from rich.console import Console
 from rich.table import Table
 
 import lanebev
 from lanebev.app.drive.build import make_calibrator
+from tools.network_options import make_model, network_parser
 from tools.real_figures import (
     Figure,
     carla_drive,
@@ -27,7 +27,7 @@ from tools.real_figures import (
     tusimple_pixels,
     udacity,
 )
-from train.commands import evaluation_parser, one_line_errors, versions
+from train.commands import one_line_errors, versions
 
 NEEDED = {
     "tusimple": "label_data.json",
@@ -38,9 +38,8 @@ NEEDED = {
 
 @one_line_errors()
 def main() -> None:
-    parser = evaluation_parser(__doc__, far_view=True)
+    parser = network_parser(__doc__)
     parser.add_argument("--json", type=Path, help="file for the results as JSON")
-    parser.add_argument("--width", type=PositiveInt, help="px of the network's input, instead of its own")
     parser.add_argument("--only", help="run only parts whose name contains this")
     parser.add_argument("--hilly", action="store_true", help="the joint calibrator with HILLY_ROADS")
     options = parser.parse_args()
@@ -50,8 +49,7 @@ def main() -> None:
     calibrators = {name: make_calibrator(name) for name in ("two-stage", "joint")}
     if options.hilly:
         calibrators["joint"] = lanebev.JointCalibrator(lanebev.HILLY_ROADS)
-    far_view = lanebev.FarView() if options.far_view else None
-    model = lanebev.LaneBEV.from_pretrained(options.weights, network_width=options.width, far_view=far_view)
+    model = make_model(options)
     start = time.monotonic()
     figures = [figure for part in parts(options, model, calibrators) for figure in part]
     print_table(figures)

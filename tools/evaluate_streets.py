@@ -1,6 +1,7 @@
 """Figures on single images of streets, by day and by night, from pixels.
 
     python -m tools.evaluate_streets [--data ../shared/data] [--weights FILE] [--json FILE] [--far-view]
+        [--precision bfloat16]
     python -m tools.evaluate_streets --rendered 24 [--width 576] [--far-view]
 
 ``kitti_road``: the road plane of the lidar is the truth of pitch and roll (0.1 to 0.2 degrees), yaw has none.
@@ -21,15 +22,16 @@ from jsonargparse.typing import PositiveFloat, PositiveInt
 from torch import Tensor
 
 import lanebev
-from lanebev import Camera, FarView, JointCalibrator, LaneBEV
+from lanebev import Camera, JointCalibrator, LaneBEV
 from lanebev.estimation.joint.frame_prior import FramePrior, prior_of_mount
 from lanebev.estimation.tracker import Tracker
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.io.images.pixels import read_image
 from lanebev.observation.frames import check_frame, network_image
 from lanebev.render import render_views
+from tools.network_options import make_model, network_parser
 from tools.single_images import as_answer, calibrate, calibrate_frame, plane_angles, summarise
-from train.commands import evaluation_parser, one_line_errors
+from train.commands import one_line_errors
 
 KITTI_LANE_WIDTH = 3.5  # m
 ASSUMED_FOV = 60.0  # deg, of a camera that is not published
@@ -139,11 +141,8 @@ def rendered(model: LaneBEV, views: int) -> dict[str, float]:
 @one_line_errors()
 def main() -> None:
     """Run the evaluation from the command line."""
-    parser = evaluation_parser(__doc__, far_view=True)
+    parser = network_parser(__doc__)
     parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument(
-        "--width", type=PositiveInt, help="px of the network's input, for images of any proportions"
-    )
     parser.add_argument(
         "--rendered", type=PositiveInt, metavar="N", help="evaluate on N rendered views instead"
     )
@@ -151,8 +150,7 @@ def main() -> None:
         "--pose-sigma-scale", type=PositiveFloat, help="instead of the factor that the weights state"
     )
     options = parser.parse_args()
-    far_view = FarView() if options.far_view else None
-    model = LaneBEV.from_pretrained(options.weights, network_width=options.width, far_view=far_view).eval()
+    model = make_model(options)
     model.pose_sigma_scale = options.pose_sigma_scale or model.pose_sigma_scale
     if options.rendered:
         report({"rendered": rendered(model, options.rendered)}, options.json)

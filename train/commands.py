@@ -43,17 +43,13 @@ def versions() -> dict[str, object]:
     }
 
 
-def evaluation_parser(description: str | None, far_view: bool = False) -> argparse.ArgumentParser:
+def evaluation_parser(description: str | None) -> argparse.ArgumentParser:
     """Return such a parser with the folder of the evaluation data and the network's weights as options.
 
     Args:
         description: docstring of the program, shown as it is.
-        far_view: add the option of a far view.
     """
     parser = command_parser(description)
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the data (../shared/data)")
     parser.add_argument("--weights", type=Path, help="other weights than the shipped")
-    if far_view:
-        words = "the network also processes far views about the horizon"
-        parser.add_argument("--far-view", action="store_true", help=words)
     return parser

@@ -4,6 +4,13 @@
 a YAML ``file`` give.
 """
 
-from lanebev.app.config.run import BACKENDS, CALIBRATORS, FOV_FOCAL_STD, RunConfig, rate_as_fraction
+from lanebev.app.config.run import (
+    BACKENDS,
+    CALIBRATORS,
+    FOV_FOCAL_STD,
+    PRECISIONS,
+    RunConfig,
+    rate_as_fraction,
+)
 
-__all__ = ["BACKENDS", "CALIBRATORS", "FOV_FOCAL_STD", "RunConfig", "rate_as_fraction"]
+__all__ = ["BACKENDS", "CALIBRATORS", "FOV_FOCAL_STD", "PRECISIONS", "RunConfig", "rate_as_fraction"]

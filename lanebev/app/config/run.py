@@ -19,6 +19,7 @@ from lanebev.numbers import parse_crop, parse_size
 
 CALIBRATORS = ("joint", "two-stage")
 BACKENDS = ("torch", "onnxruntime")
+PRECISIONS = ("float32", "bfloat16", "float16")
 FOV_FOCAL_STD = 0.2
 """Standard deviation of a guessed focal length as a fraction of it: 60 degrees of view may be 40 or 90."""
 
@@ -117,6 +118,12 @@ class RunConfig:
     rectified: bool = option(False, "the images were rectified: use the projection matrix P")
     weights: str | None = option(None, "weights of the network instead of the shipped ones", "FILE")
     device: str = option("cpu", "device of the network: cpu, cuda, cuda:1, mps (default {})", "NAME")
+    precision: str = option(
+        "float32",
+        "number format of the network's convolutions (default {}); bfloat16 takes about half the time on "
+        "processors and GPUs that have it",
+        choices=PRECISIONS,
+    )
     backend: str = option(
         "torch", "library that computes network and calibrator (default {})", choices=BACKENDS
     )
@@ -235,9 +242,12 @@ class RunConfig:
     def _check_backend(self) -> None:
         if self.backend not in BACKENDS:
             raise ValueError(f"backend: expected {' or '.join(BACKENDS)}, got {self.backend!r}")
+        if self.precision not in PRECISIONS:
+            raise ValueError(f"precision: expected one of {', '.join(PRECISIONS)}, got {self.precision!r}")
         torch_only = ("mount", "hilly", "weights")
         given = next((name for name in torch_only if getattr(self, name)), None)
         given = given or ("device" if self.device != "cpu" else None)
+        given = given or ("precision" if self.precision != "float32" else None)
         if self.backend != "torch" and given:
             raise ValueError(
                 f"{given.replace('_', ' ')}: expected --backend torch with it, got {self.backend}; an "

@@ -4,6 +4,9 @@ from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
+import torch
+from torch.nn.utils import convert_conv2d_weight_memory_format
+
 from lanebev.app.config import RunConfig
 from lanebev.app.drive.observers import FarViewObserver, LaneFileObserver, NetworkObserver, Observer
 from lanebev.app.drive.shared_network import SharedNetwork
@@ -101,14 +104,37 @@ def needs_network(config: RunConfig) -> bool:
     return config.lanes is None and config.backend == "torch"
 
 
-def make_network(weights: str | None, device: str) -> LaneBEV:
+def make_network(weights: str | None, device: str, precision: str = "float32") -> LaneBEV:
     """Load a network, the shipped one without ``weights``, on a device.
 
+    Args:
+        weights: file, or None.
+        device: name of the device.
+        precision: number format of the convolutions, one of PRECISIONS; the rest stays in single precision.
+
     Raises:
-        ValueError: weights that do not fit the network, or a device that is not there.
+        ValueError: weights that do not fit the network, or a device that is not there or lacks the format.
     """
     found = usable_device(device)
-    return LaneBEV.from_pretrained(weights).to(found)
+    model = LaneBEV.from_pretrained(weights).to(found)
+    convert_conv2d_weight_memory_format(model, torch.channels_last)  # faster
+    return with_precision(model, precision)
+
+
+def with_precision(model: LaneBEV, precision: str) -> LaneBEV:
+    """Let a model's network compute its convolutions in a number format, one of PRECISIONS, and return it.
+
+    Raises:
+        ValueError: the model's device lacks the format.
+    """
+    if precision != "float32":
+        device = next(model.parameters()).device.type
+        try:
+            lower = torch.autocast(device, getattr(torch, precision))
+        except RuntimeError as error:
+            raise ValueError(f"precision: expected one of this {device}, got {precision}: {error}") from error
+        model.segmenter.forward = lower(model.segmenter.forward)
+    return model
 
 
 def make_observer(
@@ -124,7 +150,7 @@ def make_observer(
         config: the settings.
         source: the frames.
         camera: the lens.
-        network: an already loaded network with the weights and device of the settings.
+        network: an already loaded network with the weights, device and precision of the settings.
         tracker: tracker of the same frames, on whose estimates a far view depends.
 
     Raises:
@@ -138,7 +164,7 @@ def make_observer(
     if config.backend == "onnxruntime":
         loaded: LaneBEV | SharedNetwork = onnx_model(Path(config.exported), camera, config.far_view)
     else:
-        loaded = network or make_network(config.weights, config.device)
+        loaded = network or make_network(config.weights, config.device, config.precision)
     if config.far_view and tracker is not None:
         return FarViewObserver(loaded, tracker, camera, config.stills)
     return NetworkObserver(loaded, camera)

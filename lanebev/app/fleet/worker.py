@@ -25,8 +25,8 @@ def run_tasks(tasks: Sequence[Task]) -> list[Outcome]:
     A drive that fails has an outcome that says why, and disturbs no other.
 
     Args:
-        tasks: all with the same weights and device. What is done already, by a worker that died later on, is
-            not done again.
+        tasks: all with the same weights, device and precision. What is done already, by a worker that died
+            later on, is not done again.
     """
     try:
         network = _shared_network(tasks[0].config, len(tasks))
@@ -71,10 +71,10 @@ def _shared_network(config: RunConfig, batch: int) -> SharedNetwork | None:
     if not needs_network(config):
         return None
     changed = size_and_time(Path(config.weights)) if config.weights else (0, 0)
-    return SharedNetwork(_loaded(config.weights, changed, config.device), batch)
+    return SharedNetwork(_loaded(config.weights, changed, config.device, config.precision), batch)
 
 
 @lru_cache(maxsize=1)
-def _loaded(weights: str | None, changed: tuple[int, int], device: str) -> LaneBEV:
+def _loaded(weights: str | None, changed: tuple[int, int], device: str, precision: str) -> LaneBEV:
     """Return the network of some weights; ``changed`` is the file's size and time, to notice a new one."""
-    return make_network(weights, device)
+    return make_network(weights, device, precision)

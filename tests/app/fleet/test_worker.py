@@ -140,10 +140,11 @@ def _task(name, **settings):
 
 
 def test_groups_share_a_network():
-    tasks = [_task("a"), _task("b", lanes="l"), _task("c", device="cuda"), *map(_task, "defg")]
+    alone = [_task("b", lanes="l"), _task("c", device="cuda"), _task("h", precision="bfloat16")]
+    tasks = [_task("a"), *alone, *map(_task, "defg")]
     groups = [[task.name for task in group] for group in groups_of(tasks, 3)]
-    assert groups == [["a", "d", "e"], ["f", "g"], ["b"], ["c"]]
-    assert [len(group) for group in groups_of(tasks, 1)] == [1] * 7
+    assert groups == [["a", "d", "e"], ["f", "g"], ["b"], ["c"], ["h"]]
+    assert [len(group) for group in groups_of(tasks, 1)] == [1] * 8
 
 
 class _RayError(Exception):
