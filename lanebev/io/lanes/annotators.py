@@ -78,8 +78,8 @@ def read_cvat(path: Path) -> list[FrameLines]:
 
 def _cvat(image: ET.Element) -> _Picture:
     drawn = [
-        [pair.split(",") for pair in shape.get("points", "").split(";")]
-        if shape.tag == "polyline" and may_bound_lane(shape.get("label"))
+        _of_lane(shape.get("label"), [pair.split(",") for pair in shape.get("points", "").split(";")])
+        if shape.tag == "polyline"
         else None
         for shape in image
     ]
@@ -89,7 +89,8 @@ def _cvat(image: ET.Element) -> _Picture:
 
 def _frames(pictures: list[_Picture]) -> list[FrameLines]:
     frames = [_frame(picture) for picture in pictures]
-    if any(None in picture.drawn for picture in pictures) and not any(frame.lines for frame in frames):
+    drawn = [each for picture in pictures for each in picture.drawn]
+    if drawn and all(each is None for each in drawn):
         raise ValueError("expected lanes drawn as lines, got other shapes only; draw polylines (linestrips)")
     return frames
 
@@ -106,6 +107,11 @@ def _frame(picture: _Picture) -> FrameLines:
     return FrameLines(picture.name, lines, image_size=size)
 
 
+def _of_lane(label: Any, points: Any) -> Any:
+    """Return a line's points; none of one whose label says that it bounds no lane."""
+    return points if may_bound_lane(label) else []
+
+
 def _pair(name: str, point: Any) -> list[Any]:
     return [point.get("x"), point.get("y")] if isinstance(point, dict) else as_list(name, point)
 
@@ -118,12 +124,9 @@ def _objects(fields: Any, key: str) -> list[dict[str, Any]]:
 def labelme(path: Path, value: dict[str, Any]) -> Iterator[_Picture]:
     """Yield the picture of a file of LabelMe."""
     shapes = [as_object(shape) for shape in field(value, "shapes", list)]
-    are_lines = [
-        shape.get("shape_type") in ("linestrip", "line") and may_bound_lane(shape.get("label"))
-        for shape in shapes
-    ]
+    are_lines = [shape.get("shape_type") in ("linestrip", "line") for shape in shapes]
     drawn = [
-        field(shape, "points", list) if is_line else None
+        _of_lane(shape.get("label"), field(shape, "points", list)) if is_line else None
         for shape, is_line in zip(shapes, are_lines, strict=True)
     ]
     image = field(value, "imagePath", str).replace("\\", "/")
@@ -141,12 +144,11 @@ def vil100(_: Path, value: dict[str, Any]) -> Iterator[_Picture]:
 def supervisely(path: Path, value: dict[str, Any]) -> Iterator[_Picture]:
     """Yield the picture of a file, which is named after it (``1.jpg.json``)."""
     objects = _objects(value, "objects")
-    are_lines = [
-        each.get("geometryType") in ("line", "polyline") and may_bound_lane(each.get("classTitle"))
-        for each in objects
-    ]
+    are_lines = [each.get("geometryType") in ("line", "polyline") for each in objects]
     drawn = [
-        field(field(each, "points", dict), "exterior", list) if is_line else None
+        _of_lane(each.get("classTitle"), field(field(each, "points", dict), "exterior", list))
+        if is_line
+        else None
         for each, is_line in zip(objects, are_lines, strict=True)
     ]
     yield _Picture(str(path).removesuffix(".json"), value.get("size"), drawn)
@@ -156,8 +158,8 @@ def darwin(_: Path, value: dict[str, Any]) -> Iterator[_Picture]:
     """Yield the picture of a file of V7."""
     item = field(value, "item", dict)
     drawn = [
-        each["line"] and field(each["line"], "path", list)
-        if "line" in each and may_bound_lane(each.get("name"))
+        _of_lane(each.get("name"), each["line"] and field(each["line"], "path", list))
+        if "line" in each
         else None
         for each in _objects(value, "annotations")
     ]
@@ -171,7 +173,7 @@ def labelbox(_: Path, value: dict[str, Any]) -> Iterator[_Picture]:
         label for project in field(value, "projects", dict).values() for label in _objects(project, "labels")
     ]
     objects = [each for label in labels for each in _objects(label.get("annotations") or {}, "objects")]
-    drawn = [each.get("line") if may_bound_lane(each.get("name")) else None for each in objects]
+    drawn = [_of_lane(each.get("name"), each["line"]) if each.get("line") else None for each in objects]
     name = row.get("external_id") or row.get("global_key") or row.get("row_data")
     yield _Picture(name, value.get("media_attributes"), drawn)
 

@@ -94,6 +94,13 @@ def test_lines_whose_labels_say_that_they_bound_no_lane_are_left_out(tmp_path, w
     assert [line.points.tolist() for line in frame.lines] == POINTS[1:]
 
 
+@pytest.mark.parametrize("write", TOOLS[:3])
+def test_a_picture_with_a_kerb_alone_has_no_lane(tmp_path, write):
+    path = tmp_path / "1.jpg.json"
+    path.write_text(json.dumps(write()).replace('"lane"', '"curb"'))
+    assert read_lanes(path)[0].lines == []
+
+
 def test_a_label_with_the_word_horizontal_is_no_horizon(tmp_path):
     path = tmp_path / "1.jpg.json"
     path.write_text(json.dumps(TOOLS[0]()).replace('"lane"', '"horizontal lane"', 1))
