@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import torch
+from torch import Tensor
 from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from lanebev.app.config import RunConfig
@@ -127,13 +129,21 @@ def with_precision(model: LaneBEV, precision: str) -> LaneBEV:
     Raises:
         ValueError: the model's device lacks the format.
     """
-    if precision != "float32":
-        device = next(model.parameters()).device.type
-        try:
-            lower = torch.autocast(device, getattr(torch, precision))
-        except RuntimeError as error:
-            raise ValueError(f"precision: expected one of this {device}, got {precision}: {error}") from error
-        model.segmenter.forward = lower(model.segmenter.forward)
+    if precision == "float32":
+        return model
+    device, forward = next(model.parameters()).device.type, model.segmenter.forward
+    lower = partial(torch.autocast, device, getattr(torch, precision))
+    try:
+        lower()
+    except RuntimeError as error:
+        raise ValueError(f"precision: expected one of this {device}, got {precision}: {error}") from error
+
+    def in_precision(image: Tensor) -> Tensor:
+        with lower():  # one for each call: several threads call it
+            logits: Tensor = forward(image)
+        return logits
+
+    model.segmenter.forward = in_precision
     return model
 
 
