@@ -121,8 +121,7 @@ class LaneSegmenter(nn.Module):
         _check_scale(image)
         image = image.to(self.head.weight.dtype)
         mean, std = (constant(each, like=image).view(3, 1, 1) for each in (IMAGENET_MEAN, IMAGENET_STD))
-        normalised = (image - mean) / std
-        stem, c2, c3, c4, c5 = self.trunk(normalised.contiguous(memory_format=torch.channels_last))  # faster
+        stem, c2, c3, c4, c5 = self.trunk((image - mean) / std)
         lateral2, lateral3, lateral4, lateral5 = self.lateral
         x = lateral5(c5) + self.position(_positions(c5))
         x = lateral4(c4) + upsample_aligned(x, c4.shape[-2:])

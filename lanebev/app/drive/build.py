@@ -7,7 +7,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from lanebev.app.config import RunConfig
 from lanebev.app.drive.observers import FarViewObserver, LaneFileObserver, NetworkObserver, Observer
@@ -31,6 +30,7 @@ from lanebev.io.lanes.size import lanes_of_whole_images
 from lanebev.pipeline import LaneBEV
 from lanebev.tensors import usable_device
 from lanebev.view.grid import BEVGrid
+from lanebev.weights import order_for_inference
 
 RunTracker = Tracker[JointState] | Tracker[TwoStageState]
 
@@ -119,7 +119,7 @@ def make_network(weights: str | None, device: str, precision: str = "float32") -
     """
     found = usable_device(device)
     model = LaneBEV.from_pretrained(weights).to(found)
-    convert_conv2d_weight_memory_format(model, torch.channels_last)  # faster
+    order_for_inference(model)
     return with_precision(model, precision)
 
 
