@@ -34,7 +34,6 @@ from lanebev.tensors import map_tensors, usable_device
 from lanebev.types import Calibration, Extrinsics, Status, check_type
 from lanebev.view.frame import remap_frame
 from lanebev.view.grid import BEVGrid
-from lanebev.weights import order_for_inference
 
 logger = logging.getLogger(__name__)
 
@@ -247,7 +246,6 @@ class Session:
             return vertices_from_lines(lines, self.camera), 1.0
         if self._model is None:
             self._model = LaneBEV.from_pretrained()
-            order_for_inference(self._model)
         model = self._model.eval().to(self.device)
         point = None if model.far_view is None else self.tracker.vanishing_point()
         _, vertices = model.boundary_vertices(network_image(image, self.device), point)

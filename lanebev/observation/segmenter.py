@@ -136,7 +136,7 @@ class LaneSegmenter(nn.Module):
         x = F.relu(self.norm(self.refine(F.relu(x))))
         logits = F.pixel_shuffle(self.head(x), self.shuffle)
         stride = self.config.output_stride
-        return logits[..., : -(-image.shape[-2] // stride), : -(-image.shape[-1] // stride)].contiguous()
+        return logits[..., : -(-image.shape[-2] // stride), : -(-image.shape[-1] // stride)]
 
 
 def _check_scale(image: Tensor) -> None:

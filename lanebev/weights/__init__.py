@@ -14,8 +14,6 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import nn
-from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from lanebev.numbers import stand_in
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig
@@ -71,14 +69,6 @@ def is_checkpoint(path: Path) -> bool:
         return False
     with open(path, "rb") as file:
         return file.read(len(_ZIP)) == _ZIP
-
-
-def order_for_inference(network: nn.Module) -> None:
-    """Store the weights of a network's convolutions in channels-last order, in which they take less time.
-
-    Not for training: gradients of 1 × 1 convolutions of stride 2 crash in this order on the CPU (torch 2.13).
-    """
-    convert_conv2d_weight_memory_format(network, torch.channels_last)
 
 
 def save_segmenter(

@@ -30,7 +30,6 @@ from lanebev.io.lanes.size import lanes_of_whole_images
 from lanebev.pipeline import LaneBEV
 from lanebev.tensors import usable_device
 from lanebev.view.grid import BEVGrid
-from lanebev.weights import order_for_inference
 
 RunTracker = Tracker[JointState] | Tracker[TwoStageState]
 
@@ -119,7 +118,6 @@ def make_network(weights: str | None, device: str, precision: str = "float32") -
     """
     found = usable_device(device)
     model = LaneBEV.from_pretrained(weights).to(found)
-    order_for_inference(model)
     return with_precision(model, precision)
 
 
