@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from lanebev.app.config import RunConfig
 from lanebev.app.drive.observers import FarViewObserver, LaneFileObserver, NetworkObserver, Observer
@@ -124,6 +125,8 @@ def make_network(weights: str | None, device: str, precision: str = "float32") -
 def with_precision(model: LaneBEV, precision: str) -> LaneBEV:
     """Let a model's network compute its convolutions in a number format, one of PRECISIONS, and return it.
 
+    For inference only.
+
     Raises:
         ValueError: the model's device lacks the format.
     """
@@ -139,8 +142,10 @@ def with_precision(model: LaneBEV, precision: str) -> LaneBEV:
     def in_precision(image: Tensor) -> Tensor:
         with lower():  # one for each call: several threads call it
             logits: Tensor = forward(image)
-        return logits
+        return logits.contiguous()
 
+    # in this order convolutions take less time; on the CPU, gradients of some crash in it (torch 2.13)
+    convert_conv2d_weight_memory_format(model, torch.channels_last)
     model.segmenter.forward = in_precision
     return model
 
