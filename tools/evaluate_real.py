@@ -19,14 +19,7 @@ from rich.table import Table
 import lanebev
 from lanebev.app.drive.build import make_calibrator
 from tools.network_options import make_model, network_parser
-from tools.real_figures import (
-    Figure,
-    carla_drive,
-    carla_stills,
-    tusimple_labels,
-    tusimple_pixels,
-    udacity,
-)
+from tools.real_figures import Figure, carla_drive, carla_stills, tusimple_labels, tusimple_pixels, udacity
 from train.commands import one_line_errors, versions
 
 NEEDED = {

@@ -13,17 +13,7 @@ from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.testing.moments import FPS, PLACES, Change, Moment, moments
 from lanebev.testing.motions import Pose, moved, sinusoids
 from lanebev.testing.streets import wandering
-from tools.replay.kinds import (
-    EGO_LANE,
-    FRAMES,
-    SHOCK,
-    Generated,
-    bend,
-    drop,
-    in_curve,
-    knock,
-    winding,
-)
+from tools.replay.kinds import EGO_LANE, FRAMES, SHOCK, Generated, bend, drop, in_curve, knock, winding
 
 IN_CURVE = "motion up to 1.5°, 1.2 Hz, R 300 m"
 WINDING = "winding road at 3 to 12 m/s"

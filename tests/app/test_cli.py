@@ -13,11 +13,7 @@ import pytest
 import yaml
 
 from lanebev.app.config import RunConfig
-from tests.app.straight_road import (
-    fails,
-    lane_lines,
-    run,
-)
+from tests.app.straight_road import fails, lane_lines, run
 
 
 def test_a_report_that_nobody_reads_is_no_error(data, tmp_path, monkeypatch):

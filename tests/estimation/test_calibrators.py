@@ -5,12 +5,7 @@ import math
 import pytest
 import torch
 
-from lanebev import (
-    JointCalibrator,
-    LaneSegments,
-    Status,
-    TwoStageCalibrator,
-)
+from lanebev import JointCalibrator, LaneSegments, Status, TwoStageCalibrator
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import POSE, lanes, no_lanes, stack_rows
 from tests.estimation.calibrated import drive, finite

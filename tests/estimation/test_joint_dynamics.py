@@ -10,11 +10,7 @@ from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.config import MotionConfig
 from lanebev.estimation.joint.filter.evidence import adapt_motion_scale
 from lanebev.estimation.joint.filter.prediction import predict_state
-from lanebev.estimation.joint.measurement.residuals import (
-    NUM_SHAPE,
-    ROLL,
-    VERTICAL,
-)
+from lanebev.estimation.joint.measurement.residuals import NUM_SHAPE, ROLL, VERTICAL
 from lanebev.estimation.joint.motion.dynamics import RoadMotion, Spread, motion
 from lanebev.estimation.joint.motion.low_pass import pose_covariance, pose_transition
 from lanebev.estimation.joint.state import JointState

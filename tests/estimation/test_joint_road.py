@@ -6,9 +6,7 @@ import torch
 from lanebev.estimation.joint.config import MotionConfig
 from lanebev.estimation.joint.filter.update import estimated_entries
 from lanebev.estimation.joint.layout import SHAPE, STEPS
-from lanebev.estimation.joint.measurement.residuals import (
-    NUM_SHAPE,
-)
+from lanebev.estimation.joint.measurement.residuals import NUM_SHAPE
 from lanebev.estimation.joint.measurement.road_curve import (
     KNOT_SPACING,
     NUM_STEPS,

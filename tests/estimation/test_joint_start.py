@@ -10,13 +10,8 @@ from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.filter.start import start_moments
 from lanebev.estimation.joint.frame.bends import straight_or_bend
 from lanebev.estimation.joint.layout import STEPS
-from lanebev.estimation.joint.measurement.residuals import (
-    CURVATURE,
-)
-from lanebev.estimation.joint.measurement.road_curve import (
-    KNOT_SPACING,
-    NUM_STEPS,
-)
+from lanebev.estimation.joint.measurement.residuals import CURVATURE
+from lanebev.estimation.joint.measurement.road_curve import KNOT_SPACING, NUM_STEPS
 from lanebev.testing.moments import WIDTH, moments
 from lanebev.testing.moments import observe as see
 from lanebev.types import Status

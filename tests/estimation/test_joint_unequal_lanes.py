@@ -15,12 +15,7 @@ from lanebev.estimation.joint.frame.single_frame import fit_observations
 from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.layout import NUM_POSE
 from lanebev.estimation.joint.measurement.observations import boundary_places, observe
-from lanebev.estimation.joint.measurement.residuals import (
-    HEIGHT,
-    NUM_SHAPE,
-    OFFSET,
-    ROLL,
-)
+from lanebev.estimation.joint.measurement.residuals import HEIGHT, NUM_SHAPE, OFFSET, ROLL
 from lanebev.estimation.joint.output import (
     as_calibration,
     beyond_filter,

@@ -6,11 +6,7 @@ import math
 import pytest
 import torch
 
-from lanebev import (
-    LaneSegments,
-    Status,
-    TwoStageCalibrator,
-)
+from lanebev import LaneSegments, Status, TwoStageCalibrator
 from lanebev.estimation.reasons import Reason
 from lanebev.estimation.two_stage.direction import incidence
 from lanebev.estimation.two_stage.state import TwoStageConfig

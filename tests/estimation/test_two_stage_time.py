@@ -5,11 +5,7 @@ import math
 import pytest
 import torch
 
-from lanebev import (
-    LaneSegments,
-    Status,
-    TwoStageCalibrator,
-)
+from lanebev import LaneSegments, Status, TwoStageCalibrator
 from lanebev.estimation.reasons import Reason
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import POSE, lanes, no_lanes

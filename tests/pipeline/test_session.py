@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lanebev import (
-    BEVGrid,
-    Camera,
-    JointCalibrator,
-    LaneBEV,
-    Session,
-    Status,
-    TwoStageCalibrator,
-)
+from lanebev import BEVGrid, Camera, JointCalibrator, LaneBEV, Session, Status, TwoStageCalibrator
 from lanebev.estimation.joint.config import MotionConfig
 from lanebev.estimation.joint.layout import layout
 from lanebev.estimation.reasons import REASON_WORDS, Reason, describe_reasons

@@ -20,14 +20,7 @@ from train.end_to_end import EndToEnd, gradient_ratio
 from train.labels import ViewConfig
 from train.module import unpack
 from train.pool import read_shard, write_shard
-from train.poses import (
-    GradientClip,
-    PoseBatch,
-    PoseBatches,
-    fit_poses,
-    pose_loss,
-    student_t_nll,
-)
+from train.poses import GradientClip, PoseBatch, PoseBatches, fit_poses, pose_loss, student_t_nll
 
 SIZE = (144, 256)
 

@@ -7,12 +7,7 @@ from kornia.geometry.transform import warp_perspective
 from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.view.canonical import CanonicalView
-from lanebev.view.matrices import (
-    ego_from_camera,
-    ego_from_road,
-    image_from_ego,
-    lift_splat_inputs,
-)
+from lanebev.view.matrices import ego_from_camera, ego_from_road, image_from_ego, lift_splat_inputs
 from lanebev.view.paint import ImageFromBEV
 
 GRID = BEVGrid(x=(-4.0, 4.0), z=(5.0, 25.0), resolution=0.1)

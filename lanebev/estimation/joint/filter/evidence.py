@@ -24,10 +24,7 @@ _CURVED_SIGMAS = 2.0  # ratio of the vertical curvature to its sigma from which 
 _POSE_DECAY = 0.85  # factor per frame on the pose's evidence, since a detector's errors last over frames
 CALL = 5.0  # sigmas of evidence at which half of the noise is admitted
 EVIDENCE_TIME = 0.15  # s, time constant of the evidence
-_OPEN_CURVATURE, _OPEN_STEP = (
-    3e-4,
-    1e-3,
-)  # 1/m, of curvature and steps, as ``open_pose``
+_OPEN_CURVATURE, _OPEN_STEP = 3e-4, 1e-3  # 1/m, of curvature and steps, as ``open_pose``
 _OPEN_VERTICAL_CURVATURE = 2e-4  # 1/m, likewise
 _SCALE_RISE = 0.3  # s, in which the variance of the motion grows by a factor e if it is half of the right one
 _SCALE_MEMORY = 1.0  # s, time constant of the decay to the variance of ``MotionConfig``

@@ -18,22 +18,12 @@ from lanebev.estimation.checks import is_running
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.frame.bends import straight_or_bend
 from lanebev.estimation.joint.frame.reading_fit import fit_readings, reading_model
-from lanebev.estimation.joint.frame.readings import (
-    Readings,
-    log_prior,
-    log_prior_of_half,
-    readings,
-)
+from lanebev.estimation.joint.frame.readings import Readings, log_prior, log_prior_of_half, readings
 from lanebev.estimation.joint.frame.start_search import linear_starts, spread_subset
 from lanebev.estimation.joint.frame_prior import FramePrior, student_log
 from lanebev.estimation.joint.layout import STEPS
 from lanebev.estimation.joint.measurement.observations import Observations, boundary_places, observations
-from lanebev.estimation.joint.measurement.residuals import (
-    HEIGHT,
-    OFFSET,
-    PITCH,
-    ROLL,
-)
+from lanebev.estimation.joint.measurement.residuals import HEIGHT, OFFSET, PITCH, ROLL
 from lanebev.estimation.joint.measurement.road_curve import KNOT_SPACING
 from lanebev.geometry.linalg import solve_spd
 from lanebev.geometry.road import lane_width_covariance
