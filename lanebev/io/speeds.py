@@ -4,6 +4,7 @@ import csv
 import math
 import re
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +17,9 @@ _NEAREST = 1.0  # s between a frame and the nearest speed, at most
 _FASTEST = 100.0  # m/s
 _SPEED = ("speed", "velocity", "vel", "v", "vf")  # words of a column's title
 _TIME = ("time", "timestamp", "stamp", "t")
+_LIKE_TIME = re.compile(r"time|date|stamp|sec", re.IGNORECASE)  # in a title that is none of these
 _SPEED_UNITS = {
+    **dict.fromkeys(("m/s", "m/sec", "mps"), 1.0),
     **dict.fromkeys(("km/h", "kmh", "kph", "kmph", "km", "km/hr", "kmhr"), 1 / 3.6),
     **dict.fromkeys(("mph", "mi/h", "mi/hr", "miles"), 0.44704),
     **dict.fromkeys(("kn", "kt", "kts", "knot", "knots"), 1852 / 3600),
@@ -24,6 +27,9 @@ _SPEED_UNITS = {
     **dict.fromkeys(("cm/s", "cm"), 0.01),
     **dict.fromkeys(("mm/s", "mm"), 0.001),
 }
+_APART = re.compile(r"\b(?:km|miles|ft|fps|cm|mm)\b(?!/)")  # in a comment, where they are units of others
+_PAIR = re.compile(r"\d+,\d+", re.ASCII)  # one number with a decimal comma, or two whole ones
+_DECIMALS = re.compile(r"-?\d+(?:,\d+)?(?:\s+-?\d+(?:,\d+)?)+", re.ASCII)
 _OF_OTHERS = {  # in titles of other columns
     "accuracy", "std", "stddev", "sigma", "error", "uncertainty", "limit", "desired", "target", "cruise",
     "angular", "engine", "motor", "rpm", "fan", "wind",
@@ -36,7 +42,7 @@ _TIME_UNITS = {
     **dict.fromkeys(("h", "hr", "hours"), 3600.0),
 }
 _NO_NUMBER = ("", "nan", "none", "null")
-_UNKNOWN = ("-1", "-1.0")  # speeds that phones write
+_UNKNOWN = -1  # speed that phones write
 _FORM = "expected a speed in each line, or time and speed, or a first line of titles that names them"
 
 
@@ -93,7 +99,7 @@ def read_speeds(path: str | Path) -> Speeds:
 
 
 def _rows(text: str) -> list[list[str]]:
-    """Return the cells of each line; with semicolons between them, numbers may have decimal commas.
+    """Return the cells of each line; where commas do not separate them, numbers may have decimal commas.
 
     Lines that begin with # are left out, but for titles above the numbers, as by ``numpy.savetxt``.
     """
@@ -101,7 +107,10 @@ def _rows(text: str) -> list[list[str]]:
     first = next((place for place, line in enumerate(lines) if line[0] != "#"), len(lines))
     table = [line for line in lines[first:] if line[0] != "#"]
     numbers = table[min(1, len(table) - 1)] if table else ""
-    above = [lines[first - 1].lstrip("# ")] if first else []
+    above = [_APART.sub("", lines[first - 1].lstrip("# "))] if first else []
+    if _are_commas_decimal(table):
+        table = [line.replace(",", ".") for line in table]
+        numbers = numbers.replace(",", ".")
     delimiter = next((sign for sign in ";\t," if sign in numbers), None)
     if delimiter is not None:
         cells = csv.reader([*above, *table], delimiter=delimiter, skipinitialspace=True)
@@ -121,9 +130,27 @@ def _rows(text: str) -> list[list[str]]:
     return rows
 
 
+def _are_commas_decimal(table: list[str]) -> bool:
+    """Tell whether commas are within the numbers of a table, not between its columns.
+
+    Raises:
+        ValueError: it cannot be told.
+    """
+    if not table:
+        return False
+    pairs = [line.split(",") for line in table if _PAIR.fullmatch(line)]
+    if len(pairs) == len(table) > len({first for first, _ in pairs}):
+        raise ValueError(
+            f"expected rising times, got {table[0]!r} and the like; write decimals with a point, or above "
+            "them the titles time,speed"
+        )
+    of_speed = "," not in table[0] and _names(table[0], _SPEED) and not _names(table[0], _TIME)
+    return of_speed or _DECIMALS.fullmatch(table[-1]) is not None
+
+
 def _states_unit(text: str) -> bool:
     """Tell whether a title or a comment says in which unit speeds are."""
-    return _names(text, _SPEED) and not _SPEED_UNITS.keys().isdisjoint(_words(text))
+    return _names(text, _SPEED) and _unit(text, _SPEED_UNITS) != 1.0
 
 
 def _are_titles(cells: list[str], below: list[list[str]]) -> bool:
@@ -146,13 +173,16 @@ def _speeds_of(rows: list[list[str]]) -> Speeds:
     if titles is not None:
         speed, metres = _column(titles, _SPEED, _SPEED_UNITS)
         time, seconds = _column(titles, _TIME, _TIME_UNITS) if len(titles) > 1 else (None, 1.0)
+        if time is None and speed != 0:
+            _check_counts(titles[0], [row[0] for row in rows])
     else:
         time, speed = {1: (None, 0), 2: (0, 1)}.get(len(first), (None, None))
         seconds = metres = 1.0
     if speed is None:
         raise ValueError(f"{_FORM}, got {' '.join(first)[:100]!r}")
     cells = [row[speed] for row in rows]
-    speeds = metres * np.array([math.nan if cell in _UNKNOWN else _number(cell) for cell in cells])
+    speeds = np.array([_number(cell) for cell in cells])
+    speeds = metres * np.where(speeds == _UNKNOWN, math.nan, speeds)
     if (fastest := np.nanmax(np.abs(speeds), initial=0.0)) > _FASTEST:
         raise ValueError(f"expected m/s up to {_FASTEST:g}, got {fastest:g}; name another unit, as speed_kmh")
     if time is None:
@@ -161,6 +191,21 @@ def _speeds_of(rows: list[list[str]]) -> Speeds:
     if not (np.diff(times) >= 0).all():  # false on NaN
         raise ValueError("expected times that rise, got others")
     return Speeds(speeds, times)
+
+
+def _check_counts(title: str, cells: list[str]) -> None:
+    """Raise if the first column of a table without times seems to have these.
+
+    Raises:
+        ValueError: it has a title like a time's, or numbers that rise and do not count the frames.
+    """
+    numbers = [_number(cell) for cell in cells] if all(map(_is_number, cells)) else []
+    steps = {b - a for a, b in pairwise(numbers)}
+    if _LIKE_TIME.search(title) or (steps != {1.0} and min(steps, default=0.0) > 0):
+        raise ValueError(
+            f"expected a column time (s since the source's first frame), got {title}; give it that title, "
+            "or leave it out where there is a speed for each frame"
+        )
 
 
 def _number(cell: str) -> float:
@@ -195,7 +240,11 @@ def _column(titles: list[str], names: Sequence[str], units: Mapping[str, float])
         raise ValueError(f"expected one column of {names[0]}, got {several}; leave the others out")
     if not found:
         return None, 1.0
-    return found[0], next((units[word] for word in _words(titles[found[0]]) if word in units), 1.0)
+    return found[0], _unit(titles[found[0]], units)
+
+
+def _unit(title: str, units: Mapping[str, float]) -> float:
+    return next((units[word] for word in _words(title) if word in units), 1.0)
 
 
 def _names(title: str, names: Sequence[str]) -> bool:

@@ -38,6 +38,7 @@ def read(tmp_path):
         "t speed_kmph\n0 36\n0.1 39.6\n0.2 46.8\n",
         "t speed_km_h\n0 36\n0.1 39.6\n0.2 46.8\n",
         "t,speed_knots\n0,19.438445\n0.1,21.382289\n0.2,25.269978\n",
+        "0,0 10,0\n0,1 11,0\n0,2 13,0\n",
         "\ufefftime,speed\n0,10\n0.1,11\n0.2,13\n",
         "# of NumPy\n# speed_kmh time\n36 0\n39.6 0.1\n46.8 0.2\n",
         "# vehicle speed\n0 10\n0.1 11\n0.2 13\n",
@@ -64,6 +65,11 @@ def test_times_and_speeds(read, text):
         "# speed limit 50 km/h\n10\n11\nnan\n",
         "# speed limit 50 km/h\nframe,speed\n0,10\n1,11\n2,\n",
         "# speed in km/h\nspeed_kmh\n36\n39.6\nnan\n",
+        "# vehicle speed log v1.0 (mm)\n10\n11\nnan\n",
+        "# speed of each frame, 30 fps\n10\n11\nnan\n",
+        "# speed (m/s) below 130 km/h\n10\n11\nnan\n",
+        "speed (km/h)\n36,0\n39,6\nnan\n",  # a decimal comma
+        "# speed\n10.0\n11.0\n-1.000000e+00\n",  # of numpy.savetxt
     ],
 )
 def test_a_speed_for_each_frame(read, text):
@@ -73,7 +79,7 @@ def test_a_speed_for_each_frame(read, text):
 
 
 def test_a_speed_that_a_phone_does_not_know(read):
-    np.testing.assert_array_equal(read("time,speed\n0,-1\n1,-1.0\n2,-1.2\n").speeds, [np.nan, np.nan, -1.2])
+    np.testing.assert_array_equal(read("time,speed\n0,-1\n1,-1.00\n2,-1.2\n").speeds, [np.nan, np.nan, -1.2])
 
 
 def test_a_time_a_second_before_the_first_frame(read):
@@ -118,6 +124,13 @@ def test_a_speed_between_two_and_beside_them():
         ("0,10\n0.1,130\n", "expected m/s up to 100, got 130; name another unit, as speed_kmh"),
         ("0.2,10\n0.1,11\n", "expected times that rise, got others"),
         ("nan,10\n0.1,11\n", "expected times that rise, got others"),
+        ("13,88\n13,91\n", "expected rising times, got '13,88' and the like; write decimals with a point"),
+        (
+            "seconds,speed\n0,10\n1,11\n",
+            r"expected a column time \(s since .*got seconds; give it that title",
+        ),
+        ("ms,speed\n0,10\n33,11\n", "expected a column time .*got ms"),
+        ("datetime,speed\n2026-11-30 10:00:00,10\n", "expected a column time .*got datetime"),
         (b"\x89PNG\x00\xff\xfe", "not a text file"),
     ],
 )
