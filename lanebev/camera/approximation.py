@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from lanebev.camera.parameters import CameraParameters
+from lanebev.camera.parameters import CameraParameters, matrix_entries
 
 Array = NDArray[np.float64]
 Radius = Callable[[Array], Array]
@@ -62,8 +62,7 @@ def radial_camera(
         raise ValueError(f"intrinsics: expected positive focal lengths, got {fx:g}, {fy:g}")
     corner = math.hypot(max(cx, width - 1 - cx) / fx, max(cy, height - 1 - cy) / fy)
     scale, distortion = kannala_brandt_like(radius, corner, max(fx, fy))
-    matrix = [scale * fx, 0.0, cx, 0.0, scale * fy, cy, 0.0, 0.0, 1.0]
-    return CameraParameters(matrix, distortion, "fisheye", size)
+    return CameraParameters(matrix_entries(scale * fx, scale * fy, cx, cy), distortion, "fisheye", size)
 
 
 def kannala_brandt_like(radius: Radius, corner: float, focal: float) -> tuple[float, list[float]]:

@@ -12,8 +12,14 @@ import numpy as np
 
 from lanebev.camera.approximation import fov_model, kannala_brandt_like, radial_camera
 from lanebev.camera.choice import Readers, telling_names
-from lanebev.camera.parameters import OFF_CENTRE, CameraParameters, centre_offset, size_of_images
-from lanebev.camera.parsing import mapping, number, once, whole_number
+from lanebev.camera.parameters import (
+    OFF_CENTRE,
+    CameraParameters,
+    centre_offset,
+    matrix_entries,
+    size_of_images,
+)
+from lanebev.camera.parsing import mapping, number, once, stated_size
 from lanebev.numbers import finite_numbers, shown
 
 _KITTI = re.compile(r"^[ \t]*P(?:_rect_)?\d+[ \t]*:", re.MULTILINE | re.ASCII)
@@ -164,7 +170,7 @@ def _colmap(name: str, width: str, height: str, values: str) -> CameraParameters
     cx, cy, size = given["cx"] - 0.5, given["cy"] - 0.5, (int(height), int(width))
     if name == "FOV":
         return radial_camera((fx, fy), (cx, cy), size, partial(fov_model, omega=given["omega"]))
-    return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, model, size)
+    return CameraParameters(matrix_entries(fx, fy, cx, cy), distortion, model, size)
 
 
 def is_woodscape(record: Any) -> bool:
@@ -179,7 +185,7 @@ def woodscape(record: Mapping[str, Any]) -> CameraParameters:
     Source: WoodScape (Yogamani et al. 2019), scripts/calibration/projection.py.
     """
     fields = mapping("intrinsic", record["intrinsic"])
-    height, width = whole_number(fields, "height"), whole_number(fields, "width")
+    height, width = stated_size(fields)
     slopes = [number(fields, key) for key in ("k1", "k2", "k3", "k4")]
     aspect = number(fields, "aspect_ratio")
     cx = 0.5 * (width - 1) + number(fields, "cx_offset")
@@ -192,5 +198,4 @@ def woodscape(record: Mapping[str, Any]) -> CameraParameters:
         lambda angle: angle * np.polyval(relative[::-1], angle), corner, slopes[0]
     )
     fx = scale * slopes[0]
-    matrix = [fx, 0.0, cx, 0.0, fx * aspect, cy, 0.0, 0.0, 1.0]
-    return CameraParameters(matrix, distortion, "fisheye", (height, width))
+    return CameraParameters(matrix_entries(fx, fx * aspect, cx, cy), distortion, "fisheye", (height, width))

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lanebev.camera.named_lens import LENS_NAMES, stated_lens
-from lanebev.camera.parameters import CameraParameters, centre_offset, checked
+from lanebev.camera.parameters import CameraParameters, centre_offset, checked, matrix_entries
 from lanebev.camera.parsing import camera_matrix, mapping, number, numbers, whole_number
 from lanebev.numbers import shown
 
@@ -227,8 +227,8 @@ def _short(fields: Mapping[str, Any], rectified: bool) -> CameraParameters:
     height, width = whole_number(fields, *_HEIGHT_KEYS[::-1]), whole_number(fields, *_WIDTH_KEYS[::-1])
     fx, fy, cx, cy = (number(fields, key) for key in ("fx", "fy", "cx", "cy"))
     model = stated_model(fields)
-    matrix, lens = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], stated_lens(fields, _LENS_KEYS, model)
-    camera = CameraParameters(matrix, lens, model, (height, width))
+    lens = stated_lens(fields, _LENS_KEYS, model)
+    camera = CameraParameters(matrix_entries(fx, fy, cx, cy), lens, model, (height, width))
     return without_lens(camera) if rectified else camera
 
 

@@ -34,6 +34,11 @@ class CameraParameters(NamedTuple):
     remark: str = ""
 
 
+def matrix_entries(fx: float, fy: float, cx: float, cy: float) -> list[float]:
+    """Return the nine entries of a camera matrix without skew, row by row."""
+    return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+
+
 def centre_offset(matrix: Sequence[float], image_size: tuple[int, int]) -> float:
     """Return how far the principal point is from the centre of an image, in shares of its sides.
 

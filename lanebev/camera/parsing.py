@@ -13,6 +13,7 @@ from typing import Any
 
 import yaml
 
+from lanebev.camera.parameters import matrix_entries
 from lanebev.numbers import finite_numbers, shown
 
 _LARGEST_YAML = 1_000_000  # characters; PyYAML reads some 100,000 a second
@@ -62,11 +63,7 @@ def parse_documents(text: str) -> list[Any]:
     if start in ("{", "["):
         try:
             fields = json.loads(
-                text,
-                object_pairs_hook=once,
-                parse_int=str,
-                parse_float=str,
-                parse_constant=str,
+                text, object_pairs_hook=once, parse_int=str, parse_float=str, parse_constant=str
             )
             return [fields]
         except (json.JSONDecodeError, RecursionError):
@@ -255,8 +252,10 @@ def _read_once(
     return first
 
 
-def number(fields: Mapping[str, Any], *keys: str) -> float:
-    """Return the finite number of a key."""
+def number(fields: Mapping[str, Any], *keys: str, default: float | None = None) -> float:
+    """Return the finite number of a key, or the default if the key is not there."""
+    if default is not None and all(fields.get(key) is None for key in keys):
+        return default
     return _read_once(fields, keys, lambda value: finite_numbers(keys[0], [value], 1))[0]
 
 
@@ -266,6 +265,17 @@ def whole_number(fields: Mapping[str, Any], *keys: str) -> int:
     if value != round(value):
         raise ValueError(f"{keys[0]}: expected whole pixels, got {value:g}")
     return round(value)
+
+
+def stated_size(fields: Mapping[str, Any], height: str = "height", width: str = "width") -> tuple[int, int]:
+    """Return (height, width) px of images, by the names of their keys."""
+    return whole_number(fields, height), whole_number(fields, width)
+
+
+def listed_size(fields: Mapping[str, Any], key: str) -> tuple[int, int]:
+    """Return (height, width) px of images, of a list with the width first."""
+    width, height = numbers(fields, key, count=2)
+    return round(height), round(width)
 
 
 def numbers(fields: Mapping[str, Any], *keys: str, count: int | None = None) -> list[float]:
@@ -289,8 +299,7 @@ def camera_matrix(fields: Mapping[str, Any], *keys: str) -> list[float]:
 
 def _unpadded(name: str, entries: list[float]) -> list[float]:
     if len(entries) == 4:
-        fx, fy, cx, cy = entries
-        return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+        return matrix_entries(*entries)
     is_padded = len(entries) in (12, 16) and not any(entries[3:12:4])
     if is_padded and entries[12:] in ([], [0.0, 0.0, 0.0, 1.0]):
         entries = [*entries[0:3], *entries[4:7], *entries[8:11]]

@@ -7,15 +7,13 @@ from typing import Any
 
 from lanebev.camera.choice import Readers
 from lanebev.camera.named_lens import named_lens
-from lanebev.camera.parameters import CameraParameters
-from lanebev.camera.parsing import mapping, number, numbers, required, whole_number
+from lanebev.camera.parameters import CameraParameters, matrix_entries
+from lanebev.camera.parsing import mapping, number, numbers, required, stated_size, whole_number
 from lanebev.numbers import shown
 
 _GYROFLOW_MODELS = {"": "fisheye", "opencv_fisheye": "fisheye", "opencv_standard": "pinhole"}
 _NERF_MODELS = {
-    "OPENCV": "pinhole",
-    "PINHOLE": "pinhole",
-    "SIMPLE_PINHOLE": "pinhole",
+    **dict.fromkeys(("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"), "pinhole"),
     "OPENCV_FISHEYE": "fisheye",
 }
 _REALSENSE_MODELS = ("none", "brownconrady", "inversebrownconrady", "modifiedbrownconrady")
@@ -58,9 +56,7 @@ def gyroflow(fields: Mapping[str, Any]) -> CameraParameters:
     lens = mapping("fisheye_params", fields["fisheye_params"])
     size = mapping("calib_dimension", required(fields, ["calib_dimension"]))
     matrix, distortion = numbers(lens, "camera_matrix", count=9), numbers(lens, "distortion_coeffs")
-    return CameraParameters(
-        matrix, distortion, _GYROFLOW_MODELS[name], (whole_number(size, "h"), whole_number(size, "w"))
-    )
+    return CameraParameters(matrix, distortion, _GYROFLOW_MODELS[name], stated_size(size, "h", "w"))
 
 
 def nerf(fields: Mapping[str, Any]) -> CameraParameters:
@@ -77,11 +73,8 @@ def nerf(fields: Mapping[str, Any]) -> CameraParameters:
     is_fisheye = str(fields.get("is_fisheye")).lower() == "true"
     model = "fisheye" if is_fisheye else _NERF_MODELS[name]
     fx, cx, cy = (number(fields, key) for key in ("fl_x", "cx", "cy"))
-    fy = fx if fields.get("fl_y") is None else number(fields, "fl_y")
-    matrix = [fx, 0.0, cx - 0.5, 0.0, fy, cy - 0.5, 0.0, 0.0, 1.0]
-    return CameraParameters(
-        matrix, named_lens(fields, model), model, (whole_number(fields, "h"), whole_number(fields, "w"))
-    )
+    matrix = matrix_entries(fx, number(fields, "fl_y", default=fx), cx - 0.5, cy - 0.5)
+    return CameraParameters(matrix, named_lens(fields, model), model, stated_size(fields, "h", "w"))
 
 
 def realsense(fields: Mapping[str, Any]) -> CameraParameters:
@@ -99,8 +92,7 @@ def realsense(fields: Mapping[str, Any]) -> CameraParameters:
             f"model: expected brown_conrady, or coeffs of zeros, got {shown(stated)}; calibrate by OpenCV"
         )
     fx, fy, cx, cy = (number(fields, key) for key in ("fx", "fy", "ppx", "ppy"))
-    size = (whole_number(fields, "height"), whole_number(fields, "width"))
-    return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, "pinhole", size)
+    return CameraParameters(matrix_entries(fx, fy, cx, cy), distortion, "pinhole", stated_size(fields))
 
 
 def open3d(fields: Mapping[str, Any]) -> CameraParameters:
@@ -108,8 +100,7 @@ def open3d(fields: Mapping[str, Any]) -> CameraParameters:
     matrix = numbers(fields, "intrinsic_matrix", count=9)
     if not (matrix[2] or matrix[5]):
         matrix = [*matrix[0::3], *matrix[1::3], *matrix[2::3]]
-    size = (whole_number(fields, "height"), whole_number(fields, "width"))
-    return CameraParameters(matrix, [], "pinhole", size)
+    return CameraParameters(matrix, [], "pinhole", stated_size(fields))
 
 
 def depthai_cameras(content: Any) -> Readers:
@@ -124,9 +115,8 @@ def depthai_cameras(content: Any) -> Readers:
 def _depthai(fields: Mapping[str, Any]) -> CameraParameters:
     """Read a camera of ``cameraData``; ``cameraType`` 1 is a fisheye, of whose coefficients four count."""
     matrix, distortion = numbers(fields, "intrinsicMatrix", count=9), numbers(fields, "distortionCoeff")
-    size = (whole_number(fields, "height"), whole_number(fields, "width"))
     is_fisheye = str(fields.get("cameraType")).strip().lower() in ("1", "fisheye")
-    return CameraParameters(matrix, distortion, "fisheye" if is_fisheye else "pinhole", size)
+    return CameraParameters(matrix, distortion, "fisheye" if is_fisheye else "pinhole", stated_size(fields))
 
 
 def metashape(fields: Mapping[str, Any]) -> CameraParameters:
@@ -146,8 +136,7 @@ def metashape(fields: Mapping[str, Any]) -> CameraParameters:
     width, height = whole_number(fields, "width"), whole_number(fields, "height")
     focal = number(fields, "f")
     cx, cy, b1, b2, k1, k2, k3, p1, p2 = (
-        number(fields, key) if fields.get(key) is not None else 0.0
-        for key in ("cx", "cy", "b1", "b2", "k1", "k2", "k3", "p1", "p2")
+        number(fields, key, default=0.0) for key in ("cx", "cy", "b1", "b2", "k1", "k2", "k3", "p1", "p2")
     )
     x, y = 0.5 * width + cx - 0.5, 0.5 * height + cy - 0.5
     return CameraParameters(

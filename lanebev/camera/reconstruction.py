@@ -6,17 +6,13 @@ from typing import Any
 
 from lanebev.camera.choice import Readers
 from lanebev.camera.named_lens import named_lens
-from lanebev.camera.parameters import CameraParameters
-from lanebev.camera.parsing import mapping, number, numbers, required, whole_number
+from lanebev.camera.parameters import CameraParameters, matrix_entries
+from lanebev.camera.parsing import mapping, number, numbers, required, stated_size
 from lanebev.numbers import shown
 
 _OPENSFM_MODELS = {
-    "perspective": "pinhole",
-    "simple_radial": "pinhole",
-    "radial": "pinhole",
-    "brown": "pinhole",
-    "fisheye": "fisheye",
-    "fisheye_opencv": "fisheye",
+    **dict.fromkeys(("perspective", "simple_radial", "radial", "brown"), "pinhole"),
+    **dict.fromkeys(("fisheye", "fisheye_opencv"), "fisheye"),
 }
 _OPENMVG_LENSES = {  # keys of the coefficients -> their model, and their places in OpenCV's order
     "disto_k1": ("pinhole", (0,)),
@@ -44,15 +40,16 @@ def _opensfm(fields: Mapping[str, Any]) -> CameraParameters:
     name = str(fields["projection_type"]).strip().lower()
     if name not in _OPENSFM_MODELS:
         raise ValueError(f"projection_type: expected one of {', '.join(_OPENSFM_MODELS)}, got {shown(name)}")
-    model, size = _OPENSFM_MODELS[name], (whole_number(fields, "height"), whole_number(fields, "width"))
+    model, size = _OPENSFM_MODELS[name], stated_size(fields)
     fx, fy = (
         number(fields, key if fields.get(key) is not None else "focal") for key in ("focal_x", "focal_y")
     )
-    x, y = (number(fields, key) if fields.get(key) is not None else 0.0 for key in ("c_x", "c_y"))
+    x, y = (number(fields, key, default=0.0) for key in ("c_x", "c_y"))
     unit, (height, width) = max(size), size
     cx, cy = 0.5 * (width - 1) + unit * x, 0.5 * (height - 1) + unit * y
-    matrix = [unit * fx, 0.0, cx, 0.0, unit * fy, cy, 0.0, 0.0, 1.0]
-    return CameraParameters(matrix, named_lens(fields, model), model, size)
+    return CameraParameters(
+        matrix_entries(unit * fx, unit * fy, cx, cy), named_lens(fields, model), model, size
+    )
 
 
 def openmvg_cameras(content: Any) -> Readers:
@@ -73,7 +70,7 @@ def _openmvg(entry: Mapping[str, Any]) -> CameraParameters:
     value = mapping("value", required(entry, ["value"]))
     fields = mapping("data", mapping("ptr_wrapper", required(value, ["ptr_wrapper"])).get("data"))
     fields = {**fields, **mapping("value0", fields.get("value0") or {})}
-    size = (whole_number(fields, "height"), whole_number(fields, "width"))
+    size = stated_size(fields)
     focal, (cx, cy) = number(fields, "focal_length"), numbers(fields, "principal_point", count=2)
     model, distortion = "pinhole", [0.0] * 5
     for key, (own, places) in _OPENMVG_LENSES.items():
@@ -82,4 +79,4 @@ def _openmvg(entry: Mapping[str, Any]) -> CameraParameters:
             for place, coefficient in zip(places, numbers(fields, key, count=len(places)), strict=True):
                 distortion[place] = coefficient
     lens = distortion[:4] if model == "fisheye" else distortion
-    return CameraParameters([focal, 0.0, cx, 0.0, focal, cy, 0.0, 0.0, 1.0], lens, model, size)
+    return CameraParameters(matrix_entries(focal, focal, cx, cy), lens, model, size)

@@ -13,8 +13,14 @@ from lanebev.camera.choice import Readers, telling_names
 from lanebev.camera.datasets import is_woodscape, woodscape
 from lanebev.camera.formats import DISTORTION_KEYS, stated_model, with_sides
 from lanebev.camera.named_lens import LENS_NAMES, stated_lens
-from lanebev.camera.parameters import OFF_CENTRE, CameraParameters, centre_offset, size_of_images
-from lanebev.camera.parsing import camera_matrix, number, numbers, whole_number
+from lanebev.camera.parameters import (
+    OFF_CENTRE,
+    CameraParameters,
+    centre_offset,
+    matrix_entries,
+    size_of_images,
+)
+from lanebev.camera.parsing import camera_matrix, listed_size, number, whole_number
 from lanebev.numbers import shown
 
 Record = Mapping[str, Any]
@@ -51,14 +57,7 @@ _LAYOUTS = (
     _Layout("opencv_interactive-calibration's", "cameraMatrix", sides="cameraResolution"),
 )
 _CITYSCAPES = _Layout("Cityscapes'", "intrinsic", (1024, 2048))  # by numbers with names
-_LENS_KEYS = (
-    *DISTORTION_KEYS,
-    "camera_distortion",
-    "camera_dist_coeffs",
-    "Distortion",
-    "cam_D",
-    "DistCoeff",
-)
+_LENS_KEYS = (*DISTORTION_KEYS, "camera_distortion", "camera_dist_coeffs", "Distortion", "cam_D", "DistCoeff")
 _LIKE_LENS = re.compile(  # with words before it, but "undistorted" is none
     r"([a-z]+_)*?(dist(?!ance|ribut|.*(model|type|std))|radial|tangential|[kp][1-6]$)", re.IGNORECASE
 )
@@ -120,12 +119,12 @@ def _read(record: Record, image_size: tuple[int, int] | None, rectified: bool) -
     if named := _named_numbers(record):
         record = {**record, **named}  # whose lens and size count too
         fx, fy, cx, cy = (number(record, *keys) for keys in (("fx",), ("fy",), ("cx", "u0"), ("cy", "v0")))
-        matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+        matrix = matrix_entries(fx, fy, cx, cy)
     else:
         matrix = camera_matrix(record, layout.matrix)
         if _is_waymos(matrix):
             record = {**record, "distortion": matrix[4:]}
-            matrix = [matrix[0], 0.0, matrix[2], 0.0, matrix[1], matrix[3], 0.0, 0.0, 1.0]
+            matrix = matrix_entries(*matrix[:4])
     _check_lens_keys(record)
     model = "fisheye" if record.get("Lens") == "Fisheye" else stated_model(record, layout.model)
     distortion = stated_lens(record, _LENS_KEYS, model)
@@ -150,8 +149,7 @@ def _size(
         ValueError: it states none, and the principal point is in the middle of neither.
     """
     if layout.sides:
-        width, height = numbers(record, layout.sides, count=2)
-        return round(height), round(width)
+        return listed_size(record, layout.sides)
     with suppress(ValueError):  # of a list that is no size, such as that of a map
         record = with_sides({**record, "cx": matrix[2], "cy": matrix[5]})
     sides = (("height", "image_height"), ("width", "image_width"))

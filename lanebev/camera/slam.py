@@ -7,8 +7,8 @@ from typing import Any
 
 from lanebev.camera.approximation import Array, double_sphere, extended_unified, fov_model, radial_camera
 from lanebev.camera.choice import Readers
-from lanebev.camera.parameters import CameraParameters
-from lanebev.camera.parsing import mapping, number, numbers, required, whole_number
+from lanebev.camera.parameters import CameraParameters, matrix_entries
+from lanebev.camera.parsing import listed_size, mapping, number, numbers, required, stated_size, whole_number
 from lanebev.numbers import shown
 
 _KALIBR_MODELS = {  # camera_model, distortion_model of Kalibr, EuRoC and TUM-VI
@@ -136,13 +136,8 @@ def _kalibr(fields: Mapping[str, Any]) -> CameraParameters:
     elif any(fields.get(key) for key in coefficients) and any(numbers(fields, *coefficients)):
         raise ValueError("distortion_model: expected the one of distortion_coeffs, got none; add the entry")
     *xi, fx, fy, cx, cy = intrinsics
-    width, height = numbers(fields, "resolution", count=2)
-    return CameraParameters(
-        [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
-        [*xi, *distortion],
-        model,
-        (round(height), round(width)),
-    )
+    size = listed_size(fields, "resolution")
+    return CameraParameters(matrix_entries(fx, fy, cx, cy), [*xi, *distortion], model, size)
 
 
 def _radial(
@@ -159,8 +154,7 @@ def _radial(
     *shape, fx, fy, cx, cy = numbers(fields, "intrinsics", count=before + 4)
     if after:
         shape += numbers(fields, "distortion_coeffs", count=after)
-    width, height = numbers(fields, "resolution", count=2)
-    size = (round(height), round(width))
+    size = listed_size(fields, "resolution")
     return radial_camera((fx, fy), (cx, cy), size, lambda angle: radius(angle, *shape))
 
 
@@ -168,7 +162,7 @@ def camodocal(fields: Mapping[str, Any]) -> CameraParameters:
     """Read CamOdoCal's YAML, which VINS and KITTI-360's fisheyes use: PINHOLE, KANNALA_BRANDT or MEI."""
     name = str(required(fields, ["model_type"])).strip().upper()
     projection = mapping("projection_parameters", required(fields, ["projection_parameters"]))
-    size = (whole_number(fields, "image_height"), whole_number(fields, "image_width"))
+    size = stated_size(fields, "image_height", "image_width")
     if name == "KANNALA_BRANDT":
         fx, fy, cx, cy = (number(projection, key) for key in ("mu", "mv", "u0", "v0"))
         model, distortion = "fisheye", [number(projection, key) for key in ("k2", "k3", "k4", "k5")]
@@ -183,7 +177,7 @@ def camodocal(fields: Mapping[str, Any]) -> CameraParameters:
         fx, fy, cx, cy = (number(projection, key) for key in keys)
     else:
         raise ValueError(f"model_type: expected PINHOLE, KANNALA_BRANDT or MEI, got {shown(name)}")
-    return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, model, size)
+    return CameraParameters(matrix_entries(fx, fy, cx, cy), distortion, model, size)
 
 
 def orb_slam_fields(fields: Mapping[str, Any]) -> Mapping[str, Any] | None:
@@ -212,7 +206,7 @@ def orb_slam_cameras(fields: Mapping[str, Any], rectified: bool) -> Readers:
 def _as_taken(fields: Mapping[str, Any], name: str) -> CameraParameters:
     """Read a camera of ORB-SLAM 2's stereo settings."""
     matrix, distortion = numbers(fields, f"{name}.K", count=9), numbers(fields, f"{name}.D")
-    size = (whole_number(fields, f"{name}.height"), whole_number(fields, f"{name}.width"))
+    size = stated_size(fields, f"{name}.height", f"{name}.width")
     return CameraParameters(matrix, distortion, "pinhole", size)
 
 
@@ -224,11 +218,11 @@ def _orb_slam(fields: Mapping[str, Any], of: str) -> CameraParameters:
     model, names = _ORB_SLAM_MODELS[kind.lower()]
     fx, fy, cx, cy = (number(fields, of + key) for key in ("fx", "fy", "cx", "cy"))
     given = [of + key for key in names.split()]
-    distortion = [number(fields, key) if fields.get(key) is not None else 0.0 for key in given]
+    distortion = [number(fields, key, default=0.0) for key in given]
     if model == "pinhole" and fields.get(of + "k4") is not None and number(fields, of + "k4"):
         raise ValueError(f"{of}k4: expected none of {kind}, got one; is Camera.type: KannalaBrandt8 missing?")
     size = (
         whole_number(fields, "Camera.height", "Camera.rows"),
         whole_number(fields, "Camera.width", "Camera.cols"),
     )
-    return CameraParameters([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], distortion, model, size)
+    return CameraParameters(matrix_entries(fx, fy, cx, cy), distortion, model, size)
