@@ -66,8 +66,7 @@ def _print(text: str) -> None:
 def _signals_unwind(received: list[int]) -> Iterator[None]:
     """Raise KeyboardInterrupt on SIGINT, SIGTERM, SIGHUP; a second signal waits while outputs are undone.
 
-    Args:
-        received: numbers of the signals are added to it, since Ray raises an exception of its own instead.
+    The signals' numbers are added to ``received``, since Ray raises an exception of its own instead.
     """
 
     def stop(number: int, _: object) -> None:

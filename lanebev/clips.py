@@ -16,10 +16,6 @@ def per_frame(name: str, value: float | Tensor, batch: int, steps: int, like: Te
         batch: B.
         steps: T.
         like: tensor whose device and dtype are taken.
-
-    Raises:
-        TypeError: neither number nor tensor.
-        ValueError: another shape.
     """
     check_number_or_tensor(name, value)
     if isinstance(value, (int, float)):  # a tensor made of a number would be a constant to torch.compile
@@ -40,10 +36,6 @@ def drive_starts(reset: Tensor, batch: int, steps: int) -> Tensor:
         reset: (B, T) bool, or (B,), which applies to the first frame.
         batch: B.
         steps: T.
-
-    Raises:
-        TypeError: not a tensor.
-        ValueError: another shape or type of number.
     """
     check_tensor("reset", reset)
     if reset.dtype != torch.bool or reset.shape not in ((batch,), (batch, steps)):

@@ -94,11 +94,7 @@ def _bytes_of_pipe(path: Path) -> bytes:
 
 
 def check_number(name: str, value: object, expected: str = "a number") -> None:
-    """Raise unless an argument is a number of Python or NumPy; a truth value is none.
-
-    Raises:
-        TypeError: naming the argument, and what came.
-    """
+    """Raise unless an argument is a number of Python or NumPy; a truth value is none."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name}: expected {expected}, got {type(value).__qualname__}")
 
@@ -110,10 +106,6 @@ def check_settings(config: Any, positive: Collection[str] = (), infinite: Collec
         config: an instance; fields whose default is no number are not checked.
         positive: names of those that must be more than 0.
         infinite: names of those that may be infinite.
-
-    Raises:
-        TypeError: a field is no number.
-        ValueError: naming the field, what was expected and what came.
     """
     for name in (part.name for part in fields(config) if isinstance(part.default, Real)):
         value = getattr(config, name)
@@ -132,11 +124,7 @@ def shown(value: Any, most: int = 60) -> str:
 
 
 def finite_numbers(name: str, values: Sequence[Any], count: int | None = None) -> list[float]:
-    """Convert texts or numbers to floats, ``count`` of them if given.
-
-    Raises:
-        ValueError: another count, or one that is not a finite number; a truth value is none.
-    """
+    """Convert texts or numbers to floats, ``count`` of them if given."""
     if count is not None and len(values) != count:
         raise ValueError(f"{name}: expected {count} number{'s'[: count != 1]}, got {len(values)}")
     numbers = _floats(values)
@@ -146,11 +134,7 @@ def finite_numbers(name: str, values: Sequence[Any], count: int | None = None) -
 
 
 def numbers_or_gaps(name: str, values: Sequence[Any]) -> list[float]:
-    """Convert texts or numbers to floats, NaN for missing ones: ``null``, ``nan`` or NaN.
-
-    Raises:
-        ValueError: one that is none of these, or infinite.
-    """
+    """Convert texts or numbers to floats, NaN for missing ones: ``null``, ``nan`` or NaN."""
     numbers = _floats([math.nan if value is None else value for value in values])
     if numbers is None or any(map(math.isinf, numbers)):
         raise ValueError(
@@ -174,11 +158,7 @@ def _listed(values: Sequence[Any]) -> str:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Return (height, width) of a text such as ``1280x720``, width first.
-
-    Raises:
-        ValueError: another text, or sides that are no image's.
-    """
+    """Return (height, width) of a text such as ``1280x720``, width first."""
     match = re.fullmatch(r"\s*(\d{1,6})\s*[x×X]\s*(\d{1,6})\s*", text, re.ASCII)
     if match is None or 0 in (size := (int(match[2]), int(match[1]))):
         raise ValueError(f"lanes size: expected WIDTHxHEIGHT in px, such as 1280x720, got {text!r}")
@@ -186,11 +166,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_crop(text: str) -> tuple[int, int, int, int]:
-    """Return (top, left, height, width) of a text such as ``1280x480+0+240``: WIDTHxHEIGHT+LEFT+TOP.
-
-    Raises:
-        ValueError: another text, or sides that are no image's.
-    """
+    """Return (top, left, height, width) of a text such as ``1280x480+0+240``: WIDTHxHEIGHT+LEFT+TOP."""
     number = r"\s*(\d{1,6})\s*"
     match = re.fullmatch(rf"{number}[x×X]{number}\+{number}\+{number}", text, re.ASCII)
     width, height, left, top = map(int, match.groups()) if match else (0, 0, 0, 0)

@@ -14,11 +14,7 @@ def open_pipe(path: str | Path) -> FileIO:
 
 
 def await_bytes(pipe: FileIO) -> None:
-    """Wait until something has come through a pipe, or it ends.
-
-    Raises:
-        ValueError: nothing has come for 30 s.
-    """
+    """Wait until something has come through a pipe, or it ends."""
     if hasattr(select, "poll"):  # not on Windows
         waiting = select.poll()
         waiting.register(pipe, select.POLLIN)

@@ -98,11 +98,7 @@ def recorded() -> bool:
 
 
 def usable_device(device: torch.device | str | int) -> torch.device:
-    """Return a device by its name.
-
-    Raises:
-        ValueError: PyTorch cannot use it here.
-    """
+    """Return a device by its name."""
     try:
         found = torch.device(device)
         torch.empty(0, device=found)

@@ -42,12 +42,7 @@ KINDS = ("highway", "varied")
 
 
 class SegmenterFile(nn.Module):
-    """A network whose logits an ONNX file computes.
-
-    Args:
-        segmenter: exported network, which has the settings.
-        part: its file.
-    """
+    """A network whose logits an ONNX file computes."""
 
     def __init__(self, segmenter: LaneSegmenter, part: OnnxPart) -> None:
         super().__init__()

@@ -227,13 +227,7 @@ _CHANGES: dict[str, Callable[[Random, float], Change]] = {
 
 
 def follow(drive: Drive, seed: int, calibrator: JointCalibrator) -> Errors:
-    """Run the calibrator on a drive.
-
-    Args:
-        drive: the drive.
-        seed: of the noise.
-        calibrator: joint calibrator of any configuration.
-    """
+    """Run the calibrator on a drive."""
     state = calibrator.initial_state(1, dtype=torch.float64)
     by_sigma, nees = [torch.zeros(0, 4, dtype=torch.float64)], [torch.zeros(0, dtype=torch.float64)]
     frames = observe(drive.moments, 1, drive.sigma, drive.per_boundary, seed, torch.float64)
@@ -259,12 +253,7 @@ def row(name: str, errors: Sequence[Errors]) -> str:
 
 
 def print_mixed(drives: int, first: int) -> None:
-    """Measure the joint calibrator on drives drawn at random.
-
-    Args:
-        drives: how many.
-        first: seed of the first.
-    """
+    """Measure the joint calibrator on drives drawn at random."""
     seeds = range(first, first + drives)
     drawn = [draw(seed) for seed in seeds]
     found = [follow(drive, seed, JointCalibrator()) for drive, seed in zip(drawn, seeds, strict=True)]

@@ -82,11 +82,7 @@ class RunDifference(NamedTuple):
 
 
 def row_difference(found: Sequence[ExtrinsicsRow], expected: Sequence[ExtrinsicsRow]) -> RunDifference:
-    """Compare rows of the same frames; NaN in both is no difference, NaN in one of them is infinite.
-
-    Raises:
-        ValueError: another number of rows.
-    """
+    """Compare rows of the same frames; NaN in both is no difference, NaN in one of them is infinite."""
     angle = height = sigma = 0.0
     for one, other in zip(found, expected, strict=True):
         pairs = list(zip(one[2:10], other[2:10], strict=True))

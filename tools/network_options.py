@@ -11,11 +11,7 @@ from train.commands import evaluation_parser
 
 
 def network_parser(description: str | None) -> argparse.ArgumentParser:
-    """Return the parser of an evaluation, with the options of :func:`make_model`.
-
-    Args:
-        description: docstring of the program, shown as it is.
-    """
+    """Return the parser of an evaluation, with the options of :func:`make_model`."""
     parser = evaluation_parser(description)
     parser.add_argument("--width", type=PositiveInt, help="px of the network's input, instead of its own")
     parser.add_argument("--precision", choices=PRECISIONS, default=PRECISIONS[0], help="of the network")

@@ -114,13 +114,7 @@ def bandwidth(megabytes: int) -> float:
 
 
 def print_profile(rows: int, segments: int, runs: int) -> None:
-    """Print a frame's time by function.
-
-    Args:
-        rows: of the batch.
-        segments: of each row, six boundaries.
-        runs: of which the smallest time of each operation counts.
-    """
+    """Print a frame's time by function."""
     torch.set_num_threads(1)
     found = profile(rows, segments, runs)
     times, sizes, numbers = zip(*found.values(), strict=True)

@@ -22,11 +22,7 @@ def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
 
 
 def read_arrays(path: Path, names: Sequence[str], kind: str) -> list[NDArray[Any]]:
-    """Read the arrays of these names.
-
-    Raises:
-        ValueError: not a file of this kind, which the message names.
-    """
+    """Read the arrays of these names."""
     try:
         with np.load(path) as file:
             return [file[name] for name in names]
@@ -54,11 +50,7 @@ def encode_jpegs(images: Iterable[NDArray[np.uint8]]) -> tuple[NDArray[np.uint8]
 
 
 def decode_jpeg(jpeg: NDArray[np.uint8], ends: NDArray[np.int64], index: int) -> NDArray[np.uint8]:
-    """Decode one of the images of :func:`encode_jpegs`, (H, W, 3).
-
-    Raises:
-        ValueError: it does not decode.
-    """
+    """Decode one of the images of :func:`encode_jpegs`, (H, W, 3)."""
     start = ends[index - 1] if index else 0
     image = cv2.imdecode(jpeg[start : ends[index]], cv2.IMREAD_COLOR_RGB)
     if image is None:

@@ -16,11 +16,7 @@ from train.export import trained_segmenter
 
 
 def average(segmenters: list[LaneSegmenter]) -> LaneSegmenter:
-    """Return a network with the mean of the weights; counters are those of the first.
-
-    Raises:
-        ValueError: networks of different configurations.
-    """
+    """Return a network with the mean of the weights; counters are those of the first."""
     first, *others = segmenters
     for other in others:
         if other.config != first.config:

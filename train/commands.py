@@ -44,11 +44,7 @@ def versions() -> dict[str, object]:
 
 
 def evaluation_parser(description: str | None) -> argparse.ArgumentParser:
-    """Return such a parser with the folder of the evaluation data and the network's weights as options.
-
-    Args:
-        description: docstring of the program, shown as it is.
-    """
+    """Return such a parser with the folder of the evaluation data and the network's weights as options."""
     parser = command_parser(description)
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the data (../shared/data)")
     parser.add_argument("--weights", type=Path, help="other weights than the shipped")

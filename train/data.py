@@ -60,11 +60,7 @@ class PoolFrames:
         self.folder, self.resident = Path(folder), resident
 
     def paths(self) -> list[Path]:
-        """Return the shards present now.
-
-        Raises:
-            ValueError: there are none.
-        """
+        """Return the shards present now."""
         paths = sorted(self.folder.glob("*.npz"))
         if not paths:
             raise ValueError(

@@ -60,9 +60,6 @@ def read_entries(layout: Format, root: Path, names: list[str]) -> list[Entry]:
             ``file_path`` is under the root's ``images``.
         root: root of the data set.
         names: relative to the root.
-
-    Raises:
-        ValueError: a file is missing or malformed, or there are no entries.
     """
     entries: list[Entry] = []
     for name in names:
@@ -82,11 +79,7 @@ def read_entries(layout: Format, root: Path, names: list[str]) -> list[Entry]:
 
 
 def check_sizes(entries: list[Entry]) -> None:
-    """Warn if lines seem to be in pixels of smaller or cropped images, by some entries of each image size.
-
-    Raises:
-        ValueError: they lie outside the images, so that they are in pixels of larger ones.
-    """
+    """Warn if lines seem to be in pixels of smaller or cropped images, by some entries of each image size."""
     of_size: dict[tuple[int, int], list[FrameLines]] = defaultdict(list)
     for entry in entries[:: max(1, len(entries) // _LOOKED_AT)]:
         size = image_size(entry.image)
@@ -119,9 +112,6 @@ def labelled_image(entry: Entry, num_boundaries: int = NUM_BOUNDARIES) -> Labell
     """Decode an image and give its lines their boundary; lines beyond the outermost are left out.
 
     Boundaries are those that the file states, as in a ``lanes.json`` of our own, else by their order.
-
-    Raises:
-        ValueError: the image is missing, cut, or does not decode.
     """
     image = read_image(entry.image)
     lines = entry.lines.lines

@@ -21,11 +21,7 @@ from train.losses import unweighted_bias
 
 
 def checkpoint_weights(path: Path) -> dict[str, Tensor]:
-    """Return the segmenter's weights in a Lightning checkpoint, the averaged ones if there are any.
-
-    Raises:
-        ValueError: no segmenter in it.
-    """
+    """Return the segmenter's weights in a Lightning checkpoint, the averaged ones if there are any."""
     return _read_checkpoint(path)[0]
 
 
@@ -115,11 +111,7 @@ def widen(narrow: dict[str, Tensor], wide: dict[str, Tensor], noise: float = 0.0
 
 
 def checkpoint_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
-    """Return a checkpoint's network, class weights undone in the last bias, and its training settings.
-
-    Raises:
-        ValueError: no segmenter in it.
-    """
+    """Return a checkpoint's network, class weights undone in the last bias, and its training settings."""
     weights, settings = _read_checkpoint(path)
     try:
         segmenter = LaneSegmenter(segmenter_config(settings["network"]))
@@ -132,11 +124,7 @@ def checkpoint_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
 
 
 def trained_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
-    """Return the network of a checkpoint or a weights file, for inference, and its training settings.
-
-    Raises:
-        ValueError: neither of them.
-    """
+    """Return the network of a checkpoint or a weights file, for inference, and its training settings."""
     if not is_checkpoint(path):
         return load_segmenter(path), read_metadata(path).get("training", {})
     segmenter, settings = checkpoint_segmenter(path)
@@ -148,11 +136,7 @@ def trained_segmenter(path: Path) -> tuple[LaneSegmenter, dict[str, Any]]:
 
 
 def checkout_commit() -> str:
-    """Return the commit of the code: ``LANEBEV_COMMIT`` of the environment, else of this checkout.
-
-    Raises:
-        ValueError: neither is there.
-    """
+    """Return the commit of the code: ``LANEBEV_COMMIT`` of the environment, else of this checkout."""
     if given := os.environ.get("LANEBEV_COMMIT"):
         return given
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]

@@ -37,13 +37,7 @@ class ExtractionError(NamedTuple):
 
 
 def extraction_error(frame: RenderedFrame, size: tuple[int, int], config: LineConfig) -> ExtractionError:
-    """Draw each boundary's mask, extract, and compare with the boundary.
-
-    Args:
-        frame: rendered images.
-        size: (h, w) of the masks.
-        config: config of the extraction; its stripes are drawn.
-    """
+    """Draw each boundary's mask, extract, and compare with the boundary."""
     masks = boundary_masks(frame, size, config.half_width).double()
     segments = extract_segments(masks, size, config, size)._asdict()
     batch, boundaries = frame.boundaries.shape[:2]

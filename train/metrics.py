@@ -88,9 +88,6 @@ def tusimple_lane_score(
         predicted: x of each lane on each row, negative where there is none.
         labelled: the same.
         rows: y.
-
-    Raises:
-        ValueError: a lane without one x per row.
     """
     for name, lanes in (("predicted", predicted), ("labelled", labelled)):
         if any(len(lane) != len(rows) for lane in lanes):

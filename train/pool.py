@@ -108,11 +108,7 @@ def write_shard(path: Path, frames: list[RenderedFrame]) -> None:
 
 
 def read_shard(path: Path) -> Shard:
-    """Read one shard.
-
-    Raises:
-        ValueError: not a shard.
-    """
+    """Read one shard."""
     own = Shard._fields[:-1]
     arrays = read_arrays(path, (*own, *Pose._fields), "a pool shard")
     jpeg, ends, points, painted, visible, vanishing = arrays[: len(own)]
@@ -120,11 +116,7 @@ def read_shard(path: Path) -> Shard:
 
 
 def shard_size(path: Path) -> int:
-    """Return the number of a shard's frames, without reading them.
-
-    Raises:
-        ValueError: not a shard.
-    """
+    """Return the number of a shard's frames, without reading them."""
     return len(read_arrays(path, ("ends",), "a pool shard")[0])
 
 

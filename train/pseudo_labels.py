@@ -85,11 +85,7 @@ def label_rows(curves: Boundaries, camera: Camera, extrinsics: Extrinsics) -> ND
 
 
 def fitted_curves(result: Path, camera: Camera) -> tuple[Boundaries, list[ExtrinsicsRow]]:
-    """Fit the boundaries of every frame of a run together, on the run's pose.
-
-    Raises:
-        ValueError: the folder has no run's result, or one whose files are of different frames.
-    """
+    """Fit the boundaries of every frame of a run together, on the run's pose."""
     rows, entries = read_extrinsics(result / "extrinsics.csv"), read_lanes(result / "lanes.json")
     if len(rows) != len(entries):
         raise ValueError(
@@ -139,22 +135,14 @@ def write_labels(result: Path, source: str, out: Path, camera: Camera, reach: in
 
 
 def check_camera_of_run(result: Path, camera: Camera) -> None:
-    """Raise unless a camera is that of a run, by the ``calibration.yaml`` in its folder.
-
-    Raises:
-        ValueError: it is another.
-    """
+    """Raise unless a camera is that of a run, by the ``calibration.yaml`` in its folder."""
     path = result / "calibration.yaml"
     if path.is_file() and Camera.from_file(path).fingerprint() != camera.fingerprint():
         raise ValueError(f"camera: expected that of the run, got another; {path} is the run's")
 
 
 def frames_of_run(source: str, result: Path) -> Iterator[Frame]:
-    """Yield the frames that a run took of its source.
-
-    Raises:
-        ValueError: they are not as many as the run has.
-    """
+    """Yield the frames that a run took of its source."""
     run = read_run(result)
     got = 0
     for frame in source_of_run(source, run):
@@ -167,11 +155,7 @@ def frames_of_run(source: str, result: Path) -> Iterator[Frame]:
 
 
 def write_entry(out: Path, frame: Frame, x: NDArray[np.float64]) -> dict[str, object]:
-    """Write the image of a frame, and return its entry of ``labels.json`` with boundaries (L, R) px.
-
-    Raises:
-        ValueError: the image has another number of rows than the boundaries.
-    """
+    """Write the image of a frame, and return its entry of ``labels.json`` with boundaries (L, R) px."""
     assert frame.image is not None
     rows = image_rows(frame.image.shape[0])
     if len(rows) != x.shape[1]:

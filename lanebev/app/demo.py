@@ -36,9 +36,6 @@ def demo(out: str, progress: ProgressOf | None = None) -> str:
 
     Returns:
         what to print.
-
-    Raises:
-        ValueError: the folder cannot be written.
     """
     drive = Drive(SEED, IMAGE_SIZE, FRAMES, float(FPS))
     folder = Path(out) / "drive"

@@ -70,16 +70,9 @@ class Sample:
 def doctor(config: RunConfig, progress: Progress | None = None) -> tuple[str, int]:
     """Check a source and its camera.
 
-    Args:
-        config: source, camera, and settings of the network.
-        progress: wraps the frames that are checked.
-
     Returns:
         the text to print, and 0 if all checks passed, 1 if something is doubtful, 2 if the camera does not
         fit.
-
-    Raises:
-        ValueError: source or camera cannot be read.
     """
     source = make_source(config)
     camera = camera_of(config, source)

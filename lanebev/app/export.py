@@ -26,9 +26,6 @@ def export(config: ExportConfig, begun: Callable[[str], None] = lambda _: None) 
 
     Returns:
         a line for each file.
-
-    Raises:
-        ValueError: bad input, or the packages of ONNX are not there.
     """
     camera = Camera.from_file(config.camera)
     model = LaneBEV.from_pretrained(

@@ -10,10 +10,5 @@ class Progress(Protocol):
     """Wraps the items of a job and shows how many are done."""
 
     def __call__(self, items: Iterator[Item], total: int) -> Iterator[Item]:
-        """Yield the items unchanged and show how many are done.
-
-        Args:
-            items: what the job works on.
-            total: how many there are.
-        """
+        """Yield the items unchanged and show how many are done."""
         ...

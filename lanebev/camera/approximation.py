@@ -75,9 +75,6 @@ def kannala_brandt_like(radius: Radius, corner: float, focal: float) -> tuple[fl
         radius: r(θ) for a focal length of 1.
         corner: distance of the farthest corner from the principal point, in focal lengths.
         focal: px.
-
-    Raises:
-        ValueError: it is no lens, or none that is near.
     """
     angles = _WIDEST * np.linspace(0.0, 1.0, _SAMPLES + 1)[1:]
     with np.errstate(all="ignore"):

@@ -35,9 +35,6 @@ def chosen(readers: Readers, wanted: str | None, has_usual: bool) -> CameraParam
         readers: what reads each of them.
         wanted: name of a camera, None for the first.
         has_usual: whether the first is the one that most people mean.
-
-    Raises:
-        ValueError: no camera has this name, or none is named, they differ and none is usual.
     """
     if wanted is not None and wanted not in readers:
         names = f"expected one of {_listed(readers)}" if "" not in readers else "expected no name of a camera"

@@ -121,9 +121,6 @@ def colmap_text(path: Path) -> str:
     """Return COLMAP's ``cameras.bin`` as its ``cameras.txt`` would be.
 
     Source: COLMAP, scripts/python/read_write_model.py.
-
-    Raises:
-        ValueError: it cannot be read, is none, is cut, or has a camera of a further model.
     """
     try:
         with open(path, "rb") as file:

@@ -153,11 +153,7 @@ def spelled(key: str) -> str:
 
 
 def _spelled_once(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields by their known keys.
-
-    Raises:
-        ValueError: two keys mean the same.
-    """
+    """Return the fields by their known keys."""
     known: dict[str, str] = {}
     for key in fields:
         if (first := known.setdefault(spelled(key), key)) != key:
@@ -173,9 +169,6 @@ def with_sides(fields: Mapping[str, Any]) -> Mapping[str, Any]:
 
     OpenCV has the width first, NumPy the height: it is the order in which the principal point is nearer to
     the middle. Of three numbers the smallest is that of channels, which PyTorch has first.
-
-    Raises:
-        ValueError: the list is none of two sides, and perhaps a number of channels.
     """
     fields = {key: _two_sides(value) for key, value in fields.items()}
     lists = (key for key, value in fields.items() if isinstance(value, list | Mapping))
@@ -206,11 +199,7 @@ def _two_sides(value: Any) -> Any:
 
 
 def _of_images(fields: Mapping[str, Any], rectified: bool, image_size: tuple[int, int]) -> CameraParameters:
-    """Read a file that states no size as one for these images, with a remark.
-
-    Raises:
-        ValueError: its principal point is not near their centre, so that it may be of others.
-    """
+    """Read a file that states no size as one for these images, with a remark."""
     height, width = image_size
     camera = opencv_or_ros({**fields, "width": width, "height": height}, rectified)
     if centre_offset(camera.matrix, image_size) > _OFF_CENTRE:
@@ -233,11 +222,7 @@ def _short(fields: Mapping[str, Any], rectified: bool) -> CameraParameters:
 
 
 def without_lens(camera: CameraParameters) -> CameraParameters:
-    """Return the camera of rectified images, for a file that has no projection matrix of them.
-
-    Raises:
-        ValueError: the lens distorts, so that the camera of rectified images is unknown.
-    """
+    """Return the camera of rectified images, for a file that has no projection matrix of them."""
     if camera.model != "pinhole" or any(camera.distortion):
         raise ValueError("projection_matrix: expected P for rectified images, got none; add the entry")
     return camera._replace(distortion=[])
@@ -264,13 +249,6 @@ def stated_model(fields: Mapping[str, Any], usual: str = "pinhole") -> str:
     """Return the lens model; beside another one, "pinhole" states the projection only, as in Kalibr.
 
     Of the keys after the first, names that are no lens model are ignored: they may be a product's.
-
-    Args:
-        fields: fields of the file.
-        usual: the model where none is stated.
-
-    Raises:
-        ValueError: the first model is not known, or two that differ are stated.
     """
     written = [str(fields[key]).strip().lower() for key in _MODEL_KEYS if fields.get(key) is not None]
     names = [_ALSO.get(name, name) for name in (re.sub(r"[\s_-]+", "_", each) for each in written)]

@@ -29,11 +29,7 @@ from lanebev.types import check_numbers_known, check_tensor
 
 
 def check_camera(value: object) -> None:
-    """Raise unless an argument is a camera.
-
-    Raises:
-        TypeError: saying what came and how to make one.
-    """
+    """Raise unless an argument is a camera."""
     if not isinstance(value, Camera):
         got = type(value).__qualname__
         raise TypeError(f"camera: expected a lanebev.Camera, got {got}; see Camera.from_file and from_fov")

@@ -21,9 +21,6 @@ def named_lens(fields: Mapping[str, Any], model: str) -> list[float]:
     Args:
         fields: fields of the camera or of its lens.
         model: "pinhole" or "fisheye"; another one has no such names.
-
-    Raises:
-        ValueError: a coefficient that the model does not have, or k4 without k5 and k6.
     """
     names = LENS_NAMES.get(model, ())
     given = {name: number(fields, name) for name in LENS_NAMES["pinhole"] if fields.get(name) is not None}
@@ -49,9 +46,6 @@ def stated_lens(fields: Mapping[str, Any], keys: Sequence[str], model: str) -> l
         fields: fields of the camera.
         keys: spellings of the list's key.
         model: "pinhole", "fisheye" or "omni".
-
-    Raises:
-        ValueError: they are stated twice, or beside them another key that would not count.
     """
     given = [key for key in keys if fields.get(key) is not None]
     if any(fields.get(name) is not None for name in LENS_NAMES["pinhole"]):

@@ -53,11 +53,7 @@ def centre_offset(matrix: Sequence[float], image_size: tuple[int, int]) -> float
 def size_of_images(
     whose: str, image_size: tuple[int, int] | None, known: tuple[int, int] | None, spread: int = 0
 ) -> tuple[int, int] | None:
-    """Return the images' size, else the data set's.
-
-    Raises:
-        ValueError: they differ: the images were resized.
-    """
+    """Return the images' size, else the data set's."""
     if image_size and known and max(abs(image_size[0] - known[0]), abs(image_size[1] - known[1])) > spread:
         raise ValueError(
             f"expected images of about {known[1]} x {known[0]} px, {whose}, got "
@@ -73,9 +69,6 @@ def checked(camera: CameraParameters, restated: bool = False) -> CameraParameter
         camera: camera as read from the file.
         restated: the file states the camera matrix twice, as a program does. Then it may be of a cropped
             image, with its principal point outside of it and a focal length of any number of image sides.
-
-    Raises:
-        ValueError: a value that no real camera has, and which.
     """
     height, width = camera.image_size
     if not (0 < height <= _LONGEST_SIDE and 0 < width <= _LONGEST_SIDE):

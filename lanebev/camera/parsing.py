@@ -219,11 +219,7 @@ def _xml_value(element: ET.Element) -> Any:
 
 
 def required(fields: Mapping[str, Any], keys: Sequence[str]) -> Any:
-    """Return the value of the first of these spellings of a key that is there.
-
-    Raises:
-        ValueError: none of them is.
-    """
+    """Return the value of the first of these spellings of a key that is there."""
     return fields[_given(fields, keys)[0]]
 
 
@@ -241,9 +237,6 @@ def _read_once(
     """Return the numbers that ``read`` finds in the value of a key; in another spelling they are the same.
 
     Zeros at the end do not make a difference, as of coefficients.
-
-    Raises:
-        ValueError: no spelling of the key is there, or two with different numbers.
     """
     given = _given(fields, keys)
     first, *others = (read(fields[key]) for key in given)

@@ -44,11 +44,7 @@ def matlab(fields: Mapping[str, Any]) -> CameraParameters:
 
 
 def gyroflow(fields: Mapping[str, Any]) -> CameraParameters:
-    """Read a lens profile of Gyroflow, for images of ``calib_dimension``.
-
-    Raises:
-        ValueError: the camera distorts its images once more, or the lens model is none of OpenCV's.
-    """
+    """Read a lens profile of Gyroflow, for images of ``calib_dimension``."""
     name = str(fields.get("distortion_model") or "").strip().lower()
     if name not in _GYROFLOW_MODELS or fields.get("digital_lens"):
         got = shown(fields.get("digital_lens") or name)
@@ -63,9 +59,6 @@ def nerf(fields: Mapping[str, Any]) -> CameraParameters:
     """Read ``transforms.json`` of instant-ngp or Nerfstudio, whose pixels are COLMAP's.
 
     Source: instant-ngp, scripts/colmap2nerf.py; Nerfstudio, docs/quickstart/data_conventions.md.
-
-    Raises:
-        ValueError: the camera model is none of OpenCV's.
     """
     name = str(fields.get("camera_model") or "OPENCV").strip().upper()
     if name not in _NERF_MODELS:
@@ -78,11 +71,7 @@ def nerf(fields: Mapping[str, Any]) -> CameraParameters:
 
 
 def realsense(fields: Mapping[str, Any]) -> CameraParameters:
-    """Read the intrinsics of Intel's librealsense: JSON, YAML, or what ``rs-enumerate-devices -c`` prints.
-
-    Raises:
-        ValueError: a lens whose model OpenCV does not have.
-    """
+    """Read the intrinsics of Intel's librealsense: JSON, YAML, or what ``rs-enumerate-devices -c`` prints."""
     fields = {key.lower(): value for key, value in fields.items()}
     distortion = numbers(fields, "coeffs") if fields.get("coeffs") is not None else []
     stated = str(fields.get("model") or fields.get("distortion") or "none")
@@ -124,9 +113,6 @@ def metashape(fields: Mapping[str, Any]) -> CameraParameters:
 
     Source: Agisoft Metashape, User Manual, "Camera models": cx and cy are relative to the middle of the
     image, the centre of the first pixel is at (0.5, 0.5), and P1 and P2 are OpenCV's p2 and p1.
-
-    Raises:
-        ValueError: a projection or coefficients that OpenCV does not have.
     """
     name = str(fields["projection"]).strip().lower()
     unfit = [key for key in ("k4", "p3", "p4") if fields.get(key) is not None and number(fields, key)]

@@ -144,9 +144,6 @@ def _size(
     Other programs write such records for images of other sizes. Images of another size are those of the
     record if its principal point is less than half as far from their centre as from that of the data set's
     images, in shares of the sides; else they were resized.
-
-    Raises:
-        ValueError: it states none, and the principal point is in the middle of neither.
     """
     if layout.sides:
         return listed_size(record, layout.sides)

@@ -19,12 +19,7 @@ LANE_WIDTHS = (1.0, 10.0)  # m, smallest and largest of a lane
 
 
 def check_segments(segments: LaneSegments, intrinsics: Tensor) -> None:
-    """Raise on shapes that don't fit each other, and on whole numbers.
-
-    Raises:
-        TypeError: no :class:`LaneSegments`, or not of tensors.
-        ValueError: naming the tensor, what was expected and what came.
-    """
+    """Raise on shapes that don't fit each other, and on whole numbers."""
     if not isinstance(segments, LaneSegments):
         raise TypeError(f"segments: expected lanebev.LaneSegments(...), got {type(segments).__qualname__}")
     for name, part in segments._asdict().items():
@@ -46,16 +41,8 @@ def check_segments(segments: LaneSegments, intrinsics: Tensor) -> None:
 def check_state(state: TensorTuple, kind: type[TensorTuple], rows: int) -> Tensor:
     """Check that a state is a NamedTuple of the expected class with so many rows.
 
-    Args:
-        state: state given by the caller.
-        kind: the expected class.
-        rows: B.
-
     Returns:
         its first tensor, (B, D), whose dtype and device are those of the calibrator.
-
-    Raises:
-        ValueError: naming the tensor, what was expected and what came.
     """
     if not isinstance(state, kind):
         raise ValueError(
@@ -76,12 +63,7 @@ def check_state(state: TensorTuple, kind: type[TensorTuple], rows: int) -> Tenso
 
 
 def check_new_state(batch_size: object, dtype: torch.dtype) -> None:
-    """Raise unless a state can have so many rows and this dtype.
-
-    Raises:
-        TypeError: a batch size that is no whole number.
-        ValueError: a negative batch size, or another dtype than float32 and float64.
-    """
+    """Raise unless a state can have so many rows and this dtype."""
     if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]  # sizes are tensors
         return
     if not isinstance(batch_size, (int, torch.SymInt, Integral)) or isinstance(batch_size, bool):
@@ -97,10 +79,6 @@ def clean_segments(segments: LaneSegments, num_boundaries: int) -> LaneSegments:
 
     Non-finite entries, no length, no positive sigma, or a boundary index outside 0..L-1 make a segment
     unusable. The masked entries carry no gradient.
-
-    Args:
-        segments: unchecked segments.
-        num_boundaries: L.
 
     Returns:
         segments of the same shapes, finite throughout.
@@ -171,12 +149,7 @@ def unused_frame(calibration: Calibration, skipped: Tensor) -> Calibration:
 
 
 def as_batch(value: float | Tensor, like: Tensor, name: str = "dt") -> Tensor:
-    """Convert a number or a (B,) tensor to (B,), with the dtype and device of ``like`` (B, ...).
-
-    Raises:
-        TypeError: neither number nor tensor.
-        ValueError: another shape.
-    """
+    """Convert a number or a (B,) tensor to (B,), with the dtype and device of ``like`` (B, ...)."""
     check_number_or_tensor(name, value)
     if isinstance(value, (int, float)):  # a tensor made of a number would be a constant to torch.compile
         return torch.full(like.shape[:1], value, dtype=like.dtype, device=like.device)
@@ -187,12 +160,7 @@ def as_batch(value: float | Tensor, like: Tensor, name: str = "dt") -> Tensor:
 
 
 def as_lane_width(value: float | Tensor, like: Tensor, num_boundaries: int) -> Tensor:
-    """Convert a lane width prior, float, (B,) or (B, L-1), to (B, L-1) m.
-
-    Raises:
-        TypeError: neither number nor tensor.
-        ValueError: another shape, or a number that is no lane's width in metres.
-    """
+    """Convert a lane width prior, float, (B,) or (B, L-1), to (B, L-1) m."""
     check_number_or_tensor("lane_width", value)
     least, most = LANE_WIDTHS
     if isinstance(value, (int, float)) and not least <= value <= most:

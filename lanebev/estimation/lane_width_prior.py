@@ -23,9 +23,6 @@ def check_lane_width_prior(width: float, std: float, names: tuple[str, str]) -> 
         width: m.
         std: m.
         names: what the two are called in the message.
-
-    Raises:
-        ValueError: one is not finite or out of range.
     """
     if not 0.0 <= std <= _MOST_STD:
         raise ValueError(f"{names[1]}: expected 0 to {_MOST_STD:g} m, got {std:g}")

@@ -34,9 +34,6 @@ def quantize_segmenter(path: Path, feeds: Iterable[Feed]) -> None:
     Args:
         path: file of :func:`lanebev.export.write.write_onnx`.
         feeds: inputs for the calibration of the ranges.
-
-    Raises:
-        ValueError: the packages of ONNX are not there.
     """
     try:
         import onnx

@@ -194,11 +194,7 @@ def onnx_calibrator(folder: Path, name: str, calibrator: Calibrator[StateT]) -> 
 
 
 def _part(folder: Path, name: str) -> OnnxPart:
-    """Return the part of this name in a folder.
-
-    Raises:
-        ValueError: its file is missing, or of another part.
-    """
+    """Return the part of this name in a folder."""
     part = OnnxPart(folder / f"{name}.onnx")
     if part.facts["part"] != name:
         raise ValueError(f"{folder / name}.onnx: expected the {name}, got the {part.facts['part']}")

@@ -169,11 +169,7 @@ def _state_inputs(calibrator: Calibrator[Any]) -> Inputs:
 
 
 def exported_calibrator(model: LaneBEV) -> Calibrator[Any]:
-    """Return the model's calibrator, which is one of the package's.
-
-    Raises:
-        TypeError: it is somebody else's module.
-    """
+    """Return the model's calibrator, which is one of the package's."""
     if not isinstance(model.calibrator, Calibrator):
         got = type(model.calibrator).__qualname__
         raise TypeError(f"calibrator: expected a lanebev calibrator to export, got {got}")

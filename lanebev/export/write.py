@@ -39,11 +39,7 @@ def write_program(part: Part, path: Path) -> None:
 
 
 def write_onnx(part: Part, path: Path) -> None:
-    """Write a part as one ONNX file.
-
-    Raises:
-        ValueError: the packages of ONNX are not there.
-    """
+    """Write a part as one ONNX file."""
     try:
         from lanebev.export.operators import translations
     except ImportError as error:

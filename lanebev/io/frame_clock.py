@@ -38,10 +38,6 @@ class FrameClock:
 
         Args:
             stamp: of this frame, s; None assumes the time step of the frame before.
-
-        Raises:
-            TypeError: not a number.
-            ValueError: not finite.
         """
         if stamp is None:
             if self.stamp is None and not self.is_doubted:

@@ -273,11 +273,7 @@ def _opened(source: str) -> av.container.InputContainer:
 
 
 def _opened_pipe(pipe: FileIO, name: str) -> av.container.InputContainer:
-    """Open a pipe when something has come through it.
-
-    Raises:
-        ValueError: it is a terminal, or nothing came.
-    """
+    """Open a pipe when something has come through it."""
     if pipe.isatty():
         raise ValueError(f"stream {name}: expected a pipe, as from ffmpeg, got a terminal")
     try:

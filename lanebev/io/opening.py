@@ -121,9 +121,6 @@ def _typical_image(paths: Sequence[str]) -> NDArray[np.uint8]:
     """Return the first whole image whose size is the most frequent one of the first images.
 
     Where none of these is whole, it is the first whole image of any size.
-
-    Raises:
-        ValueError: none decodes; the error is that of the first.
     """
     sizes = Counter(filter(None, map(stated_size, paths[:_LOOKED_AT])))
     usual = sizes.most_common(1)[0][0] if sizes else None

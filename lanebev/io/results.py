@@ -163,11 +163,7 @@ def read_extrinsics(path: str | Path) -> list[ExtrinsicsRow]:
 
 
 def _read_row(texts: Sequence[str], count: int) -> ExtrinsicsRow:
-    """Return a row of ``extrinsics.csv`` with this number of columns.
-
-    Raises:
-        ValueError: it has another number, or a value is none of its column.
-    """
+    """Return a row of ``extrinsics.csv`` with this number of columns."""
     if len(texts) != count:
         raise ValueError(f"expected {count} values, got {shown(','.join(texts))}; is the file cut?")
     values = []

@@ -88,9 +88,6 @@ def read_speeds(path: str | Path) -> Speeds:
     ``speed`` and, if there is one, ``time``, among others, with another unit than m/s and s in them, such as
     ``speed_kmh`` and ``time_ms``; they may be in a comment, as of ``numpy.savetxt``. A speed that is empty,
     ``nan`` or -1 is not known.
-
-    Raises:
-        ValueError: the file cannot be read, or is no such table.
     """
     try:
         return _speeds_of(_rows(read_text(Path(path))))
@@ -229,11 +226,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _column(titles: list[str], names: Sequence[str], units: Mapping[str, float]) -> tuple[int | None, float]:
-    """Return which column has one of these words in its title, None if there is none, and its unit.
-
-    Raises:
-        ValueError: there are several.
-    """
+    """Return which column has one of these words in its title, None if there is none, and its unit."""
     found = [place for place, title in enumerate(titles) if _names(title, names)]
     if len(found) > 1:
         several = ", ".join(titles[place] for place in found)

@@ -24,10 +24,6 @@ def check_frame(frame: NDArray[np.uint8] | Tensor, image_size: tuple[int, int]) 
 
     Returns:
         (3, H, W).
-
-    Raises:
-        TypeError: neither an array nor a tensor.
-        ValueError: another shape or type of number.
     """
     height, width = image_size
     if isinstance(frame, np.ndarray):
@@ -68,12 +64,7 @@ def _remedy(frame: NDArray[np.generic], image_size: tuple[int, int]) -> str:
 
 
 def check_images(image: Tensor) -> None:
-    """Raise unless these are images (B, 3, H, W), or clips (B, T, 3, H, W), of floating point.
-
-    Raises:
-        TypeError: not a tensor.
-        ValueError: another shape, no pixels, or whole numbers.
-    """
+    """Raise unless these are images (B, 3, H, W), or clips (B, T, 3, H, W), of floating point."""
     check_tensor("image", image)
     if image.ndim not in (4, 5) or image.shape[-3] != 3:
         raise ValueError(f"image: expected (B, 3, H, W) or (B, T, 3, H, W), got {tuple(image.shape)}")

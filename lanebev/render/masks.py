@@ -28,9 +28,6 @@ def boundary_masks(
 
     Returns:
         (B, L, h, w) in [0, 1].
-
-    Raises:
-        ValueError: a half width that is not positive.
     """
     if not half_width_px > 0:
         raise ValueError(f"half_width_px: expected > 0, got {half_width_px}")

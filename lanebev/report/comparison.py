@@ -56,9 +56,6 @@ def common_frames(first: RunFolder, second: RunFolder) -> list[Pair]:
     """Return the rows of the same frames: of images by name, else by number in the source.
 
     The name is the end of the path, as long as it must be to tell the frames of each run apart.
-
-    Raises:
-        ValueError: there are none.
     """
     keys: tuple[Sequence[object], Sequence[object]] | None = _names(first.rows, second.rows)
     if keys is None:
@@ -105,11 +102,7 @@ def differing(first: Mapping[str, str], second: Mapping[str, str]) -> dict[str, 
 
 
 def render_comparison(first: RunFolder, second: RunFolder) -> str:
-    """Return the page that shows two runs side by side.
-
-    Raises:
-        ValueError: they have no frame in common.
-    """
+    """Return the page that shows two runs side by side."""
     pairs = common_frames(first, second)
     stills = bool(pairs[0][0].image) and len({row.time_s for row, _ in pairs}) == 1
     found = differences(pairs)

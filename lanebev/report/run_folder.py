@@ -61,11 +61,7 @@ class RunFolder:
 
 
 def read_run(folder: str | Path) -> RunFolder:
-    """Read a run's folder; ``report.html`` in it may be missing or another program's.
-
-    Raises:
-        ValueError: the folder has no ``extrinsics.csv``, or it is not ours or has no frame.
-    """
+    """Read a run's folder; ``report.html`` in it may be missing or another program's."""
     folder = Path(folder)
     rows = read_extrinsics(folder / "extrinsics.csv")
     if not rows:

@@ -78,12 +78,7 @@ class Verdict:
 
 
 def verdict(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> Verdict:
-    """Return the verdict on a run from the status, reasons and sigmas of its frames.
-
-    Args:
-        rows: one per frame.
-        stills: independent images, so there are no intervals of time.
-    """
+    """Return the verdict on a run from the status, reasons and sigmas of its frames."""
     if not rows:
         return Verdict("poor", "Not calibrated: there was no frame.", "", ())
     tracked = np.array([row.status == "TRACKING" for row in rows])

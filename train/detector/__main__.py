@@ -28,11 +28,7 @@ RANGES = ((5.0, 53.0), (5.0, 20.0), (20.0, 35.0), (35.0, 53.0))
 
 
 def trained(experiment: Experiment, arm: Arm, seed: int, frames: DriveFrames) -> DetectorTraining:
-    """Train an arm, or go on with it from its last checkpoint; "tuned" continues "online".
-
-    Raises:
-        ValueError: "tuned" before "online".
-    """
+    """Train an arm, or go on with it from its last checkpoint; "tuned" continues "online"."""
     L.seed_everything(seed, verbose=False)
     module, steps = DetectorTraining(experiment, arm, seed), int(experiment.steps)
     last = begun_checkpoint(experiment, arm, seed)

@@ -24,11 +24,7 @@ def checkpoint_step(path: Path) -> int:
 
 
 def begun_checkpoint(experiment: Experiment, arm: Arm, seed: int) -> Path | None:
-    """Return the checkpoint that the training of an arm continues: its last, or that of "online"; or None.
-
-    Raises:
-        ValueError: "tuned" before "online".
-    """
+    """Return the checkpoint that the training of an arm continues: its last, or that of "online"; or None."""
     last = experiment.out / f"{arm}-{seed}" / "last.ckpt"
     if last.exists() or arm != "tuned":
         return last if last.exists() else None
@@ -39,11 +35,7 @@ def begun_checkpoint(experiment: Experiment, arm: Arm, seed: int) -> Path | None
 
 
 def trained_arm(experiment: Experiment, arm: Arm, seed: int) -> DetectorTraining:
-    """Load an arm as it was at the end of its training.
-
-    Raises:
-        ValueError: it was not trained.
-    """
+    """Load an arm as it was at the end of its training."""
     last = experiment.out / f"{arm}-{seed}" / "last.ckpt"
     if not last.exists():
         raise ValueError(f"{arm}-{seed}: expected a trained arm, got no {last}; run python -m train.detector")

@@ -171,11 +171,7 @@ def write_drive(path: Path, record: DriveRecord) -> None:
 
 
 def read_drive(path: Path) -> DriveRecord:
-    """Read a drive.
-
-    Raises:
-        ValueError: not a drive.
-    """
+    """Read a drive."""
     own, state = DriveRecord._fields[:-1], JointState._fields
     names = (*own, *(f"state_{name}" for name in state))
     arrays = read_arrays(path, names, "a drive that train.detector.drives wrote")

@@ -20,12 +20,7 @@ from train.detector.targets import detection_loss
 
 
 def pose_gradients(module: DetectorTraining, frames: DriveFrames) -> Tensor:
-    """Compute the gradient (N, 4) of the loss on the poses of the online calibration.
-
-    Args:
-        module: in evaluation mode.
-        frames: N of them, in batches of 8, over whose boxes the loss is the mean.
-    """
+    """Compute the gradient (N, 4) of the loss on the poses of the online calibration."""
     gradients: list[Tensor] = []
     for rows in torch.arange(len(frames)).split(TOGETHER):
         batch = frames.__getitems__(rows.tolist())

@@ -26,11 +26,7 @@ Results = dict[str, list[dict[str, Any]]]
 
 
 def read_results(folder: Path) -> Results:
-    """Read the results of a run by arm.
-
-    Raises:
-        ValueError: there are none.
-    """
+    """Read the results of a run by arm."""
     results = {arm: [json.loads(p.read_text()) for p in sorted(folder.glob(f"{arm}-*.json"))] for arm in ARMS}
     if not any(results.values()):
         raise ValueError(f"{folder}: expected results of train.detector, got none")

@@ -82,11 +82,7 @@ def _not_yaml(error: yaml.YAMLError) -> str:
 
 
 def parsed_settings(given: Mapping[str, object]) -> dict[str, object]:
-    """Parse the names and values of a YAML file to settings, as the command line does.
-
-    Raises:
-        ValueError: an unknown name, or a value that its setting does not allow.
-    """
+    """Parse the names and values of a YAML file to settings, as the command line does."""
     known = {setting.name: setting for setting in fields(RunConfig)}
     values: dict[str, object] = {}
     for key, value in given.items():

@@ -23,11 +23,7 @@ _MOST_CELLS = 4096  # pixels a side of the bird's-eye view, which H.264 encodes
 
 
 def parsed(parse: Callable[[str], object], text: str) -> object:
-    """Return a setting by its text.
-
-    Raises:
-        ValueError: the text is none of it.
-    """
+    """Return a setting by its text."""
     try:
         return parse(text)
     except ValueError as error:
@@ -36,22 +32,14 @@ def parsed(parse: Callable[[str], object], text: str) -> object:
 
 
 def parse_path(text: str) -> str:
-    """Return a path, with the home folder in place of ~, which shells leave in quotes and after =.
-
-    Raises:
-        ValueError: the path is empty.
-    """
+    """Return a path, with the home folder in place of ~, which shells leave in quotes and after =."""
     if not text:
         raise ValueError("expected a path, got an empty string")
     return os.path.expanduser(text)
 
 
 def parse_rate(text: str) -> float:
-    """Return a frame rate of a text such as ``29.97`` or ``30000/1001``.
-
-    Raises:
-        ValueError: the text is neither.
-    """
+    """Return a frame rate of a text such as ``29.97`` or ``30000/1001``."""
     match = re.fullmatch(r"\s*(\d{1,9})\s*/\s*(\d{1,9})\s*", text, re.ASCII)
     try:
         return int(match[1]) / int(match[2]) if match else float(text)
@@ -60,11 +48,7 @@ def parse_rate(text: str) -> float:
 
 
 def parse_grid(text: str) -> tuple[float, float, float, float, float]:
-    """Return (near, far, left, right, resolution) in m from a text such as ``3:60,-10:10/0.05``.
-
-    Raises:
-        ValueError: the text has another form, or the picture would be empty or too large.
-    """
+    """Return (near, far, left, right, resolution) in m from a text such as ``3:60,-10:10/0.05``."""
     number = r"([-+]?\d+(?:\.\d*)?|[-+]?\.\d+)"
     match = re.fullmatch(rf"{number}:{number},{number}:{number}/{number}", text.replace(" ", ""), re.ASCII)
     if match is None:
@@ -73,11 +57,7 @@ def parse_grid(text: str) -> tuple[float, float, float, float, float]:
 
 
 def check_grid(grid: Sequence[float]) -> tuple[float, float, float, float, float]:
-    """Return (near, far, left, right, resolution) in m, unless it is no range of a bird's-eye view.
-
-    Raises:
-        ValueError: not five numbers, or the picture would be empty or too large.
-    """
+    """Return (near, far, left, right, resolution) in m, unless it is no range of a bird's-eye view."""
     if len(grid) != 5 or not all(map(math.isfinite, grid)):
         raise ValueError(f"grid: expected the numbers (near, far, left, right, resolution), got {grid}")
     near, far, left, right, step = map(float, grid)
@@ -95,9 +75,6 @@ def check_types(settings: object) -> None:
     """Raise unless the values of settings have the types of their fields.
 
     Paths become texts, lists tuples, and numbers, of NumPy too, those of Python.
-
-    Raises:
-        TypeError: another type; the message names the setting.
     """
     for each in fields(settings):  # type: ignore[arg-type]  # a dataclass
         kind, value = str(each.type).removesuffix(" | None"), getattr(settings, each.name)

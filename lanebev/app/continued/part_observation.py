@@ -31,9 +31,6 @@ def observe_part(config: RunConfig, path: Path, network: SharedNetwork | None = 
 
     Returns:
         the number of frames.
-
-    Raises:
-        ValueError: see :func:`lanebev.app.run.run`.
     """
     source = make_source(config, may_take_none=True)
     camera = camera_of(config, source)

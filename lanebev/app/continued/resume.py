@@ -17,9 +17,6 @@ def load_states(config: RunConfig, tracker: RunTracker, camera: Camera) -> str |
 
     Returns:
         why they are not those asked for, if they are not: the file is damaged.
-
-    Raises:
-        ValueError: ``resume`` is no earlier run's folder, or of one with another calibrator or camera.
     """
     if config.resume is None:
         return None

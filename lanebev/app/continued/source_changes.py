@@ -25,12 +25,7 @@ def files_of(source: FrameSource) -> Files:
 
 
 def changes_remark(source: FrameSource, before: Files) -> str:
-    """Return how many files of a source came, went or were written again since then; nothing if none did.
-
-    Args:
-        source: the source.
-        before: result of :func:`files_of` when it was opened.
-    """
+    """Return how many files of a source came, went or changed since ``before``; nothing if none did."""
     now = files_of(source)
     counts = {
         "new": len(now.keys() - before.keys()),

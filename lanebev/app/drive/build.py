@@ -46,9 +46,6 @@ def make_camera(
         config: the settings.
         image_size: (height, width) px of the source's images.
         pixel_aspect: width over height of their pixels, of which a camera file's focal lengths know.
-
-    Raises:
-        ValueError: the file is none of a camera.
     """
     if config.fov is not None:
         height, width = image_size
@@ -70,22 +67,14 @@ def make_calibrator(name: str) -> JointCalibrator | TwoStageCalibrator:
 
 
 def make_tracker(config: RunConfig, camera: Camera) -> RunTracker:
-    """Make the tracker with the calibrator, the prior and the standard deviations of the settings.
-
-    Raises:
-        ValueError: ``mount`` is no calibration of a mount.
-    """
+    """Make the tracker with the calibrator, the prior and the standard deviations of the settings."""
     if config.calibrator == "two-stage":
         return _tracker(TwoStageCalibrator(), config, camera)
     return _tracker(JointCalibrator(joint_config(config)), config, camera)
 
 
 def joint_config(config: RunConfig) -> JointConfig:
-    """Return the joint calibrator's configuration, with the prior and the roads of the settings.
-
-    Raises:
-        ValueError: ``mount`` is no calibration of a mount.
-    """
+    """Return the joint calibrator's configuration, with the prior and the roads of the settings."""
     roads = HILLY_ROADS if config.hilly else JointConfig()
     if config.mount is None:
         return roads
@@ -126,9 +115,6 @@ def with_precision(model: LaneBEV, precision: str) -> LaneBEV:
     """Let a model's network compute its convolutions in a number format, one of PRECISIONS, and return it.
 
     For inference only.
-
-    Raises:
-        ValueError: the model's device lacks the format.
     """
     if precision == "float32":
         return model
@@ -193,11 +179,7 @@ def input_files(config: RunConfig, source: FrameSource) -> list[str | Path]:
 
 
 def match_image_size(camera: Camera, source: FrameSource) -> FrameSource:
-    """Return the source with the camera's image size: that of most of its frames, or of some.
-
-    Raises:
-        ValueError: the camera file is for images of another size.
-    """
+    """Return the source with the camera's image size: that of most of its frames, or of some."""
     if camera.image_size == source.image_size:
         return source
     if any(image_size(path) == camera.image_size for path in source.paths[:_LOOKED_AT]):

@@ -96,11 +96,7 @@ def _opened(source: str, topic: str | None, fps: Fraction | None) -> FrameSource
 
 
 def _speeds(config: RunConfig, source: FrameSource) -> Speeds | None:
-    """Return the speeds of the vehicle that the settings give.
-
-    Raises:
-        ValueError: they cannot be read, or are not those of the source's frames.
-    """
+    """Return the speeds of the vehicle that the settings give."""
     if config.speed_topic is not None:
         if not isinstance(source, BagSource):
             raise ValueError(f"speed topic: expected a bag with it, got {config.source}; leave it out")
@@ -145,21 +141,13 @@ def _speeds_remark(speeds: Speeds | None, source: FrameSource) -> str:
 
 
 def source_of_run(source: str, run: RunFolder) -> FrameSource:
-    """Open the source of a finished run again, with its frame rate, topic and the frames that it took.
-
-    Raises:
-        ValueError: nothing there, or nothing that decodes.
-    """
+    """Open the source of a finished run again, with its frame rate, topic and the frames that it took."""
     found = _opened(source, run.topic, rate_as_fraction(run.fps))
     return replace(found, selection=run.selection())
 
 
 def camera_of(config: RunConfig, source: FrameSource) -> Camera:
-    """Make the camera of the settings, or else of the bag that the frames are from.
-
-    Raises:
-        ValueError: the camera file is none, or the bag has no camera.
-    """
+    """Make the camera of the settings, or else of the bag that the frames are from."""
     if config.camera or config.fov is not None or not isinstance(source, BagSource):
         return make_camera(config, source.image_size, source.pixel_aspect)
     if source.lens is None:

@@ -41,11 +41,7 @@ class Cluster:
 
 
 def check_ray() -> None:
-    """Raise unless Ray is installed.
-
-    Raises:
-        ValueError: it is not.
-    """
+    """Raise unless Ray is installed."""
     if find_spec("ray") is None:
         raise ValueError(
             "fleet: expected the library ray, got none; install it with pip install 'lanebev[fleet]'"
@@ -112,11 +108,6 @@ class _Queue:
 
     def end(self, task: Task, outcome: Outcome, is_last: bool) -> Outcome | None:
         """Note what became of a task, and queue it again or the task that follows.
-
-        Args:
-            task: the task.
-            outcome: what became of it.
-            is_last: whether it must not be tried again.
 
         Returns:
             the outcome of the drive, if it has ended.

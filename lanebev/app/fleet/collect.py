@@ -34,10 +34,6 @@ def collect_frames(drives: Sequence[Drive], out: str | Path) -> None:
     """Update the data set: add finished drives, remove all others.
 
     The columns are those of a run's Parquet file, and ``drive``. A file that is newer than the run stays.
-
-    Args:
-        drives: finished drives.
-        out: folder of the fleet.
     """
     check_installed(["parquet"])
     import pyarrow.parquet

@@ -89,9 +89,6 @@ def path_inside(text: str, base: Path, inside: Path) -> str:
         text: relative to ``base``, or absolute.
         base: folder of the manifest.
         inside: folder that it must not leave, links resolved.
-
-    Raises:
-        ValueError: it leaves that folder, also by a link.
     """
     whole = os.path.normpath(base / text)
     try:

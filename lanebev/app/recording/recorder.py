@@ -150,14 +150,7 @@ class Recorder:
         truth: Sequence[ExtrinsicsRow] | None = None,
         mount: MountCalibration | None = None,
     ) -> Report:
-        """Write the tables and the report, after the last frame and outside of ``with``.
-
-        Args:
-            facts: what ran, for the report.
-            title: title of the report.
-            truth: a row per frame, of a rendered drive.
-            mount: mount estimate at the end.
-        """
+        """Write the tables and the report, after the last frame and outside of ``with``."""
         write_extrinsics(self.path("extrinsics.csv"), self.rows)
         if self.smoothed:
             write_extrinsics(self.path("filtered.csv"), self._filtered_rows)

@@ -68,12 +68,7 @@ class StoredNumbers:
         self._file = io.BytesIO() if folder is None else tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
 
     def append(self, values: NDArray[np.float64]) -> None:
-        """Add the array of the next frame.
-
-        Raises:
-            ValueError: it has another shape.
-            OSError: the disk is full.
-        """
+        """Add the array of the next frame."""
         if values.shape != self._shape:
             raise ValueError(f"values: expected shape {self._shape}, got {values.shape}")
         self._file.write(np.ascontiguousarray(values, np.float64).tobytes())

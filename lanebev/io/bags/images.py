@@ -56,9 +56,6 @@ class TopicImages:
         """Return the image of the next message as (H, W, 3) RGB.
 
         Source: Foxglove's ``CompressedVideo``: a packet holds one frame, and none refers to later ones.
-
-        Raises:
-            ValueError: see :func:`message_image`; or a packet without an image, as before a key frame.
         """
         if not is_video(message):
             return message_image(message)
@@ -83,9 +80,6 @@ def message_image(message: Any) -> NDArray[np.uint8]:
 
     Source: ROS's ``sensor_msgs/CompressedImage`` and ``Image`` (``image_encodings.hpp``), Foxglove's
     ``CompressedImage`` and ``RawImage``.
-
-    Raises:
-        ValueError: it does not decode, or is of an encoding that is not known.
     """
     data = np.frombuffer(bytes(message.data), np.uint8)
     if not hasattr(message, "encoding"):

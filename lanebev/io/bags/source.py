@@ -49,11 +49,7 @@ class BagSource(FrameSource):
         return [number for number, time in enumerate(times) if self.selection.takes(number, time)]
 
     def frame_times(self, clock: RisingClock[float] | None = None) -> Iterator[float]:
-        """Yield the times of the frames, s since the first, up to where the bag cannot be read.
-
-        Args:
-            clock: what gives them; None for a new one.
-        """
+        """Yield the times of the frames, s since the first, up to where the bag cannot be read."""
         first, clock = None, clock or RisingClock(float(1 / self.fps))
         with contextlib.suppress(ValueError), open_bag(Path(self.source)) as bag:
             for logged, message in bag.messages(self.topic):
@@ -119,11 +115,7 @@ def _unstamped_remark(clock: RisingClock[float]) -> str:
 
 
 def _first_image(bag: Bag, topic: str) -> NDArray[np.uint8] | None:
-    """Return a topic's first image, of a video the first one from a key frame on; None without images.
-
-    Raises:
-        ValueError: it does not decode.
-    """
+    """Return a topic's first image, of a video the first one from a key frame on; None without images."""
     images = TopicImages()
     for number, (_, message) in enumerate(bag.messages(topic)):
         try:

@@ -17,9 +17,6 @@ def kitti_calib(record: RunRecord) -> str:
     with a row (0 0 0 1). There is no lidar here: the frame's origin is on the road below the camera. All four
     cameras, P0 to P3, are this one, and the rotation of rectification is none. KITTI's images have no lens
     distortion: undistort yours with the same K.
-
-    Raises:
-        ValueError: the run has no camera, or no pose.
     """
     intrinsics = record.lens().intrinsics.double()
     projection = torch.cat([intrinsics, intrinsics.new_zeros(3, 1)], dim=1)

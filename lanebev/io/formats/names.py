@@ -40,11 +40,7 @@ FORMATS = {
 
 
 def parse_formats(text: str) -> tuple[str, ...]:
-    """Return the names of formats in a text such as ``parquet,mcap``, each once.
-
-    Raises:
-        ValueError: another name, or none.
-    """
+    """Return the names of formats in a text such as ``parquet,mcap``, each once."""
     names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
     if not names:
         raise ValueError(f"formats: expected some of {', '.join(FORMATS)}, separated by commas, got {text!r}")
@@ -53,22 +49,14 @@ def parse_formats(text: str) -> tuple[str, ...]:
 
 
 def check_formats(names: Iterable[str]) -> None:
-    """Raise unless these are names of formats.
-
-    Raises:
-        ValueError: one of them is none.
-    """
+    """Raise unless these are names of formats."""
     for name in names:
         if name not in FORMATS:
             raise ValueError(f"formats: expected some of {', '.join(FORMATS)}, got {name!r}")
 
 
 def check_installed(names: Iterable[str]) -> None:
-    """Raise unless all that these formats need is installed.
-
-    Raises:
-        ValueError: a library is missing; the message says what installs it.
-    """
+    """Raise unless all that these formats need is installed."""
     for name in names:
         known = FORMATS[name]
         for module in known.needs:

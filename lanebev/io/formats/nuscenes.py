@@ -16,9 +16,6 @@ def calibrated_sensor(record: RunRecord) -> list[dict[str, Any]]:
     y, z) place the sensor in the ego vehicle's frame (x forward, y left, z up), whose origin is on the
     ground; ``camera_intrinsic`` is K of images without lens distortion. nuScenes' origin is below the
     middle of the rear axle, which lanes do not tell: here it is below the camera.
-
-    Raises:
-        ValueError: the run has no camera, or no pose.
     """
     matrix = vehicle_from_camera(record.standing_pose().extrinsics)[0].double()
     x, y, z, w = quaternion_xyzw(matrix)

@@ -16,9 +16,6 @@ def opencv_poses(record: RunRecord) -> dict[str, Any]:
     (X right, Y down, Z along the lanes, origin on the road below the camera) to the camera's (x right, y
     down, z forward). ``rvecs`` and ``tvecs`` have a row per frame, ``frames`` its number. For the model
     "fisheye" it is ``cv2.fisheye.projectPoints``.
-
-    Raises:
-        ValueError: the run has no camera, or no pose.
     """
     rvecs, tvecs = record.poses().rvec_tvec()
     rvec, tvec = record.standing_pose().extrinsics.rvec_tvec()

@@ -46,9 +46,6 @@ def live_calibration(record: RunRecord) -> dict[str, Any]:
 
     Source: commaai/openpilot, ``cereal/log.capnp``, ``LiveCalibrationData``. openpilot itself holds roll at
     zero.
-
-    Raises:
-        ValueError: the run has no pose.
     """
     standing = record.standing_pose()
     angles = openpilot_angles(standing.extrinsics)[0].tolist()

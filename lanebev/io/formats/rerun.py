@@ -90,9 +90,6 @@ def open_viewer(where: str, camera: Camera) -> RerunLog:
         where: "viewer" for one that is opened, else the address of one that is there, as
             ``rerun+http://127.0.0.1:9876/proxy``.
         camera: the lens.
-
-    Raises:
-        ValueError: the library is not installed, no viewer opens, or the address is none.
     """
     check_installed(["rerun"])
     import rerun

@@ -6,9 +6,5 @@ from lanebev.io.formats.record import RunRecord
 
 
 def write(path: Path, record: RunRecord) -> None:
-    """Write the camera, see :func:`lanebev.camera.files.camera_info`.
-
-    Raises:
-        ValueError: the run has no camera.
-    """
+    """Write the camera, see :func:`lanebev.camera.files.camera_info`."""
     record.lens().to_file(path)

@@ -17,9 +17,6 @@ def static_transform(record: RunRecord) -> dict[str, Any]:
     Source: REP 103 (base frames: x forward, y left, z up; optical frames: x right, y down, z forward), REP
     105 and 120 (``base_footprint`` lies on the ground). The transform takes points of the child, the camera,
     to the parent, which is below the camera here. The quaternion is x, y, z, w.
-
-    Raises:
-        ValueError: the run has no pose.
     """
     matrix = vehicle_from_camera(record.standing_pose().extrinsics)[0].double()
     translation, rotation = matrix[:3, 3].tolist(), quaternion_xyzw(matrix)
@@ -34,11 +31,7 @@ def static_transform(record: RunRecord) -> dict[str, Any]:
 
 
 def launch_file(record: RunRecord) -> str:
-    """Return a file for ``ros2 launch``: ``static_transform_publisher`` of ``tf2_ros`` with the transform.
-
-    Raises:
-        ValueError: the run has no pose.
-    """
+    """Return a file for ``ros2 launch``: ``static_transform_publisher`` of ``tf2_ros`` with the transform."""
     fields = static_transform(record)
     place, turn = fields["transform"]["translation"], fields["transform"]["rotation"]
     numbers = {**place, **{f"q{axis}": value for axis, value in turn.items()}}

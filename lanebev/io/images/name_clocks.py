@@ -57,9 +57,6 @@ def read_clocks(paths: tuple[str, ...]) -> NameClocks | None:
     A time has a date or at least a fraction of a second. Where day and month may be exchanged, they are read
     so that the drive is the shorter one.
 
-    Args:
-        paths: paths of the images.
-
     Returns:
         None if a name has no time, if all have the same, or if they differ in other words.
     """

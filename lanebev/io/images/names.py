@@ -95,9 +95,6 @@ def times_from_names(paths: Sequence[str]) -> tuple[float, ...]:
     They do if each has a time of day with its date, or ends with a time since 1970 of one kind (seconds with
     a fraction, seconds and nanoseconds, or a whole number of milli-, micro- or nanoseconds), and all of them
     rise in steps of half a millisecond to a minute, with a median of at least 4 ms.
-
-    Args:
-        paths: paths of the images, in order.
     """
     clocks = read_clocks(tuple(paths))
     by_clock = clocks.seconds if clocks is not None and clocks.is_one_camera else ()
@@ -106,11 +103,7 @@ def times_from_names(paths: Sequence[str]) -> tuple[float, ...]:
 
 
 def untimed_remark(paths: Sequence[str]) -> tuple[str, str]:
-    """Return why frames have no times from their names, and what to do.
-
-    Args:
-        paths: paths of the images, in order.
-    """
+    """Return why frames have no times from their names, and what to do."""
     clocks = read_clocks(tuple(paths))
     times = clocks.seconds if clocks else ()
     if are_of_a_drive(times):
@@ -174,9 +167,6 @@ def drives_remark(paths: Sequence[str]) -> str:
 
     Files of the same numbers in one folder are those of several cameras, or images and masks. Files of the
     same names in several folders are those of several drives.
-
-    Args:
-        paths: paths of the images.
     """
     numbers: dict[tuple[str, tuple[str, ...]], list[str]] = defaultdict(list)
     folders: dict[str, list[str]] = defaultdict(list)
@@ -205,9 +195,6 @@ def jump_remark(paths: Sequence[str]) -> str:
 
     A number jumps where images are missing, and where a counter began again at 0: later images come first. Of
     numbers that are times, such as milliseconds, steps differ a little.
-
-    Args:
-        paths: paths of the images, in order.
     """
     clocks = read_clocks(tuple(paths))
     times = clocks.seconds if clocks else _times_since_1970(paths)

@@ -111,11 +111,7 @@ def is_damaged_jpeg(data: bytes) -> bool:
 
 
 def _check_single(image: Image.Image) -> None:
-    """Raise if a file is an animation or has pages, all of one size; those of a camera file are previews.
-
-    Raises:
-        OSError: it is, with the number of pictures.
-    """
+    """Raise OSError if a file is an animation or has pages of one size; a camera file has previews."""
     count = getattr(image, "n_frames", 1)
     if count == 1 or image.format not in ("PNG", "TIFF", "WEBP"):
         return
@@ -140,11 +136,7 @@ def _upright(image: Image.Image) -> Image.Image:
 
 
 def _eight_bit(image: Image.Image) -> Image.Image:
-    """Convert 16-bit grey by its own scale; ``convert`` would clip it at 255.
-
-    Raises:
-        OSError: floating-point pixels, whose scale is unknown.
-    """
+    """Convert 16-bit grey by its own scale; ``convert`` would clip it at 255."""
     if image.mode == "F":
         raise OSError("floating point, expected 8 or 16 bits")
     if not image.mode.startswith("I"):

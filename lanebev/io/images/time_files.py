@@ -29,9 +29,6 @@ def times_from_file(paths: Sequence[str]) -> tuple[tuple[float, ...], str]:
     a time of day, or a number: seconds, or milli-, micro- or nanoseconds since 1970. Before the number may be
     the image's; of several columns a first line says which has the times.
 
-    Args:
-        paths: paths of the images, in order.
-
     Returns:
         the times, or none, and in words why a file that is there is not used.
     """
@@ -68,11 +65,7 @@ def _file_of(folder: Path) -> Path | None:
 
 
 def _stamps(text: str) -> list[str]:
-    """Return the time of each line as a number, s; a first line of words and comments after # have none.
-
-    Raises:
-        ValueError: what a line has instead.
-    """
+    """Return the time of each line as a number, s; a first line of words and comments after # have none."""
     rows = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     wholes = [line.strip().split(",")[0] for line in rows if _DECIMAL_COMMA.fullmatch(line.strip())]
     if len(wholes) == len(rows) > len({*wholes}):  # as numbers of images they would differ

@@ -47,11 +47,7 @@ Pictures = Callable[[Path, dict[str, Any]], Iterator[_Picture]]
 
 
 def read_annotations(path: Path, pictures: Pictures) -> list[FrameLines]:
-    """Read the lines that were drawn in a tool; other shapes are left out.
-
-    Raises:
-        ValueError: the pictures have shapes and none is a line.
-    """
+    """Read the lines that were drawn in a tool; other shapes are left out."""
     found: list[_Picture] = []
     for line, value in json_values(path, lane_text(path)):
         with Where(path, line):
@@ -61,11 +57,7 @@ def read_annotations(path: Path, pictures: Pictures) -> list[FrameLines]:
 
 
 def read_cvat(path: Path) -> list[FrameLines]:
-    """Read the polylines of the images in a file of "CVAT for images"; other shapes are left out.
-
-    Raises:
-        ValueError: it has no image, as that of "CVAT for video", or it has shapes and none is a polyline.
-    """
+    """Read the polylines of the images in a file of "CVAT for images"; other shapes are left out."""
     with Where(path, None):
         try:
             images = ET.fromstring(lane_text(path)).findall("image")

@@ -16,9 +16,6 @@ logger = logging.getLogger(__name__)
 class LaneDoubts:
     """Notices polylines in pixels of other images, or of unequal lanes; logs it once, as long as it lasts.
 
-    Args:
-        camera: the lens.
-
     Attributes:
         doubt: the doubt about the last frames that were judged, in words; empty if there is none.
     """

@@ -153,11 +153,7 @@ def match_frames(names: Sequence[str], frames: Sequence[FrameLines]) -> list[int
 
 
 def _best_entries(names: Sequence[str], frames: Sequence[FrameLines]) -> list[_Match | None]:
-    """Return for each image the entry that shares the longest end of the path with it.
-
-    Raises:
-        ValueError: two entries match an image equally well.
-    """
+    """Return for each image the entry that shares the longest end of the path with it."""
     by_tail: dict[tuple[str, ...], list[int]] = defaultdict(list)
     for entry, frame in enumerate(frames):
         parts = _parts(frame.name)

@@ -171,9 +171,6 @@ def is_probable(name: str, probability: Any) -> bool:
     Args:
         name: of the line, for messages.
         probability: number, or those of several classes, of which the largest counts; None if there is none.
-
-    Raises:
-        ValueError: it is no number.
     """
     given = probability if isinstance(probability, list) else [probability]
     return probability in (None, []) or max(finite_numbers(f"{name}: probability", given)) >= _PROBABLE

@@ -23,9 +23,6 @@ def check_boundary_order(frames: Sequence[FrameLines]) -> None:
     """Raise if the boundary numbers fall from left to right in most pairs of neighbours.
 
     Two neighbours of a frame that states the numbers are compared on the lowest row that both reach.
-
-    Raises:
-        ValueError: they fall.
     """
     rising = [rises for frame in frames for rises in _rising(frame)]
     if 2 * sum(rising) < len(rising):
@@ -76,11 +73,7 @@ def _upwards(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def repeats_remark(frames: Sequence[FrameLines]) -> str:
-    """Return how many frames have the lines of the frame before, if these are many but not all; else nothing.
-
-    Args:
-        frames: lanes of a drive, in order.
-    """
+    """Return how many frames of a drive have the lines of the frame before, if many but not all have."""
     pairs = [(before, frame) for before, frame in pairwise(frames) if frame.lines]
     repeated = sum(_have_the_same_lines(*pair) for pair in pairs)
     if not _MOST_REPEATED * len(pairs) < repeated < len(pairs):
@@ -114,10 +107,6 @@ def unequal_lanes_remark(frames: Sequence[FrameLines], camera: Camera) -> str:
 
     Two lanes of any widths look like equal ones to a camera with a certain roll, so that the pose does not
     tell.
-
-    Args:
-        frames: lanes of a drive.
-        camera: the lens.
     """
     looked_at = frames[:: max(1, len(frames) // _LOOKED_AT)]
     rolls = [0.0, *(math.radians(sign * roll) for roll in range(1, _MOST_ROLL + 1) for sign in (-1, 1))]

@@ -76,9 +76,6 @@ def lanes_of_whole_images(
         size: (height, width) px of that; None is the size of the part.
         crop: (top, left, height, width) px of the part; None is all of the images.
         image_size: (height, width) px of the whole images.
-
-    Raises:
-        ValueError: the part is empty or reaches beyond the images.
     """
     top, left, height, width = crop or (0, 0, *image_size)
     inside = top >= 0 and left >= 0 and top + height <= image_size[0] and left + width <= image_size[1]
@@ -111,9 +108,6 @@ def size_remark(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> st
     Args:
         frames: frames of one drive.
         image_size: (height, width) px of its images.
-
-    Raises:
-        ValueError: lanes lie outside the images, so that they are in pixels of larger ones.
     """
     doubt = size_doubt(frames, image_size)
     if doubt is None:

@@ -29,9 +29,6 @@ def check_inputs_stay(folder: str | Path, inputs: Iterable[str | Path]) -> None:
     Args:
         folder: output folder.
         inputs: files that the run reads, its state to resume with left out: that one is meant to be renewed.
-
-    Raises:
-        ValueError: an input is one of the files that a run replaces or removes in this folder.
     """
     outputs = {Path(os.path.realpath(folder)) / name for name in OUTPUT_NAMES}
     for path in map(Path, inputs):
@@ -49,9 +46,6 @@ def check_result(path: str | Path, runs: Iterable[str | Path], inputs: Iterable[
         path: path of the file.
         runs: output folders of runs, whose own outputs stay; those in other formats are meant to be renewed.
         inputs: other files that it reads.
-
-    Raises:
-        ValueError: it would.
     """
     kept = {Path(os.path.realpath(run)) / name for run in runs for name in _OWN_NAMES}
     kept |= {Path(os.path.realpath(each)) for each in inputs}

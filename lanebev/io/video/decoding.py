@@ -45,11 +45,7 @@ _ONE_THREAD = ("h264", "hevc", "vp9")
 
 
 def open_video(source: str) -> av.container.InputContainer:
-    """Open a container that has a video stream.
-
-    Raises:
-        ValueError: it does not open, or there is none.
-    """
+    """Open a container that has a video stream."""
     try:
         # abspath: else what precedes a colon is taken for a protocol; titles may be in any encoding
         container = av.open(os.path.abspath(source), metadata_errors="replace")
@@ -281,9 +277,6 @@ def rgb(frame: av.VideoFrame | str, matrix: Sequence[int] | None) -> NDArray[np.
     Args:
         frame: decoded, or what is wrong with a lost one.
         matrix: matrix of the stream, see :func:`display_matrix`.
-
-    Raises:
-        ValueError: it is a lost one.
     """
     if isinstance(frame, str):
         raise ValueError(f"expected a whole frame, got: {frame}")

@@ -42,9 +42,6 @@ def open_at(source: str, start: float) -> Iterator[StartedVideo]:
     Args:
         source: its path.
         start: s since its first frame.
-
-    Raises:
-        ValueError: see :func:`lanebev.io.video.decoding.open_video`.
     """
     if start > 0:
         with open_video(source) as container:

@@ -54,24 +54,12 @@ class Painted(NamedTuple):
 
 
 def prepare(scene: Scene, size: tuple[int, int]) -> Prepared:
-    """Compute what does not go by pixels, for scenes of which parts are painted together.
-
-    Args:
-        scene: B of them.
-        size: image (height, width).
-    """
+    """Compute what does not go by pixels, for scenes of which parts are painted together."""
     return Prepared(coarse_plane(scene.lens, size), hexahedra(scene.objects, scene.lens, size))
 
 
 def paint_view(scene: Scene, prepared: Prepared, size: tuple[int, int], features: Features) -> Painted:
-    """Render scenes to linear radiance.
-
-    Args:
-        scene: B of them.
-        prepared: see :func:`prepare`.
-        size: image (height, width).
-        features: what the scenes have.
-    """
+    """Render scenes to linear radiance."""
     view = pixel_rays(scene.lens, prepared.plane, size)
     canvas = empty_canvas(view.ray_y.numel(), view.ray_y.device)
     lowest = lowest_slopes(scene.alignment, scene.lens.extrinsics.height)[:, -1:]

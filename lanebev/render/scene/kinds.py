@@ -41,9 +41,6 @@ def sample_kinds(sampler: BatchSampler, kind: str) -> Kinds:
         sampler: the randomness.
         kind: one of ``KINDS``: "any" is mostly plain highways, "varied" never draws on purpose a plain one,
             any other name is that kind alone.
-
-    Raises:
-        ValueError: an unknown kind.
     """
     if kind not in KINDS:
         raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")

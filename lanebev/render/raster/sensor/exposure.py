@@ -48,10 +48,6 @@ def tone_curve(value: Tensor, contrast: Tensor) -> Tensor:
 
     A soft shoulder above 0.6, a power of 1 / 2.2, and an S-shaped curve through 0, 0.45 and 1 whose slope in
     the middle is the contrast.
-
-    Args:
-        value: linear.
-        contrast: broadcasts.
     """
     over = (value - _SHOULDER).clamp(min=0)
     value = value.clamp(1e-4, _SHOULDER) + 0.4 * (1 - torch.exp(-over / 0.4))
