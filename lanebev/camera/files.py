@@ -46,6 +46,15 @@ _BY_KEY = {
     "projection": metashape,
 }
 _OF_OTHERS = re.compile(r"width|\bf_?x\b|matrix", re.IGNORECASE)  # in texts other than KITTI's
+_POLYNOMIAL = (
+    "expected the model pinhole, fisheye or omni, got Scaramuzza's polynomial; calibrate it as a fisheye of "
+    "OpenCV or Kalibr, or undistort the images and give the camera of those"
+)
+_NOT_READ = {  # by words of the file
+    **dict.fromkeys(("MappingCoefficients", "poly_parameters", "DIRECT mapping function"), _POLYNOMIAL),
+    "focal_length_x_px_": "expected one camera, got several of Argoverse 1; write one as {fx: ..., fy: ..., "
+    "cx: ..., cy: ..., width: ..., height: ..., distortion: [k1, k2, 0, 0, k3]}",
+}
 _OF_OPEN3D = {"intrinsic_matrix", "width", "height"}
 _OF_INI = (
     "it states four coefficients and no lens model; they are taken as k1 k2 k3 k4 of a fisheye, as ROS "
@@ -101,6 +110,8 @@ def read_camera(
     except ValueError as error:
         raise ValueError(f"camera file {path}: expected a readable camera file, got: {error}") from error
     try:
+        if said := next((said for word, said in _NOT_READ.items() if word in text), ""):
+            raise ValueError(said)
         if is_colmap(text):
             camera = checked(chosen(colmap_cameras(text), name, has_usual=False))
         elif is_kitti(text) or (kind == ".txt" and not bare and not _OF_OTHERS.search(text)):

@@ -24,6 +24,7 @@ _NO_BREAK_SPACE = "\u00a0"  # of texts copied from web pages
 _ROS_INI = re.compile(r"^\[image\]\s*$", re.MULTILINE)
 _SECTION = re.compile(r"^\[[A-Za-z]\w*\]\s*$", re.MULTILINE)  # of other programs' INI, and of TOML
 _OF_FISHEYE = 4  # coefficients
+_OF_FORMER_ROS = (5, 8)  # coefficients that its calibrator stated, and those that it wrote
 _AROUND_NUMBERS = re.compile(r"#.*|[\s,;\[\]()]+")
 _MOST_BARE = 1_000  # characters of a text of numbers alone
 _INI_KEYS = {
@@ -315,6 +316,8 @@ def _opencv_data(name: str, value: Mapping[str, Any], count: int | None) -> tupl
     shape = as_list.get("sizes") or [entry for key in ("rows", "cols") for entry in _flat(as_list.get(key))]
     sizes = finite_numbers(f"{name}.rows and .cols", _sequence(name, shape))
     data = _sequence(name, as_list.get("data") or [])
+    if (math.prod(sizes), len(data)) == _OF_FORMER_ROS:
+        count = len(data)
     return data, count or (round(min(math.prod(sizes), 1e6)) if sizes else len(data))
 
 

@@ -629,6 +629,36 @@ def test_binary_files_say_how_to_write_them_as_texts(tmp_path, name, data, words
 
 
 @pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        (
+            "fisheye.json",
+            '{"MappingCoefficients": [875, -3e-4, 1e-7, 0], "ImageSize": [720, 1280]}',
+            "polynom",
+        ),
+        (
+            "c.yaml",
+            "model_type: scaramuzza\nimage_width: 1280\npoly_parameters:\n   p0: -300\n",
+            "polynomial",
+        ),
+        (
+            "calib_results.txt",
+            "#polynomial coefficients for the DIRECT mapping function\n5 -290 0\n",
+            "polynom",
+        ),
+        (
+            "argoverse.json",
+            '{"camera_data_": [{"value": {"focal_length_x_px_": 1392}}]}',
+            "got several of Argoverse 1; .*k3",
+        ),
+    ],
+)
+def test_what_is_not_read_says_what_to_do(tmp_path, name, text, words):
+    with pytest.raises(ValueError, match=f"{name}: expected .*{words}"):
+        _read(tmp_path / name, text)
+
+
+@pytest.mark.parametrize(
     ("name", "text"),
     [
         ("K.txt", "# camera matrix\n6.33e+02 0.0 4.08e+02\r\n0 633 245\r\n0 0 1\r\n"),
