@@ -27,7 +27,7 @@ from lanebev.io.lanes.parsing import FrameLines
 from lanebev.io.state import lane_width_remark, load_state, save_state
 from lanebev.numbers import check_number
 from lanebev.observation.boundary_vertices import BoundaryVertices
-from lanebev.observation.frames import check_frame, network_image
+from lanebev.observation.frames import check_frame, image_bytes, network_image
 from lanebev.observation.polylines import LINE_SIGMA, lines_from_polylines, vertices_from_lines
 from lanebev.pipeline import LaneBEV
 from lanebev.tensors import map_tensors, usable_device
@@ -179,7 +179,7 @@ class Session:
         bev, valid = None, None
         if self.grid is not None and pixels is not None:
             bev, valid = remap_frame(
-                _as_bytes(pixels), self.camera, calibration.extrinsics, self.grid, vertical_curvature
+                image_bytes(pixels), self.camera, calibration.extrinsics, self.grid, vertical_curvature
             )
             bev = bev if self.colours == "rgb" else np.ascontiguousarray(bev[..., ::-1])
         std = calibration.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
@@ -298,9 +298,3 @@ def _calibrator_of(model: LaneBEV) -> Calibrator[Any]:
         got = type(own).__qualname__
         raise TypeError(f"model: expected one with a lanebev.Calibrator, got {got}; give one as calibrator=")
     return deepcopy(own).cpu()
-
-
-def _as_bytes(image: Tensor) -> NDArray[np.uint8]:
-    """Return an image (3, H, W), bytes or in [0, 1], as (H, W, 3) bytes."""
-    pixels = image if image.dtype == torch.uint8 else (255 * image).round().clamp(0, 255).byte()
-    return pixels.permute(1, 2, 0).contiguous().cpu().numpy()

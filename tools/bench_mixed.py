@@ -21,7 +21,7 @@ from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.testing.moments import CAMERA, PLACES, WIDTH, Change, Moment, drift, observe
-from lanebev.testing.motions import Motion, Pose, moved, sinusoids, suspension
+from lanebev.testing.motions import Motion, Pose, moved, share_done, sinusoids, suspension
 from lanebev.types import Status
 from train.commands import command_parser, one_line_errors
 
@@ -190,7 +190,7 @@ def _lane_change(random: Random, speed: float) -> Change:
     start, side = random.uniform(1.5, 5.0), random.choice((-1, 1))
 
     def change(t: float, moment: Moment) -> Moment:
-        done = min(max((t - start) / _CHANGE, 0.0), 1.0)
+        done = share_done(t, start, _CHANGE)
         aside = side * WIDTH * (done - math.sin(2 * math.pi * done) / (2 * math.pi))
         crossed = side if abs(aside) > WIDTH / 2 else 0
         places = PLACES + (moment.places - PLACES).roll(-crossed)
@@ -206,7 +206,7 @@ def _knock(random: Random, speed: float) -> Change:
     jump = (pitch, yaw, roll, random.uniform(-0.2, 0.2))
 
     def change(t: float, moment: Moment) -> Moment:
-        share = min(max((t - start) / _KNOCK, 0.0), 1.0)
+        share = share_done(t, start, _KNOCK)
         tag = "knock" if start <= t < start + _KNOCK + SETTLING else moment.tag
         return replace(moment, pose=moved(moment.pose, jump, share), tag=tag)
 

@@ -23,6 +23,7 @@ from lanebev.app.config import PRECISIONS, RunConfig
 from lanebev.app.drive.build import with_precision
 from lanebev.app.run import run
 from lanebev.io.video.writer import VideoWriter
+from lanebev.observation.frames import image_bytes
 from lanebev.pipeline import LaneBEV
 from lanebev.render import Drive
 from lanebev.weights import load_segmenter
@@ -34,8 +35,7 @@ SIZE, FPS, RENDERED = (720, 1280), 20, 8
 def write_video(folder: Path, frames: int) -> tuple[str, str]:
     """Write a drive of so many frames (a few rendered ones, forth and back) and its camera."""
     drive = Drive(3, SIZE, RENDERED, float(FPS))
-    images = [drive.frame(k).image[0] for k in range(min(RENDERED, frames))]
-    pictures = [(255 * image).round().byte().permute(1, 2, 0).contiguous().numpy() for image in images]
+    pictures = [image_bytes(drive.frame(k).image[0]) for k in range(min(RENDERED, frames))]
     order = [k if k < len(pictures) else 2 * len(pictures) - 1 - k for k in range(2 * len(pictures))]
     video, camera = folder / "drive.mp4", folder / "camera.yaml"
     with VideoWriter(video, Fraction(FPS)) as writer:

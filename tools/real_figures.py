@@ -19,6 +19,7 @@ from lanebev.observation.segments import camera_segments, segments_from_lines
 from lanebev.report.lane_curves import lane_curves
 from lanebev.report.measure import measure_boundaries, select_inliers, spread
 from lanebev.report.plots import width_deviation
+from lanebev.tensors import join_tensors
 
 TUSIMPLE_FOCAL = 1000.0  # px, assumed: the camera is not published
 UDACITY_LANE_WIDTH, CARLA_LANE_WIDTH, TUSIMPLE_LANE_WIDTH = 3.66, 3.5, 3.7
@@ -119,7 +120,7 @@ def tusimple_pixels(data: Path, model: Any, calibrators: dict[str, Any]) -> Iter
     yield Figure(part, "accuracy", "-", accuracy, 0.92, least=True)
     yield Figure(part, "false positives", "-", false_positive, 0.25)
     yield Figure(part, "false negatives", "-", false_negative, 0.15)
-    segments = LaneSegments(*(torch.cat(parts) for parts in zip(*seen, strict=True)))
+    segments = join_tensors(torch.cat, seen)
     intrinsics = camera.intrinsics.expand(len(images), 3, 3)
     for name, calibrator in calibrators.items():
         pose = calibrate_still(calibrator, segments, intrinsics, TUSIMPLE_LANE_WIDTH).extrinsics.stack()
@@ -161,7 +162,7 @@ def carla_stills(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterabl
     camera = Camera.from_file(data / "carla" / "camera.yaml")
     names = [name for name in truth if name.endswith(".png")]
     seen = still_segments([str(data / "carla" / name) for name in names], model, camera)
-    segments = LaneSegments(*(torch.cat(parts) for parts in zip(*seen, strict=True)))
+    segments = join_tensors(torch.cat, seen)
     intrinsics = camera.intrinsics.expand(len(names), 3, 3)
     expected = torch.stack([truth[name] for name in names])
     for name, calibrator in calibrators.items():

@@ -13,6 +13,7 @@ from jsonargparse.typing import PositiveInt
 from numpy.typing import NDArray
 
 from lanebev.geometry.lens import distort_points
+from lanebev.observation.frames import image_bytes
 from lanebev.render import RenderedFrame, render_views
 from lanebev.render.scene.kinds import KINDS
 from train.commands import command_parser, one_line_errors
@@ -63,8 +64,7 @@ def main() -> None:
     start = time.perf_counter()
     while len(pictures) < wanted:
         frame = render_views(min(args.batch, wanted - len(pictures)), size, generator, kind=args.kind)
-        for row, image in enumerate(frame.image):
-            picture = np.ascontiguousarray((image.permute(1, 2, 0) * 255).round().byte().numpy())
+        for row, picture in enumerate(image_bytes(frame.image)):
             if args.truth:
                 draw_truth(picture, frame, row)
             pictures.append(picture)

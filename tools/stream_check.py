@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 
 from lanebev.io.results import read_extrinsics
 from lanebev.numbers import parse_size
+from lanebev.observation.frames import image_bytes
 from train.commands import command_parser
 
 _BOUNDARY = "frame"
@@ -188,8 +189,7 @@ def watch(seconds: float, fps: float, size: tuple[int, int]) -> StreamFigures:
     from lanebev.render import Drive
 
     drive = Drive(10, size, 60, fps)
-    pictures = (drive.frame(number).image[0] for number in range(len(drive)))
-    images = [(255 * each.permute(1, 2, 0)).round().byte().contiguous().numpy() for each in pictures]
+    images = [image_bytes(drive.frame(number).image[0]) for number in range(len(drive))]
     with tempfile.TemporaryDirectory() as temporary, MjpegServer(images, fps) as server:
         folder = Path(temporary)
         drive.camera.to_file(folder / "camera.yaml")

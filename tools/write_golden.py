@@ -21,6 +21,7 @@ from PIL import Image
 
 import lanebev
 from lanebev.cli import main as command
+from lanebev.observation.frames import image_bytes
 from lanebev.render import Drive
 from train.commands import command_parser, one_line_errors
 
@@ -80,8 +81,7 @@ def write_inputs() -> None:
         fields = {"raw_file": f"frames/{number:06d}.png", "h_samples": rows.astype(int).tolist()}
         lines.append(json.dumps(fields | {"lanes": [*found.values()], "boundary": [*found]}))
     (FOLDER / "lanes.json").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    picture = (255 * drive.frame(0).image[0].permute(1, 2, 0)).round().byte().numpy()
-    Image.fromarray(picture).save(FOLDER / "frame.png", optimize=True)
+    Image.fromarray(image_bytes(drive.frame(0).image[0])).save(FOLDER / "frame.png", optimize=True)
 
 
 @one_line_errors()

@@ -8,7 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from lanebev.io.output.whole_file import whole_file
 
@@ -28,14 +27,6 @@ def read_arrays(path: Path, names: Sequence[str], kind: str) -> list[NDArray[Any
             return [file[name] for name in names]
     except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path}: expected {kind} with {', '.join(names)}, got: {error}") from error
-
-
-def as_bytes(images: Tensor) -> NDArray[np.uint8]:
-    """Convert images (..., 3, H, W) in [0, 1] to (..., H, W, 3) bytes."""
-    array: NDArray[np.uint8] = (
-        (images * 255).round().clamp(0, 255).byte().movedim(-3, -1).contiguous().numpy()
-    )
-    return array
 
 
 def encode_jpegs(images: Iterable[NDArray[np.uint8]]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:

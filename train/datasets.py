@@ -108,7 +108,7 @@ def _culane_entry(root: Path, line: str) -> Entry:
     return Entry(image, read_culane(image.with_suffix(".lines.txt")))
 
 
-def labelled_image(entry: Entry, num_boundaries: int = NUM_BOUNDARIES) -> LabelledImage:
+def labelled_image(entry: Entry) -> LabelledImage:
     """Decode an image and give its lines their boundary; lines beyond the outermost are left out.
 
     Boundaries are those that the file states, as in a ``lanes.json`` of our own, else by their order.
@@ -118,11 +118,11 @@ def labelled_image(entry: Entry, num_boundaries: int = NUM_BOUNDARIES) -> Labell
     drawn = [line.points[np.isfinite(line.points).all(-1)] for line in lines]
     drawn = [points[np.argsort(-points[:, 1])] for points in drawn]  # near to far
     count = max([len(points) for points in drawn] + [2])
-    points = np.full((num_boundaries, count, 2), np.nan, np.float32)
+    points = np.full((NUM_BOUNDARIES, count, 2), np.nan, np.float32)
     told = all(line.boundary is not None for line in lines)
-    indices = [line.boundary for line in lines] if told else boundary_indices(drawn, num_boundaries)
+    indices = [line.boundary for line in lines] if told else boundary_indices(drawn, NUM_BOUNDARIES)
     for line, index in zip(drawn, indices, strict=True):
-        if index is not None and index < num_boundaries:
+        if index is not None and index < NUM_BOUNDARIES:
             points[index, : len(line)] = line
     there = np.asarray(np.isfinite(points).all(-1))
     return LabelledImage(image, points, there, there, np.full(2, np.nan, np.float32))

@@ -17,6 +17,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from lanebev import FarView
 from lanebev.observation.far_view import view_sizes
 from lanebev.render import WindowConfig
+from lanebev.tensors import join_tensors
 from train.budget import Stage, stage_at, used_share
 from train.data import Batch, Seed, run_position
 from train.labels import ViewConfig
@@ -88,7 +89,7 @@ class LiveBatches(IterableDataset[Batch]):
                     blocks = {each: blocks.get(each) or self._render(each, ahead) for each in needed}
                     parts = [blocks[each // self.together].part(each % self.together) for each in wanted]
                     same = [part for part in parts if part.image.shape == parts[-1].image.shape]
-                    views = Views(*(torch.cat(field) for field in zip(*same, strict=True)))
+                    views = join_tensors(torch.cat, same)
                 with self.watch.time("labelling"):
                     rng = np.random.default_rng((*self.seed, number))
                     which = torch.from_numpy(rng.random(len(views.image)) < self.view.flip)

@@ -156,7 +156,7 @@ class Segmentation(L.LightningModule):
 
     def validation_step(self, batch: Batch | ScoredBatch, batch_idx: int) -> None:
         """Compute the loss, and the recall of each boundary's points."""
-        image, target, weight = unpack(batch.views if isinstance(batch, ScoredBatch) else batch)
+        image, target, weight = unpack(batch)
         logits = self(image)
         self.log("val/loss", boundary_cross_entropy(logits, target, weight), batch_size=len(image))
         found, there = point_recall(logits.softmax(1)[:, 1:], target[:, 1:])
@@ -186,8 +186,7 @@ class Segmentation(L.LightningModule):
 
     def test_step(self, batch: Batch | ScoredBatch, batch_idx: int) -> None:
         """Compute the loss, the intersection over union of each boundary, and scores."""
-        views = batch.views if isinstance(batch, ScoredBatch) else batch
-        image, target, weight = unpack(views)
+        image, target, weight = unpack(batch)
         logits = self(image)
         self.log("test/loss", boundary_cross_entropy(logits, target, weight), batch_size=len(image))
         self.iou.update(logits.argmax(1), torch.where(weight > 0, target.argmax(1), _NOT_LABELLED))
@@ -203,7 +202,7 @@ class Segmentation(L.LightningModule):
 
     def predict_step(self, batch: Batch | ScoredBatch, batch_idx: int) -> Tensor:
         """Return probabilities, (B, 1+L, h, w)."""
-        return self(unpack(batch.views if isinstance(batch, ScoredBatch) else batch)[0]).softmax(1)  # type: ignore[no-any-return]
+        return self(unpack(batch)[0]).softmax(1)  # type: ignore[no-any-return]
 
     def configure_optimizers(self) -> Any:
         """Return the optimizer with a learning rate that warms up, stays and decays."""
@@ -243,8 +242,9 @@ _SETTINGS = (
 )  # fmt: skip
 
 
-def unpack(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+def unpack(batch: Batch | ScoredBatch) -> tuple[Tensor, Tensor, Tensor]:
     """Return image in [0, 1], target (B, 1+L, h, w) with its background, weight (B, h, w)."""
-    target = batch.target.float() / 255
+    views = batch.views if isinstance(batch, ScoredBatch) else batch
+    target = views.target.float() / 255
     background = (1 - target.sum(1, keepdim=True)).clamp(min=0)
-    return batch.image.float() / 255, torch.cat([background, target], dim=1), batch.weight.float()
+    return views.image.float() / 255, torch.cat([background, target], dim=1), views.weight.float()

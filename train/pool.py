@@ -15,8 +15,9 @@ import torch
 from jsonargparse.typing import PositiveInt
 
 from lanebev.geometry.vanishing_point import vanishing_point
+from lanebev.observation.frames import image_bytes
 from lanebev.render import RenderedFrame, render_views
-from train.archives import as_bytes, decode_jpeg, encode_jpegs, read_arrays, write_arrays
+from train.archives import decode_jpeg, encode_jpegs, read_arrays, write_arrays
 from train.commands import command_parser, one_line_errors
 from train.labels import LabelledImage
 from train.maps import boundaries_as_taken
@@ -81,7 +82,7 @@ def labelled_images(frame: RenderedFrame) -> Iterator[LabelledImage]:
     """Return the rows of a rendered batch, with boundaries as the lens shows them."""
     pitch, yaw, _, _ = frame.extrinsics
     vanishing = vanishing_point(pitch, yaw, frame.intrinsics, frame.distortion)
-    points, images = boundaries_as_taken(frame), as_bytes(frame.image)
+    points, images = boundaries_as_taken(frame), image_bytes(frame.image)
     for row, image in enumerate(images):
         yield LabelledImage(
             image,

@@ -28,6 +28,7 @@ from train.rendering import labelled, rendered
 
 _HIDDEN = (255.0, 255.0, 255.0)
 _OPACITY = 0.7
+_COLUMNS, _SHOWN_WIDTH = 4, 400  # pictures in a row of the sheet, and px of each
 
 
 def labelled_view(batch: Batch) -> Tensor:
@@ -43,20 +44,13 @@ def labelled_view(batch: Batch) -> Tensor:
     return ((1 - covered) * batch.image.float() + _OPACITY * paint).clamp(0, 255).byte()
 
 
-def save_sheet(images: Tensor, path: Path, columns: int = 4, width: int = 400) -> None:
-    """Save images (B, 3, H, W) uint8 side by side, each ``width`` px wide.
-
-    Args:
-        images: images, all of one size.
-        path: path of the PNG.
-        columns: columns of the sheet.
-        width: px.
-    """
-    height = round(width * images.shape[-2] / images.shape[-1])
-    small = F.interpolate(images.float(), size=(height, width), mode="bilinear", antialias=True)
-    small = F.pad(small, (0, 0, 0, 0, 0, 0, 0, -len(images) % columns))
-    rows = small.unflatten(0, (-1, columns)).permute(0, 3, 1, 4, 2)  # (rows, H, columns, W, 3)
-    sheet = rows.reshape(-1, columns * width, 3).round().clamp(0, 255).byte().cpu().numpy()
+def save_sheet(images: Tensor, path: Path) -> None:
+    """Save images (B, 3, H, W) uint8 side by side as a PNG."""
+    height = round(_SHOWN_WIDTH * images.shape[-2] / images.shape[-1])
+    small = F.interpolate(images.float(), size=(height, _SHOWN_WIDTH), mode="bilinear", antialias=True)
+    small = F.pad(small, (0, 0, 0, 0, 0, 0, 0, -len(images) % _COLUMNS))
+    rows = small.unflatten(0, (-1, _COLUMNS)).permute(0, 3, 1, 4, 2)  # (rows, H, columns, W, 3)
+    sheet = rows.reshape(-1, _COLUMNS * _SHOWN_WIDTH, 3).round().clamp(0, 255).byte().cpu().numpy()
     Image.fromarray(sheet).save(path)
 
 

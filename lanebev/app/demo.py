@@ -17,6 +17,7 @@ from lanebev.io.lanes.tusimple import tusimple_line
 from lanebev.io.output.folder import OutputFolder
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video.writer import VideoWriter
+from lanebev.observation.frames import image_bytes
 from lanebev.observation.polylines import BoundaryRows, LaneLine, rows_from_vertices, vertices_from_lines
 from lanebev.render import Drive, RenderedFrame
 from lanebev.types import Calibration, Extrinsics, Status
@@ -65,8 +66,7 @@ def write_drive(
     with VideoWriter(path("drive.mp4"), Fraction(FPS), _RENDERED_CRF) as video, Background() as background:
         for number in progress(numbers, len(drive)) if progress else numbers:
             frame = drive.frame(number)
-            picture = (255 * frame.image[0].permute(1, 2, 0)).round().byte().contiguous().numpy()
-            background.submit(partial(video.write, picture))
+            background.submit(partial(video.write, image_bytes(frame.image[0])))
             rows.append(_truth_row(number, float(drive.times[number]), frame))
             widths.append(float(frame.lane_width.mean()))
             lines.append(tusimple_line(f"drive.mp4/{number:06d}", *true_lanes(drive, frame)))

@@ -16,13 +16,8 @@ from torch import Tensor
 from lanebev.camera.files import camera_from_fields, read_camera, write_camera
 from lanebev.camera.parameters import CameraParameters
 from lanebev.geometry.distortion import check_lens, lens_model, max_undistorted_radius
-from lanebev.geometry.lens import (
-    check_points,
-    denormalise_points,
-    distort_points,
-    invert_distortion,
-    normalise_points,
-)
+from lanebev.geometry.lens import check_points, denormalise_points, distort_points, invert_distortion
+from lanebev.geometry.road import rays_from_pixels
 from lanebev.numbers import check_number
 from lanebev.tensors import device_of_numbers
 from lanebev.types import check_numbers_known, check_tensor
@@ -274,8 +269,7 @@ class Camera:
 
     def rays(self, points: Tensor) -> Tensor:
         """Convert pixels as taken (N, 2) to camera rays (N, 3) with z = 1."""
-        plane = normalise_points(self.undistort_points(points)[0], self.intrinsics)
-        return torch.cat([plane, torch.ones_like(plane[..., :1])], dim=-1)
+        return rays_from_pixels(self.undistort_points(points)[0], self.intrinsics)
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Project points of the camera frame to pixels as taken.

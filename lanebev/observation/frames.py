@@ -96,6 +96,12 @@ def network_image(frame: Tensor, device: torch.device) -> Tensor:
     return image.float().div_(255) if image.dtype == torch.uint8 else image.float()
 
 
+def image_bytes(image: Tensor) -> NDArray[np.uint8]:
+    """Convert images (..., 3, H, W), of bytes or in [0, 1], to (..., H, W, 3) bytes."""
+    pixels = image if image.dtype == torch.uint8 else (255 * image).round().clamp(0, 255).byte()
+    return pixels.movedim(-3, -1).contiguous().cpu().numpy()
+
+
 def resized_size(image_size: tuple[int, int], network_width: int, pixels: int | None) -> tuple[int, int]:
     """Compute the size (h, w) px of a network's input for images of (H, W) px.
 

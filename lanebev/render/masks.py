@@ -11,27 +11,20 @@ _FAR = 8  # sides of the map; farther from its origin than this nothing is drawn
 
 
 @torch.no_grad()
-def boundary_masks(
-    frame: RenderedFrame,
-    size: tuple[int, int],
-    half_width_px: float,
-    *,
-    model: str = "pinhole",
-) -> Tensor:
+def boundary_masks(frame: RenderedFrame, size: tuple[int, int], half_width_px: float) -> Tensor:
     """Return soft masks of the boundaries in the image as taken, drawn by :func:`draw_stripes`.
 
     Args:
-        frame: B rendered images.
+        frame: B rendered images of pinhole cameras.
         size: (h, w) of the masks; the image is taken to be resized to it, pixel centres at integers.
         half_width_px: in pixels of the masks.
-        model: the frame's lens model.
 
     Returns:
         (B, L, h, w) in [0, 1].
     """
     if not half_width_px > 0:
         raise ValueError(f"half_width_px: expected > 0, got {half_width_px}")
-    points = distort_points(frame.boundaries.flatten(1, 2), frame.intrinsics, frame.distortion, model)
+    points = distort_points(frame.boundaries.flatten(1, 2), frame.intrinsics, frame.distortion)
     scale = points.new_tensor([size[1] / frame.image.shape[3], size[0] / frame.image.shape[2]])
     points = ((points + 0.5) * scale - 0.5).unflatten(1, frame.visible.shape[1:])
     return draw_stripes(points, frame.visible, size, half_width_px)

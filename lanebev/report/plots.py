@@ -47,8 +47,8 @@ def plot_estimates(
     measured = states <= AxisState.UNCERTAIN
     true = None if truth is None else estimates(truth)
     figures: list[Any] = []
+    shown = x_range(x)
     for axis, label in enumerate(_LABELS):
-        shown = figures[0].x_range if figures else x_range(x)
         plot = new_figure(label, shown, value_limits(value[:, axis], std[:, axis], known[:, axis], axis))
         undetermined = known[:, axis] & ~measured[:, axis]
         kinds = {_LINE: (measured[:, axis], "estimate ±2σ"), _UNDETERMINED: (undetermined, "not determined")}
@@ -79,8 +79,8 @@ def plot_two(
     stds = np.stack([estimate_stds(first), estimate_stds(second)])
     states = np.stack([all_axis_states(first), all_axis_states(second)])
     figures: list[Any] = []
+    shown = x_range(x)
     for axis, label in enumerate(_LABELS):
-        shown = figures[0].x_range if figures else x_range(x)
         value, std, state = values[..., axis], stds[..., axis], states[..., axis]
         known, measured = state != AxisState.UNKNOWN, state <= AxisState.UNCERTAIN
         plot = new_figure(label, shown, value_limits(value.ravel(), std.ravel(), known.ravel(), axis))
@@ -104,8 +104,8 @@ def plot_differences(
         stills: each image is on its own.
     """
     figures: list[Any] = []
+    shown = x_range(x)
     for axis, label in enumerate(_LABELS):
-        shown = figures[0].x_range if figures else x_range(x)
         finite = np.isfinite(change[:, axis]) & np.isfinite(sigma[:, axis])
         most = float(np.abs(change[finite, axis]).max(initial=0.1 * LEAST_RANGE[axis]))
         plot = new_figure(f"Δ {label}", shown, (-1.2 * most, 1.2 * most), height=120)

@@ -129,6 +129,11 @@ def landing_time() -> float:
     return math.sqrt(2 * _DROP / _GRAVITY)
 
 
+def share_done(t: float, start: float, seconds: float) -> float:
+    """Return the share of a change that is done at t (s): 0 up to its start, 1 after so many seconds."""
+    return min(max((t - start) / seconds, 0.0), 1.0)
+
+
 def moved(pose: Pose, by: Pose, share: float = 1.0) -> Pose:
     """Return a pose with differences added, or a share of them."""
     pitch, yaw, roll, height = (value + share * more for value, more in zip(pose, by, strict=True))

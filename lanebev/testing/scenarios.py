@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from lanebev.testing.moments import FPS, PLACES, WIDTH, Change, Moment, drift, swing
+from lanebev.testing.motions import share_done
 
 
 def _clothoid(s: Tensor, radius: float, transition: float) -> Tensor:
@@ -36,7 +37,7 @@ def _sharp_bends(t: float, moment: Moment) -> Moment:
 
 
 def _lane_change(t: float, moment: Moment) -> Moment:
-    done = min(max((t - 2.0) / 4.0, 0.0), 1.0)
+    done = share_done(t, 2.0, 4.0)
     moved = WIDTH * (done - math.sin(2 * math.pi * done) / (2 * math.pi))  # camera to the right
     crossed = moved > WIDTH / 2
     return replace(
@@ -52,17 +53,13 @@ def _bumps(t: float, moment: Moment) -> Moment:
 
 
 def _brake(t: float, moment: Moment) -> Moment:
-    dive = (
-        math.radians(1.5)
-        * min(max((t - 3.0) / 0.3, 0.0), 1.0)
-        * (1.0 if t < 5.0 else max(0.0, 1 - (t - 5) / 0.3))
-    )
+    dive = math.radians(1.5) * share_done(t, 3.0, 0.3) * (1 - share_done(t, 5.0, 0.3))
     pitch, yaw, roll, height = moment.pose
     return replace(moment, pose=(pitch + dive, yaw, roll, height))
 
 
 def _exit(t: float, moment: Moment) -> Moment:
-    away = min(max(t - 3.0, 0.0), 3.0) / 3.0
+    away = share_done(t, 3.0, 3.0)
     headings, places = moment.headings.clone(), moment.places.clone()
     if 0 < away < 1:
         headings[5], places[5] = 0.06, places[5] + 3.0 * away

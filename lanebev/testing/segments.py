@@ -9,6 +9,7 @@ from lanebev.estimation.checks import padded
 from lanebev.estimation.joint.measurement.observations import boundary_places
 from lanebev.geometry.road import image_from_road_points
 from lanebev.observation.segments import LaneSegments
+from lanebev.tensors import join_tensors
 from lanebev.types import Extrinsics
 
 INTRINSICS = torch.tensor([[1000.0, 0.0, 640.0], [0.0, 1000.0, 360.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -112,4 +113,4 @@ def no_lanes() -> LaneSegments:
 def stack_rows(*rows: LaneSegments) -> LaneSegments:
     """Make one batch of rows with different numbers of segments, padded with weight zero to the longest."""
     longest = max(row.weight.shape[1] for row in rows)
-    return LaneSegments(*map(torch.cat, zip(*(padded(row, longest) for row in rows), strict=True)))
+    return join_tensors(torch.cat, [padded(row, longest) for row in rows])

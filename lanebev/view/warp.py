@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from numbers import Real
-from typing import overload
 
 import torch
 from torch import Tensor, nn
@@ -49,32 +48,6 @@ class BEVWarp(nn.Module):
         self.plane_heights = None if plane_heights is None else tuple(map(float, plane_heights))
         if self.plane_heights == ():
             raise ValueError("plane_heights: expected one plane at least, or None for the road, got none")
-
-    @overload
-    def forward(
-        self,
-        image: Tensor,
-        intrinsics: Tensor,
-        extrinsics: Extrinsics,
-        distortion: Tensor | None = None,
-        model: str = "pinhole",
-        image_size: tuple[int, int] | None = None,
-        strides: float | None = None,
-        vertical_curvature: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]: ...
-
-    @overload
-    def forward(
-        self,
-        image: Sequence[Tensor],
-        intrinsics: Tensor,
-        extrinsics: Extrinsics,
-        distortion: Tensor | None = None,
-        model: str = "pinhole",
-        image_size: tuple[int, int] | None = None,
-        strides: Sequence[float] | None = None,
-        vertical_curvature: Tensor | None = None,
-    ) -> tuple[list[Tensor], Tensor]: ...
 
     def forward(
         self,

@@ -8,7 +8,17 @@ import torch
 
 from lanebev.camera.model import Camera
 from lanebev.testing.moments import PLACES, Change, Moment, moments, swing
-from lanebev.testing.motions import MOUNT, Motion, Pose, fall, landing_time, moved, sinusoids, suspension
+from lanebev.testing.motions import (
+    MOUNT,
+    Motion,
+    Pose,
+    fall,
+    landing_time,
+    moved,
+    share_done,
+    sinusoids,
+    suspension,
+)
 from lanebev.testing.scenarios import SCENARIOS
 from lanebev.testing.streets import wandering
 
@@ -116,7 +126,7 @@ def knock(by: Pose) -> Change:
     """Turn and move the camera by a pose in 0.1 s, for good."""
 
     def change(t: float, moment: Moment) -> Moment:
-        share = min(max((t - SHOCK) / 0.1, 0.0), 1.0)
+        share = share_done(t, SHOCK, 0.1)
         return replace(moment, pose=moved(moment.pose, by, share), tag="knock" if 0 < share < 1 else "")
 
     return change

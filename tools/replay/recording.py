@@ -13,6 +13,7 @@ from lanebev.batch import select_rows
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.mount import MountCalibration, MountEstimator
 from lanebev.observation.segments import LaneSegments, camera_segments
+from lanebev.tensors import join_tensors
 from lanebev.testing.moments import CAMERA, WIDTH, Moment, observe
 from lanebev.types import Calibration
 from tools.replay.kinds import Generated
@@ -110,7 +111,7 @@ def record(generated: Generated, seed: int) -> Recording:
 def _segments(drive: list[Moment], seed: int) -> LaneSegments:
     """Convert segments to (T, N) in the pixels of the ideal camera."""
     frames = [found for _, found in observe(drive, 1, SIGMA, SEGMENTS, seed, torch.float64)]
-    return LaneSegments._make(torch.cat(parts) for parts in zip(*frames, strict=True))
+    return join_tensors(torch.cat, frames)
 
 
 def _intervals(drive: list[Moment]) -> Tensor:

@@ -19,7 +19,8 @@ from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.observation.segments import camera_segments
 from lanebev.pipeline import LaneBEV
 from lanebev.render import Drive
-from lanebev.testing.motions import Motion, Pose, fall, landing_time, moved
+from lanebev.tensors import join_tensors
+from lanebev.testing.motions import Motion, Pose, fall, landing_time, moved, share_done
 from lanebev.types import Extrinsics
 from tools.replay.kinds import FRAMES, KNOCK
 from tools.replay.recording import Recording
@@ -53,8 +54,7 @@ class Shock(NamedTuple):
 
 def _knocked(t: float) -> Pose:
     """Return a knock of 3° and 25 cm in 0.1 s that stays."""
-    share = min(max((t - _KNOCKED_AT) / 0.1, 0.0), 1.0)
-    return moved((0.0, 0.0, 0.0, 0.0), KNOCK, share)
+    return moved((0.0, 0.0, 0.0, 0.0), KNOCK, share_done(t, _KNOCKED_AT, 0.1))
 
 
 FALL = Shock(fall, 0.0, landing_time())
@@ -117,7 +117,7 @@ def see(rendered: Rendered) -> dict[str, Any]:
             seen.append(model.boundary_vertices(frames.image)[1])
             poses.append(frames.extrinsics.stack().double())
             width = width or float(frames.lane_width[0, frames.lane_width.shape[1] // 2])
-    vertices = BoundaryVertices._make(torch.cat(parts) for parts in zip(*seen, strict=True))
+    vertices = join_tensors(torch.cat, seen)
     return {
         "points": (vertices.points.clamp(0, 1023) * _PIXEL).round().numpy().astype(np.uint16),
         "weight": (vertices.weight * 255).round().numpy().astype(np.uint8),

@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lanebev.estimation.joint.state import JointState
+from lanebev.observation.frames import image_bytes
 from lanebev.pipeline import LaneBEV
 from lanebev.render import Drive
 from lanebev.render.camera_motion import SmoothNoise
 from lanebev.render.scene.sampler import BatchSampler
+from lanebev.tensors import join_tensors
 from lanebev.types import Extrinsics
 from lanebev.view.grid import BEVGrid
-from train.archives import as_bytes, decode_jpeg, encode_jpegs, read_arrays, write_arrays
+from train.archives import decode_jpeg, encode_jpegs, read_arrays, write_arrays
 from train.commands import command_parser, one_line_errors
 from train.detector.boxes import in_grid, visible_share
 
@@ -104,7 +106,7 @@ def render_drive(seed: int, frames: int, size: tuple[int, int], fps: float, lane
     """
     drive = ShakingDrive(seed, image_size=size, num_frames=frames, fps=fps)
     taken = [drive.frame(index) for index in range(frames)]
-    jpeg, ends = encode_jpegs(as_bytes(frame.image[0]) for frame in taken)
+    jpeg, ends = encode_jpegs(image_bytes(frame.image[0]) for frame in taken)
     truth = [
         torch.cat(part)
         for part in zip(
@@ -154,7 +156,7 @@ def calibrate_online(record: DriveRecord, lanes: LaneBEV, fps: float) -> tuple[T
         frame = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
         out, state = lanes(frame, intrinsics, state, 1 / fps, width[None], bev=False)
         poses.append(out.calibration.extrinsics.stack())
-    return torch.cat(poses), JointState(*(torch.cat(part) for part in zip(*before, strict=True)))
+    return torch.cat(poses), join_tensors(torch.cat, before)
 
 
 def has_vehicles(seed: int, frames: int, fps: float) -> bool:

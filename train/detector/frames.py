@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
 from lanebev.estimation.joint.state import JointState
+from lanebev.tensors import join_tensors, map_tensors
 from lanebev.view.grid import BEVGrid
 from train.detector.boxes import in_grid
 from train.detector.drives import WARM_UP, DriveRecord, read_drive
@@ -79,7 +80,7 @@ def frames_of(records: list[DriveRecord], grid: BEVGrid) -> Frames:
         return torch.from_numpy(np.concatenate([part[WARM_UP:] for part in parts]))
 
     boxes = joined([record.boxes for record in records])
-    states = [_after_warm_up(record.state) for record in records]
+    states = [map_tensors(lambda part: part[WARM_UP:], record.state) for record in records]
     count = [len(record.ends) for record in records]
     return Frames(
         image=joined([record.images() for record in records]).permute(0, 3, 1, 2),
@@ -89,13 +90,8 @@ def frames_of(records: list[DriveRecord], grid: BEVGrid) -> Frames:
         online=joined([record.online for record in records]),
         intrinsics=joined([np.repeat(r.intrinsics[None], n, 0) for r, n in zip(records, count, strict=True)]),
         lane_width=joined([record.lane_width for record in records]),
-        state=JointState(*(torch.cat(part) for part in zip(*states, strict=True))),
+        state=join_tensors(torch.cat, states),
     )
-
-
-def _after_warm_up(state: JointState) -> JointState:
-    """Return the states of the frames after the warm-up."""
-    return JointState(*(part[WARM_UP:] for part in state))
 
 
 class StepBatches(Sampler[list[int]]):

@@ -223,7 +223,7 @@ class Recorder:
         image = frame.image if frame.image is not None else np.zeros((*self.camera.image_size, 3), np.uint8)
         place = frame.name if self.single or self.stills else f"frame {frame.number}   {frame.time:.2f} s"
         words = ", ".join(reason_words([str(reason.name) for reason in reasons]))
-        headline = _shortened(place)
+        headline = place if len(place) <= _LONGEST_NAME else "…" + place[1 - _LONGEST_NAME :]
         return draw_panels(image, self.camera, segments, calibration, headline, views, self.grid, words)
 
     def _write_pictures(self, frame: Frame, bev: NDArray[np.uint8], overlay: NDArray[np.uint8]) -> None:
@@ -243,7 +243,3 @@ def _row(done: Recorded, estimate: Estimate) -> ExtrinsicsRow:
     return extrinsics_row(
         frame.number, frame.time, calibration, segments.weight, frame.name, reasons, vertical
     )
-
-
-def _shortened(name: str) -> str:
-    return name if len(name) <= _LONGEST_NAME else "…" + name[1 - _LONGEST_NAME :]
