@@ -162,11 +162,14 @@ def as_batch(value: float | Tensor, like: Tensor, name: str = "dt") -> Tensor:
 def as_lane_width(value: float | Tensor, like: Tensor, num_boundaries: int) -> Tensor:
     """Convert a lane width prior, float, (B,) or (B, L-1), to (B, L-1) m."""
     check_number_or_tensor("lane_width", value)
-    least, most = LANE_WIDTHS
-    if isinstance(value, (int, float)) and not least <= value <= most:
-        raise ValueError(f"lane_width: expected {least:g} to {most:g} m, got {value}")
+    rows, lanes = like.shape[0], num_boundaries - 1
+    if isinstance(value, (int, float)):
+        least, most = LANE_WIDTHS
+        if not least <= value <= most:
+            raise ValueError(f"lane_width: expected {least:g} to {most:g} m, got {value}")
+        return as_batch(value, like).unsqueeze(-1).expand(rows, lanes)
     width = torch.as_tensor(value, dtype=like.dtype, device=like.device)
-    rows, lanes, got = like.shape[0], num_boundaries - 1, tuple(width.shape)
+    got = tuple(width.shape)
     if width.ndim == 1:
         width = width.unsqueeze(-1)
     fits = width.ndim == 0 or (

@@ -130,6 +130,8 @@ def lines_from_polylines(
             points = np.array(given.tolist() if isinstance(given, Tensor) else given, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise ValueError(f"polylines[{key}]: expected (P, 2) px, got {shown(given)}") from error
+        if points.shape == (0,):  # an empty list, of a line that is not seen
+            points = points.reshape(0, 2)
         if points.ndim != 2 or points.shape[1] != 2:
             raise ValueError(f"polylines[{key}]: expected (P, 2) px, got shape {points.shape}")
         points = _with_rows(points)

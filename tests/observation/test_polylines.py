@@ -120,6 +120,8 @@ def test_polylines_by_boundary_are_taken_at_their_word():
     tensors = LaneSegments.from_polylines([torch.from_numpy(left).float(), torch.from_numpy(right)], CAMERA)
     assert set(tensors.boundary[tensors.weight > 0].tolist()) == {2, 3}
     assert LaneSegments.from_polylines([], CAMERA).weight.sum() == 0
+    empty = LaneSegments.from_polylines([[], left, right, []], CAMERA)
+    assert set(empty.boundary[empty.weight > 0].tolist()) == {2, 3}
 
 
 def test_a_dense_polyline_says_no_more_than_one_on_rows():

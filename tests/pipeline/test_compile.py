@@ -101,8 +101,8 @@ def test_mount():
     [JointCalibrator(iterations=1, start_iterations=1), TwoStageCalibrator(num_hypotheses=20)],
     ids=["joint", "two-stage"],
 )
-def test_an_interval_that_varies_makes_no_graph_per_frame(calibrator):
-    """Every video of variable frame rate: dt as a float, another one in each frame."""
+def test_numbers_that_vary_make_no_graph_per_frame(calibrator):
+    """Every video of variable frame rate: dt as a float, another one in each frame; lanes of a map."""
     torch.compiler.reset()
     graphs = []
 
@@ -113,7 +113,8 @@ def test_an_interval_that_varies_makes_no_graph_per_frame(calibrator):
     compiled = torch.compile(calibrator, backend=backend)
     state = calibrator.initial_state(1, dtype=torch.float64)
     for frame in range(6):
-        _, state = compiled(lanes(seed=frame), K[None], state, 0.033 + 1e-4 * frame)
+        width = 3.5 + 0.01 * frame
+        _, state = compiled(lanes(seed=frame), K[None], state, 0.033 + 1e-4 * frame, width)
     assert len(graphs) <= 2
 
 
