@@ -124,11 +124,17 @@ class Segmentation(L.LightningModule):
         checkpoint["settings"] = self.settings
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse another network's in one line, not in one of each weight."""
+        """Refuse another network's in one line, not in one of each weight, and another optimizer's state."""
         own, other = self.settings["network"], checkpoint["settings"]["network"]
         for name in sorted(own.keys() - {"image_size", "sigma_scale", "pose_sigma_scale"}):
             if own[name] != other[name]:
                 raise ValueError(f"ckpt_path: expected a network of {name} {own[name]}, got {other[name]}")
+        own, other = self.settings["optimizer"], checkpoint["settings"]["optimizer"]
+        if own != other and self._trainer is not None and self._trainer.training:
+            raise ValueError(
+                f"ckpt_path: expected a run by {own}, got {other}; to begin anew from its weights, give it "
+                "as --model.init_args.init_from"
+            )
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Augment, segment, compare."""
@@ -225,13 +231,13 @@ class Segmentation(L.LightningModule):
         return rate_factor(step, self.trainer.max_steps, used_share(self.trainer, step), **schedule)
 
     def on_train_start(self) -> None:
-        """Set the rate anew: a checkpoint has that of the run as long as it was, a finished one's is 0."""
+        """Set rate and weight decay as given: a checkpoint has those of the run before, perhaps 0."""
         for schedule in self.trainer.lr_scheduler_configs:
-            factor = self._rate(self.trainer.global_step)
-            for group, base in zip(
-                schedule.scheduler.optimizer.param_groups, schedule.scheduler.base_lrs, strict=True
-            ):
-                group["lr"] = base * factor
+            groups = schedule.scheduler.optimizer.param_groups
+            schedule.scheduler.base_lrs = [self.settings["learning_rate"]] * len(groups)
+            for group in groups:
+                group["lr"] = self.settings["learning_rate"] * self._rate(self.trainer.global_step)
+            groups[0]["weight_decay"] = self.settings["weight_decay"]
         if self.compiled:
             self.segmenter.compile()  # in place: weights keep their names
 

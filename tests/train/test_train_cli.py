@@ -155,18 +155,24 @@ def test_an_interrupted_run_ends_as_one_in_a_piece(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_finished_run_goes_on_at_its_own_rate(tmp_path, monkeypatch):
-    """Its checkpoint was written when the rate had come to its end, 0."""
-    rates = []
+    """Its checkpoint was written when the rate had come to its end, 0; another rate may be given."""
+    rates, decays = [], []
     step = Segmentation.training_step
 
     def noted(self, batch, batch_idx):
-        rates.append(self.trainer.optimizers[0].param_groups[0]["lr"])
+        first, second = self.trainer.optimizers[0].param_groups
+        assert second["weight_decay"] == 0
+        rates.append(first["lr"])
+        decays.append(first["weight_decay"])
         return step(self, batch, batch_idx)
 
     monkeypatch.setattr(Segmentation, "training_step", noted)
     run("fit", "fast.yaml", tmp_path)
     run("fit", "fast.yaml", tmp_path, "--trainer.max_steps=4", "--ckpt_path=last")
-    assert rates == [2e-3] * 4
+    others = ["--model.init_args.learning_rate=5e-4", "--model.init_args.weight_decay=0.1"]
+    run("fit", "fast.yaml", tmp_path, "--trainer.max_steps=6", "--ckpt_path=last", *others)
+    assert rates == [2e-3] * 4 + [5e-4] * 2
+    assert decays == [0.02] * 4 + [0.1] * 2
 
 
 def test_last_of_nothing_is_an_error(tmp_path, capsys):
@@ -193,6 +199,11 @@ def test_checkpoints_of_another_kind_are_one_line(tmp_path, capsys):
     path, wider = next(tmp_path.rglob("last.ckpt")), "--model.init_args.network.base_width=16"
     said = refused(capsys, "test", "fast.yaml", tmp_path, f"--ckpt_path={path}", wider)
     assert said == "error: ckpt_path: expected a network of base_width 16, got 4"
+    by_sgd = ("--trainer.max_steps=2", "--model.init_args.optimizer=sgd", "--ckpt_path=last")
+    said = refused(capsys, "fit", "fast.yaml", tmp_path, *by_sgd)
+    assert said.startswith(
+        "error: ckpt_path: expected a run by sgd, got adamw; to begin anew from its weights"
+    )
     said = refused(capsys, "fit", "fast.yaml", tmp_path, f"--model.init_args.init_from={path}", wider)
     assert "weights do not fit the network" in said
     with pytest.raises(ValueError, match="expected a file that can be written"):
