@@ -19,6 +19,7 @@ from lanebev.io.lanes.remarks import (
     left_out_remark,
     other_camera_remark,
     repeats_remark,
+    two_scales_remark,
     unequal_lanes_remark,
 )
 from lanebev.io.lanes.size import size_remark
@@ -83,7 +84,7 @@ class LaneFileObserver:
     ) -> None:
         self.entries = [_as_taken(entry, camera) for entry in entries]
         self.camera = camera
-        self.remark = size_remark(entries, camera.image_size)
+        self.remark = size_remark(entries, camera.image_size) or two_scales_remark(entries)
         if not any(entry.lines for entry in entries):
             self.remark = "lanes: none of the entries has a line"
         check_boundary_order(entries)

@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 
 from lanebev.camera.model import Camera
 from lanebev.io.lanes.parsing import FrameLines
+from lanebev.io.lanes.size import meeting_point
 from lanebev.observation.polylines import lane_width_ratios
 
 _LEAST_FRAMES = 10  # with lanes, among which each boundary is seen in one
 _MOST_REPEATED = 0.3  # fraction of frames with the lanes of the one before; all if nothing moves
 _LOOKED_AT = 50  # frames
+_LEAST_SMALLER = 3  # frames with lanes of another scale
+_SMALLER, _SAME_SCALE = 0.9, 0.1  # ratio of two scales at most; relative, by which ratios of one may differ
 _SAME_FOCAL = 0.01  # relative, by which focal lengths of one camera may differ
 _UNEQUAL = 1.8  # ratio
 _MOST_ROLL = 2  # degrees; with it six boundaries of equally wide lanes look as if of a ratio of up to 2.4
@@ -88,6 +91,31 @@ def _have_the_same_lines(one: FrameLines, other: FrameLines) -> bool:
     first, second = ([line.points for line in frame.lines] for frame in (one, other))
     pairs = zip(first, second, strict=False)
     return len(first) == len(second) and all(np.array_equal(*pair, equal_nan=True) for pair in pairs)
+
+
+def two_scales_remark(frames: Sequence[FrameLines]) -> str:
+    """Return a remark if lanes of some frames are as of smaller images than the others; else nothing.
+
+    Their lowest row, and column and row where they meet, are then smaller by the same factor. A turned camera
+    or hidden lanes do not change all three so.
+    """
+    drawn = [frame for frame in frames if any(len(line.points) for line in frame.lines)]
+    lows = np.array([max(line.points[:, 1].max(initial=0) for line in frame.lines) for frame in drawn])
+    order = np.argsort(lows, kind="stable")
+    if len(drawn) < 2 or not lows.min() > 0:
+        return ""
+    split = 1 + int(np.argmin(lows[order][:-1] / lows[order][1:]))
+    if not _LEAST_SMALLER <= split <= len(drawn) - _LEAST_SMALLER:
+        return ""
+    parts = order[:split], order[split:]
+    smaller, larger = ((np.median(lows[part]), *meeting_point([drawn[i] for i in part])) for part in parts)
+    ratios = np.array(smaller) / np.array(larger)
+    if not (ratios.max() < _SMALLER and np.ptp(ratios) < _SAME_SCALE * ratios.min()):  # false on NaN
+        return ""
+    return (
+        f"lanes: those of {split} of {len(drawn)} frames are {np.median(ratios):.2g} times as large as the "
+        "others, as of smaller images; convert them to pixels of the images"
+    )
 
 
 def other_camera_remark(frames: Sequence[FrameLines], camera: Camera) -> str:

@@ -12,7 +12,7 @@ from lanebev import Camera
 from lanebev.app.drive.observers import LaneFileObserver
 from lanebev.io.frames import Selection
 from lanebev.io.lanes.parsing import FrameLines
-from lanebev.io.lanes.remarks import unequal_lanes_remark
+from lanebev.io.lanes.remarks import two_scales_remark, unequal_lanes_remark
 from lanebev.io.opening import open_source
 from lanebev.io.video.writer import VideoWriter
 from lanebev.observation.polylines import LaneLine
@@ -59,6 +59,25 @@ def test_lanes_that_a_slow_detector_repeats_are_noticed(tmp_path):
     assert remarks[1] == remarks[6] == ""  # all the same: nothing moves
     assert remarks[2].startswith("lanes: 3 of 6 frames have the lines of the frame before")
     assert remarks[3].startswith("lanes: 4 of 6 frames have the lines of the frame before")
+
+
+@pytest.mark.parametrize(
+    ("scale", "lowest", "pitch"),
+    [(0.5, 1.0, 0.0), (0.8, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, 0.7, 0.0), (1.0, 1.0, 0.06), (1.0, 0.7, 0.06)],
+)
+def test_lanes_of_two_scales_are_noticed(scale, lowest, pitch):
+    """Some frames in pixels of smaller images; not lanes that begin farther ahead, or another pitch."""
+    rng = np.random.default_rng(0)
+    frames = []
+    for number in range(12):
+        horizon = 170.0 - 500 * (pitch * (number > 6) + rng.normal(0, 0.003))
+        rows = np.arange(horizon + 10, 350.0 * (lowest if number > 6 else 1.0), 10.0)
+        lines = [np.stack([315 + place * (rows - horizon), rows], axis=-1) for place in (-3.9, -1.3, 1.3)]
+        factor = scale if number > 6 else 1.0
+        frames.append(FrameLines(f"{number}", [LaneLine(factor * line) for line in lines]))
+    said = f"lanes: those of 5 of 12 frames are {scale:g} times as large as the others"
+    assert two_scales_remark(frames).partition(", as of")[0] == (said if scale < 1 else "")
+    assert two_scales_remark(frames[:7]) == two_scales_remark([]) == ""
 
 
 def test_lanes_of_different_widths_are_noticed(tmp_path):
